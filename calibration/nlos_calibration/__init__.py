@@ -1,0 +1,1 @@
+"""Scene geometry: wall, rig, calibration records."""

@@ -1,0 +1,22 @@
+"""Errors of the calibration package.
+
+CalibrationError (ValueError)    exit 1   root
+├── WallRefusedError             exit 1   what the lidar saw is not a bare wall we can trust
+└── RecordFileError              exit 4   a rig or wall record that cannot be read
+"""
+
+
+class CalibrationError(ValueError):
+    """Root of the errors that the calibration foresaw."""
+
+    exit_code = 1
+
+
+class WallRefusedError(CalibrationError):
+    """What the lidar saw is not a bare wall that can be trusted; the message says why."""
+
+
+class RecordFileError(CalibrationError):
+    """A rig or wall record that cannot be read."""
+
+    exit_code = 4

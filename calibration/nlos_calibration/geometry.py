@@ -1,0 +1,47 @@
+"""The wall frame, the lidar frame, and the pose between them.
+
+Wall frame: origin at the foot of the perpendicular from the lidar to the wall, z into the room, x = the lidar's x axis
+projected on the wall, y = z cross x. Lidar frame: x right, y down, z along the optical axis. A wall plane seen by the
+lidar (unit normal towards the lidar, distance) is therefore a whole pose.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def normal_from_angles(yaw_rad: float, pitch_rad: float) -> Array:
+    """The wall's normal (3,) in the lidar frame; positive yaw turns the axis towards wall +x, positive pitch up."""
+    return np.array(
+        [np.sin(yaw_rad) * np.cos(pitch_rad), -np.sin(pitch_rad), -np.cos(yaw_rad) * np.cos(pitch_rad)],
+    )
+
+
+def angles_from_normal(normal_lidar: Array) -> tuple[float, float]:
+    """(yaw_rad, pitch_rad) of a wall whose unit normal in the lidar frame is `normal_lidar` (3,)."""
+    x, y, z = normal_lidar
+    return float(np.arctan2(x, -z)), float(np.arcsin(np.clip(-y, -1.0, 1.0)))
+
+
+def wall_from_plane(normal_lidar: Array, distance_m: float) -> Array:
+    """The pose wall_from_lidar (4, 4) for a plane normal . p + distance_m = 0, the normal (3,) towards the lidar.
+
+    The rows of the rotation are the wall's axes seen from the lidar: z = normal, x = the lidar's x made orthogonal to
+    it, y = z cross x. Raises ValueError where the lidar's x axis is the normal itself, which leaves x undefined.
+    """
+    z_axis = normal_lidar / np.linalg.norm(normal_lidar)
+    x_axis = np.array([1.0, 0.0, 0.0]) - z_axis[0] * z_axis
+    if np.linalg.norm(x_axis) < 1e-9:
+        message = "the lidar's x axis is along the wall's normal: the wall frame's x is undefined; turn the lidar"
+        raise ValueError(message)
+    x_axis /= np.linalg.norm(x_axis)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis])
+    pose[2, 3] = distance_m
+    return pose
+
+
+def facing_angle_rad(wall_from_lidar: Array) -> float:
+    """The angle between the optical axis and the wall's normal, from the pose (4, 4)."""
+    return float(np.arccos(np.clip(-wall_from_lidar[2, 2], -1.0, 1.0)))

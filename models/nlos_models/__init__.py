@@ -1,0 +1,1 @@
+"""Neural networks: Res-VAE, compressor, training, inference."""

@@ -1,0 +1,60 @@
+"""Arrays to shuffled batches. Where the arrays come from is not this package's business."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Half = NDArray[np.float16]
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class MapSet:
+    """Lidar maps and the images of what was hidden: what the compressor learns from."""
+
+    depth_m: Float32
+    """(n, 64, 80); NaN where there is no return."""
+    intensity: Float32
+    """(n, 64, 80)."""
+    image: Half | Float32
+    """(n, 64, 64) in [0, 1]."""
+
+
+def shuffled(count: int, batch: int, generator: torch.Generator) -> Iterator[Tensor]:
+    """Index batches over one epoch; the last, smaller one is left out, so that no batch norm sees a single sample."""
+    order = torch.randperm(count, generator=generator)
+    for start in range(0, count - min(batch, count) + 1, batch):
+        yield order[start : start + batch]
+
+
+def flip_some(tensors: list[Tensor], flips: Tensor) -> list[Tensor]:
+    """Mirror the flagged samples (n,) top to bottom in every tensor (n, ..., rows, columns).
+
+    The rig is symmetric about y = 0: a mirrored object is seen as mirrored maps, so this is data, not distortion.
+    """
+    chosen = flips.bool()
+    return [torch.where(chosen.view(-1, *[1] * (t.ndim - 1)), t.flip(-2), t) for t in tensors]
+
+
+def image_batches(images: Half, batch: int, generator: torch.Generator) -> Iterator[Tensor]:
+    """One epoch of images (b, 1, 64, 64), shuffled and mirrored at random."""
+    for index in shuffled(len(images), batch, generator):
+        chosen = torch.from_numpy(images[index.numpy()].astype(np.float32))[:, None]
+        yield flip_some([chosen], torch.rand(len(index), generator=generator) < 0.5)[0]
+
+
+def map_batches(maps: MapSet, batch: int, generator: torch.Generator) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """One epoch of depth (b, 64, 80), intensity (b, 64, 80) and images (b, 1, 64, 64), shuffled and mirrored."""
+    for index in shuffled(len(maps.image), batch, generator):
+        rows = index.numpy()
+        depth, intensity = torch.from_numpy(maps.depth_m[rows]), torch.from_numpy(maps.intensity[rows])
+        image = torch.from_numpy(maps.image[rows].astype(np.float32))[:, None]
+        depth, intensity, image = flip_some(
+            [depth, intensity, image],
+            torch.rand(len(rows), generator=generator) < 0.5,
+        )
+        yield depth, intensity, image

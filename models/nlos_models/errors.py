@@ -1,0 +1,24 @@
+"""Errors of the models package.
+
+ModelError (ValueError)          exit 1   root
+├── CheckpointError              exit 4   weights that cannot be read or do not fit the model
+└── RecipeError                  exit 4   a training recipe that cannot be read
+"""
+
+
+class ModelError(ValueError):
+    """Root of the errors that the models foresaw."""
+
+    exit_code = 1
+
+
+class CheckpointError(ModelError):
+    """Weights that cannot be read, or do not fit the model they are meant for."""
+
+    exit_code = 4
+
+
+class RecipeError(ModelError):
+    """A training recipe that cannot be read."""
+
+    exit_code = 4

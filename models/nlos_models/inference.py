@@ -1,0 +1,109 @@
+"""Inference: maps in, images out; ONNX Runtime on a CPU, torch on a GPU."""
+
+import hashlib
+import logging
+import os
+import warnings
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nlos_models.checkpoint import CheckpointRecord, load_pipeline
+from nlos_models.errors import ModelError
+from nlos_models.pipeline import Pipeline
+
+Float32 = NDArray[np.float32]
+
+MAP_SHAPE = (64, 80)
+OPSET = 18
+
+
+class Reconstructor(Protocol):
+    """A trained pipeline, ready to run."""
+
+    record: CheckpointRecord
+    runtime: str
+
+    def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
+        """Maps (n, 64, 80), NaN depth where there is no return, to images (n, 64, 64) in [0, 1]."""
+        ...
+
+
+class TorchReconstructor:
+    """The pipeline as torch runs it; the definition that the others are held against."""
+
+    def __init__(self, pipeline: Pipeline, record: CheckpointRecord, device: str) -> None:
+        self.record, self.runtime = record, f"torch on {device}"
+        self._pipeline, self._device = pipeline.to(device).eval(), device
+
+    def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
+        with torch.inference_mode():
+            maps = [torch.from_numpy(np.ascontiguousarray(m)).to(self._device) for m in (depth_m, intensity)]
+            return self._pipeline(*maps).cpu().numpy()
+
+
+class OnnxReconstructor:
+    """The pipeline exported to ONNX and run by ONNX Runtime: about five times faster than torch at batch 1."""
+
+    def __init__(self, model: Path, record: CheckpointRecord, threads: int = 1) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 3
+        self.record, self.runtime = record, "ONNX Runtime on cpu"
+        self._session: Any = onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
+
+    def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
+        inputs = {"depth_m": np.ascontiguousarray(depth_m), "intensity": np.ascontiguousarray(intensity)}
+        return self._session.run(None, inputs)[0]
+
+
+def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
+    """The shipped weights (None), or a checkpoint folder's, on the best device at hand.
+
+    The ONNX file is exported once into the folder `cache`, named by the checksum of the weights.
+    Raises CheckpointError where the weights cannot be read.
+    """
+    pipeline, record = load_pipeline(folder)
+    if torch.cuda.is_available():
+        return TorchReconstructor(pipeline, record, "cuda")
+    model = cache / f"{_checksum(pipeline)}.onnx"
+    if not model.exists():
+        export_onnx(pipeline, model)
+    return OnnxReconstructor(model, record)
+
+
+def export_onnx(pipeline: Pipeline, path: Path) -> None:
+    """Write the whole pipeline, preprocessing included, as one ONNX file with a free batch size."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.stem}.{os.getpid()}.part.onnx")
+    example = (torch.ones(2, *MAP_SHAPE), torch.ones(2, *MAP_SHAPE))
+    for noisy in ("onnxscript", "torch.onnx"):
+        logging.getLogger(noisy).setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter warns of its own internals
+        program = torch.onnx.export(
+            pipeline.eval(),
+            example,
+            dynamo=True,
+            input_names=["depth_m", "intensity"],
+            output_names=["image"],
+            dynamic_shapes=({0: torch.export.Dim("n")}, {0: torch.export.Dim("n")}),
+            opset_version=OPSET,
+            verbose=False,
+        )
+    if program is None:
+        raise ModelError("torch's exporter returned no ONNX program: install a torch between 2.6 and 2.13")
+    program.save(part, external_data=False)
+    part.replace(path)
+
+
+def _checksum(pipeline: Pipeline) -> str:
+    digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
+    for name, tensor in sorted(pipeline.state_dict().items()):
+        digest.update(name.encode() + tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]

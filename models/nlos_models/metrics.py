@@ -1,0 +1,40 @@
+"""Metrics by name (v in [0, 1], background where v < 0.05); one value per object."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Images = NDArray[np.float32]
+Values = NDArray[np.float64]
+
+BACKGROUND_BELOW_V = 0.05
+CLOSE = 0.02
+
+
+def surface(image: Images) -> NDArray[np.bool_]:
+    """Where an image (..., 64, 64) shows a surface."""
+    return image >= BACKGROUND_BELOW_V
+
+
+def accuracy_mean_abs(image: Images, truth: Images) -> Values:
+    """1 - mean |v - v_true| over all pixels, (n,)."""
+    return 1.0 - np.abs(image.astype(np.float64) - truth).mean((-2, -1))
+
+
+def accuracy_within_2_percent(image: Images, truth: Images) -> Values:
+    """Share of all pixels with |v - v_true| <= 0.02, (n,)."""
+    return (np.abs(image - truth) <= CLOSE).mean((-2, -1))
+
+
+def silhouette_iou(image: Images, truth: Images) -> Values:
+    """Intersection over union of the surface masks, (n,); 1 where both are empty."""
+    mine, its = surface(image), surface(truth)
+    union = (mine | its).sum((-2, -1))
+    return np.where(union > 0, (mine & its).sum((-2, -1)) / np.maximum(union, 1), 1.0)
+
+
+def foreground_rmse_mm(image: Images, truth: Images, mm_per_v: float) -> Values:
+    """RMSE of depth over pixels that are surface in both, (n,); NaN where they share none."""
+    both = surface(image) & surface(truth)
+    squares = np.where(both, np.square(image.astype(np.float64) - truth), 0.0).sum((-2, -1))
+    count = both.sum((-2, -1))
+    return np.where(count > 0, mm_per_v * np.sqrt(squares / np.maximum(count, 1)), np.nan)

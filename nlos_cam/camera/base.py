@@ -1,0 +1,33 @@
+"""The seam that every camera is seen through. Everything above it is ignorant of librealsense."""
+
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Protocol, Self
+
+from nlos_calibration.projection import Intrinsics
+
+from nlos_cam.frames import Frame
+
+
+class Camera(Protocol):
+    """A source of Frames in SI units. Entering starts it; leaving stops it, whatever happened inside.
+
+    Iterating yields frames until the source ends: a recording's end is a normal end, a live camera goes on. Frames that
+    lack a stream are counted in `incomplete` and skipped; frame numbers that never came are counted in `dropped`.
+    """
+
+    uri: str
+    intrinsics: Intrinsics
+    incomplete: int
+    dropped: int
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
+
+    def __iter__(self) -> Iterator[Frame]: ...

@@ -1,0 +1,80 @@
+"""The world that a simulated camera looks at: a scene's loop of poses, rendered ahead and cached; the sensor is live."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from nlos_calibration.rig import Rig
+
+from nlos_cam.cache import cache_folder
+from nlos_cam.frames import Float32
+from nlos_cam.render.renderer import MultiBounce, render
+from nlos_cam.render.scene_file import SceneFile, bare_wall_scene, load_scene, paper_scene
+from nlos_cam.render.sensor import SensedImages, Sensor
+
+OnProgress = Callable[[int, int], None]
+"""Called with poses done and poses in all."""
+
+
+class World:
+    """A loop of instants. Frame numbers beyond the loop start it again, with other noise."""
+
+    def __init__(self, scene: SceneFile, echoes: list[MultiBounce], truths: list[Float32 | None]) -> None:
+        self.scene = scene
+        self._echoes, self._truths = echoes, truths
+        self._sensor = Sensor(scene.rig, scene.sensor)
+
+    @property
+    def rig(self) -> Rig:
+        """The rig whose lidar sees this world."""
+        return self.scene.rig
+
+    def images(self, number: int) -> SensedImages:
+        """What the device delivers as frame `number`; the same number gives the same bits."""
+        generator = np.random.default_rng([number, len(self._echoes)])
+        return self._sensor.expose(self._echoes[number % len(self._echoes)], generator)
+
+    def truth_depth_m(self, number: int) -> Float32 | None:
+        """The hidden depth (64, 64) at frame `number`; None where nothing is hidden."""
+        return self._truths[number % len(self._truths)]
+
+
+def open_world(name: str, on_progress: OnProgress | None = None) -> World:
+    """The world of a scene: "" the paper's rig with a moving object, "bare-wall", or a scene.toml's path.
+
+    Renders the loop ahead on first use and keeps it in the cache folder. Raises SceneError for a scene that cannot be.
+    """
+    scene = {"": paper_scene, "bare-wall": bare_wall_scene}.get(name, lambda: load_scene(Path(name)))()
+    cached = cache_folder() / "worlds" / f"{scene.checksum}.npz"
+    if not cached.exists():
+        _store(cached, *_render_loop(scene, on_progress))
+    with np.load(cached) as file:
+        echoes = [MultiBounce(*maps) for maps in zip(file["peak"], file["runner_up"], file["path_m"], strict=True)]
+        truths = list(file["truth_m"])
+    return World(scene, echoes, truths if scene.hidden else [None])
+
+
+def _render_loop(scene: SceneFile, on_progress: OnProgress | None) -> tuple[list[MultiBounce], list[Float32]]:
+    echoes: list[MultiBounce] = []
+    truths: list[Float32] = []
+    for number in range(scene.poses):
+        instant = scene.scene_at(number)
+        echoes.append(render(instant).multi)
+        truths.append(instant.object_depth_m if instant.object_depth_m is not None else np.zeros((0, 0), np.float32))
+        if on_progress:
+            on_progress(number + 1, scene.poses)
+    return echoes, truths
+
+
+def _store(path: Path, echoes: list[MultiBounce], truths: list[Float32]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
+    np.savez_compressed(
+        part,
+        peak=np.stack([echo.peak for echo in echoes]),
+        runner_up=np.stack([echo.runner_up for echo in echoes]),
+        path_m=np.stack([echo.path_m for echo in echoes]),
+        truth_m=np.stack(truths),
+    )
+    part.replace(path)

@@ -1,0 +1,62 @@
+"""What every command shares: where output goes, how a result or an error is told, what is never overwritten."""
+
+import json as json_module
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from nlos_cam.errors import OutputExistsError
+
+Json = Annotated[bool, typer.Option("--json", help="End stdout with one JSON object; progress goes to stderr.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what --out names, if it exists.")]
+
+stderr = Console(stderr=True, highlight=False)
+
+
+def say(text: str) -> None:
+    """Tell the person at the terminal; never on stdout, which belongs to results."""
+    stderr.print(text, soft_wrap=True)
+
+
+def finish(result: dict[str, Any], *, as_json: bool, text: str) -> None:
+    """End a command: one JSON object on stdout, or a sentence for a person."""
+    if as_json:
+        print(json_module.dumps(result), flush=True)  # noqa: T201  stdout is the machine's
+    else:
+        Console(highlight=False).print(text, soft_wrap=True)
+
+
+@contextmanager
+def progress() -> Generator[Progress]:
+    """A progress bar on stderr."""
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, TimeRemainingColumn(), console=stderr, transient=True) as bar:
+        yield bar
+
+
+@contextmanager
+def tracked(description: str) -> Generator[Callable[[int, int], None]]:
+    """A progress bar as a function of what is done and how much there is in all."""
+    with progress() as bar:
+        task = bar.add_task(description, total=None)
+
+        def update(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield update
+
+
+def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) -> Path:
+    """Where to write: `out`, or a dated name in the current folder. Raises OutputExistsError unless `overwrite`."""
+    path = out or Path(f"{stem}-{datetime.now().astimezone():%Y%m%d-%H%M%S}{suffix}")
+    if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+        raise OutputExistsError(f"{path} exists: choose another --out, or add --overwrite to replace it")
+    if not path.parent.is_dir():
+        raise OutputExistsError(f"the folder of {path} does not exist: create {path.parent} first")
+    return path

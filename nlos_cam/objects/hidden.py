@@ -1,0 +1,80 @@
+"""A hidden object placed in the object box, and its depth map as the wall sees it."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from nlos_calibration.rig import ObjectBox
+from numpy.typing import NDArray
+from trimesh.transformations import euler_matrix
+
+from nlos_cam.errors import SceneError
+from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.objects.categories import CATEGORIES
+from nlos_cam.objects.raster import orthographic_depth
+
+Triangles = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where an object stands in the box: angles about wall x, y, z in turn; offsets from the box's middle."""
+
+    tilt_x_rad: float = 0.0
+    tilt_y_rad: float = 0.0
+    turn_z_rad: float = 0.0
+    size_m: float = 0.2
+    """The larger of its extents along x and y, once turned."""
+    x_m: float = 0.0
+    y_m: float = 0.0
+    front_m: float = 0.03
+    """From z_near to the object's nearest point."""
+
+
+def category_triangles(category: str, seed: int) -> Triangles:
+    """The triangles (n, 3, 3) of one variation of a category, in its own units. Raises SceneError if unknown."""
+    if category not in CATEGORIES:
+        raise SceneError(f"no object category {category!r}: choose one of {', '.join(CATEGORIES)}")
+    mesh = CATEGORIES[category](np.random.default_rng(seed))
+    return np.asarray(mesh.triangles, np.float64)
+
+
+def place(triangles: Triangles, pose: Pose, box: ObjectBox) -> Triangles:
+    """The triangles (n, 3, 3) turned, scaled and moved into the box, in the wall frame.
+
+    A thing deeper than the box is flattened to fit: its silhouette stays.
+    """
+    turn = euler_matrix(pose.tilt_x_rad, pose.tilt_y_rad, pose.turn_z_rad)[:3, :3]
+    points = triangles.reshape(-1, 3) @ turn.T
+    points = points - (points.min(0) + points.max(0)) / 2
+    points *= pose.size_m / np.ptp(points[:, :2], axis=0).max()
+    room_m = box.z_far_m - box.z_near_m - pose.front_m
+    points[:, 2] *= min(1.0, room_m / max(np.ptp(points[:, 2]), 1e-9))
+    middle_x, middle_y = (box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2
+    points += (middle_x + pose.x_m, middle_y + pose.y_m, box.z_near_m + pose.front_m - points[:, 2].min())
+    return points.reshape(-1, 3, 3)
+
+
+def random_pose(generator: np.random.Generator, box: ObjectBox) -> Pose:
+    """A pose that keeps the whole object in the box: sizes of half to nine tenths of it, tilts to 20 degrees."""
+    width_m = min(box.x_max_m - box.x_min_m, box.y_max_m - box.y_min_m)
+    size_m = width_m * generator.uniform(0.55, 0.9)
+    tilt_x, tilt_y, turn_z = np.radians(generator.uniform([-15, -20, -35], [15, 20, 35]))
+    spare_m = (width_m - size_m) / 2
+    x_m, y_m = generator.uniform(-spare_m, spare_m, 2)
+    front_m = generator.uniform(0.0, 0.35) * (box.z_far_m - box.z_near_m)
+    return Pose(tilt_x, tilt_y, turn_z, size_m, x_m, y_m, front_m)
+
+
+def object_depth(seed: int, box: ObjectBox, categories: Sequence[str] = tuple(CATEGORIES)) -> tuple[str, Float32]:
+    """One random object: its category and its depth map (64, 64) in metres, NaN background; the seed decides all."""
+    generator = np.random.default_rng([seed, OBJECT_PIXELS])
+    category = str(generator.choice(list(categories)))
+    triangles = category_triangles(category, int(generator.integers(2**31)))
+    return category, orthographic_depth(place(triangles, random_pose(generator, box), box), box)
+
+
+def object_depths(seeds: Sequence[int], box: ObjectBox) -> Iterator[Float32]:
+    """Depth maps (64, 64) of many random objects, in the order of their seeds."""
+    for seed in seeds:
+        yield object_depth(seed, box)[1]

@@ -1,0 +1,44 @@
+"""Orthographic depth of a triangle mesh as the wall sees it: the surface nearest the wall, cell by cell."""
+
+import numba
+import numpy as np
+from nlos_calibration.rig import ObjectBox
+from numpy.typing import NDArray
+
+from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.objects.depth_image import cell_centres_m
+
+
+@numba.njit(cache=True)
+def _fill(
+    triangles: NDArray[np.float64],
+    x_m: NDArray[np.float64],
+    y_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    depth = np.full((y_m.size, x_m.size), np.inf)
+    pitch_x, pitch_y = x_m[1] - x_m[0], y_m[0] - y_m[1]
+    for t in range(triangles.shape[0]):
+        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = triangles[t]
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        if abs(area) < 1e-14:  # seen edge on
+            continue
+        j0 = max(int(np.ceil((min(ax, bx, cx) - x_m[0]) / pitch_x)), 0)
+        j1 = min(int(np.floor((max(ax, bx, cx) - x_m[0]) / pitch_x)), x_m.size - 1)
+        i0 = max(int(np.ceil((y_m[0] - max(ay, by, cy)) / pitch_y)), 0)
+        i1 = min(int(np.floor((y_m[0] - min(ay, by, cy)) / pitch_y)), y_m.size - 1)
+        for i in range(i0, i1 + 1):
+            for j in range(j0, j1 + 1):
+                u = ((bx - x_m[j]) * (cy - y_m[i]) - (cx - x_m[j]) * (by - y_m[i])) / area
+                v = ((cx - x_m[j]) * (ay - y_m[i]) - (ax - x_m[j]) * (cy - y_m[i])) / area
+                if u >= 0 and v >= 0 and u + v <= 1:
+                    depth[i, j] = min(depth[i, j], u * az + v * bz + (1 - u - v) * cz)
+    return depth
+
+
+def orthographic_depth(triangles_m: NDArray[np.float64], box: ObjectBox, pixels: int = OBJECT_PIXELS) -> Float32:
+    """Depth (pixels, pixels) in metres of triangles (n, 3, 3) given in the wall frame; NaN where there is none.
+
+    A cell is sampled at its centre. Surfaces outside the box's depths are not clipped: place the mesh first.
+    """
+    depth = _fill(np.ascontiguousarray(triangles_m, np.float64), *cell_centres_m(box, pixels))
+    return np.where(np.isinf(depth), np.nan, depth).astype(np.float32)
