@@ -44,12 +44,8 @@ def save_vae(folder: Path, vae: ResVae, record: CheckpointRecord) -> None:
 
 def save_pipeline(folder: Path, pipeline: Pipeline, record: CheckpointRecord) -> None:
     """Write compressor, decoder and the preprocessing's statistics, with their record, into a folder."""
-    parts: dict[str, nn.Module] = {
-        "compressor": pipeline.compressor,
-        "preprocess": pipeline.preprocess,
-        "decoder": pipeline.decoder,
-    }
-    _save(folder, parts, record)
+    names = ("compressor", "preprocess", "decoder")
+    _save(folder, {name: getattr(pipeline, name) for name in names}, record)
 
 
 def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:

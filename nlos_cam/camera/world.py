@@ -1,4 +1,4 @@
-"""The world that a simulated camera looks at: a scene's loop of poses, rendered ahead and cached; the sensor is live."""
+"""The world that a simulated camera sees: a scene's loop of poses, rendered ahead and cached; the sensor is live."""
 
 import os
 from collections.abc import Callable
