@@ -5,10 +5,11 @@ from torch import Tensor, nn
 from nlos_models.compressor import Compressor
 from nlos_models.preprocess import Preprocess
 from nlos_models.res_vae import Decoder
+from nlos_models.silhouette import cut_silhouette
 
 
 class Pipeline(nn.Module):
-    """Maps (n, 64, 80) to images (n, 64, 64) in [0, 1]: preprocessing, compressor, decoder."""
+    """Maps (n, 64, 80) to images (n, 64, 64) in [0, 1]: preprocessing, compressor, decoder, silhouette."""
 
     def __init__(self, compressor: Compressor, decoder: Decoder, left_noise: float = 0.2) -> None:
         super().__init__()
@@ -22,4 +23,4 @@ class Pipeline(nn.Module):
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
         """Maps (n, 64, 80) to images (n, 64, 64)."""
-        return self.decoder(self.latent(depth_m, intensity))[:, 0]
+        return cut_silhouette(self.decoder(self.latent(depth_m, intensity)))[:, 0]

@@ -14,6 +14,7 @@ from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import split_and_stack
 from nlos_models.recipe import Recipe
 from nlos_models.res_vae import LATENT, ResVae
+from nlos_models.silhouette import cut_silhouette
 from nlos_models.train import OnStep, fit
 
 SCORING_BATCH = 100
@@ -114,7 +115,7 @@ def _parts(images: Half) -> list[Half]:
 @torch.inference_mode()
 def _rebuild(vae: ResVae, images: Half) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     mean, _ = vae.encoder(torch.from_numpy(images.astype(np.float32))[:, None])
-    return vae.decoder(mean)[:, 0].float().numpy()
+    return cut_silhouette(vae.decoder(mean))[:, 0].float().numpy()
 
 
 def _figures(image: np.ndarray[tuple[int, ...], np.dtype[np.float32]], truth: Half | np.ndarray) -> dict[str, float]:  # pyright: ignore[reportMissingTypeArgument]
