@@ -29,9 +29,10 @@ OnProgress = Callable[[int, int], None]
 class Interval:
     """An estimate over objects and its bootstrap 95 % interval."""
 
-    value: float
-    low: float
-    high: float
+    value: float | None
+    """None where no object has a value (no reconstruction shares a pixel with its truth)."""
+    low: float | None
+    high: float | None
 
 
 def sense_test_objects(rig: Rig, box: ObjectBox, first_seed: int, count: int, on_progress: OnProgress) -> MapSet:
@@ -69,7 +70,7 @@ def interval(values: NDArray[np.float64]) -> Interval:
     """Mean over objects (n,) and its bootstrap 95 % interval; objects without a value are left out."""
     values = values[~np.isnan(values)]
     if not values.size:
-        return Interval(float("nan"), float("nan"), float("nan"))
+        return Interval(None, None, None)
     picks = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
     low, high = np.quantile(values[picks].mean(1), [0.025, 0.975])
     return Interval(float(values.mean()), float(low), float(high))

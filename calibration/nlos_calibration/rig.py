@@ -3,9 +3,10 @@
 import hashlib
 import tomllib
 from importlib import resources
+from importlib.resources.abc import Traversable
 from math import degrees, radians
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Self, TypeVar
 
 import numpy as np
 import tomli_w
@@ -18,6 +19,7 @@ from nlos_calibration.projection import Intrinsics
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+R = TypeVar("R", bound=BaseModel)
 
 
 class Record(BaseModel):
@@ -143,12 +145,17 @@ def load_rig(name_or_path: str | Path) -> Rig:
     """
     packaged = resources.files("nlos_calibration") / "rigs" / f"{name_or_path}.toml"
     source = packaged if packaged.is_file() else Path(name_or_path)
+    return read_record(source, Rig, "rig", "give a packaged name (paper-rig) or a file")
+
+
+def read_record(source: Traversable, model: type[R], what: str, advice: str) -> R:
+    """A validated record from a TOML file. Raises RecordFileError, with `advice` where there is no such file."""
     try:
-        return Rig.model_validate(tomllib.loads(source.read_text(encoding="utf-8")))
+        return model.model_validate(tomllib.loads(source.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
-        raise RecordFileError(f"no rig {str(name_or_path)!r}: give a packaged name (paper-rig) or a file") from error
+        raise RecordFileError(f"no {what} {source}: {advice}") from error
     except ValidationError as error:
-        raise RecordFileError(f"{source} is not a rig: {first_problem(error)}") from error
+        raise RecordFileError(f"{source} is not a {what}: {first_problem(error)}") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise RecordFileError(f"{source} cannot be read as TOML: {error}") from error
 

@@ -53,8 +53,13 @@ def tracked(description: str) -> Generator[Callable[[int, int], None]]:
 
 
 def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) -> Path:
-    """Where to write: `out`, or a dated name in the current folder. Raises OutputExistsError unless `overwrite`."""
+    """Where to write: `out`, or a dated name in the current folder; no suffix means a folder, which may be there empty.
+
+    Raises OutputExistsError where that would replace something and `overwrite` was not given.
+    """
     path = out or Path(f"{stem}-{datetime.now().astimezone():%Y%m%d-%H%M%S}{suffix}")
+    if suffix and path.is_dir():
+        raise OutputExistsError(f"{path} is a folder: name a {suffix} file in it")
     if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
         raise OutputExistsError(f"{path} exists: choose another --out, or add --overwrite to replace it")
     if not path.parent.is_dir():

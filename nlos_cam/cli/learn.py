@@ -9,7 +9,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from nlos_calibration.rig import load_rig
+from nlos_calibration.wall_record import rig_named
 from nlos_models.checkpoint import CheckpointRecord, load_vae, save_pipeline, save_vae
 from nlos_models.inference import load_reconstructor
 from nlos_models.recipe import Recipe, load_recipe
@@ -47,7 +47,7 @@ def build(
     json: Json = False,
 ) -> None:
     """Render random objects into HDF5 shards; run it again after a stop and it goes on."""
-    plan = dataset.DatasetPlan(load_rig(rig), seed)
+    plan = dataset.DatasetPlan(rig_named(rig), seed)
     with tracked("rendering objects") as on_progress:
         dataset.build(plan, count, out, workers=workers, on_progress=on_progress)
     finish({"objects": count, "out": str(out)}, as_json=json, text=f"{count} objects in {out}")
@@ -56,7 +56,7 @@ def build(
 def vae(recipe_file: RecipeFile, out: RunFolder, json: Json = False) -> None:
     """Train a Res-VAE on procedural objects (SI 3)."""
     recipe = _recipe(recipe_file, "vae")
-    rig = load_rig(PAPER_RIG)
+    rig = rig_named(PAPER_RIG)
     box = dataset.DatasetPlan(rig, 0).box
     say(f"making {recipe.objects + recipe.held_out} objects")
     images = dataset.procedural_images(dataset.TRAINING_SEED, recipe.objects, box)
@@ -112,7 +112,7 @@ def evaluate(
     """Judge the reconstruction on objects never trained on, beside the trivial baselines."""
     folder, started = output_path(out, "evaluation", "", overwrite=overwrite), time.perf_counter()
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
-    plan = dataset.DatasetPlan(load_rig(reconstructor.record.rig_name), dataset.TEST_SEED)
+    plan = dataset.DatasetPlan(rig_named(reconstructor.record.rig_name), dataset.TEST_SEED)
     if data:
         maps, plan = dataset.read(data)
     else:

@@ -4,7 +4,6 @@ import importlib
 import json
 import sys
 
-import click
 import typer
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
@@ -35,12 +34,10 @@ def main(arguments: list[str]) -> int:
     """Run one command and return its exit code (see docs/reference: 0, 1, 2, 3, 4, 130)."""
     try:
         return build_app()(arguments, standalone_mode=False) or 0
-    except click.exceptions.Abort:
+    except (typer.Abort, KeyboardInterrupt):
         return INTERRUPTED
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    except click.ClickException as error:
-        error.show()
+    except typer.TyperException as error:
+        stderr.print(error.format_message(), soft_wrap=True, markup=False)
         return error.exit_code
     except (NlosCamError, CalibrationError, ModelError) as error:
         stderr.print(f"[bold red]error:[/] {_escaped(error)}", soft_wrap=True)

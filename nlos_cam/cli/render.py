@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from nlos_calibration.rig import load_rig
+from nlos_calibration.wall_record import rig_named
 from rich.table import Table
 
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, stderr
@@ -37,7 +37,7 @@ def command(
 ) -> None:
     """Render what a lidar of highest-echo kind reports of a hidden object."""
     path = output_path(out, "render", ".npz", overwrite=overwrite)
-    chosen_rig = load_scene(scene).rig if scene else load_rig(rig)
+    chosen_rig = load_scene(scene).rig if scene else rig_named(rig)
     target = Scene(chosen_rig)
     depth_m = _depth_of(hidden, seed, target)
     target = Scene(chosen_rig, depth_m)

@@ -1,0 +1,155 @@
+import json
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pytest
+import typer
+from nlos_calibration.errors import WallRefusedError
+from nlos_calibration.rig import load_rig
+from nlos_calibration.wall import wall_depth
+from nlos_calibration.wall_record import load_wall
+
+from nlos_cam.cli import calibrate
+from nlos_cam.errors import OutputExistsError
+from nlos_cam.frames import Frame
+
+RIG = load_rig("bare-wall")
+Call = Callable[..., Any]
+
+
+class FakeCamera:
+    """A camera of 10 frames of the bare wall; `scale` moves the wall, `patch` puts part of the view behind it."""
+
+    def __init__(self, uri: str, scale: float, patch: float, frames: int) -> None:
+        self.uri, self.intrinsics = uri, RIG.pinhole.scaled(160, 120)
+        self.incomplete = self.dropped = self.taken = 0
+        self.frames = frames
+        depth_m = scale * wall_depth(RIG.wall_from_lidar, self.intrinsics)
+        depth_m[40:80, 40:100] *= patch
+        self.depth_m = depth_m.astype(np.float32)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        counts = np.zeros(self.depth_m.shape, np.uint8)
+        for number in range(self.frames):
+            self.taken += 1
+            yield Frame(self.depth_m, counts, counts, number / 30.0, number, self.intrinsics)
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch) -> Call:
+    """Run `nlos-cam calibrate` on a fake camera; returns that camera."""
+
+    def run(*arguments: str, scale: float = 1.0, patch: float = 1.0, frames: int = 10) -> FakeCamera | None:
+        opened: list[FakeCamera] = []
+
+        def open_fake(uri: str, *, on_progress: Callable[[int, int], None]) -> FakeCamera:
+            on_progress(1, 1)
+            opened.append(FakeCamera(uri, scale, patch, frames))
+            return opened[0]
+
+        monkeypatch.setattr(calibrate, "open_camera", open_fake)
+        app = typer.Typer()
+        calibrate.register(app)
+        app(list(arguments), standalone_mode=False)
+        return opened[0] if opened else None
+
+    return run
+
+
+def test_the_record_and_the_json_say_the_same(call: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "wall.toml"
+    call("--wall", "--camera", "sim:bare-wall", "--out", str(out), "--json")
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    record = load_wall(out)
+    assert result.pop("out") == str(out)
+    assert result == record.model_dump(include=set(result))
+    assert set(result) >= {"distance_m", "facing_deg", "residual_m", "inlier_fraction", "verdict", "frames"}
+    assert (result["distance_m"], result["facing_deg"]) == pytest.approx((0.2, 45.0), abs=1e-6)
+    assert (record.camera, record.frames, record.verdict) == ("sim:bare-wall", 10, "good")
+    assert abs((record.created - datetime.now().astimezone().date()).days) <= 1
+
+
+def test_no_more_frames_are_taken_than_asked_for(call: Call, tmp_path: Path) -> None:
+    out = tmp_path / "wall.toml"
+    camera = call("--wall", "--camera", "sim", "--frames", "3", "--out", str(out))
+    assert camera.taken == load_wall(out).frames == 3
+
+
+def test_a_recording_is_opened_by_its_path(call: Call, tmp_path: Path) -> None:
+    assert call("--wall", "--bag", "run.bag", "--out", str(tmp_path / "wall.toml")).uri == "bag:run.bag"
+
+
+def test_a_person_is_told_distance_angle_residual_and_verdict(
+    call: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call("--wall", "--camera", "sim:bare-wall", "--out", str(tmp_path / "w.toml"))
+    told = capsys.readouterr().out
+    for part in ("0.2000 m", "45.00 degrees", "mm RMS", "good", "w.toml"):
+        assert part in told
+
+
+def test_a_wall_out_of_range_is_written_and_said(
+    call: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "wall.toml"
+    call("--wall", "--camera", "sim:bare-wall", "--out", str(out), scale=2.0)
+    assert load_wall(out).verdict == "out of range"
+    assert "move the lidar closer" in capsys.readouterr().out
+
+
+def test_a_refusal_writes_nothing(call: Call, tmp_path: Path) -> None:
+    with pytest.raises(WallRefusedError, match="behind the wall's plane") as caught:
+        call("--wall", "--camera", "sim", "--out", str(tmp_path / "wall.toml"), patch=1.5)
+    assert caught.value.exit_code == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_source_without_frames_is_refused(call: Call, tmp_path: Path) -> None:
+    with pytest.raises(WallRefusedError, match="gave no frames"):
+        call("--wall", "--camera", "sim", "--out", str(tmp_path / "wall.toml"), frames=0)
+
+
+def test_an_existing_record_is_kept_unless_asked(call: Call, tmp_path: Path) -> None:
+    out = tmp_path / "wall.toml"
+    out.write_text("mine", encoding="utf-8")
+    with pytest.raises(OutputExistsError):
+        call("--wall", "--camera", "sim:bare-wall", "--out", str(out))
+    assert out.read_text(encoding="utf-8") == "mine"
+    call("--wall", "--camera", "sim:bare-wall", "--out", str(out), "--overwrite")
+    assert load_wall(out).verdict == "good"
+
+
+def test_without_out_a_dated_name_in_this_folder(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    call("--wall", "--camera", "sim:bare-wall")
+    (path,) = tmp_path.glob("wall-*.toml")
+    assert load_wall(path).verdict == "good"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--camera", "sim"],
+        ["--wall"],
+        ["--wall", "--camera", "sim", "--bag", "run.bag"],
+        ["--wall", "--camera", "sim", "--frames", "0"],
+    ],
+)
+def test_wrong_usage_is_told(call: Call, arguments: list[str]) -> None:
+    with pytest.raises(typer.BadParameter) as caught:
+        call(*arguments)
+    assert caught.value.exit_code == 2
