@@ -1,0 +1,139 @@
+"""`nlos-cam live` and `nlos-cam replay`: frames in, hidden depth out."""
+
+import signal
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from threading import Event
+from types import FrameType
+from typing import Annotated
+
+import typer
+from nlos_calibration.rig import Rig, load_rig
+from nlos_calibration.wall_record import load_wall
+from nlos_models.inference import Reconstructor, load_reconstructor
+
+from nlos_cam.cache import cache_folder
+from nlos_cam.camera import Recording, open_camera
+from nlos_cam.camera.clock import WallClock
+from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, tracked
+from nlos_cam.live import LiveReport, run_live
+from nlos_cam.replay import REPORT, replay
+from nlos_cam.view.viewer import NullViewer, Viewer
+
+INTERRUPTED = 130
+CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:scene.toml, bag:run.bag.")]
+Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it (wall.toml).")]
+Weights = Annotated[Path | None, typer.Option("--weights", help="A folder of other weights than the shipped ones.")]
+Seconds = Annotated[float | None, typer.Option("--seconds", min=0.1, help="Stop after so long; else at Ctrl-C.")]
+NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
+RecordTo = Annotated[Path | None, typer.Option("--record", help="Also record the camera's streams (F.bag).")]
+BagFile = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording with depth, infrared and confidence.")]
+Out = Annotated[Path | None, typer.Option("--out", help="The folder to write.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command("live")(live)
+    app.command("replay")(replay_bag)
+
+
+def live(
+    camera: CameraUri,
+    wall: Wall = None,
+    seconds: Seconds = None,
+    no_view: NoView = False,
+    record: RecordTo = None,
+    weights: Weights = None,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Show what is hidden around the corner, live, in a browser."""
+    rig = _rig(wall)
+    recording = Recording(output_path(record, "live", ".bag", overwrite=overwrite)) if record else None
+    with tracked("rendering the scene ahead") as on_progress:
+        opened = open_camera(camera, on_progress=on_progress, recording=recording)
+    network = _network(weights, rig)
+    with stop_on_signals() as stop, _viewer(rig, no_view=no_view) as viewer, opened as source:
+        say(
+            f"live view: {viewer.address}  (Ctrl-C ends it)"
+            if viewer.address
+            else "running without a view (Ctrl-C ends it)"
+        )
+        recorded, clock = camera.startswith("bag:"), WallClock().now
+        report = run_live(source, rig, network, viewer, stop=stop, seconds=seconds, recorded=recorded, clock=clock)
+    if recording:
+        say(f"recorded {recording.sets} frames to {recording.path}")
+    finish(asdict(report), as_json=json, text=_told(report))
+    if stop.is_set():
+        raise typer.Exit(INTERRUPTED)
+
+
+def replay_bag(
+    bag: BagFile,
+    wall: Wall = None,
+    out: Out = None,
+    weights: Weights = None,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Reconstruct every frame of a recording: the same frames and the same bits each time."""
+    path = output_path(out, "replay", "", overwrite=overwrite)
+    rig, opened = _rig(wall), open_camera(f"bag:{bag}")
+    network = _network(weights, rig)
+    with opened as source, stop_on_signals() as stop, progress() as bar:
+        task = bar.add_task("reconstructing", total=None)
+        report = replay(source, rig, network, path, stop=stop, on_frame=lambda: bar.advance(task))
+    text = f"{report.frames} frames in {report.seconds:.1f} s: {path / REPORT}"
+    finish(asdict(report), as_json=json, text=text)
+    if stop.is_set():
+        raise typer.Exit(INTERRUPTED)
+
+
+@contextmanager
+def stop_on_signals() -> Generator[Event]:
+    """An event that Ctrl-C or a request to terminate sets while the block lasts: the loop ends, results are told."""
+    stop = Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        stop.set()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _rig(wall: Path | None) -> Rig:
+    return load_wall(wall).rig if wall else load_rig("paper-rig")
+
+
+def _network(weights: Path | None, rig: Rig) -> Reconstructor:
+    """The networks, ready; says what they are, and whether they were trained for this rig."""
+    network = load_reconstructor(weights, cache_folder() / "onnx")
+    say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
+    if network.record.rig_checksum != rig.checksum:
+        say(f"note: rig {rig.name} is another one; what the networks show of it is off the more the two differ")
+    return network
+
+
+def _viewer(rig: Rig, *, no_view: bool) -> Viewer:
+    if no_view:
+        return NullViewer()
+    from nlos_cam.view.rerun_viewer import RerunViewer
+
+    return RerunViewer(rig)
+
+
+def _told(report: LiveReport) -> str:
+    latency, stages = report.latency_ms, report.stages_ms
+    told = ", ".join(f"{name} {value:.1f}" for name, value in stages.items())
+    return (
+        f"{report.frames} frames, {report.fps:.1f} per second, {report.dropped} dropped\n"
+        f"latency  {latency['p50']:.0f} ms median, {latency['p95']:.0f} ms p95, {latency['p99']:.0f} ms p99\n"
+        f"stages   {told} (median ms)"
+    )

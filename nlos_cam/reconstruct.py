@@ -1,0 +1,54 @@
+"""Lidar maps in, hidden depth out: pure, no input or output."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from nlos_calibration.rig import ObjectBox, Rig
+from numpy.typing import NDArray
+
+from nlos_cam.errors import SceneError
+from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.objects.depth_image import depth_from_image
+
+Clock = Callable[[], float]
+Network = Callable[[Float32, Float32], Float32]
+"""depth_m (n, 64, 80) with NaN and intensity (n, 64, 80) to images v (n, 64, 64) in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The hidden object as the networks see it."""
+
+    depth_m: Float32
+    """(64, 64) over the object box: distance from the wall, NaN where there is no surface."""
+    wall_from_object: NDArray[np.float64]
+    """(4, 4); the object frame has the wall's axes and its origin on the wall, before the middle of the box."""
+    uncertainty_m: Float32 | None
+    """(64, 64); None from networks that do not tell."""
+    timings_s: Mapping[str, float]
+    """Seconds by stage."""
+
+
+def object_box(rig: Rig) -> ObjectBox:
+    """The box that a reconstruction is placed in. Raises SceneError where the rig has none."""
+    if rig.object_box is None:
+        raise SceneError(f"rig {rig.name!r} has no object box to reconstruct in: add [object_box] to its record")
+    return rig.object_box
+
+
+def pose_of(box: ObjectBox) -> NDArray[np.float64]:
+    """wall_from_object (4, 4) of a box."""
+    pose = np.eye(4)
+    pose[:2, 3] = (box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2
+    return pose
+
+
+def reconstruct(maps: LidarMaps, rig: Rig, network: Network, clock: Clock = time.perf_counter) -> Reconstruction:
+    """The hidden depth behind one frame's maps. Raises SceneError for a rig without an object box."""
+    box = object_box(rig)
+    begun_s = clock()
+    image = network(maps.depth_m[np.newaxis], maps.intensity[np.newaxis])[0]
+    depth_m = depth_from_image(image, box)
+    return Reconstruction(depth_m, pose_of(box), None, {"network": clock() - begun_s})

@@ -1,0 +1,69 @@
+"""The live view in a browser: a web server on the loopback, and for each browser a drawing of the newest moments."""
+
+import time
+from collections.abc import Callable
+from threading import Event
+from types import TracebackType
+from typing import Self
+
+from nlos_calibration.rig import Rig
+
+from nlos_cam.view.assets import page_assets
+from nlos_cam.view.drawing import Drawing
+from nlos_cam.view.latest import Latest
+from nlos_cam.view.server import Send, ViewServer
+from nlos_cam.view.viewer import Moment
+
+PREFERRED_PORT = 9090
+DRAW_PERIOD_S = 1 / 12
+LIDAR_EVERY = 2
+"""Lidar pictures, which are large, go out with every second drawing."""
+WAIT_S = 0.5
+
+
+class RerunViewer:
+    """Serves the view while entered. Nobody watching costs nothing: drawing is done for each browser, in its thread."""
+
+    def __init__(self, rig: Rig, clock: Callable[[], float] = time.monotonic) -> None:
+        self.address: str | None = None
+        self._rig, self._clock = rig, clock
+        self._moments = Latest[Moment]()
+        self._closed = Event()
+
+    def __enter__(self) -> Self:
+        self._server = ViewServer(page_assets(), self._stream, PREFERRED_PORT)
+        self.address = self._server.address
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._closed.set()
+        self._moments.close()
+        self._server.close()
+
+    def show(self, moment: Moment) -> None:
+        """Hand over the newest moment; one that was not drawn yet is forgotten."""
+        self._moments.put(moment)
+
+    def _stream(self, send: Send) -> None:
+        """Draw for one browser until it leaves, which `send` tells by an OSError, or the viewer closes."""
+        drawing: Drawing | None = None
+        count = drawn = 0
+        try:
+            while not self._closed.is_set():
+                begun_s = self._clock()
+                newest = self._moments.after(count, WAIT_S)
+                if newest is None:
+                    continue
+                count, moment = newest
+                drawing = drawing or Drawing(self._rig, moment)
+                send(drawing.draw(moment, with_lidar=drawn % LIDAR_EVERY == 0))
+                drawn += 1
+                self._closed.wait(max(0.0, begun_s + DRAW_PERIOD_S - self._clock()))
+        finally:
+            if drawing is not None:
+                drawing.close()

@@ -1,0 +1,60 @@
+"""What the streaming loop asks of a viewer, and the viewer that shows nothing."""
+
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol, Self
+
+from nlos_cam.frames import Frame
+from nlos_cam.reconstruct import Reconstruction
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One frame and what came of it."""
+
+    frame: Frame
+    reconstruction: Reconstruction
+    published_s: float
+    """The loop's clock when the reconstruction was ready."""
+    latency_s: float
+    """From the frame's timestamp to `published_s`, on one clock."""
+
+
+class Viewer(Protocol):
+    """Shows the newest moment. `show` returns at once: a viewer may skip moments, and never slows the loop."""
+
+    @property
+    def address(self) -> str | None:
+        """Where a browser finds it."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
+
+    def show(self, moment: Moment) -> None: ...
+
+
+class NullViewer:
+    """A viewer for runs that nobody watches."""
+
+    address: str | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        pass
+
+    def show(self, moment: Moment) -> None:
+        pass

@@ -1,0 +1,186 @@
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from datetime import date
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Self
+
+import numpy as np
+import pytest
+from nlos_calibration.projection import Intrinsics
+from nlos_calibration.rig import dump_toml, load_rig
+from nlos_calibration.wall import WallFit
+from nlos_calibration.wall_record import wall_record
+
+from nlos_cam.cli import live as commands
+from nlos_cam.cli.main import main
+from nlos_cam.frames import Frame
+from nlos_cam.view import rerun_viewer
+
+RIG = load_rig("paper-rig")
+SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
+
+
+class FakeNetwork:
+    runtime, record = "nothing at all", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum)
+
+    def __call__(self, *_: np.ndarray) -> np.ndarray:
+        return np.full((1, 64, 64), 0.5, np.float32)
+
+
+class FakeCamera:
+    intrinsics, incomplete, dropped = SMALL, 0, 0
+
+    def __init__(self, uri: str, on_frame: Callable[[int], None]) -> None:
+        self.uri, self._on_frame = uri, on_frame
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Frame]:
+        depth_m, ir = np.full((64, 80), 0.3, np.float32), np.full((64, 80), 9, np.uint8)
+        for number in range(20):
+            self._on_frame(number)
+            yield Frame(depth_m, ir, ir, number / 1000, number, SMALL)
+
+
+class Opened:
+    """Notes how cameras were opened; `on_frame` runs before each frame."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, dict[str, Any]]] = []
+        self.on_frame: Callable[[int], None] = lambda _: None
+
+    def __call__(self, uri: str, **options: Any) -> FakeCamera:
+        self.calls.append((uri, options))
+        return FakeCamera(uri, self.on_frame)
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Opened]:
+    opened = Opened()
+    monkeypatch.setattr(commands, "open_camera", opened)
+    monkeypatch.setattr(commands, "load_reconstructor", lambda *_: FakeNetwork())
+    monkeypatch.chdir(tmp_path)
+    before = signal.getsignal(signal.SIGINT)
+    yield opened
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+def told(capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
+    """The JSON object that ends stdout, and stderr."""
+    captured = capsys.readouterr()
+    return json.loads(captured.out.splitlines()[-1]), captured.err
+
+
+def interrupt_at(number: int) -> Callable[[int], None]:
+    """Ctrl-C once frame `number` is wanted."""
+    answered = threading.Event()
+
+    def on_frame(wanted: int) -> None:
+        if wanted == number:
+            os.kill(os.getpid(), signal.SIGINT)
+            answered.wait(0.5)  # until the loop has ended: a live camera gives no frame meanwhile
+
+    return on_frame
+
+
+def write_wall(path: Path) -> None:
+    pose, facing = RIG.wall_from_lidar, RIG.facing_deg
+    fit = WallFit(0.2, 45.0, 0.0, facing, pose, 1e-4, 0.99, "good", "fine")
+    record = wall_record(fit, SMALL, camera="sim:bare-wall", frames=9, created=date(2026, 1, 2))
+    path.write_text(dump_toml(record), encoding="utf-8")
+
+
+@pytest.mark.usefixtures("opened")
+def test_live_ends_with_one_object_that_scripts_depend_on(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["live", "--camera", "bag:fake", "--no-view", "--json"]) == 0
+    report, _ = told(capsys)
+    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms"}
+    assert (report["frames"], report["dropped"]) == (20, 0)
+    assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
+    assert set(report["stages_ms"]) == {"wait", "maps", "network", "view"}
+
+
+@pytest.mark.usefixtures("opened")
+def test_live_tells_a_person_in_words(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["live", "--camera", "bag:fake", "--no-view"]) == 0
+    assert "20 frames" in capsys.readouterr().out
+
+
+def test_a_live_camera_is_not_waited_for(opened: Opened, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["live", "--camera", "sim", "--no-view", "--json"]) == 0
+    report, _ = told(capsys)
+    assert report["frames"] + report["dropped"] == 20
+    assert [uri for uri, _ in opened.calls] == ["sim"]
+
+
+def test_ctrl_c_keeps_the_report_and_says_130(opened: Opened, capsys: pytest.CaptureFixture[str]) -> None:
+    opened.on_frame = interrupt_at(10)
+    assert main(["live", "--camera", "bag:fake", "--no-view", "--json"]) == 130
+    assert told(capsys)[0]["frames"] <= 10
+
+
+def test_seconds_end_a_run(opened: Opened, capsys: pytest.CaptureFixture[str]) -> None:
+    opened.on_frame = lambda number: threading.Event().wait(0.05 if number else 0.0)  # type: ignore[assignment]
+    assert main(["live", "--camera", "sim", "--no-view", "--seconds", "0.2", "--json"]) == 0
+    assert told(capsys)[0]["frames"] < 20
+
+
+@pytest.mark.usefixtures("opened")
+def test_the_address_of_the_view_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
+    assert main(["live", "--camera", "bag:fake", "--json"]) == 0
+    assert "http://127.0.0.1:" in told(capsys)[1]
+
+
+def test_record_hands_a_recording_to_the_camera_and_replaces_nothing_unasked(
+    opened: Opened,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    bag = tmp_path / "run.bag"
+    arguments = ["live", "--camera", "sim", "--no-view", "--record", str(bag), "--json"]
+    assert main(arguments) == 0
+    assert opened.calls[-1][1]["recording"].path == bag
+    bag.write_text("mine")
+    assert main(arguments) == 1
+    assert told(capsys)[0]["error"]["type"] == "OutputExistsError"
+    assert main([*arguments, "--overwrite"]) == 0
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_wall_other_than_the_networks_is_used_and_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_wall(tmp_path / "wall.toml")
+    run = ["replay", "run.bag", "--out", "out", "--json"]
+    assert main([*run, "--wall", "wall.toml"]) == 0
+    assert "rig measured is another one" in told(capsys)[1].replace("\n", " ")
+    with np.load(tmp_path / "out" / "reconstruction.npz") as file:
+        assert str(file["rig_name"]) == "measured"
+    assert main([*run, "--wall", "none.toml", "--overwrite"]) == 4
+    assert told(capsys)[0]["error"]["type"] == "RecordFileError"
+
+
+def test_replay_writes_its_folder_and_one_object(opened: Opened, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", "run.bag", "--out", "out", "--json"]) == 0
+    report, progress = told(capsys)
+    assert set(report) == {"frames", "seconds", "out"}
+    assert (report["frames"], report["out"]) == (20, "out")
+    assert "another" not in progress
+    assert opened.calls == [("bag:run.bag", {})]
+    assert main(["replay", "run.bag", "--out", "out"]) == 1
+    assert main(["replay", "run.bag", "--out", "out", "--overwrite"]) == 0
+
+
+def test_an_interrupted_replay_keeps_its_results(opened: Opened, capsys: pytest.CaptureFixture[str]) -> None:
+    opened.on_frame = interrupt_at(10)
+    assert main(["replay", "run.bag", "--out", "out", "--json"]) == 130
+    report, _ = told(capsys)
+    with np.load("out/reconstruction.npz") as file:
+        assert len(file["depth_m"]) == report["frames"] <= 10

@@ -1,0 +1,36 @@
+from threading import Thread
+
+from nlos_cam.view.latest import Latest
+
+
+def test_a_late_reader_gets_the_newest_value_only() -> None:
+    slot = Latest[str]()
+    for value in "abc":
+        slot.put(value)
+    newest = slot.after(0, 1.0)
+    assert newest == (3, "c")
+    assert slot.after(3, 0.0) is None
+
+
+def test_a_waiting_reader_is_woken_by_a_value() -> None:
+    slot = Latest[int]()
+    found: list[tuple[int, int] | None] = []
+    reader = Thread(target=lambda: found.append(slot.after(0, 10.0)))
+    reader.start()
+    slot.put(7)
+    reader.join(10.0)
+    assert found == [(1, 7)]
+
+
+def test_closing_wakes_every_reader_with_nothing() -> None:
+    slot = Latest[int]()
+    found: list[tuple[int, int] | None] = []
+    readers = [Thread(target=lambda: found.append(slot.after(0, 10.0))) for _ in range(3)]
+    for reader in readers:
+        reader.start()
+    slot.close()
+    for reader in readers:
+        reader.join(10.0)
+    assert found == [None] * 3
+    slot.put(1)
+    assert slot.after(0, 0.0) is None

@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.reconstruct import object_box
+from nlos_cam.view.pictures import (
+    BACKGROUND_RGB,
+    JUMP_M,
+    depth_span_m,
+    hidden_rgb,
+    infrared_grey,
+    lidar_rgb,
+    surface,
+)
+
+BOX = object_box(load_rig("paper-rig"))
+NOTHING = np.full((64, 64), np.nan, np.float32)
+
+
+def flat(z_m: float) -> np.ndarray:
+    return np.full((64, 64), z_m, np.float32)
+
+
+def test_near_is_brighter_than_far_and_far_brighter_than_nothing() -> None:
+    brightness = [
+        hidden_rgb(depth_m, BOX).sum(axis=-1).mean() for depth_m in (flat(0.13), flat(0.25), flat(0.4), NOTHING)
+    ]
+    assert brightness == sorted(brightness, reverse=True)
+    assert len(set(brightness)) == 4
+
+
+def test_what_has_no_depth_is_background_in_both_pictures() -> None:
+    assert (hidden_rgb(NOTHING, BOX) == BACKGROUND_RGB).all()
+    assert (lidar_rgb(NOTHING, 0.1, 1.0) == BACKGROUND_RGB).all()
+    depth_m = flat(0.3)
+    depth_m[5, 6] = np.nan
+    is_background = (lidar_rgb(depth_m, 0.1, 1.0) == BACKGROUND_RGB).all(axis=-1)
+    assert np.argwhere(is_background).tolist() == [[5, 6]]
+
+
+def test_lidar_depth_is_red_near_and_blue_far_and_clips_beyond() -> None:
+    near, far = lidar_rgb(flat(0.1), 0.1, 1.0)[0, 0], lidar_rgb(flat(1.0), 0.1, 1.0)[0, 0]
+    assert near[0] > near[2]
+    assert far[2] > far[0]
+    np.testing.assert_array_equal(lidar_rgb(flat(9.0), 0.1, 1.0)[0, 0], far)
+
+
+def test_infrared_keeps_the_order_of_counts_and_its_ends() -> None:
+    grey = infrared_grey(np.arange(256, dtype=np.uint8)[None])[0].astype(int)
+    assert (grey[0], grey[255]) == (0, 255)
+    assert (np.diff(grey) >= 0).all()
+
+
+def test_the_span_of_a_map_holds_most_of_it_and_exists_without_returns() -> None:
+    depth_m = np.linspace(0.2, 1.2, 64 * 64, dtype=np.float32).reshape(64, 64)
+    near_m, far_m = depth_span_m(depth_m)
+    assert 0.2 <= near_m < 0.25
+    assert 1.15 < far_m <= 1.2
+    assert depth_span_m(NOTHING) == (0.0, 1.0)
+
+
+def test_a_full_map_is_one_sheet_inside_the_box() -> None:
+    mesh = surface(flat(0.2), BOX)
+    assert len(mesh.points_m) == len(mesh.rgb) == 64 * 64
+    assert len(mesh.triangles) == 2 * 63 * 63
+    assert mesh.triangles.max() == 64 * 64 - 1
+    assert (mesh.points_m[:, 0] > BOX.x_min_m).all()
+    assert (mesh.points_m[:, 0] < BOX.x_max_m).all()
+    np.testing.assert_allclose(mesh.points_m[:, 2], 0.2)
+
+
+def test_the_sheet_covers_what_its_cells_cover() -> None:
+    mesh = surface(flat(0.2), BOX)
+    a, b, c = np.moveaxis(mesh.points_m[mesh.triangles].astype(float), 1, 0)
+    area_m2 = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+    assert area_m2 == pytest.approx((0.25 * 63 / 64) ** 2, rel=1e-4)
+
+
+def test_no_triangle_crosses_a_jump_or_touches_the_background() -> None:
+    depth_m = flat(0.2)
+    depth_m[:, 32:] += 2 * JUMP_M
+    depth_m[:8] = np.nan
+    mesh = surface(depth_m, BOX)
+    corners_m = mesh.points_m[mesh.triangles][..., 2]
+    assert np.isfinite(mesh.points_m).all()
+    assert np.ptp(corners_m, axis=1).max() < JUMP_M
+
+
+def test_nothing_has_no_surface() -> None:
+    mesh = surface(NOTHING, BOX)
+    assert len(mesh.points_m) == len(mesh.triangles) == len(mesh.rgb) == 0

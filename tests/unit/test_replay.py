@@ -1,0 +1,116 @@
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+from typing import Self
+
+import numpy as np
+import pytest
+from nlos_calibration.projection import Intrinsics
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.errors import OutputExistsError, RecordingError
+from nlos_cam.frames import Frame
+from nlos_cam.replay import REPORT, RESULT, SHEET, Samples, replay
+
+RIG = load_rig("paper-rig")
+SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
+
+
+def network(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+    """Shows the depth map's left half as if it were the hidden object."""
+    return np.nan_to_num(depth_m[:, :, :64])
+
+
+class Recorded:
+    """A recording of so many frames."""
+
+    uri, intrinsics, incomplete, dropped = "bag:fake.bag", SMALL, 0, 0
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Frame]:
+        for number in range(self._count):
+            depth_m = np.random.default_rng(number).uniform(0.1, 1.0, (64, 80)).astype(np.float32)
+            yield Frame(depth_m, np.full((64, 80), 9, np.uint8), depth_m, 5.0 + number / 30, 100 + number, SMALL)
+
+
+def test_every_frame_is_written_with_its_number_time_and_place(tmp_path: Path) -> None:
+    counted = []
+    out = tmp_path / "out"
+    report = replay(Recorded(40), RIG, network, out, stop=Event(), on_frame=lambda: counted.append(1))
+    assert (report.frames, report.out, len(counted)) == (40, str(out), 40)
+    with np.load(out / RESULT) as file:
+        assert file["depth_m"].shape == (40, 64, 64)
+        assert file["depth_m"].dtype == np.float32
+        np.testing.assert_array_equal(file["frame_number"], np.arange(100, 140))
+        np.testing.assert_allclose(file["timestamp_s"], 5.0 + np.arange(40) / 30)
+        assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
+        corner_m = file["origin_m"] + file["pitch_m"] * 63
+        np.testing.assert_allclose(file["origin_m"] - file["pitch_m"] / 2, [0.325, 0.125])
+        np.testing.assert_allclose(corner_m + file["pitch_m"] / 2, [0.575, -0.125])
+        assert np.nanmin(file["depth_m"]) >= file["z_near_m"] - 1e-6
+        assert np.nanmax(file["depth_m"]) <= file["z_far_m"] + 1e-6
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["out"]
+    assert sorted(file.name for file in out.iterdir()) == sorted([RESULT, SHEET, REPORT])
+    assert (out / SHEET).read_bytes().startswith(b"\x89PNG")
+    assert "frames: 40" in (out / REPORT).read_text()
+
+
+def test_two_replays_are_equal_to_the_bit(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        replay(Recorded(12), RIG, network, tmp_path / name, stop=Event())
+    for file in (RESULT, SHEET, REPORT):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_an_interrupted_replay_keeps_what_is_done_and_says_so(tmp_path: Path) -> None:
+    stop, done = Event(), []
+
+    def on_frame() -> None:
+        done.append(1)
+        if len(done) == 7:
+            stop.set()
+
+    report = replay(Recorded(1000), RIG, network, tmp_path / "out", stop=stop, on_frame=on_frame)
+    assert report.frames == 7
+    assert "Interrupted" in (tmp_path / "out" / REPORT).read_text()
+
+
+def test_a_recording_without_frames_leaves_nothing_behind(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no frame"):
+        replay(Recorded(0), RIG, network, tmp_path / "out", stop=Event())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_files_of_the_same_name_are_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("keep me")
+    (tmp_path / REPORT).write_text("old")
+    replay(Recorded(2), RIG, network, tmp_path, stop=Event())
+    assert (tmp_path / "mine.txt").read_text() == "keep me"
+    assert "Replay" in (tmp_path / REPORT).read_text()
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(OutputExistsError, match="is a file"):
+        replay(Recorded(2), RIG, network, tmp_path / "out", stop=Event())
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+@pytest.mark.parametrize("count", [1, 5, 6, 7, 100, 1001])
+def test_samples_are_few_ordered_and_spread(count: int) -> None:
+    samples = Samples(6)
+    for number in range(count):
+        samples.add(number)  # type: ignore[arg-type]
+    chosen = samples.chosen()
+    assert len(chosen) == min(count, 6)
+    assert chosen[0] == 0
+    assert chosen == sorted(set(chosen))
+    assert chosen[-1] >= 0.7 * (count - 1)
