@@ -6,7 +6,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
-GATES = (("ruff", "format", "--check"), ("ruff", "check"), ("pyright",), ("lint-imports",))
+GATES = (
+    ("ruff", "format", "--check"),
+    ("ruff", "check"),
+    ("pyright",),
+    ("lint-imports",),
+    ("python", "tools/file_map.py", "--check"),
+)
 LONGEST_FILE = 250
 
 

@@ -1,0 +1,99 @@
+"""One run of a device's three streams through the SDK's sensor API, the same for every backend."""
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from nlos_calibration.projection import Intrinsics
+
+from nlos_cam.camera.inbox import Inbox
+from nlos_cam.camera.streams import FRAMES_PER_S, FrameSet, intrinsics_of, is_needed, sample_from_sdk, stream_name
+from nlos_cam.frames import Float32, Frame
+
+Size = tuple[int, int]
+"""Width and height in pixels."""
+
+
+def find_streams(device: Any, size: Size | None = None) -> tuple[Any, dict[str, Any]]:
+    """The sensor that offers most of the needed streams, and their profiles; at `size` and 30 frames/s, if given."""
+    best: tuple[Any, dict[str, Any]] = (None, {})
+    for sensor in device.query_sensors():
+        profiles = [profile for profile in sensor.get_stream_profiles() if is_needed(profile)]
+        found = {stream_name(profile): profile for profile in profiles if size is None or _has(profile, size)}
+        best = max(best, (sensor, found), key=lambda pair: len(pair[1]))
+    return best
+
+
+def _has(profile: Any, size: Size) -> bool:
+    video = profile.as_video_stream_profile()
+    return (video.width(), video.height()) == size and profile.fps() == FRAMES_PER_S
+
+
+def read_settings(sensor: Any) -> dict[str, float]:
+    """Every option that the sensor lets be read, by the SDK's name."""
+    settings: dict[str, float] = {}
+    for option in sensor.get_supported_options():
+        try:
+            settings[option.name] = float(sensor.get_option(option))
+        except RuntimeError:  # listed, but not readable in this state
+            continue
+    return settings
+
+
+def _depth_unit_m(sensor: Any) -> float:
+    settings = read_settings(sensor)
+    if "depth_units" not in settings:
+        raise RuntimeError("it does not tell its depth unit")
+    return settings["depth_units"]
+
+
+class Session:
+    """Three streams of one sensor, delivered to an inbox from `start` to `stop`. Errors are the SDK's RuntimeError."""
+
+    def __init__(self, sensor: Any, profiles: Mapping[str, Any], inbox: Inbox) -> None:
+        self.inbox = inbox
+        self.settings: dict[str, float] = {}
+        self.intrinsics: Intrinsics = intrinsics_of(profiles["depth"])
+        self._sensor: Any = sensor
+        self._profiles = list(profiles.values())
+        self._unit_m = np.float32(_depth_unit_m(sensor))
+        self._listening = False
+
+    def start(self, prepare: Callable[[Any], None] | None = None) -> None:
+        """Let frames come, once `prepare` has had the running sensor."""
+        self._sensor.open(self._profiles)
+        self._listening = prepare is None  # a recording's first frame comes while `start` still runs
+        self._sensor.start(self._on_frame)
+        if prepare:
+            prepare(self._sensor)
+        self.settings = read_settings(self._sensor)
+        self._listening = True
+
+    def _on_frame(self, frame: Any) -> None:
+        if self._listening:
+            self.inbox.put(sample_from_sdk(frame))
+
+    def stop(self) -> None:
+        """Stop and close the sensor, and let go of it."""
+        self.inbox.close()  # first: the SDK waits for its callbacks, and a callback may wait for room
+        for end in (self._sensor.stop, self._sensor.close):
+            with suppress(RuntimeError):  # a device that vanished, or never started, is stopped already
+                end()
+        self._sensor = None
+        self._profiles.clear()
+
+    def frame(self, found: FrameSet, truth_depth_m: Float32 | None = None) -> Frame:
+        """A set in SI units."""
+        depth_m = found.depth_z16 * self._unit_m
+        depth_m[found.depth_z16 == 0] = np.nan
+        return Frame(
+            depth_m=depth_m,
+            ir=found.ir,
+            confidence=found.confidence_raw8 >> np.uint8(4),
+            timestamp_s=found.timestamp_s,
+            frame_number=found.number,
+            intrinsics=self.intrinsics,
+            settings=self.settings,
+            truth_depth_m=truth_depth_m,
+        )

@@ -1,0 +1,67 @@
+"""A lidar that librealsense takes for a device, and that delivers what is pushed into it."""
+
+from typing import Any
+
+import numpy as np
+from nlos_calibration.projection import Intrinsics
+from numpy.typing import NDArray
+
+from nlos_cam.camera.streams import FORMATS, FRAMES_PER_S
+from nlos_cam.render.sensor import DEPTH_UNIT_M, SensedImages
+
+NAME, SERIAL = "Simulated L515", "simulated"
+SENSOR_NAME = "L500 Depth Sensor"
+BYTES_PER_PIXEL = {"depth": 2, "infrared": 1, "confidence": 1}
+
+
+class SoftwareLidar:
+    """An `rs.software_device` with the L515's depth sensor: same sensor name, streams, formats and depth unit."""
+
+    def __init__(self, intrinsics: Intrinsics, sdk: Any) -> None:
+        self._sdk, self._intrinsics = sdk, intrinsics
+        self.device: Any = sdk.software_device()
+        self.device.update_info(sdk.camera_info.name, NAME)
+        self.device.register_info(sdk.camera_info.serial_number, SERIAL)
+        self.device.register_info(sdk.camera_info.product_line, "L500")
+        self._sensor: Any = self.device.add_sensor(SENSOR_NAME)
+        self._sensor.add_read_only_option(sdk.option.depth_units, DEPTH_UNIT_M)
+        self._profiles = {stream: self._add(stream, uid) for uid, stream in enumerate(FORMATS)}
+        self._register_extrinsics()
+
+    def _add(self, stream: str, uid: int) -> Any:
+        made = self._sdk.video_stream()
+        made.type, made.index, made.uid = getattr(self._sdk.stream, stream), 0, uid
+        made.width, made.height, made.fps = self._intrinsics.width, self._intrinsics.height, FRAMES_PER_S
+        made.bpp, made.fmt = BYTES_PER_PIXEL[stream], getattr(self._sdk.format, FORMATS[stream])
+        made.intrinsics = self._sdk_intrinsics()
+        return self._sdk.video_stream_profile(self._sensor.add_video_stream(made, True))
+
+    def _sdk_intrinsics(self) -> Any:
+        made, mine = self._sdk.intrinsics(), self._intrinsics
+        made.width, made.height = mine.width, mine.height
+        made.fx, made.fy, made.ppx, made.ppy = mine.fx, mine.fy, mine.ppx, mine.ppy
+        made.model, made.coeffs = self._sdk.distortion.none, [0.0] * 5
+        return made
+
+    def _register_extrinsics(self) -> None:
+        """All streams are seen from one place; without saying so, playback fails."""
+        same = self._sdk.extrinsics()
+        same.rotation, same.translation = np.eye(3).ravel().tolist(), [0.0] * 3
+        for one in self._profiles.values():
+            for other in self._profiles.values():
+                if one is not other:
+                    one.register_extrinsics_to(other, same)
+
+    def push(self, number: int, timestamp_s: float, images: SensedImages) -> None:
+        """Deliver one instant on all three streams; only while the sensor streams."""
+        pixels = {"depth": images.depth_z16, "infrared": images.ir, "confidence": images.confidence << 4}
+        for stream in self._profiles:
+            self._push(stream, number, timestamp_s, pixels[stream])
+
+    def _push(self, stream: str, number: int, timestamp_s: float, pixels: NDArray[Any]) -> None:
+        frame = self._sdk.software_video_frame()  # a new one each time: a pushed frame belongs to the SDK
+        frame.pixels, frame.bpp = np.ascontiguousarray(pixels), BYTES_PER_PIXEL[stream]
+        frame.stride = self._intrinsics.width * BYTES_PER_PIXEL[stream]
+        frame.timestamp, frame.frame_number = timestamp_s * 1e3, number
+        frame.domain, frame.profile = self._sdk.timestamp_domain.global_time, self._profiles[stream]
+        self._sensor.on_video_frame(frame)

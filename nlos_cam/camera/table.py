@@ -1,0 +1,57 @@
+"""Cameras by name. Backends are imported when asked for; simulation is never fallen back to."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nlos_cam.camera.base import Camera
+from nlos_cam.errors import CameraNotFoundError, NlosCamError
+
+if TYPE_CHECKING:
+    from nlos_cam.camera.record import Recording
+
+OnProgress = Callable[[int, int], None]
+"""Called with poses rendered and poses in all, while a simulated world is rendered ahead."""
+
+SIMULATED = {
+    "sim": "simulated: the paper's rig with a moving hidden object",
+    "sim:bare-wall": "simulated: the same wall with nothing hidden",
+}
+"""The packaged worlds; they are there for the asking."""
+NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or bag:FILE.bag"
+
+
+def open_camera(uri: str, *, on_progress: OnProgress | None = None, recording: "Recording | None" = None) -> Camera:
+    """The camera of that name, found and checked but not started; a live one is recorded if asked for.
+
+    Raises CameraNotFoundError, RecordingError, SceneError; NlosCamError for a recording of a recording.
+    """
+    scheme, _, rest = uri.partition(":")
+    if scheme == "bag" and rest:
+        return _replay(uri, Path(rest), recording)
+    if scheme == "sim":
+        return _simulated(uri, rest, on_progress, recording)
+    if scheme == "l515":
+        return _l515(uri, rest, recording)
+    raise CameraNotFoundError(f"no camera is called {uri!r}: use {NAMES}")
+
+
+def _replay(uri: str, path: Path, recording: "Recording | None") -> Camera:
+    from nlos_cam.camera.replay import ReplayCamera
+
+    if recording:
+        raise NlosCamError(f"{uri} is a recording already: copy the file, or give a live camera (l515, sim)")
+    return ReplayCamera(path)
+
+
+def _simulated(uri: str, name: str, on_progress: OnProgress | None, recording: "Recording | None") -> Camera:
+    from nlos_cam.camera.simulated import SimulatedCamera
+    from nlos_cam.camera.world import open_world
+
+    return SimulatedCamera(uri, open_world(name, on_progress), recording=recording)
+
+
+def _l515(uri: str, serial: str, recording: "Recording | None") -> Camera:
+    from nlos_cam.camera.l515 import L515Camera
+
+    return L515Camera(uri, serial, recording=recording)

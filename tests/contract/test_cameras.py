@@ -1,0 +1,164 @@
+"""One suite for every camera. An L515's rows run where one is connected, and skip elsewhere."""
+
+import subprocess
+import sys
+from itertools import islice, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nlos_cam.camera import Camera, Recording, open_camera
+from nlos_cam.camera.l515 import list_devices
+from nlos_cam.camera.replay import verify
+from nlos_cam.camera.world import World, open_world
+from nlos_cam.errors import CameraError, NlosCamError
+from nlos_cam.frames import Frame
+
+RECORDED = 12
+SEEN = 5
+ENDS_CLEANLY = """
+import sys
+from itertools import islice
+from nlos_cam.camera import open_camera
+with open_camera(sys.argv[1]) as camera:
+    print(len(list(islice(camera, 3))))
+"""
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bare wall, recorded as `capture` does."""
+    path = tmp_path_factory.mktemp("contract") / "wall.bag"
+    with open_camera("sim:bare-wall", recording=Recording(path, frames=RECORDED)) as camera:
+        assert len(list(camera)) == RECORDED
+    return path
+
+
+@pytest.fixture(params=["sim", "sim:bare-wall", "bag", pytest.param("l515", marks=pytest.mark.hardware)])
+def uri(request: pytest.FixtureRequest) -> str:
+    if request.param == "l515" and not any("L515" in info.name for info in list_devices()):
+        pytest.skip("no L515 is connected")
+    return f"bag:{request.getfixturevalue('bag')}" if request.param == "bag" else request.param
+
+
+@pytest.fixture
+def camera(uri: str) -> Camera:
+    return open_camera(uri)
+
+
+def look(camera: Camera, count: int = SEEN) -> list[Frame]:
+    with camera:
+        return list(islice(camera, count))
+
+
+def world_of(uri: str) -> World | None:
+    """What the camera looks at, where we know it."""
+    if uri.startswith("l515"):
+        return None
+    return open_world("" if uri == "sim" else "bare-wall")
+
+
+def test_frames_have_the_shapes_and_types_of_the_seam(camera: Camera) -> None:
+    shape = camera.intrinsics.height, camera.intrinsics.width
+    for frame in look(camera):
+        assert frame.depth_m.shape == frame.ir.shape == frame.confidence.shape == shape
+        assert (frame.depth_m.dtype, frame.ir.dtype, frame.confidence.dtype) == (np.float32, np.uint8, np.uint8)
+        assert frame.intrinsics == camera.intrinsics
+
+
+def test_depth_is_in_metres_and_confidence_in_levels(camera: Camera) -> None:
+    for frame in look(camera):
+        seen = frame.depth_m[~np.isnan(frame.depth_m)]
+        assert seen.size > 0.5 * frame.depth_m.size
+        assert seen.min() > 0.05
+        assert seen.max() < 16.4
+        assert frame.confidence.max() <= 15
+
+
+def test_numbers_and_timestamps_rise_together(camera: Camera) -> None:
+    for one, next_one in pairwise(look(camera)):
+        assert next_one.frame_number > one.frame_number
+        frames_later = (next_one.timestamp_s - one.timestamp_s) * 30
+        assert frames_later == pytest.approx(next_one.frame_number - one.frame_number, abs=0.5)
+
+
+def test_settings_are_those_read_back(camera: Camera) -> None:
+    frame = look(camera)[0]
+    assert frame.settings["depth_units"] == pytest.approx(0.00025)
+
+
+def test_what_is_delivered_is_what_the_world_exposed(uri: str, camera: Camera) -> None:
+    world = world_of(uri)
+    if world is None:
+        pytest.skip("only a simulated world is known to the bit")
+    for frame in look(camera):
+        images = world.images(frame.frame_number)
+        depth_z16 = np.nan_to_num(frame.depth_m / np.float32(0.00025)).round()
+        np.testing.assert_array_equal(depth_z16, images.depth_z16)
+        np.testing.assert_array_equal(frame.ir, images.ir)
+        np.testing.assert_array_equal(frame.confidence, images.confidence)
+
+
+def test_the_truth_is_given_where_the_camera_knows_it(uri: str, camera: Camera) -> None:
+    frame = look(camera)[0]
+    if uri != "sim":
+        assert frame.truth_depth_m is None
+    else:
+        np.testing.assert_array_equal(frame.truth_depth_m, open_world("").truth_depth_m(frame.frame_number))
+        assert frame.truth_depth_m.shape == (64, 64)
+
+
+def test_it_can_be_entered_again(camera: Camera) -> None:
+    assert len(look(camera)) == len(look(camera)) == SEEN
+
+
+def test_nothing_is_lost_on_the_way_to_a_reader_that_keeps_up(camera: Camera) -> None:
+    look(camera)
+    assert (camera.incomplete, camera.dropped) == (0, 0)
+
+
+def test_iterating_before_entering_is_an_error(camera: Camera) -> None:
+    with pytest.raises(CameraError, match="not started"):
+        next(iter(camera))
+
+
+def test_leaving_ends_an_iteration(camera: Camera) -> None:
+    with camera:
+        frames = iter(camera)
+        next(frames)
+    assert list(frames) == []
+
+
+def test_an_error_inside_leaves_the_camera_stopped(camera: Camera) -> None:
+    with pytest.raises(ZeroDivisionError), camera:
+        _ = 1 // 0
+    assert len(look(camera)) == SEEN
+
+
+def test_a_process_that_used_it_ends_cleanly(uri: str) -> None:
+    ended = subprocess.run(  # noqa: PLW1510  the code is what is tested
+        [sys.executable, "-c", ENDS_CLEANLY, uri], capture_output=True, text=True, timeout=120
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "3\n", "")
+
+
+def test_a_recording_is_complete_on_every_stream(bag: Path) -> None:
+    found = verify(bag)
+    assert found.streams == dict.fromkeys(("depth", "infrared", "confidence"), RECORDED)
+    assert (found.frames, found.dropped) == (RECORDED, 0)
+
+
+def test_a_recording_gives_the_same_bits_each_time(bag: Path) -> None:
+    with open_camera(f"bag:{bag}") as camera:
+        first, second = list(camera), list(camera)
+    assert len(first) == len(second) == RECORDED
+    for one, other in zip(first, second, strict=True):
+        assert (one.frame_number, one.timestamp_s) == (other.frame_number, other.timestamp_s)
+        for images in ("depth_m", "ir", "confidence"):
+            np.testing.assert_array_equal(getattr(one, images), getattr(other, images))
+
+
+def test_a_recording_cannot_be_recorded(bag: Path, tmp_path: Path) -> None:
+    with pytest.raises(NlosCamError, match="is a recording already"):
+        open_camera(f"bag:{bag}", recording=Recording(tmp_path / "copy.bag"))

@@ -1,0 +1,185 @@
+import gc
+import os
+import re
+import subprocess
+import sys
+import time
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nlos_cam.camera import software_lidar
+from nlos_cam.camera.record import Recording
+from nlos_cam.camera.replay import ReplayCamera, verify
+from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera.streams import FORMATS
+from nlos_cam.errors import RecordingError, StreamMissingError
+
+
+def bits(path: Path, pause_s: float = 0.0) -> list[bytes]:
+    found: list[bytes] = []
+    with ReplayCamera(path) as camera:
+        for frame in camera:
+            time.sleep(pause_s)
+            found.append(frame.depth_m.tobytes() + frame.ir.tobytes() + frame.confidence.tobytes())
+    return found
+
+
+def record_streams(path: Path, world: Any) -> Path:
+    """A recording of the streams that a SoftwareLidar has just now."""
+    sdk = load_sdk()
+    lidar = software_lidar.SoftwareLidar(world.rig.pinhole, sdk)
+    recorder = sdk.recorder(str(path), lidar.device)
+    sensor = lidar.device.query_sensors()[0]
+    sensor.open(sensor.get_stream_profiles())
+    sensor.start(lambda _: None)
+    lidar.push(0, 0.0, world.images(0))
+    sensor.stop()
+    sensor.close()
+    del recorder
+    gc.collect()
+    return path
+
+
+def without_index(path: Path) -> bytes:
+    """The file as a killed recording leaves it: the header's index_pos is 0."""
+    content = path.read_bytes()
+    return re.sub(rb"(?s)(index_pos=).{8}", rb"\1" + bytes(8), content, count=1)
+
+
+def test_every_pushed_bit_comes_back(noise_bag: Path, noise_world: Any) -> None:
+    world = noise_world()
+    with ReplayCamera(noise_bag) as camera:
+        frames = list(camera)
+    assert [frame.frame_number for frame in frames] == list(range(20))
+    for frame in frames:
+        images = world.images(frame.frame_number)
+        np.testing.assert_array_equal(np.isnan(frame.depth_m), images.depth_z16 == 0)
+        np.testing.assert_array_equal(np.nan_to_num(frame.depth_m / np.float32(0.00025)).round(), images.depth_z16)
+        np.testing.assert_array_equal(frame.ir, images.ir)
+        np.testing.assert_array_equal(frame.confidence, images.confidence)
+
+
+def test_a_slow_reader_gets_the_same_frames(noise_bag: Path) -> None:
+    assert bits(noise_bag, pause_s=0.01) == bits(noise_bag)
+
+
+def test_each_iteration_starts_at_the_first_frame(noise_bag: Path) -> None:
+    with ReplayCamera(noise_bag) as camera:
+        for taken in (1, 9, 20, 3):
+            assert [frame.frame_number for frame in islice(camera, taken)] == list(range(taken))
+
+
+def test_counters_are_those_of_the_last_iteration(noise_bag: Path) -> None:
+    with ReplayCamera(noise_bag) as camera:
+        for _ in range(2):
+            assert len(list(camera)) == 20
+            assert set(camera.arrived.values()) == {20}
+
+
+def test_verifying_tells_what_is_in_the_file(noise_bag: Path) -> None:
+    found = verify(noise_bag)
+    assert (found.frames, found.dropped) == (20, 0)
+    assert found.seconds == pytest.approx(19 / 30, abs=1e-3)
+    assert found.streams == {"depth": 20, "infrared": 20, "confidence": 20}
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"", "is empty"),
+        (b"a text file\n", "is not a .bag recording"),
+        (b"#ROSBAG V2.0\n", "cut short or damaged"),
+    ],
+)
+def test_a_file_that_is_no_recording_is_told_in_one_line(tmp_path: Path, content: bytes, told: str) -> None:
+    path = tmp_path / "broken.bag"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=told) as raised:
+        ReplayCamera(path)
+    assert "\n" not in str(raised.value)
+    assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_recording_is_told(noise_bag: Path, tmp_path: Path, share: float) -> None:
+    path = tmp_path / "cut.bag"
+    content = noise_bag.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(RecordingError, match="cut short or damaged"):
+        ReplayCamera(path)
+
+
+def test_a_killed_recording_is_told(noise_bag: Path, tmp_path: Path) -> None:
+    path = tmp_path / "killed.bag"
+    path.write_bytes(without_index(noise_bag))
+    with pytest.raises(RecordingError, match="was never closed"):
+        ReplayCamera(path)
+
+
+def test_a_missing_path_and_a_folder_are_told(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="does not exist"):
+        ReplayCamera(tmp_path / "none.bag")
+    with pytest.raises(RecordingError, match="is a folder"):
+        ReplayCamera(tmp_path)
+
+
+def test_a_recording_that_is_damaged_within_does_not_end_quietly(
+    recorded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlos_cam.camera.replay.END_TOLERANCE_S", 0.0)
+    path = recorded(tmp_path / "damaged.bag", frames=200)  # more than the SDK writes as one compressed piece
+    assert verify(path).frames == 200
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 500] = bytes(500)
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match="is damaged"):
+        verify(path)
+
+
+@pytest.mark.parametrize("streams", [("depth",), ("depth", "infrared"), ("infrared", "confidence")])
+def test_a_missing_stream_is_named_with_what_to_do(
+    noise_world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, streams: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(software_lidar, "FORMATS", {stream: FORMATS[stream] for stream in streams})
+    path = record_streams(tmp_path / "partial.bag", noise_world())
+    with pytest.raises(StreamMissingError) as raised:
+        ReplayCamera(path)
+    for stream in FORMATS:
+        assert (f"no {stream}" in str(raised.value)) == (stream not in streams)
+    assert "--camera l515" in str(raised.value)
+
+
+def test_a_recording_of_no_frames_is_told(noise_world: Any, hurried_clock: Any, tmp_path: Path) -> None:
+    path = tmp_path / "nothing.bag"
+    camera = SimulatedCamera("sim", noise_world(), clock=hurried_clock(), recording=Recording(path))
+    camera._world.fails_at = 0
+    with camera, pytest.raises(ZeroDivisionError):
+        next(iter(camera))
+    with pytest.raises(RecordingError, match="holds no frames"):
+        ReplayCamera(path)
+
+
+def test_a_real_recording_of_another_camera_says_what_it_lacks() -> None:
+    path = Path(os.environ.get("NLOS_CAM_TEST_DATA", "data")) / "realsense_d435_depth_color_640x480.bag"
+    if not path.exists():
+        pytest.skip(f"a D435's recording is not at {path}: NLOS_CAM_TEST_DATA names its folder")
+    with pytest.raises(StreamMissingError, match="no infrared and no confidence stream") as raised:
+        ReplayCamera(path)
+    assert "--camera l515" in str(raised.value)
+
+
+@pytest.mark.parametrize("reads", ["list(camera)", "next(iter(camera))", "None"])
+@pytest.mark.parametrize("leaves", ["camera.__exit__(None, None, None)", "None"])
+def test_the_process_ends_cleanly_wherever_it_stops(noise_bag: Path, reads: str, leaves: str) -> None:
+    program = (
+        "from nlos_cam.camera import open_camera\n"
+        f"camera = open_camera('bag:{noise_bag}').__enter__()\nfound = {reads}\n{leaves}\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)  # noqa: PLW1510  the code is what is tested
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
