@@ -73,12 +73,13 @@ def sense_object(depth_m: Float32, sensor: Sensor, seed: int, accuracy: str = "s
 
 def build(plan: DatasetPlan, count: int, folder: Path, *, workers: int, on_progress: OnProgress) -> None:
     """Bring a folder up to `count` objects. Raises RecordingError where it holds another plan's shards."""
+    _ = plan.box  # refuse a rig that cannot hide anything before anything is made
     folder.mkdir(parents=True, exist_ok=True)
     _agree(folder, plan)
     starts = range(plan.first_seed, plan.first_seed + count, SHARD)
     end = plan.first_seed + count
     jobs = {_shard(folder, start): range(start, min(start + SHARD, end)) for start in starts}
-    missing = {path: seeds for path, seeds in jobs.items() if not path.exists()}
+    missing = {path: seeds for path, seeds in jobs.items() if not _holds(path, seeds)}
     done = count - sum(len(seeds) for seeds in missing.values())
     on_progress(done, count)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
@@ -89,7 +90,7 @@ def build(plan: DatasetPlan, count: int, folder: Path, *, workers: int, on_progr
                 done += futures[future]
                 on_progress(done, count)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)
             raise
 
 
@@ -117,6 +118,17 @@ def _one_thread() -> None:
 
 def _shard(folder: Path, start: int) -> Path:
     return folder / f"shard-{start:09d}.h5"
+
+
+def _holds(shard: Path, seeds: Sequence[int]) -> bool:
+    """Whether a shard is there with all of these objects: the last one of a smaller dataset has too few."""
+    if not shard.exists():
+        return False
+    try:
+        with h5py.File(shard) as file:
+            return len(file["seed"]) >= len(seeds)  # pyright: ignore[reportArgumentType] (a data set, by our own hand)
+    except (OSError, KeyError) as error:
+        raise RecordingError(f"{shard} cannot be read as a shard: {error}; delete it and build again") from error
 
 
 def _build_shard(plan: DatasetPlan, path: Path, seeds: Sequence[int]) -> None:

@@ -64,7 +64,7 @@ def _reduce_cells(
             n = 0
             for r in range(row_edges[i], row_edges[i + 1]):
                 for c in range(column_edges[j], column_edges[j + 1]):
-                    if depth_m[r, c] > 0.0:  # false for NaN too
+                    if 0.0 < depth_m[r, c] < np.inf:  # false for NaN too
                         samples[n], counts[n] = depth_m[r, c], ir[r, c]
                         n += 1
             if n == 0:

@@ -75,12 +75,14 @@ def load_record(folder: Path) -> CheckpointRecord:
     """The record of a checkpoint folder."""
     try:
         return CheckpointRecord.model_validate_json((folder / RECORD).read_text(encoding="utf-8"))
-    except OSError as error:
+    except (OSError, UnicodeDecodeError) as error:
         raise CheckpointError(
             f"no checkpoint in {folder}: {RECORD} cannot be read; train one, or name another"
         ) from error
     except ValidationError as error:
-        raise CheckpointError(f"{folder / RECORD} is not a checkpoint's record: {error.errors()[0]['msg']}") from error
+        problem = error.errors()[0]
+        field = ".".join(str(part) for part in problem["loc"])
+        raise CheckpointError(f"{folder / RECORD} is not a checkpoint's record: {field}: {problem['msg']}") from error
 
 
 def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -> None:

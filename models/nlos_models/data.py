@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -47,14 +48,27 @@ def image_batches(images: Half, batch: int, generator: torch.Generator) -> Itera
         yield flip_some([chosen], torch.rand(len(index), generator=generator) < 0.5)[0]
 
 
-def map_batches(maps: MapSet, batch: int, generator: torch.Generator) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """One epoch of depth (b, 64, 80), intensity (b, 64, 80) and images (b, 1, 64, 64), shuffled and mirrored."""
+class MapBatch(NamedTuple):
+    """One batch of maps, some of them mirrored."""
+
+    depth_m: Tensor
+    """(b, 64, 80)."""
+    intensity: Tensor
+    """(b, 64, 80)."""
+    image: Tensor
+    """(b, 1, 64, 64)."""
+    row: Tensor
+    """(b,); which samples of the set these are."""
+    mirrored: Tensor
+    """(b,); which of them are mirrored."""
+
+
+def map_batches(maps: MapSet, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
+    """One epoch of maps and images, shuffled and mirrored at random."""
     for index in shuffled(len(maps.image), batch, generator):
         rows = index.numpy()
         depth, intensity = torch.from_numpy(maps.depth_m[rows]), torch.from_numpy(maps.intensity[rows])
         image = torch.from_numpy(maps.image[rows].astype(np.float32))[:, None]
-        depth, intensity, image = flip_some(
-            [depth, intensity, image],
-            torch.rand(len(rows), generator=generator) < 0.5,
-        )
-        yield depth, intensity, image
+        mirrored = torch.rand(len(rows), generator=generator) < 0.5
+        depth, intensity, image = flip_some([depth, intensity, image], mirrored)
+        yield MapBatch(depth, intensity, image, index, mirrored)

@@ -4,7 +4,7 @@ import tomllib
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from nlos_models.errors import RecipeError
 
@@ -32,6 +32,13 @@ class Recipe(BaseModel):
     image_weight: float = 0.0
     deviations: list[str] = Field(default_factory=list[str])
     """Where this recipe leaves the supporting information, and why."""
+
+    @field_validator("batch")
+    @classmethod
+    def _no_more_than_objects(cls, batch: int, info: ValidationInfo) -> int:
+        if batch > info.data.get("objects", batch):
+            raise ValueError(f"a batch must not be larger than objects ({info.data['objects']})")
+        return batch
 
 
 def load_recipe(path: Path) -> Recipe:

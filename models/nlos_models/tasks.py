@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nlos_models.compressor import Compressor
-from nlos_models.data import Half, MapSet, image_batches, map_batches
+from nlos_models.data import Half, MapBatch, MapSet, image_batches, map_batches
 from nlos_models.losses import image_error, kl_divergence, latent_error
 from nlos_models.metrics import silhouette_iou
 from nlos_models.pipeline import Pipeline
@@ -36,7 +36,7 @@ def train_vae(
 
     def loss(image: Tensor) -> Tensor:
         image = image.contiguous(memory_format=torch.channels_last)
-        rebuilt, mean, log_variance = vae(image, torch.randn(len(image), LATENT))
+        rebuilt, mean, log_variance = vae(image, torch.randn(len(image), LATENT, device=image.device))
         return image_error(rebuilt, image) + recipe.kl_weight * kl_divergence(mean, log_variance)
 
     def score() -> dict[str, float]:
@@ -73,15 +73,16 @@ def train_compressor(
     pipeline = pipeline.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub lacks it)
     vae.requires_grad_(requires_grad=False).eval()
 
-    def loss(batch: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        depth, intensity, image = batch
+    targets = [_latents(vae, maps.image), _latents(vae, maps.image[:, ::-1])]  # as they are, and mirrored
+
+    def loss(batch: MapBatch) -> Tensor:
         vae.eval()
-        latent = pipeline.latent(depth, intensity)
-        with torch.no_grad():
-            mean, log_variance = vae.encoder(image)
+        latent = pipeline.latent(batch.depth_m, batch.intensity)
+        straight, mirrored = (pair[batch.row.cpu()].to(latent.device) for pair in targets)
+        mean, log_variance = torch.where(batch.mirrored[:, None, None], mirrored, straight).unbind(1)
         value = recipe.latent_weight * latent_error(latent, mean, log_variance)
         if recipe.image_weight:
-            value = value + recipe.image_weight * image_error(vae.decoder(latent), image)
+            value = value + recipe.image_weight * image_error(vae.decoder(latent), batch.image)
         return value
 
     def score() -> dict[str, float]:
@@ -104,8 +105,16 @@ def train_compressor(
 def run(pipeline: Pipeline, maps: MapSet) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     """Images (n, 64, 64) that the pipeline makes of maps, in eval mode."""
     parts = [slice(k, k + SCORING_BATCH) for k in range(0, len(maps.image), SCORING_BATCH)]
-    depth, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
-    return np.concatenate([pipeline(depth[part], intensity[part]).float().numpy() for part in parts])
+    device = next(pipeline.parameters()).device
+    depth, intensity = (torch.from_numpy(m).to(device) for m in (maps.depth_m, maps.intensity))
+    return np.concatenate([pipeline(depth[part], intensity[part]).float().cpu().numpy() for part in parts])
+
+
+@torch.no_grad()
+def _latents(vae: ResVae, images: Half | np.ndarray) -> Tensor:  # pyright: ignore[reportMissingTypeArgument]
+    """Mean and log-variance (n, 2, 256) of images (n, 64, 64)."""
+    parts = (torch.from_numpy(part.astype(np.float32))[:, None] for part in _parts(images))
+    return torch.cat([torch.stack(vae.encoder(part), dim=1) for part in parts])
 
 
 def _parts(images: Half) -> list[Half]:
@@ -114,8 +123,9 @@ def _parts(images: Half) -> list[Half]:
 
 @torch.inference_mode()
 def _rebuild(vae: ResVae, images: Half) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    mean, _ = vae.encoder(torch.from_numpy(images.astype(np.float32))[:, None])
-    return cut_silhouette(vae.decoder(mean))[:, 0].float().numpy()
+    device = next(vae.parameters()).device
+    mean, _ = vae.encoder(torch.from_numpy(images.astype(np.float32)).to(device)[:, None])
+    return cut_silhouette(vae.decoder(mean))[:, 0].float().cpu().numpy()
 
 
 def _figures(image: np.ndarray[tuple[int, ...], np.dtype[np.float32]], truth: Half | np.ndarray) -> dict[str, float]:  # pyright: ignore[reportMissingTypeArgument]

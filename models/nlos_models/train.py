@@ -10,6 +10,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
+from nlos_models.errors import RecipeError
 from nlos_models.recipe import Recipe
 
 Batches = Callable[[torch.Generator], Iterable[Any]]
@@ -61,15 +62,18 @@ def fit(
     An epoch is repeatable: its shuffle and noise depend on the recipe's seed and the epoch alone.
     """
     fabric = fabric or Fabric(accelerator="auto", devices=1, precision=recipe.precision)
+    module.to(fabric.device)
     optimizer = torch.optim.Adam(
         [p for p in module.parameters() if p.requires_grad], recipe.learning_rate, recipe.betas
     )
     schedule = _schedule(recipe, optimizer, recipe.epochs * steps_per_epoch)
-    state: dict[str, Any] = {"module": module, "optimizer": optimizer, "schedule": schedule, "epoch": 0}
+    networks = {"module": module, "optimizer": optimizer, "schedule": schedule}
+    state: dict[str, Any] = {**networks, "epoch": 0, "recipe": recipe.model_dump_json()}
     folder.mkdir(parents=True, exist_ok=True)
-    if (folder / "last.ckpt").exists():
-        fabric.load(folder / "last.ckpt", state)
+    _resume(fabric, folder / "last.ckpt", state)
     for epoch in range(state["epoch"], recipe.epochs):
+        if optimizer.param_groups[0]["lr"] < SMALLEST_RATE:
+            break
         started = time.perf_counter()
         torch.manual_seed(recipe.seed * 100_003 + epoch)
         generator = torch.Generator().manual_seed(recipe.seed * 100_003 + epoch)
@@ -89,8 +93,15 @@ def fit(
         state["epoch"] = epoch + 1
         fabric.save(folder / "last.ckpt.part", state)
         (folder / "last.ckpt.part").replace(folder / "last.ckpt")
-        if rate < SMALLEST_RATE:
-            break
+
+
+def _resume(fabric: Fabric, checkpoint: Path, state: dict[str, Any]) -> None:
+    """Load the last epoch's state, if there is one. Raises RecipeError where another recipe made it."""
+    wanted = state["recipe"]
+    if checkpoint.exists():
+        fabric.load(checkpoint, state)
+    if state["recipe"] != wanted:
+        raise RecipeError(f"{checkpoint.parent} holds a run of another recipe: choose another --out")
 
 
 def _one_epoch(

@@ -5,6 +5,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from nlos_calibration.projection import Intrinsics
+from nlos_calibration.rig import Rig
 
 from nlos_cam.frames import Frame
 
@@ -18,6 +19,8 @@ class Camera(Protocol):
 
     uri: str
     intrinsics: Intrinsics
+    rig: Rig | None
+    """The bench, where the camera knows it (a simulated one does)."""
     incomplete: int
     dropped: int
 

@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from nlos_calibration.projection import Intrinsics
+from nlos_calibration.rig import Rig
 
 from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.record import Recording
@@ -25,6 +26,7 @@ class LiveCamera(ABC):
 
     def __init__(self, uri: str, device: Any, size: Size, sdk: Any, recording: Recording | None) -> None:
         self.uri = uri
+        self.rig: Rig | None = None
         self.incomplete = self.dropped = 0
         self.silence_s = 5.0
         self._device, self._size, self._sdk, self._recording = device, size, sdk, recording

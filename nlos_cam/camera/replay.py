@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from nlos_calibration.projection import Intrinsics
+from nlos_calibration.rig import Rig
 
 from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.sdk import load_sdk
@@ -20,8 +21,8 @@ from nlos_cam.frames import Frame
 
 MAGIC = b"#ROSBAG V2.0"
 POLL_S = 0.05
-START_TIMEOUT_S = 1.0
-"""A recording of which nothing has come by then is empty."""
+START_TIMEOUT_S = 30.0
+"""Before its first frame, a playback that has not begun looks like one that has ended."""
 
 END_TOLERANCE_S = 1.0
 """What is recorded besides frames (notifications, options) may be later than the last frame."""
@@ -35,6 +36,7 @@ class ReplayCamera:
 
     def __init__(self, path: Path) -> None:
         self.uri = f"bag:{path}"
+        self.rig: Rig | None = None
         self.incomplete = self.dropped = 0
         self.arrived: Counter[str] = Counter()
         """Frames of each stream in the last iteration."""
@@ -108,10 +110,12 @@ class ReplayCamera:
         waited_s = 0.0
         while (found := inbox.take(POLL_S)) is None and not inbox.ended:
             waited_s += POLL_S
-            begun = inbox.arrived.total() > 0 or waited_s > START_TIMEOUT_S
             # asked, and not called back: a callback from a thread that ends may find the interpreter waiting for it
-            if begun and playback.current_status() == self._sdk.playback_status.stopped:
+            stopped = playback.current_status() == self._sdk.playback_status.stopped
+            if stopped and inbox.arrived.total() > 0:
                 inbox.finish()
+            elif waited_s > START_TIMEOUT_S:
+                raise RecordingError(f"{self._path} gave no frame in {START_TIMEOUT_S:.0f} s: record it again")
         return found
 
 

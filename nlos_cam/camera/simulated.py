@@ -3,6 +3,8 @@
 from threading import Event, Thread
 from typing import Any
 
+from nlos_calibration.rig import Rig
+
 from nlos_cam.camera.clock import Clock, WallClock
 from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.live_camera import LiveCamera
@@ -42,6 +44,7 @@ class SimulatedCamera(LiveCamera):
         pinhole, sdk = world.rig.pinhole, load_sdk()
         self._lidar = SoftwareLidar(pinhole, sdk)
         super().__init__(uri, self._lidar.device, (pinhole.width, pinhole.height), sdk, recording)
+        self.rig: Rig | None = world.rig
 
     def _prepare(self, sensor: Any) -> None:
         """Nothing to set."""

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from nlos_calibration.rig import Rig
@@ -13,6 +14,8 @@ from nlos_cam.render.renderer import MultiBounce, render
 from nlos_cam.render.scene_file import SceneFile, bare_wall_scene, load_scene, paper_scene
 from nlos_cam.render.sensor import SensedImages, Sensor
 
+Loop = tuple[list[MultiBounce], list[Float32]]
+"""Echoes and hidden depth of each pose."""
 OnProgress = Callable[[int, int], None]
 """Called with poses done and poses in all."""
 
@@ -47,15 +50,24 @@ def open_world(name: str, on_progress: OnProgress | None = None) -> World:
     """
     scene = {"": paper_scene, "bare-wall": bare_wall_scene}.get(name, lambda: load_scene(Path(name)))()
     cached = cache_folder() / "worlds" / f"{scene.checksum}.npz"
-    if not cached.exists():
-        _store(cached, *_render_loop(scene, on_progress))
-    with np.load(cached) as file:
-        echoes = [MultiBounce(*maps) for maps in zip(file["peak"], file["runner_up"], file["path_m"], strict=True)]
-        truths = list(file["truth_m"])
-    return World(scene, echoes, truths if scene.hidden else [None])
+    if (loop := _load(cached)) is None:
+        loop = _render_loop(scene, on_progress)
+        _store(cached, *loop)
+    echoes, truths = loop
+    return World(scene, echoes, list(truths) if scene.hidden else [None])
 
 
-def _render_loop(scene: SceneFile, on_progress: OnProgress | None) -> tuple[list[MultiBounce], list[Float32]]:
+def _load(path: Path) -> Loop | None:
+    """A cached loop; None where there is none, or it is damaged and must be rendered anew."""
+    try:
+        with np.load(path) as file:
+            maps = zip(file["peak"], file["runner_up"], file["path_m"], strict=True)
+            return [MultiBounce(*of_pose) for of_pose in maps], list(file["truth_m"])
+    except (OSError, ValueError, EOFError, KeyError, BadZipFile):
+        return None
+
+
+def _render_loop(scene: SceneFile, on_progress: OnProgress | None) -> Loop:
     echoes: list[MultiBounce] = []
     truths: list[Float32] = []
     for number in range(scene.poses):

@@ -90,7 +90,8 @@ def compressor(
         raise SceneError(f"{data} and {held_out_data} were rendered for different rigs: build one of them again")
     with tracked("training the compressor") as on_step:
         pipeline, figures = train_compressor(recipe, trained_vae, maps, held_out, out, on_step)
-    made_by = record.model_copy(update={"compressor_recipe": recipe, "figures": figures})
+    tied = {"rig_name": plan.rig.name, "rig_checksum": plan.rig.checksum}
+    made_by = record.model_copy(update={**tied, "compressor_recipe": recipe, "figures": figures})
     save_pipeline(out, pipeline, made_by)
     save_vae(out, trained_vae, made_by)
     finish({"out": str(out), **figures}, as_json=json, text=f"weights in {out}: {figures}")

@@ -15,7 +15,7 @@ from nlos_calibration.wall_record import load_wall
 from nlos_models.inference import Reconstructor, load_reconstructor
 
 from nlos_cam.cache import cache_folder
-from nlos_cam.camera import Recording, open_camera
+from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, tracked
 from nlos_cam.live import LiveReport, run_live
@@ -50,10 +50,11 @@ def live(
     json: Json = False,
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
-    rig = _rig(wall)
+    measured = load_wall(wall).rig if wall else None
     recording = Recording(output_path(record, "live", ".bag", overwrite=overwrite)) if record else None
     with tracked("rendering the scene ahead") as on_progress:
         opened = open_camera(camera, on_progress=on_progress, recording=recording)
+    rig = measured or _rig_of(opened)
     network = _network(weights, rig)
     with stop_on_signals() as stop, _viewer(rig, no_view=no_view) as viewer, opened as source:
         say(
@@ -80,7 +81,8 @@ def replay_bag(
 ) -> None:
     """Reconstruct every frame of a recording: the same frames and the same bits each time."""
     path = output_path(out, "replay", "", overwrite=overwrite)
-    rig, opened = _rig(wall), open_camera(f"bag:{bag}")
+    measured, opened = load_wall(wall).rig if wall else None, open_camera(f"bag:{bag}")
+    rig = measured or _rig_of(opened)
     network = _network(weights, rig)
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
@@ -108,8 +110,9 @@ def stop_on_signals() -> Generator[Event]:
             signal.signal(number, handler)
 
 
-def _rig(wall: Path | None) -> Rig:
-    return load_wall(wall).rig if wall else load_rig("paper-rig")
+def _rig_of(camera: Camera) -> Rig:
+    """The camera's own, if it knows one that can hide something; else the paper's."""
+    return camera.rig if camera.rig and camera.rig.object_box else load_rig("paper-rig")
 
 
 def _network(weights: Path | None, rig: Rig) -> Reconstructor:

@@ -36,7 +36,7 @@ def command(
     json: Json = False,
 ) -> None:
     """Render what a lidar of highest-echo kind reports of a hidden object."""
-    path = output_path(out, "render", ".npz", overwrite=overwrite)
+    path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
     chosen_rig = load_scene(scene).rig if scene else rig_named(rig)
     target = Scene(chosen_rig)
     depth_m = _depth_of(hidden, seed, target)
@@ -65,7 +65,7 @@ def _depth_of(hidden: str, seed: int, scene: Scene) -> np.ndarray[Any, np.dtype[
     if hidden.endswith(".npy"):
         try:
             return np.load(hidden).astype(np.float32)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, EOFError) as error:
             raise SceneError(f"{hidden} cannot be read as a depth map: {error}") from error
     if hidden not in CATEGORIES:
         raise SceneError(f"no object {hidden!r}: give a .npy depth map, or one of {', '.join(CATEGORIES)}")

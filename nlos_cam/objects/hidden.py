@@ -49,6 +49,10 @@ def place(triangles: Triangles, pose: Pose, box: ObjectBox) -> Triangles:
     points = points - (points.min(0) + points.max(0)) / 2
     points *= pose.size_m / np.ptp(points[:, :2], axis=0).max()
     room_m = box.z_far_m - box.z_near_m - pose.front_m
+    if room_m < 0:
+        raise SceneError(
+            f"front_m of {pose.front_m:g} m leaves the box, which is {room_m + pose.front_m:g} m deep: lower it"
+        )
     points[:, 2] *= min(1.0, room_m / max(np.ptp(points[:, 2]), 1e-9))
     middle_x, middle_y = (box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2
     points += (middle_x + pose.x_m, middle_y + pose.y_m, box.z_near_m + pose.front_m - points[:, 2].min())

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from nlos_cam.frames import OBJECT_PIXELS, Float32
 from nlos_cam.objects.depth_image import cell_centres_m
 
+EDGE = 1e-9
+"""Of a triangle: an edge that two triangles share leaves no hole, whichever way rounding falls."""
+
 
 @numba.njit(cache=True)
 def _fill(
@@ -30,7 +33,7 @@ def _fill(
             for j in range(j0, j1 + 1):
                 u = ((bx - x_m[j]) * (cy - y_m[i]) - (cx - x_m[j]) * (by - y_m[i])) / area
                 v = ((cx - x_m[j]) * (ay - y_m[i]) - (ax - x_m[j]) * (cy - y_m[i])) / area
-                if u >= 0 and v >= 0 and u + v <= 1:
+                if u >= -EDGE and v >= -EDGE and u + v <= 1 + EDGE:
                     depth[i, j] = min(depth[i, j], u * az + v * bz + (1 - u - v) * cz)
     return depth
 

@@ -90,8 +90,8 @@ def _refuse_line_of_sight(rig: Rig, patches: Patches, beams: Beams) -> None:
     with np.errstate(divide="ignore", invalid="ignore"):
         column = in_lidar[:, 0] / in_lidar[:, 2] * pinhole.fx + pinhole.ppx
         row = in_lidar[:, 1] / in_lidar[:, 2] * pinhole.fy + pinhole.ppy
-    aimed = (in_lidar[:, 2] > 0) & (np.abs(column - pinhole.width / 2) <= pinhole.width / 2)
-    aimed &= np.abs(row - pinhole.height / 2) <= pinhole.height / 2
+    aimed = (in_lidar[:, 2] > 0) & (np.abs(column + 0.5 - pinhole.width / 2) <= pinhole.width / 2)
+    aimed &= np.abs(row + 0.5 - pinhole.height / 2) <= pinhole.height / 2
     seen = aimed & ~_behind_occluder(rig, beams.lidar_m, patches)
     if seen.any():
         raise SceneError(

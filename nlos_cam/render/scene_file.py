@@ -4,11 +4,15 @@ import hashlib
 import tomllib
 from math import pi, radians, sin
 from pathlib import Path
+from typing import Annotated
 
+from nlos_calibration.errors import RecordFileError
 from nlos_calibration.rig import Record, Rig, first_problem, load_rig
-from pydantic import ConfigDict, Field, ValidationError, field_validator
+from nlos_calibration.wall_record import rig_named
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator
 
 from nlos_cam.errors import SceneError
+from nlos_cam.objects.categories import CATEGORIES
 from nlos_cam.objects.hidden import Pose, category_triangles, place
 from nlos_cam.objects.raster import orthographic_depth
 from nlos_cam.render.scene import Scene
@@ -18,10 +22,16 @@ RENDERING_VERSION = 1
 """Raised with any change of what a scene renders to, so that cached worlds are rendered anew."""
 
 
+def _known(category: str) -> str:
+    if category not in CATEGORIES:
+        raise ValueError(f"no such category: choose one of {', '.join(CATEGORIES)}")
+    return category
+
+
 class HiddenObject(Record):
     """One variation of a procedural category, and how it stands at rest."""
 
-    category: str
+    category: Annotated[str, AfterValidator(_known)]
     seed: int = Field(default=0, ge=0)
     size_m: float = Field(default=0.18, gt=0)
     tilt_x_deg: float = 0.0
@@ -112,9 +122,15 @@ def bare_wall_scene() -> SceneFile:
 
 
 def load_scene(path: Path) -> SceneFile:
-    """A scene from TOML. Raises SceneError with the first problem."""
+    """A scene from TOML; a rig's path in it starts from its own folder. Raises SceneError with the first problem."""
     try:
-        return SceneFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        if isinstance(rig := content.get("rig"), str):
+            beside = path.parent / rig
+            content["rig"] = rig_named(str(beside if beside.is_file() else rig)).model_dump()
+        return SceneFile.model_validate(content)
+    except RecordFileError as error:
+        raise SceneError(f"{path} is not a scene: rig: {error}") from error
     except ValidationError as error:
         raise SceneError(f"{path} is not a scene: {first_problem(error)}") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

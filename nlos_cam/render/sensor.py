@@ -115,7 +115,8 @@ class Sensor:
         self._direct, self._length = beams.direct.astype(np.float32), beams.length_m.astype(np.float32)
         self._cos_axis = beams.cos_axis.astype(np.float32)
         bare = rig.model_copy(update={"occluder": None})
-        self._gain = model.bare_wall_counts / cast(bare, pinhole).direct.max()
+        brightest = cast(bare, pinhole).direct.max()
+        self._gain = model.bare_wall_counts / brightest if brightest > 0 else 0.0
         self._alive = np.random.default_rng(0).random(self._direct.size) >= model.dead_share
         row = (np.arange(pinhole.height) + 0.5) * MAP_ROWS // pinhole.height
         column = (np.arange(pinhole.width) + 0.5) * MAP_COLUMNS // pinhole.width

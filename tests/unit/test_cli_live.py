@@ -32,7 +32,7 @@ class FakeNetwork:
 
 
 class FakeCamera:
-    intrinsics, incomplete, dropped = SMALL, 0, 0
+    intrinsics, rig, incomplete, dropped = SMALL, None, 0, 0
 
     def __init__(self, uri: str, on_frame: Callable[[int], None]) -> None:
         self.uri, self._on_frame = uri, on_frame

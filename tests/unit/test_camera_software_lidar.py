@@ -1,0 +1,54 @@
+"""The software device looks to the SDK as an L515 does: names, streams, formats, unit, geometry."""
+
+from dataclasses import astuple
+from typing import Any
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.streams import intrinsics_of, is_needed, stream_name
+
+PINHOLE = load_rig("paper-rig").pinhole
+
+
+@pytest.fixture(scope="module")
+def lidar() -> SoftwareLidar:
+    return SoftwareLidar(PINHOLE, load_sdk())
+
+
+@pytest.fixture(scope="module")
+def profiles(lidar: SoftwareLidar) -> dict[str, Any]:
+    [sensor] = lidar.device.query_sensors()
+    return {stream_name(profile): profile for profile in sensor.get_stream_profiles()}
+
+
+def test_it_is_named_as_simulated(lidar: SoftwareLidar) -> None:
+    info = load_sdk().camera_info
+    told = [lidar.device.get_info(key) for key in (info.name, info.serial_number, info.product_line)]
+    assert told == ["Simulated L515", "simulated", "L500"]
+
+
+def test_it_has_the_l515s_depth_sensor_and_unit(lidar: SoftwareLidar) -> None:
+    [sensor] = lidar.device.query_sensors()
+    assert sensor.get_info(load_sdk().camera_info.name) == "L500 Depth Sensor"
+    assert sensor.as_depth_sensor().get_depth_scale() == pytest.approx(0.00025)
+
+
+def test_it_has_the_three_streams_in_the_formats_we_read(profiles: dict[str, Any]) -> None:
+    assert set(profiles) == {"depth", "infrared", "confidence"}
+    assert all(is_needed(profile) and profile.fps() == 30 for profile in profiles.values())
+
+
+def test_every_stream_has_the_rigs_intrinsics(profiles: dict[str, Any]) -> None:
+    for profile in profiles.values():
+        np.testing.assert_allclose(astuple(intrinsics_of(profile)), astuple(PINHOLE), rtol=1e-6)
+
+
+def test_all_streams_are_seen_from_one_place(profiles: dict[str, Any]) -> None:
+    for stream in ("infrared", "confidence"):
+        same = profiles["depth"].get_extrinsics_to(profiles[stream])
+        np.testing.assert_array_equal(np.reshape(same.rotation, (3, 3)), np.eye(3))
+        np.testing.assert_array_equal(same.translation, np.zeros(3))

@@ -1,0 +1,177 @@
+"""Checkpoints: float16 round trips, strict loading, and errors that say which file and what."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from nlos_models.checkpoint import CheckpointRecord, load_pipeline, load_record, load_vae, save_pipeline, save_vae
+from nlos_models.compressor import Compressor
+from nlos_models.errors import CheckpointError
+from nlos_models.pipeline import Pipeline
+from nlos_models.recipe import Recipe
+from nlos_models.res_vae import Decoder, ResVae
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+RECORD = CheckpointRecord(
+    rig_name="paper-rig",
+    rig_checksum="0123456789ab",
+    vae_recipe=Recipe(task="vae", objects=10, held_out=1, epochs=1, batch=2, learning_rate=1e-3),
+    figures={"held_out_iou": 0.5},
+)
+PARTS = ("compressor", "preprocess", "decoder")
+
+
+def _worn(module: nn.Module) -> nn.Module:
+    """A network whose statistics are not those of a new one; some are too small for float16."""
+    generator = torch.Generator().manual_seed(1)
+    for name, buffer in module.named_buffers():
+        if buffer.is_floating_point():
+            small = 1e-9 if "running_var" in name else 1.0
+            buffer.copy_(small * torch.rand(buffer.shape, generator=generator))
+    return module
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("pipeline")
+    save_pipeline(folder, Pipeline(_worn(Compressor()), Decoder()), RECORD)
+    return folder
+
+
+@pytest.fixture
+def folder(saved: Path, tmp_path: Path) -> Path:
+    """The same checkpoint, to be harmed: the files that a test replaces are its own."""
+    for path in saved.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    return tmp_path
+
+
+def _replace(path: Path, content: bytes) -> None:
+    path.unlink()
+    path.write_bytes(content)
+
+
+def _change(path: Path, tensors: dict[str, torch.Tensor]) -> None:
+    path.unlink()
+    save_file(tensors, path)
+
+
+def test_a_pipeline_comes_back_within_float16_and_its_statistics_exactly(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    pipeline = Pipeline(_worn(Compressor()), _worn(Decoder()))
+    pipeline.preprocess.mean.copy_(torch.tensor([0.1, 1e-9, 20.0, 3.0]))
+    pipeline.preprocess.spread.copy_(torch.tensor([1e-8, 0.2, 100_000.0, 3.0]))
+    save_pipeline(tmp_path, pipeline, RECORD)
+    loaded, record = load_pipeline(tmp_path)
+    assert record == RECORD
+    assert not loaded.training
+    for name, tensor in pipeline.state_dict().items():
+        back, exact = loaded.state_dict()[name], "running" in name or "preprocess" in name
+        assert back.dtype == tensor.dtype
+        torch.testing.assert_close(back, tensor, rtol=0 if exact else 1e-3, atol=0 if exact else 1e-7)
+
+
+def test_saving_a_loaded_checkpoint_gives_the_same_bits(saved: Path, tmp_path: Path) -> None:
+    save_pipeline(tmp_path, *load_pipeline(saved))
+    names = sorted(path.name for path in saved.iterdir())
+    assert names == sorted(path.name for path in tmp_path.iterdir())
+    for name in names:
+        assert (tmp_path / name).read_bytes() == (saved / name).read_bytes()
+
+
+def test_a_vae_comes_back_and_saves_to_the_same_bits(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    vae = ResVae()
+    save_vae(tmp_path / "one", vae, RECORD)
+    loaded, record = load_vae(tmp_path / "one")
+    save_vae(tmp_path / "two", loaded, record)
+    assert record == RECORD
+    assert not loaded.training
+    torch.testing.assert_close(loaded.state_dict(), vae.state_dict(), rtol=1e-3, atol=1e-7)
+    for name in ("encoder", "decoder"):
+        first, second = ((tmp_path / n / f"{name}.safetensors").read_bytes() for n in ("one", "two"))
+        assert first == second
+
+
+def test_weights_are_stored_in_half(saved: Path) -> None:
+    tensors = load_file(saved / "decoder.safetensors")
+    assert tensors["output.weight"].dtype == torch.float16
+    assert all(t.dtype == torch.float32 for name, t in tensors.items() if "running" in name)
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_an_absent_file_is_named(folder: Path, part: str) -> None:
+    (folder / f"{part}.safetensors").unlink()
+    with pytest.raises(CheckpointError, match=rf"{part}\.safetensors cannot be read"):
+        load_pipeline(folder)
+
+
+@pytest.mark.parametrize("content", [b"", b"not tensors", b"\xff" * 64])
+def test_a_corrupt_file_is_named(folder: Path, content: bytes) -> None:
+    _replace(folder / "decoder.safetensors", content)
+    with pytest.raises(CheckpointError, match=r"decoder\.safetensors cannot be read"):
+        load_pipeline(folder)
+
+
+def test_a_truncated_file_is_named(folder: Path) -> None:
+    path = folder / "decoder.safetensors"
+    _replace(path, path.read_bytes()[:-100])
+    with pytest.raises(CheckpointError, match=r"decoder\.safetensors cannot be read"):
+        load_pipeline(folder)
+
+
+@pytest.mark.parametrize("harm", ["missing", "extra", "misshapen"])
+def test_a_tensor_that_does_not_fit_is_named(folder: Path, harm: str) -> None:
+    path = folder / "decoder.safetensors"
+    tensors = load_file(path)
+    if harm == "missing":
+        del tensors["output.bias"]
+    if harm == "extra":
+        tensors["output.more"] = torch.zeros(1)
+    if harm == "misshapen":
+        tensors["output.bias"] = torch.zeros(2)
+    _change(path, tensors)
+    with pytest.raises(CheckpointError, match=r"does not fit this network: .*output\.") as caught:
+        load_pipeline(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_vae_is_no_pipeline(tmp_path: Path) -> None:
+    save_vae(tmp_path, ResVae(), RECORD)
+    with pytest.raises(CheckpointError, match="compressor"):
+        load_pipeline(tmp_path)
+
+
+def test_an_absent_folder_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="train one, or name another"):
+        load_pipeline(tmp_path / "none")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe\x00\x80"])
+def test_a_corrupt_record_is_named(folder: Path, content: bytes) -> None:
+    _replace(folder / "checkpoint.json", content)
+    with pytest.raises(CheckpointError, match=r"checkpoint\.json"):
+        load_record(folder)
+
+
+@pytest.mark.parametrize(("field", "value"), [("rig_name", None), ("colour", "red")])
+def test_a_wrong_field_of_the_record_is_named(folder: Path, field: str, value: str | None) -> None:
+    facts = RECORD.model_dump(mode="json")
+    if value is None:
+        del facts[field]
+    else:
+        facts[field] = value
+    _replace(folder / "checkpoint.json", json.dumps(facts).encode())
+    with pytest.raises(CheckpointError, match=field):
+        load_record(folder)
+
+
+@pytest.mark.parametrize("value", [1e6, float("nan"), float("inf")])
+def test_weights_beyond_float16_are_refused_at_saving(tmp_path: Path, value: float) -> None:
+    decoder = Decoder()
+    nn.init.constant_(decoder.output.weight, value)
+    with pytest.raises(CheckpointError, match=r"output\.weight does not fit into float16"):
+        save_pipeline(tmp_path, Pipeline(Compressor(), decoder), RECORD)

@@ -1,0 +1,248 @@
+"""`dataset build`, `train`, `evaluate`: from objects to weights to figures, in the small."""
+
+import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Self
+
+import numpy as np
+import pytest
+import torch
+from nlos_calibration.rig import load_rig
+from nlos_models.checkpoint import load_pipeline, load_vae
+
+from nlos_cam import dataset
+from nlos_cam.cli import learn
+from nlos_cam.cli.main import main
+
+RIG = load_rig("paper-rig")
+RECIPE = """
+task = "{task}"
+objects = 4
+held_out = 2
+epochs = 1
+batch = 2
+learning_rate = 1e-3
+schedule = "one-cycle"
+"""
+Call = Callable[..., Any]
+
+
+class InThisProcess:
+    """Stands for the pool of processes, whose start takes seconds."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        pass
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def submit(self, work: Call, *arguments: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(work(*arguments))
+        return future
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def _recipe(folder: Path, task: str) -> str:
+    path = folder / f"{task}.toml"
+    path.write_text(RECIPE.format(task=task), encoding="utf-8")
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recipes, a trained VAE, and two datasets."""
+    folder = tmp_path_factory.mktemp("learn")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "ProcessPoolExecutor", InThisProcess)
+        for name, count, seed in (("data", "4", "0"), ("held-out", "2", "10000000")):
+            assert main(["dataset", "build", "--out", str(folder / name), "--count", count, "--seed", seed]) == 0
+    _recipe(folder, "compressor")
+    assert main(["train", "vae", "--recipe", _recipe(folder, "vae"), "--out", str(folder / "vae")]) == 0
+    return folder
+
+
+def _last(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def _train_compressor(made: Path, out: Path, **changes: str) -> int:
+    names = {"recipe": "compressor.toml", "vae": "vae", "dataset": "data", "held-out": "held-out"} | changes
+    options = [part for name, value in names.items() for part in (f"--{name}", str(made / value))]
+    return main(["train", "compressor", *options, "--out", str(out), "--json"])
+
+
+def test_build_says_what_it_built_and_goes_on_where_it_was(
+    made: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset, "_build_shard", lambda *_: pytest.fail("built again"))
+    out = str(made / "data")
+    assert main(["dataset", "build", "--out", out, "--count", "4", "--json"]) == 0
+    assert _last(capsys) == {"objects": 4, "out": out}
+    maps, plan = dataset.read(made / "data")
+    assert len(maps.image) == 4
+    assert (plan.rig, plan.first_seed) == (RIG, 0)
+
+
+def test_build_into_another_plans_folder_is_4(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["dataset", "build", "--out", str(made / "data"), "--count", "4", "--seed", "7", "--json"]) == 4
+    assert _last(capsys)["error"]["type"] == "RecordingError"
+
+
+def test_build_needs_a_rig_with_a_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["dataset", "build", "--out", str(tmp_path / "d"), "--count", "1", "--workers", "1"]
+    assert main([*arguments, "--rig", "bare-wall"]) == 1
+    assert "object_box" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "many"])
+def test_build_of_no_objects_is_wrong_usage(tmp_path: Path, count: str) -> None:
+    assert main(["dataset", "build", "--out", str(tmp_path / "d"), "--count", count]) == 2
+
+
+def test_a_trained_vae_has_weights_a_log_and_a_record(made: Path) -> None:
+    _, record = load_vae(made / "vae")
+    assert (record.rig_name, record.rig_checksum) == (RIG.name, RIG.checksum)
+    assert record.vae_recipe.objects == 4
+    assert set(record.figures) == {"held_out_loss", "held_out_iou"}
+    assert len((made / "vae" / "log.csv").read_text(encoding="utf-8").splitlines()) == 2
+
+
+def test_training_again_changes_nothing(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (made / "vae" / "decoder.safetensors").read_bytes()
+    assert main(["train", "vae", "--recipe", str(made / "vae.toml"), "--out", str(made / "vae"), "--json"]) == 0
+    assert set(_last(capsys)) == {"out", "held_out_loss", "held_out_iou"}
+    assert (made / "vae" / "decoder.safetensors").read_bytes() == before
+
+
+def test_a_trained_compressor_is_a_pipeline_with_the_vaes_decoder(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _train_compressor(made, tmp_path / "run") == 0
+    result = _last(capsys)
+    assert result["out"] == str(tmp_path / "run")
+    pipeline, record = load_pipeline(tmp_path / "run")
+    assert record.compressor_recipe is not None
+    assert (record.vae_recipe.task, record.compressor_recipe.task) == ("vae", "compressor")
+    assert record.figures == {name: result[name] for name in ("held_out_loss", "held_out_iou")}
+    vae, _ = load_vae(made / "vae")
+    torch.testing.assert_close(pipeline.decoder.state_dict(), vae.decoder.state_dict(), rtol=0, atol=0)
+
+
+def test_the_weights_are_tied_to_the_rig_that_the_maps_were_rendered_for(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, original = RIG.model_copy(update={"name": "other"}), dataset.read
+
+    def read(folder: Path) -> tuple[dataset.MapSet, dataset.DatasetPlan]:
+        maps, plan = original(folder)
+        return maps, replace(plan, rig=other)
+
+    monkeypatch.setattr(dataset, "read", read)
+    assert _train_compressor(made, tmp_path / "run") == 0
+    _, record = load_pipeline(tmp_path / "run")
+    assert (record.rig_name, record.rig_checksum) == (other.name, other.checksum)
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "words"),
+    [
+        ({"recipe": "vae.toml"}, 1, "a recipe for 'vae'"),
+        ({"recipe": "none.toml"}, 4, "none.toml"),
+        ({"dataset": "held-out"}, 1, "holds 2 objects, the recipe asks for 4"),
+        ({"dataset": "none"}, 4, "no dataset in"),
+        ({"vae": "data"}, 4, "encoder.safetensors"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, str], code: int, words: str
+) -> None:
+    assert _train_compressor(made, tmp_path / "run", **changes) == code
+    assert words in _last(capsys)["error"]["message"]
+    assert not (tmp_path / "run").exists()
+
+
+def test_datasets_of_two_rigs_are_refused(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = dataset.read
+
+    def read(folder: Path) -> tuple[dataset.MapSet, dataset.DatasetPlan]:
+        maps, plan = original(folder)
+        return maps, replace(plan, rig=RIG.model_copy(update={"name": folder.name}))
+
+    monkeypatch.setattr(dataset, "read", read)
+    assert _train_compressor(made, tmp_path / "run") == 1
+    assert "different rigs" in _last(capsys)["error"]["message"]
+
+
+class Guesser:
+    """A network that answers everything with the same plate."""
+
+    runtime, record = "none", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum)
+
+    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+        assert depth_m.shape == intensity.shape == (1, 64, 80)
+        image = np.zeros((1, 64, 64), np.float32)
+        image[:, 16:48, 16:48] = 0.6
+        return image
+
+
+@pytest.fixture
+def guessing(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = dataset.procedural_images
+    monkeypatch.setattr(learn, "load_reconstructor", lambda *_: Guesser())
+    monkeypatch.setattr(dataset, "procedural_images", lambda seed, count, box: original(seed, min(count, 5), box))
+
+
+@pytest.mark.usefixtures("guessing")
+def test_evaluate_judges_beside_the_baselines(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, data = tmp_path / "figures", str(made / "held-out")
+    arguments = ["evaluate", "--out", str(out), "--dataset", data, "--training", str(made / "data"), "--json"]
+    assert main(arguments) == 0
+    result = _last(capsys)
+    metrics = {"silhouette_iou", "accuracy_mean_abs", "accuracy_within_2_percent", "foreground_rmse_mm"}
+    assert set(result) == {*metrics, "baselines", "objects", "seconds", "out"}
+    assert result["objects"] == 2
+    assert set(result["baselines"]) == {"all_background", "mean_object", "nearest_neighbour"}
+    for figures in (result, *result["baselines"].values()):
+        for name in metrics:
+            assert set(figures[name]) == {"value", "low", "high"}
+    iou = result["silhouette_iou"]
+    assert 0 < iou["low"] <= iou["value"] <= iou["high"] <= 1
+    assert result["baselines"]["all_background"]["silhouette_iou"]["value"] == 0
+    assert result["baselines"]["all_background"]["foreground_rmse_mm"]["value"] is None
+    written = json.loads((out / "figures.json").read_text(encoding="utf-8"))
+    assert written == {name: value for name, value in result.items() if name != "out"}
+    assert (out / "sheet.png").read_bytes().startswith(b"\x89PNG")
+    assert main(arguments) == 1
+    assert _last(capsys)["error"]["type"] == "OutputExistsError"
+    assert main([*arguments, "--overwrite"]) == 0
+
+
+@pytest.mark.usefixtures("guessing")
+def test_evaluate_renders_test_objects_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--out", str(tmp_path / "figures"), "--count", "1", "--json"]) == 0
+    result = _last(capsys)
+    assert result["objects"] == 1
+    assert set(result["baselines"]) == {"all_background", "mean_object"}
+
+
+def test_evaluate_without_weights_is_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--out", str(tmp_path / "f"), "--weights", str(tmp_path / "none"), "--json"]) == 4
+    assert _last(capsys)["error"]["type"] == "CheckpointError"
+    assert not (tmp_path / "f").exists()

@@ -1,0 +1,146 @@
+"""The command line's frame: one call, an exit code, one line for an error, one object for a machine."""
+
+import json
+import sys
+from collections.abc import Callable
+
+import pytest
+import typer
+from nlos_calibration.errors import CalibrationError, RecordFileError, WallRefusedError
+from nlos_models.errors import CheckpointError, ModelError, RecipeError
+
+from nlos_cam import errors
+from nlos_cam.cli import main as module
+from nlos_cam.cli.common import Json, finish
+from nlos_cam.cli.main import build_app, main, run
+
+CODES = [
+    (errors.SceneError, 1),
+    (errors.OutputExistsError, 1),
+    (WallRefusedError, 1),
+    (CalibrationError, 1),
+    (ModelError, 1),
+    (errors.CameraNotFoundError, 3),
+    (errors.CameraLostError, 3),
+    (errors.RecordingError, 4),
+    (errors.StreamMissingError, 4),
+    (RecordFileError, 4),
+    (CheckpointError, 4),
+    (RecipeError, 4),
+]
+Act = Callable[[], None]
+
+
+@pytest.fixture
+def does(monkeypatch: pytest.MonkeyPatch) -> Callable[[Act], None]:
+    """A command line of one command, `act`, that does what it is told."""
+
+    def install(act: Act) -> None:
+        app = typer.Typer()
+
+        @app.callback()
+        def root() -> None: ...
+
+        @app.command("act")
+        def command(count: int = 1, json: Json = False) -> None:
+            act()
+            finish({"count": count}, as_json=json, text=f"{count} done")
+
+        monkeypatch.setattr(module, "build_app", lambda: app)
+
+    return install
+
+
+def _raise(error: BaseException) -> Act:
+    def act() -> None:
+        raise error
+
+    return act
+
+
+def test_a_command_that_works_is_0_and_its_sentence_is_on_stdout(
+    does: Callable[[Act], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    does(lambda: None)
+    assert main(["act"]) == 0
+    assert capsys.readouterr().out == "1 done\n"
+
+
+def test_with_json_the_last_line_of_stdout_is_one_object(
+    does: Callable[[Act], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    does(lambda: print("a line of the command's own"))  # noqa: T201
+    assert main(["act", "--count", "3", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == {"count": 3}
+
+
+@pytest.mark.parametrize(("kind", "code"), CODES, ids=lambda value: getattr(value, "__name__", str(value)))
+def test_a_foreseen_error_has_its_code_and_one_line(
+    does: Callable[[Act], None], capsys: pytest.CaptureFixture[str], kind: type[Exception], code: int
+) -> None:
+    message = "a depth of [3] m\nin [red]"
+    does(_raise(kind(message)))
+    assert main(["act"]) == code
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err == "error: a depth of [3] m in [red]\n"
+    assert main(["act", "--json"]) == code
+    last = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert last == {"error": {"type": kind.__name__, "message": message}}
+
+
+def test_ctrl_c_is_130(does: Callable[[Act], None], capsys: pytest.CaptureFixture[str]) -> None:
+    does(_raise(KeyboardInterrupt()))
+    assert main(["act"]) == 130
+    does(_raise(typer.Abort()))
+    assert main(["act"]) == 130
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["act", "--cuont", "3"], ["act", "--count", "many"], ["nothing"], ["act", "3"]])
+def test_wrong_usage_is_2_and_told_on_stderr(
+    does: Callable[[Act], None], capsys: pytest.CaptureFixture[str], arguments: list[str]
+) -> None:
+    does(lambda: None)
+    assert main(arguments) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err
+
+
+def test_an_error_nobody_foresaw_is_not_hidden(does: Callable[[Act], None]) -> None:
+    does(_raise(ZeroDivisionError("a bug")))
+    with pytest.raises(ZeroDivisionError):
+        main(["act"])
+
+
+def test_the_console_script_exits_with_the_code(
+    does: Callable[[Act], None], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    does(_raise(errors.CameraNotFoundError("no device")))
+    monkeypatch.setattr(sys, "argv", ["nlos-cam", "act"])
+    with pytest.raises(SystemExit) as caught:
+        run()
+    assert caught.value.code == 3
+    assert "no device" in capsys.readouterr().err
+
+
+def test_help_is_0_and_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    for name in ("devices", "capture", "calibrate", "live", "replay", "render", "dataset", "train", "evaluate"):
+        assert name in shown
+
+
+def test_every_command_takes_json() -> None:
+    def leaves(app: typer.Typer, path: str) -> list[tuple[str, object]]:
+        found = [(f"{path} {c.name}", c.callback) for c in app.registered_commands]
+        for group in app.registered_groups:
+            assert group.typer_instance is not None
+            found += leaves(group.typer_instance, f"{path} {group.name}")
+        return found
+
+    commands = leaves(build_app(), "nlos-cam")
+    assert len(commands) >= 10
+    for name, callback in commands:
+        assert "json" in getattr(callback, "__annotations__", {}), name

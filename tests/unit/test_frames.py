@@ -1,0 +1,151 @@
+"""Frames to maps: which pixel falls in which cell, and what a cell makes of its pixels."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nlos_calibration.projection import Intrinsics
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Frame, LidarMaps, _edges, maps_from_frame
+from nlos_cam.render.sensor import Sensor, SensorModel
+
+SIZES = [(480, 640), (240, 320), (768, 1024), (64, 80), (100, 90), (32, 40)]
+PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)
+
+
+def _frame(depth_m: np.ndarray, ir: np.ndarray | int = 10) -> Frame:
+    counts = np.broadcast_to(np.uint8(ir), depth_m.shape).copy()
+    confidence = np.full(depth_m.shape, 15, np.uint8)
+    return Frame(depth_m.astype(np.float32), counts, confidence, 0.0, 0, PINHOLE)
+
+
+def _maps(depth_m: np.ndarray, ir: np.ndarray | int = 10) -> LidarMaps:
+    return maps_from_frame(_frame(depth_m, ir))
+
+
+def _cell(k: int, pixels: int, cells: int) -> int:
+    return int((k + 0.5) * cells / pixels)
+
+
+@pytest.mark.parametrize(("pixels", "cells"), [(size[k], (MAP_ROWS, MAP_COLUMNS)[k]) for size in SIZES for k in (0, 1)])
+def test_edges_part_the_pixels_among_the_cells_that_hold_their_centres(pixels: int, cells: int) -> None:
+    edges = _edges(pixels, cells)
+    assert (edges[0], edges[-1], len(edges)) == (0, pixels, cells + 1)
+    assert (np.diff(edges) >= 0).all()
+    found = np.searchsorted(edges, np.arange(pixels), side="right") - 1
+    assert found.tolist() == [_cell(k, pixels, cells) for k in range(pixels)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_pixel_belongs_to_one_cell(size: tuple[int, int]) -> None:
+    generator = np.random.default_rng(0)
+    for row, column in generator.integers((0, 0), size, (40, 2)):
+        depth = np.full(size, np.nan)
+        depth[row, column] = 0.5
+        found = np.argwhere(_maps(depth).valid).tolist()
+        assert found == [[_cell(row, size[0], MAP_ROWS), _cell(column, size[1], MAP_COLUMNS)]]
+
+
+@pytest.mark.parametrize("size", SIZES[:4])
+def test_a_constant_frame_gives_constant_maps(size: tuple[int, int]) -> None:
+    maps = _maps(np.full(size, 0.375), 77)
+    assert maps.depth_m.shape == maps.intensity.shape == maps.valid.shape == (MAP_ROWS, MAP_COLUMNS)
+    assert maps.depth_m.dtype == maps.intensity.dtype == np.float32
+    assert maps.valid.all()
+    assert (maps.depth_m == np.float32(0.375)).all()
+    assert (maps.intensity == 77).all()
+
+
+def test_a_frame_of_the_maps_own_size_is_its_maps() -> None:
+    depth = np.random.default_rng(0).uniform(0.2, 1, (64, 80)).astype(np.float32)
+    np.testing.assert_array_equal(_maps(depth).depth_m, depth)
+
+
+def test_depth_is_the_median_of_the_valid_samples() -> None:
+    generator = np.random.default_rng(1)
+    depth = generator.uniform(0.2, 1, (480, 640)).astype(np.float32)
+    depth[generator.random(depth.shape) < 0.3] = np.nan
+    maps = _maps(depth)
+    for i, j in [(0, 0), (1, 5), (31, 40), (63, 79)]:
+        rows = [r for r in range(480) if _cell(r, 480, MAP_ROWS) == i]
+        samples = depth[rows][:, 8 * j : 8 * j + 8]
+        assert maps.depth_m[i, j] == pytest.approx(np.nanmedian(samples), rel=1e-6)
+
+
+def test_intensity_is_the_mean_over_the_samples_near_the_median() -> None:
+    depth, ir = np.full((512, 640), 0.5), np.full((512, 640), 20, np.uint8)
+    depth[:8, :3], ir[:8, :3] = 0.8, 200  # another winner in 24 of the first cell's 64 pixels
+    depth[0, 7], ir[0, 7] = 0.509, 60
+    depth[1, 7], ir[1, 7] = 0.511, 240
+    maps = _maps(depth, ir)
+    assert maps.depth_m[0, 0] == np.float32(0.5)
+    assert maps.intensity[0, 0] == pytest.approx((38 * 20 + 60) / 39)
+    assert maps.intensity[0, 1] == 20
+
+
+def test_two_winners_in_balance_still_give_an_intensity() -> None:
+    depth, ir = np.full((512, 640), 0.4), np.full((512, 640), 10, np.uint8)
+    depth[:, ::2], ir[:, ::2] = 0.8, 30
+    maps = _maps(depth, ir)
+    assert maps.valid.all()
+    assert ((maps.depth_m >= np.float32(0.4)) & (maps.depth_m <= np.float32(0.8))).all()
+    assert ((maps.intensity >= 10) & (maps.intensity <= 30)).all()
+
+
+@pytest.mark.parametrize("nothing", [np.nan, 0.0, -0.1, np.inf, -np.inf])
+def test_what_is_no_depth_does_not_count(nothing: float) -> None:
+    depth = np.full((480, 640), 0.5)
+    depth[::2] = nothing
+    ir = np.full((480, 640), 10, np.uint8)
+    ir[::2] = 255
+    maps = _maps(depth, ir)
+    assert maps.valid.all()
+    assert (maps.depth_m == np.float32(0.5)).all()
+    assert (maps.intensity == 10).all()
+
+
+@pytest.mark.parametrize("nothing", [np.nan, 0.0, -0.1, np.inf, -np.inf])
+def test_a_cell_with_no_depth_is_nan_0_and_not_valid(nothing: float) -> None:
+    depth = np.full((480, 640), 0.5)
+    depth[:15, :8] = nothing
+    maps = _maps(depth, 90)
+    assert np.isnan(maps.depth_m[:2, 0]).all()
+    assert (maps.intensity[:2, 0] == 0).all()
+    assert not maps.valid[:2, 0].any()
+    assert maps.valid.sum() == MAP_ROWS * MAP_COLUMNS - 2
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**16), size=st.sampled_from(SIZES[:4]), share=st.floats(0, 1))
+def test_maps_stay_within_what_the_frame_holds(seed: int, size: tuple[int, int], share: float) -> None:
+    generator = np.random.default_rng(seed)
+    depth = generator.uniform(0.1, 9, size).astype(np.float32)
+    depth[generator.random(size) < share] = np.nan
+    ir = generator.integers(0, 256, size, np.uint8)
+    maps = _maps(depth, ir)
+    np.testing.assert_array_equal(maps.valid, ~np.isnan(maps.depth_m))
+    assert (maps.intensity[~maps.valid] == 0).all()
+    if maps.valid.any():
+        assert np.nanmin(depth) <= np.nanmin(maps.depth_m)
+        assert np.nanmax(maps.depth_m) <= np.nanmax(depth)
+    assert maps.intensity.max() <= 255
+
+
+def test_mirroring_the_frame_mirrors_the_maps() -> None:
+    generator = np.random.default_rng(3)
+    depth, ir = generator.uniform(0.2, 1, (240, 320)), generator.integers(0, 256, (240, 320), np.uint8)
+    maps, mirrored = _maps(depth, ir), _maps(depth[:, ::-1], ir[:, ::-1])
+    # 320 pixels make whole columns of 4; rows of 3.75 break ties at a centre on an edge to one side
+    np.testing.assert_array_equal(maps.depth_m[:, ::-1], mirrored.depth_m)
+    np.testing.assert_allclose(maps.intensity[:, ::-1], mirrored.intensity, rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", SIZES[:3])
+def test_the_simulated_sensor_spreads_cells_as_maps_gather_them(size: tuple[int, int]) -> None:
+    rig = load_rig("bare-wall")
+    rows, columns = size
+    intrinsics = rig.intrinsics.model_copy(update={"height": rows, "width": columns})
+    cell = Sensor(rig.model_copy(update={"intrinsics": intrinsics}), SensorModel())._cell.reshape(size)
+    maps = _maps(cell + 1)
+    np.testing.assert_array_equal(maps.depth_m.ravel(), np.arange(MAP_ROWS * MAP_COLUMNS) + 1)

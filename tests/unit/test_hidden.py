@@ -1,0 +1,95 @@
+"""Placing objects in the box, and which objects a seed means."""
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import ObjectBox, load_rig
+
+from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.categories import CATEGORIES
+from nlos_cam.objects.hidden import Pose, category_triangles, object_depth, object_depths, place, random_pose
+
+BOX = load_rig("paper-rig").object_box
+CUP = category_triangles("cup", 0)
+
+
+def _points(pose: Pose, box: ObjectBox = BOX) -> np.ndarray:
+    return place(CUP, pose, box).reshape(-1, 3)
+
+
+def test_size_offset_and_front_are_what_the_pose_says() -> None:
+    points = _points(Pose(turn_z_rad=0.4, tilt_x_rad=0.2, size_m=0.15, x_m=0.02, y_m=-0.03, front_m=0.04))
+    assert np.ptp(points[:, :2], axis=0).max() == pytest.approx(0.15)
+    middle = (points.min(0) + points.max(0)) / 2
+    np.testing.assert_allclose(middle[:2], [0.45 + 0.02, -0.03], atol=1e-12)
+    assert points[:, 2].min() == pytest.approx(BOX.z_near_m + 0.04)
+
+
+def test_a_turn_about_z_turns_the_silhouette_counter_clockwise_seen_with_x_right_and_y_up() -> None:
+    straight, turned = _points(Pose()), _points(Pose(turn_z_rad=np.pi / 2))
+    straight, turned = straight - straight.mean(0), turned - turned.mean(0)
+    scale = np.ptp(turned[:, :2], axis=0).max() / np.ptp(straight[:, :2], axis=0).max()
+    np.testing.assert_allclose(turned[:, 0], -scale * straight[:, 1], atol=1e-9)
+    np.testing.assert_allclose(turned[:, 1], scale * straight[:, 0], atol=1e-9)
+
+
+def test_a_thing_deeper_than_the_box_is_flattened_and_keeps_its_silhouette() -> None:
+    shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
+    deep, flat = _points(Pose()), _points(Pose(), shallow)
+    assert flat[:, 2].max() == pytest.approx(shallow.z_far_m)
+    np.testing.assert_allclose(flat[:, :2], deep[:, :2])
+
+
+@pytest.mark.parametrize("front_m", [0.3, 1.0])
+def test_no_room_behind_the_front_is_refused_not_turned_inside_out(front_m: float) -> None:
+    with pytest.raises(SceneError, match="front_m"):
+        place(CUP, Pose(front_m=front_m), BOX)
+
+
+def test_a_random_pose_is_decided_by_its_generator() -> None:
+    first, again, other = (random_pose(np.random.default_rng(s), BOX) for s in (1, 1, 2))
+    assert first == again
+    assert first != other
+
+
+def test_an_unknown_category_is_named_beside_the_known() -> None:
+    with pytest.raises(SceneError, match=r"'teapot'.*airplane.*tower"):
+        category_triangles("teapot", 0)
+
+
+def test_the_seed_decides_all() -> None:
+    category, depth = object_depth(17, BOX)
+    again, same = object_depth(17, BOX)
+    assert again == category
+    np.testing.assert_array_equal(same, depth)
+
+
+def test_many_objects_come_in_the_order_of_their_seeds() -> None:
+    for seed, depth in zip((9, 3, 7), object_depths((9, 3, 7), BOX), strict=True):
+        np.testing.assert_array_equal(depth, object_depth(seed, BOX)[1])
+
+
+def test_training_held_out_and_test_objects_are_different_objects() -> None:
+    groups = [
+        {object_depth(first + k, BOX)[1].tobytes() for k in range(25)}
+        for first in (TRAINING_SEED, HELD_OUT_SEED, TEST_SEED)
+    ]
+    assert [len(group) for group in groups] == [25, 25, 25]
+    assert len(set.union(*groups)) == 75
+
+
+def test_every_category_comes_up() -> None:
+    assert {object_depth(seed, BOX)[0] for seed in range(80)} == set(CATEGORIES)
+
+
+def test_a_choice_of_categories_is_kept_to() -> None:
+    assert {object_depth(seed, BOX, ("cup", "hat"))[0] for seed in range(12)} == {"cup", "hat"}
+
+
+def test_depths_are_within_the_box() -> None:
+    for seed in range(20):
+        depth = object_depth(seed, BOX)[1]
+        assert depth.shape == (64, 64)
+        assert depth.dtype == np.float32
+        assert np.nanmin(depth) >= BOX.z_near_m - 1e-6
+        assert np.nanmax(depth) <= BOX.z_far_m + 1e-6

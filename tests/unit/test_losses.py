@@ -1,0 +1,51 @@
+"""Losses against hand-made examples; the reduction is sum over entries, mean over samples."""
+
+import pytest
+import torch
+from nlos_models.losses import image_error, kl_divergence, latent_error
+
+
+def test_the_image_error_sums_pixels_and_averages_samples() -> None:
+    image, truth = torch.zeros(2, 1, 64, 64), torch.zeros(2, 1, 64, 64)
+    image[0, 0, 3, 4], image[0, 0, 5, 6] = 1.0, 0.5
+    assert image_error(image, truth).item() == pytest.approx((1 + 0.25) / 2)
+
+
+def test_kl_is_0_for_the_standard_normal_and_positive_elsewhere() -> None:
+    zero = torch.zeros(3, 256)
+    assert kl_divergence(zero, zero).item() == 0
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        mean, log_variance = torch.randn(2, 3, 256, generator=generator)
+        assert kl_divergence(mean, log_variance) > 0
+
+
+def test_kl_follows_its_closed_form() -> None:
+    mean, log_variance = torch.full((1, 1), 2.0), torch.full((1, 1), 4.0).log()
+    expected = torch.distributions.kl_divergence(
+        torch.distributions.Normal(2.0, 2.0), torch.distributions.Normal(0.0, 1.0)
+    )
+    assert kl_divergence(mean, log_variance).item() == pytest.approx(expected.item())
+
+
+def test_an_error_weighs_by_the_encoders_own_doubt() -> None:
+    latent, mean = torch.ones(1, 2), torch.zeros(1, 2)
+    sure, unsure = torch.full((1, 2), 0.25).log(), torch.full((1, 2), 4.0).log()
+    assert latent_error(latent, mean, sure).item() == pytest.approx(2 / 0.25)
+    assert latent_error(latent, mean, unsure).item() == pytest.approx(2 / 4)
+    assert latent_error(mean, mean, sure).item() == 0
+
+
+@pytest.mark.parametrize("limit", [-10.0, 10.0])
+@pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16, torch.float16])
+def test_losses_stay_finite_at_the_ends_of_the_log_variance(limit: float, precision: torch.dtype) -> None:
+    mean = torch.full((2, 256), 3.0, dtype=precision)
+    log_variance = torch.full((2, 256), limit, dtype=precision)
+    for value in (kl_divergence(mean, log_variance), latent_error(-mean, mean, log_variance)):
+        assert value.dtype == torch.float32
+        assert torch.isfinite(value)
+
+
+def test_half_precision_images_are_summed_in_single_precision() -> None:
+    image, truth = torch.ones(1, 1, 64, 64, dtype=torch.bfloat16), torch.zeros(1, 1, 64, 64)
+    assert image_error(image, truth).item() == 4096

@@ -1,0 +1,52 @@
+"""Compressor and decoder as one network, on the maps that a bench may well deliver."""
+
+import pytest
+import torch
+from nlos_models.compressor import Compressor
+from nlos_models.pipeline import Pipeline
+from nlos_models.res_vae import Decoder
+from nlos_models.silhouette import LEAST_V
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> Pipeline:
+    torch.manual_seed(0)
+    return Pipeline(Compressor(), Decoder()).eval()
+
+
+def _hard(name: str) -> tuple[torch.Tensor, torch.Tensor]:
+    depth, intensity = torch.full((1, 64, 80), 0.3), torch.full((1, 64, 80), 10.0)
+    if name == "all zero":
+        depth, intensity = torch.zeros_like(depth), torch.zeros_like(intensity)
+    if name == "saturated":
+        intensity[:] = 255.0
+    if name == "half invalid":
+        depth[:, :, :40] = torch.nan
+    if name == "all invalid":
+        depth[:] = torch.nan
+    return depth, intensity
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("name", ["constant", "all zero", "saturated", "half invalid", "all invalid"])
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_hard_maps_give_a_possible_hidden_image(pipeline: Pipeline, name: str, bfloat16: bool) -> None:
+    with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+        image = pipeline(*_hard(name))
+    assert image.shape == (1, 64, 64)
+    assert ((image == 0) | ((image >= LEAST_V) & (image <= 1))).all()
+
+
+@torch.inference_mode()
+def test_a_sample_does_not_depend_on_its_batch(pipeline: Pipeline) -> None:
+    depth, intensity = torch.rand(3, 64, 80), 50 * torch.rand(3, 64, 80)
+    alone = torch.cat([pipeline.latent(d[None], i[None]) for d, i in zip(depth, intensity, strict=True)])
+    torch.testing.assert_close(pipeline.latent(depth, intensity), alone, atol=1e-4, rtol=1e-3)
+
+
+@torch.inference_mode()
+def test_maps_that_are_not_contiguous_give_the_same(pipeline: Pipeline) -> None:
+    depth, intensity = torch.rand(1, 80, 64), 50 * torch.rand(1, 80, 64)
+    turned = pipeline.latent(depth.transpose(1, 2), intensity.transpose(1, 2))
+    copied = pipeline.latent(depth.transpose(1, 2).contiguous(), intensity.transpose(1, 2).contiguous())
+    torch.testing.assert_close(turned, copied, atol=1e-5, rtol=1e-4)
