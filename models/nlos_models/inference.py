@@ -65,7 +65,7 @@ class OnnxReconstructor:
 def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
     """The shipped weights (None), or a checkpoint folder's, on the best device at hand.
 
-    The ONNX file is exported once into the folder `cache`, named by the checksum of the weights.
+    The ONNX file is exported once into the folder `cache`, named by a checksum of weights and code.
     Raises CheckpointError where the weights cannot be read.
     """
     pipeline, record = load_pipeline(folder)
@@ -103,7 +103,10 @@ def export_onnx(pipeline: Pipeline, path: Path) -> None:
 
 
 def _checksum(pipeline: Pipeline) -> str:
+    """Of all that decides what an exported network computes: exporter, weights, and this package's own code."""
     digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
     for name, tensor in sorted(pipeline.state_dict().items()):
         digest.update(name.encode() + tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]

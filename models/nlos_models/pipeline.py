@@ -1,11 +1,12 @@
 """Compressor and decoder as one network: lidar maps in, image of what is hidden out."""
 
+import torch
 from torch import Tensor, nn
 
 from nlos_models.compressor import Compressor
 from nlos_models.preprocess import Preprocess
 from nlos_models.res_vae import Decoder
-from nlos_models.silhouette import cut_silhouette
+from nlos_models.silhouette import cut_silhouette, lift_edges
 
 
 class Pipeline(nn.Module):
@@ -23,4 +24,5 @@ class Pipeline(nn.Module):
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
         """Maps (n, 64, 80) to images (n, 64, 64)."""
-        return cut_silhouette(self.decoder(self.latent(depth_m, intensity)))[:, 0]
+        image = self.decoder(self.latent(depth_m, intensity))
+        return torch.where(cut_silhouette(image) > 0, lift_edges(image), 0.0)[:, 0]

@@ -1,8 +1,8 @@
-"""Where the surface ends: the last step from a decoded image to a hidden depth map.
+"""Where the surface ends, and how deep it is there: the last step from a decoded image to a hidden depth map.
 
-A network trained on squared error answers with the mean of what could be there: beside a silhouette, a fraction of the
-surface's v. By the convention v < 0.05 nearly all of that would count as surface. So a pixel is kept only if it reaches
-KEPT_SHARE of the brightest within the window about it.
+A network trained on squared error answers with the mean of what could be there: near a silhouette, a fraction of the
+surface's v. By the convention v < 0.05 nearly all of that would count as surface, and much too far away. So a pixel is
+kept only if it reaches KEPT_SHARE of the brightest about it, and what is kept is lifted to the surface's own v.
 """
 
 import torch
@@ -11,6 +11,8 @@ from torch.nn import functional
 
 WINDOW = 13
 """Pixels; about 5 cm in the paper's box."""
+LIFT_WINDOW = 7
+"""Pixels; about as wide as silhouettes are blurred."""
 KEPT_SHARE = 0.4
 LEAST_V = 0.1
 """v of the farthest surface (z_far)."""
@@ -21,3 +23,10 @@ def cut_silhouette(image: Tensor) -> Tensor:
     brightest = functional.max_pool2d(image, WINDOW, stride=1, padding=WINDOW // 2)
     kept = (image >= KEPT_SHARE * brightest) & (image >= LEAST_V)
     return torch.where(kept, image, torch.zeros_like(image))
+
+
+def lift_edges(image: Tensor) -> Tensor:
+    """Raise decoded images (n, 1, h, w) to the smoothed brightest of their surroundings; nothing gets darker."""
+    pad = LIFT_WINDOW // 2
+    brightest = functional.max_pool2d(image, LIFT_WINDOW, stride=1, padding=pad)
+    return torch.maximum(image, functional.avg_pool2d(brightest, LIFT_WINDOW, 1, pad, count_include_pad=False))

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from nlos_models.silhouette import KEPT_SHARE, LEAST_V, WINDOW, cut_silhouette
+from nlos_models.silhouette import KEPT_SHARE, LEAST_V, WINDOW, cut_silhouette, lift_edges
 
 
 def _blurred() -> torch.Tensor:
@@ -50,3 +50,19 @@ def test_brightest_pixels_are_never_cut() -> None:
     image = _blurred()
     peak = image.flatten(1).argmax(1)
     assert (cut_silhouette(image).flatten(1).gather(1, peak[:, None]) > 0).all()
+
+
+def test_lifting_only_brightens_and_stays_within_the_images_own_values() -> None:
+    image = _blurred()
+    lifted = lift_edges(image)
+    assert (lifted >= image).all()
+    assert (lifted <= image.amax((2, 3), keepdim=True) + 1e-6).all()
+
+
+def test_a_plateau_and_a_blurred_edge_of_it_come_out_level() -> None:
+    image = torch.zeros(1, 1, 64, 64)
+    image[..., 10:40, 20:50] = 0.8
+    image[..., 10:40, 50:52] = 0.5
+    lifted = lift_edges(image)
+    torch.testing.assert_close(lifted[..., 10:40, 20:48], image[..., 10:40, 20:48])
+    assert (lifted[..., 15:35, 50:52] > 0.7).all()
