@@ -14,8 +14,6 @@ from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.render.sensor import DEPTH_UNIT_M, SensedImages
 
-JOIN_TIMEOUT_S = 5.0
-
 
 @pytest.fixture(autouse=True)
 def nothing_left_running() -> Iterator[None]:
@@ -24,7 +22,7 @@ def nothing_left_running() -> Iterator[None]:
     yield
     left = [thread for thread in threading.enumerate() if thread not in before]
     for thread in left:
-        thread.join(JOIN_TIMEOUT_S)
+        thread.join(timeout=5.0)
     assert not [thread.name for thread in left if thread.is_alive()]
 
 
@@ -95,8 +93,7 @@ def noise_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_noise(tmp_path_factory.mktemp("bags") / "noise.bag", 20)
 
 
-class Named(SimpleNamespace):
-    """A member of one of the SDK's enumerations."""
+Named = SimpleNamespace  # a member of one of the SDK's enumerations
 
 
 class FakeProfile:
@@ -140,8 +137,7 @@ class FakeFrame:
         return self.number * 1000 / 30
 
     def get_data(self) -> np.ndarray:
-        kind = np.uint16 if self.profile.stream == "depth" else np.uint8
-        return np.full(self.profile.size[::-1], 240, kind)
+        return np.full(self.profile.size[::-1], 240, np.uint16 if self.profile.stream == "depth" else np.uint8)
 
 
 class FakeSensor:

@@ -8,7 +8,7 @@ from typing import Any
 from nlos_cam.camera.streams import SAME_INSTANT_S, FrameSet
 from nlos_cam.errors import RecordingError
 
-BOUNDARY_WAIT_S = 0.2
+BOUNDARY_WAIT_S = 1.0
 """How long stopping waits for the set in flight, so that no stream has one frame more than another."""
 
 

@@ -6,12 +6,14 @@ import sys
 import time
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from nlos_cam.camera import software_lidar
+from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.record import Recording
 from nlos_cam.camera.replay import ReplayCamera, verify
 from nlos_cam.camera.sdk import load_sdk
@@ -163,6 +165,13 @@ def test_a_recording_of_no_frames_is_told(noise_world: Any, hurried_clock: Any, 
         next(iter(camera))
     with pytest.raises(RecordingError, match="holds no frames"):
         ReplayCamera(path)
+
+
+def test_a_playback_that_never_begins_is_told(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.camera.replay.START_TIMEOUT_S", 0.0)
+    stopped = SimpleNamespace(current_status=lambda: load_sdk().playback_status.stopped)
+    with ReplayCamera(noise_bag) as camera, pytest.raises(RecordingError, match="gave no frame"):
+        camera._next(Inbox(lossless=True), stopped)
 
 
 def test_a_real_recording_of_another_camera_says_what_it_lacks() -> None:
