@@ -13,11 +13,14 @@ from nlos_models.inference import Reconstructor
 from nlos_models.preprocess import channel_statistics, split_and_stack
 from numpy.typing import NDArray
 
-from nlos_cam.dataset import sense_object
-from nlos_cam.frames import Float32
+from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera.world import World
+from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
 from nlos_cam.objects.depth_image import image_from_depth
 from nlos_cam.objects.hidden import object_depth
-from nlos_cam.render.sensor import Sensor, SensorModel
+from nlos_cam.render.renderer import MultiBounce, render
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.scene_file import SceneFile
 
 RESAMPLES = 2000
 SHEET_COLUMNS = 10
@@ -36,17 +39,28 @@ class Interval:
 
 
 def sense_test_objects(rig: Rig, box: ObjectBox, first_seed: int, count: int, on_progress: OnProgress) -> MapSet:
-    """Maps and images of unseen objects through the simulated camera's sensor, noise and quantisation on."""
-    sensor, seeds = Sensor(rig, SensorModel()), range(first_seed, first_seed + count)
-    depths, intensities, images = [], [], []
-    for done, seed in enumerate(seeds):
+    """Maps and images of unseen objects, each shown to the simulated camera in turn: noise, SDK and all."""
+    echoes: list[MultiBounce] = []
+    truths: list[Float32 | None] = []
+    for seed in range(first_seed, first_seed + count):
         _, depth_m = object_depth(seed, box)
-        maps = sense_object(depth_m, sensor, seed)
-        depths.append(maps.depth_m)
-        intensities.append(maps.intensity)
-        images.append(image_from_depth(depth_m, box))
-        on_progress(done + 1, count)
-    return MapSet(np.stack(depths), np.stack(intensities), np.stack(images))
+        echoes.append(render(Scene(rig, depth_m)).multi)
+        truths.append(depth_m)
+        on_progress(len(echoes), count)
+    maps = _look(World(SceneFile(name="test objects", rig=rig), echoes, truths), count)
+    images = [image_from_depth(depth_m, box) for depth_m in truths if depth_m is not None]
+    return MapSet(np.stack([m.depth_m for m in maps]), np.stack([m.intensity for m in maps]), np.stack(images))
+
+
+def _look(world: World, count: int) -> list[LidarMaps]:
+    """The maps of each instant of a loop; an instant that a busy machine dropped is met again in the next round."""
+    maps: dict[int, LidarMaps] = {}
+    with SimulatedCamera("sim:test objects", world) as camera:
+        for frame in camera:
+            maps.setdefault(frame.frame_number % count, maps_from_frame(frame))
+            if len(maps) == count:
+                break
+    return [maps[number] for number in range(count)]
 
 
 def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:

@@ -109,7 +109,7 @@ def test_objects_are_reconstructed_one_at_a_time_in_order(images: np.ndarray) ->
     np.testing.assert_array_equal(made, np.nan_to_num(maps.depth_m[:, :, 8:72]))
 
 
-def test_test_objects_come_through_the_sensor_and_are_those_of_their_seeds() -> None:
+def test_test_objects_come_through_the_simulated_camera_and_are_those_of_their_seeds() -> None:
     assert RIG.object_box is not None
     seen: list[tuple[int, int]] = []
     maps = sense_test_objects(RIG, RIG.object_box, TEST_SEED, 2, lambda done, total: seen.append((done, total)))
@@ -119,7 +119,8 @@ def test_test_objects_come_through_the_sensor_and_are_those_of_their_seeds() -> 
         expected = image_from_depth(object_depth(TEST_SEED + k, RIG.object_box)[1], RIG.object_box)
         np.testing.assert_array_equal(maps.image[k], expected)
     again = sense_test_objects(RIG, RIG.object_box, TEST_SEED + 1, 1, lambda *_: None)
-    np.testing.assert_array_equal(again.depth_m[0], maps.depth_m[1])
+    same = np.abs(again.depth_m[0] - maps.depth_m[1]) < 0.003  # another frame's noise; ties may go the other way
+    assert same.mean() > 0.98
 
 
 @pytest.mark.parametrize("count", [1, 12])
