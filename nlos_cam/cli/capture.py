@@ -2,6 +2,7 @@
 
 import json as json_module
 from pathlib import Path
+from threading import Event
 from typing import Annotated
 
 import typer
@@ -11,7 +12,7 @@ from rich.progress import Progress, TaskID
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.replay import Verified, verify
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say
+from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stop_on_signals
 from nlos_cam.errors import RecordingError
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:bare-wall or sim:SCENE.toml.")]
@@ -84,16 +85,15 @@ def _record(uri: str, recording: Recording, bar: Progress, total: int | None) ->
 
     source = open_camera(uri, on_progress=on_progress, recording=recording)
     task = bar.add_task(f"recording {escape(uri)}", total=total)
-    with source:
-        return _watch(source, bar, task)
+    with stop_on_signals() as stop, source:
+        return _watch(source, bar, task, stop)
 
 
-def _watch(source: Camera, bar: Progress, task: TaskID) -> bool:
-    try:
-        for _ in source:
-            bar.advance(task)
-    except KeyboardInterrupt:
-        return True
+def _watch(source: Camera, bar: Progress, task: TaskID, stop: Event) -> bool:
+    for _ in source:
+        bar.advance(task)
+        if stop.is_set():
+            return True
     return False
 
 

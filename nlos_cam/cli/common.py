@@ -1,10 +1,13 @@
 """What every command shares: where output goes, how a result or an error is told, what is never overwritten."""
 
 import json as json_module
+import signal
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from threading import Event
+from types import FrameType
 from typing import Annotated, Any
 
 import typer
@@ -50,6 +53,23 @@ def tracked(description: str) -> Generator[Callable[[int, int], None]]:
             bar.update(task, completed=done, total=total)
 
         yield update
+
+
+@contextmanager
+def stop_on_signals() -> Generator[Event]:
+    """An event that Ctrl-C or a request to terminate sets while the block lasts: the loop ends, results are told."""
+    stop = Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        stop.set()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) -> Path:

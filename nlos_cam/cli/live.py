@@ -1,12 +1,7 @@
 """`nlos-cam live` and `nlos-cam replay`: frames in, hidden depth out."""
 
-import signal
-from collections.abc import Generator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from threading import Event
-from types import FrameType
 from typing import Annotated
 
 import typer
@@ -17,7 +12,7 @@ from nlos_models.inference import Reconstructor, load_reconstructor
 from nlos_cam.cache import cache_folder
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
-from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, tracked
+from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stop_on_signals, tracked
 from nlos_cam.live import LiveReport, run_live
 from nlos_cam.replay import REPORT, replay
 from nlos_cam.view.viewer import NullViewer, Viewer
@@ -91,23 +86,6 @@ def replay_bag(
     finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)
-
-
-@contextmanager
-def stop_on_signals() -> Generator[Event]:
-    """An event that Ctrl-C or a request to terminate sets while the block lasts: the loop ends, results are told."""
-    stop = Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        del number, frame
-        stop.set()
-
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _rig_of(camera: Camera) -> Rig:
