@@ -136,12 +136,15 @@ def test_what_cannot_be_captured_leaves_no_file(
 def test_ctrl_c_ends_without_loss(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     arguments = ["--camera", "sim:bare-wall", "--json", "--out", str(path)]
-    process = subprocess.Popen([sys.executable, "-c", PROGRAM, *arguments], stdout=subprocess.PIPE, text=True)
-    while not (path.exists() and path.stat().st_size > 1_000_000):
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    stdout, _ = process.communicate(timeout=60)
+    with subprocess.Popen([sys.executable, "-c", PROGRAM, *arguments], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            while not (path.exists() and path.stat().st_size > 1_000_000):
+                assert process.poll() is None
+                time.sleep(0.01)
+            process.send_signal(signal.SIGINT)
+            stdout, _ = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert process.returncode == 130
     found, told = verify(path), json.loads(stdout)
     assert found.frames == told["frames"] > 0
