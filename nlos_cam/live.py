@@ -146,6 +146,14 @@ def steps(reader: FrameReader, rig: Rig, network: Network, clock: Clock = time.t
         begun_s = clock()
 
 
+def warm_up(camera: Camera, rig: Rig, network: Network) -> None:
+    """Compile and load what the first frame would have to wait for, while the frames after it are dropped."""
+    shape = camera.intrinsics.height, camera.intrinsics.width
+    dark, none = np.zeros(shape, np.uint8), np.full(shape, np.nan, np.float32)
+    blank = Frame(none, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics)
+    reconstruct(maps_from_frame(blank), rig, network)
+
+
 @dataclass(frozen=True)
 class LiveReport:
     """What a live run did. Start-up, until the first frame's result, is in no figure."""

@@ -13,7 +13,7 @@ from nlos_cam.cache import cache_folder
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stop_on_signals, tracked
-from nlos_cam.live import LiveReport, run_live
+from nlos_cam.live import LiveReport, run_live, warm_up
 from nlos_cam.replay import REPORT, replay
 from nlos_cam.view.viewer import NullViewer, Viewer
 
@@ -51,6 +51,7 @@ def live(
         opened = open_camera(camera, on_progress=on_progress, recording=recording)
     rig = measured or _rig_of(opened)
     network = _network(weights, rig)
+    warm_up(opened, rig, network)
     with stop_on_signals() as stop, _viewer(rig, no_view=no_view) as viewer, opened as source:
         say(
             f"live view: {viewer.address}  (Ctrl-C ends it)"

@@ -11,7 +11,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam import live
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
-from nlos_cam.live import QUEUE_FRAMES, FrameReader, paced, run_live, steps
+from nlos_cam.live import QUEUE_FRAMES, FrameReader, paced, run_live, steps, warm_up
 from nlos_cam.view.viewer import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
@@ -223,3 +223,14 @@ def test_a_run_without_a_frame_reports_zeros() -> None:
     report = run_live(FakeCamera(0), RIG, network, NullViewer(), stop=Event())
     assert (report.frames, report.fps, report.dropped, report.stages_ms) == (0, 0.0, 0, {})
     assert set(report.latency_ms.values()) == {0.0}
+
+
+def test_warming_up_runs_the_way_of_a_frame_once_and_takes_none_from_the_camera() -> None:
+    seen: list[tuple[int, ...]] = []
+
+    def noting(depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+        seen.append(depth_m.shape)
+        return network(depth_m, intensity)
+
+    warm_up(FakeCamera(0), load_rig("paper-rig"), noting)
+    assert seen == [(1, 64, 80)]
