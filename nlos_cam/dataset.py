@@ -5,8 +5,9 @@ object, its rendering and its noise depend on its seed alone, so the shards are 
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
@@ -16,9 +17,9 @@ import numpy as np
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_models.data import Half, MapSet
 
-from nlos_cam.errors import RecordingError, SceneError
+from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
-from nlos_cam.objects.depth_image import image_from_depth
+from nlos_cam.objects.depth_image import image_from_depth, object_box
 from nlos_cam.objects.hidden import object_depth, object_depths
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
@@ -46,9 +47,7 @@ class DatasetPlan:
     @property
     def box(self) -> ObjectBox:
         """The rig's object box; SceneError where it has none."""
-        if self.rig.object_box is None:
-            raise SceneError(f"rig {self.rig.name!r} has no object_box to hide objects in: add one")
-        return self.rig.object_box
+        return object_box(self.rig)
 
     @property
     def provenance(self) -> str:
@@ -101,12 +100,9 @@ def read(folder: Path) -> tuple[MapSet, DatasetPlan]:
         raise RecordingError(f"no dataset in {folder}: it holds no shard-*.h5; make one with `nlos-cam dataset build`")
     parts: dict[str, list[Float32]] = {name: [] for name in MAP_CHANNELS}
     for shard in shards:
-        try:
-            with h5py.File(shard) as file:
-                for name, part in parts.items():
-                    part.append(np.asarray(file[name]))
-        except (OSError, KeyError) as error:
-            raise RecordingError(f"{shard} cannot be read as a shard: {error}; delete it and build again") from error
+        with _opened(shard) as file:
+            for name, part in parts.items():
+                part.append(np.asarray(file[name]))
     return MapSet(*(np.concatenate(parts[name]) for name in MAP_CHANNELS)), _plan_of(shards[0])
 
 
@@ -120,15 +116,22 @@ def _shard(folder: Path, start: int) -> Path:
     return folder / f"shard-{start:09d}.h5"
 
 
+@contextmanager
+def _opened(shard: Path) -> Generator[h5py.File]:
+    """A shard to read from. Raises RecordingError where it, or what is asked of it inside, cannot be read."""
+    try:
+        with h5py.File(shard) as file:
+            yield file
+    except (OSError, KeyError) as error:
+        raise RecordingError(f"{shard} cannot be read as a shard: {error}; delete it and build again") from error
+
+
 def _holds(shard: Path, seeds: Sequence[int]) -> bool:
     """Whether a shard is there with all of these objects: the last one of a smaller dataset has too few."""
     if not shard.exists():
         return False
-    try:
-        with h5py.File(shard) as file:
-            return len(file["seed"]) >= len(seeds)  # pyright: ignore[reportArgumentType] (a data set, by our own hand)
-    except (OSError, KeyError) as error:
-        raise RecordingError(f"{shard} cannot be read as a shard: {error}; delete it and build again") from error
+    with _opened(shard) as file:
+        return len(file["seed"]) >= len(seeds)  # pyright: ignore[reportArgumentType] (a data set, by our own hand)
 
 
 def _build_shard(plan: DatasetPlan, path: Path, seeds: Sequence[int]) -> None:
@@ -158,11 +161,8 @@ def _agree(folder: Path, plan: DatasetPlan) -> None:
 
 
 def _provenance(shard: Path) -> str:
-    try:
-        with h5py.File(shard) as file:
-            return str(file.attrs["plan"])
-    except (OSError, KeyError) as error:
-        raise RecordingError(f"{shard} cannot be read as a shard: {error}; delete it and build again") from error
+    with _opened(shard) as file:
+        return str(file.attrs["plan"])
 
 
 def _plan_of(shard: Path) -> DatasetPlan:

@@ -147,7 +147,10 @@ def steps(reader: FrameReader, rig: Rig, network: Network, clock: Clock = time.t
 
 
 def warm_up(camera: Camera, rig: Rig, network: Network) -> None:
-    """Compile and load what the first frame would have to wait for, while the frames after it are dropped."""
+    """Reconstruct a frame without any return, before the camera is entered.
+
+    What is compiled or allocated on first use would otherwise hold up the first frame, and drop those after it.
+    """
     shape = camera.intrinsics.height, camera.intrinsics.width
     dark, none = np.zeros(shape, np.uint8), np.full(shape, np.nan, np.float32)
     blank = Frame(none, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics)
@@ -215,7 +218,6 @@ def run_live(
     One that is `recorded` loses no frame and is shown at the speed it was recorded. Raises what the camera raises.
     """
     tally = Tally()
-    _warm_up(camera, rig, network)
     frames = paced(camera, stop, clock) if recorded else camera
     with FrameReader(frames, keeps_all=recorded, stop=stop, clock=clock) as reader:
         for step in steps(reader, rig, network, clock):
@@ -236,11 +238,3 @@ def paced(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]
         if stop.wait(max(0.0, frame.timestamp_s + offset_s - clock())):
             return
         yield frame
-
-
-def _warm_up(camera: Camera, rig: Rig, network: Network) -> None:
-    """Reconstruct a frame without any return: what is compiled or allocated on first use is so before frames wait."""
-    shape = camera.intrinsics.height, camera.intrinsics.width
-    nothing = np.zeros(shape, np.uint8)
-    frame = Frame(np.full(shape, np.nan, np.float32), nothing, nothing, 0.0, 0, camera.intrinsics)
-    reconstruct(maps_from_frame(frame), rig, network)

@@ -8,9 +8,8 @@ import numpy as np
 from nlos_calibration.rig import ObjectBox, Rig
 from numpy.typing import NDArray
 
-from nlos_cam.errors import SceneError
 from nlos_cam.frames import Float32, LidarMaps
-from nlos_cam.objects.depth_image import depth_from_image
+from nlos_cam.objects.depth_image import depth_from_image, object_box
 
 Clock = Callable[[], float]
 Network = Callable[[Float32, Float32], Float32]
@@ -29,13 +28,6 @@ class Reconstruction:
     """(64, 64); None from networks that do not tell."""
     timings_s: Mapping[str, float]
     """Seconds by stage."""
-
-
-def object_box(rig: Rig) -> ObjectBox:
-    """The box that a reconstruction is placed in. Raises SceneError where the rig has none."""
-    if rig.object_box is None:
-        raise SceneError(f"rig {rig.name!r} has no object box to reconstruct in: add [object_box] to its record")
-    return rig.object_box
 
 
 def pose_of(box: ObjectBox) -> NDArray[np.float64]:

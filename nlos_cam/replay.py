@@ -19,7 +19,8 @@ from nlos_cam.camera.base import Camera
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.live import FrameReader, Step, steps
-from nlos_cam.reconstruct import Clock, Network, object_box
+from nlos_cam.objects.depth_image import object_box
+from nlos_cam.reconstruct import Clock, Network
 
 RESULT, SHEET, REPORT = "reconstruction.npz", "frames.png", "report.md"
 SHEET_FRAMES = 6

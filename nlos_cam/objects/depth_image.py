@@ -1,14 +1,22 @@
 """Hidden depth in its two forms: metres over the object box, and the image v in [0, 1] that the networks speak."""
 
 import numpy as np
-from nlos_calibration.rig import ObjectBox
+from nlos_calibration.rig import ObjectBox, Rig
 from numpy.typing import NDArray
 
+from nlos_cam.errors import SceneError
 from nlos_cam.frames import OBJECT_PIXELS, Float32
 
 FARTHEST_V = 0.1
 """v of a surface at z_far; background is 0."""
 BACKGROUND_BELOW_V = 0.05
+
+
+def object_box(rig: Rig) -> ObjectBox:
+    """The box that hidden objects live in. Raises SceneError where the rig has none."""
+    if rig.object_box is None:
+        raise SceneError(f"rig {rig.name!r} has no object_box to hide an object in: add [object_box] to its record")
+    return rig.object_box
 
 
 def image_from_depth(depth_m: NDArray[np.floating], box: ObjectBox) -> Float32:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS, Float32
-from nlos_cam.objects.depth_image import cell_centres_m
+from nlos_cam.objects.depth_image import cell_centres_m, object_box
 
 Array = NDArray[np.float64]
 
@@ -48,8 +48,7 @@ class Scene:
         depth = self.object_depth_m
         if depth is None:
             return
-        if self.rig.object_box is None:
-            raise SceneError(f"rig {self.rig.name!r} has no object_box to hide an object in: add one")
+        _ = self.box  # refuse a rig that has none
         if depth.shape != (OBJECT_PIXELS, OBJECT_PIXELS):
             raise SceneError(f"object depth has shape {depth.shape}: it must be ({OBJECT_PIXELS}, {OBJECT_PIXELS})")
         surface = depth[~np.isnan(depth)]
@@ -67,9 +66,7 @@ class Scene:
     @property
     def box(self) -> ObjectBox:
         """The object box; SceneError where the rig has none."""
-        if self.rig.object_box is None:
-            raise SceneError(f"rig {self.rig.name!r} has no object_box")
-        return self.rig.object_box
+        return object_box(self.rig)
 
     @cached_property
     def patches(self) -> Patches | None:

@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
-from nlos_cam.reconstruct import object_box
+from nlos_cam.objects.depth_image import object_box
 from nlos_cam.view.pictures import depth_span_m, hidden_rgb, infrared_grey, lidar_rgb, surface
 from nlos_cam.view.viewer import Moment
 

@@ -5,7 +5,8 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import Frame
-from nlos_cam.reconstruct import Reconstruction, object_box, pose_of
+from nlos_cam.objects.depth_image import object_box
+from nlos_cam.reconstruct import Reconstruction, pose_of
 from nlos_cam.view.drawing import Drawing
 from nlos_cam.view.viewer import Moment
 

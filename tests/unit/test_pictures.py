@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.reconstruct import object_box
+from nlos_cam.objects.depth_image import object_box
 from nlos_cam.view.pictures import (
     BACKGROUND_RGB,
     JUMP_M,
