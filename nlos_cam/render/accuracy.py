@@ -6,31 +6,60 @@ from typing import Literal
 from nlos_cam.errors import SceneError
 
 Stop = Literal["draft", "standard", "fine", "reference"]
+MOST_RELAY_CELLS = 512
+"""Along a side of the relay wall."""
+MOST_BEAMS_PER_CELL = 8
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """What a stop of the dial sets."""
+    """What a stop of the dial sets. Raises SceneError for a setting that no renderer has."""
 
     name: str
-    relay_columns: int
-    relay_rows: int
-    sub_bins: int
-    """Table bins per bin of path length; 0 is the brute-force reference."""
-    tolerance: float
+    relay_columns: int = 80
+    relay_rows: int = 64
+    sub_bins: int = 8
+    """Table bins per bin of path length, a power of two; 0 is the brute-force reference."""
+    object_stride: int = 1
+    """Cells of the depth map, along each axis, that are taken as one patch."""
+    sectors: int = 8
+    """Of each face of the horizon tables: decides time, not the result."""
+    beams_per_cell: int = 1
+    """Along each axis of a map cell."""
+    scatter_nodes: int = 8
+    """Along each axis of the wall: where a BRDF that is not Lambertian is tabulated for incoming light."""
+    tolerance: float = 1e-3
     """What the effects that a plan leaves out may change together, as relative L1 of the transient."""
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "relay_columns": (1, MOST_RELAY_CELLS),
+            "relay_rows": (1, MOST_RELAY_CELLS),
+            "object_stride": (1, 16),
+            "sectors": (1, 256),
+            "beams_per_cell": (1, MOST_BEAMS_PER_CELL),
+            "scatter_nodes": (2, 64),
+            "tolerance": (0, 1),
+        }
+        for field, (least, most) in ranges.items():
+            if not least <= (value := getattr(self, field)) <= most:
+                raise SceneError(f"{field} is {value}: it must lie in {least} to {most}")
+        if self.sub_bins not in {0, 1, 2, 4, 8, 16, 32, 64}:
+            raise SceneError(f"sub_bins is {self.sub_bins}: it must be a power of two up to 64, or 0 for brute force")
 
 
 STOPS = {
-    "draft": Accuracy("draft", 40, 32, 1, 3e-2),
-    "standard": Accuracy("standard", 80, 64, 1, 1e-3),
-    "fine": Accuracy("fine", 80, 64, 4, 1e-4),
-    "reference": Accuracy("reference", 80, 64, 0, 0.0),
+    "draft": Accuracy("draft", 40, 32, sub_bins=4, object_stride=2, scatter_nodes=4, tolerance=3e-2),
+    "standard": Accuracy("standard"),
+    "fine": Accuracy("fine", sub_bins=64, scatter_nodes=16, tolerance=1e-4),
+    "reference": Accuracy("reference", sub_bins=0, tolerance=0.0),
 }
 
 
-def accuracy_named(name: str) -> Accuracy:
+def accuracy_named(name: str | Accuracy) -> Accuracy:
     """The setting behind a stop's name. Raises SceneError where there is no such stop."""
+    if isinstance(name, Accuracy):
+        return name
     if name not in STOPS:
         raise SceneError(f"no accuracy {name!r}: choose one of {', '.join(STOPS)}")
     return STOPS[name]

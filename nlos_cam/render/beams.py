@@ -1,13 +1,17 @@
 """The first leg: where each beam of the lidar lands, and what returns straight from there (S1)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
+from nlos_cam.render.near import NEAR_DIAGONALS, softened
+
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 SPEED_OF_LIGHT_M_PER_S = 299_792_458.0
 
 
@@ -18,22 +22,43 @@ class Beams:
     shape: tuple[int, int]
     foot_m: Array
     """(n, 3); where the beam lands, in the wall frame."""
+    direction: Array
+    """(n, 3); unit, in the wall frame."""
     length_m: Array
     """(n,); d1."""
     cos_incidence: Array
     """(n,); to the normal of what it meets."""
     cos_axis: Array
     """(n,); beam to optical axis: S5 turns range into depth by it."""
-    on_wall: NDArray[np.bool_]
+    on_wall: Mask
     """(n,); the beam lights the wall, and so may reach the hidden object."""
     direct: Array
     """(n,); I_direct, 0 where nothing returns inside the gate."""
     lidar_m: Array
     """(3,)."""
 
+    def met(
+        self, rig: Rig, which: NDArray[np.int64], length_m: Array, cosine: Array, albedo: Array, solid_angle: float
+    ) -> "Beams":
+        """The same where some beams meet something on their way, at a length and a cosine (k,), and return from it."""
+        foot, length, incidence = self.foot_m.copy(), self.length_m.copy(), self.cos_incidence.copy()
+        on_wall, direct = self.on_wall.copy(), self.direct.copy()
+        foot[which] = self.lidar_m + length_m[:, None] * self.direction[which]
+        length[which], incidence[which], on_wall[which] = length_m, cosine, False
+        direct[which] = albedo * returned(rig, length_m, cosine, solid_angle)
+        return replace(self, foot_m=foot, length_m=length, cos_incidence=incidence, on_wall=on_wall, direct=direct)
 
-def cast(rig: Rig, intrinsics: Intrinsics) -> Beams:
-    """One beam per pixel of the intrinsics: on to the occluder if that is nearer, else the wall, else nothing."""
+    def without_direct(self) -> "Beams":
+        """The same where nothing returns straight."""
+        return replace(self, direct=np.zeros_like(self.direct))
+
+
+@lru_cache(maxsize=16)
+def cast(rig: Rig, intrinsics: Intrinsics, *, lambertian: bool = False, occluder: bool = True) -> Beams:
+    """One beam per pixel of the intrinsics: on to the occluder if that is nearer, else the wall, else nothing.
+
+    A rig's beams are worked out once, and cannot be written into.
+    """
     pose = rig.wall_from_lidar
     lidar = pose[:3, 3]
     rays = intrinsics.rays().reshape(-1, 3)
@@ -43,20 +68,30 @@ def cast(rig: Rig, intrinsics: Intrinsics) -> Beams:
         wall_length = np.where(direction[:, 2] < 0, -lidar[2] / direction[:, 2], np.inf)
         wall_point = lidar + wall_length[:, None] * direction
         wall_length[~_inside(rig, wall_point)] = np.inf
-        stop_length = _occluder_length(rig, lidar, direction)
+        stop_length = _occluder_length(rig, lidar, direction) if occluder else np.full_like(wall_length, np.inf)
     on_wall = wall_length < stop_length
     length = np.minimum(wall_length, stop_length)
     length[np.isinf(length)] = np.nan
-    cos_incidence = np.where(on_wall, -direction[:, 2], np.abs(direction[:, 0]))
-    in_gate = 2 * length < SPEED_OF_LIGHT_M_PER_S * rig.device.gate_s
-    # S1, with S_unit_wall the device's receiver cell
-    returned = cos_incidence * rig.device.receiver_cell_m2 / (2 * np.pi * length**2)
+    cosine = np.where(on_wall, -direction[:, 2], np.abs(direction[:, 0]))
+    direct = returned(rig, length, cosine, np.pi if lambertian else 2 * np.pi)
     foot = lidar + length[:, None] * direction
     shape = (intrinsics.height, intrinsics.width)
-    return Beams(shape, foot, length, cos_incidence, cos_axis, on_wall, np.where(in_gate, returned, 0.0), lidar)
+    beams = Beams(shape, foot, direction, length, cosine, cos_axis, on_wall, direct, lidar)
+    for column in (foot, direction, length, cosine, cos_axis, on_wall, direct, lidar):
+        column.flags.writeable = False
+    return beams
 
 
-def _inside(rig: Rig, point: Array) -> NDArray[np.bool_]:
+def returned(rig: Rig, length_m: Array, cosine: Array, solid_angle: float) -> Array:
+    """I_direct (n,) of S1, with S_unit_wall the device's receiver cell; 0 outside the gate or where nothing is met."""
+    cell_m2 = rig.device.receiver_cell_m2
+    near_m = NEAR_DIAGONALS * np.sqrt(2 * cell_m2)
+    in_gate = 2 * length_m < SPEED_OF_LIGHT_M_PER_S * rig.device.gate_s
+    light = cosine * cell_m2 / (solid_angle * softened(length_m**2, cell_m2 / solid_angle, near_m))
+    return np.where(in_gate, light, 0.0)
+
+
+def _inside(rig: Rig, point: Array) -> Mask:
     x, y, wall = point[:, 0], point[:, 1], rig.wall
     return (x >= wall.x_min_m) & (x <= wall.x_max_m) & (y >= wall.y_min_m) & (y <= wall.y_max_m)
 

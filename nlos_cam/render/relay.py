@@ -7,13 +7,14 @@ from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 NO_OCCLUDER = (np.inf, np.inf)
 """An edge that blocks nothing: no x lies on both sides of it."""
 
 
 @dataclass(frozen=True)
 class Relay:
-    """The cells of the relay wall that the lidar sees (the occluder cuts off the others)."""
+    """Cells of the relay wall."""
 
     x_m: Array
     """(n,)."""
@@ -21,7 +22,20 @@ class Relay:
     """(n,)."""
     length_m: Array
     """(n,); d4."""
+    cos_lidar: Array
+    """(n,); the way to the lidar against the wall's normal."""
     cell_m2: float
+    diagonal_m: float
+    """Of a cell."""
+
+    def kept(self, which: Mask) -> "Relay":
+        """Only some of the cells."""
+        columns = self.x_m[which], self.y_m[which], self.length_m[which], self.cos_lidar[which]
+        return Relay(*columns, self.cell_m2, self.diagonal_m)
+
+    def behind(self, edge_m: tuple[float, float], lidar_m: Array) -> Mask:
+        """Which cells (n,) an occluder of that edge hides from the lidar."""
+        return behind(edge_m, self.x_m, np.zeros_like(self.x_m), lidar_m)
 
 
 def occluder_edge(rig: Rig) -> tuple[float, float]:
@@ -30,7 +44,7 @@ def occluder_edge(rig: Rig) -> tuple[float, float]:
 
 
 def relay_cells(rig: Rig, lidar_m: Array, columns: int, rows: int) -> Relay:
-    """Cut the relay wall into columns x rows cells and keep those in the lidar's sight."""
+    """Cut the relay wall into columns x rows cells, as if nothing stood in front of it."""
     extent = rig.relay
     pitch_x, pitch_y = (extent.x_max_m - extent.x_min_m) / columns, (extent.y_max_m - extent.y_min_m) / rows
     x, y = np.meshgrid(
@@ -38,10 +52,13 @@ def relay_cells(rig: Rig, lidar_m: Array, columns: int, rows: int) -> Relay:
         extent.y_min_m + (np.arange(rows) + 0.5) * pitch_y,
     )
     x, y = x.ravel().astype(np.float64), y.ravel().astype(np.float64)
-    edge_x, edge_z = occluder_edge(rig)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = (edge_x - x) / (lidar_m[0] - x)
-        behind = (share > 0) & (share < 1) & (share * lidar_m[2] >= edge_z)
-    seen = ~behind
     length = np.sqrt((x - lidar_m[0]) ** 2 + (y - lidar_m[1]) ** 2 + lidar_m[2] ** 2)
-    return Relay(x[seen], y[seen], length[seen], pitch_x * pitch_y)
+    return Relay(x, y, length, lidar_m[2] / length, pitch_x * pitch_y, float(np.hypot(pitch_x, pitch_y)))
+
+
+def behind(edge_m: tuple[float, float], x_m: Array, z_m: Array, lidar_m: Array) -> Mask:
+    """Which points (n,) the half plane x = edge_m[0], z >= edge_m[1] hides from the lidar."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = (edge_m[0] - lidar_m[0]) / (x_m - lidar_m[0])
+        height = lidar_m[2] + share * (z_m - lidar_m[2])
+        return (share > 0) & (share < 1) & (height >= edge_m[1])

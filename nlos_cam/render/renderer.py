@@ -1,34 +1,26 @@
 """`render`: a scene to the depth and intensity maps that a lidar of highest-echo kind reports (S1 to S5)."""
 
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32
+from nlos_cam.errors import SceneError
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, WINNER_SPREAD_M, Float32
 from nlos_cam.render import cpu, reference
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams, cast
-from nlos_cam.render.effects import Plan, included, plan
-from nlos_cam.render.relay import NO_OCCLUDER, Relay, occluder_edge, relay_cells
-from nlos_cam.render.scene import Patches, Scene
-from nlos_cam.render.visibility import height_field, horizon_table
+from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams
+from nlos_cam.render.echo import MultiBounce, add_direct, compete, spread, strongest
+from nlos_cam.render.effects import Effects, Plan, included
+from nlos_cam.render.job import Job, near_legs
+from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.scene import Scene
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class MultiBounce:
-    """The strongest and second strongest three-bounce bins of each beam."""
-
-    peak: Float32
-    """(64, 80); 0 where no path comes back."""
-    runner_up: Float32
-    """(64, 80)."""
-    path_m: Float32
-    """(64, 80); path length at the strongest bin's centre, NaN where there is none."""
+Implementation = Callable[[Job], NDArray[np.floating[Any]]]
 
 
 @dataclass(frozen=True)
@@ -36,124 +28,169 @@ class Rendering:
     """What the lidar reports of a scene, free of sensor noise."""
 
     depth_m: Float32
-    """(64, 80); along the optical axis, NaN where nothing returns."""
+    """(64, 80); along the optical axis, NaN where nothing returns. Of several beams per cell, their median."""
     intensity: Float32
-    """(64, 80); in units of I0."""
+    """(64, 80); in units of I0. Of several beams per cell, the mean of those within 1 cm of the median."""
     margin: Float32
     """(64, 80); how far the winner stands above the runner-up, as a share of the winner: 0 is a tie."""
     multi: MultiBounce
+    """Of every beam."""
     plan: Plan
     seconds: dict[str, float]
     """Time spent, by effect."""
-    accuracy: str
+    accuracy: Accuracy
+    near_legs: int
+    """Legs between patches and wall so short that near contact's average took the place of 1 / d^2."""
+    colour: Float32 | None = None
+    """(64, 80, 3); intensity in each channel of the albedo, where it has three."""
 
 
-def render(scene: Scene, accuracy: str = "standard") -> Rendering:
-    """Depth, intensity and margin of every map cell."""
-    setting = accuracy_named(accuracy)
-    started = time.perf_counter()
-    beams = cast(scene.rig, scene.cell_intrinsics)
-    verdicts = plan(scene, beams, setting.tolerance)
-    seconds = {"direct": time.perf_counter() - started}
-    histogram = _transient(scene, beams, setting, verdicts, seconds)
-    multi = strongest(histogram, scene.rig.device.bin_m)
-    depth, intensity, margin = compete(beams, multi)
-    shape = beams.shape
-    multi = MultiBounce(multi.peak.reshape(shape), multi.runner_up.reshape(shape), multi.path_m.reshape(shape))
-    maps = depth.reshape(shape), intensity.reshape(shape), margin.reshape(shape)
-    return Rendering(*maps, multi, verdicts, seconds, accuracy)
+def render(
+    scene: Scene, accuracy: str | Accuracy = "standard", effects: Effects = "auto", backend: str = "cpu"
+) -> Rendering:
+    """Depth, intensity and margin of every map cell. Raises SceneError for a scene that cannot be rendered."""
+    clock = Clock()
+    ready = Prepared.of(scene, accuracy_named(accuracy), effects)
+    clock.spent("direct")
+    job = ready.job()
+    beams, bin_m = ready.beams, scene.rig.device.bin_m
+    histogram = _of_all(ready, job, backend)
+    clock.spent("three-bounce")
+    mixed = _mixed(histogram, ready) if included(ready.plan, "pulse") else None
+    multi = strongest(histogram if mixed is None else mixed, bin_m)
+    multi = replace(multi, direct_included=mixed is not None).of(beams.shape)
+    clock.spent("pulse" if mixed is not None else "direct")
+    maps = compete(beams, multi)
+    colour = _colour(ready, multi, backend) if ready.channels == 3 else None
+    clock.spent("colour")
+    near = near_legs(job) if job else 0
+    return Rendering(*_cells(*maps), multi, ready.plan, clock.seconds, ready.stage.accuracy, near, colour)
 
 
-def transient(scene: Scene, accuracy: str = "standard") -> Float32:
-    """The three-bounce histograms (64, 80, bins) over path length, from 0 in bins of the device's width."""
-    setting = accuracy_named(accuracy)
-    beams = cast(scene.rig, scene.cell_intrinsics)
-    histogram = _transient(scene, beams, setting, plan(scene, beams, setting.tolerance), {})
-    return histogram.reshape(*beams.shape, -1)
+def render_all(
+    scenes: Iterable[Scene], accuracy: str | Accuracy = "standard", effects: Effects = "auto", backend: str = "cpu"
+) -> Iterable[Rendering]:
+    """Render a batch, one after another; what depends on the rig alone is worked out once."""
+    return (render(scene, accuracy, effects, backend) for scene in scenes)
 
 
-def reference_transient(scene: Scene, chosen: NDArray[np.int64]) -> Array:
-    """The brute-force histograms (len(chosen), bins) of some beams (flat indices) that light the wall."""
-    setting = accuracy_named("reference")
-    beams = cast(scene.rig, scene.cell_intrinsics)
-    verdicts = plan(scene, beams, setting.tolerance)
-    patches, relay, edge = _stage(scene, beams, setting, verdicts)
-    if patches is None or scene.object_depth_m is None:
-        return np.zeros((len(chosen), 1))
-    bin_m = scene.rig.device.bin_m
-    field = height_field(scene.object_depth_m, scene.box, shades=included(verdicts, "self-occlusion"))
-    bins = _bins(scene.rig, beams, patches, bin_m)
-    return reference.transient(beams, chosen, patches, relay, edge, field, bin_m, bins)
+def transient(
+    scene: Scene, accuracy: str | Accuracy = "standard", effects: Effects = "auto", backend: str = "cpu"
+) -> Float32:
+    """All that comes back, as histograms (64, 80, bins) over path length, from 0 in bins of the device's width.
+
+    With beams_per_cell k they are (64 k, 80 k, bins); with the colour effect a channel axis (3) follows.
+    """
+    ready = Prepared.of(scene, accuracy_named(accuracy), effects)
+    channels = [None] if ready.channels == 1 else [0, 1, 2]
+    parts = [_mixed(_of_all(ready, ready.job(channel), backend), ready) for channel in channels]
+    shaped = [part.reshape(*ready.beams.shape, -1) for part in parts]
+    return shaped[0] if ready.channels == 1 else np.stack(shaped, -1)
 
 
-def _stage(
+def three_bounce(
     scene: Scene,
-    beams: Beams,
-    setting: Accuracy,
-    verdicts: Plan,
-) -> tuple[Patches | None, Relay, tuple[float, float]]:
-    """Patches, relay wall and occluder as the plan wants them."""
-    patches = scene.patches if included(verdicts, "three-bounce") else None
-    if patches is not None and not included(verdicts, "tilt"):
-        level = np.zeros_like(patches.normal)
-        level[:, 2] = -1.0
-        patches = replace(patches, normal=level, beta=np.ones_like(patches.beta))
-    relay = relay_cells(scene.rig, beams.lidar_m, setting.relay_columns, setting.relay_rows)
-    return patches, relay, occluder_edge(scene.rig) if included(verdicts, "occluder") else NO_OCCLUDER
+    accuracy: str | Accuracy = "standard",
+    effects: Effects = "auto",
+    backend: str = "cpu",
+    chosen: NDArray[np.int64] | None = None,
+) -> NDArray[np.floating[Any]]:
+    """Three-bounce histograms alone (n, bins), of some beams (flat indices) or of all; float64 from the reference."""
+    ready = Prepared.of(scene, accuracy_named(accuracy), effects)
+    return histograms(ready, ready.job(), backend, chosen)
 
 
-def _transient(scene: Scene, beams: Beams, setting: Accuracy, verdicts: Plan, seconds: dict[str, float]) -> Float32:
-    """Histograms (n, bins) of every beam, and the time each effect took."""
-    patches, relay, edge = _stage(scene, beams, setting, verdicts)
-    count = len(beams.length_m)
-    if patches is None or scene.object_depth_m is None or not beams.on_wall.any():
-        return np.zeros((count, 1), np.float32)
-    bin_m, chosen = scene.rig.device.bin_m, np.flatnonzero(beams.on_wall)
-    bins = _bins(scene.rig, beams, patches, bin_m)
-    histogram = np.zeros((count, bins), np.float32)
-    started = time.perf_counter()
-    field = height_field(scene.object_depth_m, scene.box, shades=included(verdicts, "self-occlusion"))
-    if setting.sub_bins == 0:
-        histogram[chosen] = reference.transient(beams, chosen, patches, relay, edge, field, bin_m, bins)
-    else:
-        horizons = horizon_table(field, patches.point_m)
-        seconds["self-occlusion"] = time.perf_counter() - started
-        started, sub = time.perf_counter(), setting.sub_bins
-        fine = cpu.transient(beams, chosen, patches, relay, edge, horizons, bin_m / sub, bins * sub)
-        histogram[chosen] = fine.reshape(len(chosen), bins, sub).sum(-1)
-    seconds["three-bounce"] = time.perf_counter() - started
-    return histogram
+def histograms(
+    ready: Prepared, job: Job | None, backend: str, chosen: NDArray[np.int64] | None = None
+) -> NDArray[np.floating[Any]]:
+    """The same of what is prepared already; 0 where a beam does not light the wall."""
+    lit = ready.beams.on_wall
+    chosen = np.arange(len(lit)) if chosen is None else chosen
+    if job is None:
+        return np.zeros((len(chosen), 1), np.float32)
+    wanted = chosen[lit[chosen]]
+    some = job if len(wanted) == len(job.foot_m) else job.some((np.cumsum(lit) - 1)[wanted])
+    found = implementation(job.accuracy, backend)(some)
+    every = np.zeros((len(chosen), found.shape[1]), found.dtype)
+    every[lit[chosen]] = found
+    return every
 
 
-def _bins(rig: Rig, beams: Beams, patches: Patches, bin_m: float) -> int:
-    """Bins up to the longest possible path or the gate, whichever is shorter."""
-    feet = beams.foot_m[beams.on_wall]
-    wall = rig.relay
-    relay_corner = np.abs([[wall.x_min_m, wall.y_min_m], [wall.x_max_m, wall.y_max_m]]).max(0)
-    corner = np.append(np.maximum(np.abs(feet[:, :2]).max(0), relay_corner), 0.0)
-    reach = np.linalg.norm(corner + np.abs(patches.point_m).max(0))
-    longest = beams.length_m[beams.on_wall].max() + 2 * reach + np.linalg.norm([*relay_corner, beams.lidar_m[2]])
-    return int(np.ceil(min(longest, SPEED_OF_LIGHT_M_PER_S * rig.device.gate_s) / bin_m))
+def implementation(accuracy: Accuracy, backend: str) -> Implementation:
+    """Which of the three renders at an accuracy. Raises SceneError where there is no such backend."""
+    if accuracy.sub_bins == 0:
+        return reference.histograms
+    if backend != "cpu":
+        raise SceneError(f"no backend {backend!r}: choose cpu")
+    return cpu.histograms
 
 
-def strongest(histogram: NDArray[np.floating], bin_m: float) -> MultiBounce:
-    """The strongest and second strongest bins of histograms (n, bins); ties go to the shortest path."""
-    rows = np.arange(len(histogram))
-    winner = histogram.argmax(1)
-    peak = histogram[rows, winner]
-    others = histogram.copy()
-    others[rows, winner] = 0
-    path = np.where(peak > 0, (winner + 0.5) * bin_m, np.nan)
-    return MultiBounce(peak.astype(np.float32), others.max(1).astype(np.float32), path.astype(np.float32))
+class Clock:
+    """Seconds by name, from one mark to the next."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def spent(self, name: str) -> None:
+        """Book the time since the last mark."""
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
 
 
-def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32]:
-    """S5: depth, intensity and margin (n,) of the strongest echo of each beam; a tie goes to the direct return."""
-    direct, peak = beams.direct.astype(np.float32), multi.peak
-    wins = peak > direct
-    intensity = np.where(wins, peak, direct)
-    second = np.maximum(np.where(wins, direct, peak), multi.runner_up)
-    length = np.where(wins, multi.path_m / 2, beams.length_m)
-    depth = np.where(intensity > 0, length * beams.cos_axis, np.nan)
-    margin = np.where(intensity > 0, 1 - second / np.maximum(intensity, np.finfo(np.float32).tiny), 0)
-    return depth.astype(np.float32), intensity, margin.astype(np.float32)
+def _of_all(ready: Prepared, job: Job | None, backend: str) -> Float32:
+    return histograms(ready, job, backend).astype(np.float32, copy=False)
+
+
+def _mixed(histogram: Float32, ready: Prepared) -> Float32:
+    """Direct returns and the pulse's width, added to three-bounce histograms, up to the gate."""
+    device = ready.stage.rig.device
+    whole = add_direct(histogram, ready.beams, device.bin_m)
+    if included(ready.plan, "pulse") and ready.stage.scene.pulse_ns > 0:
+        whole = spread(whole, ready.stage.scene.pulse_ns, device.bin_m)
+    return whole[:, : max(int(SPEED_OF_LIGHT_M_PER_S * device.gate_s / device.bin_m), 1)]
+
+
+def _colour(ready: Prepared, multi: MultiBounce, backend: str) -> Float32:
+    """Intensity (64, 80, 3) in each channel at the echo that won; the wall is white."""
+    bin_m, rows = ready.stage.rig.device.bin_m, np.arange(multi.peak.size)
+    wins = (multi.peak.ravel() > ready.beams.direct) | multi.direct_included
+    at = np.nan_to_num(multi.path_m.ravel() / bin_m, nan=0).astype(np.int64)
+    channels: list[Float32] = []
+    for channel in range(3):
+        histogram = _of_all(ready, ready.job(channel), backend)
+        if multi.direct_included:
+            histogram = _mixed(histogram, ready)
+        value = np.where(wins, histogram[rows, np.minimum(at, histogram.shape[1] - 1)], ready.beams.direct)
+        channels.append(_cell_mean(value.reshape(multi.peak.shape)).astype(np.float32))
+    return np.stack(channels, -1)
+
+
+def _blocks(image: NDArray[Any]) -> NDArray[Any]:
+    """An image of k x k beams per cell as (64, 80, k * k)."""
+    k = image.shape[0] // MAP_ROWS
+    return image.reshape(MAP_ROWS, k, MAP_COLUMNS, k).swapaxes(1, 2).reshape(MAP_ROWS, MAP_COLUMNS, k * k)
+
+
+def _cell_mean(image: NDArray[Any]) -> NDArray[Any]:
+    return _blocks(image).mean(-1)
+
+
+def _cells(depth: Float32, intensity: Float32, margin: Float32) -> tuple[Float32, Float32, Float32]:
+    """Maps of beams to maps of cells, as frames are reduced to cells."""
+    if depth.shape == (MAP_ROWS, MAP_COLUMNS):
+        return depth, intensity, margin
+    depths, values = _blocks(depth), _blocks(intensity)
+    valid = ~np.isnan(depths)
+    some = valid.any(-1)
+    median = np.full(some.shape, np.nan, np.float32)
+    median[some] = np.nanmedian(depths[some], axis=-1)
+    near = valid & (np.abs(depths - median[..., None]) <= WINNER_SPREAD_M)
+    count = near.sum(-1)
+    mean = np.where(
+        count > 0,
+        (values * near).sum(-1) / np.maximum(count, 1),
+        (values * valid).sum(-1) / np.maximum(valid.sum(-1), 1),
+    )
+    return median, mean.astype(np.float32), _cell_mean(margin).astype(np.float32)

@@ -1,9 +1,10 @@
 """Self-occlusion V: does the hidden object shade a leg between one of its own patches and the wall?
 
-The object is opaque from its depth map away from the wall. Seen from a patch at z_s, along one direction in plan, a
-cell at distance t and depth z' rises to the slope (z_s - z' - bias) / t; the steepest of them is the horizon. A wall
-point at distance rho lies at the slope z_s / rho, and is visible if that is not below the horizon. The reference walks
-the exact direction of each leg; the fast path looks it up in a table of directions.
+The object is opaque from its depth map away from the wall. A leg from a patch at depth z crosses, after k cells along its
+major axis, a surface of depth z'. It is blocked where z - z' - bias > k z / u for some k, u being its length in cells along
+that axis. So each direction has one number, its horizon max_k (z - z' - bias) / k, and a leg is free if z >= u * horizon.
+The reference walks the exact direction of each leg. The fast paths look up bounds of the horizon over sectors of directions, and
+walk only the legs that the bounds leave open: the same answer for a small part of the walks.
 """
 
 from typing import NamedTuple
@@ -13,111 +14,183 @@ import numpy as np
 from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 
-from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.frames import Float32
 from nlos_cam.objects.depth_image import cell_centres_m
+from nlos_cam.render.patches import cell_pitch_m
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
-DIRECTIONS = 256
+FACES = 4
+"""Directions along +columns, -columns, +rows, -rows, each with its own sectors."""
 BIAS_CELLS = 0.25
 """A cell must rise above the leg by this share of the pitch: less is the grid's own roughness."""
-NOTHING = -1.0
-"""A horizon that hides nothing: every wall point lies at a positive slope."""
+ROUNDING = 1e-5
+"""By this share bounds are widened, so that a leg told in float32 is walked where float64 might differ."""
 
 
 class HeightField(NamedTuple):
     """A depth map laid out for walking: NaN is background, which neither shades nor receives."""
 
     depth_m: Array
-    """(64, 64)."""
+    """(n, n)."""
     x_0_m: float
     """Wall x of column 0; y of row 0."""
     y_0_m: float
     pitch_x_m: float
     pitch_y_m: float
+    nearest_m: float
+    """To the wall: nothing rises above this."""
+    first_row: int
+    """That holds a surface; and so on."""
+    last_row: int
+    first_column: int
+    last_column: int
     shades: bool
     """False skips the walk: the plan found that nothing can be in the way."""
 
 
-def height_field(depth_m: Float32, box: ObjectBox, *, shades: bool) -> HeightField:
-    """Lay out a depth map (64, 64) over its box."""
-    x_m, y_m = cell_centres_m(box)
-    return HeightField(depth_m.astype(np.float64), x_m[0], y_m[0], x_m[1] - x_m[0], y_m[0] - y_m[1], shades)
+def height_field(depth_m: NDArray[np.floating], box: ObjectBox, *, shades: bool) -> HeightField:
+    """Lay out a depth map (n, n) over its box."""
+    x_m, y_m = cell_centres_m(box, len(depth_m))
+    rows, columns = np.nonzero(~np.isnan(depth_m))
+    nearest = float(np.nanmin(depth_m)) if rows.size else np.inf
+    ends = (int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max())) if rows.size else (0, 0, 0, 0)
+    pitch = cell_pitch_m(box, depth_m.shape)
+    return HeightField(depth_m.astype(np.float64), float(x_m[0]), float(y_m[0]), *pitch, nearest, *ends, shades)
 
 
 @numba.njit(cache=True)
-def horizon(field: HeightField, point: Array, dx: float, dy: float) -> float:
-    """The steepest slope that the surface reaches, seen from `point` (3,), in the plan direction (dx, dy)."""
-    column, row = (point[0] - field.x_0_m) / field.pitch_x_m, (field.y_0_m - point[1]) / field.pitch_y_m
-    step_c, step_r = dx / field.pitch_x_m, -dy / field.pitch_y_m
-    stride = max(abs(step_c), abs(step_r))
-    step_c, step_r = step_c / stride, step_r / stride
-    step_m = np.sqrt((step_c * field.pitch_x_m) ** 2 + (step_r * field.pitch_y_m) ** 2)
-    along_columns = abs(step_c) >= abs(step_r)
-    bias = BIAS_CELLS * max(field.pitch_x_m, field.pitch_y_m)
-    steepest = NOTHING
-    for k in range(1, OBJECT_PIXELS):
-        c, r = column + k * step_c, row + k * step_r
-        along, across = (c, r) if along_columns else (r, c)
-        if along < -0.5 or along > OBJECT_PIXELS - 0.5:
-            break
-        low = int(np.floor(across))
-        near = _depth(field, along, low, along_columns)
-        far = _depth(field, along, low + 1, along_columns)
-        depth = _between(near, far, across - low)
-        slope = (point[2] - depth - bias) / (k * step_m)
-        if slope > steepest:  # noqa: PLR1730  false for NaN, which max() would keep
-            steepest = slope
-    return steepest
+def bias_m(field: HeightField) -> float:
+    """By how much a cell must rise above a leg to shade it."""
+    return BIAS_CELLS * max(field.pitch_x_m, field.pitch_y_m)
 
 
 @numba.njit(cache=True)
-def _depth(field: HeightField, along: float, across: int, along_columns: bool) -> float:
-    exact = round(along)
-    row, column = (across, exact) if along_columns else (exact, across)
-    if row < 0 or column < 0 or row >= OBJECT_PIXELS or column >= OBJECT_PIXELS:
+def _depth(field: HeightField, along: int, across: int, along_columns: bool) -> float:
+    """The depth of a cell within the ends along the walk's axis; NaN beyond those across it."""
+    first = field.first_row if along_columns else field.first_column
+    last = field.last_row if along_columns else field.last_column
+    if across < first or across > last:
         return np.nan
-    return field.depth_m[row, column]
+    return field.depth_m[across, along] if along_columns else field.depth_m[along, across]
 
 
 @numba.njit(cache=True)
-def _between(near: float, far: float, share: float) -> float:
+def _between(field: HeightField, along: int, across: float, along_columns: bool) -> float:
     """Interpolate two neighbours; where one is background, the nearer of the two decides."""
+    low = int(np.floor(across))
+    share = across - low
+    near, far = _depth(field, along, low, along_columns), _depth(field, along, low + 1, along_columns)
     if np.isnan(near) or np.isnan(far):
         return near if share < 0.5 else far
     return near + share * (far - near)
 
 
 @numba.njit(cache=True)
-def visible(field: HeightField, point: Array, x: float, y: float) -> bool:
-    """Whether the wall point (x, y) and a patch's centre (3,) see each other past the rest of the object."""
-    if not field.shades:
-        return True
-    dx, dy = x - point[0], y - point[1]
-    rho = np.sqrt(dx * dx + dy * dy)
-    if rho < 1e-9:
-        return True
-    return point[2] >= rho * horizon(field, point, dx, dy)
+def _steps(field: HeightField, start: int, forward: bool, along_columns: bool) -> int:
+    """How many steps along an axis stay where there may be a surface."""
+    first = field.first_column if along_columns else field.first_row
+    last = field.last_column if along_columns else field.last_row
+    return last - start if forward else start - first
 
 
 @numba.njit(cache=True)
-def sector(dx: float, dy: float) -> int:
-    """The table's direction nearest to (dx, dy), by an angle-like number that needs no trigonometry."""
-    ramp = dy / (abs(dx) + abs(dy) + 1e-30)
-    turn = 1.0 + ramp if dx >= 0 else 3.0 - ramp
-    return int(turn * (DIRECTIONS / 4) + 0.5) % DIRECTIONS
+def blocked(field: HeightField, row: int, column: int, depth_m: float, u: float, v: float) -> bool:
+    """Whether the object blocks the leg from a cell to the wall point u columns and v rows away."""
+    along_columns = abs(u) >= abs(v)
+    major, minor = (u, v) if along_columns else (v, u)
+    if abs(major) < 1e-9:
+        return False
+    start, across = (column, row) if along_columns else (row, column)
+    tilt, step = minor / abs(major), 1 if major > 0 else -1
+    limit, bias = depth_m / abs(major), bias_m(field)
+    for k in range(1, _steps(field, start, major > 0, along_columns) + 1):
+        if (depth_m - field.nearest_m - bias) / k <= limit:
+            return False  # neither this cell nor any beyond can rise so high
+        if (depth_m - _between(field, start + k * step, across + k * tilt, along_columns) - bias) / k > limit:
+            return True
+    return False
+
+
+@numba.njit(cache=True)
+def visible(field: HeightField, row: int, column: int, point: Array, x: float, y: float) -> bool:
+    """Whether the wall point (x, y) and a patch's centre (3,) see each other past the rest of the object."""
+    if not field.shades:
+        return True
+    return not blocked(field, row, column, point[2], (x - point[0]) / field.pitch_x_m, (point[1] - y) / field.pitch_y_m)
+
+
+@numba.njit(cache=True)
+def segment_blocked(
+    field: HeightField, row: int, column: int, depth_m: float, to_row: int, to_column: int, to_depth_m: float
+) -> bool:
+    """Whether the object stands between two of its own cells."""
+    across, down = to_column - column, to_row - row
+    along_columns = abs(across) >= abs(down)
+    start, start_across = (column, row) if along_columns else (row, column)
+    major, minor = (across, down) if along_columns else (down, across)
+    count, bias = abs(major), bias_m(field)
+    for k in range(1, count):
+        depth = _between(field, start + k * major // count, start_across + k * minor / count, along_columns)
+        if depth < depth_m + (to_depth_m - depth_m) * k / count - bias:
+            return True
+    return False
+
+
+@numba.njit(cache=True)
+def _bounds_at(
+    field: HeightField, along: int, across_a: float, across_b: float, along_columns: bool
+) -> tuple[float, float]:
+    """The smallest and the largest depth that `_between` takes from across_a to across_b; NaN last where it meets background."""
+    a, b = _between(field, along, across_a, along_columns), _between(field, along, across_b, along_columns)
+    first, last = int(np.ceil(across_a - 0.5)), int(np.floor(across_b + 0.5))
+    gap = np.isnan(a) or np.isnan(b)
+    for across in range(first, last + 1):
+        gap = gap or np.isnan(_depth(field, along, across, along_columns))
+    least, most = np.inf, -np.inf
+    for depth in (a, b):
+        if not np.isnan(depth):
+            least, most = min(least, depth), max(most, depth)
+    for across in range(first, last + 1):
+        depth = _depth(field, along, across, along_columns)
+        if not np.isnan(depth) and (gap or across_a <= across <= across_b):
+            least, most = min(least, depth), max(most, depth)
+    return least, np.nan if gap else most
+
+
+@numba.njit(cache=True)
+def _horizons(
+    field: HeightField, row: int, column: int, depth_m: float, face: int, a: float, b: float, reach: float
+) -> tuple[float, float]:
+    """Bounds of the horizon over a sector: directions that go a to b cells across for each cell along the face's axis."""
+    along_columns, forward = face < 2, face % 2 == 0
+    start, across = (column, row) if along_columns else (row, column)
+    low, high, step, bias = 0.0, depth_m / reach, 1 if forward else -1, bias_m(field)
+    for k in range(1, _steps(field, start, forward, along_columns) + 1):
+        if (depth_m - field.nearest_m - bias) / k <= max(low, depth_m / reach):
+            break
+        least, most = _bounds_at(field, start + k * step, across + k * a, across + k * b, along_columns)
+        high = max(high, (depth_m - least - bias) / k)
+        if not np.isnan(most):
+            low = max(low, (depth_m - most - bias) / k)
+    return low, high
 
 
 @numba.njit(cache=True, parallel=True)
-def horizon_table(field: HeightField, points: Array) -> Float32:
-    """Horizons (n, DIRECTIONS) of patches (n, 3) in every direction of `sector`."""
-    table = np.full((len(points), DIRECTIONS), NOTHING, np.float32)
-    if not field.shades:
-        return table
-    for s in numba.prange(len(points)):
-        for k in range(DIRECTIONS):
-            turn = k * 4.0 / DIRECTIONS
-            ramp = turn - 1.0 if turn < 2 else 3.0 - turn
-            dx = (1.0 - abs(ramp)) * (1.0 if turn < 2 else -1.0)
-            table[s, k] = horizon(field, points[s], dx, ramp)
-    return table
+def horizon_table(
+    field: HeightField, rows: Index, columns: Index, depth_m: Array, reach: Array, sectors: int
+) -> tuple[Float32, Float32]:
+    """Lower and upper bounds (n, FACES * sectors) of the horizons of patches, for every sector of directions.
+
+    `reach` (n,) is the longest leg to the wall in cells: what no leg can meet is left out.
+    """
+    low, high = np.empty((len(rows), FACES * sectors), np.float32), np.empty((len(rows), FACES * sectors), np.float32)
+    for s in numba.prange(len(rows)):
+        for face in range(FACES):
+            for sector in range(sectors):
+                a, b = 2.0 * sector / sectors - 1.0, 2.0 * (sector + 1) / sectors - 1.0
+                below, above = _horizons(field, rows[s], columns[s], depth_m[s], face, a, b, reach[s])
+                k = face * sectors + sector
+                low[s, k], high[s, k] = below * (1 - ROUNDING), above * (1 + ROUNDING)
+    return low, high

@@ -1,0 +1,104 @@
+"""The last step: of all that comes back along a beam, the strongest echo (S5)."""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos_cam.frames import Float32
+from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams
+
+Array = NDArray[np.float64]
+
+SIGMAS_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
+
+
+@dataclass(frozen=True)
+class MultiBounce:
+    """The strongest and second strongest bins of each beam: of three bounces, or of the whole waveform."""
+
+    peak: Float32
+    """(rows, columns); 0 where no path comes back."""
+    runner_up: Float32
+    """(rows, columns)."""
+    path_m: Float32
+    """(rows, columns); path length at the strongest bin's centre, NaN where there is none."""
+    direct_included: bool = False
+    """Whether the direct return is in the waveform already: a pulse of some width mixes it with the rest."""
+
+    def of(self, shape: tuple[int, int]) -> "MultiBounce":
+        """The same in the shape of an image."""
+        maps = self.peak.reshape(shape), self.runner_up.reshape(shape), self.path_m.reshape(shape)
+        return MultiBounce(*maps, self.direct_included)
+
+
+@numba.njit(cache=True, parallel=True)
+def _two_strongest(histogram: NDArray[np.floating]) -> tuple[NDArray[np.int64], Float32, Float32]:
+    rows, bins = histogram.shape
+    winner, peak, second = np.zeros(rows, np.int64), np.zeros(rows, np.float32), np.zeros(rows, np.float32)
+    for i in numba.prange(rows):
+        best, next_best, at = np.float32(0), np.float32(0), 0
+        for k in range(bins):
+            value = np.float32(histogram[i, k])
+            if value > best:  # a tie stays with the shorter path
+                best, next_best, at = value, best, k
+            elif value > next_best:
+                next_best = value
+        winner[i], peak[i], second[i] = at, best, next_best
+    return winner, peak, second
+
+
+def strongest(histogram: NDArray[np.floating], bin_m: float) -> MultiBounce:
+    """The strongest and second strongest bins of histograms (n, bins); ties go to the shortest path."""
+    winner, peak, second = _two_strongest(histogram)
+    path = np.where(peak > 0, (winner + 0.5) * bin_m, np.nan).astype(np.float32)
+    return MultiBounce(peak, second, path)
+
+
+def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32]:
+    """S5: depth, intensity and margin (rows, columns) of the strongest echo of each beam; a tie goes to the direct return."""
+    direct, peak = beams.direct.astype(np.float32).reshape(beams.shape), multi.peak
+    if multi.direct_included:
+        direct = np.zeros_like(direct)
+    wins = peak > direct
+    intensity = np.where(wins, peak, direct)
+    second = np.maximum(np.where(wins, direct, peak), multi.runner_up)
+    length = np.where(wins, multi.path_m / 2, beams.length_m.reshape(beams.shape))
+    depth = np.where(intensity > 0, length * beams.cos_axis.reshape(beams.shape), np.nan)
+    margin = np.where(intensity > 0, 1 - second / np.maximum(intensity, np.finfo(np.float32).tiny), 0)
+    return depth.astype(np.float32), intensity, margin.astype(np.float32)
+
+
+def add_direct(histogram: Float32, beams: Beams, bin_m: float) -> Float32:
+    """Histograms (n, bins) with each beam's direct return in the bin of its own path, longer where that needs it."""
+    returns = np.flatnonzero(beams.direct > 0)
+    at = np.floor(2 * beams.length_m[returns] / bin_m).astype(np.int64)
+    longer = max(int(at.max(initial=-1)) + 1 - histogram.shape[1], 0)
+    whole = np.pad(histogram, [(0, 0), (0, longer)])
+    whole[returns, at] += beams.direct[returns].astype(np.float32)
+    return whole
+
+
+def pulse_bins(pulse_ns: float, bin_m: float) -> float:
+    """Standard deviation, in bins of path length, of a Gaussian pulse of that full width at half height."""
+    return pulse_ns * 1e-9 * SPEED_OF_LIGHT_M_PER_S * SIGMAS_PER_FWHM / bin_m
+
+
+def spread(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
+    """Histograms (n, bins) as a pulse of that width makes them; longer by its tail, none of the light is lost."""
+    sigma = pulse_bins(pulse_ns, bin_m)
+    half = int(np.ceil(4 * sigma)) + 1
+    edges = np.arange(-half, half + 2) - 0.5
+    kernel = np.diff([_normal(edge / sigma) for edge in edges])
+    kernel /= kernel.sum()
+    size = histogram.shape[1] + 2 * half
+    spectrum = np.fft.rfft(histogram.astype(np.float64), size, axis=1) * np.fft.rfft(kernel, size)
+    wide = np.fft.irfft(spectrum, size, axis=1)[:, half:]  # what would come before time 0 is cut
+    return np.maximum(wide, 0).astype(np.float32)
+
+
+def _normal(x: float) -> float:
+    from math import erf, sqrt
+
+    return (1 + erf(x / sqrt(2))) / 2

@@ -1,0 +1,116 @@
+"""The hidden surface as the renderer sees it: one patch for each cell of the depth map that holds a surface."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from nlos_calibration.rig import ObjectBox
+from numpy.typing import NDArray
+
+from nlos_cam.objects.depth_image import cell_centres_m
+
+Array = NDArray[np.float64]
+
+JUMP_M = 0.02
+"""Neighbours further apart in depth than this are not one surface: beta (S3) must not join them by a curtain."""
+
+
+@dataclass(frozen=True)
+class Patches:
+    """The active cells of a hidden surface, one row each: centre, normal towards the wall, beta (S3)."""
+
+    point_m: Array
+    """(n, 3)."""
+    normal: Array
+    """(n, 3), unit."""
+    beta: Array
+    """(n,); true area over projected area."""
+    albedo: Array
+    """(n,); what part of the light a patch gives back, times the share of its cell that it fills."""
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    cell_m2: float
+    """S_unit_target: projected area of a cell."""
+    diagonal_m: float
+    """Of a cell."""
+
+    @property
+    def area_m2(self) -> Array:
+        """(n,); true area."""
+        return self.beta * self.cell_m2
+
+    @property
+    def slope(self) -> Array:
+        """(n, 2); dz/dx and dz/dy."""
+        return -self.normal[:, :2] / self.normal[:, 2:]
+
+    def level(self) -> "Patches":
+        """The same without tilt: facing the wall squarely, beta 1."""
+        normal = np.zeros_like(self.normal)
+        normal[:, 2] = -1.0
+        return replace(self, normal=normal, beta=np.ones_like(self.beta))
+
+
+def slope_along(depth: Array, axis: int, pitch_m: float, jump_m: float = JUMP_M) -> Array:
+    """Forward difference along an axis; backward at an edge or a jump; 0 where no neighbour is the same surface."""
+    padding = [(1, 1) if a == axis else (0, 0) for a in range(2)]
+    step = np.diff(np.pad(depth, padding, constant_values=np.nan), axis=axis)
+    step = np.where(np.abs(step) <= jump_m, step, np.nan)
+    forward = np.take(step, range(1, step.shape[axis]), axis)
+    backward = np.take(step, range(step.shape[axis] - 1), axis)
+    return np.nan_to_num(np.where(np.isnan(forward), backward, forward), nan=0.0) / pitch_m
+
+
+def make_patches(depth: Array, box: ObjectBox, albedo: Array, jump_m: float = JUMP_M) -> Patches:
+    """The patches of a depth map (rows, columns), NaN for background, with the albedo (rows, columns) of its cells."""
+    x_m, y_m = cell_centres_m(box, len(depth))
+    pitch_x, pitch_y = cell_pitch_m(box, depth.shape)
+    row, column = np.nonzero(~np.isnan(depth))
+    slope_x = slope_along(depth, 1, pitch_x, jump_m)[row, column]
+    slope_y = -slope_along(depth, 0, pitch_y, jump_m)[row, column]  # rows run along -y
+    beta = np.sqrt(1 + slope_x**2 + slope_y**2)  # S3, divided through by dx dy
+    normal = np.stack([slope_x, slope_y, -np.ones_like(beta)], axis=-1) / beta[:, None]
+    point = np.stack([x_m[column], y_m[row], depth[row, column]], axis=-1)
+    diagonal_m = float(np.hypot(pitch_x, pitch_y))
+    return Patches(point, normal, beta, albedo[row, column], row, column, pitch_x * pitch_y, diagonal_m)
+
+
+def cell_pitch_m(box: ObjectBox, shape: tuple[int, int]) -> tuple[float, float]:
+    """Width and height of a cell of a depth map (rows, columns) over a box."""
+    return (box.x_max_m - box.x_min_m) / shape[1], (box.y_max_m - box.y_min_m) / shape[0]
+
+
+def clustered(patches: Patches, stride: int, size: int) -> Patches:
+    """Blocks of stride x stride cells of a grid (size, size) as one patch each, where a beam can hardly tell them apart.
+
+    What a block takes of the light is exact for its cells' own tilt, since S2 is linear in area times normal; that they stand
+    at their mean point is the error.
+    """
+    block = patches.row // stride * size + patches.column // stride
+    blocks, which, count = np.unique(block, return_inverse=True, return_counts=True)
+
+    def summed(columns: Array) -> Array:
+        return np.stack([np.bincount(which, column, len(blocks)) for column in columns.T], -1)
+
+    area = summed((patches.albedo * patches.beta)[:, None] * patches.normal)
+    albedo = summed(patches.albedo[:, None])[:, 0] / stride**2
+    length = np.linalg.norm(area, axis=-1)
+    beta = np.divide(length / stride**2, albedo, out=np.ones_like(albedo), where=albedo > 0)
+    level = np.array([0.0, 0.0, -1.0])
+    return Patches(
+        summed(patches.point_m) / count[:, None],
+        np.where(length[:, None] > 0, area / np.maximum(length, 1e-30)[:, None], level),
+        beta,
+        albedo,
+        blocks // size,
+        blocks % size,
+        patches.cell_m2 * stride**2,
+        patches.diagonal_m * stride,
+    )
+
+
+def coarser(depth: Array, stride: int) -> Array:
+    """The mean depth of blocks of stride x stride cells, NaN where none of them is a surface."""
+    size = len(depth) // stride
+    blocks = depth.reshape(size, stride, size, stride)
+    count = (~np.isnan(blocks)).sum((1, 3))
+    return np.nansum(blocks, axis=(1, 3)) / np.where(count > 0, count, np.nan)

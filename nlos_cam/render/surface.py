@@ -1,0 +1,114 @@
+"""What a hidden surface is made of: its albedo, and how it scatters.
+
+A BRDF is given relative to a perfectly diffuse surface (pi f_r in the rendering equation), as a function of three cosines:
+incoming to normal, outgoing to normal, incoming to outgoing. Every isotropic BRDF is one. Written with arithmetic alone, the
+same function runs compiled on scalars, on arrays and on tensors.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from nlos_calibration.rig import Record
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from nlos_cam.errors import SceneError
+
+Brdf = Callable[[Any, Any, Any], Any]
+"""(cos_in, cos_out, cos_between) -> value; 1 is a white Lambertian surface."""
+
+
+def phong(diffuse: float, specular: float, exponent: float) -> Brdf:
+    """A lobe about the mirrored direction, normalised so that diffuse + specular <= 1 never gives out more than came in."""
+    gain = specular * (exponent + 2) / 2
+
+    def brdf(cos_in: Any, cos_out: Any, cos_between: Any) -> Any:
+        mirror = 2 * cos_in * cos_out - cos_between
+        return diffuse + gain * ((mirror + abs(mirror)) / 2) ** exponent
+
+    return brdf
+
+
+def retroreflective(diffuse: float, specular: float, exponent: float) -> Brdf:
+    """A lobe about the direction that the light came from, normalised as `phong` is."""
+    gain = specular * (exponent + 2) / 2
+
+    def brdf(cos_in: Any, cos_out: Any, cos_between: Any) -> Any:
+        del cos_in, cos_out
+        return diffuse + gain * ((cos_between + abs(cos_between)) / 2) ** exponent
+
+    return brdf
+
+
+class Material(Record):
+    """A BRDF by name, as scene files and the command line give it."""
+
+    kind: Literal["lambertian", "phong", "retroreflective"] = "lambertian"
+    specular: float = Field(default=0.5, ge=0, le=1)
+    """Share of the albedo that the lobe takes; the rest is diffuse. A Lambertian surface has none."""
+    exponent: float = Field(default=20.0, ge=1, le=2000)
+    """Of the lobe's cosine: 20 is a lobe of about 30 degrees full width, 200 of about 10."""
+    albedo: float | tuple[float, float, float] = 1.0
+    """One, or three for red, green and blue."""
+
+    @model_validator(mode="after")
+    def _reflects_no_more_than_it_gets(self) -> "Material":
+        if not all(0 <= value <= 1 for value in np.atleast_1d(self.albedo)):
+            raise ValueError(f"albedo must lie in 0 to 1, not {self.albedo}")
+        return self
+
+    @property
+    def surface(self) -> "Surface":
+        """The surface of this material."""
+        return Surface(np.asarray(self.albedo, np.float64), self.brdf)
+
+    @property
+    def brdf(self) -> Brdf | None:
+        """Its BRDF; None is Lambertian."""
+        if self.kind == "lambertian":
+            return None
+        return {"phong": phong, "retroreflective": retroreflective}[self.kind](
+            1 - self.specular, self.specular, self.exponent
+        )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Albedo and BRDF of a hidden object. Raises SceneError for an albedo that is not one."""
+
+    albedo: NDArray[np.floating[Any]] | float = 1.0
+    """(), (3,), or for each cell of the depth map (rows, columns) or (rows, columns, 3); 0 to 1."""
+    brdf: Brdf | None = None
+    """None is Lambertian."""
+
+    def __post_init__(self) -> None:
+        albedo = np.asarray(self.albedo)
+        if albedo.ndim not in {0, 1, 2, 3} or (albedo.ndim in {1, 3} and albedo.shape[-1] != 3):
+            raise SceneError(f"albedo has shape {albedo.shape}: give one, three, or one or three for each cell")
+        if not (np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1):
+            raise SceneError(f"albedo runs from {albedo.min():g} to {albedo.max():g}: it must lie in 0 to 1")
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the albedo has three channels."""
+        return np.ndim(self.albedo) in {1, 3}
+
+    def over(self, shape: tuple[int, int]) -> NDArray[np.float64]:
+        """The albedo of every cell of a depth map, (rows, columns, channels). Raises SceneError where it does not fit."""
+        albedo = np.asarray(self.albedo, np.float64)
+        if not self.coloured:
+            albedo = albedo[..., None]
+        if albedo.ndim == 3 and albedo.shape[:2] != shape:
+            raise SceneError(f"albedo is of {albedo.shape[:2]} cells, the depth map of {shape}: they must agree")
+        return np.broadcast_to(albedo, (*shape, albedo.shape[-1]))
+
+
+def brdf_range(brdf: Brdf) -> tuple[float, float]:
+    """The least and the largest value of a BRDF over the hemisphere, mirrored and returned directions among them."""
+    theta = np.radians(np.linspace(0, 85, 18))
+    cos_in, cos_out, turn = np.meshgrid(np.cos(theta), np.cos(theta), np.linspace(0, np.pi, 13), indexing="ij")
+    cos_between = cos_in * cos_out + np.sqrt((1 - cos_in**2) * (1 - cos_out**2)) * np.cos(turn)
+    value = np.broadcast_to(brdf(cos_in, cos_out, cos_between), cos_in.shape)
+    return float(value.min()), float(value.max())

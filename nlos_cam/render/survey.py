@@ -1,0 +1,156 @@
+"""How much light goes which way, told from a coarse look: some beams, some relay cells, every patch.
+
+The verdicts on effects need to know what leaving one out would change, for a small part of what rendering costs.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos_cam.render.beams import Beams
+from nlos_cam.render.patches import Patches
+from nlos_cam.render.reference import occluded
+from nlos_cam.render.relay import NO_OCCLUDER, Relay
+from nlos_cam.render.visibility import BIAS_CELLS, HeightField
+
+Array = NDArray[np.float64]
+
+SOME_BEAMS, SOME_CELLS = 160, 96
+CAUTION = 1.5
+"""What is told from a coarse look is taken this much larger before it is called a bound."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """For each patch (n,): the light that reaches it from the beams, and that which the lidar gets of what it gives."""
+
+    taken: Array
+    given: Array
+    taken_tilt: Array
+    """How much of it changes, beam by beam, where the patch is taken to face the wall squarely."""
+    given_tilt: Array
+    taken_cut: Array
+    """How much more it would be without the occluder."""
+    given_cut: Array
+
+    @property
+    def energy(self) -> Array:
+        """(n,); of three bounces over each patch."""
+        return self.taken * self.given
+
+    def share(self, change: Array) -> float:
+        """A change of each patch's energy (n,) as a bound on the relative change of the whole, 1 being all or more."""
+        whole, part = float(self.energy.sum()), CAUTION * float(change.sum())
+        return min(part / whole, 1.0) if whole > 0 else float(part > 0)
+
+    @property
+    def tilt(self) -> float:
+        """What leaving tilt out changes at most."""
+        return self.share(self.taken_tilt * (self.given + self.given_tilt) + self.taken * self.given_tilt)
+
+    @property
+    def occluder(self) -> float:
+        """What leaving the occluder out changes at most."""
+        return self.share((self.taken + self.taken_cut) * (self.given + self.given_cut) - self.energy)
+
+
+def survey(beams: Beams, patches: Patches, relay: Relay, edge_m: tuple[float, float], *, lambertian: bool) -> Survey:
+    """Look at some of the beams that light the wall, and some cells of a whole relay (none cut off by the occluder)."""
+    lit = np.flatnonzero(beams.on_wall)
+    lit = lit[:: max(len(lit) // SOME_BEAMS, 1)]
+    some = slice(None, None, max(len(relay.x_m) // SOME_CELLS, 1))
+    hidden = relay.behind(edge_m, beams.lidar_m)[some]
+    strength = patches.albedo * patches.beta
+    feet = beams.foot_m[lit, 0], beams.foot_m[lit, 1]
+    start = np.ones(len(lit)) if lambertian else beams.cos_incidence[lit]
+    end = (relay.cos_lidar if lambertian else np.ones_like(relay.x_m))[some] / relay.length_m[some] ** 2
+    shape = patches.point_m, patches.normal, patches.beta
+    taken = _sums(*shape, *feet, start, np.zeros(len(lit), np.bool_), *edge_m, lambertian, False)  # noqa: FBT003
+    given = _sums(*shape, relay.x_m[some], relay.y_m[some], end, hidden, *edge_m, lambertian, True)  # noqa: FBT003
+    scale = strength / max(len(lit), 1)
+    return Survey(taken[0] * scale, given[0], taken[1] * scale, given[1], taken[2] * scale, given[2])
+
+
+@numba.njit(cache=True, parallel=True)
+def _sums(
+    points: Array,
+    normals: Array,
+    beta: Array,
+    x: Array,
+    y: Array,
+    weight: Array,
+    hidden: NDArray[np.bool_],
+    edge_x: float,
+    edge_z: float,
+    lambertian: bool,
+    outgoing: bool,
+) -> Array:
+    """Sums (3, n) over points of the wall: the light, what tilt changes of it, what the occluder cuts off."""
+    sums = np.zeros((3, len(points)))
+    for s in numba.prange(len(points)):
+        point, normal = points[s], normals[s]
+        for w in range(len(x)):
+            dx, dy, z = x[w] - point[0], y[w] - point[1], point[2]
+            squared = dx * dx + dy * dy + z * z
+            length = np.sqrt(squared)
+            at_wall = z / length
+            tilted = max(normal[0] * dx + normal[1] * dy - normal[2] * z, 0.0) / length
+            # from the lidar a patch takes by its cosine and area, towards it gives (paper) whatever its cosine
+            bent = (tilted if lambertian else (1.0 if tilted > 0 else 0.0)) if outgoing else tilted
+            level = (at_wall if lambertian else (1.0 if at_wall > 0 else 0.0)) if outgoing else at_wall / beta[s]
+            if outgoing or lambertian:
+                bent, level = bent * at_wall, level * at_wall
+            light = weight[w] / max(squared, 1e-12)
+            if hidden[w] or occluded(point[0], z, x[w], 0.0, edge_x, edge_z):
+                sums[2, s] += light * bent
+            else:
+                sums[0, s] += light * bent
+                sums[1, s] += light * abs(bent - level)
+    return sums
+
+
+def occluder_meets(edge_m: tuple[float, float], patches: Patches, beams: Beams, relay: Relay) -> bool:
+    """Whether the occluder may cut any leg between wall and patches, or between a whole relay and the lidar; never wrongly no."""
+    if edge_m == NO_OCCLUDER:
+        return False
+    if relay.behind(edge_m, beams.lidar_m).any():
+        return True
+    feet = beams.foot_m[beams.on_wall, 0]
+    x, z = patches.point_m[:, 0], patches.point_m[:, 2]
+    least, most = min(relay.x_m.min(), feet.min(initial=np.inf)), max(relay.x_m.max(), feet.max(initial=-np.inf))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        from_right = (x > edge_m[0]) & (least < edge_m[0]) & (z * (edge_m[0] - least) / (x - least) >= edge_m[1])
+        from_left = (x < edge_m[0]) & (most > edge_m[0]) & (z * (most - edge_m[0]) / (most - x) >= edge_m[1])
+    return bool((from_right | from_left).any())
+
+
+def shaded(patches: Patches, field: HeightField) -> NDArray[np.bool_]:
+    """Which patches (n,) have another rise above their tangent plane: elsewhere the surface is its own lower convex hull.
+
+    Only such a patch can be shaded: what stays below the tangent plane cannot cut a leg to the lit side.
+    """
+    point, slope = patches.point_m.astype(np.float32), patches.slope.astype(np.float32)
+    bias = np.float32(BIAS_CELLS * max(field.pitch_x_m, field.pitch_y_m))
+    x, y, z = (np.ascontiguousarray(point[:, axis]) for axis in range(3))
+    return _rises_above(x, y, z, slope[:, 0].copy(), slope[:, 1].copy(), bias)
+
+
+@numba.njit(cache=True, parallel=True, fastmath={"contract", "reassoc", "nsz"})
+def _rises_above(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    z: NDArray[np.float32],
+    slope_x: NDArray[np.float32],
+    slope_y: NDArray[np.float32],
+    bias: np.float32,
+) -> NDArray[np.bool_]:
+    result = np.zeros(len(x), np.bool_)
+    for s in numba.prange(len(x)):
+        lowest = np.float32(1e9)
+        for t in range(len(x)):
+            height = z[t] - slope_x[s] * x[t] - slope_y[s] * y[t]
+            lowest = min(lowest, height)
+        result[s] = lowest < z[s] - slope_x[s] * x[s] - slope_y[s] * y[s] - bias
+    return result
