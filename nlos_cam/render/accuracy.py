@@ -26,8 +26,8 @@ class Accuracy:
     """Of each face of the horizon tables: decides time, not the result."""
     beams_per_cell: int = 1
     """Along each axis of a map cell."""
-    scatter_nodes: int = 8
-    """Along each axis of the wall: where a BRDF that is not Lambertian is tabulated for incoming light."""
+    scatter_error: float = 5e-3
+    """Of a BRDF that is not Lambertian, tabulated at so many places of incoming light as keep it (relative L1)."""
     tolerance: float = 1e-3
     """What the effects that a plan leaves out may change together, as relative L1 of the transient."""
 
@@ -38,7 +38,7 @@ class Accuracy:
             "object_stride": (1, 16),
             "sectors": (1, 256),
             "beams_per_cell": (1, MOST_BEAMS_PER_CELL),
-            "scatter_nodes": (2, 64),
+            "scatter_error": (1e-4, 1),
             "tolerance": (0, 1),
         }
         for field, (least, most) in ranges.items():
@@ -49,9 +49,9 @@ class Accuracy:
 
 
 STOPS = {
-    "draft": Accuracy("draft", 40, 32, sub_bins=4, object_stride=2, scatter_nodes=4, tolerance=3e-2),
+    "draft": Accuracy("draft", 40, 32, sub_bins=4, object_stride=2, scatter_error=3e-2, tolerance=3e-2),
     "standard": Accuracy("standard"),
-    "fine": Accuracy("fine", sub_bins=64, scatter_nodes=16, tolerance=1e-4),
+    "fine": Accuracy("fine", sub_bins=64, scatter_error=1e-3, tolerance=1e-4),
     "reference": Accuracy("reference", sub_bins=0, tolerance=0.0),
 }
 

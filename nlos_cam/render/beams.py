@@ -48,17 +48,27 @@ class Beams:
         direct[which] = albedo * returned(rig, length_m, cosine, solid_angle)
         return replace(self, foot_m=foot, length_m=length, cos_incidence=incidence, on_wall=on_wall, direct=direct)
 
+    def of_rows(self, start: int, end: int) -> "Beams":
+        """Those of some rows of the image."""
+        kept, columns = slice(start * self.shape[1], end * self.shape[1]), vars(self)
+        parts = {name: columns[name][kept] for name in columns if name not in {"shape", "lidar_m"}}
+        return Beams(shape=(end - start, self.shape[1]), lidar_m=self.lidar_m, **parts)
+
     def without_direct(self) -> "Beams":
         """The same where nothing returns straight."""
         return replace(self, direct=np.zeros_like(self.direct))
 
 
-@lru_cache(maxsize=16)
 def cast(rig: Rig, intrinsics: Intrinsics, *, lambertian: bool = False, occluder: bool = True) -> Beams:
     """One beam per pixel of the intrinsics: on to the occluder if that is nearer, else the wall, else nothing.
 
     A rig's beams are worked out once, and cannot be written into.
     """
+    return _cast(rig, intrinsics, lambertian, occluder)  # pyright: ignore[reportArgumentType]  frozen, so hashable
+
+
+@lru_cache(maxsize=16)
+def _cast(rig: Rig, intrinsics: Intrinsics, lambertian: bool, occluder: bool) -> Beams:
     pose = rig.wall_from_lidar
     lidar = pose[:3, 3]
     rays = intrinsics.rays().reshape(-1, 3)

@@ -1,7 +1,7 @@
 """Inter-reflection: light that goes from patch to patch, straight or by way of the wall, before it comes back.
 
-Both only lengthen what follows the first patch. So they are added to the patches' tables: a patch gives, beside its own returns,
-those of every patch that it lights, that much later and by the form factor weaker.
+Both only lengthen what follows the first patch. So they are added to the patches' tables: a patch gives, beside its own
+returns, those of every patch that it lights, that much later and by the form factor weaker.
 """
 
 import numba
@@ -148,9 +148,9 @@ def _carry(factor: Array, steps: Index, histogram: Float32, width: int) -> Float
 
 
 def with_inter_reflection(job: Job, first: NDArray[np.int32], histogram: Float32) -> Float32:
-    """The patches' histograms (n, k) in sub-bins, each starting at its bin `first` (n,), with one bounce more on the object.
+    """The patches' histograms (n, k) in sub-bins, from their bins `first` (n,) on, with one bounce more on the object.
 
-    The result is wider by the longest detour.
+    They come out wider by the longest detour.
     """
     per_bin, point = job.accuracy.sub_bins, job.patches.point_m
     per_m, start = per_bin / job.bin_m, first.astype(np.int64) * per_bin
@@ -174,10 +174,10 @@ def _patches(job: Job) -> tuple[Array, Array, Array, Array, Index, Index, Height
 
 def wall_factors(job: Job, cells: Array) -> tuple[Array, Array]:
     """Form factors (n, m) from the patches of a job to cells of the wall (m, 3), and back."""
-    cell_m2 = wall_cell_m2(job)
+    p, cell_m2 = job.patches, wall_cell_m2(job)
+    where = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
     wall = cells[:, 0].copy(), cells[:, 1].copy(), cell_m2, cell_m2 / job.solid_angle
-    *where, field, near_m, lambertian = _patches(job)
-    return patch_to_wall(*where, *wall, *job.edge_m, field, near_m, lambertian)
+    return patch_to_wall(*where, *wall, *job.edge_m, job.field, job.near_m, job.lambertian)
 
 
 def _wall_extent(job: Job) -> Array:

@@ -7,8 +7,6 @@ patch and a bin. Neither rounding leans: a path lies anywhere within its sub-bin
 edge in the middle of that.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +15,7 @@ from nlos_cam.render.between import with_inter_reflection
 from nlos_cam.render.job import Job
 from nlos_cam.render.kernels import LANES, shift_and_add, sub_bins, tables
 from nlos_cam.render.legs import Optics, Points32, Surface32
-from nlos_cam.render.scatter import scattering
+from nlos_cam.render.scatter import nodes, scattering
 from nlos_cam.render.visibility import horizon_table
 
 Array = NDArray[np.float64]
@@ -32,29 +30,10 @@ def histograms(job: Job) -> Float32:
     if job.brdf is None:
         return stage.histograms(np.empty((0, 0), np.float32), np.ones(len(job.foot_m)))
     total = np.zeros((len(job.foot_m), job.bins), np.float32)
-    for foot, share in nodes(job.foot_m, job.accuracy.scatter_nodes):
+    for foot, share in nodes(job, job.brdf):
         factor = scattering(job.brdf)(foot, job.patches.point_m, job.patches.normal, job.relay.x_m, job.relay.y_m)
         total += stage.histograms(factor.astype(np.float32), share)
     return total
-
-
-def nodes(foot_m: Array, count: int) -> Iterator[tuple[Array, Array]]:
-    """Feet (3,) that stand for those around them, and to what share (n,) each beam is one's: linear in between.
-
-    Their columns and rows are quantiles of the feet's own, so that they are dense where the beams are.
-    """
-    lines = [np.unique(np.quantile(foot_m[:, axis], np.linspace(0, 1, count))) for axis in (0, 1)]
-    hats = [_hats(foot_m[:, axis], line) for axis, line in enumerate(lines)]
-    for i, x in enumerate(lines[0]):
-        for j, y in enumerate(lines[1]):
-            share = hats[0][i] * hats[1][j]
-            if share.any():
-                yield np.array([x, y, 0.0]), share
-
-
-def _hats(at: Array, line: Array) -> Array:
-    """Linear interpolation between the points of a line as weights (len(line), len(at))."""
-    return np.stack([np.interp(at, line, one) for one in np.eye(len(line))])
 
 
 class _Stage:
@@ -70,12 +49,13 @@ class _Stage:
             patches.row,
             patches.column,
         )
-        self.relay = Points32(
-            *map(_single, (relay.x_m, relay.y_m, relay.length_m, job.relay_weight)), np.float32(job.soft_wall_m2)
-        )
+        columns = relay.x_m, relay.y_m, relay.length_m, job.relay_weight
+        self.relay = _points(columns, job.soft_wall_m2)
         self.low, self.high = horizons(job)
+        edge_x, edge_z = job.edge_m
         self.optics = Optics(
-            *map(np.float32, job.edge_m),
+            np.float32(edge_x),
+            np.float32(edge_z),
             np.float32(job.near_m**2),
             job.lambertian,
             np.float32(accuracy.sub_bins / job.bin_m),
@@ -87,12 +67,8 @@ class _Stage:
         """Histograms (n, bins) of the beams, each taken to some share (n,)."""
         job, shadow = self.job, (self.optics, self.job.field, self.low, self.high)
         some = np.flatnonzero(share)
-        feet = Points32(
-            *_columns(job.foot_m[some])[:2],
-            _single(job.length_m[some]),
-            _single(job.beam_weight[some] * share[some]),
-            np.float32(0),
-        )
+        x, y, _ = job.foot_m[some].T
+        feet = _points((x, y, job.length_m[some], job.beam_weight[some] * share[some]), 0.0)
         first, fine = sub_bins(self.surface, self.relay, *shadow, factor, job.accuracy.sub_bins, self.width)
         if job.more_bounces:
             fine = with_inter_reflection(job, first, fine)
@@ -107,6 +83,11 @@ class _Stage:
 
 def _single(column: Array) -> Float32:
     return np.ascontiguousarray(column, np.float32)
+
+
+def _points(columns: tuple[Array, Array, Array, Array], soft_m2: float) -> Points32:
+    x, y, length, weight = (_single(column) for column in columns)
+    return Points32(x, y, length, weight, np.float32(soft_m2))
 
 
 def _columns(points: Array) -> tuple[Float32, Float32, Float32]:
@@ -129,7 +110,8 @@ def horizons(job: Job) -> tuple[Float32, Float32]:
 def _width(job: Job) -> int:
     """Bins from the shortest to the longest d3 + d4 of any patch, in whole vectors.
 
-    The sum is convex over the wall: longest at a corner of the relay; never shorter than the straight way to the mirrored lidar.
+    The sum is convex over the wall: longest at a corner of the relay, and never shorter than the straight way to the
+    mirrored lidar.
     """
     x, y, z = job.patches.point_m.T
     relay, lidar = job.relay, job.lidar_m

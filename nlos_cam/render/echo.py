@@ -32,6 +32,18 @@ class MultiBounce:
         maps = self.peak.reshape(shape), self.runner_up.reshape(shape), self.path_m.reshape(shape)
         return MultiBounce(*maps, self.direct_included)
 
+    def spread_over(self, which: NDArray[np.bool_]) -> "MultiBounce":
+        """Those (k,) of some beams (n,) as (n,), with nothing for the others."""
+        every = nothing(len(which))
+        every.peak[which], every.runner_up[which], every.path_m[which] = self.peak, self.runner_up, self.path_m
+        return every
+
+
+def nothing(count: int) -> MultiBounce:
+    """The echoes (n,) of beams that light no wall, or find nothing hidden."""
+    dark = np.zeros((2, count), np.float32)
+    return MultiBounce(dark[0], dark[1], np.full(count, np.nan, np.float32))
+
 
 @numba.njit(cache=True, parallel=True)
 def _two_strongest(histogram: NDArray[np.floating]) -> tuple[NDArray[np.int64], Float32, Float32]:
@@ -57,7 +69,7 @@ def strongest(histogram: NDArray[np.floating], bin_m: float) -> MultiBounce:
 
 
 def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32]:
-    """S5: depth, intensity and margin (rows, columns) of the strongest echo of each beam; a tie goes to the direct return."""
+    """S5: depth, intensity and margin (rows, columns) of the strongest echoes; a tie goes to the direct return."""
     direct, peak = beams.direct.astype(np.float32).reshape(beams.shape), multi.peak
     if multi.direct_included:
         direct = np.zeros_like(direct)

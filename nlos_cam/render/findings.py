@@ -77,7 +77,7 @@ def _brdf(stage: Stage) -> Finding:
     if stage.patches is None or brdf is None:
         return "brdf", 0.0, "the surface is Lambertian" if brdf is None else "nothing is hidden"
     low, high = brdf_range(brdf)
-    cost = f"tables for {stage.accuracy.scatter_nodes}^2 directions of incoming light instead of one"
+    cost = "tables for every direction that light comes from, some dozens times the cost"
     return (
         "brdf",
         min((high - low) / high, 1.0) if high > 0 else 0.0,

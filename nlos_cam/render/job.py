@@ -62,7 +62,7 @@ class Job:
 
     @cached_property
     def soft_patch_m2(self) -> Array:
-        """(n,); what near contact adds to d2^2 at a patch: with it, a disc of that area takes no more than all the light."""
+        """(n,); what near contact adds to d2^2 at a patch."""
         return self.patches.area_m2 / self.solid_angle
 
     @property

@@ -1,4 +1,4 @@
-"""The two sums of the fast renderer, compiled: relay cells into a table for each patch, tables into histograms of beams."""
+"""The two sums of the fast renderer, compiled: relay cells into patches' tables, tables into beams' histograms."""
 
 import numba
 import numpy as np
@@ -34,7 +34,7 @@ def _count(
     legs = scratch(cells)
     geometry(legs, s, surface, relay, 0, cells, optics, field, True)
     if optics.sectors:
-        shade(legs, s, surface, relay, 0, cells, optics, field, low, high)
+        shade(legs, s, surface, relay, 0, cells, field, low, high)
     if len(factor):
         for q in range(cells):
             legs.weight[q] *= factor[s, q]
@@ -73,7 +73,7 @@ def sub_bins(
 
 @numba.njit(cache=True, parallel=True)
 def tables(histogram: Float32, per_bin: int) -> Float32:
-    """Histograms (n, width * per_bin) in sub-bins as sums to bins (n, per_bin, width), one for each shift by sub-bins."""
+    """Histograms (n, width * per_bin) in sub-bins as sums to bins (n, per_bin, width), for each shift by sub-bins."""
     patches, width = len(histogram), histogram.shape[1] // per_bin
     table = np.zeros((patches, per_bin, width), np.float32)
     for s in numba.prange(patches):
@@ -109,7 +109,7 @@ def _add_tile(
     for s in range(len(table)):
         geometry(legs, s, surface, feet, start, count, optics, field, False)
         if optics.sectors:
-            shade(legs, s, surface, feet, start, count, optics, field, low, high)
+            shade(legs, s, surface, feet, start, count, field, low, high)
         for i in range(count):
             legs.sector[i] = np.int32(
                 (legs.length_m[i] + feet.length_m[start + i]) * optics.inverse_bin + np.float32(0.5)

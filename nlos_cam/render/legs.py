@@ -1,4 +1,4 @@
-"""Legs between patches and points of the wall, many at a time, for the CPU (numba, float32): weight, length, visibility."""
+"""Legs between patches and points of the wall, many at a time (numba, float32): weight, length, visibility."""
 
 from typing import NamedTuple
 
@@ -76,8 +76,8 @@ def geometry(
 ) -> None:
     """Legs from patch s to points: weight without visibility and length, vector by vector.
 
-    Towards the lidar (`outgoing`) the weight has the wall's cosine, and in Lambertian radiometry the patch's; from it the
-    patch's, and in Lambertian radiometry the wall's.
+    Towards the lidar (`outgoing`) the weight has the wall's cosine, and in Lambertian radiometry the patch's; from it
+    the patch's, and in Lambertian radiometry the wall's.
     """
     x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
     nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
@@ -120,7 +120,6 @@ def shade(
     points: Points32,
     start: int,
     count: int,
-    optics: Optics,
     field: HeightField,
     low: Float32,
     high: Float32,

@@ -12,8 +12,8 @@ NEAR_DIAGONALS = 4
 def softened(squared_m2: Array, soft_m2: Array | float, near_m: float) -> Array:
     """d^2 that stays finite at contact: plus the receiving area over the solid angle, fading out towards `near_m`.
 
-    On the axis of a disc of area a the average of 1 / d^2 is 1 / (d^2 + a / pi), by which the disc never takes more than was
-    sent. Beyond a few diagonals the two agree, and S1 and S2 hold to the letter.
+    On the axis of a disc of area a the average of 1 / d^2 is 1 / (d^2 + a / pi), by which it never takes more than
+    was sent. Beyond a few diagonals the two agree, and S1 and S2 hold to the letter.
     """
     ramp = np.maximum(1 - squared_m2 / near_m**2, 0.0)
     return squared_m2 + soft_m2 * ramp * ramp

@@ -80,16 +80,17 @@ def cell_pitch_m(box: ObjectBox, shape: tuple[int, int]) -> tuple[float, float]:
 
 
 def clustered(patches: Patches, stride: int, size: int) -> Patches:
-    """Blocks of stride x stride cells of a grid (size, size) as one patch each, where a beam can hardly tell them apart.
+    """Blocks of stride x stride cells of a grid (size, size) as one patch each: a beam hardly tells them apart.
 
-    What a block takes of the light is exact for its cells' own tilt, since S2 is linear in area times normal; that they stand
-    at their mean point is the error.
+    What a block takes of the light is exact for its cells' own tilt, since S2 is linear in area times normal; that they
+    stand at their mean point is the error.
     """
     block = patches.row // stride * size + patches.column // stride
-    blocks, which, count = np.unique(block, return_inverse=True, return_counts=True)
+    found = np.unique(block, return_inverse=True, return_counts=True)
+    blocks, which, count = (column.astype(np.int64) for column in found)
 
     def summed(columns: Array) -> Array:
-        return np.stack([np.bincount(which, column, len(blocks)) for column in columns.T], -1)
+        return np.stack([np.bincount(which, column, len(blocks)).astype(np.float64) for column in columns.T], -1)
 
     area = summed((patches.albedo * patches.beta)[:, None] * patches.normal)
     albedo = summed(patches.albedo[:, None])[:, 0] / stride**2

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.between import AROUND_M
 from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams
+from nlos_cam.render.between import AROUND_M
 from nlos_cam.render.effects import Effects, Plan, included
 from nlos_cam.render.findings import plan
 from nlos_cam.render.job import Job
@@ -37,8 +37,8 @@ class Prepared:
     channels: int
 
     @classmethod
-    def of(cls, scene: Scene, accuracy: Accuracy, effects: Effects) -> Self:
-        """Plan a scene and apply what the plan says of beams and wall."""
+    def of(cls, scene: Scene, accuracy: Accuracy, effects: Effects, rows: tuple[int, int] | None = None) -> Self:
+        """Plan a scene and apply what the plan says of beams and wall; keep the beams of some rows of the map."""
         stage = Stage(scene, accuracy)
         verdicts = plan(stage, effects)
         stands = included(verdicts, "occluder")
@@ -52,42 +52,48 @@ class Prepared:
             hidden |= sight.hidden
         if not included(verdicts, "direct"):
             beams = beams.without_direct()
+        if rows is not None:
+            beams = beams.of_rows(rows[0] * accuracy.beams_per_cell, rows[1] * accuracy.beams_per_cell)
         coloured = scene.surface.coloured and included(verdicts, "colour")
         return cls(stage, verdicts, beams, stage.relay.kept(~hidden), edge, 3 if coloured else 1)
 
     def job(self, channel: int | None = None) -> Job | None:
-        """The job of one channel of the albedo, None for their mean; None where no three-bounce path is wanted or possible."""
-        wanted = included(self.plan, "three-bounce") and self.stage.patches is not None
-        if not wanted or not self.relay.x_m.size or not self.beams.on_wall.any():
+        """The job of one channel of the albedo, or of their mean; None where no three-bounce path is wanted."""
+        wanted = included(self.plan, "three-bounce")
+        if not (wanted and self.relay.x_m.size and self.beams.on_wall.any()):
             return None
-        patches = self._patches(channel)
+        if (patches := self._patches(channel)) is None:
+            return None
         field = self.stage.field._replace(shades=included(self.plan, "self-occlusion"))
         job = self.stage.job(self.beams, patches, self.relay, self.edge_m, field)
         if included(self.plan, "brdf"):
             job = replace(job, brdf=self.stage.scene.surface.brdf)
         if included(self.plan, "inter-reflection"):
             job = replace(job, more_bounces=True, bins=self._bins_with_detours(job))
-        size = len(job.foot_m) * job.bins * (8 if self.stage.accuracy.sub_bins == 0 else 4)
-        if size > MOST_BYTES:
-            cells = self.stage.accuracy.beams_per_cell
-            raise SceneError(
-                f"{len(job.foot_m)} beams of {job.bins} bins need {size / 2**30:.1f} GiB, at most {MOST_BYTES >> 30}: lower "
-                f"beams_per_cell ({cells}), widen bin_m ({job.bin_m:g}) or shorten gate_s"
-            )
+        _refuse_too_large(job)
         return job
 
-    def _patches(self, channel: int | None) -> Patches:
+    def _patches(self, channel: int | None) -> Patches | None:
         stage, surface = self.stage, self.stage.scene.surface
-        patches = stage.patches if channel is None else stage.patches_of(channel)
-        assert patches is not None
-        if not included(self.plan, "tilt"):
+        patches = stage.patches if channel is None or stage.patches is None else stage.patches_of(channel)
+        if patches is not None and not included(self.plan, "tilt"):
             patches = patches.level()
-        if surface.brdf is not None and not included(self.plan, "brdf"):
+        if patches is not None and surface.brdf is not None and not included(self.plan, "brdf"):
             patches = replace(patches, albedo=patches.albedo * np.mean(brdf_range(surface.brdf)))
         return patches
 
     def _bins_with_detours(self, job: Job) -> int:
-        """By way of another patch or of the wall about the object a path is longer by at most twice across that wall."""
+        """By way of another patch, or of the wall about it, a path is longer by at most twice across that wall."""
         most = 2 * np.linalg.norm(np.ptp(job.patches.point_m, axis=0) + 2 * AROUND_M)
         gate = SPEED_OF_LIGHT_M_PER_S * self.stage.rig.device.gate_s
         return int(np.ceil(min(job.bins * job.bin_m + most, gate) / job.bin_m))
+
+
+def _refuse_too_large(job: Job) -> None:
+    """Raise SceneError where the histograms alone would take more than MOST_BYTES."""
+    size = len(job.foot_m) * job.bins * (8 if job.accuracy.sub_bins == 0 else 4)
+    if size > MOST_BYTES:
+        raise SceneError(
+            f"{len(job.foot_m)} beams of {job.bins} bins need {size / 2**30:.1f} GiB, at most {MOST_BYTES >> 30}: "
+            f"lower beams_per_cell ({job.accuracy.beams_per_cell}), widen bin_m ({job.bin_m:g}) or shorten gate_s"
+        )

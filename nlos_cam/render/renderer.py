@@ -1,6 +1,5 @@
 """`render`: a scene to the depth and intensity maps that a lidar of highest-echo kind reports (S1 to S5)."""
 
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, WINNER_SPREAD_M, Float32
+from nlos_cam.frames import MAP_COLUMNS, WINNER_SPREAD_M, Float32
 from nlos_cam.render import cpu, reference
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams
-from nlos_cam.render.echo import MultiBounce, add_direct, compete, spread, strongest
+from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S
+from nlos_cam.render.echo import MultiBounce, add_direct, compete, nothing, spread, strongest
 from nlos_cam.render.effects import Effects, Plan, included
 from nlos_cam.render.job import Job, near_legs
 from nlos_cam.render.prepare import Prepared
@@ -36,8 +35,6 @@ class Rendering:
     multi: MultiBounce
     """Of every beam."""
     plan: Plan
-    seconds: dict[str, float]
-    """Time spent, by effect."""
     accuracy: Accuracy
     near_legs: int
     """Legs between patches and wall so short that near contact's average took the place of 1 / d^2."""
@@ -46,25 +43,23 @@ class Rendering:
 
 
 def render(
-    scene: Scene, accuracy: str | Accuracy = "standard", effects: Effects = "auto", backend: str = "cpu"
+    scene: Scene,
+    accuracy: str | Accuracy = "standard",
+    effects: Effects = "auto",
+    backend: str = "cpu",
+    rows: tuple[int, int] | None = None,
 ) -> Rendering:
-    """Depth, intensity and margin of every map cell. Raises SceneError for a scene that cannot be rendered."""
-    clock = Clock()
-    ready = Prepared.of(scene, accuracy_named(accuracy), effects)
-    clock.spent("direct")
-    job = ready.job()
-    beams, bin_m = ready.beams, scene.rig.device.bin_m
-    histogram = _of_all(ready, job, backend)
-    clock.spent("three-bounce")
-    mixed = _mixed(histogram, ready) if included(ready.plan, "pulse") else None
-    multi = strongest(histogram if mixed is None else mixed, bin_m)
-    multi = replace(multi, direct_included=mixed is not None).of(beams.shape)
-    clock.spent("pulse" if mixed is not None else "direct")
+    """Depth, intensity and margin of every map cell, or of the rows from the first to before the second.
+
+    Raises SceneError for a scene that cannot be rendered.
+    """
+    ready = Prepared.of(scene, accuracy_named(accuracy), effects, rows)
+    job, beams = ready.job(), ready.beams
+    multi = _echoes(ready, job, backend).of(beams.shape)
     maps = compete(beams, multi)
     colour = _colour(ready, multi, backend) if ready.channels == 3 else None
-    clock.spent("colour")
     near = near_legs(job) if job else 0
-    return Rendering(*_cells(*maps), multi, ready.plan, clock.seconds, ready.stage.accuracy, near, colour)
+    return Rendering(*_cells(*maps), multi, ready.plan, ready.stage.accuracy, near, colour)
 
 
 def render_all(
@@ -125,18 +120,14 @@ def implementation(accuracy: Accuracy, backend: str) -> Implementation:
     return cpu.histograms
 
 
-class Clock:
-    """Seconds by name, from one mark to the next."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def spent(self, name: str) -> None:
-        """Book the time since the last mark."""
-        now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
-        self._last = now
+def _echoes(ready: Prepared, job: Job | None, backend: str) -> MultiBounce:
+    """The strongest bins (n,) of every beam: of three bounces, or with a pulse of some width of the whole waveform."""
+    beams, bin_m = ready.beams, ready.stage.rig.device.bin_m
+    if included(ready.plan, "pulse"):
+        return replace(strongest(_mixed(_of_all(ready, job, backend), ready), bin_m), direct_included=True)
+    if job is None:
+        return nothing(len(beams.on_wall))
+    return strongest(implementation(job.accuracy, backend)(job), bin_m).spread_over(beams.on_wall)
 
 
 def _of_all(ready: Prepared, job: Job | None, backend: str) -> Float32:
@@ -168,9 +159,9 @@ def _colour(ready: Prepared, multi: MultiBounce, backend: str) -> Float32:
 
 
 def _blocks(image: NDArray[Any]) -> NDArray[Any]:
-    """An image of k x k beams per cell as (64, 80, k * k)."""
-    k = image.shape[0] // MAP_ROWS
-    return image.reshape(MAP_ROWS, k, MAP_COLUMNS, k).swapaxes(1, 2).reshape(MAP_ROWS, MAP_COLUMNS, k * k)
+    """An image of k x k beams per cell as (rows, 80, k * k)."""
+    k = image.shape[1] // MAP_COLUMNS
+    return image.reshape(-1, k, MAP_COLUMNS, k).swapaxes(1, 2).reshape(-1, MAP_COLUMNS, k * k)
 
 
 def _cell_mean(image: NDArray[Any]) -> NDArray[Any]:
@@ -179,7 +170,7 @@ def _cell_mean(image: NDArray[Any]) -> NDArray[Any]:
 
 def _cells(depth: Float32, intensity: Float32, margin: Float32) -> tuple[Float32, Float32, Float32]:
     """Maps of beams to maps of cells, as frames are reduced to cells."""
-    if depth.shape == (MAP_ROWS, MAP_COLUMNS):
+    if depth.shape[1] == MAP_COLUMNS:
         return depth, intensity, margin
     depths, values = _blocks(depth), _blocks(intensity)
     valid = ~np.isnan(depths)

@@ -1,6 +1,6 @@
 """A BRDF on the legs of one beam's foot: the factor that couples the way to a patch with the way from it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -8,9 +8,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_cam.render.job import Job
 from nlos_cam.render.surface import Brdf
 
 Array = NDArray[np.float64]
+PROBES = 4096
+"""Legs on which an interpolation is tried."""
+MOST_NODES = 64
+"""Along each axis."""
 Scattering = Callable[[Array, Array, Array, Array, Array], Array]
 
 
@@ -39,3 +44,64 @@ def scattering(brdf: Brdf) -> Scattering:
         return table
 
     return factor
+
+
+def scattered(brdf: Brdf, foot: Array, point: Array, normal: Array, out: Array) -> Array:
+    """The same factor (n,) leg by leg: feet, points, normals and wall points (n, 3), for a look without compiling."""
+    to_foot, to_wall = foot - point, out - point
+    to_foot /= np.linalg.norm(to_foot, axis=1, keepdims=True)
+    to_wall /= np.linalg.norm(to_wall, axis=1, keepdims=True)
+    cos_in, cos_out = (to_foot * normal).sum(1), (to_wall * normal).sum(1)
+    value = brdf(cos_in, cos_out, (to_foot * to_wall).sum(1))
+    return np.where((cos_in > 0) & (cos_out > 0), value, 0.0)
+
+
+def nodes(job: Job, brdf: Brdf) -> Iterator[tuple[Array, Array]]:
+    """Feet (3,) that stand for those around them, and to what share (n,) each beam is one's: linear in between.
+
+    Their columns and rows are quantiles of the feet's own, so that they are dense where the beams are.
+    """
+    lines = _lines(job.foot_m, node_count(job, brdf))
+    hats = [_hats(job.foot_m[:, axis], line) for axis, line in enumerate(lines)]
+    for i, x in enumerate(lines[0]):
+        for j, y in enumerate(lines[1]):
+            share = hats[0][i] * hats[1][j]
+            if share.any():
+                yield np.array([x, y, 0.0]), share
+
+
+def _lines(foot_m: Array, count: int) -> list[Array]:
+    return [np.unique(np.quantile(foot_m[:, axis], np.linspace(0, 1, count))) for axis in (0, 1)]
+
+
+def node_count(job: Job, brdf: Brdf) -> int:
+    """As many nodes along each axis as keep the interpolation, tried on some legs, within the accuracy's error."""
+    generator, patches, relay = np.random.default_rng(0), job.patches, job.relay
+    s, q = generator.integers(len(patches.beta), size=PROBES), generator.integers(len(relay.x_m), size=PROBES)
+    out = np.stack([relay.x_m[q], relay.y_m[q], np.zeros(PROBES)], 1)
+    foot = job.foot_m[generator.integers(len(job.foot_m), size=PROBES)]
+    exact, count = scattered(brdf, foot, patches.point_m[s], patches.normal[s], out), 4
+    while count < MOST_NODES:
+        corners = [_bracket(foot[:, axis], line) for axis, line in enumerate(_lines(job.foot_m, count))]
+        guess = np.zeros(PROBES)
+        for i in (0, 1):
+            for j in (0, 1):
+                at = np.stack([corners[0][i], corners[1][j], np.zeros(PROBES)], 1)
+                share = np.abs(1 - i - corners[0][2]) * np.abs(1 - j - corners[1][2])
+                guess += share * scattered(brdf, at, patches.point_m[s], patches.normal[s], out)
+        if np.abs(guess - exact).sum() <= job.accuracy.scatter_error * exact.sum():
+            break
+        count *= 2
+    return count
+
+
+def _bracket(at: Array, line: Array) -> tuple[Array, Array, Array]:
+    """The points of a line before and after, and how far in between (0 to 1)."""
+    before = np.clip(np.searchsorted(line, at, "right") - 1, 0, max(len(line) - 2, 0))
+    low, high = line[before], line[np.minimum(before + 1, len(line) - 1)]
+    return low, high, np.divide(at - low, high - low, out=np.zeros_like(at), where=high > low)
+
+
+def _hats(at: Array, line: Array) -> Array:
+    """Linear interpolation between the points of a line as weights (len(line), len(at))."""
+    return np.stack([np.interp(at, line, one) for one in np.eye(len(line))])

@@ -1,4 +1,4 @@
-"""What is rendered at one instant: a rig, the depth map of what is hidden, what it is made of, and by which radiometry."""
+"""What is rendered at one instant: a rig, the depth map of what is hidden, its surface, and by which radiometry."""
 
 from dataclasses import dataclass, field
 from typing import Literal, get_args
@@ -84,6 +84,6 @@ def _check_depth(depth: Float32) -> None:
     if surface.size and not (np.isfinite(surface).all() and surface.min() >= 0):
         where = "behind the wall" if surface.min() < 0 else "not finite"
         raise SceneError(
-            f"object depth runs from {surface.min():.3g} to {surface.max():.3g} m, which is {where}: every surface must "
+            f"object depth runs from {surface.min():.3g} to {surface.max():.3g} m, {where}: every surface must "
             "be finite and at least 0 m off the wall (use NaN for background)",
         )

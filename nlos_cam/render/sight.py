@@ -1,7 +1,7 @@
 """Line of sight: where rays between the lidar and the wall meet the hidden object, which then is not hidden at all.
 
-The object is opaque from its depth map away from the wall: each cell of the map is a column that starts at its depth. A ray
-meets a column either through its front, the surface itself, or through the side by which it enters the cell.
+The object is opaque from its depth map away from the wall: each cell of the map is a column that starts at its depth. A
+ray meets a column either through its front, the surface itself, or through the side by which it enters the cell.
 """
 
 from dataclasses import dataclass
@@ -36,9 +36,13 @@ def _first_hit(
     """Length to the first column within `length`, cosine there, row and column of its cell; inf where there is none."""
     rows, columns = field.depth_m.shape
     left, top = field.x_0_m - field.pitch_x_m / 2, field.y_0_m + field.pitch_y_m / 2
-    in_x, out_x = _entry(start[0], direction[0], left, left + columns * field.pitch_x_m)
-    in_y, out_y = _entry(start[1], direction[1], top - rows * field.pitch_y_m, top)
+    first_x, last_x = left + field.first_column * field.pitch_x_m, left + (field.last_column + 1) * field.pitch_x_m
+    first_y, last_y = top - (field.last_row + 1) * field.pitch_y_m, top - field.first_row * field.pitch_y_m
+    in_x, out_x = _entry(start[0], direction[0], first_x, last_x)
+    in_y, out_y = _entry(start[1], direction[1], first_y, last_y)
     t, end = max(in_x, in_y, 0.0), min(out_x, out_y, length)
+    if t < end and start[2] + (end if direction[2] > 0 else t) * direction[2] < field.nearest_m:
+        return np.inf, 0.0, -1, -1  # it passes between the object and the wall
     side = abs(direction[0]) if in_x >= in_y else abs(direction[1])
     while t < end:
         middle = t + 1e-9
@@ -69,8 +73,8 @@ def first_hits(
 ) -> tuple[Array, Array, Index, Index]:
     """Where rays from a point (3,), unit directions (n, 3), meet the object before their lengths (n,).
 
-    Gives length (n,), inf where nothing is met; cosine to what is met (n,); and its row and column (n,). `slope` is of the
-    depth map, dz/dx and dz/dy (2, rows, columns).
+    Gives length (n,), inf where nothing is met; cosine to what is met (n,); and its row and column (n,). `slope` is of
+    the depth map, dz/dx and dz/dy (2, rows, columns).
     """
     n = len(lengths)
     length, cosine, row, column = np.full(n, np.inf), np.zeros(n), np.full(n, -1), np.full(n, -1)
@@ -101,42 +105,14 @@ def look(beams: Beams, relay: Relay, field: HeightField, depth_m: Array, jump_m:
     to_cells = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1) - beams.lidar_m
     directions = np.concatenate([beams.direction, to_cells / relay.length_m[:, None]])
     lengths = np.concatenate([np.nan_to_num(beams.length_m, nan=np.inf), relay.length_m])
-    met = np.flatnonzero(may_meet(field, beams.lidar_m, directions, lengths))
-    if not met.size:
-        return None
     slope = np.stack(
         [slope_along(depth_m, 1, field.pitch_x_m, jump_m), -slope_along(depth_m, 0, field.pitch_y_m, jump_m)]
     )
-    length, cosine, row, column = first_hits(field, slope, beams.lidar_m, directions[met], lengths[met])
+    length, cosine, row, column = first_hits(field, slope, beams.lidar_m, directions, lengths)
     hit, count = np.isfinite(length), len(beams.length_m)
     if not hit.any():
         return None
     if length[hit].min() <= 0:
         raise SceneError(f"the object surrounds the lidar, {beams.lidar_m[2]:g} m off the wall: move it or the lidar")
-    of_beam, hidden = hit & (met < count), np.zeros(len(relay.x_m), np.bool_)
-    hidden[met[hit & (met >= count)] - count] = True
-    return Sight(met[of_beam], length[of_beam], cosine[of_beam], row[of_beam], column[of_beam], hidden)
-
-
-def may_meet(field: HeightField, start: Array, directions: Array, lengths: Array) -> NDArray[np.bool_]:
-    """Which rays (n, 3) from a point (3,) pass the box about the object at all: cheap, and never wrongly no."""
-    rows, columns = np.nonzero(~np.isnan(field.depth_m))
-    low = np.array(
-        [
-            field.x_0_m + (columns.min() - 0.5) * field.pitch_x_m,
-            field.y_0_m - (rows.max() + 0.5) * field.pitch_y_m,
-            field.nearest_m,
-        ]
-    )
-    high = np.array(
-        [
-            field.x_0_m + (columns.max() + 0.5) * field.pitch_x_m,
-            field.y_0_m - (rows.min() - 0.5) * field.pitch_y_m,
-            np.inf,
-        ]
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (low - start) / directions, (high - start) / directions
-    a, b = np.where(np.isnan(a), -np.inf, a), np.where(np.isnan(b), np.inf, b)
-    enter, leave = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
-    return (enter <= leave) & (leave >= 0) & (enter <= lengths)
+    which = np.flatnonzero(hit[:count])
+    return Sight(which, length[which], cosine[which], row[which], column[which], hit[count:])

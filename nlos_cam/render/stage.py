@@ -132,7 +132,7 @@ class Stage:
 
 
 def bins_of(beams: Beams, patches: Patches, relay: Relay, device: DeviceConstants) -> int:
-    """Bins up to the longest three-bounce path or the gate, whichever is shorter: lengths are convex, longest at corners."""
+    """Bins up to the gate or the longest three-bounce path: lengths are convex, longest at corners."""
     x, y, z = ((column.min(), column.max()) for column in patches.point_m.T)
     corners = np.array([(a, b, z[1]) for a in x for b in y])
     feet = beams.foot_m[beams.on_wall]

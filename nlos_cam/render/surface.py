@@ -1,8 +1,8 @@
 """What a hidden surface is made of: its albedo, and how it scatters.
 
-A BRDF is given relative to a perfectly diffuse surface (pi f_r in the rendering equation), as a function of three cosines:
-incoming to normal, outgoing to normal, incoming to outgoing. Every isotropic BRDF is one. Written with arithmetic alone, the
-same function runs compiled on scalars, on arrays and on tensors.
+A BRDF is given relative to a perfectly diffuse surface (pi f_r in the rendering equation), as a function of three
+cosines: incoming to normal, outgoing to normal, incoming to outgoing. Every isotropic BRDF is one. Written with
+arithmetic alone, the same function runs compiled on scalars, on arrays and on tensors.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ Brdf = Callable[[Any, Any, Any], Any]
 
 
 def phong(diffuse: float, specular: float, exponent: float) -> Brdf:
-    """A lobe about the mirrored direction, normalised so that diffuse + specular <= 1 never gives out more than came in."""
+    """A lobe about the mirrored direction, normalised: diffuse + specular <= 1 never gives more than it takes."""
     gain = specular * (exponent + 2) / 2
 
     def brdf(cos_in: Any, cos_out: Any, cos_between: Any) -> Any:
@@ -35,8 +35,7 @@ def retroreflective(diffuse: float, specular: float, exponent: float) -> Brdf:
     """A lobe about the direction that the light came from, normalised as `phong` is."""
     gain = specular * (exponent + 2) / 2
 
-    def brdf(cos_in: Any, cos_out: Any, cos_between: Any) -> Any:
-        del cos_in, cos_out
+    def brdf(_cos_in: Any, _cos_out: Any, cos_between: Any) -> Any:
         return diffuse + gain * ((cos_between + abs(cos_between)) / 2) ** exponent
 
     return brdf
@@ -96,7 +95,7 @@ class Surface:
         return np.ndim(self.albedo) in {1, 3}
 
     def over(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """The albedo of every cell of a depth map, (rows, columns, channels). Raises SceneError where it does not fit."""
+        """The albedo (rows, columns, channels) of a depth map's cells. Raises SceneError where it does not fit."""
         albedo = np.asarray(self.albedo, np.float64)
         if not self.coloured:
             albedo = albedo[..., None]

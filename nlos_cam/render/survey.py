@@ -67,8 +67,8 @@ def survey(beams: Beams, patches: Patches, relay: Relay, edge_m: tuple[float, fl
     start = np.ones(len(lit)) if lambertian else beams.cos_incidence[lit]
     end = (relay.cos_lidar if lambertian else np.ones_like(relay.x_m))[some] / relay.length_m[some] ** 2
     shape = patches.point_m, patches.normal, patches.beta
-    taken = _sums(*shape, *feet, start, np.zeros(len(lit), np.bool_), *edge_m, lambertian, False)  # noqa: FBT003
-    given = _sums(*shape, relay.x_m[some], relay.y_m[some], end, hidden, *edge_m, lambertian, True)  # noqa: FBT003
+    taken = _sums(*shape, *feet, start, np.zeros(len(lit), np.bool_), *edge_m, lambertian, False)
+    given = _sums(*shape, relay.x_m[some], relay.y_m[some], end, hidden, *edge_m, lambertian, True)
     scale = strength / max(len(lit), 1)
     return Survey(taken[0] * scale, given[0], taken[1] * scale, given[1], taken[2] * scale, given[2])
 
@@ -112,7 +112,7 @@ def _sums(
 
 
 def occluder_meets(edge_m: tuple[float, float], patches: Patches, beams: Beams, relay: Relay) -> bool:
-    """Whether the occluder may cut any leg between wall and patches, or between a whole relay and the lidar; never wrongly no."""
+    """Whether the occluder may cut any leg between wall and patches or wall and lidar; never wrongly no."""
     if edge_m == NO_OCCLUDER:
         return False
     if relay.behind(edge_m, beams.lidar_m).any():
@@ -127,7 +127,7 @@ def occluder_meets(edge_m: tuple[float, float], patches: Patches, beams: Beams, 
 
 
 def shaded(patches: Patches, field: HeightField) -> NDArray[np.bool_]:
-    """Which patches (n,) have another rise above their tangent plane: elsewhere the surface is its own lower convex hull.
+    """Which patches (n,) have another rise above their tangent plane: the rest of the surface is its lower convex hull.
 
     Only such a patch can be shaded: what stays below the tangent plane cannot cut a leg to the lit side.
     """

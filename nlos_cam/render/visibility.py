@@ -1,10 +1,10 @@
 """Self-occlusion V: does the hidden object shade a leg between one of its own patches and the wall?
 
-The object is opaque from its depth map away from the wall. A leg from a patch at depth z crosses, after k cells along its
-major axis, a surface of depth z'. It is blocked where z - z' - bias > k z / u for some k, u being its length in cells along
-that axis. So each direction has one number, its horizon max_k (z - z' - bias) / k, and a leg is free if z >= u * horizon.
-The reference walks the exact direction of each leg. The fast paths look up bounds of the horizon over sectors of directions, and
-walk only the legs that the bounds leave open: the same answer for a small part of the walks.
+The object is opaque from its depth map away from the wall. A leg from a patch at depth z crosses, after k cells along
+its major axis, a surface of depth z'. It is blocked where z - z' - bias > k z / u for some k, u being its length in
+cells along that axis. So each direction has one number, its horizon max_k (z - z' - bias) / k, and a leg is free if
+z >= u * horizon. The reference walks the exact direction of each leg. The fast paths look up bounds of the horizon over
+sectors of directions, and walk only the legs that the bounds leave open: the same answer for a small part of the walks.
 """
 
 from typing import NamedTuple
@@ -142,7 +142,7 @@ def segment_blocked(
 def _bounds_at(
     field: HeightField, along: int, across_a: float, across_b: float, along_columns: bool
 ) -> tuple[float, float]:
-    """The smallest and the largest depth that `_between` takes from across_a to across_b; NaN last where it meets background."""
+    """The least and the largest depth that `_between` takes from across_a to across_b, NaN for the latter at a gap."""
     a, b = _between(field, along, across_a, along_columns), _between(field, along, across_b, along_columns)
     first, last = int(np.ceil(across_a - 0.5)), int(np.floor(across_b + 0.5))
     gap = np.isnan(a) or np.isnan(b)
@@ -163,7 +163,7 @@ def _bounds_at(
 def _horizons(
     field: HeightField, row: int, column: int, depth_m: float, face: int, a: float, b: float, reach: float
 ) -> tuple[float, float]:
-    """Bounds of the horizon over a sector: directions that go a to b cells across for each cell along the face's axis."""
+    """Bounds of the horizon over a sector: directions that go a to b cells across for each cell along the axis."""
     along_columns, forward = face < 2, face % 2 == 0
     start, across = (column, row) if along_columns else (row, column)
     low, high, step, bias = 0.0, depth_m / reach, 1 if forward else -1, bias_m(field)
