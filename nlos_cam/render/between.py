@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from nlos_cam.frames import Float32
 from nlos_cam.render.job import Job
 from nlos_cam.render.near import softened
-from nlos_cam.render.reference import occluded
-from nlos_cam.render.visibility import HeightField, segment_blocked, visible
+from nlos_cam.render.visibility import HeightField, occluded, segment_blocked, visible
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -9,20 +9,13 @@ from numpy.typing import NDArray
 
 from nlos_cam.render.job import Job
 from nlos_cam.render.near import softened
+from nlos_cam.render.reference_between import more_paths
 from nlos_cam.render.scatter import scattering
-from nlos_cam.render.visibility import HeightField, visible
+from nlos_cam.render.visibility import HeightField, occluded, visible
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-
-@numba.njit(cache=True)
-def occluded(ax: float, az: float, bx: float, bz: float, edge_x: float, edge_z: float) -> bool:
-    """Whether the half plane x = edge_x, z >= edge_z cuts the segment from a to b."""
-    if (ax - edge_x) * (bx - edge_x) >= 0:
-        return False
-    return az + (edge_x - ax) / (bx - ax) * (bz - az) >= edge_z
 
 
 @numba.njit(cache=True, parallel=True)
@@ -49,6 +42,30 @@ def legs(
 
 
 _softened = numba.njit(cache=True)(softened)
+
+
+@numba.njit(cache=True)
+def _taken(
+    foot: Array, normal: Array, point: Array, strength: float, soft: float, near_m: float, lambertian: bool
+) -> float:
+    """What of S2 the way from a beam's foot to a patch makes: the light that the patch gives on."""
+    to_foot = foot - point
+    d2 = np.sqrt((to_foot**2).sum())
+    cos_2 = (normal * to_foot).sum() / d2
+    taken = strength * cos_2 / _softened(d2**2, soft, near_m)
+    return taken * point[2] / d2 if lambertian else taken  # leaving the wall
+
+
+@numba.njit(cache=True)
+def _given(
+    x: float, y: float, normal: Array, point: Array, relay_weight: float, soft: float, near_m: float, lambertian: bool
+) -> float:
+    """What of S2 the way from a patch over a relay cell to the lidar makes."""
+    dx, dy = x - point[0], y - point[1]
+    d3 = np.sqrt(dx**2 + dy**2 + point[2] ** 2)
+    cos_3 = point[2] / d3
+    given = relay_weight * cos_3 / _softened(d3**2, soft, near_m)
+    return given * (normal[0] * dx + normal[1] * dy - normal[2] * point[2]) / d3 if lambertian else given
 
 
 @numba.njit(cache=True, parallel=True)
@@ -78,51 +95,92 @@ def _paths(
         for s in range(len(points)):
             if not lit[s, p]:
                 continue
-            to_p = foot[p] - points[s]
-            d2 = np.sqrt((to_p**2).sum())
-            cos_2 = (normals[s] * to_p).sum() / d2
-            a = beam_weight[p] * strength[s] * cos_2 / _softened(d2**2, soft_patch[s], near_m)
-            if lambertian:
-                a *= points[s, 2] / d2  # leaving the wall
+            a = beam_weight[p] * _taken(foot[p], normals[s], points[s], strength[s], soft_patch[s], near_m, lambertian)
+            d2 = np.sqrt(((foot[p] - points[s]) ** 2).sum())
             for q in range(len(x)):
                 if not seen[s, q]:
                     continue
-                d3 = np.sqrt((x[q] - points[s, 0]) ** 2 + (y[q] - points[s, 1]) ** 2 + points[s, 2] ** 2)
-                cos_3 = points[s, 2] / d3
-                b = relay_weight[q] * cos_3 / _softened(d3**2, soft_wall, near_m)
-                if lambertian:  # leaving the object
-                    b *= (
-                        normals[s, 0] * (x[q] - points[s, 0])
-                        + normals[s, 1] * (y[q] - points[s, 1])
-                        - normals[s, 2] * points[s, 2]
-                    ) / d3
+                b = _given(x[q], y[q], normals[s], points[s], relay_weight[q], soft_wall, near_m, lambertian)
                 if factor.size:
                     b *= factor[s, q]
+                d3 = np.sqrt((x[q] - points[s, 0]) ** 2 + (y[q] - points[s, 1]) ** 2 + points[s, 2] ** 2)
                 k = int(np.floor((d1[p] + d2 + d3 + d4[q]) / bin_m))  # S4
                 if k < bins:
                     histogram[p, k] += a * b  # S2
     return histogram
 
 
+@numba.njit(cache=True)
+def _ends(
+    foot: Array,
+    beam_weight: Array,
+    lit: Mask,
+    points: Array,
+    normals: Array,
+    strength: Array,
+    soft_patch: Array,
+    x: Array,
+    y: Array,
+    relay_weight: Array,
+    soft_wall: float,
+    seen: Mask,
+    near_m: float,
+    lambertian: bool,
+) -> tuple[Array, Array]:
+    """Both ends of every path: taken (beams, patches) and given (patches, cells)."""
+    taken, given = np.zeros((len(foot), len(points))), np.zeros((len(points), len(x)))
+    for s in range(len(points)):
+        for p in range(len(foot)):
+            if lit[s, p]:
+                taken[p, s] = beam_weight[p] * _taken(
+                    foot[p], normals[s], points[s], strength[s], soft_patch[s], near_m, lambertian
+                )
+        for q in range(len(x)):
+            if seen[s, q]:
+                given[s, q] = _given(x[q], y[q], normals[s], points[s], relay_weight[q], soft_wall, near_m, lambertian)
+    return taken, given
+
+
 def histograms(job: Job) -> Array:
     """Histograms (n, bins) of I_multi over path length, for the job's beams."""
+    three = _three_bounces(job)
+    return three + _more_bounces(job) if job.more_bounces else three
+
+
+def _three_bounces(job: Job) -> Array:
     if job.brdf is None:
         return _some(job, slice(None), np.empty((0, 0)))
-    patches, relay, rows = job.patches, job.relay, []
+    patches, relay, rows = job.patches, job.relay, list[Array]()
     for p in range(len(job.foot_m)):
         factor = scattering(job.brdf)(job.foot_m[p], patches.point_m, patches.normal, relay.x_m, relay.y_m)
         rows.append(_some(job, slice(p, p + 1), factor))
     return np.concatenate(rows)
 
 
+def _more_bounces(job: Job) -> Array:
+    p, relay, (lit, seen) = job.patches, job.relay, _visible(job, job.foot_m)
+    surface = p.point_m, p.normal, job.strength, job.soft_patch_m2
+    wall = relay.x_m, relay.y_m, job.relay_weight, job.soft_wall_m2, seen
+    taken, given = _ends(job.foot_m, job.beam_weight, lit, *surface, *wall, job.near_m, job.lambertian)
+    return more_paths(job, taken, given)
+
+
+def _visible(job: Job, foot: Array) -> tuple[Mask, Mask]:
+    """V of the legs between patches and feet, and between patches and relay cells."""
+    p, relay = job.patches, job.relay
+    where = p.point_m, p.normal, p.row, p.column
+    to_feet = legs(*where, foot[:, 0].copy(), foot[:, 1].copy(), *job.edge_m, job.field)
+    return to_feet, legs(*where, relay.x_m, relay.y_m, *job.edge_m, job.field)
+
+
 def _some(job: Job, which: slice, factor: Array) -> Array:
     patches, relay, foot = job.patches, job.relay, np.ascontiguousarray(job.foot_m[which])
-    where = patches.point_m, patches.normal, patches.row, patches.column
+    lit, seen = _visible(job, foot)
     return _paths(
         foot,
         job.length_m[which],
         job.beam_weight[which],
-        legs(*where, foot[:, 0].copy(), foot[:, 1].copy(), *job.edge_m, job.field),
+        lit,
         patches.point_m,
         patches.normal,
         job.strength,
@@ -132,7 +190,7 @@ def _some(job: Job, which: slice, factor: Array) -> Array:
         relay.length_m,
         job.relay_weight,
         job.soft_wall_m2,
-        legs(*where, relay.x_m, relay.y_m, *job.edge_m, job.field),
+        seen,
         factor,
         job.near_m,
         job.lambertian,

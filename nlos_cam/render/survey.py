@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from nlos_cam.render.beams import Beams
 from nlos_cam.render.patches import Patches
-from nlos_cam.render.reference import occluded
 from nlos_cam.render.relay import NO_OCCLUDER, Relay
-from nlos_cam.render.visibility import BIAS_CELLS, HeightField
+from nlos_cam.render.visibility import BIAS_CELLS, HeightField, occluded
 
 Array = NDArray[np.float64]
 

@@ -61,6 +61,14 @@ def height_field(depth_m: NDArray[np.floating], box: ObjectBox, *, shades: bool)
 
 
 @numba.njit(cache=True)
+def occluded(ax: float, az: float, bx: float, bz: float, edge_x: float, edge_z: float) -> bool:
+    """Whether the half plane x = edge_x, z >= edge_z cuts the segment from a to b."""
+    if (ax - edge_x) * (bx - edge_x) >= 0:
+        return False
+    return az + (edge_x - ax) / (bx - ax) * (bz - az) >= edge_z
+
+
+@numba.njit(cache=True)
 def bias_m(field: HeightField) -> float:
     """By how much a cell must rise above a leg to shade it."""
     return BIAS_CELLS * max(field.pitch_x_m, field.pitch_y_m)

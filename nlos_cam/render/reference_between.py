@@ -1,0 +1,97 @@
+"""Inter-reflection path by path, in float64: what `between` is held against. For small scenes; others are refused."""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos_cam.errors import SceneError
+from nlos_cam.render.between import form_factor, wall_cells, wall_factors
+from nlos_cam.render.job import Job
+from nlos_cam.render.visibility import HeightField, segment_blocked
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+MOST_PATHS = 3e10
+"""Some minutes' worth."""
+
+
+def more_paths(job: Job, taken: Array, given: Array) -> Array:
+    """Histograms (n, bins) of the paths that meet the object twice.
+
+    `taken` (n, patches) is the light that each patch gives on of each beam, `given` (patches, m) what the lidar gets of
+    it by each relay cell. Raises SceneError where there are more than MOST_PATHS.
+    """
+    point, cells = job.patches.point_m, wall_cells(job)
+    count = taken.size * given.size * len(cells)
+    if count > MOST_PATHS:
+        raise SceneError(
+            f"inter-reflection path by path would sum {count:.1g} paths, at most {MOST_PATHS:.0e}: choose fine, "
+            "or leave inter-reflection out of the effects"
+        )
+    relay = np.stack([job.relay.x_m, job.relay.y_m, np.zeros_like(job.relay.x_m)], 1)
+    there, back = wall_factors(job, cells)
+    d2 = np.linalg.norm(job.foot_m[:, None] - point, axis=-1) + job.length_m[:, None]
+    d3 = np.linalg.norm(point[:, None] - relay, axis=-1) + job.relay.length_m
+    to_wall = np.linalg.norm(point[:, None] - cells, axis=-1)
+    patches = point, job.patches.normal, job.strength, job.soft_patch_m2, job.patches.row, job.patches.column
+    factors = _factors(*patches, job.field, job.near_m, job.lambertian)
+    return _sum(taken, d2, given, d3, factors, point, there, back, to_wall, job.bin_m, job.bins)
+
+
+@numba.njit(cache=True)
+def _factors(
+    points: Array,
+    normals: Array,
+    strength: Array,
+    soft: Array,
+    rows: Index,
+    columns: Index,
+    field: HeightField,
+    near_m: float,
+    lambertian: bool,
+) -> Array:
+    table = np.zeros((len(points), len(points)))
+    for a in range(len(points)):
+        for b in range(len(points)):
+            if segment_blocked(field, rows[a], columns[a], points[a, 2], rows[b], columns[b], points[b, 2]):
+                continue
+            table[a, b] = form_factor(
+                points[a], normals[a], points[b], normals[b], strength[b], soft[b], near_m, lambertian
+            )
+    return table
+
+
+@numba.njit(cache=True, parallel=True)
+def _sum(
+    taken: Array,
+    d2: Array,
+    given: Array,
+    d3: Array,
+    factors: Array,
+    points: Array,
+    there: Array,
+    back: Array,
+    to_wall: Array,
+    bin_m: float,
+    bins: int,
+) -> Array:
+    histogram = np.zeros((len(taken), bins))
+    for p in numba.prange(len(taken)):
+        for a in range(len(points)):
+            if taken[p, a] == 0:
+                continue
+            for b in range(len(points)):
+                away = np.sqrt(((points[a] - points[b]) ** 2).sum())
+                for q in range(given.shape[1]):
+                    ends, light = d2[p, a] + d3[b, q], taken[p, a] * given[b, q]
+                    if light == 0:
+                        continue
+                    k = int(np.floor((ends + away) / bin_m))
+                    if k < bins:
+                        histogram[p, k] += light * factors[a, b]
+                    for w in range(there.shape[1]):
+                        k = int(np.floor((ends + to_wall[a, w] + to_wall[b, w]) / bin_m))
+                        if k < bins:
+                            histogram[p, k] += light * there[a, w] * back[b, w]
+    return histogram
