@@ -10,12 +10,13 @@ from nlos_calibration.rig import Rig
 
 from nlos_cam.cache import cache_folder
 from nlos_cam.frames import Float32
-from nlos_cam.render.renderer import MultiBounce, render
+from nlos_cam.render.renderer import MultiBounce
+from nlos_cam.render.scan import render_scan
 from nlos_cam.render.scene_file import SceneFile, bare_wall_scene, load_scene, paper_scene
 from nlos_cam.render.sensor import SensedImages, Sensor
 
 Loop = tuple[list[MultiBounce], list[Float32]]
-"""Echoes and hidden depth of each pose."""
+"""Echoes of each frame, and hidden depth in the middle of its scan."""
 OnProgress = Callable[[int, int], None]
 """Called with poses done and poses in all."""
 
@@ -71,9 +72,9 @@ def _render_loop(scene: SceneFile, on_progress: OnProgress | None) -> Loop:
     echoes: list[MultiBounce] = []
     truths: list[Float32] = []
     for number in range(scene.poses):
-        instant = scene.scene_at(number)
-        echoes.append(render(instant).multi)
-        truths.append(instant.object_depth_m if instant.object_depth_m is not None else np.zeros((0, 0), np.float32))
+        echoes.append(render_scan(lambda share, start=number: scene.scene_at(start + share)).multi)
+        truth = scene.scene_at(number + 0.5).object_depth_m
+        truths.append(np.zeros((0, 0), np.float32) if truth is None else truth)
         if on_progress:
             on_progress(number + 1, scene.poses)
     return echoes, truths
