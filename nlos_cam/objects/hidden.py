@@ -11,7 +11,7 @@ from trimesh.transformations import euler_matrix
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import OBJECT_PIXELS, Float32
 from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.raster import orthographic_depth, share_outside
 
 Triangles = NDArray[np.float64]
 
@@ -39,24 +39,61 @@ def category_triangles(category: str, seed: int) -> Triangles:
     return np.asarray(mesh.triangles, np.float64)
 
 
+@dataclass(frozen=True)
+class Fit:
+    """How much of a placed object the box takes."""
+
+    depth_m: float
+    """Along z, before it is flattened."""
+    room_m: float
+    """Depth of the box behind the object's front: a deeper thing is flattened to it."""
+    outside: float
+    """Share of its silhouette that lies beside the box, and is cut off."""
+
+
+def fit(triangles: Triangles, pose: Pose, box: ObjectBox) -> Fit:
+    """How `place` and the rasteriser make an object fit the box."""
+    depth_m = float(np.ptp(_at_size(triangles, pose)[:, 2]))
+    return Fit(depth_m, _room_m(pose, box), share_outside(place(triangles, pose, box), box))
+
+
 def place(triangles: Triangles, pose: Pose, box: ObjectBox) -> Triangles:
     """The triangles (n, 3, 3) turned, scaled and moved into the box, in the wall frame.
 
-    A thing deeper than the box is flattened to fit: its silhouette stays.
+    A thing deeper than the box is flattened to fit: its silhouette stays. Raises SceneError where front_m leaves none.
     """
+    points = _at_size(triangles, pose)
+    points[:, 2] *= min(1.0, _room_m(pose, box) / max(np.ptp(points[:, 2]), 1e-9))
+    middle_x, middle_y = (box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2
+    points += (middle_x + pose.x_m, middle_y + pose.y_m, box.z_near_m + pose.front_m - points[:, 2].min())
+    return points.reshape(-1, 3, 3)
+
+
+def nothing_to_see(label: str, box: ObjectBox) -> SceneError:
+    """The error of an object that shows the wall nothing."""
+    return SceneError(
+        f"{label} shows no surface in the object box (x {box.x_min_m:g} to {box.x_max_m:g} m, y {box.y_min_m:g} to "
+        f"{box.y_max_m:g} m): it lies beside it, is seen edge on or misses every cell; change x_m, y_m, size_m or its "
+        "angles"
+    )
+
+
+def _at_size(triangles: Triangles, pose: Pose) -> Triangles:
+    """The corners (3 n, 3), turned and scaled about their middle."""
     turn = euler_matrix(pose.tilt_x_rad, pose.tilt_y_rad, pose.turn_z_rad)[:3, :3]
     points = triangles.reshape(-1, 3) @ turn.T
     points = points - (points.min(0) + points.max(0)) / 2
     points *= pose.size_m / np.ptp(points[:, :2], axis=0).max()
+    return points
+
+
+def _room_m(pose: Pose, box: ObjectBox) -> float:
     room_m = box.z_far_m - box.z_near_m - pose.front_m
     if room_m < 0:
         raise SceneError(
             f"front_m of {pose.front_m:g} m leaves the box, which is {room_m + pose.front_m:g} m deep: lower it"
         )
-    points[:, 2] *= min(1.0, room_m / max(np.ptp(points[:, 2]), 1e-9))
-    middle_x, middle_y = (box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2
-    points += (middle_x + pose.x_m, middle_y + pose.y_m, box.z_near_m + pose.front_m - points[:, 2].min())
-    return points.reshape(-1, 3, 3)
+    return room_m
 
 
 def random_pose(generator: np.random.Generator, box: ObjectBox) -> Pose:

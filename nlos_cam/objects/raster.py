@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from nlos_cam.frames import OBJECT_PIXELS, Float32
 from nlos_cam.objects.depth_image import cell_centres_m
 
+FINE_PIXELS = 256
 EDGE = 1e-9
 """Of a triangle: an edge that two triangles share leaves no hole, whichever way rounding falls."""
 
@@ -41,7 +42,25 @@ def _fill(
 def orthographic_depth(triangles_m: NDArray[np.float64], box: ObjectBox, pixels: int = OBJECT_PIXELS) -> Float32:
     """Depth (pixels, pixels) in metres of triangles (n, 3, 3) given in the wall frame; NaN where there is none.
 
-    A cell is sampled at its centre. Surfaces outside the box's depths are not clipped: place the mesh first.
+    A cell is sampled at its centre, and what lies beside the box is cut off. Surfaces outside the box's depths are not
+    clipped: place the mesh first.
     """
     depth = _fill(np.ascontiguousarray(triangles_m, np.float64), *cell_centres_m(box, pixels))
     return np.where(np.isinf(depth), np.nan, depth).astype(np.float32)
+
+
+def share_outside(triangles_m: NDArray[np.float64], box: ObjectBox) -> float:
+    """The share of the silhouette of triangles (n, 3, 3) that lies beside the box, to about 1 %.
+
+    0 where all of it is inside, or it is seen edge on and has none.
+    """
+    points = triangles_m.reshape(-1, 3)
+    (x0, y0, _), (x1, y1, _) = points.min(0), points.max(0)
+    inside = min(x0 - box.x_min_m, box.x_max_m - x1, y0 - box.y_min_m, box.y_max_m - y1) >= -EDGE
+    if inside or x0 == x1 or y0 == y1:
+        return 0.0
+    around = box.model_copy(update={"x_min_m": x0, "x_max_m": x1, "y_min_m": y0, "y_max_m": y1})
+    x_m, y_m = cell_centres_m(around, FINE_PIXELS)
+    beside_x, beside_y = (x_m < box.x_min_m) | (x_m > box.x_max_m), (y_m < box.y_min_m) | (y_m > box.y_max_m)
+    silhouette = ~np.isnan(orthographic_depth(triangles_m, around, FINE_PIXELS))
+    return float((beside_x | beside_y[:, None])[silhouette].sum() / max(silhouette.sum(), 1))

@@ -7,7 +7,7 @@ from nlos_calibration.rig import ObjectBox, load_rig
 from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.hidden import Pose, category_triangles, object_depth, object_depths, place, random_pose
+from nlos_cam.objects.hidden import Pose, category_triangles, fit, object_depth, object_depths, place, random_pose
 
 BOX = load_rig("paper-rig").object_box
 CUP = category_triangles("cup", 0)
@@ -38,6 +38,17 @@ def test_a_thing_deeper_than_the_box_is_flattened_and_keeps_its_silhouette() -> 
     deep, flat = _points(Pose()), _points(Pose(), shallow)
     assert flat[:, 2].max() == pytest.approx(shallow.z_far_m)
     np.testing.assert_allclose(flat[:, :2], deep[:, :2])
+
+
+def test_a_fit_tells_what_placing_does() -> None:
+    inside, beside = fit(CUP, Pose(size_m=0.2), BOX), fit(CUP, Pose(size_m=0.2, x_m=0.25), BOX)
+    assert inside.outside == 0
+    assert beside.outside == 1
+    assert inside.depth_m == pytest.approx(np.ptp(_points(Pose(size_m=0.2))[:, 2]))
+    assert inside.room_m == pytest.approx(BOX.z_far_m - BOX.z_near_m - Pose().front_m)
+    shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
+    flattened = fit(CUP, Pose(size_m=0.2), shallow)
+    assert flattened.depth_m == inside.depth_m > flattened.room_m == pytest.approx(0.03)
 
 
 @pytest.mark.parametrize("front_m", [0.3, 1.0])

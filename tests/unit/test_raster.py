@@ -8,7 +8,7 @@ import trimesh
 from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.objects.depth_image import cell_centres_m
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.raster import orthographic_depth, share_outside
 
 BOX = ObjectBox(x_min_m=0.0, x_max_m=0.64, y_min_m=-0.32, y_max_m=0.32, z_near_m=0.1, z_far_m=0.6)
 X, Y = np.meshgrid(*cell_centres_m(BOX))
@@ -110,3 +110,29 @@ def test_every_dtype_and_layout_gives_the_same() -> None:
 
 def test_it_works_at_other_resolutions() -> None:
     assert orthographic_depth(_quad((0.3, 0.3, 0.3, 0.3)), BOX, pixels=17).shape == (17, 17)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("side", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_the_share_of_a_plate_beside_the_box_is_what_sticks_out(share: float, side: tuple[int, int]) -> None:
+    plate = trimesh.creation.box(extents=(0.1, 0.1, 0.01))
+    x, y = (s * (0.32 - 0.05 + 0.1 * share) for s in side)
+    assert share_outside(_triangles(plate, (0.32 + x, y, 0.3)), BOX) == pytest.approx(share, abs=0.01)
+
+
+def test_the_share_counts_the_silhouette_not_the_layers() -> None:
+    inside, outside = _quad((0.3, 0.3, 0.3, 0.3), 0.1, 0.2), _quad((0.3, 0.3, 0.3, 0.3), 0.65, 0.75)
+    layers = [outside + np.array((0, 0, 0.1 * k)) for k in range(4)]
+    assert share_outside(np.concatenate([inside, *layers]), BOX) == pytest.approx(0.5)
+
+
+def test_nothing_is_outside_of_what_fits_or_is_seen_edge_on() -> None:
+    edge_on = np.array([[(3.0, -1, 0.2), (3.0, 1, 0.2), (3.0, 0, 0.5)]])
+    sliver = np.array(
+        [
+            [(3.0, -1, 0.2), (3.5, 0.37, 0.2), (3.5, 0.37 + 1e-9, 0.5)],
+            [(4.0, 1, 0.2), (4.0 - 1e-6, 1, 0.2), (4, 1 - 1e-6, 0.2)],
+        ]
+    )
+    exact = np.array([[(0.0, -0.32, 0.2), (0.64, -0.32, 0.2), (0.64, 0.32 + 1e-12, 0.2)]])
+    assert [share_outside(triangles, BOX) for triangles in (edge_on, sliver, exact)] == [0, 0, 0]
