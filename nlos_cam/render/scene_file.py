@@ -4,16 +4,29 @@ import hashlib
 import tomllib
 from math import pi, radians, sin
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Self
 
+import numpy as np
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.rig import Record, Rig, first_problem, load_rig
 from nlos_calibration.wall_record import rig_named
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.hidden import Pose, category_triangles, place
+from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.files import MeshFile, Up, read_mesh, upright
+from nlos_cam.objects.hidden import Pose, Triangles, category_triangles, nothing_to_see, place
 from nlos_cam.objects.raster import orthographic_depth
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor import SensorModel
@@ -28,19 +41,74 @@ def _known(category: str) -> str:
     return category
 
 
-class HiddenObject(Record):
-    """One variation of a procedural category, and how it stands at rest."""
+def _mesh(value: object) -> MeshFile:
+    if isinstance(value, MeshFile):
+        return value
+    if not isinstance(value, str | Path):
+        raise PydanticCustomError("mesh_file", "must be the path of a mesh")
+    try:
+        return read_mesh(Path(value))
+    except SceneError as error:
+        raise PydanticCustomError("mesh_file", "{problem}", {"problem": str(error)}) from error
 
-    category: Annotated[str, AfterValidator(_known)]
+
+def _within(low: float, high: float) -> AfterValidator:
+    """A range that NaN is outside of, told as a whole."""
+
+    def check(value: float) -> float:
+        if not low <= value <= high:
+            raise PydanticCustomError("range", "must be from {low} to {high}", {"low": f"{low:g}", "high": f"{high:g}"})
+        return value
+
+    return AfterValidator(check)
+
+
+Mesh = Annotated[MeshFile, PlainValidator(_mesh), PlainSerializer(lambda mesh: str(mesh.path), str)]
+Size = Annotated[float, _within(0.001, 10)]
+Length = Annotated[float, _within(-10, 10)]
+Reach = Annotated[float, _within(0, 10)]
+Angle = Annotated[float, _within(-360, 360)]
+
+
+class HiddenObject(Record):
+    """One variation of a procedural category, or a mesh from a file, and how it stands at rest."""
+
+    category: Annotated[str, AfterValidator(_known)] | None = None
     seed: int = Field(default=0, ge=0)
-    size_m: float = Field(default=0.18, gt=0)
-    tilt_x_deg: float = 0.0
-    tilt_y_deg: float = 0.0
-    turn_deg: float = 0.0
-    x_m: float = 0.0
-    y_m: float = 0.0
-    front_m: float = Field(default=0.03, ge=0)
+    """Which variation of the category."""
+    size_m: Size = 0.18
+    """The larger of its extents along x and y, once turned: the unit of a mesh's file does not matter."""
+    tilt_x_deg: Angle = 0.0
+    tilt_y_deg: Angle = 0.0
+    turn_deg: Angle = 0.0
+    x_m: Length = 0.0
+    y_m: Length = 0.0
+    front_m: Reach = 0.03
     """From the box's near side to the object's nearest point."""
+    file: Mesh | None = None
+    """A .obj, .stl or .ply; a path in a scene file starts from its folder."""
+    up: Up = "y"
+    """Which axis of the mesh's file points up."""
+
+    @model_validator(mode="after")
+    def _one_thing(self) -> Self:
+        if (self.category is None) == (self.file is None):
+            raise PydanticCustomError("one_thing", "give one of category and file")
+        if self.file and self.seed:
+            raise PydanticCustomError("seed", "seed is for a category: a file has no variations")
+        if self.category and self.up != "y":
+            raise PydanticCustomError("up", "up is for a file: a category stands with y up")
+        return self
+
+    @property
+    def label(self) -> str:
+        """What a message calls it: the category, or the file's path."""
+        return str(self.file.path) if self.file else str(self.category)
+
+    @property
+    def triangles(self) -> Triangles:
+        """(n, 3, 3), before it is placed: y up, -z towards the wall."""
+        return upright(self.file.triangles, self.up) if self.file else category_triangles(self.label, self.seed)
 
 
 class Motion(Record):
@@ -48,11 +116,11 @@ class Motion(Record):
 
     poses: int = Field(default=90, gt=0)
     """At 30 poses a second."""
-    sway_x_m: float = 0.0
-    sway_y_m: float = 0.0
-    approach_m: float = Field(default=0.0, ge=0)
-    turn_deg: float = 0.0
-    tilt_deg: float = 0.0
+    sway_x_m: Length = 0.0
+    sway_y_m: Length = 0.0
+    approach_m: Reach = 0.0
+    turn_deg: Angle = 0.0
+    tilt_deg: Angle = 0.0
 
 
 class SceneFile(Record):
@@ -75,8 +143,11 @@ class SceneFile(Record):
     @property
     def checksum(self) -> str:
         """Twelve hexadecimal digits that change with anything that changes a rendering."""
-        geometry = self.model_dump_json(exclude={"name", "sensor"})
-        return hashlib.sha256(f"{RENDERING_VERSION} {geometry}".encode()).hexdigest()[:12]
+        mesh = self.hidden.file if self.hidden else None
+        of_file = {"file"} if mesh else {"file", "up"}  # without a file: what it was before there were any
+        geometry = self.model_dump_json(exclude={"name": True, "sensor": True, "hidden": of_file})
+        content = mesh.sha256 if mesh else ""
+        return hashlib.sha256(f"{RENDERING_VERSION} {geometry}{content}".encode()).hexdigest()[:12]
 
     @property
     def poses(self) -> int:
@@ -88,12 +159,17 @@ class SceneFile(Record):
         if self.hidden is None:
             return Scene(self.rig)
         if self.rig.object_box is None:
-            raise SceneError(f"rig {self.rig.name!r} has no object_box to hide {self.hidden.category!r} in: add one")
-        triangles = category_triangles(self.hidden.category, self.hidden.seed)
-        placed = place(triangles, self._pose(self.hidden, number), self.rig.object_box)
+            raise SceneError(f"rig {self.rig.name!r} has no object_box to hide {self.hidden.label!r} in: add one")
+        placed = place(self.hidden.triangles, self.pose_at(self.hidden, number), self.rig.object_box)
         return Scene(self.rig, orthographic_depth(placed, self.rig.object_box))
 
-    def _pose(self, rest: HiddenObject, number: int) -> Pose:
+    def shows_at(self, number: int) -> bool:
+        """Whether the wall sees any of the object at one instant of the loop."""
+        depth_m = self.scene_at(number).object_depth_m
+        return depth_m is not None and bool(np.isfinite(depth_m).any())
+
+    def pose_at(self, rest: HiddenObject, number: int) -> Pose:
+        """The pose at one instant of the loop of what stands at rest as `rest` says."""
         turn, motion = 2 * pi * number / self.poses, self.motion
         return Pose(
             tilt_x_rad=radians(rest.tilt_x_deg),
@@ -122,16 +198,30 @@ def bare_wall_scene() -> SceneFile:
 
 
 def load_scene(path: Path) -> SceneFile:
-    """A scene from TOML; a rig's path in it starts from its own folder. Raises SceneError with the first problem."""
+    """A scene from TOML; the paths of a rig and a mesh in it start from its own folder.
+
+    Raises SceneError with the first problem.
+    """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-        if isinstance(rig := content.get("rig"), str):
-            beside = path.parent / rig
-            content["rig"] = rig_named(str(beside if beside.is_file() else rig)).model_dump()
-        return SceneFile.model_validate(content)
+        scene = SceneFile.model_validate(_from_folder(content, path.parent))
     except RecordFileError as error:
         raise SceneError(f"{path} is not a scene: rig: {error}") from error
     except ValidationError as error:
         raise SceneError(f"{path} is not a scene: {first_problem(error)}") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise SceneError(f"{path} cannot be read as a scene: {error}") from error
+    if scene.hidden and not any(scene.shows_at(number) for number in range(scene.poses)):
+        raise nothing_to_see(scene.hidden.label, object_box(scene.rig))
+    return scene
+
+
+def _from_folder(content: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The content of a scene file with its rig read and its mesh's path made whole, both from its own folder."""
+    if isinstance(rig := content.get("rig"), str):
+        beside = folder / rig
+        content["rig"] = rig_named(str(beside if beside.is_file() else rig)).model_dump()
+    hidden = content.get("object", content.get("hidden"))
+    if isinstance(hidden, dict) and isinstance(file := hidden.get("file"), str):
+        hidden["file"] = str((folder / file).resolve())
+    return content
