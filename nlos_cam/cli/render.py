@@ -10,10 +10,20 @@ from nlos_calibration.wall_record import rig_named
 from rich.table import Table
 
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, stderr
-from nlos_cam.errors import SceneError
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.hidden import Pose, category_triangles, place
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.cli.hidden_object import (
+    Front,
+    Object,
+    OffsetX,
+    OffsetY,
+    Seed,
+    Size,
+    TiltX,
+    TiltY,
+    Turn,
+    UpAxis,
+    hidden_depth,
+)
+from nlos_cam.frames import Float32
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import load_scene
@@ -25,12 +35,20 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    hidden: Annotated[str, typer.Argument(metavar="OBJECT", help="A category's name, or a .npy depth map (64, 64).")],
+    hidden: Object,
     out: Annotated[Path | None, typer.Option("--out", help="Maps (.npz); a picture goes beside them.")] = None,
     scene: Annotated[Path | None, typer.Option("--scene", help="A scene.toml whose rig to use.")] = None,
     rig: Annotated[str, typer.Option("--rig", help="A packaged rig's name, or a rig's TOML file.")] = "paper-rig",
     accuracy: Annotated[str, typer.Option("--accuracy", help="draft, standard, fine or reference.")] = "standard",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Which variation of the category.")] = 0,
+    seed: Seed = None,
+    up: UpAxis = None,
+    size_m: Size = None,
+    tilt_x_deg: TiltX = None,
+    tilt_y_deg: TiltY = None,
+    turn_deg: Turn = None,
+    x_m: OffsetX = None,
+    y_m: OffsetY = None,
+    front_m: Front = None,
     explain: Annotated[bool, typer.Option("--explain", help="Tell which effects the scene calls for.")] = False,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -38,8 +56,9 @@ def command(
     """Render what a lidar of highest-echo kind reports of a hidden object."""
     path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
     chosen_rig = load_scene(scene).rig if scene else rig_named(rig)
-    target = Scene(chosen_rig)
-    depth_m = _depth_of(hidden, seed, target)
+    angles = {"tilt_x_deg": tilt_x_deg, "tilt_y_deg": tilt_y_deg, "turn_deg": turn_deg}
+    place = {"size_m": size_m, "x_m": x_m, "y_m": y_m, "front_m": front_m}
+    depth_m = hidden_depth(hidden, chosen_rig, {"seed": seed, "up": up, **angles, **place})
     target = Scene(chosen_rig, depth_m)
     started = time.perf_counter()
     rendering = render(target, accuracy)
@@ -59,17 +78,6 @@ def command(
     result = {"seconds": seconds, "accuracy": accuracy, "effects": _effects(rendering), "out": str(path)}
     text = f"rendered in {seconds:.2f} s at {accuracy!r}: {path}, picture {path.with_suffix('.png')}"
     finish(result, as_json=json, text=text)
-
-
-def _depth_of(hidden: str, seed: int, scene: Scene) -> np.ndarray[Any, np.dtype[np.float32]]:
-    if hidden.endswith(".npy"):
-        try:
-            return np.load(hidden).astype(np.float32)
-        except (OSError, ValueError, EOFError) as error:
-            raise SceneError(f"{hidden} cannot be read as a depth map: {error}") from error
-    if hidden not in CATEGORIES:
-        raise SceneError(f"no object {hidden!r}: give a .npy depth map, or one of {', '.join(CATEGORIES)}")
-    return orthographic_depth(place(category_triangles(hidden, seed), Pose(), scene.box), scene.box)
 
 
 def _effects(rendering: Rendering) -> list[dict[str, Any]]:
@@ -93,7 +101,7 @@ def _table(rendering: Rendering) -> Table:
     return table
 
 
-def _draw(path: Path, depth_m: np.ndarray[Any, np.dtype[np.float32]], rendering: Rendering) -> None:
+def _draw(path: Path, depth_m: Float32, rendering: Rendering) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3), layout="constrained")

@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from nlos_calibration.rig import dump_toml, load_rig
 
 from nlos_cam.cli.main import main
 from nlos_cam.objects.hidden import object_depth
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_file import SceneFile
+from nlos_cam.render.scene_file import HiddenObject, SceneFile
 
 RIG = load_rig("paper-rig")
 EFFECTS = ["direct", "three-bounce", "self-occlusion", "tilt", "occluder"]
@@ -62,6 +63,33 @@ def test_a_depth_map_from_a_file_is_rendered_as_the_library_does(
         np.testing.assert_array_equal(file["object_depth_m"], _depth())
 
 
+PLACED = {
+    "size_m": 0.15,
+    "tilt_x_deg": -10.0,
+    "tilt_y_deg": 200.0,
+    "turn_deg": 30.0,
+    "x_m": -0.01,
+    "y_m": 0.02,
+    "front_m": 0.05,
+}
+
+
+@pytest.mark.parametrize("kind", ["category", "file"])
+def test_a_placed_object_is_what_a_scene_file_says_of_it(tmp_path: Path, kind: str) -> None:
+    """Every option is given, and each arrives."""
+    thing, out = tmp_path / "thing.ply", tmp_path / "maps.npz"
+    trimesh.creation.box(extents=(30, 20, 10)).export(thing)
+    of_kind = {"category": ("hat", {"seed": 4}), "file": (str(thing), {"up": "z"})}
+    name, only = of_kind[kind]
+    fields = PLACED | only
+    options = [text for field, value in fields.items() for text in (f"--{field.replace('_', '-')}", str(value))]
+    assert main(["render", name, *options, "--accuracy", "draft", "--out", str(out)]) == 0
+    hidden = HiddenObject.model_validate({kind: name, **fields})
+    with np.load(out) as file:
+        expected = SceneFile(name="same", rig=RIG, hidden=hidden).scene_at(0).object_depth_m
+        np.testing.assert_array_equal(file["object_depth_m"], expected)
+
+
 def test_what_is_there_is_overwritten_only_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "cup.npz"
     out.write_bytes(b"precious")
@@ -97,7 +125,16 @@ def test_a_scene_lends_its_rig(tmp_path: Path) -> None:
         (["cup", "--scene", "none.toml"], 1, "none.toml"),
         (["none.npy"], 1, "none.npy"),
         ([], 2, ""),
-        (["cup", "--seed", "-1"], 2, ""),
+        (["cup", "--seed", "-1"], 2, "seed"),
+        (["cup", "--size-m", "nan"], 2, "size_m: must be from 0.001 to 10 (got nan)"),
+        (["cup", "--size-m", "-1"], 2, "size_m"),
+        (["cup", "--up", "z"], 2, "leave out --up"),
+        (["cup", "--up", "w"], 2, "'y', 'z'"),
+        (["none.stl", "--seed", "1"], 2, "leave out --seed"),
+        (["none.npy", "--turn-deg", "1"], 2, "leave out --turn-deg"),
+        (["none.stl"], 1, "none.stl cannot be read"),
+        (["none.glb"], 1, "no object 'none.glb'"),
+        (["cup", "--x-m", "1"], 1, "cup shows no surface in the object box"),
     ],
 )
 def test_what_cannot_be_has_its_code_and_one_line(
@@ -106,6 +143,7 @@ def test_what_cannot_be_has_its_code_and_one_line(
     assert main(["render", *arguments, "--out", str(tmp_path / "maps.npz")]) == code
     shown = capsys.readouterr()
     assert words in shown.err
+    assert not shown.err or shown.err.count("\n") == 1
     assert "Traceback" not in shown.err
     assert not list(tmp_path.iterdir())
 
