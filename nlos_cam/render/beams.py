@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 from nlos_calibration.projection import Intrinsics
-from nlos_calibration.rig import Rig
+from nlos_calibration.rig import DeviceConstants, Rig
 from numpy.typing import NDArray
 
 from nlos_cam.render.near import NEAR_DIAGONALS, softened
@@ -99,6 +99,11 @@ def returned(rig: Rig, length_m: Array, cosine: Array, solid_angle: float) -> Ar
     in_gate = 2 * length_m < SPEED_OF_LIGHT_M_PER_S * rig.device.gate_s
     light = cosine * cell_m2 / (solid_angle * softened(length_m**2, cell_m2 / solid_angle, near_m))
     return np.where(in_gate, light, 0.0)
+
+
+def gate_bins(device: DeviceConstants) -> int:
+    """Bins of path length that begin inside the gate: the last may reach beyond it."""
+    return max(int(np.ceil(SPEED_OF_LIGHT_M_PER_S * device.gate_s / device.bin_m)), 1)
 
 
 def _inside(rig: Rig, point: Array) -> Mask:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams
+from nlos_cam.render.beams import Beams, gate_bins
 from nlos_cam.render.between import AROUND_M
 from nlos_cam.render.effects import Effects, Plan, included
 from nlos_cam.render.findings import plan
@@ -85,8 +85,7 @@ class Prepared:
     def _bins_with_detours(self, job: Job) -> int:
         """By way of another patch, or of the wall about it, a path is longer by at most twice across that wall."""
         most = 2 * np.linalg.norm(np.ptp(job.patches.point_m, axis=0) + 2 * AROUND_M)
-        gate = SPEED_OF_LIGHT_M_PER_S * self.stage.rig.device.gate_s
-        return int(np.ceil(min(job.bins * job.bin_m + most, gate) / job.bin_m))
+        return min(job.bins + int(np.ceil(most / job.bin_m)), gate_bins(self.stage.rig.device))
 
 
 def _refuse_too_large(job: Job) -> None:

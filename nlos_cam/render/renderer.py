@@ -11,7 +11,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, WINNER_SPREAD_M, Float32
 from nlos_cam.render import cpu, reference
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S
+from nlos_cam.render.beams import gate_bins
 from nlos_cam.render.echo import MultiBounce, add_direct, compete, nothing, spread, strongest
 from nlos_cam.render.effects import Effects, Plan, included
 from nlos_cam.render.job import Job, near_legs
@@ -140,7 +140,7 @@ def _mixed(histogram: Float32, ready: Prepared) -> Float32:
     whole = add_direct(histogram, ready.beams, device.bin_m)
     if included(ready.plan, "pulse") and ready.stage.scene.pulse_ns > 0:
         whole = spread(whole, ready.stage.scene.pulse_ns, device.bin_m)
-    return whole[:, : max(int(SPEED_OF_LIGHT_M_PER_S * device.gate_s / device.bin_m), 1)]
+    return whole[:, : gate_bins(device)]
 
 
 def _colour(ready: Prepared, multi: MultiBounce, backend: str) -> Float32:

@@ -8,7 +8,7 @@ from nlos_calibration.rig import DeviceConstants, Rig
 from numpy.typing import NDArray
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams, cast
+from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams, cast, gate_bins
 from nlos_cam.render.between import share_of_more_bounces
 from nlos_cam.render.job import Job
 from nlos_cam.render.patches import Patches, clustered, coarser
@@ -141,5 +141,5 @@ def bins_of(beams: Beams, patches: Patches, relay: Relay, device: DeviceConstant
         [(a, b, 0.0) for a in (relay.x_m.min(), relay.x_m.max()) for b in (relay.y_m.min(), relay.y_m.max())]
     )
     back = np.linalg.norm(ends - beams.lidar_m, axis=-1) + np.linalg.norm(ends[:, None] - corners[None], axis=-1).max(1)
-    longest_m = min(there.max() + back.max(), SPEED_OF_LIGHT_M_PER_S * device.gate_s)
-    return max(int(np.ceil(longest_m / device.bin_m)), 1)
+    longest_bin = int((there.max() + back.max()) / device.bin_m)  # of a path on a bin's edge, the bin beyond it
+    return min(longest_bin + 2, gate_bins(device))  # one to spare: the fast renderers round lengths
