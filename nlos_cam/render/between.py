@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.frames import Float32
 from nlos_cam.render.job import Job
-from nlos_cam.render.near import softened
+from nlos_cam.render.near import contact_m2, softened
 from nlos_cam.render.visibility import HeightField, occluded, segment_blocked, visible
 
 Array = NDArray[np.float64]
@@ -175,7 +175,7 @@ def wall_factors(job: Job, cells: Array) -> tuple[Array, Array]:
     """Form factors (n, m) from the patches of a job to cells of the wall (m, 3), and back."""
     p, cell_m2 = job.patches, wall_cell_m2(job)
     where = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
-    wall = cells[:, 0].copy(), cells[:, 1].copy(), cell_m2, cell_m2 / job.solid_angle
+    wall = cells[:, 0].copy(), cells[:, 1].copy(), cell_m2, contact_m2(cell_m2, job.solid_angle)
     return patch_to_wall(*where, *wall, *job.edge_m, job.field, job.near_m, job.lambertian)
 
 
@@ -211,7 +211,7 @@ def share_of_more_bounces(job: Job, taken: Array, given: Array) -> float:
     taken, given, sites = taken[some], given[some], (p.row[some].copy(), p.column[some].copy())
     straight = patch_to_patch(*where, *sites, job.field, job.near_m, job.lambertian) @ given
     cells, cell_m2 = wall_cells(job), wall_cell_m2(job)
-    wall = cells[:, 0].copy(), cells[:, 1].copy(), cell_m2, cell_m2 / job.solid_angle
+    wall = cells[:, 0].copy(), cells[:, 1].copy(), cell_m2, contact_m2(cell_m2, job.solid_angle)
     there, back = patch_to_wall(*where, *sites, *wall, *job.edge_m, job.field, job.near_m, job.lambertian)
     by_wall = there @ (back.T @ given)
     whole = float((taken * given).sum())

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.near import NEAR_DIAGONALS, softened
+from nlos_cam.render.near import NEAR_DIAGONALS, contact_m2, softened
 from nlos_cam.render.patches import Patches
 from nlos_cam.render.relay import Relay
 from nlos_cam.render.surface import Brdf
@@ -63,12 +63,12 @@ class Job:
     @cached_property
     def soft_patch_m2(self) -> Array:
         """(n,); what near contact adds to d2^2 at a patch."""
-        return self.patches.area_m2 / self.solid_angle
+        return contact_m2(self.patches.area_m2, self.solid_angle)
 
     @property
     def soft_wall_m2(self) -> float:
         """The same for d3^2 at a cell of the relay wall."""
-        return self.relay.cell_m2 / self.solid_angle
+        return contact_m2(self.relay.cell_m2, self.solid_angle)
 
     @cached_property
     def beam_weight(self) -> Array:

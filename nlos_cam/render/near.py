@@ -1,5 +1,7 @@
 """Near contact: 1 / d^2 from the middle of a cell is its average only from afar."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,6 +9,15 @@ Array = NDArray[np.float64]
 
 NEAR_DIAGONALS = 4
 """Near contact begins at this many diagonals of the larger cell."""
+MANY = 1.2
+"""Neighbours take their share too: without this a plane of square cells takes 7 % more than was sent. It suffices for
+cells up to twice as long as wide."""
+Area = TypeVar("Area", Array, float)
+
+
+def contact_m2(area_m2: Area, solid_angle: float) -> Area:
+    """What near contact adds to d^2 at one cell of many: with it, a plane of cells takes no more than was sent."""
+    return MANY * area_m2 / solid_angle
 
 
 def softened(squared_m2: Array, soft_m2: Array | float, near_m: float) -> Array:
