@@ -8,7 +8,6 @@ from nlos_cam.render.echo import pulse_bins
 from nlos_cam.render.effects import Effects, Plan, decide
 from nlos_cam.render.relay import occluder_edge
 from nlos_cam.render.stage import Stage
-from nlos_cam.render.surface import brdf_range
 from nlos_cam.render.survey import CAUTION, occluder_meets, shaded
 
 Finding = tuple[str, float, str]
@@ -69,18 +68,20 @@ def _tilt(stage: Stage) -> Finding:
     if stage.patches is None or stage.light is None:
         return "tilt", 0.0, "nothing to tilt"
     steepest = sqrt(max(float(stage.patches.beta.max()) ** 2 - 1, 0.0))
-    return "tilt", stage.light.tilt if steepest else 0.0, f"steepest slope {steepest:.3g}"
+    low, high = stage.brdf_range
+    bound = stage.light.tilt if low == high else 1.0  # a lobe turns by twice the tilt, and away from where it was seen
+    return "tilt", bound if steepest else 0.0, f"steepest slope {steepest:.3g}"
 
 
 def _brdf(stage: Stage) -> Finding:
     brdf = stage.scene.surface.brdf
     if stage.patches is None or brdf is None:
         return "brdf", 0.0, "the surface is Lambertian" if brdf is None else "nothing is hidden"
-    low, high = brdf_range(brdf)
+    low, high = stage.brdf_range
     cost = "tables for every direction that light comes from, some dozens times the cost"
     return (
         "brdf",
-        min((high - low) / high, 1.0) if high > 0 else 0.0,
+        min((high - low) / (2 * low), 1.0) if low > 0 else float(high > 0),  # the mean of both takes its place
         f"the BRDF runs from {low:.3g} to {high:.3g}: {cost}",
     )
 

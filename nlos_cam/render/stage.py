@@ -15,6 +15,7 @@ from nlos_cam.render.patches import Patches, clustered, coarser
 from nlos_cam.render.relay import Relay, occluder_edge, relay_cells
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sight import Sight, look
+from nlos_cam.render.surface import brdf_range
 from nlos_cam.render.survey import Survey, survey
 from nlos_cam.render.visibility import HeightField, height_field
 
@@ -93,7 +94,16 @@ class Stage:
         """The coarse look at the patches."""
         if self.patches is None:
             return None
-        return survey(self.beams(), self.patches, self.relay, occluder_edge(self.rig), lambertian=self.lambertian)
+        low, high = self.brdf_range
+        return survey(
+            self.job(self.beams(), self.patches, self.relay, occluder_edge(self.rig), self.field), high / max(low, 1e-9)
+        )
+
+    @cached_property
+    def brdf_range(self) -> tuple[float, float]:
+        """The least and the largest value of the surface's BRDF."""
+        brdf = self.scene.surface.brdf
+        return (1.0, 1.0) if brdf is None else brdf_range(brdf)
 
     @cached_property
     def sight(self) -> Sight | None:

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.render.beams import Beams
+from nlos_cam.render.job import Job
+from nlos_cam.render.near import softened
 from nlos_cam.render.patches import Patches
 from nlos_cam.render.relay import NO_OCCLUDER, Relay
 from nlos_cam.render.visibility import BIAS_CELLS, HeightField, occluded
@@ -33,6 +35,8 @@ class Survey:
     taken_cut: Array
     """How much more it would be without the occluder."""
     given_cut: Array
+    uneven: float
+    """How many times as much a BRDF may make one patch give as another."""
 
     @property
     def energy(self) -> Array:
@@ -41,7 +45,7 @@ class Survey:
 
     def share(self, change: Array) -> float:
         """A change of each patch's energy (n,) as a bound on the relative change of the whole, 1 being all or more."""
-        whole, part = float(self.energy.sum()), CAUTION * float(change.sum())
+        whole, part = float(self.energy.sum()), CAUTION * self.uneven * float(change.sum())
         return min(part / whole, 1.0) if whole > 0 else float(part > 0)
 
     @property
@@ -55,21 +59,26 @@ class Survey:
         return self.share((self.taken + self.taken_cut) * (self.given + self.given_cut) - self.energy)
 
 
-def survey(beams: Beams, patches: Patches, relay: Relay, edge_m: tuple[float, float], *, lambertian: bool) -> Survey:
-    """Look at some of the beams that light the wall, and some cells of a whole relay (none cut off by the occluder)."""
-    lit = np.flatnonzero(beams.on_wall)
-    lit = lit[:: max(len(lit) // SOME_BEAMS, 1)]
+def survey(job: Job, uneven: float) -> Survey:
+    """Look at some beams of a job, and some cells of its relay, which is whole: none cut off by the occluder.
+
+    `uneven` is how many times as much a BRDF may make one patch give as another.
+    """
+    patches, relay = job.patches, job.relay
+    lit = slice(None, None, max(len(job.foot_m) // SOME_BEAMS, 1))
     some = slice(None, None, max(len(relay.x_m) // SOME_CELLS, 1))
-    hidden = relay.behind(edge_m, beams.lidar_m)[some]
-    strength = patches.albedo * patches.beta
-    feet = beams.foot_m[lit, 0], beams.foot_m[lit, 1]
-    start = np.ones(len(lit)) if lambertian else beams.cos_incidence[lit]
-    end = (relay.cos_lidar if lambertian else np.ones_like(relay.x_m))[some] / relay.length_m[some] ** 2
-    shape = patches.point_m, patches.normal, patches.beta
-    taken = _sums(*shape, *feet, start, np.zeros(len(lit), np.bool_), *edge_m, lambertian, False)
-    given = _sums(*shape, relay.x_m[some], relay.y_m[some], end, hidden, *edge_m, lambertian, True)
-    scale = strength / max(len(lit), 1)
-    return Survey(taken[0] * scale, given[0], taken[1] * scale, given[1], taken[2] * scale, given[2])
+    shape, start = (patches.point_m, patches.normal, patches.beta), job.beam_weight[lit]
+    feet = job.foot_m[lit, 0], job.foot_m[lit, 1], start, np.zeros(len(start), np.bool_)
+    hidden = relay.behind(job.edge_m, job.lidar_m)[some]
+    cells = relay.x_m[some], relay.y_m[some], job.relay_weight[some], hidden
+    soft_wall = np.full_like(patches.beta, job.soft_wall_m2)
+    taken = _sums(*shape, *feet, job.soft_patch_m2, job.near_m, *job.edge_m, job.lambertian, False)
+    given = _sums(*shape, *cells, soft_wall, job.near_m, *job.edge_m, job.lambertian, True)
+    scale = job.strength / len(start)
+    return Survey(taken[0] * scale, given[0], taken[1] * scale, given[1], taken[2] * scale, given[2], uneven)
+
+
+_softened = numba.njit(cache=True)(softened)
 
 
 @numba.njit(cache=True, parallel=True)
@@ -81,6 +90,8 @@ def _sums(
     y: Array,
     weight: Array,
     hidden: NDArray[np.bool_],
+    soft: Array,
+    near_m: float,
     edge_x: float,
     edge_z: float,
     lambertian: bool,
@@ -93,7 +104,7 @@ def _sums(
         for w in range(len(x)):
             dx, dy, z = x[w] - point[0], y[w] - point[1], point[2]
             squared = dx * dx + dy * dy + z * z
-            length = np.sqrt(squared)
+            length = max(np.sqrt(squared), 1e-12)  # where the object touches the wall
             at_wall = z / length
             tilted = max(normal[0] * dx + normal[1] * dy - normal[2] * z, 0.0) / length
             # from the lidar a patch takes by its cosine and area, towards it gives (paper) whatever its cosine
@@ -101,7 +112,7 @@ def _sums(
             level = (at_wall if lambertian else (1.0 if at_wall > 0 else 0.0)) if outgoing else at_wall / beta[s]
             if outgoing or lambertian:
                 bent, level = bent * at_wall, level * at_wall
-            light = weight[w] / max(squared, 1e-12)
+            light = weight[w] / _softened(squared, soft[s], near_m)
             if hidden[w] or occluded(point[0], z, x[w], 0.0, edge_x, edge_z):
                 sums[2, s] += light * bent
             else:
