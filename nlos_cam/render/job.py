@@ -38,6 +38,8 @@ class Job:
     bin_m: float
     bins: int
     accuracy: Accuracy
+    map_foot_m: Array
+    """(k, 3); of every beam of the map: a BRDF is tabulated among these, whichever of them are rendered."""
     wall_m: tuple[float, float, float, float]
     """(x_min, x_max, y_min, y_max) of the physical wall, which inter-reflection goes over."""
     brdf: Brdf | None = None

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
+from nlos_cam.frames import MAP_ROWS
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.beams import Beams, gate_bins
 from nlos_cam.render.between import AROUND_M
@@ -17,7 +18,6 @@ from nlos_cam.render.patches import Patches
 from nlos_cam.render.relay import NO_OCCLUDER, Relay, occluder_edge
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.stage import Stage
-from nlos_cam.render.surface import brdf_range
 
 Array = NDArray[np.float64]
 
@@ -32,6 +32,10 @@ class Prepared:
     stage: Stage
     plan: Plan
     beams: Beams
+    """Those of the rows that are wanted."""
+    first_beam: int
+    map_beams: Beams
+    """Of the whole map: what is told from all beams does not depend on the rows."""
     relay: Relay
     edge_m: tuple[float, float]
     channels: int
@@ -52,10 +56,10 @@ class Prepared:
             hidden |= sight.hidden
         if not included(verdicts, "direct"):
             beams = beams.without_direct()
-        if rows is not None:
-            beams = beams.of_rows(rows[0] * accuracy.beams_per_cell, rows[1] * accuracy.beams_per_cell)
+        start, end = (row * accuracy.beams_per_cell for row in rows or (0, MAP_ROWS))
+        part, first = beams.of_rows(start, end), start * beams.shape[1]
         coloured = scene.surface.coloured and included(verdicts, "colour")
-        return cls(stage, verdicts, beams, stage.relay.kept(~hidden), edge, 3 if coloured else 1)
+        return cls(stage, verdicts, part, first, beams, stage.relay.kept(~hidden), edge, 3 if coloured else 1)
 
     def job(self, channel: int | None = None) -> Job | None:
         """The job of one channel of the albedo, or of their mean; None where no three-bounce path is wanted."""
@@ -65,13 +69,19 @@ class Prepared:
         if (patches := self._patches(channel)) is None:
             return None
         field = self.stage.field._replace(shades=included(self.plan, "self-occlusion"))
-        job = self.stage.job(self.beams, patches, self.relay, self.edge_m, field)
+        job = self.stage.job(self.map_beams, patches, self.relay, self.edge_m, field)
         if included(self.plan, "brdf"):
             job = replace(job, brdf=self.stage.scene.surface.brdf)
         if included(self.plan, "inter-reflection"):
             job = replace(job, more_bounces=True, bins=self._bins_with_detours(job))
+        job = self._of_rows(job)
         _refuse_too_large(job)
         return job
+
+    def _of_rows(self, job: Job) -> Job:
+        lit = np.flatnonzero(self.map_beams.on_wall)
+        wanted = (lit >= self.first_beam) & (lit < self.first_beam + len(self.beams.on_wall))
+        return job if wanted.all() else job.some(np.flatnonzero(wanted))
 
     def _patches(self, channel: int | None) -> Patches | None:
         stage, surface = self.stage, self.stage.scene.surface
@@ -79,7 +89,7 @@ class Prepared:
         if patches is not None and not included(self.plan, "tilt"):
             patches = patches.level()
         if patches is not None and surface.brdf is not None and not included(self.plan, "brdf"):
-            patches = replace(patches, albedo=patches.albedo * np.mean(brdf_range(surface.brdf)))
+            patches = replace(patches, albedo=patches.albedo * np.mean(stage.brdf_range))
         return patches
 
     def _bins_with_detours(self, job: Job) -> int:

@@ -33,11 +33,11 @@ def scattering(brdf: Brdf) -> Scattering:
         for s in numba.prange(len(points)):
             point, normal = points[s], normals[s]
             to_foot = foot - point
-            to_foot = to_foot / np.sqrt((to_foot**2).sum())
+            to_foot = to_foot / max(np.sqrt((to_foot**2).sum()), 1e-12)
             cos_in = (to_foot * normal).sum()
             for q in range(len(x)):
                 dx, dy = x[q] - point[0], y[q] - point[1]
-                d3 = np.sqrt(dx**2 + dy**2 + point[2] ** 2)
+                d3 = max(np.sqrt(dx**2 + dy**2 + point[2] ** 2), 1e-12)  # where the object touches the wall
                 cos_out = (normal[0] * dx + normal[1] * dy - normal[2] * point[2]) / d3
                 cos_between = (to_foot[0] * dx + to_foot[1] * dy - to_foot[2] * point[2]) / d3
                 table[s, q] = compiled(cos_in, cos_out, cos_between) if cos_in > 0 and cos_out > 0 else 0.0
@@ -49,8 +49,8 @@ def scattering(brdf: Brdf) -> Scattering:
 def scattered(brdf: Brdf, foot: Array, point: Array, normal: Array, out: Array) -> Array:
     """The same factor (n,) leg by leg: feet, points, normals and wall points (n, 3), for a look without compiling."""
     to_foot, to_wall = foot - point, out - point
-    to_foot /= np.linalg.norm(to_foot, axis=1, keepdims=True)
-    to_wall /= np.linalg.norm(to_wall, axis=1, keepdims=True)
+    to_foot /= np.maximum(np.linalg.norm(to_foot, axis=1, keepdims=True), 1e-12)
+    to_wall /= np.maximum(np.linalg.norm(to_wall, axis=1, keepdims=True), 1e-12)
     cos_in, cos_out = (to_foot * normal).sum(1), (to_wall * normal).sum(1)
     value = brdf(cos_in, cos_out, (to_foot * to_wall).sum(1))
     return np.where((cos_in > 0) & (cos_out > 0), value, 0.0)
@@ -61,7 +61,7 @@ def nodes(job: Job, brdf: Brdf) -> Iterator[tuple[Array, Array]]:
 
     Their columns and rows are quantiles of the feet's own, so that they are dense where the beams are.
     """
-    lines = _lines(job.foot_m, node_count(job, brdf))
+    lines = _lines(job.map_foot_m, node_count(job, brdf))
     hats = [_hats(job.foot_m[:, axis], line) for axis, line in enumerate(lines)]
     for i, x in enumerate(lines[0]):
         for j, y in enumerate(lines[1]):
@@ -79,10 +79,10 @@ def node_count(job: Job, brdf: Brdf) -> int:
     generator, patches, relay = np.random.default_rng(0), job.patches, job.relay
     s, q = generator.integers(len(patches.beta), size=PROBES), generator.integers(len(relay.x_m), size=PROBES)
     out = np.stack([relay.x_m[q], relay.y_m[q], np.zeros(PROBES)], 1)
-    foot = job.foot_m[generator.integers(len(job.foot_m), size=PROBES)]
+    foot = job.map_foot_m[generator.integers(len(job.map_foot_m), size=PROBES)]
     exact, count = scattered(brdf, foot, patches.point_m[s], patches.normal[s], out), 4
     while count < MOST_NODES:
-        corners = [_bracket(foot[:, axis], line) for axis, line in enumerate(_lines(job.foot_m, count))]
+        corners = [_bracket(foot[:, axis], line) for axis, line in enumerate(_lines(job.map_foot_m, count))]
         guess = np.zeros(PROBES)
         for i in (0, 1):
             for j in (0, 1):

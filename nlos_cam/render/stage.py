@@ -137,6 +137,7 @@ class Stage:
             bin_m=device.bin_m,
             bins=bins_of(beams, patches, relay, device),
             accuracy=self.accuracy,
+            map_foot_m=beams.foot_m[lit],
             wall_m=(wall.x_min_m, wall.x_max_m, wall.y_min_m, wall.y_max_m),
         )
 
