@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+BEAM_GROUP = 256
+"""Beams summed in one compiled call."""
+
 
 @numba.njit(cache=True, parallel=True)
 def legs(
@@ -148,39 +151,41 @@ def histograms(job: Job) -> Array:
 
 
 def _three_bounces(job: Job) -> Array:
-    if job.brdf is None:
-        return _some(job, slice(None), np.empty((0, 0)))
-    patches, relay, rows = job.patches, job.relay, list[Array]()
-    for p in range(len(job.foot_m)):
-        factor = scattering(job.brdf)(job.foot_m[p], patches.point_m, patches.normal, relay.x_m, relay.y_m)
-        rows.append(_some(job, slice(p, p + 1), factor))
-    return np.concatenate(rows)
+    """In groups of beams, between which Ctrl-C is heard: one beam at a time where a BRDF couples the legs."""
+    patches, relay, count = job.patches, job.relay, len(job.foot_m)
+    seen = _visible(job, relay.x_m, relay.y_m)
+    histogram, group = np.zeros((count, job.bins)), BEAM_GROUP if job.brdf is None else 1
+    for which in (slice(start, start + group) for start in range(0, count, group)):
+        factor = np.empty((0, 0))
+        if job.brdf is not None:
+            foot = job.foot_m[which.start]
+            factor = scattering(job.brdf)(foot, patches.point_m, patches.normal, relay.x_m, relay.y_m)
+        histogram[which] = _some(job, which, seen, factor)
+    return histogram
 
 
 def _more_bounces(job: Job) -> Array:
-    p, relay, (lit, seen) = job.patches, job.relay, _visible(job, job.foot_m)
+    p, relay = job.patches, job.relay
     surface = p.point_m, p.normal, job.strength, job.soft_patch_m2
-    wall = relay.x_m, relay.y_m, job.relay_weight, job.soft_wall_m2, seen
+    lit = _visible(job, job.foot_m[:, 0].copy(), job.foot_m[:, 1].copy())
+    wall = relay.x_m, relay.y_m, job.relay_weight, job.soft_wall_m2, _visible(job, relay.x_m, relay.y_m)
     taken, given = _ends(job.foot_m, job.beam_weight, lit, *surface, *wall, job.near_m, job.lambertian)
     return more_paths(job, taken, given)
 
 
-def _visible(job: Job, foot: Array) -> tuple[Mask, Mask]:
-    """V of the legs between patches and feet, and between patches and relay cells."""
-    p, relay = job.patches, job.relay
-    where = p.point_m, p.normal, p.row, p.column
-    to_feet = legs(*where, foot[:, 0].copy(), foot[:, 1].copy(), *job.edge_m, job.field)
-    return to_feet, legs(*where, relay.x_m, relay.y_m, *job.edge_m, job.field)
+def _visible(job: Job, x_m: Array, y_m: Array) -> Mask:
+    """V (n, m) of the legs between the job's patches and points of the wall."""
+    p = job.patches
+    return legs(p.point_m, p.normal, p.row, p.column, x_m, y_m, *job.edge_m, job.field)
 
 
-def _some(job: Job, which: slice, factor: Array) -> Array:
+def _some(job: Job, which: slice, seen: Mask, factor: Array) -> Array:
     patches, relay, foot = job.patches, job.relay, np.ascontiguousarray(job.foot_m[which])
-    lit, seen = _visible(job, foot)
     return _paths(
         foot,
         job.length_m[which],
         job.beam_weight[which],
-        lit,
+        _visible(job, foot[:, 0].copy(), foot[:, 1].copy()),
         patches.point_m,
         patches.normal,
         job.strength,
