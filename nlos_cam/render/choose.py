@@ -1,0 +1,180 @@
+"""The stop of the dial for a scene: the cheapest that keeps an error bound, or the most accurate within a time budget.
+
+Both are found out on the spot. The error: brute force on a few beams, and each stop on the same. The time: of a small
+share of the beams, in two sizes, since planning and tables are paid once and beams one by one. The look costs about as
+much as one beam in a hundred by brute force; the budget is for the rendering after it.
+"""
+
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos_cam.errors import SceneError
+from nlos_cam.render.accuracy import STOPS, Accuracy
+from nlos_cam.render.agreement import relative_error
+from nlos_cam.render.echo import spread, strongest
+from nlos_cam.render.effects import Effects, included
+from nlos_cam.render.kernels import BEAM_TILE
+from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.renderer import histograms
+from nlos_cam.render.scene import Scene
+
+Index = NDArray[np.int64]
+
+SAMPLE_BEAMS = 32
+"""At least so many are summed by brute force."""
+CAUTION = 1.5
+"""The largest error of a sample, times this, is at least the 99th percentile of all in nine draws of ten."""
+SHARE = 4
+"""One beam of this many is timed, and one of as many of those."""
+REPEATS = 3
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A stop, and what it may be expected to cost and to miss by."""
+
+    accuracy: Accuracy
+    predicted_error: float
+    """Of peak intensity: the 99th percentile of its relative error, rather too large than too small."""
+    predicted_seconds: float
+
+
+Work = Callable[[], NDArray[np.floating[Any]]]
+Stopwatch = Callable[[Work, int], float]
+"""The least seconds that a piece of work took, in a number of repeats."""
+
+
+def least_seconds(work: Work, repeats: int) -> float:
+    """A stopwatch by the clock."""
+    taken: list[float] = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - started)
+    return min(taken)
+
+
+def choose(
+    scene: Scene,
+    max_error: float | None = None,
+    max_seconds: float | None = None,
+    effects: Effects = "auto",
+    backend: str = "cpu",
+    *,
+    stops: Collection[Accuracy] = tuple(STOPS.values()),
+    stopwatch: Stopwatch = least_seconds,
+) -> Choice:
+    """The cheapest stop that keeps `max_error`; with `max_seconds` alone, the most accurate that keeps it.
+
+    Raises SceneError where none does, with what the nearest misses by, and where a bound is no bound.
+    """
+    for name, value in (("max_error", max_error), ("max_seconds", max_seconds)):
+        if value is not None and not 0 <= value < inf:
+            raise SceneError(f"{name} is {value}: it must be a finite number, not negative")
+    if max_error is None and max_seconds is None:
+        raise SceneError("neither max_error nor max_seconds is given: give one, or both")
+    return pick(predict(scene, effects, backend, stops, stopwatch), max_error, max_seconds)
+
+
+def pick(choices: Collection[Choice], max_error: float | None, max_seconds: float | None) -> Choice:
+    """The choice of `choose` among these."""
+    error, seconds = inf if max_error is None else max_error, inf if max_seconds is None else max_seconds
+    kept = [choice for choice in choices if choice.predicted_error <= error and choice.predicted_seconds <= seconds]
+    if not kept:
+        raise SceneError(_nothing_keeps(choices, error, seconds))
+    if max_error is None:
+        return min(kept, key=lambda choice: (choice.predicted_error, choice.predicted_seconds))
+    return min(kept, key=lambda choice: (choice.predicted_seconds, choice.predicted_error))
+
+
+def _nothing_keeps(choices: Collection[Choice], max_error: float, max_seconds: float) -> str:
+    def missed(choice: Choice) -> float:
+        return max(choice.predicted_error / max(max_error, 1e-9), choice.predicted_seconds / max(max_seconds, 1e-9))
+
+    nearest = min(choices, key=missed)
+    error, seconds = nearest.predicted_error, nearest.predicted_seconds
+    asked = [f"max_error {max_error:g}"] * (max_error < inf) + [f"max_seconds {max_seconds:g}"] * (max_seconds < inf)
+    over = [f"an error of {error:.3g} is {error - max_error:.3g} too large"] * (error > max_error)
+    over += [f"{seconds:.3g} s are {seconds - max_seconds:.3g} s too long"] * (seconds > max_seconds)
+    return (
+        f"no accuracy keeps {' and '.join(asked)}: the nearest is {nearest.accuracy.name}, where {' and '.join(over)}; "
+        "allow that much"
+    )
+
+
+def predict(
+    scene: Scene, effects: Effects, backend: str, stops: Collection[Accuracy], stopwatch: Stopwatch
+) -> list[Choice]:
+    """What each stop costs and misses by. One of them must be brute force, and all cast one beam per cell."""
+    (brute,) = (stop for stop in stops if stop.sub_bins == 0)
+    ready = Prepared.of(scene, brute, effects)
+    lit = np.flatnonzero(ready.beams.on_wall)
+    sample = some_of(lit, _whole_rounds(SAMPLE_BEAMS, 1))
+    truth = histograms(ready, ready.job(), backend, sample).max(1)
+    choices: list[Choice] = []
+    for stop in stops:
+        seconds = _seconds(scene, stop, effects, backend, lit, stopwatch)
+        if stop is brute:
+            choices.append(Choice(stop, 0.0, seconds))
+            continue
+        there = Prepared.of(scene, stop, effects)
+        found = histograms(there, there.job(), backend, sample).max(1)
+        error = CAUTION * float(relative_error(found, truth).max(initial=0.0))
+        choices.append(Choice(stop, error, seconds))
+    return choices
+
+
+def some_of(lit: Index, count: int) -> Index:
+    """About `count` of the beams, spread over the map: one at random, but always the same, from each strip."""
+    if len(lit) <= count:
+        return lit
+    edges = np.linspace(0, len(lit), count + 1)
+    within = np.random.default_rng(0).random(count)
+    return lit[(edges[:-1] + within * np.diff(edges)).astype(np.int64)]
+
+
+def _whole_rounds(beams: float, tile: int) -> int:
+    """At least so many beams that every thread has as many tiles of them as every other."""
+    one_round = tile * numba.get_num_threads()
+    return int(-(-beams // one_round)) * one_round
+
+
+def _seconds(scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: Index, stopwatch: Stopwatch) -> float:
+    """Seconds of a whole rendering, told from those of some beams and of some of those."""
+    if stop.sub_bins == 0:
+        tile, repeats, beams = 1, 1, SAMPLE_BEAMS
+    else:
+        tile, repeats, beams = BEAM_TILE, REPEATS, len(lit) / SHARE
+    few = some_of(lit, _whole_rounds(beams / SHARE, tile))
+    many = some_of(lit, max(_whole_rounds(beams, tile), 2 * len(few)))
+
+    def rendered(chosen: Index) -> Work:
+        return lambda: _render_some(scene, stop, effects, backend, chosen)
+
+    rendered(few)()  # compiles
+    of_few, of_many = (stopwatch(rendered(chosen), repeats) for chosen in (few, many))
+    if len(few) == len(many):
+        return of_many
+    each = max(of_many - of_few, 0.0) / (len(many) - len(few))
+    return of_many + each * (len(lit) - len(many))
+
+
+def _render_some(
+    scene: Scene, stop: Accuracy, effects: Effects, backend: str, chosen: Index
+) -> NDArray[np.floating[Any]]:
+    """The work of a rendering, for some of the beams."""
+    ready = Prepared.of(scene, stop, effects)
+    found = np.empty((0, 0))
+    for channel in [None] if ready.channels == 1 else [None, 0, 1, 2]:
+        found = histograms(ready, ready.job(channel), backend, chosen)
+        if included(ready.plan, "pulse") and scene.pulse_ns > 0:
+            found = spread(found.astype(np.float32), scene.pulse_ns, scene.rig.device.bin_m)
+        strongest(found, scene.rig.device.bin_m)
+    return found
