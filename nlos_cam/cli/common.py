@@ -59,14 +59,30 @@ def tracked(description: str) -> Generator[Callable[[int, int], None]]:
 def stop_on_signals() -> Generator[Event]:
     """An event that Ctrl-C or a request to terminate sets while the block lasts: the loop ends, results are told."""
     stop = Event()
+    with _on_signals(stop.set):
+        yield stop
 
+
+@contextmanager
+def interrupted_by_signals() -> Generator[None]:
+    """Ctrl-C or a request to terminate raises KeyboardInterrupt in the block, also where a shell had them ignored."""
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with _on_signals(interrupt):
+        yield
+
+
+@contextmanager
+def _on_signals(act: Callable[[], None]) -> Generator[None]:
     def on_signal(number: int, frame: FrameType | None) -> None:
         del number, frame
-        stop.set()
+        act()
 
     before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield stop
+        yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -46,7 +46,7 @@ class Choice:
     predicted_seconds: float
 
 
-Work = Callable[[], NDArray[np.floating[Any]]]
+Work = Callable[[], object]
 Stopwatch = Callable[[Work, int], float]
 """The least seconds that a piece of work took, in a number of repeats."""
 
