@@ -57,7 +57,7 @@ def share_outside(triangles_m: NDArray[np.float64], box: ObjectBox) -> float:
     points = triangles_m.reshape(-1, 3)
     (x0, y0, _), (x1, y1, _) = points.min(0), points.max(0)
     inside = min(x0 - box.x_min_m, box.x_max_m - x1, y0 - box.y_min_m, box.y_max_m - y1) >= -EDGE
-    if inside or x0 == x1 or y0 == y1:
+    if inside:
         return 0.0
     around = box.model_copy(update={"x_min_m": x0, "x_max_m": x1, "y_min_m": y0, "y_max_m": y1})
     x_m, y_m = cell_centres_m(around, FINE_PIXELS)

@@ -32,8 +32,8 @@ POSES: list[dict[str, Any]] = [
 def mesh(tmp_path: Path) -> str:
     corners = [(0, 0, 0), (1, 0, 0), (0, 0.6, 0), (0, 0, 0.4)]
     solid = trimesh.Trimesh(corners, [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], process=False)
-    solid.export(tmp_path / "wedge [1].stl")
-    return str(tmp_path / "wedge [1].stl")
+    solid.export(tmp_path / "wedge [b].stl")
+    return str(tmp_path / "wedge [b].stl")
 
 
 def _of_scene(rig: Rig = RIG, **fields: Any) -> np.ndarray:
@@ -73,16 +73,16 @@ def test_a_depth_map_is_taken_as_it_is(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_an_empty_depth_map_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(tmp_path / "none.npy", np.full((64, 64), np.nan))
-    assert np.isnan(hidden_depth(str(tmp_path / "none.npy"), RIG, {})).all()
+    np.save(tmp_path / "none [b].npy", np.full((64, 64), np.nan))
+    assert np.isnan(hidden_depth(str(tmp_path / "none [b].npy"), RIG, {})).all()
     told = capsys.readouterr().err
-    assert "none.npy is an empty object" in told
+    assert "none [b].npy is an empty object" in told
     assert told.count("\n") == 1
 
 
 def test_what_sticks_out_of_the_box_is_cut_and_told(mesh: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Half a wide plate: the box ends in its middle."""
-    plate = str(Path(mesh).with_name("plate.ply"))
+    plate = str(Path(mesh).with_name("plate [b].ply"))
     trimesh.creation.box(extents=(1, 0.2, 0.01)).export(plate)
     depth = hidden_depth(plate, RIG, {"size_m": 0.2, "x_m": 0.125})
     told = capsys.readouterr().err

@@ -4,6 +4,7 @@ import logging
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,7 @@ end_header
 3 0 2 3
 0 1
 """
+UNREADABLE = "string or file could not be read to its end due to unmatched data"
 WITHOUT_EXTRAS = """
 import sys
 from importlib.machinery import PathFinder
@@ -113,6 +115,24 @@ def test_the_parsers_log_stays_with_it(
     _read(tmp_path, "thing.stl", EXPORTS["binary.stl"])
     assert not caplog.records
     assert logging.getLogger("trimesh").level == before
+
+
+@pytest.mark.parametrize(("warning", "is_damage"), [(UNREADABLE, True), ("old fashioned", False)])
+def test_of_warnings_only_that_of_unreadable_numbers_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, warning: str, is_damage: bool
+) -> None:
+    """A newer numpy raises what an older one warns of, and then it goes on with the numbers before."""
+    load = trimesh.load_scene
+
+    def warns(*arguments: object, **named: object) -> object:
+        warnings.warn(warning, DeprecationWarning, stacklevel=1)
+        return load(*arguments, **named)
+
+    monkeypatch.setattr(trimesh, "load_scene", warns)
+    if is_damage:
+        assert "damaged" in _refused(tmp_path, "thing.stl", EXPORTS["text.stl"])
+    else:
+        assert len(_read(tmp_path, "thing.stl", EXPORTS["text.stl"]).triangles) == len(SOLID.faces)
 
 
 @pytest.mark.parametrize(

@@ -50,9 +50,10 @@ def test_a_meshs_path_starts_from_the_scenes_own_folder(tmp_path: Path, monkeypa
     assert scene.shows_at(0)
 
 
-def test_a_scene_with_a_mesh_survives_a_file_in_another_folder(tmp_path: Path) -> None:
+def test_a_scene_with_a_mesh_survives_a_file_in_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _wedge(tmp_path)
-    scene = _load(tmp_path, WEDGE.replace("[motion]", 'up = "z"\n\n[motion]'))
+    monkeypatch.chdir(tmp_path)
+    scene = _load(Path(), WEDGE.replace("[motion]", 'up = "z"\n\n[motion]'))
     (tmp_path / "elsewhere").mkdir()
     again = _load(tmp_path / "elsewhere", dump_toml(scene))
     assert again == scene
