@@ -24,7 +24,8 @@ from nlos_cam.objects.hidden import object_depth, object_depths
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import RENDERING_VERSION
-from nlos_cam.render.sensor import Sensor, SensorModel
+from nlos_cam.render.sensor import Sensor
+from nlos_cam.render.sensor_model import SensorModel
 
 TRAINING_SEED, HELD_OUT_SEED, TEST_SEED = 0, 10_000_000, 20_000_000
 """Objects that judge come from seeds that no training run reaches."""

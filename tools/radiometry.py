@@ -18,7 +18,7 @@ from nlos_cam.objects.hidden import object_depth
 from nlos_cam.render.beams import cast
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.sensor import SensorModel
+from nlos_cam.render.sensor_model import SensorModel
 
 DOCS = Path(__file__).parents[1] / "docs"
 RIG = load_rig("paper-rig")

@@ -114,21 +114,29 @@ def predict(
 ) -> list[Choice]:
     """What each stop costs and misses by. One of them must be brute force, and all cast one beam per cell."""
     (brute,) = (stop for stop in stops if stop.sub_bins == 0)
-    ready = Prepared.of(scene, brute, effects)
+    whole = Prepared.of(scene, brute, effects)
+    ready = Prepared.of(scene, brute, _three_bounces_of(whole))
     lit = np.flatnonzero(ready.beams.on_wall)
     sample = some_of(lit, _whole_rounds(SAMPLE_BEAMS, 1))
     truth = histograms(ready, ready.job(), backend, sample).max(1)
     choices: list[Choice] = []
     for stop in stops:
+        if stop is brute and included(whole.plan, "inter-reflection"):
+            continue
         seconds = _seconds(scene, stop, effects, backend, lit, stopwatch)
         if stop is brute:
             choices.append(Choice(stop, 0.0, seconds))
             continue
-        there = Prepared.of(scene, stop, effects)
+        there = Prepared.of(scene, stop, _three_bounces_of(Prepared.of(scene, stop, effects)))
         found = histograms(there, there.job(), backend, sample).max(1)
         error = CAUTION * float(relative_error(found, truth).max(initial=0.0))
         choices.append(Choice(stop, error, seconds))
     return choices
+
+
+def _three_bounces_of(ready: Prepared) -> Effects:
+    """What a plan includes, but for inter-reflection: path by path that would take hours."""
+    return [effect.name for effect in ready.plan if effect.included and effect.name != "inter-reflection"]
 
 
 def some_of(lit: Index, count: int) -> Index:

@@ -2,125 +2,29 @@
 
 import hashlib
 import tomllib
+from dataclasses import replace
 from math import pi, radians, sin
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any
 
 import numpy as np
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.rig import Record, Rig, first_problem, load_rig
 from nlos_calibration.wall_record import rig_named
-from pydantic import (
-    AfterValidator,
-    ConfigDict,
-    Field,
-    PlainSerializer,
-    PlainValidator,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
-from pydantic_core import PydanticCustomError
+from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.categories import CATEGORIES
 from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.files import MeshFile, Up, read_mesh, upright
-from nlos_cam.objects.hidden import Pose, Triangles, category_triangles, nothing_to_see, place
+from nlos_cam.objects.hidden import Pose, nothing_to_see, place
 from nlos_cam.objects.raster import orthographic_depth
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import SensorModel
+from nlos_cam.render.hidden_record import HiddenObject, Motion
+from nlos_cam.render.patches import JUMP_M
+from nlos_cam.render.scene import Radiometry, Scene
+from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.surface import Material
 
-RENDERING_VERSION = 1
+RENDERING_VERSION = 2
 """Raised with any change of what a scene renders to, so that cached worlds are rendered anew."""
-
-
-def _known(category: str) -> str:
-    if category not in CATEGORIES:
-        raise ValueError(f"no such category: choose one of {', '.join(CATEGORIES)}")
-    return category
-
-
-def _mesh(value: object) -> MeshFile:
-    if isinstance(value, MeshFile):
-        return value
-    if not isinstance(value, str | Path):
-        raise PydanticCustomError("mesh_file", "must be the path of a mesh")
-    try:
-        return read_mesh(Path(value))
-    except SceneError as error:
-        raise PydanticCustomError("mesh_file", "{problem}", {"problem": str(error)}) from error
-
-
-def _within(low: float, high: float) -> AfterValidator:
-    """A range that NaN is outside of, told as a whole."""
-
-    def check(value: float) -> float:
-        if not low <= value <= high:
-            raise PydanticCustomError("range", "must be from {low} to {high}", {"low": f"{low:g}", "high": f"{high:g}"})
-        return value
-
-    return AfterValidator(check)
-
-
-Mesh = Annotated[MeshFile, PlainValidator(_mesh), PlainSerializer(lambda mesh: str(mesh.path), str)]
-Size = Annotated[float, _within(0.001, 10)]
-Length = Annotated[float, _within(-10, 10)]
-Reach = Annotated[float, _within(0, 10)]
-Angle = Annotated[float, _within(-360, 360)]
-
-
-class HiddenObject(Record):
-    """One variation of a procedural category, or a mesh from a file, and how it stands at rest."""
-
-    category: Annotated[str, AfterValidator(_known)] | None = None
-    seed: int = Field(default=0, ge=0)
-    """Which variation of the category."""
-    size_m: Size = 0.18
-    """The larger of its extents along x and y, once turned: the unit of a mesh's file does not matter."""
-    tilt_x_deg: Angle = 0.0
-    tilt_y_deg: Angle = 0.0
-    turn_deg: Angle = 0.0
-    x_m: Length = 0.0
-    y_m: Length = 0.0
-    front_m: Reach = 0.03
-    """From the box's near side to the object's nearest point."""
-    file: Mesh | None = None
-    """A .obj, .stl or .ply; a path in a scene file starts from its folder."""
-    up: Up = "y"
-    """Which axis of the mesh's file points up."""
-
-    @model_validator(mode="after")
-    def _one_thing(self) -> Self:
-        if (self.category is None) == (self.file is None):
-            raise PydanticCustomError("one_thing", "give one of category and file")
-        if self.file and self.seed:
-            raise PydanticCustomError("seed", "seed is for a category: a file has no variations")
-        if self.category and self.up != "y":
-            raise PydanticCustomError("up", "up is for a file: a category stands with y up")
-        return self
-
-    @property
-    def label(self) -> str:
-        """What a message calls it: the category, or the file's path."""
-        return str(self.file.path) if self.file else str(self.category)
-
-    @property
-    def triangles(self) -> Triangles:
-        """(n, 3, 3), before it is placed: y up, -z towards the wall."""
-        return upright(self.file.triangles, self.up) if self.file else category_triangles(self.label, self.seed)
-
-
-class Motion(Record):
-    """A loop of poses: each quantity swings to and fro by its amplitude, at its own whole number of swings a loop."""
-
-    poses: int = Field(default=90, gt=0)
-    """At 30 poses a second."""
-    sway_x_m: Length = 0.0
-    sway_y_m: Length = 0.0
-    approach_m: Reach = 0.0
-    turn_deg: Angle = 0.0
-    tilt_deg: Angle = 0.0
 
 
 class SceneFile(Record):
@@ -134,6 +38,9 @@ class SceneFile(Record):
     """`object` in the file."""
     motion: Motion = Motion(poses=1)
     sensor: SensorModel = SensorModel()
+    radiometry: Radiometry = "paper"
+    jump_m: float = Field(default=JUMP_M, ge=0, allow_inf_nan=False)
+    """Neighbours further apart in depth than this are not one surface."""
 
     @field_validator("rig", mode="before")
     @classmethod
@@ -144,31 +51,36 @@ class SceneFile(Record):
     def checksum(self) -> str:
         """Twelve hexadecimal digits that change with anything that changes a rendering."""
         mesh = self.hidden.file if self.hidden else None
-        of_file = {"file"} if mesh else {"file", "up"}  # without a file: what it was before there were any
-        geometry = self.model_dump_json(exclude={"name": True, "sensor": True, "hidden": of_file})
-        content = mesh.sha256 if mesh else ""
-        return hashlib.sha256(f"{RENDERING_VERSION} {geometry}{content}".encode()).hexdigest()[:12]
+        seen = {"name": True, "sensor": True, "hidden": {"file"}}
+        facts = self.model_dump_json(exclude=seen), mesh and mesh.sha256, self.sensor.pulse_ns
+        return hashlib.sha256(f"{RENDERING_VERSION} {facts}".encode()).hexdigest()[:12]
 
     @property
     def poses(self) -> int:
         """How many instants the loop has."""
         return self.motion.poses if self.hidden else 1
 
-    def scene_at(self, number: int) -> Scene:
-        """The scene at one instant of the loop."""
+    @property
+    def bare(self) -> Scene:
+        """The scene with nothing hidden."""
+        material = self.hidden.material if self.hidden else Material()
+        return Scene(self.rig, None, material.surface, self.radiometry, self.jump_m, self.sensor.pulse_ns)
+
+    def scene_at(self, number: float) -> Scene:
+        """The scene at one instant of the loop; fractions lie between two frames."""
         if self.hidden is None:
-            return Scene(self.rig)
+            return self.bare
         if self.rig.object_box is None:
             raise SceneError(f"rig {self.rig.name!r} has no object_box to hide {self.hidden.label!r} in: add one")
         placed = place(self.hidden.triangles, self.pose_at(self.hidden, number), self.rig.object_box)
-        return Scene(self.rig, orthographic_depth(placed, self.rig.object_box))
+        return replace(self.bare, object_depth_m=orthographic_depth(placed, self.rig.object_box))
 
-    def shows_at(self, number: int) -> bool:
+    def shows_at(self, number: float) -> bool:
         """Whether the wall sees any of the object at one instant of the loop."""
         depth_m = self.scene_at(number).object_depth_m
         return depth_m is not None and bool(np.isfinite(depth_m).any())
 
-    def pose_at(self, rest: HiddenObject, number: int) -> Pose:
+    def pose_at(self, rest: HiddenObject, number: float) -> Pose:
         """The pose at one instant of the loop of what stands at rest as `rest` says."""
         turn, motion = 2 * pi * number / self.poses, self.motion
         return Pose(

@@ -12,7 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from nlos_calibration.rig import Record
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator
+from pydantic_core import PydanticCustomError
 
 from nlos_cam.errors import SceneError
 
@@ -52,11 +53,12 @@ class Material(Record):
     albedo: float | tuple[float, float, float] = 1.0
     """One, or three for red, green and blue."""
 
-    @model_validator(mode="after")
-    def _reflects_no_more_than_it_gets(self) -> "Material":
-        if not all(0 <= value <= 1 for value in np.atleast_1d(self.albedo)):
-            raise ValueError(f"albedo must lie in 0 to 1, not {self.albedo}")
-        return self
+    @field_validator("albedo")
+    @classmethod
+    def _no_more_than_it_gets(cls, albedo: float | tuple[float, float, float]) -> float | tuple[float, float, float]:
+        if not all(0 <= value <= 1 for value in np.atleast_1d(albedo)):
+            raise PydanticCustomError("albedo", "must lie in 0 to 1")
+        return albedo
 
     @property
     def surface(self) -> "Surface":

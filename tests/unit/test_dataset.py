@@ -16,7 +16,8 @@ from nlos_cam.dataset import DatasetPlan, build, procedural_images, read, sense_
 from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.objects.depth_image import image_from_depth
 from nlos_cam.objects.hidden import object_depth
-from nlos_cam.render.sensor import Sensor, SensorModel
+from nlos_cam.render.sensor import Sensor
+from nlos_cam.render.sensor_model import SensorModel
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft")
 COUNT, SHARD = 6, 2

@@ -5,10 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration.projection import Intrinsics
-from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Frame, LidarMaps, _edges, maps_from_frame
-from nlos_cam.render.sensor import Sensor, SensorModel
+from nlos_cam.render.sensor import cell_of_pixels
 
 SIZES = [(480, 640), (240, 320), (768, 1024), (64, 80), (100, 90), (32, 40)]
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)
@@ -143,9 +142,6 @@ def test_mirroring_the_frame_mirrors_the_maps() -> None:
 
 @pytest.mark.parametrize("size", SIZES[:3])
 def test_the_simulated_sensor_spreads_cells_as_maps_gather_them(size: tuple[int, int]) -> None:
-    rig = load_rig("bare-wall")
-    rows, columns = size
-    intrinsics = rig.intrinsics.model_copy(update={"height": rows, "width": columns})
-    cell = Sensor(rig.model_copy(update={"intrinsics": intrinsics}), SensorModel())._cell.reshape(size)
+    cell = cell_of_pixels(size, (MAP_ROWS, MAP_COLUMNS)).reshape(size)
     maps = _maps(cell + 1)
     np.testing.assert_array_equal(maps.depth_m.ravel(), np.arange(MAP_ROWS * MAP_COLUMNS) + 1)

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.scene_file import HiddenObject, Motion, SceneFile, bare_wall_scene, load_scene, paper_scene
-from nlos_cam.render.sensor import SensorModel
+from nlos_cam.render.sensor_model import SensorModel
 
 CUP = """
 name = "cup"

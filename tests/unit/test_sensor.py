@@ -1,35 +1,25 @@
-"""The sensor chain: truth within quantisation when noise is off, and each step of it when it is on."""
+"""The sensor on a rig: gain, dead pixels, confidence, range noise, beams per cell, repeatable frames."""
 
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import Occluder, Rig, load_rig
-from pydantic import ValidationError
+from nlos_calibration.rig import Occluder, load_rig
 
+from nlos_cam.errors import SceneError
 from nlos_cam.objects.hidden import object_depth
 from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import DEPTH_UNIT_M, MOST_CONFIDENT, SATURATED, SensedImages, Sensor, SensorModel
+from nlos_cam.render.sensor import SensedImages, Sensor, cell_of_pixels
+from nlos_cam.render.sensor_model import DEPTH_UNIT_M, MOST_CONFIDENT, SATURATED, SensorModel
 
 RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
-QUIET = SensorModel(
-    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0, bare_wall_counts=48
-)
+QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 NO_ECHO = MultiBounce(
     np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32), np.full((64, 80), np.nan, np.float32)
 )
-
-
-def _at_map_size(rig: Rig) -> Rig:
-    """The same rig with one pixel for each map cell."""
-    cells = rig.pinhole.scaled(80, 64)
-    intrinsics = rig.intrinsics.model_copy(
-        update={name: getattr(cells, name) for name in ("width", "height", "fx", "fy", "ppx", "ppy")}
-    )
-    return rig.model_copy(update={"intrinsics": intrinsics})
 
 
 def _generator(seed: int = 0) -> np.random.Generator:
@@ -44,28 +34,11 @@ def rendering() -> Rendering:
 
 @pytest.fixture(scope="module")
 def quiet(rendering: Rendering) -> SensedImages:
-    return Sensor(_at_map_size(RIG), QUIET).expose(rendering.multi, _generator())
-
-
-def test_without_noise_it_reports_the_renderers_winner_within_quantisation(
-    rendering: Rendering, quiet: SensedImages
-) -> None:
-    returned = quiet.depth_z16 > 0
-    assert returned.mean() > 0.5
-    assert not (returned & np.isnan(rendering.depth_m)).any()
-    error = quiet.depth_z16[returned] * DEPTH_UNIT_M - rendering.depth_m[returned]
-    assert np.abs(error).max() <= DEPTH_UNIT_M / 2 + 1e-6
-
-
-def test_without_noise_ir_is_linear_in_intensity_and_saturates(rendering: Rendering, quiet: SensedImages) -> None:
-    bare = _at_map_size(BARE)
-    gain = 48 / render(Scene(bare)).intensity.max()
-    counts = np.minimum(gain * rendering.intensity, SATURATED)
-    assert np.abs(quiet.ir - counts).max() <= 0.5 + 1e-3
+    return Sensor(RIG, QUIET).expose(rendering.multi, _generator())
 
 
 def test_the_frame_is_the_same_in_si_units(quiet: SensedImages) -> None:
-    frame = quiet.frame(_at_map_size(RIG).pinhole)
+    frame = quiet.frame(RIG.pinhole)
     np.testing.assert_array_equal(np.isnan(frame.depth_m), quiet.depth_z16 == 0)
     np.testing.assert_allclose(np.nan_to_num(frame.depth_m), quiet.depth_z16 * DEPTH_UNIT_M, rtol=1e-6)
     np.testing.assert_array_equal(frame.ir, quiet.ir)
@@ -158,16 +131,6 @@ def test_range_noise_has_the_spread_that_the_model_says() -> None:
     assert in_sigmas.std() == pytest.approx(1, abs=0.02)
 
 
-def test_read_and_shot_noise_add_in_squares() -> None:
-    flat = replace(NO_ECHO, peak=np.full((64, 80), 1e-3, np.float32), path_m=np.full((64, 80), 1.0, np.float32))
-    counts = float(Sensor(BARE, QUIET).expose(flat, _generator()).ir[240, 600])
-    model = QUIET.model_copy(update={"read_noise_counts": 3.0, "shot_noise": 0.5})
-    noisy = Sensor(BARE, model).expose(flat, _generator(1)).ir[:, 500:].astype(float)
-    assert 30 < counts < SATURATED - 30
-    assert noisy.mean() == pytest.approx(counts, abs=0.5)
-    assert noisy.std() == pytest.approx(np.sqrt(9 + 0.25 * counts), rel=0.02)
-
-
 def test_a_gate_shorter_than_every_path_leaves_black_images() -> None:
     device = BARE.device.model_copy(update={"gate_s": 0.1 / SPEED_OF_LIGHT_M_PER_S})
     images = Sensor(BARE.model_copy(update={"device": device}), SensorModel()).expose(NO_ECHO, _generator())
@@ -176,9 +139,45 @@ def test_a_gate_shorter_than_every_path_leaves_black_images() -> None:
     assert not images.confidence.any()
 
 
-@pytest.mark.parametrize(
-    ("field", "value"), [("bare_wall_counts", 0), ("shot_noise", -1), ("dead_share", 1.0), ("gain", 2)]
-)
-def test_a_model_that_cannot_be_names_its_field(field: str, value: float) -> None:
-    with pytest.raises(ValidationError, match=field):
-        SensorModel.model_validate({field: value})
+def _finer(multi: MultiBounce, k: int) -> MultiBounce:
+    """The same echoes from k x k equal beams in each cell."""
+    maps = (np.repeat(np.repeat(m, k, 0), k, 1) for m in (multi.peak, multi.runner_up, multi.path_m))
+    return MultiBounce(*maps)
+
+
+@pytest.mark.parametrize("k", [2, 3, 8])
+def test_equal_beams_in_a_cell_are_one_beam(rendering: Rendering, k: int) -> None:
+    sensor = Sensor(RIG, SensorModel())
+    one, many = (sensor.expose(multi, _generator()) for multi in (rendering.multi, _finer(rendering.multi, k)))
+    for name in ("depth_z16", "ir", "confidence"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+
+
+@pytest.mark.parametrize("k", [1, 2, 5])
+def test_a_pixel_takes_the_beam_whose_part_of_the_cell_holds_its_centre(k: int) -> None:
+    rows, columns = 64 * k, 80 * k
+    cell = cell_of_pixels((480, 640), (rows, columns)).reshape(480, 640)
+    row, column = np.divmod(cell, columns)
+    centre_row, centre_column = (np.arange(480) + 0.5) / 480, (np.arange(640) + 0.5) / 640
+    assert (np.abs(centre_row[:, None] - (row + 0.5) / rows) <= 0.5 / rows + 1e-12).all()
+    assert (np.abs(centre_column - (column + 0.5) / columns) <= 0.5 / columns + 1e-12).all()
+    np.testing.assert_array_equal(cell_of_pixels((rows, columns), (rows, columns)), np.arange(rows * columns))
+
+
+@pytest.mark.parametrize("shape", [(64, 81), (128, 80), (32, 40), (80, 64), (96, 120), (0, 0)])
+def test_maps_of_another_shape_are_refused(shape: tuple[int, int]) -> None:
+    empty = np.zeros(shape, np.float32)
+    with pytest.raises(SceneError, match=r"shape \(\d+, \d+\): give \(64 k, 80 k\)"):
+        Sensor(BARE, QUIET).expose(MultiBounce(empty, empty, empty), _generator())
+
+
+def test_a_direct_return_among_the_echoes_does_not_compete_again() -> None:
+    sensor = Sensor(BARE, QUIET)
+    faint = replace(NO_ECHO, peak=np.full((64, 80), 1e-9, np.float32), path_m=np.full((64, 80), 1.0, np.float32))
+    assert sensor.expose(faint, _generator()).ir.max() == 48
+    for echo in (NO_ECHO, faint):
+        assert not sensor.expose(replace(echo, direct_included=True), _generator()).ir.any()
+    strong = replace(faint, peak=np.full((64, 80), 1.0, np.float32))
+    apart, mixed = (sensor.expose(replace(strong, direct_included=mixed), _generator()) for mixed in (False, True))
+    np.testing.assert_array_equal(apart.depth_z16, mixed.depth_z16)
+    assert (mixed.confidence >= apart.confidence).all()

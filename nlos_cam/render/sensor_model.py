@@ -1,0 +1,38 @@
+"""What a sensor is like: its gain, pulse, ambient light and noise as a validated record, and the device's constants."""
+
+from nlos_calibration.rig import Record
+from pydantic import Field
+
+DEPTH_UNIT_M = 0.00025
+"""The L515's Z16 unit."""
+FARTHEST = 65535
+"""The most that Z16 holds, in its unit."""
+SATURATED = 255
+"""The full scale of the IR's 8 bits, in counts."""
+MOST_CONFIDENT = 15
+SURE_COUNTS = 6.0
+"""IR counts at which the signal alone gives 63 % of the confidence it can give."""
+
+
+class SensorModel(Record):
+    """Gain, pulse, ambient light and noise. Every field at 0 (and the gain) leaves saturation and quantisation alone.
+
+    Light is counted in IR counts before saturation, which are linear in it.
+    """
+
+    bare_wall_counts: float = Field(default=48.0, gt=0, le=1e6)
+    """IR counts of the brightest bare-wall return: fixes the gain."""
+    pulse_ns: float = Field(default=0.0, ge=0, le=100, allow_inf_nan=False)
+    """Full width of the laser's pulse at half its maximum. 1 ns is 0.3 m of path; 0 is a pulse shorter than any bin."""
+    ambient_counts: float = Field(default=0.0, ge=0, lt=SATURATED, allow_inf_nan=False)
+    """Steady light on the detector beside the echo. The device subtracts its mean: the data sheet calls the IR the
+    intensity of the reflected laser, not the scene's. Left of it are its shot noise, the counts it takes of the 8
+    bits, which saturate that much earlier, and the confidence it costs."""
+    range_noise_m: float = Field(default=0.0005, ge=0, le=10)
+    range_noise_per_m: float = Field(default=0.002, ge=0, le=1)
+    """Standard deviation of range: the one, plus the other for each metre of depth."""
+    read_noise_counts: float = Field(default=0.7, ge=0, le=SATURATED)
+    shot_noise: float = Field(default=0.3, ge=0, le=SATURATED)
+    """Standard deviation over the square root of the counts: 1 / shot_noise^2 photoelectrons make a count."""
+    dead_share: float = Field(default=0.002, ge=0, lt=1)
+    """Share of pixels that never give depth; which ones is a matter of the sensor, not of the frame."""

@@ -1,0 +1,61 @@
+"""The stages of the sensor, one by one."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nlos_cam.render.sensor_chain import Chain, Echoes, compete, noise_counts, quantise, saturate, surety
+
+NO_STAGE = Chain(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NOISY = NO_STAGE._replace(read_variance=0.49, shot_variance=0.09)
+COUNTS = st.floats(0, 1e4)
+
+
+@given(st.floats(-1e3, 1e3))
+def test_quantising_moves_by_half_a_unit_at_most_within_the_range(value: float) -> None:
+    whole = quantise(value, 255)
+    assert abs(whole - min(max(value, 0.0), 255.0)) <= 0.5
+
+
+@pytest.mark.parametrize(("value", "whole"), [(np.nan, 0), (-np.inf, 0), (np.inf, 255), (1e300, 255), (0.5, 1)])
+def test_what_is_no_number_is_nothing_and_what_is_too_much_is_the_most(value: float, whole: int) -> None:
+    assert quantise(value, 255) == whole
+
+
+@pytest.mark.parametrize(
+    ("own", "peak", "outcome"),
+    [
+        (2.0, 2.0, (False, 2.0, 2.0)),
+        (2.0, 2.5, (True, 2.5, 2.0)),
+        (0.1, 2.5, (True, 2.5, 0.5)),
+        (2.0, 1.0, (False, 2.0, 1.0)),
+    ],
+)
+def test_a_tie_goes_to_the_direct_return(own: float, peak: float, outcome: tuple[bool, float, float]) -> None:
+    echoes = Echoes(*(np.array([0.0, value], np.float32) for value in (peak, 0.5, 1.0)))
+    assert compete(own, echoes, 1) == outcome
+
+
+@given(COUNTS, st.floats(0, 254))
+def test_shot_and_read_noise_add_in_squares(counts: float, ambient: float) -> None:
+    shot, read = NOISY._replace(read_variance=0.0), NOISY._replace(shot_variance=0.0)
+    light = counts + ambient
+    squares = noise_counts(light, shot) ** 2 + noise_counts(light, read) ** 2
+    assert noise_counts(light, NOISY) ** 2 == pytest.approx(squares)
+
+
+@given(COUNTS, st.floats(0, 254))
+def test_below_full_scale_ambient_light_leaves_no_pedestal(counts: float, ambient: float) -> None:
+    left = saturate(counts + ambient, NO_STAGE._replace(ambient_counts=ambient))
+    assert left == pytest.approx(min(counts, 255 - ambient))
+
+
+@given(COUNTS, st.floats(0, 1), st.floats(0, 254))
+def test_surety_is_a_share_that_rises_with_signal_and_margin(counts: float, margin: float, ambient: float) -> None:
+    chain = NOISY._replace(ambient_counts=ambient)
+    sure = surety(counts, margin, chain)
+    assert 0 <= sure <= 1
+    assert sure <= surety(1.1 * counts, margin, chain)
+    assert sure <= surety(counts, (1 + margin) / 2, chain)
+    assert sure <= surety(counts, margin, NOISY)

@@ -1,0 +1,134 @@
+"""Verdicts of the sensor: a stage is in exactly when the model has it, and out it costs nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.render import sensor as sensor_module
+from nlos_cam.render.effects import included
+from nlos_cam.render.renderer import MultiBounce
+from nlos_cam.render.sensor import SensedImages, Sensor
+from nlos_cam.render.sensor_effects import sensor_effects
+from nlos_cam.render.sensor_model import DEPTH_UNIT_M, SensorModel
+
+BARE = load_rig("bare-wall")
+CHAIN = (
+    "gain",
+    "ambient light",
+    "shot noise",
+    "read noise",
+    "saturation",
+    "range noise",
+    "quantisation",
+    "dead pixels",
+)
+FORMAT = {"gain", "saturation", "quantisation"}
+QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
+HAS = {
+    "ambient light": {"ambient_counts": 60.0, "shot_noise": 0.3},
+    "shot noise": {"shot_noise": 0.3},
+    "read noise": {"read_noise_counts": 0.7},
+    "range noise": {"range_noise_m": 0.001},
+    "dead pixels": {"dead_share": 0.05},
+}
+LACKS = {
+    "ambient light": {"ambient_counts": 0.0},
+    "shot noise": {"shot_noise": 0.0},
+    "read noise": {"read_noise_counts": 0.0},
+    "range noise": {"range_noise_m": 0.0, "range_noise_per_m": 0.0},
+    "dead pixels": {"dead_share": 0.0},
+}
+RICH = SensorModel(ambient_counts=60, dead_share=0.05)
+
+
+def _flat(counts: float) -> MultiBounce:
+    gain = Sensor(BARE, QUIET)._chain.gain
+    peak = np.full((64, 80), counts / gain, np.float32)
+    return MultiBounce(peak, np.zeros_like(peak), np.ones_like(peak), direct_included=True)
+
+
+def _seen(model: SensorModel, counts: float) -> SensedImages:
+    return Sensor(BARE, model).expose(_flat(counts), np.random.default_rng(4))
+
+
+def _turned(model: SensorModel, name: str, counts: float, monkeypatch: pytest.MonkeyPatch) -> SensedImages:
+    """The images where one verdict is turned round."""
+    turned = tuple(replace(e, included=not e.included) if e.name == name else e for e in sensor_effects(model))
+    with monkeypatch.context() as patch:
+        patch.setattr(sensor_module, "sensor_effects", lambda _: turned)
+        return _seen(model, counts)
+
+
+def _same(one: SensedImages, other: SensedImages) -> bool:
+    return all(np.array_equal(getattr(one, n), getattr(other, n)) for n in ("depth_z16", "ir", "confidence"))
+
+
+@pytest.mark.parametrize("name", HAS)
+def test_a_stage_is_called_for_exactly_when_the_model_has_it(name: str) -> None:
+    bare, rich = sensor_effects(QUIET.model_copy(update=HAS[name])), sensor_effects(RICH.model_copy(update=LACKS[name]))
+    assert included(bare, name)
+    assert {e.name for e in rich if not e.included} == {name}
+    assert next(e.bound for e in rich if e.name == name) == 0
+
+
+@pytest.mark.parametrize("model", [SensorModel(), QUIET, RICH], ids=["default", "quiet", "rich"])
+def test_the_chain_has_its_order_and_its_reasons(model: SensorModel) -> None:
+    verdicts = sensor_effects(model)
+    assert tuple(effect.name for effect in verdicts) == CHAIN
+    for effect in verdicts:
+        assert effect.included == (effect.bound > 0)
+        assert ("metres" in effect.reason or "relative L1" in effect.reason) == effect.included
+    assert {e.name for e in verdicts if e.included} >= FORMAT
+
+
+@pytest.mark.parametrize("name", HAS)
+def test_leaving_out_what_the_model_has_changes_the_images(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = QUIET.model_copy(update=HAS[name])
+    assert not _same(_seen(model, 30.0), _turned(model, name, 30.0, monkeypatch))
+
+
+@pytest.mark.parametrize("name", HAS)
+def test_forcing_in_what_the_model_lacks_changes_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _same(_seen(QUIET, 30.0), _turned(QUIET, name, 30.0, monkeypatch))
+
+
+@pytest.mark.parametrize(
+    ("name", "deviates"), [("shot noise", 1), ("read noise", 1), ("range noise", 1), ("dead pixels", 0), ("none", 0)]
+)
+def test_noise_that_is_left_out_is_not_drawn(name: str, deviates: int) -> None:
+    sensor, drawn, counted = (
+        Sensor(BARE, QUIET.model_copy(update=HAS.get(name, {}))),
+        *map(np.random.default_rng, (7, 7)),
+    )
+    sensor.expose(_flat(30.0), drawn)
+    counted.standard_normal((deviates, 640 * 480), np.float32)
+    assert drawn.bit_generator.state == counted.bit_generator.state
+
+
+@pytest.mark.parametrize("name", ["ambient light", "shot noise", "read noise"])
+@pytest.mark.parametrize("counts", [1.0, 5.0, 30.0, 120.0, 195.0, 250.0])
+def test_the_ir_changes_by_no_more_than_the_bound(name: str, counts: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    bound = next(e.bound for e in sensor_effects(RICH) if e.name == name)
+    with_it, without = _seen(RICH, counts).ir.astype(float), _turned(RICH, name, counts, monkeypatch).ir.astype(float)
+    assert np.abs(with_it - without).mean() <= bound * counts
+
+
+def test_the_depth_changes_by_no_more_than_the_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    bounds = {e.name: e.bound for e in sensor_effects(RICH)}
+    seen = _seen(RICH, 30.0).depth_z16.astype(float)
+    still = _turned(RICH, "range noise", 30.0, monkeypatch).depth_z16.astype(float)
+    assert 0 < np.abs(seen - still).mean() * DEPTH_UNIT_M <= bounds["range noise"]
+    whole = _turned(RICH, "dead pixels", 30.0, monkeypatch).depth_z16.astype(float)
+    assert np.abs(seen - whole).sum() / whole.sum() == pytest.approx(bounds["dead pixels"], rel=0.05)
+
+
+def test_saturation_and_quantisation_are_all_that_parts_the_images_from_the_light() -> None:
+    for counts in (0.6, 47.7, 254.2, 700.3):
+        seen = _seen(QUIET, counts)
+        assert np.unique(seen.ir) == [min(round(counts), 255)]
+        depth_m = 0.5 * Sensor(BARE, QUIET)._optics.cos_axis.reshape(seen.ir.shape)
+        apart = np.abs(seen.depth_z16 * DEPTH_UNIT_M - depth_m)[seen.confidence > 0]
+        bound = next(e.bound for e in sensor_effects(QUIET) if e.name == "quantisation")
+        assert bound / 2 < apart.max() <= bound + 1e-7
