@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.render.beams import Beams
+from nlos_cam.render.between import AROUND_M
 from nlos_cam.render.job import Job
 from nlos_cam.render.near import softened
 from nlos_cam.render.patches import Patches
@@ -129,7 +130,9 @@ def occluder_meets(edge_m: tuple[float, float], patches: Patches, beams: Beams, 
         return True
     feet = beams.foot_m[beams.on_wall, 0]
     x, z = patches.point_m[:, 0], patches.point_m[:, 2]
-    least, most = min(relay.x_m.min(), feet.min(initial=np.inf)), max(relay.x_m.max(), feet.max(initial=-np.inf))
+    # inter-reflection goes over the wall about the object too
+    least = min(relay.x_m.min(), feet.min(initial=np.inf), x.min() - AROUND_M)
+    most = max(relay.x_m.max(), feet.max(initial=-np.inf), x.max() + AROUND_M)
     with np.errstate(divide="ignore", invalid="ignore"):
         from_right = (x > edge_m[0]) & (least < edge_m[0]) & (z * (edge_m[0] - least) / (x - least) >= edge_m[1])
         from_left = (x < edge_m[0]) & (most > edge_m[0]) & (z * (most - edge_m[0]) / (most - x) >= edge_m[1])
