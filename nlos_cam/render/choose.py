@@ -2,7 +2,7 @@
 
 Both are found out on the spot. The error: brute force on a few beams, and each stop on the same. The time: of a small
 share of the beams, in two sizes, since planning and tables are paid once and beams one by one. The look costs about as
-much as one beam in a hundred by brute force; the budget is for the rendering after it.
+much as three beams in a hundred by brute force; the budget is for the rendering after it.
 """
 
 import time

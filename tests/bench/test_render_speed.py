@@ -1,0 +1,16 @@
+"""Seconds of the dial's quick stops on the default scene: `pytest tests/bench -m bench --benchmark-enable`."""
+
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from nlos_cam.render.renderer import render
+from nlos_cam.render.scene_file import paper_scene
+
+
+@pytest.mark.bench
+@pytest.mark.parametrize("stop", ["draft", "standard", "fine"])
+def test_a_stop_of_the_dial(benchmark: BenchmarkFixture, stop: str) -> None:
+    scene = paper_scene().scene_at(0)
+    render(scene, stop)  # compiles
+    rendering = benchmark(render, scene, stop)
+    assert rendering.accuracy.name == stop
