@@ -170,15 +170,17 @@ def test_the_choice_keeps_what_was_asked() -> None:
     assert choose(scene, max_seconds=10.0, stops=SMALL, stopwatch=watch).accuracy.name == "fine"
 
 
-def test_what_an_effect_is_asked_for_is_what_is_timed() -> None:
+def test_the_effects_that_are_asked_for_are_timed_and_compared() -> None:
     seen: list[float] = []
 
     def watch(work: Work, repeats: int) -> float:
         seen.append(float(np.abs(work()).max()))
         return float(repeats)
 
-    choose(_scene(), 1.0, effects=["direct"], stops=SMALL, stopwatch=watch)
+    found = predict(_scene(), ["direct"], "cpu", SMALL, watch)
     assert max(seen) == 0  # no third bounce was asked for
+    assert all(choice.predicted_error == 0 for choice in found)
+    assert choose(_scene(), 0.0, effects=["direct"], stops=SMALL, stopwatch=by_rows(1, 0)).accuracy.name != "reference"
 
 
 def test_where_nothing_is_hidden_every_stop_is_exact() -> None:
