@@ -61,7 +61,7 @@ class _Stage:
             np.float32(accuracy.sub_bins / job.bin_m),
             accuracy.sectors if job.field.shades else 0,
         )
-        self.width = _width(job)
+        self.width = table_width(job)
 
     def histograms(self, factor: Float32, share: Array) -> Float32:
         """Histograms (n, bins) of the beams, each taken to some share (n,)."""
@@ -107,7 +107,7 @@ def horizons(job: Job) -> tuple[Float32, Float32]:
     return horizon_table(field, *where, accuracy.sectors)
 
 
-def _width(job: Job) -> int:
+def table_width(job: Job) -> int:
     """Bins from the shortest to the longest d3 + d4 of any patch, in whole vectors.
 
     The sum is convex over the wall: longest at a corner of the relay, and never shorter than the straight way to the

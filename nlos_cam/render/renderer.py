@@ -1,7 +1,9 @@
 """`render`: a scene to the depth and intensity maps that a lidar of highest-echo kind reports (S1 to S5)."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,10 @@ from nlos_cam.render.scene import Scene
 
 Array = NDArray[np.float64]
 Implementation = Callable[[Job], NDArray[np.floating[Any]]]
+BACKENDS = "cpu", "torch", "cuda"
+"""numba; torch on the CPU; torch on a GPU."""
+TOGETHER = 16
+"""Objects that torch works on at a time: by then starting its kernels takes next to nothing of their time."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +60,14 @@ def render(
     Raises SceneError for a scene that cannot be rendered.
     """
     ready = Prepared.of(scene, accuracy_named(accuracy), effects, rows)
-    job, beams = ready.job(), ready.beams
-    multi = _echoes(ready, job, backend).of(beams.shape)
-    maps = compete(beams, multi)
+    job = ready.job()
+    return _rendered(ready, job, None if job is None else implementation(job.accuracy, backend)(job), backend)
+
+
+def _rendered(ready: Prepared, job: Job | None, found: NDArray[np.floating[Any]] | None, backend: str) -> Rendering:
+    """What the lidar reports, from the histograms (n, bins) of a job's beams."""
+    multi = _echoes(ready, found).of(ready.beams.shape)
+    maps = compete(ready.beams, multi)
     colour = _colour(ready, multi, backend) if ready.channels == 3 else None
     near = near_legs(job) if job else 0
     return Rendering(*_cells(*maps), multi, ready.plan, ready.stage.accuracy, near, colour)
@@ -64,9 +75,15 @@ def render(
 
 def render_all(
     scenes: Iterable[Scene], accuracy: str | Accuracy = "standard", effects: Effects = "auto", backend: str = "cpu"
-) -> Iterable[Rendering]:
-    """Render a batch, one after another; what depends on the rig alone is worked out once."""
-    return (render(scene, accuracy, effects, backend) for scene in scenes)
+) -> Iterator[Rendering]:
+    """Render a batch: what depends on the rig alone is worked out once, and torch takes many objects at a time."""
+    stop, rest = accuracy_named(accuracy), iter(scenes)
+    while some := list(islice(rest, 1 if backend == "cpu" else TOGETHER)):
+        ready = [Prepared.of(scene, stop, effects) for scene in some]
+        jobs = [one.job() for one in ready]
+        found = iter(_histograms_of_all([job for job in jobs if job is not None], stop, backend))
+        for one, job in zip(ready, jobs, strict=True):
+            yield _rendered(one, job, None if job is None else next(found), backend)
 
 
 def transient(
@@ -101,33 +118,51 @@ def histograms(
     """The same of what is prepared already; 0 where a beam does not light the wall."""
     lit = ready.beams.on_wall
     chosen = np.arange(len(lit)) if chosen is None else chosen
-    if job is None:
-        return np.zeros((len(chosen), 1), np.float32)
     wanted = chosen[lit[chosen]]
+    if job is None:
+        return _spread_over(lit[chosen], None)
     some = job if len(wanted) == len(job.foot_m) else job.some((np.cumsum(lit) - 1)[wanted])
-    found = implementation(job.accuracy, backend)(some)
-    every = np.zeros((len(chosen), found.shape[1]), found.dtype)
-    every[lit[chosen]] = found
+    return _spread_over(lit[chosen], implementation(job.accuracy, backend)(some))
+
+
+def _spread_over(lit: NDArray[np.bool_], found: NDArray[np.floating[Any]] | None) -> NDArray[np.floating[Any]]:
+    """The histograms (k, bins) of lit beams as those (n, bins) of all, 0 for the others."""
+    if found is None:
+        return np.zeros((len(lit), 1), np.float32)
+    every = np.zeros((len(lit), found.shape[1]), found.dtype)
+    every[lit] = found
     return every
 
 
 def implementation(accuracy: Accuracy, backend: str) -> Implementation:
-    """Which of the three renders at an accuracy. Raises SceneError where there is no such backend."""
+    """Which of the three renders at an accuracy. Raises SceneError where there is no such backend, or no GPU for it."""
+    if backend not in BACKENDS:
+        raise SceneError(f"no backend {backend!r}: choose one of {', '.join(BACKENDS)}")
     if accuracy.sub_bins == 0:
         return reference.histograms
-    if backend != "cpu":
-        raise SceneError(f"no backend {backend!r}: choose cpu")
-    return cpu.histograms
+    if backend == "cpu":
+        return cpu.histograms
+    from nlos_cam.render import cuda  # torch takes a second to import
+
+    return partial(cuda.histograms, device=cuda.device_named(backend))
 
 
-def _echoes(ready: Prepared, job: Job | None, backend: str) -> MultiBounce:
+def _histograms_of_all(jobs: Sequence[Job], accuracy: Accuracy, backend: str) -> list[NDArray[np.floating[Any]]]:
+    one_by_one = implementation(accuracy, backend)
+    if backend == "cpu" or accuracy.sub_bins == 0:
+        return [one_by_one(job) for job in jobs]
+    from nlos_cam.render import cuda
+
+    return [*cuda.histograms_of_all(jobs, cuda.device_named(backend))]
+
+
+def _echoes(ready: Prepared, found: NDArray[np.floating[Any]] | None) -> MultiBounce:
     """The strongest bins (n,) of every beam: of three bounces, or with a pulse of some width of the whole waveform."""
-    beams, bin_m = ready.beams, ready.stage.rig.device.bin_m
+    lit, bin_m = ready.beams.on_wall, ready.stage.rig.device.bin_m
     if included(ready.plan, "pulse"):
-        return replace(strongest(_mixed(_of_all(ready, job, backend), ready), bin_m), direct_included=True)
-    if job is None:
-        return nothing(len(beams.on_wall))
-    return strongest(implementation(job.accuracy, backend)(job), bin_m).spread_over(beams.on_wall)
+        whole = _mixed(_spread_over(lit, found).astype(np.float32, copy=False), ready)
+        return replace(strongest(whole, bin_m), direct_included=True)
+    return nothing(len(lit)) if found is None else strongest(found, bin_m).spread_over(lit)
 
 
 def _of_all(ready: Prepared, job: Job | None, backend: str) -> Float32:
