@@ -1,5 +1,6 @@
 """`tradeoff render`: what accuracy costs in time, measured here and now against brute force."""
 
+from dataclasses import replace
 from json import dumps
 from pathlib import Path
 from typing import Annotated, Any
@@ -7,8 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
-from nlos_cam.objects.hidden import Pose, category_triangles, place
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.cli.hidden_object import hidden_depth
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import paper_scene
 from nlos_cam.render.tradeoff import Row, facts, measure, settings
@@ -32,7 +32,8 @@ def _group() -> None:
 def render(
     out: Annotated[Path | None, typer.Option("--out", help="A folder for table and plot.")] = None,
     category: Annotated[
-        str | None, typer.Option("--object", help="A category to hide; else the default scene's airplane.")
+        str | None,
+        typer.Option("--object", help="A category, mesh or depth map to hide; else the default scene's airplane."),
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Which variation of the category.")] = None,
     overwrite: Overwrite = False,
@@ -58,8 +59,7 @@ def _scene(category: str | None, seed: int) -> Scene:
     scene = paper_scene().scene_at(0)
     if category is None:
         return scene
-    triangles = place(category_triangles(category, seed), Pose(), scene.box)
-    return Scene(scene.rig, orthographic_depth(triangles, scene.box))
+    return replace(scene, object_depth_m=hidden_depth(category, scene.rig, {"seed": seed or None}))
 
 
 def _measured(scene: Scene, planned: int) -> tuple[list[Row], bool]:

@@ -11,12 +11,15 @@ from nlos_calibration.rig import dump_toml, load_rig
 
 from nlos_cam.cli.main import main
 from nlos_cam.objects.hidden import object_depth
+from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import HiddenObject, SceneFile
+from nlos_cam.render.sensor_effects import sensor_effects
+from nlos_cam.render.sensor_model import SensorModel
 
 RIG = load_rig("paper-rig")
-EFFECTS = ["direct", "three-bounce", "self-occlusion", "tilt", "occluder"]
+NAMES = [*EFFECTS, *(effect.name for effect in sensor_effects(SensorModel()))]
 
 
 def _depth() -> np.ndarray:
@@ -35,7 +38,7 @@ def test_a_category_becomes_maps_a_picture_and_an_account(tmp_path: Path, capsys
     result = json.loads(shown.out.splitlines()[-1])
     assert (result["accuracy"], result["out"]) == ("draft", str(out))
     assert result["seconds"] > 0
-    assert [effect["name"] for effect in result["effects"]] == EFFECTS
+    assert [effect["name"] for effect in result["effects"]] == NAMES
     assert all(set(e) == {"name", "included", "reason", "bound", "seconds"} for e in result["effects"])
     assert "self-occlusion" in shown.err
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")

@@ -110,7 +110,7 @@ def test_a_signal_during_brute_force_leaves_nothing(
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["--object", "teapot"], 1, "no object category 'teapot'"),
+        (["--object", "teapot"], 1, "no object 'teapot'"),
         (["--seed", "3"], 2, "--object"),
         (["--object", "cup", "--seed", "-1"], 2, ""),
     ],

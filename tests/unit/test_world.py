@@ -60,10 +60,10 @@ def test_the_loop_begins_again_with_other_noise(world: World) -> None:
     assert not np.array_equal(world.images(1).confidence, first.confidence)
 
 
-def test_the_truth_is_what_was_rendered(world: World) -> None:
+def test_the_truth_is_what_stood_there_in_the_middle_of_the_scan(world: World) -> None:
     for number in range(4):
         truth = world.truth_depth_m(number)
-        expected = world.scene.scene_at(number % 2).object_depth_m
+        expected = world.scene.scene_at(number % 2 + 0.5).object_depth_m
         assert truth is not None
         np.testing.assert_array_equal(truth, expected)
 
@@ -75,7 +75,7 @@ def test_a_cached_world_is_the_rendered_one(
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
     fresh = open_world(str(scene), lambda done, total: seen.append((done, total)))
     assert seen == [(1, 2), (2, 2)]
-    monkeypatch.setattr(module, "render", lambda *_: pytest.fail("rendered again"))
+    monkeypatch.setattr(module, "render_scan", lambda *_: pytest.fail("rendered again"))
     cached = open_world(str(scene), lambda done, total: seen.append((done, total)))
     assert len(seen) == 2
     for number in (0, 1, 5):
@@ -87,7 +87,7 @@ def test_a_cached_world_is_the_rendered_one(
 def test_the_same_scene_with_another_sensor_is_not_rendered_again(
     scene: Path, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "render", lambda *_: pytest.fail("rendered again"))
+    monkeypatch.setattr(module, "render_scan", lambda *_: pytest.fail("rendered again"))
     other = tmp_path / "scene.toml"
     other.write_text(scene.read_text(encoding="utf-8") + "sensor = { dead_share = 0.5 }\n", encoding="utf-8")
     harmed = open_world(str(other)).images(0)
