@@ -50,11 +50,11 @@ class Sites(NamedTuple):
 
 
 def lay_out(jobs: Sequence[Job], device: torch.device) -> tuple[Fields, Sites]:
-    """The fields and sites of jobs that share a grid; an object that shades nothing has an empty field."""
+    """The fields and sites of jobs that share a grid; an object that shades nothing has bounds of 0."""
     fields = [job.field for job in jobs]
     size = len(fields[0].depth_m)
     steps = max(max(f.last_row - f.first_row, f.last_column - f.first_column) for f in fields)
-    rows = torch.as_tensor(np.stack([f.depth_m if f.shades else np.full_like(f.depth_m, np.nan) for f in fields]))
+    rows = torch.as_tensor(np.stack([f.depth_m for f in fields]))
     columns = rows.transpose(1, 2)
     faces = torch.stack([columns, columns.flip(1), rows, rows.flip(1)], 1)
     padded = pad(faces, (1, 1, 0, steps), value=torch.nan).flatten().to(device, torch.float32)

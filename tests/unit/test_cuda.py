@@ -1,6 +1,8 @@
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +15,10 @@ from nlos_cam.render import cuda, kernels
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.job import Job
 from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.relay import NO_OCCLUDER
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
+from nlos_cam.render.surface import phong
 
 CPU = torch.device("cpu")
 RIG = load_rig("paper-rig")
@@ -65,6 +69,7 @@ def test_a_shifted_sum_is_what_a_loop_says() -> None:
     generator = torch.Generator().manual_seed(2)
     table, weight = torch.rand(4, 2, 3, generator=generator), torch.rand(4, 5, generator=generator)
     shift, at = torch.randint(0, 2, (4, 5), generator=generator), torch.randint(0, 14, (4, 5), generator=generator)
+    at[:, 4] = 13  # beyond the gate
     expected = torch.zeros(5, 12 + 3 + 2)
     for s in range(4):
         for p in range(5):
@@ -97,6 +102,31 @@ def test_jobs_come_back_in_their_order() -> None:
         alone = cuda.histograms(job, CPU)
         assert found.shape == alone.shape == (len(job.foot_m), job.bins)
         np.testing.assert_allclose(found, alone, rtol=1e-5, atol=1e-6 * alone.max())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"edge_m": NO_OCCLUDER},
+        {"lambertian": True},
+        {"bin_m": 0.02},
+        {"receiver_cell_m2": 1.0},
+        {"accuracy": replace(SMALL, sub_bins=2)},
+    ],
+)
+def test_jobs_that_differ_in_more_than_the_object_do_not_share_a_batch(change: dict[str, Any]) -> None:
+    job = _job(_scene(8))
+    other = replace(job, **change)
+    found = cuda.histograms_of_all([job, other], CPU)
+    np.testing.assert_allclose(found[1], cuda.histograms(other, CPU), rtol=1e-5, atol=1e-6 * found[1].max())
+
+
+@pytest.mark.parametrize("change", [{"brdf": phong(0.5, 0.5, 3.0)}, {"more_bounces": True}])
+def test_jobs_whose_tables_need_more_than_the_wall_stay_apart(change: dict[str, Any]) -> None:
+    jobs = [replace(_job(_scene(size), 10), **change) for size in (4, 3)]
+    for job, found in zip(jobs, cuda.histograms_of_all(jobs, CPU), strict=True):
+        np.testing.assert_allclose(found, cuda.histograms(job, CPU), rtol=1e-5, atol=1e-6 * found.max())
+        assert not np.allclose(found, cuda.histograms(replace(job, brdf=None, more_bounces=False), CPU), rtol=1e-3)
 
 
 def test_objects_that_shade_and_that_do_not_share_a_batch() -> None:

@@ -3,6 +3,7 @@ import pytest
 import torch
 from nlos_calibration.rig import Occluder, load_rig
 
+from nlos_cam.objects.depth_image import cell_centres_m, object_box
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.cuda_legs import Optics, Surface, Wall, legs, scattered
 from nlos_cam.render.job import Job
@@ -54,9 +55,9 @@ def test_a_free_leg_weighs_what_s2_says(radiometry: str, nearest_m: float) -> No
     np.testing.assert_allclose(weight.numpy()[free], expected[free], rtol=2e-4)
 
 
-@pytest.mark.parametrize("occluder_x_m", [0.2, 0.43, 1.0])
+@pytest.mark.parametrize("occluder_x_m", [0.2, 0.43, 1.0, float(cell_centres_m(object_box(RIG), 12)[0][5])])
 def test_occluder_and_lit_side_are_those_of_the_reference(occluder_x_m: float) -> None:
-    """The edge before, in the middle of, and behind the object."""
+    """The edge before, in the middle of, and behind the object; and right through a column of its patches."""
     job = _job(occluder_x_m=occluder_x_m)
     p, relay = job.patches, job.relay
     exact = exact_legs(p.point_m, p.normal, p.row, p.column, relay.x_m, relay.y_m, *job.edge_m, job.field)
