@@ -119,8 +119,8 @@ def histograms(
     lit = ready.beams.on_wall
     chosen = np.arange(len(lit)) if chosen is None else chosen
     wanted = chosen[lit[chosen]]
-    if job is None:
-        return _spread_over(lit[chosen], None)
+    if job is None or not wanted.size:
+        return _spread_over(lit[chosen], np.zeros((0, job.bins), np.float32) if job else None)
     some = job if len(wanted) == len(job.foot_m) else job.some((np.cumsum(lit) - 1)[wanted])
     return _spread_over(lit[chosen], implementation(job.accuracy, backend)(some))
 
