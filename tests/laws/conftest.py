@@ -1,0 +1,68 @@
+"""The implementations that every law of the renderer is held against, and a setting small enough for the brute force."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+import pytest
+
+from nlos_cam.render import renderer
+from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.render.effects import Effects
+from nlos_cam.render.job import Job
+from nlos_cam.render.scene import Scene
+
+IMPLEMENTATIONS = ("cpu", "reference")
+COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
+"""Small enough for the brute force to take milliseconds."""
+
+
+@dataclass(frozen=True)
+class Implementation:
+    """One of the renderers, by the same verbs."""
+
+    name: str
+
+    def _how(self, accuracy: Accuracy) -> tuple[Accuracy, str]:
+        return (replace(accuracy, sub_bins=0), "cpu") if self.name == "reference" else (accuracy, self.name)
+
+    def transient(self, scene: Scene, effects: Effects = "auto", accuracy: Accuracy = COARSE) -> np.ndarray:
+        setting, backend = self._how(accuracy)
+        return renderer.transient(scene, setting, effects, backend)
+
+    def render(self, scene: Scene, effects: Effects = "auto", accuracy: Accuracy = COARSE) -> renderer.Rendering:
+        setting, backend = self._how(accuracy)
+        return renderer.render(scene, setting, effects, backend)
+
+    def three_bounce(
+        self,
+        scene: Scene,
+        chosen: np.ndarray | None = None,
+        effects: Effects = "auto",
+        accuracy: Accuracy = COARSE,
+    ) -> np.ndarray:
+        setting, backend = self._how(accuracy)
+        return renderer.three_bounce(scene, setting, effects, backend, chosen)
+
+    def histograms(self, job: Job) -> np.ndarray:
+        setting, backend = self._how(job.accuracy)
+        return renderer.implementation(setting, backend)(replace(job, accuracy=setting))
+
+
+@pytest.fixture(scope="session", params=IMPLEMENTATIONS)
+def implementation(request: pytest.FixtureRequest) -> Implementation:
+    return Implementation(request.param)
+
+
+@pytest.fixture(scope="session")
+def every_implementation() -> tuple[Implementation, ...]:
+    return tuple(map(Implementation, IMPLEMENTATIONS))
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    yield
+    numba.set_num_threads(before)

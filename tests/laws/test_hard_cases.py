@@ -1,0 +1,209 @@
+"""Hard cases on every implementation: finite, bounded, and never a surprise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nlos_calibration.rig import LidarPose, Rig, load_rig
+
+from nlos_cam.errors import SceneError
+from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S
+from nlos_cam.render.effects import EFFECTS
+from nlos_cam.render.renderer import Rendering
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.surface import Surface
+
+RIG = load_rig("paper-rig")
+OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
+FEW = Accuracy("few", relay_columns=4, relay_rows=4)
+MOST_EFFECTS = sorted(set(EFFECTS) - {"inter-reflection", "pulse"})
+
+
+def _grid(value: float = np.nan, cells: int = 8) -> np.ndarray:
+    return np.full((cells, cells), value, np.float32)
+
+
+def _with_spike() -> np.ndarray:
+    depth = _grid(0.38)
+    depth[4, 4] = 1e-3
+    return depth
+
+
+def _cliff() -> np.ndarray:
+    depth = _grid(0.38)
+    depth[:, :4] = 0.13
+    return depth
+
+
+def _one_pixel() -> np.ndarray:
+    depth = _grid()
+    depth[3, 5] = 0.2
+    return depth
+
+
+OBJECTS = {
+    "touching": _grid(0.0),
+    "half touching": np.linspace(0, 0.2, 64, dtype=np.float32).reshape(8, 8),
+    "one pixel": _one_pixel(),
+    "one cell is the whole grid": _grid(0.2, 1),
+    "empty": _grid(),
+    "spike": _with_spike(),
+    "cliff": _cliff(),
+    "full": _grid(0.25),
+    "tiny and huge": np.geomspace(1e-38, 1e3, 64, dtype=np.float32).reshape(8, 8),
+}
+
+
+def _check(rendering: Rendering) -> None:
+    assert np.isfinite(rendering.intensity).all()
+    assert ((rendering.intensity >= 0) & (rendering.intensity <= 1)).all()
+    assert ((rendering.margin >= 0) & (rendering.margin <= 1)).all()
+    assert ((rendering.depth_m > 0) | np.isnan(rendering.depth_m)).all()
+    np.testing.assert_array_equal(np.isnan(rendering.depth_m), rendering.intensity == 0)
+
+
+def _lidar(distance_m: float, yaw_deg: float, rig: Rig = RIG) -> Rig:
+    return rig.model_copy(update={"lidar": LidarPose(distance_m=distance_m, yaw_deg=yaw_deg)})
+
+
+@pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
+@pytest.mark.parametrize("name", OBJECTS)
+def test_objects(implementation, name: str, radiometry) -> None:
+    for jump_m in (0.02, 10.0):
+        scene = Scene(RIG, OBJECTS[name], radiometry=radiometry, jump_m=jump_m)
+        _check(implementation.render(scene, MOST_EFFECTS, FEW))
+
+
+@pytest.mark.parametrize("distance_m", [0.15, 0.3])
+@pytest.mark.parametrize("yaw_deg", [15.0, 75.0, 89.9, -75.0, 54.999])
+def test_lidars(implementation, distance_m: float, yaw_deg: float) -> None:
+    """At 55 degrees the outermost beams go along the wall; beyond it some never meet it."""
+    for rig in (RIG, OPEN):
+        rendering = implementation.render(Scene(_lidar(distance_m, yaw_deg, rig), _one_pixel()), accuracy=FEW)
+        _check(rendering)
+    lost = np.isnan(rendering.depth_m)
+    assert lost.any() or abs(yaw_deg) < 60
+
+
+def test_a_beam_along_the_wall(implementation) -> None:
+    """An axis turned by 90 degrees less half a pixel: a column of beams runs exactly along the wall."""
+    pinhole = OPEN.pinhole.scaled(80, 64)
+    angle = np.degrees(np.arctan((79 - pinhole.ppx) / pinhole.fx))
+    rendering = implementation.render(Scene(_lidar(0.2, 90 - angle, OPEN), _one_pixel()), accuracy=FEW)
+    _check(rendering)
+    assert np.isnan(rendering.depth_m[:, 79]).all()
+
+
+@pytest.mark.parametrize("gate_m", [1e-9, 0.1, 0.9, 1.2034])
+def test_gates(implementation, gate_m: float) -> None:
+    device = RIG.device.model_copy(update={"gate_s": gate_m / SPEED_OF_LIGHT_M_PER_S})
+    scene = Scene(RIG.model_copy(update={"device": device}), _grid(0.2))
+    rendering, whole = implementation.render(scene, accuracy=FEW), implementation.transient(scene, accuracy=FEW)
+    _check(rendering)
+    if gate_m < 0.2:
+        assert not whole.any()
+        assert np.isnan(rendering.depth_m).all()
+    assert whole.shape[2] * RIG.device.bin_m < gate_m + 2 * RIG.device.bin_m
+    heard = np.isfinite(rendering.multi.path_m)
+    assert (rendering.multi.path_m[heard] < gate_m + RIG.device.bin_m).all()
+    np.testing.assert_allclose(
+        rendering.multi.peak[heard], whole[heard].max(-1), rtol=1e-6 if gate_m < 1 else 1
+    )  # transient and render keep the same last bin
+
+
+def test_a_path_exactly_on_a_bins_edge_is_kept(implementation) -> None:
+    """The longest path of all beams, in a grid of bins that ends right there."""
+    depth, one = _grid(), replace(FEW, relay_columns=1, relay_rows=1)
+    depth[3, 3] = 0.25
+    from nlos_cam.render.prepare import Prepared
+
+    job = Prepared.of(Scene(OPEN, depth), one, ["three-bounce"]).job()
+    assert job is not None
+    cell = np.array([job.relay.x_m[0], job.relay.y_m[0], 0])
+    point = job.patches.point_m[0]
+    path = job.length_m + np.linalg.norm(job.foot_m - point, axis=1) + np.linalg.norm(cell - point)
+    longest = float((path + job.relay.length_m[0]).max())
+    for bins in (50, 64, 100):
+        device = OPEN.device.model_copy(update={"bin_m": longest / bins})
+        rig = OPEN.model_copy(update={"device": device})
+        found = implementation.three_bounce(Scene(rig, depth), effects=["three-bounce"], accuracy=one)
+        assert (found > 0).any(1).sum() == len(job.foot_m)
+
+
+def test_two_equal_maxima_go_to_the_shorter_path(implementation) -> None:
+    from nlos_cam.render.echo import strongest
+
+    histogram = np.zeros((3, 50), np.float32)
+    histogram[:, [7, 31]] = 0.5
+    histogram[1, 20] = 0.6
+    found = strongest(histogram, 0.01)
+    np.testing.assert_allclose(found.path_m, [0.075, 0.205, 0.075])
+    np.testing.assert_allclose(found.runner_up, 0.5)
+    dark = implementation.render(Scene(RIG, _grid(0.2), Surface(0.0)), accuracy=FEW)
+    assert np.isnan(dark.multi.path_m).all()
+
+
+def test_a_million_to_one_in_one_histogram(implementation) -> None:
+    """A patch a millionth as white is still seen, as bright as alone, beside one that is white."""
+    depth, albedo = _grid(), np.full((8, 8), 1e-6)
+    depth[1, 1], depth[6, 6], albedo[1, 1] = 0.14, 0.4, 1.0
+    alone = _grid()
+    alone[6, 6] = 0.4
+    effects, some = ["three-bounce", "occluder"], np.arange(5120)[::61]
+    both = implementation.three_bounce(Scene(RIG, depth, Surface(albedo)), some, effects, FEW)
+    dim = implementation.three_bounce(Scene(RIG, alone, Surface(albedo)), some, effects, FEW)
+    only = implementation.three_bounce(Scene(RIG, depth, Surface(np.where(albedo < 1, 0, 1.0))), some, effects, FEW)
+    own = (dim > 0) & (only[:, : dim.shape[1]] == 0)
+    assert own.sum() > 100
+    assert both.max() > 1e6 * both[:, : dim.shape[1]][own].max()
+    np.testing.assert_allclose(both[:, : dim.shape[1]][own], dim[own], rtol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, ">f4", np.longdouble])
+@pytest.mark.parametrize("layout", ["C", "F", "strided", "read-only"])
+def test_every_dtype_and_layout_gives_the_same(implementation, dtype, layout: str) -> None:
+    plain = _cliff().astype(np.float16)
+    depth = plain.astype(dtype, order="F" if layout == "F" else "C")
+    if layout == "strided":
+        depth = np.repeat(np.repeat(depth, 2, 0), 3, 1)[::2, ::3]
+    depth.flags.writeable = layout != "read-only"
+    expected = implementation.three_bounce(Scene(RIG, plain.astype(np.float32)), np.arange(5120)[::401], accuracy=FEW)
+    found = implementation.three_bounce(Scene(RIG, depth), np.arange(5120)[::401], accuracy=FEW)
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, -0.1, -1e-9])
+def test_depths_that_cannot_be_are_refused_in_one_line(bad: float) -> None:
+    depth = _grid(0.2)
+    depth[3, 3] = bad
+    with pytest.raises(SceneError, match=r"^object depth runs from .*at least 0 m off the wall.*NaN for background\)$"):
+        Scene(RIG, depth)
+
+
+values = st.one_of(st.just(np.nan), st.floats(0, 0.5, width=32), st.sampled_from([0.0, 1e-38, 1e-9, 5.0]))
+grids = st.integers(1, 6).flatmap(lambda n: st.lists(values, min_size=n * n, max_size=n * n))
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(
+    cells=grids,
+    albedo=st.sampled_from([0.0, 1e-6, 1.0]),
+    radiometry=st.sampled_from(["paper", "lambertian"]),
+    rig=st.sampled_from([RIG, OPEN, _lidar(0.15, 15.0), _lidar(0.15, 75.0, OPEN)]),
+    jump_m=st.sampled_from([0.0, 0.02, 10.0]),
+)
+def test_whatever_the_depths(implementation, cells: list[float], albedo: float, radiometry, rig: Rig, jump_m) -> None:
+    size = int(np.sqrt(len(cells)))
+    depth = np.array(cells, np.float32).reshape(size, size)
+    scene = Scene(rig, depth, Surface(albedo), radiometry, jump_m)
+    try:
+        rendering = implementation.render(scene, MOST_EFFECTS, FEW)
+    except SceneError as error:
+        assert "surrounds the lidar" in str(error)  # noqa: PT017
+        return
+    _check(rendering)
+    if albedo == 0:
+        assert not rendering.multi.peak.any()

@@ -1,0 +1,96 @@
+"""The same scene gives the same bits: again, by any number of threads, and whatever else is rendered with it."""
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.render.accuracy import STOPS, Accuracy
+from nlos_cam.render.effects import EFFECTS
+from nlos_cam.render.renderer import render, render_all
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.surface import Surface, phong
+
+RIG = load_rig("paper-rig")
+COARSE = Accuracy("coarse", relay_columns=7, relay_rows=5, scatter_error=0.1)
+FEW = replace(COARSE, relay_columns=2, relay_rows=2)
+DEPTH = np.random.default_rng(0).uniform(0.13, 0.35, (8, 8)).astype(np.float32)
+SCENES = {
+    "plain": Scene(RIG, DEPTH),
+    "lambertian": Scene(RIG, DEPTH, radiometry="lambertian", jump_m=0.5),
+    "shiny": Scene(RIG, DEPTH[:3, :3], Surface(1.0, phong(0.4, 0.6, 10))),
+    "bouncing": Scene(RIG, DEPTH[:3, :3], radiometry="lambertian"),
+}
+EVERY = np.arange(5120)
+DISTANT = EVERY[::97]
+
+
+def _effects(name: str) -> set[str]:
+    return set(EFFECTS) - (set() if name == "bouncing" else {"inter-reflection"})
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_again_and_on_one_thread(implementation, name: str, one_thread) -> None:
+    first = implementation.three_bounce(SCENES[name], DISTANT, _effects(name), FEW)
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    for _ in range(2):
+        np.testing.assert_array_equal(implementation.three_bounce(SCENES[name], DISTANT, _effects(name), FEW), first)
+    assert first.any()
+
+
+@pytest.fixture(scope="module")
+def whole(implementation) -> dict[str, np.ndarray]:
+    chosen = {name: EVERY if name in {"plain", "lambertian"} else DISTANT for name in SCENES}
+    return {
+        name: implementation.three_bounce(scene, chosen[name], _effects(name), FEW) for name, scene in SCENES.items()
+    }
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(name=st.sampled_from(sorted(SCENES)), start=st.integers(0, 5000), step=st.integers(1, 900))
+def test_the_other_beams_do_not_matter(implementation, whole, name: str, start: int, step: int) -> None:
+    known = whole[name]
+    if len(known) == len(EVERY):
+        some = EVERY[start::step]
+        expected = known[some]
+    else:
+        places = np.arange(len(DISTANT))[start % len(DISTANT) :: step]
+        some, expected = DISTANT[places], known[places]
+    found = implementation.three_bounce(SCENES[name], some, _effects(name), FEW)
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("name", ["plain", "lambertian"])
+def test_rows_alone_are_rows_of_the_whole(name: str) -> None:
+    scene = SCENES[name]
+    every, part = render(scene, COARSE), render(scene, COARSE, rows=(17, 40))
+    np.testing.assert_array_equal(part.intensity, every.intensity[17:40])
+    np.testing.assert_array_equal(part.depth_m, every.depth_m[17:40])
+    np.testing.assert_array_equal(part.margin, every.margin[17:40])
+
+
+def test_rows_of_a_shiny_object_and_of_many_beams_per_cell_too() -> None:
+    scene = SCENES["shiny"]
+    accuracy = replace(FEW, scatter_error=0.5, beams_per_cell=2)
+    every, part = render(scene, accuracy), render(scene, accuracy, rows=(30, 33))
+    np.testing.assert_array_equal(part.intensity, every.intensity[30:33])
+
+
+def test_a_batch_gives_what_each_gives_alone_also_a_batch_of_one() -> None:
+    scenes = [SCENES["plain"], SCENES["lambertian"], Scene(RIG)]
+    for batch in (scenes, scenes[:1]):
+        for one, scene in zip(render_all(batch, COARSE), batch, strict=True):
+            np.testing.assert_array_equal(one.intensity, render(scene, COARSE).intensity)
+
+
+def test_a_whole_object_at_the_named_stops(one_thread) -> None:
+    depth = np.random.default_rng(1).uniform(0.13, 0.35, (32, 32)).astype(np.float32)
+    first = render(Scene(RIG, depth), STOPS["draft"])
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    again = render(Scene(RIG, depth), STOPS["draft"])
+    np.testing.assert_array_equal(first.intensity, again.intensity)
+    np.testing.assert_array_equal(first.multi.runner_up, again.multi.runner_up)
