@@ -16,7 +16,7 @@ from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Float32, Frame
 from nlos_cam.render.beams import cast
 from nlos_cam.render.effects import Effect, included
 from nlos_cam.render.renderer import MultiBounce
-from nlos_cam.render.sensor_chain import Bytes, Chain, Echoes, Optics, expose
+from nlos_cam.render.sensor_chain import Bytes, Chain, Echoes, Optics, expose, signal_surety
 from nlos_cam.render.sensor_effects import sensor_effects
 from nlos_cam.render.sensor_model import DEPTH_UNIT_M, SensorModel
 
@@ -46,27 +46,19 @@ class Sensor:
     def __init__(self, rig: Rig, model: SensorModel) -> None:
         self.rig = rig
         verdicts = sensor_effects(model)
-        beams = cast(rig, rig.pinhole)
-        dead = np.random.default_rng(0).random(beams.direct.size) < model.dead_share
-        self._optics = Optics(
-            beams.direct.astype(np.float32),
-            beams.length_m.astype(np.float32),
-            beams.cos_axis.astype(np.float32),
-            dead if included(verdicts, "dead pixels") else dead[:0],
-        )
-        self._echoes_only = self._optics._replace(direct=np.zeros_like(self._optics.direct))
         self._chain = _chain(rig, model, verdicts)
+        self._optics = _optics(rig, self._chain, model.dead_share if included(verdicts, "dead pixels") else 0.0)
+        self._echoes_only = self._optics._replace(direct=np.zeros_like(self._optics.direct))
         self._lights = included(verdicts, "shot noise") or included(verdicts, "read noise")
         self._ranges = included(verdicts, "range noise")
 
     def expose(self, multi: MultiBounce, generator: np.random.Generator) -> SensedImages:
         """The images of one instant, with the generator's noise; maps (64 k, 80 k) hold k x k beams for each cell."""
         shape = (self.rig.intrinsics.height, self.rig.intrinsics.width)
-        echoes = Echoes(multi.peak.ravel(), multi.runner_up.ravel(), multi.path_m.ravel())
         cell = cell_of_pixels(shape, multi.peak.shape)
         light, ranges = (self._deviates(generator, wanted=wanted) for wanted in (self._lights, self._ranges))
         optics = self._echoes_only if multi.direct_included else self._optics
-        z16, ir, confidence = expose(optics, echoes, cell, light, ranges, self._chain)
+        z16, ir, confidence = expose(optics, _echoes(multi, self._chain), cell, light, ranges, self._chain)
         return SensedImages(z16.reshape(shape), ir.reshape(shape), confidence.reshape(shape))
 
     def _deviates(self, generator: np.random.Generator, *, wanted: bool) -> Float32:
@@ -90,6 +82,22 @@ def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...]) -> Chain:
         range_noise_m=called_for("range noise", model.range_noise_m),
         range_noise_per_m=called_for("range noise", model.range_noise_per_m),
     )
+
+
+def _optics(rig: Rig, chain: Chain, dead_share: float) -> Optics:
+    beams = cast(rig, rig.pinhole)
+    direct = beams.direct.astype(np.float32)
+    surety, length_m = signal_surety(direct, chain), beams.length_m.astype(np.float32)
+    dead = np.random.default_rng(0).random(direct.size if dead_share else 0) < dead_share
+    return Optics(direct, surety, length_m, beams.cos_axis.astype(np.float32), dead)
+
+
+def _echoes(multi: MultiBounce, chain: Chain) -> Echoes:
+    """The echoes flattened; an intensity that is no finite number is no echo."""
+    peak, runner_up = (
+        np.where((map_ > 0) & (map_ < np.inf), map_, np.float32(0)).ravel() for map_ in (multi.peak, multi.runner_up)
+    )
+    return Echoes(peak, signal_surety(peak, chain), np.minimum(runner_up, peak), multi.path_m.ravel())
 
 
 @lru_cache(maxsize=4)

@@ -1,7 +1,7 @@
 """The sensor's stages, in the order in which light meets them, and the loop that leads each pixel through them.
 
     echo (S5) -> gain -> ambient light -> shot and read noise -> saturation -> 8 bits            IR
-    margin and signal above the noise -> 4 bits                                                  confidence
+    signal above the noise, winner above the second -> 4 bits                                    confidence
     path / 2 x cos(beam, optical axis) -> range noise -> 0.25 mm -> dead pixels                  depth
 
 Shot and read noise are independent, so one deviate carries the root of their summed variances. A pixel without an echo
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from nlos_cam.frames import Float32
 from nlos_cam.render.sensor_model import DEPTH_UNIT_M, FARTHEST, MOST_CONFIDENT, SATURATED, SURE_COUNTS
 
+Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 
@@ -38,6 +39,8 @@ class Optics(NamedTuple):
 
     direct: Float32
     """In units of I0."""
+    surety: Array
+    """`signal_surety` of the direct return."""
     length_m: Float32
     cos_axis: Float32
     dead: NDArray[np.bool_]
@@ -45,19 +48,22 @@ class Optics(NamedTuple):
 
 
 class Echoes(NamedTuple):
-    """The map cells' echoes, flattened."""
+    """The map cells' echoes, flattened; 0 <= runner_up <= peak, and both are finite."""
 
     peak: Float32
+    surety: Array
+    """`signal_surety` of the peak."""
     runner_up: Float32
     path_m: Float32
 
 
 @numba.njit(cache=True)
-def compete(own: float, echoes: Echoes, cell: int) -> tuple[bool, float, float]:
-    """S5: whether the cell's echo wins over the pixel's own direct return, the winner, and the second strongest."""
-    peak = echoes.peak[cell]
-    wins = peak > own
-    return wins, peak if wins else own, max(own if wins else peak, echoes.runner_up[cell])
+def compete(optics: Optics, pixel: int, echoes: Echoes, cell: int) -> tuple[float, float, float, float]:
+    """S5: intensity, surety and length of the pixel's own return or the cell's echo, the stronger; and the second."""
+    own, peak, runner_up = optics.direct[pixel], echoes.peak[cell], echoes.runner_up[cell]
+    if peak > own:
+        return peak, echoes.surety[cell], echoes.path_m[cell] / 2, max(own, runner_up)
+    return own, optics.surety[pixel], optics.length_m[pixel], max(peak, runner_up)
 
 
 @numba.njit(cache=True)
@@ -79,13 +85,17 @@ def quantise(value: float, most: int) -> int:
 
 
 @numba.njit(cache=True)
-def surety(counts: float, margin: float, chain: Chain) -> float:
-    """From 0 to 1, how sure: the winner's lead, weighted by how far the signal stands above the noise."""
-    if chain.ambient_counts > 0:
-        noisy = noise_counts(counts + chain.ambient_counts, chain)
-        if noisy > 0:
-            counts *= noise_counts(counts, chain) / noisy
-    return (1 - np.exp(-counts / SURE_COUNTS)) * (0.5 + 0.5 * margin)
+def signal_surety(intensity: Float32, chain: Chain) -> Array:
+    """From 0 to 1 (n,), how far signals (n,) stand above the noise: as if dimmed by what ambient light adds to it."""
+    surety = np.empty(intensity.size)
+    for i in range(intensity.size):
+        counts = chain.gain * intensity[i]
+        if chain.ambient_counts > 0:
+            noise = noise_counts(counts + chain.ambient_counts, chain)
+            if noise > 0:
+                counts *= noise_counts(counts, chain) / noise
+        surety[i] = 1 - np.exp(-counts / SURE_COUNTS)
+    return surety
 
 
 @numba.njit(cache=True)
@@ -101,19 +111,18 @@ def expose(
     pixels = optics.direct.size
     z16, ir, confidence = np.zeros(pixels, np.uint16), np.zeros(pixels, np.uint8), np.zeros(pixels, np.uint8)
     for i in range(pixels):
-        c = cell[i]
-        wins, intensity, second = compete(optics.direct[i], echoes, c)
-        if not 0 < intensity < np.inf:
+        intensity, surety, length_m, second = compete(optics, i, echoes, cell[i])
+        if intensity <= 0:
             continue
-        counts = chain.gain * intensity
-        light = counts + chain.ambient_counts
+        light = chain.gain * intensity + chain.ambient_counts
         if light_deviates.size:
             light += light_deviates[i] * noise_counts(light, chain)
         ir[i] = quantise(saturate(light, chain), SATURATED)
-        confidence[i] = quantise(MOST_CONFIDENT * surety(counts, 1 - second / intensity, chain), MOST_CONFIDENT)
+        # half of the signal's own surety is the winner's lead
+        confidence[i] = int(MOST_CONFIDENT * (surety * (0.5 + 0.5 * (1 - second / intensity))) + 0.5)
         if confidence[i] == 0 or (optics.dead.size and optics.dead[i]):
             continue
-        depth_m = (echoes.path_m[c] / 2 if wins else optics.length_m[i]) * optics.cos_axis[i]
+        depth_m = length_m * optics.cos_axis[i]
         if range_deviates.size:
             depth_m += range_deviates[i] * (chain.range_noise_m + chain.range_noise_per_m * depth_m)
         z16[i] = quantise(depth_m / DEPTH_UNIT_M, FARTHEST)

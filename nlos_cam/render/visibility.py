@@ -57,7 +57,9 @@ def height_field(depth_m: NDArray[np.floating], box: ObjectBox, *, shades: bool)
     nearest = float(np.nanmin(depth_m)) if rows.size else np.inf
     ends = (int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max())) if rows.size else (0, 0, 0, 0)
     pitch = cell_pitch_m(box, depth_m.shape)
-    return HeightField(np.array(depth_m, np.float64, order="C"), float(x_m[0]), float(y_m[0]), *pitch, nearest, *ends, shades)
+    return HeightField(
+        np.array(depth_m, np.float64, order="C"), float(x_m[0]), float(y_m[0]), *pitch, nearest, *ends, shades
+    )
 
 
 @numba.njit(cache=True)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlos_cam.render.sensor_chain import Chain, Echoes, compete, noise_counts, quantise, saturate, surety
+from nlos_cam.render.sensor_chain import Chain, Echoes, Optics, compete, noise_counts, quantise, saturate, signal_surety
 
 NO_STAGE = Chain(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 NOISY = NO_STAGE._replace(read_variance=0.49, shot_variance=0.09)
@@ -26,15 +26,18 @@ def test_what_is_no_number_is_nothing_and_what_is_too_much_is_the_most(value: fl
 @pytest.mark.parametrize(
     ("own", "peak", "outcome"),
     [
-        (2.0, 2.0, (False, 2.0, 2.0)),
-        (2.0, 2.5, (True, 2.5, 2.0)),
-        (0.1, 2.5, (True, 2.5, 0.5)),
-        (2.0, 1.0, (False, 2.0, 1.0)),
+        (2.0, 2.0, (2.0, 0.25, 3.0, 2.0)),
+        (2.0, 2.5, (2.5, 0.75, 4.0, 2.0)),
+        (0.125, 2.5, (2.5, 0.75, 4.0, 0.5)),
+        (2.0, 1.0, (2.0, 0.25, 3.0, 1.0)),
     ],
 )
-def test_a_tie_goes_to_the_direct_return(own: float, peak: float, outcome: tuple[bool, float, float]) -> None:
-    echoes = Echoes(*(np.array([0.0, value], np.float32) for value in (peak, 0.5, 1.0)))
-    assert compete(own, echoes, 1) == outcome
+def test_the_stronger_return_wins_and_a_tie_goes_to_the_direct_one(
+    own: float, peak: float, outcome: tuple[float, ...]
+) -> None:
+    optics = Optics(*(np.array([value], np.float32) for value in (own, 0.25, 3.0, 1.0)), np.zeros(0, np.bool_))
+    echoes = Echoes(*(np.array([0.0, value], np.float32) for value in (peak, 0.75, 0.5, 8.0)))
+    assert compete(optics, 0, echoes, 1) == outcome
 
 
 @given(COUNTS, st.floats(0, 254))
@@ -51,11 +54,13 @@ def test_below_full_scale_ambient_light_leaves_no_pedestal(counts: float, ambien
     assert left == pytest.approx(min(counts, 255 - ambient))
 
 
-@given(COUNTS, st.floats(0, 1), st.floats(0, 254))
-def test_surety_is_a_share_that_rises_with_signal_and_margin(counts: float, margin: float, ambient: float) -> None:
-    chain = NOISY._replace(ambient_counts=ambient)
-    sure = surety(counts, margin, chain)
-    assert 0 <= sure <= 1
-    assert sure <= surety(1.1 * counts, margin, chain)
-    assert sure <= surety(counts, (1 + margin) / 2, chain)
-    assert sure <= surety(counts, margin, NOISY)
+@given(st.lists(COUNTS, min_size=2, max_size=20), st.floats(0, 254))
+def test_surety_is_a_share_that_rises_with_the_signal_and_not_with_ambient_light(
+    counts: list[float], ambient: float
+) -> None:
+    signals = np.sort(np.array(counts, np.float32))
+    for chain in (NOISY, NO_STAGE):
+        sure = signal_surety(signals, chain._replace(ambient_counts=ambient))
+        assert ((sure >= 0) & (sure <= 1)).all()
+        assert (np.diff(sure) >= 0).all()
+        assert (sure <= signal_surety(signals, chain)).all()
