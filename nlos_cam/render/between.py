@@ -22,8 +22,6 @@ SOME_PATCHES = 256
 AROUND_M = 0.4
 """How far about the object that wall reaches: beyond, less than a hundredth of a patch's light arrives."""
 
-_softened = numba.njit(cache=True)(softened)
-
 
 @numba.njit(cache=True)
 def form_factor(
@@ -36,7 +34,7 @@ def form_factor(
     cos_out, cos_in = (normal_a * leg).sum(), -(normal_b * leg).sum()
     if cos_out <= 0 or cos_in <= 0:
         return 0.0
-    factor = strength * cos_in / length / ((np.pi if lambertian else 2 * np.pi) * (_softened(squared, soft, near_m)))
+    factor = strength * cos_in / length / ((np.pi if lambertian else 2 * np.pi) * (softened(squared, soft, near_m)))
     return factor * cos_out / length if lambertian else factor
 
 

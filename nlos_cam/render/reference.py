@@ -44,10 +44,7 @@ def legs(
     return table
 
 
-_softened = numba.njit(cache=True)(softened)
-
-
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _taken(
     foot: Array, normal: Array, point: Array, strength: float, soft: float, near_m: float, lambertian: bool
 ) -> float:
@@ -55,20 +52,22 @@ def _taken(
     to_foot = foot - point
     d2 = np.sqrt((to_foot**2).sum())
     cos_2 = (normal * to_foot).sum() / d2
-    taken = strength * cos_2 / _softened(d2**2, soft, near_m)
+    taken = strength * cos_2 / softened(d2**2, soft, near_m)
     return taken * point[2] / d2 if lambertian else taken  # leaving the wall
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _given(
-    x: float, y: float, normal: Array, point: Array, relay_weight: float, soft: float, near_m: float, lambertian: bool
-) -> float:
-    """What of S2 the way from a patch over a relay cell to the lidar makes."""
-    dx, dy = x - point[0], y - point[1]
-    d3 = np.sqrt(dx**2 + dy**2 + point[2] ** 2)
-    cos_3 = point[2] / d3
-    given = relay_weight * cos_3 / _softened(d3**2, soft, near_m)
-    return given * (normal[0] * dx + normal[1] * dy - normal[2] * point[2]) / d3 if lambertian else given
+    dx: float, dy: float, z: float, facing: float, relay_weight: float, soft: float, near_m: float, lambertian: bool
+) -> tuple[float, float]:
+    """What of S2 the way from a patch over a relay cell to the lidar makes; and d3.
+
+    The cell is (dx, dy, -z) away, which times the patch's normal is `facing`.
+    """
+    squared = dx**2 + dy**2 + z**2
+    d3 = np.sqrt(squared)
+    given = relay_weight * (z / d3) / softened(squared, soft, near_m)  # cos t3
+    return (given * facing / d3 if lambertian else given), d3
 
 
 @numba.njit(cache=True, parallel=True)
@@ -100,13 +99,16 @@ def _paths(
                 continue
             a = beam_weight[p] * _taken(foot[p], normals[s], points[s], strength[s], soft_patch[s], near_m, lambertian)
             d2 = np.sqrt(((foot[p] - points[s]) ** 2).sum())
+            px, py, pz = points[s]
+            nx, ny, nz = normals[s]
             for q in range(len(x)):
                 if not seen[s, q]:
                     continue
-                b = _given(x[q], y[q], normals[s], points[s], relay_weight[q], soft_wall, near_m, lambertian)
+                dx, dy = x[q] - px, y[q] - py
+                facing = nx * dx + ny * dy - nz * pz
+                b, d3 = _given(dx, dy, pz, facing, relay_weight[q], soft_wall, near_m, lambertian)
                 if factor.size:
                     b *= factor[s, q]
-                d3 = np.sqrt((x[q] - points[s, 0]) ** 2 + (y[q] - points[s, 1]) ** 2 + points[s, 2] ** 2)
                 k = int(np.floor((d1[p] + d2 + d3 + d4[q]) / bin_m))  # S4
                 if k < bins:
                     histogram[p, k] += a * b  # S2
@@ -140,7 +142,9 @@ def _ends(
                 )
         for q in range(len(x)):
             if seen[s, q]:
-                given[s, q] = _given(x[q], y[q], normals[s], points[s], relay_weight[q], soft_wall, near_m, lambertian)
+                dx, dy, z = x[q] - points[s, 0], y[q] - points[s, 1], points[s, 2]
+                facing = normals[s, 0] * dx + normals[s, 1] * dy - normals[s, 2] * z
+                given[s, q], _ = _given(dx, dy, z, facing, relay_weight[q], soft_wall, near_m, lambertian)
     return taken, given
 
 

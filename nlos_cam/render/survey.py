@@ -79,9 +79,6 @@ def survey(job: Job, uneven: float) -> Survey:
     return Survey(taken[0] * scale, given[0], taken[1] * scale, given[1], taken[2] * scale, given[2], uneven)
 
 
-_softened = numba.njit(cache=True)(softened)
-
-
 @numba.njit(cache=True, parallel=True)
 def _sums(
     points: Array,
@@ -113,7 +110,7 @@ def _sums(
             level = (at_wall if lambertian else (1.0 if at_wall > 0 else 0.0)) if outgoing else at_wall / beta[s]
             if outgoing or lambertian:
                 bent, level = bent * at_wall, level * at_wall
-            light = weight[w] / _softened(squared, soft[s], near_m)
+            light = weight[w] / softened(squared, soft[s], near_m)
             if hidden[w] or occluded(point[0], z, x[w], 0.0, edge_x, edge_z):
                 sums[2, s] += light * bent
             else:
