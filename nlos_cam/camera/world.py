@@ -62,8 +62,8 @@ def _load(path: Path) -> Loop | None:
     """A cached loop; None where there is none, or it is damaged and must be rendered anew."""
     try:
         with np.load(path) as file:
-            maps = zip(file["peak"], file["runner_up"], file["path_m"], strict=True)
-            return [MultiBounce(*of_pose) for of_pose in maps], list(file["truth_m"])
+            maps, mixed = zip(file["peak"], file["runner_up"], file["path_m"], strict=True), bool(file["direct_included"])
+            return [MultiBounce(*of_pose, mixed) for of_pose in maps], list(file["truth_m"])
     except (OSError, ValueError, EOFError, KeyError, BadZipFile):
         return None
 
@@ -88,6 +88,7 @@ def _store(path: Path, echoes: list[MultiBounce], truths: list[Float32]) -> None
         peak=np.stack([echo.peak for echo in echoes]),
         runner_up=np.stack([echo.runner_up for echo in echoes]),
         path_m=np.stack([echo.path_m for echo in echoes]),
+        direct_included=echoes[0].direct_included,
         truth_m=np.stack(truths),
     )
     part.replace(path)

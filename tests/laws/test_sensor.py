@@ -22,9 +22,8 @@ FRAMES = 100
 
 def _at_map_size(rig: Rig) -> Rig:
     """The same rig with one pixel for each map cell."""
-    cells = rig.pinhole.scaled(80, 64)
-    intrinsics = {name: getattr(cells, name) for name in ("width", "height", "fx", "fy", "ppx", "ppy")}
-    return rig.model_copy(update={"intrinsics": rig.intrinsics.model_copy(update=intrinsics)})
+    cells = rig.intrinsics.model_copy(update=vars(rig.pinhole.scaled(80, 64)))
+    return rig.model_copy(update={"intrinsics": cells})
 
 
 RIG, BARE = _at_map_size(load_rig("paper-rig")), _at_map_size(load_rig("bare-wall"))

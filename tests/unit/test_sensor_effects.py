@@ -13,7 +13,10 @@ from nlos_cam.render.sensor import SensedImages, Sensor
 from nlos_cam.render.sensor_effects import sensor_effects
 from nlos_cam.render.sensor_model import DEPTH_UNIT_M, SensorModel
 
-BARE = load_rig("bare-wall")
+WIDTH, HEIGHT = 160, 128
+FULL = load_rig("bare-wall")
+SMALL = FULL.intrinsics.model_copy(update=vars(FULL.pinhole.scaled(WIDTH, HEIGHT)))
+BARE = FULL.model_copy(update={"intrinsics": SMALL})
 CHAIN = (
     "gain",
     "ambient light",
@@ -73,6 +76,11 @@ def test_a_stage_is_called_for_exactly_when_the_model_has_it(name: str) -> None:
     assert next(e.bound for e in rich if e.name == name) == 0
 
 
+@pytest.mark.parametrize("field", ["range_noise_m", "range_noise_per_m"])
+def test_either_kind_of_range_noise_calls_for_it(field: str) -> None:
+    assert included(sensor_effects(QUIET.model_copy(update={field: 0.001})), "range noise")
+
+
 @pytest.mark.parametrize("model", [SensorModel(), QUIET, RICH], ids=["default", "quiet", "rich"])
 def test_the_chain_has_its_order_and_its_reasons(model: SensorModel) -> None:
     verdicts = sensor_effects(model)
@@ -103,16 +111,30 @@ def test_noise_that_is_left_out_is_not_drawn(name: str, deviates: int) -> None:
         *map(np.random.default_rng, (7, 7)),
     )
     sensor.expose(_flat(30.0), drawn)
-    counted.standard_normal((deviates, 640 * 480), np.float32)
+    counted.standard_normal((deviates, WIDTH * HEIGHT), np.float32)
     assert drawn.bit_generator.state == counted.bit_generator.state
+
+
+def _ir_change(model: SensorModel, name: str, counts: float, monkeypatch: pytest.MonkeyPatch) -> tuple[float, float]:
+    """Mean change of the IR without a stage, in counts, and the stage's bound."""
+    with_it, without = _seen(model, counts).ir.astype(float), _turned(model, name, counts, monkeypatch).ir.astype(float)
+    return float(np.abs(with_it - without).mean()), next(e.bound for e in sensor_effects(model) if e.name == name)
 
 
 @pytest.mark.parametrize("name", ["ambient light", "shot noise", "read noise"])
 @pytest.mark.parametrize("counts", [1.0, 5.0, 30.0, 120.0, 195.0, 250.0])
 def test_the_ir_changes_by_no_more_than_the_bound(name: str, counts: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    bound = next(e.bound for e in sensor_effects(RICH) if e.name == name)
-    with_it, without = _seen(RICH, counts).ir.astype(float), _turned(RICH, name, counts, monkeypatch).ir.astype(float)
-    assert np.abs(with_it - without).mean() <= bound * counts
+    change, bound = _ir_change(RICH, name, counts, monkeypatch)
+    assert change <= bound * counts
+
+
+def test_a_bound_of_the_ir_is_near_what_its_worst_case_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    noisy = QUIET.model_copy(update={"read_noise_counts": 2.0})
+    change, bound = _ir_change(noisy, "read noise", 30.0, monkeypatch)  # the same at 1 count, were it not cut at 0
+    assert bound / 2 < change <= bound
+    lit = QUIET.model_copy(update={"ambient_counts": 60.0})
+    change, bound = _ir_change(lit, "ambient light", 300.0, monkeypatch)
+    assert change == pytest.approx(255 * bound)
 
 
 def test_the_depth_changes_by_no_more_than_the_bounds(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,6 +94,16 @@ def test_the_same_scene_with_another_sensor_is_not_rendered_again(
     assert (harmed.depth_z16 > 0).sum() < 0.7 * (world.images(0).depth_z16 > 0).sum()
 
 
+def test_a_pulse_of_some_width_is_kept_with_the_direct_return_mixed_in(tmp_path: Path) -> None:
+    wide = tmp_path / "wide.toml"
+    wide.write_text(SCENE.replace("poses = 2", "poses = 1") + "sensor = { pulse_ns = 1.0 }\n", encoding="utf-8")
+    rendered, cached = open_world(str(wide)), open_world(str(wide))
+    assert _equal(rendered.images(0), cached.images(0))
+    plain = tmp_path / "plain.toml"
+    plain.write_text(SCENE.replace("poses = 2", "poses = 1"), encoding="utf-8")
+    assert not np.array_equal(rendered.images(0).ir, open_world(str(plain)).images(0).ir)
+
+
 def test_a_bare_wall_hides_nothing() -> None:
     world = open_world("bare-wall")
     assert world.truth_depth_m(0) is None
