@@ -62,7 +62,10 @@ def _load(path: Path) -> Loop | None:
     """A cached loop; None where there is none, or it is damaged and must be rendered anew."""
     try:
         with np.load(path) as file:
-            maps, mixed = zip(file["peak"], file["runner_up"], file["path_m"], strict=True), bool(file["direct_included"])
+            maps, mixed = (
+                zip(file["peak"], file["runner_up"], file["path_m"], strict=True),
+                bool(file["direct_included"]),
+            )
             return [MultiBounce(*of_pose, mixed) for of_pose in maps], list(file["truth_m"])
     except (OSError, ValueError, EOFError, KeyError, BadZipFile):
         return None

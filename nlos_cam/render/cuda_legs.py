@@ -110,12 +110,12 @@ def _cut(surface: Surface, wall: Wall, edge_m: tuple[float, float]) -> Tensor:
 def scattered(brdf: Brdf, foot_m: Array, surface: Surface, wall: Wall) -> Tensor:
     """The factor (n, m) of a BRDF on the ways from one foot (3,) over patches to points of the wall."""
     x, y, z = (float(place) - column for place, column in zip(foot_m, surface[:3], strict=True))
-    d2 = (x * x + y * y + z * z).sqrt()
+    d2 = (x * x + y * y + z * z).sqrt().clamp(min=1e-12)  # where the object touches the wall
     x, y, z = x / d2, y / d2, z / d2
     dx, dy, dz = wall.x_m - surface.x_m, wall.y_m - surface.y_m, -surface.z_m
-    d3 = (dx * dx + dy * dy + dz * dz).sqrt()
+    d3 = (dx * dx + dy * dy + dz * dz).sqrt().clamp(min=1e-12)
     cos_in = surface.normal_x * x + surface.normal_y * y + surface.normal_z * z
     cos_out = (surface.normal_x * dx + surface.normal_y * dy + surface.normal_z * dz) / d3
     cos_between = (x * dx + y * dy + z * dz) / d3
-    factor = torch.as_tensor(brdf(cos_in, cos_out, cos_between), dtype=torch.float32, device=d3.device)
-    return torch.where((cos_in > 0) & (cos_out > 0), factor, 0)
+    value = brdf(cos_in.clamp(min=0), cos_out.clamp(min=0), cos_between)  # legs cut the dark side off themselves
+    return torch.as_tensor(value, dtype=torch.float32, device=d3.device).expand(d3.shape)

@@ -150,8 +150,8 @@ def _ends(
 
 def histograms(job: Job) -> Array:
     """Histograms (n, bins) of I_multi over path length, for the job's beams."""
-    three = _three_bounces(job)
-    return three + _more_bounces(job) if job.more_bounces else three
+    more = _more_bounces(job) if job.more_bounces else 0.0  # first: it refuses what would take too long
+    return _three_bounces(job) + more
 
 
 def _three_bounces(job: Job) -> Array:

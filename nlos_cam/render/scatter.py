@@ -40,7 +40,7 @@ def scattering(brdf: Brdf) -> Scattering:
                 d3 = max(np.sqrt(dx**2 + dy**2 + point[2] ** 2), 1e-12)  # where the object touches the wall
                 cos_out = (normal[0] * dx + normal[1] * dy - normal[2] * point[2]) / d3
                 cos_between = (to_foot[0] * dx + to_foot[1] * dy - to_foot[2] * point[2]) / d3
-                table[s, q] = compiled(cos_in, cos_out, cos_between) if cos_in > 0 and cos_out > 0 else 0.0
+                table[s, q] = compiled(max(cos_in, 0.0), max(cos_out, 0.0), cos_between)
         return table
 
     return factor
@@ -52,8 +52,7 @@ def scattered(brdf: Brdf, foot: Array, point: Array, normal: Array, out: Array) 
     to_foot /= np.maximum(np.linalg.norm(to_foot, axis=1, keepdims=True), 1e-12)
     to_wall /= np.maximum(np.linalg.norm(to_wall, axis=1, keepdims=True), 1e-12)
     cos_in, cos_out = (to_foot * normal).sum(1), (to_wall * normal).sum(1)
-    value = brdf(cos_in, cos_out, (to_foot * to_wall).sum(1))
-    return np.where((cos_in > 0) & (cos_out > 0), value, 0.0)
+    return brdf(np.maximum(cos_in, 0.0), np.maximum(cos_out, 0.0), (to_foot * to_wall).sum(1)) + np.zeros(len(foot))
 
 
 def nodes(job: Job, brdf: Brdf) -> Iterator[tuple[Array, Array]]:
@@ -81,6 +80,8 @@ def node_count(job: Job, brdf: Brdf) -> int:
     out = np.stack([relay.x_m[q], relay.y_m[q], np.zeros(PROBES)], 1)
     foot = job.map_foot_m[generator.integers(len(job.map_foot_m), size=PROBES)]
     exact, count = scattered(brdf, foot, patches.point_m[s], patches.normal[s], out), 4
+    # legs to the dark side carry nothing, and are cut off where their weight is told
+    lit = np.all([((end - patches.point_m[s]) * patches.normal[s]).sum(1) > 0 for end in (foot, out)], axis=0)
     while count < MOST_NODES:
         corners = [_bracket(foot[:, axis], line) for axis, line in enumerate(_lines(job.map_foot_m, count))]
         guess = np.zeros(PROBES)
@@ -89,7 +90,7 @@ def node_count(job: Job, brdf: Brdf) -> int:
                 at = np.stack([corners[0][i], corners[1][j], np.zeros(PROBES)], 1)
                 share = np.abs(1 - i - corners[0][2]) * np.abs(1 - j - corners[1][2])
                 guess += share * scattered(brdf, at, patches.point_m[s], patches.normal[s], out)
-        if np.abs(guess - exact).sum() <= job.accuracy.scatter_error * exact.sum():
+        if np.abs(guess - exact)[lit].sum() <= job.accuracy.scatter_error * exact[lit].sum():
             break
         count *= 2
     return count
