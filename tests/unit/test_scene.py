@@ -1,103 +1,88 @@
-"""One instant: what is refused, and the patches of surfaces whose slope is known."""
+"""One instant: what is refused, in one line, and what a scene tells of itself."""
 
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.scene import CLEARANCE_M, JUMP_M, Patches, Scene
+from nlos_cam.render.scene import FINEST_GRID, Scene
+from nlos_cam.render.surface import Surface
 
 RIG = load_rig("paper-rig")
-BOX = RIG.object_box
-PITCH = 0.25 / 64
 
 
-def _depth(z_m: float = 0.25) -> np.ndarray:
-    depth = np.full((64, 64), np.nan, np.float32)
-    depth[10:30, 20:50] = z_m
+def _depth(z_m: float = 0.25, cells: int = 8) -> np.ndarray:
+    depth = np.full((cells, cells), np.nan, np.float32)
+    depth[1:4, 2:6] = z_m
     return depth
 
 
-def _patches(depth: np.ndarray) -> Patches:
-    patches = Scene(RIG, depth).patches
-    assert patches is not None
-    return patches
-
-
-@pytest.mark.parametrize("z_m", [0.0, -0.1, CLEARANCE_M - 1e-3, np.inf, -np.inf])
+@pytest.mark.parametrize("z_m", [-0.1, -1e-6, np.inf, -np.inf])
 def test_depths_that_cannot_be_are_refused_with_their_range(z_m: float) -> None:
     depth = _depth()
-    depth[12, 22] = z_m
-    with pytest.raises(SceneError, match=r"runs from .* to .* m: .*NaN for background"):
+    depth[2, 3] = z_m
+    with pytest.raises(SceneError, match=r"runs from .* to .* m, (behind the wall|not finite): .*NaN for background"):
         Scene(RIG, depth)
 
 
-@pytest.mark.parametrize("shape", [(63, 64), (64,), (1, 64, 64), (0, 0)])
+def test_touching_the_wall_is_no_error() -> None:
+    patches = Scene(RIG, _depth(0.0)).patches
+    assert patches is not None
+    assert len(patches.beta) == 12
+
+
+@pytest.mark.parametrize("shape", [(7, 8), (8,), (1, 8, 8), (0, 0), (FINEST_GRID + 1, FINEST_GRID + 1)])
 def test_another_shape_is_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(SceneError, match=r"shape .*must be \(64, 64\)"):
+    with pytest.raises(SceneError, match=r"shape .*must be \(n, n\), n of 1 to 256"):
         Scene(RIG, np.full(shape, 0.3, np.float32))
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.bool_, np.complex128])
+def test_what_has_no_nan_is_refused(dtype: type) -> None:
+    with pytest.raises(SceneError, match=r"of (int64|bool|complex128): it must be of floating point"):
+        Scene(RIG, np.ones((8, 8), dtype))
+
+
+@pytest.mark.parametrize("field", ["jump_m", "pulse_ns"])
+@pytest.mark.parametrize("value", [-1e-9, np.inf, np.nan])
+def test_a_number_out_of_range_is_refused_by_its_name(field: str, value: float) -> None:
+    with pytest.raises(SceneError, match=f"{field} is .*finite number, not negative"):
+        Scene(RIG, **{field: value})
+
+
+def test_another_radiometry_is_refused() -> None:
+    with pytest.raises(SceneError, match="no radiometry 'gothic': choose one of paper, lambertian"):
+        Scene(RIG, radiometry="gothic")  # pyright: ignore[reportArgumentType]
 
 
 def test_an_object_needs_a_box() -> None:
     bare = load_rig("bare-wall")
     with pytest.raises(SceneError, match="object_box"):
         Scene(bare, _depth())
-    with pytest.raises(SceneError, match="object_box"):
-        _ = Scene(bare).box
     assert Scene(bare).patches is None
+
+
+def test_an_albedo_of_other_cells_is_refused() -> None:
+    with pytest.raises(SceneError, match=r"\(5, 5\) cells, the depth map of \(8, 8\)"):
+        Scene(RIG, _depth(), Surface(np.ones((5, 5))))
 
 
 def test_nothing_hidden_has_no_patches() -> None:
     assert Scene(RIG).patches is None
-    assert Scene(RIG, np.full((64, 64), np.nan, np.float32)).patches is None
+    assert Scene(RIG, np.full((8, 8), np.nan, np.float32)).patches is None
 
 
-def test_there_is_one_patch_per_surface_cell_at_its_centre() -> None:
-    patches = _patches(_depth())
-    assert len(patches.beta) == 20 * 30
-    np.testing.assert_allclose(patches.point_m[:, 0], BOX.x_min_m + (patches.column + 0.5) * PITCH)
-    np.testing.assert_allclose(patches.point_m[:, 1], BOX.y_max_m - (patches.row + 0.5) * PITCH)
-    np.testing.assert_allclose(patches.point_m[:, 2], 0.25)
-    assert patches.cell_m2 == pytest.approx(PITCH**2)
+def test_patches_take_one_channel_of_the_albedo_or_the_mean() -> None:
+    scene = Scene(RIG, _depth(), Surface(np.array([0.9, 0.6, 0.0])))
+    for channel, albedo in ((None, 0.5), (0, 0.9), (2, 0.0)):
+        patches = scene.patches_of(channel)
+        assert patches is not None
+        np.testing.assert_allclose(patches.albedo, albedo)
 
 
-@pytest.mark.parametrize(("slope_x", "slope_y"), [(0.0, 0.0), (0.7, 0.0), (0.0, -0.4), (0.3, 0.5)])
-def test_a_plane_has_its_own_normal_and_area_to_the_last_row_and_column(slope_x: float, slope_y: float) -> None:
-    rows, columns = np.mgrid[0:64, 0:64]
-    depth = np.where(np.isnan(_depth()), np.nan, 0.25 + slope_x * PITCH * columns - slope_y * PITCH * rows)
-    patches = _patches((depth - 0.05).astype(np.float32))
-    beta = np.sqrt(1 + slope_x**2 + slope_y**2)
-    np.testing.assert_allclose(patches.beta, beta, rtol=1e-4)
-    expected = np.broadcast_to(np.array([slope_x, slope_y, -1]) / beta, patches.normal.shape)
-    np.testing.assert_allclose(patches.normal, expected, atol=1e-4)
-
-
-def test_normals_are_unit_and_face_the_wall() -> None:
-    generator = np.random.default_rng(0)
-    patches = _patches((0.25 + 0.01 * generator.random((64, 64))).astype(np.float32))
-    np.testing.assert_allclose(np.linalg.norm(patches.normal, axis=1), 1)
-    assert (patches.normal[:, 2] < 0).all()
-    assert (patches.beta >= 1).all()
-    np.testing.assert_allclose(-1 / patches.normal[:, 2], patches.beta)
-
-
-@pytest.mark.parametrize(("step_m", "joined"), [(0.9 * JUMP_M, True), (1.1 * JUMP_M, False)])
-def test_a_step_is_one_surface_up_to_the_jump(step_m: float, joined: bool) -> None:
-    depth = _depth()
-    depth[:, 35:] += np.float32(step_m)
-    assert (_patches(depth).beta.max() > 2) == joined
-
-
-def test_a_lone_cell_is_level() -> None:
-    depth = np.full((64, 64), np.nan, np.float32)
-    depth[63, 63] = 0.3
-    patches = _patches(depth)
-    assert patches.beta.tolist() == [1.0]
-    assert patches.normal.tolist() == [[0.0, 0.0, -1.0]]
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_every_float_and_layout_gives_the_same_patches(dtype: type[np.floating]) -> None:
-    expected, found = _patches(_depth()), _patches(np.asfortranarray(_depth().astype(dtype)))
-    np.testing.assert_allclose(found.point_m, expected.point_m, rtol=1e-3)
-    np.testing.assert_array_equal(found.row, expected.row)
+def test_beams_are_spread_evenly_over_the_cells() -> None:
+    scene = Scene(RIG)
+    one, two = scene.cell_intrinsics, scene.intrinsics(2)
+    assert (one.width, one.height, two.width, two.height) == (80, 64, 160, 128)
+    pairs = two.rays()[::2, ::2] + two.rays()[1::2, 1::2]
+    np.testing.assert_allclose(pairs / 2, one.rays(), atol=1e-9)
