@@ -5,7 +5,7 @@ import pytest
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Extent, LidarPose, Occluder, Rig, load_rig
 
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, cast
+from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, cast, gate_bins
 
 BARE, PAPER = load_rig("bare-wall"), load_rig("paper-rig")
 
@@ -101,3 +101,36 @@ def test_the_receiver_cell_scales_the_return_and_no_grid_does() -> None:
     np.testing.assert_allclose(cast(BARE.model_copy(update={"device": device}), _cells(BARE)).direct, 3 * beams.direct)
     fine, coarse = cast(BARE, BARE.pinhole.scaled(243, 195)), cast(BARE, BARE.pinhole.scaled(81, 65))
     np.testing.assert_allclose(fine.direct.reshape(195, 243)[1::3, 1::3].ravel(), coarse.direct, rtol=1e-9)
+
+
+def test_rows_of_beams_are_those_of_the_image() -> None:
+    beams = cast(PAPER, _cells(PAPER))
+    part = beams.of_rows(3, 5)
+    assert part.shape == (2, 80)
+    np.testing.assert_array_equal(part.foot_m, beams.foot_m[240:400])
+    np.testing.assert_array_equal(part.direct, beams.direct[240:400])
+    np.testing.assert_array_equal(part.lidar_m, beams.lidar_m)
+    assert not beams.without_direct().direct.any()
+
+
+def test_what_a_beam_meets_on_its_way_takes_the_walls_place() -> None:
+    beams = cast(BARE, _cells(BARE))
+    met = beams.met(BARE, np.array([7]), np.array([0.1]), np.array([0.5]), np.array([0.25]), 2 * np.pi)
+    assert not met.on_wall[7]
+    np.testing.assert_allclose(met.foot_m[7], beams.lidar_m + 0.1 * beams.direction[7])
+    assert met.direct[7] == pytest.approx(0.25 * 0.5 * 1e-4 / (2 * np.pi * 0.01), rel=0.02)
+    others = np.arange(5120) != 7
+    np.testing.assert_array_equal(met.direct[others], beams.direct[others])
+
+
+@pytest.mark.parametrize(("gate_m", "bins"), [(0.999, 100), (1.001, 101), (1e-6, 1)])
+def test_the_bins_of_a_gate_begin_inside_it(gate_m: float, bins: int) -> None:
+    device = BARE.device.model_copy(update={"gate_s": gate_m / SPEED_OF_LIGHT_M_PER_S})
+    assert gate_bins(device) == bins
+
+
+def test_a_rigs_beams_are_worked_out_once_and_cannot_be_written_into() -> None:
+    beams = cast(PAPER, _cells(PAPER))
+    assert cast(PAPER, _cells(PAPER)) is beams
+    with pytest.raises(ValueError, match="read-only"):
+        beams.direct[0] = 1
