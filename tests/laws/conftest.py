@@ -1,4 +1,4 @@
-"""The implementations that every law of the renderer is held against, and a setting small enough for the brute force."""
+"""The implementations that laws of the renderer are held against, and a setting that the brute force can bear."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,4 +1,6 @@
-"""Near contact: 1 / d^2 from the middle of a cell never gives out more than came in, and far away it is S2 to the letter."""
+"""Near contact: no more light goes out than came in, and far away it is S2 to the letter."""
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +46,7 @@ def test_it_fades_out_and_leaves_the_distance_alone_beyond() -> None:
 
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
 @pytest.mark.parametrize("z_m", [0.0, 1e-30, 1e-9, 1e-4, 0.01])
-def test_an_object_touching_the_wall_is_finite_and_counted(implementation, radiometry, z_m: float) -> None:
+def test_an_object_touching_the_wall_is_finite_and_counted(implementation: Any, radiometry: Any, z_m: float) -> None:
     scene = Scene(RIG, np.full((8, 8), z_m, np.float32), radiometry=radiometry)
     rendering = implementation.render(scene, ["direct", "three-bounce", "occluder", "tilt", "self-occlusion"])
     assert np.isfinite(rendering.intensity).all()

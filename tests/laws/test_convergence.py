@@ -1,6 +1,8 @@
 """Refining any one grid changes the result towards a limit, and the winner does not drift with the grids."""
 
 from dataclasses import replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,12 +53,10 @@ def _beams(per_cell: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("grid", "sizes"), [(_relay, (10, 20, 40, 80)), (_object, (8, 16, 32, 64)), (_beams, (1, 2, 4))]
 )
-def test_refining_a_grid_changes_less_each_time(grid, sizes: tuple[int, ...]) -> None:
+def test_refining_a_grid_changes_less_each_time(grid: Any, sizes: tuple[int, ...]) -> None:
     found = [grid(size) for size in sizes]
-    steps = [
-        float(np.abs(finer - coarser).sum() / finer.sum()) for coarser, finer in zip(found[:-1], found[1:], strict=True)
-    ]
-    assert all(later < earlier for earlier, later in zip(steps[:-1], steps[1:], strict=True)), steps
+    steps = [float(np.abs(finer - coarser).sum() / finer.sum()) for coarser, finer in pairwise(found)]
+    assert all(later < earlier for earlier, later in pairwise(steps)), steps
     assert 0 < steps[-1] < 0.5 * steps[0]
     assert steps[-1] < 0.05
 
@@ -68,7 +68,7 @@ def test_refining_sub_bins_ends_at_the_brute_force() -> None:
         float(np.abs(three_bounce(scene, replace(base, sub_bins=n), chosen=SOME) - exact).sum() / exact.sum())
         for n in (1, 4, 16, 64)
     ]
-    assert all(later < 0.7 * earlier for earlier, later in zip(errors[:-1], errors[1:], strict=True)), errors
+    assert all(later < 0.7 * earlier for earlier, later in pairwise(errors)), errors
 
 
 def test_which_echo_wins_does_not_drift_with_the_grid() -> None:

@@ -1,6 +1,7 @@
-"""Every effect, two-sided on the transient in relative L1: called for and it matters, not called for and it does not."""
+"""Every effect, two-sided on the transient in relative L1: where called for it matters, elsewhere it does not."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,7 +79,7 @@ NOT_CALLED_FOR = {
 }
 
 
-def _with(implementation, scene: Scene, names: set[str], accuracy: Accuracy = COARSE) -> np.ndarray:
+def _with(implementation: Any, scene: Scene, names: set[str], accuracy: Accuracy = COARSE) -> np.ndarray:
     if scene.surface.brdf is not None:  # beam by beam in the brute force: some of them will do
         return implementation.three_bounce(scene, SOME, names, accuracy)[None, ..., None]
     found = implementation.transient(scene, names, accuracy)
@@ -104,7 +105,7 @@ def test_every_effect_has_its_two_scenes() -> None:
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_what_is_called_for_is_included_and_leaving_it_out_changes_more_than_the_tolerance(
-    implementation, name: str
+    implementation: Any, name: str
 ) -> None:
     scene = CALLED_FOR[name]
     if name == "inter-reflection" and implementation.name == "reference":
@@ -117,7 +118,7 @@ def test_what_is_called_for_is_included_and_leaving_it_out_changes_more_than_the
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_what_is_not_called_for_is_left_out_and_forcing_it_in_changes_less(implementation, name: str) -> None:
+def test_what_is_not_called_for_is_left_out_and_forcing_it_in_changes_less(implementation: Any, name: str) -> None:
     scene = NOT_CALLED_FOR[name]
     left_out = _left_out(scene)
     assert name in left_out
@@ -126,8 +127,15 @@ def test_what_is_not_called_for_is_left_out_and_forcing_it_in_changes_less(imple
     assert _change(forced, whole) <= COARSE.tolerance
 
 
+def _random(cells: int, base_m: float, rough_m: float, share: float, seed: int) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    depth = (base_m + rough_m * generator.random((cells, cells))).astype(np.float32)
+    depth[generator.random((cells, cells)) < share] = np.nan
+    return depth
+
+
 depths = st.builds(
-    lambda cells, base_m, rough_m, share, seed: _random(cells, base_m, rough_m, share, seed),
+    _random,
     st.integers(1, 8),
     st.sampled_from([0.002, 0.02, 0.12, 0.25]),
     st.sampled_from([0.0, 1e-4, 1e-2, 0.1, 0.3]),
@@ -143,13 +151,6 @@ scenes = st.builds(
     jump_m=st.sampled_from([0.02, 0.5]),
     pulse_ns=st.sampled_from([0.0, 1e-3, 1e-2]),
 )
-
-
-def _random(cells: int, base_m: float, rough_m: float, share: float, seed: int) -> np.ndarray:
-    generator = np.random.default_rng(seed)
-    depth = (base_m + rough_m * generator.random((cells, cells))).astype(np.float32)
-    depth[generator.random((cells, cells)) < share] = np.nan
-    return depth
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

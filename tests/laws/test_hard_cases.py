@@ -1,6 +1,7 @@
 """Hard cases on every implementation: finite, bounded, and never a surprise."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,7 +72,7 @@ def _lidar(distance_m: float, yaw_deg: float, rig: Rig = RIG) -> Rig:
 
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
 @pytest.mark.parametrize("name", OBJECTS)
-def test_objects(implementation, name: str, radiometry) -> None:
+def test_objects(implementation: Any, name: str, radiometry: Any) -> None:
     for jump_m in (0.02, 10.0):
         scene = Scene(RIG, OBJECTS[name], radiometry=radiometry, jump_m=jump_m)
         _check(implementation.render(scene, MOST_EFFECTS, FEW))
@@ -79,7 +80,7 @@ def test_objects(implementation, name: str, radiometry) -> None:
 
 @pytest.mark.parametrize("distance_m", [0.15, 0.3])
 @pytest.mark.parametrize("yaw_deg", [15.0, 75.0, 89.9, -75.0, 54.999])
-def test_lidars(implementation, distance_m: float, yaw_deg: float) -> None:
+def test_lidars(implementation: Any, distance_m: float, yaw_deg: float) -> None:
     """At 55 degrees the outermost beams go along the wall; beyond it some never meet it."""
     for rig in (RIG, OPEN):
         rendering = implementation.render(Scene(_lidar(distance_m, yaw_deg, rig), _one_pixel()), accuracy=FEW)
@@ -88,7 +89,7 @@ def test_lidars(implementation, distance_m: float, yaw_deg: float) -> None:
     assert lost.any() or abs(yaw_deg) < 60
 
 
-def test_a_beam_along_the_wall(implementation) -> None:
+def test_a_beam_along_the_wall(implementation: Any) -> None:
     """An axis turned by 90 degrees less half a pixel: a column of beams runs exactly along the wall."""
     pinhole = OPEN.pinhole.scaled(80, 64)
     angle = np.degrees(np.arctan((79 - pinhole.ppx) / pinhole.fx))
@@ -98,7 +99,7 @@ def test_a_beam_along_the_wall(implementation) -> None:
 
 
 @pytest.mark.parametrize("gate_m", [1e-9, 0.1, 0.9, 1.2034])
-def test_gates(implementation, gate_m: float) -> None:
+def test_gates(implementation: Any, gate_m: float) -> None:
     device = RIG.device.model_copy(update={"gate_s": gate_m / SPEED_OF_LIGHT_M_PER_S})
     scene = Scene(RIG.model_copy(update={"device": device}), _grid(0.2))
     rendering, whole = implementation.render(scene, accuracy=FEW), implementation.transient(scene, accuracy=FEW)
@@ -114,7 +115,7 @@ def test_gates(implementation, gate_m: float) -> None:
     )  # transient and render keep the same last bin
 
 
-def test_a_path_exactly_on_a_bins_edge_is_kept(implementation) -> None:
+def test_a_path_exactly_on_a_bins_edge_is_kept(implementation: Any) -> None:
     """The longest path of all beams, in a grid of bins that ends right there."""
     depth, one = _grid(), replace(FEW, relay_columns=1, relay_rows=1)
     depth[3, 3] = 0.25
@@ -133,7 +134,7 @@ def test_a_path_exactly_on_a_bins_edge_is_kept(implementation) -> None:
         assert (found > 0).any(1).sum() == len(job.foot_m)
 
 
-def test_two_equal_maxima_go_to_the_shorter_path(implementation) -> None:
+def test_two_equal_maxima_go_to_the_shorter_path(implementation: Any) -> None:
     from nlos_cam.render.echo import strongest
 
     histogram = np.zeros((3, 50), np.float32)
@@ -146,7 +147,7 @@ def test_two_equal_maxima_go_to_the_shorter_path(implementation) -> None:
     assert np.isnan(dark.multi.path_m).all()
 
 
-def test_a_million_to_one_in_one_histogram(implementation) -> None:
+def test_a_million_to_one_in_one_histogram(implementation: Any) -> None:
     """A patch a millionth as white is still seen, as bright as alone, beside one that is white."""
     depth, albedo = _grid(), np.full((8, 8), 1e-6)
     depth[1, 1], depth[6, 6], albedo[1, 1] = 0.14, 0.4, 1.0
@@ -164,7 +165,7 @@ def test_a_million_to_one_in_one_histogram(implementation) -> None:
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, ">f4", np.longdouble])
 @pytest.mark.parametrize("layout", ["C", "F", "strided", "read-only"])
-def test_every_dtype_and_layout_gives_the_same(implementation, dtype, layout: str) -> None:
+def test_every_dtype_and_layout_gives_the_same(implementation: Any, dtype: Any, layout: str) -> None:
     plain = _cliff().astype(np.float16)
     depth = plain.astype(dtype, order="F" if layout == "F" else "C")
     if layout == "strided":
@@ -195,7 +196,9 @@ grids = st.integers(1, 6).flatmap(lambda n: st.lists(values, min_size=n * n, max
     rig=st.sampled_from([RIG, OPEN, _lidar(0.15, 15.0), _lidar(0.15, 75.0, OPEN)]),
     jump_m=st.sampled_from([0.0, 0.02, 10.0]),
 )
-def test_whatever_the_depths(implementation, cells: list[float], albedo: float, radiometry, rig: Rig, jump_m) -> None:
+def test_whatever_the_depths(
+    implementation: Any, cells: list[float], albedo: float, radiometry: Any, rig: Rig, jump_m: Any
+) -> None:
     size = int(np.sqrt(len(cells)))
     depth = np.array(cells, np.float32).reshape(size, size)
     scene = Scene(rig, depth, Surface(albedo), radiometry, jump_m)

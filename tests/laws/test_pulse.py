@@ -1,5 +1,7 @@
 """Laws of a pulse that has some width: it spreads light in time, makes none and loses none."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
@@ -13,7 +15,7 @@ DEPTH = np.full((4, 4), 0.3, np.float32)
 WIDTHS_NS = (1e-4, 0.01, 0.1, 0.3, 1.0)
 
 
-def test_energy_is_kept_and_the_peak_falls_as_the_width_grows(implementation) -> None:
+def test_energy_is_kept_and_the_peak_falls_as_the_width_grows(implementation: Any) -> None:
     thin = implementation.transient(Scene(RIG, DEPTH)).astype(np.float64)
     peak = thin.max()
     for pulse_ns in WIDTHS_NS[1:4]:
@@ -23,7 +25,7 @@ def test_energy_is_kept_and_the_peak_falls_as_the_width_grows(implementation) ->
         peak = wide.max()
 
 
-def test_zero_width_is_no_pulse(implementation) -> None:
+def test_zero_width_is_no_pulse(implementation: Any) -> None:
     scene = Scene(RIG, DEPTH, pulse_ns=0.0)
     effects = ["direct", "three-bounce", "occluder"]
     np.testing.assert_array_equal(
@@ -52,7 +54,7 @@ def test_a_nanosecond_is_thirty_centimetres_of_path_at_half_height() -> None:
     assert wide.shape[0] > 400 + 3 * pulse_bins(1.0, BIN_M)  # room for the tail
 
 
-def test_the_direct_return_mixes_with_what_comes_at_the_same_time(implementation) -> None:
+def test_the_direct_return_mixes_with_what_comes_at_the_same_time(implementation: Any) -> None:
     """With a wide pulse the waveform's highest bin is told from both, in the grid of bins."""
     rendering = implementation.render(Scene(RIG, DEPTH, pulse_ns=1.0))
     assert rendering.multi.direct_included

@@ -1,6 +1,7 @@
 """The same scene gives the same bits: again, by any number of threads, and whatever else is rendered with it."""
 
 from dataclasses import replace
+from typing import Any
 
 import numba
 import numpy as np
@@ -33,8 +34,9 @@ def _effects(name: str) -> set[str]:
     return set(EFFECTS) - (set() if name == "bouncing" else {"inter-reflection"})
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("name", SCENES)
-def test_again_and_on_one_thread(implementation, name: str, one_thread) -> None:
+def test_again_and_on_one_thread(implementation: Any, name: str) -> None:
     first = implementation.three_bounce(SCENES[name], DISTANT, _effects(name), FEW)
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     for _ in range(2):
@@ -43,7 +45,7 @@ def test_again_and_on_one_thread(implementation, name: str, one_thread) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(implementation) -> dict[str, np.ndarray]:
+def whole(implementation: Any) -> dict[str, np.ndarray]:
     chosen = {name: EVERY if name in {"plain", "lambertian"} else DISTANT for name in SCENES}
     return {
         name: implementation.three_bounce(scene, chosen[name], _effects(name), FEW) for name, scene in SCENES.items()
@@ -52,7 +54,7 @@ def whole(implementation) -> dict[str, np.ndarray]:
 
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(name=st.sampled_from(sorted(SCENES)), start=st.integers(0, 5000), step=st.integers(1, 900))
-def test_the_other_beams_do_not_matter(implementation, whole, name: str, start: int, step: int) -> None:
+def test_the_other_beams_do_not_matter(implementation: Any, whole: Any, name: str, start: int, step: int) -> None:
     known = whole[name]
     if len(known) == len(EVERY):
         some = EVERY[start::step]
@@ -87,7 +89,8 @@ def test_a_batch_gives_what_each_gives_alone_also_a_batch_of_one() -> None:
             np.testing.assert_array_equal(one.intensity, render(scene, COARSE).intensity)
 
 
-def test_a_whole_object_at_the_named_stops(one_thread) -> None:
+@pytest.mark.usefixtures("one_thread")
+def test_a_whole_object_at_the_named_stops() -> None:
     depth = np.random.default_rng(1).uniform(0.13, 0.35, (32, 32)).astype(np.float32)
     first = render(Scene(RIG, depth), STOPS["draft"])
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
