@@ -86,7 +86,7 @@ class Surface:
 
     def __post_init__(self) -> None:
         albedo = np.asarray(self.albedo)
-        if albedo.ndim not in {0, 1, 2, 3} or (albedo.ndim in {1, 3} and albedo.shape[-1] != 3):
+        if albedo.size == 0 or albedo.ndim > 3 or (albedo.ndim in {1, 3} and albedo.shape[-1] != 3):
             raise SceneError(f"albedo has shape {albedo.shape}: give one, three, or one or three for each cell")
         if not (np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1):
             raise SceneError(f"albedo runs from {albedo.min():g} to {albedo.max():g}: it must lie in 0 to 1")
