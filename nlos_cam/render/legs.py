@@ -1,4 +1,7 @@
-"""Legs between patches and points of the wall, many at a time (numba, float32): weight, length, visibility."""
+"""Legs between patches and points of the wall, many at a time (numba, float32): weight, length, visibility.
+
+These are compiled into `kernels`, whose cache looks at its own file alone: after a change here, delete __pycache__.
+"""
 
 from typing import NamedTuple
 
