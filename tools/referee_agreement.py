@@ -144,7 +144,7 @@ def trial(case: Case) -> Trial:
 
 
 def _wrong(case: Case, ours: Array, theirs: Estimate, which: Mask) -> dict[str, float]:
-    """The same figure of renderers that are wrong: each must be far from 1, also where a scale is fitted to help it."""
+    """The same figure of renderers that are wrong, a scale fitted to help some: what stays near 1 goes unnoticed."""
     found = {
         "one bin late": reduced_chi_square(np.roll(ours, 1, axis=1), theirs.mean, theirs.error, which),
         "1 % brighter": reduced_chi_square(1.01 * ours, theirs.mean, theirs.error, which),
