@@ -5,12 +5,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.between import form_factor, wall_cells, wall_factors
+from nlos_cam.render.between import patch_to_patch, wall_cells, wall_factors
 from nlos_cam.render.job import Job
-from nlos_cam.render.visibility import HeightField, segment_blocked
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 MOST_PATHS = 3e10
 """Some minutes' worth."""
@@ -35,31 +33,8 @@ def more_paths(job: Job, taken: Array, given: Array) -> Array:
     d3 = np.linalg.norm(point[:, None] - relay, axis=-1) + job.relay.length_m
     to_wall = np.linalg.norm(point[:, None] - cells, axis=-1)
     patches = point, job.patches.normal, job.strength, job.soft_patch_m2, job.patches.row, job.patches.column
-    factors = _factors(*patches, job.field, job.near_m, job.lambertian)
+    factors = patch_to_patch(*patches, job.field, job.near_m, job.lambertian)
     return _sum(taken, d2, given, d3, factors, point, there, back, to_wall, job.bin_m, job.bins)
-
-
-@numba.njit(cache=True)
-def _factors(
-    points: Array,
-    normals: Array,
-    strength: Array,
-    soft: Array,
-    rows: Index,
-    columns: Index,
-    field: HeightField,
-    near_m: float,
-    lambertian: bool,
-) -> Array:
-    table = np.zeros((len(points), len(points)))
-    for a in range(len(points)):
-        for b in range(len(points)):
-            if segment_blocked(field, rows[a], columns[a], points[a, 2], rows[b], columns[b], points[b, 2]):
-                continue
-            table[a, b] = form_factor(
-                points[a], normals[a], points[b], normals[b], strength[b], soft[b], near_m, lambertian
-            )
-    return table
 
 
 @numba.njit(cache=True, parallel=True)
