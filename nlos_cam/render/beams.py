@@ -8,7 +8,7 @@ from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import DeviceConstants, Rig
 from numpy.typing import NDArray
 
-from nlos_cam.render.near import NEAR_DIAGONALS, softened
+from nlos_cam.render.near import NEAR_DIAGONALS, softened, solid_angle
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -83,7 +83,7 @@ def _cast(rig: Rig, intrinsics: Intrinsics, lambertian: bool, occluder: bool) ->
     length = np.minimum(wall_length, stop_length)
     length[np.isinf(length)] = np.nan
     cosine = np.where(on_wall, -direction[:, 2], np.abs(direction[:, 0]))
-    direct = returned(rig, length, cosine, np.pi if lambertian else 2 * np.pi)
+    direct = returned(rig, length, cosine, solid_angle(lambertian=lambertian))
     foot = lidar + length[:, None] * direction
     shape = (intrinsics.height, intrinsics.width)
     beams = Beams(shape, foot, direction, length, cosine, cos_axis, on_wall, direct, lidar)

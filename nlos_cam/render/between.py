@@ -38,6 +38,27 @@ def form_factor(
     return factor * cos_out / length if lambertian else factor
 
 
+@numba.njit(cache=True)
+def _between_patches(
+    a: int,
+    b: int,
+    points: Array,
+    normals: Array,
+    strength: Array,
+    soft: Array,
+    rows: Index,
+    columns: Index,
+    field: HeightField,
+    near_m: float,
+    lambertian: bool,
+) -> float:
+    """The form factor from patch a to patch b, 0 where the object stands between."""
+    factor = form_factor(points[a], normals[a], points[b], normals[b], strength[b], soft[b], near_m, lambertian)
+    if factor > 0 and segment_blocked(field, rows[a], columns[a], points[a, 2], rows[b], columns[b], points[b, 2]):
+        return 0.0
+    return factor
+
+
 @numba.njit(cache=True, parallel=True)
 def patch_to_patch(
     points: Array,
@@ -55,11 +76,9 @@ def patch_to_patch(
     table = np.zeros((n, n))
     for a in numba.prange(n):
         for b in range(n):
-            factor = form_factor(points[a], normals[a], points[b], normals[b], strength[b], soft[b], near_m, lambertian)
-            if factor > 0 and not segment_blocked(
-                field, rows[a], columns[a], points[a, 2], rows[b], columns[b], points[b, 2]
-            ):
-                table[a, b] = factor
+            table[a, b] = _between_patches(
+                a, b, points, normals, strength, soft, rows, columns, field, near_m, lambertian
+            )
     return table
 
 
@@ -124,10 +143,8 @@ def _over_the_object(
     out = np.zeros((len(points), width), np.float32)
     for a in numba.prange(len(points)):
         for b in range(len(points)):
-            factor = form_factor(points[a], normals[a], points[b], normals[b], strength[b], soft[b], near_m, lambertian)
-            if factor > 0 and not segment_blocked(
-                field, rows[a], columns[a], points[a, 2], rows[b], columns[b], points[b, 2]
-            ):
+            factor = _between_patches(a, b, points, normals, strength, soft, rows, columns, field, near_m, lambertian)
+            if factor > 0:
                 away = np.sqrt(((points[b] - points[a]) ** 2).sum())
                 _add(out[a], int(np.rint(away * per_m)) + start[b] - start[a], factor, histogram[b])
     return out
@@ -167,6 +184,11 @@ def _patches(job: Job) -> tuple[Array, Array, Array, Array, Index, Index, Height
     p = job.patches
     where = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
     return *where, job.field, job.near_m, job.lambertian
+
+
+def object_factors(job: Job) -> Array:
+    """Form factors (n, n) from patch to patch of a job."""
+    return patch_to_patch(*_patches(job))
 
 
 def wall_factors(job: Job, cells: Array) -> tuple[Array, Array]:

@@ -182,7 +182,7 @@ def _render_some(
     found = np.empty((0, 0))
     for channel in [None] if ready.channels == 1 else [None, 0, 1, 2]:
         found = histograms(ready, ready.job(channel), backend, chosen)
-        if included(ready.plan, "pulse") and scene.pulse_ns > 0:
+        if included(ready.plan, "pulse"):
             found = spread(found.astype(np.float32), scene.pulse_ns, scene.rig.device.bin_m)
         strongest(found, scene.rig.device.bin_m)
     return found

@@ -99,6 +99,8 @@ def pulse_bins(pulse_ns: float, bin_m: float) -> float:
 
 def spread(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
     """Histograms (n, bins) as a pulse of that width makes them; longer by its tail, none of the light is lost."""
+    if pulse_ns == 0:
+        return histogram
     sigma = pulse_bins(pulse_ns, bin_m)
     half = int(np.ceil(4 * sigma)) + 1
     edges = np.arange(-half, half + 2) - 0.5

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.near import NEAR_DIAGONALS, contact_m2, softened
+from nlos_cam.render.near import NEAR_DIAGONALS, contact_m2, softened, solid_angle
 from nlos_cam.render.patches import Patches
 from nlos_cam.render.relay import Relay
 from nlos_cam.render.surface import Brdf
@@ -54,8 +54,8 @@ class Job:
 
     @property
     def solid_angle(self) -> float:
-        """What each bounce spreads its light over: pi with the cosine of the rendering equation, 2 pi without (S2)."""
-        return np.pi if self.lambertian else 2 * np.pi
+        """What each bounce spreads its light over."""
+        return solid_angle(lambertian=self.lambertian)
 
     @cached_property
     def near_m(self) -> float:

@@ -16,6 +16,11 @@ cells up to twice as long as wide."""
 Area = TypeVar("Area", Array, float)
 
 
+def solid_angle(*, lambertian: bool) -> float:
+    """What each bounce spreads its light over: pi with the cosine of the rendering equation, 2 pi without (S1, S2)."""
+    return np.pi if lambertian else 2 * np.pi
+
+
 def contact_m2(area_m2: Area, solid_angle: float) -> Area:
     """What near contact adds to d^2 at one cell of many: with it, a plane of cells takes no more than was sent."""
     return MANY * area_m2 / solid_angle

@@ -14,6 +14,7 @@ from nlos_cam.render.between import AROUND_M
 from nlos_cam.render.effects import Effects, Plan, included
 from nlos_cam.render.findings import plan
 from nlos_cam.render.job import Job
+from nlos_cam.render.near import solid_angle
 from nlos_cam.render.patches import Patches
 from nlos_cam.render.relay import NO_OCCLUDER, Relay, occluder_edge
 from nlos_cam.render.scene import Scene
@@ -51,8 +52,8 @@ class Prepared:
         hidden = stage.relay.behind(edge, beams.lidar_m)
         if included(verdicts, "line-of-sight") and (sight := stage.sight) is not None:
             albedo = stage.albedo[sight.row, sight.column]
-            solid_angle = np.pi if stage.lambertian else 2 * np.pi
-            beams = beams.met(scene.rig, sight.beam, sight.length_m, sight.cosine, albedo, solid_angle)
+            spread = solid_angle(lambertian=stage.lambertian)
+            beams = beams.met(scene.rig, sight.beam, sight.length_m, sight.cosine, albedo, spread)
             hidden |= sight.hidden
         if not included(verdicts, "direct"):
             beams = beams.without_direct()

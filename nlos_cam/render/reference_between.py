@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.between import patch_to_patch, wall_cells, wall_factors
+from nlos_cam.render.between import object_factors, wall_cells, wall_factors
 from nlos_cam.render.job import Job
 
 Array = NDArray[np.float64]
@@ -32,8 +32,7 @@ def more_paths(job: Job, taken: Array, given: Array) -> Array:
     d2 = np.linalg.norm(job.foot_m[:, None] - point, axis=-1) + job.length_m[:, None]
     d3 = np.linalg.norm(point[:, None] - relay, axis=-1) + job.relay.length_m
     to_wall = np.linalg.norm(point[:, None] - cells, axis=-1)
-    patches = point, job.patches.normal, job.strength, job.soft_patch_m2, job.patches.row, job.patches.column
-    factors = patch_to_patch(*patches, job.field, job.near_m, job.lambertian)
+    factors = object_factors(job)
     return _sum(taken, d2, given, d3, factors, point, there, back, to_wall, job.bin_m, job.bins)
 
 

@@ -173,7 +173,7 @@ def _mixed(histogram: Float32, ready: Prepared) -> Float32:
     """Direct returns and the pulse's width, added to three-bounce histograms, up to the gate."""
     device = ready.stage.rig.device
     whole = add_direct(histogram, ready.beams, device.bin_m)
-    if included(ready.plan, "pulse") and ready.stage.scene.pulse_ns > 0:
+    if included(ready.plan, "pulse"):
         whole = spread(whole, ready.stage.scene.pulse_ns, device.bin_m)
     return whole[:, : gate_bins(device)]
 

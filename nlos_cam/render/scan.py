@@ -6,7 +6,7 @@ from math import ceil
 
 import numpy as np
 
-from nlos_cam.frames import MAP_ROWS, Float32
+from nlos_cam.frames import MAP_ROWS
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
 from nlos_cam.render.effects import Effect, Effects
 from nlos_cam.render.renderer import Rendering, render, three_bounce
@@ -51,26 +51,22 @@ def slices(verdict: Effect, setting: Accuracy) -> int:
 
 def joined(parts: list[Rendering], verdict: Effect) -> Rendering:
     """Renderings of some rows each as one of all rows."""
-
-    def stacked(maps: list[Float32]) -> Float32:
-        return np.concatenate(maps)
-
     multi = replace(
         parts[0].multi,
-        peak=stacked([part.multi.peak for part in parts]),
-        runner_up=stacked([part.multi.runner_up for part in parts]),
-        path_m=stacked([part.multi.path_m for part in parts]),
+        peak=np.concatenate([part.multi.peak for part in parts]),
+        runner_up=np.concatenate([part.multi.runner_up for part in parts]),
+        path_m=np.concatenate([part.multi.path_m for part in parts]),
     )
     colours = [part.colour for part in parts if part.colour is not None]
     return replace(
         parts[0],
-        depth_m=stacked([part.depth_m for part in parts]),
-        intensity=stacked([part.intensity for part in parts]),
-        margin=stacked([part.margin for part in parts]),
+        depth_m=np.concatenate([part.depth_m for part in parts]),
+        intensity=np.concatenate([part.intensity for part in parts]),
+        margin=np.concatenate([part.margin for part in parts]),
         multi=multi,
         plan=(*parts[0].plan, verdict),
         near_legs=sum(part.near_legs for part in parts),
-        colour=stacked(colours) if colours else None,
+        colour=np.concatenate(colours) if colours else None,
     )
 
 

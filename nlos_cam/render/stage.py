@@ -90,14 +90,17 @@ class Stage:
         return relay_cells(self.rig, self.beams().lidar_m, self.accuracy.relay_columns, self.accuracy.relay_rows)
 
     @cached_property
-    def light(self) -> Survey | None:
-        """The coarse look at the patches."""
+    def _whole_job(self) -> Job | None:
+        """What is looked at for verdicts: every effect in, the whole relay wall."""
         if self.patches is None:
             return None
+        return self.job(self.beams(), self.patches, self.relay, occluder_edge(self.rig), self.field)
+
+    @cached_property
+    def light(self) -> Survey | None:
+        """The coarse look at the patches."""
         low, high = self.brdf_range
-        return survey(
-            self.job(self.beams(), self.patches, self.relay, occluder_edge(self.rig), self.field), high / max(low, 1e-9)
-        )
+        return None if self._whole_job is None else survey(self._whole_job, high / max(low, 1e-9))
 
     @cached_property
     def brdf_range(self) -> tuple[float, float]:
@@ -115,10 +118,9 @@ class Stage:
     @cached_property
     def more_bounces(self) -> float:
         """How much energy inter-reflection carries, against three bounces."""
-        if self.patches is None or self.light is None:
+        if self._whole_job is None or self.light is None:
             return 0.0
-        job = self.job(self.beams(), self.patches, self.relay, occluder_edge(self.rig), self.field)
-        return share_of_more_bounces(job, self.light.taken, self.light.given)
+        return share_of_more_bounces(self._whole_job, self.light.taken, self.light.given)
 
     def job(self, beams: Beams, patches: Patches, relay: Relay, edge_m: tuple[float, float], field: HeightField) -> Job:
         """The three-bounce histograms of all beams that light the wall, as a job."""
