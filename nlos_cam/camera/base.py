@@ -1,6 +1,7 @@
 """The seam that every camera is seen through. Everything above it is ignorant of librealsense."""
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -21,8 +22,12 @@ class Camera(Protocol):
     intrinsics: Intrinsics
     rig: Rig | None
     """The bench, where the camera knows it (a simulated one does)."""
+    identity: Mapping[str, str]
+    """Of the device: name, serial, firmware, usb_type; without what it does not tell."""
     incomplete: int
     dropped: int
+    counts: Counter[str]
+    """What else befell it, by name (duplicate, out_of_order, wrong_size, restarted, reset, replugged); never zero."""
 
     def __enter__(self) -> Self: ...
 
@@ -34,3 +39,7 @@ class Camera(Protocol):
     ) -> None: ...
 
     def __iter__(self) -> Iterator[Frame]: ...
+
+    def telemetry(self) -> Mapping[str, float]:
+        """The options that can be read now, temperatures among them, by the SDK's name; empty where there are none."""
+        ...

@@ -2,7 +2,8 @@
 
 import atexit
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import Any, Self
 
@@ -27,7 +28,9 @@ class LiveCamera(ABC):
     def __init__(self, uri: str, device: Any, size: Size, sdk: Any, recording: Recording | None) -> None:
         self.uri = uri
         self.rig: Rig | None = None
+        self.identity: Mapping[str, str] = {}
         self.incomplete = self.dropped = 0
+        self.counts: Counter[str] = Counter()
         self.silence_s = 5.0
         self._device, self._size, self._sdk, self._recording = device, size, sdk, recording
         self._session: Session | None = None
@@ -44,6 +47,17 @@ class LiveCamera(ABC):
     @abstractmethod
     def _end(self) -> None:
         """No more frames are wanted."""
+
+    def _is_connected(self) -> bool:
+        """Whether the device is still there."""
+        return True
+
+    def _reconnect(self) -> Any | None:
+        """The device anew, when it has come back; None while it has not."""
+        return self._device
+
+    def _reset(self) -> None:
+        """Make the device start afresh, as by unplugging it; it vanishes and comes back."""
 
     @abstractmethod
     def _truth_depth_m(self, number: int) -> Float32 | None:
@@ -111,6 +125,9 @@ class LiveCamera(ABC):
             self._count(session.inbox)
             yield session.frame(found, self._truth_depth_m(found.number))
         self._count(session.inbox)
+
+    def telemetry(self) -> Mapping[str, float]:
+        return self._session.telemetry() if self._session else {}
 
     def _count(self, inbox: Inbox) -> None:
         self.incomplete, self.dropped = inbox.incomplete, inbox.dropped

@@ -3,7 +3,7 @@
 import atexit
 import gc
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -37,7 +37,9 @@ class ReplayCamera:
     def __init__(self, path: Path) -> None:
         self.uri = f"bag:{path}"
         self.rig: Rig | None = None
+        self.identity: Mapping[str, str] = {}
         self.incomplete = self.dropped = 0
+        self.counts: Counter[str] = Counter()
         self.arrived: Counter[str] = Counter()
         """Frames of each stream in the last iteration."""
         self._path, self._sdk = path, load_sdk()
@@ -102,6 +104,9 @@ class ReplayCamera:
             raise RecordingError(
                 f"{self._path} is damaged {reached_s:.1f} s into its {duration_s:.1f} s: nothing after that can be read"
             )
+
+    def telemetry(self) -> Mapping[str, float]:
+        return {}
 
     def _count(self, inbox: Inbox) -> None:
         self.incomplete, self.dropped, self.arrived = inbox.incomplete, inbox.dropped, inbox.arrived

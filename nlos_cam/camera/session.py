@@ -74,6 +74,10 @@ class Session:
         if self._listening:
             self.inbox.put(sample_from_sdk(frame))
 
+    def telemetry(self) -> dict[str, float]:
+        """The options as they read now."""
+        return read_settings(self._sensor)
+
     def stop(self) -> None:
         """Stop and close the sensor, and let go of it."""
         self.inbox.close()  # first: the SDK waits for its callbacks, and a callback may wait for room
