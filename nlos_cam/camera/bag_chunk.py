@@ -24,6 +24,7 @@ from nlos_cam.camera.bag_format import (
 )
 
 LEAST_PIECE_BYTES, MOST_PIECE_BYTES = 1 << 16, 4 << 20
+LZ4_MAGIC = b'\x04"M\x18'
 LZ4_TAIL_BYTES = 8
 """End mark and checksum of an lz4 frame."""
 
@@ -78,6 +79,30 @@ class Examined:
     """What is wrong with it; empty if nothing is."""
 
 
+def find_chunk(read: Read, at: int) -> Record | None:
+    """The chunk that begins there, or the data of one that lost its header; None where neither does.
+
+    Raises BagFormatError where no record begins either.
+    """
+    if read(at, len(LZ4_MAGIC)) == LZ4_MAGIC:
+        return Record(Op.CHUNK, {"compression": b"lz4"}, at, 0)
+    record = read_record(read, at)
+    if record.op is Op.MESSAGE or (record.op is Op.CONNECTION and _is_message(read, record.end)):
+        return Record(Op.CHUNK, {"compression": b"none"}, at, 0)
+    return record if record.op is Op.CHUNK else None
+
+
+def is_headless(chunk: Record) -> bool:
+    """Whether `find_chunk` found data without its header."""
+    return "size" not in chunk.fields
+
+
+def _is_message(read: Read, at: int) -> bool:
+    with suppress(BagFormatError):
+        return read_record(read, at).op is Op.MESSAGE
+    return False
+
+
 def examine(read: Read, at: int, record: Record, file_end: int) -> Examined:
     """Unpack and check the chunk that `record`, which starts at `at`, says is there.
 
@@ -120,9 +145,11 @@ def _piece_bytes(record: Record) -> int:
 
 
 def _wrong_lengths(record: Record, end: int, size: int) -> str:
+    if is_headless(record):
+        return ""  # the damage is before it
     if record.data_bytes == 0:
         return "it was never finished"
-    if record.end != end or record.fields.get("size") != size.to_bytes(4, "little"):
+    if record.end != end or record.fields["size"] != size.to_bytes(4, "little"):
         return "it has another length than it says"
     return ""
 
@@ -175,7 +202,7 @@ def read_content(read: Read, at: int, end: int, expected_bytes: int) -> Content:
     entries: dict[int, list[bytes]] = {}
     reached, ending, why = at, Ending.WHOLE, ""
     try:
-        for start, record in _records(read, at, end, expected_bytes):
+        for start, record in _confirmed(_records(read, at, end, expected_bytes)):
             if record.op is Op.CONNECTION:
                 found = read_connection(read, record)
                 connections[found.number] = found
@@ -204,6 +231,22 @@ def _records(read: Read, at: int, end: int, expected_bytes: int) -> Iterator[tup
             raise BagFormatError(f"it holds more than {CHUNK_LIMIT >> 20} MiB")
         yield at, record
         at = record.end
+
+
+def _confirmed(records: Iterator[tuple[int, Record]]) -> Iterator[tuple[int, Record]]:
+    """All but the one before damage: its length may be what is wrong."""
+    last: tuple[int, Record] | None = None
+    try:
+        for found in records:
+            if last:
+                yield last
+            last = found
+    except BagCutError:
+        if last:
+            yield last
+        raise
+    if last:
+        yield last
 
 
 def _time(entry: bytes) -> tuple[int, int]:

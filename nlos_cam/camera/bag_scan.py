@@ -1,13 +1,22 @@
 """A bag read chunk by chunk without its index: what is whole, what is damaged and where, and on after damage."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from nlos_cam.camera.bag_chunk import Chunk, Ending, Examined, examine, salvage_set_up
+from nlos_cam.camera.bag_chunk import (
+    LZ4_MAGIC,
+    Chunk,
+    Ending,
+    Examined,
+    examine,
+    find_chunk,
+    is_headless,
+    salvage_set_up,
+)
 from nlos_cam.camera.bag_format import (
     MAGIC,
     SET_UP_TIME,
@@ -22,11 +31,13 @@ from nlos_cam.camera.bag_format import (
 
 WINDOW_BYTES = 1 << 20
 LONGEST_START_BYTES = 32
-"""From a record's first byte to the end of what FIRST_FIELD finds in it, at most."""
-BEFORE_FIRST_FIELD = 5
+"""From a record's first byte to the end of what RECORD_START finds in it, at most."""
+RECORD_START = re.compile(rb"\x00\x00\x00(?:compression|conn|op|chunk_pos|chunk_count)=|" + re.escape(LZ4_MAGIC))
+"""A record's first field, behind the first byte of its length; or a packed chunk's data."""
+BEFORE_FIELD_BYTES = 5
+"""From where a record begins to what RECORD_START finds."""
 COMPRESSIONS = (b"lz4", b"none")
-FIRST_FIELD = re.compile(rb"\x00\x00\x00(?:compression|conn|op|chunk_pos|chunk_count)=")
-"""A record's first field, behind the first byte of its length; five bytes before it, the record begins."""
+COMPRESSION = re.compile(rb"\x00\x00\x00compression=(lz4|none)")
 OnProgress = Callable[[int, int], None]
 """Called with bytes done and bytes in all."""
 
@@ -59,9 +70,8 @@ def unreported(done: int, total: int) -> None:
 def scan_bag(path: Path, report: OnProgress = unreported) -> Scan:
     """Read a bag from end to end, a chunk at a time. Raises OSError where the file cannot be read."""
     with path.open("rb") as file:
-        walk = _Walk(file)
-        for at in walk.steps():
-            report(at, walk.end)
+        walk = _Walk(file, report)
+        walk.run()
     # what a chunk says of a connection counts more than what the file's end says: it is checked
     return Scan(walk.end, walk.chunks, walk.trailing | walk.connections, walk.damages)
 
@@ -69,8 +79,8 @@ def scan_bag(path: Path, report: OnProgress = unreported) -> Scan:
 class _Walk:
     """Goes from record to record, and after damage on to the next that makes sense."""
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
+    def __init__(self, file: BinaryIO, report: OnProgress) -> None:
+        self._file, self._report = file, report
         self.end = file.seek(0, 2)
         self.chunks: list[Chunk] = []
         self.connections: dict[int, Connection] = {}
@@ -78,35 +88,34 @@ class _Walk:
         self.damages: list[Damage] = []
         self._seen = set[tuple[tuple[int, bytes], ...]]()
         self._set_up = False
+        self._is_plain = self._first_chunk_is_plain()
 
     def read(self, at: int, count: int) -> bytes:
         """As many of these bytes as are there."""
         self._file.seek(at)
         return self._file.read(max(0, min(count, self.end - at)))
 
-    def steps(self) -> Iterator[int]:
-        """Walk; yields how far it has come."""
+    def run(self) -> None:
+        """Walk to the file's end."""
         at = len(MAGIC)
         if self.read(0, at) != MAGIC:
             at = self._lose(0, "it does not begin as a recording does", search_at=0)
         while at < self.end:
             at = self._step(at)
-            yield at
+            self._report(at, self.end)
 
     def _step(self, at: int) -> int:
         try:
+            if chunk := self._find_chunk(at):
+                return self._take_chunk(at, chunk)
             record = read_record(self.read, at)
-            if record.op is Op.CHUNK:
-                return self._take_chunk(at, record)
             self._take_other(record)
         except BagFormatError as error:
             return self._lose(at, str(error), search_at=at + 1)
         return record.end
 
     def _take_other(self, record: Record) -> None:
-        """Note a connection, pass over the index. Raises BagFormatError for what has no place outside a chunk."""
-        if record.op is Op.MESSAGE:
-            raise BagFormatError("a message is outside of any chunk")
+        """Note a connection, pass over the index. Raises BagFormatError where that is damaged."""
         if record.op is Op.CONNECTION:
             found = read_connection(self.read, record)
             self.trailing.setdefault(found.number, found)
@@ -120,7 +129,7 @@ class _Walk:
             if self._take(found) and found.why:
                 self.damages.append(Damage(at, 0, found.why))
             return found.end
-        resumed = self._search(found.end)
+        resumed = self._search(found.end + 1)
         if found.chunk is None:
             self._lose_chunk(at, record, resumed, found.why)
         elif found.chunk.content is None or resumed == self.end:
@@ -170,19 +179,40 @@ class _Walk:
     def _search(self, at: int) -> int:
         """Where the next record that makes sense begins, or the file's end."""
         for window_at in range(at, self.end, WINDOW_BYTES):
-            for match in FIRST_FIELD.finditer(self.read(window_at, WINDOW_BYTES + LONGEST_START_BYTES)):
-                start = window_at + match.start() - BEFORE_FIRST_FIELD
+            self._report(window_at, self.end)
+            for match in RECORD_START.finditer(self.read(window_at, WINDOW_BYTES + LONGEST_START_BYTES)):
+                before = 0 if match[0] == LZ4_MAGIC else BEFORE_FIELD_BYTES
+                start = window_at + match.start() - before
                 if start >= at and self._makes_sense(start):
                     return start
         return self.end
 
     def _makes_sense(self, at: int) -> bool:
         with suppress(BagFormatError):
-            record = read_record(self.read, at)
-            if record.op is Op.CHUNK:
-                return record.fields.get("compression") in COMPRESSIONS
-            self._take_other(record)
-            # a connection within a damaged chunk is as good as one at the end, but a message follows it
-            in_chunk = record.op is Op.CONNECTION and record.end < self.end
-            return not in_chunk or read_record(self.read, record.end).op is not Op.MESSAGE
+            if (chunk := self._find_chunk(at)) is None:
+                record = read_record(self.read, at)
+                if record.op is Op.CONNECTION and not self._is_at_end(record.end):
+                    return False
+                self._take_other(record)
+                return True
+            if is_headless(chunk):
+                return examine(self.read, at, chunk, self.end).chunk is not None
+            return chunk.fields.get("compression") in COMPRESSIONS
+        return False
+
+    def _is_at_end(self, at: int) -> bool:
+        """Whether this may follow a connection of the file's end; in a chunk, a message does."""
+        return at == self.end or read_record(self.read, at).op in {Op.CONNECTION, Op.CHUNK_INFO}
+
+    def _find_chunk(self, at: int) -> Record | None:
+        """As `find_chunk`. Messages that show in packed data are no chunk, though: half of them is elsewhere."""
+        chunk = find_chunk(self.read, at)
+        if chunk and is_headless(chunk) and chunk.fields["compression"] == b"none" and not self._is_plain:
+            raise BagFormatError("a message is outside of any chunk")
+        return chunk
+
+    def _first_chunk_is_plain(self) -> bool:
+        for window_at in range(0, self.end, WINDOW_BYTES):
+            if found := COMPRESSION.search(self.read(window_at, WINDOW_BYTES + LONGEST_START_BYTES)):
+                return found[1] == b"none"
         return False

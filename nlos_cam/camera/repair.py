@@ -26,6 +26,8 @@ from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
 
 FRAMES_TOPIC = re.compile(r"/([A-Za-z]+)_\d+/image/data$")
+VERSION_TOPIC = "/file_version"
+"""The first of what describes the device; librealsense plays nothing without."""
 RECORD_BYTES = 128
 """More than a record takes besides its data, where that is an index or a chunk."""
 
@@ -73,7 +75,11 @@ def _readable(scan: Scan) -> tuple[list[Chunk], list[Damage]]:
             lost.setdefault(number, Damage(chunk.at, 0, why))
         if known:
             chunks.append(replace(chunk, index=known))
-    return chunks, sorted([*scan.damages, *lost.values()], key=lambda damage: damage.position)
+    damages = [*scan.damages, *lost.values()]
+    topics = {scan.connections[number].topic.lower() for chunk in chunks for number in chunk.index}
+    if VERSION_TOPIC not in topics:
+        damages.append(Damage(0, 0, "what describes the streams is lost: librealsense will not play this"))
+    return chunks, sorted(damages, key=lambda damage: damage.position)
 
 
 def _holds_frames(chunk: Chunk) -> bool:
@@ -85,6 +91,8 @@ def _why_nothing(scan: Scan) -> str:
         return "it is empty"
     if not scan.chunks:
         return f"none of its {scan.bytes} bytes are a whole piece of a recording"
+    if any(_holds_frames(chunk) for chunk in scan.chunks):
+        return "nothing that is left of it tells what its messages are"
     return "it ends before the first frame"
 
 
