@@ -65,21 +65,46 @@ def repair(path: Path, out: Path, report: OnProgress = unreported) -> Repaired:
 
 
 def _readable(scan: Scan) -> tuple[list[Chunk], list[Damage]]:
-    """Chunks without the messages whose connection nothing describes, and those messages as damage."""
-    lost: dict[int, Damage] = {}
-    chunks: list[Chunk] = []
-    for chunk in scan.chunks:
-        known = {number: entries for number, entries in chunk.index.items() if number in scan.connections}
-        for number in chunk.index.keys() - known.keys():
-            why = f"nothing tells what connection {number} is: its messages cannot be read"
-            lost.setdefault(number, Damage(chunk.at, 0, why))
-        if known:
-            chunks.append(replace(chunk, index=known))
-    damages = [*scan.damages, *lost.values()]
-    topics = {scan.connections[number].topic.lower() for chunk in chunks for number in chunk.index}
-    if VERSION_TOPIC not in topics:
+    """The chunks, with an index of the messages that something describes, and of each frame once; what is damaged."""
+    found = _Index(scan.connections)
+    chunks = [chunk for chunk in (found.narrow(chunk) for chunk in scan.chunks) if chunk.index]
+    damages = [*scan.damages, *found.damages.values()]
+    if VERSION_TOPIC not in {scan.connections[number].topic.lower() for chunk in chunks for number in chunk.index}:
         damages.append(Damage(0, 0, "what describes the streams is lost: librealsense will not play this"))
     return chunks, sorted(damages, key=lambda damage: damage.position)
+
+
+class _Index:
+    """Narrows the indexes of chunks, one after the other, to what can be read."""
+
+    def __init__(self, connections: Mapping[int, Connection]) -> None:
+        self.damages: dict[int, Damage] = {}
+        """By connection."""
+        self._connections = connections
+        self._taken = set[tuple[int, bytes]]()
+
+    def narrow(self, chunk: Chunk) -> Chunk:
+        index = {number: self._once(chunk.at, number, entries) for number, entries in chunk.index.items()}
+        return replace(chunk, index={number: entries for number, entries in index.items() if entries})
+
+    def _once(self, at: int, number: int, entries: bytes) -> bytes:
+        if number not in self._connections:
+            self._note(at, number, "nothing tells what it is")
+            return b""
+        if not FRAMES_TOPIC.search(self._connections[number].topic):
+            return entries
+        new: list[bytes] = []
+        for start in range(0, len(entries), ENTRY_BYTES):
+            frame = number, entries[start : start + 8]
+            if frame not in self._taken:
+                self._taken.add(frame)
+                new.append(entries[start : start + ENTRY_BYTES])
+        if len(new) * ENTRY_BYTES < len(entries):
+            self._note(at, number, "some of its frames are there twice, and taken once")
+        return b"".join(new)
+
+    def _note(self, at: int, number: int, why: str) -> None:
+        self.damages.setdefault(number, Damage(at, 0, f"connection {number}: {why}"))
 
 
 def _holds_frames(chunk: Chunk) -> bool:
@@ -110,14 +135,16 @@ def _write(path: Path, out: Path, scan: Scan, report: OnProgress) -> None:
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         _check_space(out, scan)
-        with path.open("rb") as source, part.open("xb") as target:
+        with path.open("rb") as source:
+            target = part.open("xb")  # so that what is removed below is ours
             try:
-                _Writer(source, target, scan, report).write()
-                target.flush()
-                os.fsync(target.fileno())
+                with target:
+                    _Writer(source, target, scan, report).write()
+                    target.flush()
+                    os.fsync(target.fileno())
                 part.replace(out)
             except BaseException:
-                part.unlink()
+                part.unlink(missing_ok=True)
                 raise
     except OSError as error:
         if isinstance(error, NlosCamError):

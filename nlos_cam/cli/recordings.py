@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from nlos_cam.camera.bag_scan import Damage
 from nlos_cam.camera.repair import Repaired, repair
 from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, tracked
 
@@ -38,14 +37,9 @@ def repair_bag(bag: BagFile, out: Out = None, overwrite: Overwrite = False, json
 
 def _told(found: Repaired) -> str:
     frames = ", ".join(f"{count} {stream}" for stream, count in found.recovered_frames.items())
-    lines = [f"recovered frames: {frames} (in {found.chunks} pieces)"]
-    lines += [f"lost: {_place(damage)}" for damage in found.damages[:MOST_TOLD]] or ["lost: nothing"]
+    lost = sum(damage.bytes for damage in found.damages)
+    told = [f"recovered {found.chunks} pieces with {frames} frames; lost {lost} bytes"]
+    told += [f"at byte {damage.position}: {damage.why}" for damage in found.damages[:MOST_TOLD]]
     if (more := len(found.damages) - MOST_TOLD) > 0:
-        lines.append(f"lost: {more} more places")
-    return "\n".join([*lines, f"wrote {found.out}"])
-
-
-def _place(damage: Damage) -> str:
-    if damage.bytes == 0:
-        return f"no bytes at {damage.position}, where {damage.why}"
-    return f"{damage.bytes} bytes at {damage.position}: {damage.why}"
+        told.append(f"and at {more} more places")
+    return "\n".join([*told, f"wrote {found.out}"])
