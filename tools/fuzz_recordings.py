@@ -1,4 +1,4 @@
-"""Corrupted recordings through everything that reads recordings: docs/fuzz.json (count and seed as arguments).
+"""Corrupted recordings through everything that reads recordings: docs/fuzz.json (arguments: count, seed).
 
 Each is made from its own seed; one that ends in a crash, a hang, too much memory or an error nobody foresaw is told
 with that seed, and kept.

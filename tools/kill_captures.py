@@ -1,4 +1,4 @@
-"""Captures of the simulated camera, killed at random moments and repaired: docs/kills.json (count and seed as arguments).
+"""Captures of the simulated camera, killed at random moments and repaired: docs/kills.json (arguments: count, seed).
 
 What was on disk is counted by a reader of its own, which knows the format only as far as it must. Exits with 1 where a
 chunk was lost, or a frame is not what the camera saw.
