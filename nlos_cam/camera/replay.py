@@ -100,7 +100,7 @@ class ReplayCamera:
         """The SDK ends quietly where it cannot read on. Raises RecordingError where that is not the end."""
         if duration_s - reached_s > END_TOLERANCE_S:
             raise RecordingError(
-                f"{self._path} is damaged {reached_s:.1f} s into its {duration_s:.1f} s: nothing after that can be read"
+                f"{self._path} is damaged {reached_s:.1f} s into its {duration_s:.1f} s: {_repair(self._path)}"
             )
 
     def _count(self, inbox: Inbox) -> None:
@@ -128,7 +128,11 @@ def _load(path: Path, sdk: Any) -> Any:
             what = "was never closed (its recording was killed), so it has no index"
         else:
             what = f"is cut short or damaged ({error})"
-        raise RecordingError(f"{path} {what}: copy it again if it was copied, else record it again") from error
+        raise RecordingError(f"{path} {what}: copy it again if it was copied, else {_repair(path)}") from error
+
+
+def _repair(path: Path) -> str:
+    return f"run `nlos-cam repair {path} --out {path.stem}-repaired.bag`"
 
 
 def _check_file(path: Path) -> None:
