@@ -1,25 +1,19 @@
 """One chunk of a bag: whether it is whole, what is in it, and what of a broken one can still be had."""
 
-import struct
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from enum import Enum
 
 from lz4.frame import LZ4FrameDecompressor
 
+from nlos_cam.camera.bag_content import Ending, read_content, reader, set_up_records
 from nlos_cam.camera.bag_format import (
     CHUNK_LIMIT,
     CUT,
-    SET_UP_TIME,
-    BagCutError,
     BagFormatError,
     Connection,
     Op,
     Read,
     Record,
-    message_key,
-    read_connection,
     read_record,
 )
 
@@ -27,28 +21,6 @@ LEAST_PIECE_BYTES, MOST_PIECE_BYTES = 1 << 16, 4 << 20
 LZ4_MAGIC = b'\x04"M\x18'
 LZ4_TAIL_BYTES = 8
 """End mark and checksum of an lz4 frame."""
-
-
-class Ending(Enum):
-    """How a chunk's data ends."""
-
-    WHOLE = "whole"
-    CUT = "cut off"
-    BROKEN = "broken"
-
-
-@dataclass(frozen=True)
-class Content:
-    """The records in a chunk, as far as they can be read."""
-
-    connections: dict[int, Connection]
-    index: dict[int, bytes]
-    """Of each connection, its entries as in an index record, sorted by time."""
-    bytes: int
-    """Up to here all is whole."""
-    ending: Ending
-    why: str
-    """What is wrong with the bytes after that; empty if nothing is."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +100,7 @@ def _examine_lz4(read: Read, at: int, record: Record, file_end: int) -> Examined
     unpacked, end, ending, why = unpack(read, record.data_at, file_end, _piece_bytes(record))
     if ending is Ending.BROKEN:
         return Examined(None, {}, record.data_at, ending, why)
-    found = read_content(_reader(unpacked), 0, len(unpacked), len(unpacked))
+    found = read_content(reader(unpacked), 0, len(unpacked), len(unpacked))
     if ending is Ending.CUT:
         chunk = Chunk(at, "none", found.bytes, 0, found.bytes, unpacked[: found.bytes], found.index)
         return Examined(chunk if found.index else None, found.connections, record.data_at, ending, why)
@@ -180,79 +152,8 @@ def salvage_set_up(read: Read, at: int, record: Record, file_end: int) -> tuple[
     Not one frame can be read without it, and a recording holds it once. It may be wrong, where frames are not taken.
     """
     end = min(record.end, file_end) - LZ4_TAIL_BYTES
-    unpacked = _reader(unpack(read, record.data_at, end, LEAST_PIECE_BYTES)[0])
+    unpacked = reader(unpack(read, record.data_at, end, LEAST_PIECE_BYTES)[0])
     connections = read_content(unpacked, 0, CHUNK_LIMIT, CHUNK_LIMIT).connections
-    content = b"".join(unpacked(start, found.end - start) for start, found in _set_up_records(unpacked))
-    index = read_content(_reader(content), 0, len(content), len(content)).index
+    content = b"".join(unpacked(start, found.end - start) for start, found in set_up_records(unpacked))
+    index = read_content(reader(content), 0, len(content), len(content)).index
     return Chunk(at, "none", len(content), 0, len(content), content, index) if index else None, connections
-
-
-def _set_up_records(read: Read) -> Iterator[tuple[int, Record]]:
-    with suppress(BagFormatError):
-        for start, record in _records(read, 0, CHUNK_LIMIT, CHUNK_LIMIT):
-            if record.op is Op.CONNECTION or message_key(record)[1] == SET_UP_TIME:
-                yield start, record
-
-
-def read_content(read: Read, at: int, end: int, expected_bytes: int) -> Content:
-    """The connections and messages from `at` on: to `expected_bytes` further, if a record ends there, else to where
-    something else comes, at most to `end`.
-    """
-    connections: dict[int, Connection] = {}
-    entries: dict[int, list[bytes]] = {}
-    reached, ending, why = at, Ending.WHOLE, ""
-    try:
-        for start, record in _confirmed(_records(read, at, end, expected_bytes)):
-            if record.op is Op.CONNECTION:
-                found = read_connection(read, record)
-                connections[found.number] = found
-            else:
-                connection, time = message_key(record)
-                entries.setdefault(connection, []).append(time + (start - at).to_bytes(4, "little"))
-            reached = record.end
-    except BagCutError as error:
-        ending, why = Ending.CUT, str(error)
-    except BagFormatError as error:
-        ending, why = Ending.BROKEN, str(error)
-    index = {connection: b"".join(sorted(found, key=_time)) for connection, found in sorted(entries.items())}
-    return Content(connections, index, reached - at, ending, why)
-
-
-def _records(read: Read, at: int, end: int, expected_bytes: int) -> Iterator[tuple[int, Record]]:
-    """Messages and connections, and where each starts. Raises BagFormatError where neither comes."""
-    expected_end = at + expected_bytes
-    while at != expected_end and read(at, 1):
-        record = read_record(read, at)
-        if record.op not in {Op.MESSAGE, Op.CONNECTION}:
-            return
-        if not read(record.end - 1, 1):
-            raise BagCutError(CUT)
-        if record.end > end:
-            raise BagFormatError(f"it holds more than {CHUNK_LIMIT >> 20} MiB")
-        yield at, record
-        at = record.end
-
-
-def _confirmed(records: Iterator[tuple[int, Record]]) -> Iterator[tuple[int, Record]]:
-    """All but the one before damage: its length may be what is wrong."""
-    last: tuple[int, Record] | None = None
-    try:
-        for found in records:
-            if last:
-                yield last
-            last = found
-    except BagCutError:
-        if last:
-            yield last
-        raise
-    if last:
-        yield last
-
-
-def _time(entry: bytes) -> tuple[int, int]:
-    seconds, nanoseconds = struct.unpack_from("<II", entry)
-    return seconds, nanoseconds
-
-
-def _reader(content: bytes) -> Read:
-    return lambda at, count: content[at : at + count]

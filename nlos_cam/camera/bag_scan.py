@@ -10,13 +10,13 @@ from typing import BinaryIO
 from nlos_cam.camera.bag_chunk import (
     LZ4_MAGIC,
     Chunk,
-    Ending,
     Examined,
     examine,
     find_chunk,
     is_headless,
     salvage_set_up,
 )
+from nlos_cam.camera.bag_content import Ending
 from nlos_cam.camera.bag_format import (
     MAGIC,
     SET_UP_TIME,

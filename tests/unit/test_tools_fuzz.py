@@ -9,7 +9,7 @@ import pytest
 
 TOOLS = Path(__file__).parents[2] / "tools"
 BAD_ACTIONS = """
-import os, time
+import mmap, os, time
 from pathlib import Path
 from nlos_cam.errors import RecordingError
 
@@ -19,7 +19,7 @@ def act(path: Path, folder: Path) -> None:
         case "exit": os._exit(0)
         case "hang": time.sleep(60)
         case "memory": bytearray((1 << 30) + (1 << 20))
-        case "enough memory": bytearray(900 << 20)
+        case "enough memory": mmap.mmap(-1, 900 << 20)
         case "unexpected": raise ValueError("nobody foresaw this")
         case "refused": raise RecordingError("foreseen")
         case "writes": (folder / "more").write_bytes(b"x")
@@ -45,7 +45,7 @@ def test_the_watch_notices_each_kind_of_harm_and_goes_on(tool: Tool, tmp_path: P
     actions.write_text(BAD_ACTIONS)
     whole.write_text("whole")
     found: dict[str, str] = {}
-    with tool("fuzz_harness").Watched(actions, whole, timeout_s=2.0) as watched:
+    with tool("fuzz_harness").Watched(actions, whole, timeout_s=3.0) as watched:
         for name in VERDICTS:
             path = tmp_path / name
             path.write_text(name)
