@@ -1,7 +1,7 @@
 """Corrupted recordings through everything that reads recordings: docs/fuzz.json (arguments: count, seed).
 
-Each is made from its own seed; one that ends in a crash, a hang, too much memory or an error nobody foresaw is told
-with that seed, and kept.
+One that ends in a crash, a hang, too much memory or an error nobody foresaw is told with its seed, and kept: the seed
+gives the same damage again, but librealsense stamps a recording with other times in each run.
 """
 
 import json
