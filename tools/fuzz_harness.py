@@ -81,19 +81,19 @@ class Watched:
 
 
 def verdict_of(actions: dict[str, Action], path: Path) -> Verdict:
-    """Do every action; the worst that came of them."""
-    refused = ""
+    """Do every action; the worst that came of them, or, if all is well, which of them refused the file and why."""
+    refused: list[str] = []
     for name, action in actions.items():
         with tempfile.TemporaryDirectory() as folder:
             try:
                 action(path, Path(folder))
             except NlosCamError as error:
-                refused = f"{name}: {error}"
+                refused.append(f"{name}: {error}")
             except MemoryError:
                 return "memory", name
             except Exception as error:  # noqa: BLE001  whatever it is, it is a finding
                 return "unexpected", f"{name}: {error!r}"
-    return ("refused", refused) if refused else ("done", "")
+    return ("refused", "\n".join(refused)) if refused else ("done", "")
 
 
 def limit_memory() -> None:

@@ -26,6 +26,8 @@ class Findings:
     """What became of the corrupted recordings."""
 
     verdicts: dict[str, int] = field(default_factory=dict[str, int])
+    refused_by: dict[str, int] = field(default_factory=dict[str, int])
+    """How many each action refused with one line."""
     bad: list[dict[str, str | int]] = field(default_factory=list[dict[str, str | int]])
 
 
@@ -44,6 +46,9 @@ def fuzz(recordings: dict[str, Path], actions: Path, count: int, seed: int, keep
             findings.verdicts[kind] = findings.verdicts.get(kind, 0) + 1
             if kind in GOOD:
                 path.unlink()
+                for line in told.splitlines():
+                    action = line.partition(":")[0]
+                    findings.refused_by[action] = findings.refused_by.get(action, 0) + 1
             else:
                 findings.bad.append({"seed": number, "recording": name, "ways": ways, "verdict": kind, "told": told})
                 print(f"{kind}: seed {number}, {path} ({ways}): {told}")
