@@ -115,5 +115,6 @@ def test_forty_corrupted_recordings_end_in_frames_or_a_line(
 ) -> None:
     findings = tool("fuzz_recordings").fuzz(noise_bags, TOOLS / "fuzz_actions.py", 40, 0, tmp_path)
     assert findings.bad == []
-    assert set(findings.verdicts) == {"done", "refused"}
-    assert findings.verdicts["done"] > 10
+    assert set(findings.verdicts) <= {"done", "refused"}
+    assert findings.refused_by["replay"] > 10
+    assert findings.refused_by["repair"] < 30  # most of what replay refuses can be repaired
