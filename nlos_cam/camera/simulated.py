@@ -43,7 +43,7 @@ class SimulatedCamera(LiveCamera):
         self._thread: Thread | None = None
         pinhole, sdk = world.rig.pinhole, load_sdk()
         self._lidar = SoftwareLidar(pinhole, sdk)
-        super().__init__(uri, self._lidar.device, (pinhole.width, pinhole.height), sdk, recording)
+        super().__init__(uri, self._lidar.device, (pinhole.width, pinhole.height), sdk, recording, self._clock)
         self.rig: Rig | None = world.rig
 
     def _prepare(self, sensor: Any) -> None:
