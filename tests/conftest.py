@@ -136,6 +136,9 @@ class FakeFrame:
     def get_timestamp(self) -> float:
         return self.number * 1000 / 30
 
+    def get_frame_timestamp_domain(self) -> Named:
+        return Named(name="global_time")
+
     def get_data(self) -> np.ndarray:
         return np.full(self.profile.size[::-1], 240, np.uint16 if self.profile.stream == "depth" else np.uint8)
 
