@@ -60,7 +60,7 @@ class LiveCamera(ABC):
         self.incomplete = self.dropped = 0
         self.counts.clear()
         self._past_incomplete = self._past_dropped = 0
-        self._arrived: Counter[str] = Counter()
+        self._past_counts, self._arrived = Counter[str](), Counter[str]()
         self._continuity = Continuity()
         self._left = Event()
         self._recovery: Recovery | None = None
@@ -192,11 +192,13 @@ class LiveCamera(ABC):
         self._continuity.restart(counted=self.incomplete + self.dropped - told)
         self._past_incomplete += inbox.incomplete
         self._past_dropped += inbox.dropped
+        self._past_counts += inbox.counts
         self._arrived += inbox.arrived
 
     def _count(self, inbox: Inbox) -> None:
         self.incomplete = self._past_incomplete + inbox.incomplete
         self.dropped = self._past_dropped + inbox.dropped + self._continuity.missed
+        self.counts.update({name: self._past_counts[name] + n - self.counts[name] for name, n in inbox.counts.items()})
 
     def __iter__(self) -> Iterator[Frame]:
         if not self._entered:

@@ -2,13 +2,23 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.camera.inbox import Inbox
-from nlos_cam.camera.streams import FRAMES_PER_S, FrameSet, intrinsics_of, is_needed, sample_from_sdk, stream_name
+from nlos_cam.camera.streams import (
+    FRAMES_PER_S,
+    FrameSet,
+    Sample,
+    intrinsics_of,
+    is_needed,
+    sample_from_sdk,
+    stream_name,
+)
+from nlos_cam.camera.unwrap import ClockUnwrap
 from nlos_cam.frames import Float32, Frame
 
 Size = tuple[int, int]
@@ -55,9 +65,11 @@ class Session:
         self.inbox = inbox
         self.settings: dict[str, float] = {}
         self.intrinsics: Intrinsics = intrinsics_of(profiles["depth"])
+        inbox.expect((self.intrinsics.height, self.intrinsics.width))
         self._sensor: Any = sensor
         self._profiles = list(profiles.values())
         self._unit_m = np.float32(_depth_unit_m(sensor))
+        self._clocks = {stream: ClockUnwrap() for stream in profiles}
         self._listening = False
 
     def start(self, prepare: Callable[[Any], None] | None = None) -> None:
@@ -72,7 +84,13 @@ class Session:
 
     def _on_frame(self, frame: Any) -> None:
         if self._listening:
-            self.inbox.put(sample_from_sdk(frame))
+            self.inbox.put(self._unwrapped(sample_from_sdk(frame), frame.get_frame_timestamp_domain().name))
+
+    def _unwrapped(self, sample: Sample, domain: str) -> Sample:
+        """A sample on a clock that goes on: the device's own wraps every 71.6 minutes, for each stream by itself."""
+        if domain != "hardware_clock":
+            return sample
+        return replace(sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s))
 
     def telemetry(self) -> dict[str, float]:
         """The options as they read now."""
