@@ -1,11 +1,11 @@
 """A real Intel RealSense L515."""
 
 import logging
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
+from nlos_cam.camera.clock import Clock
 from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.live_camera import LiveCamera
 from nlos_cam.camera.record import Recording
@@ -80,21 +80,22 @@ class L515Camera(LiveCamera):
         *,
         recording: Recording | None = None,
         sdk: Any = None,
-        sleep: Callable[[float], None] = time.sleep,
+        clock: Clock | None = None,
     ) -> None:
         sdk = sdk or load_sdk()
-        self._sleep = sleep
         self._context = sdk.context()  # one for discovery and streaming: two of them fight over the device
         device, info = _find(sdk, self._context, serial)
         size = USB2_SIZE if info.usb_type.startswith("2") else USB3_SIZE
         if size == USB2_SIZE:
             log.warning("%s is on USB %s: only 320 x 240; turn the plug round or use a USB 3 cable", uri, info.usb_type)
-        super().__init__(uri, device, size, sdk, recording)
+        self._serial = info.serial
+        super().__init__(uri, device, size, sdk, recording, clock)
+        self.identity: Mapping[str, str] = {key: value for key, value in asdict(info).items() if value}
 
     def _prepare(self, sensor: Any) -> None:
         """Preset first, since it changes the others; after start, since starting resets it."""
         self._set(sensor, {"global_time_enabled": 1.0, "visual_preset": SHORT_RANGE})
-        self._sleep(PRESET_SETTLES_S)
+        self._clock.wait(self._left, PRESET_SETTLES_S)
         self._set(sensor, NEAR_WALL)
         for name, wanted in NEAR_WALL.items():
             self._check(sensor, name, wanted)
@@ -112,6 +113,16 @@ class L515Camera(LiveCamera):
         found = sensor.get_option(option) if sensor.supports(option) else None
         if found != wanted:
             log.warning("%s reads back %s = %s where %g was set", self.uri, name, found, wanted)
+
+    def _is_connected(self) -> bool:
+        return self._reconnect() is not None
+
+    def _reconnect(self) -> Any | None:
+        there = connected(self._sdk, self._context)
+        return next((device for device, info in there if info.serial == self._serial), None)
+
+    def _reset(self) -> None:
+        self._device.hardware_reset()
 
     def _begin(self, inbox: Inbox) -> None:
         """It runs already."""

@@ -53,7 +53,7 @@ class SimulatedCamera(LiveCamera):
         self._start_s: float | None = None
         self._plug_in(0)
         pinhole = world.rig.pinhole
-        super().__init__(uri, self._lidar.device, (pinhole.width, pinhole.height), load_sdk(), recording)
+        super().__init__(uri, self._lidar.device, (pinhole.width, pinhole.height), load_sdk(), recording, self._clock)
         self.rig: Rig | None = world.rig
 
     def __enter__(self) -> Self:

@@ -47,7 +47,8 @@ def live(
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
     measured = load_wall(wall).rig if wall else None
-    recording = Recording(output_path(record, "live", ".bag", overwrite=overwrite)) if record else None
+    path = output_path(record, "live", ".bag", overwrite=overwrite) if record else None
+    recording = Recording(path, optional=True) if path else None
     with tracked("rendering the scene ahead") as on_progress:
         opened = open_camera(camera, on_progress=on_progress, recording=recording)
     rig = measured or _rig_of(opened)

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from fake_librealsense import FakeDevice
+from fake_lidar import NapClock
 
 from nlos_cam.camera.l515 import NEAR_WALL
 from nlos_cam.camera.streams import FORMATS
@@ -27,8 +29,8 @@ def test_another_realsense_is_named_and_not_taken(fake_l515: Make, fake_camera: 
 def test_the_serial_number_chooses(fake_l515: Make, fake_camera: Make) -> None:
     one, other = fake_l515("f1"), fake_l515("f2")
     with fake_camera(one, other, serial="f2"):
-        assert other.sensor.opened
-    assert not one.sensor.opened
+        assert other.opened
+    assert not one.opened
 
 
 def test_one_of_several_has_to_be_named(fake_l515: Make, fake_camera: Make) -> None:
@@ -48,28 +50,28 @@ def test_the_link_decides_the_resolution(
     device = fake_l515(usb=usb)
     with fake_camera(device) as camera:
         assert (camera.intrinsics.width, camera.intrinsics.height) == size
-        assert [(profile.stream, profile.size) for profile in device.sensor.opened] == [(one, size) for one in FORMATS]
+        assert [(profile.stream, profile.size) for profile in device.opened] == [(one, size) for one in FORMATS]
     assert ("USB 2.1" in caplog.text) == (usb == "2.1")
 
 
 def test_near_wall_settings_follow_the_preset_which_follows_the_start(fake_l515: Make, fake_camera: Make) -> None:
-    device, sleeps = fake_l515(), []
-    with fake_camera(device, naps=sleeps):
-        did = device.sensor.did
+    device, clock = fake_l515(), NapClock()
+    with fake_camera(device, clock=clock):
+        did = device.did
         assert did.index("start") < did.index("visual_preset") < min(did.index(name) for name in NEAR_WALL)
-    assert sleeps == [0.5]
-    assert device.sensor.options["visual_preset"] == 5.0
+    assert clock.naps == [0.5]
+    assert device.options["visual_preset"] == 5.0
 
 
 def test_frames_carry_the_settings_as_read_back(
     caplog: pytest.LogCaptureFixture, fake_l515: Make, fake_camera: Make
 ) -> None:
     device = fake_l515()
-    device.sensor.stubborn = {"min_distance"}
+    device.stubborn = {"min_distance"}
     with fake_camera(device) as camera:
-        device.sensor.deliver(range(1, 2))
+        device.deliver(range(1, 2))
         frame = next(iter(camera))
-    assert frame.settings == device.sensor.options
+    assert frame.settings == device.options
     assert frame.settings["min_distance"] == 9.0
     assert [record.message for record in caplog.records] == ["l515 reads back min_distance = 9.0 where 0 was set"]
 
@@ -87,17 +89,19 @@ def test_an_option_that_is_refused_is_told_and_the_rest_set(
     caplog: pytest.LogCaptureFixture, fake_l515: Make, fake_camera: Make
 ) -> None:
     device = fake_l515()
-    device.sensor.refused = {"min_distance"}
+    device.refused = {"min_distance"}
     with fake_camera(device):
-        assert device.sensor.options["invalidation_bypass"] == 0.0
+        assert device.options["invalidation_bypass"] == 0.0
     assert "does not take min_distance = 0: out of range" in caplog.text
 
 
-def test_a_device_that_cannot_be_asked_is_told(fake_l515: Make, fake_camera: Make) -> None:
-    def fail(_: str) -> bool:
+def test_a_device_that_cannot_be_asked_is_told(
+    monkeypatch: pytest.MonkeyPatch, fake_l515: Make, fake_camera: Make
+) -> None:
+    def fail(_device: FakeDevice, _key: str) -> bool:
         raise RuntimeError("no permission")
 
+    monkeypatch.setattr(FakeDevice, "supports", fail)
     device = fake_l515()
-    device.supports = fail
     with pytest.raises(CameraError, match="no permission"):
         fake_camera(device)

@@ -2,6 +2,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fake_librealsense import FakeDevice, FakeSensor
 
 from nlos_cam.camera.session import find_streams, read_settings
 from nlos_cam.camera.streams import FORMATS
@@ -24,21 +25,21 @@ def test_settings_are_all_that_can_be_read() -> None:
 
 
 def test_the_sensor_with_most_of_our_streams_is_found(fake_l515: Any) -> None:
-    partial, whole = fake_l515(streams=("infrared",)), fake_l515()
-    device = SimpleNamespace(query_sensors=lambda: [partial.sensor, whole.sensor])
+    partial, whole = FakeSensor(fake_l515(streams=("infrared",)), 0), FakeSensor(fake_l515(), 0)
+    device = SimpleNamespace(query_sensors=lambda: [partial, whole])
     sensor, profiles = find_streams(device)
-    assert sensor is whole.sensor
+    assert sensor is whole
     assert set(profiles) == set(FORMATS)
 
 
 @pytest.mark.parametrize("size", [(1024, 768), (640, 480), (320, 240)])
 def test_profiles_are_those_of_the_size_asked_for(fake_l515: Any, size: tuple[int, int]) -> None:
-    _, profiles = find_streams(fake_l515(), size)
+    _, profiles = find_streams(FakeDevice(fake_l515(), 0), size)
     assert {profile.size for profile in profiles.values()} == {size}
 
 
 def test_a_size_that_is_not_offered_finds_no_streams(fake_l515: Any) -> None:
-    assert find_streams(fake_l515(), (100, 100))[1] == {}
+    assert find_streams(FakeDevice(fake_l515(), 0), (100, 100))[1] == {}
 
 
 def test_a_device_without_sensors_has_no_streams() -> None:
