@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from nlos_cam.camera.base import Camera
 from nlos_cam.errors import OutputExistsError, RecordingError
+from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.live import FrameReader, Step, steps
+from nlos_cam.live import steps
+from nlos_cam.live_report import Step
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.reconstruct import Clock, Network
 
