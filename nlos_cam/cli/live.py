@@ -12,6 +12,7 @@ from nlos_models.inference import Reconstructor, load_reconstructor
 from nlos_cam.cache import cache_folder
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
+from nlos_cam.camera.table import Reader
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stop_on_signals, tracked
 from nlos_cam.live import LiveReport, run_live, warm_up
 from nlos_cam.replay import REPORT, replay
@@ -24,6 +25,7 @@ Weights = Annotated[Path | None, typer.Option("--weights", help="A folder of oth
 Seconds = Annotated[float | None, typer.Option("--seconds", min=0.1, help="Stop after so long; else at Ctrl-C.")]
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 RecordTo = Annotated[Path | None, typer.Option("--record", help="Also record the camera's streams (F.bag).")]
+ReadBy = Annotated[Reader, typer.Option("--reader", help="Who reads the file: plain (we), or sdk (librealsense).")]
 BagFile = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording with depth, infrared and confidence.")]
 Out = Annotated[Path | None, typer.Option("--out", help="The folder to write.")]
 
@@ -72,12 +74,13 @@ def replay_bag(
     wall: Wall = None,
     out: Out = None,
     weights: Weights = None,
+    reader: ReadBy = "plain",
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Reconstruct every frame of a recording: the same frames and the same bits each time."""
     path = output_path(out, "replay", "", overwrite=overwrite)
-    measured, opened = load_wall(wall).rig if wall else None, open_camera(f"bag:{bag}")
+    measured, opened = load_wall(wall).rig if wall else None, open_camera(f"bag:{bag}", reader=reader)
     rig = measured or _rig_of(opened)
     network = _network(weights, rig)
     with opened as source, stop_on_signals() as stop, progress() as bar:
