@@ -56,7 +56,7 @@ class LiveCamera(ABC):
         """The device anew, when it has come back; None while it has not."""
         return self._device
 
-    def _reset(self) -> None:
+    def _reset(self) -> None:  # noqa: B027  a device that has no such thing
         """Make the device start afresh, as by unplugging it; it vanishes and comes back."""
 
     @abstractmethod
