@@ -1,7 +1,7 @@
 """What can be seen to be amiss with a frame: blank, half invalid, saturated."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -22,6 +22,11 @@ def amiss(frame: Frame) -> list[str]:
     if np.count_nonzero(frame.ir == 255) > SATURATED_SHARE * pixels:
         names.append("saturated")
     return names
+
+
+def in_words(counts: Mapping[str, int]) -> str:
+    """Counts by name as a person reads them; empty where there are none."""
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
 
 
 def watched(frames: Iterable[Frame], seen: Counter[str]) -> Iterator[Frame]:

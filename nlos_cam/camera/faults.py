@@ -64,9 +64,9 @@ class FaultyDevice:
         self._plugged_in_at = self._counted_from = plugged_in_at
         self._held: list[Delivery] = []
         wraps = [fault.at_frame for fault in faults if fault.kind == "clock_wrap"]
-        self._wraps_at = wraps[0] if wraps else None
         self.has_own_clock = bool(wraps)
-        """Whether its timestamps are not the host's time."""
+        """Whether its timestamps are not the host's time: they begin at 0 with it, but for the first, which wraps."""
+        self._clock_from = plugged_in_at or sum(wraps)
         self.has_other_size = any(fault.kind == "wrong_size" for fault in faults)
 
     def is_there(self, instant: int) -> bool:
@@ -98,7 +98,7 @@ class FaultyDevice:
         return [*handed * (2 if self._befallen(instant, "duplicate") else 1), *late]
 
     def _timestamp_s(self, instant: int, due_s: float) -> float:
-        return due_s if self._wraps_at is None else (instant - self._wraps_at) / FRAMES_PER_S % PERIOD_S
+        return (instant - self._clock_from) / FRAMES_PER_S % PERIOD_S if self.has_own_clock else due_s
 
     def _spoil(self, delivery: Delivery, instant: int) -> Delivery:
         images = delivery.images

@@ -5,10 +5,10 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.camera.inbox import Inbox
+from nlos_cam.camera.si_units import frame_in_si
 from nlos_cam.camera.streams import (
     FRAMES_PER_S,
     FrameSet,
@@ -71,7 +71,7 @@ class Session:
         inbox.expect((self.intrinsics.height, self.intrinsics.width))
         self._sensor: Any = sensor
         self._profiles = list(profiles.values())
-        self._unit_m = np.float32(_depth_unit_m(sensor))
+        self._unit_m = _depth_unit_m(sensor)
         self._clocks = {stream: ClockUnwrap() for stream in profiles}
         self._preview = Inbox(lossless=False)
         """Of frames from before the settings hold."""
@@ -137,15 +137,4 @@ class Session:
 
     def frame(self, found: FrameSet, truth_depth_m: Float32 | None = None) -> Frame:
         """A set in SI units."""
-        depth_m = found.depth_z16 * self._unit_m
-        depth_m[found.depth_z16 == 0] = np.nan
-        return Frame(
-            depth_m=depth_m,
-            ir=found.ir,
-            confidence=found.confidence_raw8 >> np.uint8(4),
-            timestamp_s=found.timestamp_s,
-            frame_number=found.number,
-            intrinsics=self.intrinsics,
-            settings=self.settings,
-            truth_depth_m=truth_depth_m,
-        )
+        return frame_in_si(found, self._unit_m, self.intrinsics, self.settings, truth_depth_m)
