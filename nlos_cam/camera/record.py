@@ -18,8 +18,12 @@ class Recording:
     Give it to `open_camera`; the camera begins it on entering and closes it on leaving.
     """
 
-    def __init__(self, path: Path, *, frames: int | None = None, seconds: float | None = None) -> None:
+    def __init__(
+        self, path: Path, *, frames: int | None = None, seconds: float | None = None, optional: bool = False
+    ) -> None:
         self.path = path
+        self.optional = optional
+        """Whether a camera whose device falls silent, which ends the recording, goes on without it."""
         self.sets = 0
         """Complete sets of streams so far, from the first that a reader of the camera sees."""
         self._frames, self._seconds = frames, seconds

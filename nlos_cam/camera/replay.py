@@ -67,7 +67,7 @@ class ReplayCamera:
             raise CameraError(f"{self.uri} is not started: iterate inside `with`")
         self._iterations += 1
         self.arrived = Counter()
-        pairing = Pairing()
+        pairing = Pairing((self.intrinsics.height, self.intrinsics.width))
         try:
             yield from self._frames(pairing, self._iterations)
         except RecordingError:
@@ -93,7 +93,7 @@ class ReplayCamera:
         self._count(pairing)
 
     def _count(self, pairing: Pairing) -> None:
-        self.incomplete, self.dropped = pairing.incomplete, pairing.dropped
+        self.incomplete, self.dropped, self.counts = pairing.incomplete, pairing.dropped, pairing.counts
 
     def telemetry(self) -> Mapping[str, float]:
         return self._settings
