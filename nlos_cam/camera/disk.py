@@ -7,6 +7,7 @@ from pathlib import Path
 from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.errors import DiskFullError
 
 BYTES_PER_PIXEL = 4
 """16 bits of depth, 8 of infrared, 8 of confidence."""
@@ -33,6 +34,18 @@ def recording_s(intrinsics: Intrinsics, free: int) -> float:
     return max(0, free - RESERVE_BYTES) / (bytes_per_frame(intrinsics) * FRAMES_PER_S)
 
 
+def check_room(path: Path, intrinsics: Intrinsics, frames: int, free: int) -> None:
+    """Raise DiskFullError where so many frames may not fit, and leave the reserve."""
+    needed = frames * bytes_per_frame(intrinsics)
+    if free < needed + RESERVE_BYTES:
+        size = f"{intrinsics.width} x {intrinsics.height}"
+        raise DiskFullError(
+            f"{path}: {frames} frames of {size} may need {needed / 1e9:.2f} GB (uncompressed; how far they compress is "
+            f"not known ahead) beside {RESERVE_BYTES / 1e9:.1f} GB that stay free, and {free / 1e9:.2f} GB are free: "
+            "make room, record less, or name a --out on another disk"
+        )
+
+
 def closing_bytes(path: Path) -> int:
     """More than closing a recording adds to it."""
     return CHUNK_BYTES + int(path.stat().st_size * INDEX_SHARE)
@@ -49,8 +62,9 @@ def can_grow(path: Path, by_bytes: int) -> bool:
             file.seek(length)
             wrote = file.write(bytes(by_bytes))
             os.fsync(file.fileno())
-        return wrote == by_bytes
     except OSError:
         return False
+    else:
+        return wrote == by_bytes
     finally:
         os.truncate(path, length)
