@@ -92,7 +92,7 @@ class Recording:
 
     def _is_short_of_space(self) -> bool:
         """Looked at once a second."""
-        return self.sets % FRAMES_PER_S == 0 and self._free(self.path) < RESERVE_BYTES
+        return self.sets % FRAMES_PER_S == 1 and self._free(self.path) < RESERVE_BYTES
 
     def _is_full(self, timestamp_s: float) -> bool:
         if self._frames is not None and self.sets >= self._frames:

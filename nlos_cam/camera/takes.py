@@ -88,7 +88,7 @@ class Takes:
                 raise
             take = replace(take, state="disk full", error=error, closed=False)
         if take:
-            yield take
+            yield replace(take, sets=self._recording.sets)  # with the one that was in flight when it ended
 
     def _enter(self, entered: ExitStack) -> Iterator[Frame]:
         try:

@@ -112,9 +112,8 @@ def _jobs(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> list
 def _check_disk(camera: Camera, jobs: list[Job], each: int | None) -> None:
     """Raises DiskFullError where they may not fit; says how long there is room where no limit was given."""
     path, free = jobs[0].path, free_bytes(jobs[0].path)
-    if each is not None:
-        check_room(path, camera.intrinsics, each * len(jobs), free)
-    else:
+    check_room(path, camera.intrinsics, (each or 0) * len(jobs), free)
+    if each is None:
         minutes = recording_s(camera.intrinsics, free) / 60
         say(f"there is room for {minutes:.0f} minutes or more ({free / 1e9:.1f} GB free); Ctrl-C ends it")
 
