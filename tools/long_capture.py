@@ -114,7 +114,7 @@ def read(path: Path, reader: Reader, on_frame: Callable[[], None]) -> Reading:
         for frame in camera:
             digest.update(f"{frame.frame_number} {frame.timestamp_s:.6f}".encode())
             for pixels in (frame.depth_m, frame.ir, frame.confidence):
-                digest.update(np.ascontiguousarray(pixels))
+                digest.update(np.ascontiguousarray(pixels).data)
             frames += 1
             on_frame()
     return Reading(frames, time.monotonic() - begun_s, digest.hexdigest())

@@ -1,5 +1,6 @@
 """Recording a live camera to .bag, until it is full, or the disk is: one take, or several in a row."""
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event
@@ -8,9 +9,12 @@ from typing import Any
 from nlos_cam.camera.disk import RESERVE_BYTES, free_bytes
 from nlos_cam.camera.sdk_recorder import SdkRecorder
 from nlos_cam.camera.streams import FRAMES_PER_S, SAME_INSTANT_S, FrameSet
+from nlos_cam.errors import DiskFullError
 
 BOUNDARY_WAIT_S = 1.0
 """How long to wait for the set in flight, so that no stream has one frame more than another."""
+
+log = logging.getLogger(__name__)
 
 
 class Recording:
@@ -27,9 +31,12 @@ class Recording:
         frames: int | None = None,
         seconds: float | None = None,
         last: bool = True,
+        optional: bool = False,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
         self.path = path
+        self.optional = optional
+        """Whether a camera goes on without it when it ends early: the device fell silent, or the disk is full."""
         self.sets = 0
         """Complete sets of streams in this take so far, from the first that a reader of the camera sees."""
         self.begun = False
@@ -79,7 +86,7 @@ class Recording:
             return False
         if self._recorder and not self._paused.is_set():
             self._count(found, self._recorder)
-        return self._paused.is_set() and (self._last or self.disk_full)
+        return self._paused.is_set() and (self._last or self.disk_full) and not (self.disk_full and self.optional)
 
     def _count(self, found: FrameSet, recorder: SdkRecorder) -> None:
         self._first_s = found.timestamp_s if self.sets == 0 else self._first_s
@@ -89,6 +96,8 @@ class Recording:
         if self.disk_full or self._is_full(found.timestamp_s) or self._stopping.is_set():
             recorder.pause()  # queued behind the frames seen so far: none of them is lost
             self._paused.set()
+        if self.disk_full and self.optional:
+            log.warning("%s: the disk is full, and the recording ends after %d frames", self.path, self.sets)
 
     def _is_short_of_space(self) -> bool:
         """Looked at once a second."""
@@ -117,7 +126,12 @@ class Recording:
             self._paused.set()
 
     def close(self) -> None:
-        """Write the index and close the file. Raises DiskFullError where that cannot be."""
+        """Write the index and close the file. Raises DiskFullError where that cannot be; an optional one warns."""
         recorder, self._recorder = self._recorder, None
-        if recorder:
-            recorder.close()
+        try:
+            if recorder:
+                recorder.close()
+        except DiskFullError as error:
+            if not self.optional:
+                raise
+            log.warning("%s", error)

@@ -42,7 +42,7 @@ class Temperatures(Record):
     time_s: Finite
     """Since the first frame, by the device's clock."""
     celsius: dict[str, Finite]
-    """By the SDK's name of the option; -9999 is the photodiode's for its first seconds."""
+    """By the SDK's name of the option."""
 
 
 class WallFile(Record):

@@ -128,7 +128,7 @@ def test_only_the_last_take_ends_the_iteration(camera: Make, tmp_path: Path) -> 
         assert recording.done
         recording.close()
         recording.next_take(tmp_path / "b.bag", last=True)
-        assert len(list(source)) < 3 + CAPACITY
+        assert len(list(source)) <= CAPACITY + 1 + 3
     assert recording.sets == 3
 
 
@@ -173,3 +173,18 @@ def test_a_disk_that_fills_up_ends_a_take_that_is_not_the_last(camera: Make, tmp
     with camera(recording) as source:
         assert list(source)
     assert verify(recording.path).frames == recording.sets == 1
+
+
+@pytest.mark.parametrize("ending", ["little space", "no index"])
+def test_a_camera_goes_on_without_an_optional_one(
+    camera: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, ending: str
+) -> None:
+    if ending == "no index":
+        monkeypatch.setattr("nlos_cam.camera.sdk_recorder.can_grow", lambda *_: False)
+    left = 0 if ending == "little space" else 2 * RESERVE_BYTES
+    recording = Recording(tmp_path / "a.bag", optional=True, free=lambda _: left)
+    with camera(recording) as source:
+        assert len(list(islice(source, 40))) == 40
+    assert recording.sets == 1 or ending == "no index"
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert "a.bag" in warning
