@@ -142,7 +142,10 @@ def settle(take: Take, read_back: Callable[[Path], Verified | None]) -> Take:
             path.unlink(missing_ok=True)
         return take
     settled = _read_back(take, read_back) if take.closed else take
-    settled.sidecar.finish(settled.state, settled.summary)
+    try:
+        settled.sidecar.finish(settled.state, settled.summary)
+    except DiskFullError as error:
+        return replace(settled, error=settled.error or error)
     return settled
 
 

@@ -115,7 +115,7 @@ def _check_disk(camera: Camera, jobs: list[Job], each: int | None) -> None:
     check_room(path, camera.intrinsics, (each or 0) * len(jobs), free)
     if each is None:
         minutes = recording_s(camera.intrinsics, free) / 60
-        say(f"there is room for {minutes:.0f} minutes or more ({free / 1e9:.1f} GB free); Ctrl-C ends it")
+        say(f"there is room for {minutes:.1f} minutes or more ({free / 1e9:.1f} GB free); Ctrl-C ends it")
 
 
 def _make(takes: Takes, stop: Event, each: int | None, pause_s: float | None) -> list[Take]:

@@ -156,6 +156,20 @@ def test_little_space_ends_it_whole(run: Run) -> None:
     assert load_sidecar(take.sidecar.path).state == "disk full"
 
 
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_disk_too_full_for_the_sidecar_too_hides_no_other_error(
+    run: Run, monkeypatch: pytest.MonkeyPatch, indexed: bool
+) -> None:
+    def full(*_: Any) -> None:
+        raise DiskFullError("0.json cannot be written")
+
+    monkeypatch.setattr("nlos_cam.camera.sidecar.SidecarFile.finish", full)
+    monkeypatch.setattr("nlos_cam.camera.sdk_recorder.can_grow", lambda *_: indexed)
+    (take,) = run(frames=4)
+    assert (take.found is not None) == indexed
+    assert ("0.json cannot be written" if indexed else "nlos-cam repair") in str(take.error)
+
+
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_file_that_cannot_be_closed_is_told_and_not_read_back(
     run: Run, monkeypatch: pytest.MonkeyPatch, count: int

@@ -12,9 +12,11 @@ import pytest
 import typer
 
 from nlos_cam.camera import Recording
+from nlos_cam.camera.quality import Quality
 from nlos_cam.camera.replay import Verified, verify
 from nlos_cam.camera.sidecar import load_sidecar
 from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera.takes import Job, Take
 from nlos_cam.cli import capture
 from nlos_cam.errors import CameraNotFoundError, DiskFullError, NlosCamError, OutputExistsError
 
@@ -26,6 +28,12 @@ app = typer.Typer()
 capture.register(app)
 sys.exit(app(sys.argv[1:], standalone_mode=False) or 0)
 """
+
+
+def ended_at_once(folder: Path) -> Take:
+    """A take that was interrupted before its first frame."""
+    beside = SimpleNamespace(path=folder / "a.json")
+    return Take(Job(folder / "a.bag"), "interrupted", 0, Quality(), beside)
 
 
 def app() -> typer.Typer:
@@ -159,6 +167,17 @@ def test_a_disk_without_room_is_refused_before_anything_is_written(
         run("--takes", "2", "--frames", "500", *out)
     assert list(tmp_path.iterdir()) == []
     assert run("--takes", "2", "--frames", "5", *out)["frames"] == 10
+
+
+def test_without_a_limit_it_is_told_how_long_there_is_room(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(capture, "say", told.append)
+    monkeypatch.setattr(capture, "free_bytes", lambda _: 200_000_000 + 64 * 48 * 4 * 30 * 90)
+    monkeypatch.setattr(capture.Takes, "record", lambda *_: (one for one in [ended_at_once(tmp_path)]))
+    assert run("--out", str(tmp_path / "a.bag"))["exit"] == 130
+    assert "room for 1.5 minutes or more" in told[0]
 
 
 def test_an_error_that_ends_a_take_is_told_and_gives_the_exit_code(
