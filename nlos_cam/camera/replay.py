@@ -138,11 +138,12 @@ class Verified:
     """Frames of each stream."""
 
 
-def verify(path: Path) -> Verified:
+def verify(path: Path, on_frame: Callable[[], None] = lambda: None) -> Verified:
     """Read a recording from end to end. Raises RecordingError where it cannot be."""
     frames, first_s, last_s = 0, 0.0, 0.0
     with ReplayCamera(path) as camera:
         for frame in camera:
             first_s, last_s = first_s if frames else frame.timestamp_s, frame.timestamp_s
             frames += 1
+            on_frame()
         return Verified(frames, camera.dropped + camera.incomplete, last_s - first_s, dict(camera.arrived))
