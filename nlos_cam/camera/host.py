@@ -1,6 +1,5 @@
 """What this host is to a camera: system, container, kernel modules, udev rules, and nodes that open or do not."""
 
-import errno
 import os
 import platform
 import sys
@@ -44,7 +43,6 @@ class Node:
 
     path: str
     error: str = ""
-    missing: bool = False
 
 
 @dataclass(frozen=True)
@@ -160,6 +158,5 @@ def _node(path: str, opening: Callable[[str], None]) -> Node:
     try:
         opening(path)
     except OSError as error:
-        missing = error.errno in {errno.ENOENT, errno.ENXIO, errno.ENODEV}
-        return Node(path, error.strerror or str(error), missing=missing)
+        return Node(path, error.strerror or str(error))
     return Node(path)
