@@ -3,7 +3,7 @@
 from nlos_cam.camera.host import Host
 from nlos_cam.camera.sysfs import KernelCamera
 from nlos_cam.camera.udev import RELOAD, WRITE_AND_INSTALL
-from nlos_cam.camera.usb_ids import L515
+from nlos_cam.camera.usb_ids import L515, LIDARS
 from nlos_cam.doctor.check import Finding, failed, ok, skipped, warning
 from nlos_cam.doctor.facts import Facts
 
@@ -17,6 +17,7 @@ HID_MODULES = ("hid_sensor_hub", "hid_sensor_accel_3d", "hid_sensor_gyro_3d")
 HID_OPTIONS = "CONFIG_HID_SENSOR_HUB, CONFIG_HID_SENSOR_ACCEL_3D and CONFIG_HID_SENSOR_GYRO_3D"
 LEAST_SENSORS = 2
 """librealsense on Linux leaves out an L515 of which it does not see accelerometer and gyroscope."""
+JOIN = "`sudo usermod -aG plugdev,video $USER`, and log in again"
 PASSERS_BY = {"pipewire", "wireplumber"}
 """Desktop services that keep a camera's node open without streaming."""
 
@@ -57,6 +58,8 @@ def udev_rules(facts: Facts) -> Finding:
         return skipped("in a container the host's rules count")
     if host.platform.is_root:
         return warning("no udev rules for the L515: only root can open it", WRITE_AND_INSTALL)
+    if host.nodes and not any(node.error for node in host.nodes):
+        return warning("no udev rules for the L515, though this user can open it now", WRITE_AND_INSTALL)
     return failed("no udev rules for the L515: it opens for root only", WRITE_AND_INSTALL)
 
 
@@ -78,19 +81,15 @@ def _permission_fix(host: Host) -> str:
         return CONTAINER_FIX
     if not host.rules:
         return WRITE_AND_INSTALL
-    groups = (
-        ""
-        if host.platform.in_plugdev
-        else "; if that is not enough, `sudo usermod -aG plugdev,video $USER`, log in again"
-    )
-    return f"{RELOAD}; then unplug the camera and plug it in again{groups}"
+    fix = f"{RELOAD}; then unplug the camera and plug it in again"
+    return fix if host.platform.in_plugdev else f"{fix}; if that is not enough, {JOIN}"
 
 
 def video_driver(facts: Facts) -> Finding:
     """Whether uvcvideo has made video nodes of the camera."""
     if reason := _not_here(facts):
         return skipped(reason)
-    cameras = [camera for camera in facts.host.cameras if camera.product_id == L515]
+    cameras = [camera for camera in facts.host.cameras if LIDARS[camera.product_id][0] == "camera"]
     if bare := [camera.port for camera in cameras if not camera.video_nodes]:
         state = facts.host.modules.get("uvcvideo", "unknown")
         fix = "install a kernel with CONFIG_USB_VIDEO_CLASS" if state == "missing" else "sudo modprobe uvcvideo"

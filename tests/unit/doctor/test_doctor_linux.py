@@ -15,15 +15,25 @@ def hide(bench: Any) -> None:
 
 
 def test_missing_udev_rules_fail_with_how_to_write_them(bench: Any) -> None:
+    bench.unplug()
     (bench.linux.root / RULES).unlink()
-    assert set(bench.failed()) == {"udev-rules"}
+    assert set(bench.failed()) == {"usb-camera", "udev-rules"}
     fix = bench.failed()["udev-rules"].fix
     assert "nlos-cam doctor --write-udev" in fix
     assert "udevadm control --reload-rules" in fix
 
 
+def test_without_rules_a_camera_that_does_not_open_is_a_failure_and_one_that_does_a_warning(bench: Any) -> None:
+    (bench.linux.root / RULES).unlink()
+    assert bench.failed() == {}
+    assert bench.checks()["udev-rules"].status == "warning"
+    bench.refused["/dev/video30"] = PermissionError(errno.EACCES, "Permission denied")
+    assert set(bench.failed()) == {"udev-rules", "permissions"}
+
+
 def test_root_needs_no_rules_but_is_warned(bench: Any) -> None:
     (bench.linux.root / RULES).unlink()
+    bench.unplug()
     bench.platform = replace(bench.platform, is_root=True)
     assert bench.checks()["udev-rules"].status == "warning"
 
@@ -100,6 +110,11 @@ def test_no_video_nodes_fail(bench: Any) -> None:
     check = bench.failed()["video-driver"]
     assert "2-2" in check.detail
     assert check.fix == "sudo modprobe uvcvideo"
+
+
+def test_a_pre_production_unit_needs_video_nodes_and_no_motion_sensors(bench: Any) -> None:
+    bench.linux.plug("2-2", product="0b3d", address=5, hid=0, video=0)
+    assert set(bench.failed()) == {"video-driver"}
 
 
 def test_a_kernel_without_uvcvideo_is_named_as_the_cause(bench: Any) -> None:
