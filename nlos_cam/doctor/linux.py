@@ -53,7 +53,7 @@ def udev_rules(facts: Facts) -> Finding:
     if host.platform.system != "linux":
         return skipped(NOT_LINUX)
     if host.rules:
-        return ok(", ".join(host.rules))
+        return ok(f"rules in {', '.join(host.rules)}")
     if host.container:
         return skipped("in a container the host's rules count")
     if host.platform.is_root:

@@ -99,6 +99,19 @@ def test_a_container_that_hides_the_sensors_is_named_as_the_cause(bench: Any) ->
     assert "-v /sys:/sys" in bench.failed()["hid-sensors"].fix
 
 
+def test_a_container_that_shows_sensors_of_others_is_not_blamed(bench: Any) -> None:
+    bench.linux.write(".dockerenv", "")
+    bench.linux.plug("2-2", address=5, hid=0)
+    assert "modprobe" in bench.failed()["hid-sensors"].fix
+
+
+def test_a_camera_without_any_hid_device_is_told_as_such(bench: Any) -> None:
+    bench.linux.plug("2-2", address=5, hid=0)
+    assert "(none; 0003:8086:0B64.5 (hid-generic))" in bench.failed()["hid-sensors"].detail
+    (bench.linux.root / "sys/bus/hid/devices/0003:8086:0B64.5").unlink()
+    assert "(none; no HID device)" in bench.failed()["hid-sensors"].detail
+
+
 def test_a_camera_that_offers_no_hid_interface_is_to_be_replugged(bench: Any, device: Any) -> None:
     bench.linux.plug("2-2", address=5, hid=0)
     bench.usb.devices = [device(port_numbers=(2,), classes=(0x0E, 0xFF))]
@@ -140,6 +153,7 @@ def test_a_process_that_holds_the_camera_fails_with_its_name_and_number(bench: A
 
 def test_a_desktop_service_that_looks_on_is_a_warning(bench: Any) -> None:
     bench.linux.process(42, "wireplumber", "/dev/video30")
+    bench.linux.process(43, "pipewire", "/dev/video30")
     assert bench.checks()["in-use"].status == "warning"
     bench.linux.process(41, "cheese", "/dev/video30")
     assert bench.checks()["in-use"].status == "failed"
@@ -193,5 +207,13 @@ def test_where_times_come_from_is_told(bench: Any) -> None:
     assert "this host's clock" in bench.checks()["metadata"].detail
     bench.linux.write("sys/module/uvcvideo/version", "1.1.1.realsense-6.1")
     assert "the camera's clock" in bench.checks()["metadata"].detail
+    bench.platform = Platform("darwin", "arm64", (3, 11))
+    assert bench.checks()["metadata"].detail == "only Linux and Windows have it"
     bench.platform = Platform("windows", "amd64", (3, 11))
     assert "realsense_metadata_win10.ps1" in bench.checks()["metadata"].detail
+
+
+def test_without_uvcvideo_there_are_no_times_to_tell_of(bench: Any) -> None:
+    bench.linux.load()
+    check = bench.checks()["metadata"]
+    assert (check.status, check.detail) == ("skipped", "uvcvideo is not loaded")
