@@ -8,7 +8,7 @@ from nlos_cam.doctor.facts import Facts
 
 MACOS_WHEEL = "pyrealsense2-macosx==2.54.2"
 FROM_SOURCE = "build librealsense 2.54.2 from source with -DBUILD_PYTHON_BINDINGS=ON"
-NEWEST_PYTHON = {"linux x86_64": (3, 11), "windows amd64": (3, 11), "linux aarch64": (3, 9), "darwin": (3, 12)}
+NEWEST_PYTHON = {"linux x86_64": (3, 11), "windows amd64": (3, 11), "darwin": (3, 12)}
 """The last Python that a wheel with the L515's driver exists for; macOS has a community's."""
 TESTED = (2, 54, 2)
 REMOVED = (2, 55)
@@ -39,7 +39,7 @@ def python(facts: Facts) -> Finding:
         )
     newest = NEWEST_PYTHON.get(f"{on.system} {on.machine}") or NEWEST_PYTHON.get(on.system)
     if newest is None:
-        return failed(f"{here}: no wheel of librealsense was ever made for it", FROM_SOURCE)
+        return failed(f"{here}: there is no wheel of librealsense 2.54.2 for it", FROM_SOURCE)
     if on.python > newest:
         last = f"{newest[0]}.{newest[1]}"
         return failed(

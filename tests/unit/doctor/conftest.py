@@ -128,10 +128,6 @@ def fake_device(product: int = 0x0B64, serial: str = "00000000F0246262", **chang
     return SimpleNamespace(**told | changes)
 
 
-def denied() -> usb.core.USBError:
-    return usb.core.USBError("Access denied (insufficient permissions)", -3, errno.EACCES)
-
-
 class FakeLinux:
     """The file systems of a Linux host, as far as they matter: plain files and links below `root`."""
 
@@ -251,4 +247,4 @@ def device() -> Callable[..., SimpleNamespace]:
 
 @pytest.fixture
 def access_denied() -> usb.core.USBError:
-    return denied()
+    return usb.core.USBError("Access denied (insufficient permissions)", -3, errno.EACCES)

@@ -102,6 +102,13 @@ def test_one_file_behind_two_folders_is_told_once(bench: Any, tmp_path: Path) ->
     assert len(look(tmp_path).rules) == 1
 
 
+def test_processes_are_searched_only_for_a_camera(bench: Any, tmp_path: Path) -> None:
+    bench.linux.write("proc/43/fd", "stands for a folder that may not be listed")
+    assert look(tmp_path).closed_processes == 1
+    bench.unplug()
+    assert look(tmp_path).closed_processes == 0
+
+
 def test_every_node_is_opened_and_refusals_are_kept(bench: Any) -> None:
     bench.refused = {
         "/dev/video30": PermissionError(errno.EACCES, "Permission denied"),

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 import usb.backend
 import usb.core
+import usb.util
 from usb.backend.libusb1 import _LibUSB
 
-from nlos_cam.camera.usb import UsbDevice, firmware_of, scan, sdk_serial
+from nlos_cam.camera.usb import SPEEDS, SUPER_SPEED, UsbDevice, firmware_of, scan, sdk_serial
 
 Make = Callable[..., SimpleNamespace]
 
@@ -72,6 +73,7 @@ def test_strangers_are_counted_and_not_told(seen: Callable[..., list[UsbDevice]]
         (0x0210, 0, True),
         (0x0320, 0, False),
         (0x0210, None, True),
+        (0x0300, None, False),
     ],
 )
 def test_the_link_is_slow_by_its_speed_or_else_by_its_version(
@@ -82,9 +84,30 @@ def test_the_link_is_slow_by_its_speed_or_else_by_its_version(
     assert ("USB 2" in found.link) == slow
 
 
+def test_every_speed_that_pyusb_names_has_its_words() -> None:
+    named = {getattr(usb.util, name) for name in dir(usb.util) if name.startswith("SPEED_")}
+    assert named - {usb.util.SPEED_UNKNOWN} <= SPEEDS.keys()
+    assert SUPER_SPEED == usb.util.SPEED_SUPER
+    assert SPEEDS[usb.util.SPEED_HIGH] == "480 Mbit/s (USB 2)"
+    assert SPEEDS[usb.util.SPEED_SUPER] == "5 Gbit/s (USB 3)"
+
+
+def test_the_label_tells_what_is_known(seen: Callable[..., list[UsbDevice]], device: Make) -> None:
+    [here, nowhere] = seen(device(), device(serial="", port_numbers=None))
+    assert (here.label, nowhere.label) == ("L515 f0246262 at 2-1", "L515")
+
+
 @pytest.mark.parametrize(
     ("bcd_device", "firmware"),
-    [(0x1058, "1.5.8"), (0x1052, "1.5.2"), (0x1041, "1.4.1"), (0x1158, ""), (0x0058, ""), (0x105A, "")],
+    [
+        (0x1058, "1.5.8"),
+        (0x1052, "1.5.2"),
+        (0x1041, "1.4.1"),
+        (0x1158, ""),
+        (0x0058, ""),
+        (0x105A, ""),
+        (0x1099, "1.9.9"),
+    ],
 )
 def test_firmware_is_read_from_the_release_number_or_not_at_all(bcd_device: int, firmware: str) -> None:
     assert firmware_of(bcd_device) == firmware

@@ -74,6 +74,17 @@ def test_a_camera_that_only_the_sdk_sees_points_to_the_doctor(listed: Listed, be
     assert "nlos-cam doctor" in listed()
 
 
+def test_the_columns_say_who_sees_a_camera(listed: Listed, bench: Any) -> None:
+    def row() -> list[str]:
+        return next(line for line in listed().splitlines() if "f0246262" in line).split()
+
+    assert row()[-2:] == ["yes", "yes"]
+    bench.sdk_devices.clear()
+    assert row()[-2:] == ["no", "yes"]
+    bench.sdk_error = ImportError("no such module")
+    assert row()[-2:] == ["3)", "yes"]  # nobody asked the SDK
+
+
 def test_no_device_is_said(listed: Listed, bench: Any) -> None:
     bench.unplug()
     assert "no L515 is seen" in listed()

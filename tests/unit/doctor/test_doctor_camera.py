@@ -48,6 +48,9 @@ def test_a_camera_that_only_the_sdk_sees_is_a_warning(bench: Any) -> None:
     checks = bench.checks()
     assert checks["usb-camera"].status == checks["sdk-camera"].status == "warning"
     assert (checks["link"].status, checks["firmware"].status) == ("ok", "ok")
+    assert "as a user" in checks["usb-camera"].fix
+    bench.linux.write(".dockerenv", "")
+    assert "-v /dev:/dev" in bench.checks()["usb-camera"].fix
 
 
 @pytest.mark.parametrize("product", [0x0B55, 0x0ADC])
@@ -102,6 +105,14 @@ def test_three_numbers_from_usb_are_judged_as_far_as_they_go(
     bench.usb.devices = [device(bcdDevice=bcd_device)]
     bench.sdk_devices.clear()
     assert bench.checks()["firmware"].status == status
+
+
+def test_a_firmware_that_nobody_tells_is_told_apart_from_no_camera(bench: Any, device: Any) -> None:
+    bench.usb.devices = [device(bcdDevice=0)]
+    bench.sdk_devices.clear()
+    assert bench.checks()["firmware"].detail == "no camera tells its firmware"
+    bench.unplug()
+    assert bench.checks()["firmware"].detail.startswith("no L515")
 
 
 def test_the_older_of_two_firmwares_counts(bench: Any, device: Any, fake_l515: Any) -> None:

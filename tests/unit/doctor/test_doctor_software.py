@@ -103,6 +103,7 @@ def test_an_older_sdk_that_knows_the_l515_is_a_warning(bench: Any) -> None:
 def test_an_sdk_that_pip_does_not_know_is_not_judged(bench: Any) -> None:
     del bench.installed["pyrealsense2"]
     checks = bench.checks()
+    assert "unknown version" in checks["sdk"].detail
     assert checks["sdk-version"].status == checks["sdk-alone"].status == "skipped"
 
 
@@ -118,8 +119,11 @@ def test_a_missing_libusb_fails_and_what_hangs_on_it_is_left_out(bench: Any) -> 
     assert {name for name, check in checks.items() if check.status == "failed"} == {"libusb"}
     assert "No backend available" in checks["libusb"].detail
     assert "pip install pyusb libusb-package" in checks["libusb"].fix
+    assert "sudo apt" in checks["libusb"].fix
     assert checks["usb-camera"].status == "skipped"
     assert checks["sdk-camera"].status == "ok"  # the SDK sees it all the same
+    bench.platform = Platform("windows", "amd64", (3, 11))
+    assert "apt" not in bench.checks()["libusb"].fix
 
 
 def test_macos_without_a_camera_fails(bench: Any) -> None:
