@@ -14,6 +14,7 @@ from nlos_cam.errors import NlosCamError
 INTERRUPTED = 130
 COMMANDS = {
     "devices": "devices",
+    "doctor": "doctor",
     "capture": "capture",
     "repair": "recordings",
     "export": "recordings",

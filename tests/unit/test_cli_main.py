@@ -131,7 +131,18 @@ def test_the_console_script_exits_with_the_code(
 def test_help_is_0_and_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     shown = capsys.readouterr().out
-    for name in ("devices", "capture", "calibrate", "live", "replay", "render", "dataset", "train", "evaluate"):
+    for name in (
+        "devices",
+        "doctor",
+        "capture",
+        "calibrate",
+        "live",
+        "replay",
+        "render",
+        "dataset",
+        "train",
+        "evaluate",
+    ):
         assert name in shown
 
 
