@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from threading import Event
+from threading import Event, Timer
 from typing import Any
 
 import numpy as np
@@ -186,6 +186,19 @@ def test_a_device_that_never_comes_back_ends_the_run_with_one_line_and_what_was_
     assert "\n" not in str(error.value)
     assert until_then[0].frames == 5
     assert until_then[0].counts == {"duplicate": 1, **counts}
+
+
+def test_stopping_ends_a_wait_for_a_device_that_is_gone(camera: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_reader, "LET_GO_AFTER_S", 0.01)
+    gone = camera(fault("unplug", FOREVER))
+    gone.silence_s, gone.replug_s = 0.05, float("inf")
+    stop = Event()
+    timer = Timer(0.5, stop.set)
+    timer.start()
+    with gone:
+        report = run_live(gone, RIG, network, NullViewer(), stop=stop)
+    assert report.frames == 5
+    timer.join()
 
 
 def test_a_camera_that_is_entered_again_meets_the_same_faults(camera: Make) -> None:
