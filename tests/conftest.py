@@ -98,6 +98,11 @@ def fake_l515() -> type[FakeLidar]:
 
 
 @pytest.fixture
+def fake_sdk() -> type[FakeSdk]:
+    return FakeSdk
+
+
+@pytest.fixture
 def fake_camera() -> Callable[..., L515Camera]:
     """An L515Camera on a fake SDK that sees these lidars, by a clock that moves only by waiting."""
 

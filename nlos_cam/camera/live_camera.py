@@ -94,14 +94,14 @@ class LiveCamera(ABC):
         """The hidden depth at a frame, by the device's own number, where it is known."""
 
     def _new_session(self) -> Session:
-        sensor, profiles = find_streams(self._device, self._size)
-        if missing := [stream for stream in FORMATS if stream not in profiles]:
-            width, height = self._size
-            raise CameraError(f"{self.uri} offers no {' and no '.join(missing)} at {width} x {height}, 30 frames/s")
         try:
-            return Session(sensor, profiles, Inbox(lossless=False, on_set=self._on_set))
+            sensor, profiles = find_streams(self._device, self._size)
+            if not (missing := [stream for stream in FORMATS if stream not in profiles]):
+                return Session(sensor, profiles, Inbox(lossless=False, on_set=self._on_set))
         except RuntimeError as error:
             raise CameraError(f"{self.uri} cannot be read ({error}): unplug it, wait 10 s, plug it in again") from error
+        width, height = self._size
+        raise CameraError(f"{self.uri} offers no {' and no '.join(missing)} at {width} x {height}, 30 frames/s")
 
     def _cured(self, start: Callable[[], None]) -> None:
         """Start; where the device has lost its calibration, once more after a reset."""
@@ -139,15 +139,14 @@ class LiveCamera(ABC):
                 return
             self._session = session
             try:
-                session.start(self._make_ready)
+                session.start(self._prepare, self._record)
                 self._begin(session.inbox)
             except BaseException:
                 self._stop()
                 raise
 
-    def _make_ready(self, sensor: Any) -> None:
-        """A recording begins when the settings hold: the SDK's recorder takes to a sensor that runs."""
-        self._prepare(sensor)
+    def _record(self) -> None:
+        """The settings hold: the SDK's recorder takes to a sensor that runs."""
         if self._recording:
             # never paused meanwhile: the SDK then stamps frames out of order when it resumes
             self._recording.begin(self._device, self._sdk)
@@ -164,6 +163,8 @@ class LiveCamera(ABC):
         """Stop, and end an iteration under way; again does nothing."""
         atexit.unregister(self._leave)
         self._left.set()
+        if session := self._session:
+            session.end_wait()
         with self._changing:
             if self._recording and self._session:
                 self._recording.stop()

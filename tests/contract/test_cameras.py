@@ -1,4 +1,4 @@
-"""One suite for every camera. An L515's rows run where one is connected, and skip elsewhere."""
+"""One suite for every camera. An L515's rows run where one is connected, and skip elsewhere; a fake one's run."""
 
 import subprocess
 import sys
@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_librealsense import FakeSdk
+from fake_lidar import FakeLidar
 
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.l515 import list_devices
@@ -15,6 +17,7 @@ from nlos_cam.camera.world import World, open_world
 from nlos_cam.errors import CameraError, NlosCamError
 from nlos_cam.frames import Frame
 
+FAKE_L515 = "l515:fake"
 RECORDED = 12
 SEEN = 5
 ENDS_CLEANLY = """
@@ -35,8 +38,11 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(params=["sim", "sim:bare-wall", "bag", pytest.param("l515", marks=pytest.mark.hardware)])
-def uri(request: pytest.FixtureRequest) -> str:
+@pytest.fixture(params=["sim", "sim:bare-wall", "bag", FAKE_L515, pytest.param("l515", marks=pytest.mark.hardware)])
+def uri(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == FAKE_L515:
+        sdk = FakeSdk(FakeLidar("fake", runs=(10**6, 10**6), laser_power=93.0))
+        monkeypatch.setattr("nlos_cam.camera.l515.load_sdk", lambda: sdk)
     if request.param == "l515" and not any("L515" in info.name for info in list_devices()):
         pytest.skip("no L515 is connected")
     return f"bag:{request.getfixturevalue('bag')}" if request.param == "bag" else request.param
@@ -138,6 +144,8 @@ def test_an_error_inside_leaves_the_camera_stopped(camera: Camera) -> None:
 
 
 def test_a_process_that_used_it_ends_cleanly(uri: str) -> None:
+    if uri == FAKE_L515:
+        pytest.skip("the fake SDK is in this process only")
     ended = subprocess.run(  # noqa: PLW1510  the code is what is tested
         [sys.executable, "-c", ENDS_CLEANLY, uri], capture_output=True, text=True, timeout=120
     )

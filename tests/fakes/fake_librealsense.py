@@ -5,6 +5,7 @@ tests/unit/test_fake_librealsense.py holds the names against the real module.
 """
 
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +20,7 @@ class FakeSensor:
 
     def __init__(self, lidar: FakeLidar, generation: int) -> None:
         self.lidar, self.generation = lidar, generation
-        sizes = [(320, 240)] if lidar.info["usb_type_descriptor"].startswith("2") else SIZES
+        sizes = [(320, 240)] if lidar.info.get("usb_type_descriptor", "").startswith("2") else SIZES
         self.profiles = [FakeProfile(stream, size, lidar) for size in sizes for stream in lidar.streams]
 
     def _check(self) -> None:
@@ -51,17 +52,22 @@ class FakeSensor:
     def supports(self, option: Named) -> bool:
         return option.name in self.lidar.options
 
-    def get_option(self, option: Named) -> float:
+    def _need(self, option: Named) -> None:
         self._check()
+        if not self.supports(option):
+            raise RuntimeError(f"object doesn't support option {option.name}")
+
+    def get_option(self, option: Named) -> float:
+        self._need(option)
         return self.lidar.options[option.name]
 
     def get_option_range(self, option: Named) -> SimpleNamespace:
-        self._check()
+        self._need(option)
         low, high, step = self.lidar.ranges.get(option.name, (0.0, 100.0, 1.0))
         return SimpleNamespace(min=low, max=high, step=step, default=low)
 
     def set_option(self, option: Named, value: float) -> None:
-        self._check()
+        self._need(option)
         self.lidar.did.append(option.name)
         low, high, _ = self.lidar.ranges.get(option.name, (0.0, 100.0, 1.0))
         if option.name in self.lidar.refused or not low <= value <= high:
@@ -83,6 +89,8 @@ class FakeDevice:
         return self.lidar.info[key]
 
     def query_sensors(self) -> list[FakeSensor]:
+        if self.generation != self.lidar.generation:
+            raise RuntimeError(GONE)
         return [FakeSensor(self.lidar, self.generation)]
 
     def hardware_reset(self) -> None:
@@ -92,6 +100,20 @@ class FakeDevice:
         self.lidar.did.append("reset")
         self.lidar.unplug()
         self.lidar.uncalibrated, self.lidar.back_after = False, self.lidar.reset_takes
+
+
+class FakeRecorder:
+    """Makes a file, and notes when it began: it has no frames to put into it."""
+
+    def __init__(self, path: str, device: FakeDevice) -> None:
+        device.lidar.did.append("record")
+        Path(path).write_bytes(b"")
+
+    def query_sensors(self) -> list[FakeSensor]:
+        return []
+
+    def pause(self) -> None:
+        pass
 
 
 class FakeContext:
@@ -116,9 +138,12 @@ class Names:
 class FakeSdk:
     """The module."""
 
+    recorder = FakeRecorder
+
     def __init__(self, *lidars: FakeLidar) -> None:
         self.camera_info, self.option = Names(str), Names(lambda name: Named(name=name))
-        self._context = FakeContext(list(lidars))
+        self.lidars, self.contexts = list(lidars), 0
 
     def context(self) -> FakeContext:
-        return self._context
+        self.contexts += 1
+        return FakeContext(self.lidars)

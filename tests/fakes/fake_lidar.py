@@ -154,6 +154,11 @@ class FakeLidar:
         self._thread = Thread(target=self._run, args=(frames, stopping), name="fake SDK", daemon=True)
         self._thread.start()
 
+    def finish_run(self) -> bool:
+        """Wait until a run has given its frames; whether it did in good time."""
+        self._thread.join(5.0)
+        return not self._thread.is_alive()
+
     def _run(self, frames: int, stopping: Event) -> None:
         for number in range(frames):
             if stopping.wait(PACE_S):
