@@ -161,19 +161,9 @@ def test_a_recording_of_no_frames_is_told(noise_world: Any, hurried_clock: Any, 
         ReplayCamera(path)
 
 
-def _real_recording() -> Path:
-    """A D435's recording, in a data folder of the checkout or beside it."""
-    root, name = Path(__file__).parents[2], "data/realsense_d435_depth_color_640x480.bag"
-    found = [root / name, *sorted(root.parent.glob(f"*/{name}"))]
-    if path := next((path for path in found if path.is_file()), None):
-        return path
-    pytest.skip(f"no {name} in this checkout, or in a folder beside it")
-
-
-def test_a_real_recording_of_another_camera_says_what_it_lacks() -> None:
-    path = _real_recording()
+def test_a_real_recording_of_another_camera_says_what_it_lacks(real_bag: Path) -> None:
     with pytest.raises(StreamMissingError, match="no infrared and no confidence stream") as raised:
-        ReplayCamera(path)
+        ReplayCamera(real_bag)
     assert "--camera l515" in str(raised.value)
 
 
