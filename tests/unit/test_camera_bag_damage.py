@@ -71,11 +71,13 @@ def test_damage_is_told_in_one_line_or_does_not_matter(
         content = damaged(content, random)
     path = tmp_path / "damaged.bag"
     path.write_bytes(content)
+    told = f"{path} is fine"
     try:
         read_all(path)
     except RecordingError as error:
-        assert "\n" not in str(error)
-        assert str(path) in str(error)
+        told = str(error)
+    assert told.startswith(str(path))
+    assert "\n" not in told
 
 
 @pytest.mark.parametrize("kind", ["noise_bag", "noise_bag_uncompressed"])

@@ -161,7 +161,7 @@ def test_a_recording_that_tells_no_depth_unit_is_an_error(rewritten: Any, tail_m
 
 def test_a_stream_without_its_intrinsics_is_an_error(rewritten: Any) -> None:
     path = rewritten(lambda topic, time_ns, raw: [] if topic.endswith("camera_info") else [(time_ns, raw)])
-    with pytest.raises(RecordingError, match="it has no .*camera_info"):
+    with pytest.raises(RecordingError, match=r"it has no .*camera_info"):
         BagFile(path)
 
 
