@@ -17,8 +17,7 @@ class Camera(Protocol):
     Leaving ends an iteration, by whichever thread; doing so again does nothing. Iterating yields frames until the
     source ends: a recording's end is a normal end, a live camera goes on. Frames that lack a stream are counted in
     `incomplete` and skipped; frame numbers that never came are counted in `dropped`. Numbers and timestamps rise
-    together, 30 a second, also over an outage after which the device counts anew: the numbers that would have filled it
-    are dropped.
+    together, 30 a second, also over an outage after which the device counts anew: its numbers count as dropped.
     """
 
     uri: str

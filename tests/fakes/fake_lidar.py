@@ -87,6 +87,8 @@ class FakeFrame:
 class FakeLidar:
     """An L515 on USB. Each start of its sensor takes the next of `runs`, and gives that many frames from number 0.
 
+    While it `flaps` more than once, it stays with the first.
+
     Without `runs` it gives one frame on starting, and then what it is told to `deliver`.
     """
 
@@ -116,7 +118,8 @@ class FakeLidar:
         self.reset_takes = 2
         """Looks until it is back."""
         self.plugged, self.generation = True, 0
-        self.unplug_after_run = False
+        self.flaps = 0
+        """How often it is still to be unplugged at the end of a run, and plugged in when it was looked for twice."""
         self.back_after = 0
         """After unplugging itself, it is plugged in when it was looked for so often; never, if 0."""
         self.saturated_share: Callable[[float], float] = lambda _: 0.0
@@ -150,7 +153,7 @@ class FakeLidar:
             self.deliver(range(1))
             return
         self._stopping = stopping = Event()
-        frames = self.runs.pop(0) if self.runs else 0
+        frames = 0 if not self.runs else self.runs[0] if self.flaps > 1 else self.runs.pop(0)
         self._thread = Thread(target=self._run, args=(frames, stopping), name="fake SDK", daemon=True)
         self._thread.start()
 
@@ -164,8 +167,8 @@ class FakeLidar:
             if stopping.wait(PACE_S):
                 return
             self.deliver(range(number, number + 1))
-        if self.unplug_after_run and frames and not stopping.wait(PACE_S):
-            self.back_after = 2
+        if self.flaps and frames and not stopping.wait(PACE_S):
+            self.flaps, self.back_after = self.flaps - 1, 2
             self.unplug()
 
     def deliver(self, numbers: range, streams: tuple[str, ...] = tuple(FORMATS)) -> None:

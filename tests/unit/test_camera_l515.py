@@ -172,7 +172,7 @@ def test_what_saturates_with_the_weakest_laser_is_told_with_advice(
 def test_a_device_that_comes_back_has_the_laser_power_that_was_found(fake_l515: Make, fake_camera: Make) -> None:
     lidar = fake_l515(usb="2.1", runs=(100, 10**6), laser_power=93.0)
     lidar.saturated_share = lambda power: 0.3 if power > 60.0 else 0.0
-    lidar.unplug_after_run = True
+    lidar.flaps = 1
     with fake_camera(lidar) as camera:
         camera.silence_s = 0.3
         frames = iter(camera)
