@@ -85,6 +85,8 @@ class BagContainer:
                 index = reader.indexes[connection.id]
                 found[connection.topic].extend(Entry(*place, connection.id) for place in index)
                 self.types[connection.topic] = connection.msgtype
+        if not found:
+            raise ValueError("its index lists nothing")
         self.entries = {topic: sorted(entries) for topic, entries in found.items()}
         self.end_ns = max((entries[-1].time_ns for entries in self.entries.values() if entries), default=0)
 
@@ -167,9 +169,11 @@ def told(path: Path, what: str) -> Generator[None]:
     except Exception as error:  # damaged bytes make the libraries raise nearly anything
         if isinstance(error, OSError) and error.strerror:
             raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-        detail = " ".join(str(error).split()) or type(error).__name__
+        detail = " ".join(str(error).split()) or "its parts do not fit together"
         if "not indexed" in detail:
             what, detail = "was never closed", "its recording was killed, so it has no index"
+        elif "index looks damaged" in detail:
+            detail = "its index cannot be read"
         raise RecordingError(f"{path} {what} ({detail}): {advice(path)}") from error
 
 

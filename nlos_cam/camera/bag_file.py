@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from heapq import merge
 from itertools import count, repeat
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -152,8 +153,8 @@ class BagFile:
         with self._container.told_at(entry):
             tail = bag_messages.depth_unit_m(self._container.raw(entry))
         unit_m = self.settings().get("depth_units", tail)
-        if unit_m is None:
-            raise RecordingError(f"{self.path}: {info.topic} does not tell its depth unit: record it again")
+        if unit_m is None or not 0 < unit_m < inf:
+            raise RecordingError(f"{self.path}: {info.topic} does not tell its depth unit ({unit_m}): record it again")
         return unit_m
 
 
