@@ -12,7 +12,7 @@ from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
-from nlos_cam.camera.bag_messages import parse
+from nlos_cam.camera.bag_messages import is_known, parse
 from nlos_cam.errors import RecordingError
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -82,13 +82,22 @@ class BagContainer:
         found: dict[str, list[Entry]] = defaultdict(list)
         with Reader(cast("Any", _BoundedPath(self.path))) as reader:
             for connection in reader.connections:
-                index = reader.indexes[connection.id]
+                index = reader.indexes.pop(connection.id)  # of ten minutes, it is half a million tuples
                 found[connection.topic].extend(Entry(*place, connection.id) for place in index)
                 self.types[connection.topic] = connection.msgtype
         if not found:
             raise ValueError("its index lists nothing")
         self.entries = {topic: sorted(entries) for topic, entries in found.items()}
         self.end_ns = max((entries[-1].time_ns for entries in self.entries.values() if entries), default=0)
+
+    def check(self) -> None:
+        """Read every message. Raises RecordingError at the first that is damaged."""
+        each = [(entry, topic) for topic, entries in self.entries.items() for entry in entries]
+        for entry, topic in sorted(each, key=lambda found: (found[0].chunk_pos, found[0].offset)):
+            with self.told_at(entry):
+                raw = self.raw(entry)
+                if is_known(self.types[topic]):
+                    parse(raw, self.types[topic])
 
     def read(self, topic: str, entry: Entry) -> Any:
         """A message, as `parse` gives it."""

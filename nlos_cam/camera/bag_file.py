@@ -98,6 +98,10 @@ class BagFile:
         """When the last message was recorded, on the recorder's clock."""
         return self._container.end_ns
 
+    def check(self) -> None:
+        """Read everything, also what there is no method for. Raises RecordingError at the first damage."""
+        self._container.check()
+
     def sensor_name(self, stream: str) -> str:
         """What the sensor of a stream is called; empty where that is not recorded."""
         return self._key_values(f"{DEVICE}/sensor_{self.streams[stream].sensor}/info").get("name", "")

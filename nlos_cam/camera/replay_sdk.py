@@ -29,15 +29,16 @@ START_TIMEOUT_S = 30.0
 class SdkReplayCamera:
     """The frames of a .bag through librealsense. Iterating starts at the first; none is dropped, since the SDK waits.
 
-    The file's index is read by us first, so that no broken one reaches the SDK, and so that an end that comes too early
-    is noticed. A frame's settings are those with which the recording began. Raises what ReplayCamera raises, and
-    CameraError where there is no SDK.
+    The file is read by us first, since the SDK crashes on some damaged ones; where its playback ends is held against
+    the index. A frame's settings are those with which the recording began. Raises what ReplayCamera raises, but on
+    opening, and CameraError where there is no SDK.
     """
 
     def __init__(self, path: Path) -> None:
         self.uri = f"bag:{path}"
         self.rig: Rig | None = None
         self._path, self._bag, self._sdk = path, open_lidar_bag(path), load_sdk()
+        self._bag.check()
         self.identity: Mapping[str, str] = identity_of(self._bag)
         self.incomplete = self.dropped = 0
         self.counts: Counter[str] = Counter()

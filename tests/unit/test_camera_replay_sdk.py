@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from nlos_cam.camera import open_camera
+from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.replay import ReplayCamera
 from nlos_cam.camera.replay_sdk import SdkReplayCamera
@@ -128,13 +129,29 @@ def last_chunk_damaged(path: Path, target: Path) -> Path:
     return target
 
 
-def test_an_end_that_comes_too_early_is_told_by_both(recorded: Any, tmp_path: Path) -> None:
-    whole = recorded(tmp_path / "whole.bag", frames=150)  # more than the SDK writes as one compressed piece
-    path = last_chunk_damaged(whole, tmp_path / "damaged.bag")
+@pytest.fixture(scope="module")
+def damaged(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("damaged")
+    whole = recorded(folder / "whole.bag", frames=150)  # more than the SDK writes as one compressed piece
+    return last_chunk_damaged(whole, folder / "damaged.bag")
+
+
+TOLD = r"is damaged \d+\.\d s into its .*nlos-cam repair"
+
+
+def test_damage_does_not_reach_the_sdk(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = SimpleNamespace(context=lambda: pytest.fail("the SDK was given the file"))
+    monkeypatch.setattr("nlos_cam.camera.replay_sdk.load_sdk", lambda: fake)
+    with pytest.raises(RecordingError, match=TOLD):
+        SdkReplayCamera(damaged)
+
+
+def test_a_playback_that_ends_too_early_is_told(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(BagFile, "check", lambda _: None)
     found: dict[type, list[int]] = {}
-    for camera in (ReplayCamera(path), SdkReplayCamera(path)):
+    for camera in (ReplayCamera(damaged), SdkReplayCamera(damaged)):
         frames: list[int] = []
-        with camera, pytest.raises(RecordingError, match=r"is damaged \d+\.\d s into its .*nlos-cam repair"):
+        with camera, pytest.raises(RecordingError, match=TOLD):
             frames.extend(frame.frame_number for frame in camera)
         assert camera.dropped == 0
         found[type(camera)] = frames
