@@ -15,7 +15,8 @@ INTERRUPTED = 130
 COMMANDS = {
     "devices": "devices",
     "capture": "capture",
-    "export": "export",
+    "repair": "recordings",
+    "export": "recordings",
     "calibrate": "calibrate",
     "live": "live",
     "replay": "live",
