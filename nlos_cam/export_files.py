@@ -101,7 +101,7 @@ class PointSink:
     def __init__(self, folder: Path, rays: NDArray[np.float64], unit_m: float) -> None:
         self._folder, self._rays, self._unit_m = folder / POINTS, rays, unit_m
         self._folder.mkdir()
-        self._pairing = Pairing()
+        self._pairing = Pairing(rays.shape[:2])
         self.written = 0
 
     def add(self, sample: Sample) -> None:

@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 from nlos_cam.camera.base import Camera
 from nlos_cam.errors import RecordingError
 from nlos_cam.folders import renamed_when_whole
+from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.live import FrameReader, Step, steps
+from nlos_cam.live import steps
+from nlos_cam.live_report import Step
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.reconstruct import Clock, Network
+from nlos_cam.sightings import in_words
 
 RESULT, SHEET, REPORT = "reconstruction.npz", "frames.png", "report.md"
 SHEET_FRAMES = 6
@@ -156,6 +159,7 @@ def _report(camera: Camera, rig: Rig, results: _Results, *, stopped: bool) -> st
         "",
         f"- frames: {frames}, numbers {results.numbers[0]} to {results.numbers[-1]}, {times_s[-1] - times_s[0]:.2f} s",
         f"- skipped: {camera.incomplete} without all streams, {camera.dropped} that the recording lacks",
+        f"- seen: {in_words(camera.counts) or 'nothing odd'}",
         f"- frames with a hidden surface: {results.with_surface} ({results.with_surface / frames:.0%})",
         f"- rig: {rig.name} {rig.checksum}, {rig.lidar.distance_m:.3f} m to the wall, {rig.facing_deg:.1f} degrees",
         f"- maps: {MAP_ROWS} x {MAP_COLUMNS}; hidden depth: {OBJECT_PIXELS} x {OBJECT_PIXELS} in `{RESULT}`",

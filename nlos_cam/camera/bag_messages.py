@@ -80,10 +80,16 @@ def timestamp_s(image: Any) -> float:
 
 
 def pixels(image: Any, encoding: str, intrinsics: Intrinsics) -> NDArray[Any]:
-    """An image's values, (height, width) or (height, width, values per pixel). Raises ValueError for a wrong size."""
-    if (image.encoding, image.width, image.height) != (encoding, intrinsics.width, intrinsics.height):
-        raise ValueError(f"an image of {image.width} x {image.height} {image.encoding}")
+    """An image's values, (height, width) or (height, width, values per pixel).
+
+    A device may deliver another size than it tells; its rows then follow without a gap. Raises ValueError for an image
+    that contradicts itself.
+    """
     _, dtype, channels = ENCODINGS[encoding]
+    is_usual = (image.width, image.height) == (intrinsics.width, intrinsics.height)
+    is_whole = image.step == image.width * channels * np.dtype(dtype).itemsize
+    if image.encoding != encoding or not (is_usual or is_whole):
+        raise ValueError(f"an image of {image.width} x {image.height} {image.encoding}")
     rows = image.data.reshape(image.height, image.step)
     values = np.array(rows[:, : image.width * channels * np.dtype(dtype).itemsize]).view(dtype)
     return values.reshape(image.height, image.width, *([channels] if channels > 1 else []))

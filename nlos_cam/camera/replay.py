@@ -67,7 +67,7 @@ class ReplayCamera:
             raise CameraError(f"{self.uri} is not started: iterate inside `with`")
         self._iterations += 1
         self.arrived = Counter()
-        pairing = Pairing()
+        pairing = Pairing((self.intrinsics.height, self.intrinsics.width))
         try:
             yield from self._frames(pairing, self._iterations)
         except RecordingError:
@@ -93,7 +93,7 @@ class ReplayCamera:
         self._count(pairing)
 
     def _count(self, pairing: Pairing) -> None:
-        self.incomplete, self.dropped = pairing.incomplete, pairing.dropped
+        self.incomplete, self.dropped, self.counts = pairing.incomplete, pairing.dropped, pairing.counts
 
     def telemetry(self) -> Mapping[str, float]:
         return self._settings
@@ -138,11 +138,12 @@ class Verified:
     """Frames of each stream."""
 
 
-def verify(path: Path) -> Verified:
+def verify(path: Path, on_frame: Callable[[], None] = lambda: None) -> Verified:
     """Read a recording from end to end. Raises RecordingError where it cannot be."""
     frames, first_s, last_s = 0, 0.0, 0.0
     with ReplayCamera(path) as camera:
         for frame in camera:
             first_s, last_s = first_s if frames else frame.timestamp_s, frame.timestamp_s
             frames += 1
+            on_frame()
         return Verified(frames, camera.dropped + camera.incomplete, last_s - first_s, dict(camera.arrived))

@@ -4,7 +4,6 @@ import atexit
 import gc
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,7 +13,7 @@ from nlos_calibration.rig import Rig
 
 from nlos_cam.camera.bag_container import advice
 from nlos_cam.camera.inbox import Inbox
-from nlos_cam.camera.replay import device_clock, identity_of, open_lidar_bag
+from nlos_cam.camera.replay import identity_of, open_lidar_bag
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import Session, find_streams
 from nlos_cam.camera.streams import FORMATS, FrameSet
@@ -55,6 +54,8 @@ class SdkReplayCamera:
             return playback, Session(*find_streams(playback), Inbox(lossless=True))
         except RuntimeError as error:
             raise self._damaged(f"is cut short or damaged ({error})") from error
+        except KeyError as error:  # it takes a damaged description for one of another stream
+            raise self._damaged(f"is damaged (librealsense finds no {error} in it)") from error
 
     def _damaged(self, what: str) -> RecordingError:
         return RecordingError(f"{self._path} {what}: {advice(self._path)}")
@@ -88,11 +89,11 @@ class SdkReplayCamera:
             raise CameraError(f"{self.uri} is not started: iterate inside `with`")
         self._stop()
         playback, session = self._open()
-        self._session, clock = session, device_clock(self._bag)
+        self._session = session
         session.start()
         while found := self._next(session.inbox, playback):
             self._count(session.inbox)
-            yield session.frame(replace(found, timestamp_s=clock(found.timestamp_s)))
+            yield session.frame(found)
         self._count(session.inbox)
         if not session.inbox.closed:  # else it was left early
             self._check_end(playback.get_position() / 1e9)
@@ -112,6 +113,7 @@ class SdkReplayCamera:
 
     def _count(self, inbox: Inbox) -> None:
         self.incomplete, self.dropped, self.arrived = inbox.incomplete, inbox.dropped, inbox.arrived
+        self.counts = inbox.counts
 
     def _next(self, inbox: Inbox, playback: Any) -> FrameSet | None:
         waited_s = 0.0

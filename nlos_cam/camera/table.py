@@ -61,7 +61,8 @@ def _simulated(uri: str, name: str, on_progress: OnProgress | None, recording: "
     from nlos_cam.camera.simulated import SimulatedCamera
     from nlos_cam.camera.world import open_world
 
-    return SimulatedCamera(uri, open_world(name, on_progress), recording=recording)
+    world = open_world(name, on_progress)
+    return SimulatedCamera(uri, world, recording=recording, faults=world.scene.faults)
 
 
 def _l515(uri: str, serial: str, recording: "Recording | None") -> Camera:

@@ -1,4 +1,4 @@
-"""One suite for every camera. An L515's rows run where one is connected, and skip elsewhere."""
+"""One suite for every camera. An L515's rows run where one is connected, and skip elsewhere; a fake one's run."""
 
 import json
 import subprocess
@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_librealsense import FakeSdk
+from fake_lidar import FakeLidar
 
-from nlos_cam.camera import Camera, Recording, open_camera
+from nlos_cam.camera import SIMULATED, Camera, Recording, open_camera
 from nlos_cam.camera.l515 import list_devices
 from nlos_cam.camera.replay import verify
 from nlos_cam.camera.world import World, open_world
 from nlos_cam.errors import CameraError, NlosCamError
 from nlos_cam.frames import Frame
 
+FAKE_L515 = "l515:fake"
 RECORDED = 12
 SEEN = 5
 READERS = {"bag": "plain", "bag-sdk": "sdk"}
@@ -39,9 +42,12 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(params=["sim", "sim:bare-wall", "bag", "bag-sdk", pytest.param("l515", marks=pytest.mark.hardware)])
-def opens(request: pytest.FixtureRequest) -> dict[str, Any]:
+@pytest.fixture(params=[*SIMULATED, *READERS, FAKE_L515, pytest.param("l515", marks=pytest.mark.hardware)])
+def opens(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What `open_camera` is given."""
+    if request.param == FAKE_L515:
+        sdk = FakeSdk(FakeLidar("fake", runs=(10**6, 10**6), laser_power=93.0))
+        monkeypatch.setattr("nlos_cam.camera.l515.load_sdk", lambda: sdk)
     if request.param == "l515" and not any("L515" in info.name for info in list_devices()):
         pytest.skip("no L515 is connected")
     if request.param in READERS:
@@ -150,6 +156,8 @@ def test_an_error_inside_leaves_the_camera_stopped(camera: Camera) -> None:
 
 
 def test_a_process_that_used_it_ends_cleanly(opens: dict[str, Any]) -> None:
+    if opens["uri"] == FAKE_L515:
+        pytest.skip("the fake SDK is in this process only")
     ended = subprocess.run(  # noqa: PLW1510  the code is what is tested
         [sys.executable, "-c", ENDS_CLEANLY, json.dumps(opens)], capture_output=True, text=True, timeout=120
     )

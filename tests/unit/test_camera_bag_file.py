@@ -197,10 +197,10 @@ def test_damage_in_any_message_is_found_by_the_check(noise_bag_uncompressed: Pat
         BagFile(path).check()
 
 
-def test_an_image_of_another_size_is_found_by_the_check(rewritten: Any) -> None:
-    def narrower(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
-        halved = raw.replace(struct.pack("<II", 48, 64), struct.pack("<II", 24, 64), 1)
-        return [(time_ns, halved if topic.endswith("Depth_0/image/data") else raw)]
+def test_an_image_that_is_smaller_than_it_says_is_found_by_the_check(rewritten: Any) -> None:
+    def wider(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
+        doubled = raw.replace(struct.pack("<II", 48, 64), struct.pack("<II", 48, 128), 1)
+        return [(time_ns, doubled if topic.endswith("Depth_0/image/data") else raw)]
 
-    with pytest.raises(RecordingError, match="an image of 64 x 24 mono16"):
-        BagFile(rewritten(narrower)).check()
+    with pytest.raises(RecordingError, match="an image of 128 x 48 mono16"):
+        BagFile(rewritten(wider)).check()

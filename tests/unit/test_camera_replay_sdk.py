@@ -187,6 +187,12 @@ def test_what_the_sdk_refuses_is_told(noise_bag: Path, monkeypatch: pytest.Monke
         SdkReplayCamera(noise_bag)
 
 
+def test_a_stream_that_the_sdk_does_not_find_is_told(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.camera.replay_sdk.find_streams", lambda _: (None, {}))
+    with pytest.raises(RecordingError, match=r"is damaged \(librealsense finds no 'depth' in it\): `nlos-cam repair"):
+        SdkReplayCamera(noise_bag)
+
+
 def test_a_playback_that_never_begins_is_told(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.camera.replay_sdk.START_TIMEOUT_S", 0.0)
     stopped = SimpleNamespace(current_status=lambda: load_sdk().playback_status.stopped)

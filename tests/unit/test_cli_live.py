@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from datetime import date
 from pathlib import Path
@@ -38,6 +39,7 @@ class FakeCamera:
 
     def __init__(self, uri: str, on_frame: Callable[[int], None]) -> None:
         self.uri, self._on_frame = uri, on_frame
+        self.counts: Counter[str] = Counter()
 
     def __enter__(self) -> Self:
         return self
@@ -104,7 +106,7 @@ def write_wall(path: Path) -> None:
 def test_live_ends_with_one_object_that_scripts_depend_on(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["live", "--camera", "bag:fake", "--no-view", "--json"]) == 0
     report, _ = told(capsys)
-    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms"}
+    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms", "counts"}
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
     assert set(report["stages_ms"]) == {"wait", "maps", "network", "view"}
