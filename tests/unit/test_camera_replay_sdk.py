@@ -1,6 +1,7 @@
 """Two readers, one truth: librealsense's playback and our own reading of the same files."""
 
 import gc
+import re
 import struct
 import time
 from collections.abc import Callable, Iterable
@@ -12,7 +13,6 @@ from typing import Any
 import pytest
 
 from nlos_cam.camera import open_camera
-from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.replay import ReplayCamera
 from nlos_cam.camera.replay_sdk import SdkReplayCamera
@@ -146,8 +146,23 @@ def test_damage_does_not_reach_the_sdk(damaged: Path, monkeypatch: pytest.Monkey
         SdkReplayCamera(damaged)
 
 
+def test_damage_that_only_the_sdk_would_meet_does_not_reach_it(
+    noise_bag_uncompressed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content, path = bytearray(noise_bag_uncompressed.read_bytes()), tmp_path / "damaged.bag"
+    header = re.search(rb"\x2f\0\0\0.\0\0\0(?:ver|conn|count)=", content)  # of an index
+    assert header
+    content[header.start() + 3] = 0xFF
+    path.write_bytes(content)
+    assert len(seen(ReplayCamera(path))[0]) == 20
+    fake = SimpleNamespace(context=lambda: pytest.fail("the SDK was given the file"))
+    monkeypatch.setattr("nlos_cam.camera.replay_sdk.load_sdk", lambda: fake)
+    with pytest.raises(RecordingError, match=r"is damaged \(at byte \d+: a record's header .*nlos-cam repair"):
+        SdkReplayCamera(path)
+
+
 def test_a_playback_that_ends_too_early_is_told(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(BagFile, "check", lambda _: None)
+    monkeypatch.setattr(SdkReplayCamera, "_check_all", lambda _: None)
     found: dict[type, list[int]] = {}
     for camera in (ReplayCamera(damaged), SdkReplayCamera(damaged)):
         frames: list[int] = []
