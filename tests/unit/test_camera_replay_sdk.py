@@ -150,9 +150,8 @@ def test_damage_that_only_the_sdk_would_meet_does_not_reach_it(
     noise_bag_uncompressed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content, path = bytearray(noise_bag_uncompressed.read_bytes()), tmp_path / "damaged.bag"
-    header = re.search(rb"\x2f\0\0\0.\0\0\0(?:ver|conn|count)=", content)  # of an index
-    assert header
-    content[header.start() + 3] = 0xFF
+    headers = list(re.finditer(rb"(?s)\x2f\0\0\0.\0\0\0(?:op|ver|conn|count)=", content))  # of indexes
+    content[headers[-1].start() + 3] = 0xFF
     path.write_bytes(content)
     assert len(seen(ReplayCamera(path))[0]) == 20
     fake = SimpleNamespace(context=lambda: pytest.fail("the SDK was given the file"))
