@@ -29,7 +29,7 @@ class Camera(Protocol):
     incomplete: int
     dropped: int
     counts: Counter[str]
-    """What else befell it, by name (duplicate, out_of_order, wrong_size, restarted, reset, replugged); never zero."""
+    """What else befell it, by name, never zero: restarted, reset, replugged, and what `Pairing.counts` tells."""
 
     def __enter__(self) -> Self: ...
 

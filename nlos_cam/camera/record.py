@@ -92,16 +92,16 @@ class Recording:
         self._first_s = found.timestamp_s if self.sets == 0 else self._first_s
         self._last_s = found.timestamp_s
         self.sets += 1
-        self.disk_full = recorder.failure is not None or self._is_short_of_space()
+        self.disk_full = self.sets % FRAMES_PER_S == 1 and self._is_disk_full(recorder)  # looked at once a second
         if self.disk_full or self._is_full(found.timestamp_s) or self._stopping.is_set():
             recorder.pause()  # queued behind the frames seen so far: none of them is lost
             self._paused.set()
         if self.disk_full and self.optional:
             log.warning("%s: the disk is full, and the recording ends after %d frames", self.path, self.sets)
 
-    def _is_short_of_space(self) -> bool:
-        """Looked at once a second."""
-        return self.sets % FRAMES_PER_S == 1 and self._free(self.path) < RESERVE_BYTES
+    def _is_disk_full(self, recorder: SdkRecorder) -> bool:
+        recorder.watch()
+        return recorder.failure is not None or self._free(self.path) < RESERVE_BYTES
 
     def _is_full(self, timestamp_s: float) -> bool:
         if self._frames is not None and self.sets >= self._frames:

@@ -13,7 +13,7 @@ WHEEL, MAC_WHEEL = "pyrealsense2==2.54.2.5684", "pyrealsense2-macosx==2.54.2"
 
 
 def wheel_for(python: tuple[int, int], system: str, machine: str) -> str | None:
-    """The wheel for such a place, by `sys.platform` and `platform.machine()`; None where none knows the L515."""
+    """The wheel to install, by `sys.platform` and `platform.machine()`; None where none knows the L515."""
     if system == "darwin":
         return MAC_WHEEL if python < (3, 13) else None
     return WHEEL if python < (3, 12) and (system, machine) in {("linux", "x86_64"), ("win32", "AMD64")} else None

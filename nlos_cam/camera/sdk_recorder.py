@@ -10,19 +10,19 @@ from typing import Any
 from nlos_cam.camera.disk import can_grow, closing_bytes
 from nlos_cam.errors import DiskFullError, RecordingError
 
-FAILED = "Stopping recording"
-"""How its notification begins when it cannot write."""
+STILL_S = 5.0
+"""A file that has not grown for so long while frames came is not written any more."""
 FLUSH_S = 9.0
 """A pause that took longer gave up (after 10 s) before everything was written."""
 FLUSHES = 30
 """Pauses until a disk is taken for one that takes nothing any more (5 minutes)."""
-QUIET_S = 0.2
 
 
 class SdkRecorder:
     """Records what `device` delivers from now on. Raises RecordingError where nothing can be written.
 
-    Its thread tells of writing that failed, for which it needs the interpreter, which the SDK holds while it pauses.
+    librealsense's recorder goes on quietly when it cannot write. It would tell in a notification, but whoever listens
+    to those from Python locks up when a device is stopped or vanishes in the middle of one: the file is watched.
     """
 
     def __init__(
@@ -32,30 +32,27 @@ class SdkRecorder:
         sdk: Any,
         *,
         now: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.path = path
         self.failure: str | None = None
         """Why it could not write."""
-        self._told = 0
-        self._now, self._sleep = now, sleep
+        self._now, self._grew_s, self._bytes = now, now(), 0
         try:
             path.unlink(missing_ok=True)
             self._recorder: Any = sdk.recorder(str(path), device)
         except (RuntimeError, OSError) as error:
             raise RecordingError(f"{path} cannot be written ({error}): choose another --out") from error
-        for sensor in self._recorder.query_sensors():
-            sensor.set_notifications_callback(self._on_notification)
 
-    def _on_notification(self, notification: Any) -> None:
-        if notification.description.startswith(FAILED):
-            self._told += 1
-            self.failure = self.failure or notification.description
+    def watch(self) -> None:
+        """Look whether the file grows, about once a second, while frames come."""
+        if (size := self.path.stat().st_size) != self._bytes:
+            self._bytes, self._grew_s = size, self._now()
+        elif self._now() - self._grew_s > STILL_S:
+            self.failure = f"nothing was written for {STILL_S:.0f} s"
 
     def pause(self) -> None:
         """Record nothing more. What came is written before this returns, if the disk takes it."""
-        if self.failure is None:
-            self._recorder.pause()
+        self._recorder.pause()
 
     def close(self) -> None:
         """Write the index and close the file: the SDK does when nothing refers to its recorder any more.
@@ -76,15 +73,10 @@ class SdkRecorder:
             self.pause()
             if self.failure or self._now() - begun_s < FLUSH_S:
                 return
-            self._sleep(QUIET_S)  # the thread may wait to tell of a failure
         self.failure = "the disk takes nothing any more"
 
     def _abandon(self) -> None:
         """Leave the file as it is. Raises DiskFullError."""
-        told = -1
-        while told != self._told:  # until then its thread may need the interpreter, which may end otherwise
-            told = self._told
-            self._sleep(QUIET_S)
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recorder))  # not even the program's end destroys it
         self._recorder = None
         raise DiskFullError(

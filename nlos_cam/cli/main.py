@@ -8,12 +8,13 @@ import typer
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
-from nlos_cam.cli.common import stderr
+from nlos_cam.cli.common import stderr, stop_on_signals
 from nlos_cam.errors import NlosCamError
 
 INTERRUPTED = 130
 COMMANDS = {
     "devices": "devices",
+    "doctor": "doctor",
     "capture": "capture",
     "repair": "recordings",
     "export": "recordings",
@@ -51,7 +52,9 @@ def main(arguments: list[str]) -> int:
     """Run one command and return its exit code (see docs/reference: 0, 1, 2, 3, 4, 130)."""
     try:
         asked = next((argument for argument in arguments if not argument.startswith("-")), "")
-        return build_app(asked)(arguments, standalone_mode=False) or 0
+        with stop_on_signals() as stop:  # an interrupted import can end in any error of any library
+            app = build_app(asked)
+        return INTERRUPTED if stop.is_set() else app(arguments, standalone_mode=False) or 0
     except (typer.Abort, KeyboardInterrupt):
         return INTERRUPTED
     except typer.TyperException as error:

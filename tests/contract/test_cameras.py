@@ -12,7 +12,7 @@ import pytest
 from fake_librealsense import FakeSdk
 from fake_lidar import FakeLidar
 
-from nlos_cam.camera import SIMULATED, Camera, Recording, open_camera
+from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.l515 import list_devices
 from nlos_cam.camera.replay import verify
 from nlos_cam.camera.world import World, open_world
@@ -42,7 +42,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(params=[*SIMULATED, *READERS, FAKE_L515, pytest.param("l515", marks=pytest.mark.hardware)])
+@pytest.fixture(
+    params=["sim", "sim:bare-wall", "bag", "bag-sdk", FAKE_L515, pytest.param("l515", marks=pytest.mark.hardware)]
+)
 def opens(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What `open_camera` is given."""
     if request.param == FAKE_L515:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from threading import Event
+from threading import Event, Timer
 from typing import Any
 
 import numpy as np
@@ -47,9 +47,10 @@ def camera(noise_world: Any, hurried_clock: Any, monkeypatch: pytest.MonkeyPatch
             noise = super().images(number)
             return SensedImages(noise.depth_z16 | 1, noise.ir // 2, noise.confidence)
 
-    def make(*faults: Fault, recording: Recording | None = None) -> SimulatedCamera:
-        made = SimulatedCamera("sim:quiet", QuietWorld(), clock=hurried_clock(), faults=faults, recording=recording)
-        made.silence_s = 0.1
+    def make(*faults: Fault, clock: Any = None, recording: Recording | None = None) -> SimulatedCamera:
+        clock = clock or hurried_clock()
+        made = SimulatedCamera("sim:quiet", QuietWorld(), clock=clock, faults=faults, recording=recording)
+        made.silence_s = 0.5  # of real time: an outage is that long, and no other pause should be
         return made
 
     return make
@@ -163,8 +164,13 @@ def test_a_device_that_is_plugged_in_again_goes_on(camera: Make, own_clock: bool
     assert report.dropped == moments[-1].frame.frame_number + 1 - report.frames
 
 
-def test_a_long_stall_has_the_streams_restarted(camera: Make) -> None:
-    moments, report = live(camera(fault("stall", 400)), last=1500)
+def test_a_long_stall_has_the_streams_restarted(camera: Make, hurried_clock: Any) -> None:
+    class Strolling(hurried_clock):
+        def wait(self, stop: Event, seconds: float) -> bool:
+            return super().wait(stop, seconds) or stop.wait(0.005)
+
+    stalled = camera(fault("stall", 150), clock=Strolling())  # 0.75 s, or more on a busy machine
+    moments, report = live(stalled, last=300)
     rises(moments)
     assert report.counts["restarted"] >= 1
     assert "replugged" not in report.counts
@@ -186,6 +192,19 @@ def test_a_device_that_never_comes_back_ends_the_run_with_one_line_and_what_was_
     assert "\n" not in str(error.value)
     assert until_then[0].frames == 5
     assert until_then[0].counts == {"duplicate": 1, **counts}
+
+
+def test_stopping_ends_a_wait_for_a_device_that_is_gone(camera: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_reader, "LET_GO_AFTER_S", 0.01)
+    gone = camera(fault("unplug", FOREVER))
+    gone.silence_s, gone.replug_s = 0.05, float("inf")
+    stop = Event()
+    timer = Timer(1.0, stop.set)
+    timer.start()
+    with gone:
+        report = run_live(gone, RIG, network, NullViewer(), stop=stop)
+    assert report.frames == 5
+    timer.join()
 
 
 def test_a_camera_that_is_entered_again_meets_the_same_faults(camera: Make) -> None:

@@ -35,20 +35,20 @@ def pinhole(width: int = 3, height: int = 2) -> Intrinsics:
     return Intrinsics(width, height, 1.0, 1.0, 1.0, 1.0)
 
 
-WRONG = [{"encoding": "8UC1"}, {"width": 2}, {"width": 4}, {"height": 1}, {"height": 2**32 - 1}, {"step": 4}]
-
-
-@pytest.mark.parametrize("changed", WRONG)
-def test_an_image_that_contradicts_itself_is_an_error(changed: dict[str, object]) -> None:
+@pytest.mark.parametrize(
+    "changed",
+    [{"width": 2}, {"width": 4}, {"height": 3}, {"width": 6, "step": 6}, {"encoding": "8UC1"}, {"step": 4}],
+)
+def test_an_image_that_contradicts_itself_or_its_stream_is_an_error(changed: dict[str, object]) -> None:
     image = parse(raw_image("0", b""), IMAGE)
     vars(image).update(changed)
     with pytest.raises(ValueError, match=r"an image of|reshape"):
         pixels(image, "mono8", pinhole())
 
 
-@pytest.mark.parametrize("told", [pinhole(4, 2), pinhole(2, 3)])
-def test_an_image_may_be_of_another_size_than_its_stream(told: Intrinsics) -> None:
-    assert pixels(parse(raw_image("0", b""), IMAGE), "mono8", told).shape == (2, 3)
+def test_a_device_may_deliver_another_size_than_it_tells() -> None:
+    image = parse(raw_image("0", b""), IMAGE)
+    np.testing.assert_array_equal(pixels(image, "mono8", pinhole(64, 48)), [[0, 1, 2], [3, 4, 5]])
 
 
 def test_rows_may_be_padded() -> None:

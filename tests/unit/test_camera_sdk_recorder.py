@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera.sdk_recorder import FLUSH_S, FLUSHES, SdkRecorder
+from nlos_cam.camera.sdk_recorder import FLUSH_S, FLUSHES, STILL_S, SdkRecorder
 from nlos_cam.errors import DiskFullError, RecordingError
 
 UNTIL_THE_LIMIT = """
 import importlib.util, resource, sys
 from pathlib import Path
+sys.path.insert(0, str(Path(sys.argv[1]).parent / "fakes"))
 spec = importlib.util.spec_from_file_location("fakes", sys.argv[1])
 fakes = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(fakes)
@@ -31,21 +32,11 @@ class FakeRecorder:
     def __init__(self, path: str, device: Any) -> None:
         Path(path).write_bytes(b"recorded")
         self.device, self.pauses = device, 0
-        self.told: Callable[[Any], None] = lambda _: None
         self.on_pause: Callable[[], None] = lambda: None
-
-    def query_sensors(self) -> list[Any]:
-        return [self]
-
-    def set_notifications_callback(self, callback: Callable[[Any], None]) -> None:
-        self.told = callback
 
     def pause(self) -> None:
         self.pauses += 1
         self.on_pause()
-
-    def tell(self, description: str) -> None:
-        self.told(SimpleNamespace(description=description))
 
 
 class FakeTime:
@@ -67,7 +58,7 @@ def clock() -> FakeTime:
 @pytest.fixture
 def made(tmp_path: Path, clock: FakeTime) -> SdkRecorder:
     sdk = SimpleNamespace(recorder=FakeRecorder)
-    return SdkRecorder(tmp_path / "a.bag", "device", sdk, now=clock.now, sleep=clock.pass_by)
+    return SdkRecorder(tmp_path / "a.bag", "device", sdk, now=clock.now)
 
 
 def test_it_replaces_what_was_there(tmp_path: Path) -> None:
@@ -104,44 +95,24 @@ def test_a_disk_that_takes_nothing_any_more_is_given_up(made: SdkRecorder, clock
     assert fake.pauses == FLUSHES
 
 
-@pytest.mark.parametrize("when", ["before closing", "while it is flushed"])
-def test_what_the_sdk_tells_of_writing_ends_it_in_one_line(made: SdkRecorder, when: str) -> None:
-    fake = made._recorder
-    if when == "before closing":
-        fake.tell("Stopping recording for sensor. (Error: Failed to write frame. Problem writing data to disk)")
-    else:
-        fake.on_pause = lambda: fake.tell("Stopping recording for sensor. (Error: Problem writing data to disk)")
+def test_a_file_that_grows_no_more_ends_it_in_one_line(made: SdkRecorder, clock: FakeTime) -> None:
+    made.watch()
+    clock.pass_by(STILL_S + 1)
+    made.watch()
     with pytest.raises(
-        DiskFullError, match=r"Problem writing .*nlos-cam repair .*a\.bag --out .*a-repaired\.bag"
+        DiskFullError, match=r"nothing was written .*nlos-cam repair .*a\.bag --out .*a-repaired\.bag"
     ) as told:
         made.close()
     assert "\n" not in str(told.value)
 
 
-def test_a_failed_one_is_not_paused_for_its_thread_may_wait_for_us(made: SdkRecorder) -> None:
-    fake = made._recorder
-    fake.tell("Stopping recording for sensor. (Error: disk full)")
-    made.pause()
-    assert fake.pauses == 0
-
-
-def test_it_waits_until_the_sdk_has_told_everything(made: SdkRecorder, clock: FakeTime) -> None:
-    fake, left = made._recorder, [1, 2, 3]
-    fake.tell("Stopping recording for sensor. (Error: disk full)")
-
-    def nap(seconds: float) -> None:
-        clock.pass_by(seconds)
-        if left:
-            fake.tell(f"Stopping recording for sensor. (Error: again {left.pop()})")
-
-    made._sleep = nap
-    with pytest.raises(DiskFullError, match="disk full"):
-        made.close()
-    assert not left
-
-
-def test_other_notifications_are_no_failure(made: SdkRecorder) -> None:
-    made._recorder.tell("Temperature warning")
+def test_a_file_that_grows_now_and_then_is_no_failure(made: SdkRecorder, clock: FakeTime) -> None:
+    for _ in range(10):
+        made.watch()
+        clock.pass_by(STILL_S / 2)
+        made.watch()
+        with made.path.open("ab") as file:
+            file.write(b"more")
     made.close()
     assert made.failure is None
 

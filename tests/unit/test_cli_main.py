@@ -1,6 +1,8 @@
 """The command line's frame: one call, an exit code, one line for an error, one object for a machine."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -129,7 +131,18 @@ def test_the_console_script_exits_with_the_code(
 def test_help_is_0_and_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     shown = capsys.readouterr().out
-    for name in ("devices", "capture", "calibrate", "live", "replay", "render", "dataset", "train", "evaluate"):
+    for name in (
+        "devices",
+        "doctor",
+        "capture",
+        "calibrate",
+        "live",
+        "replay",
+        "render",
+        "dataset",
+        "train",
+        "evaluate",
+    ):
         assert name in shown
 
 
@@ -162,3 +175,13 @@ def test_listing_devices_does_not_wait_for_the_networks() -> None:
     program = "import sys; from nlos_cam.cli.main import build_app; build_app('devices'); print('torch' in sys.modules)"
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
     assert ended.stdout == "False\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal here")
+def test_ctrl_c_while_a_command_is_loaded_is_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: str) -> Callable[..., int]:
+        os.kill(os.getpid(), signal.SIGINT)
+        return lambda *_, **__: 0
+
+    monkeypatch.setattr(module, "build_app", interrupted)
+    assert main(["live"]) == 130
