@@ -81,7 +81,7 @@ def record_noise(path: Path, frames: int) -> Path:
     return path
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def recorded() -> Callable[..., Path]:
     return record_noise
 

@@ -2,7 +2,7 @@
 
 from bz2 import BZ2Decompressor
 from collections import defaultdict
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from io import BufferedReader, BytesIO, FileIO
 from pathlib import Path
@@ -12,10 +12,10 @@ from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
-from nlos_cam.camera.bag_messages import parse
+from nlos_cam.camera.bag_format import MAGIC
+from nlos_cam.camera.bag_messages import is_known, parse
 from nlos_cam.errors import RecordingError
 
-MAGIC = b"#ROSBAG V2.0\n"
 MOST_BYTES = 2**26
 """Of a chunk; librealsense begins a new one after 768 kB."""
 DECOMPRESSORS = {"lz4": LZ4FrameDecompressor, "bz2": BZ2Decompressor}
@@ -82,13 +82,22 @@ class BagContainer:
         found: dict[str, list[Entry]] = defaultdict(list)
         with Reader(cast("Any", _BoundedPath(self.path))) as reader:
             for connection in reader.connections:
-                index = reader.indexes[connection.id]
+                index = reader.indexes.pop(connection.id)  # of ten minutes, it is half a million tuples
                 found[connection.topic].extend(Entry(*place, connection.id) for place in index)
                 self.types[connection.topic] = connection.msgtype
         if not found:
             raise ValueError("its index lists nothing")
         self.entries = {topic: sorted(entries) for topic, entries in found.items()}
         self.end_ns = max((entries[-1].time_ns for entries in self.entries.values() if entries), default=0)
+
+    def everything(self) -> Iterator[tuple[str, Entry, Any]]:
+        """Every message with its topic, in the order of the file; None for one of a type that `parse` does not know."""
+        each = [(entry, topic) for topic, entries in self.entries.items() for entry in entries]
+        for entry, topic in sorted(each, key=lambda found: (found[0].chunk_pos, found[0].offset)):
+            with self.told_at(entry):
+                raw, message_type = self.raw(entry), self.types[topic]
+                message = parse(raw, message_type) if is_known(message_type) else None
+            yield topic, entry, message
 
     def read(self, topic: str, entry: Entry) -> Any:
         """A message, as `parse` gives it."""

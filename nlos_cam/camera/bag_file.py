@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from nlos_calibration.projection import Intrinsics
+from numpy.typing import NDArray
 
 from nlos_cam.camera import bag_messages
 from nlos_cam.camera.bag_container import BagContainer, Entry
@@ -98,6 +99,17 @@ class BagFile:
         """When the last message was recorded, on the recorder's clock."""
         return self._container.end_ns
 
+    def check(self) -> None:
+        """Read everything, also what there is no method for. Raises RecordingError at the first damage."""
+        images = {f"{info.topic}/image/data": info for info in self.streams.values() if info.format}
+        for topic, entry, message in self._container.everything():
+            if topic in images:
+                self._pixels(message, images[topic], entry)
+
+    def _pixels(self, image: Any, info: StreamInfo, entry: Entry) -> NDArray[Any]:
+        with self._container.told_at(entry):
+            return bag_messages.pixels(image, info.encoding, info.intrinsics)
+
     def sensor_name(self, stream: str) -> str:
         """What the sensor of a stream is called; empty where that is not recorded."""
         return self._key_values(f"{DEVICE}/sensor_{self.streams[stream].sensor}/info").get("name", "")
@@ -122,9 +134,7 @@ class BagFile:
                 f"{self.path}: its {stream} stream is encoded as {info.encoding}, which we cannot read"
             )
         image = self._container.read(f"{info.topic}/image/data", entry)
-        with self._container.told_at(entry):
-            pixels = bag_messages.pixels(image, info.encoding, info.intrinsics)
-        return Sample(stream, image.header.seq, bag_messages.timestamp_s(image), pixels)
+        return Sample(stream, image.header.seq, bag_messages.timestamp_s(image), self._pixels(image, info, entry))
 
     def metadata(self, stream: str, index: int) -> FrameMetadata:
         """What is told of that frame besides its image."""

@@ -47,6 +47,11 @@ def _types() -> Typestore:
     return types
 
 
+def is_known(message_type: str) -> bool:
+    """Whether `parse` takes messages of this type; librealsense has some more of its own."""
+    return message_type in _types().fielddefs
+
+
 def parse(raw: memoryview, message_type: str) -> Any:
     """A message as rosbags has it. Raises nearly anything for bytes that are none."""
     if message_type == "sensor_msgs/msg/Image" and _has_tail(raw):

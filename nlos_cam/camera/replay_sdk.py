@@ -11,7 +11,8 @@ from typing import Any, Self
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig
 
-from nlos_cam.camera.bag_container import advice
+from nlos_cam.camera.bag_container import advice, told
+from nlos_cam.camera.bag_scan import scan_bag
 from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.replay import identity_of, open_lidar_bag
 from nlos_cam.camera.sdk import load_sdk
@@ -28,15 +29,16 @@ START_TIMEOUT_S = 30.0
 class SdkReplayCamera:
     """The frames of a .bag through librealsense. Iterating starts at the first; none is dropped, since the SDK waits.
 
-    The file's index is read by us first, so that no broken one reaches the SDK, and so that an end that comes too early
-    is noticed. A frame's settings are those with which the recording began. Raises what ReplayCamera raises, and
-    CameraError where there is no SDK.
+    The file is read by us first, since some damaged ones crash the SDK, or hang it; where its playback ends is held
+    against the index. A frame's settings are those with which the recording began. Raises what ReplayCamera raises, but
+    on opening, and CameraError where there is no SDK.
     """
 
     def __init__(self, path: Path) -> None:
         self.uri = f"bag:{path}"
         self.rig: Rig | None = None
         self._path, self._bag, self._sdk = path, open_lidar_bag(path), load_sdk()
+        self._check_all()
         self.identity: Mapping[str, str] = identity_of(self._bag)
         self.incomplete = self.dropped = 0
         self.counts: Counter[str] = Counter()
@@ -46,6 +48,13 @@ class SdkReplayCamera:
         self._session: Session | None = None
         self.intrinsics: Intrinsics = self._open()[1].intrinsics
 
+    def _check_all(self) -> None:
+        """Raise RecordingError for any damage, in what we read of a recording and in what only the SDK does."""
+        self._bag.check()
+        with told(self._path, "is damaged"):
+            if damages := scan_bag(self._path).damages:
+                raise ValueError(f"at byte {damages[0].position}: {damages[0].why}")
+
     def _open(self) -> tuple[Any, Session]:
         try:
             playback = self._sdk.context().load_device(str(self._path)).as_playback()
@@ -53,6 +62,8 @@ class SdkReplayCamera:
             return playback, Session(*find_streams(playback), Inbox(lossless=True))
         except RuntimeError as error:
             raise self._damaged(f"is cut short or damaged ({error})") from error
+        except KeyError as error:  # it takes a damaged description for one of another stream
+            raise self._damaged(f"is damaged (librealsense finds no {error} in it)") from error
 
     def _damaged(self, what: str) -> RecordingError:
         return RecordingError(f"{self._path} {what}: {advice(self._path)}")

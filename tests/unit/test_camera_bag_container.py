@@ -60,6 +60,26 @@ def test_the_place_of_damage_is_told(noise_bag: Path, tmp_path: Path) -> None:
     assert f"`nlos-cam repair {path} --out damaged-repaired.bag`" in str(told.value)
 
 
+def test_everything_is_every_message_as_it_follows_in_the_file(noise_bag: Path) -> None:
+    bag = BagContainer(noise_bag)
+    found = list(bag.everything())
+    assert sorted((entry, topic) for topic, entry, _ in found) == sorted(
+        (entry, topic) for topic, entries in bag.entries.items() for entry in entries
+    )
+    places = [(entry.chunk_pos, entry.offset) for _, entry, _ in found]
+    assert places == sorted(places)
+    assert next(message for topic, _, message in found if topic == "/file_version").data == 4
+
+
+def test_a_message_of_a_type_that_we_do_not_know_is_no_damage(noise_bag_uncompressed: Path, tmp_path: Path) -> None:
+    path = tmp_path / "other.bag"
+    path.write_bytes(
+        noise_bag_uncompressed.read_bytes().replace(b"geometry_msgs/Transform", b"realsense_msgs/Transfor")
+    )
+    found = {topic: message for topic, _, message in BagContainer(path).everything()}
+    assert [topic for topic, message in found.items() if message is None] == [t for t in found if "/tf/" in t]
+
+
 def test_an_index_that_leads_elsewhere_is_told(noise_bag: Path) -> None:
     bag = BagContainer(noise_bag)
     one, other = (bag.entries[f"/device_0/sensor_0/{name}_0/image/data"][0] for name in ("Depth", "Infrared"))

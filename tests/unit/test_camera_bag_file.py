@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nlos_cam.camera.bag_container import BagContainer
 from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import read_settings
@@ -179,3 +180,27 @@ def test_streams_of_one_kind_are_told_apart_by_their_index(noise_bag_uncompresse
     path.write_bytes(noise_bag_uncompressed.read_bytes().replace(b"Infrared_0", b"Infrared_2"))
     assert set(BagFile(path).streams) == {"depth", "infrared_2", "confidence"}
     assert BagFile(path).sample("infrared_2", 19).number == 19
+
+
+def test_a_whole_recording_passes_the_check(bag: BagFile) -> None:
+    bag.check()
+
+
+@pytest.mark.parametrize("topic", ["/sensor_0/info", "/Depth_Units/description", "/Infrared_0/tf/1", "/image/data"])
+def test_damage_in_any_message_is_found_by_the_check(noise_bag_uncompressed: Path, tmp_path: Path, topic: str) -> None:
+    bag, path = BagContainer(noise_bag_uncompressed), tmp_path / "damaged.bag"
+    name = next(name for name in bag.entries if name.endswith(topic))
+    content, message = noise_bag_uncompressed.read_bytes(), bytes(bag.raw(bag.entries[name][-1]))
+    where = content.rindex(message) - 4  # its length
+    path.write_bytes(content[:where] + b"\xff\xff" + content[where + 2 :])
+    with pytest.raises(RecordingError, match="is damaged"):
+        BagFile(path).check()
+
+
+def test_an_image_that_is_smaller_than_it_says_is_found_by_the_check(rewritten: Any) -> None:
+    def wider(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
+        doubled = raw.replace(struct.pack("<II", 48, 64), struct.pack("<II", 48, 128), 1)
+        return [(time_ns, doubled if topic.endswith("Depth_0/image/data") else raw)]
+
+    with pytest.raises(RecordingError, match="an image of 128 x 48 mono16"):
+        BagFile(rewritten(wider)).check()

@@ -1,6 +1,7 @@
 """Two readers, one truth: librealsense's playback and our own reading of the same files."""
 
 import gc
+import re
 import struct
 import time
 from collections.abc import Callable, Iterable
@@ -128,13 +129,43 @@ def last_chunk_damaged(path: Path, target: Path) -> Path:
     return target
 
 
-def test_an_end_that_comes_too_early_is_told_by_both(recorded: Any, tmp_path: Path) -> None:
-    whole = recorded(tmp_path / "whole.bag", frames=150)  # more than the SDK writes as one compressed piece
-    path = last_chunk_damaged(whole, tmp_path / "damaged.bag")
+@pytest.fixture(scope="module")
+def damaged(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("damaged")
+    whole = recorded(folder / "whole.bag", frames=150)  # more than the SDK writes as one compressed piece
+    return last_chunk_damaged(whole, folder / "damaged.bag")
+
+
+TOLD = r"is damaged \d+\.\d s into its .*nlos-cam repair"
+
+
+def test_damage_does_not_reach_the_sdk(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = SimpleNamespace(context=lambda: pytest.fail("the SDK was given the file"))
+    monkeypatch.setattr("nlos_cam.camera.replay_sdk.load_sdk", lambda: fake)
+    with pytest.raises(RecordingError, match=TOLD):
+        SdkReplayCamera(damaged)
+
+
+def test_damage_that_only_the_sdk_would_meet_does_not_reach_it(
+    noise_bag_uncompressed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content, path = bytearray(noise_bag_uncompressed.read_bytes()), tmp_path / "damaged.bag"
+    headers = list(re.finditer(rb"(?s)\x2f\0\0\0.\0\0\0(?:op|ver|conn|count)=", content))  # of indexes
+    content[headers[-1].start() + 3] = 0xFF
+    path.write_bytes(content)
+    assert len(seen(ReplayCamera(path))[0]) == 20
+    fake = SimpleNamespace(context=lambda: pytest.fail("the SDK was given the file"))
+    monkeypatch.setattr("nlos_cam.camera.replay_sdk.load_sdk", lambda: fake)
+    with pytest.raises(RecordingError, match=r"is damaged \(at byte \d+: a record's header .*nlos-cam repair"):
+        SdkReplayCamera(path)
+
+
+def test_a_playback_that_ends_too_early_is_told(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SdkReplayCamera, "_check_all", lambda _: None)
     found: dict[type, list[int]] = {}
-    for camera in (ReplayCamera(path), SdkReplayCamera(path)):
+    for camera in (ReplayCamera(damaged), SdkReplayCamera(damaged)):
         frames: list[int] = []
-        with camera, pytest.raises(RecordingError, match=r"is damaged \d+\.\d s into its .*nlos-cam repair"):
+        with camera, pytest.raises(RecordingError, match=TOLD):
             frames.extend(frame.frame_number for frame in camera)
         assert camera.dropped == 0
         found[type(camera)] = frames
@@ -167,6 +198,12 @@ def test_what_the_sdk_refuses_is_told(noise_bag: Path, monkeypatch: pytest.Monke
     fake = SimpleNamespace(context=lambda: SimpleNamespace(load_device=refuse))
     monkeypatch.setattr("nlos_cam.camera.replay_sdk.load_sdk", lambda: fake)
     with pytest.raises(RecordingError, match=r"cut short or damaged \(no such stream\): `nlos-cam repair"):
+        SdkReplayCamera(noise_bag)
+
+
+def test_a_stream_that_the_sdk_does_not_find_is_told(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.camera.replay_sdk.find_streams", lambda _: (None, {}))
+    with pytest.raises(RecordingError, match=r"is damaged \(librealsense finds no 'depth' in it\): `nlos-cam repair"):
         SdkReplayCamera(noise_bag)
 
 
