@@ -6,7 +6,7 @@ from importlib import metadata
 from typing import Any
 
 from nlos_cam.camera.host import Host, read_host
-from nlos_cam.camera.l515 import DeviceInfo, connected
+from nlos_cam.camera.l515 import DeviceInfo, connected, shared_context
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.usb import UsbDevice, UsbScan, scan, sdk_serial
 from nlos_cam.errors import CameraError
@@ -111,7 +111,7 @@ def look_at_sdk(
     except CameraError as error:
         return Sdk(packages, load_error=str(error.__cause__ or error))  # the cause alone: what to do is told beside it
     try:
-        return Sdk(packages, devices=tuple(info for _, info in connected(sdk, sdk.context())))
+        return Sdk(packages, devices=tuple(info for _, info in connected(sdk, shared_context(sdk))))
     except (CameraError, RuntimeError, AttributeError) as error:  # AttributeError: a folder of its name, not the wheel
         return Sdk(packages, query_error=str(error))
 

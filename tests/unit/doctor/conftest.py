@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import usb.core
+from fake_librealsense import FakeSdk
 from usb.backend import IBackend
 
 from nlos_cam.camera.host import Platform, read_host
@@ -213,8 +214,9 @@ class Bench:
     def load_sdk(self) -> Any:
         if self.sdk_error:
             raise CameraError(f"librealsense cannot be loaded ({self.sdk_error})") from self.sdk_error
-        context = SimpleNamespace(query_devices=lambda: self.sdk_devices)
-        return SimpleNamespace(context=lambda: context, camera_info=_Names())
+        sdk = FakeSdk()
+        sdk.lidars = self.sdk_devices
+        return sdk
 
     def facts(self) -> Facts:
         host = read_host(self.linux.root, self.platform, self.open_node)
@@ -226,13 +228,6 @@ class Bench:
 
     def failed(self) -> dict[str, Check]:
         return {name: check for name, check in self.checks().items() if check.status == "failed"}
-
-
-class _Names:
-    """Stands for an enumeration: any member is its own name."""
-
-    def __getattr__(self, name: str) -> str:
-        return name
 
 
 @pytest.fixture

@@ -1,5 +1,5 @@
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -42,9 +42,9 @@ def test_an_sdk_that_cannot_list_is_told(bench: Any) -> None:
     def fail() -> None:
         raise RuntimeError("failed to set power state")
 
-    bench.load_sdk = lambda: SimpleNamespace(context=lambda: SimpleNamespace(query_devices=fail))
+    bench.load_sdk = lambda: Mock(context=lambda: Mock(query_devices=fail))
     assert "failed to set power state" in bench.facts().sdk.query_error
-    bench.load_sdk = lambda: SimpleNamespace(context=fail)
+    bench.load_sdk = lambda: Mock(context=fail)
     assert "failed to set power state" in bench.facts().sdk.query_error
 
 
@@ -56,7 +56,7 @@ def test_an_error_without_a_cause_is_its_own() -> None:
 
 
 def test_a_folder_of_the_wheels_name_is_told(bench: Any) -> None:
-    bench.load_sdk = SimpleNamespace
+    bench.load_sdk = object
     assert "attribute" in bench.facts().sdk.query_error
 
 

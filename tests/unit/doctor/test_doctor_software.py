@@ -1,6 +1,6 @@
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import usb.core
@@ -79,7 +79,7 @@ def test_an_sdk_that_cannot_list_fails(bench: Any) -> None:
     def fail() -> None:
         raise RuntimeError("failed to set power state")
 
-    bench.load_sdk = lambda: SimpleNamespace(context=fail)
+    bench.load_sdk = lambda: Mock(context=fail)
     check = bench.failed()["sdk"]
     assert "failed to set power state" in check.detail
     assert "unplug the camera" in check.fix
