@@ -83,8 +83,11 @@ def kill(command: list[str], path: Path, after_s: float) -> None:
         try:
             deadline_s = time.monotonic() + START_TIMEOUT_S
             while not (path.exists() and path.stat().st_size) and time.monotonic() < deadline_s:
+                if process.poll() is not None:
+                    break
                 time.sleep(0.01)
-            time.sleep(after_s)
+            else:
+                time.sleep(after_s)
             if process.poll() is not None:
                 raise RuntimeError(f"the capture ended by itself, with exit code {process.returncode}")
         finally:

@@ -1,6 +1,6 @@
 """The simulated L515: a rendered world with a thin device in front of it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from threading import Event, Thread
 from typing import Any, Self
 
@@ -12,7 +12,7 @@ from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.live_camera import LiveCamera
 from nlos_cam.camera.record import Recording
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.software_lidar import NAME, SERIAL, SoftwareLidar
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.camera.world import World
 from nlos_cam.errors import CameraLostError
@@ -55,6 +55,7 @@ class SimulatedCamera(LiveCamera):
         pinhole = world.rig.pinhole
         super().__init__(uri, self._lidar.device, (pinhole.width, pinhole.height), load_sdk(), recording, self._clock)
         self.rig: Rig | None = world.rig
+        self.identity: Mapping[str, str] = {"name": NAME, "serial": SERIAL}
 
     def __enter__(self) -> Self:
         self._start_s = None

@@ -120,6 +120,11 @@ def test_what_is_delivered_is_what_the_world_exposed(uri: str, camera: Camera) -
         np.testing.assert_array_equal(frame.confidence, images.confidence)
 
 
+def test_it_tells_which_device_it_is(camera: Camera) -> None:
+    assert {"name", "serial"} <= set(camera.identity)
+    assert all(camera.identity.values())
+
+
 def test_the_truth_is_given_where_the_camera_knows_it(uri: str, camera: Camera) -> None:
     frame = look(camera)[0]
     if uri != "sim":

@@ -11,7 +11,7 @@ import pytest
 CAPTURE = """
 import sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/fakes"]
 from conftest import record_noise
 record_noise(Path(sys.argv[2]), 10**9)
 """
