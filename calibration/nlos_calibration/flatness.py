@@ -55,9 +55,6 @@ class _Sums:
     right: Array
     """(4,)."""
 
-    def __add__(self, other: "_Sums") -> "_Sums":
-        return _Sums(self.matrix + other.matrix, self.right + other.right)
-
     def step(self, offset_m: float = 0.0) -> Array:
         """By how much the slopes (3,) of this part alone differ, once `offset_m` is added to every depth."""
         # an offset to be added is an error to be subtracted: the fourth unknown is its negative
@@ -87,18 +84,25 @@ def flatness(plane: PlaneFit, rays: Array) -> Flatness:
 
 
 def _halves(plane: PlaneFit, rays: Array) -> tuple[list[_Sums], _Sums, float]:
-    """Left, right, upper and lower half of some inliers; all of these; their mean square in standard deviations."""
+    """Eight halves of some inliers, of four ways to cut; all of these; their mean square in standard deviations.
+
+    A step along a cut leaves both of its halves flat; a step across it leaves both as tilted as the whole.
+    """
     some = np.flatnonzero(plane.inliers)
     some = some[:: max(len(some) // HALVES_POINTS, 1)]
     seen, weight = rays[some], 1.0 / plane.sigmas_m[some]
     sigmas = plane.errors_m[some] * weight
     predicted_m = 1.0 / (seen @ plane.slopes)
     rows = np.column_stack([seen * (-(predicted_m**2) * weight)[:, np.newaxis], weight])
-    right, low = seen[:, 0] > np.median(seen[:, 0]), seen[:, 1] > np.median(seen[:, 1])
-    quarters = [_sums(rows, sigmas, part) for part in (~right & ~low, right & ~low, ~right & low, right & low)]
-    upper, lower = quarters[0] + quarters[1], quarters[2] + quarters[3]
-    halves = [quarters[0] + quarters[2], quarters[1] + quarters[3], upper, lower]
-    return halves, upper + lower, float(sigmas @ sigmas) / max(len(sigmas) - 3, 1)
+    x, y = (seen[:, :2] - np.median(seen[:, :2], axis=0)).T
+    eighth = np.floor(np.arctan2(y, x) * 4.0 / np.pi).astype(np.int64) % 8
+    eighths = [_sums(rows, sigmas, eighth == one) for one in range(8)]
+    halves = [_total([eighths[(one + more) % 8] for more in range(4)]) for one in range(8)]
+    return halves, _total(eighths), float(sigmas @ sigmas) / max(len(sigmas) - 3, 1)
+
+
+def _total(parts: list[_Sums]) -> _Sums:
+    return _Sums(sum((part.matrix for part in parts), np.zeros((4, 4))), sum((part.right for part in parts), np.zeros(4)))
 
 
 def _sums(rows: Array, sigmas: Array, part: NDArray[np.bool_]) -> _Sums:

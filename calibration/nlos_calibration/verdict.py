@@ -13,11 +13,13 @@ DISTANCE_RANGE_M, FACING_RANGE_DEG = (0.15, 0.30), (15.0, 75.0)
 """The paper's ranges (SI 1)."""
 TOLERANCE_M, TOLERANCE_DEG = 0.001, 0.2
 """What the measurement may err by: a wall on the edge of a range is in it, a bend that shifts it by less is none."""
-REFUSED_TOLERANCES = 5.0
+DOUBTED_TOLERANCES, REFUSED_TOLERANCES = 0.7, 5.0
 """A wall is refused whose halves differ from the whole by this much: 5 mm or 1 degree (a bend of 2 degrees). Less could
-also be ripples of the lidar, 1 or 2 mm high and as wide as half the view: those are told, not refused."""
-MAX_RIPPLE_M = 0.002
-"""RMS normal to the wall. The L515's ripples are a millimetre or two high."""
+also be ripples of the lidar, 1 or 2 mm high and as wide as half the view: those are told, not refused. It is doubted
+from somewhat less than a tolerance on, since a half that bends itself says too little."""
+DOUBTED_RIPPLE_M, MAX_RIPPLE_M = 0.0009, 0.002
+"""RMS normal to the wall. The L515's ripples are a millimetre or two high; two panes 2 mm apart are 1 mm off a plane
+between them."""
 TOLD_RIPPLE_M, TOLD_NOISE_SCALE = 0.0003, 2.0
 
 
@@ -67,11 +69,15 @@ def _amounts(flat: Flatness) -> str:
 
 def _doubts(flat: Flatness) -> list[str]:
     """Why the plane may be another than the wall's."""
-    if _tolerances(flat.bend_m, flat.bend_deg) <= 1.0:
-        return []
-    if _explained_by_offset(flat):
+    bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTED_TOLERANCES
+    if bent and _explained_by_offset(flat):
         why = f"the depths look as if {flat.offset_m * 1e3:+.1f} mm were missing from each (or the wall is curved): "
         return [why + "measure the distance with a tape and give it with --tape-m"]
+    if flat.ripple_m > DOUBTED_RIPPLE_M:
+        why = f"parts of the wall are {flat.ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the lidar, or a wall "
+        return [why + "that is not flat; take a flat, matt wall and let the lidar warm up"]
+    if not bent:
+        return []
     if flat.bend_m <= SURE_SIGMAS * flat.bend_std_m and flat.bend_deg <= SURE_SIGMAS * flat.bend_std_deg:
         return [f"noise leaves {_amounts(flat)} between half of the view and the whole: average more frames"]
     why = f"half of the view differs from the whole by {_amounts(flat)}: a bent wall, or ripples of the lidar; "

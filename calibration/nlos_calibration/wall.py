@@ -19,10 +19,10 @@ Array = NDArray[np.float64]
 MIN_VALID_SHARE = 0.05
 STUCK_SHARE = 0.99
 """Of depths that are one and the same: noise spreads those of a true wall, even one that is faced squarely."""
-BLOCK_PIXELS, STRAY_IN_BLOCK = 4, 0.875
+BLOCK_PIXELS, SEEN_IN_BLOCK, STRAY_IN_BLOCK = 4, 0.75, 0.875
 MAX_STRAY_SHARE = 0.05
 """Scattered outliers are noise; blocks that stray as one are another surface or another path. At 40 % of scattered
-outliers a full block strays by chance once in 8,000."""
+outliers a full block strays by chance once in 8,000, and one in which nothing else is seen counts once in 200."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +79,12 @@ def fit_wall(
     plane = fit_plane((rays * depth_m[..., np.newaxis]).reshape(-1, 3), generator, noise)
     if plane.normal[2] >= 0.0:
         raise WallRefusedError("the optical axis never meets the wall's plane: turn the lidar towards the wall")
-    pose = wall_from_plane(plane.normal, plane.distance_m)
-    _check_one_surface(depth_m, wall_depth(pose, intrinsics))
+    scale = noise.scale if noise is not None and noise.measured else plane.noise_scale
+    _check_one_surface(depth_m, wall_depth(wall_from_plane(plane.normal, plane.distance_m), intrinsics), scale)
     flat = flatness(plane, rays)
     check_flat(flat)
     measures = measures_of(plane.slopes, flat.correlation * plane.covariance)
     measures = replace(measures, distance_m=plane.distance_m - origin_m * float(plane.normal[2]))
-    scale = noise.scale if noise is not None and noise.measured else plane.noise_scale
     verdict, advice = judge(measures.distance_m, measures.facing_deg, flat)
     return WallFit(
         **vars(measures),
@@ -117,14 +116,14 @@ def _check_depth(depth_m: Array) -> None:
         raise WallRefusedError(f"the lidar says {middle_m:.4f} m everywhere, as if it were stuck: start it again")
 
 
-def _check_one_surface(depth_m: Array, expected_m: Array) -> None:
+def _check_one_surface(depth_m: Array, expected_m: Array, noise_scale: float) -> None:
     """Refuse a map in which blocks of pixels stray from the wall together (NaN in `depth_m` is neither)."""
-    noise_m = depth_noise_m(depth_m)
+    gate_m = GATE_SIGMAS * max(noise_scale, 1.0) * depth_noise_m(depth_m)
     valid = np.isfinite(depth_m)
-    behind = valid & (depth_m - expected_m > GATE_SIGMAS * noise_m)
-    before = valid & (expected_m - depth_m > GATE_SIGMAS * noise_m)
+    behind = valid & (depth_m - expected_m > gate_m)
+    before = valid & (expected_m - depth_m > gate_m)
     seen, behind_seen, before_seen = (block_sums(mask, BLOCK_PIXELS) for mask in (valid, behind, before))
-    blocks = seen >= BLOCK_PIXELS**2 / 2
+    blocks = seen >= SEEN_IN_BLOCK * BLOCK_PIXELS**2
     total = max(int(blocks.sum()), 1)
     stray = blocks & (behind_seen + before_seen >= STRAY_IN_BLOCK * seen)
     if stray.sum() <= MAX_STRAY_SHARE * total:
