@@ -21,6 +21,7 @@ from typing import Protocol
 import lz4.frame
 import numpy as np
 
+from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.repair import repair
 from nlos_cam.camera.replay_sdk import SdkReplayCamera
 from nlos_cam.camera.world import open_world
@@ -58,7 +59,7 @@ class Kill:
     """Of those on disk."""
     frames_recovered: dict[str, int]
     frames_played: dict[str, int]
-    """By librealsense, from what was repaired."""
+    """By librealsense, from what was repaired; as our own reader counts them where a stream has none yet."""
     frames_wrong: int
     """Played sets that are not, bit for bit, what the camera saw."""
     repair_s: float
@@ -117,6 +118,9 @@ def frames_in(chunks: list[bytes]) -> dict[str, int]:
 
 def played(path: Path, world: Seen) -> tuple[dict[str, int], int]:
     """Frames that librealsense plays, and the sets among them that are not as the world was."""
+    in_file = {name: info.frames for name, info in BagFile(path).streams.items()}
+    if missing := set(STREAMS) - set(in_file):  # killed before the first set was whole: there is nothing to pair
+        return in_file | dict.fromkeys(missing, 0), 0
     wrong = 0
     with SdkReplayCamera(path) as camera:
         for frame in camera:
