@@ -1,25 +1,29 @@
 """A plane through a lidar's points: consensus first, then least squares over the points that agree.
 
-Along the ray r = p / p_z of a pixel, a plane normal . p + distance_m = 0 reads 1 / p_z = slopes . r with slopes =
--normal / distance_m: linear in the unknowns, with the noise on the left side only, so least squares has no bias.
+Along the ray r = p / p_z of a pixel, a plane normal . p + distance_m = 0 reads p_z = 1 / (slopes . r) with slopes =
+-normal / distance_m. The noise is on p_z, so that is what is fitted (by Gauss and Newton's steps): 1 / p_z would be
+linear in the slopes, but noise moves its mean.
 """
 
 from dataclasses import dataclass
-from typing import TypeVar
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlos_calibration.errors import WallRefusedError
+from nlos_calibration.range_noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
 
 Array = NDArray[np.float64]
-Depth = TypeVar("Depth", float, Array)
+Mask = NDArray[np.bool_]
 
-NOISE_FLOOR_M, NOISE_PER_METRE = 0.0005, 0.002
-"""Standard deviation of one depth sample: the floor, and what each metre of depth adds."""
 GATE_SIGMAS = 5.0
+MIN_SCALE, MAX_SCALE = 0.25, 8.0
+"""Of the residuals over the noise to expect: a gate cannot close on exact depth, nor open to anything."""
 MIN_DEPTH_M = 0.01
 """Nothing nearer can be measured, and the gate would be as wide as the depth."""
+FARTHEST_M = 1000.0
+"""Where a beam that never meets the plane is held to meet it."""
 MIN_POINTS = 100
 """A plane through fewer points cannot be checked."""
 MIN_INLIER_FRACTION = 0.5
@@ -28,6 +32,10 @@ MIN_RAY_EXTENT = 0.1
 """How wide (tangent of an angle) the middle four fifths of the points must be seen: a line has no plane of its own."""
 MIN_TRIPLE_AREA = 1e-4
 TRIPLES, SCORED_POINTS, MAX_REFITS = 300, 2000, 20
+SETTLED_SIGMAS = 1e-3
+"""A step this small against the slopes' uncertainty changes nothing."""
+MEDIAN_PER_SIGMA = 0.67449
+"""The median of |x| of a normal distribution."""
 
 
 @dataclass(frozen=True)
@@ -41,76 +49,163 @@ class PlaneFit:
     """RMS distance of the inliers from the plane."""
     inlier_fraction: float
     """Share of the valid points that lie on the plane."""
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     """(N,); False for points that are not valid."""
+    slopes: Array
+    """(3,); -normal / distance_m."""
+    covariance: Array
+    """(3, 3) of the slopes, scaled by the residuals, as if these were independent of one another."""
+    noise_scale: float
+    """RMS of the residuals over the noise to expect."""
+    errors_m: Array
+    """(N,); how far each point's depth is beyond the plane's; NaN but for inliers."""
+    sigmas_m: Array
+    """(N,); the noise to expect there; NaN but for inliers."""
 
 
-def depth_noise_m(depth_m: Depth) -> Depth:
-    """The standard deviation of a depth sample at `depth_m`, any shape."""
-    return NOISE_FLOOR_M + NOISE_PER_METRE * depth_m
+@dataclass(frozen=True)
+class _Points:
+    """The points that are valid."""
+
+    rays: Array
+    depth_m: Array
+    noise: MeanNoise
+
+    def at(self, points: Mask | slice) -> "_Points":
+        return _Points(self.rays[points], self.depth_m[points], self.noise.at(points))
+
+    def few(self) -> "_Points":
+        return self.at(slice(None, None, max(len(self.rays) // STATISTICS_POINTS, 1)))
 
 
-def fit_plane(points_m: Array, generator: np.random.Generator) -> PlaneFit:
+def fit_plane(points_m: Array, generator: np.random.Generator, noise: MeanNoise | None = None) -> PlaneFit:
     """Fit the plane that most of the points (N, 3) in the lidar frame lie on; NaN and points behind are left out.
 
-    Raises WallRefusedError where there are too few points, where no plane holds half of them, and where they are seen
-    along a line (collinear, or a wall seen edge on).
+    `noise` is that of the depths; one sample's where it is not given. Raises WallRefusedError where there are too few
+    points, where no plane holds half of them, and where they are seen along a line (collinear, or a wall seen edge on).
     """
     valid = np.isfinite(points_m).all(axis=1) & (points_m[:, 2] >= MIN_DEPTH_M)
     count = int(valid.sum())
     if count < MIN_POINTS:
         raise WallRefusedError(f"{count} points in front of the lidar, {MIN_POINTS} needed: point it at the wall")
-    points = points_m[valid].astype(np.float64)
-    rays, inverse = points / points[:, 2:], 1.0 / points[:, 2]
-    gate = GATE_SIGMAS * depth_noise_m(points[:, 2]) * inverse**2
-    slopes, inside = _refit(rays, inverse, gate, _consensus(rays, inverse, gate, generator))
-    _check_majority(inside, inverse - rays @ slopes)
-    _check_extent(rays[inside])
+    depth_m = points_m[valid, 2].astype(np.float64)
+    points = _Points(points_m[valid] / depth_m[:, np.newaxis], depth_m, (noise or MeanNoise()).at(valid))
+    slopes, scale, _ = _refit(points.few(), _consensus(points, generator), np.inf)
+    slopes, _, inside = _refit(points, slopes, scale)
+    _check_majority(inside, points, slopes)
+    agreed = points.at(inside)
+    _check_extent(agreed.few().rays)
     distance_m = 1.0 / float(np.linalg.norm(slopes))
-    normal = -slopes * distance_m
-    residual_m = float(np.sqrt(np.mean((points[inside] @ normal + distance_m) ** 2)))
+    errors_m, sigmas_m, predicted_m = _errors(agreed, slopes)
+    rows, _ = _rows(agreed.rays, errors_m, sigmas_m, predicted_m, np.ones(len(errors_m), np.bool_))
+    chi2 = _chi2(errors_m, sigmas_m)
     inliers = valid.copy()
     inliers[valid] = inside
-    return PlaneFit(normal, distance_m, residual_m, float(inside.mean()), inliers)
+    return PlaneFit(
+        normal=-slopes * distance_m,
+        distance_m=distance_m,
+        residual_m=float(np.sqrt(np.mean((errors_m * distance_m / predicted_m) ** 2))),
+        inlier_fraction=float(inside.mean()),
+        inliers=inliers,
+        slopes=slopes,
+        covariance=chi2 * np.linalg.pinv(rows.T @ rows).astype(np.float64),
+        noise_scale=sqrt(chi2),
+        errors_m=_spread_over(inliers, errors_m),
+        sigmas_m=_spread_over(inliers, sigmas_m),
+    )
 
 
-def _consensus(rays: Array, inverse: Array, gate: Array, generator: np.random.Generator) -> Array:
+def _spread_over(inliers: Mask, values: Array) -> Array:
+    everywhere = np.full(len(inliers), np.nan)
+    everywhere[inliers] = values
+    return everywhere
+
+
+def _errors(points: _Points, slopes: Array) -> tuple[Array, Array, Array]:
+    """How far depths are beyond the plane's, the noise to expect there, and the plane's depth (far if it has none)."""
+    predicted_m = 1.0 / np.maximum(points.rays @ slopes, 1.0 / FARTHEST_M)
+    return points.depth_m - predicted_m, points.noise.of(predicted_m), predicted_m
+
+
+def _consensus(points: _Points, generator: np.random.Generator) -> Array:
     """The slopes (3,), out of those through random triples of points, that the most points agree on."""
-    triples = generator.integers(len(rays), size=(TRIPLES, 3))
+    triples = generator.integers(len(points.rays), size=(TRIPLES, 3))
     # the determinant of three rays is twice the area of their triangle in the image: none for points seen in a line
-    triples = triples[np.abs(np.linalg.det(rays[triples])) > 2.0 * MIN_TRIPLE_AREA]
+    triples = triples[np.abs(np.linalg.det(points.rays[triples])) > 2.0 * MIN_TRIPLE_AREA]
     if len(triples) == 0:
         raise WallRefusedError(_in_a_line(0.0))
-    candidates = np.linalg.solve(rays[triples], inverse[triples][..., np.newaxis])[..., 0]
-    some = generator.integers(len(rays), size=SCORED_POINTS)
-    errors = (inverse[some, np.newaxis] - rays[some] @ candidates.T) / gate[some, np.newaxis]
+    candidates = np.linalg.solve(points.rays[triples], 1.0 / points.depth_m[triples][..., np.newaxis])[..., 0]
+    some = generator.integers(len(points.rays), size=SCORED_POINTS)
+    predicted_m = 1.0 / np.maximum(points.rays[some] @ candidates.T, 1.0 / FARTHEST_M)
+    errors = (points.depth_m[some, np.newaxis] - predicted_m) / _widest_m(predicted_m, points.noise)
     return candidates[np.argmin(np.minimum(errors**2, 1.0).sum(axis=0))]
 
 
-def _refit(rays: Array, inverse: Array, gate: Array, slopes: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Weighted least squares over the inliers, repeated until they stay the same: (slopes, inliers)."""
-    inside = np.abs(inverse - rays @ slopes) <= gate
+def _widest_m(predicted_m: Array, noise: MeanNoise) -> Array:
+    """The gate to begin with: that of a single sample, since ripples do not fall with the number of samples."""
+    return GATE_SIGMAS * max(noise.scale, 1.0) * depth_noise_m(predicted_m)
+
+
+def _refit(points: _Points, slopes: Array, scale: float) -> tuple[Array, float, Mask]:
+    """Weighted least squares over the points inside the gate, repeated until it moves no more.
+
+    Returns slopes, the residuals' scale (inf while it is not known) and which points are inside.
+    """
+    inside, few = np.zeros(len(points.rays), np.bool_), points.few()
     for _ in range(MAX_REFITS):
+        errors_m, sigmas_m, predicted_m = _errors(points, slopes)
+        inside = np.abs(errors_m) <= _gate_m(points.noise, scale, sigmas_m, predicted_m)
         if inside.sum() < 3:
             break
-        slopes = _least_squares(rays[inside], inverse[inside], slopes)
-        before, inside = inside, np.abs(inverse - rays @ slopes) <= gate
-        if np.array_equal(before, inside):
+        rows, sigmas = _rows(points.rays, errors_m, sigmas_m, predicted_m, inside)
+        step = np.linalg.lstsq(rows.T @ rows, rows.T @ sigmas)[0]
+        slopes, before = slopes + step, scale
+        scale = _residual_scale(few, slopes, scale)
+        if float(np.sum((rows @ step) ** 2)) < SETTLED_SIGMAS**2 and abs(scale - before) < SETTLED_SIGMAS * before:
             break
-    return slopes, inside
+    return slopes, scale, inside
 
 
-def _least_squares(rays: Array, inverse: Array, slopes: Array) -> Array:
+def _rows(rays: Array, errors_m: Array, sigmas_m: Array, predicted_m: Array, inside: Mask) -> tuple[Array, Array]:
+    """The linear least-squares problem of a step of the slopes, in standard deviations: d p_z = -p_z^2 r . step."""
     # weights from the plane predicted last, not from the noisy sample: those would favour samples that err far
-    depth_m = 1.0 / (rays @ slopes)
-    root_weight = depth_m**2 / depth_noise_m(depth_m)
-    return np.linalg.lstsq(rays * root_weight[:, np.newaxis], inverse * root_weight)[0].astype(np.float64)
+    weight = np.where(inside, 1.0 / sigmas_m, 0.0)
+    return rays * (predicted_m**2 * weight)[:, np.newaxis], -errors_m * weight
 
 
-def _check_majority(inside: NDArray[np.bool_], nearer: Array) -> None:
+def _gate_m(noise: MeanNoise, scale: float, sigmas_m: Array, predicted_m: Array) -> Array:
+    """How far inliers may be off: the noise as the residuals show it, once they do.
+
+    A noise that was measured opens the gate no further: more than that is structure.
+    """
+    widest_m = _widest_m(predicted_m, noise)
+    if not np.isfinite(scale):
+        return widest_m
+    return np.minimum(GATE_SIGMAS * max(scale, MIN_SCALE) * sigmas_m, widest_m * (1.0 if noise.measured else MAX_SCALE))
+
+
+def _residual_scale(points: _Points, slopes: Array, scale: float) -> float:
+    """The residuals over the noise to expect, by the median of those inside the gate, which few outliers move."""
+    errors_m, sigmas_m, predicted_m = _errors(points, slopes)
+    inside = np.abs(errors_m) <= _gate_m(points.noise, scale, sigmas_m, predicted_m)
+    if not inside.any():
+        return scale
+    return float(np.median(np.abs(errors_m[inside] / sigmas_m[inside]))) / MEDIAN_PER_SIGMA
+
+
+def _chi2(errors_m: Array, sigmas_m: Array) -> float:
+    """The residuals' mean square in standard deviations, which scales the covariance of the slopes.
+
+    The mean, not the median: outliers inside the gate move the slopes like the noise that they look like.
+    """
+    return float(np.sum((errors_m / sigmas_m) ** 2)) / max(len(errors_m) - 3, 1)
+
+
+def _check_majority(inside: Mask, points: _Points, slopes: Array) -> None:
     if inside.mean() >= MIN_INLIER_FRACTION:
         return
-    behind, before = (~inside & (nearer <= 0.0)).mean(), (~inside & (nearer > 0.0)).mean()
+    farther = _errors(points, slopes)[0] > 0.0
+    behind, before = (~inside & farther).mean(), (~inside & ~farther).mean()
     raise WallRefusedError(
         f"only {inside.mean():.1%} of the depth lies on one plane ({MIN_INLIER_FRACTION:.0%} needed), {behind:.0%} is "
         f"behind it and {before:.0%} in front: take away object and occluder, so that the lidar sees one bare wall",

@@ -1,38 +1,75 @@
-"""The record of a measured wall, `wall.toml`: what was measured, from what, and the rig it yields."""
+"""The record of a measured wall, `wall.toml`: what was measured, from what, how surely, and the rig it yields."""
 
+from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from nlos_calibration.projection import Intrinsics
+from nlos_calibration.range_offset import Cause
 from nlos_calibration.rig import Finite, LidarPose, PinholeRecord, Positive, Record, Rig, load_rig, read_record
-from nlos_calibration.wall import Verdict, WallFit
+from nlos_calibration.verdict import Verdict
+from nlos_calibration.wall import WallFit
 
 Row = tuple[Finite, Finite, Finite, Finite]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 POSE_TOLERANCE = 1e-6
+VERSION = 2
+"""2 adds to 1 what is None, empty or 0 by default: uncertainties, flatness, the device, the reference, the offset."""
+
+
+def _upgraded(version: Any) -> Any:
+    """The version once read; those that this program does not know are refused."""
+    if isinstance(version, int) and version > VERSION:
+        raise ValueError(f"written by a newer nlos-cam, this one reads up to {VERSION}: update it, or measure again")
+    return VERSION if version == 1 else version
 
 
 class WallRecord(Record):
     """A measured wall. Occluder and object box of `rig` may be edited by hand; its lidar is what was measured."""
 
-    schema_version: Literal[1] = 1
+    schema_version: Annotated[Literal[2], BeforeValidator(_upgraded)] = VERSION
     created: date
     camera: str
     """The URI of the camera or recording."""
+    serial: str = ""
+    """Of the device; empty where it is not known, like the firmware and the settings."""
+    firmware: str = ""
+    settings: dict[str, Finite] = Field(default_factory=dict)
+    """The device's options as read back when streaming began."""
     frames: Annotated[int, Field(gt=0)]
     """How many were averaged."""
     distance_m: Positive
+    distance_std_m: NotNegative | None = None
+    """Standard uncertainty, as are all *_std; None in records of version 1."""
     facing_deg: Annotated[float, Field(ge=0, lt=90)]
+    facing_std_deg: NotNegative | None = None
     yaw_deg: Finite
+    yaw_std_deg: NotNegative | None = None
     pitch_deg: Finite
+    pitch_std_deg: NotNegative | None = None
     wall_from_lidar: tuple[Row, Row, Row, Row]
-    residual_m: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    range_offset_m: Finite = 0.0
+    """What is to be added to the lidar's depth; the pose has it in it (`range_offset`)."""
+    range_offset_std_m: NotNegative | None = None
+    """None where the offset was not measured."""
+    range_offset_cause: Cause | None = None
+    residual_m: NotNegative
+    noise_scale: NotNegative | None = None
+    """The noise of a depth sample over the lidar's nominal."""
     inlier_fraction: Annotated[float, Field(ge=0, le=1)]
+    ripple_m: NotNegative | None = None
+    bend_m: NotNegative | None = None
+    bend_deg: NotNegative | None = None
+    reference: str = ""
+    """The file of the bare wall's reference maps, beside this one; empty where there is none."""
+    reference_sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")] = ""
     verdict: Verdict
     advice: str
+    warnings: tuple[str, ...] = ()
     rig: Rig
 
     @model_validator(mode="after")
@@ -46,17 +83,32 @@ class WallRecord(Record):
         return self
 
 
-def wall_record(fit: WallFit, intrinsics: Intrinsics, *, camera: str, frames: int, created: date) -> WallRecord:
-    """The record of `fit`; its rig is the paper's with the measured pose and the camera's intrinsics."""
+def wall_record(
+    fit: WallFit,
+    intrinsics: Intrinsics,
+    *,
+    camera: str,
+    frames: int,
+    created: date,
+    others: Mapping[str, object] | None = None,
+) -> WallRecord:
+    """The record of `fit`; its rig is the paper's with the measured pose and the camera's intrinsics.
+
+    `others` are further fields: the device's, the reference's, the range offset's.
+    """
     lidar = LidarPose(distance_m=fit.distance_m, yaw_deg=fit.yaw_deg, pitch_deg=fit.pitch_deg)
     pinhole = PinholeRecord.model_validate(vars(intrinsics))
     rig = load_rig("paper-rig").model_copy(update={"name": "measured", "lidar": lidar, "intrinsics": pinhole})
-    measured = vars(fit) | {"wall_from_lidar": fit.wall_from_lidar.tolist()}
+    measured = {name: value for name, value in vars(fit).items() if name in WallRecord.model_fields}
+    measured |= {"wall_from_lidar": fit.wall_from_lidar.tolist(), **(others or {})}
     return WallRecord.model_validate(measured | {"camera": camera, "frames": frames, "created": created, "rig": rig})
 
 
 def load_wall(path: Path) -> WallRecord:
-    """Read a `wall.toml`. Raises RecordFileError, with the first problem, where it is not one."""
+    """Read a `wall.toml`, of this version or an older one.
+
+    Raises RecordFileError, with the first problem, where it is not one.
+    """
     return read_record(path, WallRecord, "wall record", "write one with `nlos-cam calibrate --wall`")
 
 

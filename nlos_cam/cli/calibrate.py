@@ -1,5 +1,7 @@
 """`nlos-cam calibrate`: measure the bench before using it."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
@@ -7,10 +9,12 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.projection import Intrinsics
+from nlos_calibration.range_offset import tape_the_wall
 from nlos_calibration.rig import dump_toml
-from nlos_calibration.wall import DepthMean, fit_wall
+from nlos_calibration.wall import WallFit, fit_wall
 from nlos_calibration.wall_record import WallRecord, wall_record
 from rich.markup import escape
 
@@ -21,7 +25,28 @@ Wall = Annotated[bool, typer.Option("--wall", help="Measure the bare wall: no ob
 CameraUri = Annotated[str | None, typer.Option("--camera", help="l515, l515:SERIAL, sim:bare-wall, ...")]
 Bag = Annotated[Path | None, typer.Option("--bag", help="A recording of the bare wall.")]
 Frames = Annotated[int, typer.Option("--frames", min=1, help="How many frames to average.")]
+Tape = Annotated[
+    float | None,
+    typer.Option("--tape-m", min=0.01, help="Distance by hand, from the front glass to the wall along its normal."),
+]
 Out = Annotated[Path | None, typer.Option("--out", help="The record to write (TOML).")]
+TOLD = {
+    "distance_m",
+    "distance_std_m",
+    "facing_deg",
+    "facing_std_deg",
+    "yaw_deg",
+    "yaw_std_deg",
+    "pitch_deg",
+    "pitch_std_deg",
+    "range_offset_m",
+    "residual_m",
+    "inlier_fraction",
+    "verdict",
+    "warnings",
+    "frames",
+}
+"""What --json tells of the record."""
 
 
 def register(app: typer.Typer) -> None:
@@ -34,6 +59,7 @@ def calibrate(
     camera: CameraUri = None,
     bag: Bag = None,
     frames: Frames = 60,
+    tape_m: Tape = None,
     out: Out = None,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -41,23 +67,30 @@ def calibrate(
     """Find the wall's distance and angle from frames of the bare wall, and write them as a record."""
     uri = _source(camera, bag, wall=wall)
     path = output_path(out, "wall", ".toml", overwrite=overwrite)
-    mean, intrinsics = _average(uri, frames)
-    fit = fit_wall(mean.mean_m(), intrinsics, np.random.default_rng(0))
+    seen = _look(uri, frames)
+    fit, offset = _fitted(seen, tape_m)
     today = datetime.now().astimezone().date()
-    record = wall_record(fit, intrinsics, camera=uri, frames=mean.frames, created=today)
+    record = wall_record(
+        fit,
+        seen.intrinsics,
+        camera=uri,
+        frames=seen.mean.frames,
+        created=today,
+        others=seen.device | offset,
+    )
     path.write_text(dump_toml(record), encoding="utf-8")
-    measured = {
-        "distance_m",
-        "facing_deg",
-        "yaw_deg",
-        "pitch_deg",
-        "residual_m",
-        "inlier_fraction",
-        "verdict",
-        "frames",
-    }
-    result = record.model_dump(mode="json", include=measured) | {"out": str(path)}
+    result = record.model_dump(mode="json", include=TOLD) | {"out": str(path)}
     finish(result, as_json=json, text=_told(record, path))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What was looked at, and by what."""
+
+    mean: DepthMean
+    intrinsics: Intrinsics
+    device: dict[str, object]
+    """Serial, firmware and settings, as the record names them."""
 
 
 def _source(camera: str | None, bag: Path | None, *, wall: bool) -> str:
@@ -71,26 +104,62 @@ def _source(camera: str | None, bag: Path | None, *, wall: bool) -> str:
     raise typer.BadParameter("give one of --camera URI and --bag F.bag")
 
 
-def _average(uri: str, frames: int) -> tuple[DepthMean, Intrinsics]:
-    """The mean depth over at most `frames` frames, and the intrinsics it was seen with."""
+def _look(uri: str, frames: int) -> _Seen:
+    """The mean depth over at most `frames` frames, and what it was seen with."""
     with tracked("opening the camera") as on_progress:
         found = open_camera(uri, on_progress=on_progress)
     with found as source, progress() as bar:
         mean = DepthMean(source.intrinsics.height, source.intrinsics.width)
+        settings: Mapping[str, float] = {}
         for frame in bar.track(islice(source, frames), total=frames, description="looking at the wall"):
             mean.add(frame.depth_m)
+            settings = frame.settings
         if mean.frames == 0:
             raise WallRefusedError(f"{uri} gave no frames: record the wall again, or look at it live")
-        return mean, source.intrinsics
+        device = {name: source.identity.get(name, "") for name in ("serial", "firmware")}
+        return _Seen(mean, source.intrinsics, {**device, "settings": dict(settings)})
+
+
+def _fitted(seen: _Seen, tape_m: float | None) -> tuple[WallFit, dict[str, object]]:
+    """The wall, and what the record says of the lidar's offset where a distance was measured by hand."""
+    depth_m, noise = seen.mean.mean_m(), seen.mean.noise()
+
+    def fit_with(offset_m: float, origin_m: float) -> WallFit:
+        return fit_wall(depth_m + offset_m, seen.intrinsics, np.random.default_rng(0), noise, origin_m)
+
+    if tape_m is None:
+        return fit_with(0.0, 0.0), {}
+    taped = tape_the_wall(fit_with, tape_m)
+    return taped.fit, {
+        "range_offset_m": taped.offset_m,
+        "range_offset_std_m": taped.offset_std_m,
+        "range_offset_cause": taped.cause,
+    }
 
 
 def _told(record: WallRecord, path: Path) -> str:
+    """What was measured, with the half width of each 95 % interval."""
     colour = "green" if record.verdict == "good" else "yellow"
-    angle = f"{record.facing_deg:.2f} degrees (yaw {record.yaw_deg:+z.2f}, pitch {record.pitch_deg:+z.2f})"
-    return (
-        f"distance  {record.distance_m:.4f} m\n"
-        f"facing    {angle}\n"
-        f"residual  {record.residual_m * 1e3:.2f} mm RMS, {record.inlier_fraction:.1%} of the depth on the plane\n"
-        f"verdict   [bold {colour}]{record.verdict}[/]: {record.advice}\n"
-        f"wrote {escape(str(path))}"
+    facing, yaw, pitch = (
+        f"{angle} ± {_interval(std):.3f}"
+        for angle, std in (
+            (f"{record.facing_deg:.2f}", record.facing_std_deg),
+            (f"{record.yaw_deg:+z.2f}", record.yaw_std_deg),
+            (f"{record.pitch_deg:+z.2f}", record.pitch_std_deg),
+        )
     )
+    lines = [
+        f"distance  {record.distance_m:.4f} m ± {1e3 * _interval(record.distance_std_m):.3f} mm",
+        f"facing    {facing} degrees (yaw {yaw}, pitch {pitch})",
+        f"residual  {record.residual_m * 1e3:.2f} mm RMS, {record.inlier_fraction:.1%} of the depth on the plane",
+    ]
+    if record.range_offset_std_m is not None:
+        offset, interval = 1e3 * record.range_offset_m, 1e3 * _interval(record.range_offset_std_m)
+        lines.append(f"offset    {offset:+.1f} ± {interval:.1f} mm of the lidar's {record.range_offset_cause}")
+    lines.append(f"verdict   [bold {colour}]{record.verdict}[/]: {record.advice}")
+    lines += [f"note      {warning}" for warning in record.warnings]
+    return "\n".join([*lines, f"wrote {escape(str(path))}"])
+
+
+def _interval(std: float | None) -> float:
+    return 1.96 * (std or 0.0)

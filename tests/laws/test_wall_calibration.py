@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import angles_from_normal, normal_from_angles, wall_from_plane
 from nlos_calibration.plane import fit_plane
 from nlos_calibration.rig import load_rig
-from nlos_calibration.wall import DepthMean, WallFit, fit_wall, wall_depth
+from nlos_calibration.wall import WallFit, fit_wall, wall_depth
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -38,7 +39,7 @@ def measured(depth_m: Array, seed: int = 0, frames: int = FRAMES, dead: float = 
     mean, generator = DepthMean(*depth_m.shape), np.random.default_rng(seed)
     for _ in range(frames):
         mean.add(through_sensor(depth_m, generator, dead).astype(np.float32))
-    return fit_wall(mean.mean_m(), PINHOLE, generator)
+    return fit_wall(mean.mean_m(), PINHOLE, generator, mean.noise())
 
 
 def assert_close(fit: WallFit, distance_m: float, pose: Array) -> None:

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 import pytest
 import typer
-from nlos_calibration.errors import WallRefusedError
+from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import load_wall
@@ -26,6 +26,7 @@ class FakeCamera:
 
     def __init__(self, uri: str, scale: float, patch: float, frames: int) -> None:
         self.uri, self.intrinsics = uri, RIG.pinhole.scaled(160, 120)
+        self.identity = {"name": "L515", "serial": "f0246262", "firmware": "1.5.8.1"}
         self.incomplete = self.dropped = self.taken = 0
         self.frames = frames
         depth_m = scale * wall_depth(RIG.wall_from_lidar, self.intrinsics)
@@ -46,7 +47,7 @@ class FakeCamera:
         counts = np.zeros(self.depth_m.shape, np.uint8)
         for number in range(self.frames):
             self.taken += 1
-            yield Frame(self.depth_m, counts, counts, number / 30.0, number, self.intrinsics)
+            yield Frame(self.depth_m, counts, counts, number / 30.0, number, self.intrinsics, {"laser_power": 80.0})
 
 
 @pytest.fixture
@@ -76,8 +77,9 @@ def test_the_record_and_the_json_say_the_same(call: Call, tmp_path: Path, capsys
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     record = load_wall(out)
     assert result.pop("out") == str(out)
-    assert result == record.model_dump(include=set(result))
+    assert result == record.model_dump(mode="json", include=set(result))
     assert set(result) >= {"distance_m", "facing_deg", "residual_m", "inlier_fraction", "verdict", "frames"}
+    assert set(result) >= {"distance_std_m", "facing_std_deg", "yaw_std_deg", "pitch_std_deg", "range_offset_m"}
     assert (result["distance_m"], result["facing_deg"]) == pytest.approx((0.2, 45.0), abs=1e-6)
     assert (record.camera, record.frames, record.verdict) == ("sim:bare-wall", 10, "good")
     assert abs((record.created - datetime.now().astimezone().date()).days) <= 1
@@ -98,8 +100,30 @@ def test_a_person_is_told_distance_angle_residual_and_verdict(
 ) -> None:
     call("--wall", "--camera", "sim:bare-wall", "--out", str(tmp_path / "w.toml"))
     told = capsys.readouterr().out
-    for part in ("0.2000 m", "45.00 degrees", "mm RMS", "good", "w.toml"):
+    for part in ("0.2000 m ± ", "45.00 ± ", "mm RMS", "good", "w.toml"):
         assert part in told
+
+
+def test_the_device_is_in_the_record(call: Call, tmp_path: Path) -> None:
+    call("--wall", "--camera", "l515", "--out", str(tmp_path / "w.toml"))
+    record = load_wall(tmp_path / "w.toml")
+    assert (record.serial, record.firmware, record.settings) == ("f0246262", "1.5.8.1", {"laser_power": 80.0})
+
+
+def test_a_tape_moves_the_wall_to_where_it_says(call: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "w.toml"
+    call("--wall", "--camera", "sim:bare-wall", "--tape-m", "0.203", "--out", str(out))
+    record = load_wall(out)
+    assert record.distance_m == record.rig.lidar.distance_m == pytest.approx(0.203, abs=2e-6)
+    assert record.range_offset_m == pytest.approx(0.003 * np.sqrt(2.0), abs=1e-5)
+    assert (record.range_offset_cause, record.verdict) == ("origin", "good")
+    assert "offset    +4.2 ± 1.4 mm of the lidar's origin" in capsys.readouterr().out
+
+
+def test_a_misread_tape_writes_nothing(call: Call, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"the tape says 0\.3000 m and the lidar 0\.2000 m"):
+        call("--wall", "--camera", "sim:bare-wall", "--tape-m", "0.3", "--out", str(tmp_path / "w.toml"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_wall_out_of_range_is_written_and_said(
@@ -108,7 +132,7 @@ def test_a_wall_out_of_range_is_written_and_said(
     out = tmp_path / "wall.toml"
     call("--wall", "--camera", "sim:bare-wall", "--out", str(out), scale=2.0)
     assert load_wall(out).verdict == "out of range"
-    assert "move the lidar closer" in capsys.readouterr().out
+    assert "move the lidar 10 cm closer" in capsys.readouterr().out
 
 
 def test_a_refusal_writes_nothing(call: Call, tmp_path: Path) -> None:
@@ -147,6 +171,7 @@ def test_without_out_a_dated_name_in_this_folder(call: Call, tmp_path: Path, mon
         ["--wall"],
         ["--wall", "--camera", "sim", "--bag", "run.bag"],
         ["--wall", "--camera", "sim", "--frames", "0"],
+        ["--wall", "--camera", "sim", "--tape-m", "0"],
     ],
 )
 def test_wrong_usage_is_told(call: Call, arguments: list[str]) -> None:

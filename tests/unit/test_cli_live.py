@@ -93,7 +93,24 @@ def interrupt_at(number: int) -> Callable[[int], None]:
 
 def write_wall(path: Path) -> None:
     pose, facing = RIG.wall_from_lidar, RIG.facing_deg
-    fit = WallFit(0.2, 45.0, 0.0, facing, pose, 1e-4, 0.99, "good", "fine")
+    fit = WallFit(
+        0.2,
+        45.0,
+        0.0,
+        facing,
+        *(0.0,) * 4,
+        pose,
+        1e-4,
+        1.0,
+        0.99,
+        np.ones((1, 1), bool),
+        0.0,
+        0.0,
+        0.0,
+        "good",
+        "fine",
+        (),
+    )
     record = wall_record(fit, SMALL, camera="sim:bare-wall", frames=9, created=date(2026, 1, 2))
     path.write_text(dump_toml(record), encoding="utf-8")
 

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import normal_from_angles
-from nlos_calibration.plane import MIN_POINTS, depth_noise_m, fit_plane
+from nlos_calibration.plane import MIN_POINTS, fit_plane
+from nlos_calibration.range_noise import depth_noise_m
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]

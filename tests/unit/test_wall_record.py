@@ -11,6 +11,7 @@ from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import WallRecord, load_wall, wall_record
 
 PINHOLE = Intrinsics(160, 120, 114.0, 115.0, 80.5, 59.0)
+VERSION_1 = Path(__file__).parent / "wall_v1.toml"
 EXAMPLE = Path(__file__).parents[2] / "calibration/records/wall.toml"
 
 
@@ -35,6 +36,43 @@ def test_the_rig_is_the_papers_as_measured(record: WallRecord) -> None:
     assert record.rig.checksum != paper.checksum
 
 
+def test_a_record_says_how_surely(record: WallRecord) -> None:
+    stds = record.distance_std_m, record.yaw_std_deg, record.pitch_std_deg, record.facing_std_deg
+    assert all(std is not None and 0.0 <= std < 1e-3 for std in stds)
+    assert record.noise_scale is not None
+
+
+def test_a_record_may_name_device_reference_and_offset(tmp_path: Path, record: WallRecord) -> None:
+    others = {
+        "serial": "f0246262",
+        "firmware": "1.5.8.1",
+        "settings": {"laser_power": 80.0},
+        "reference": "wall.npz",
+        "reference_sha256": "0" * 64,
+        "range_offset_m": -0.0045,
+        "range_offset_std_m": 0.0005,
+    }
+    path = tmp_path / "wall.toml"
+    path.write_text(dump_toml(record.model_copy(update=others)), encoding="utf-8")
+    assert load_wall(path).model_dump(include=set(others)) == others
+
+
+def test_version_1_is_read_as_what_it_says_and_no_more() -> None:
+    old = load_wall(VERSION_1)
+    assert old.schema_version == 2
+    assert (old.distance_m, old.frames, old.verdict) == (0.19999943926475988, 60, "good")
+    assert old.distance_std_m is None
+    assert old.range_offset_std_m is None
+    assert (old.serial, old.settings, old.reference, old.range_offset_m) == ("", {}, "", 0.0)
+
+
+def test_version_1_written_again_is_version_2(tmp_path: Path) -> None:
+    path = tmp_path / "wall.toml"
+    path.write_text(dump_toml(load_wall(VERSION_1)), encoding="utf-8")
+    assert "schema_version = 2" in path.read_text(encoding="utf-8")
+    assert load_wall(path) == load_wall(VERSION_1)
+
+
 def test_occluder_and_object_box_may_be_edited(tmp_path: Path, record: WallRecord) -> None:
     box = ObjectBox(x_min_m=0.3, x_max_m=0.5, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.15, z_far_m=0.3)
     rig = record.rig.model_copy(update={"occluder": Occluder(x_m=0.25, z_min_m=0.08), "object_box": box})
@@ -46,7 +84,11 @@ def test_occluder_and_object_box_may_be_edited(tmp_path: Path, record: WallRecor
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
-        ("schema_version = 1", "schema_version = 2", "schema_version: .*got 2"),
+        ("schema_version = 2", "schema_version = 3", "newer nlos-cam, this one reads up to 2.*got 3"),
+        ("schema_version = 2", "schema_version = 0", "schema_version: .*got 0"),
+        ("schema_version = 2", 'schema_version = "2"', "schema_version: .*got '2'"),
+        ("distance_std_m = ", "distance_std_m = -", "distance_std_m: .*got -"),
+        ('reference_sha256 = ""', 'reference_sha256 = "abc"', "reference_sha256: .*got 'abc'"),
         ("frames = 60", "frames = 0", "frames: .*got 0"),
         ("frames = 60", "frames = 60\nmood = 1", "mood: .*got 1"),
         ('verdict = "good"', 'verdict = "fine"', "verdict: .*got 'fine'"),

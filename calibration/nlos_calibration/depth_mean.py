@@ -1,0 +1,84 @@
+"""Streaming statistics of depth frames: mean, spread and number of each pixel's samples, without the flicker."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos_calibration.range_noise import MeanNoise, depth_noise_m, measured_noise
+
+Array = NDArray[np.float64]
+
+FIRST_FRAMES = 5
+"""Their median is what later samples are held against."""
+STRAY_SIGMAS = 20.0
+"""Samples farther than this (in nominal noise) from that median are no echo of the same surface. Wide on purpose: at
+four times the nominal noise nothing of it is cut, and what strays within is told by the spread."""
+
+
+class DepthMean:
+    """The mean of each pixel over the frames that had a return there; holds a few maps, not the frames.
+
+    Sums are kept of the deviations from the median of the first frames: a sample far from it is not counted.
+    """
+
+    def __init__(self, height: int, width: int) -> None:
+        self.frames = 0
+        self._first: list[Array] = []
+        self._median_m: Array | None = None
+        self._count = np.zeros((height, width), np.int64)
+        self._sum_m, self._squares_m2 = np.zeros((height, width)), np.zeros((height, width))
+
+    def add(self, depth_m: NDArray[np.floating]) -> None:
+        """Take one frame (height, width) in; NaN, infinite and not positive samples are no return."""
+        valid_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan).astype(np.float64)
+        self.frames += 1
+        if self._median_m is not None:
+            self._take(valid_m, self._median_m)
+            return
+        self._first.append(valid_m)
+        if len(self._first) == FIRST_FRAMES:
+            self._settled_m()
+
+    def mean_m(self) -> Array:
+        """(height, width); NaN where fewer than half of the frames had a return."""
+        mean_m = self._settled_m() + self._sum_m / np.maximum(self._count, 1)
+        return np.where(2 * self._count >= max(self.frames, 1), mean_m, np.nan)
+
+    def spread_m(self) -> Array:
+        """(height, width); the standard deviation of a sample, NaN where there are fewer than two."""
+        self._settled_m()
+        freedom = np.where(self._count > 1, self._count - 1.0, np.nan)
+        squares_m2 = self._squares_m2 - self._sum_m**2 / np.maximum(self._count, 1)
+        return np.sqrt(np.maximum(squares_m2, 0.0) / freedom)
+
+    def count(self) -> NDArray[np.int64]:
+        """(height, width); how many samples each mean is of."""
+        self._settled_m()
+        return self._count.copy()
+
+    def noise(self) -> MeanNoise:
+        """What the flattened mean is uncertain by."""
+        return measured_noise(self.mean_m().ravel(), self.spread_m().ravel(), self.count().ravel())
+
+    def _settled_m(self) -> Array:
+        """The median of the first frames, once they are there or a result is wanted: their sums are about it."""
+        if self._median_m is None:
+            self._median_m = _median(np.stack(self._first)) if self._first else np.full(self._count.shape, np.nan)
+            for depth_m in self._first:
+                self._take(depth_m, self._median_m)
+            self._first.clear()
+        return self._median_m
+
+    def _take(self, depth_m: Array, median_m: Array) -> None:
+        off_m = depth_m - median_m
+        counted = np.abs(off_m) <= STRAY_SIGMAS * depth_noise_m(median_m)  # False for NaN
+        off_m[~counted] = 0.0
+        self._count += counted
+        self._sum_m += off_m
+        self._squares_m2 += off_m**2
+
+
+def _median(frames_m: Array) -> Array:
+    """The median of each pixel over frames (n, height, width) without the NaNs, of an even number the upper."""
+    ordered = np.sort(frames_m, axis=0)  # NaN last
+    middle = np.isfinite(frames_m).sum(axis=0) // 2
+    return np.take_along_axis(ordered, middle[np.newaxis], axis=0)[0]

@@ -1,0 +1,84 @@
+"""What the lidar's depth lacks against a distance measured by hand, and what that does to the pose.
+
+Sign: true depth = the lidar's depth + offset_m, along the optical axis; the truth counts from the front glass. The tape
+goes from the point of the glass on the optical axis to the wall, along the wall's normal. The data sheet says that
+4.5 mm lie between the glass and the zero of depth, and its readers disagree about the sign: so it is measured.
+
+Two causes look alike where the wall is faced squarely, and are told apart by how flat an oblique wall looks:
+origin: the beams meet in the zero of depth, which lies offset_m before the glass. The wall is flat as it is seen; the
+    pose's origin moves along the optical axis, and the distance by offset_m x cos(facing).
+depth: the beams meet in the glass, and every depth is too short by offset_m. That bends and turns an oblique wall
+    (by 0.2 degrees at 45 degrees and 4.5 mm); corrected depths are fitted anew.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import cos, hypot, radians
+from typing import Literal
+
+from nlos_calibration.errors import CalibrationError, WallRefusedError
+from nlos_calibration.wall import WallFit
+
+TAPE_STD_M = 0.0005
+"""Standard uncertainty of a distance read by eye."""
+MAX_OFFSET_M = 0.03
+"""More is a misreading."""
+AGREED_M, MAX_STEPS = 1e-6, 8
+
+Cause = Literal["origin", "depth"]
+FitWith = Callable[[float, float], WallFit]
+"""The wall with (depth_offset_m added to each depth, the pose's origin origin_m behind the zero of depth)."""
+
+
+@dataclass(frozen=True)
+class TapedWall:
+    """A wall whose distance was measured by hand, and what that says about the lidar."""
+
+    fit: WallFit
+    """Its distance is the tape's, and so is that uncertainty."""
+    offset_m: float
+    """To be added to the lidar's depth."""
+    offset_std_m: float
+    cause: Cause
+
+
+def tape_the_wall(fit_with: FitWith, tape_m: float) -> TapedWall:
+    """The offset with which the wall is at `tape_m`, as the cause that lets the wall look flatter.
+
+    Raises CalibrationError where tape and lidar cannot both be right.
+    """
+    plain = fit_with(0.0, 0.0)
+    axis_share = cos(radians(plain.facing_deg))
+    origin_m = (tape_m - plain.distance_m) / axis_share
+    if abs(origin_m) > MAX_OFFSET_M:
+        raise CalibrationError(
+            f"the tape says {tape_m:.4f} m and the lidar {plain.distance_m:.4f} m: no offset of the lidar is "
+            f"{abs(origin_m) * 1e3:.0f} mm; measure from the front glass to the wall, along the wall's normal",
+        )
+    moved = _taped(fit_with(0.0, origin_m), origin_m, axis_share, "origin")
+    corrected = _corrected(fit_with, plain, origin_m, tape_m)
+    return corrected if corrected is not None and corrected.fit.bend_deg < plain.bend_deg else moved
+
+
+def _corrected(fit_with: FitWith, plain: WallFit, offset_m: float, tape_m: float) -> TapedWall | None:
+    """The wall with all depths corrected, by secants; None where no correction leaves a wall at `tape_m`."""
+    before, step_m = plain, offset_m
+    for _ in range(MAX_STEPS):
+        try:
+            fit = fit_with(offset_m, 0.0)
+        except WallRefusedError:
+            return None
+        effect = (fit.distance_m - before.distance_m) / step_m if step_m else 1.0
+        if effect <= 0.0:
+            return None
+        before, step_m = fit, (tape_m - fit.distance_m) / effect
+        if abs(step_m) < AGREED_M:
+            return _taped(fit, offset_m, effect, "depth")
+        offset_m += step_m
+    return None
+
+
+def _taped(fit: WallFit, offset_m: float, effect: float, cause: Cause) -> TapedWall:
+    """`effect` is by how much the distance changes with the offset."""
+    std_m = hypot(TAPE_STD_M, fit.distance_std_m) / effect
+    return TapedWall(replace(fit, distance_std_m=TAPE_STD_M), offset_m, std_m, cause)
