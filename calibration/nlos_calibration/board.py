@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from nlos_calibration.rig import Positive, Record
 
 Array = NDArray[np.float64]
-Dictionary = Literal["DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_1000"]
+Dictionary = Literal["DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250"]
 Paper = Literal["a4", "a3", "letter"]
 
 PAPER_MM: dict[Paper, tuple[float, float]] = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
@@ -71,6 +71,7 @@ class Board(Record):
 
 BOARDS: dict[Paper, Board] = {
     "a4": Board(squares_x=6, squares_y=9, square_mm=30.0, marker_mm=22.5),
-    "a3": Board(squares_x=8, squares_y=12, square_mm=33.0, marker_mm=24.75),
+    "a3": Board(squares_x=9, squares_y=13, square_mm=30.0, marker_mm=22.5, dictionary="DICT_4X4_100"),
     "letter": Board(squares_x=6, squares_y=8, square_mm=30.0, marker_mm=22.5),
 }
+"""Squares of 30 mm: larger ones leave too few corners in view at 0.15 m, smaller ones drown in the laser's spot."""
