@@ -72,7 +72,8 @@ def bent(seen: View, bend_deg: float, share: float, direction_rad: float = 0.0) 
     other = View(wall_from_plane(turned, distance_m), seen.pinhole)
     # of two planes the one in front is seen where the wall bends towards the lidar, the one behind where it bends away
     depth_m = np.where(s > fold_m, other.depth_m, seen.depth_m)
-    return depth_m, other if share > 0.5 else seen
+    returned = (depth_m > 0.0) & (depth_m < LONGEST_DEPTH_M)
+    return depth_m, other if (s > fold_m)[returned].mean() > 0.5 else seen
 
 
 def raised(seen: View, height_m: Array) -> Array:
@@ -104,7 +105,9 @@ def window(seen: View, gap_m: float, pane: int = 12) -> Array:
 def patch(seen: View, share: float) -> NDArray[np.bool_]:
     """A rectangle (height, width) in the middle of the view, that takes `share` of it."""
     rows, columns = np.indices(seen.depth_m.shape)
-    tall, wide = (np.abs(at / size - 0.5) < np.sqrt(share) / 2.0 for at, size in zip((rows, columns), rows.shape, strict=True))
+    tall, wide = (
+        np.abs(at / size - 0.5) < np.sqrt(share) / 2.0 for at, size in zip((rows, columns), rows.shape, strict=True)
+    )
     return tall & wide
 
 
@@ -117,8 +120,8 @@ def rippled(seen: View, amplitude_m: float, waves: float, generator: np.random.G
 
 
 def with_outliers(depth_m: Array, share: float, generator: np.random.Generator) -> Array:
-    """Depth in which `share` of the pixels read anything from 5 cm to 2 m."""
-    stray = generator.random(depth_m.shape) < share
+    """Depth of which `share` of the returns read anything from 5 cm to 2 m."""
+    stray = (generator.random(depth_m.shape) < share) & (depth_m < LONGEST_DEPTH_M)
     return np.where(stray, generator.uniform(0.05, 2.0, depth_m.shape), depth_m)
 
 

@@ -102,7 +102,9 @@ def _halves(plane: PlaneFit, rays: Array) -> tuple[list[_Sums], _Sums, float]:
 
 
 def _total(parts: list[_Sums]) -> _Sums:
-    return _Sums(sum((part.matrix for part in parts), np.zeros((4, 4))), sum((part.right for part in parts), np.zeros(4)))
+    return _Sums(
+        sum((part.matrix for part in parts), np.zeros((4, 4))), sum((part.right for part in parts), np.zeros(4))
+    )
 
 
 def _sums(rows: Array, sigmas: Array, part: NDArray[np.bool_]) -> _Sums:

@@ -79,33 +79,49 @@ class _Points:
 
 
 def fit_plane(points_m: Array, generator: np.random.Generator, noise: MeanNoise | None = None) -> PlaneFit:
-    """Fit the plane that most of the points (N, 3) in the lidar frame lie on; NaN and points behind are left out.
+    """Fit the plane that most of the points (N, 3) in the lidar frame lie on: `fit_depth` of points."""
+    depth_m = np.where(np.isfinite(points_m).all(axis=1), points_m[:, 2], np.nan)
+    seen = depth_m >= MIN_DEPTH_M
+    rays = np.divide(points_m, depth_m[:, np.newaxis], out=np.zeros_like(points_m), where=seen[:, np.newaxis])
+    return fit_depth(rays, depth_m, generator, noise)
+
+
+def fit_depth(rays: Array, depth_m: Array, generator: np.random.Generator, noise: MeanNoise | None = None) -> PlaneFit:
+    """Fit the plane that most of the depths (N,) along rays (N, 3) of unit z lie on, but for NaN and what is behind.
 
     `noise` is that of the depths; one sample's where it is not given. Raises WallRefusedError where there are too few
-    points, where no plane holds half of them, and where they are seen along a line (collinear, or a wall seen edge on).
+    depths, where no plane holds half of them, and where they are seen along a line (collinear, or a wall seen edge on).
     """
-    valid = np.isfinite(points_m).all(axis=1) & (points_m[:, 2] >= MIN_DEPTH_M)
+    valid = np.isfinite(depth_m) & (depth_m >= MIN_DEPTH_M)
     count = int(valid.sum())
     if count < MIN_POINTS:
         raise WallRefusedError(f"{count} points in front of the lidar, {MIN_POINTS} needed: point it at the wall")
-    depth_m = points_m[valid, 2].astype(np.float64)
-    points = _Points(points_m[valid] / depth_m[:, np.newaxis], depth_m, (noise or MeanNoise()).at(valid))
+    points = _Points(rays[valid], depth_m[valid], (noise or MeanNoise()).at(valid))
     slopes, scale, _ = _refit(points.few(), _consensus(points, generator), np.inf)
     slopes, _, inside = _refit(points, slopes, scale)
     _check_majority(inside, points, slopes)
-    agreed = points.at(inside)
+    agreed = points if inside.all() else points.at(inside)
     _check_extent(agreed.few().rays)
-    distance_m = 1.0 / float(np.linalg.norm(slopes))
-    errors_m, sigmas_m, predicted_m = _errors(agreed, slopes)
-    rows, _ = _rows(agreed.rays, errors_m, sigmas_m, predicted_m, np.ones(len(errors_m), np.bool_))
-    chi2 = _chi2(errors_m, sigmas_m)
     inliers = valid.copy()
     inliers[valid] = inside
+    return _plane(slopes, agreed, float(inside.mean()), inliers)
+
+
+def _plane(slopes: Array, agreed: _Points, inlier_fraction: float, inliers: Mask) -> PlaneFit:
+    """The plane of `slopes`, fitted to the points that agreed.
+
+    Its covariance is scaled by the residuals' mean square, not their median: outliers inside the gate move the slopes
+    like the noise that they look like.
+    """
+    errors_m, sigmas_m, predicted_m = _errors(agreed, slopes)
+    rows, sigmas = _rows(agreed.rays, errors_m, sigmas_m, predicted_m, np.ones(len(errors_m), np.bool_))
+    chi2 = float(sigmas @ sigmas) / max(len(sigmas) - 3, 1)
+    distance_m = 1.0 / float(np.linalg.norm(slopes))
     return PlaneFit(
         normal=-slopes * distance_m,
         distance_m=distance_m,
         residual_m=float(np.sqrt(np.mean((errors_m * distance_m / predicted_m) ** 2))),
-        inlier_fraction=float(inside.mean()),
+        inlier_fraction=inlier_fraction,
         inliers=inliers,
         slopes=slopes,
         covariance=chi2 * np.linalg.pinv(rows.T @ rows).astype(np.float64),
@@ -121,9 +137,14 @@ def _spread_over(inliers: Mask, values: Array) -> Array:
     return everywhere
 
 
+def plane_depth_m(rays: Array, slopes: Array) -> Array:
+    """The depth (...) of planes along rays (..., 3), far away where a ray never meets them; slopes (3,) or (3, n)."""
+    return 1.0 / np.maximum(rays @ slopes, 1.0 / FARTHEST_M)
+
+
 def _errors(points: _Points, slopes: Array) -> tuple[Array, Array, Array]:
     """How far depths are beyond the plane's, the noise to expect there, and the plane's depth (far if it has none)."""
-    predicted_m = 1.0 / np.maximum(points.rays @ slopes, 1.0 / FARTHEST_M)
+    predicted_m = plane_depth_m(points.rays, slopes)
     return points.depth_m - predicted_m, points.noise.of(predicted_m), predicted_m
 
 
@@ -136,7 +157,7 @@ def _consensus(points: _Points, generator: np.random.Generator) -> Array:
         raise WallRefusedError(_in_a_line(0.0))
     candidates = np.linalg.solve(points.rays[triples], 1.0 / points.depth_m[triples][..., np.newaxis])[..., 0]
     some = generator.integers(len(points.rays), size=SCORED_POINTS)
-    predicted_m = 1.0 / np.maximum(points.rays[some] @ candidates.T, 1.0 / FARTHEST_M)
+    predicted_m = plane_depth_m(points.rays[some], candidates.T.astype(np.float64))
     errors = (points.depth_m[some, np.newaxis] - predicted_m) / _widest_m(predicted_m, points.noise)
     return candidates[np.argmin(np.minimum(errors**2, 1.0).sum(axis=0))]
 
@@ -191,14 +212,6 @@ def _residual_scale(points: _Points, slopes: Array, scale: float) -> float:
     if not inside.any():
         return scale
     return float(np.median(np.abs(errors_m[inside] / sigmas_m[inside]))) / MEDIAN_PER_SIGMA
-
-
-def _chi2(errors_m: Array, sigmas_m: Array) -> float:
-    """The residuals' mean square in standard deviations, which scales the covariance of the slopes.
-
-    The mean, not the median: outliers inside the gate move the slopes like the noise that they look like.
-    """
-    return float(np.sum((errors_m / sigmas_m) ** 2)) / max(len(errors_m) - 3, 1)
 
 
 def _check_majority(inside: Mask, points: _Points, slopes: Array) -> None:

@@ -56,14 +56,16 @@ def _facing_std_rad(normal: Array, turn: Array) -> float:
     """How surely the facing angle f is known.
 
     Turns towards the axis change it one for one. Turns aside by s change it to sqrt(f^2 + s^2): nothing while s is
-    small against f, s itself where the wall is faced squarely, s^2 / sqrt(f^2 + s^2) in between.
+    small against f, s itself where the wall is faced squarely, s^2 / sqrt(f^2 + s^2) in between. There f is measured
+    too large by s: the least f that s allows is taken.
     """
     facing_rad, sideways = _facing_rad(normal), float(np.hypot(normal[0], normal[1]))
     x, y = normal[:2] / sideways if sideways > 0.0 else (1.0, 0.0)
     towards = np.array([x * -normal[2], y * -normal[2], sideways])
     aside = np.array([-y, x, 0.0])
     variance = float(aside @ turn @ aside)
-    second_order = variance**2 / (variance + facing_rad**2) if variance > 0.0 else 0.0
+    least_rad = max(facing_rad - 2.0 * sqrt(max(variance, 0.0)), 0.0)
+    second_order = variance**2 / (variance + least_rad**2) if variance > 0.0 else 0.0
     return sqrt(float(towards @ turn @ towards) + second_order)
 
 

@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.flatness import block_sums, flatness
 from nlos_calibration.geometry import wall_from_plane
-from nlos_calibration.plane import GATE_SIGMAS, fit_plane
+from nlos_calibration.plane import GATE_SIGMAS, fit_depth, plane_depth_m
 from nlos_calibration.projection import Intrinsics
-from nlos_calibration.range_noise import QUANTUM_M, STATISTICS_POINTS, MeanNoise, depth_noise_m
+from nlos_calibration.range_noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
 from nlos_calibration.uncertainty import WallMeasures, measures_of
 from nlos_calibration.verdict import Verdict, check_flat, judge, warnings
 
 Array = NDArray[np.float64]
 
 MIN_VALID_SHARE = 0.05
-STUCK_SHARE = 0.99
+STUCK_SHARE = 0.5
 """Of depths that are one and the same: noise spreads those of a true wall, even one that is faced squarely."""
 BLOCK_PIXELS, SEEN_IN_BLOCK, STRAY_IN_BLOCK = 4, 0.75, 0.875
 MAX_STRAY_SHARE = 0.05
@@ -76,11 +76,11 @@ def fit_wall(
     depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan)
     _check_depth(depth_m)
     rays = intrinsics.rays()
-    plane = fit_plane((rays * depth_m[..., np.newaxis]).reshape(-1, 3), generator, noise)
+    plane = fit_depth(rays.reshape(-1, 3), depth_m.ravel(), generator, noise)
     if plane.normal[2] >= 0.0:
         raise WallRefusedError("the optical axis never meets the wall's plane: turn the lidar towards the wall")
     scale = noise.scale if noise is not None and noise.measured else plane.noise_scale
-    _check_one_surface(depth_m, wall_depth(wall_from_plane(plane.normal, plane.distance_m), intrinsics), scale)
+    _check_one_surface(depth_m, plane_depth_m(rays, plane.slopes), scale)
     flat = flatness(plane, rays)
     check_flat(flat)
     measures = measures_of(plane.slopes, flat.correlation * plane.covariance)
@@ -111,9 +111,12 @@ def _check_depth(depth_m: Array) -> None:
             f"{share:.1%} of the pixels have depth, {MIN_VALID_SHARE:.0%} needed: is the lens free and the wall near?",
         )
     some_m = valid_m[:: max(len(valid_m) // STATISTICS_POINTS, 1)]
-    middle_m = float(np.median(some_m))
-    if (np.abs(some_m - middle_m) < QUANTUM_M / 2.0).mean() >= STUCK_SHARE:
-        raise WallRefusedError(f"the lidar says {middle_m:.4f} m everywhere, as if it were stuck: start it again")
+    values_m, times = np.unique(some_m, return_counts=True)
+    if times.max() >= STUCK_SHARE * len(some_m):
+        raise WallRefusedError(
+            f"{times.max() / len(some_m):.0%} of the view reads {values_m[times.argmax()]:.5f} m, as if the lidar were "
+            "stuck: start it again",
+        )
 
 
 def _check_one_surface(depth_m: Array, expected_m: Array, noise_scale: float) -> None:
