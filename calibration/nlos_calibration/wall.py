@@ -35,6 +35,8 @@ class WallFit(WallMeasures):
 
     wall_from_lidar: Array
     """(4, 4)."""
+    covariance: Array = field(repr=False)
+    """(3, 3) of -normal / distance, as seen from the zero of depth."""
     residual_m: float
     """RMS distance of the inliers from the plane."""
     noise_scale: float
@@ -83,12 +85,14 @@ def fit_wall(
     _check_one_surface(depth_m, plane_depth_m(rays, plane.slopes), scale)
     flat = flatness(plane, rays)
     check_flat(flat)
-    measures = measures_of(plane.slopes, flat.correlation * plane.covariance)
+    covariance = flat.correlation * plane.covariance
+    measures = measures_of(plane.slopes, covariance)
     measures = replace(measures, distance_m=plane.distance_m - origin_m * float(plane.normal[2]))
     verdict, advice = judge(measures.distance_m, measures.facing_deg, flat)
     return WallFit(
         **vars(measures),
         wall_from_lidar=wall_from_plane(plane.normal, measures.distance_m),
+        covariance=covariance,
         residual_m=plane.residual_m,
         noise_scale=scale,
         inlier_fraction=plane.inlier_fraction,

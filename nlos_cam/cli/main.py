@@ -12,7 +12,7 @@ from nlos_cam.cli.common import stderr
 from nlos_cam.errors import NlosCamError
 
 INTERRUPTED = 130
-COMMAND_FILES = ("devices", "capture", "calibrate", "live", "render", "tradeoff", "learn")
+COMMAND_FILES = ("devices", "capture", "calibrate", "board", "live", "render", "tradeoff", "learn")
 """Files of this package that hold commands; each adds its own through `register(app)`."""
 
 
