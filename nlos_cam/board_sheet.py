@@ -1,4 +1,4 @@
-"""The sheet that `nlos-cam board` prints: the board's pattern to exact scale, a bar to check it by, what to do with it."""
+"""The sheet that `nlos-cam board` prints: the board's pattern to exact scale, a bar to check it by, and advice."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,7 +36,9 @@ def sheet_figure(paper: Paper) -> "Figure":
     axes.add_patch(_patch(list(black_cells(board, *pattern_origin_mm(paper)))))
     axes.add_patch(_patch(bar_mm(paper)))
     middle_mm = width_mm / 2.0
-    axes.text(middle_mm, height_mm - TEXT_ABOVE_EDGE_MM, _text(board, paper), size=TEXT_POINTS, ha="center", va="bottom")
+    axes.text(
+        middle_mm, height_mm - TEXT_ABOVE_EDGE_MM, _text(board, paper), size=TEXT_POINTS, ha="center", va="bottom"
+    )
     return figure
 
 
@@ -97,6 +99,6 @@ def _text(board: Board, paper: Paper) -> str:
     return (
         "Print at 100 % (not “fit to page”): this bar must measure 100 mm. If it measures B mm, give "
         f"--square-mm {board.square_mm / BAR_MM:g} x B.\n"
-        "Use a laser printer: toner is black in infrared, dye ink is white. Glue the sheet flat on the near side of the "
-        f"wall.\nnlos-cam board, {paper}: {squares}"
+        "Use a laser printer: toner is black in infrared, dye ink is white. Glue the sheet flat on the near side of "
+        f"the wall.\nnlos-cam board, {paper}: {squares}"
     )

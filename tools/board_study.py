@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from board_trials import FLAT, Bench, Trial, by_corners, by_image, random_bench, summary, trials
-from board_view import Light, at_near_edge, frames_of, in_the_middle
+from board_view import Light, at_near_edge, clean_view, frames_of, in_the_middle
 from matplotlib.figure import Figure
 from nlos_calibration.board import BOARDS, Board
 from nlos_calibration.board_corners import find_corners
@@ -97,7 +97,9 @@ def told(rows: list[dict[str, object]]) -> dict[str, object]:
         "fewest_corners": min((row["corners"] for row in worst), default=0),
         "worst_mm": max((row["worst_mm"] for row in worst), default=None),
         "worst_deg": max((row["worst_deg"] for row in worst), default=None),
-        "not_found": [f"{row['distance_m']:.2f} m, {row['angle_deg']:.0f} degrees" for row in rows if row["found"] == 0],
+        "not_found": [
+            f"{row['distance_m']:.2f} m, {row['angle_deg']:.0f} degrees" for row in rows if row["found"] == 0
+        ],
     }
 
 
@@ -126,7 +128,7 @@ def honesty_of_bows(count: int, sigma_px: float) -> dict[str, object]:
 
 
 def ways_to_average(count: int) -> dict[str, object]:
-    """Of the same frames: one detection in their mean, against the mean of the planes of each, with 1/n of the variance."""
+    """Of the same frames: one detection in their mean, against the weighted mean of each frame's own plane."""
     generator = np.random.default_rng(17)
     exact = PrintErrors(1e-6, 1e-6, 1e-6)
     image, planes = list[Trial](), list[Trial]()
@@ -143,8 +145,6 @@ def ways_to_average(count: int) -> dict[str, object]:
 
 
 def _clean(bench: Bench) -> Array:
-    from board_view import clean_view
-
     return clean_view(bench.board, bench.seen, bench.placed, bench.light)
 
 
@@ -178,7 +178,9 @@ def main() -> None:
     """Measure, write, draw, print."""
     grid = over_grid(near(A4, Light()), FRAMES, repeats=10)
     sizes = {
-        f"{square:g}": {f"{spot:g}": told(over_grid(near(of_squares(square), Light(spot_mm=spot)), FRAMES)) for spot in SPOTS_MM}
+        f"{square:g}": {
+            f"{spot:g}": told(over_grid(near(of_squares(square), Light(spot_mm=spot)), FRAMES)) for spot in SPOTS_MM
+        }
         for square in TO_FILL_A4
     }
     result = {
@@ -189,7 +191,10 @@ def main() -> None:
         "in_the_middle_of_the_view": told(over_grid(middle, FRAMES)),
         "a3": told(over_grid(near(BOARDS["a3"], Light()), FRAMES)),
         "squares_by_spot_mm": sizes,
-        "gain": {f"{counts:g}": told(over_grid(near(A4, Light(counts)), FRAMES)) for counts in (3.0, 12.0, 48.0, 200.0, 800.0)},
+        "gain": {
+            f"{counts:g}": told(over_grid(near(A4, Light(counts)), FRAMES))
+            for counts in (3.0, 12.0, 48.0, 200.0, 800.0)
+        },
         "random_benches": {str(frames): honesty(300, frames, frames) for frames in (1, 30)},
         "random_benches_and_bows": {f"{sigma:g}": honesty_of_bows(1000, sigma) for sigma in (0.05, 0.2)},
         "ways_to_average": ways_to_average(40),

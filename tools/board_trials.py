@@ -4,7 +4,7 @@ A trial is (errors in mm and degrees, the same over their stated standard uncert
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from board_view import Light, Placed, at_near_edge, clean_view, corners_px, frames_of
@@ -33,7 +33,7 @@ class Bench:
     board: Board
     seen: View
     placed: Placed
-    light: Light = Light()
+    light: Light = field(default_factory=Light)
 
     def mean(self, frames: int, generator: np.random.Generator) -> Array:
         """The mean infrared image (height, width) of some frames."""

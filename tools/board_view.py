@@ -96,7 +96,9 @@ def clean_view(board: Board, seen: View, placed: Placed, light: Light | None = N
     return cv2.GaussianBlur(counts, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE).astype(np.float64)
 
 
-def frames_of(clean: Array, generator: np.random.Generator, count: int, light: Light | None = None) -> NDArray[np.uint8]:
+def frames_of(
+    clean: Array, generator: np.random.Generator, count: int, light: Light | None = None
+) -> NDArray[np.uint8]:
     """Frames (count, height, width) of what the lidar delivers of a view."""
     light = light or Light()
     noise = generator.standard_normal((count, *clean.shape), np.float32)

@@ -61,7 +61,9 @@ class Board(Record):
 
     def measured(self, square_mm: float) -> "Board":
         """The same board where a print's squares turned out to measure `square_mm`."""
-        return self.model_copy(update={"square_mm": square_mm, "marker_mm": self.marker_mm * square_mm / self.square_mm})
+        return self.model_copy(
+            update={"square_mm": square_mm, "marker_mm": self.marker_mm * square_mm / self.square_mm}
+        )
 
     def pattern(self, pixels_per_square: int) -> NDArray[np.uint8]:
         """The pattern without a margin (squares_y k, squares_x k), 0 is black; each square has k x k pixels."""

@@ -6,6 +6,7 @@ over copies of itself.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -64,15 +65,17 @@ def find_corners(image: NDArray[np.floating] | NDArray[np.uint8], board: Board) 
 
 
 def even_contrast(image: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image (height, width) with its contrast limited and made even, in 8 bits: dim parts as clear as bright ones."""
+    """The image (height, width) with its contrast limited and made even, in 8 bits: dim parts are as clear as bright."""
     brightest = float(np.quantile(image, BRIGHTEST_QUANTILE))
     fine = np.clip(image / max(brightest, 1e-9) * 65535.0, 0.0, 65535.0).astype(np.uint16)
-    return (cv2.createCLAHE(CONTRAST_LIMIT, CONTRAST_TILES).apply(fine) >> 8).astype(np.uint8)
+    even = np.asarray(cv2.createCLAHE(CONTRAST_LIMIT, CONTRAST_TILES).apply(fine), np.uint16)
+    return (even >> 8).astype(np.uint8)
 
 
 def _detect(image: NDArray[np.uint8], board: Board) -> tuple[Corners, int]:
     """The corners, and how many markers were read."""
-    pixels, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(image)
+    found: tuple[Any, ...] = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(image)
+    pixels, ids, _, markers = found  # each None where there are none, which OpenCV's types do not say
     count = 0 if markers is None else len(markers)
     if ids is None:
         return Corners(np.zeros(0, np.int64), np.zeros((0, 2))), count

@@ -7,6 +7,7 @@ which no image shows.
 
 from dataclasses import dataclass, replace
 from math import degrees, sqrt
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from nlos_calibration.projection import Intrinsics
 Array = NDArray[np.float64]
 
 OUTLIER_SIGMAS, SIGMA_FLOOR_PX = 5.0, 0.02
-MAGSAC_PX = 1.0
+LEAST_SQUARES, MAGSAC_PX = 0, 1.0
 MEDIAN_PER_SIGMA = 0.67449
 """The median of |x| of a normal distribution."""
 MIN_GOOD_SHARE = 0.7
@@ -108,10 +109,7 @@ def _seen(corners: Corners, board: Board, intrinsics: Intrinsics, printed: Print
 
 def _good(points_m: Array, pixels: Array) -> NDArray[np.bool_]:
     """Which corners lie as on a plane with most others: the detector now and then takes an edge for a corner."""
-    found, _ = cv2.findHomography(points_m[:, :2], pixels, cv2.USAC_MAGSAC, MAGSAC_PX)
-    if found is None:
-        raise BoardRefusedError(IN_A_LINE)
-    errors_px = np.linalg.norm(pixels - _projected(points_m, found), axis=1)
+    errors_px = np.linalg.norm(_off_a_plane_px(points_m, pixels, cv2.USAC_MAGSAC), axis=1)
     sigma_px = max(float(np.median(errors_px)) / sqrt(2.0) / MEDIAN_PER_SIGMA, SIGMA_FLOOR_PX)
     good = errors_px < OUTLIER_SIGMAS * sigma_px
     if good.sum() < max(MIN_CORNERS, MIN_GOOD_SHARE * len(good)):
@@ -122,14 +120,17 @@ def _good(points_m: Array, pixels: Array) -> NDArray[np.bool_]:
     return good
 
 
-def _projected(points_m: Array, homography: Array) -> Array:
-    return cv2.perspectiveTransform(points_m[np.newaxis, :, :2], homography)[0].astype(np.float64)
+def _off_a_plane_px(points_m: Array, pixels: Array, method: int) -> Array:
+    """Residuals (n, 2) of any plane seen by any pinhole."""
+    found: tuple[Any, ...] = cv2.findHomography(points_m[:, :2], pixels, method, MAGSAC_PX)
+    if found[0] is None:  # OpenCV's types do not say so
+        raise BoardRefusedError(IN_A_LINE)
+    return pixels - np.asarray(cv2.perspectiveTransform(points_m[np.newaxis, :, :2], found[0])[0], np.float64)
 
 
 def _plane_variance_px2(points_m: Array, pixels: Array) -> float:
     """Of the residuals of any plane seen by any pinhole. Raises BoardRefusedError where it is no noise."""
-    found, _ = cv2.findHomography(points_m[:, :2], pixels, 0)
-    variance_px2 = _variance_px2(pixels - _projected(points_m, found), spent=8)
+    variance_px2 = _variance_px2(_off_a_plane_px(points_m, pixels, LEAST_SQUARES), spent=8)
     if variance_px2 > MAX_RESIDUAL_PX**2:
         raise BoardRefusedError(
             f"the board is not flat: its corners are {sqrt(variance_px2):.2f} pixels RMS off a plane, "
@@ -160,13 +161,13 @@ def _check_print(pose: BoardPose) -> None:
     stretch, bows_m = float(pose.parameters[6]), pose.parameters[7:]
     if abs(stretch) > MAX_STRETCH:
         raise BoardRefusedError(
-            f"the squares do not fit: they are seen {100.0 * stretch:+.1f} % wider than high; print without stretching, "
-            "and use the lidar's own intrinsics",
+            f"the squares do not fit: they are seen {100.0 * stretch:+.1f} % wider than high; print without "
+            "stretching, and use the lidar's own intrinsics",
         )
     if float(np.abs(bows_m).max()) > MAX_BOW_M:
         raise BoardRefusedError(
-            f"the board is not flat: its middle stands {1e3 * float(bows_m.sum()):+.1f} mm off the wall; glue it to the "
-            "wall or to a stiff plate",
+            f"the board is not flat: its middle stands {1e3 * float(bows_m.sum()):+.1f} mm off the wall; glue it to "
+            "the wall or to a stiff plate",
         )
 
 
@@ -175,6 +176,6 @@ def _check_certain(slopes: Array, covariance: Array) -> None:
     angle_std_deg = degrees(distance_m * sqrt(float(np.linalg.eigvalsh(covariance)[-1])))
     if angle_std_deg > MAX_ANGLE_STD_DEG:
         raise BoardRefusedError(
-            f"the board fixes the wall's angle to {angle_std_deg:.1f} degrees only, {MAX_ANGLE_STD_DEG:g} needed: it is "
-            "seen too far off, edge on, or too little of it; move it to the near side of the view",
+            f"the board fixes the wall's angle to {angle_std_deg:.1f} degrees only, {MAX_ANGLE_STD_DEG:g} needed: it "
+            "is seen too far off, edge on, or too little of it; move it to the near side of the view",
         )

@@ -36,7 +36,7 @@ class SeenCorners:
     size_m: Array
     """(2,); the drawing's width and height."""
     print_std: Array
-    """(3,); what is to be expected of the print's stretch (width over height) and of its bows along x and y in metres."""
+    """(3,); what to expect of the print's stretch (width over height) and of its bows along x and y (m)."""
     variance_px2: float
     """Of a coordinate."""
 
@@ -73,8 +73,10 @@ class BoardPose:
 def solve_pose(seen: SeenCorners) -> BoardPose:
     """The better of the two poses that a plane seen from afar allows. Raises BoardRefusedError where neither is."""
     _, turns, shifts, _ = cv2.solvePnPGeneric(seen.points_m, seen.pixels, seen.camera, None, flags=cv2.SOLVEPNP_IPPE)
-    starts = [np.concatenate([turn.ravel(), shift.ravel(), np.zeros(3)]) for turn, shift in zip(turns, shifts, strict=True)]
-    best, *others = sorted((refine_pose(seen, start) for start in starts), key=lambda pose: pose.chi2)
+    starts = [np.append(np.concatenate([turn, shift]), np.zeros(3)) for turn, shift in zip(turns, shifts, strict=True)]
+    best, *others = sorted(
+        (refine_pose(seen, start.astype(np.float64)) for start in starts), key=lambda pose: pose.chi2
+    )
     for other in others:
         apart_deg = degrees(np.arccos(np.clip(float(best.normal @ other.normal), -1.0, 1.0)))
         if apart_deg > SAME_NORMAL_DEG and other.chi2 - best.chi2 < AMBIGUOUS_CHI2:
@@ -101,7 +103,7 @@ def refine_pose(seen: SeenCorners, parameters: Array) -> BoardPose:
         if gain <= SETTLED * float(errors @ errors):
             break
     errors_px = errors[:-3].reshape(-1, 2) * sqrt(seen.variance_px2)
-    return BoardPose(parameters, errors_px, float(errors @ errors), np.linalg.inv(rows.T @ rows))
+    return BoardPose(parameters, errors_px, float(errors @ errors), np.linalg.inv(rows.T @ rows).astype(np.float64))
 
 
 def _linear(seen: SeenCorners, parameters: Array) -> tuple[Array, Array]:
@@ -114,7 +116,7 @@ def _linear(seen: SeenCorners, parameters: Array) -> tuple[Array, Array]:
     expected = np.hstack([np.zeros((3, 6)), np.diag(1.0 / seen.print_std)])
     rows = np.vstack([np.hstack([by_pose[:, :6], by_print_px]) / sigma_px, expected])
     errors = np.append((seen.pixels - pixels.reshape(-1, 2)).ravel() / sigma_px, -parameters[6:] / seen.print_std)
-    return rows, errors
+    return rows.astype(np.float64), errors
 
 
 def _printed(seen: SeenCorners, how: Array) -> tuple[Array, Array]:
