@@ -7,11 +7,12 @@ on the wall do.
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from board_trials import FLAT, Bench, Trial, by_corners, by_image, random_bench, summary, trials
-from board_view import Light, at_near_edge, clean_view, frames_of, in_the_middle
+from board_view import Light, at_near_edge, in_the_middle
 from matplotlib.figure import Figure
 from nlos_calibration.board import BOARDS, Board
 from nlos_calibration.board_corners import find_corners
@@ -35,7 +36,20 @@ TO_FILL_A4 = {
     30.0: (6, 9, "DICT_4X4_50"),
     40.0: (5, 6, "DICT_4X4_50"),
 }
-SPOTS_MM = (0.0, 1.0, 2.0, 3.0)
+SPOTS_MM, GAINS = (0.0, 1.0, 2.0, 3.0), (3.0, 12.0, 48.0, 200.0, 800.0)
+
+
+@dataclass(frozen=True)
+class Runs:
+    """How many trials."""
+
+    grid: int = 10
+    images: int = 300
+    corners: int = 1000
+    ways: int = 40
+
+
+RUNS = Runs()
 
 
 def of_squares(square_mm: float) -> Board:
@@ -134,7 +148,7 @@ def ways_to_average(count: int) -> dict[str, object]:
     image, planes = list[Trial](), list[Trial]()
     for _ in range(count):
         bench = random_bench(A4, PINHOLE, generator, Light(), exact)
-        frames = frames_of(_clean(bench), generator, FRAMES, bench.light)
+        frames = bench.frames(FRAMES, generator)
         try:
             image.append(bench.judged(fit_board(find_corners(frames.mean(axis=0), A4), A4, PINHOLE, exact)))
             fits = [fit_board(find_corners(frame, A4), A4, PINHOLE, exact) for frame in frames]
@@ -142,10 +156,6 @@ def ways_to_average(count: int) -> dict[str, object]:
             continue
         planes.append(bench.judged(_mean_plane(fits)))
     return {"of_images": summary(image, []), "of_planes": summary(planes, [])}
-
-
-def _clean(bench: Bench) -> Array:
-    return clean_view(bench.board, bench.seen, bench.placed, bench.light)
 
 
 def _mean_plane(fits: list[BoardFit]) -> BoardFit:
@@ -164,8 +174,10 @@ def draw(grid: list[dict[str, object]], sizes: dict[str, dict[str, dict[str, obj
         degrees = [row["angle_deg"] for row in rows]
         errors.plot(degrees, [row["worst_mm"] for row in rows], marker="o", label=f"{distance_m:.2f} m")
         angles.plot(degrees, [row["worst_deg"] for row in rows], marker="o")
-    errors.set(xlabel="facing angle (degrees)", ylabel="worst distance error (mm)", ylim=(0, None))
-    angles.set(xlabel="facing angle (degrees)", ylabel="worst angle error (degrees)", ylim=(0, None))
+    errors.set(xlabel="facing angle (degrees)", ylabel="worst distance error (mm)")
+    angles.set(xlabel="facing angle (degrees)", ylabel="worst angle error (degrees)")
+    errors.set_ylim(bottom=0)
+    angles.set_ylim(bottom=0)
     errors.legend(fontsize=8)
     for square, spots in sizes.items():
         found.plot(SPOTS_MM, [100 * float(str(spots[f"{s:g}"]["found"])) for s in SPOTS_MM], marker="o", label=square)
@@ -176,7 +188,7 @@ def draw(grid: list[dict[str, object]], sizes: dict[str, dict[str, dict[str, obj
 
 def main() -> None:
     """Measure, write, draw, print."""
-    grid = over_grid(near(A4, Light()), FRAMES, repeats=10)
+    grid = over_grid(near(A4, Light()), FRAMES, RUNS.grid)
     sizes = {
         f"{square:g}": {
             f"{spot:g}": told(over_grid(near(of_squares(square), Light(spot_mm=spot)), FRAMES)) for spot in SPOTS_MM
@@ -191,13 +203,12 @@ def main() -> None:
         "in_the_middle_of_the_view": told(over_grid(middle, FRAMES)),
         "a3": told(over_grid(near(BOARDS["a3"], Light()), FRAMES)),
         "squares_by_spot_mm": sizes,
-        "gain": {
-            f"{counts:g}": told(over_grid(near(A4, Light(counts)), FRAMES))
-            for counts in (3.0, 12.0, 48.0, 200.0, 800.0)
+        "brightest_counts": {f"{counts:g}": told(over_grid(near(A4, Light(counts)), FRAMES)) for counts in GAINS},
+        "random_benches_by_frames": {str(frames): honesty(RUNS.images, frames, frames) for frames in (1, FRAMES)},
+        "random_benches_and_bows_by_sigma_px": {
+            f"{sigma:g}": honesty_of_bows(RUNS.corners, sigma) for sigma in (0.05, 0.2)
         },
-        "random_benches": {str(frames): honesty(300, frames, frames) for frames in (1, 30)},
-        "random_benches_and_bows": {f"{sigma:g}": honesty_of_bows(1000, sigma) for sigma in (0.05, 0.2)},
-        "ways_to_average": ways_to_average(40),
+        "ways_to_average": ways_to_average(RUNS.ways),
     }
     text = json.dumps(result, indent=1)
     (DOCS / "board_study.json").write_text(text + "\n", encoding="utf-8")

@@ -35,10 +35,9 @@ class Bench:
     placed: Placed
     light: Light = field(default_factory=Light)
 
-    def mean(self, frames: int, generator: np.random.Generator) -> Array:
-        """The mean infrared image (height, width) of some frames."""
-        clean = clean_view(self.board, self.seen, self.placed, self.light)
-        return frames_of(clean, generator, frames, self.light).mean(axis=0)
+    def frames(self, count: int, generator: np.random.Generator) -> NDArray[np.uint8]:
+        """Infrared frames (count, height, width)."""
+        return frames_of(clean_view(self.board, self.seen, self.placed, self.light), generator, count, self.light)
 
     def judged(self, fit: BoardFit) -> Trial:
         """A fit against the truth."""
@@ -74,7 +73,7 @@ def random_bench(
 
 def by_image(bench: Bench, frames: int, generator: np.random.Generator, printed: PrintErrors = FLAT) -> BoardFit:
     """The plane from the mean of rendered frames."""
-    found = find_corners(bench.mean(frames, generator), bench.board)
+    found = find_corners(bench.frames(frames, generator).mean(axis=0), bench.board)
     return fit_board(found, bench.board, bench.seen.pinhole, printed)
 
 

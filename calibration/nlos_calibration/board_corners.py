@@ -65,7 +65,7 @@ def find_corners(image: NDArray[np.floating] | NDArray[np.uint8], board: Board) 
 
 
 def even_contrast(image: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image (height, width) with its contrast limited and made even, in 8 bits: dim parts are as clear as bright."""
+    """The image (height, width) with its contrast limited and made even, in 8 bits: dim parts as clear as bright."""
     brightest = float(np.quantile(image, BRIGHTEST_QUANTILE))
     fine = np.clip(image / max(brightest, 1e-9) * 65535.0, 0.0, 65535.0).astype(np.uint16)
     even = np.asarray(cv2.createCLAHE(CONTRAST_LIMIT, CONTRAST_TILES).apply(fine), np.uint16)
