@@ -35,7 +35,9 @@ MAX_STRETCH, MAX_BOW_M = 0.015, 0.0015
 """More is no printer's error, and no sheet that was glued on."""
 MAX_ANGLE_STD_DEG = 1.0
 """A board seen edge on, or a few corners close together, say less."""
-IN_A_LINE = "the board's corners are seen in a line, as of a board seen edge on: turn the lidar towards the wall"
+IN_A_LINE = (
+    "the board's corners are seen in a line, as of a board seen edge on, or mirrored: turn the lidar to the wall"
+)
 
 
 @dataclass(frozen=True)

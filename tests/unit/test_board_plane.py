@@ -166,3 +166,19 @@ def test_few_corners_are_less_sure() -> None:
     few = np.isin(found.ids, [0, 1, 2, 5, 6, 7, 10, 11, 12])
     all_of_them, some = (fit_board(which, A4, PINHOLE) for which in (found, Corners(found.ids[few], found.pixels[few])))
     assert np.trace(some.covariance) > 4.0 * np.trace(all_of_them.covariance)
+
+
+@pytest.mark.parametrize("kind", ["scattered", "in a line", "mirrored", "in a heap"])
+def test_corners_that_are_no_boards_are_refused_whatever_their_number(kind: str) -> None:
+    generator = np.random.default_rng(0)
+    for count in range(8, 41):
+        ids = np.sort(generator.choice(40, count, replace=False))
+        x_m, y_m, _ = A4.corners_m[ids].T
+        pixels = {
+            "scattered": generator.uniform(0.0, 480.0, (count, 2)),
+            "in a line": np.column_stack([2000.0 * x_m, np.full(count, 50.0)]),
+            "mirrored": np.column_stack([400.0 - 1500.0 * x_m, 1500.0 * y_m]),
+            "in a heap": np.full((count, 2), 100.0),
+        }[kind]
+        with pytest.raises(BoardRefusedError):
+            fit_board(Corners(ids, pixels + generator.normal(0.0, 0.05, (count, 2))), A4, PINHOLE)
