@@ -39,7 +39,8 @@ def settings() -> list[Setting]:
     bare = [Setting("bare", noise, share, 0.0, n) for noise, share, n in product(NOISES, OUTLIERS, FRAMES)]
     partial = [Setting("no return", noise, share, 0.0, 8) for noise, share in product((1.0, 4.0), (0.0, 0.2, 0.4))]
     flicker = [Setting("bare", 1.0, 0.0, share, 30) for share in (0.02, 0.1, 0.4)]
-    ripples = [Setting("rippled", noise, 0.0, 0.0, n) for noise, n in product((1.0, 4.0), (1, 8, 30))]
+    uneven = product(("rippled", "patchy"), (1.0, 4.0), (1, 8, 30))
+    ripples = [Setting(scene, noise, 0.0, 0.0, n) for scene, noise, n in uneven]
     sensor = [Setting("sensor", 1.0, 0.0, share, n) for share, n in ((0.0, 1), (0.0, 8), (0.02, 8))]
     tried = list(product((1.0, 4.0), (0.0, 0.2), (1, 8)))
     hard = [Setting(scene, noise, share, 0.0, n) for scene in HARD for noise, share, n in tried]
@@ -127,6 +128,7 @@ def _others(found: Found) -> Iterator[dict[str, Any]]:
             f"{share:.0%} of samples flicker", pooled(found, lambda s, a=share: s.scene == "bare" and s.flicker == a)
         )
     yield row("ripples up to 2 mm", pooled(found, lambda s: s.scene == "rippled"))
+    yield row("drift up to 1 mm, in patches", pooled(found, lambda s: s.scene == "patchy"))
     yield row("the simulated camera's sensor", pooled(found, lambda s: s.scene == "sensor"))
 
 

@@ -12,7 +12,7 @@ from nlos_calibration.rig import LidarPose, PinholeRecord, load_rig
 from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall import WallFit, fit_wall
 from numpy.typing import NDArray
-from wall_scenes import View, bent, curved, looked_at, patch, rippled, stepped, view, window, with_outliers
+from wall_scenes import View, bent, curved, looked_at, patch, patchy, rippled, stepped, view, window, with_outliers
 
 from nlos_cam.render.echo import MultiBounce
 from nlos_cam.render.sensor import Sensor
@@ -147,6 +147,11 @@ def _rippled(seen: View, generator: Generator) -> tuple[Array, View]:
     return rippled(seen, generator.uniform(0.0002, 0.002), generator.uniform(2.5, 12.0), generator), seen
 
 
+def _patchy(seen: View, generator: Generator) -> tuple[Array, View]:
+    """Up to 1 mm."""
+    return patchy(seen, generator.uniform(0.0002, 0.001), generator), seen
+
+
 def _stuck(seen: View, generator: Generator) -> tuple[Array, View]:
     return np.full(seen.depth_m.shape, generator.uniform(0.1, 1.0)), seen
 
@@ -162,7 +167,7 @@ HARD: dict[str, Callable[[View, Generator], tuple[Array, View]]] = {
     "stuck": _stuck,
     "window": _window,
 }
-SCENES = {"bare": _bare, "no return": _no_return, "rippled": _rippled, **HARD}
+SCENES = {"bare": _bare, "no return": _no_return, "rippled": _rippled, "patchy": _patchy, **HARD}
 
 
 def drawn(generator: Generator, pinhole: Intrinsics) -> View:

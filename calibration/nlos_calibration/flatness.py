@@ -1,8 +1,6 @@
-"""Is it one flat wall? What the residuals of the plane still show once the noise is averaged out of them.
+"""Is it one flat wall? Whether a part of the view tells of another plane than the whole.
 
-Two questions. Would a part of the view tell of another plane than the whole? A bend, a curve, a step or an offset of
-the range does that, and no small residual excuses it. And are neighbouring residuals alike? Ripples of the lidar do
-that: they leave the plane where it is, but it is less sure than independent noise would make it.
+A bend, a curve, a step or an offset of the range does that, and no small residual excuses it.
 """
 
 from dataclasses import dataclass
@@ -14,10 +12,6 @@ from nlos_calibration.plane import PlaneFit
 
 Array = NDArray[np.float64]
 
-BLOCKS_ACROSS = 40
-"""The finest blocks: fine enough for ripples of half a degree, coarse enough to average noise."""
-COARSER = (1, 2, 4, 8)
-"""Blocks of blocks: ripples may be wide."""
 SURE_SIGMAS = 3.0
 HALVES_POINTS = 60_000
 """Enough to compare halves by."""
@@ -27,7 +21,7 @@ MAX_OFFSET_M = 0.02
 
 @dataclass(frozen=True)
 class Flatness:
-    """How far the depth is from one flat wall seen by a lidar whose noise is independent from pixel to pixel."""
+    """How far the depth is from one flat wall."""
 
     bend_m: float
     bend_deg: float
@@ -35,10 +29,6 @@ class Flatness:
     bend_std_m: float
     bend_std_deg: float
     """What noise alone makes of that."""
-    ripple_m: float
-    """RMS, normal to the wall, of what blocks of pixels deviate by beyond their noise."""
-    correlation: float
-    """By how much the slopes' covariance grows since neighbouring residuals are alike; 1 where they are not."""
     offset_m: float
     """What to add to every depth so that the halves agree best."""
     offset_bend_m: float
@@ -69,14 +59,11 @@ def flatness(plane: PlaneFit, rays: Array) -> Flatness:
     bend_m, bend_deg = _bend(plane, [half.step() for half in halves])
     left_m, left_deg = _bend(plane, [half.step(offset_m) for half in halves], whole.step(offset_m))
     stds = [_std(plane, chi2 * np.linalg.pinv(half.matrix[:3, :3]).astype(np.float64)) for half in halves]
-    ripple_m, correlation = _ripple(plane, rays)
     return Flatness(
         bend_m=bend_m,
         bend_deg=bend_deg,
         bend_std_m=max(std[0] for std in stds),
         bend_std_deg=max(std[1] for std in stds),
-        ripple_m=ripple_m,
-        correlation=correlation,
         offset_m=offset_m,
         offset_bend_m=left_m,
         offset_bend_deg=left_deg,
@@ -138,45 +125,3 @@ def _offset_m(whole: _Sums, chi2: float) -> float:
     offset_m = -float(np.linalg.lstsq(whole.matrix, whole.right)[0][3])
     std_m = float(np.sqrt(chi2 * np.linalg.pinv(whole.matrix)[3, 3]))
     return offset_m if SURE_SIGMAS * std_m < abs(offset_m) <= MAX_OFFSET_M else 0.0
-
-
-def _ripple(plane: PlaneFit, rays: Array) -> tuple[float, float]:
-    """RMS (m) of the blocks' deviation beyond noise, and the growth of the covariance that goes with it."""
-    shape = rays.shape[:2]
-    seen = plane.inliers.reshape(shape)
-    across = np.where(plane.inliers, plane.distance_m * (rays.reshape(-1, 3) @ plane.slopes), 0.0)
-    errors_m, sigmas_m = np.nan_to_num(plane.errors_m), np.where(plane.inliers, plane.sigmas_m, 1.0)
-    sigmas = errors_m / sigmas_m
-    size = max(2, rays.shape[1] // BLOCKS_ACROSS)
-    maps = (seen, sigmas, sigmas**2, errors_m * across, (sigmas_m * across) ** 2)
-    count, total, squares, normal_m, variance_m2 = (block_sums(one.reshape(shape), size) for one in maps)
-    full = count >= size**2 / 2
-    within = _ratio(squares - total**2 / np.maximum(count, 1.0), count - 1.0, full)
-    beyond_m2 = (normal_m[full] ** 2 - within * variance_m2[full]) / count[full] ** 2
-    ripple_m = float(np.sqrt(max(beyond_m2.mean(), 0.0))) if full.any() else 0.0
-    return ripple_m, _correlation(count, total, float(sigmas @ sigmas) / max(int(seen.sum()) - 3, 1))
-
-
-def _correlation(count: Array, total: Array, chi2: float) -> float:
-    """The mean square of block means over what it would be if residuals were independent, where that is sure.
-
-    Of blocks of several sizes the largest: the mean over a patch as wide as a ripple varies most.
-    """
-    found = 1.0
-    for size in COARSER:
-        counts, totals = block_sums(count, size), block_sums(total, size)
-        blocks = int((counts >= counts.max() / 2).sum())
-        growth = float((totals**2).sum() / counts.sum()) / chi2 if chi2 > 0.0 else 1.0
-        if growth > 1.0 + SURE_SIGMAS * np.sqrt(2.0 / max(blocks - 3, 1)):
-            found = max(found, growth)
-    return found
-
-
-def _ratio(above: Array, below: Array, some: NDArray[np.bool_]) -> float:
-    return float(above[some].sum() / max(below[some].sum(), 1.0))
-
-
-def block_sums(values: NDArray[np.generic], size: int) -> Array:
-    """The sums over blocks of `size` x `size`."""
-    rows, columns = (np.arange(0, length, size) for length in values.shape)
-    return np.add.reduceat(np.add.reduceat(values.astype(np.float64), rows, axis=0), columns, axis=1)

@@ -195,14 +195,11 @@ def _rows(rays: Array, errors_m: Array, sigmas_m: Array, predicted_m: Array, ins
 
 
 def _gate_m(noise: MeanNoise, scale: float, sigmas_m: Array, predicted_m: Array) -> Array:
-    """How far inliers may be off: the noise as the residuals show it, once they do.
-
-    A noise that was measured opens the gate no further: more than that is structure.
-    """
+    """How far inliers may be off: the noise as the residuals show it, once they do."""
     widest_m = _widest_m(predicted_m, noise)
     if not np.isfinite(scale):
         return widest_m
-    return np.minimum(GATE_SIGMAS * max(scale, MIN_SCALE) * sigmas_m, widest_m * (1.0 if noise.measured else MAX_SCALE))
+    return np.minimum(GATE_SIGMAS * max(scale, MIN_SCALE) * sigmas_m, MAX_SCALE * widest_m)
 
 
 def _residual_scale(points: _Points, slopes: Array, scale: float) -> float:

@@ -23,7 +23,7 @@ between them."""
 TOLD_RIPPLE_M, TOLD_NOISE_SCALE = 0.0003, 2.0
 
 
-def check_flat(flat: Flatness) -> None:
+def check_flat(flat: Flatness, ripple_m: float) -> None:
     """Refuse a wall that surely bends, curves or steps, unless an offset of the lidar's range explains it."""
     sure_m, sure_deg = flat.bend_m - SURE_SIGMAS * flat.bend_std_m, flat.bend_deg - SURE_SIGMAS * flat.bend_std_deg
     if _tolerances(sure_m, sure_deg) > REFUSED_TOLERANCES and not _explained_by_offset(flat):
@@ -31,25 +31,25 @@ def check_flat(flat: Flatness) -> None:
             f"the wall is not one flat wall: half of the view differs from the whole by {_amounts(flat)}, as of a "
             "bend, a curve or a step; take a flat wall, or move so that only one is in view",
         )
-    if flat.ripple_m > MAX_RIPPLE_M:
+    if ripple_m > MAX_RIPPLE_M:
         raise WallRefusedError(
-            f"the wall is not flat: parts are {flat.ripple_m * 1e3:.1f} mm RMS off the plane, {MAX_RIPPLE_M * 1e3:.1f} "
+            f"the wall is not flat: parts are {ripple_m * 1e3:.1f} mm RMS off the plane, {MAX_RIPPLE_M * 1e3:.1f} "
             "mm allowed; take a flat, matt wall and let the lidar warm up",
         )
 
 
-def judge(distance_m: float, facing_deg: float, flat: Flatness) -> tuple[Verdict, str]:
+def judge(distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float) -> tuple[Verdict, str]:
     """The verdict, and one sentence: what it rests on, or what to do."""
-    doubts, problems = _doubts(flat), out_of_range(distance_m, facing_deg)
+    doubts, problems = _doubts(flat, ripple_m), out_of_range(distance_m, facing_deg)
     verdict: Verdict = "doubtful" if doubts else "out of range" if problems else "good"
     return verdict, "; ".join(doubts + problems) or "distance and angle are inside the paper's ranges"
 
 
-def warnings(flat: Flatness, noise_scale: float) -> tuple[str, ...]:
+def warnings(ripple_m: float, noise_scale: float) -> tuple[str, ...]:
     """What does not change the verdict but should be known."""
     told: list[str] = []
-    if flat.ripple_m > TOLD_RIPPLE_M:
-        told.append(f"the depth has ripples of {flat.ripple_m * 1e3:.1f} mm RMS: the uncertainties allow for them")
+    if ripple_m > TOLD_RIPPLE_M:
+        told.append(f"the depth has ripples of {ripple_m * 1e3:.1f} mm RMS: the uncertainties allow for them")
     if noise_scale > TOLD_NOISE_SCALE:
         told.append(f"depth is {noise_scale:.1f} times as noisy as the lidar's should be: warm it up, dim the light")
     return tuple(told)
@@ -67,14 +67,14 @@ def _amounts(flat: Flatness) -> str:
     return f"{flat.bend_m * 1e3:.1f} mm and {flat.bend_deg:.2f} degrees"
 
 
-def _doubts(flat: Flatness) -> list[str]:
+def _doubts(flat: Flatness, ripple_m: float) -> list[str]:
     """Why the plane may be another than the wall's."""
     bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTED_TOLERANCES
     if bent and _explained_by_offset(flat):
         why = f"the depths look as if {flat.offset_m * 1e3:+.1f} mm were missing from each (or the wall is curved): "
         return [why + "measure the distance with a tape and give it with --tape-m"]
-    if flat.ripple_m > DOUBTED_RIPPLE_M:
-        why = f"parts of the wall are {flat.ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the lidar, or a wall "
+    if ripple_m > DOUBTED_RIPPLE_M:
+        why = f"parts of the wall are {ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the lidar, or a wall "
         return [why + "that is not flat; take a flat, matt wall and let the lidar warm up"]
     if not bent:
         return []

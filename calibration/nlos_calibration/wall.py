@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.flatness import block_sums, flatness
+from nlos_calibration.flatness import flatness
 from nlos_calibration.geometry import wall_from_plane
 from nlos_calibration.plane import GATE_SIGMAS, fit_depth, plane_depth_m
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.range_noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
+from nlos_calibration.ripples import block_sums, ripples
 from nlos_calibration.uncertainty import WallMeasures, measures_of
 from nlos_calibration.verdict import Verdict, check_flat, judge, warnings
 
@@ -82,27 +83,26 @@ def fit_wall(
     if plane.normal[2] >= 0.0:
         raise WallRefusedError("the optical axis never meets the wall's plane: turn the lidar towards the wall")
     scale = noise.scale if noise is not None and noise.measured else plane.noise_scale
-    _check_one_surface(depth_m, plane_depth_m(rays, plane.slopes), scale)
-    flat = flatness(plane, rays)
-    check_flat(flat)
-    covariance = flat.correlation * plane.covariance
-    measures = measures_of(plane.slopes, covariance)
+    _check_one_surface(depth_m, plane_depth_m(rays, plane.slopes))
+    flat, rippled = flatness(plane, rays), ripples(plane, rays)
+    check_flat(flat, rippled.rms_m)
+    measures = measures_of(plane.slopes, rippled.covariance)
     measures = replace(measures, distance_m=plane.distance_m - origin_m * float(plane.normal[2]))
-    verdict, advice = judge(measures.distance_m, measures.facing_deg, flat)
+    verdict, advice = judge(measures.distance_m, measures.facing_deg, flat, rippled.rms_m)
     return WallFit(
         **vars(measures),
         wall_from_lidar=wall_from_plane(plane.normal, measures.distance_m),
-        covariance=covariance,
+        covariance=rippled.covariance,
         residual_m=plane.residual_m,
         noise_scale=scale,
         inlier_fraction=plane.inlier_fraction,
         inliers=plane.inliers.reshape(depth_m.shape),
-        ripple_m=flat.ripple_m,
+        ripple_m=rippled.rms_m,
         bend_m=flat.bend_m,
         bend_deg=flat.bend_deg,
         verdict=verdict,
         advice=advice,
-        warnings=warnings(flat, scale),
+        warnings=warnings(rippled.rms_m, scale),
     )
 
 
@@ -123,9 +123,9 @@ def _check_depth(depth_m: Array) -> None:
         )
 
 
-def _check_one_surface(depth_m: Array, expected_m: Array, noise_scale: float) -> None:
+def _check_one_surface(depth_m: Array, expected_m: Array) -> None:
     """Refuse a map in which blocks of pixels stray from the wall together (NaN in `depth_m` is neither)."""
-    gate_m = GATE_SIGMAS * max(noise_scale, 1.0) * depth_noise_m(depth_m)
+    gate_m = GATE_SIGMAS * depth_noise_m(depth_m)
     valid = np.isfinite(depth_m)
     behind = valid & (depth_m - expected_m > gate_m)
     before = valid & (expected_m - depth_m > gate_m)

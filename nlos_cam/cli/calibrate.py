@@ -177,7 +177,7 @@ def _told(record: WallRecord, path: Path) -> str:
     """What was measured, with the half width of each 95 % interval."""
     colour = "green" if record.verdict == "good" else "yellow"
     facing, yaw, pitch = (
-        f"{angle} ± {_interval(std):.3f}"
+        f"{angle} ± {_interval(std):.4f}"
         for angle, std in (
             (f"{record.facing_deg:.2f}", record.facing_std_deg),
             (f"{record.yaw_deg:+z.2f}", record.yaw_std_deg),
@@ -185,7 +185,7 @@ def _told(record: WallRecord, path: Path) -> str:
         )
     )
     lines = [
-        f"distance  {record.distance_m:.4f} m ± {1e3 * _interval(record.distance_std_m):.3f} mm",
+        f"distance  {record.distance_m:.4f} m ± {1e3 * _interval(record.distance_std_m):.4f} mm",
         f"facing    {facing} degrees (yaw {yaw}, pitch {pitch})",
     ]
     if record.residual_m is not None:

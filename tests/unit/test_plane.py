@@ -3,7 +3,7 @@ import pytest
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import normal_from_angles
 from nlos_calibration.plane import MIN_POINTS, fit_plane
-from nlos_calibration.range_noise import depth_noise_m
+from nlos_calibration.range_noise import MeanNoise, depth_noise_m
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -50,6 +50,40 @@ def test_the_residual_is_the_distance_of_the_inliers_from_the_plane(generator: n
     assert fit.residual_m == pytest.approx(np.sqrt(np.mean(distances**2)))
     assert fit.inliers.mean() == pytest.approx(fit.inlier_fraction)
     assert not fit.inliers[::10].any()
+
+
+@pytest.mark.parametrize("noise", [0.5, 1.0, 4.0])
+def test_the_covariance_is_the_spread_of_what_is_measured(generator: np.random.Generator, noise: float) -> None:
+    fits = [fit_plane(wall_points(generator, 1500, noise=noise)[0], generator) for _ in range(150)]
+    truth = -wall_points(generator, 1)[1] / 0.2
+    told = np.mean([fit.covariance for fit in fits], axis=0)
+    # chi-square of 150 times 3 unknowns, and with it an error of the mean, were there a bias
+    errors = np.array([fit.slopes for fit in fits]) - truth
+    chi2 = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(told), errors)
+    assert chi2.mean() / 3.0 == pytest.approx(1.0, abs=0.25)
+    bias = errors.mean(axis=0)
+    assert bias @ np.linalg.inv(told) @ bias * 150 < 16.0
+    assert np.mean([fit.noise_scale for fit in fits]) == pytest.approx(noise, rel=0.05)
+
+
+def test_many_samples_say_more_where_there_are_many(generator: np.random.Generator) -> None:
+    points, _ = wall_points(generator, 1000)
+    one = fit_plane(points, generator, MeanNoise(np.full(1000, 4.0)))
+    half = np.where(points[:, 0] > 0.0, 400.0, 4.0)
+    both = fit_plane(points, generator, MeanNoise(half))
+    assert one.noise_scale == pytest.approx(2.0, rel=0.1)  # the points are as noisy as single samples
+    assert not np.allclose(both.slopes, one.slopes, rtol=1e-6)
+
+
+def test_the_gate_closes_on_what_little_noise_is_left(generator: np.random.Generator) -> None:
+    """Points 3 mm behind the wall pass for noise of a single sample, but not for that of a hundred."""
+    points, normal = wall_points(generator, 4000, noise=0.1)
+    away = generator.random(4000) < 0.1
+    points[away] *= 1.0 + 0.003 / np.linalg.norm(points[away], axis=1)[:, np.newaxis]
+    fit = fit_plane(points, generator, MeanNoise(np.full(4000, 100.0)))
+    assert fit.inlier_fraction == pytest.approx(0.9, abs=0.03)
+    assert fit.distance_m == pytest.approx(0.2, abs=2e-5)
+    assert angle_deg(fit.normal, normal) < 0.02
 
 
 def test_points_without_a_return_are_left_out(generator: np.random.Generator) -> None:

@@ -77,6 +77,14 @@ def test_a_patch_at_another_depth_is_refused(factor: float, side: str) -> None:
     assert 10 <= int(share[1]) <= 25
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_scattered_depth_where_the_wall_is_never_met_is_noise(seed: int) -> None:
+    depth_m, generator = bare(0.25, 66.0), np.random.default_rng(seed)
+    stray = generator.random(depth_m.shape) < 0.4
+    depth_m[stray] = generator.uniform(0.05, 2.0, int(stray.sum()))
+    assert fitted(depth_m).distance_m == pytest.approx(0.25, abs=1e-4)
+
+
 def test_a_surface_where_the_wall_would_never_be_met_is_refused() -> None:
     depth_m = bare(yaw_deg=75.0)
     depth_m[:, -30:] = 0.5
