@@ -3,6 +3,7 @@
     NlosCamError                     exit 1   root; one clear line: what, the value, what to do
     ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be rendered
     ├── OutputExistsError (FileExistsError)  exit 1   --out is there and --overwrite was not given
+    ├── DiskFullError (OSError)      exit 1   too little room for what is to be written, or none left
     ├── CameraError (OSError)        exit 3   a device that is missing or does not do as asked
     │   ├── CameraNotFoundError      exit 3   no such device
     │   └── CameraLostError          exit 3   it was there, and vanished or fell silent
@@ -25,6 +26,10 @@ class SceneError(NlosCamError, ValueError):
 
 class OutputExistsError(NlosCamError, FileExistsError):
     """An output path that exists, and that nobody asked to overwrite."""
+
+
+class DiskFullError(NlosCamError, OSError):
+    """A disk with too little room for what is to be written, or with none left."""
 
 
 class CameraError(NlosCamError, OSError):

@@ -15,6 +15,8 @@ WINNER_SPREAD_M = 0.01
 """Samples of a cell this close to its median depth count towards its intensity: a plain mean would mix winners."""
 
 Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Real = float | np.float32
 
 
 @dataclass(frozen=True)
@@ -48,9 +50,66 @@ class LidarMaps:
     """(64, 80)."""
 
 
-@numba.njit(cache=True)
+NO_SAMPLE = np.int32(0x7FFFFFFF)
+"""Depth is compared by its bits: those of positive floats are ordered as the floats are, and this is beyond them."""
+INFINITE_BITS = np.int32(0x7F800000)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _gather(depth_bits: Int32, ir: NDArray[np.uint8], bits: Int32, counts: NDArray[np.uint8]) -> np.int32:
+    """Copy one cell's samples side by side; how many of them are a return (not NaN, 0, negative or infinite)."""
+    valid, k = np.int32(0), 0
+    for r in range(depth_bits.shape[0]):
+        for c in range(depth_bits.shape[1]):
+            sample = depth_bits[r, c]
+            is_return = (sample > 0) & (sample < INFINITE_BITS)
+            bits[k], counts[k] = sample if is_return else NO_SAMPLE, ir[r, c]
+            valid += np.int32(is_return)
+            k += 1
+    return valid
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _two_from(bits: Int32, rank: np.int32) -> tuple[np.int32, np.int32]:
+    """The bits of the samples of that rank (0 is the smallest) and the next, by bisection between samples."""
+    low, high = NO_SAMPLE, np.int32(0)
+    for i in range(bits.size):
+        low = min(low, bits[i])
+        high = max(high, bits[i] if bits[i] != NO_SAMPLE else np.int32(0))
+    while low < high:
+        middle = low + ((high - low) >> 1)
+        up_to, below, above = np.int32(0), np.int32(0), NO_SAMPLE
+        for i in range(bits.size):
+            is_below = bits[i] <= middle
+            up_to += np.int32(is_below)
+            below = max(below, bits[i] if is_below else np.int32(0))
+            above = min(above, NO_SAMPLE if is_below else bits[i])
+        if up_to > rank:
+            high = below
+        else:
+            low = above
+    up_to, above = np.int32(0), NO_SAMPLE
+    for i in range(bits.size):
+        is_below = bits[i] <= low
+        up_to += np.int32(is_below)
+        above = min(above, NO_SAMPLE if is_below else bits[i])
+    return low, low if up_to > rank + 1 else above
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _mean_near(bits: Int32, depth_m: Float32, counts: NDArray[np.uint8], median_m: Real, spread_m: Real) -> np.floating:
+    """The mean count of the samples within `spread_m` of the median; NaN if there are none."""
+    total, near = np.int32(0), np.int32(0)
+    for i in range(bits.size):
+        is_near = (bits[i] != NO_SAMPLE) & (abs(depth_m[i] - median_m) <= spread_m)
+        near += np.int32(is_near)
+        total += np.int32(counts[i]) if is_near else np.int32(0)
+    return np.float32(total) / np.float32(near)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _reduce_cells(
-    depth_m: Float32,
+    depth_bits: Int32,
     ir: NDArray[np.uint8],
     row_edges: NDArray[np.int64],
     column_edges: NDArray[np.int64],
@@ -58,25 +117,21 @@ def _reduce_cells(
 ) -> tuple[Float32, Float32]:
     rows, columns = row_edges.size - 1, column_edges.size - 1
     depth, intensity = np.full((rows, columns), np.nan, np.float32), np.zeros((rows, columns), np.float32)
-    samples, counts = np.empty(most, np.float32), np.empty(most, np.float32)
+    bits, middle, counts = np.empty(most, np.int32), np.empty(2, np.int32), np.empty(most, np.uint8)
+    samples_m, middle_m = bits.view(np.float32), middle.view(np.float32)
     for i in range(rows):
+        top, bottom = row_edges[i], row_edges[i + 1]
         for j in range(columns):
-            n = 0
-            for r in range(row_edges[i], row_edges[i + 1]):
-                for c in range(column_edges[j], column_edges[j + 1]):
-                    if 0.0 < depth_m[r, c] < np.inf:  # false for NaN too
-                        samples[n], counts[n] = depth_m[r, c], ir[r, c]
-                        n += 1
-            if n == 0:
+            left, right = column_edges[j], column_edges[j + 1]
+            n = (bottom - top) * (right - left)
+            valid = _gather(depth_bits[top:bottom, left:right], ir[top:bottom, left:right], bits[:n], counts[:n])
+            if valid == 0:
                 continue
-            median = np.median(samples[:n])
-            total, near = np.float32(0.0), 0
-            for k in range(n):
-                if abs(samples[k] - median) <= WINNER_SPREAD_M:
-                    total += counts[k]
-                    near += 1
-            depth[i, j] = median
-            intensity[i, j] = total / near if near else counts[:n].mean()
+            middle[0], middle[1] = _two_from(bits[:n], (valid - np.int32(1)) >> 1)
+            depth[i, j] = middle_m[0] if valid % 2 else (middle_m[0] + middle_m[1]) / np.float32(2.0)
+            mean = _mean_near(bits[:n], samples_m[:n], counts[:n], depth[i, j], np.float32(WINNER_SPREAD_M))
+            # the two middle samples may lie far apart, and none near their mean
+            intensity[i, j] = mean if mean == mean else _mean_near(bits[:n], samples_m[:n], counts[:n], 0.0, np.inf)  # noqa: PLR0124  NaN
     return depth, intensity
 
 
@@ -90,5 +145,5 @@ def maps_from_frame(frame: Frame) -> LidarMaps:
     height, width = frame.depth_m.shape
     most = ceil(height / MAP_ROWS + 1) * ceil(width / MAP_COLUMNS + 1)
     edges = _edges(height, MAP_ROWS), _edges(width, MAP_COLUMNS)
-    depth, intensity = _reduce_cells(frame.depth_m, frame.ir, *edges, most)
+    depth, intensity = _reduce_cells(frame.depth_m.view(np.int32), frame.ir, *edges, most)
     return LidarMaps(depth, intensity, ~np.isnan(depth))

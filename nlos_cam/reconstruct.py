@@ -8,7 +8,7 @@ import numpy as np
 from nlos_calibration.rig import ObjectBox, Rig
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps
 from nlos_cam.objects.depth_image import depth_from_image, object_box
 
 Clock = Callable[[], float]
@@ -38,9 +38,15 @@ def pose_of(box: ObjectBox) -> NDArray[np.float64]:
 
 
 def reconstruct(maps: LidarMaps, rig: Rig, network: Network, clock: Clock = time.perf_counter) -> Reconstruction:
-    """The hidden depth behind one frame's maps. Raises SceneError for a rig without an object box."""
+    """The hidden depth behind one frame's maps. Raises SceneError for a rig without an object box.
+
+    Maps without any return tell nothing, so nothing is made of them: the networks, which take a cell without a return
+    for an average one, would show an average object.
+    """
     box = object_box(rig)
     begun_s = clock()
-    image = network(maps.depth_m[np.newaxis], maps.intensity[np.newaxis])[0]
-    depth_m = depth_from_image(image, box)
+    if maps.valid.any():
+        depth_m = depth_from_image(network(maps.depth_m[np.newaxis], maps.intensity[np.newaxis])[0], box)
+    else:
+        depth_m = np.full((OBJECT_PIXELS, OBJECT_PIXELS), np.nan, np.float32)
     return Reconstruction(depth_m, pose_of(box), None, {"network": clock() - begun_s})

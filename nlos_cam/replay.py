@@ -1,10 +1,7 @@
 """A whole recording to files: every frame's hidden depth, a contact sheet and a short report."""
 
-import os
-import shutil
 import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -16,11 +13,15 @@ from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
 from nlos_cam.camera.base import Camera
-from nlos_cam.errors import OutputExistsError, RecordingError
+from nlos_cam.errors import RecordingError
+from nlos_cam.folders import renamed_when_whole
+from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.live import FrameReader, Step, steps
+from nlos_cam.live import steps
+from nlos_cam.live_report import Step
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.reconstruct import Clock, Network
+from nlos_cam.sightings import in_words
 
 RESULT, SHEET, REPORT = "reconstruction.npz", "frames.png", "report.md"
 SHEET_FRAMES = 6
@@ -91,7 +92,7 @@ def replay(
     and what the camera raises.
     """
     begun_s = clock()
-    with _renamed_when_whole(out) as part, TemporaryFile(dir=part) as depths:
+    with renamed_when_whole(out) as part, TemporaryFile(dir=part) as depths:
         results = _Results(depths, [], [], 0, Samples(SHEET_FRAMES))
         with FrameReader(camera, keeps_all=True, stop=stop, clock=clock) as reader:
             for step in steps(reader, rig, network, clock):
@@ -103,22 +104,6 @@ def replay(
         draw_sheet(part / SHEET, results.samples.chosen())
         (part / REPORT).write_text(_report(camera, rig, results, stopped=stop.is_set()), encoding="utf-8")
     return ReplayReport(len(results.numbers), clock() - begun_s, str(out))
-
-
-@contextmanager
-def _renamed_when_whole(out: Path) -> Generator[Path]:
-    """A folder to write in, beside `out`; renamed to it at the end, removed after an error."""
-    if out.exists() and not out.is_dir():
-        raise OutputExistsError(f"{out} is a file: choose a folder's name for --out")
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
-    part.mkdir()
-    try:
-        yield part
-        out.mkdir(exist_ok=True)
-        for file in part.iterdir():
-            file.replace(out / file.name)
-    finally:
-        shutil.rmtree(part)
 
 
 def _write_result(path: Path, results: _Results, rig: Rig) -> None:
@@ -174,6 +159,7 @@ def _report(camera: Camera, rig: Rig, results: _Results, *, stopped: bool) -> st
         "",
         f"- frames: {frames}, numbers {results.numbers[0]} to {results.numbers[-1]}, {times_s[-1] - times_s[0]:.2f} s",
         f"- skipped: {camera.incomplete} without all streams, {camera.dropped} that the recording lacks",
+        f"- seen: {in_words(camera.counts) or 'nothing odd'}",
         f"- frames with a hidden surface: {results.with_surface} ({results.with_surface / frames:.0%})",
         f"- rig: {rig.name} {rig.checksum}, {rig.lidar.distance_m:.3f} m to the wall, {rig.facing_deg:.1f} degrees",
         f"- maps: {MAP_ROWS} x {MAP_COLUMNS}; hidden depth: {OBJECT_PIXELS} x {OBJECT_PIXELS} in `{RESULT}`",

@@ -1,18 +1,17 @@
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Self
 
 import numpy as np
 import pytest
+from fake_librealsense import FakeSdk
+from fake_lidar import FakeLidar, NapClock
 from nlos_calibration.rig import Rig, load_rig
 
 from nlos_cam.camera import Recording
-from nlos_cam.camera.l515 import NEAR_WALL, L515Camera
+from nlos_cam.camera.l515 import L515Camera
 from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.camera.streams import FORMATS
-from nlos_cam.render.sensor import DEPTH_UNIT_M, SensedImages
+from nlos_cam.render.sensor import SensedImages
 
 
 @pytest.fixture(autouse=True)
@@ -82,7 +81,7 @@ def record_noise(path: Path, frames: int) -> Path:
     return path
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def recorded() -> Callable[..., Path]:
     return record_noise
 
@@ -93,158 +92,24 @@ def noise_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_noise(tmp_path_factory.mktemp("bags") / "noise.bag", 20)
 
 
-Named = SimpleNamespace  # a member of one of the SDK's enumerations
-
-
-class FakeProfile:
-    def __init__(self, stream: str, width: int, height: int) -> None:
-        self.stream, self.size = stream, (width, height)
-
-    def stream_type(self) -> Named:
-        return Named(name=self.stream)
-
-    def format(self) -> Named:
-        return Named(name=FORMATS[self.stream])
-
-    def fps(self) -> int:
-        return 30
-
-    def width(self) -> int:
-        return self.size[0]
-
-    def height(self) -> int:
-        return self.size[1]
-
-    def as_video_stream_profile(self) -> Self:
-        return self
-
-    def get_intrinsics(self) -> SimpleNamespace:
-        width, height = self.size
-        return SimpleNamespace(width=width, height=height, fx=460.0, fy=461.0, ppx=width / 2, ppy=height / 2)
-
-
-class FakeFrame:
-    def __init__(self, profile: FakeProfile, number: int) -> None:
-        self.profile, self.number = profile, number
-
-    def get_profile(self) -> FakeProfile:
-        return self.profile
-
-    def get_frame_number(self) -> int:
-        return self.number
-
-    def get_timestamp(self) -> float:
-        return self.number * 1000 / 30
-
-    def get_data(self) -> np.ndarray:
-        return np.full(self.profile.size[::-1], 240, np.uint16 if self.profile.stream == "depth" else np.uint8)
-
-
-class FakeSensor:
-    """A sensor that keeps what it is told, but for what it is `stubborn` about, and delivers a frame on starting."""
-
-    def __init__(self, sizes: list[tuple[int, int]], streams: tuple[str, ...]) -> None:
-        self.profiles = [FakeProfile(stream, *size) for size in sizes for stream in streams]
-        self.options = {"depth_units": DEPTH_UNIT_M, "visual_preset": 4.0, "global_time_enabled": 0.0}
-        self.options |= dict.fromkeys(NEAR_WALL, 9.0)
-        self.stubborn: set[str] = set()
-        self.refused: set[str] = set()
-        self.did: list[Any] = []
-        self.opened: list[FakeProfile] = []
-        self.start_error: Exception | None = None
-        self.callback: Callable[[FakeFrame], None] = lambda _: None
-
-    def get_stream_profiles(self) -> list[FakeProfile]:
-        return self.profiles
-
-    def open(self, profiles: list[FakeProfile]) -> None:
-        self.opened = profiles
-
-    def start(self, callback: Callable[[FakeFrame], None]) -> None:
-        if self.start_error:
-            raise self.start_error
-        self.did.append("start")
-        self.callback = callback
-        self.deliver(range(1))
-
-    def deliver(self, numbers: range) -> None:
-        for number in numbers:
-            for profile in self.opened:
-                self.callback(FakeFrame(profile, number))
-
-    def stop(self) -> None:
-        self.did.append("stop")
-
-    def close(self) -> None:
-        self.did.append("close")
-
-    def get_supported_options(self) -> list[Named]:
-        return [Named(name=name) for name in self.options]
-
-    def supports(self, option: Named) -> bool:
-        return option.name in self.options
-
-    def get_option(self, option: Named) -> float:
-        return self.options[option.name]
-
-    def set_option(self, option: Named, value: float) -> None:
-        self.did.append(option.name)
-        if option.name in self.refused:
-            raise RuntimeError("out of range")
-        if option.name not in self.stubborn:
-            self.options[option.name] = value
-
-
-class FakeDevice:
-    def __init__(self, sensor: FakeSensor, **info: str) -> None:
-        self.sensor, self.info = sensor, info
-
-    def supports(self, key: str) -> bool:
-        return key in self.info
-
-    def get_info(self, key: str) -> str:
-        return self.info[key]
-
-    def query_sensors(self) -> list[FakeSensor]:
-        return [self.sensor]
-
-
-class Names:
-    """Stands for an enumeration: any member is its own name."""
-
-    def __init__(self, make: Callable[[str], Any]) -> None:
-        self.make = make
-
-    def __getattr__(self, name: str) -> Any:
-        return self.make(name)
-
-
-def sdk_with(*devices: FakeDevice) -> SimpleNamespace:
-    context = SimpleNamespace(query_devices=lambda: list(devices))
-    return SimpleNamespace(context=lambda: context, camera_info=Names(str), option=Names(lambda name: Named(name=name)))
-
-
-def l515(
-    serial: str = "f0246262",
-    usb: str = "3.2",
-    streams: tuple[str, ...] = tuple(FORMATS),
-    name: str = "Intel RealSense L515",
-) -> FakeDevice:
-    sensor = FakeSensor([(1024, 768), (640, 480), (320, 240)], streams)
-    return FakeDevice(sensor, name=name, serial_number=serial, usb_type_descriptor=usb, firmware_version="01.05.08.01")
+@pytest.fixture
+def fake_l515() -> type[FakeLidar]:
+    return FakeLidar
 
 
 @pytest.fixture
-def fake_l515() -> Callable[..., FakeDevice]:
-    return l515
+def fake_sdk() -> type[FakeSdk]:
+    return FakeSdk
 
 
 @pytest.fixture
 def fake_camera() -> Callable[..., L515Camera]:
-    """An L515Camera on a fake SDK that sees these devices; `naps` takes what it would have slept."""
+    """An L515Camera on a fake SDK that sees these lidars, by a clock that moves only by waiting."""
 
-    def make(*devices: FakeDevice, serial: str = "", naps: list[float] | None = None) -> L515Camera:
-        uri, sleeps = f"l515:{serial}".rstrip(":"), naps if naps is not None else []
-        return L515Camera(uri, serial, sdk=sdk_with(*devices), sleep=sleeps.append)
+    def make(
+        *lidars: FakeLidar, serial: str = "", clock: NapClock | None = None, recording: Recording | None = None
+    ) -> L515Camera:
+        uri, sdk = f"l515:{serial}".rstrip(":"), FakeSdk(*lidars)
+        return L515Camera(uri, serial, sdk=sdk, clock=clock or NapClock(), recording=recording)
 
     return make

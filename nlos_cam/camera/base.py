@@ -14,8 +14,10 @@ from nlos_cam.frames import Frame
 class Camera(Protocol):
     """A source of Frames in SI units. Entering starts it; leaving stops it, whatever happened inside.
 
-    Iterating yields frames until the source ends: a recording's end is a normal end, a live camera goes on. Frames that
-    lack a stream are counted in `incomplete` and skipped; frame numbers that never came are counted in `dropped`.
+    Leaving ends an iteration, by whichever thread; doing so again does nothing. Iterating yields frames until the
+    source ends: a recording's end is a normal end, a live camera goes on. Frames that lack a stream are counted in
+    `incomplete` and skipped; frame numbers that never came are counted in `dropped`. Numbers and timestamps rise
+    together, 30 a second, also over an outage after which the device counts anew: its numbers count as dropped.
     """
 
     uri: str
@@ -27,7 +29,7 @@ class Camera(Protocol):
     incomplete: int
     dropped: int
     counts: Counter[str]
-    """What else befell it, by name (duplicate, out_of_order, wrong_size, restarted, reset, replugged); never zero."""
+    """What else befell it, by name, never zero: restarted, reset, replugged, and what `Pairing.counts` tells."""
 
     def __enter__(self) -> Self: ...
 

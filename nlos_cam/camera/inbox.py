@@ -40,9 +40,19 @@ class Inbox:
         return self._pairing.dropped + self._evicted
 
     @property
+    def counts(self) -> Counter[str]:
+        """What else the pairing saw, by name."""
+        with self._changed:
+            return Counter(self._pairing.counts)
+
+    @property
     def ended(self) -> bool:
         """Whether nothing is left to take, and nothing will come."""
         return (self._finished or self.closed) and not self._sets
+
+    def expect(self, shape: tuple[int, int]) -> None:
+        """Take only samples of this shape (rows, columns) for good ones."""
+        self._pairing.shape = shape
 
     def put(self, sample: Sample) -> None:
         """Take a sample from an SDK thread."""

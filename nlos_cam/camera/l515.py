@@ -1,13 +1,16 @@
 """A real Intel RealSense L515."""
 
 import logging
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
 from typing import Any
 
+from nlos_cam.camera.clock import Clock
 from nlos_cam.camera.inbox import Inbox
+from nlos_cam.camera.laser_power import MOST_SATURATED, saturated_share, turn_down
 from nlos_cam.camera.live_camera import LiveCamera
+from nlos_cam.camera.options import NOT_OFFERED, Options
 from nlos_cam.camera.record import Recording
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import Size
@@ -16,7 +19,8 @@ from nlos_cam.frames import Float32
 
 USB3_SIZE: Size = (640, 480)
 USB2_SIZE: Size = (320, 240)
-SHORT_RANGE = 5.0
+PRESET = {"global_time_enabled": 1.0, "visual_preset": 5.0}
+"""Timestamps of the host, and short range, whose lower gain does not saturate so near."""
 NEAR_WALL = {
     "min_distance": 0.0,
     "confidence_threshold": 1.0,
@@ -27,6 +31,11 @@ NEAR_WALL = {
 }
 """For a wall at 0.15 to 0.30 m, on top of the short-range preset: starting values, to be tuned on a bench."""
 PRESET_SETTLES_S = 0.5
+LASER_POWER = "laser_power"
+UNDER_WAY = 3
+"""Sets that may have been taken before the last change."""
+LOOKED_AT = 3
+LOOK_TIMEOUT_S = 0.5
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +48,12 @@ class DeviceInfo:
     serial: str
     firmware: str
     usb_type: str
+
+
+@cache
+def shared_context(sdk: Any) -> Any:
+    """The one context of this process, for discovery and streaming: two of them fight over a device."""
+    return sdk.context()
 
 
 def connected(sdk: Any, context: Any) -> list[tuple[Any, DeviceInfo]]:
@@ -63,15 +78,19 @@ def _told(device: Any, key: Any) -> str:
 def list_devices() -> list[DeviceInfo]:
     """Every device that the SDK sees now."""
     sdk = load_sdk()
-    return [info for _, info in connected(sdk, sdk.context())]
+    return [info for _, info in connected(sdk, shared_context(sdk))]
 
 
 class L515Camera(LiveCamera):
     """An L515 by serial number, or the only one; 640 x 480 at 30 frames/s, 320 x 240 on USB 2.
 
-    Its options are set for a near wall once it runs, and read back into `Frame.settings`; a recording begins with the
-    half second that this takes. Raises CameraNotFoundError.
+    Once it runs, its options are set for a near wall and its laser is turned down until its returns do not saturate;
+    frames come, and a recording begins, when that is done. What the options read then is in `Frame.settings`. Raises
+    CameraNotFoundError.
     """
+
+    differences: Mapping[str, str]
+    """Options that are not as wanted, and how."""
 
     def __init__(
         self,
@@ -80,38 +99,87 @@ class L515Camera(LiveCamera):
         *,
         recording: Recording | None = None,
         sdk: Any = None,
-        sleep: Callable[[float], None] = time.sleep,
+        clock: Clock | None = None,
     ) -> None:
         sdk = sdk or load_sdk()
-        self._sleep = sleep
-        self._context = sdk.context()  # one for discovery and streaming: two of them fight over the device
+        self._context = shared_context(sdk)
         device, info = _find(sdk, self._context, serial)
         size = USB2_SIZE if info.usb_type.startswith("2") else USB3_SIZE
         if size == USB2_SIZE:
             log.warning("%s is on USB %s: only 320 x 240; turn the plug round or use a USB 3 cable", uri, info.usb_type)
-        super().__init__(uri, device, size, sdk, recording)
+        self._serial, self.differences = info.serial, {}
+        super().__init__(uri, device, size, sdk, recording, clock)
+        self.identity: Mapping[str, str] = {key: value for key, value in asdict(info).items() if value}
+
+    def _begin_anew(self) -> None:
+        super()._begin_anew()
+        self._laser_power: float | None = None
+        """As it was found, for when the device comes back."""
 
     def _prepare(self, sensor: Any) -> None:
         """Preset first, since it changes the others; after start, since starting resets it."""
-        self._set(sensor, {"global_time_enabled": 1.0, "visual_preset": SHORT_RANGE})
-        self._sleep(PRESET_SETTLES_S)
-        self._set(sensor, NEAR_WALL)
-        for name, wanted in NEAR_WALL.items():
-            self._check(sensor, name, wanted)
+        options = Options(sensor, self._sdk)
+        differences = self._put(options, PRESET)
+        self._settle()
+        differences |= self._put(options, NEAR_WALL)
+        for name, difference in differences.items():
+            if self.differences.get(name) != difference:
+                log.warning("%s: %s: %s", self.uri, name, difference)
+        self.differences = differences
+        self._turn_down(options)
 
-    def _set(self, sensor: Any, values: dict[str, float]) -> None:
-        for name, value in values.items():
-            option = getattr(self._sdk.option, name)
-            try:
-                sensor.set_option(option, value)
-            except RuntimeError as error:
-                log.warning("%s does not take %s = %g: %s", self.uri, name, value, error)
+    def _put(self, options: Options, wanted: Mapping[str, float]) -> dict[str, str]:
+        """Set options, twice where they do not take; how they differ from what is wanted then."""
+        differences = options.put_all(wanted)
+        again = {name: wanted[name] for name, difference in differences.items() if difference != NOT_OFFERED}
+        if not again:
+            return differences
+        self._settle()
+        return {name: differences[name] for name in differences.keys() - again.keys()} | options.put_all(again)
 
-    def _check(self, sensor: Any, name: str, wanted: float) -> None:
-        option = getattr(self._sdk.option, name)
-        found = sensor.get_option(option) if sensor.supports(option) else None
-        if found != wanted:
-            log.warning("%s reads back %s = %s where %g was set", self.uri, name, found, wanted)
+    def _settle(self) -> None:
+        self._clock.wait(self._left, PRESET_SETTLES_S)
+
+    def _turn_down(self, options: Options) -> None:
+        """Turn the laser down until its returns do not saturate, from where it was if the device came back."""
+        limits, preset = options.limits(LASER_POWER), options.get(LASER_POWER)
+        if limits is None or preset is None:
+            return
+        power = preset if self._laser_power is None else self._laser_power
+        if power != preset:
+            options.put(LASER_POWER, power)
+        settled = turn_down(power, limits, self._saturated, lambda lower: not options.put(LASER_POWER, lower))
+        self._laser_power = settled.power
+        if settled.power < power:
+            log.warning("%s: laser power %g saturated: turned down to %g", self.uri, power, settled.power)
+        if (settled.saturated or 0.0) > MOST_SATURATED:
+            log.warning(
+                "%s: %.1f %% of the infrared image is saturated at laser power %g: go farther from the wall, or tilt "
+                "the camera by 5 to 15 degrees",
+                self.uri,
+                100 * (settled.saturated or 0.0),
+                settled.power,
+            )
+
+    def _saturated(self) -> float | None:
+        """The share of saturated pixels now; None where no frames come."""
+        shares: list[float] = []
+        for index in range(UNDER_WAY + LOOKED_AT):
+            found = self._session.look(LOOK_TIMEOUT_S) if self._session else None
+            if found is None:
+                return None
+            shares += [saturated_share(found.ir)] if index >= UNDER_WAY else []
+        return sum(shares) / len(shares)
+
+    def _is_connected(self) -> bool:
+        return self._reconnect() is not None
+
+    def _reconnect(self) -> Any | None:
+        there = connected(self._sdk, self._context)
+        return next((device for device, info in there if info.serial == self._serial), None)
+
+    def _reset(self) -> None:
+        self._device.hardware_reset()
 
     def _begin(self, inbox: Inbox) -> None:
         """It runs already."""

@@ -2,17 +2,30 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.camera.inbox import Inbox
-from nlos_cam.camera.streams import FRAMES_PER_S, FrameSet, intrinsics_of, is_needed, sample_from_sdk, stream_name
+from nlos_cam.camera.si_units import frame_in_si
+from nlos_cam.camera.streams import (
+    FRAMES_PER_S,
+    FrameSet,
+    Sample,
+    intrinsics_of,
+    is_needed,
+    sample_from_sdk,
+    stream_name,
+)
+from nlos_cam.camera.unwrap import ClockUnwrap
 from nlos_cam.frames import Float32, Frame
 
 Size = tuple[int, int]
 """Width and height in pixels."""
+NOT_YET = -9999.0
+"""A temperature that the firmware has not measured yet: the photodiode's, until 5 s after the start."""
+BOUNDARY_WAIT_S = 0.2
 
 
 def find_streams(device: Any, size: Size | None = None) -> tuple[Any, dict[str, Any]]:
@@ -31,14 +44,14 @@ def _has(profile: Any, size: Size) -> bool:
 
 
 def read_settings(sensor: Any) -> dict[str, float]:
-    """Every option that the sensor lets be read, by the SDK's name."""
+    """Every option that the sensor lets be read, by the SDK's name; empty when it is gone."""
     settings: dict[str, float] = {}
     for option in sensor.get_supported_options():
         try:
             settings[option.name] = float(sensor.get_option(option))
         except RuntimeError:  # listed, but not readable in this state
             continue
-    return settings
+    return {name: value for name, value in settings.items() if value != NOT_YET}
 
 
 def _depth_unit_m(sensor: Any) -> float:
@@ -55,31 +68,66 @@ class Session:
         self.inbox = inbox
         self.settings: dict[str, float] = {}
         self.intrinsics: Intrinsics = intrinsics_of(profiles["depth"])
+        inbox.expect((self.intrinsics.height, self.intrinsics.width))
         self._sensor: Any = sensor
         self._profiles = list(profiles.values())
-        self._unit_m = np.float32(_depth_unit_m(sensor))
+        self._unit_m = _depth_unit_m(sensor)
+        self._clocks = {stream: ClockUnwrap() for stream in profiles}
+        self._preview = Inbox(lossless=False)
+        """Of frames from before the settings hold."""
         self._listening = False
 
-    def start(self, prepare: Callable[[Any], None] | None = None) -> None:
-        """Let frames come, once `prepare` has had the running sensor."""
+    def start(self, prepare: Callable[[Any], None] | None = None, ready: Callable[[], None] | None = None) -> None:
+        """Let frames come, once `prepare` has had the running sensor; from `ready` on, none is lost.
+
+        Raises RuntimeError when the device vanishes meanwhile.
+        """
         self._sensor.open(self._profiles)
         self._listening = prepare is None  # a recording's first frame comes while `start` still runs
         self._sensor.start(self._on_frame)
         if prepare:
             prepare(self._sensor)
         self.settings = read_settings(self._sensor)
+        if not self.settings:
+            raise RuntimeError("it vanished while it was set up")
+        if self._preview.arrived:
+            self.look(BOUNDARY_WAIT_S)  # else the first set would lack what came before this
+        if ready:
+            ready()
         self._listening = True
+        self._preview.close()
+
+    def look(self, timeout_s: float) -> FrameSet | None:
+        """While the sensor is prepared, the next set that comes; None when none does, or `end_wait` was called."""
+        while self._preview.take(0.0):
+            pass
+        return self._preview.take(timeout_s)
+
+    def end_wait(self) -> None:
+        """Let go of whoever looks, from any thread."""
+        self._preview.close()
 
     def _on_frame(self, frame: Any) -> None:
-        if self._listening:
-            self.inbox.put(sample_from_sdk(frame))
+        inbox = self.inbox if self._listening else self._preview
+        inbox.put(self._unwrapped(sample_from_sdk(frame), frame.get_frame_timestamp_domain().name))
+
+    def _unwrapped(self, sample: Sample, domain: str) -> Sample:
+        """A sample on a clock that goes on: the device's own wraps every 71.6 minutes, for each stream by itself."""
+        if domain != "hardware_clock":
+            return sample
+        return replace(sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s))
 
     def telemetry(self) -> dict[str, float]:
-        """The options as they read now."""
-        return read_settings(self._sensor)
+        """The options as they read now; empty when the device is gone, or the session has stopped."""
+        sensor = self._sensor
+        try:
+            return read_settings(sensor) if sensor else {}
+        except RuntimeError:
+            return {}
 
     def stop(self) -> None:
         """Stop and close the sensor, and let go of it."""
+        self.end_wait()
         self.inbox.close()  # first: the SDK waits for its callbacks, and a callback may wait for room
         for end in (self._sensor.stop, self._sensor.close):
             with suppress(RuntimeError):  # a device that vanished, or never started, is stopped already
@@ -89,15 +137,4 @@ class Session:
 
     def frame(self, found: FrameSet, truth_depth_m: Float32 | None = None) -> Frame:
         """A set in SI units."""
-        depth_m = found.depth_z16 * self._unit_m
-        depth_m[found.depth_z16 == 0] = np.nan
-        return Frame(
-            depth_m=depth_m,
-            ir=found.ir,
-            confidence=found.confidence_raw8 >> np.uint8(4),
-            timestamp_s=found.timestamp_s,
-            frame_number=found.number,
-            intrinsics=self.intrinsics,
-            settings=self.settings,
-            truth_depth_m=truth_depth_m,
-        )
+        return frame_in_si(found, self._unit_m, self.intrinsics, self.settings, truth_depth_m)

@@ -1,11 +1,13 @@
 """The simulated L515: a rendered world with a thin device in front of it."""
 
+from collections.abc import Sequence
 from threading import Event, Thread
-from typing import Any
+from typing import Any, Self
 
 from nlos_calibration.rig import Rig
 
 from nlos_cam.camera.clock import Clock, WallClock
+from nlos_cam.camera.faults import Delivery, FaultyDevice
 from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.live_camera import LiveCamera
 from nlos_cam.camera.record import Recording
@@ -15,18 +17,24 @@ from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.camera.world import World
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Float32
+from nlos_cam.render.fault_record import Fault
 
 MOST_LATE = FRAMES_PER_S
 """Frames that a world may deliver late, when the machine is busy; beyond that it drops numbers."""
 JOIN_TIMEOUT_S = 5.0
+RESET_INSTANTS = FRAMES_PER_S
+"""How long a device that is reset is gone."""
+REMEMBERED = 1000
+"""Frames of which the instant is known, for their truth; a reader is never as late as that."""
 
 
 class SimulatedCamera(LiveCamera):
-    """A world seen through librealsense's software device, 30 frames/s.
+    """A world seen through librealsense's software device, 30 frames/s, with the `faults` that it is given.
 
-    The device does not model: start-up and warm-up, options (depth units apart) and presets, other resolutions, the
-    colour camera and the motion sensors, per-frame metadata, clock drift and jitter, USB errors and lost frames. The
-    world's docstrings say what the images do not model.
+    The world begins when the camera is entered, and goes on whatever befalls the device. The device does not model:
+    start-up and warm-up, options (depth units apart) and presets, other resolutions, the colour camera and the motion
+    sensors, per-frame metadata, clock drift and jitter, and no fault that it is not given. The world's docstrings say
+    what the images do not model.
     """
 
     def __init__(
@@ -36,22 +44,38 @@ class SimulatedCamera(LiveCamera):
         *,
         clock: Clock | None = None,
         recording: Recording | None = None,
+        faults: Sequence[Fault] = (),
     ) -> None:
-        self._world, self._clock = world, clock or WallClock()
+        self._world, self._clock, self._faults = world, clock or WallClock(), tuple(faults)
         world.images(0)  # compiles, which would make the first frames late
         self._stopping = Event()
         self._thread: Thread | None = None
-        pinhole, sdk = world.rig.pinhole, load_sdk()
-        self._lidar = SoftwareLidar(pinhole, sdk)
-        super().__init__(uri, self._lidar.device, (pinhole.width, pinhole.height), sdk, recording)
+        self._start_s: float | None = None
+        self._plug_in(0)
+        pinhole = world.rig.pinhole
+        super().__init__(uri, self._lidar.device, (pinhole.width, pinhole.height), load_sdk(), recording, self._clock)
         self.rig: Rig | None = world.rig
+
+    def __enter__(self) -> Self:
+        self._start_s = None
+        self._plug_in(0)
+        self._device = self._lidar.device
+        return super().__enter__()
+
+    def _plug_in(self, instant: int) -> None:
+        self._model = model = FaultyDevice(self._faults, instant)
+        self._instants: dict[int, int] = {}
+        pinhole, other_size, own_clock = self._world.rig.pinhole, model.has_other_size, model.has_own_clock
+        self._lidar = SoftwareLidar(pinhole, load_sdk(), has_other_size=other_size, has_own_clock=own_clock)
 
     def _prepare(self, sensor: Any) -> None:
         """Nothing to set."""
 
     def _begin(self, inbox: Inbox) -> None:
+        first = self._instant() + 1 if self._start_s is not None else 0
+        self._start_s = self._clock.now() if self._start_s is None else self._start_s
         self._stopping.clear()
-        self._thread = Thread(target=self._run, args=(inbox,), name=f"world of {self.uri}", daemon=True)
+        self._thread = Thread(target=self._run, args=(inbox, first), name=f"world of {self.uri}", daemon=True)
         self._thread.start()
 
     def _end(self) -> None:
@@ -63,22 +87,48 @@ class SimulatedCamera(LiveCamera):
             raise CameraLostError(f"{self.uri} did not stop within {JOIN_TIMEOUT_S:.0f} s")
         self._thread = None
 
-    def _truth_depth_m(self, number: int) -> Float32 | None:
-        return self._world.truth_depth_m(number)
+    def _instant(self) -> int:
+        """The world's instant that is now."""
+        return int((self._clock.now() - self._start_s) * FRAMES_PER_S) if self._start_s is not None else 0
 
-    def _run(self, inbox: Inbox) -> None:
+    def _is_connected(self) -> bool:
+        return self._model.is_there(self._instant())
+
+    def _reconnect(self) -> Any | None:
+        instant = self._instant()
+        if not self._model.is_there(instant):
+            if self._model.is_gone(instant):
+                return None
+            self._plug_in(instant)
+        return self._lidar.device
+
+    def _reset(self) -> None:
+        self._model.unplug(self._instant(), RESET_INSTANTS)
+
+    def _truth_depth_m(self, number: int) -> Float32 | None:
+        instant = self._instants.get(number)
+        return None if instant is None else self._world.truth_depth_m(instant)
+
+    def _run(self, inbox: Inbox, first: int) -> None:
         try:
-            self._deliver()
+            self._deliver(first)
         except Exception as error:  # noqa: BLE001  whatever it is, it is for the consumer's thread
             inbox.fail(error)
 
-    def _deliver(self) -> None:
-        """Expose each frame ahead, and push it when it is due."""
-        number, start_s = 0, self._clock.now()
+    def _deliver(self, instant: int) -> None:
+        """Expose each instant ahead, and hand over what the device makes of it when it is due."""
+        start_s = self._start_s or 0.0
         while True:
-            images, due_s = self._world.images(number), start_s + number / FRAMES_PER_S
+            images, due_s = self._world.images(instant), start_s + instant / FRAMES_PER_S
             if self._clock.wait(self._stopping, due_s - self._clock.now()):
                 return
-            self._lidar.push(number, due_s, images)
-            late = int((self._clock.now() - start_s) * FRAMES_PER_S) - number
-            number += max(1, late - MOST_LATE)
+            for delivery in self._model.hand_over(instant, due_s, images):
+                self._push(delivery)
+            late = int((self._clock.now() - start_s) * FRAMES_PER_S) - instant
+            instant += max(1, late - MOST_LATE)
+
+    def _push(self, delivery: Delivery) -> None:
+        self._instants[delivery.number] = delivery.instant
+        if len(self._instants) > REMEMBERED:
+            del self._instants[next(iter(self._instants))]
+        self._lidar.push(delivery.number, delivery.timestamp_s, delivery.images, delivery.streams)

@@ -1,5 +1,6 @@
 """A lidar that librealsense takes for a device, and that delivers what is pushed into it."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -15,29 +16,42 @@ BYTES_PER_PIXEL = {"depth": 2, "infrared": 1, "confidence": 1}
 
 
 class SoftwareLidar:
-    """An `rs.software_device` with the L515's depth sensor: same sensor name, streams, formats and depth unit."""
+    """An `rs.software_device` with the L515's depth sensor: same sensor name, streams, formats and depth unit.
 
-    def __init__(self, intrinsics: Intrinsics, sdk: Any) -> None:
-        self._sdk, self._intrinsics = sdk, intrinsics
+    It streams at one size; one that `has_other_size` can also be made to deliver frames of half the rows and columns.
+    Its timestamps are the host's time, unless it `has_own_clock`.
+    """
+
+    def __init__(
+        self, intrinsics: Intrinsics, sdk: Any, *, has_other_size: bool = False, has_own_clock: bool = False
+    ) -> None:
+        self._sdk = sdk
+        domains = sdk.timestamp_domain
+        self._domain = domains.hardware_clock if has_own_clock else domains.global_time
         self.device: Any = sdk.software_device()
         self.device.update_info(sdk.camera_info.name, NAME)
         self.device.register_info(sdk.camera_info.serial_number, SERIAL)
         self.device.register_info(sdk.camera_info.product_line, "L500")
         self._sensor: Any = self.device.add_sensor(SENSOR_NAME)
         self._sensor.add_read_only_option(sdk.option.depth_units, DEPTH_UNIT_M)
-        self._profiles = {stream: self._add(stream, uid) for uid, stream in enumerate(FORMATS)}
+        sizes = [intrinsics, intrinsics.scaled(intrinsics.width // 2, intrinsics.height // 2)]
+        self._profiles: dict[tuple[str, tuple[int, ...]], Any] = {}
+        for size in sizes if has_other_size else sizes[:1]:
+            for stream in FORMATS:
+                self._profiles[stream, (size.height, size.width)] = self._add(stream, size)
         self._register_extrinsics()
 
-    def _add(self, stream: str, uid: int) -> Any:
+    def _add(self, stream: str, size: Intrinsics) -> Any:
         made = self._sdk.video_stream()
-        made.type, made.index, made.uid = getattr(self._sdk.stream, stream), 0, uid
-        made.width, made.height, made.fps = self._intrinsics.width, self._intrinsics.height, FRAMES_PER_S
+        made.type, made.index, made.uid = getattr(self._sdk.stream, stream), 0, len(self._profiles)
+        made.width, made.height, made.fps = size.width, size.height, FRAMES_PER_S
         made.bpp, made.fmt = BYTES_PER_PIXEL[stream], getattr(self._sdk.format, FORMATS[stream])
-        made.intrinsics = self._sdk_intrinsics()
-        return self._sdk.video_stream_profile(self._sensor.add_video_stream(made, True))
+        made.intrinsics = self._sdk_intrinsics(size)
+        is_default = made.uid < len(FORMATS)
+        return self._sdk.video_stream_profile(self._sensor.add_video_stream(made, is_default))
 
-    def _sdk_intrinsics(self) -> Any:
-        made, mine = self._sdk.intrinsics(), self._intrinsics
+    def _sdk_intrinsics(self, mine: Intrinsics) -> Any:
+        made = self._sdk.intrinsics()
         made.width, made.height = mine.width, mine.height
         made.fx, made.fy, made.ppx, made.ppy = mine.fx, mine.fy, mine.ppx, mine.ppy
         made.model, made.coeffs = self._sdk.distortion.none, [0.0] * 5
@@ -52,16 +66,19 @@ class SoftwareLidar:
                 if one is not other:
                     one.register_extrinsics_to(other, same)
 
-    def push(self, number: int, timestamp_s: float, images: SensedImages) -> None:
-        """Deliver one instant on all three streams; only while the sensor streams."""
+    def push(
+        self, number: int, timestamp_s: float, images: SensedImages, streams: Collection[str] = tuple(FORMATS)
+    ) -> None:
+        """Deliver one instant on its streams, at the size of its images; only while the sensor streams."""
         pixels = {"depth": images.depth_z16, "infrared": images.ir, "confidence": images.confidence << 4}
-        for stream in self._profiles:
-            self._push(stream, number, timestamp_s, pixels[stream])
+        for (stream, shape), profile in self._profiles.items():
+            if stream in streams and shape == images.ir.shape:
+                self._push(profile, stream, number, timestamp_s, pixels[stream])
 
-    def _push(self, stream: str, number: int, timestamp_s: float, pixels: NDArray[Any]) -> None:
+    def _push(self, profile: Any, stream: str, number: int, timestamp_s: float, pixels: NDArray[Any]) -> None:
         frame = self._sdk.software_video_frame()  # a new one each time: a pushed frame belongs to the SDK
         frame.pixels, frame.bpp = np.ascontiguousarray(pixels), BYTES_PER_PIXEL[stream]
-        frame.stride = self._intrinsics.width * BYTES_PER_PIXEL[stream]
+        frame.stride = pixels.shape[1] * BYTES_PER_PIXEL[stream]
         frame.timestamp, frame.frame_number = timestamp_s * 1e3, number
-        frame.domain, frame.profile = self._sdk.timestamp_domain.global_time, self._profiles[stream]
+        frame.domain, frame.profile = self._domain, profile  # of its size: the SDK reads as many pixels as that says
         self._sensor.on_video_frame(frame)

@@ -1,5 +1,7 @@
 """The streams that a lidar delivers through librealsense, and how three single frames become one set."""
 
+from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +15,13 @@ FRAMES_PER_S = 30
 SAME_INSTANT_S = 0.5 / FRAMES_PER_S
 """Frames of one number whose timestamps differ by more were not taken together."""
 WAITING_SETS = 30
-"""Numbers that may wait for a stream; the oldest beyond that is given up."""
+"""Numbers that may wait for a stream; beyond that, the one that waited longest is given up."""
+LATE_NUMBERS = 30
+"""A number this little behind the last one decided is late; one further back is of a count that began anew."""
+MOST_GAP = 300 * FRAMES_PER_S
+"""Numbers between two sets that are taken as dropped (5 minutes' worth); beyond a wider gap the count began anew."""
+STALL_S = 5 / FRAMES_PER_S
+"""Two sets that are further apart in time than their numbers say, by more than this, were held up."""
 
 
 @dataclass(frozen=True)
@@ -60,51 +68,127 @@ def intrinsics_of(profile: Any) -> Intrinsics:
     return Intrinsics(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy)
 
 
-class Pairing:
-    """Pairs samples by frame number and timestamp, and counts the numbers that did not become a set."""
+class Occurrences:
+    """Counts by name, in frames: what befalls two or three streams of one frame is one occurrence."""
 
     def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._streams: dict[tuple[str, int], Counter[str]] = {}
+
+    def note(self, name: str, sample: Sample) -> None:
+        """Count, unless the frame's other streams made it count as often already."""
+        streams = self._streams.setdefault((name, sample.number), Counter())
+        most = max(streams.values(), default=0)
+        streams[sample.stream] += 1
+        if streams[sample.stream] > most:
+            self.counts[name] += 1
+        if len(self._streams) > WAITING_SETS:
+            del self._streams[next(iter(self._streams))]
+
+
+class Pairing:
+    """Makes sets of samples with one number and instant, each once and in order, and counts what did not become one.
+
+    Every number is decided once, in order: a set, incomplete, or dropped. A set decides all numbers before it, since
+    streams come in order. Memory is bounded whatever comes. Samples must have `shape` (rows, columns), where given.
+    """
+
+    def __init__(self, shape: tuple[int, int] | None = None) -> None:
+        self.shape = shape
         self.incomplete = 0
-        """Numbers of which some stream came, and some did not or was of another instant."""
+        """Numbers of which something came, but not all streams, or not of one instant, or not of the shape."""
         self.dropped = 0
-        """Numbers of which nothing came, between two sets."""
+        """Numbers of which nothing came, after the first that was decided."""
+        self._occurrences = Occurrences()
         self._waiting: dict[int, dict[str, Sample]] = {}
-        self._last: int | None = None
-        self._incomplete_since_last = 0
+        self._decided: int | None = None
+        """The highest number that is."""
+        self._sets: deque[int] = deque(maxlen=LATE_NUMBERS + 1)
+        """The last numbers that became sets."""
+        self._zero_s: float | None = None
+        """Of the last set: its time, less what its number stands for."""
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What else was seen, by name.
+
+        duplicate: it came again. out_of_order: it came after its number was decided as incomplete or dropped.
+        wrong_size: another shape. stalled: nothing came for a while, though no number is missing. renumbered: the
+        device began to count anew. stray: no set, and far from all other numbers, so that it is not `incomplete`.
+        """
+        return self._occurrences.counts
 
     def add(self, sample: Sample) -> FrameSet | None:
-        """Take a sample; the set that it completes, if it does. A number that was passed over stays so."""
-        if self._last is not None and sample.number <= self._last:
+        """Take a sample; the set that it completes, if it does."""
+        number = sample.number
+        if self._decided is not None and self._decided - LATE_NUMBERS <= number <= self._decided:
+            self._occurrences.note("duplicate" if number in self._sets else "out_of_order", sample)
             return None
-        samples = self._waiting.setdefault(sample.number, {})
-        samples[sample.stream] = sample
+        samples = self._waiting.setdefault(number, {})
+        if self.shape not in {None, sample.pixels.shape}:
+            self._occurrences.note("wrong_size", sample)
+        elif sample.stream in samples:
+            self._occurrences.note("duplicate", sample)
+        else:
+            samples[sample.stream] = sample
         if len(samples) == len(FORMATS):
-            return self._complete(sample.number)
+            return self._complete(number)
         if len(self._waiting) > WAITING_SETS:
-            self._give_up([min(self._waiting)])
+            self._give_up(next(iter(self._waiting)))
         return None
 
     def finish(self) -> None:
         """Give up whatever still waits: no more samples will come."""
-        self._give_up(list(self._waiting))
+        for number in sorted(self._waiting):
+            self._give_up(number)
 
     def _complete(self, number: int) -> FrameSet | None:
-        """Streams come in order, so whatever is older than a complete set will never be one."""
-        samples = self._waiting[number]
+        samples = self._waiting.pop(number)
+        self._decide(number)
         times = [sample.timestamp_s for sample in samples.values()]
         if max(times) - min(times) > SAME_INSTANT_S:
-            self._give_up([waiting for waiting in self._waiting if waiting <= number])
+            self.incomplete += 1
             return None
-        del self._waiting[number]
-        self._give_up([waiting for waiting in self._waiting if waiting < number])
-        if self._last is not None:
-            self.dropped += number - self._last - 1 - self._incomplete_since_last
-        self._last, self._incomplete_since_last = number, 0
         depth, ir, confidence = (samples[stream] for stream in FORMATS)
+        self._sets.append(number)
+        self._note_stall(number, depth.timestamp_s)
         return FrameSet(number, depth.timestamp_s, depth.pixels, ir.pixels, confidence.pixels)
 
-    def _give_up(self, numbers: list[int]) -> None:
+    def _decide(self, number: int) -> None:
+        """Decide every number before this one."""
+        before, self._decided = self._decided, number
+        if before is None:
+            self._pass_over(lambda waiting: waiting < number)
+        elif before < number <= before + MOST_GAP:
+            incomplete = self._pass_over(lambda waiting: before < waiting < number)
+            self.dropped += number - before - 1 - incomplete
+        else:
+            self._occurrences.counts["renumbered"] += 1
+            self._sets.clear()
+            self._zero_s = None
+            self._pass_over(lambda waiting: not number < waiting <= number + WAITING_SETS)
+
+    def _pass_over(self, chosen: Callable[[int], bool]) -> int:
+        """Count waiting numbers as incomplete; how many they are."""
+        numbers = [number for number in self._waiting if chosen(number)]
         for number in numbers:
             del self._waiting[number]
         self.incomplete += len(numbers)
-        self._incomplete_since_last += len(numbers)
+        return len(numbers)
+
+    def _give_up(self, number: int) -> None:
+        """Decide a number that waited in vain, if it is the next one that can be; else forget it."""
+        after = self._decided
+        ahead = [waiting for waiting in self._waiting if after is None or after < waiting <= after + MOST_GAP]
+        del self._waiting[number]
+        if ahead and number == min(ahead):
+            self._decide(number)
+            self.incomplete += 1
+        else:
+            self._occurrences.counts["stray"] += 1
+
+    def _note_stall(self, number: int, timestamp_s: float) -> None:
+        zero_s = timestamp_s - number / FRAMES_PER_S
+        if self._zero_s is not None and zero_s - self._zero_s > STALL_S:
+            self._occurrences.counts["stalled"] += 1
+        self._zero_s = zero_s

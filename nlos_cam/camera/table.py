@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from nlos_cam.camera.base import Camera
 from nlos_cam.errors import CameraNotFoundError, NlosCamError
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 OnProgress = Callable[[int, int], None]
 """Called with poses rendered and poses in all, while a simulated world is rendered ahead."""
 
+Reader = Literal["plain", "sdk"]
+
 SIMULATED = {
     "sim": "simulated: the paper's rig with a moving hidden object",
     "sim:bare-wall": "simulated: the same wall with nothing hidden",
@@ -21,14 +23,21 @@ SIMULATED = {
 NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or bag:FILE.bag"
 
 
-def open_camera(uri: str, *, on_progress: OnProgress | None = None, recording: "Recording | None" = None) -> Camera:
+def open_camera(
+    uri: str,
+    *,
+    on_progress: OnProgress | None = None,
+    recording: "Recording | None" = None,
+    reader: Reader = "plain",
+) -> Camera:
     """The camera of that name, found and checked but not started; a live one is recorded if asked for.
 
-    Raises CameraNotFoundError, RecordingError, SceneError; NlosCamError for a recording of a recording.
+    `reader` says who reads a recording: we ourselves, or librealsense. Raises CameraNotFoundError, RecordingError,
+    SceneError; NlosCamError for a recording of a recording.
     """
     scheme, _, rest = uri.partition(":")
     if scheme == "bag" and rest:
-        return _replay(uri, Path(rest), recording)
+        return _replay(uri, Path(rest), recording, reader)
     if scheme == "sim":
         return _simulated(uri, rest, on_progress, recording)
     if scheme == "l515":
@@ -36,11 +45,15 @@ def open_camera(uri: str, *, on_progress: OnProgress | None = None, recording: "
     raise CameraNotFoundError(f"no camera is called {uri!r}: use {NAMES}")
 
 
-def _replay(uri: str, path: Path, recording: "Recording | None") -> Camera:
-    from nlos_cam.camera.replay import ReplayCamera
-
+def _replay(uri: str, path: Path, recording: "Recording | None", reader: Reader) -> Camera:
     if recording:
         raise NlosCamError(f"{uri} is a recording already: copy the file, or give a live camera (l515, sim)")
+    if reader == "sdk":
+        from nlos_cam.camera.replay_sdk import SdkReplayCamera
+
+        return SdkReplayCamera(path)
+    from nlos_cam.camera.replay import ReplayCamera
+
     return ReplayCamera(path)
 
 
@@ -48,7 +61,8 @@ def _simulated(uri: str, name: str, on_progress: OnProgress | None, recording: "
     from nlos_cam.camera.simulated import SimulatedCamera
     from nlos_cam.camera.world import open_world
 
-    return SimulatedCamera(uri, open_world(name, on_progress), recording=recording)
+    world = open_world(name, on_progress)
+    return SimulatedCamera(uri, world, recording=recording, faults=world.scene.faults)
 
 
 def _l515(uri: str, serial: str, recording: "Recording | None") -> Camera:

@@ -1,26 +1,50 @@
-"""`nlos-cam capture`: record a live camera, and read the recording back."""
+"""`nlos-cam capture`: record a live camera, in one take or several, and read each recording back."""
 
-import json as json_module
+import sys
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Annotated
 
 import typer
 from rich.markup import escape
-from rich.progress import Progress, TaskID
+from rich.progress import Progress
 
 from nlos_cam.camera import Camera, Recording, open_camera
+from nlos_cam.camera.disk import check_room, free_bytes, recording_s
 from nlos_cam.camera.replay import Verified, verify
+from nlos_cam.camera.sidecar import sidecar_path, wall_of
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stop_on_signals
-from nlos_cam.errors import RecordingError
+from nlos_cam.camera.takes import Job, Take, Takes, settle
+from nlos_cam.cli.capture_told import ending, result, told
+from nlos_cam.cli.common import (
+    Json,
+    Overwrite,
+    finish,
+    interrupted_by_signals,
+    output_path,
+    progress,
+    say,
+    stop_on_signals,
+    tracked,
+)
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:bare-wall or sim:SCENE.toml.")]
 Seconds = Annotated[float | None, typer.Option("--seconds", min=1 / FRAMES_PER_S, help="Stop after so long.")]
 Frames = Annotated[int | None, typer.Option("--frames", min=1, help="Stop after so many frames.")]
-Label = Annotated[str | None, typer.Option("--label", help="A name for what is seen, kept in F.json beside F.bag.")]
-Out = Annotated[Path | None, typer.Option("--out", help="The recording to write (.bag).")]
+TakeCount = Annotated[int, typer.Option("--takes", min=1, max=9999, help="So many in a row: F-01.bag, F-02.bag, ...")]
+Pause = Annotated[
+    float | None,
+    typer.Option("--pause-s", min=0.0, help="Seconds between takes; else Enter begins the next, on a terminal."),
+]
+Labels = Annotated[
+    list[str] | None,
+    typer.Option("--label", help="A name for what is seen, kept in F.json beside F.bag; with --takes one, or each."),
+]
+Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it, for F.json.")]
 INTERRUPTED = 130
+Out = Annotated[Path | None, typer.Option("--out", help="The recording to write (.bag).")]
 
 
 def register(app: typer.Typer) -> None:
@@ -32,84 +56,111 @@ def capture(
     camera: CameraUri,
     seconds: Seconds = None,
     frames: Frames = None,
-    label: Label = None,
+    takes: TakeCount = 1,
+    pause_s: Pause = None,
+    label: Labels = None,
+    wall: Wall = None,
     out: Out = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Record depth, infrared and confidence to .bag until --seconds, --frames or Ctrl-C, and verify the file."""
-    path = _checked(seconds, frames, out, overwrite=overwrite)
-    note = _checked_note(path, label, overwrite=overwrite)
-    recording = Recording(path, frames=frames, seconds=seconds)
-    total = frames or (round(seconds * FRAMES_PER_S) if seconds else None)
-    with progress() as bar:
-        interrupted = _record(camera, recording, bar, total)
-    found = _verified(recording)
-    result = {"frames": found.frames, "dropped": found.dropped, "seconds": round(found.seconds, 3), "out": str(path)}
-    _write_note(note, camera, label, overwrite=overwrite)
-    if label is not None:
-        result["label"] = label
-    finish(result, as_json=json, text=_told(found, path))
+    """Record depth, infrared and confidence to .bag until --seconds, --frames or Ctrl-C, and verify each file."""
+    jobs = _jobs(_base(seconds, frames, takes, out), takes, label or [], overwrite=overwrite)
+    measured = wall_of(wall) if wall else None
+    recording = Recording(jobs[0].path, frames=frames, seconds=seconds, last=takes == 1)
+    with interrupted_by_signals(), tracked("rendering the world ahead") as on_progress:
+        source = open_camera(camera, on_progress=on_progress, recording=recording)
+    each = frames or (round(seconds * FRAMES_PER_S) if seconds else None)
+    _check_disk(source, jobs, each)
+    with stop_on_signals() as stop:
+        made = _make(Takes(source, recording, jobs, wall=measured), stop, each, pause_s)
+        interrupted = stop.is_set() or made[-1].state == "interrupted"
+    finish(result(made, several=takes > 1), as_json=json, text=escape("\n".join(map(told, made))))
+    if failure := ending(made[-1]):
+        say(f"[bold red]error:[/] {escape(str(failure))}")
+        raise typer.Exit(failure.exit_code)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
 
 
-def _checked(seconds: float | None, frames: int | None, out: Path | None, *, overwrite: bool) -> Path:
-    """The path to write. Raises typer.BadParameter for arguments that contradict each other."""
+def _base(seconds: float | None, frames: int | None, takes: int, out: Path | None) -> Path:
+    """The name that takes are numbered after. Raises typer.BadParameter for arguments that contradict each other."""
     if seconds is not None and frames is not None:
         raise typer.BadParameter("give one of --seconds and --frames")
+    if takes > 1 and seconds is None and frames is None:
+        raise typer.BadParameter(f"--takes {takes}: say how long each is, with --seconds or --frames")
     if out is not None and out.suffix != ".bag":
         raise typer.BadParameter(f"--out {out}: a recording's name ends in .bag")
-    return output_path(out, "capture", ".bag", overwrite=overwrite)
+    return out or output_path(None, "capture", ".bag", overwrite=False)
 
 
-def _checked_note(path: Path, label: str | None, *, overwrite: bool) -> Path:
-    """The file beside the recording that keeps the label: the SDK's recorder has no place for it."""
-    note = path.with_suffix(".json")
-    return note if label is None else output_path(note, "", "", overwrite=overwrite)
+def _jobs(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> list[Job]:
+    """What is to be recorded where. Raises OutputExistsError where that would replace something unasked."""
+    if len(labels) not in {0, 1, takes}:
+        raise typer.BadParameter(f"{len(labels)} --label for {takes} takes: give one for all, or one for each")
+    digits = max(2, len(str(takes)))
+    paths = [base.with_stem(f"{base.stem}-{number:0{digits}}") for number in range(1, takes + 1)]
+    jobs = list(
+        map(Job, paths if takes > 1 else [base], labels * takes if len(labels) == 1 else labels or [None] * takes)
+    )
+    for job in jobs:
+        for path in (job.path, sidecar_path(job.path)):
+            output_path(path, "", path.suffix, overwrite=overwrite)
+    return jobs
 
 
-def _write_note(note: Path, camera: str, label: str | None, *, overwrite: bool) -> None:
-    if label is not None:
-        note.write_text(json_module.dumps({"label": label, "camera": camera}) + "\n", encoding="utf-8")
-    elif overwrite:  # the label of the recording that was replaced
-        note.unlink(missing_ok=True)
+def _check_disk(camera: Camera, jobs: list[Job], each: int | None) -> None:
+    """Raises DiskFullError where they may not fit; says how long there is room where no limit was given."""
+    path, free = jobs[0].path, free_bytes(jobs[0].path)
+    check_room(path, camera.intrinsics, (each or 0) * len(jobs), free)
+    if each is None:
+        minutes = recording_s(camera.intrinsics, free) / 60
+        say(f"there is room for {minutes:.1f} minutes or more ({free / 1e9:.1f} GB free); Ctrl-C ends it")
 
 
-def _record(uri: str, recording: Recording, bar: Progress, total: int | None) -> bool:
-    """Record until it is full; True if Ctrl-C came first."""
-    rendering = bar.add_task("rendering the world ahead", visible=False)
-
-    def on_progress(done: int, of: int) -> None:
-        bar.update(rendering, completed=done, total=of, visible=done < of)
-
-    source = open_camera(uri, on_progress=on_progress, recording=recording)
-    task = bar.add_task(f"recording {escape(uri)}", total=total)
-    with stop_on_signals() as stop, source:
-        return _watch(source, bar, task, stop)
-
-
-def _watch(source: Camera, bar: Progress, task: TaskID, stop: Event) -> bool:
-    for _ in source:
-        bar.advance(task)
-        if stop.is_set():
-            return True
-    return False
-
-
-def _verified(recording: Recording) -> Verified:
-    """What the closed file holds. Raises RecordingError where that is less than what was seen to pass."""
-    found = verify(recording.path)
-    if found.frames < recording.sets:
-        raise RecordingError(
-            f"{recording.path} holds {found.frames} of the {recording.sets} frames that came: check the disk's free "
-            "space and speed, and record again"
-        )
-    if found.dropped:
-        say(f"[yellow]{found.dropped} frames never came:[/] the recording has gaps")
-    return found
+def _make(takes: Takes, stop: Event, each: int | None, pause_s: float | None) -> list[Take]:
+    """Record the takes, one after another, and read each back."""
+    made: list[Take] = []
+    with progress() as bar:
+        task = bar.add_task("recording", total=each)
+        with closing(takes.record(stop, lambda sets: bar.update(task, completed=sets))) as recorded:
+            for take in recorded:
+                made.append(settle(take, partial(_read_back, bar, take.sets)))
+                if dropped := made[-1].summary.dropped:
+                    say(f"[yellow]{dropped} frames never came:[/] the recording has gaps")
+                if made[-1].state != "complete" or stop.is_set():
+                    break
+                if left := len(takes.jobs) - len(made):
+                    _pause(bar, stop, pause_s, f"{told(made[-1])}\n{left} more to take")
+                    bar.reset(task)
+                if stop.is_set():
+                    break
+    return made
 
 
-def _told(found: Verified, path: Path) -> str:
-    size_mb = path.stat().st_size / 1e6
-    return f"{found.frames} frames, {found.seconds:.1f} s, {size_mb:.0f} MB, read back whole\nwrote {escape(str(path))}"
+def _read_back(bar: Progress, sets: int, path: Path) -> Verified | None:
+    """What the closed file holds; None if Ctrl-C came first."""
+    task = bar.add_task("reading it back", total=sets)
+    try:
+        with interrupted_by_signals():
+            return verify(path, on_frame=lambda: bar.advance(task))
+    except KeyboardInterrupt:
+        return None
+    finally:
+        bar.remove_task(task)
+
+
+def _pause(bar: Progress, stop: Event, pause_s: float | None, text: str) -> None:
+    """Wait so long, or for Enter on a terminal; Ctrl-C sets `stop`."""
+    say(escape(text))
+    if pause_s is not None or not sys.stdin.isatty():
+        stop.wait(pause_s or 0.0)
+        return
+    bar.stop()
+    say("press Enter to begin the next take")
+    try:
+        with interrupted_by_signals():
+            sys.stdin.readline()
+    except KeyboardInterrupt:
+        stop.set()
+    bar.start()

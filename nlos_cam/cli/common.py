@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
 from nlos_cam.errors import OutputExistsError
 
@@ -33,6 +34,11 @@ def finish(result: dict[str, Any], *, as_json: bool, text: str) -> None:
         print(json_module.dumps(result), flush=True)  # noqa: T201  stdout is the machine's
     else:
         Console(highlight=False).print(text, soft_wrap=True)
+
+
+def show(table: Table) -> None:
+    """A table on stdout, for a person."""
+    Console(highlight=False).print(table)
 
 
 @contextmanager

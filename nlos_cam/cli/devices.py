@@ -1,13 +1,21 @@
-"""`nlos-cam devices`: which cameras there are."""
+"""`nlos-cam devices`: which cameras there are, as librealsense and as USB see them."""
 
 from dataclasses import asdict
+from typing import Any
 
 import typer
 from rich.markup import escape
+from rich.table import Table
 
 from nlos_cam.camera import SIMULATED
-from nlos_cam.camera.l515 import DeviceInfo, list_devices
-from nlos_cam.cli.common import Json, finish
+from nlos_cam.camera.l515 import DeviceInfo
+from nlos_cam.camera.usb import UsbDevice
+from nlos_cam.cli.common import Json, finish, show
+from nlos_cam.doctor import Facts, gather
+from nlos_cam.doctor.facts import Pair
+
+SEEN = {True: "yes", False: "[red]no[/]", None: ""}
+"""A camera seen, not seen, and not looked for."""
 
 
 def register(app: typer.Typer) -> None:
@@ -16,22 +24,83 @@ def register(app: typer.Typer) -> None:
 
 
 def devices(json: Json = False) -> None:
-    """List the cameras that librealsense sees, and the simulated ones that can be asked for."""
-    real = [asdict(info) | {"uri": _uri(info), "simulated": False} for info in list_devices()]
+    """List the cameras that librealsense and USB see, side by side, and the simulated ones that can be asked for."""
+    facts = gather()
+    if not json:
+        show(_table(facts))
+    finish(_result(facts), as_json=json, text=_told(facts))
+
+
+def _result(facts: Facts) -> dict[str, Any]:
+    seen = {id(pair.sdk): _usb_seen(facts, pair) for pair in facts.pairs if pair.sdk}
+    real = [
+        asdict(info) | {"uri": _uri(info), "simulated": False, "usb_seen": seen.get(id(info))}
+        for info in facts.sdk.devices
+    ]
     simulated = [
-        {"name": name, "serial": "", "firmware": "", "usb_type": "", "uri": uri, "simulated": True}
+        {"name": name, "serial": "", "firmware": "", "usb_type": "", "uri": uri, "simulated": True, "usb_seen": None}
         for uri, name in SIMULATED.items()
     ]
-    found = real + simulated
-    told = [] if real else ["librealsense sees no device; these need none:"]
-    finish({"devices": found}, as_json=json, text="\n".join(told + [_line(device) for device in found]))
+    return {
+        "devices": real + simulated,
+        "usb": [_usb(device) | {"sdk_seen": _sdk_seen(facts, device)} for device in facts.usb.devices],
+        "sdk_error": facts.sdk.error,
+        "usb_error": facts.usb.error,
+    }
 
 
-def _uri(info: DeviceInfo) -> str:
+def _usb(device: UsbDevice) -> dict[str, Any]:
+    named = ("id", "kind", "meaning", "serial", "product", "firmware", "usb_type", "link", "port", "bus", "address")
+    return {name: getattr(device, name) for name in named} | {
+        "interfaces": list(device.interfaces),
+        "error": device.error,
+    }
+
+
+def _usb_seen(facts: Facts, pair: Pair) -> bool | None:
+    return None if facts.usb.error else pair.usb is not None
+
+
+def _sdk_seen(facts: Facts, device: UsbDevice) -> bool | None:
+    """Only of the L515's family is it known which device of the SDK is which on USB."""
+    if facts.sdk.error:
+        return None
+    return next((pair.sdk is not None for pair in facts.pairs if pair.usb is device), None)
+
+
+def _uri(info: DeviceInfo | None) -> str:
     """What `--camera` takes for it; empty for a device that is no L515."""
-    return f"l515:{info.serial}" if "L515" in info.name else ""
+    return f"l515:{info.serial}" if info and "L515" in info.name else ""
 
 
-def _line(device: dict[str, str | bool]) -> str:
-    told = [f"{key} {device[key]}" for key in ("serial", "firmware", "usb_type") if device[key]]
-    return escape(f"{device['uri'] or '(not an L515)':<20} {device['name']}  {', '.join(told)}".rstrip())
+def _table(facts: Facts) -> Table:
+    table = Table("--camera", "name", "serial", "firmware", "link", "SDK", "USB", box=None, pad_edge=False)
+    for pair in facts.pairs:
+        table.add_row(*_row(facts, pair))
+    for device in facts.usb.of_kind("recovery") + facts.usb.of_kind("other"):
+        table.add_row("", escape(device.meaning), escape(device.serial), device.firmware, device.link, "", SEEN[True])
+    for info in facts.sdk.devices:
+        if info not in facts.sdk.lidars:
+            table.add_row("", *map(escape, (info.name, info.serial, info.firmware, info.usb_type)), SEEN[True], "")
+    for uri, name in SIMULATED.items():
+        table.add_row(uri, escape(name))
+    return table
+
+
+def _row(facts: Facts, pair: Pair) -> list[str]:
+    seen = SEEN[None if facts.sdk.error else pair.sdk is not None], SEEN[_usb_seen(facts, pair)]
+    return [_uri(pair.sdk), *map(escape, (pair.name, pair.serial, pair.firmware, pair.link)), *seen]
+
+
+def _told(facts: Facts) -> str:
+    """What is missing, and where to ask why."""
+    told: list[str] = []
+    if error := facts.sdk.error:
+        told.append(f"[yellow]librealsense cannot be asked:[/] {escape(error)}")
+    if facts.usb.error:
+        told.append(f"[yellow]USB cannot be looked at:[/] {escape(facts.usb.error)}")
+    if not facts.pairs:
+        told.append("no L515 is seen, neither by librealsense nor on USB; the simulated cameras need none")
+    if told or any(pair.usb is None or pair.sdk is None for pair in facts.pairs):
+        told.append("`nlos-cam doctor` says why, and what to do")
+    return "\n".join(told) or "librealsense and USB see the same"

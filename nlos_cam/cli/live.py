@@ -12,9 +12,12 @@ from nlos_models.inference import Reconstructor, load_reconstructor
 from nlos_cam.cache import cache_folder
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
+from nlos_cam.camera.table import Reader
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stop_on_signals, tracked
-from nlos_cam.live import LiveReport, run_live, warm_up
+from nlos_cam.live import run_live, warm_up
+from nlos_cam.live_report import LiveReport
 from nlos_cam.replay import REPORT, replay
+from nlos_cam.sightings import in_words
 from nlos_cam.view.viewer import NullViewer, Viewer
 
 INTERRUPTED = 130
@@ -24,6 +27,7 @@ Weights = Annotated[Path | None, typer.Option("--weights", help="A folder of oth
 Seconds = Annotated[float | None, typer.Option("--seconds", min=0.1, help="Stop after so long; else at Ctrl-C.")]
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 RecordTo = Annotated[Path | None, typer.Option("--record", help="Also record the camera's streams (F.bag).")]
+ReadBy = Annotated[Reader, typer.Option("--reader", help="Who reads the file: plain (we), or sdk (librealsense).")]
 BagFile = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording with depth, infrared and confidence.")]
 Out = Annotated[Path | None, typer.Option("--out", help="The folder to write.")]
 
@@ -46,7 +50,8 @@ def live(
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
     measured = load_wall(wall).rig if wall else None
-    recording = Recording(output_path(record, "live", ".bag", overwrite=overwrite)) if record else None
+    path = output_path(record, "live", ".bag", overwrite=overwrite) if record else None
+    recording = Recording(path, optional=True) if path else None
     with tracked("rendering the scene ahead") as on_progress:
         opened = open_camera(camera, on_progress=on_progress, recording=recording)
     rig = measured or _rig_of(opened)
@@ -58,8 +63,17 @@ def live(
             if viewer.address
             else "running without a view (Ctrl-C ends it)"
         )
-        recorded, clock = camera.startswith("bag:"), WallClock().now
-        report = run_live(source, rig, network, viewer, stop=stop, seconds=seconds, recorded=recorded, clock=clock)
+        report = run_live(
+            source,
+            rig,
+            network,
+            viewer,
+            stop=stop,
+            seconds=seconds,
+            recorded=camera.startswith("bag:"),
+            clock=WallClock().now,
+            on_error=lambda until_then: say(_told(until_then)),
+        )
     if recording:
         say(f"recorded {recording.sets} frames to {recording.path}")
     finish(asdict(report), as_json=json, text=_told(report))
@@ -72,12 +86,13 @@ def replay_bag(
     wall: Wall = None,
     out: Out = None,
     weights: Weights = None,
+    reader: ReadBy = "plain",
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Reconstruct every frame of a recording: the same frames and the same bits each time."""
     path = output_path(out, "replay", "", overwrite=overwrite)
-    measured, opened = load_wall(wall).rig if wall else None, open_camera(f"bag:{bag}")
+    measured, opened = load_wall(wall).rig if wall else None, open_camera(f"bag:{bag}", reader=reader)
     rig = measured or _rig_of(opened)
     network = _network(weights, rig)
     with opened as source, stop_on_signals() as stop, progress() as bar:
@@ -114,8 +129,9 @@ def _viewer(rig: Rig, *, no_view: bool) -> Viewer:
 def _told(report: LiveReport) -> str:
     latency, stages = report.latency_ms, report.stages_ms
     told = ", ".join(f"{name} {value:.1f}" for name, value in stages.items())
+    seen = in_words(report.counts)
     return (
         f"{report.frames} frames, {report.fps:.1f} per second, {report.dropped} dropped\n"
         f"latency  {latency['p50']:.0f} ms median, {latency['p95']:.0f} ms p95, {latency['p99']:.0f} ms p99\n"
-        f"stages   {told} (median ms)"
+        f"stages   {told} (median ms)" + (f"\nseen     {seen}" if seen else "")
     )

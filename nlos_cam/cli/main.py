@@ -8,16 +8,34 @@ import typer
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
-from nlos_cam.cli.common import stderr
+from nlos_cam.cli.common import stderr, stop_on_signals
 from nlos_cam.errors import NlosCamError
 
 INTERRUPTED = 130
-COMMAND_FILES = ("devices", "capture", "calibrate", "board", "live", "render", "tradeoff", "learn")
-"""Files of this package that hold commands; each adds its own through `register(app)`."""
+COMMANDS = {
+    "devices": "devices",
+    "doctor": "doctor",
+    "capture": "capture",
+    "repair": "recordings",
+    "export": "recordings",
+    "calibrate": "calibrate",
+    "board": "board",
+    "live": "live",
+    "replay": "live",
+    "render": "render",
+    "tradeoff": "tradeoff",
+    "dataset": "learn",
+    "train": "learn",
+    "evaluate": "learn",
+}
+"""Each command, and the file of this package that holds it, which adds its own through `register(app)`."""
 
 
-def build_app() -> typer.Typer:
-    """The command tree, from the files that hold the commands."""
+def build_app(asked: str = "") -> typer.Typer:
+    """The command tree: of the file that holds the command `asked` for, or, if there is none, of all of them.
+
+    One command need not wait for what others import.
+    """
     app = typer.Typer(
         name="nlos-cam",
         help="See around a corner with a consumer lidar.",
@@ -25,7 +43,8 @@ def build_app() -> typer.Typer:
         pretty_exceptions_enable=False,
         add_completion=False,
     )
-    for name in COMMAND_FILES:
+    app.callback()(lambda: None)  # else typer leaves out the name of an only command
+    for name in [COMMANDS[asked]] if asked in COMMANDS else dict.fromkeys(COMMANDS.values()):
         importlib.import_module(f"nlos_cam.cli.{name}").register(app)
     return app
 
@@ -33,7 +52,10 @@ def build_app() -> typer.Typer:
 def main(arguments: list[str]) -> int:
     """Run one command and return its exit code (see docs/reference: 0, 1, 2, 3, 4, 130)."""
     try:
-        return build_app()(arguments, standalone_mode=False) or 0
+        asked = next((argument for argument in arguments if not argument.startswith("-")), "")
+        with stop_on_signals() as stop:  # an interrupted import can end in any error of any library
+            app = build_app(asked)
+        return INTERRUPTED if stop.is_set() else app(arguments, standalone_mode=False) or 0
     except (typer.Abort, KeyboardInterrupt):
         return INTERRUPTED
     except typer.TyperException as error:

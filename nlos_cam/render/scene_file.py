@@ -5,18 +5,19 @@ import tomllib
 from dataclasses import replace
 from math import pi, radians, sin
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.rig import Record, Rig, first_problem, load_rig
 from nlos_calibration.wall_record import rig_named
-from pydantic import ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.hidden import Pose, nothing_to_see, place
 from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.render.fault_record import Fault, one_wrap
 from nlos_cam.render.hidden_record import HiddenObject, Motion
 from nlos_cam.render.patches import JUMP_M
 from nlos_cam.render.scene import Radiometry, Scene
@@ -41,6 +42,8 @@ class SceneFile(Record):
     radiometry: Radiometry = "paper"
     jump_m: float = Field(default=JUMP_M, ge=0, allow_inf_nan=False)
     """Neighbours further apart in depth than this are not one surface."""
+    faults: Annotated[tuple[Fault, ...], AfterValidator(one_wrap)] = ()
+    """What befalls the simulated camera; nothing of it is rendered."""
 
     @field_validator("rig", mode="before")
     @classmethod
@@ -51,7 +54,7 @@ class SceneFile(Record):
     def checksum(self) -> str:
         """Twelve hexadecimal digits that change with anything that changes a rendering."""
         mesh = self.hidden.file if self.hidden else None
-        seen = {"name": True, "sensor": True, "hidden": {"file"}}
+        seen = {"name": True, "sensor": True, "faults": True, "hidden": {"file"}}
         facts = self.model_dump_json(exclude=seen), mesh and mesh.sha256, self.sensor.pulse_ns
         return hashlib.sha256(f"{RENDERING_VERSION} {facts}".encode()).hexdigest()[:12]
 

@@ -1,12 +1,16 @@
-"""One suite for every camera. An L515's rows run where one is connected, and skip elsewhere."""
+"""One suite for every camera. An L515's rows run where one is connected, and skip elsewhere; a fake one's run."""
 
+import json
 import subprocess
 import sys
 from itertools import islice, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from fake_librealsense import FakeSdk
+from fake_lidar import FakeLidar
 
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.l515 import list_devices
@@ -15,13 +19,16 @@ from nlos_cam.camera.world import World, open_world
 from nlos_cam.errors import CameraError, NlosCamError
 from nlos_cam.frames import Frame
 
+FAKE_L515 = "l515:fake"
 RECORDED = 12
 SEEN = 5
+READERS = {"bag": "plain", "bag-sdk": "sdk"}
 ENDS_CLEANLY = """
+import json
 import sys
 from itertools import islice
 from nlos_cam.camera import open_camera
-with open_camera(sys.argv[1]) as camera:
+with open_camera(**json.loads(sys.argv[1])) as camera:
     print(len(list(islice(camera, 3))))
 """
 
@@ -35,16 +42,29 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(params=["sim", "sim:bare-wall", "bag", pytest.param("l515", marks=pytest.mark.hardware)])
-def uri(request: pytest.FixtureRequest) -> str:
+@pytest.fixture(
+    params=["sim", "sim:bare-wall", "bag", "bag-sdk", FAKE_L515, pytest.param("l515", marks=pytest.mark.hardware)]
+)
+def opens(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What `open_camera` is given."""
+    if request.param == FAKE_L515:
+        sdk = FakeSdk(FakeLidar("fake", runs=(10**6, 10**6), laser_power=93.0))
+        monkeypatch.setattr("nlos_cam.camera.l515.load_sdk", lambda: sdk)
     if request.param == "l515" and not any("L515" in info.name for info in list_devices()):
         pytest.skip("no L515 is connected")
-    return f"bag:{request.getfixturevalue('bag')}" if request.param == "bag" else request.param
+    if request.param in READERS:
+        return {"uri": f"bag:{request.getfixturevalue('bag')}", "reader": READERS[request.param]}
+    return {"uri": request.param}
 
 
 @pytest.fixture
-def camera(uri: str) -> Camera:
-    return open_camera(uri)
+def uri(opens: dict[str, Any]) -> str:
+    return opens["uri"]
+
+
+@pytest.fixture
+def camera(opens: dict[str, Any]) -> Camera:
+    return open_camera(**opens)
 
 
 def look(camera: Camera, count: int = SEEN) -> list[Frame]:
@@ -137,9 +157,11 @@ def test_an_error_inside_leaves_the_camera_stopped(camera: Camera) -> None:
     assert len(look(camera)) == SEEN
 
 
-def test_a_process_that_used_it_ends_cleanly(uri: str) -> None:
+def test_a_process_that_used_it_ends_cleanly(opens: dict[str, Any]) -> None:
+    if opens["uri"] == FAKE_L515:
+        pytest.skip("the fake SDK is in this process only")
     ended = subprocess.run(  # noqa: PLW1510  the code is what is tested
-        [sys.executable, "-c", ENDS_CLEANLY, uri], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", ENDS_CLEANLY, json.dumps(opens)], capture_output=True, text=True, timeout=120
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "3\n", "")
 
@@ -150,9 +172,9 @@ def test_a_recording_is_complete_on_every_stream(bag: Path) -> None:
     assert found.frames == RECORDED
 
 
-def test_a_recording_gives_the_same_bits_each_time(bag: Path) -> None:
-    with open_camera(f"bag:{bag}") as camera:
-        first, second = list(camera), list(camera)
+@pytest.mark.parametrize("readers", [("plain", "plain"), ("sdk", "sdk"), ("plain", "sdk")])
+def test_a_recording_gives_the_same_bits_each_time_and_on_both_readers(bag: Path, readers: tuple[Any, Any]) -> None:
+    first, second = (look(open_camera(f"bag:{bag}", reader=reader), RECORDED + 1) for reader in readers)
     assert len(first) == len(second) == RECORDED
     for one, other in zip(first, second, strict=True):
         assert (one.frame_number, one.timestamp_s) == (other.frame_number, other.timestamp_s)
@@ -160,6 +182,7 @@ def test_a_recording_gives_the_same_bits_each_time(bag: Path) -> None:
             np.testing.assert_array_equal(getattr(one, images), getattr(other, images))
 
 
-def test_a_recording_cannot_be_recorded(bag: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("reader", READERS.values())
+def test_a_recording_cannot_be_recorded(bag: Path, tmp_path: Path, reader: Any) -> None:
     with pytest.raises(NlosCamError, match="is a recording already"):
-        open_camera(f"bag:{bag}", recording=Recording(tmp_path / "copy.bag"))
+        open_camera(f"bag:{bag}", recording=Recording(tmp_path / "copy.bag"), reader=reader)

@@ -1,63 +1,150 @@
 """What only a real L515 can show.
 
 The bench: one L515 (firmware 1.5.8.1) on USB 3, 0.2 m from a bare matt white wall, turned 45 degrees to it, nothing
-else within 1 m; no other program using it. Run with `pytest -m hardware`; every test skips where no L515 is connected.
+else within 1 m; no other program using it. Someone at the cable, where a test asks for it to be pulled (run with `-s`,
+and NLOS_CAM_AT_THE_BENCH=1); a second L515 for the test of two. The ten minutes want NLOS_CAM_TEN_MINUTES=1 and 20 GB.
+Run with `pytest -m hardware`; every test skips where what it needs is not there.
 """
 
-from itertools import islice
+import os
+from collections.abc import Callable
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nlos_cam.camera import Camera, Recording, open_camera
-from nlos_cam.camera.l515 import NEAR_WALL, list_devices
-from nlos_cam.camera.replay import verify
+from nlos_cam.camera.l515 import NEAR_WALL, L515Camera, list_devices
+from nlos_cam.camera.replay import ReplayCamera, verify
 
 pytestmark = pytest.mark.hardware
 SECONDS = 5
 
 
+def serials() -> list[str]:
+    return [info.serial for info in list_devices() if "L515" in info.name]
+
+
 @pytest.fixture
 def camera() -> Camera:
-    if not any("L515" in info.name for info in list_devices()):
+    if not serials():
         pytest.skip("no L515 is connected")
-    return open_camera("l515")
+    return open_camera(f"l515:{serials()[0]}")
+
+
+@pytest.fixture
+def at_the_bench(camera: Camera, capsys: pytest.CaptureFixture[str]) -> Callable[[str], None]:
+    """Asks the person at the bench for something."""
+    assert camera
+    if not os.environ.get("NLOS_CAM_AT_THE_BENCH"):
+        pytest.skip("nobody is at the bench (NLOS_CAM_AT_THE_BENCH=1)")
+
+    def ask(what: str) -> None:
+        with capsys.disabled():
+            print(f"\n>>> {what}", flush=True)  # noqa: T201  it is for the person
+
+    return ask
 
 
 def test_five_seconds_come_without_a_gap(camera: Camera) -> None:
     with camera:
         frames = list(islice(camera, 30 * SECONDS))
     assert (camera.dropped, camera.incomplete) == (0, 0)
+    assert not camera.counts
     assert frames[-1].timestamp_s - frames[0].timestamp_s == pytest.approx(SECONDS, abs=0.1)
 
 
 def test_near_wall_settings_are_taken(camera: Camera) -> None:
+    assert isinstance(camera, L515Camera)
     with camera:
         settings = next(iter(camera)).settings
+    assert camera.differences == {}
     assert {name: settings[name] for name in NEAR_WALL} == NEAR_WALL
 
 
 def test_the_wall_is_seen_near_and_unsaturated(camera: Camera) -> None:
+    """The laser was turned down as far as that takes, and not off."""
     with camera:
         frame = list(islice(camera, 30))[-1]
     assert 0.1 < np.nanmedian(frame.depth_m) < 1.5
     assert np.count_nonzero(~np.isnan(frame.depth_m)) > 0.5 * frame.depth_m.size
     assert np.count_nonzero(frame.ir == 255) < 0.001 * frame.ir.size
+    assert frame.settings["laser_power"] > 0
 
 
-@pytest.mark.usefixtures("camera")
-def test_a_recording_holds_every_frame(tmp_path: Path) -> None:
+def test_temperatures_are_told_from_five_seconds_after_the_start(camera: Camera) -> None:
+    with camera:
+        assert next(iter(camera)).settings.get("apd_temperature", 20.0) > -100
+        list(islice(camera, 30 * 6))
+        telemetry = camera.telemetry()
+    for name in ("ldd_temperature", "mc_temperature", "ma_temperature", "apd_temperature"):
+        assert 0 < telemetry[name] < 100
+    assert camera.telemetry() == {}
+
+
+def test_a_recording_holds_every_frame_and_the_settings_that_held(camera: Camera, tmp_path: Path) -> None:
     recording = Recording(tmp_path / "wall.bag", seconds=SECONDS)
-    with open_camera("l515", recording=recording) as source:
+    with open_camera(camera.uri, recording=recording) as source:
         seen = list(source)
     found = verify(recording.path)
     assert found.frames >= recording.sets == len(seen)
     assert found.dropped == 0
+    with ReplayCamera(recording.path) as replayed:
+        settings = next(iter(replayed)).settings
+    assert {name: settings[name] for name in (*NEAR_WALL, "laser_power")} == {
+        name: seen[0].settings[name] for name in (*NEAR_WALL, "laser_power")
+    }
 
 
-@pytest.mark.usefixtures("camera")
-def test_it_can_be_found_by_its_serial_number() -> None:
-    [serial] = [info.serial for info in list_devices() if "L515" in info.name]
-    with open_camera(f"l515:{serial}") as source:
-        next(iter(source))
+def test_it_is_survived_when_its_cable_is_pulled_and_plugged_in(
+    camera: Camera, at_the_bench: Callable[[str], None]
+) -> None:
+    with camera:
+        before = list(islice(camera, 30))
+        at_the_bench("pull the L515's cable, wait 10 s, plug it into the same port")
+        after: list[float] = []
+        frames = [before[-1]]
+        while not camera.counts["replugged"] or len(after) < 30:
+            frames.append(next(iter(camera)))
+            after += [frames[-1].timestamp_s] if camera.counts["replugged"] else []
+    assert camera.counts["replugged"] == 1
+    assert all(one.frame_number < next_one.frame_number for one, next_one in pairwise(frames))
+    assert all(one.timestamp_s < next_one.timestamp_s for one, next_one in pairwise(frames))
+    assert camera.dropped > 5 * 30
+    assert frames[-1].settings == pytest.approx(before[-1].settings, abs=10.0)  # temperatures and noise drift
+
+
+def test_a_recording_whose_cable_is_pulled_can_be_read(
+    camera: Camera, at_the_bench: Callable[[str], None], tmp_path: Path
+) -> None:
+    recording = Recording(tmp_path / "pulled.bag", optional=True)
+    with open_camera(camera.uri, recording=recording) as source:
+        list(islice(source, 90))
+        at_the_bench("pull the L515's cable, wait 10 s, plug it in again")
+        while not source.counts["replugged"]:
+            next(iter(source))
+        assert verify(recording.path).frames >= 90
+
+
+def test_two_cameras_run_at_once() -> None:
+    found = serials()
+    if len(found) < 2:
+        pytest.skip("two L515s are needed")
+    with open_camera(f"l515:{found[0]}") as one, open_camera(f"l515:{found[1]}") as other:
+        for camera, serial in ((one, found[0]), (other, found[1])):
+            assert camera.identity["serial"] == serial
+            assert len(list(islice(camera, 30 * SECONDS))) == 30 * SECONDS
+            assert camera.incomplete == 0
+
+
+@pytest.mark.timeout(900)
+def test_ten_minutes_are_recorded_without_a_gap(camera: Camera, tmp_path: Path) -> None:
+    if not os.environ.get("NLOS_CAM_TEN_MINUTES"):
+        pytest.skip("it takes ten minutes and 20 GB (NLOS_CAM_TEN_MINUTES=1)")
+    recording = Recording(tmp_path / "long.bag", seconds=600)
+    with open_camera(camera.uri, recording=recording) as source:
+        frames = sum(1 for _ in source)
+        assert (source.dropped, source.incomplete, source.counts) == (0, 0, {})
+    assert frames == 18_000
+    assert verify(recording.path).dropped == 0

@@ -98,3 +98,15 @@ def test_each_set_is_shown_as_it_passes() -> None:
     seen: list[int] = []
     put(Inbox(lossless=False, on_set=lambda found: seen.append(found.number)), range(4))
     assert seen == [0, 1, 2, 3]
+
+
+def test_what_is_expected_is_a_shape_and_the_rest_is_counted() -> None:
+    inbox = Inbox(lossless=False)
+    inbox.expect((1, 1))
+    for number, shape in enumerate([(1, 1), (2, 1), (1, 1)]):
+        for stream in FORMATS:
+            inbox.put(Sample(stream, number, number / 30, np.zeros(shape)))
+    assert take_all(inbox) == [0, 2]
+    assert inbox.counts == {"wrong_size": 1}
+    inbox.counts["wrong_size"] = 9
+    assert inbox.counts == {"wrong_size": 1}

@@ -1,33 +1,22 @@
 import gc
 import re
+import struct
 import subprocess
 import sys
-import time
-from itertools import islice
+import threading
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from nlos_cam.camera import software_lidar
-from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.record import Recording
 from nlos_cam.camera.replay import ReplayCamera, verify
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import RecordingError, StreamMissingError
-
-
-def bits(path: Path, pause_s: float = 0.0) -> list[bytes]:
-    found: list[bytes] = []
-    with ReplayCamera(path) as camera:
-        for frame in camera:
-            time.sleep(pause_s)
-            found.append(frame.depth_m.tobytes() + frame.ir.tobytes() + frame.confidence.tobytes())
-    return found
 
 
 def record_streams(path: Path, world: Any) -> Path:
@@ -63,16 +52,6 @@ def test_every_pushed_bit_comes_back(noise_bag: Path, noise_world: Any) -> None:
         np.testing.assert_array_equal(np.nan_to_num(frame.depth_m / np.float32(0.00025)).round(), images.depth_z16)
         np.testing.assert_array_equal(frame.ir, images.ir)
         np.testing.assert_array_equal(frame.confidence, images.confidence)
-
-
-def test_a_slow_reader_gets_the_same_frames(noise_bag: Path) -> None:
-    assert bits(noise_bag, pause_s=0.01) == bits(noise_bag)
-
-
-def test_each_iteration_starts_at_the_first_frame(noise_bag: Path) -> None:
-    with ReplayCamera(noise_bag) as camera:
-        for taken in (1, 9, 20, 3):
-            assert [frame.frame_number for frame in islice(camera, taken)] == list(range(taken))
 
 
 def test_counters_are_those_of_the_last_iteration(noise_bag: Path) -> None:
@@ -129,18 +108,63 @@ def test_a_missing_path_and_a_folder_are_told(tmp_path: Path) -> None:
         ReplayCamera(tmp_path)
 
 
-def test_a_recording_that_is_damaged_within_does_not_end_quietly(
-    recorded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("nlos_cam.camera.replay.END_TOLERANCE_S", 0.0)
-    path = recorded(tmp_path / "damaged.bag", frames=200)  # more than the SDK writes as one compressed piece
-    assert verify(path).frames == 200
+def test_damage_within_is_told_after_the_frames_before_it(recorded: Any, tmp_path: Path) -> None:
+    path = recorded(tmp_path / "damaged.bag", frames=150)  # more than the SDK writes as one compressed piece
+    assert verify(path).frames == 150
     content = bytearray(path.read_bytes())
-    middle = len(content) // 2
-    content[middle : middle + 500] = bytes(500)
+    where = content.rindex(b"compression=lz4") + 200
+    content[where : where + 100] = bytes(100)
     path.write_bytes(content)
+    frames: list[int] = []
+    with ReplayCamera(path) as camera, pytest.raises(RecordingError, match=r"is damaged \d+\.\d s into its") as raised:
+        frames.extend(frame.frame_number for frame in camera)
+    assert f"`nlos-cam repair {path} --out damaged-repaired.bag`" in str(raised.value)
+    assert frames == list(range(len(frames)))
+    assert max(camera.arrived.values()) - len(frames) == camera.incomplete <= 1
+    assert 0 < len(frames) < 150
     with pytest.raises(RecordingError, match="is damaged"):
         verify(path)
+
+
+def test_what_never_came_and_what_came_in_part_are_counted(rewritten: Any) -> None:
+    def with_gaps(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
+        number = int.from_bytes(raw[:4], "little") if topic.endswith("/image/data") else -1
+        lacks = {8: "Infrared_0", 12: "Confidence_0", 19: "Depth_0"}.get(number, "none")
+        return [] if number in {3, 4} or lacks in topic else [(time_ns, raw)]
+
+    with ReplayCamera(rewritten(with_gaps)) as camera:
+        numbers = [frame.frame_number for frame in camera]
+    assert numbers == [n for n in range(20) if n not in {3, 4, 8, 12, 19}]
+    assert (camera.dropped, camera.incomplete) == (2, 3)
+    assert camera.arrived == {"depth": 17, "infrared": 17, "confidence": 17}
+
+
+def test_settings_are_those_in_force_when_the_frame_was_recorded(rewritten: Any) -> None:
+    value, changed_ns = "/device_0/sensor_0/option/Frames_Queue_Size/value", 5_000_000
+
+    def changing(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
+        number = int.from_bytes(raw[:4], "little")
+        time_ns = time_ns if topic.endswith(value) or time_ns == 1 else 1000 + number * 1_000_000
+        changes = [(changed_ns, struct.pack("<f", 7.0))] if topic == value else []
+        return [] if topic.endswith("/metadata") else [(time_ns, raw), *changes]
+
+    with ReplayCamera(rewritten(changing)) as camera:
+        for frame in camera:
+            assert frame.settings["frames_queue_size"] == (7.0 if frame.frame_number >= 5 else 0.0)
+            assert camera.telemetry() == frame.settings
+
+
+def test_it_tells_which_camera_was_recorded(noise_bag: Path) -> None:
+    assert ReplayCamera(noise_bag).identity == {"name": "Simulated L515", "serial": "simulated"}
+
+
+def test_an_iteration_ends_where_another_begins(noise_bag: Path) -> None:
+    with ReplayCamera(noise_bag) as camera:
+        first = iter(camera)
+        assert next(first).frame_number == 0
+        assert len(list(camera)) == 20
+        assert list(first) == []
+        assert set(camera.arrived.values()) == {20}
 
 
 @pytest.mark.parametrize("streams", [("depth",), ("depth", "infrared"), ("infrared", "confidence")])
@@ -166,27 +190,39 @@ def test_a_recording_of_no_frames_is_told(noise_world: Any, hurried_clock: Any, 
         ReplayCamera(path)
 
 
-def test_a_playback_that_never_begins_is_told(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.camera.replay.START_TIMEOUT_S", 0.0)
-    stopped = SimpleNamespace(current_status=lambda: load_sdk().playback_status.stopped)
-    with ReplayCamera(noise_bag) as camera, pytest.raises(RecordingError, match="gave no frame"):
-        camera._next(Inbox(lossless=True), stopped)
-
-
-def _real_recording() -> Path:
-    """A D435's recording, in a data folder of the checkout or beside it."""
-    root, name = Path(__file__).parents[2], "data/realsense_d435_depth_color_640x480.bag"
-    found = [root / name, *sorted(root.parent.glob(f"*/{name}"))]
-    if path := next((path for path in found if path.is_file()), None):
-        return path
-    pytest.skip(f"no {name} in this checkout, or in a folder beside it")
-
-
-def test_a_real_recording_of_another_camera_says_what_it_lacks() -> None:
-    path = _real_recording()
+def test_a_real_recording_of_another_camera_says_what_it_lacks(real_bag: Path) -> None:
     with pytest.raises(StreamMissingError, match="no infrared and no confidence stream") as raised:
-        ReplayCamera(path)
+        ReplayCamera(real_bag)
     assert "--camera l515" in str(raised.value)
+
+
+WITHOUT_SDK = """
+import sys
+sys.modules["pyrealsense2"] = None
+from nlos_cam.camera import open_camera
+from nlos_cam.errors import CameraError
+uri = sys.argv[1]
+with open_camera(uri) as camera:
+    print(len(list(camera)))
+try:
+    open_camera(uri, reader="sdk")
+except CameraError as error:
+    print(error)
+"""
+
+
+def test_a_recording_is_read_where_there_is_no_sdk(noise_bag: Path) -> None:
+    run = [sys.executable, "-c", WITHOUT_SDK, f"bag:{noise_bag}"]
+    told = subprocess.run(run, capture_output=True, text=True, check=True, timeout=120).stdout.splitlines()
+    assert told[0] == "20"
+    assert told[1].startswith("librealsense cannot be loaded")
+
+
+def test_reading_starts_no_thread(noise_bag: Path) -> None:
+    before = threading.active_count()
+    with ReplayCamera(noise_bag) as camera:
+        for _ in camera:
+            assert threading.active_count() == before
 
 
 @pytest.mark.parametrize("reads", ["list(camera)", "next(iter(camera))", "None"])

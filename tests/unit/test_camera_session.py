@@ -1,9 +1,14 @@
+from collections.abc import Callable
+from threading import Timer
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fake_librealsense import FakeDevice, FakeSensor
+from fake_lidar import FakeLidar
 
-from nlos_cam.camera.session import find_streams, read_settings
+from nlos_cam.camera.inbox import Inbox
+from nlos_cam.camera.session import Session, find_streams, read_settings
 from nlos_cam.camera.streams import FORMATS
 
 
@@ -24,22 +29,75 @@ def test_settings_are_all_that_can_be_read() -> None:
 
 
 def test_the_sensor_with_most_of_our_streams_is_found(fake_l515: Any) -> None:
-    partial, whole = fake_l515(streams=("infrared",)), fake_l515()
-    device = SimpleNamespace(query_sensors=lambda: [partial.sensor, whole.sensor])
+    partial, whole = FakeSensor(fake_l515(streams=("infrared",)), 0), FakeSensor(fake_l515(), 0)
+    device = SimpleNamespace(query_sensors=lambda: [partial, whole])
     sensor, profiles = find_streams(device)
-    assert sensor is whole.sensor
+    assert sensor is whole
     assert set(profiles) == set(FORMATS)
 
 
 @pytest.mark.parametrize("size", [(1024, 768), (640, 480), (320, 240)])
 def test_profiles_are_those_of_the_size_asked_for(fake_l515: Any, size: tuple[int, int]) -> None:
-    _, profiles = find_streams(fake_l515(), size)
+    _, profiles = find_streams(FakeDevice(fake_l515(), 0), size)
     assert {profile.size for profile in profiles.values()} == {size}
 
 
 def test_a_size_that_is_not_offered_finds_no_streams(fake_l515: Any) -> None:
-    assert find_streams(fake_l515(), (100, 100))[1] == {}
+    assert find_streams(FakeDevice(fake_l515(), 0), (100, 100))[1] == {}
 
 
 def test_a_device_without_sensors_has_no_streams() -> None:
     assert find_streams(SimpleNamespace(query_sensors=list)) == (None, {})
+
+
+def test_what_is_not_measured_yet_is_no_setting(fake_l515: Any) -> None:
+    sensor = FakeSensor(fake_l515(apd_temperature=-9999.0, ldd_temperature=40.0), 0)
+    settings = read_settings(sensor)
+    assert settings["ldd_temperature"] == 40.0
+    assert "apd_temperature" not in settings
+
+
+@pytest.fixture
+def preparing(fake_l515: Any) -> Callable[[Callable[[Session, FakeLidar], Any]], Any]:
+    """What an act gives that is done while a session prepares its sensor."""
+
+    def prepare(act: Callable[[Session, FakeLidar], Any]) -> Any:
+        lidar, given = fake_l515(usb="2.1"), list[Any]()
+        session = Session(*find_streams(FakeDevice(lidar, 0)), Inbox(lossless=False))
+        session.start(lambda _: given.append(act(session, lidar)))
+        session.stop()
+        assert session.inbox.arrived.total() == 0  # what comes meanwhile is not delivered
+        return given[0]
+
+    return prepare
+
+
+def test_while_a_sensor_is_prepared_the_next_set_can_be_looked_at(preparing: Any) -> None:
+    def look(session: Session, lidar: FakeLidar) -> int:
+        lidar.deliver(range(1, 4))
+        later = Timer(0.1, lidar.deliver, [range(4, 5)])
+        later.start()
+        return session.look(5.0).number
+
+    assert preparing(look) == 4
+
+
+def test_a_look_ends_when_nothing_comes_or_nobody_waits_any_more(preparing: Any) -> None:
+    def look(session: Session, _: FakeLidar) -> list[Any]:
+        nothing = session.look(0.01)
+        Timer(0.1, session.end_wait).start()
+        return [nothing, session.look(30.0)]
+
+    assert preparing(look) == [None, None]
+
+
+def test_a_device_that_vanishes_while_it_is_prepared_is_an_error(preparing: Any) -> None:
+    with pytest.raises(RuntimeError, match="vanished"):
+        preparing(lambda _, lidar: lidar.unplug())
+
+
+def test_telemetry_of_a_session_that_stopped_is_empty(fake_l515: Any) -> None:
+    session = Session(*find_streams(FakeDevice(fake_l515(usb="2.1"), 0)), Inbox(lossless=False))
+    assert session.telemetry()
+    session.stop()
+    assert session.telemetry() == {}

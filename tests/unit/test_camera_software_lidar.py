@@ -52,3 +52,12 @@ def test_all_streams_are_seen_from_one_place(profiles: dict[str, Any]) -> None:
         same = profiles["depth"].get_extrinsics_to(profiles[stream])
         np.testing.assert_array_equal(np.reshape(same.rotation, (3, 3)), np.eye(3))
         np.testing.assert_array_equal(same.translation, np.zeros(3))
+
+
+@pytest.mark.parametrize(("other", "sizes"), [(False, [(640, 480)]), (True, [(640, 480), (320, 240)])])
+def test_it_has_another_size_only_where_it_is_asked_for(other: bool, sizes: list[tuple[int, int]]) -> None:
+    [sensor] = SoftwareLidar(PINHOLE, load_sdk(), has_other_size=other).device.query_sensors()
+    videos = [profile.as_video_stream_profile() for profile in sensor.get_stream_profiles()]
+    assert sorted({(video.width(), video.height()) for video in videos}) == sorted(sizes)
+    assert len(videos) == 3 * len(sizes)
+    assert {(v.width(), v.height()) for v in videos if v.is_default()} == {(640, 480)}

@@ -1,6 +1,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,6 +30,11 @@ def test_a_scene_that_is_not_there_is_a_scene_error() -> None:
 def test_a_recording_that_is_not_there_is_a_recording_error() -> None:
     with pytest.raises(RecordingError, match="nowhere"):
         open_camera("bag:nowhere.bag")
+
+
+@pytest.mark.parametrize(("reader", "kind"), [("plain", "ReplayCamera"), ("sdk", "SdkReplayCamera")])
+def test_a_recording_is_read_by_who_is_asked_to(noise_bag: Path, reader: Any, kind: str) -> None:
+    assert type(open_camera(f"bag:{noise_bag}", reader=reader)).__name__ == kind
 
 
 def test_a_colon_may_be_part_of_a_path(noise_bag: Path, tmp_path: Path) -> None:

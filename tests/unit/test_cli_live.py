@@ -1,7 +1,10 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from datetime import date
 from pathlib import Path
@@ -36,6 +39,7 @@ class FakeCamera:
 
     def __init__(self, uri: str, on_frame: Callable[[int], None]) -> None:
         self.uri, self._on_frame = uri, on_frame
+        self.counts: Counter[str] = Counter()
 
     def __enter__(self) -> Self:
         return self
@@ -120,7 +124,7 @@ def write_wall(path: Path) -> None:
 def test_live_ends_with_one_object_that_scripts_depend_on(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["live", "--camera", "bag:fake", "--no-view", "--json"]) == 0
     report, _ = told(capsys)
-    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms"}
+    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms", "counts"}
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
     assert set(report["stages_ms"]) == {"wait", "maps", "network", "view"}
@@ -191,7 +195,7 @@ def test_replay_writes_its_folder_and_one_object(opened: Opened, capsys: pytest.
     assert set(report) == {"frames", "seconds", "out"}
     assert (report["frames"], report["out"]) == (20, "out")
     assert "another" not in progress
-    assert opened.calls == [("bag:run.bag", {})]
+    assert opened.calls == [("bag:run.bag", {"reader": "plain"})]
     assert main(["replay", "run.bag", "--out", "out"]) == 1
     assert main(["replay", "run.bag", "--out", "out", "--overwrite"]) == 0
 
@@ -202,3 +206,24 @@ def test_an_interrupted_replay_keeps_its_results(opened: Opened, capsys: pytest.
     report, _ = told(capsys)
     with np.load("out/reconstruction.npz") as file:
         assert len(file["depth_m"]) == report["frames"] <= 10
+
+
+def test_replay_reads_as_asked(opened: Opened) -> None:
+    assert main(["replay", "run.bag", "--out", "out", "--reader", "sdk"]) == 0
+    assert opened.calls == [("bag:run.bag", {"reader": "sdk"})]
+    assert main(["replay", "run.bag", "--reader", "quick"]) == 2
+
+
+WITHOUT_SDK = """
+import sys
+sys.modules["pyrealsense2"] = None
+from nlos_cam.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_replay_needs_no_sdk(noise_bag: Path, tmp_path: Path) -> None:
+    run = [sys.executable, "-c", WITHOUT_SDK, "replay", str(noise_bag), "--out", str(tmp_path / "out"), "--json"]
+    ended = subprocess.run(run, capture_output=True, text=True, timeout=250)  # noqa: PLW1510  the code is what is tested
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout.splitlines()[-1])["frames"] == 20

@@ -1,6 +1,9 @@
 """The command line's frame: one call, an exit code, one line for an error, one object for a machine."""
 
 import json
+import os
+import signal
+import subprocess
 import sys
 from collections.abc import Callable
 
@@ -12,7 +15,7 @@ from nlos_models.errors import CheckpointError, ModelError, RecipeError
 from nlos_cam import errors
 from nlos_cam.cli import main as module
 from nlos_cam.cli.common import Json, finish
-from nlos_cam.cli.main import build_app, main, run
+from nlos_cam.cli.main import COMMANDS, build_app, main, run
 
 CODES = [
     (errors.SceneError, 1),
@@ -46,7 +49,7 @@ def does(monkeypatch: pytest.MonkeyPatch) -> Callable[[Act], None]:
             act()
             finish({"count": count}, as_json=json, text=f"{count} done")
 
-        monkeypatch.setattr(module, "build_app", lambda: app)
+        monkeypatch.setattr(module, "build_app", lambda _: app)
 
     return install
 
@@ -128,19 +131,57 @@ def test_the_console_script_exits_with_the_code(
 def test_help_is_0_and_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     shown = capsys.readouterr().out
-    for name in ("devices", "capture", "calibrate", "live", "replay", "render", "dataset", "train", "evaluate"):
+    for name in (
+        "devices",
+        "doctor",
+        "capture",
+        "calibrate",
+        "live",
+        "replay",
+        "render",
+        "dataset",
+        "train",
+        "evaluate",
+    ):
         assert name in shown
 
 
-def test_every_command_takes_json() -> None:
-    def leaves(app: typer.Typer, path: str) -> list[tuple[str, object]]:
-        found = [(f"{path} {c.name}", c.callback) for c in app.registered_commands]
-        for group in app.registered_groups:
-            assert group.typer_instance is not None
-            found += leaves(group.typer_instance, f"{path} {group.name}")
-        return found
+def leaves(app: typer.Typer, path: str) -> list[tuple[str, object]]:
+    found = [
+        (f"{path} {c.name or getattr(c.callback, '__name__', None)}".strip(), c.callback)
+        for c in app.registered_commands
+    ]
+    for group in app.registered_groups:
+        assert group.typer_instance is not None
+        found += leaves(group.typer_instance, f"{path} {group.name}".strip())
+    return found
 
-    commands = leaves(build_app(), "nlos-cam")
+
+def test_every_command_takes_json() -> None:
+    commands = leaves(build_app(), "")
     assert len(commands) >= 10
     for name, callback in commands:
         assert "json" in getattr(callback, "__annotations__", {}), name
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_is_in_the_file_that_the_table_names(command: str) -> None:
+    names = {name for name, _ in leaves(build_app(command), "")}
+    assert any(name.split()[0] == command for name in names)
+    assert names <= {name for name, _ in leaves(build_app(), "")}
+
+
+def test_listing_devices_does_not_wait_for_the_networks() -> None:
+    program = "import sys; from nlos_cam.cli.main import build_app; build_app('devices'); print('torch' in sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    assert ended.stdout == "False\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal here")
+def test_ctrl_c_while_a_command_is_loaded_is_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: str) -> Callable[..., int]:
+        os.kill(os.getpid(), signal.SIGINT)
+        return lambda *_, **__: 0
+
+    monkeypatch.setattr(module, "build_app", interrupted)
+    assert main(["live"]) == 130

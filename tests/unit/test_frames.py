@@ -72,6 +72,21 @@ def test_depth_is_the_median_of_the_valid_samples() -> None:
         assert maps.depth_m[i, j] == pytest.approx(np.nanmedian(samples), rel=1e-6)
 
 
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**16), valid=st.integers(0, 60), values=st.sampled_from([1, 2, 5, 1000]))
+def test_every_count_of_samples_and_ties_has_numpys_median(seed: int, valid: int, values: int) -> None:
+    generator = np.random.default_rng(seed)
+    cells = np.full((64 * 80, 60), np.nan, np.float32)
+    cells[:, :valid] = 0.2 + 0.001 * generator.integers(0, values, (64 * 80, valid))
+    cells = generator.permuted(cells, axis=1)
+    # 512 rows: every cell is 8 rows of 8 columns, four of its 64 pixels without a return
+    whole = np.concatenate([cells, np.full((64 * 80, 4), np.nan, np.float32)], axis=1)
+    depth = whole.reshape(64, 80, 8, 8).transpose(0, 2, 1, 3).reshape(512, 640)
+    maps = _maps(depth)
+    expected = np.median(cells[:, :, None][~np.isnan(cells)].reshape(64 * 80, valid), axis=1) if valid else np.nan
+    np.testing.assert_allclose(maps.depth_m.ravel(), expected, rtol=1e-6)
+
+
 def test_intensity_is_the_mean_over_the_samples_near_the_median() -> None:
     depth, ir = np.full((512, 640), 0.5), np.full((512, 640), 20, np.uint8)
     depth[:8, :3], ir[:8, :3] = 0.8, 200  # another winner in 24 of the first cell's 64 pixels

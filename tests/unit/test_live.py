@@ -1,4 +1,5 @@
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from threading import Event
 from typing import Self
@@ -8,10 +9,12 @@ import pytest
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
-from nlos_cam import live
-from nlos_cam.errors import CameraLostError
+from nlos_cam import frame_reader
+from nlos_cam.errors import CameraLostError, SceneError
+from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import Frame
-from nlos_cam.live import QUEUE_FRAMES, FrameReader, paced, run_live, steps, warm_up
+from nlos_cam.live import paced, run_live, steps, warm_up
+from nlos_cam.live_report import LiveReport
 from nlos_cam.view.viewer import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
@@ -35,6 +38,7 @@ class FakeCamera:
 
     def __init__(self, count: int | None, on_frame: Callable[[int], None] = lambda _: None) -> None:
         self._count, self._on_frame, self.offset_s = count, on_frame, 0.0
+        self.counts: Counter[str] = Counter()
 
     def __enter__(self) -> Self:
         return self
@@ -48,27 +52,6 @@ class FakeCamera:
             self._on_frame(number)
             yield frame(number, self.offset_s)
             number += 1
-
-
-def read_behind(reader: FrameReader) -> None:
-    """Wait until the camera has ended: a consumer as late as can be."""
-    reader._thread.join(10.0)
-    assert not reader._thread.is_alive()
-
-
-def test_a_recording_is_read_whole_and_in_order_by_a_late_consumer() -> None:
-    with FrameReader(FakeCamera(50), keeps_all=True, stop=Event()) as reader:
-        numbers = [arrival.frame.frame_number for arrival in reader]
-    assert numbers == list(range(50))
-    assert reader.dropped == []
-
-
-def test_a_full_queue_drops_the_oldest_and_tells_which() -> None:
-    with FrameReader(FakeCamera(10), keeps_all=False, stop=Event()) as reader:
-        read_behind(reader)
-        numbers = [arrival.frame.frame_number for arrival in reader]
-    assert numbers == [7, 8, 9]
-    assert reader.dropped == list(range(10 - QUEUE_FRAMES))
 
 
 def test_a_recording_is_paced_by_its_timestamps() -> None:
@@ -89,53 +72,6 @@ def test_a_recording_is_paced_by_its_timestamps() -> None:
     assert waits_s == pytest.approx([0.0, PERIOD_S - 0.01, 3 * PERIOD_S - 0.01, 0.0])
     stop.set()
     assert list(paced([frame(0)], stop, lambda: 0.0)) == []
-
-
-@pytest.mark.parametrize("keeps_all", [True, False])
-def test_every_frame_is_either_given_or_counted_as_dropped(keeps_all: bool) -> None:
-    with FrameReader(FakeCamera(200), keeps_all=keeps_all, stop=Event()) as reader:
-        numbers = [arrival.frame.frame_number for arrival in reader]
-    assert sorted(numbers + reader.dropped) == list(range(200))
-    assert numbers == sorted(numbers)
-
-
-def test_the_cameras_error_is_raised_to_the_consumer_after_the_frames_before_it() -> None:
-    def fail_at_two(number: int) -> None:
-        if number == 2:
-            raise CameraLostError("unplugged")
-
-    seen = []
-    with (
-        pytest.raises(CameraLostError, match="unplugged"),
-        FrameReader(FakeCamera(None, fail_at_two), keeps_all=True, stop=Event()) as reader,
-    ):
-        seen.extend(arrival.frame.frame_number for arrival in reader)
-    assert seen == [0, 1]
-
-
-def test_stop_ends_an_endless_camera() -> None:
-    stop = Event()
-    with FrameReader(FakeCamera(None), keeps_all=True, stop=stop) as reader:
-        for arrival in reader:
-            if arrival.frame.frame_number == 5:
-                stop.set()
-    assert not reader._thread.is_alive()
-
-
-def test_leaving_early_ends_the_thread() -> None:
-    with FrameReader(FakeCamera(None), keeps_all=True, stop=Event()) as reader:
-        next(iter(reader))
-    assert not reader._thread.is_alive()
-
-
-def test_a_camera_that_hangs_is_told_after_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "JOIN_TIMEOUT_S", 0.05)
-    release = Event()
-    reader = FrameReader(FakeCamera(None, lambda _: release.wait(10.0)), keeps_all=True, stop=Event())
-    with pytest.raises(CameraLostError, match="did not stop"), reader:
-        pass
-    release.set()
-    read_behind(reader)
 
 
 def test_steps_times_every_stage_with_the_clock_it_is_given() -> None:
@@ -213,18 +149,6 @@ def test_a_run_ends_after_the_seconds_it_is_given() -> None:
     assert report.frames == pytest.approx(31, abs=2)
 
 
-def test_what_the_camera_lost_counts_as_dropped() -> None:
-    camera = FakeCamera(4)
-    camera.incomplete, camera.dropped = 2, 3  # type: ignore[misc]
-    assert run_live(camera, RIG, network, NullViewer(), stop=Event(), recorded=True).dropped == 5
-
-
-def test_a_run_without_a_frame_reports_zeros() -> None:
-    report = run_live(FakeCamera(0), RIG, network, NullViewer(), stop=Event())
-    assert (report.frames, report.fps, report.dropped, report.stages_ms) == (0, 0.0, 0, {})
-    assert set(report.latency_ms.values()) == {0.0}
-
-
 def test_warming_up_runs_the_way_of_a_frame_once_and_takes_none_from_the_camera() -> None:
     seen: list[tuple[int, ...]] = []
 
@@ -234,3 +158,70 @@ def test_warming_up_runs_the_way_of_a_frame_once_and_takes_none_from_the_camera(
 
     warm_up(FakeCamera(0), load_rig("paper-rig"), noting)
     assert seen == [(1, 64, 80)]
+
+
+def failing_at(*numbers: int) -> Callable[..., np.ndarray]:
+    """A network that fails on these frames, counted from 0."""
+    calls = iter(range(10_000))
+
+    def fails(*_: np.ndarray) -> np.ndarray:
+        if next(calls) in numbers:
+            raise ZeroDivisionError("an odd frame")
+        return network()
+
+    return fails
+
+
+def test_a_frame_that_comes_to_no_result_is_counted_and_survived(caplog: pytest.LogCaptureFixture) -> None:
+    viewer = ListViewer()
+    report = run_live(FakeCamera(10), RIG, failing_at(3, 4), viewer, stop=Event(), recorded=True)
+    assert [moment.frame.frame_number for moment in viewer.moments] == [0, 1, 2, 5, 6, 7, 8, 9]
+    assert (report.counts, report.dropped) == ({"failed": 2}, 2)
+    assert "frame 3 came to no result (ZeroDivisionError: an odd frame)" in caplog.text
+
+
+def test_an_error_that_is_not_the_frames_ends_the_run_at_once() -> None:
+    with pytest.raises(SceneError, match="object_box"):
+        run_live(FakeCamera(9), load_rig("bare-wall"), network, ListViewer(), stop=Event(), recorded=True)
+
+
+def test_a_recording_is_not_reconstructed_past_an_error() -> None:
+    with (
+        pytest.raises(ZeroDivisionError, match="an odd frame"),
+        FrameReader(FakeCamera(9), keeps_all=True, stop=Event()) as reader,
+    ):
+        list(steps(reader, RIG, failing_at(3)))
+
+
+def test_what_the_camera_raises_is_raised_once_the_report_is_told() -> None:
+    def fail_at_two(number: int) -> None:
+        if number == 2:
+            raise CameraLostError("unplugged")
+
+    camera, until_then = FakeCamera(None, fail_at_two), list[LiveReport]()
+    camera.counts = Counter(restarted=3)
+    with pytest.raises(CameraLostError, match="unplugged"):
+        run_live(camera, RIG, network, NullViewer(), stop=Event(), recorded=True, on_error=until_then.append)
+    [report] = until_then
+    assert (report.frames, report.counts) == (2, {"restarted": 3})
+
+
+def test_a_run_ends_after_its_seconds_also_where_no_frame_comes_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_reader, "LET_GO_AFTER_S", 0.01)
+    shown, left, now_s, viewer = Event(), Event(), [0.0], ListViewer()
+    viewer.show = lambda _: shown.set()  # type: ignore[method-assign]
+
+    class Silent(FakeCamera):
+        def __exit__(self, *_: object) -> None:
+            left.set()
+
+    def on_frame(number: int) -> None:
+        if number == 5:
+            assert shown.wait(10.0)
+            now_s.append(1000.0)
+            assert left.wait(10.0)
+
+    camera = Silent(None, on_frame)
+    report = run_live(camera, RIG, network, viewer, stop=Event(), seconds=500.0, clock=lambda: now_s[-1])
+    assert left.is_set()
+    assert report.frames <= 5

@@ -1,3 +1,4 @@
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
@@ -27,6 +28,7 @@ class Recorded:
     uri, intrinsics, incomplete, dropped = "bag:fake.bag", SMALL, 0, 0
 
     def __init__(self, count: int) -> None:
+        self.counts = Counter(duplicate=2, out_of_order=1)
         self._count = count
 
     def __enter__(self) -> Self:
@@ -61,6 +63,7 @@ def test_every_frame_is_written_with_its_number_time_and_place(tmp_path: Path) -
     assert sorted(file.name for file in out.iterdir()) == sorted([RESULT, SHEET, REPORT])
     assert (out / SHEET).read_bytes().startswith(b"\x89PNG")
     assert "frames: 40" in (out / REPORT).read_text()
+    assert "seen: 2 duplicate, 1 out of order" in (out / REPORT).read_text()
 
 
 def test_two_replays_are_equal_to_the_bit(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from nlos_calibration.rig import dump_toml, load_rig
 from pydantic import ValidationError
 
 from nlos_cam.errors import SceneError
+from nlos_cam.render.fault_record import Fault
 from nlos_cam.render.scene_file import HiddenObject, Motion, SceneFile, bare_wall_scene, load_scene, paper_scene
 from nlos_cam.render.sensor_model import SensorModel
 
@@ -205,3 +206,17 @@ def test_a_rigs_path_starts_from_the_scenes_own_folder(tmp_path: Path) -> None:
 def test_an_object_that_only_part_of_its_loop_shows_is_a_scene(tmp_path: Path) -> None:
     scene = _load(tmp_path, CUP.replace("size_m = 0.15", "x_m = 0.25").replace("sway_x_m = 0.03", "sway_x_m = 0.2"))
     assert [scene.shows_at(0), scene.shows_at(6)] == [False, True]
+
+
+def test_faults_are_read_and_change_nothing_that_is_rendered(tmp_path: Path) -> None:
+    scene = _load(tmp_path, CUP)
+    faulty = _load(tmp_path, CUP + '[[faults]]\nkind = "stall"\nat_frame = 30\nframes = 9\n')
+    assert (scene.faults, faulty.faults) == ((), (Fault(kind="stall", at_frame=30, frames=9),))
+    assert faulty.checksum == scene.checksum
+
+
+@pytest.mark.parametrize("fault", ['kind = "explode"', 'kind = "stall"\nframes = -2', 'kind = "stall"\nwhen = 3'])
+def test_a_fault_that_cannot_be_is_told_in_one_line(tmp_path: Path, fault: str) -> None:
+    with pytest.raises(SceneError, match=r"scene\.toml is not a scene: faults\.0\.") as told:
+        _load(tmp_path, f"{CUP}[[faults]]\nat_frame = 1\n{fault}\n")
+    assert "\n" not in str(told.value)

@@ -1,0 +1,191 @@
+"""The .bag container, read through rosbags: its messages, within bounds that no damage breaks."""
+
+from bz2 import BZ2Decompressor
+from collections import defaultdict
+from collections.abc import Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from io import BufferedReader, BytesIO, FileIO
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+from lz4.frame import LZ4FrameDecompressor
+from rosbags.rosbag1 import Reader
+from rosbags.rosbag1.reader import Header, RecordType, read_uint32
+
+from nlos_cam.camera.bag_format import MAGIC
+from nlos_cam.camera.bag_messages import is_known, parse
+from nlos_cam.errors import RecordingError
+
+MOST_BYTES = 2**26
+"""Of a chunk; librealsense begins a new one after 768 kB."""
+DECOMPRESSORS = {"lz4": LZ4FrameDecompressor, "bz2": BZ2Decompressor}
+
+
+class Entry(NamedTuple):
+    """Where a message is; entries sort by time, then by place in the file."""
+
+    time_ns: int
+    """On the recorder's clock, which starts at 0."""
+    chunk_pos: int
+    offset: int
+    connection: int
+
+
+class _BoundedFile(BufferedReader):
+    """A file that gives no more in all than it holds, and at most a chunk at once: absurd lengths read short."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(FileIO(path))
+        self._left = path.stat().st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        wanted = self._left if size is None or size < 0 else size
+        found = super().read(min(wanted, self._left, MOST_BYTES))
+        self._left -= len(found)
+        return found
+
+
+class _BoundedPath:
+    """What rosbags takes for a path."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def exists(self) -> bool:
+        return True
+
+    def open(self, mode: str) -> _BoundedFile:
+        del mode
+        return _BoundedFile(self._path)
+
+
+class BagContainer:
+    """The messages of an indexed .bag by topic. Holds the index and one chunk; no file stays open.
+
+    Raises RecordingError, on opening and on reading, for whatever cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.entries: dict[str, list[Entry]] = {}
+        """Of each topic, in order."""
+        self.types: dict[str, str] = {}
+        """Of each topic, as rosbags names message types."""
+        self.end_ns = 0
+        """The time of the last message."""
+        self._chunk_pos, self._chunk = -1, b""
+        _check_start(path)
+        with told(path, "is cut short or damaged"):
+            self._read_index()
+
+    def _read_index(self) -> None:
+        found: dict[str, list[Entry]] = defaultdict(list)
+        with Reader(cast("Any", _BoundedPath(self.path))) as reader:
+            for connection in reader.connections:
+                index = reader.indexes.pop(connection.id)  # of ten minutes, it is half a million tuples
+                found[connection.topic].extend(Entry(*place, connection.id) for place in index)
+                self.types[connection.topic] = connection.msgtype
+        if not found:
+            raise ValueError("its index lists nothing")
+        self.entries = {topic: sorted(entries) for topic, entries in found.items()}
+        self.end_ns = max((entries[-1].time_ns for entries in self.entries.values() if entries), default=0)
+
+    def everything(self) -> Iterator[tuple[str, Entry, Any]]:
+        """Every message with its topic, in the order of the file; None for one of a type that `parse` does not know."""
+        each = [(entry, topic) for topic, entries in self.entries.items() for entry in entries]
+        for entry, topic in sorted(each, key=lambda found: (found[0].chunk_pos, found[0].offset)):
+            with self.told_at(entry):
+                raw, message_type = self.raw(entry), self.types[topic]
+                message = parse(raw, message_type) if is_known(message_type) else None
+            yield topic, entry, message
+
+    def read(self, topic: str, entry: Entry) -> Any:
+        """A message, as `parse` gives it."""
+        with self.told_at(entry):
+            return parse(self.raw(entry), self.types[topic])
+
+    def told_at(self, entry: Entry) -> AbstractContextManager[None]:
+        """Raise what goes wrong within as a RecordingError that says where in the recording this is."""
+        place = f"{entry.time_ns / 1e9:.1f} s into its {self.end_ns / 1e9:.1f} s, at byte {entry.chunk_pos}"
+        return told(self.path, f"is damaged {place}")
+
+    def damage(self, what: str) -> RecordingError:
+        """The error for a recording that lacks what it should have."""
+        return RecordingError(f"{self.path} is damaged ({what}): {advice(self.path)}")
+
+    def raw(self, entry: Entry) -> memoryview:
+        """A message's bytes. Raises nearly anything for damaged ones."""
+        if entry.chunk_pos != self._chunk_pos:
+            self._chunk, self._chunk_pos = self._read_chunk(entry.chunk_pos), entry.chunk_pos
+        stream = BytesIO(self._chunk)
+        stream.seek(entry.offset)
+        header = Header.read(stream, RecordType.MSGDATA)
+        if (header.get_time("time"), header.get_uint32("conn")) != (entry.time_ns, entry.connection):
+            raise ValueError("the index leads to another message")
+        size = read_uint32(stream)
+        found = memoryview(self._chunk)[stream.tell() : stream.tell() + size]
+        if len(found) != size:
+            raise ValueError(f"a message of {size} bytes has {len(found)}")
+        return found
+
+    def _read_chunk(self, position: int) -> bytes:
+        with _BoundedFile(self.path) as file:
+            file.seek(position)
+            header = Header.read(file, RecordType.CHUNK)
+            packed = file.read(read_uint32(file))
+        return _unpacked(packed, header.get_string("compression"), header.get_uint32("size"))
+
+
+def _unpacked(packed: bytes, compression: str, size: int) -> bytes:
+    """A chunk's content, which must be of `size`. Raises ValueError where it is not, or that is absurd."""
+    if size > MOST_BYTES:
+        raise ValueError(f"a chunk of {size} bytes")
+    if compression == "none":
+        content, whole = packed, True
+    else:
+        decompressor = DECOMPRESSORS[compression]()
+        content = cast("bytes", decompressor.decompress(packed, size + 1))  # one more: on to the checksum at the end
+        whole = decompressor.eof
+    if len(content) != size or not whole:
+        raise ValueError(f"a chunk of {size} bytes has {len(content)}")
+    return content
+
+
+def _check_start(path: Path) -> None:
+    """Say what is wrong with a file in words of our own, before rosbags does in its."""
+    if not path.exists():
+        raise RecordingError(f"{path} does not exist: give the path of a .bag recording")
+    if path.is_dir():
+        raise RecordingError(f"{path} is a folder: give the path of a .bag recording")
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(MAGIC))
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    if not start:
+        raise RecordingError(f"{path} is empty: record it again")
+    if start != MAGIC:
+        raise RecordingError(f"{path} is not a .bag recording (it starts with {start!r}): give one made by `capture`")
+
+
+@contextmanager
+def told(path: Path, what: str) -> Generator[None]:
+    """Raise what goes wrong within as a RecordingError of one line that says what to do."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except Exception as error:  # damaged bytes make the libraries raise nearly anything
+        if isinstance(error, OSError) and error.strerror:
+            raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+        detail = " ".join(str(error).split()) or "its parts do not fit together"
+        if "not indexed" in detail:
+            what, detail = "was never closed", "its recording was killed, so it has no index"
+        elif "index looks damaged" in detail:
+            detail = "its index cannot be read"
+        raise RecordingError(f"{path} {what} ({detail}): {advice(path)}") from error
+
+
+def advice(path: Path) -> str:
+    """What to do about a recording that cannot be read to its end."""
+    return f"`nlos-cam repair {path} --out {path.stem}-repaired.bag` recovers what is whole in it"

@@ -1,0 +1,199 @@
+"""Rebuilding a killed, cut or damaged recording: every whole chunk of it, with a new index, in a new file."""
+
+import os
+import re
+import shutil
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO
+
+from nlos_cam.camera.bag_chunk import Chunk
+from nlos_cam.camera.bag_format import (
+    ENTRY_BYTES,
+    FILE_HEADER_BYTES,
+    MAGIC,
+    SET_UP_TIME,
+    Connection,
+    pack_chunk_head,
+    pack_chunk_info,
+    pack_file_header,
+    pack_index,
+)
+from nlos_cam.camera.bag_scan import Damage, OnProgress, Scan, scan_bag, unreported
+from nlos_cam.camera.streams import FORMATS
+from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
+
+FRAMES_TOPIC = re.compile(r"/([A-Za-z]+)_\d+/image/data$")
+VERSION_TOPIC = "/file_version"
+"""The first of what describes the device; librealsense plays nothing without."""
+RECORD_BYTES = 128
+"""More than a record takes besides its data, where that is an index or a chunk."""
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """What a repair found, and what of it is in the new file."""
+
+    recovered_frames: dict[str, int]
+    """Of depth, infrared and confidence, and of every other stream of images there is."""
+    chunks: int
+    damages: list[Damage]
+    """In the order of the file."""
+    out: Path
+
+
+def repair(path: Path, out: Path, report: OnProgress = unreported) -> Repaired:
+    """Write what is whole in the recording `path` to `out`, which is replaced; `path` is only read.
+
+    `out` appears when all of it is written. Raises RecordingError where nothing can be recovered, OutputExistsError if
+    both are one file, NlosCamError where `out` cannot be written.
+    """
+    try:
+        same = out.exists() and out.samefile(path)
+        scan = None if same else scan_bag(path, lambda done, total: report(done, 2 * total))
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}): give the path of a .bag recording") from error
+    if scan is None:
+        raise OutputExistsError(f"{out} is the recording itself, which is never changed: choose another --out")
+    chunks, damages = _readable(scan)
+    if not any(_holds_frames(chunk) for chunk in chunks):
+        raise RecordingError(f"{path} has nothing to recover: {_why_nothing(scan)}")
+    _write(path, out, replace(scan, chunks=chunks), report)
+    return Repaired(_frames(chunks, scan.connections), len(chunks), damages, out)
+
+
+def _readable(scan: Scan) -> tuple[list[Chunk], list[Damage]]:
+    """The chunks, with an index of the messages that something describes, and of each frame once; what is damaged."""
+    found = _Index(scan.connections)
+    chunks = [chunk for chunk in (found.narrow(chunk) for chunk in scan.chunks) if chunk.index]
+    damages = [*scan.damages, *found.damages.values()]
+    if VERSION_TOPIC not in {scan.connections[number].topic.lower() for chunk in chunks for number in chunk.index}:
+        damages.append(Damage(0, 0, "what describes the streams is lost: librealsense will not play this"))
+    return chunks, sorted(damages, key=lambda damage: damage.position)
+
+
+class _Index:
+    """Narrows the indexes of chunks, one after the other, to what can be read."""
+
+    def __init__(self, connections: Mapping[int, Connection]) -> None:
+        self.damages: dict[int, Damage] = {}
+        """By connection."""
+        self._connections = connections
+        self._taken = set[tuple[int, bytes]]()
+
+    def narrow(self, chunk: Chunk) -> Chunk:
+        index = {number: self._once(chunk.at, number, entries) for number, entries in chunk.index.items()}
+        return replace(chunk, index={number: entries for number, entries in index.items() if entries})
+
+    def _once(self, at: int, number: int, entries: bytes) -> bytes:
+        if number not in self._connections:
+            self._note(at, number, "nothing tells what it is")
+            return b""
+        if not FRAMES_TOPIC.search(self._connections[number].topic):
+            return entries
+        new: list[bytes] = []
+        for start in range(0, len(entries), ENTRY_BYTES):
+            frame = number, entries[start : start + 8]
+            if frame not in self._taken:
+                self._taken.add(frame)
+                new.append(entries[start : start + ENTRY_BYTES])
+        if len(new) * ENTRY_BYTES < len(entries):
+            self._note(at, number, "some of its frames are there twice, and taken once")
+        return b"".join(new)
+
+    def _note(self, at: int, number: int, why: str) -> None:
+        self.damages.setdefault(number, Damage(at, 0, f"connection {number}: {why}"))
+
+
+def _holds_frames(chunk: Chunk) -> bool:
+    return any(entries[-ENTRY_BYTES:-4] != SET_UP_TIME for entries in chunk.index.values())
+
+
+def _why_nothing(scan: Scan) -> str:
+    if not scan.bytes:
+        return "it is empty"
+    if not scan.chunks:
+        return f"none of its {scan.bytes} bytes are a whole piece of a recording"
+    if any(_holds_frames(chunk) for chunk in scan.chunks):
+        return "nothing that is left of it tells what its messages are"
+    return "it ends before the first frame"
+
+
+def _frames(chunks: list[Chunk], connections: Mapping[int, Connection]) -> dict[str, int]:
+    frames = Counter(dict.fromkeys(FORMATS, 0))
+    for chunk in chunks:
+        for number, entries in chunk.index.items():
+            if stream := FRAMES_TOPIC.search(connections[number].topic):
+                frames[stream[1].lower()] += len(entries) // ENTRY_BYTES
+    return dict(frames)
+
+
+def _write(path: Path, out: Path, scan: Scan, report: OnProgress) -> None:
+    """Write beside `out`, and rename: whatever interrupts leaves no half of a file under its name."""
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        _check_space(out, scan)
+        with path.open("rb") as source:
+            target = part.open("xb")  # so that what is removed below is ours
+            try:
+                with target:
+                    _Writer(source, target, scan, report).write()
+                    target.flush()
+                    os.fsync(target.fileno())
+                part.replace(out)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
+    except OSError as error:
+        if isinstance(error, NlosCamError):
+            raise
+        raise NlosCamError(f"{out} cannot be written ({error.strerror}): choose another --out") from error
+
+
+def _check_space(out: Path, scan: Scan) -> None:
+    index = sum(len(entries) + RECORD_BYTES for chunk in scan.chunks for entries in chunk.index.values())
+    needed = scan.bytes + index + RECORD_BYTES * len(scan.chunks) + 2 * FILE_HEADER_BYTES
+    free = shutil.disk_usage(out.parent).free
+    if free < needed:
+        raise NlosCamError(f"{out} needs {needed >> 20} MB, and {free >> 20} MB are free: choose another --out")
+
+
+class _Writer:
+    """Writes a bag of given chunks and connections."""
+
+    def __init__(self, source: BinaryIO, target: BinaryIO, scan: Scan, report: OnProgress) -> None:
+        self._source, self._target, self._scan, self._report = source, target, scan, report
+
+    def write(self) -> None:
+        self._write_header(0)
+        infos = [self._write_chunk(chunk) for chunk in self._scan.chunks]
+        index_at = self._target.tell()
+        connections = sorted(self._scan.connections.values(), key=lambda connection: connection.number)
+        self._target.writelines([connection.record for connection in connections] + infos)
+        self._write_header(index_at)
+        self._report(2 * self._scan.bytes, 2 * self._scan.bytes)
+
+    def _write_header(self, index_at: int) -> None:
+        self._target.seek(0)
+        self._target.write(MAGIC + pack_file_header(len(self._scan.connections), len(self._scan.chunks), index_at))
+
+    def _write_chunk(self, chunk: Chunk) -> bytes:
+        """Write a chunk and its index; what the file's index says of it."""
+        at = self._target.tell()
+        self._target.write(pack_chunk_head(chunk.compression, chunk.size, chunk.data_bytes))
+        if chunk.content is None:
+            self._copy(chunk)
+        else:
+            self._target.write(chunk.content)
+        self._target.writelines(pack_index(number, entries) for number, entries in chunk.index.items())
+        self._report(min(2 * self._scan.bytes, self._scan.bytes + self._target.tell()), 2 * self._scan.bytes)
+        return pack_chunk_info(at, chunk.index)
+
+    def _copy(self, chunk: Chunk) -> None:
+        self._source.seek(chunk.data_at)
+        data = self._source.read(chunk.data_bytes)
+        if len(data) < chunk.data_bytes:
+            raise RecordingError(f"{self._source.name} changed while it was read: repair it when it is written")
+        self._target.write(data)

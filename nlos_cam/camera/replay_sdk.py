@@ -1,0 +1,136 @@
+"""A recording as a camera, played back by librealsense: the second reader, that ours is checked against."""
+
+import atexit
+import gc
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from nlos_calibration.projection import Intrinsics
+from nlos_calibration.rig import Rig
+
+from nlos_cam.camera.bag_container import advice, told
+from nlos_cam.camera.bag_scan import scan_bag
+from nlos_cam.camera.inbox import Inbox
+from nlos_cam.camera.replay import identity_of, open_lidar_bag
+from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera.session import Session, find_streams
+from nlos_cam.camera.streams import FORMATS, FrameSet
+from nlos_cam.errors import CameraError, RecordingError
+from nlos_cam.frames import Frame
+
+POLL_S = 0.05
+START_TIMEOUT_S = 30.0
+"""Before its first frame, a playback that has not begun looks like one that has ended."""
+
+
+class SdkReplayCamera:
+    """The frames of a .bag through librealsense. Iterating starts at the first; none is dropped, since the SDK waits.
+
+    The file is read by us first, since some damaged ones crash the SDK, or hang it; where its playback ends is held
+    against the index. A frame's settings are those with which the recording began. Raises what ReplayCamera raises, but
+    on opening, and CameraError where there is no SDK.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.uri = f"bag:{path}"
+        self.rig: Rig | None = None
+        self._path, self._bag, self._sdk = path, open_lidar_bag(path), load_sdk()
+        self._check_all()
+        self.identity: Mapping[str, str] = identity_of(self._bag)
+        self.incomplete = self.dropped = 0
+        self.counts: Counter[str] = Counter()
+        self.arrived: Counter[str] = Counter()
+        """Frames of each stream in the last iteration."""
+        self._entered = False
+        self._session: Session | None = None
+        self.intrinsics: Intrinsics = self._open()[1].intrinsics
+
+    def _check_all(self) -> None:
+        """Raise RecordingError for any damage, in what we read of a recording and in what only the SDK does."""
+        self._bag.check()
+        with told(self._path, "is damaged"):
+            if damages := scan_bag(self._path).damages:
+                raise ValueError(f"at byte {damages[0].position}: {damages[0].why}")
+
+    def _open(self) -> tuple[Any, Session]:
+        try:
+            playback = self._sdk.context().load_device(str(self._path)).as_playback()
+            playback.set_real_time(False)
+            return playback, Session(*find_streams(playback), Inbox(lossless=True))
+        except RuntimeError as error:
+            raise self._damaged(f"is cut short or damaged ({error})") from error
+        except KeyError as error:  # it takes a damaged description for one of another stream
+            raise self._damaged(f"is damaged (librealsense finds no {error} in it)") from error
+
+    def _damaged(self, what: str) -> RecordingError:
+        return RecordingError(f"{self._path} {what}: {advice(self._path)}")
+
+    def __enter__(self) -> Self:
+        self._entered = True
+        atexit.register(self._leave)  # for a program that ends without leaving: the SDK's threads would crash it
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._leave()
+
+    def _leave(self) -> None:
+        atexit.unregister(self._leave)
+        self._entered = False
+        self._stop()
+
+    def _stop(self) -> None:
+        if self._session:
+            self._session.stop()
+        self._session = None
+        gc.collect()
+
+    def __iter__(self) -> Iterator[Frame]:
+        if not self._entered:
+            raise CameraError(f"{self.uri} is not started: iterate inside `with`")
+        self._stop()
+        playback, session = self._open()
+        self._session = session
+        session.start()
+        while found := self._next(session.inbox, playback):
+            self._count(session.inbox)
+            yield session.frame(found)
+        self._count(session.inbox)
+        if not session.inbox.closed:  # else it was left early
+            self._check_end(playback.get_position() / 1e9)
+
+    def _check_end(self, reached_s: float) -> None:
+        """The SDK ends quietly where it cannot read on. Raises RecordingError where the index lists more."""
+        for stream in FORMATS:
+            listed, came = self._bag.streams[stream].frames, self.arrived[stream]
+            if came < listed:
+                raise self._damaged(
+                    f"is damaged {reached_s:.1f} s into its {self._bag.end_ns / 1e9:.1f} s: the SDK's playback gave "
+                    f"{came} of {listed} {stream} frames"
+                )
+
+    def telemetry(self) -> Mapping[str, float]:
+        return self._session.telemetry() if self._session else {}
+
+    def _count(self, inbox: Inbox) -> None:
+        self.incomplete, self.dropped, self.arrived = inbox.incomplete, inbox.dropped, inbox.arrived
+        self.counts = inbox.counts
+
+    def _next(self, inbox: Inbox, playback: Any) -> FrameSet | None:
+        waited_s = 0.0
+        while (found := inbox.take(POLL_S)) is None and not inbox.ended:
+            waited_s += POLL_S
+            # asked, and not called back: a callback from a thread that ends may find the interpreter waiting for it
+            stopped = playback.current_status() == self._sdk.playback_status.stopped
+            if stopped and inbox.arrived.total() > 0:
+                inbox.finish()
+            elif waited_s > START_TIMEOUT_S:
+                raise RecordingError(f"{self._path} gave no frame in {START_TIMEOUT_S:.0f} s: record it again")
+        return found

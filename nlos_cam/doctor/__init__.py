@@ -1,0 +1,7 @@
+"""Why a camera is not found, and what to do about it."""
+
+from nlos_cam.doctor.check import Check
+from nlos_cam.doctor.diagnosis import diagnose
+from nlos_cam.doctor.facts import Facts, gather
+
+__all__ = ["Check", "Facts", "diagnose", "gather"]

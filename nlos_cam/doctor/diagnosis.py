@@ -1,0 +1,82 @@
+"""The diagnosis: every check in order, and the reason why USB and librealsense differ."""
+
+from collections.abc import Callable
+
+from nlos_cam.doctor import camera, linux, software
+from nlos_cam.doctor.check import Check, Finding, failed, ok, skipped, warning
+from nlos_cam.doctor.facts import Facts
+
+REPLUG = (
+    "unplug the camera, wait 5 s, plug it straight into a USB 3 port and run this again; if it stays, run with "
+    "LRS_LOG_LEVEL=DEBUG in the environment and look for `partial enum`"
+)
+REPLUG_WINDOWS = (
+    "in the Device Manager uninstall every RealSense device together with its driver, unplug the camera and plug it in "
+    "again: Windows' own camera driver has to take it, not one of Zadig or of a vendor"
+)
+CAUSES: dict[str, Callable[[Facts], Finding]] = {
+    "sdk-version": software.sdk_version,
+    "sdk-alone": software.sdk_alone,
+    "system": software.system,
+    "container": linux.container,
+    "permissions": linux.permissions,
+    "video-driver": linux.video_driver,
+    "hid-sensors": linux.hid_sensors,
+    "in-use": linux.in_use,
+    "firmware": camera.firmware,
+}
+"""What can hide from librealsense a camera that USB shows, the likeliest first."""
+
+
+def sdk_camera(facts: Facts) -> Finding:
+    """Whether librealsense sees the cameras that USB shows, and if not, why."""
+    if facts.sdk.error:
+        return skipped("librealsense cannot be asked: see sdk")
+    hidden = [pair.label for pair in facts.pairs if not pair.sdk]
+    if hidden:
+        return _hidden(facts, ", ".join(hidden))
+    if not facts.pairs:
+        return skipped(camera.ABSENT)
+    told = ", ".join(f"l515:{pair.sdk.serial}" for pair in facts.pairs if pair.sdk)
+    if facts.usb.error or all(pair.usb for pair in facts.pairs):
+        return ok(f"librealsense sees {told}")
+    return warning(f"librealsense sees {told}, USB not all of it", linux.CONTAINER_FIX)
+
+
+def _hidden(facts: Facts, told: str) -> Finding:
+    """Failed, for the first cause that was found."""
+    found = {name: check(facts) for name, check in CAUSES.items()}
+    causes = {name: finding for name, finding in found.items() if finding.status == "failed"}
+    if not causes:
+        fix = REPLUG_WINDOWS if facts.host.platform.system == "windows" else REPLUG
+        return failed(f"USB shows {told}, librealsense does not, and nothing here says why", fix)
+    reasons = "; ".join(f"{name}: {finding.detail}" for name, finding in causes.items())
+    return failed(f"USB shows {told}, librealsense does not: {reasons}", next(iter(causes.values())).fix)
+
+
+CHECKS: dict[str, Callable[[Facts], Finding]] = {
+    "python": software.python,
+    "system": software.system,
+    "sdk": software.sdk,
+    "sdk-version": software.sdk_version,
+    "sdk-alone": software.sdk_alone,
+    "libusb": software.libusb,
+    "usb-camera": camera.usb_camera,
+    "recovery": camera.recovery,
+    "link": camera.link,
+    "container": linux.container,
+    "udev-rules": linux.udev_rules,
+    "permissions": linux.permissions,
+    "video-driver": linux.video_driver,
+    "hid-sensors": linux.hid_sensors,
+    "in-use": linux.in_use,
+    "sdk-camera": sdk_camera,
+    "firmware": camera.firmware,
+    "metadata": linux.metadata,
+}
+"""Every check by its name, in the order in which they are told."""
+
+
+def diagnose(facts: Facts) -> list[Check]:
+    """Every check's outcome; none is left out."""
+    return [Check(name, **vars(check(facts))) for name, check in CHECKS.items()]

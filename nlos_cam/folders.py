@@ -1,0 +1,30 @@
+"""Folders of results: written under another name, and renamed when whole."""
+
+import os
+import shutil
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+from nlos_cam.errors import OutputExistsError
+
+
+@contextmanager
+def renamed_when_whole(out: Path) -> Generator[Path]:
+    """A folder to write in, beside `out`; its contents replace those of the same names in `out` at the end.
+
+    After an error it is removed. Raises OutputExistsError where `out` is a file.
+    """
+    if out.exists() and not out.is_dir():
+        raise OutputExistsError(f"{out} is a file: choose a folder's name for --out")
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    part.mkdir()
+    try:
+        yield part
+        out.mkdir(exist_ok=True)
+        for made in part.iterdir():
+            if made.is_dir():
+                shutil.rmtree(out / made.name, ignore_errors=True)
+            made.replace(out / made.name)
+    finally:
+        shutil.rmtree(part)

@@ -1,0 +1,135 @@
+"""A thread that reads a camera's frames into a bounded queue, so that a slow loop never holds up a camera."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from threading import Condition, Event, Thread
+from types import TracebackType
+from typing import Self
+
+from nlos_cam.errors import CameraLostError
+from nlos_cam.frames import Frame
+from nlos_cam.reconstruct import Clock
+
+QUEUE_FRAMES = 3
+LET_GO_AFTER_S = 1.0
+"""What still reads after this is waiting for a camera."""
+JOIN_TIMEOUT_S = 10.0
+POLL_S = 0.1
+"""How often a wait looks up, so that a signal is answered."""
+SAME_CLOCK_S = 10.0
+"""Timestamps this close to the host's time of day are host time; others have a zero of their own."""
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A frame, and when the reader had it."""
+
+    frame: Frame
+    arrived_s: float
+
+
+class FrameReader:
+    """A thread that reads frames into a queue of three while entered.
+
+    When the queue is full it drops the oldest frame and counts it by number, or, if it `keeps_all`, waits. Iterating
+    ends where the frames end, when `stop` is set, or when it is `enough`, also while no frame comes; their source's
+    exception is raised to whoever iterates. On leaving, a source that keeps the thread waiting is told to `let_go`.
+    """
+
+    def __init__(
+        self,
+        frames: Iterable[Frame],
+        *,
+        keeps_all: bool,
+        stop: Event,
+        clock: Clock = time.time,
+        enough: Callable[[], bool] = lambda: False,
+        let_go: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.dropped: list[int] = []
+        """Frame numbers."""
+        self._least_delay_s = float("inf")
+        self._frames, self._keeps_all, self._clock = frames, keeps_all, clock
+        self._stop, self._enough, self._let_go = stop, enough, let_go
+        self._left = False
+        self._queue: deque[Arrival] = deque()
+        self._changed = Condition()
+        self._ended = False
+        self._error: BaseException | None = None
+        self._thread = Thread(target=self._read, name="frame reader", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with self._changed:
+            self._left = True
+            self._changed.notify_all()
+        self._thread.join(LET_GO_AFTER_S)
+        if self._thread.is_alive():
+            self._let_go()
+            self._thread.join(JOIN_TIMEOUT_S)
+        if self._thread.is_alive() and error is None:
+            raise CameraLostError(f"the camera did not stop within {JOIN_TIMEOUT_S:.0f} s: replug it")
+
+    def __iter__(self) -> Iterator[Arrival]:
+        while (arrival := self._next()) is not None:
+            yield arrival
+
+    def _next(self) -> Arrival | None:
+        with self._changed:
+            while not (self._queue or self._ended or self._is_done):
+                self._changed.wait(POLL_S)
+            if self._is_done:
+                return None
+            if self._queue:
+                self._changed.notify_all()
+                return self._queue.popleft()
+            if self._error is not None:
+                raise self._error
+            return None
+
+    def _read(self) -> None:
+        try:
+            for frame in self._frames:
+                if not self._put(Arrival(frame, self._clock())):
+                    return
+        except BaseException as error:  # noqa: BLE001  whatever it was, the consumer raises it
+            self._error = error
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def _put(self, arrival: Arrival) -> bool:
+        """Queue a frame; False if nobody wants more."""
+        with self._changed:
+            while self._keeps_all and len(self._queue) == QUEUE_FRAMES and not self._unwanted:
+                self._changed.wait(POLL_S)
+            if len(self._queue) == QUEUE_FRAMES:
+                self.dropped.append(self._queue.popleft().frame.frame_number)
+            self._queue.append(arrival)
+            self._least_delay_s = min(self._least_delay_s, arrival.arrived_s - arrival.frame.timestamp_s)
+            self._changed.notify_all()
+            return not self._unwanted
+
+    @property
+    def offset_s(self) -> float:
+        """What makes host time of a timestamp: 0 if it is that already, else such that the fastest delivery took 0."""
+        return 0.0 if abs(self._least_delay_s) < SAME_CLOCK_S else self._least_delay_s
+
+    @property
+    def _is_done(self) -> bool:
+        return self._stop.is_set() or self._enough()
+
+    @property
+    def _unwanted(self) -> bool:
+        return self._left or self._stop.is_set()

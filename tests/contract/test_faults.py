@@ -1,0 +1,241 @@
+"""The live loop over every fault of the simulated device, with librealsense in between: it goes on, and counts."""
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from threading import Event, Timer
+from typing import Any
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam import frame_reader
+from nlos_cam.camera import Recording, inbox
+from nlos_cam.camera.replay import ReplayCamera
+from nlos_cam.camera.replay_sdk import SdkReplayCamera
+from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.errors import CameraLostError
+from nlos_cam.frames import Frame
+from nlos_cam.live import run_live
+from nlos_cam.live_report import LiveReport
+from nlos_cam.render.fault_record import Fault
+from nlos_cam.render.sensor import SensedImages
+from nlos_cam.view.viewer import Moment, NullViewer
+
+RIG = load_rig("paper-rig")
+LAST = 30
+"""The instant at which a run ends."""
+FOREVER = 10**9
+PLENTY = 100_000
+
+Make = Callable[..., SimulatedCamera]
+
+
+def network(*_: np.ndarray) -> np.ndarray:
+    return np.full((1, 64, 64), 0.5, np.float32)
+
+
+@pytest.fixture
+def camera(noise_world: Any, hurried_clock: Any, monkeypatch: pytest.MonkeyPatch) -> Make:
+    """A camera in a world without noise that saturates; nothing is dropped because the machine is slow."""
+    monkeypatch.setattr(inbox, "CAPACITY", PLENTY)
+    monkeypatch.setattr(frame_reader, "QUEUE_FRAMES", PLENTY)
+
+    class QuietWorld(noise_world):
+        def images(self, number: int) -> SensedImages:
+            noise = super().images(number)
+            return SensedImages(noise.depth_z16 | 1, noise.ir // 2, noise.confidence)
+
+    def make(*faults: Fault, clock: Any = None, recording: Recording | None = None) -> SimulatedCamera:
+        clock = clock or hurried_clock()
+        made = SimulatedCamera("sim:quiet", QuietWorld(), clock=clock, faults=faults, recording=recording)
+        made.silence_s = 0.5  # of real time: an outage is that long, and no other pause should be
+        return made
+
+    return make
+
+
+class Until:
+    """A camera that ends at the LAST instant, or some later one, of its world."""
+
+    def __init__(self, camera: SimulatedCamera, last: int = LAST) -> None:
+        self.camera, self.last = camera, last
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.camera, name)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self.camera:
+            yield frame
+            if instant_of(frame) >= self.last:
+                return
+
+
+class ListViewer(NullViewer):
+    def __init__(self) -> None:
+        self.moments: list[Moment] = []
+
+    def show(self, moment: Moment) -> None:
+        self.moments.append(moment)
+
+
+def instant_of(frame: Frame) -> int:
+    assert frame.truth_depth_m is not None
+    return int(frame.truth_depth_m[0, 0])
+
+
+def live(camera: SimulatedCamera, last: int = LAST, **options: Any) -> tuple[list[Moment], LiveReport]:
+    viewer = ListViewer()
+    with camera:
+        report = run_live(Until(camera, last), RIG, network, viewer, stop=Event(), **options)  # type: ignore[arg-type]
+    assert report.frames == len(viewer.moments)
+    return viewer.moments, report
+
+
+def fault(kind: Any, frames: int = 3, **options: Any) -> Fault:
+    return Fault(kind=kind, at_frame=5, frames=frames, **options)
+
+
+@pytest.mark.parametrize(
+    ("befalls", "missing", "counts"),
+    [
+        (fault("stall", 3), [5, 6, 7], {}),
+        (fault("stall", 10), [*range(5, 15)], {"stalled": 1}),
+        (fault("drops"), [5, 6, 7], {"dropped_camera": 3}),
+        (fault("drops", stream="depth"), [5, 6, 7], {"incomplete": 3}),
+        (fault("drops", stream="confidence"), [5, 6, 7], {"incomplete": 3}),
+        (fault("duplicate"), [], {"duplicate": 3}),
+        (fault("out_of_order"), [5, 7, 9], {"out_of_order": 3, "dropped_camera": 3}),
+        (fault("all_zero"), [], {"blank": 3}),
+        (fault("saturated"), [], {"saturated": 3}),
+        (fault("half_invalid"), [], {"half_invalid": 3}),
+        (fault("wrong_size"), [5, 6, 7], {"wrong_size": 3, "incomplete": 3}),
+        (Fault(kind="clock_wrap", at_frame=5), [], {}),
+    ],
+    ids=lambda value: f"{value.kind} {value.stream or ''}".strip() if isinstance(value, Fault) else "",
+)
+def test_a_fault_that_passes_is_survived_and_counted(
+    camera: Make, befalls: Fault, missing: list[int], counts: dict[str, int]
+) -> None:
+    moments, report = live(camera(befalls))
+    assert [instant_of(moment.frame) for moment in moments] == [n for n in range(LAST + 1) if n not in missing]
+    assert report.counts == counts
+    for one, next_one in pairwise(moments):
+        rise_s = next_one.frame.timestamp_s - one.frame.timestamp_s
+        assert rise_s * 30 == pytest.approx(instant_of(next_one.frame) - instant_of(one.frame), abs=1e-3)
+
+
+def test_without_faults_nothing_is_counted_and_every_bit_is_the_worlds(camera: Make) -> None:
+    plain = camera()
+    moments, report = live(plain)
+    assert (report.counts, report.dropped) == ({}, 0)
+    assert [moment.frame.frame_number for moment in moments] == list(range(LAST + 1))
+    for moment in moments:
+        frame, images = moment.frame, plain._world.images(moment.frame.frame_number)
+        np.testing.assert_array_equal((frame.depth_m / np.float32(0.00025)).round(), images.depth_z16)
+        np.testing.assert_array_equal(frame.ir, images.ir)
+        np.testing.assert_array_equal(frame.confidence, images.confidence)
+
+
+def test_of_a_frame_without_depth_nothing_is_shown(camera: Make) -> None:
+    moments, _ = live(camera(fault("all_zero")))
+    shown = [instant_of(each.frame) for each in moments if np.isfinite(each.reconstruction.depth_m).any()]
+    assert shown == [n for n in range(LAST + 1) if n not in {5, 6, 7}]
+
+
+def rises(moments: list[Moment]) -> None:
+    frames = [moment.frame for moment in moments]
+    for one, next_one in pairwise(frames):
+        assert next_one.frame_number > one.frame_number
+        assert next_one.timestamp_s > one.timestamp_s
+
+
+@pytest.mark.parametrize("own_clock", [False, True])
+def test_a_device_that_is_plugged_in_again_goes_on(camera: Make, own_clock: bool) -> None:
+    wraps = [Fault(kind="clock_wrap", at_frame=20)] if own_clock else []
+    moments, report = live(camera(fault("unplug", 30), *wraps), last=600)
+    rises(moments)
+    seen = [instant_of(moment.frame) for moment in moments]
+    assert seen[:5] == [0, 1, 2, 3, 4]
+    assert seen[5] >= 35
+    assert seen == sorted(set(seen))
+    assert report.counts["replugged"] == 1
+    assert report.dropped == moments[-1].frame.frame_number + 1 - report.frames
+
+
+def test_a_long_stall_has_the_streams_restarted(camera: Make, hurried_clock: Any) -> None:
+    class Strolling(hurried_clock):
+        def wait(self, stop: Event, seconds: float) -> bool:
+            return super().wait(stop, seconds) or stop.wait(0.005)
+
+    stalled = camera(fault("stall", 150), clock=Strolling())  # 0.75 s, or more on a busy machine
+    moments, report = live(stalled, last=300)
+    rises(moments)
+    assert report.counts["restarted"] >= 1
+    assert "replugged" not in report.counts
+
+
+@pytest.mark.parametrize(
+    ("kind", "told", "counts"),
+    [
+        ("unplug", "it was unplugged and did not start within", {}),
+        ("stall", "nor after 3 restarts of its streams and a reset", {"restarted": 3, "reset": 1}),
+    ],
+)
+def test_a_device_that_never_comes_back_ends_the_run_with_one_line_and_what_was_counted(
+    camera: Make, kind: Any, told: str, counts: dict[str, int]
+) -> None:
+    until_then: list[LiveReport] = []
+    with pytest.raises(CameraLostError, match=told) as error:
+        live(camera(fault(kind, FOREVER), Fault(kind="duplicate", at_frame=2)), on_error=until_then.append)
+    assert "\n" not in str(error.value)
+    assert until_then[0].frames == 5
+    assert until_then[0].counts == {"duplicate": 1, **counts}
+
+
+def test_stopping_ends_a_wait_for_a_device_that_is_gone(camera: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_reader, "LET_GO_AFTER_S", 0.01)
+    gone = camera(fault("unplug", FOREVER))
+    gone.silence_s, gone.replug_s = 0.05, float("inf")
+    stop = Event()
+    timer = Timer(1.0, stop.set)
+    timer.start()
+    with gone:
+        report = run_live(gone, RIG, network, NullViewer(), stop=stop)
+    assert report.frames == 5
+    timer.join()
+
+
+def test_a_camera_that_is_entered_again_meets_the_same_faults(camera: Make) -> None:
+    again = camera(fault("unplug", 5), Fault(kind="duplicate", at_frame=2))
+    for _ in range(2):
+        _, report = live(again, last=300)
+        assert (report.counts["duplicate"], report.counts["replugged"]) == (1, 1)
+
+
+RECORDED = [
+    Fault(kind="drops", at_frame=2, stream="infrared"),
+    Fault(kind="drops", at_frame=4, frames=2),
+    Fault(kind="duplicate", at_frame=7),
+    Fault(kind="out_of_order", at_frame=9),
+    Fault(kind="wrong_size", at_frame=13),
+    Fault(kind="stall", at_frame=15, frames=8),
+    Fault(kind="clock_wrap", at_frame=20),
+    Fault(kind="all_zero", at_frame=25),
+]
+
+
+@pytest.mark.parametrize("reader", [ReplayCamera, SdkReplayCamera])
+def test_a_recording_of_faults_is_replayed_as_it_was_seen(camera: Make, tmp_path: Path, reader: Any) -> None:
+    recording = Recording(tmp_path / "faulty.bag", frames=40)
+    with camera(*RECORDED, recording=recording) as recorded:
+        seen = list(recorded)
+    with reader(recording.path) as replayed:
+        again = list(replayed)
+    assert [frame.frame_number for frame in again] == [frame.frame_number for frame in seen]
+    np.testing.assert_allclose([f.timestamp_s for f in again], [f.timestamp_s for f in seen], atol=1e-6)
+    for one, other in zip(seen, again, strict=True):
+        np.testing.assert_array_equal(one.depth_m, other.depth_m)
+    assert replayed.counts == recorded.counts == {"duplicate": 1, "out_of_order": 1, "wrong_size": 1, "stalled": 1}
+    assert (replayed.incomplete, replayed.dropped) == (recorded.incomplete, recorded.dropped) == (2, 3)

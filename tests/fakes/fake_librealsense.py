@@ -1,0 +1,149 @@
+"""Stands for pyrealsense2: what the camera layer uses of it, over fake lidars.
+
+Devices and sensors are handles on a `FakeLidar`, which fail once it was unplugged, as librealsense's do.
+tests/unit/test_fake_librealsense.py holds the names against the real module.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from fake_lidar import FakeFrame, FakeLidar, FakeProfile, Named
+
+SIZES = [(1024, 768), (640, 480), (320, 240)]
+GONE = "failed to set power state"
+
+
+class FakeSensor:
+    """A handle on the lidar's depth sensor."""
+
+    def __init__(self, lidar: FakeLidar, generation: int) -> None:
+        self.lidar, self.generation = lidar, generation
+        sizes = [(320, 240)] if lidar.info.get("usb_type_descriptor", "").startswith("2") else SIZES
+        self.profiles = [FakeProfile(stream, size, lidar) for size in sizes for stream in lidar.streams]
+
+    def _check(self) -> None:
+        if not self.lidar.plugged or self.generation != self.lidar.generation:
+            raise RuntimeError(GONE)
+
+    def get_stream_profiles(self) -> list[FakeProfile]:
+        return self.profiles
+
+    def open(self, profiles: list[FakeProfile]) -> None:
+        self._check()
+        self.lidar.opened = list(profiles)
+
+    def start(self, callback: Callable[[FakeFrame], None]) -> None:
+        self._check()
+        self.lidar.start(callback)
+
+    def stop(self) -> None:
+        self.lidar.stop()
+        self._check()
+
+    def close(self) -> None:
+        self.lidar.did.append("close")
+        self._check()
+
+    def get_supported_options(self) -> list[Named]:
+        return [Named(name=name) for name in self.lidar.options]
+
+    def supports(self, option: Named) -> bool:
+        return option.name in self.lidar.options
+
+    def _need(self, option: Named) -> None:
+        self._check()
+        if not self.supports(option):
+            raise RuntimeError(f"object doesn't support option {option.name}")
+
+    def get_option(self, option: Named) -> float:
+        self._need(option)
+        return self.lidar.options[option.name]
+
+    def get_option_range(self, option: Named) -> SimpleNamespace:
+        self._need(option)
+        low, high, step = self.lidar.ranges.get(option.name, (0.0, 100.0, 1.0))
+        return SimpleNamespace(min=low, max=high, step=step, default=low)
+
+    def set_option(self, option: Named, value: float) -> None:
+        self._need(option)
+        self.lidar.did.append(option.name)
+        low, high, _ = self.lidar.ranges.get(option.name, (0.0, 100.0, 1.0))
+        if option.name in self.lidar.refused or not low <= value <= high:
+            raise RuntimeError("out of range")
+        if option.name not in self.lidar.stubborn:
+            self.lidar.options[option.name] = value
+
+
+class FakeDevice:
+    """A handle on the lidar, good until it is unplugged."""
+
+    def __init__(self, lidar: FakeLidar, generation: int) -> None:
+        self.lidar, self.generation = lidar, generation
+
+    def supports(self, key: str) -> bool:
+        return key in self.lidar.info
+
+    def get_info(self, key: str) -> str:
+        return self.lidar.info[key]
+
+    def query_sensors(self) -> list[FakeSensor]:
+        if self.generation != self.lidar.generation:
+            raise RuntimeError(GONE)
+        return [FakeSensor(self.lidar, self.generation)]
+
+    def hardware_reset(self) -> None:
+        """It leaves the bus and comes back, with its calibration."""
+        if self.generation != self.lidar.generation:
+            raise RuntimeError("hwmon command 0x20 failed. Error type: no device")
+        self.lidar.did.append("reset")
+        self.lidar.unplug()
+        self.lidar.uncalibrated, self.lidar.back_after = False, self.lidar.reset_takes
+
+
+class FakeRecorder:
+    """Makes a file, and notes when it began: it has no frames to put into it."""
+
+    def __init__(self, path: str, device: FakeDevice) -> None:
+        device.lidar.did.append("record")
+        Path(path).write_bytes(b"")
+
+    def query_sensors(self) -> list[FakeSensor]:
+        return []
+
+    def pause(self) -> None:
+        pass
+
+
+class FakeContext:
+    def __init__(self, lidars: list[FakeLidar]) -> None:
+        self.lidars = lidars
+
+    def query_devices(self) -> list[FakeDevice]:
+        return [FakeDevice(lidar, lidar.generation) for lidar in self.lidars if lidar.look_for()]
+
+
+class Names:
+    """Stands for an enumeration: any member is its own name. Keeps what was asked for."""
+
+    def __init__(self, make: Callable[[str], Any]) -> None:
+        self.make, self.asked = make, set[str]()
+
+    def __getattr__(self, name: str) -> Any:
+        self.asked.add(name)
+        return self.make(name)
+
+
+class FakeSdk:
+    """The module."""
+
+    recorder = FakeRecorder
+
+    def __init__(self, *lidars: FakeLidar) -> None:
+        self.camera_info, self.option = Names(str), Names(lambda name: Named(name=name))
+        self.lidars, self.contexts = list(lidars), 0
+
+    def context(self) -> FakeContext:
+        self.contexts += 1
+        return FakeContext(self.lidars)

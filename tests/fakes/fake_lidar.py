@@ -1,0 +1,193 @@
+"""An L515 on USB, with the faults that they have; what librealsense makes of it is in fake_librealsense.py."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Event, Thread
+from types import SimpleNamespace
+from typing import Self
+
+import numpy as np
+
+from nlos_cam.camera.l515 import NEAR_WALL
+from nlos_cam.camera.streams import FORMATS
+from nlos_cam.render.sensor import DEPTH_UNIT_M
+
+Named = SimpleNamespace  # a member of one of the SDK's enumerations
+PACE_S = 0.002
+
+
+class NapClock:
+    """A clock that moves only by waiting, and notes how long it was asked to."""
+
+    def __init__(self) -> None:
+        self.time_s, self.naps = 1e9, list[float]()
+
+    def now(self) -> float:
+        return self.time_s
+
+    def wait(self, stop: Event, seconds: float) -> bool:
+        self.naps.append(seconds)
+        self.time_s += seconds
+        return stop.wait(0.001)
+
+
+class FakeProfile:
+    def __init__(self, stream: str, size: tuple[int, int], lidar: "FakeLidar") -> None:
+        self.stream, self.size, self.lidar = stream, size, lidar
+
+    def stream_type(self) -> Named:
+        return Named(name=self.stream)
+
+    def format(self) -> Named:
+        return Named(name=FORMATS[self.stream])
+
+    def fps(self) -> int:
+        return 30
+
+    def width(self) -> int:
+        return self.size[0]
+
+    def height(self) -> int:
+        return self.size[1]
+
+    def as_video_stream_profile(self) -> Self:
+        return self
+
+    def get_intrinsics(self) -> SimpleNamespace:
+        width, height = self.size
+        if self.lidar.uncalibrated:
+            raise RuntimeError(f"intrinsics for resolution {width},{height} doesn't exist")
+        return SimpleNamespace(width=width, height=height, fx=460.0, fy=461.0, ppx=width / 2, ppy=height / 2)
+
+
+@dataclass(frozen=True)
+class FakeFrame:
+    profile: FakeProfile
+    number: int
+    timestamp_ms: float
+    pixels: np.ndarray
+    domain: str = "global_time"
+
+    def get_profile(self) -> FakeProfile:
+        return self.profile
+
+    def get_frame_number(self) -> int:
+        return self.number
+
+    def get_timestamp(self) -> float:
+        return self.timestamp_ms
+
+    def get_frame_timestamp_domain(self) -> Named:
+        return Named(name=self.domain)
+
+    def get_data(self) -> np.ndarray:
+        return self.pixels
+
+
+class FakeLidar:
+    """An L515 on USB. Each start of its sensor takes the next of `runs`, and gives that many frames from number 0.
+
+    While it `flaps` more than once, it stays with the first.
+
+    Without `runs` it gives one frame on starting, and then what it is told to `deliver`.
+    """
+
+    def __init__(
+        self,
+        serial: str = "f0246262",
+        usb: str = "3.2",
+        streams: tuple[str, ...] = tuple(FORMATS),
+        name: str = "Intel RealSense L515",
+        runs: tuple[int, ...] | None = None,
+        **options: float,
+    ) -> None:
+        self.info = {"name": name, "serial_number": serial, "usb_type_descriptor": usb}
+        self.info["firmware_version"] = "01.05.08.01"
+        self.streams, self.runs = streams, list(runs) if runs is not None else None
+        factory = {"depth_units": DEPTH_UNIT_M, "visual_preset": 4.0, "global_time_enabled": 0.0}
+        self.factory = factory | dict.fromkeys(NEAR_WALL, 9.0) | options
+        self.options = dict(self.factory)
+        self.ranges: dict[str, tuple[float, float, float]] = {}
+        """Lowest, highest and step of an option that has a range."""
+        self.stubborn: set[str] = set()
+        self.refused: set[str] = set()
+        self.did: list[str] = []
+        self.opened: list[FakeProfile] = []
+        self.start_error: Exception | None = None
+        self.uncalibrated = False
+        self.reset_takes = 2
+        """Looks until it is back."""
+        self.plugged, self.generation = True, 0
+        self.flaps = 0
+        """How often it is still to be unplugged at the end of a run, and plugged in when it was looked for twice."""
+        self.back_after = 0
+        """After unplugging itself, it is plugged in when it was looked for so often; never, if 0."""
+        self.saturated_share: Callable[[float], float] = lambda _: 0.0
+        """Share of infrared pixels at 255, by laser power."""
+        self.zero_ms = 0.0
+        self._callback: Callable[[FakeFrame], None] | None = None
+        self._stopping, self._thread = Event(), None
+
+    def unplug(self) -> None:
+        self.did.append("unplugged")
+        self.plugged, self.generation = False, self.generation + 1
+        self._stopping.set()
+        self._callback, self.options = None, dict(self.factory)
+
+    def plug_in(self) -> None:
+        self.plugged = True
+
+    def look_for(self) -> bool:
+        """Whether it is on USB, now that somebody looks."""
+        if not self.plugged and self.back_after:
+            self.back_after -= 1
+            self.plugged = self.back_after == 0
+        return self.plugged
+
+    def start(self, callback: Callable[[FakeFrame], None]) -> None:
+        if self.start_error:
+            raise self.start_error
+        self.did.append("start")
+        self._callback = callback
+        if self.runs is None:
+            self.deliver(range(1))
+            return
+        self._stopping = stopping = Event()
+        frames = 0 if not self.runs else self.runs[0] if self.flaps > 1 else self.runs.pop(0)
+        self._thread = Thread(target=self._run, args=(frames, stopping), name="fake SDK", daemon=True)
+        self._thread.start()
+
+    def finish_run(self) -> bool:
+        """Wait until a run has given its frames; whether it did in good time."""
+        self._thread.join(5.0)
+        return not self._thread.is_alive()
+
+    def _run(self, frames: int, stopping: Event) -> None:
+        for number in range(frames):
+            if stopping.wait(PACE_S):
+                return
+            self.deliver(range(number, number + 1))
+        if self.flaps and frames and not stopping.wait(PACE_S):
+            self.flaps, self.back_after = self.flaps - 1, 2
+            self.unplug()
+
+    def deliver(self, numbers: range, streams: tuple[str, ...] = tuple(FORMATS)) -> None:
+        for number in numbers:
+            for profile in self.opened:
+                if self._callback and profile.stream in streams:
+                    self._callback(FakeFrame(profile, number, self.zero_ms + number * 1000 / 30, self._pixels(profile)))
+
+    def _pixels(self, profile: FakeProfile) -> np.ndarray:
+        pixels = np.full(profile.size[::-1], 240, np.uint16 if profile.stream == "depth" else np.uint8)
+        if profile.stream == "infrared":
+            share = self.saturated_share(self.options.get("laser_power", 0.0))
+            pixels.ravel()[: round(share * pixels.size)] = 255
+        return pixels
+
+    def stop(self) -> None:
+        self.did.append("stop")
+        self._callback = None
+        self._stopping.set()
+        if self._thread:
+            self._thread.join(5.0)
+            self._thread = None

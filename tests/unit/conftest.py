@@ -1,0 +1,69 @@
+import importlib
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from rosbags.rosbag1 import Reader, Writer
+
+TOOLS = Path(__file__).parents[2] / "tools"
+DATA = "data/realsense_d435_depth_color_640x480.bag"
+
+
+@pytest.fixture(scope="session")
+def tool() -> Iterator[Callable[[str], ModuleType]]:
+    """A module of the tools folder, by name."""
+    sys.path.insert(0, str(TOOLS))
+    yield importlib.import_module
+    sys.path.remove(str(TOOLS))
+
+
+@pytest.fixture(scope="session")
+def noise_bags(tool: Callable[[str], ModuleType], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Forty frames of noise, recorded "packed" and "plain", and each of them "-unindexed" as a kill leaves it."""
+    return tool("noise_recordings").make_all(tmp_path_factory.mktemp("noise"))
+
+
+@pytest.fixture
+def real_bag() -> Path:
+    """A D435's recording of 2018, in a data folder of the checkout or beside it."""
+    root = Path(__file__).parents[2]
+    found = [root / DATA, *sorted(root.parent.glob(f"*/{DATA}"))]
+    if path := next((path for path in found if path.is_file()), None):
+        return path
+    pytest.skip(f"no {DATA} in this checkout, or in a folder beside it")
+
+
+Edit = Callable[[str, int, bytes], Iterable[tuple[int, bytes]]]
+
+
+def rewrite(source: Path, target: Path, edit: Edit, compression: str | None = None) -> Path:
+    """A recording whose messages (topic, time in ns, bytes) are those that `edit` makes of another's."""
+    writer = Writer(target)
+    if compression:
+        writer.set_compression(Writer.CompressionFormat[compression])
+    with Reader(source) as reader, writer:
+        made = {
+            found.id: writer.add_connection(found.topic, found.msgtype, msgdef=found.msgdef.data, md5sum=found.digest)
+            for found in reader.connections
+        }
+        for connection, time_ns, raw in reader.messages():
+            for new_time_ns, new_raw in edit(connection.topic, time_ns, raw):
+                writer.write(made[connection.id], new_time_ns, new_raw)
+    return target
+
+
+@pytest.fixture
+def rewritten(noise_bag: Path, tmp_path: Path) -> Callable[..., Path]:
+    def make(edit: Edit, *, source: Path = noise_bag, compression: str | None = None) -> Path:
+        return rewrite(source, tmp_path / "rewritten.bag", edit, compression)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def noise_bag_uncompressed(noise_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same frames, where no checksum guards them."""
+    target = tmp_path_factory.mktemp("bags") / "uncompressed.bag"
+    return rewrite(noise_bag, target, lambda _, time_ns, raw: [(time_ns, raw)])

@@ -1,0 +1,45 @@
+import re
+
+import pytest
+
+from nlos_cam.camera.udev import FILE_NAME, RELOAD, WRITE_AND_INSTALL, install, rules
+from nlos_cam.camera.usb_ids import LIDARS, OTHERS
+
+CLAUSE = re.compile(r'[A-Z]+(\{\w+\})?(==|:=|\+=)"[^"]*"')
+
+
+def lines() -> list[str]:
+    return [line for line in rules().splitlines() if line and not line.startswith("#")]
+
+
+@pytest.mark.parametrize("product_id", LIDARS)
+def test_every_user_may_open_every_member_of_the_family(product_id: int) -> None:
+    [rule] = [line for line in lines() if f'"{product_id:04x}"' in line and line.startswith('SUBSYSTEMS=="usb"')]
+    assert 'ATTRS{idVendor}=="8086"' in rule
+    assert 'MODE:="0666"' in rule
+
+
+def test_the_motion_sensors_are_opened_too() -> None:
+    sensors = [line for line in lines() if not line.startswith("SUBSYSTEMS")]
+    assert [line.split(",")[0] for line in sensors] == ['KERNEL=="iio*"', 'DRIVER=="hid_sensor*"']
+    assert all('ATTRS{idProduct}=="0b64"' in line and "chmod -R 0777 /sys/%p" in line for line in sensors)
+
+
+def test_every_line_is_one_rule_of_clauses_with_commas_between() -> None:
+    for line in lines():
+        assert all(CLAUSE.fullmatch(clause) for clause in line.split(", ")), line
+
+
+def test_the_host_would_recognise_the_file() -> None:
+    assert "0b64" in rules().lower()
+
+
+def test_the_commands_name_the_file_and_reload() -> None:
+    assert f"--write-udev {FILE_NAME}" in WRITE_AND_INSTALL
+    assert WRITE_AND_INSTALL.endswith(RELOAD)
+    assert "'my rules'" in install("my rules")
+    assert install("a").index("install") < install("a").index("udevadm")
+
+
+def test_no_id_is_in_both_tables() -> None:
+    assert not LIDARS.keys() & OTHERS.keys()

@@ -1,0 +1,86 @@
+import struct
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from nlos_calibration.projection import Intrinsics
+
+from nlos_cam.camera.bag_messages import ENCODINGS, depth_unit_m, metadata, parse, pixels, sdk_name, timestamp_s
+from nlos_cam.camera.sdk import load_sdk
+
+IMAGE = "sensor_msgs/msg/Image"
+
+
+def text(value: str) -> bytes:
+    return struct.pack("<I", len(value)) + value.encode()
+
+
+def raw_image(version: str, tail: bytes, values: bytes = bytes(range(6))) -> memoryview:
+    """An image of 3 x 2 as librealsense writes it: the version of the format stands where ROS has the frame_id."""
+    header = struct.pack("<III", 7, 12, 345_678_901) + text(version)
+    size = struct.pack("<II", 2, 3) + text("mono8") + b"\0" + struct.pack("<I", 3)
+    return memoryview(header + size + struct.pack("<I", len(values)) + values + tail)
+
+
+@pytest.mark.parametrize(("version", "tail"), [("0", b""), ("1", struct.pack("<f", 0.25))])
+def test_an_image_is_read_with_and_without_its_tail(version: str, tail: bytes) -> None:
+    raw = raw_image(version, tail)
+    image = parse(raw, IMAGE)
+    assert (image.header.seq, timestamp_s(image)) == (7, pytest.approx(12.345_678_901))
+    np.testing.assert_array_equal(pixels(image, "mono8", pinhole()), [[0, 1, 2], [3, 4, 5]])
+    assert depth_unit_m(raw) == (0.25 if tail else None)
+
+
+def pinhole(width: int = 3, height: int = 2) -> Intrinsics:
+    return Intrinsics(width, height, 1.0, 1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"width": 2}, {"width": 4}, {"height": 3}, {"width": 6, "step": 6}, {"encoding": "8UC1"}, {"step": 4}],
+)
+def test_an_image_that_contradicts_itself_or_its_stream_is_an_error(changed: dict[str, object]) -> None:
+    image = parse(raw_image("0", b""), IMAGE)
+    vars(image).update(changed)
+    with pytest.raises(ValueError, match=r"an image of|reshape"):
+        pixels(image, "mono8", pinhole())
+
+
+def test_a_device_may_deliver_another_size_than_it_tells() -> None:
+    image = parse(raw_image("0", b""), IMAGE)
+    np.testing.assert_array_equal(pixels(image, "mono8", pinhole(64, 48)), [[0, 1, 2], [3, 4, 5]])
+
+
+def test_rows_may_be_padded() -> None:
+    image = parse(raw_image("0", b"", bytes(range(10))), IMAGE)
+    image.step = 5
+    np.testing.assert_array_equal(pixels(image, "mono8", pinhole()), [[0, 1, 2], [5, 6, 7]])
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_an_encoding_is_the_sdks_format_of_that_name(encoding: str) -> None:
+    found = ENCODINGS[encoding]
+    assert found.sdk_format in load_sdk().format.__members__
+    bytes_per_pixel = found.channels * np.dtype(found.dtype).itemsize
+    values = np.arange(6 * bytes_per_pixel, dtype=np.uint8)
+    image = SimpleNamespace(encoding=encoding, width=3, height=2, step=3 * bytes_per_pixel, data=values)
+    made = pixels(image, encoding, pinhole())
+    assert made.shape == ((2, 3) if found.channels == 1 else (2, 3, found.channels))
+    assert made.tobytes() == values.tobytes()
+
+
+def test_names_are_those_of_the_sdks_wheel() -> None:
+    sdk = load_sdk()
+    assert sdk_name("Depth Units") in sdk.option.__members__
+    assert sdk_name("Min_Distance") in sdk.option.__members__
+    assert sdk_name("Hardware Clock") in sdk.timestamp_domain.__members__
+    assert sdk_name("Frame Laser Power") in sdk.frame_metadata_value.__members__
+    assert sdk_name("Auto-Exposure Mode") == "auto_exposure_mode"
+
+
+def test_metadata_are_numbers_by_name_and_a_clock() -> None:
+    pairs = {"system_time": "15.25", "timestamp_domain": "System Time", "Frame Counter": "169"}
+    found = metadata([SimpleNamespace(key=key, value=value) for key, value in pairs.items()])
+    assert found.domain == "system_time"
+    assert found.values == {"system_time": 15.25, "frame_counter": 169.0}
+    assert not metadata([]).domain

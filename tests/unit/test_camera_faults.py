@@ -1,0 +1,138 @@
+"""What a faulty device hands over of each instant, before the SDK has it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nlos_cam.camera.faults import Delivery, FaultyDevice
+from nlos_cam.camera.streams import FORMATS
+from nlos_cam.camera.unwrap import PERIOD_S
+from nlos_cam.render.fault_record import Fault
+from nlos_cam.render.sensor import SensedImages
+
+START_S = 1e9
+
+
+def images(instant: int) -> SensedImages:
+    """Images of 4 x 6 pixels that tell their instant."""
+    return SensedImages(
+        np.full((4, 6), 1000 + instant, np.uint16), np.full((4, 6), 100, np.uint8), np.full((4, 6), 9, np.uint8)
+    )
+
+
+def handed(*faults: Fault, until: int = 12, plugged_in_at: int = 0) -> list[Delivery]:
+    device, came = FaultyDevice(faults, plugged_in_at), list[Delivery]()
+    for instant in range(plugged_in_at, until):
+        came += device.hand_over(instant, START_S + instant / 30, images(instant))
+    return came
+
+
+def numbers(came: list[Delivery]) -> list[int]:
+    return [delivery.number for delivery in came]
+
+
+def instants(came: list[Delivery]) -> list[int]:
+    return [delivery.instant for delivery in came]
+
+
+def same(one: SensedImages, other: SensedImages) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("depth_z16", "ir", "confidence"))
+
+
+@given(st.integers(0, 1000))
+def test_without_faults_each_instant_is_handed_over_as_it_is(instant: int) -> None:
+    seen = images(instant)
+    [delivery] = FaultyDevice().hand_over(instant, START_S, seen)
+    assert delivery.images is seen
+    assert (delivery.number, delivery.instant, delivery.timestamp_s) == (instant, instant, START_S)
+    assert delivery.streams == tuple(FORMATS)
+
+
+def test_a_stall_hands_nothing_over_and_does_not_count() -> None:
+    came = handed(Fault(kind="stall", at_frame=3, frames=4))
+    assert instants(came) == [0, 1, 2, 7, 8, 9, 10, 11]
+    assert numbers(came) == list(range(8))
+
+
+def test_drops_are_counted_by_the_device_and_not_handed_over() -> None:
+    came = handed(Fault(kind="drops", at_frame=3, frames=4))
+    assert numbers(came) == instants(came) == [0, 1, 2, 7, 8, 9, 10, 11]
+
+
+@pytest.mark.parametrize("stream", FORMATS)
+def test_one_stream_alone_may_lose_frames(stream: Any) -> None:
+    came = handed(Fault(kind="drops", at_frame=3, frames=4, stream=stream))
+    assert numbers(came) == list(range(12))
+    short = [delivery.number for delivery in came if stream not in delivery.streams]
+    assert short == [3, 4, 5, 6]
+    assert all(len(delivery.streams) >= 2 for delivery in came)
+
+
+def test_duplicates_come_twice_at_once() -> None:
+    assert numbers(handed(Fault(kind="duplicate", at_frame=1, frames=2), until=4)) == [0, 1, 1, 2, 2, 3]
+
+
+def test_out_of_order_frames_come_after_the_next_with_their_own_time() -> None:
+    came = handed(Fault(kind="out_of_order", at_frame=1, frames=2), until=7)
+    assert numbers(came) == [0, 2, 1, 4, 3, 5, 6]
+    assert [delivery.timestamp_s for delivery in came] == [START_S + number / 30 for number in numbers(came)]
+
+
+@pytest.mark.parametrize("kind", ["all_zero", "saturated", "half_invalid", "wrong_size"])
+def test_images_are_spoiled_while_it_lasts_and_no_other_is_touched(kind: Any) -> None:
+    came = handed(Fault(kind=kind, at_frame=2, frames=3), until=7)
+    assert numbers(came) == list(range(7))
+    spoiled = [each.number for each in came if not same(each.images, images(each.number))]
+    assert spoiled == [2, 3, 4]
+
+
+def test_how_images_are_spoiled() -> None:
+    def spoiled(kind: Any) -> SensedImages:
+        return handed(Fault(kind=kind, at_frame=0), until=1)[0].images
+
+    black = spoiled("all_zero")
+    assert not any(image.any() for image in (black.depth_z16, black.ir, black.confidence))
+    assert (spoiled("saturated").ir == 255).all()
+    assert np.count_nonzero(spoiled("half_invalid").depth_z16) == 12
+    assert spoiled("wrong_size").depth_z16.shape == spoiled("wrong_size").ir.shape == (2, 3)
+
+
+def test_faults_of_one_instant_add_up() -> None:
+    both = Fault(kind="half_invalid", at_frame=0), Fault(kind="saturated", at_frame=0)
+    [delivery] = handed(*both, until=1)
+    assert (np.count_nonzero(delivery.images.depth_z16), delivery.images.ir.min()) == (12, 255)
+
+
+def test_a_device_that_is_unplugged_stays_so_and_another_counts_from_0() -> None:
+    fault = Fault(kind="unplug", at_frame=3, frames=4)
+    device = FaultyDevice([fault])
+    assert [instant for instant in range(12) if device.is_there(instant)] == [0, 1, 2]
+    assert [instant for instant in range(12) if device.is_gone(instant)] == [3, 4, 5, 6]
+    assert instants(handed(fault)) == [0, 1, 2]
+    again = handed(fault, plugged_in_at=7)
+    assert (instants(again), numbers(again)) == ([7, 8, 9, 10, 11], [0, 1, 2, 3, 4])
+
+
+def test_one_can_be_unplugged_at_any_time() -> None:
+    device = FaultyDevice()
+    device.unplug(5, 2)
+    assert [instant for instant in range(9) if device.is_there(instant)] == [0, 1, 2, 3, 4]
+    assert [instant for instant in range(9) if device.is_gone(instant)] == [5, 6]
+
+
+def test_a_clock_that_wraps_jumps_back_by_its_period_and_nothing_else_changes() -> None:
+    came = handed(Fault(kind="clock_wrap", at_frame=5))
+    assert numbers(came) == list(range(12))
+    times_s = [delivery.timestamp_s for delivery in came]
+    assert all(0 <= time_s < PERIOD_S for time_s in times_s)
+    steps_s = np.diff(times_s)
+    assert steps_s[4] == pytest.approx(1 / 30 - PERIOD_S, abs=1e-6)
+    np.testing.assert_allclose(np.delete(steps_s, 4), 1 / 30, atol=1e-6)
+
+
+def test_a_device_that_is_plugged_in_again_has_its_own_clock_from_0() -> None:
+    came = handed(Fault(kind="clock_wrap", at_frame=5), plugged_in_at=7)
+    np.testing.assert_allclose([delivery.timestamp_s for delivery in came], np.arange(5) / 30, atol=1e-9)

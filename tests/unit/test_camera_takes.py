@@ -1,0 +1,216 @@
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import pytest
+
+from nlos_cam.camera.record import Recording
+from nlos_cam.camera.replay import Verified, verify
+from nlos_cam.camera.sidecar import load_sidecar, sidecar_path
+from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera.takes import Job, Take, Takes, settle
+from nlos_cam.errors import CameraLostError, DiskFullError, RecordingError
+
+Run = Callable[..., list[Take]]
+
+
+@pytest.fixture
+def world(noise_world: Any) -> Any:
+    """A NoiseWorld that can vanish."""
+
+    class Vanishing(noise_world):
+        vanishes_at: int | None = None
+
+        def images(self, number: int) -> Any:
+            if number == self.vanishes_at:
+                raise CameraLostError("sim vanished: replug it")
+            return super().images(number)
+
+    return Vanishing()
+
+
+@pytest.fixture
+def run(world: Any, hurried_clock: Any, tmp_path: Path) -> Run:
+    """Record takes of a NoiseWorld and settle each; `stop_at` sets recorded, Ctrl-C."""
+
+    def call(
+        count: int = 1,
+        stop_at: int | None = None,
+        read_back: Callable[[Path], Verified | None] = verify,
+        **limits: Any,
+    ) -> list[Take]:
+        jobs = [Job(tmp_path / f"{number}.bag", label=f"object {number}") for number in range(count)]
+        recording, stop = Recording(jobs[0].path, last=count == 1, **limits), Event()
+        camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
+
+        def on_sets(sets: int) -> None:
+            if stop_at is not None and sets >= stop_at:
+                stop.set()
+
+        with closing(Takes(camera, recording, jobs).record(stop, on_sets)) as takes:
+            return [settle(take, read_back) for take in takes]
+
+    return call
+
+
+def test_a_take_holds_what_came_and_its_sidecar_says_so(run: Run) -> None:
+    (take,) = run(frames=12)
+    assert (take.state, take.sets, take.error) == ("complete", 12, None)
+    assert take.found == verify(take.job.path)
+    found = load_sidecar(sidecar_path(take.job.path))
+    assert (found.state, found.label, found.camera) == ("complete", "object 0", "sim")
+    assert found.summary == take.summary
+    assert found.summary
+    assert (found.summary.frames, found.summary.streams["infrared"]) == (12, 12)
+    assert found.rig
+
+
+def test_the_figures_are_those_of_the_frames_in_the_file(run: Run, noise_world: Any) -> None:
+    (take,) = run(frames=5)
+    assert take.quality.frames_seen == 5
+    images = [noise_world().images(number) for number in range(5)]
+    assert take.quality.saturated_share == sum((image.ir == 255).mean() for image in images) / 5
+    assert take.quality.invalid_share == sum((image.depth_z16 == 0).mean() for image in images) / 5
+    assert take.quality.confidence_mean == pytest.approx(sum(image.confidence.mean() for image in images) / 5)
+
+
+def test_several_takes_each_have_file_sidecar_and_label(run: Run) -> None:
+    takes = run(count=3, frames=6)
+    assert [take.state for take in takes] == ["complete"] * 3
+    for number, take in enumerate(takes):
+        assert verify(take.job.path).streams == dict.fromkeys(("depth", "infrared", "confidence"), 6)
+        assert load_sidecar(sidecar_path(take.job.path)).label == f"object {number}"
+        assert take.quality.frames_seen <= 6
+
+
+def test_each_take_is_whole_before_the_next_begins(run: Run, tmp_path: Path) -> None:
+    there: list[list[str]] = []
+
+    def read_back(path: Path) -> Verified:
+        there.append(sorted(entry.name for entry in tmp_path.glob("*.bag")))
+        return verify(path)
+
+    run(count=2, frames=3, read_back=read_back)
+    assert there == [["0.bag"], ["0.bag", "1.bag"]]
+
+
+def test_ctrl_c_keeps_what_was_recorded_and_begins_nothing_more(run: Run, tmp_path: Path) -> None:
+    (take,) = run(count=3, frames=500, stop_at=7)
+    assert take.state == "interrupted"
+    assert take.found
+    assert take.found.frames == take.sets >= 7
+    assert load_sidecar(sidecar_path(take.job.path)).state == "interrupted"
+    assert not (tmp_path / "1.bag").exists()
+
+
+def test_ctrl_c_while_it_is_read_back_loses_nothing(run: Run) -> None:
+    (take,) = run(frames=4, read_back=lambda _: None)
+    assert (take.state, take.found, take.error) == ("interrupted", None, None)
+    assert load_sidecar(take.sidecar.path).state == "interrupted"
+    assert verify(take.job.path).frames == 4
+
+
+def test_a_camera_that_vanishes_leaves_a_whole_file(run: Run, world: Any) -> None:
+    world.vanishes_at = 8
+    (take,) = run(count=2, frames=500)
+    assert (take.state, take.sets) == ("lost", 8)
+    assert isinstance(take.error, CameraLostError)
+    assert take.found
+    assert take.found.frames == 8
+    assert load_sidecar(take.sidecar.path).state == "lost"
+
+
+def test_a_camera_that_gave_nothing_leaves_nothing(world: Any, tmp_path: Path, hurried_clock: Any) -> None:
+    recording = Recording(tmp_path / "0.bag")
+    camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
+    world.vanishes_at = 0
+    (take,) = [
+        settle(one, verify) for one in Takes(camera, recording, [Job(tmp_path / "0.bag")]).record(Event(), print)
+    ]
+    assert (take.state, take.sets, take.found) == ("lost", 0, None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_camera_that_does_not_start_leaves_nothing(world: Any, tmp_path: Path, hurried_clock: Any) -> None:
+    recording = Recording(tmp_path / "0.bag")
+    camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
+
+    def fail(_: Any) -> None:
+        raise CameraLostError("sim does not start: replug it")
+
+    camera._prepare = fail
+    with pytest.raises(CameraLostError, match="does not start"):
+        list(Takes(camera, recording, [Job(tmp_path / "0.bag")]).record(Event(), print))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_little_space_ends_it_whole(run: Run) -> None:
+    (take,) = run(count=2, frames=500, free=lambda _: 0)
+    assert (take.state, take.sets) == ("disk full", 1)
+    assert isinstance(take.error, DiskFullError)
+    assert "less than 200 MB" in str(take.error)
+    assert take.found
+    assert take.found.frames == 1
+    assert load_sidecar(take.sidecar.path).state == "disk full"
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_disk_too_full_for_the_sidecar_too_hides_no_other_error(
+    run: Run, monkeypatch: pytest.MonkeyPatch, indexed: bool
+) -> None:
+    def full(*_: Any) -> None:
+        raise DiskFullError("0.json cannot be written")
+
+    monkeypatch.setattr("nlos_cam.camera.sidecar.SidecarFile.finish", full)
+    monkeypatch.setattr("nlos_cam.camera.sdk_recorder.can_grow", lambda *_: indexed)
+    (take,) = run(frames=4)
+    assert (take.found is not None) == indexed
+    assert ("0.json cannot be written" if indexed else "nlos-cam repair") in str(take.error)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_file_that_cannot_be_closed_is_told_and_not_read_back(
+    run: Run, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    monkeypatch.setattr("nlos_cam.camera.sdk_recorder.can_grow", lambda *_: False)
+    (take,) = run(count=count, frames=4, read_back=lambda _: pytest.fail("it has no index"))
+    assert (take.state, take.closed, take.found) == ("disk full", False, None)
+    assert "nlos-cam repair" in str(take.error)
+    found = load_sidecar(take.sidecar.path)
+    assert found.state == "disk full"
+    assert found.summary
+    assert (found.summary.frames, found.summary.frames_seen) == (None, 4)
+
+
+def test_a_file_that_holds_less_than_came_is_damaged(run: Run) -> None:
+    (take,) = run(frames=5, read_back=lambda _: Verified(3, 0, 0.1, {}))
+    assert (take.state, load_sidecar(take.sidecar.path).state) == ("damaged", "damaged")
+    assert "holds 3 of the 5 frames" in str(take.error)
+
+
+def test_a_file_that_cannot_be_read_back_is_damaged(run: Run) -> None:
+    def read_back(path: Path) -> Verified:
+        raise RecordingError(f"{path} is cut short")
+
+    (take,) = run(frames=5, read_back=read_back)
+    assert (take.state, str(take.error)) == ("damaged", f"{take.job.path} is cut short")
+
+
+def test_a_first_set_that_was_on_its_way_is_no_damage_to_a_later_take(run: Run) -> None:
+    takes = run(count=2, frames=5, read_back=lambda _: Verified(4, 0, 0.1, {}))
+    assert [take.state for take in takes] == ["damaged", "complete"]
+
+
+def test_leaving_between_takes_leaves_the_camera(world: Any, hurried_clock: Any, tmp_path: Path) -> None:
+    jobs = [Job(tmp_path / "0.bag"), Job(tmp_path / "1.bag")]
+    recording = Recording(jobs[0].path, frames=3, last=False)
+    camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
+    takes = Takes(camera, recording, jobs).record(Event(), print)
+    next(takes)
+    assert camera._thread
+    takes.close()
+    assert camera._thread is None
+    assert verify(jobs[0].path).frames == 3
+    assert not jobs[1].path.exists()

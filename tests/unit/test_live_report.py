@@ -1,0 +1,86 @@
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from nlos_calibration.projection import Intrinsics
+
+from nlos_cam.errors import NlosCamError, SceneError
+from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.live_report import MOST_FAILED, LiveReport, Step, Tally
+from nlos_cam.reconstruct import Reconstruction
+
+SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
+NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})
+
+
+def frame(number: int) -> Frame:
+    depth_m, ir = np.full((64, 80), 0.3, np.float32), np.full((64, 80), 9, np.uint8)
+    return Frame(depth_m, ir, ir, number / 30, number, SMALL)
+
+
+def reported(tally: Tally, camera: dict[str, Any] | None = None, dropped: int = 0, offset_s: float = 0.0) -> LiveReport:
+    of_camera = {"incomplete": 0, "dropped": 0, "counts": Counter[str](), **(camera or {})}
+    reader: Any = SimpleNamespace(dropped=list(range(dropped)), offset_s=offset_s)
+    seen_through: Any = SimpleNamespace(**of_camera)
+    return tally.report(seen_through, reader)
+
+
+def tally_of(ages_s: list[float]) -> Tally:
+    """A frame every thirtieth of a second, each published so long after its timestamp."""
+    tally = Tally()
+    for number, age_s in enumerate(ages_s):
+        one = frame(number)
+        stages_s = {"wait": 0.001, "network": 0.01 * (number + 1)}
+        tally.add(Step(one, maps_from_frame(one), NOTHING, one.timestamp_s + age_s, stages_s), view_s=0.002)
+    return tally
+
+
+def test_a_run_without_a_frame_reports_zeros() -> None:
+    report = reported(Tally())
+    assert (report.frames, report.fps, report.dropped, report.stages_ms, report.counts) == (0, 0.0, 0, {}, {})
+    assert set(report.latency_ms.values()) == {0.0}
+
+
+def test_rate_latency_and_stages_are_those_of_the_frames() -> None:
+    report = reported(tally_of([0.005] * 31), offset_s=0.002)
+    assert report.frames == 31
+    assert report.fps == pytest.approx(30.0)
+    assert report.latency_ms == pytest.approx({"p50": 3.0, "p95": 3.0, "p99": 3.0}, abs=1e-6)
+    assert report.stages_ms == pytest.approx({"wait": 1.0, "network": 160.0, "view": 2.0})
+
+
+def test_a_run_lasts_from_its_first_result() -> None:
+    assert Tally().lasted_s(1e9) == 0.0
+    assert tally_of([0.5, 0.1]).lasted_s(4.5) == pytest.approx(4.0)
+
+
+def test_counts_say_what_was_seen_and_where_frames_were_lost() -> None:
+    tally = Tally()
+    tally.seen.update(["blank", "blank"])
+    tally.fail(frame(1), ZeroDivisionError("odd"), 1)
+    report = reported(tally, {"incomplete": 2, "dropped": 3, "counts": Counter(duplicate=1, stalled=0)}, dropped=4)
+    assert report.counts == {
+        "duplicate": 1,
+        "incomplete": 2,
+        "dropped_camera": 3,
+        "dropped_loop": 4,
+        "failed": 1,
+        "blank": 2,
+    }
+    assert report.dropped == 2 + 3 + 4 + 1
+
+
+def test_frames_that_fail_are_borne_until_they_are_many_in_a_row() -> None:
+    tally = Tally()
+    for in_a_row in range(1, MOST_FAILED):
+        tally.fail(frame(in_a_row), ZeroDivisionError("an odd frame"), in_a_row)
+    with pytest.raises(NlosCamError, match=f"{MOST_FAILED} frames in a row .*ZeroDivisionError: an odd frame"):
+        tally.fail(frame(99), ZeroDivisionError("an odd frame"), MOST_FAILED)
+    assert tally.failed == MOST_FAILED
+
+
+def test_an_error_that_is_not_the_frames_is_not_borne() -> None:
+    with pytest.raises(SceneError, match="no object_box"):
+        Tally().fail(frame(1), SceneError("no object_box"), 1)
