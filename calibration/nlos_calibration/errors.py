@@ -2,6 +2,7 @@
 
 CalibrationError (ValueError)    exit 1   root
 ├── WallRefusedError             exit 1   what the lidar saw is not a bare wall we can trust
+├── BoardRefusedError            exit 1   there is no board in the image whose plane we can trust
 └── RecordFileError              exit 4   a rig or wall record that cannot be read
 """
 
@@ -14,6 +15,10 @@ class CalibrationError(ValueError):
 
 class WallRefusedError(CalibrationError):
     """What the lidar saw is not a bare wall that can be trusted; the message says why."""
+
+
+class BoardRefusedError(CalibrationError):
+    """There is no board in the image whose plane can be trusted; the message says why."""
 
 
 class RecordFileError(CalibrationError):

@@ -40,7 +40,7 @@ def check_flat(flat: Flatness, ripple_m: float) -> None:
 
 def judge(distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float) -> tuple[Verdict, str]:
     """The verdict, and one sentence: what it rests on, or what to do."""
-    doubts, problems = _doubts(flat, ripple_m), _out_of_range(distance_m, facing_deg)
+    doubts, problems = _doubts(flat, ripple_m), out_of_range(distance_m, facing_deg)
     verdict: Verdict = "doubtful" if doubts else "out of range" if problems else "good"
     return verdict, "; ".join(doubts + problems) or "distance and angle are inside the paper's ranges"
 
@@ -84,7 +84,7 @@ def _doubts(flat: Flatness, ripple_m: float) -> list[str]:
     return [why + "take a flat wall and let the lidar warm up"]
 
 
-def _out_of_range(distance_m: float, facing_deg: float) -> list[str]:
+def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
     """What is out of the paper's ranges, each with what to do."""
     problems: list[str] = []
     low, high = DISTANCE_RANGE_M

@@ -36,6 +36,8 @@ class WallFit(WallMeasures):
 
     wall_from_lidar: Array
     """(4, 4)."""
+    covariance: Array = field(repr=False)
+    """(3, 3) of -normal / distance, as seen from the zero of depth."""
     residual_m: float
     """RMS distance of the inliers from the plane."""
     noise_scale: float
@@ -90,6 +92,7 @@ def fit_wall(
     return WallFit(
         **vars(measures),
         wall_from_lidar=wall_from_plane(plane.normal, measures.distance_m),
+        covariance=rippled.covariance,
         residual_m=plane.residual_m,
         noise_scale=scale,
         inlier_fraction=plane.inlier_fraction,

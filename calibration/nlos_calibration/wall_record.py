@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from nlos_calibration.board_wall import BoardRecord, WallByBoard
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.range_offset import Cause
 from nlos_calibration.rig import Finite, LidarPose, PinholeRecord, Positive, Record, Rig, load_rig, read_record
@@ -18,7 +19,7 @@ Row = tuple[Finite, Finite, Finite, Finite]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 POSE_TOLERANCE = 1e-6
 VERSION = 2
-"""2 adds to 1 what is None, empty or 0 by default: uncertainties, flatness, the device, the reference, the offset."""
+"""2 adds to 1 what is None, empty or 0 by default: uncertainties, flatness, device, board, reference, offset."""
 
 
 def _upgraded(version: Any) -> Any:
@@ -57,13 +58,16 @@ class WallRecord(Record):
     range_offset_std_m: NotNegative | None = None
     """None where the offset was not measured."""
     range_offset_cause: Cause | None = None
-    residual_m: NotNegative
+    residual_m: NotNegative | None = None
+    """None, like what else is the depth's, where the depth was refused and the plane is the board's alone."""
     noise_scale: NotNegative | None = None
     """The noise of a depth sample over the lidar's nominal."""
-    inlier_fraction: Annotated[float, Field(ge=0, le=1)]
+    inlier_fraction: Annotated[float, Field(ge=0, le=1)] | None = None
     ripple_m: NotNegative | None = None
     bend_m: NotNegative | None = None
     bend_deg: NotNegative | None = None
+    board: BoardRecord | None = None
+    """What a printed board said; None where none was asked for."""
     reference: str = ""
     """The file of the bare wall's reference maps, beside this one; empty where there is none."""
     reference_sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")] = ""
@@ -84,7 +88,7 @@ class WallRecord(Record):
 
 
 def wall_record(
-    fit: WallFit,
+    fit: WallFit | WallByBoard,
     intrinsics: Intrinsics,
     *,
     camera: str,
@@ -94,7 +98,7 @@ def wall_record(
 ) -> WallRecord:
     """The record of `fit`; its rig is the paper's with the measured pose and the camera's intrinsics.
 
-    `others` are further fields: the device's, the reference's, the range offset's.
+    `others` are further fields: the device's, the board's, the reference's, the range offset's.
     """
     lidar = LidarPose(distance_m=fit.distance_m, yaw_deg=fit.yaw_deg, pitch_deg=fit.pitch_deg)
     pinhole = PinholeRecord.model_validate(vars(intrinsics))

@@ -9,6 +9,9 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from nlos_calibration.board import BOARDS, Board, Paper
+from nlos_calibration.board_corners import IrMean
+from nlos_calibration.board_wall import BoardRecord, WallByBoard, wall_with_board
 from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.projection import Intrinsics
@@ -29,6 +32,12 @@ Tape = Annotated[
     float | None,
     typer.Option("--tape-m", min=0.01, help="Distance by hand, from the front glass to the wall along its normal."),
 ]
+ByBoard = Annotated[bool, typer.Option("--board", help="Look for a printed board too (`nlos-cam board`), in infrared.")]
+OnPaper = Annotated[Paper | None, typer.Option("--paper", help="The paper of the printed board; a4 if not given.")]
+SquareMm = Annotated[
+    float | None,
+    typer.Option("--square-mm", min=1.0, help="Side of the board's squares as measured: its bar's length x 0.3."),
+]
 Out = Annotated[Path | None, typer.Option("--out", help="The record to write (TOML).")]
 TOLD = {
     "distance_m",
@@ -40,6 +49,7 @@ TOLD = {
     "pitch_deg",
     "pitch_std_deg",
     "range_offset_m",
+    "board",
     "residual_m",
     "inlier_fraction",
     "verdict",
@@ -60,15 +70,23 @@ def calibrate(
     bag: Bag = None,
     frames: Frames = 60,
     tape_m: Tape = None,
+    board: ByBoard = False,
+    paper: OnPaper = None,
+    square_mm: SquareMm = None,
     out: Out = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Find the wall's distance and angle from frames of the bare wall, and write them as a record."""
     uri = _source(camera, bag, wall=wall)
+    if not board and (paper or square_mm):
+        raise typer.BadParameter("--paper and --square-mm are of a board: add --board")
+    if board and tape_m is not None:
+        raise typer.BadParameter("give one of --tape-m and --board: each tells how far the lidar's range is off")
     path = output_path(out, "wall", ".toml", overwrite=overwrite)
     seen = _look(uri, frames)
-    fit, offset = _fitted(seen, tape_m)
+    printed = BOARDS[paper or "a4"] if board else None
+    fit, further = _with_board(seen, printed, square_mm) if printed else _fitted(seen, tape_m)
     today = datetime.now().astimezone().date()
     record = wall_record(
         fit,
@@ -76,7 +94,7 @@ def calibrate(
         camera=uri,
         frames=seen.mean.frames,
         created=today,
-        others=seen.device | offset,
+        others=seen.device | further,
     )
     path.write_text(dump_toml(record), encoding="utf-8")
     result = record.model_dump(mode="json", include=TOLD) | {"out": str(path)}
@@ -88,6 +106,7 @@ class _Seen:
     """What was looked at, and by what."""
 
     mean: DepthMean
+    infrared: IrMean
     intrinsics: Intrinsics
     device: dict[str, object]
     """Serial, firmware and settings, as the record names them."""
@@ -109,15 +128,17 @@ def _look(uri: str, frames: int) -> _Seen:
     with tracked("opening the camera") as on_progress:
         found = open_camera(uri, on_progress=on_progress)
     with found as source, progress() as bar:
-        mean = DepthMean(source.intrinsics.height, source.intrinsics.width)
+        shape = source.intrinsics.height, source.intrinsics.width
+        mean, infrared = DepthMean(*shape), IrMean(*shape)
         settings: Mapping[str, float] = {}
         for frame in bar.track(islice(source, frames), total=frames, description="looking at the wall"):
             mean.add(frame.depth_m)
+            infrared.add(frame.ir)
             settings = frame.settings
         if mean.frames == 0:
             raise WallRefusedError(f"{uri} gave no frames: record the wall again, or look at it live")
         device = {name: source.identity.get(name, "") for name in ("serial", "firmware")}
-        return _Seen(mean, source.intrinsics, {**device, "settings": dict(settings)})
+        return _Seen(mean, infrared, source.intrinsics, {**device, "settings": dict(settings)})
 
 
 def _fitted(seen: _Seen, tape_m: float | None) -> tuple[WallFit, dict[str, object]]:
@@ -137,6 +158,21 @@ def _fitted(seen: _Seen, tape_m: float | None) -> tuple[WallFit, dict[str, objec
     }
 
 
+def _with_board(
+    seen: _Seen, printed: Board, square_mm: float | None
+) -> tuple[WallFit | WallByBoard, dict[str, object]]:
+    """The wall from depth, where that is not refused, and from a board."""
+    depth: WallFit | WallRefusedError
+    try:
+        depth = _fitted(seen, None)[0]
+    except WallRefusedError as error:
+        depth = error
+    board = printed if square_mm is None else printed.measured(square_mm)
+    measured = square_mm is not None
+    fit, record = wall_with_board(depth, seen.infrared.mean(), board, seen.intrinsics, measured=measured)
+    return fit, {"board": record}
+
+
 def _told(record: WallRecord, path: Path) -> str:
     """What was measured, with the half width of each 95 % interval."""
     colour = "green" if record.verdict == "good" else "yellow"
@@ -151,8 +187,12 @@ def _told(record: WallRecord, path: Path) -> str:
     lines = [
         f"distance  {record.distance_m:.4f} m ± {1e3 * _interval(record.distance_std_m):.4f} mm",
         f"facing    {facing} degrees (yaw {yaw}, pitch {pitch})",
-        f"residual  {record.residual_m * 1e3:.2f} mm RMS, {record.inlier_fraction:.1%} of the depth on the plane",
     ]
+    if record.residual_m is not None:
+        share = f"{record.inlier_fraction:.1%} of the depth on the plane"
+        lines.append(f"residual  {record.residual_m * 1e3:.2f} mm RMS, {share}")
+    if record.board is not None:
+        lines.append(f"board     {_board_told(record.board)}")
     if record.range_offset_std_m is not None:
         offset, interval = 1e3 * record.range_offset_m, 1e3 * _interval(record.range_offset_std_m)
         lines.append(f"offset    {offset:+.1f} ± {interval:.1f} mm of the lidar's {record.range_offset_cause}")
@@ -163,3 +203,12 @@ def _told(record: WallRecord, path: Path) -> str:
 
 def _interval(std: float | None) -> float:
     return 1.96 * (std or 0.0)
+
+
+def _board_told(board: BoardRecord) -> str:
+    found = f"{board.distance_m:.4f} m ± {1e3 * _interval(board.distance_std_m):.2f} mm, {board.facing_deg:.2f} degrees"
+    found += f" ± {_interval(board.facing_std_deg):.3f}, by {board.corners} corners"
+    if board.disagreement_m is None or board.disagreement_deg is None:
+        return found
+    apart = f"{1e3 * board.disagreement_m:+z.2f} mm and {board.disagreement_deg:.3f} degrees from the depth's plane"
+    return f"{found}; {apart} ({board.disagreement_sigmas:.1f} sigma); used: {board.used}"

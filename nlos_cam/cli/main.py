@@ -19,6 +19,7 @@ COMMANDS = {
     "repair": "recordings",
     "export": "recordings",
     "calibrate": "calibrate",
+    "board": "board",
     "live": "live",
     "replay": "live",
     "render": "render",

@@ -104,6 +104,7 @@ def write_wall(path: Path) -> None:
         facing,
         *(0.0,) * 4,
         pose,
+        np.zeros((3, 3)),
         1e-4,
         1.0,
         0.99,

@@ -1,0 +1,183 @@
+"""The wall's plane from a board's corners, and how surely; or a refusal that says why.
+
+The plane normal . p + distance_m = 0 is told as slopes = -normal / distance_m, like the depth's. Its covariance is that
+of the corners, by their own residuals, through pose, stretch and bows (`board_pose`); and that of the print's scale,
+which no image shows.
+"""
+
+from dataclasses import dataclass, replace
+from math import degrees, sqrt
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos_calibration.board import Board
+from nlos_calibration.board_corners import MIN_CORNERS, Corners
+from nlos_calibration.board_pose import UNKNOWNS, BoardPose, SeenCorners, refine_pose, solve_pose
+from nlos_calibration.errors import BoardRefusedError
+from nlos_calibration.projection import Intrinsics
+
+Array = NDArray[np.float64]
+
+OUTLIER_SIGMAS, SIGMA_FLOOR_PX = 5.0, 0.02
+LEAST_SQUARES, MAGSAC_PX = 0, 1.0
+MEDIAN_PER_SIGMA = 0.67449
+"""The median of |x| of a normal distribution."""
+MIN_GOOD_SHARE = 0.7
+"""Of the corners that were found; more strays are no accident."""
+MAX_RESIDUAL_PX = 0.6
+"""RMS of a coordinate: the corners of one dim frame stay below a half of that."""
+MISFIT_CHI2 = 25.0
+"""How much better any homography may be than the pose, in variances."""
+MAX_STRETCH, MAX_BOW_M = 0.015, 0.0015
+"""More is no printer's error, and no sheet that was glued on."""
+MAX_ANGLE_STD_DEG = 1.0
+"""A board seen edge on, or a few corners close together, say less."""
+IN_A_LINE = (
+    "the board's corners are seen in a line, as of a board seen edge on, or mirrored: turn the lidar to the wall"
+)
+
+
+@dataclass(frozen=True)
+class PrintErrors:
+    """Standard uncertainties of a print on the wall."""
+
+    scale_std: float = 0.0025
+    """Relative: a ruler reads 100 mm to a quarter of a millimetre."""
+    stretch_std: float = 0.0035
+    """Of width over height: two axes that are each that far off."""
+    bow_std_m: float = 0.0003
+    """How far the middle of the sheet stands off, seen along either axis."""
+
+
+@dataclass(frozen=True)
+class BoardFit:
+    """The plane of a board in the lidar frame."""
+
+    slopes: Array
+    """(3,); -normal / distance_m, the normal towards the lidar."""
+    covariance: Array
+    """(3, 3) of the slopes."""
+    corners: int
+    """How many the plane rests on."""
+    residual_px: float
+    """RMS of a coordinate's residual."""
+    stretch: float
+    """Width over height as seen, less 1."""
+    bow_m: float
+    """How far the middle of the sheet stands off the wall."""
+
+
+def fit_board(corners: Corners, board: Board, intrinsics: Intrinsics, printed: PrintErrors | None = None) -> BoardFit:
+    """The plane of `board` from its corners in an image of the lidar's pinhole.
+
+    Raises BoardRefusedError where the corners do not lie as on a flat print of the right proportions, and where they
+    leave the plane open.
+    """
+    printed = printed or PrintErrors()
+    seen = _seen(corners, board, intrinsics, printed)
+    pose = solve_pose(seen)
+    _check_fit(pose)
+    pose = refine_pose(replace(seen, variance_px2=_variance_px2(pose.errors_px, UNKNOWNS)), pose.parameters)
+    _check_print(pose)
+    slopes, covariance = pose.slopes()
+    _check_certain(slopes, covariance)
+    return BoardFit(
+        slopes=slopes,
+        covariance=covariance + printed.scale_std**2 * np.outer(slopes, slopes),
+        corners=len(seen.pixels),
+        residual_px=float(np.sqrt(np.mean(pose.errors_px**2))),
+        stretch=float(np.expm1(pose.parameters[6])),
+        bow_m=float(pose.parameters[7:].sum()),
+    )
+
+
+def _seen(corners: Corners, board: Board, intrinsics: Intrinsics, printed: PrintErrors) -> SeenCorners:
+    """The corners that lie on one plane."""
+    points_m = board.corners_m[corners.ids]
+    good = _good(points_m, corners.pixels)
+    points_m, pixels = points_m[good], corners.pixels[good]
+    return SeenCorners(
+        points_m=points_m,
+        pixels=pixels,
+        camera=np.array([[intrinsics.fx, 0.0, intrinsics.ppx], [0.0, intrinsics.fy, intrinsics.ppy], [0.0, 0.0, 1.0]]),
+        size_m=np.array(board.size_mm) * 1e-3,
+        print_std=np.array([printed.stretch_std, printed.bow_std_m, printed.bow_std_m]),
+        variance_px2=_plane_variance_px2(points_m, pixels),
+    )
+
+
+def _good(points_m: Array, pixels: Array) -> NDArray[np.bool_]:
+    """Which corners lie as on a plane with most others: the detector now and then takes an edge for a corner."""
+    errors_px = np.linalg.norm(_off_a_plane_px(points_m, pixels, cv2.USAC_MAGSAC), axis=1)
+    sigma_px = max(float(np.median(errors_px)) / sqrt(2.0) / MEDIAN_PER_SIGMA, SIGMA_FLOOR_PX)
+    good = errors_px < OUTLIER_SIGMAS * sigma_px
+    if good.sum() < max(MIN_CORNERS, MIN_GOOD_SHARE * len(good)):
+        raise BoardRefusedError(
+            f"only {good.sum()} of {len(good)} corners lie on one plane: is the board flat on the wall, and the lidar "
+            "still?",
+        )
+    return good
+
+
+def _off_a_plane_px(points_m: Array, pixels: Array, method: int) -> Array:
+    """Residuals (n, 2) of any plane seen by any pinhole."""
+    found: tuple[Any, ...] = cv2.findHomography(points_m[:, :2], pixels, method, MAGSAC_PX)
+    if found[0] is None:  # OpenCV's types do not say so
+        raise BoardRefusedError(IN_A_LINE)
+    return pixels - np.asarray(cv2.perspectiveTransform(points_m[np.newaxis, :, :2], found[0])[0], np.float64)
+
+
+def _plane_variance_px2(points_m: Array, pixels: Array) -> float:
+    """Of the residuals of any plane seen by any pinhole. Raises BoardRefusedError where it is no noise."""
+    variance_px2 = _variance_px2(_off_a_plane_px(points_m, pixels, LEAST_SQUARES), spent=8)
+    if variance_px2 > MAX_RESIDUAL_PX**2:
+        raise BoardRefusedError(
+            f"the board is not flat: its corners are {sqrt(variance_px2):.2f} pixels RMS off a plane, "
+            f"{MAX_RESIDUAL_PX:g} allowed; glue it to the wall or to a stiff plate, and keep lidar and board still",
+        )
+    return variance_px2
+
+
+def _variance_px2(errors_px: Array, spent: int) -> float:
+    """Of a coordinate, from what a model with `spent` parameters leaves.
+
+    Divided by two less than that leaves: normal intervals are then as wide as Student's, which they should be where
+    noise is estimated from few corners.
+    """
+    return max(float((errors_px**2).sum()) / (errors_px.size - spent - 2), SIGMA_FLOOR_PX**2)
+
+
+def _check_fit(pose: BoardPose) -> None:
+    free = pose.errors_px.size - 8
+    if pose.chi2 > free + MISFIT_CHI2:
+        raise BoardRefusedError(
+            f"the squares do not fit: {sqrt(pose.chi2 / free):.1f} times as far off any pose as off a plane; is the "
+            "print stretched or skewed, or are these another camera's intrinsics?",
+        )
+
+
+def _check_print(pose: BoardPose) -> None:
+    stretch, bows_m = float(pose.parameters[6]), pose.parameters[7:]
+    if abs(stretch) > MAX_STRETCH:
+        raise BoardRefusedError(
+            f"the squares do not fit: they are seen {100.0 * stretch:+.1f} % wider than high; print without "
+            "stretching, and use the lidar's own intrinsics",
+        )
+    if float(np.abs(bows_m).max()) > MAX_BOW_M:
+        raise BoardRefusedError(
+            f"the board is not flat: its middle stands {1e3 * float(bows_m.sum()):+.1f} mm off the wall; glue it to "
+            "the wall or to a stiff plate",
+        )
+
+
+def _check_certain(slopes: Array, covariance: Array) -> None:
+    distance_m = 1.0 / float(np.linalg.norm(slopes))
+    angle_std_deg = degrees(distance_m * sqrt(float(np.linalg.eigvalsh(covariance)[-1])))
+    if angle_std_deg > MAX_ANGLE_STD_DEG:
+        raise BoardRefusedError(
+            f"the board fixes the wall's angle to {angle_std_deg:.1f} degrees only, {MAX_ANGLE_STD_DEG:g} needed: it "
+            "is seen too far off, edge on, or too little of it; move it to the near side of the view",
+        )

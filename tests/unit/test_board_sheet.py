@@ -1,0 +1,75 @@
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from nlos_calibration.board import BOARDS, PAPER_MM, Board, Paper
+
+from nlos_cam.board_sheet import BAR_MM, bar_mm, black_cells, pattern_origin_mm, sheet_figure, write_sheet
+
+PAPERS = list(BOARDS)
+DPI = 254
+PIXELS_PER_MM = DPI / 25.4
+
+
+@pytest.fixture(scope="module", params=PAPERS)
+def page(request: pytest.FixtureRequest) -> tuple[Paper, np.ndarray]:
+    """A sheet as a printer sees it, ten dots for a millimetre."""
+    figure = sheet_figure(request.param)
+    figure.set_dpi(DPI)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return request.param, np.asarray(canvas.buffer_rgba())[..., 0].copy()
+
+
+def test_the_detector_finds_every_corner_where_the_sheet_has_it(page: tuple[Paper, np.ndarray]) -> None:
+    paper, dots = page
+    board, (left_mm, top_mm) = BOARDS[paper], pattern_origin_mm(paper)
+    pixels, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(dots)
+    assert len(markers) == board.squares_x * board.squares_y // 2
+    assert len(ids) == len(board.corners_m)
+    expected = (board.corners_m[ids.ravel(), :2] * 1e3 + [left_mm, top_mm]) * PIXELS_PER_MM - 0.5
+    np.testing.assert_allclose(pixels, expected, atol=0.6)  # 0.06 mm
+
+
+def test_the_printed_bar_measures_100_mm(page: tuple[Paper, np.ndarray]) -> None:
+    paper, dots = page
+    (_, top_mm, _, height_mm), *_ = bar_mm(paper)
+    black = np.flatnonzero(dots[int((top_mm + height_mm / 2.0) * PIXELS_PER_MM)] < 128)
+    assert (black[-1] - black[0] + 1) / PIXELS_PER_MM == pytest.approx(BAR_MM, abs=0.15)
+    assert len(black) == black[-1] - black[0] + 1
+
+
+def test_nothing_is_drawn_where_no_printer_prints_or_on_the_pattern(page: tuple[Paper, np.ndarray]) -> None:
+    paper, dots = page
+    edge = int(5.0 * PIXELS_PER_MM)
+    frame = dots.copy()
+    frame[edge:-edge, edge:-edge] = 255
+    assert (frame == 255).all()
+    bottom = int((pattern_origin_mm(paper)[1] + BOARDS[paper].size_mm[1]) * PIXELS_PER_MM) + 1
+    quiet = dots[bottom : bottom + int(2.0 * PIXELS_PER_MM)]
+    assert (quiet == 255).all()
+
+
+def test_the_sheet_is_drawn_as_opencv_draws_the_board() -> None:
+    """Also a board whose marker does not fill a whole number of the drawing's cells."""
+    board, k = Board(squares_x=4, squares_y=5, square_mm=24.0, marker_mm=18.0), 48
+    drawn = np.full((5 * k, 4 * k), 255, np.uint8)
+    for left, top, width, height in black_cells(board, 0.0, 0.0):
+        rows, columns = ((start, start + size) for start, size in ((top, height), (left, width)))
+        drawn[slice(*(round(2 * at) for at in rows)), slice(*(round(2 * at) for at in columns))] = 0
+    np.testing.assert_array_equal(drawn, board.pattern(k))
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_the_page_is_as_large_as_the_paper_and_holds_no_pixels(tmp_path: Path, paper: Paper) -> None:
+    path = tmp_path / "board.pdf"
+    write_sheet(path, paper)
+    content = path.read_bytes()
+    assert content.startswith(b"%PDF-")
+    (box,) = re.findall(rb"/MediaBox \[([^\]]*)\]", content)
+    points = [float(number) for number in box.split()]
+    assert points == pytest.approx([0.0, 0.0, *(72.0 * mm / 25.4 for mm in PAPER_MM[paper])], abs=0.01)
+    assert b"/Subtype /Image" not in content  # lines, sharp at any resolution
