@@ -59,6 +59,8 @@ def live(
     json: Json = False,
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
+    if record is not None and record.suffix != ".bag":
+        raise typer.BadParameter(f"--record {record}: a recording's name ends in .bag")
     measured = load_wall(wall).rig if wall else None
     path = output_path(record, "live", ".bag", overwrite=overwrite) if record else None
     recording = Recording(path, optional=True) if path else None

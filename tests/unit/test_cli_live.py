@@ -214,6 +214,11 @@ def test_replay_needs_no_sdk(noise_bag: Path, tmp_path: Path) -> None:
     assert json.loads(ended.stdout.splitlines()[-1])["frames"] == 20
 
 
+@pytest.mark.usefixtures("opened")
+def test_a_recording_by_another_name_is_refused() -> None:
+    assert main(["live", "--camera", "sim", "--no-view", "--record", "run.txt"]) == 2
+
+
 @pytest.mark.parametrize("command", [("live", "--no-view", "--camera", "sim"), ("replay", "a.bag")])
 def test_ctrl_c_while_a_camera_opens_begins_no_run(
     opened: Opened, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
