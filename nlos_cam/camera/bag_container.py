@@ -6,6 +6,7 @@ from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from io import BufferedReader, BytesIO, FileIO
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple, cast
 
 from lz4.frame import LZ4FrameDecompressor
@@ -155,8 +156,9 @@ def _check_start(path: Path) -> None:
     """Say what is wrong with a file in words of our own, before rosbags does in its."""
     if not path.exists():
         raise RecordingError(f"{path} does not exist: give the path of a .bag recording")
-    if path.is_dir():
-        raise RecordingError(f"{path} is a folder: give the path of a .bag recording")
+    if not path.is_file():  # a pipe would be waited for
+        kind = "a folder" if path.is_dir() else "no file"
+        raise RecordingError(f"{path} is {kind}: give the path of a .bag recording")
     try:
         with path.open("rb") as file:
             start = file.read(len(MAGIC))
@@ -188,4 +190,9 @@ def told(path: Path, what: str) -> Generator[None]:
 
 def advice(path: Path) -> str:
     """What to do about a recording that cannot be read to its end."""
-    return f"`nlos-cam repair {path} --out {path.stem}-repaired.bag` recovers what is whole in it"
+    return f"`{repair_command(path)}` recovers what is whole in it"
+
+
+def repair_command(path: Path) -> str:
+    """What to type to have a recording repaired, into the current folder."""
+    return f"nlos-cam repair {quote(str(path))} --out {quote(f'{path.stem}-repaired.bag')}"

@@ -119,9 +119,7 @@ class L515Camera(LiveCamera):
     def _prepare(self, sensor: Any) -> None:
         """Preset first, since it changes the others; after start, since starting resets it."""
         options = Options(sensor, self._sdk)
-        differences = self._put(options, PRESET)
-        self._settle()
-        differences |= self._put(options, NEAR_WALL)
+        differences = self._put(options, PRESET) | self._put(options, NEAR_WALL)
         for name, difference in differences.items():
             if self.differences.get(name) != difference:
                 log.warning("%s: %s: %s", self.uri, name, difference)
@@ -129,13 +127,11 @@ class L515Camera(LiveCamera):
         self._turn_down(options)
 
     def _put(self, options: Options, wanted: Mapping[str, float]) -> dict[str, str]:
-        """Set options, twice where they do not take; how they differ from what is wanted then."""
-        differences = options.put_all(wanted)
-        again = {name: wanted[name] for name, difference in differences.items() if difference != NOT_OFFERED}
-        if not again:
-            return differences
+        """Set options, twice where they do not hold once the device has settled; how they differ from `wanted` then."""
+        missing = {name: note for name, note in options.put_all(wanted).items() if note == NOT_OFFERED}
         self._settle()
-        return {name: differences[name] for name in differences.keys() - again.keys()} | options.put_all(again)
+        again = {name: value for name, value in wanted.items() if options.difference(name, value)}
+        return missing | options.put_all({name: value for name, value in again.items() if name not in missing})
 
     def _settle(self) -> None:
         self._clock.wait(self._left, PRESET_SETTLES_S)

@@ -50,6 +50,8 @@ def repair(path: Path, out: Path, report: OnProgress = unreported) -> Repaired:
     `out` appears when all of it is written. Raises RecordingError where nothing can be recovered, OutputExistsError if
     both are one file, NlosCamError where `out` cannot be written.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for
+        raise RecordingError(f"{path} is no file: give the path of a .bag recording")
     try:
         same = out.exists() and out.samefile(path)
         scan = None if same else scan_bag(path, lambda done, total: report(done, 2 * total))

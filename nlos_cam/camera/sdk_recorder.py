@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from nlos_cam.camera.bag_container import repair_command
 from nlos_cam.camera.disk import can_grow, closing_bytes
 from nlos_cam.errors import DiskFullError, RecordingError
 
@@ -81,5 +82,5 @@ class SdkRecorder:
         self._recorder = None
         raise DiskFullError(
             f"{self.path} could not be written to its end ({self.failure}): free some space, and get back what is "
-            f"there with `nlos-cam repair {self.path} --out {self.path.with_name(self.path.stem + '-repaired.bag')}`"
+            f"there with `{repair_command(self.path)}`"
         )

@@ -9,6 +9,8 @@ import numpy as np
 from nlos_calibration.projection import Intrinsics
 from numpy.typing import NDArray
 
+from nlos_cam.camera.alignment import Alignment
+
 FORMATS = {"depth": "z16", "infrared": "y8", "confidence": "raw8"}
 """The streams that are needed, by the SDK's names, and the pixel format of each."""
 FRAMES_PER_S = 30
@@ -91,6 +93,7 @@ class Pairing:
 
     Every number is decided once, in order: a set, incomplete, or dropped. A set decides all numbers before it, since
     streams come in order. Memory is bounded whatever comes. Samples must have `shape` (rows, columns), where given.
+    Streams that are counted apart are numbered alike, by `Alignment`.
     """
 
     def __init__(self, shape: tuple[int, int] | None = None) -> None:
@@ -100,6 +103,7 @@ class Pairing:
         self.dropped = 0
         """Numbers of which nothing came, after the first that was decided."""
         self._occurrences = Occurrences()
+        self._alignment = Alignment(FRAMES_PER_S)
         self._waiting: dict[int, dict[str, Sample]] = {}
         self._decided: int | None = None
         """The highest number that is."""
@@ -120,6 +124,7 @@ class Pairing:
 
     def add(self, sample: Sample) -> FrameSet | None:
         """Take a sample; the set that it completes, if it does."""
+        sample = self._alignment.add(sample)
         number = sample.number
         if self._decided is not None and self._decided - LATE_NUMBERS <= number <= self._decided:
             self._occurrences.note("duplicate" if number in self._sets else "out_of_order", sample)
@@ -145,8 +150,9 @@ class Pairing:
     def _complete(self, number: int) -> FrameSet | None:
         samples = self._waiting.pop(number)
         self._decide(number)
-        times = [sample.timestamp_s for sample in samples.values()]
-        if max(times) - min(times) > SAME_INSTANT_S:
+        times_s = {stream: sample.timestamp_s for stream, sample in samples.items()}
+        self._alignment.note(times_s)
+        if max(times_s.values()) - min(times_s.values()) > SAME_INSTANT_S:
             self.incomplete += 1
             return None
         depth, ir, confidence = (samples[stream] for stream in FORMATS)

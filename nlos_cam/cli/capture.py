@@ -31,12 +31,18 @@ from nlos_cam.cli.common import (
 )
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:bare-wall or sim:SCENE.toml.")]
-Seconds = Annotated[float | None, typer.Option("--seconds", min=1 / FRAMES_PER_S, help="Stop after so long.")]
+ENDLESS_S = 1e9
+"""More than any disk holds; infinity is no number of frames."""
+Seconds = Annotated[
+    float | None, typer.Option("--seconds", min=1 / FRAMES_PER_S, max=ENDLESS_S, help="Stop after so long.")
+]
 Frames = Annotated[int | None, typer.Option("--frames", min=1, help="Stop after so many frames.")]
 TakeCount = Annotated[int, typer.Option("--takes", min=1, max=9999, help="So many in a row: F-01.bag, F-02.bag, ...")]
 Pause = Annotated[
     float | None,
-    typer.Option("--pause-s", min=0.0, help="Seconds between takes; else Enter begins the next, on a terminal."),
+    typer.Option(
+        "--pause-s", min=0.0, max=ENDLESS_S, help="Seconds between takes; else Enter begins the next, on a terminal."
+    ),
 ]
 Labels = Annotated[
     list[str] | None,

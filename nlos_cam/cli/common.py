@@ -71,13 +71,25 @@ def stop_on_signals() -> Generator[Event]:
 
 @contextmanager
 def interrupted_by_signals() -> Generator[None]:
-    """Ctrl-C or a request to terminate raises KeyboardInterrupt in the block, also where a shell had them ignored."""
+    """Ctrl-C or a request to terminate raises KeyboardInterrupt in the block, also where a shell had them ignored.
+
+    And where the block ends after one: a library may have swallowed it, or made another error of it.
+    """
+    came = Event()
 
     def interrupt() -> None:
+        came.set()
         raise KeyboardInterrupt
 
     with _on_signals(interrupt):
-        yield
+        try:
+            yield
+        except Exception as error:
+            if came.is_set():
+                raise KeyboardInterrupt from error
+            raise
+    if came.is_set():
+        raise KeyboardInterrupt
 
 
 @contextmanager

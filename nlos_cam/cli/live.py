@@ -13,7 +13,17 @@ from nlos_cam.cache import cache_folder
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
 from nlos_cam.camera.table import Reader
-from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stop_on_signals, tracked
+from nlos_cam.cli.common import (
+    Json,
+    Overwrite,
+    finish,
+    interrupted_by_signals,
+    output_path,
+    progress,
+    say,
+    stop_on_signals,
+    tracked,
+)
 from nlos_cam.live import run_live, warm_up
 from nlos_cam.live_report import LiveReport
 from nlos_cam.replay import REPORT, replay
@@ -49,14 +59,17 @@ def live(
     json: Json = False,
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
+    if record is not None and record.suffix != ".bag":
+        raise typer.BadParameter(f"--record {record}: a recording's name ends in .bag")
     measured = load_wall(wall).rig if wall else None
     path = output_path(record, "live", ".bag", overwrite=overwrite) if record else None
     recording = Recording(path, optional=True) if path else None
-    with tracked("rendering the scene ahead") as on_progress:
-        opened = open_camera(camera, on_progress=on_progress, recording=recording)
-    rig = measured or _rig_of(opened)
-    network = _network(weights, rig)
-    warm_up(opened, rig, network)
+    with interrupted_by_signals():
+        with tracked("rendering the scene ahead") as on_progress:
+            opened = open_camera(camera, on_progress=on_progress, recording=recording)
+        rig = measured or _rig_of(opened)
+        network = _network(weights, rig)
+        warm_up(opened, rig, network)
     with stop_on_signals() as stop, _viewer(rig, no_view=no_view) as viewer, opened as source:
         say(
             f"live view: {viewer.address}  (Ctrl-C ends it)"
@@ -92,9 +105,10 @@ def replay_bag(
 ) -> None:
     """Reconstruct every frame of a recording: the same frames and the same bits each time."""
     path = output_path(out, "replay", "", overwrite=overwrite)
-    measured, opened = load_wall(wall).rig if wall else None, open_camera(f"bag:{bag}", reader=reader)
-    rig = measured or _rig_of(opened)
-    network = _network(weights, rig)
+    with interrupted_by_signals():
+        measured, opened = load_wall(wall).rig if wall else None, open_camera(f"bag:{bag}", reader=reader)
+        rig = measured or _rig_of(opened)
+        network = _network(weights, rig)
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
         report = replay(source, rig, network, path, stop=stop, on_frame=lambda: bar.advance(task))

@@ -8,7 +8,7 @@ import typer
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
-from nlos_cam.cli.common import stderr, stop_on_signals
+from nlos_cam.cli.common import interrupted_by_signals, stderr, stop_on_signals
 from nlos_cam.errors import NlosCamError
 
 INTERRUPTED = 130
@@ -53,9 +53,10 @@ def main(arguments: list[str]) -> int:
     """Run one command and return its exit code (see docs/reference: 0, 1, 2, 3, 4, 130)."""
     try:
         asked = next((argument for argument in arguments if not argument.startswith("-")), "")
-        with stop_on_signals() as stop:  # an interrupted import can end in any error of any library
-            app = build_app(asked)
-        return INTERRUPTED if stop.is_set() else app(arguments, standalone_mode=False) or 0
+        with interrupted_by_signals():
+            with stop_on_signals() as stop:  # an interrupted import can end in any error of any library
+                app = build_app(asked)
+            return INTERRUPTED if stop.is_set() else app(arguments, standalone_mode=False) or 0
     except (typer.Abort, KeyboardInterrupt):
         return INTERRUPTED
     except typer.TyperException as error:

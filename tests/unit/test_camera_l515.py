@@ -64,7 +64,7 @@ def test_near_wall_settings_follow_the_preset_which_follows_the_start(fake_l515:
     with fake_camera(device, clock=clock):
         did = device.did
         assert did.index("start") < did.index("visual_preset") < min(did.index(name) for name in NEAR_WALL)
-    assert clock.naps == [0.5]
+    assert clock.naps == [0.5, 0.5]
     assert device.options["visual_preset"] == 5.0
 
 
@@ -144,6 +144,22 @@ def test_what_does_not_take_at_first_is_set_once_more(fake_l515: Make, fake_came
     assert clock.naps == [0.5, 0.5]
     assert lidar.did.count("min_distance") == 2
     assert lidar.did.count("noise_filtering") == 1
+
+
+@pytest.mark.parametrize(("name", "nap", "wanted"), [("visual_preset", 0, 5.0), ("min_distance", 1, 0.0)])
+def test_what_the_starting_device_sets_back_is_set_once_more(
+    fake_l515: Make, fake_camera: Make, name: str, nap: int, wanted: float
+) -> None:
+    class Starting(NapClock):
+        def wait(self, stop: Event, seconds: float) -> bool:
+            if len(self.naps) == nap:
+                lidar.options[name] = lidar.factory[name]
+            return super().wait(stop, seconds)
+
+    lidar = fake_l515()
+    with fake_camera(lidar, clock=Starting()) as camera:
+        assert camera.differences == {}
+    assert lidar.options[name] == wanted
 
 
 @pytest.mark.parametrize(("threshold", "found"), [(100.0, 93.0), (60.0, 53.0), (53.0, 53.0), (20.0, 13.0)])

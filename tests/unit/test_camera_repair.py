@@ -1,5 +1,6 @@
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -152,6 +153,13 @@ def test_a_missing_path_and_a_folder_are_told(tmp_path: Path) -> None:
         repair(tmp_path / "none.bag", tmp_path / "good.bag")
     with pytest.raises(RecordingError, match=r"cannot be read \("):
         repair(tmp_path, tmp_path / "good.bag")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes have names here")
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.bag")
+    with pytest.raises(RecordingError, match="is no file"):
+        repair(tmp_path / "pipe.bag", tmp_path / "good.bag")
 
 
 @pytest.mark.parametrize("link", [None, os.link, os.symlink])

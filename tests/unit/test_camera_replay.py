@@ -1,4 +1,5 @@
 import gc
+import os
 import re
 import struct
 import subprocess
@@ -106,6 +107,19 @@ def test_a_missing_path_and_a_folder_are_told(tmp_path: Path) -> None:
         ReplayCamera(tmp_path / "none.bag")
     with pytest.raises(RecordingError, match="is a folder"):
         ReplayCamera(tmp_path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes have names here")
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.bag")
+    with pytest.raises(RecordingError, match="is no file"):
+        ReplayCamera(tmp_path / "pipe.bag")
+
+
+def test_the_repair_that_is_offered_can_be_typed(tmp_path: Path, noise_bag: Path) -> None:
+    (path := tmp_path / "my run.bag").write_bytes(without_index(noise_bag))
+    with pytest.raises(RecordingError, match=r"nlos-cam repair '.*/my run\.bag' --out 'my run-repaired\.bag'"):
+        ReplayCamera(path)
 
 
 def test_damage_within_is_told_after_the_frames_before_it(recorded: Any, tmp_path: Path) -> None:

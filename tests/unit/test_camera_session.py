@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from threading import Timer
+from time import monotonic
 from types import SimpleNamespace
 from typing import Any
 
@@ -84,11 +85,11 @@ def test_while_a_sensor_is_prepared_the_next_set_can_be_looked_at(preparing: Any
 
 def test_a_look_ends_when_nothing_comes_or_nobody_waits_any_more(preparing: Any) -> None:
     def look(session: Session, _: FakeLidar) -> list[Any]:
-        nothing = session.look(0.01)
+        nothing, begun_s = session.look(0.01), monotonic()
         Timer(0.1, session.end_wait).start()
-        return [nothing, session.look(30.0)]
+        return [nothing, session.look(10.0), monotonic() - begun_s < 5.0]
 
-    assert preparing(look) == [None, None]
+    assert preparing(look) == [None, None, True]
 
 
 def test_a_device_that_vanishes_while_it_is_prepared_is_an_error(preparing: Any) -> None:

@@ -148,6 +148,8 @@ def test_the_name_is_dated_if_none_is_given(run: Run, tmp_path: Path, monkeypatc
         ("--out", "a.mp4"),
         ("--frames", "0"),
         ("--seconds", "0"),
+        ("--seconds", "inf"),
+        ("--frames", "1", "--takes", "2", "--pause-s", "inf"),
         ("--takes", "2"),
         ("--takes", "3", "--frames", "1", "--label", "a", "--label", "b"),
         ("--frames", "1", "--label", "a", "--label", "b"),

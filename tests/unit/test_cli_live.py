@@ -6,6 +6,7 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from datetime import date
 from pathlib import Path
 from types import SimpleNamespace
@@ -60,9 +61,11 @@ class Opened:
     def __init__(self) -> None:
         self.calls: list[tuple[str, dict[str, Any]]] = []
         self.on_frame: Callable[[int], None] = lambda _: None
+        self.on_open: Callable[[], None] = lambda: None
 
     def __call__(self, uri: str, **options: Any) -> FakeCamera:
         self.calls.append((uri, options))
+        self.on_open()
         return FakeCamera(uri, self.on_frame)
 
 
@@ -227,3 +230,21 @@ def test_replay_needs_no_sdk(noise_bag: Path, tmp_path: Path) -> None:
     ended = subprocess.run(run, capture_output=True, text=True, timeout=250)  # noqa: PLW1510  the code is what is tested
     assert ended.returncode == 0, ended.stderr
     assert json.loads(ended.stdout.splitlines()[-1])["frames"] == 20
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_recording_by_another_name_is_refused() -> None:
+    assert main(["live", "--camera", "sim", "--no-view", "--record", "run.txt"]) == 2
+
+
+@pytest.mark.parametrize("command", [("live", "--no-view", "--camera", "sim"), ("replay", "a.bag")])
+def test_ctrl_c_while_a_camera_opens_begins_no_run(
+    opened: Opened, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    def swallow() -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    opened.on_open = swallow
+    assert main([*command, "--json"]) == 130
+    assert capsys.readouterr().out == ""

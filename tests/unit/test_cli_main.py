@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
 import typer
@@ -185,3 +186,21 @@ def test_ctrl_c_while_a_command_is_loaded_is_130(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(module, "build_app", interrupted)
     assert main(["live"]) == 130
+
+
+def _swallowed() -> None:
+    with suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def _made_an_error() -> None:
+    try:
+        signal.raise_signal(signal.SIGTERM)
+    except KeyboardInterrupt:
+        raise errors.CameraError("initialization failed") from None
+
+
+@pytest.mark.parametrize("library", [_swallowed, _made_an_error])
+def test_ctrl_c_that_a_library_makes_something_else_of_is_130(does: Callable[[Act], None], library: Act) -> None:
+    does(library)
+    assert main(["act"]) == 130
