@@ -42,6 +42,9 @@ class Camera(Protocol):
 
     def __iter__(self) -> Iterator[Frame]: ...
 
-    def telemetry(self) -> Mapping[str, float]:
-        """The options that can be read now, temperatures among them, by the SDK's name; empty where there are none."""
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        """The options that can be read now, temperatures among them, by the SDK's name; empty where there are none.
+
+        Each costs a real device a command on its link: ask for what is needed by the `ending` of its name.
+        """
         ...

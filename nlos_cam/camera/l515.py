@@ -21,6 +21,8 @@ USB3_SIZE: Size = (640, 480)
 USB2_SIZE: Size = (320, 240)
 PRESET = {"global_time_enabled": 1.0, "visual_preset": 5.0}
 """Timestamps of the host, and short range, whose lower gain does not saturate so near."""
+MODES_OFF = ("alternate_ir", "enable_ir_reflectivity", "enable_max_usable_range")
+"""Where the firmware has them: IR would mean something else than intensity, and the preset be set to maximum range."""
 NEAR_WALL = {
     "min_distance": 0.0,
     "confidence_threshold": 1.0,
@@ -57,13 +59,23 @@ def shared_context(sdk: Any) -> Any:
 
 
 def connected(sdk: Any, context: Any) -> list[tuple[Any, DeviceInfo]]:
-    """Every device that the SDK sees. Raises CameraError where it cannot look."""
+    """Every device that the SDK sees, but for those that it fails on. Raises CameraError where it fails on all."""
+    found: list[tuple[Any, DeviceInfo]] = []
+    failure: RuntimeError | None = None
     try:
-        return [(device, _info(device, sdk)) for device in context.query_devices()]
+        listed = context.query_devices()
+        for index in range(len(listed)):
+            try:
+                found.append(((device := listed[index]), _info(device, sdk)))
+            except RuntimeError as error:
+                failure = error
     except RuntimeError as error:
+        failure = error
+    if failure and not found:
         raise CameraError(
-            f"librealsense cannot list its devices ({error}): replug them, close other programs"
-        ) from error
+            f"librealsense cannot list its devices ({failure}): replug them, close other programs"
+        ) from failure
+    return found
 
 
 def _info(device: Any, sdk: Any) -> DeviceInfo:
@@ -119,7 +131,8 @@ class L515Camera(LiveCamera):
     def _prepare(self, sensor: Any) -> None:
         """Preset first, since it changes the others; after start, since starting resets it."""
         options = Options(sensor, self._sdk)
-        differences = self._put(options, PRESET) | self._put(options, NEAR_WALL)
+        off = {name: 0.0 for name in MODES_OFF if options.get(name) not in {None, 0.0}}
+        differences = self._put(options, off | PRESET) | self._put(options, NEAR_WALL)
         for name, difference in differences.items():
             if self.differences.get(name) != difference:
                 log.warning("%s: %s: %s", self.uri, name, difference)

@@ -240,8 +240,8 @@ class LiveCamera(ABC):
             raise CameraLostError(f"{silence}: the recording ends there, whole; replug the camera and record again")
         log.warning("%s: the recording ends there, whole, after %d frames", silence, recording.sets)
 
-    def telemetry(self) -> Mapping[str, float]:
-        return session.telemetry() if (session := self._session) else {}
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        return session.telemetry(ending) if (session := self._session) else {}
 
     def _on_set(self, found: FrameSet) -> None:
         recording, session = self._recording, self._session

@@ -95,8 +95,8 @@ class ReplayCamera:
     def _count(self, pairing: Pairing) -> None:
         self.incomplete, self.dropped, self.counts = pairing.incomplete, pairing.dropped, pairing.counts
 
-    def telemetry(self) -> Mapping[str, float]:
-        return self._settings
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        return {name: value for name, value in self._settings.items() if name.endswith(ending)}
 
 
 def open_lidar_bag(path: Path) -> BagFile:

@@ -116,8 +116,8 @@ class SdkReplayCamera:
                     f"{came} of {listed} {stream} frames"
                 )
 
-    def telemetry(self) -> Mapping[str, float]:
-        return self._session.telemetry() if self._session else {}
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        return self._session.telemetry(ending) if self._session else {}
 
     def _count(self, inbox: Inbox) -> None:
         self.incomplete, self.dropped, self.arrived = inbox.incomplete, inbox.dropped, inbox.arrived

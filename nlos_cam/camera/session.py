@@ -43,10 +43,12 @@ def _has(profile: Any, size: Size) -> bool:
     return (video.width(), video.height()) == size and profile.fps() == FRAMES_PER_S
 
 
-def read_settings(sensor: Any) -> dict[str, float]:
-    """Every option that the sensor lets be read, by the SDK's name; empty when it is gone."""
+def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
+    """Every option with such a name that the sensor lets be read, by the SDK's name; empty when it is gone."""
     settings: dict[str, float] = {}
     for option in sensor.get_supported_options():
+        if not option.name.endswith(ending):
+            continue
         try:
             settings[option.name] = float(sensor.get_option(option))
         except RuntimeError:  # listed, but not readable in this state
@@ -117,11 +119,11 @@ class Session:
             return sample
         return replace(sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s))
 
-    def telemetry(self) -> dict[str, float]:
+    def telemetry(self, ending: str = "") -> dict[str, float]:
         """The options as they read now; empty when the device is gone, or the session has stopped."""
         sensor = self._sensor
         try:
-            return read_settings(sensor) if sensor else {}
+            return read_settings(sensor, ending) if sensor else {}
         except RuntimeError:
             return {}
 

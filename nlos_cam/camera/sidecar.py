@@ -161,7 +161,7 @@ class SidecarFile:
         self.path = path
         self._first_s: float | None = None
         self._looked_s, self._every_s = float("-inf"), LOOK_S
-        self._look_at = camera.telemetry
+        self._camera = camera
         self._sidecar = Sidecar(
             label=label,
             camera=camera.uri,
@@ -189,7 +189,7 @@ class SidecarFile:
                 self._write()
 
     def _look(self, time_s: float) -> None:
-        celsius = {name: value for name, value in _finite(self._look_at()).items() if name.endswith("_temperature")}
+        celsius = _finite(self._camera.telemetry("_temperature"))
         if not celsius:
             return
         series = [*self._sidecar.temperatures, Temperatures(time_s=time_s, celsius=celsius)]

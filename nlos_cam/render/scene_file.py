@@ -124,7 +124,9 @@ def load_scene(path: Path) -> SceneFile:
         raise SceneError(f"{path} is not a scene: rig: {error}") from error
     except ValidationError as error:
         raise SceneError(f"{path} is not a scene: {first_problem(error)}") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read ({error.strerror}): give the path of a scene.toml") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise SceneError(f"{path} cannot be read as a scene: {error}") from error
     if scene.hidden and not any(scene.shows_at(number) for number in range(scene.poses)):
         raise nothing_to_see(scene.hidden.label, object_box(scene.rig))

@@ -227,6 +227,7 @@ def test_telemetry_leaves_out_what_is_not_measured_yet(fake_l515: Make, fake_cam
         assert "apd_temperature" not in camera.telemetry()
         lidar.options["apd_temperature"] = 38.0
         assert camera.telemetry()["apd_temperature"] == 38.0
+        assert set(camera.telemetry("_temperature")) == {"ldd_temperature", "apd_temperature"}
         lidar.unplug()
         assert camera.telemetry() == {}
     assert camera.telemetry() == {}
