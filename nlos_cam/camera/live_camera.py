@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from threading import Event, RLock
-from types import TracebackType
 from typing import Any, Self
 
 from nlos_calibration.projection import Intrinsics
@@ -151,12 +150,7 @@ class LiveCamera(ABC):
             # never paused meanwhile: the SDK then stamps frames out of order when it resumes
             self._recording.begin(self._device, self._sdk)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._leave()
 
     def _leave(self) -> None:

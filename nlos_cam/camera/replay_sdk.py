@@ -5,7 +5,6 @@ import gc
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from nlos_calibration.projection import Intrinsics
@@ -73,12 +72,7 @@ class SdkReplayCamera:
         atexit.register(self._leave)  # for a program that ends without leaving: the SDK's threads would crash it
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._leave()
 
     def _leave(self) -> None:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from threading import Event
-from types import TracebackType
 from typing import Self
 
 from nlos_calibration.rig import Rig
@@ -35,12 +34,7 @@ class RerunViewer:
         self.address = self._server.address
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._closed.set()
         self._moments.close()
         self._server.close()

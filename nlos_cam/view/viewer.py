@@ -1,7 +1,6 @@
 """What the streaming loop asks of a viewer, and the viewer that shows nothing."""
 
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Protocol, Self
 
 from nlos_cam.frames import Frame
@@ -30,12 +29,7 @@ class Viewer(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None: ...
 
     def show(self, moment: Moment) -> None: ...
 
@@ -48,12 +42,7 @@ class NullViewer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         pass
 
     def show(self, moment: Moment) -> None:
