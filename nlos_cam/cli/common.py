@@ -115,7 +115,7 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
     if suffix and path.is_dir():
         raise OutputExistsError(f"{path} is a folder: name a {suffix} file in it")
     if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
-        raise OutputExistsError(f"{path} exists: choose another --out, or add --overwrite to replace it")
+        raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
     if not path.parent.is_dir():
         raise OutputExistsError(f"the folder of {path} does not exist: create {path.parent} first")
     return path
