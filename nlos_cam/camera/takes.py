@@ -156,7 +156,9 @@ def _read_back(take: Take, read_back: Callable[[Path], Verified | None]) -> Take
         return replace(take, state="damaged", error=error)
     if found is None:
         return replace(take, state="interrupted")
-    if found.frames < take.sets - take.cut_in:
+    # without metadata, a reader learns anew which frames belong together: some are there, and in no set
+    held = max(found.frames, min(found.streams.values(), default=0))
+    if held < take.sets - take.cut_in:
         error = RecordingError(
             f"{take.job.path} holds {found.frames} of the {take.sets} frames that came: check the disk's free space "
             "and speed, and record again"

@@ -190,6 +190,14 @@ def test_a_file_that_holds_less_than_came_is_damaged(run: Run) -> None:
     assert "holds 3 of the 5 frames" in str(take.error)
 
 
+def test_frames_that_are_there_and_in_no_set_are_no_damage(run: Run) -> None:
+    whole, short = ({"depth": 5, "infrared": 5, "confidence": count} for count in (5, 4))
+    (take,) = run(frames=5, read_back=lambda _: Verified(2, 3, 0.1, whole))
+    assert take.state == "complete"
+    (take,) = run(frames=5, read_back=lambda _: Verified(2, 3, 0.1, short))
+    assert take.state == "damaged"
+
+
 def test_a_file_that_cannot_be_read_back_is_damaged(run: Run) -> None:
     def read_back(path: Path) -> Verified:
         raise RecordingError(f"{path} is cut short")
