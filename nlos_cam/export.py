@@ -38,7 +38,7 @@ class Wanted:
 
     format: Format = "png"
     points: bool = False
-    """Also a point cloud for each whole set of depth, infrared and confidence."""
+    """A point cloud for each whole set of depth, infrared and confidence; else for the first, if all is exported."""
     streams: Collection[str] = ()
     """By name; none means all."""
     every: int = 1
@@ -65,7 +65,7 @@ def export(
         (part / INFO).write_text(json.dumps(_info(bag, wanted), indent=1) + "\n", encoding="utf-8")
         with ExitStack() as closing:
             sinks = {stream: _sink(bag, stream, part, wanted.format) for stream in streams}
-            points = _points(bag, part) if wanted.points else None
+            points = _points(bag, wanted, part)
             for sink in [*sinks.values(), *([points] if points else [])]:
                 closing.callback(sink.close)
             try:
@@ -117,8 +117,12 @@ def _sink(bag: BagFile, stream: str, folder: Path, form: Format) -> Sink:
     return NpzSink(folder, stream, {**pinhole, **unit, "encoding": np.array(info.format)})
 
 
-def _points(bag: BagFile, folder: Path) -> PointSink:
-    return PointSink(folder, bag.streams["depth"].intrinsics.rays(), bag.depth_unit_m())
+def _points(bag: BagFile, wanted: Wanted, folder: Path) -> PointSink | None:
+    has_sets = all(stream in bag.streams and bag.streams[stream].format for stream in FORMATS)
+    if not wanted.points and (wanted.streams or not has_sets):
+        return None
+    most = None if wanted.points else 1
+    return PointSink(folder, bag.streams["depth"].intrinsics.rays(), bag.depth_unit_m(), most)
 
 
 def _info(bag: BagFile, wanted: Wanted) -> dict[str, Any]:

@@ -96,16 +96,21 @@ class NpzSink:
 
 
 class PointSink:
-    """One binary PLY for each whole set: metres in the lidar frame (x right, y down, z ahead), grey by infrared."""
+    """One binary PLY for each whole set, or the first `most`; grey by infrared.
 
-    def __init__(self, folder: Path, rays: NDArray[np.float64], unit_m: float) -> None:
-        self._folder, self._rays, self._unit_m = folder / POINTS, rays, unit_m
+    Metres in the lidar frame: x right, y down, z ahead.
+    """
+
+    def __init__(self, folder: Path, rays: NDArray[np.float64], unit_m: float, most: int | None = None) -> None:
+        self._folder, self._rays, self._unit_m, self._most = folder / POINTS, rays, unit_m, most
         self._folder.mkdir()
         self._pairing = Pairing(rays.shape[:2])
         self.written = 0
 
     def add(self, sample: Sample) -> None:
-        if sample.stream in FORMATS and (found := self._pairing.add(sample)):
+        if self.written == self._most or sample.stream not in FORMATS:
+            return
+        if found := self._pairing.add(sample):
             self._write(found)
 
     def _write(self, found: FrameSet) -> None:

@@ -27,7 +27,9 @@ NewBag = Annotated[Path | None, typer.Option("--out", help="The recording to wri
 AnyBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording, of any RealSense camera.")]
 Folder = Annotated[Path | None, typer.Option("--out", help="The folder to write.")]
 As = Annotated[Format, typer.Option("--format", help="png: a 16-bit PNG a frame. npz: one file a stream.")]
-Ply = Annotated[bool, typer.Option("--ply", help="Also a point cloud (PLY, metres, lidar frame) for each frame.")]
+Ply = Annotated[
+    bool, typer.Option("--ply", help="A point cloud (PLY, metres, lidar frame) for each frame, not the first only.")
+]
 Streams = Annotated[str, typer.Option("--streams", help="Only these: names with commas between.")]
 Every = Annotated[int, typer.Option("--every", min=1, help="Only frames whose number this divides.")]
 MOST_TOLD = 5
@@ -84,7 +86,7 @@ def export_bag(
         task = bar.add_task("exporting", total=total)
         made = export(found, folder, wanted, stop=stop, on_frame=lambda: bar.advance(task))
     if made.damage:
-        raise RecordingError(f"{made.damage}; the {sum(made.frames.values())} frames before that are in {folder}")
+        raise RecordingError(f"{made.damage}; what comes before that is in {folder}")
     finish({"frames": made.frames, "out": made.out}, as_json=json, text=_told_export(made))
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)

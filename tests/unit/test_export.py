@@ -33,7 +33,7 @@ def rows(out: Path, stream: str) -> list[dict[str, str]]:
 
 def test_every_bit_of_every_frame_is_in_its_png(noise_bag: Path, tmp_path: Path) -> None:
     made = exported(noise_bag, tmp_path / "out")
-    assert made.frames == dict.fromkeys(FORMATS, FRAMES)
+    assert made.frames == dict.fromkeys(FORMATS, FRAMES) | {"points": 1}
     for stream in FORMATS:
         for row, sample in zip(rows(tmp_path / "out", stream), samples(noise_bag, stream), strict=True):
             pixels = cv2.imread(str(tmp_path / "out" / row["file"]), cv2.IMREAD_UNCHANGED)
@@ -53,7 +53,7 @@ def test_every_bit_of_every_frame_is_in_its_npz(noise_bag: Path, tmp_path: Path)
             np.testing.assert_array_equal(found["timestamp_s"], [sample.timestamp_s for sample in expected])
             assert (found["width"], found["fx"]) == (64, pytest.approx(45.7, abs=0.1))
             assert ("depth_unit_m" in found) == (stream == "depth")
-    assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [".json", ".npz", ".npz", ".npz"]
+    assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == ["", ".json", ".npz", ".npz", ".npz"]
 
 
 def test_points_are_the_depth_seen_along_the_rays(noise_bag: Path, tmp_path: Path) -> None:
@@ -70,6 +70,7 @@ def test_points_are_the_depth_seen_along_the_rays(noise_bag: Path, tmp_path: Pat
 def test_only_what_is_asked_for_is_written(noise_bag: Path, tmp_path: Path) -> None:
     made = exported(noise_bag, tmp_path / "out", streams=["infrared"], every=6)
     assert made.frames == {"infrared": 4}
+    assert not (tmp_path / "out" / "points").exists()
     assert [row["frame_number"] for row in rows(tmp_path / "out", "infrared")] == ["0", "6", "12", "18"]
     assert not (tmp_path / "out" / "depth").exists()
 
@@ -99,7 +100,7 @@ def test_stopping_keeps_what_is_done(noise_bag: Path, tmp_path: Path) -> None:
             stop.set()
 
     made = export(BagFile(noise_bag), tmp_path / "out", Wanted(format="npz"), stop=stop, on_frame=after_six)
-    assert made.frames == {"depth": 2, "infrared": 2, "confidence": 2}
+    assert made.frames == {"depth": 2, "infrared": 2, "confidence": 2, "points": 1}
     with np.load(tmp_path / "out" / "depth.npz") as found:
         assert found["pixels"].shape == (2, 48, 64)
 
