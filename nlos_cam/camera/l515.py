@@ -213,6 +213,6 @@ def _find(sdk: Any, context: Any, serial: str) -> tuple[Any, DeviceInfo]:
     seen = ", ".join(f"{info.name} {info.serial}".strip() for _, info in there) or "no device"
     wanted = f"L515 with serial {serial}" if serial else "L515"
     raise CameraNotFoundError(
-        f"no {wanted} found (librealsense sees {seen}): check the USB 3 cable and port, close other programs that use "
-        "it, and on Linux install librealsense's udev rules; without a camera, use --camera sim"
+        f"no {wanted} found (librealsense sees {seen}): check the USB 3 cable and port, and run `nlos-cam doctor`, "
+        "which says what else may hide it; without a camera, use --camera sim"
     )
