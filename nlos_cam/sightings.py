@@ -5,10 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
+from nlos_cam.camera.laser_power import MOST_SATURATED, saturated_share
 from nlos_cam.frames import Frame
-
-SATURATED_SHARE = 1e-3
-"""Of the infrared pixels at 255; the L515 under-estimates depth there."""
 
 
 def amiss(frame: Frame) -> list[str]:
@@ -19,7 +17,7 @@ def amiss(frame: Frame) -> list[str]:
         names.append("blank")
     elif 2 * with_depth <= pixels:
         names.append("half_invalid")
-    if np.count_nonzero(frame.ir == 255) > SATURATED_SHARE * pixels:
+    if saturated_share(frame.ir) > MOST_SATURATED:
         names.append("saturated")
     return names
 

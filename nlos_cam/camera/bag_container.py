@@ -13,11 +13,11 @@ from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
-from nlos_cam.camera.bag_format import MAGIC
+from nlos_cam.camera.bag_format import CHUNK_LIMIT, MAGIC
 from nlos_cam.camera.bag_messages import is_known, parse
 from nlos_cam.errors import RecordingError
 
-MOST_BYTES = 2**26
+MOST_BYTES = CHUNK_LIMIT
 """Of a chunk; librealsense begins a new one after 768 kB."""
 DECOMPRESSORS = {"lz4": LZ4FrameDecompressor, "bz2": BZ2Decompressor}
 

@@ -6,11 +6,9 @@ from pathlib import Path
 
 from nlos_calibration.projection import Intrinsics
 
-from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.camera.streams import BYTES_PER_PIXEL, FRAMES_PER_S
 from nlos_cam.errors import DiskFullError
 
-BYTES_PER_PIXEL = 4
-"""16 bits of depth, 8 of infrared, 8 of confidence."""
 RESERVE_BYTES = 200_000_000
 """A recording stops before less than this is free: five seconds of 640 x 480, and what its index takes."""
 CHUNK_BYTES = 4_000_000
@@ -21,7 +19,7 @@ INDEX_SHARE = 1e-3
 
 def bytes_per_frame(intrinsics: Intrinsics) -> int:
     """The most that a frame of three streams takes: librealsense compresses, but by how much is not known ahead."""
-    return intrinsics.width * intrinsics.height * BYTES_PER_PIXEL
+    return intrinsics.width * intrinsics.height * sum(BYTES_PER_PIXEL.values())
 
 
 def free_bytes(path: Path) -> int:

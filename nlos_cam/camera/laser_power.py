@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-SATURATED = 255
+from nlos_cam.render.sensor_model import SATURATED
+
 MOST_SATURATED = 0.001
-"""Share of infrared pixels."""
+"""Share of infrared pixels; the L515 under-estimates depth where they are."""
 STRIDES = 10
 """Strides from the strongest laser to the weakest."""
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.frames import Float32, Frame
+from nlos_cam.render.sensor_model import SATURATED
 
-SATURATED = 255
 LEAST_PAIRS = 8
 """Pairs of frames in which a pixel must be valid for its noise to count; with fewer in all, no noise is told."""
 SAMPLED_EVERY = 8

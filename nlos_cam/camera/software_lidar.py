@@ -7,12 +7,11 @@ import numpy as np
 from nlos_calibration.projection import Intrinsics
 from numpy.typing import NDArray
 
-from nlos_cam.camera.streams import FORMATS, FRAMES_PER_S
+from nlos_cam.camera.streams import BYTES_PER_PIXEL, FORMATS, FRAMES_PER_S
 from nlos_cam.render.sensor import DEPTH_UNIT_M, SensedImages
 
 NAME, SERIAL = "Simulated L515", "simulated"
 SENSOR_NAME = "L500 Depth Sensor"
-BYTES_PER_PIXEL = {"depth": 2, "infrared": 1, "confidence": 1}
 
 
 class SoftwareLidar:

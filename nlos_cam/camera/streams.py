@@ -13,6 +13,7 @@ from nlos_cam.camera.alignment import Alignment
 
 FORMATS = {"depth": "z16", "infrared": "y8", "confidence": "raw8"}
 """The streams that are needed, by the SDK's names, and the pixel format of each."""
+BYTES_PER_PIXEL = {"depth": 2, "infrared": 1, "confidence": 1}
 FRAMES_PER_S = 30
 SAME_INSTANT_S = 0.5 / FRAMES_PER_S
 """Frames of one number whose timestamps differ by more were not taken together."""

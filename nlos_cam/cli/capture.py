@@ -19,6 +19,7 @@ from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.camera.takes import Job, Take, Takes, settle
 from nlos_cam.cli.capture_told import ending, result, told
 from nlos_cam.cli.common import (
+    INTERRUPTED,
     Json,
     Overwrite,
     finish,
@@ -49,7 +50,6 @@ Labels = Annotated[
     typer.Option("--label", help="A name for what is seen, kept in F.json beside F.bag; with --takes one, or each."),
 ]
 Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it, for F.json.")]
-INTERRUPTED = 130
 Out = Annotated[Path | None, typer.Option("--out", help="The recording to write (.bag).")]
 
 

@@ -20,6 +20,9 @@ from nlos_cam.errors import OutputExistsError
 Json = Annotated[bool, typer.Option("--json", help="End stdout with one JSON object; progress goes to stderr.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what --out names, if it exists.")]
 
+INTERRUPTED = 130
+"""The exit code after Ctrl-C or a request to terminate."""
+
 stderr = Console(stderr=True, highlight=False)
 
 

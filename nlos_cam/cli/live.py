@@ -14,6 +14,7 @@ from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
 from nlos_cam.camera.table import Reader
 from nlos_cam.cli.common import (
+    INTERRUPTED,
     Json,
     Overwrite,
     finish,
@@ -30,7 +31,6 @@ from nlos_cam.replay import REPORT, replay
 from nlos_cam.sightings import in_words
 from nlos_cam.view.viewer import NullViewer, Viewer
 
-INTERRUPTED = 130
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:scene.toml, bag:run.bag.")]
 Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it (wall.toml).")]
 Weights = Annotated[Path | None, typer.Option("--weights", help="A folder of other weights than the shipped ones.")]

@@ -8,10 +8,9 @@ import typer
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
-from nlos_cam.cli.common import interrupted_by_signals, stderr, stop_on_signals
+from nlos_cam.cli.common import INTERRUPTED, interrupted_by_signals, stderr, stop_on_signals
 from nlos_cam.errors import NlosCamError
 
-INTERRUPTED = 130
 COMMANDS = {
     "devices": "devices",
     "doctor": "doctor",

@@ -9,6 +9,7 @@ from rich.markup import escape
 from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.repair import Repaired, repair
 from nlos_cam.cli.common import (
+    INTERRUPTED,
     Json,
     Overwrite,
     finish,
@@ -21,7 +22,6 @@ from nlos_cam.cli.common import (
 from nlos_cam.errors import RecordingError
 from nlos_cam.export import Exported, Format, Wanted, export
 
-INTERRUPTED = 130
 DamagedBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording that was killed, cut short or damaged.")]
 NewBag = Annotated[Path | None, typer.Option("--out", help="The recording to write (.bag).")]
 AnyBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording, of any RealSense camera.")]

@@ -7,14 +7,12 @@ from typing import Annotated, Any
 
 import typer
 
-from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
+from nlos_cam.cli.common import INTERRUPTED, Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
 from nlos_cam.cli.hidden_object import hidden_depth
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import paper_scene
 from nlos_cam.render.tradeoff import Row, facts, measure, settings
 from nlos_cam.render.tradeoff_report import as_markdown, as_table, draw
-
-INTERRUPTED = 130
 
 
 def register(app: typer.Typer) -> None:
