@@ -18,21 +18,37 @@ from nlos_calibration.wall import WallFit
 Row = tuple[Finite, Finite, Finite, Finite]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 POSE_TOLERANCE = 1e-6
-VERSION = 2
-"""2 adds to 1 what is None, empty or 0 by default: uncertainties, flatness, device, board, reference, offset."""
+VERSION = 3
+"""2 adds to 1 what is None, empty or 0 by default: uncertainties, flatness, device, board, reference, offset; and 3
+temperatures, footprint and occluder."""
 
 
 def _upgraded(version: Any) -> Any:
     """The version once read; those that this program does not know are refused."""
     if isinstance(version, int) and version > VERSION:
         raise ValueError(f"written by a newer nlos-cam, this one reads up to {VERSION}: update it, or measure again")
-    return VERSION if version == 1 else version
+    return VERSION if version in (1, 2) else version
+
+
+class OccluderRecord(Record):
+    """The occluder as it was found, or as somebody says it stands; `rig.occluder` is its half plane."""
+
+    source: Literal["detected", "entered"]
+    x_m: Finite
+    """Wall x of its edge."""
+    gap_m: Positive
+    """Between its edge and the wall: the aperture."""
+    x_std_m: NotNegative | None = None
+    """None, as gap_std_m and tilt_deg, where it was entered."""
+    gap_std_m: NotNegative | None = None
+    tilt_deg: Finite | None = None
+    """Of its sheet against the plane x = x_m, about wall y; positive leans away from the lidar's foot."""
 
 
 class WallRecord(Record):
     """A measured wall. Occluder and object box of `rig` may be edited by hand; its lidar is what was measured."""
 
-    schema_version: Annotated[Literal[2], BeforeValidator(_upgraded)] = VERSION
+    schema_version: Annotated[Literal[3], BeforeValidator(_upgraded)] = VERSION
     created: date
     camera: str
     """The URI of the camera or recording."""
@@ -41,6 +57,8 @@ class WallRecord(Record):
     firmware: str = ""
     settings: dict[str, Finite] = Field(default_factory=dict)
     """The device's options as read back when streaming began."""
+    temperatures_c: dict[str, Finite] = Field(default_factory=dict)
+    """Means while the wall was looked at, by the SDK's name; empty where the device tells none."""
     frames: Annotated[int, Field(gt=0)]
     """How many were averaged."""
     distance_m: Positive
@@ -68,6 +86,10 @@ class WallRecord(Record):
     bend_deg: NotNegative | None = None
     board: BoardRecord | None = None
     """What a printed board said; None where none was asked for."""
+    footprint_share: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Of the map's 64 x 80 cells, those that meet the wall."""
+    occluder: OccluderRecord | None = None
+    """None where it was neither found nor entered: then `rig` has the paper's."""
     reference: str = ""
     """The file of the bare wall's reference maps, beside this one; empty where there is none."""
     reference_sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")] = ""

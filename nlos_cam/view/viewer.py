@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol, Self
 
-from nlos_cam.frames import Frame
+from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.reconstruct import Reconstruction
 
 
@@ -17,6 +17,10 @@ class Moment:
     """The loop's clock when the reconstruction was ready."""
     latency_s: float
     """From the frame's timestamp to `published_s`, on one clock."""
+    difference: LidarMaps | None = None
+    """The maps less the bare wall's; None without a reference."""
+    warnings: tuple[str, ...] = ()
+    """What the person at the bench should know now, such as that the lidar has moved."""
 
 
 class Viewer(Protocol):

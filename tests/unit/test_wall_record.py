@@ -8,10 +8,10 @@ from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import ObjectBox, Occluder, dump_toml, load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
-from nlos_calibration.wall_record import WallRecord, load_wall, wall_record
+from nlos_calibration.wall_record import VERSION, WallRecord, load_wall, wall_record
 
 PINHOLE = Intrinsics(160, 120, 114.0, 115.0, 80.5, 59.0)
-VERSION_1 = Path(__file__).parent / "wall_v1.toml"
+VERSION_1, VERSION_2 = Path(__file__).parent / "wall_v1.toml", Path(__file__).parent / "wall_v2.toml"
 EXAMPLE = Path(__file__).parents[2] / "calibration/records/wall.toml"
 
 
@@ -59,18 +59,25 @@ def test_a_record_may_name_device_reference_and_offset(tmp_path: Path, record: W
 
 def test_version_1_is_read_as_what_it_says_and_no_more() -> None:
     old = load_wall(VERSION_1)
-    assert old.schema_version == 2
+    assert old.schema_version == VERSION
     assert (old.distance_m, old.frames, old.verdict) == (0.19999943926475988, 60, "good")
     assert old.distance_std_m is None
     assert old.range_offset_std_m is None
     assert (old.serial, old.settings, old.reference, old.range_offset_m) == ("", {}, "", 0.0)
 
 
-def test_version_1_written_again_is_version_2(tmp_path: Path) -> None:
+def test_version_2_is_read_as_what_it_says_and_no_more() -> None:
+    old = load_wall(VERSION_2)
+    assert (old.schema_version, old.noise_scale, old.verdict) == (VERSION, 1.0023135540076475, "good")
+    assert (old.temperatures_c, old.footprint_share, old.occluder) == ({}, None, None)
+
+
+@pytest.mark.parametrize("old", [VERSION_1, VERSION_2])
+def test_an_old_version_written_again_is_the_newest(tmp_path: Path, old: Path) -> None:
     path = tmp_path / "wall.toml"
-    path.write_text(dump_toml(load_wall(VERSION_1)), encoding="utf-8")
-    assert "schema_version = 2" in path.read_text(encoding="utf-8")
-    assert load_wall(path) == load_wall(VERSION_1)
+    path.write_text(dump_toml(load_wall(old)), encoding="utf-8")
+    assert f"schema_version = {VERSION}" in path.read_text(encoding="utf-8")
+    assert load_wall(path) == load_wall(old)
 
 
 def test_occluder_and_object_box_may_be_edited(tmp_path: Path, record: WallRecord) -> None:
@@ -84,9 +91,9 @@ def test_occluder_and_object_box_may_be_edited(tmp_path: Path, record: WallRecor
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
-        ("schema_version = 2", "schema_version = 3", "newer nlos-cam, this one reads up to 2.*got 3"),
-        ("schema_version = 2", "schema_version = 0", "schema_version: .*got 0"),
-        ("schema_version = 2", 'schema_version = "2"', "schema_version: .*got '2'"),
+        ("schema_version = 3", "schema_version = 4", "newer nlos-cam, this one reads up to 3.*got 4"),
+        ("schema_version = 3", "schema_version = 0", "schema_version: .*got 0"),
+        ("schema_version = 3", 'schema_version = "3"', "schema_version: .*got '3'"),
         ("distance_std_m = ", "distance_std_m = -", "distance_std_m: .*got -"),
         ('reference_sha256 = ""', 'reference_sha256 = "abc"', "reference_sha256: .*got 'abc'"),
         ("frames = 60", "frames = 0", "frames: .*got 0"),
