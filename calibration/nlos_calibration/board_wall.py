@@ -14,13 +14,12 @@ from nlos_calibration.combine import Combined, Plane, Used, combine
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import wall_from_plane
 from nlos_calibration.projection import Intrinsics
-from nlos_calibration.rig import Finite, Positive, Record
+from nlos_calibration.rig import Finite, NotNegative, Positive, Record
 from nlos_calibration.uncertainty import WallMeasures, measures_of
 from nlos_calibration.verdict import Verdict, out_of_range
 from nlos_calibration.wall import WallFit
 
 Array = NDArray[np.float64]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
