@@ -114,7 +114,7 @@ class SimulatedCamera(LiveCamera):
         return None if instant is None else self._world.truth_depth_m(instant)
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
-        """What the device tells, with the temperatures of the world's instant: the SDK keeps those of the plugging in."""
+        """What the device tells, its temperatures those of the world's instant: the SDK keeps the first."""
         told, celsius = super().telemetry(ending), self._world.celsius(self._instant())
         return {name: celsius.get(name, value) for name, value in told.items()}
 
