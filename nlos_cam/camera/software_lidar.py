@@ -18,8 +18,8 @@ class SoftwareLidar:
     """An `rs.software_device` with the L515's depth sensor: same sensor name, streams, formats and depth unit.
 
     It streams at one size; one that `has_other_size` can also be made to deliver frames of half the rows and columns.
-    Its timestamps are the host's time, unless it `has_own_clock`. As options it tells its depth unit and the temperatures
-    `celsius`, by the SDK's names; both stay as they are given.
+    Its timestamps are the host's time, unless it `has_own_clock`. Its options are its depth unit and the temperatures
+    `celsius`, by the SDK's names, which stay as they are given.
     """
 
     def __init__(
