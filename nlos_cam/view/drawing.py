@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.view.layout import TIMELINE, layout
 from nlos_cam.view.pictures import (
+    PICTURE_WIDTH,
     change_span_m,
     depth_span_m,
     difference_rgb,
@@ -25,8 +26,6 @@ from nlos_cam.view.wall_drawing import bench_drawings, wall_names, wall_pictures
 from nlos_cam.view.wall_text import calibration_text
 
 APPLICATION = "nlos-cam"
-LIDAR_WIDTH = 320
-"""Depth and IR are thinned to about this many columns."""
 WALL_RGBA, OCCLUDER_RGBA, LIGHT_RGBA = (120, 130, 140, 70), (90, 150, 255, 90), (255, 210, 80, 200)
 BOX_RGB, LATENCY_RGB = (150, 150, 150), (80, 200, 120)
 OCCLUDER_HEIGHT_M = 0.3
@@ -76,7 +75,7 @@ class Drawing:
         self._recording.log(path, thing, static=static)
 
     def _draw_lidar_pictures(self, moment: Moment) -> None:
-        step = max(1, moment.frame.ir.shape[1] // LIDAR_WIDTH)
+        step = max(1, moment.frame.ir.shape[1] // PICTURE_WIDTH)
         self._log("lidar/depth", rr.Image(lidar_rgb(moment.frame.depth_m[::step, ::step], *self._span_m)))
         self._log("lidar/infrared", rr.Image(infrared_grey(moment.frame.ir[::step, ::step])))
         if moment.difference is not None and self._difference_span_m is not None:

@@ -7,6 +7,7 @@ import rerun.blueprint as rrb
 from nlos_calibration.rig import Rig
 
 from nlos_cam.objects.depth_image import object_box
+from nlos_cam.view.pictures import BACKGROUND_RGB
 
 TIMELINE = "time"
 PLOT_WINDOW_S = 20.0
@@ -17,7 +18,6 @@ LIDAR_SHARES, TEXT_SHARE = (1.0, 1.0, 1.15), 1.25
 """The same where a wall was measured: the bench has more to show."""
 MEASURED_AWAY = 1.2
 """How much farther the eye is then: the footprint reaches beyond the bench."""
-PAGE_RGB = (13, 16, 17)
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,11 @@ def _picture(origin: str, name: str) -> rrb.Spatial2DView:
 
 def _bench(rig: Rig, away: float = 1.0) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
-        origin="bench", name="Bench (drag to turn)", line_grid=False, eye_controls=_eye(rig, away), background=PAGE_RGB
+        origin="bench",
+        name="Bench (drag to turn)",
+        line_grid=False,
+        eye_controls=_eye(rig, away),
+        background=BACKGROUND_RGB,
     )
 
 

@@ -14,6 +14,8 @@ from nlos_cam.objects.depth_image import cell_centres_m, image_from_depth
 Rgb = NDArray[np.uint8]
 BACKGROUND_RGB = (13, 16, 17)
 """The page's own dark: what has no surface has no colour."""
+PICTURE_WIDTH = 320
+"""What the lidar sees pixel by pixel is thinned to about this many columns."""
 DARKEST = 60
 """Where in the colour map the farthest surface starts, so that it stands out from the background."""
 JUMP_M = 0.03

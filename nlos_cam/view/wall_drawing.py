@@ -19,14 +19,13 @@ from nlos_calibration.wall_record import WallRecord
 from numpy.typing import NDArray
 
 from nlos_cam.view.layout import WallNames
-from nlos_cam.view.pictures import SATURATED_RGB, difference_rgb, noise_rgb, round_span, saturated_rgb
+from nlos_cam.view.pictures import PICTURE_WIDTH, SATURATED_RGB, difference_rgb, noise_rgb, round_span, saturated_rgb
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 RESIDUAL_SPAN_M, USUAL_NOISE_M = 0.002, 0.001
 MOST_POINTS, MOST_SATURATED = 6000, 1500
-PICTURE_WIDTH = 320
 OFF_WALL_M = 0.05
 """What strays farther from the plane is in the picture only: in 3D it would hide the bench."""
 OUTLIER_RGB = (70, 70, 70)
