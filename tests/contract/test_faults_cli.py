@@ -51,7 +51,7 @@ frames = 1_000_000
 
 
 class FakeNetwork:
-    runtime, record = "nothing at all", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum)
+    runtime, record = "nothing at all", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
 
     def __call__(self, *_: np.ndarray) -> np.ndarray:
         return np.full((1, 64, 64), 0.5, np.float32)
