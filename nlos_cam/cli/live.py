@@ -139,7 +139,7 @@ def _viewer(bench: Bench, *, no_view: bool) -> Viewer:
         return NullViewer()
     from nlos_cam.view.rerun_viewer import RerunViewer
 
-    return RerunViewer(bench.rig)
+    return RerunViewer(bench.rig, bench.measured)
 
 
 def _warn(warning: str, begins: bool) -> None:
