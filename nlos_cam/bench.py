@@ -1,7 +1,7 @@
 """What a streaming loop knows of its bench: the rig, the bare wall that difference maps are formed from, its drift."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +52,11 @@ class Bench:
             return Look(None, self.notes)
         self._drift.look(frame.depth_m, frame.settings)
         return Look(difference_of(maps, self.reference), self.notes + self._drift.warnings)
+
+    def corrected(self, maps: LidarMaps) -> LidarMaps:
+        """The maps with what the lidar's depth lacks, where that was measured (`range_offset`)."""
+        offset_m = self.measured.record.range_offset_m if self.measured else 0.0
+        return replace(maps, depth_m=maps.depth_m + np.float32(offset_m)) if offset_m else maps
 
 
 def difference_of(maps: LidarMaps, reference: BareWall) -> LidarMaps:

@@ -46,7 +46,7 @@ class Processing:
         maps = self._mean.add(maps)
         look = self.bench.look(arrival.frame, maps)
         looked_s = clock()
-        eaten = look.difference if self._eats_difference and look.difference else maps
+        eaten = look.difference if self._eats_difference and look.difference else self.bench.corrected(maps)
         reconstruction = reconstruct(eaten, self.bench.rig, self.network, clock)
         stages_s = {"wait": got_s - begun_s, "maps": mapped_s - got_s, "bench": looked_s - mapped_s}
         stages_s |= reconstruction.timings_s

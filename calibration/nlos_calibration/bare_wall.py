@@ -66,6 +66,7 @@ class BareWall:
     """(64, 80); of the maps, as all map_*; NaN where no frame had a return in the cell."""
     map_depth_std_m: Float32
     map_intensity: Float32
+    """NaN, like the depth, where no frame had a return."""
     map_intensity_std: Float32
     frames: int
     intrinsics: Intrinsics
@@ -100,7 +101,7 @@ class BareWallStatistics:
         self._ir.add(ir)
         self._saturated += ir == FULL_SCALE
         self._map_depth.add(map_depth_m)
-        self._map_intensity.add(map_intensity)
+        self._map_intensity.add(np.where(np.isfinite(map_depth_m), map_intensity, np.nan))
 
     def look_at(self, celsius: Mapping[str, float]) -> None:
         """Take one reading of the device's temperatures in; an empty one says nothing."""

@@ -103,7 +103,9 @@ def settings_changed(reference: BareWall, settings: Mapping[str, float]) -> tupl
     names = sorted(name for name in reference.settings.keys() & settings.keys() if not name.endswith(MEASURED))
     pairs = [(name, reference.settings[name], settings[name]) for name in names if name not in NO_SETTINGS]
     return tuple(
-        f"{name} was {before:g} and is {now:g}" for name, before, now in pairs if not isclose(before, now, rel_tol=ALIKE)
+        f"{name} was {before:g} and is {now:g}"
+        for name, before, now in pairs
+        if not isclose(before, now, rel_tol=ALIKE)
     )
 
 

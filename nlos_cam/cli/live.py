@@ -5,6 +5,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from nlos_calibration.errors import RecordFileError
+from nlos_calibration.rig import Rig, load_rig
+from nlos_calibration.rig_difference import rig_difference
+from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.inference import load_reconstructor
 from rich.markup import escape
 
@@ -129,9 +133,24 @@ def _processing(bench: Bench, weights: Path | None, average: int) -> Processing:
     eats_difference = network.record.input == "difference maps"
     processing = Processing(bench, network, eats_difference=eats_difference, average=average)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
-    if network.record.rig_checksum != rig.checksum:
-        say(f"note: rig {rig.name} is another one; what the networks show of it is off the more the two differ")
+    for note in _rig_notes(network.record, rig):
+        say(f"note: {note}")
     return processing
+
+
+def _rig_notes(trained: CheckpointRecord, rig: Rig) -> list[str]:
+    """How the bench differs from the one that the networks were trained for."""
+    try:
+        theirs = load_rig(trained.rig_name)
+    except RecordFileError:  # trained for a rig of a file that is not here
+        theirs = None
+    if theirs is None or theirs.checksum != trained.rig_checksum:
+        unlike = trained.rig_checksum != rig.checksum
+        return [f"the networks were trained for another rig than {rig.name}: what they show is off"] if unlike else []
+    difference = rig_difference(rig, theirs)
+    return (
+        [f"unlike the rig of the networks, this one has {'; '.join(difference)}: they err more"] if difference else []
+    )
 
 
 def _viewer(bench: Bench, *, no_view: bool) -> Viewer:

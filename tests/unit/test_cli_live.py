@@ -157,7 +157,7 @@ def test_a_wall_other_than_the_networks_is_used_and_noted(tmp_path: Path, capsys
     write_wall(tmp_path / "wall.toml")
     run = ["replay", "run.bag", "--out", "out", "--json"]
     assert main([*run, "--wall", "wall.toml"]) == 0
-    assert "rig measured is another one" in told(capsys)[1].replace("\n", " ")
+    assert "unlike the rig of the networks, this one has" in told(capsys)[1].replace("\n", " ")
     with np.load(tmp_path / "out" / "reconstruction.npz") as file:
         assert str(file["rig_name"]) == "measured"
     assert main([*run, "--wall", "none.toml", "--overwrite"]) == 4

@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
@@ -48,6 +49,19 @@ def test_networks_eat_the_mean_of_raw_maps_or_of_their_difference(tmp_path: Path
     assert done[5].frame.frame_number == 5
     assert done[5].difference is not None
     np.testing.assert_array_equal(done[5].difference.depth_m, eaten[11])
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 0.0045])
+def test_raw_maps_are_corrected_by_the_measured_offset(tmp_path: Path, offset_m: float) -> None:
+    measured, eaten = measured_wall(tmp_path), list[np.ndarray]()
+    measured = replace(measured, record=measured.record.model_copy(update={"range_offset_m": offset_m}))
+
+    def noting(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+        eaten.append(depth_m[0])
+        return network()
+
+    (step,) = all_steps(Processing(Bench(RIG, measured), noting), WallCamera(1))
+    np.testing.assert_array_equal(eaten[0], step.maps.depth_m + np.float32(offset_m))
 
 
 def test_networks_that_eat_difference_maps_need_a_reference() -> None:
