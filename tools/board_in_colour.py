@@ -44,6 +44,8 @@ TOLD = BoardView(
 )
 """What the program is told of the colour camera; its image is taken later."""
 MARGIN_PX = 5.0
+CORNERS, IMAGES = 1000, 100
+"""Benches whose corners are known, and benches that are rendered."""
 A4, LIDAR = BOARDS["a4"], load_rig("bare-wall").pinhole
 ROOM = Light(180.0, spot_mm=0.3)
 """A well exposed picture; the spot stands for the lens's blur."""
@@ -142,8 +144,8 @@ def main() -> None:
     """Measure, write, print."""
     result = {
         "assumed": vars(CameraErrors()),
-        "random_benches": {f"corners, {sigma:g} pixels": coverage(1000, sigma, 3) for sigma in (0.05, 0.2)}
-        | {"rendered, 4 frames": coverage(100, None, 4)},
+        "random_benches": {f"corners, {sigma:g} pixels": coverage(CORNERS, sigma, 3) for sigma in (0.05, 0.2)}
+        | {"rendered, 4 frames": coverage(IMAGES, None, 4)},
     }
     text = json.dumps(result, indent=1)
     OUT.write_text(text + "\n", encoding="utf-8")

@@ -1,21 +1,16 @@
-import importlib
 import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from fake_librealsense import FakeSdk
 from fake_lidar import COLOUR_FROM_DEPTH, LENS, FakeLidar
-from nlos_calibration.board import BOARDS
 from nlos_calibration.board_corners import Corners
-from nlos_calibration.board_view import BoardView, CameraErrors, find_in_view, undistorted
+from nlos_calibration.board_view import BoardView, CameraErrors, undistorted
 from nlos_calibration.projection import Intrinsics
-from nlos_calibration.rig import load_rig
-from nlos_calibration.uncertainty import measures_of
 from software_colour import SoftwareColour, record_with_colour
 
 from nlos_cam.camera.bag_file import BagFile
@@ -32,16 +27,8 @@ from nlos_cam.errors import (
 )
 from nlos_cam.render.sensor import SensedImages
 
-TOOLS = Path(__file__).parents[2] / "tools"
-A4, RIG = BOARDS["a4"], load_rig("bare-wall")
 SMALL = Intrinsics(64, 48, 60.0, 61.0, 33.0, 22.0)
 FLAT = SensedImages(np.full((48, 64), 800, np.uint16), np.full((48, 64), 48, np.uint8), np.full((48, 64), 15, np.uint8))
-
-
-@pytest.fixture
-def colour(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(TOOLS)
-    return importlib.import_module("board_in_colour")
 
 
 def small(form: str = "rgb8", lens: list[float] = LENS) -> tuple[SoftwareLidar, SoftwareColour]:
@@ -54,27 +41,6 @@ def recorded(path: Path, greys: list[int], form: str = "rgb8") -> Path:
     pair = small(form)
     depth = 3 if form in {"rgb8", "bgr8"} else 2 if form in {"yuyv", "uyvy"} else 4
     return record_with_colour(path, *pair, [FLAT], [np.full((24, 32, depth), grey, np.uint8) for grey in greys])
-
-
-def test_a_board_in_a_recordings_colour_tells_the_lidars_wall(colour: ModuleType, tmp_path: Path) -> None:
-    """From the .bag by librealsense's recorder to the plane: lens, pose and pixels all the way."""
-    views, generator = importlib.import_module("board_view"), np.random.default_rng(0)
-    seen = views.View(RIG.wall_from_lidar, RIG.pinhole)
-    bench = colour.Bench(A4, seen, views.at_near_edge(A4, seen), colour.ROOM)
-    frames = colour.colour_frames(bench, colour.as_told(), 3, generator)
-    lidar = SoftwareLidar(SMALL, load_sdk())
-    camera = SoftwareColour(lidar, colour.COLOUR, colour.LENS, colour.TOLD.lidar_from_camera)
-    rgb = [np.repeat(frame[..., np.newaxis], 3, axis=2) for frame in frames]
-    path = record_with_colour(tmp_path / "board.bag", lidar, camera, [FLAT], rgb)
-
-    view = look_in_colour(f"bag:{path}", 30)
-    np.testing.assert_allclose(view.image, frames.mean(axis=0))
-    fit = find_in_view(view, A4)
-    found = measures_of(fit.slopes, fit.covariance)
-    assert fit.corners > 15
-    assert found.distance_m == pytest.approx(0.2, abs=0.001)
-    assert (found.yaw_deg, found.pitch_deg) == pytest.approx((45.0, 0.0), abs=0.15)
-    assert found.yaw_std_deg == pytest.approx(0.2, rel=0.3)
 
 
 def test_the_last_frames_of_a_recording_are_taken(tmp_path: Path) -> None:
