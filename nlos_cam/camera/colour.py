@@ -50,7 +50,6 @@ GREY: Mapping[str, Callable[[NDArray[Any]], Any]] = {
     "bgra8": lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_BGRA2GRAY),
     "yuyv": lambda pixels: (pixels & 0xFF).astype(np.uint8),
     "uyvy": lambda pixels: (pixels >> 8).astype(np.uint8),
-    "y8": lambda pixels: pixels,
 }
 """What makes grey (height, width), in 8 bits, of the pixels of a format."""
 
