@@ -6,7 +6,6 @@ are given by how far they stand out from that wall, or by a second plane.
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.geometry import facing_angle_rad, normal_from_angles, wall_from_plane
@@ -14,6 +13,8 @@ from nlos_calibration.projection import Intrinsics
 from nlos_calibration.range_noise import QUANTUM_M, depth_noise_m
 from nlos_calibration.wall import wall_depth
 from numpy.typing import NDArray
+
+from nlos_cam.render.sensor_bias import patches, ripples
 
 Array = NDArray[np.float64]
 
@@ -114,20 +115,12 @@ def patch(seen: View, share: float) -> NDArray[np.bool_]:
 
 def rippled(seen: View, amplitude_m: float, waves: float, generator: np.random.Generator) -> Array:
     """Depth with a wave of the lidar's own over the image, `waves` of them across it, any way."""
-    rows, columns = np.indices(seen.depth_m.shape) / seen.depth_m.shape[1]
-    way, phase = generator.uniform(0.0, 2.0 * np.pi, 2)
-    wave = np.sin(2.0 * np.pi * waves * (columns * np.cos(way) + rows * np.sin(way)) + phase)
-    return seen.depth_m + amplitude_m * wave
+    return seen.depth_m + amplitude_m * ripples((seen.pinhole.height, seen.pinhole.width), waves, generator)
 
 
-def patchy(seen: View, rms_m: float, generator: np.random.Generator, patches: int = 12) -> Array:
-    """Depth that drifts here this way and there that way, in about `patches` patches across the view."""
-    height, width = seen.depth_m.shape
-    coarse = generator.standard_normal((patches * height // width + 3, patches + 3))
-    rows, columns = np.linspace(1, coarse.shape[0] - 2, height), np.linspace(1, coarse.shape[1] - 2, width)
-    where = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float32)
-    drift = cv2.remap(coarse, where, None, cv2.INTER_CUBIC)
-    return seen.depth_m + rms_m * drift / drift.std()
+def patchy(seen: View, rms_m: float, generator: np.random.Generator) -> Array:
+    """Depth that drifts here this way and there that way."""
+    return seen.depth_m + rms_m * patches((seen.pinhole.height, seen.pinhole.width), generator)
 
 
 def with_outliers(depth_m: Array, share: float, generator: np.random.Generator) -> Array:

@@ -14,13 +14,12 @@ from nlos_calibration.board_view import BoardView, find_in_view
 from nlos_calibration.combine import Combined, Plane, Used, combine
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import wall_from_plane
-from nlos_calibration.rig import Finite, Positive, Record
+from nlos_calibration.rig import Finite, NotNegative, Positive, Record
 from nlos_calibration.uncertainty import WallMeasures, measures_of
 from nlos_calibration.verdict import Verdict, out_of_range
 from nlos_calibration.wall import WallFit
 
 Array = NDArray[np.float64]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 COLOUR_IS_OFF = (
     "the colour camera's pose against the lidar, which is the factory's and may have moved: look in infrared to see"

@@ -1,6 +1,7 @@
 """The sensor: echoes to the three images a device delivers, by the ordered chain of `sensor_chain`.
 
-Not modelled: the raster's scan time, ripples, drift with temperature, mixed edges. A pulse's width is the renderer's.
+Not modelled: the raster's scan time, mixed edges, IR and confidence that change with temperature. A pulse's width is
+the renderer's.
 """
 
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Float32, Frame
 from nlos_cam.render.beams import cast
 from nlos_cam.render.effects import Effect, included
 from nlos_cam.render.renderer import MultiBounce
+from nlos_cam.render.sensor_bias import DepthBias
 from nlos_cam.render.sensor_chain import Bytes, Chain, Echoes, Optics, expose, signal_surety
 from nlos_cam.render.sensor_effects import sensor_effects
 from nlos_cam.render.sensor_model import DEPTH_UNIT_M, SensorModel
@@ -49,16 +51,23 @@ class Sensor:
         self._chain = _chain(rig, model, verdicts)
         self._optics = _optics(rig, self._chain, model.dead_share if included(verdicts, "dead pixels") else 0.0)
         self._echoes_only = self._optics._replace(direct=np.zeros_like(self._optics.direct))
+        self._bias = DepthBias((rig.intrinsics.height, rig.intrinsics.width), model, verdicts)
         self._lights = included(verdicts, "shot noise") or included(verdicts, "read noise")
         self._ranges = included(verdicts, "range noise")
 
-    def expose(self, multi: MultiBounce, generator: np.random.Generator) -> SensedImages:
-        """The images of one instant, with the generator's noise; maps (64 k, 80 k) hold k x k beams for each cell."""
+    def expose(
+        self, multi: MultiBounce, generator: np.random.Generator, *, celsius: float | None = None
+    ) -> SensedImages:
+        """The images of one instant, with the generator's noise; maps (64 k, 80 k) hold k x k beams for each cell.
+
+        `celsius` is the device's temperature; the warm device's unless given.
+        """
         shape = (self.rig.intrinsics.height, self.rig.intrinsics.width)
         cell = cell_of_pixels(shape, multi.peak.shape)
         light, ranges = (self._deviates(generator, wanted=wanted) for wanted in (self._lights, self._ranges))
         optics = self._echoes_only if multi.direct_included else self._optics
-        z16, ir, confidence = expose(optics, _echoes(multi, self._chain), cell, light, ranges, self._chain)
+        echoes, bias_m = _echoes(multi, self._chain), self._bias.at_m(celsius)
+        z16, ir, confidence = expose(optics, echoes, cell, light, ranges, bias_m, self._chain)
         return SensedImages(z16.reshape(shape), ir.reshape(shape), confidence.reshape(shape))
 
     def _deviates(self, generator: np.random.Generator, *, wanted: bool) -> Float32:

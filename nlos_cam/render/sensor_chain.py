@@ -2,7 +2,7 @@
 
     echo (S5) -> gain -> ambient light -> shot and read noise -> saturation -> 8 bits            IR
     signal above the noise, winner above the second -> 4 bits                                    confidence
-    path / 2 x cos(beam, optical axis) -> range noise -> 0.25 mm -> dead pixels                  depth
+    path / 2 x cos(beam, optical axis) -> bias -> range noise -> 0.25 mm -> dead pixels          depth
 
 Shot and read noise are independent, so one deviate carries the root of their summed variances. A pixel without an echo
 is left black: the device measures the amplitude of the echo that it finds.
@@ -105,9 +105,10 @@ def expose(
     cell: NDArray[np.int32],
     light_deviates: Float32,
     range_deviates: Float32,
+    bias_m: Float32,
     chain: Chain,
 ) -> tuple[NDArray[np.uint16], Bytes, Bytes]:
-    """Depth, IR and confidence (n,) of n pixels, each with the cell it looks at; no deviates, no noise."""
+    """Depth, IR and confidence (n,) of n pixels, each with the cell it looks at; empty deviates are no noise."""
     pixels = optics.direct.size
     z16, ir, confidence = np.zeros(pixels, np.uint16), np.zeros(pixels, np.uint8), np.zeros(pixels, np.uint8)
     for i in range(pixels):
@@ -123,6 +124,8 @@ def expose(
         if confidence[i] == 0 or (optics.dead.size and optics.dead[i]):
             continue
         depth_m = length_m * optics.cos_axis[i]
+        if bias_m.size:
+            depth_m += bias_m[i]
         if range_deviates.size:
             depth_m += range_deviates[i] * (chain.range_noise_m + chain.range_noise_per_m * depth_m)
         z16[i] = quantise(depth_m / DEPTH_UNIT_M, FARTHEST)

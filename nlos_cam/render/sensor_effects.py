@@ -11,8 +11,8 @@ IR, DEPTH = "relative L1 of the IR", "relative L1 of the depth"
 def sensor_effects(model: SensorModel) -> tuple[Effect, ...]:
     """The verdicts in the order of the chain; gain, saturation and quantisation are in every image's format.
 
-    The bound is of the images, on average over the noise and over returns of one count or more; the reason names its
-    unit.
+    The bound is of the images, on average over the noise, the view and returns of one count or more; the reason names
+    its unit.
     """
     return (
         Effect("gain", included=True, reason=f"the bare wall reads {model.bare_wall_counts:g} counts; {IR}", bound=1.0),
@@ -20,6 +20,10 @@ def sensor_effects(model: SensorModel) -> tuple[Effect, ...]:
         _shot(model),
         _read(model),
         Effect("saturation", included=True, reason=f"8 bits end at {SATURATED} counts; {IR}", bound=1.0),
+        _offset(model),
+        _ripples(model),
+        _patches(model),
+        _drift(model),
         _range(model),
         Effect(
             "quantisation", included=True, reason="0.25 mm, 8 bits, 4 bits; metres of depth", bound=DEPTH_UNIT_M / 2
@@ -48,6 +52,34 @@ def _shot(model: SensorModel) -> Effect:
 def _read(model: SensorModel) -> Effect:
     noise = model.read_noise_counts
     return _verdict("read noise", noise > 0, f"{noise:g} counts; {IR}", noise)
+
+
+def _offset(model: SensorModel) -> Effect:
+    offset_m = model.range_offset_m
+    why = f"every depth lacks {1000 * offset_m:g} mm; metres of depth"
+    return _verdict("range offset", offset_m != 0, why, abs(offset_m))
+
+
+def _ripples(model: SensorModel) -> Effect:
+    why = f"a wave of {1000 * model.ripple_m:g} mm across the view; metres of depth"
+    return _verdict("ripples", model.ripple_m > 0, why, model.ripple_m)
+
+
+def _patches(model: SensorModel) -> Effect:
+    """The mean of what a pattern adds is at most its standard deviation; it is largest in the warm device."""
+    why = f"patches of {1000 * model.patch_drift_m:g} mm in the warm device; metres of depth"
+    return _verdict("patchy drift", model.patch_drift_m > 0, why, model.patch_drift_m)
+
+
+def _drift(model: SensorModel) -> Effect:
+    """Largest where the warm-up begins; without one, no instant differs from another."""
+    warm, per_celsius_m = model.warm_up, model.drift_m_per_celsius
+    warmed = warm.to_celsius - warm.from_celsius if warm else 0.0
+    why = f"{1000 * per_celsius_m:g} mm a degree over {warmed:g} degrees; metres of depth"
+    bound = abs(per_celsius_m) * warmed
+    if per_celsius_m and not bound:
+        return Effect("drift", included=False, reason="the temperature is steady", bound=0.0)
+    return _verdict("drift", bound > 0, why, bound)
 
 
 def _range(model: SensorModel) -> Effect:

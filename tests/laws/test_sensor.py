@@ -13,10 +13,22 @@ from nlos_cam.render.beams import cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor import SensedImages, Sensor
-from nlos_cam.render.sensor_model import DEPTH_UNIT_M, MOST_CONFIDENT, SATURATED, SensorModel
+from nlos_cam.render.sensor_bias import PATCHES_SEED, RIPPLES_SEED, WAVES, patches, ripples
+from nlos_cam.render.sensor_model import DEPTH_UNIT_M, MOST_CONFIDENT, SATURATED, SensorModel, WarmUp
 
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 RICH = SensorModel(ambient_counts=40, read_noise_counts=1.5, dead_share=0)
+BIASED = RICH.model_copy(
+    update={
+        "range_offset_m": 0.0045,
+        "ripple_m": 0.002,
+        "patch_drift_m": 0.001,
+        "drift_m_per_celsius": 0.0002,
+        "warm_up": WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600),
+    }
+)
+BIAS_FIELDS = {"range_offset_m", "ripple_m", "patch_drift_m", "drift_m_per_celsius", "warm_up"}
+CELSIUS = 30.0
 FRAMES = 100
 
 
@@ -63,11 +75,21 @@ def test_without_noise_it_reports_the_renderers_winner_within_quantisation(rende
     assert np.abs(images.ir - counts).max() <= 0.5 + 1e-3
 
 
-@pytest.mark.parametrize("model", [SensorModel(), RICH, QUIET], ids=["default", "rich", "quiet"])
+def _bias_m(model: SensorModel) -> np.ndarray:
+    """At CELSIUS, a quarter of the way from cold to warm."""
+    wave, pattern = (
+        ripples((64, 80), WAVES, _generator(RIPPLES_SEED)).ravel(),
+        patches((64, 80), _generator(PATCHES_SEED)).ravel(),
+    )
+    drift_m = 0.25 * model.patch_drift_m * (pattern - pattern.mean()) - 15 * model.drift_m_per_celsius
+    return model.ripple_m * wave - model.range_offset_m + drift_m
+
+
+@pytest.mark.parametrize("model", [SensorModel(), RICH, BIASED, QUIET], ids=["default", "rich", "biased", "quiet"])
 def test_fast_is_slow(rendering: Rendering, model: SensorModel) -> None:
     """The same chain written as plain array steps, in float64."""
     fast, beams, generator = (
-        Sensor(RIG, model).expose(rendering.multi, _generator(3)),
+        Sensor(RIG, model).expose(rendering.multi, _generator(3), celsius=CELSIUS),
         cast(RIG, RIG.pinhole),
         _generator(3),
     )
@@ -83,6 +105,7 @@ def test_fast_is_slow(rendering: Rendering, model: SensorModel) -> None:
     certain = counts * (alone / noise if model.ambient_counts else 1)
     confidence = 15 * (1 - np.exp(-certain / 6)) * (1 - 0.5 * second / np.maximum(intensity, 1e-30)) + 0.5
     depth = np.where(peak > beams.direct, path / 2, beams.length_m) * beams.cos_axis
+    depth += _bias_m(model)
     depth += other * (model.range_noise_m + model.range_noise_per_m * depth)
     dead = _generator(0).random(peak.size) < model.dead_share
     kept = (intensity > 0) & (confidence >= 1) & ~dead
@@ -103,6 +126,19 @@ def test_the_mean_over_frames_is_the_chain_without_noise(ambient: float) -> None
     truth = Sensor(BARE, QUIET).expose(echo, _generator()).depth_z16.astype(float)
     apart = np.mean([f.depth_z16 for f in frames], axis=0) - truth
     assert apart.mean() == pytest.approx(0, abs=0.1)
+
+
+@pytest.mark.parametrize("path_m", [0.4, 1.0, 3.0])
+def test_a_bias_is_the_same_for_a_near_and_a_far_return_in_every_frame(path_m: float) -> None:
+    plain = QUIET.model_copy(update={name: value for name, value in BIASED if name in BIAS_FIELDS})
+    echo, free = _echo(60.0, path_m), Sensor(BARE, QUIET)
+    apart = [
+        sensor.expose(echo, _generator(1), celsius=CELSIUS).depth_z16.astype(float)
+        - free.expose(echo, _generator(2)).depth_z16
+        for sensor in [Sensor(BARE, plain)] * 2
+    ]
+    np.testing.assert_array_equal(*apart)
+    assert np.abs(apart[0].ravel() * DEPTH_UNIT_M - _bias_m(plain)).max() <= DEPTH_UNIT_M + 1e-6
 
 
 @pytest.mark.parametrize("counts", [15.0, 60.3, 120.0])
@@ -174,6 +210,10 @@ ODD = np.array([0, -0.0, -1, 1e-38, 1e-6, 1e-3, 1, 1e6, 1e38, np.nan, np.inf, -n
         read_noise_counts=st.sampled_from([0.0, 1e-200, 0.7, 255.0]),
         range_noise_per_m=st.sampled_from([0.0, 0.002, 1.0]),
         dead_share=st.sampled_from([0.0, 0.5]),
+        range_offset_m=st.sampled_from([0.0, -1.0, 1.0]),
+        ripple_m=st.sampled_from([0.0, 1e-200, 1.0]),
+        drift_m_per_celsius=st.sampled_from([0.0, -1.0, 1.0]),
+        warm_up=st.sampled_from([None, BIASED.warm_up]),
     ),
 )
 def test_no_input_makes_an_image_that_cannot_be(seed: int, included: bool, model: SensorModel) -> None:
@@ -183,7 +223,7 @@ def test_no_input_makes_an_image_that_cannot_be(seed: int, included: bool, model
         np.where(generator.random(5120) < 0.5, spread, generator.choice(ODD, 5120)).reshape(64, 80) for _ in range(3)
     )
     multi = MultiBounce(peak, runner_up, path, direct_included=included)
-    one, same = (Sensor(RIG, model).expose(multi, _generator(seed)) for _ in range(2))
+    one, same = (Sensor(RIG, model).expose(multi, _generator(seed), celsius=CELSIUS) for _ in range(2))
     for name in ("depth_z16", "ir", "confidence"):
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
     assert one.confidence.max() <= MOST_CONFIDENT

@@ -10,8 +10,9 @@ from nlos_cam.render import sensor as sensor_module
 from nlos_cam.render.effects import included
 from nlos_cam.render.renderer import MultiBounce
 from nlos_cam.render.sensor import SensedImages, Sensor
+from nlos_cam.render.sensor_bias import BIASES
 from nlos_cam.render.sensor_effects import sensor_effects
-from nlos_cam.render.sensor_model import DEPTH_UNIT_M, SensorModel
+from nlos_cam.render.sensor_model import DEPTH_UNIT_M, SensorModel, WarmUp
 
 WIDTH, HEIGHT = 160, 128
 FULL = load_rig("bare-wall")
@@ -23,27 +24,45 @@ CHAIN = (
     "shot noise",
     "read noise",
     "saturation",
+    "range offset",
+    "ripples",
+    "patchy drift",
+    "drift",
     "range noise",
     "quantisation",
     "dead pixels",
 )
 FORMAT = {"gain", "saturation", "quantisation"}
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
+WARM_UP, COLD = WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600), 25.0
 HAS = {
     "ambient light": {"ambient_counts": 60.0, "shot_noise": 0.3},
     "shot noise": {"shot_noise": 0.3},
     "read noise": {"read_noise_counts": 0.7},
+    "range offset": {"range_offset_m": -0.0045},
+    "ripples": {"ripple_m": 0.002},
+    "patchy drift": {"patch_drift_m": 0.001},
+    "drift": {"drift_m_per_celsius": -0.0002, "warm_up": WARM_UP},
     "range noise": {"range_noise_m": 0.001},
     "dead pixels": {"dead_share": 0.05},
 }
+WORST_AT = {"drift": COLD}
+"""The warm device, unless said."""
 LACKS = {
     "ambient light": {"ambient_counts": 0.0},
     "shot noise": {"shot_noise": 0.0},
     "read noise": {"read_noise_counts": 0.0},
+    "range offset": {"range_offset_m": 0.0},
+    "ripples": {"ripple_m": 0.0},
+    "patchy drift": {"patch_drift_m": 0.0},
+    "drift": {"drift_m_per_celsius": 0.0},
     "range noise": {"range_noise_m": 0.0, "range_noise_per_m": 0.0},
     "dead pixels": {"dead_share": 0.0},
 }
-RICH = SensorModel(ambient_counts=60, dead_share=0.05)
+BIASED = SensorModel(
+    range_offset_m=0.0045, ripple_m=0.001, patch_drift_m=0.0005, drift_m_per_celsius=0.0001, warm_up=WARM_UP
+)
+RICH = BIASED.model_copy(update={"ambient_counts": 60.0, "dead_share": 0.05})
 
 
 def _flat(counts: float) -> MultiBounce:
@@ -52,16 +71,18 @@ def _flat(counts: float) -> MultiBounce:
     return MultiBounce(peak, np.zeros_like(peak), np.ones_like(peak), direct_included=True)
 
 
-def _seen(model: SensorModel, counts: float) -> SensedImages:
-    return Sensor(BARE, model).expose(_flat(counts), np.random.default_rng(4))
+def _seen(model: SensorModel, counts: float, celsius: float | None = None) -> SensedImages:
+    return Sensor(BARE, model).expose(_flat(counts), np.random.default_rng(4), celsius=celsius)
 
 
-def _turned(model: SensorModel, name: str, counts: float, monkeypatch: pytest.MonkeyPatch) -> SensedImages:
+def _turned(
+    model: SensorModel, name: str, counts: float, monkeypatch: pytest.MonkeyPatch, celsius: float | None = None
+) -> SensedImages:
     """The images where one verdict is turned round."""
     turned = tuple(replace(e, included=not e.included) if e.name == name else e for e in sensor_effects(model))
     with monkeypatch.context() as patch:
         patch.setattr(sensor_module, "sensor_effects", lambda _: turned)
-        return _seen(model, counts)
+        return _seen(model, counts, celsius)
 
 
 def _same(one: SensedImages, other: SensedImages) -> bool:
@@ -93,8 +114,8 @@ def test_the_chain_has_its_order_and_its_reasons(model: SensorModel) -> None:
 
 @pytest.mark.parametrize("name", HAS)
 def test_leaving_out_what_the_model_has_changes_the_images(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = QUIET.model_copy(update=HAS[name])
-    assert not _same(_seen(model, 30.0), _turned(model, name, 30.0, monkeypatch))
+    model, celsius = QUIET.model_copy(update=HAS[name]), WORST_AT.get(name)
+    assert not _same(_seen(model, 30.0, celsius), _turned(model, name, 30.0, monkeypatch, celsius))
 
 
 @pytest.mark.parametrize("name", HAS)
@@ -144,6 +165,34 @@ def test_the_depth_changes_by_no_more_than_the_bounds(monkeypatch: pytest.Monkey
     assert 0 < np.abs(seen - still).mean() * DEPTH_UNIT_M <= bounds["range noise"]
     whole = _turned(RICH, "dead pixels", 30.0, monkeypatch).depth_z16.astype(float)
     assert np.abs(seen - whole).sum() / whole.sum() == pytest.approx(bounds["dead pixels"], rel=0.05)
+
+
+@pytest.mark.parametrize("name", BIASES)
+@pytest.mark.parametrize("celsius", [25.0, 35.0, 45.0])
+def test_the_depth_changes_by_no_more_than_the_bound_of_a_bias_and_by_half_of_it_at_worst(
+    name: str, celsius: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = BIASED.model_copy(update={"range_noise_m": 0.0, "range_noise_per_m": 0.0, "dead_share": 0.0})
+    bound = next(e.bound for e in sensor_effects(model) if e.name == name)
+
+    def change_m(celsius: float) -> float:
+        seen, without = _seen(model, 30.0, celsius), _turned(model, name, 30.0, monkeypatch, celsius)
+        return float(np.abs(seen.depth_z16.astype(float) - without.depth_z16).mean() * DEPTH_UNIT_M)
+
+    assert change_m(celsius) <= bound + DEPTH_UNIT_M / 20  # rounding to units adds to a mean of moduli
+    assert change_m(WORST_AT.get(name, 45.0)) > bound / 2
+
+
+def test_where_the_temperature_is_steady_nothing_drifts_with_it() -> None:
+    steady = QUIET.model_copy(update={"drift_m_per_celsius": 0.001})
+    drift = next(e for e in sensor_effects(steady) if e.name == "drift")
+    assert (drift.included, drift.bound, drift.reason) == (False, 0.0, "the temperature is steady")
+
+
+def test_a_bias_changes_neither_ir_nor_confidence() -> None:
+    seen, plain = (_seen(model, 30.0) for model in (BIASED, SensorModel()))
+    np.testing.assert_array_equal(seen.ir, plain.ir)
+    np.testing.assert_array_equal(seen.confidence, plain.confidence)
 
 
 def test_saturation_and_quantisation_are_all_that_parts_the_images_from_the_light() -> None:

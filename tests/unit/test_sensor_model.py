@@ -1,9 +1,11 @@
 """The sensor model: what it refuses, by the name of the field."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from nlos_cam.render.sensor_model import SATURATED, SensorModel
+from nlos_cam.render.sensor_model import SATURATED, STEADY_CELSIUS, SensorModel, WarmUp
 
 MOST = {
     "pulse_ns": 100.0,
@@ -13,6 +15,8 @@ MOST = {
     "read_noise_counts": 255.0,
     "shot_noise": 255.0,
     "dead_share": 0.99,
+    "ripple_m": 1.0,
+    "patch_drift_m": 1.0,
 }
 
 
@@ -34,5 +38,47 @@ def test_a_model_that_cannot_be_names_its_field(field: str, value: float) -> Non
         SensorModel.model_validate({field: value})
 
 
-def test_unless_asked_there_is_neither_a_pulse_nor_ambient_light() -> None:
-    assert SensorModel() == SensorModel(pulse_ns=0, ambient_counts=0)
+def test_unless_asked_there_is_neither_a_pulse_nor_ambient_light_nor_a_bias() -> None:
+    bias = dict.fromkeys(("range_offset_m", "ripple_m", "patch_drift_m", "drift_m_per_celsius"), 0.0)
+    assert SensorModel() == SensorModel(pulse_ns=0, ambient_counts=0, warm_up=None, **bias)
+
+
+@pytest.mark.parametrize("field", ["range_offset_m", "drift_m_per_celsius"])
+def test_an_offset_and_a_drift_have_either_sign(field: str) -> None:
+    for value in (-1.0, 1.0):
+        assert getattr(SensorModel.model_validate({field: value}), field) == value
+    for value in (-1.1, 1.1, float("nan")):
+        with pytest.raises(ValidationError, match=field):
+            SensorModel.model_validate({field: value})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"from_celsius": 45.0}, "from_celsius < to_celsius"),
+        ({"from_celsius": 50.0}, "from_celsius < to_celsius"),
+        ({"from_celsius": -1.0}, "from_celsius"),
+        ({"to_celsius": 101.0}, "to_celsius"),
+        ({"to_celsius": float("nan")}, "to_celsius"),
+        ({"time_constant_s": 0.0}, "time_constant_s"),
+        ({"time_constant_s": float("inf")}, "time_constant_s"),
+        ({"time_constant_min": 1.0}, "time_constant_min"),
+    ],
+)
+def test_a_warm_up_that_cannot_be_is_told(wrong: dict[str, float], named: str) -> None:
+    fields = {"from_celsius": 25.0, "to_celsius": 45.0, "time_constant_s": 600.0}
+    with pytest.raises(ValidationError, match=named):
+        SensorModel.model_validate({"warm_up": fields | wrong})
+
+
+@given(st.floats(0, 1e5), st.floats(0, 1e5))
+def test_a_device_warms_and_never_beyond_where_its_warm_up_ends(one_s: float, other_s: float) -> None:
+    model = SensorModel(warm_up=WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600))
+    earlier, later = (model.celsius_at(seconds) for seconds in sorted((one_s, other_s)))
+    assert 25 <= earlier <= later <= 45
+    # what is still missing shrinks by 1/e in each time constant
+    assert 45 - model.celsius_at(one_s + 600) == pytest.approx((45 - model.celsius_at(one_s)) / 2.718281828, abs=1e-6)
+
+
+def test_without_a_warm_up_the_temperature_is_steady() -> None:
+    assert SensorModel().celsius_at(0) == SensorModel().celsius_at(1e6) == STEADY_CELSIUS

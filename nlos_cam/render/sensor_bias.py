@@ -1,0 +1,79 @@
+"""What a device adds to the depth of each pixel, whatever is seen there: an offset, ripples, drift with temperature.
+
+Ripples and patches are fixed patterns of the device. Drift is told against the warm device: there the common drift is
+none and the patches are whole; where a warm-up begins it is the other way round.
+"""
+
+from math import inf
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos_cam.frames import Float32
+from nlos_cam.render.effects import Plan, included
+from nlos_cam.render.sensor_model import SensorModel
+
+Array = NDArray[np.float64]
+
+BIASES = {
+    "range offset": "range_offset_m",
+    "ripples": "ripple_m",
+    "patchy drift": "patch_drift_m",
+    "drift": "drift_m_per_celsius",
+}
+"""By the names of their verdicts, the fields that call for them."""
+WAVES = 5.0
+"""Of the ripples across the view."""
+RIPPLES_SEED, PATCHES_SEED = 1, 2
+"""Every device of ours has the same patterns."""
+NO_BIAS = np.zeros(0, np.float32)
+
+
+def ripples(shape: tuple[int, int], waves: float, generator: np.random.Generator) -> Array:
+    """A wave (height, width) of amplitude 1 that runs any way, `waves` of it across the width."""
+    rows, columns = np.indices(shape) / shape[1]
+    way, phase = generator.uniform(0.0, 2.0 * np.pi, 2)
+    return np.sin(2.0 * np.pi * waves * (columns * np.cos(way) + rows * np.sin(way)) + phase)
+
+
+def patches(shape: tuple[int, int], generator: np.random.Generator, across: int = 12) -> Array:
+    """A smooth pattern (height, width) of standard deviation 1, in about `across` patches across the width."""
+    height, width = shape
+    coarse = generator.standard_normal((across * height // width + 3, across + 3)).astype(np.float32)
+    rows, columns = np.linspace(1, coarse.shape[0] - 2, height), np.linspace(1, coarse.shape[1] - 2, width)
+    x, y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+    pattern = cv2.remap(coarse, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+    return pattern / pattern.std()
+
+
+class DepthBias:
+    """The bias of a device with so many pixels (height, width), as far as the verdicts include it."""
+
+    def __init__(self, shape: tuple[int, int], model: SensorModel, verdicts: Plan) -> None:
+        offset_m, ripple_m, patch_m, self._per_celsius_m = (
+            getattr(model, field) if included(verdicts, name) else 0.0 for name, field in BIASES.items()
+        )
+        self._warm_up, self._warm_celsius = model.warm_up, model.celsius_at(inf)
+        self._fixed_m = self._patches_m = NO_BIAS
+        if offset_m or ripple_m or patch_m or self._per_celsius_m:
+            wave = ripples(shape, WAVES, np.random.default_rng(RIPPLES_SEED))
+            self._fixed_m = (ripple_m * wave - offset_m).astype(np.float32).ravel()
+        if patch_m:
+            pattern = patches(shape, np.random.default_rng(PATCHES_SEED))
+            self._patches_m = (patch_m * (pattern - pattern.mean())).astype(np.float32).ravel()
+
+    def at_m(self, celsius: float | None) -> Float32:
+        """What each pixel's depth is too much by (n,), at a temperature or in the warm device; empty for no bias."""
+        celsius = self._warm_celsius if celsius is None else celsius
+        bias_m = self._fixed_m
+        if self._patches_m.size:
+            bias_m = bias_m + np.float32(self._warmth(celsius)) * self._patches_m
+        if shift_m := self._per_celsius_m * (celsius - self._warm_celsius):
+            bias_m = bias_m + np.float32(shift_m)
+        return bias_m
+
+    def _warmth(self, celsius: float) -> float:
+        """0 where the warm-up begins, 1 where it ends."""
+        warm = self._warm_up
+        return (celsius - warm.from_celsius) / (warm.to_celsius - warm.from_celsius) if warm else 1.0
