@@ -2,6 +2,7 @@
 
 import numpy as np
 from nlos_calibration.board import Board
+from nlos_calibration.board_view import BoardView
 from nlos_calibration.board_wall import WallByBoard, wall_with_board
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.range_offset import tape_the_wall
@@ -41,5 +42,6 @@ def by_board(seen: Seen, printed: Board, square_mm: float | None) -> tuple[WallF
         depth = error
     measured = square_mm is not None
     board = printed.measured(square_mm) if measured else printed
-    fit, record = wall_with_board(depth, seen.statistics.ir_mean(), board, seen.intrinsics, measured=measured)
+    view = BoardView(seen.statistics.ir_mean(), seen.intrinsics)
+    fit, record = wall_with_board(depth, view, board, measured=measured)
     return fit, {"board": record}
