@@ -53,9 +53,9 @@ def bench_picture(record: WallRecord) -> Picture:
     above.set_title(f"from above: {record.distance_m:.3f} m away, facing {record.facing_deg:.1f}°", fontsize=11)
     beside.set_title(f"from the side: pitch {record.pitch_deg:+z.1f}°", fontsize=11)
     caption = (
-        "To scale, both alike. The lidar looks along the dash-dotted line; the blue area is what it sees. Dashed edges "
-        "of the view never meet the wall. Light goes from the lidar to the wall, past the occluder's edge to the "
-        f"hidden object, and back the same way. {_occluder_told(record)}"
+        "To scale, both alike. The lidar looks along the dash-dotted line; the blue area is its field of view, the "
+        "occluder taken away. Its dashed edges never meet the wall. Light goes from the lidar to the wall, past "
+        f"the occluder's edge to the hidden object, and back the same way. {_occluder_told(record)}"
     )
     return Picture("The bench", caption, png(figure))
 

@@ -23,6 +23,10 @@ Array = NDArray[np.float64]
 DPI = 100
 STRAY, STRIPE, NO_RETURN = (0.72, 0.72, 0.72, 1.0), (0.35, 0.35, 0.35, 1.0), (0.9, 0.9, 0.9, 1.0)
 STRIPE_BLOCKS = 4
+LEVELS = 21
+"""Of colour: noise in more of them makes files large. Odd, so that the middle one is white."""
+LEAST_RESIDUAL_MM = 0.5
+"""A finer scale would make the noise of a good wall look like trouble."""
 ROUND = 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0
 SPREAD_POINTS = 500
 """Pixels of which the expected spread is drawn."""
@@ -71,7 +75,7 @@ def _residuals(record: WallRecord, reference: BareWall) -> Picture:
     stray = known & ~reference.inliers
     drawn = np.where(stray, np.nan, off_mm)
     side = block_side(drawn.shape[1])
-    limit_mm = _limit(np.abs(in_blocks(drawn, side)))
+    limit_mm = max(_limit(np.abs(in_blocks(drawn, side))), LEAST_RESIDUAL_MM)
     figure = figure_of(8.6, 5.4)
     axis = figure.add_subplot()
     scale = {"extend": "both", "cmap": "RdBu_r", "vmin": -limit_mm, "vmax": limit_mm}
@@ -80,7 +84,7 @@ def _residuals(record: WallRecord, reference: BareWall) -> Picture:
     axis.set_title("distance of the mean depth from the plane, normal to the wall", fontsize=10)
     shares = f"{_percent(stray)} of the pixels were left out of the plane (striped), {_percent(~known)} have no return."
     how = (
-        "Even, pale noise is a flat wall. Broad red or blue areas are a bent wall or ripples of the lidar; "
+        "Even, pale speckle is noise on a flat wall. Broad red or blue areas are a bent wall or ripples of the lidar; "
         f"a patch with a sharp edge is something that stands before the wall. Each dot is the mean of {side} x {side} "
         "pixels. "
     )
@@ -163,9 +167,12 @@ def _infrared(reference: BareWall) -> Picture:
 
 def _map(axis: "Axes", values: Array, label: str, *, extend: Any = "neither", **style: Any) -> "Colorbar":
     """Draw an image of the sensor in blocks, and return its colour bar."""
+    from matplotlib import colormaps
+
     height, width = values.shape
+    style |= {"cmap": colormaps[style["cmap"]].resampled(LEVELS), "interpolation": "nearest"}
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
-    image = axis.imshow(in_blocks(values, block_side(width)), extent=extent, interpolation="nearest", **style)
+    image = axis.imshow(in_blocks(values, block_side(width)), extent=extent, **style)
     bar = axis.figure.colorbar(image, ax=axis, label=label, extend=extend)
     axis.set(xlabel="column (pixels), as the lidar sees it", ylabel="row (pixels)")
     return bar

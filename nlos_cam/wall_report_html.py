@@ -28,6 +28,7 @@ svg text { fill: var(--ink); } .rail { fill: var(--faint); } .allowed { fill: va
 .inside { fill: var(--ink); } .outside { fill: #e0480f; stroke: var(--ink); }
 table { border-collapse: collapse; } th, td { text-align: left; vertical-align: top; padding: .15rem 1rem .15rem 0;
   border-bottom: 1px solid var(--faint); overflow-wrap: anywhere; } tbody th { font-weight: 600; min-width: 8rem; }
+.numbers td:nth-child(2) { white-space: nowrap; }
 .columns { display: flex; flex-wrap: wrap; gap: 0 2.5rem; }
 figure { margin: 1.5rem 0; break-inside: avoid; } figcaption { margin-top: .4rem; }
 img { max-width: 100%; height: auto; background: #fff; border-radius: .4rem; display: block; }
@@ -62,7 +63,7 @@ def pictured(picture: Picture) -> str:
 def table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...]) -> str:
     """Rows of text, of which the first cell names the row."""
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    return f"<table><thead><tr>{top}</tr></thead><tbody>{''.join(map(_row, rows))}</tbody></table>"
+    return f"<table class='numbers'><thead><tr>{top}</tr></thead><tbody>{''.join(map(_row, rows))}</tbody></table>"
 
 
 def pairs(facts: Mapping[str, str]) -> str:

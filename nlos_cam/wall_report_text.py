@@ -11,8 +11,12 @@ from nlos_calibration.wall_record import WallRecord
 from nlos_cam.wall_report_html import bullets, pairs, range_bar, table
 
 SIGMAS_95 = 1.96
-SIGNS = {"good": "✔", "out of range": "✘", "doubtful": "?"}
-"""Beside the colour, for those who do not see it."""
+VERDICTS = {
+    "good": "✔ Good: the bench can be used",
+    "out of range": "✘ Out of range: the wall is measured, but the bench has to be moved",
+    "doubtful": "? Doubtful: the wall may be elsewhere than measured",
+}
+"""Words and a sign beside the colour, for those who do not see it."""
 GAP_RANGE_M = 0.05, 0.20
 """The paper's (SI 1)."""
 LEAST_TOLD = 0.001
@@ -23,7 +27,7 @@ Row = tuple[str, str, str]
 def verdict(record: WallRecord) -> str:
     """The banner: the verdict, the advice, and the warnings."""
     name = record.verdict.replace(" ", "-")
-    banner = f"<p class='word'>{SIGNS[record.verdict]} {escape(record.verdict)}</p><p>{escape(record.advice)}</p>"
+    banner = f"<p class='word'>{VERDICTS[record.verdict]}</p><p>{escape(record.advice)}</p>"
     return f"<section class='verdict {name}'>{banner}</section>{bullets('Note', record.warnings, 'warnings')}"
 
 
@@ -31,7 +35,7 @@ def ranges(record: WallRecord) -> str:
     """Where this bench lies in the paper's ranges, as bars."""
     bars = [
         _bar_in_cm("distance", record.distance_m, DISTANCE_RANGE_M, 45.0),
-        range_bar("facing angle", record.facing_deg, FACING_RANGE_DEG, TOLERANCE_DEG, "°", 90.0),
+        range_bar("facing angle", record.facing_deg, FACING_RANGE_DEG, TOLERANCE_DEG, "degrees", 90.0),
     ]
     if record.occluder is not None:
         bars.append(_bar_in_cm("occluder's gap", record.occluder.gap_m, GAP_RANGE_M, 30.0))
@@ -86,15 +90,15 @@ def _occluder_rows(record: WallRecord) -> list[Row]:
 def _quality_rows(record: WallRecord) -> list[Row]:
     if record.residual_m is None:
         return [("depth", "refused", "the plane is the board's alone: the depth says nothing about the wall")]
-    measured: list[tuple[str, float | None, float, str, str]] = [
-        ("residual", record.residual_m, 1e3, "mm RMS", "distance of the pixels used from the plane"),
-        ("pixels on the plane", record.inlier_fraction, 100.0, "%", "of those that have depth; the rest is left out"),
-        ("noise", record.noise_scale, 1.0, "times nominal", "of one depth sample; 1 is as it should be"),
-        ("ripples", record.ripple_m, 1e3, "mm RMS", "how far parts of the wall are off the plane, beyond noise"),
-        ("bend", record.bend_m, 1e3, "mm", "a plane through half of the view against that through all of it"),
-        ("bend in angle", record.bend_deg, 1.0, "degrees", "the same as an angle"),
+    measured: list[tuple[str, float | None, str, float, str]] = [
+        ("residual", record.residual_m, "{:.2f} mm RMS", 1e3, "distance of the pixels used from the plane"),
+        ("on the plane", record.inlier_fraction, "{:.1f} %", 100.0, "of the pixels with depth; the rest is left out"),
+        ("noise", record.noise_scale, "{:.2f} times nominal", 1.0, "of one depth sample; 1 is as it should be"),
+        ("ripples", record.ripple_m, "{:.2f} mm RMS", 1e3, "of parts of the wall off the plane, beyond noise"),
+        ("bend", record.bend_m, "{:.2f} mm", 1e3, "between planes through half of the view and through all of it"),
+        ("bend", record.bend_deg, "{:.2f} degrees", 1.0, "the same as an angle"),
     ]
-    return [(name, f"{scale * v:.3g} {unit}", what) for name, v, scale, unit, what in measured if v is not None]
+    return [(name, form.format(scale * at), what) for name, at, form, scale, what in measured if at is not None]
 
 
 def board(record: WallRecord) -> str:
@@ -174,7 +178,7 @@ def _plus_minus(std: float | None, unit: str, scale: float = 1.0) -> str:
     if std is None:
         return ""
     half = SIGMAS_95 * scale * std
-    return (f" ± {half:.2g} {unit}" if half >= LEAST_TOLD else f" ± less than {LEAST_TOLD} {unit}").rstrip()
+    return (f" ± {half:.2g} {unit}" if half >= LEAST_TOLD else f" ± less than {LEAST_TOLD} {unit}").replace(" °", "°")
 
 
 def _metres(value_m: float, std_m: float | None) -> str:
@@ -182,4 +186,4 @@ def _metres(value_m: float, std_m: float | None) -> str:
 
 
 def _degrees(value_deg: float, std_deg: float | None) -> str:
-    return f"{value_deg:z.2f}{_plus_minus(std_deg, '')} degrees"
+    return f"{value_deg:z.2f}°{_plus_minus(std_deg, '°')}"
