@@ -78,11 +78,11 @@ def _residuals(record: WallRecord, reference: BareWall) -> Picture:
     limit_mm = max(_limit(np.abs(in_blocks(drawn, side))), LEAST_RESIDUAL_MM)
     figure = figure_of(8.6, 5.4)
     axis = figure.add_subplot()
-    scale = {"extend": "both", "cmap": "RdBu_r", "vmin": -limit_mm, "vmax": limit_mm}
+    scale: dict[str, Any] = {"extend": "both", "cmap": "RdBu_r", "vmin": -limit_mm, "vmax": limit_mm}
     _map(axis, drawn, "mm behind the plane (negative: before it)", **scale)
     _shade(axis, stray, ~known)
     axis.set_title("distance of the mean depth from the plane, normal to the wall", fontsize=10)
-    shares = f"{_percent(stray)} of the pixels were left out of the plane (striped), {_percent(~known)} have no return."
+    shares = f"Left out of the plane (striped): {_percent(stray)} of the pixels; without return: {_percent(~known)}."
     how = (
         "Even, pale speckle is noise on a flat wall. Broad red or blue areas are a bent wall or ripples of the lidar; "
         f"a patch with a sharp edge is something that stands before the wall. Each dot is the mean of {side} x {side} "
@@ -151,7 +151,8 @@ def _infrared(reference: BareWall) -> Picture:
     blinded = share > 0.0
     figure = figure_of(11.0, 3.9) if blinded.any() else figure_of(6.2, 4.0)
     axes = figure.subplots(1, 2 if blinded.any() else 1, squeeze=False)[0]
-    _map(axes[0], ir, "IR counts of 255", cmap="gray", vmin=0.0, vmax=min(_limit(ir), float(FULL_SCALE)))
+    high = min(_limit(ir), float(FULL_SCALE))
+    _map(axes[0], ir, "IR counts of 255", levels=3 * LEVELS, cmap="gray", vmin=0.0, vmax=high)
     axes[0].set_title("mean infrared image", fontsize=10)
     if not blinded.any():
         words = f"No pixel is saturated: the brightest is {np.nanmax(ir):.0f} of 255 counts on average."
@@ -165,12 +166,14 @@ def _infrared(reference: BareWall) -> Picture:
     return Picture(title, words, png(figure))
 
 
-def _map(axis: "Axes", values: Array, label: str, *, extend: Any = "neither", **style: Any) -> "Colorbar":
+def _map(
+    axis: "Axes", values: Array, label: str, *, extend: Any = "neither", levels: int = LEVELS, **style: Any
+) -> "Colorbar":
     """Draw an image of the sensor in blocks, and return its colour bar."""
     from matplotlib import colormaps
 
     height, width = values.shape
-    style |= {"cmap": colormaps[style["cmap"]].resampled(LEVELS), "interpolation": "nearest"}
+    style |= {"cmap": colormaps[style["cmap"]].resampled(levels), "interpolation": "nearest"}
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
     image = axis.imshow(in_blocks(values, block_side(width)), extent=extent, **style)
     bar = axis.figure.colorbar(image, ax=axis, label=label, extend=extend)

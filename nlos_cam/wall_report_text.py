@@ -167,7 +167,8 @@ def files(record: WallRecord, record_file: str) -> str:
     facts = {"record": record_file, "rig's checksum": record.rig.checksum}
     if record.reference:
         facts |= {"bare wall's reference": record.reference, "its SHA-256": record.reference_sha256}
-    name, camera = shlex.quote(record_file), "l515" if record.camera.startswith("bag:") else shlex.quote(record.camera)
+    name, kind = shlex.quote(record_file), record.camera.split(":", maxsplit=1)[0]
+    camera = {"sim": "sim", "bag": "l515"}.get(kind, shlex.quote(record.camera))
     commands = f"nlos-cam live --camera {camera} --wall {name}\nnlos-cam render cup --rig {name}"
     use = "Keep the files together. The first command shows what is hidden, live; the second renders for this bench."
     return f"<section><h2>Files and use</h2>{pairs(facts)}<p>{use}</p><pre>{escape(commands)}</pre></section>"

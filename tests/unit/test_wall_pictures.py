@@ -41,7 +41,7 @@ def test_a_figure_becomes_a_png_of_its_size() -> None:
 def test_an_exact_plane_is_drawn_pale(measured: Measured) -> None:
     residual, spread, noise, infrared = maps(measured())
     assert red_and_blue(residual) == (0.0, 0.0)
-    assert "none of the pixels were left out" in residual.caption
+    assert "striped): none of the pixels; without return: none." in residual.caption
     assert "0.000 mm RMS" in spread.caption
     assert "1.00 times the nominal" in noise.caption
     assert all(decoded(picture).std() > 1.0 for picture in (spread, noise, infrared))
@@ -70,8 +70,7 @@ def test_what_was_left_out_is_striped_and_not_coloured(measured: Measured) -> No
     depth_m[:12] = np.nan
     residual = maps(wall, depth_m=depth_m, inliers=inliers)[0]
     assert red_and_blue(residual) == (0.0, 0.0)
-    assert "18.8 % of the pixels were left out of the plane" in residual.caption
-    assert "25.0 % have no return" in residual.caption
+    assert "striped): 18.8 % of the pixels; without return: 25.0 %." in residual.caption
 
 
 def test_the_spread_tells_ripples_from_noise(measured: Measured) -> None:
@@ -98,7 +97,7 @@ def test_a_wall_no_pixel_of_which_is_used_still_shows_where_it_is_off(measured: 
     assert wall.reference is not None
     residual, spread, *_ = maps(wall, inliers=np.zeros_like(wall.reference.inliers))
     assert residual.png is not None
-    assert "100.0 % of the pixels were left out" in residual.caption
+    assert "striped): 100.0 % of the pixels" in residual.caption
     assert spread.png is None
 
 

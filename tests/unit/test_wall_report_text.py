@@ -116,7 +116,8 @@ def test_the_device_is_told_with_its_temperatures_and_settings(measured: Measure
 @pytest.mark.parametrize(
     ("camera", "record_file", "live"),
     [
-        ("sim:bare-wall", "wall.toml", "live --camera sim:bare-wall --wall wall.toml"),
+        ("l515:f0246262", "wall.toml", "live --camera l515:f0246262 --wall wall.toml"),
+        ("sim:bare-wall", "wall.toml", "live --camera sim --wall wall.toml"),
         ("bag:my wall.bag", "my wall.toml", "live --camera l515 --wall 'my wall.toml'"),
     ],
 )
