@@ -1,7 +1,7 @@
-"""Where the wall is, frame after frame, from a few hundred pixels of which many may show something else than the wall."""
+"""Where the wall is, frame after frame, from a few hundred pixels of which most may show something else."""
 
-from dataclasses import dataclass
 from math import asin, atan2, degrees, hypot, inf, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,10 @@ INSIDE_SIGMAS, GATE_SIGMAS = 3.0, 4.5
 MIN_SHARE, FAR_SHARE = 0.05, 0.25
 """Of the pixels, how many must agree on a wall: near where it was, and elsewhere. A sheet, or light that went by way of
 a hidden object, is a wall to some pixels as well, but not near where the wall was."""
+HOME_SHARE, HOME_SIGMAS = 0.5, 6.0
+"""Where at least this share of those that agree agrees with the reference as well, only pixels count that are so near
+to it: seen at a grazing angle, a detour of some centimetres is a wall turned by a degree, and the few pixels that show
+the wall itself hardly object."""
 NEAR_M, NEAR_DEG = 0.01, 4.0
 FARTHEST_M, FARTHEST_DEG = 0.1, 20.0
 """A wall that moved by more is not looked for: at right angles to it stands the occluder."""
@@ -29,13 +33,14 @@ SEARCHES = ((8.0, 1.0), (64.0, 1.0), (64.0, 0.25))
 strongest) that a search begins with; in turn, until one finds the wall."""
 NARROWING = 0.7
 """Of the gate, in each frame of a search."""
+PATIENCE = 8
+"""Frames until a plane that too few pixels agree on is given up for the next search: while it is found, they grow."""
 NOWHERE = 1e9
 RIDGE = 1e-6
 """Of information, in units in which a pixel has some 1000: enough to solve for no step where there is none."""
 
 
-@dataclass(frozen=True)
-class Sight:
+class Sight(NamedTuple):
     """What one frame says of the wall, as changes against the reference; positive distances are farther."""
 
     distance_m: float
@@ -44,14 +49,14 @@ class Sight:
     range_m: float
     """The change instead, if each depth had changed by the same."""
     misfit: float
-    """By how much less well that explains the depths: the difference of the sums of squares, in standard deviations."""
+    """By how much more that leaves of the depths than a lidar that moved: sums of squares, in standard deviations."""
 
 
 def watched_pixels(reference: BareWall) -> NDArray[np.intp]:
     """Flat indices of good pixels of the bare wall, each the one nearest to the middle of its cell of GRID."""
     height, width = reference.depth_m.shape
-    nominal_m, scale = depth_noise_m(reference.depth_m), noise_scale(reference)
-    steady = ~(reference.depth_std_m > NOISY * scale * nominal_m)  # a single frame has no spread, and is let pass
+    usual_m = noise_scale(reference) * depth_noise_m(reference.depth_m.astype(np.float64))
+    steady = ~(reference.depth_std_m > NOISY * usual_m)  # a single frame has no spread, and is let pass
     good = reference.inliers & np.isfinite(reference.depth_m) & steady & (reference.saturated == 0.0)
     rows, columns = np.nonzero(good)
     across, down = columns * GRID[1] / width, rows * GRID[0] / height
@@ -64,8 +69,8 @@ def watched_pixels(reference: BareWall) -> NDArray[np.intp]:
 
 def noise_scale(reference: BareWall) -> float:
     """The noise of a sample over the nominal."""
-    frames = np.full(reference.depth_m.size, reference.frames)
-    return measured_noise(reference.depth_m.ravel(), reference.depth_std_m.ravel(), frames).scale
+    depth_m, spread_m = (array.ravel().astype(np.float64) for array in (reference.depth_m, reference.depth_std_m))
+    return measured_noise(depth_m, spread_m, np.full(depth_m.size, reference.frames)).scale
 
 
 class WallTrack:
@@ -90,7 +95,7 @@ class WallTrack:
         self._nearest = np.argsort(np.argsort(depth_m)) / max(len(depth_m), 1)
         self._slopes = -wall_from_lidar[2, :3] / wall_from_lidar[2, 3]
         self._pose = _pose(self._slopes)
-        self._change, self._widened, self._searches = np.zeros(3), 1.0, 0
+        self._change, self._widened, self._searches, self._lost = np.zeros(3), 1.0, 0, 0
         self.share = 0.0
         """Of the pixels, those that showed the wall in the last frame."""
 
@@ -102,8 +107,8 @@ class WallTrack:
         returned = (seen_m > 0.0) & (seen_m < inf)
         off = np.divide(1.0, seen_m, out=np.full(len(seen_m), NOWHERE), where=returned)
         off = (off - self._inverse) * self._per_inverse_m
-        errors = self._begin(off)
-        weight = self._weights(errors)
+        errors, near = self._begin(off)
+        weight = self._weights(errors) if near is None else self._weights(errors) * near
         weighted = self._columns * weight
         information = weighted @ self._rows
         information.flat[::4] += RIDGE
@@ -112,21 +117,25 @@ class WallTrack:
         if self._widened > 1.0:
             self._widened = max(1.0, NARROWING * self._widened)
             return None
-        return self._sight(seen_m, returned, weight, errors - self._rows @ step)
+        return self._sight(np.where(returned, seen_m, self._depth_m), weight)
 
-    def _begin(self, off: Array) -> Array:
-        """The errors from the plane to begin with: that of the frame before, the reference's, or a search's."""
-        errors = off - self._rows @ self._change
-        here, home = _inside(errors), _inside(off)
-        if home >= max(here, MIN_SHARE):
-            self._change, self._widened, self._searches = np.zeros(3), 1.0, 0
-            errors, here = off, home
-        elif here < MIN_SHARE and self._widened == 1.0:
-            self._widened, self._change = SEARCHES[self._searches % len(SEARCHES)][0], np.zeros(3)
+    def _begin(self, off: Array) -> tuple[Array, NDArray[np.bool_] | None]:
+        """The errors from the plane to begin with: the last frame's, the reference's or a search's.
+
+        And which pixels may count, None for all.
+        """
+        if self._lost == PATIENCE:
+            self._widened, self._change, self._lost = SEARCHES[self._searches % len(SEARCHES)][0], np.zeros(3), 0
             self._searches += 1
-            errors = off
-        self.share = here
-        return errors
+        errors = off - self._rows @ self._change
+        inside, at_home = np.abs(errors) < INSIDE_SIGMAS, np.abs(off) < INSIDE_SIGMAS
+        self.share, home = _share(inside), _share(at_home)
+        if self._widened > 1.0 or home < max(MIN_SHARE, HOME_SHARE * self.share):
+            return errors, None
+        near = np.abs(off) < HOME_SIGMAS
+        if _share(inside & near) < HOME_SHARE * home:
+            self._change, self.share, errors = np.zeros(3), home, off
+        return errors, near
 
     def _weights(self, errors: Array) -> Array:
         weight = np.maximum(1.0 - (errors / (GATE_SIGMAS * self._widened)) ** 2, 0.0) ** 2
@@ -134,24 +143,24 @@ class WallTrack:
             weight *= self._nearest <= SEARCHES[(self._searches - 1) % len(SEARCHES)][1]
         return weight
 
-    def _sight(self, seen_m: Array, returned: NDArray[np.bool_], weight: Array, errors: Array) -> Sight | None:
+    def _sight(self, seen_m: Array, weight: Array) -> Sight | None:
         distance_m, yaw_deg, pitch_deg = _pose(self._slopes + self._change)
         distance_m, yaw_deg, pitch_deg = distance_m - self._pose[0], yaw_deg - self._pose[1], pitch_deg - self._pose[2]
         turn_deg = hypot(yaw_deg, pitch_deg)
         far = abs(distance_m) > NEAR_M or turn_deg > NEAR_DEG
-        lost = abs(distance_m) > FARTHEST_M or turn_deg > FARTHEST_DEG or self.share < (FAR_SHARE if far else MIN_SHARE)
-        if lost:
-            self._change = np.zeros(3) if far else self._change
+        if abs(distance_m) > FARTHEST_M or turn_deg > FARTHEST_DEG or self.share < (FAR_SHARE if far else MIN_SHARE):
+            self._lost += 1
             return None
-        nearer = np.where(returned, seen_m - self._depth_m, 0.0) * self._per_m
-        gain = weight * self._per_m
-        range_m = float(gain @ nearer) / float(gain @ self._per_m)
-        misfit = float(weight @ (nearer - range_m * self._per_m) ** 2 - weight @ errors**2)
+        self._lost = 0
+        gain, longer = weight * self._per_m, (seen_m - self._depth_m) * self._per_m
+        range_m = float(gain @ longer) / float(gain @ self._per_m)
+        plane_m = 1.0 / (self._inverse + self._rows @ self._change / self._per_inverse_m)
+        misfit = float(weight @ ((longer - range_m * self._per_m) ** 2 - ((seen_m - plane_m) * self._per_m) ** 2))
         return Sight(distance_m, yaw_deg, pitch_deg, range_m, misfit)
 
 
-def _inside(errors: Array) -> float:
-    return np.count_nonzero(np.abs(errors) < INSIDE_SIGMAS) / len(errors)
+def _share(chosen: NDArray[np.bool_]) -> float:
+    return np.count_nonzero(chosen) / len(chosen)
 
 
 def _pose(slopes: Array) -> tuple[float, float, float]:
