@@ -4,11 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nlos_calibration.bare_wall import BareWall, save_reference
+from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import dump_toml
 from nlos_calibration.wall_record import WallRecord
 
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.folders import file_when_whole
+from nlos_cam.wall_report import write_report
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ def written(files: WallFiles, record: WallRecord, reference: BareWall | None) ->
         with file_when_whole(files.reference) as part:
             digest = save_reference(part, reference)
         record = record.model_copy(update={"reference": files.reference.name, "reference_sha256": digest})
+    write_report(files.report, MeasuredWall(record, reference), files.record.name)
     with file_when_whole(files.record) as part:
         part.write_text(dump_toml(record), encoding="utf-8")
     return record

@@ -31,10 +31,12 @@ def by_depth(seen: Seen, tape_m: float | None = None) -> tuple[WallFit, dict[str
     }
 
 
-def by_board(seen: Seen, printed: Board, square_mm: float | None) -> tuple[WallFit | WallByBoard, dict[str, object]]:
+def by_board(
+    seen: Seen, printed: Board, square_mm: float | None, colour: BoardView | None = None
+) -> tuple[WallFit | WallByBoard, dict[str, object]]:
     """The wall by its depth, where that is not refused, and by a board, with what the record says of that.
 
-    Raises BoardRefusedError.
+    The board is looked for in the mean infrared, unless there is a `colour` view of it. Raises BoardRefusedError.
     """
     try:
         depth = by_depth(seen)[0]
@@ -42,6 +44,6 @@ def by_board(seen: Seen, printed: Board, square_mm: float | None) -> tuple[WallF
         depth = error
     measured = square_mm is not None
     board = printed.measured(square_mm) if measured else printed
-    view = BoardView(seen.statistics.ir_mean(), seen.intrinsics)
+    view = colour or BoardView(seen.statistics.ir_mean(), seen.intrinsics)
     fit, record = wall_with_board(depth, view, board, measured=measured)
     return fit, {"board": record}

@@ -1,11 +1,11 @@
 """The report beside a wall's record: one HTML file that says whether the bench is right, and what to move if not."""
 
-import os
 from pathlib import Path
 
 from nlos_calibration.measured_wall import MeasuredWall
 
 from nlos_cam import wall_report_text as text
+from nlos_cam.folders import file_when_whole
 from nlos_cam.wall_bench_picture import bench_picture
 from nlos_cam.wall_footprint_picture import footprint_picture
 from nlos_cam.wall_pictures import Picture, wall_maps
@@ -16,12 +16,8 @@ NO_MAPS = Picture("Maps of the wall", "This record names no reference of the bar
 
 def write_report(path: Path, wall: MeasuredWall, record_file: str) -> None:
     """Write the report (HTML) on a wall whose record is called `record_file`; it is at `path` once it is whole."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with file_when_whole(path) as part:
         part.write_text(report(wall, record_file), encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def report(wall: MeasuredWall, record_file: str) -> str:

@@ -5,12 +5,12 @@ from html import escape
 
 from nlos_calibration.board_wall import BoardRecord
 from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.uncertainty import INTERVAL_STDS
 from nlos_calibration.verdict import DISTANCE_RANGE_M, FACING_RANGE_DEG, TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall_record import WallRecord
 
 from nlos_cam.wall_report_html import bullets, pairs, range_bar, table
 
-SIGMAS_95 = 1.96
 VERDICTS = {
     "good": "✔ Good: the bench can be used",
     "out of range": "✘ Out of range: the wall is measured, but the bench has to be moved",
@@ -178,7 +178,7 @@ def _plus_minus(std: float | None, unit: str, scale: float = 1.0) -> str:
     """The half width of the 95 % interval; nothing where it is not known."""
     if std is None:
         return ""
-    half = SIGMAS_95 * scale * std
+    half = INTERVAL_STDS * scale * std
     return (f" ± {half:.2g} {unit}" if half >= LEAST_TOLD else f" ± less than {LEAST_TOLD} {unit}").replace(" °", "°")
 
 

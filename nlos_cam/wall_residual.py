@@ -4,6 +4,7 @@ from math import ceil
 
 import numpy as np
 from nlos_calibration.bare_wall import BareWall
+from nlos_calibration.measured_wall import wall_points_m
 from nlos_calibration.range_noise import MeanNoise
 from nlos_calibration.wall_record import WallRecord
 from numpy.typing import NDArray
@@ -19,14 +20,7 @@ def residual_m(record: WallRecord, reference: BareWall) -> Array:
 
     The range offset of the record is in it, by its cause (`nlos_calibration.range_offset`).
     """
-    depth_m = reference.depth_m.astype(np.float64)
-    before_m = 0.0
-    if record.range_offset_cause == "depth":
-        depth_m = depth_m + record.range_offset_m
-    else:
-        before_m = record.range_offset_m  # the beams meet so far before the pose's origin
-    pose = np.array(record.wall_from_lidar)
-    return depth_m * _towards(record, reference) - (pose[2, 3] + before_m * pose[2, 2])
+    return -wall_points_m(record, reference)[..., 2]
 
 
 def expected_std_m(record: WallRecord, reference: BareWall) -> Array:

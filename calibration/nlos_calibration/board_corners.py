@@ -40,23 +40,6 @@ class Corners:
     """(n, 2); x, y in pixel centres."""
 
 
-class ImageMean:
-    """The mean image over frames of a camera that stands still."""
-
-    def __init__(self, height: int, width: int) -> None:
-        self.frames = 0
-        self._sum = np.zeros((height, width))
-
-    def add(self, image: NDArray[np.uint8]) -> None:
-        """Take one frame (height, width) in."""
-        self._sum += image
-        self.frames += 1
-
-    def mean(self) -> Array:
-        """(height, width), in counts; zero before the first frame."""
-        return self._sum / max(self.frames, 1)
-
-
 def find_corners(image: NDArray[np.floating] | NDArray[np.uint8], board: Board, light: Light = "infrared") -> Corners:
     """The corners of `board` in an image (height, width) of any gain; `light` is for the advice in a refusal.
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from nlos_calibration.board_corners import ImageMean
+from nlos_calibration.bare_wall import Moments
 from nlos_calibration.board_view import BoardView, CameraErrors
 from numpy.typing import NDArray
 
@@ -96,7 +96,7 @@ def _recorded(path: Path, frames: int, on_frame: Callable[[], None]) -> BoardVie
         )
     info = bag.streams[COLOUR]
     lens, pose = _lens(f"{path}", *bag.lens(COLOUR)), bag.pose("depth", COLOUR)
-    mean = ImageMean(*(shape := (info.intrinsics.height, info.intrinsics.width)))
+    mean = Moments(shape := (info.intrinsics.height, info.intrinsics.width))
     for index in range(max(info.frames - frames, 0), info.frames):
         pixels = bag.sample(COLOUR, index).pixels
         if info.format not in GREY or pixels.shape[:2] != shape:
@@ -160,7 +160,7 @@ def _pose(extrinsics: Any) -> Array:
 def _mean_of(uri: str, sensor: Any, profile: Any, look: _Look) -> Array:
     """The mean grey image of a sensor, which runs only meanwhile."""
     size = intrinsics_of(profile)
-    mean, waiting = ImageMean(size.height, size.width), Queue[NDArray[Any]](maxsize=WAITING)
+    mean, waiting = Moments((size.height, size.width)), Queue[NDArray[Any]](maxsize=WAITING)
 
     def keep(frame: Any) -> None:
         with suppress(Full):  # the SDK must not wait, and of a scene that stands still another frame will do

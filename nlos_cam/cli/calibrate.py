@@ -6,12 +6,15 @@ from typing import Annotated
 
 import typer
 from nlos_calibration.board import BOARDS, Paper
+from nlos_calibration.board_corners import Light
+from nlos_calibration.board_view import BoardView
 from nlos_calibration.board_wall import WallByBoard
 from nlos_calibration.wall import WallFit
 from nlos_calibration.wall_record import OccluderRecord, WallRecord, wall_record
 
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.base import Camera
+from nlos_cam.camera.colour import look_in_colour
 from nlos_cam.cli.calibrate_told import told
 from nlos_cam.cli.calibrate_watch import watch_until_enter
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, tracked
@@ -28,7 +31,10 @@ Tape = Annotated[
     float | None,
     typer.Option("--tape-m", min=0.01, help="Distance by hand, from the front glass to the wall along its normal."),
 ]
-ByBoard = Annotated[bool, typer.Option("--board", help="Look for a printed board too (`nlos-cam board`), in infrared.")]
+ByBoard = Annotated[bool, typer.Option("--board", help="Look for a printed board too (`nlos-cam board`).")]
+BoardIn = Annotated[
+    Light, typer.Option("--board-in", help="Where the board is looked for: colour needs an L515, or a recording of it.")
+]
 OnPaper = Annotated[Paper | None, typer.Option("--paper", help="The paper of the printed board; a4 if not given.")]
 SquareMm = Annotated[
     float | None,
@@ -78,6 +84,7 @@ def calibrate(
     watch: Watch = False,
     tape_m: Tape = None,
     board: ByBoard = False,
+    board_in: BoardIn = "infrared",
     paper: OnPaper = None,
     square_mm: SquareMm = None,
     occluder_x_m: OccluderX = None,
@@ -91,16 +98,17 @@ def calibrate(
     Beside wall.toml lie wall.npz, the bare wall as difference maps need it, and wall.html, the report.
     """
     uri = _source(camera, bag, wall=wall)
-    if not board and (paper or square_mm):
-        raise typer.BadParameter("--paper and --square-mm are of a board: add --board")
+    if not board and (paper or square_mm or board_in == "colour"):
+        raise typer.BadParameter("--paper, --square-mm and --board-in are of a board: add --board")
     if board and tape_m is not None:
         raise typer.BadParameter("give one of --tape-m and --board: each tells how far the lidar's range is off")
     entered = _entered(occluder_x_m, occluder_gap_m)
     files = WallFiles.beside(output_path(out, "wall", ".toml", overwrite=overwrite), overwrite=overwrite)
     if watch:
         watch_until_enter(_opened(uri))
+    colour = _look_in_colour(uri, frames) if board_in == "colour" else None
     seen = _look(uri, frames)
-    fit, facts = by_board(seen, BOARDS[paper or "a4"], square_mm) if board else by_depth(seen, tape_m)
+    fit, facts = by_board(seen, BOARDS[paper or "a4"], square_mm, colour) if board else by_depth(seen, tape_m)
     reference = seen.reference(fit.inliers) if isinstance(fit, WallFit) else None
     record = written(files, _record(seen, fit, facts, entered), reference)
     result = record.model_dump(mode="json", include=TOLD) | {"out": str(files.record), "report": str(files.report)}
@@ -137,6 +145,13 @@ def _look(uri: str, frames: int) -> Seen:
     with _opened(uri) as source, progress() as bar:
         task = bar.add_task("looking at the wall", total=frames)
         return look(source, frames, lambda: bar.advance(task))
+
+
+def _look_in_colour(uri: str, frames: int) -> BoardView:
+    """The mean colour image; a device is looked at in colour before it is in depth."""
+    with progress() as bar:
+        task = bar.add_task("looking in colour", total=frames)
+        return look_in_colour(uri, frames, on_frame=lambda: bar.advance(task))
 
 
 def _record(

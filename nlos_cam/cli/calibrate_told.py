@@ -1,6 +1,7 @@
 """What a person is told of a calibration."""
 
 from nlos_calibration.board_wall import BoardRecord
+from nlos_calibration.uncertainty import INTERVAL_STDS
 from nlos_calibration.wall_record import OccluderRecord, WallRecord
 from rich.markup import escape
 
@@ -41,7 +42,7 @@ def told(record: WallRecord, files: WallFiles) -> str:
 
 
 def _interval(std: float | None) -> float:
-    return 1.96 * (std or 0.0)
+    return INTERVAL_STDS * (std or 0.0)
 
 
 def _occluder_told(occluder: OccluderRecord) -> str:

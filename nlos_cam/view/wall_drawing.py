@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.footprint import footprint, on_plane
-from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.measured_wall import MeasuredWall, wall_points_m
 from nlos_calibration.rig import Extent
 from nlos_calibration.verdict import Verdict
 from nlos_calibration.wall_record import WallRecord
@@ -38,19 +38,6 @@ VERDICT_RGB: dict[Verdict, tuple[int, int, int]] = {
 }
 AXIS_M = 0.05
 """How long the wall frame's axes are drawn."""
-
-
-def wall_points_m(record: WallRecord, reference: BareWall) -> Array:
-    """The reference's pixels (height, width, 3) in the wall frame, NaN where no return: z is how far off the plane.
-
-    The lidar's range offset is allowed for as it is in the record's pose.
-    """
-    of_depth_m = record.range_offset_m if record.range_offset_cause == "depth" else 0.0
-    of_origin_m = record.range_offset_m if record.range_offset_cause == "origin" else 0.0
-    pose = np.array(record.wall_from_lidar)
-    points_m = (reference.depth_m[..., np.newaxis] + of_depth_m) * reference.intrinsics.rays()
-    points_m[..., 2] += of_origin_m
-    return points_m @ pose[:3, :3].T + pose[:3, 3]
 
 
 def every_nth(shape: tuple[int, ...], most: int) -> tuple[slice, slice]:

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 
 from nlos_calibration.board_wall import BoardRecord
+from nlos_calibration.uncertainty import INTERVAL_STDS
 from nlos_calibration.wall_record import WallRecord
 
-INTERVAL_STDS = 1.96
-"""Half the width of a 95 % interval, in standard uncertainties."""
 ALL_IS_WELL = "nothing has drifted since the calibration"
 
 
