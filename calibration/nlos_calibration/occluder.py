@@ -29,6 +29,8 @@ MAX_BEHIND, TOLD_BEHIND = 0.5, 0.02
 MAX_TILT_DEG, SURE_SIGMAS = 5.0, 2.0
 MIN_GAP_M = 0.005
 """Less is as good as none, beside `WALL_BAND_M`."""
+MAX_GAP_STD_M = 0.005
+"""A ruler does better."""
 REACH_HEIGHT_M = 0.1
 """Above the wall, the paper's gap."""
 BY_HAND = "enter its place and gap by hand"
@@ -188,6 +190,11 @@ def _check_fit(found: OccluderFit) -> None:
         raise OccluderRefusedError(
             f"the occluder touches the wall (gap {found.gap_m * 1e3:.1f} mm, known to {found.gap_std_m * 1e3:.1f} mm): "
             "leave 0.05 to 0.20 m for the light to pass"
+        )
+    if found.gap_std_m > MAX_GAP_STD_M:
+        raise OccluderRefusedError(
+            f"the occluder's edge is seen to {found.gap_std_m * 1e3:.0f} mm only ({MAX_GAP_STD_M * 1e3:.0f} allowed), "
+            f"about {found.gap_m:.2f} m off the wall: too few pixels beside it have depth; {BY_HAND}"
         )
     if abs(found.edge_deg) > MAX_TILT_DEG:
         raise OccluderRefusedError(
