@@ -76,11 +76,12 @@ def open_bench(wall: Path | None, camera: Camera) -> Bench:
     measured = load_measured(wall)
     known = [measured.record.rig.pinhole, *([measured.reference.intrinsics] if measured.reference else [])]
     for intrinsics in known:
-        _check_intrinsics(intrinsics, camera.intrinsics)
+        check_intrinsics(intrinsics, camera.intrinsics)
     return Bench(measured.record.rig, measured, _notes(measured.record, camera))
 
 
-def _check_intrinsics(measured: Intrinsics, given: Intrinsics) -> None:
+def check_intrinsics(measured: Intrinsics, given: Intrinsics) -> None:
+    """Raise CalibrationError where a camera's pixels are not those that a wall was measured with."""
     of_wall, of_camera = (f"{size.width}x{size.height}" for size in (measured, given))
     if of_wall != of_camera:
         raise CalibrationError(

@@ -5,10 +5,19 @@ from nlos_calibration.board import Board
 from nlos_calibration.board_view import BoardView
 from nlos_calibration.board_wall import WallByBoard, wall_with_board
 from nlos_calibration.errors import WallRefusedError
+from nlos_calibration.measured_wall import MeasuredWall, points_m
+from nlos_calibration.occluder import find_occluder
 from nlos_calibration.range_offset import tape_the_wall
+from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall import WallFit, fit_wall
+from nlos_calibration.wall_record import WallRecord, with_occluder
+from numpy.typing import NDArray
 
+from nlos_cam.bench import check_intrinsics
 from nlos_cam.wall_look import Seen
+
+NEAR_WALL_M = 0.02
+"""Off the plane; what is farther away when the occluder stands is the occluder, or between both."""
 
 
 def by_depth(seen: Seen, tape_m: float | None = None) -> tuple[WallFit, dict[str, object]]:
@@ -47,3 +56,32 @@ def by_board(
     view = colour or BoardView(seen.statistics.ir_mean(), seen.intrinsics)
     fit, record = wall_with_board(depth, view, board, measured=measured)
     return fit, {"board": record}
+
+
+def by_occluder(seen: Seen, bare: MeasuredWall) -> tuple[WallRecord, NDArray[np.bool_]]:
+    """The record of a bare wall with the occluder that stands before it now, and the wall's pixels beside that.
+
+    Nothing may be hidden yet. Raises OccluderRefusedError, CalibrationError for another camera, and WallRefusedError
+    where the lidar has moved since.
+    """
+    record, statistics = bare.record, seen.statistics.depth
+    check_intrinsics(record.rig.pinhole, seen.intrinsics)
+    offset_m = record.range_offset_m if record.range_offset_cause == "depth" else 0.0
+    depth_m, noise, pose = statistics.mean_m() + offset_m, statistics.noise(), np.array(record.wall_from_lidar)
+    surely = {"distance_std_m": record.distance_std_m or 0.0, "yaw_std_deg": record.yaw_std_deg or 0.0}
+    found = find_occluder(depth_m, noise, seen.intrinsics, pose, np.random.default_rng(0), **surely)
+    off_m = np.abs(points_m(record, depth_m - offset_m, seen.intrinsics)[..., 2])
+    beside = np.where((off_m < NEAR_WALL_M) & ~found.pixels, depth_m, np.nan)
+    origin_m = record.range_offset_m - offset_m
+    wall = fit_wall(beside, seen.intrinsics, np.random.default_rng(0), noise, origin_m)
+    _check_stands(record, wall)
+    return with_occluder(record, found), wall.inliers
+
+
+def _check_stands(record: WallRecord, wall: WallFit) -> None:
+    apart_m, apart_deg = wall.distance_m - record.distance_m, wall.facing_deg - record.facing_deg
+    if max(abs(apart_m) / TOLERANCE_M, abs(apart_deg) / TOLERANCE_DEG) > 1.0:
+        raise WallRefusedError(
+            f"the lidar has moved since the bare wall was measured: the wall is {1e3 * apart_m:+.1f} mm farther and "
+            f"turned by {apart_deg:+.2f} degrees: calibrate the bare wall again, then put the occluder back"
+        )

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_calibration.bare_wall import BareWall, load_reference
+from nlos_calibration.projection import Intrinsics
 from nlos_calibration.wall_record import WallRecord, load_wall
 
 Array = NDArray[np.float64]
@@ -32,13 +33,17 @@ def load_measured(path: Path) -> MeasuredWall:
 
 
 def wall_points_m(record: WallRecord, reference: BareWall) -> Array:
-    """The reference's pixels (height, width, 3) in the wall frame, NaN where no return: z is how far off the plane.
+    """The reference's pixels (height, width, 3) in the wall frame, NaN where no return: z is how far off the plane."""
+    return points_m(record, reference.depth_m.astype(np.float64), reference.intrinsics)
+
+
+def points_m(record: WallRecord, depth_m: Array, intrinsics: Intrinsics) -> Array:
+    """Depths (height, width) of the lidar as points (height, width, 3) in the wall frame.
 
     The lidar's range offset is allowed for as it is in the record's pose.
     """
     of_depth_m = record.range_offset_m if record.range_offset_cause == "depth" else 0.0
-    of_origin_m = record.range_offset_m if record.range_offset_cause == "origin" else 0.0
     pose = np.array(record.wall_from_lidar)
-    points_m = (reference.depth_m[..., np.newaxis] + of_depth_m) * reference.intrinsics.rays()
-    points_m[..., 2] += of_origin_m
-    return points_m @ pose[:3, :3].T + pose[:3, 3]
+    seen_m = (depth_m[..., np.newaxis] + of_depth_m) * intrinsics.rays()
+    seen_m[..., 2] += record.range_offset_m - of_depth_m
+    return seen_m @ pose[:3, :3].T + pose[:3, 3]

@@ -33,7 +33,7 @@ MAX_GAP_STD_M = 0.005
 """A ruler does better."""
 REACH_HEIGHT_M = 0.1
 """Above the wall, the paper's gap."""
-BY_HAND = "enter its place and gap by hand"
+BY_HAND = "enter its place and gap by hand (--occluder-x-m, --occluder-gap-m)"
 
 
 @dataclass(frozen=True, eq=False)

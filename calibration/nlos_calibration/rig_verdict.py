@@ -4,9 +4,8 @@ from collections.abc import Callable
 
 from nlos_calibration.footprint import Footprint, footprint
 from nlos_calibration.object_sight import lidar_sees, wall_sees
-from nlos_calibration.rig import LidarPose, ObjectBox, Occluder, Rig
+from nlos_calibration.rig import LidarPose, ObjectBox, Occluder, OccluderRecord, Rig
 from nlos_calibration.verdict import FACING_RANGE_DEG, TOLERANCE_DEG, TOLERANCE_M, Verdict, at_least
-from nlos_calibration.wall_record import OccluderRecord
 
 GAP_RANGE_M = 0.05, 0.20
 """The paper's (SI 1): less lets too little light through, more lets the lidar see the object."""

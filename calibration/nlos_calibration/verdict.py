@@ -40,9 +40,17 @@ def check_flat(flat: Flatness, ripple_m: float) -> None:
 
 def judge(distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float) -> tuple[Verdict, str]:
     """The verdict, and one sentence: what it rests on, or what to do."""
-    doubts, problems = _doubts(flat, ripple_m), out_of_range(distance_m, facing_deg)
-    verdict: Verdict = "doubtful" if doubts else "out of range" if problems else "good"
-    return verdict, "; ".join(doubts + problems) or "distance and angle are inside the paper's ranges"
+    doubts = _doubts(flat, ripple_m)
+    if not doubts:
+        return range_verdict(distance_m, facing_deg)
+    return "doubtful", "; ".join(doubts + out_of_range(distance_m, facing_deg))
+
+
+def range_verdict(distance_m: float, facing_deg: float) -> tuple[Verdict, str]:
+    """The verdict on a plane that is not in doubt."""
+    if problems := out_of_range(distance_m, facing_deg):
+        return "out of range", "; ".join(problems)
+    return "good", "distance and angle are inside the paper's ranges"
 
 
 def warnings(ripple_m: float, noise_scale: float) -> tuple[str, ...]:

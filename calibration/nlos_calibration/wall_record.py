@@ -10,13 +10,13 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from nlos_calibration.board_wall import BoardRecord, WallByBoard
 from nlos_calibration.footprint import footprint
+from nlos_calibration.occluder import OccluderFit, rig_with_occluder
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.range_offset import Cause
 from nlos_calibration.rig import (
     Finite,
     LidarPose,
     NotNegative,
-    Occluder,
     OccluderRecord,
     PinholeRecord,
     Positive,
@@ -25,7 +25,8 @@ from nlos_calibration.rig import (
     load_rig,
     read_record,
 )
-from nlos_calibration.verdict import Verdict
+from nlos_calibration.rig_verdict import combined, judge_rig
+from nlos_calibration.verdict import Verdict, range_verdict
 from nlos_calibration.wall import WallFit
 
 Row = tuple[Finite, Finite, Finite, Finite]
@@ -121,11 +122,13 @@ def wall_record(
     An `occluder` stands where it says, else where the paper's does. `others` are further fields: the device's, the
     board's, the reference's, the range offset's.
     """
-    rig = with_occluder(_rig(fit, intrinsics), occluder)
+    rig = _rig(fit, intrinsics)
+    rig = rig_with_occluder(rig, occluder.x_m, occluder.gap_m) if occluder else rig
     seen = footprint(fit.wall_from_lidar, intrinsics, rig.wall)
     measured = {name: value for name, value in vars(fit).items() if name in WallRecord.model_fields}
     measured |= {"wall_from_lidar": fit.wall_from_lidar.tolist(), "footprint_share": seen.share, "occluder": occluder}
-    measured |= others or {}
+    verdict, advice = combined(fit.verdict, fit.advice, judge_rig(rig, seen, occluder))
+    measured |= {"verdict": verdict, "advice": advice, **(others or {})}
     return WallRecord.model_validate(measured | {"camera": camera, "frames": frames, "created": created, "rig": rig})
 
 
@@ -135,10 +138,19 @@ def _rig(fit: WallFit | WallByBoard, intrinsics: Intrinsics) -> Rig:
     return load_rig("paper-rig").model_copy(update={"name": "measured", "lidar": lidar, "intrinsics": pinhole})
 
 
-def with_occluder(rig: Rig, occluder: OccluderRecord | None) -> Rig:
-    """The same rig with the occluder where it was found, if it was."""
-    found = occluder and Occluder(x_m=occluder.x_m, z_min_m=occluder.gap_m)
-    return rig.model_copy(update={"occluder": found}) if found else rig
+def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
+    """The record with an occluder that was found since; what the wall itself leaves in doubt stays."""
+    found = {name: value for name, value in vars(fit).items() if name in OccluderRecord.model_fields}
+    occluder = OccluderRecord(source="detected", **found)
+    rig = rig_with_occluder(record.rig, occluder.x_m, occluder.gap_m)
+    wall = record.verdict, record.advice
+    if record.verdict != "doubtful":
+        wall = range_verdict(record.distance_m, record.facing_deg)
+    seen = footprint(np.array(record.wall_from_lidar), rig.pinhole, rig.wall)
+    verdict, advice = combined(*wall, judge_rig(rig, seen, occluder))
+    changed = {"occluder": occluder, "rig": rig, "verdict": verdict, "advice": advice}
+    told = {"warnings": (*record.warnings, *fit.warnings)}
+    return WallRecord.model_validate(record.model_dump() | changed | told)
 
 
 def load_wall(path: Path) -> WallRecord:

@@ -4,13 +4,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from nlos_calibration.board import BOARDS, Paper
 from nlos_calibration.board_corners import Light
 from nlos_calibration.board_view import BoardView
 from nlos_calibration.board_wall import WallByBoard
+from nlos_calibration.measured_wall import load_measured
 from nlos_calibration.wall import WallFit
 from nlos_calibration.wall_record import OccluderRecord, WallRecord, wall_record
+from numpy.typing import NDArray
 
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.base import Camera
@@ -20,11 +23,15 @@ from nlos_cam.cli.calibrate_watch import watch_until_enter
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, tracked
 from nlos_cam.wall_files import WallFiles, written
 from nlos_cam.wall_look import Seen, look
-from nlos_cam.wall_measure import by_board, by_depth
+from nlos_cam.wall_measure import by_board, by_depth, by_occluder
 
 Wall = Annotated[bool, typer.Option("--wall", help="Measure the bare wall: no object, no occluder.")]
 CameraUri = Annotated[str | None, typer.Option("--camera", help="l515, l515:SERIAL, sim:bare-wall, ...")]
 Bag = Annotated[Path | None, typer.Option("--bag", help="A recording of the bare wall.")]
+BareRecord = Annotated[
+    Path | None,
+    typer.Option("--occluder", help="Measure the occluder that stands now; the bare wall's record (wall.toml)."),
+]
 Frames = Annotated[int, typer.Option("--frames", min=1, help="How many frames to average.")]
 Watch = Annotated[bool, typer.Option("--watch", help="First show distance and angle live, until Enter is pressed.")]
 Tape = Annotated[
@@ -80,6 +87,7 @@ def calibrate(
     wall: Wall = False,
     camera: CameraUri = None,
     bag: Bag = None,
+    occluder: BareRecord = None,
     frames: Frames = 60,
     watch: Watch = False,
     tape_m: Tape = None,
@@ -95,30 +103,38 @@ def calibrate(
 ) -> None:
     """Find the wall's distance and angle from frames of the bare wall, and write them as a record, with a report.
 
-    Beside wall.toml lie wall.npz, the bare wall as difference maps need it, and wall.html, the report.
+    Beside wall.toml lie wall.npz, the bare wall as difference maps need it, and wall.html, the report. Once the
+    occluder stands, --occluder wall.toml finds it and takes a new reference, with nothing hidden yet.
     """
-    uri = _source(camera, bag, wall=wall)
+    uri = _source(camera, bag, wall=wall, occluder=occluder)
     if not board and (paper or square_mm or board_in == "colour"):
         raise typer.BadParameter("--paper, --square-mm and --board-in are of a board: add --board")
     if board and tape_m is not None:
         raise typer.BadParameter("give one of --tape-m and --board: each tells how far the lidar's range is off")
-    entered = _entered(occluder_x_m, occluder_gap_m)
+    by_hand = _entered(occluder_x_m, occluder_gap_m)
+    if occluder and (board or tape_m is not None or by_hand):
+        raise typer.BadParameter("--occluder finds the occluder beside a wall that was measured: give it alone")
+    bare = load_measured(occluder) if occluder else None
     files = WallFiles.beside(output_path(out, "wall", ".toml", overwrite=overwrite), overwrite=overwrite)
     if watch:
         watch_until_enter(_opened(uri))
     colour = _look_in_colour(uri, frames) if board_in == "colour" else None
     seen = _look(uri, frames)
-    fit, facts = by_board(seen, BOARDS[paper or "a4"], square_mm, colour) if board else by_depth(seen, tape_m)
-    reference = seen.reference(fit.inliers) if isinstance(fit, WallFit) else None
-    record = written(files, _record(seen, fit, facts, entered), reference)
+    inliers: NDArray[np.bool_] | None
+    if bare:
+        record, inliers = by_occluder(seen, bare)
+    else:
+        fit, facts = by_board(seen, BOARDS[paper or "a4"], square_mm, colour) if board else by_depth(seen, tape_m)
+        record, inliers = _record(seen, fit, facts, by_hand), fit.inliers if isinstance(fit, WallFit) else None
+    record = written(files, record, None if inliers is None else seen.reference(inliers))
     result = record.model_dump(mode="json", include=TOLD) | {"out": str(files.record), "report": str(files.report)}
     finish(result, as_json=json, text=told(record, files))
 
 
-def _source(camera: str | None, bag: Path | None, *, wall: bool) -> str:
+def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path | None) -> str:
     """The URI to read from. Raises typer.BadParameter for arguments that say too little or too much."""
-    if not wall:
-        raise typer.BadParameter("say what to measure: --wall")
+    if wall == (occluder is not None):
+        raise typer.BadParameter("say what to measure: --wall, or --occluder wall.toml once the wall is known")
     if bag is not None and camera is None:
         return f"bag:{bag}"
     if camera is not None and bag is None:

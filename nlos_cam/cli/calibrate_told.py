@@ -37,8 +37,8 @@ def told(record: WallRecord, files: WallFiles) -> str:
         lines.append(f"offset    {offset:+.1f} ± {interval:.1f} mm of the lidar's {record.range_offset_cause}")
     lines.append(f"verdict   [bold {colour}]{record.verdict}[/]: {record.advice}")
     lines += [f"note      {warning}" for warning in record.warnings]
-    beside = f" and {files.reference.name}" if record.reference else ""
-    return "\n".join([*lines, f"wrote {escape(str(files.record))}{escape(beside)}"])
+    beside = [files.reference.name] if record.reference else []
+    return "\n".join([*lines, f"wrote {escape(', '.join([str(files.record), *beside, files.report.name]))}"])
 
 
 def _interval(std: float | None) -> float:

@@ -16,6 +16,7 @@ from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import load_wall
 
 from nlos_cam.cli import calibrate
+from nlos_cam.cli.main import main
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.frames import Frame
 
@@ -144,6 +145,24 @@ def test_an_occluder_that_was_entered_is_the_rigs(
     assert "0.250 m from the foot, 0.080 m off the wall (entered)" in capsys.readouterr().out
 
 
+def test_an_occluder_is_found_once_the_wall_is_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wall, bench, scene = tmp_path / "wall.toml", tmp_path / "bench.toml", tmp_path / "empty.toml"
+    scene.write_text('name = "empty bench"\nrig = "paper-rig"\n', encoding="utf-8")
+    assert main(["calibrate", "--wall", "--camera", "sim:bare-wall", "--frames", "20", "--out", str(wall)]) == 0
+    run = ["calibrate", "--occluder", str(wall), "--camera", f"sim:{scene}", "--frames", "20", "--out", str(bench)]
+    assert main([*run, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["occluder"]["source"] == "detected"
+    assert (told["occluder"]["x_m"], told["occluder"]["gap_m"]) == pytest.approx((0.2, 0.1), abs=0.001)
+    before, after = load_measured(wall), load_measured(bench)
+    assert (after.record.distance_m, told["reference"]) == (before.record.distance_m, "bench.npz")
+    assert after.reference is not None
+    assert after.reference.inliers.mean() < 0.8
+    assert main(run) == 1
+    assert main([*run, "--overwrite"]) == 0
+    assert "m off the wall" in capsys.readouterr().out
+
+
 @pytest.mark.usefixtures("pressed_enter")
 def test_watching_ends_with_enter_and_then_the_wall_is_measured(
     call: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -226,6 +245,10 @@ def test_what_lies_beside_is_kept_unless_asked(call: Call, tmp_path: Path, name:
         ["--wall", "--camera", "sim", "--tape-m", "0"],
         ["--wall", "--camera", "sim", "--occluder-x-m", "0.2"],
         ["--wall", "--camera", "sim", "--occluder-gap-m", "0.1"],
+        ["--wall", "--camera", "sim", "--occluder", "wall.toml"],
+        ["--occluder", "wall.toml", "--camera", "sim", "--board"],
+        ["--occluder", "wall.toml", "--camera", "sim", "--tape-m", "0.2"],
+        ["--wall", "--camera", "sim", "--board-in", "colour"],
     ],
 )
 def test_wrong_usage_is_told(call: Call, arguments: list[str]) -> None:

@@ -1,13 +1,19 @@
+from datetime import date
+
 import numpy as np
 import pytest
 from nlos_calibration.bare_wall import BareWallStatistics
 from nlos_calibration.board import BOARDS
-from nlos_calibration.errors import BoardRefusedError, CalibrationError, WallRefusedError
-from nlos_calibration.rig import load_rig
+from nlos_calibration.errors import BoardRefusedError, CalibrationError, OccluderRefusedError, WallRefusedError
+from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.projection import Intrinsics
+from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
 from nlos_calibration.wall import wall_depth
+from nlos_calibration.wall_record import wall_record
 
+from nlos_cam.render.beams import cast
 from nlos_cam.wall_look import Seen
-from nlos_cam.wall_measure import by_board, by_depth
+from nlos_cam.wall_measure import by_board, by_depth, by_occluder
 
 RIG = load_rig("bare-wall")
 INTRINSICS = RIG.pinhole.scaled(160, 120)
@@ -48,3 +54,62 @@ def test_nothing_seen_is_refused() -> None:
 def test_a_board_that_is_not_there_is_refused(seen: Seen) -> None:
     with pytest.raises(BoardRefusedError):
         by_board(seen, BOARDS["a4"], None)
+
+
+BENCH = load_rig("paper-rig")
+
+
+def bench_seen(rig: Rig, intrinsics: Intrinsics = INTRINSICS) -> Seen:
+    """What the lidar of a rig sees with its occluder in place and nothing hidden, by its beams."""
+    generator, beams = np.random.default_rng(1), cast(rig, intrinsics)
+    depth_m = (beams.length_m * beams.cos_axis).reshape(intrinsics.height, intrinsics.width)
+    statistics, dark = BareWallStatistics(intrinsics), np.zeros(depth_m.shape, np.uint8)
+    cells = np.full((64, 80), 0.2, np.float32)
+    for _ in range(20):
+        noise_m = generator.standard_normal(depth_m.shape) * (0.0005 + 0.002 * depth_m)
+        statistics.add((depth_m + noise_m).astype(np.float32), dark, cells, cells)
+    return Seen("sim", statistics, intrinsics, "", "", {})
+
+
+@pytest.fixture
+def bare(seen: Seen) -> MeasuredWall:
+    fit, _ = by_depth(seen)
+    return MeasuredWall(wall_record(fit, INTRINSICS, camera="sim", frames=10, created=date(2026, 1, 2)), None)
+
+
+@pytest.mark.parametrize(("x_m", "gap_m"), [(0.2, 0.1), (0.22, 0.08), (0.19, 0.11)])
+def test_an_occluder_is_found_beside_the_known_wall(bare: MeasuredWall, x_m: float, gap_m: float) -> None:
+    seen = bench_seen(BENCH.model_copy(update={"occluder": Occluder(x_m=x_m, z_min_m=gap_m)}))
+    record, inliers = by_occluder(seen, bare)
+    assert record.occluder is not None
+    assert record.occluder.source == "detected"
+    assert (record.occluder.x_m, record.occluder.gap_m) == pytest.approx((x_m, gap_m), abs=0.002)
+    assert record.rig.occluder == Occluder(x_m=record.occluder.x_m, z_min_m=record.occluder.gap_m)
+    assert record.verdict == "good"
+    assert record.rig.lidar == bare.record.rig.lidar
+    far = np.abs(wall_depth(RIG.wall_from_lidar, INTRINSICS) - seen.statistics.depth.mean_m()) > 0.02
+    assert 0.1 < far.mean() < 0.5
+    assert not (inliers & far).any()
+    assert inliers[~far].mean() > 0.95
+
+
+def test_a_gap_out_of_the_papers_range_is_advised_on(bare: MeasuredWall) -> None:
+    record, _ = by_occluder(bench_seen(BENCH.model_copy(update={"occluder": Occluder(x_m=0.2, z_min_m=0.04)})), bare)
+    assert record.verdict == "out of range"
+    assert "0.05 to 0.20 needed: move it 1 cm away from the wall" in record.advice
+
+
+def test_a_lidar_that_moved_meanwhile_is_noticed(bare: MeasuredWall) -> None:
+    moved = BENCH.model_copy(update={"lidar": LidarPose(distance_m=0.203, yaw_deg=45.0)})
+    with pytest.raises(WallRefusedError, match=r"the lidar has moved since .*: the wall is \+3\.0 mm farther"):
+        by_occluder(bench_seen(moved), bare)
+
+
+def test_another_camera_is_noticed(bare: MeasuredWall) -> None:
+    with pytest.raises(CalibrationError, match="measured at 160x120, the camera gives 80x60"):
+        by_occluder(bench_seen(BENCH, RIG.pinhole.scaled(80, 60)), bare)
+
+
+def test_no_occluder_is_told(seen: Seen, bare: MeasuredWall) -> None:
+    with pytest.raises(OccluderRefusedError, match="--occluder-x-m"):
+        by_occluder(seen, bare)
