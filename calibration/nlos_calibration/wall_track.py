@@ -22,9 +22,9 @@ MIN_SHARE, FAR_SHARE = 0.05, 0.25
 """Of the pixels, how many must agree on a wall: near where it was, and elsewhere. A sheet, or light that went by way of
 a hidden object, is a wall to some pixels as well, but not near where the wall was."""
 HOME_SHARE, HOME_SIGMAS = 0.5, 6.0
-"""Where at least this share of those that agree agrees with the reference as well, only pixels count that are so near
-to it: seen at a grazing angle, a detour of some centimetres is a wall turned by a degree, and the few pixels that show
-the wall itself hardly object."""
+"""Where at least this share of those that agree agrees with the reference as well, only pixels count at which the plane
+is so near to it: seen at a grazing angle, a detour of some centimetres is a wall turned by a degree, and the few pixels
+that show the wall itself hardly object."""
 NEAR_M, NEAR_DEG = 0.01, 4.0
 FARTHEST_M, FARTHEST_DEG = 0.1, 20.0
 """A wall that moved by more is not looked for: at right angles to it stands the occluder."""
@@ -127,14 +127,16 @@ class WallTrack:
         if self._lost == PATIENCE:
             self._widened, self._change, self._lost = SEARCHES[self._searches % len(SEARCHES)][0], np.zeros(3), 0
             self._searches += 1
-        errors = off - self._rows @ self._change
+        predicted = self._rows @ self._change
+        errors = off - predicted
         inside, at_home = np.abs(errors) < INSIDE_SIGMAS, np.abs(off) < INSIDE_SIGMAS
         self.share, home = _share(inside), _share(at_home)
         if self._widened > 1.0 or home < max(MIN_SHARE, HOME_SHARE * self.share):
             return errors, None
-        near = np.abs(off) < HOME_SIGMAS
+        near = np.abs(predicted) < HOME_SIGMAS
         if _share(inside & near) < HOME_SHARE * home:
-            self._change, self.share, errors = np.zeros(3), home, off
+            self._change, self.share = np.zeros(3), home
+            return off, None
         return errors, near
 
     def _weights(self, errors: Array) -> Array:

@@ -1,0 +1,158 @@
+"""What a check of drift must be: silent while the lidar stands, whatever is in the way, and heard when it moves."""
+
+import numpy as np
+import pytest
+from nlos_calibration.drift import BLIND_FRAMES, DriftCheck
+from nlos_calibration.drift_window import WINDOW_FRAMES
+from nlos_calibration.projection import Intrinsics
+from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
+from nlos_calibration.wall import wall_depth
+from wall_stream import PINHOLE, SMALL, Hide, Pose, WallStream, detours, sensed, sheet, wall_from_lidar
+
+POSES = [(0.2, 45.0, 0.0), (0.15, 15.0, 0.0), (0.3, 70.0, -8.0), (0.3, 15.0, 5.0), (0.2, -60.0, 10.0), (0.2, 0.0, 0.0)]
+SHIFTS = [(0.002, 0.0, 0.0), (-0.002, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5)]
+TOLD_FRAMES = 60
+SIGMAS = 4.5
+poses = pytest.mark.parametrize("pose", POSES)
+shifts = pytest.mark.parametrize("shift", SHIFTS)
+
+
+def both(first: Hide, second: Hide) -> Hide:
+    return lambda depth_m, number: second(first(depth_m, number), number)
+
+
+def assert_right(stream: WallStream, shift: Pose) -> None:
+    """The drift is what the lidar moved by, within its uncertainty, which is no excuse."""
+    drift = stream.check.drift
+    assert drift is not None
+    assert abs(drift.distance_m - shift[0]) < SIGMAS * drift.distance_std_m < TOLERANCE_M
+    assert abs(drift.yaw_deg - shift[1]) < SIGMAS * drift.yaw_std_deg < 2 * TOLERANCE_DEG
+    assert abs(drift.pitch_deg - shift[2]) < SIGMAS * drift.pitch_std_deg < 2 * TOLERANCE_DEG
+
+
+@poses
+@pytest.mark.parametrize("intrinsics", [SMALL, PINHOLE], ids=["320", "640"])
+def test_noise_alone_is_never_told(pose: Pose, intrinsics: Intrinsics) -> None:
+    stream = WallStream(pose, intrinsics)
+    assert stream.show(pose, 500) is None
+    assert_right(stream, (0.0, 0.0, 0.0))
+    assert stream.check.wall_share > 0.95
+
+
+@poses
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_what_is_hidden_or_in_the_way_is_never_told_as_a_move(pose: Pose, share: float) -> None:
+    stream = WallStream(pose, seed=1)
+    for seed in range(3):
+        assert stream.show(pose, 100, detours(stream.places, share, seed)) is None
+    assert stream.check.wall_share == pytest.approx(1.0 - share, abs=0.05)
+    for hide in (sheet(stream.places, 0.4), both(detours(stream.places, 0.5, 4), sheet(stream.places, 0.7))):
+        assert stream.show(pose, 100, hide) is None
+
+
+@poses
+@shifts
+def test_a_knock_is_told_and_told_right(pose: Pose, shift: Pose) -> None:
+    stream = WallStream(pose, seed=2)
+    assert stream.show(pose, 40) is None
+    told = stream.show(stream.moved(*shift), TOLD_FRAMES)
+    assert told is not None
+    assert told > 3  # a frame or two are no news
+    assert_right(stream, shift)
+
+
+@poses
+@shifts
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_a_knock_is_told_beside_a_hidden_object(pose: Pose, shift: Pose, share: float) -> None:
+    stream = WallStream(pose, seed=3)
+    hide = detours(stream.places, share, 5)
+    assert stream.show(pose, 40, hide) is None
+    assert stream.show(stream.moved(*shift), TOLD_FRAMES, hide) is not None
+    assert_right(stream, shift)
+
+
+@pytest.mark.parametrize("shift", [(0.01, 0.0, 0.0), (0.0, -5.0, 0.0), (0.03, 5.0, -3.0), (-0.02, -8.0, 2.0)])
+@pytest.mark.parametrize("pose", POSES[:2])
+def test_a_large_move_is_found_beside_an_object_and_an_occluder(pose: Pose, shift: Pose) -> None:
+    stream = WallStream(pose, seed=4)
+    hide = both(detours(stream.places, 0.3, 6), sheet(stream.places, 0.8))
+    assert stream.show(pose, 40, hide) is None
+    assert stream.show(stream.moved(*shift), 3 * TOLD_FRAMES, hide) is not None
+    assert_right(stream, shift)
+
+
+@poses
+def test_going_back_ends_it(pose: Pose) -> None:
+    stream = WallStream(pose, seed=5)
+    assert stream.show(stream.moved(0.002, 0.5, -0.5), TOLD_FRAMES) is not None
+    stream.show(pose, WINDOW_FRAMES)
+    assert stream.check.warnings == ()
+
+
+@poses
+def test_a_range_that_drifts_is_told_as_such(pose: Pose) -> None:
+    stream = WallStream(pose, seed=6)
+    assert stream.show(pose, 60, lambda depth_m, _: depth_m + 0.7 * TOLERANCE_M) is None
+    stream.show(pose, 60, lambda depth_m, _: depth_m + 1.5 * TOLERANCE_M)
+    (line,) = stream.check.warnings
+    assert line.startswith("the range has drifted")
+    drift = stream.check.drift
+    assert drift is not None
+    assert abs(drift.range_m - 1.5 * TOLERANCE_M) < SIGMAS * drift.range_std_m < 0.2 * TOLERANCE_M
+
+
+@pytest.mark.parametrize("pose", POSES[:5])
+def test_a_lidar_that_moves_back_is_no_range_that_drifts(pose: Pose) -> None:
+    """But where the wall is faced squarely, both are the same."""
+    stream = WallStream(pose, seed=7)
+    stream.show(stream.moved(0.002), TOLD_FRAMES)
+    (line,) = stream.check.warnings
+    assert line.startswith("the lidar has moved")
+
+
+@pytest.mark.parametrize("offset_m", [0.7 * TOLERANCE_M, TOLERANCE_M, 1.1 * TOLERANCE_M, 1.5 * TOLERANCE_M])
+def test_warnings_do_not_flicker(offset_m: float) -> None:
+    """At the limit, and while a drift comes slowly."""
+    stream, seen = WallStream(POSES[0], seed=8), [()]
+    for _ in range(600):
+        stream.show(stream.pose, 1, lambda depth_m, number: depth_m + offset_m * min(number / 300, 1.0))
+        if seen[-1] != stream.check.warnings:
+            seen.append(stream.check.warnings)
+    assert len(seen) <= 2
+
+
+def test_a_wall_out_of_sight_is_told_after_long_and_until_it_is_back() -> None:
+    stream = WallStream(POSES[0], seed=9)
+    stream.show(stream.pose, 40)
+    assert stream.show(stream.pose, BLIND_FRAMES - 1, lambda depth_m, _: np.full_like(depth_m, np.nan)) is None
+    assert stream.check.drift is None
+    assert stream.check.wall_share == 0.0
+    assert stream.show(stream.pose, 60, detours(stream.places, 0.97, 1)) is not None
+    (line,) = stream.check.warnings
+    assert "% of the wall is seen where it was calibrated" in line
+    stream.show(stream.pose, 2 * WINDOW_FRAMES)
+    assert stream.check.warnings == ()
+
+
+def test_what_was_told_stays_while_the_wall_is_hidden() -> None:
+    stream = WallStream(POSES[0], seed=10)
+    stream.show(stream.moved(0.003), TOLD_FRAMES)
+    before = stream.check.warnings
+    stream.show(stream.pose, TOLD_FRAMES, lambda depth_m, _: np.full_like(depth_m, np.nan))
+    assert stream.check.warnings == before != ()
+
+
+def test_whole_frames_with_holes_say_the_same() -> None:
+    """As a camera gives them: every pixel has depth, but for whole columns, and whole frames, that have none."""
+    stream, generator = WallStream(POSES[0], PINHOLE, seed=11), np.random.default_rng(1)
+    check = DriftCheck(stream.reference, wall_from_lidar(stream.pose))
+    depth_m = wall_depth(wall_from_lidar(stream.moved(0.002)), PINHOLE)
+    depth_m[:, 200:400] = np.nan
+    for number in range(40):
+        frame = sensed(depth_m, generator) if number % 4 else np.full_like(depth_m, np.nan)
+        check.look(frame.astype(np.float32), {})
+    assert check.drift is not None
+    assert abs(check.drift.distance_m - 0.002) < SIGMAS * check.drift.distance_std_m < TOLERANCE_M
+    (line,) = check.warnings
+    assert line.startswith("the lidar has moved: the wall is ")
