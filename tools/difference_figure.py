@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 COLOURS = {"raw": "tab:red", "difference": "tab:blue", "levelled": "tab:green"}
 NAMES = {"raw": "raw less plane", "difference": "difference", "levelled": "difference, levelled"}
-WHAT = {"merged": "merged echo", "switched": "other echo"}
+WHAT = {"merged": "cells whose echo merged (full lines)", "switched": "cells that report another echo (dashed)"}
 SHOWN_MM = 2.0
 
 
@@ -33,7 +33,7 @@ def draw(told: dict[str, Any], example: Example, path: Path) -> None:
 
 
 def _maps(figure: Any, example: Example, frames: int) -> None:
-    axes = figure.subplots(1, 3)
+    axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.1})
     titles = {
         "signal: what the object changes (grey: occluder)": example.signal_m,
         f"raw map less the fitted plane, {frames} frames": example.raw_m,
@@ -51,15 +51,18 @@ def _by_frames(axis: Axes, wide: dict[str, Any]) -> None:
     """Merged echoes in full lines, with drift and without; other echoes in dashed ones."""
     for part, style in (("switched", "--"), ("merged", "-")):
         rows = wide[part]["by_frames"] if part in wide else []
+        if rows:
+            axis.annotate(WHAT[part], (rows[-1]["frames"], 1.3 * rows[-1]["raw"]["rms"]), ha="right", fontsize=9)
         for kind, colour in COLOURS.items():
-            label = f"{NAMES[kind]}, {WHAT[part]}" if kind == "raw" or part == "merged" else None
+            label = NAMES[kind] if part == "merged" else None
             axis.plot(*_curve(rows, "frames", kind), style, color=colour, marker="o", ms=4, label=label)
     steady = wide["merged"]["by_frames_steady"] if "merged" in wide else []
     axis.plot(*_curve(steady, "frames", "difference"), ":", color="black", lw=2, label="difference, no drift")
     axis.axhline(1, color="0.3", lw=1, ls=":")
     axis.set(xscale="log", yscale="log", xlabel="frames averaged", ylabel="RMS of the signal over RMS of all else")
+    axis.set_ylim(top=4e4)
     axis.set_title(f"paper, direct return wins {wide['direct_wins']:.0%}, +{USUAL_WARMER:g} °C", fontsize=10)
-    axis.legend(fontsize=8, loc="center right")
+    axis.legend(fontsize=8, loc="upper center", ncols=2)
 
 
 def _curve(rows: list[dict[str, Any]], along: str, kind: str) -> tuple[list[float], list[float]]:
@@ -83,10 +86,13 @@ def _lambertian(axis: Axes, told: dict[str, Any]) -> None:
     drifts = [row for row in told["depth"] if row["warmer_celsius"] is not None]
     colours = ("black", "tab:green", "tab:orange", "tab:red")
     for row, colour in zip(drifts, colours, strict=True):
-        for curve, style, what in (("matched", "-", "all cells"), ("best_cell", "--", "best cell")):
-            label = f"{what}, +{row['warmer_celsius']:g} °C"
+        warmer = row["warmer_celsius"]
+        for curve, style, what in (("matched", "-", "matched filter"), ("best_cell", "--", "best cell")):
+            label = f"{what}, {f'+{warmer:g} °C' if warmer else 'no drift'}"
             axis.plot(told["frames"], row["levelled"][f"curve_{curve}"], style, color=colour, label=label)
-    axis.plot(told["frames"], told["intensity"]["curve_matched"], ":", color="tab:purple", label="all cells, intensity")
+    axis.plot(
+        told["frames"], told["intensity"]["curve_matched"], ":", color="tab:purple", label="matched filter, intensity"
+    )
     axis.axhline(1, color="0.3", lw=1, ls=":")
     axis.set(xscale="log", yscale="log", xlabel="frames of object and of bare wall, each", ylabel="signal over noise")
     axis.set_xlim(1, 1e7)

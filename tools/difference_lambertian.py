@@ -6,18 +6,21 @@ from typing import Any
 import numpy as np
 from difference_noise import REFERENCE_CELSIUS, Pattern, biased, rms
 from difference_scenes import Bench, Signal
-from difference_sight import Mask, Sight
+from difference_sight import Mask, Sight, Track
 from difference_snr import Cells, frames_for_cells, frames_for_filter, hours, ratio
 from difference_waveform import Array
+
+from nlos_cam.frames import Float32
 
 WARMER_CELSIUS = None, 0.0, 0.1, 1.0, 5.0
 """None has an endless reference."""
 CURVE_FRAMES = np.logspace(0, 8, 33)
 
 
-def lambertian(sight: Sight, bench: Bench, sharp: list[Signal], wide: list[Signal]) -> dict[str, Any]:
-    """What is left without a pulse and with the bench's; cells are those that light reaches by way of the object."""
-    pattern, cells = Pattern(bench.rig, biased()), sight.cells
+def lambertian(sight: Sight, benches: list[Bench], later: list[Float32], track: Track) -> dict[str, Any]:
+    """What is left on the first bench, without a pulse, and on the second; cells are those that light reaches."""
+    sharp, wide = ([bench.signal(one) for one in track(later, "lambertian maps")] for bench in benches)
+    pattern, cells = Pattern(benches[1].rig, biased()), sight.cells
     chosen = [one.lit & cells for one in wide]
     depth_um = [1e6 * np.abs(one.depth_m[at]) for one, at in zip(wide, chosen, strict=True)]
     return {
@@ -28,6 +31,7 @@ def lambertian(sight: Sight, bench: Bench, sharp: list[Signal], wide: list[Signa
         },
         "lit_cells": float(np.mean([at.sum() / cells.sum() for at in chosen])),
         "depth_um": _percentiles(depth_um),
+        "depth_um_of_chips": _percentiles([1e6 * np.abs(benches[1].chips_depth_m(one)[cells]) for one in later]),
         "depth_um_of_best_cell": {
             "least": min(float(one.max()) for one in depth_um),
             "median": float(np.median([one.max() for one in depth_um])),
@@ -69,13 +73,15 @@ def _apart(sight: Sight, one: Signal, other: Signal, left_m: Array) -> Cells:
 
 def _needed(looked: list[Cells], pairs: list[Cells], times: float) -> dict[str, Any]:
     """Frames at which signal equals noise, for cells of all objects and for matched filters; and how they get there."""
-    single = np.sort(times * np.concatenate([frames_for_cells(one) for one in looked]))
+    every = [times * frames_for_cells(one) for one in looked]
+    single, best = np.sort(np.concatenate(every)), np.sort([one.min() for one in every])
     matched = np.sort(times * np.array([frames_for_filter(one) for one in looked]))
     apart = np.sort(times * np.array([frames_for_filter(one) for one in pairs]))
     ratios = [[ratio(one, n / times) for one in looked] for n in CURVE_FRAMES]
     return {
         "cells_never": float(np.isinf(single).mean()),
-        "best_cell": _told(single[0]),
+        "best_cell": _told(best[0]),
+        "best_cell_median": _told(best[len(best) // 2]),
         "hundredth_of_cells": _told(single[len(single) // 100]),
         "tenth_of_cells": _told(single[len(single) // 10]),
         "half_of_cells": _told(single[len(single) // 2]),
@@ -91,5 +97,5 @@ def _needed(looked: list[Cells], pairs: list[Cells], times: float) -> dict[str, 
 
 def _told(frames: float) -> dict[str, float | None]:
     """Frames, one at least, and hours of looking at the object; None for never, which JSON has no number for."""
-    frames = max(frames, 1.0)
+    frames = max(float(frames), 1.0)
     return {"frames": frames, "hours": hours(frames)} if np.isfinite(frames) else {"frames": None, "hours": None}

@@ -54,8 +54,10 @@ def paper(sight: Sight, bench: Bench, signals: list[Signal], track: Track) -> di
         "receiver_cell_m2": bench.rig.device.receiver_cell_m2,
         "pulse_ns": bench.pulse_ns,
         "direct_wins": _direct_wins(signals, sight.cells),
-        "confidence_changed": float(np.mean([(one.margin[sight.cells] < -CONFIDENCE_STEP).mean() for one in signals])),
     }
+    if not bench.pulse_ns:
+        falls = [(one.margin[sight.cells] < -CONFIDENCE_STEP).mean() for one in signals]
+        told["confidence_falls"] = float(np.mean(falls))
     for which, some in ((which, parts[which.__name__]) for which in (merged, switched)):
         if some:
             told[which.__name__] = _strength(some, which, sight.cells)

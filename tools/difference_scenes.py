@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from difference_waveform import Array, pulse_sigma_m, received
+from difference_waveform import Array, chips_shift_m, pulse_sigma_m, received
 from nlos_calibration.rig import Rig, load_rig
 from numpy.typing import NDArray
 
@@ -93,6 +93,12 @@ class Bench:
             return received(direct, path_m, some, bin_m, pulse_sigma_m(self.pulse_ns))
         wins = some.max(1) > direct
         return np.where(wins, (some.argmax(1) + 0.5) * bin_m, path_m), np.where(wins, some.max(1), direct)
+
+    def chips_depth_m(self, later: Float32) -> Array:
+        """Change of depth (64, 80), to first order, if the peak is that of chips instead (`chips_shift_m`)."""
+        direct, path_m = self.beams.direct[self.on_wall], 2 * self.beams.length_m[self.on_wall]
+        shift_m = chips_shift_m(direct, path_m, later[self.on_wall].astype(np.float64), self.rig.device.bin_m)
+        return self._map(shift_m / 2 * self.beams.cos_axis[self.on_wall])
 
     def merges(self, path_m: Array) -> NDArray[np.bool_]:
         """Whether paths (k,) are the direct returns' own: with a pulse, within half of its width at half height."""

@@ -69,9 +69,8 @@ def study(objects: int, track: Track) -> tuple[dict[str, Any], Any]:
         "chain": rows,
     }
     later = rendered("lambertian", objects, track)
-    sharp, wide = (Bench(paper_rig(1e-4), "lambertian", pulse_ns) for pulse_ns in (0.0, 1.0))
-    signals = [[bench.signal(one) for one in later] for bench in (sharp, wide)]
-    told["lambertian"] = lambertian(sight, wide, *signals)
+    benches = [Bench(paper_rig(1e-4), "lambertian", pulse_ns) for pulse_ns in (0.0, 1.0)]
+    told["lambertian"] = lambertian(sight, benches, later, track)
     return told, examples[min(EXAMPLE, len(examples) - 1)]
 
 

@@ -57,10 +57,8 @@ def _short(value: float) -> str:
 
 
 def _paper(one: dict[str, Any]) -> Iterable[str]:
-    name = (
-        f"{one['pulse_ns']:g} ns, {1e4 * one['receiver_cell_m2']:g} cm2, direct wins {one['direct_wins']:.0%}, "
-        f"confidence falls in {one['confidence_changed']:.0%}"
-    )
+    name = f"{one['pulse_ns']:g} ns, {1e4 * one['receiver_cell_m2']:g} cm2, direct wins {one['direct_wins']:.0%}"
+    name += f", confidence falls in {one['confidence_falls']:.0%}" if "confidence_falls" in one else ""
     ratios = " | ".join(
         f"{of}: raw / difference / levelled" for of in ("RMS", "median cell", "cells over 1", "matched")
     )
@@ -124,8 +122,8 @@ def _lambertian(told: dict[str, Any]) -> Iterable[str]:
     ]
     rows.append(["intensity", "difference", "0", *(_told(told["intensity"][name]) for name in names)])
     yield _table(
-        "drift since the reference | map | pattern, um | best cell | hundredth of cells | tenth | half "
-        "| matched filter: best object | median | worst | two objects, median pair",
+        "drift since the reference | map | pattern, um | best cell: best object | median | hundredth of cells | tenth "
+        "| half | matched filter: best object | median | worst | two objects, median pair",
         rows,
     )
 
@@ -144,4 +142,4 @@ def _told(needed: dict[str, float | None] | None) -> str:
         return f"{hours / 24 / 365:.2g} years"
     if hours >= 1:
         return f"{hours:.2g} h"
-    return f"{frames:.0f} frames"
+    return f"{frames:.0f} frame{'s' * (frames >= 1.5)}"

@@ -75,6 +75,26 @@ def test_weak_later_light_shifts_and_raises_the_peak_as_the_first_order_says(wav
     assert shift_m.min() > 1e-5
 
 
+def test_chips_shift_by_the_slope_of_their_peak_over_its_bend(waveform: ModuleType) -> None:
+    """Against chips correlated by sums: a triangle smeared by a Gaussian, searched for its highest place."""
+    chip_m, sigma_m, step_m = 0.299792458, 0.3 * 0.299792458 / 2.563, 1e-4
+    at_m = np.arange(-1.0, 1.0, step_m)
+    smear = np.exp(-0.5 * (np.arange(-0.2, 0.2, step_m) / sigma_m) ** 2)
+    peak = np.convolve(np.maximum(1 - np.abs(at_m) / chip_m, 0), smear / smear.sum(), mode="same")
+    for bins, path_m in ((5, 0.3), (15, 0.3), (22, 0.3)):
+        later = np.zeros((1, 80))
+        later[0, 30 + bins] = 1e-3
+        both = peak + 1e-3 * np.interp(at_m - (0.305 + 0.01 * bins - path_m), at_m, peak)
+        top = both.argmax()
+        bow = np.polyfit(at_m[top - 30 : top + 31], both[top - 30 : top + 31] - peak.max(), 2)
+        alone = np.polyfit(
+            at_m[peak.argmax() - 30 : peak.argmax() + 31], peak[peak.argmax() - 30 : peak.argmax() + 31], 2
+        )
+        expected_m = -bow[1] / (2 * bow[0]) + alone[1] / (2 * alone[0])
+        shift_m = waveform.chips_shift_m(np.ones(1), np.array([path_m]), later, BIN_M)
+        assert shift_m[0] == pytest.approx(expected_m, rel=0.03)
+
+
 @pytest.mark.parametrize("strength", [1e-4, 0.1, 3.0, 100.0])
 def test_the_receiver_finds_the_highest_peak_whatever_the_strength(waveform: ModuleType, strength: float) -> None:
     generator = np.random.default_rng(1)
