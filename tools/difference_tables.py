@@ -99,9 +99,21 @@ def _paper(one: dict[str, Any]) -> Iterable[str]:
 
 
 def _lambertian(told: dict[str, Any]) -> Iterable[str]:
-    yield f"lambertian: { ({k: v for k, v in told.items() if k not in {'depth', 'intensity', 'frames'}}) }"
+    sharp, percents = told["without_pulse"], ("p50", "p95", "p99", "p100")
+    changes = {
+        "depth, um": told["depth_um"],
+        "depth, um, were the peak that of chips": told["depth_um_of_chips"],
+        "IR, counts": told["counts"],
+        "margin, without a pulse": sharp["margin"],
+    }
+    yield f"lambertian without a pulse: at most {sharp['depth_um_max']:g} um and {sharp['counts_max']:g} counts"
+    yield _table(
+        "lambertian, change by an object | median cell | 95th percentile | 99th | most",
+        [[name, *(_short(row[at]) for at in percents)] for name, row in changes.items()],
+    )
     names = (
         "best_cell",
+        "best_cell_median",
         "hundredth_of_cells",
         "tenth_of_cells",
         "half_of_cells",
