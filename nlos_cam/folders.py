@@ -1,4 +1,4 @@
-"""Folders of results: written under another name, and renamed when whole."""
+"""Results, a file or a folder: written under another name, and renamed when whole."""
 
 import os
 import shutil
@@ -28,3 +28,14 @@ def renamed_when_whole(out: Path) -> Generator[Path]:
             made.replace(out / made.name)
     finally:
         shutil.rmtree(part)
+
+
+@contextmanager
+def file_when_whole(path: Path) -> Generator[Path]:
+    """A file to write beside `path`, which it replaces at the end; after an error it is removed."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,9 +1,10 @@
 """What a live run did: how fast, how late, and what it saw."""
 
 import logging
+import re
 from collections import Counter, deque
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,6 +19,8 @@ MOST_FAILED = 30
 REMEMBERED = 100_000
 """Latencies are told of the last frames only (55 minutes at 30 frames/s): memory stays bounded."""
 
+FIGURES = re.compile(r"\d+(\.\d+)?")
+
 log = logging.getLogger(__name__)
 
 
@@ -30,6 +33,61 @@ class Step:
     reconstruction: Reconstruction
     published_s: float
     stages_s: Mapping[str, float]
+    difference: LidarMaps | None = None
+    """The maps less the bare wall's; None without a reference."""
+    warnings: tuple[str, ...] = ()
+
+
+OnWarning = Callable[[str, bool], None]
+"""Called with a warning, and whether it begins (or ends)."""
+
+
+def say_nothing(warning: str, begins: bool) -> None:
+    """Nobody listens to warnings as they come."""
+    del warning, begins
+
+
+@dataclass
+class Held:
+    """The frames that a warning held for."""
+
+    text: str
+    """As it was told last."""
+    frames: int
+    first: int
+    last: int
+    """Frame numbers; it may have ended and begun again between."""
+
+
+class Warned:
+    """Which warnings held for which frames; tells when one begins and when it ends, not when its figures change."""
+
+    def __init__(self, on_warning: OnWarning = say_nothing) -> None:
+        self._held: dict[str, Held] = {}
+        self._on_warning, self._now = on_warning, set[str]()
+
+    def add(self, step: Step) -> None:
+        number, before = step.frame.frame_number, self._now
+        self._now = {self._note(warning, number) for warning in step.warnings}
+        for subject, held in self._held.items():
+            if (begins := subject in self._now) != (subject in before):
+                self._on_warning(held.text, begins)
+
+    def _note(self, warning: str, number: int) -> str:
+        """Count a frame for a warning; what it is about."""
+        subject = FIGURES.sub("", warning)
+        held = self._held.setdefault(subject, Held(warning, 0, number, number))
+        held.text, held.frames, held.last = warning, held.frames + 1, number
+        return subject
+
+    @property
+    def held(self) -> list[Held]:
+        """Each warning, in the order in which they first began."""
+        return list(self._held.values())
+
+    def frames(self) -> dict[str, int]:
+        """How many frames each held for."""
+        return {held.text: held.frames for held in self.held}
 
 
 @dataclass(frozen=True)
@@ -43,16 +101,20 @@ class LiveReport:
     latency_ms: Mapping[str, float]
     """p50, p95 and p99 from timestamp to result; `FrameReader.offset_s` tells how clocks are matched."""
     stages_ms: Mapping[str, float]
-    """Median by stage: wait (for a frame), maps, network, view (handing over to it)."""
+    """Median by stage: wait (for a frame), maps, bench (their difference and what has drifted), network, view (handing
+    over to it)."""
     counts: Mapping[str, int]
     """By name, those that are not 0: what the camera counts, incomplete and dropped_camera; dropped_loop, for which the
     loop was too slow; failed, which came to no result; blank, half_invalid, saturated (see `sightings`)."""
+    warnings: Mapping[str, int] = field(default_factory=dict[str, int])
+    """Of the bench, and the frames that each held for."""
 
 
 class Tally:
     """Collects what LiveReport tells."""
 
-    def __init__(self) -> None:
+    def __init__(self, on_warning: OnWarning = say_nothing) -> None:
+        self.warned = Warned(on_warning)
         self.frames = 0
         self.failed = 0
         """Frames of which no result could be made."""
@@ -69,6 +131,7 @@ class Tally:
         self._last_s = step.published_s
         self._ages_s.append(step.published_s - step.frame.timestamp_s)
         self._stages_s.append({**step.stages_s, "view": view_s})
+        self.warned.add(step)
 
     def fail(self, frame: Frame, error: Exception, in_a_row: int) -> None:
         """Count a frame that came to no result. Raises an error that is not the frame's, and after MOST_FAILED."""
@@ -95,4 +158,5 @@ class Tally:
         lost = {"incomplete": camera.incomplete, "dropped_camera": camera.dropped, "dropped_loop": len(reader.dropped)}
         counts = {**camera.counts, **lost, "failed": self.failed, **self.seen}
         dropped = sum(lost.values()) + self.failed
-        return LiveReport(self.frames, fps, dropped, latency_ms, stages_ms, {k: n for k, n in counts.items() if n})
+        told = {name: count for name, count in counts.items() if count}
+        return LiveReport(self.frames, fps, dropped, latency_ms, stages_ms, told, self.warned.frames())

@@ -1,29 +1,32 @@
-"""A whole recording to files: every frame's hidden depth, a contact sheet and a short report."""
+"""A whole recording to files: every frame's hidden depth, its difference maps, a contact sheet and a short report."""
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Event
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
+from nlos_cam.bench import Bench
 from nlos_cam.camera.base import Camera
+from nlos_cam.contact_sheet import draw_sheet
 from nlos_cam.errors import RecordingError
 from nlos_cam.folders import renamed_when_whole
 from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.live import steps
-from nlos_cam.live_report import Step
+from nlos_cam.live_report import OnWarning, Step, Warned, say_nothing
 from nlos_cam.objects.depth_image import object_box
-from nlos_cam.reconstruct import Clock, Network
+from nlos_cam.processing import Processing, read_along, steps
+from nlos_cam.reconstruct import Clock
 from nlos_cam.sightings import in_words
 
-RESULT, SHEET, REPORT = "reconstruction.npz", "frames.png", "report.md"
+RESULT, DIFFERENCE, SHEET, REPORT = "reconstruction.npz", "difference.npz", "frames.png", "report.md"
 SHEET_FRAMES = 6
 
 
@@ -35,6 +38,8 @@ class ReplayReport:
     seconds: float
     """How long the replay took."""
     out: str
+    warnings: Mapping[str, int] = field(default_factory=dict[str, int])
+    """Of the bench, and the frames that each held for."""
 
 
 class Samples:
@@ -57,103 +62,115 @@ class Samples:
         return [self._kept[i] for i in np.linspace(0, len(self._kept) - 1, count).round().astype(int)]
 
 
-@dataclass
-class _Results:
-    """What is collected from the steps; depth maps go to a file, so that an hour fits into memory."""
+class _Stack:
+    """Arrays of one shape that go to a file as they come, so that an hour of them fits into memory."""
 
-    depths: IO[bytes]
-    timestamps_s: list[float]
-    numbers: list[int]
-    with_surface: int
-    samples: Samples
+    def __init__(self, file: IO[bytes], *shape: int) -> None:
+        self._file, self._shape, self._count = file, shape, 0
+
+    def add(self, array: NDArray[np.float32]) -> None:
+        self._file.write(np.ascontiguousarray(array, np.float32).tobytes())
+        self._count += 1
+
+    def all(self) -> NDArray[np.float32]:
+        """(count, *shape), mapped from the file."""
+        self._file.flush()
+        return np.memmap(self._file, np.float32, "r", shape=(self._count, *self._shape))
+
+
+class _Results:
+    """What is collected from the steps; `new_file` gives what the arrays go to."""
+
+    def __init__(self, new_file: Callable[[], IO[bytes]], on_warning: OnWarning) -> None:
+        self.hidden_m = _Stack(new_file(), OBJECT_PIXELS, OBJECT_PIXELS)
+        self.difference_m, self.difference_intensity = (_Stack(new_file(), MAP_ROWS, MAP_COLUMNS) for _ in range(2))
+        self.timestamps_s: list[float] = []
+        self.numbers: list[int] = []
+        self.with_surface = 0
+        self.samples, self.warned = Samples(SHEET_FRAMES), Warned(on_warning)
 
     def add(self, step: Step) -> None:
         depth_m = step.reconstruction.depth_m
-        self.depths.write(np.ascontiguousarray(depth_m, np.float32).tobytes())
+        self.hidden_m.add(depth_m)
+        if step.difference:
+            self.difference_m.add(step.difference.depth_m)
+            self.difference_intensity.add(step.difference.intensity)
         self.timestamps_s.append(step.frame.timestamp_s)
         self.numbers.append(step.frame.frame_number)
         self.with_surface += bool(np.isfinite(depth_m).any())
         self.samples.add(step)
+        self.warned.add(step)
 
 
 def replay(
     camera: Camera,
-    rig: Rig,
-    network: Network,
+    processing: Processing,
     out: Path,
     *,
     stop: Event,
     on_frame: Callable[[], None] = lambda: None,
+    on_warning: OnWarning = say_nothing,
     clock: Clock = time.time,
 ) -> ReplayReport:
     """Reconstruct every frame of an entered recording into the folder `out`; its files of the same names are replaced.
 
-    Setting `stop` ends it early and keeps what is done. Raises RecordingError for a recording without a whole frame,
-    and what the camera raises.
+    Difference maps are written where the bench has a reference; those of an earlier replay go. Setting `stop` ends it
+    early and keeps what is done. Raises RecordingError for a recording without a whole frame, and what the camera
+    raises.
     """
-    begun_s = clock()
-    with renamed_when_whole(out) as part, TemporaryFile(dir=part) as depths:
-        results = _Results(depths, [], [], 0, Samples(SHEET_FRAMES))
-        with FrameReader(camera, keeps_all=True, stop=stop, clock=clock) as reader:
-            for step in steps(reader, rig, network, clock):
+    begun_s, bench = clock(), processing.bench
+    with renamed_when_whole(out) as part, ExitStack() as files:
+        results = _Results(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
+        frames, thermometer = read_along(camera, camera, bench)
+        with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader:
+            for step in steps(reader, processing, clock, thermometer=thermometer):
                 results.add(step)
                 on_frame()
         if not results.numbers:
             raise RecordingError(f"{camera.uri} holds no frame with depth, infrared and confidence: record it again")
-        _write_result(part / RESULT, results, rig)
+        np.savez_compressed(part / RESULT, **_of_frames(results, bench.rig), **_hidden(results, bench.rig))
+        if bench.reference:
+            np.savez_compressed(part / DIFFERENCE, **_of_frames(results, bench.rig), **_difference(results, bench))
         draw_sheet(part / SHEET, results.samples.chosen())
-        (part / REPORT).write_text(_report(camera, rig, results, stopped=stop.is_set()), encoding="utf-8")
-    return ReplayReport(len(results.numbers), clock() - begun_s, str(out))
+        (part / REPORT).write_text(_report(camera, bench, results, stopped=stop.is_set()), encoding="utf-8")
+    if not bench.reference:
+        (out / DIFFERENCE).unlink(missing_ok=True)
+    return ReplayReport(len(results.numbers), clock() - begun_s, str(out), results.warned.frames())
 
 
-def _write_result(path: Path, results: _Results, rig: Rig) -> None:
+def _of_frames(results: _Results, rig: Rig) -> dict[str, Any]:
+    """Which frames a file's arrays are of, and by which rig."""
+    return {
+        "timestamp_s": np.array(results.timestamps_s),
+        "frame_number": np.array(results.numbers, np.int64),
+        "rig_name": rig.name,
+        "rig_checksum": rig.checksum,
+    }
+
+
+def _hidden(results: _Results, rig: Rig) -> dict[str, Any]:
     box = object_box(rig)
     pitch_x_m = (box.x_max_m - box.x_min_m) / OBJECT_PIXELS
     pitch_y_m = (box.y_max_m - box.y_min_m) / OBJECT_PIXELS
-    results.depths.flush()
-    shape = len(results.numbers), OBJECT_PIXELS, OBJECT_PIXELS
-    np.savez_compressed(
-        path,
-        depth_m=np.memmap(results.depths, np.float32, "r", shape=shape),
-        timestamp_s=np.array(results.timestamps_s),
-        frame_number=np.array(results.numbers, np.int64),
-        origin_m=np.array([box.x_min_m + pitch_x_m / 2, box.y_max_m - pitch_y_m / 2]),  # wall (x, y) of pixel (0, 0)
-        pitch_m=np.array([pitch_x_m, -pitch_y_m]),  # wall (x, y) from one column, one row to the next
-        z_near_m=box.z_near_m,
-        z_far_m=box.z_far_m,
-        rig_name=rig.name,
-        rig_checksum=rig.checksum,
-    )
+    return {
+        "depth_m": results.hidden_m.all(),
+        "origin_m": np.array([box.x_min_m + pitch_x_m / 2, box.y_max_m - pitch_y_m / 2]),  # wall (x, y) of pixel (0, 0)
+        "pitch_m": np.array([pitch_x_m, -pitch_y_m]),  # wall (x, y) from one column, one row to the next
+        "z_near_m": box.z_near_m,
+        "z_far_m": box.z_far_m,
+    }
 
 
-def draw_sheet(path: Path, chosen: list[Step]) -> None:
-    """A picture of some frames, one column each: lidar depth, infrared, hidden depth."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(2.2 * len(chosen) + 1, 6.5), layout="constrained")
-    rows = figure.subplots(3, len(chosen), squeeze=False)
-    looks = {"lidar depth (m)": "turbo_r", "infrared (counts)": "gray", "hidden depth (m)": "inferno_r"}
-    parts = zip(
-        *((step.maps.depth_m, step.maps.intensity, step.reconstruction.depth_m) for step in chosen), strict=True
-    )
-    for axes, images, (title, colours) in zip(rows, parts, looks.items(), strict=True):
-        low, high = _limits(images)
-        drawn = [axis.imshow(image, colours, vmin=low, vmax=high) for axis, image in zip(axes, images, strict=True)]
-        figure.colorbar(drawn[0], ax=list(axes), label=title)
-        for axis in axes:
-            axis.set_axis_off()
-    for axis, step in zip(rows[0], chosen, strict=True):
-        axis.set_title(f"frame {step.frame.frame_number}")
-    figure.savefig(path, dpi=80)
+def _difference(results: _Results, bench: Bench) -> dict[str, Any]:
+    return {
+        "depth_m": results.difference_m.all(),
+        "intensity": results.difference_intensity.all(),
+        "reference_sha256": bench.measured.record.reference_sha256 if bench.measured else "",
+    }
 
 
-def _limits(images: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
-    values = np.concatenate([image[np.isfinite(image)] for image in images])
-    return (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
-
-
-def _report(camera: Camera, rig: Rig, results: _Results, *, stopped: bool) -> str:
-    frames, times_s = len(results.numbers), results.timestamps_s
+def _report(camera: Camera, bench: Bench, results: _Results, *, stopped: bool) -> str:
+    frames, times_s, rig = len(results.numbers), results.timestamps_s, bench.rig
     lines = [
         f"# Replay of {camera.uri}",
         "",
@@ -163,9 +180,18 @@ def _report(camera: Camera, rig: Rig, results: _Results, *, stopped: bool) -> st
         f"- frames with a hidden surface: {results.with_surface} ({results.with_surface / frames:.0%})",
         f"- rig: {rig.name} {rig.checksum}, {rig.lidar.distance_m:.3f} m to the wall, {rig.facing_deg:.1f} degrees",
         f"- maps: {MAP_ROWS} x {MAP_COLUMNS}; hidden depth: {OBJECT_PIXELS} x {OBJECT_PIXELS} in `{RESULT}`",
+        *_bench_told(bench, results.warned),
         "",
         f"![some frames]({SHEET})",
     ]
     if stopped:
         lines.insert(2, "**Interrupted: the frames below are those done until then.**\n")
     return "\n".join(lines) + "\n"
+
+
+def _bench_told(bench: Bench, warned: Warned) -> list[str]:
+    lines: list[str] = []
+    if bench.reference:
+        lines.append(f"- difference from the bare wall, the mean of {bench.reference.frames} frames: in `{DIFFERENCE}`")
+    told = (f"{held.frames} frames from {held.first} to {held.last}: {held.text}" for held in warned.held)
+    return lines + [f"- warning, {each}" for each in told]

@@ -47,6 +47,9 @@ class NoiseWorld:
     def truth_depth_m(self, number: int) -> np.ndarray:
         return np.full((64, 64), number, np.float32)
 
+    def celsius(self, number: int) -> dict[str, float]:
+        return {"ldd_temperature": 20.0 + number}
+
 
 class HurriedClock:
     """A clock by which everything is due as soon as it is asked for: it moves only by waiting."""

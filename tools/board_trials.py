@@ -13,7 +13,7 @@ from nlos_calibration.board_corners import Corners, find_corners
 from nlos_calibration.board_plane import BoardFit, PrintErrors, fit_board
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.projection import Intrinsics
-from nlos_calibration.uncertainty import measures_of
+from nlos_calibration.uncertainty import INTERVAL_STDS, measures_of
 from numpy.typing import NDArray
 from wall_scenes import View, view
 
@@ -105,7 +105,7 @@ def summary(measured: list[Trial], refused: list[str]) -> dict[str, object]:
     if not measured:
         return {"measured": 0, "refused": len(refused)}
     off, sigmas = (np.abs(np.stack(column)) for column in zip(*measured, strict=True))
-    inside = sigmas <= 1.96
+    inside = sigmas <= INTERVAL_STDS
     return {
         "measured": len(measured),
         "refused": len(refused),

@@ -9,6 +9,7 @@ from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import LidarPose, PinholeRecord, load_rig
+from nlos_calibration.uncertainty import INTERVAL_STDS
 from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall import WallFit, fit_wall
 from numpy.typing import NDArray
@@ -25,7 +26,6 @@ DISTANCES_M, FACING_DEG, PITCHES_DEG = (0.15, 0.20, 0.25, 0.30), (15.0, 30.0, 45
 BARE = load_rig("bare-wall")
 SIZE = 160, 120
 SENSOR_SIZE = 320, 240
-SURE = 1.96
 EMPTY = np.zeros((64, 80), np.float32)
 NO_ECHO = MultiBounce(EMPTY, EMPTY, np.full((64, 80), np.nan, np.float32))
 
@@ -231,5 +231,5 @@ def held_against(fit: WallFit, truth: View, where: tuple[float, float]) -> Outco
         distance_error_m=float(errors[0][0]),
         facing_error_deg=float(errors[1][0]),
         turn_deg=float(np.degrees(np.arcsin(min(hypot(*across), 1.0)))),
-        inside=tuple(bool(abs(error) <= SURE * std) for error, std in errors),
+        inside=tuple(bool(abs(error) <= INTERVAL_STDS * std) for error, std in errors),
     )

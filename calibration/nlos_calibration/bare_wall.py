@@ -66,6 +66,7 @@ class BareWall:
     """(64, 80); of the maps, as all map_*; NaN where no frame had a return in the cell."""
     map_depth_std_m: Float32
     map_intensity: Float32
+    """NaN, like the depth, where no frame had a return."""
     map_intensity_std: Float32
     frames: int
     intrinsics: Intrinsics
@@ -100,7 +101,7 @@ class BareWallStatistics:
         self._ir.add(ir)
         self._saturated += ir == FULL_SCALE
         self._map_depth.add(map_depth_m)
-        self._map_intensity.add(map_intensity)
+        self._map_intensity.add(np.where(np.isfinite(map_depth_m), map_intensity, np.nan))
 
     def look_at(self, celsius: Mapping[str, float]) -> None:
         """Take one reading of the device's temperatures in; an empty one says nothing."""
@@ -111,10 +112,17 @@ class BareWallStatistics:
         """(height, width), in counts; NaN before the first frame."""
         return self._ir.mean()
 
+    def celsius(self) -> dict[str, float]:
+        """The mean of each thermometer's readings."""
+        return {name: float(np.mean(values)) for name, values in self._series().items()}
+
+    def _series(self) -> dict[str, list[float]]:
+        names = sorted(set[str]().union(*self._celsius))
+        return {name: [look[name] for look in self._celsius if name in look] for name in names}
+
     def reference(self, inliers: NDArray[np.bool_], *, serial: str, settings: Mapping[str, float]) -> BareWall:
         """What was collected, with the pixels that the wall's plane rests on."""
-        names = sorted(set[str]().union(*self._celsius))
-        series = {name: [look[name] for look in self._celsius if name in look] for name in names}
+        series = self._series()
         statistics = {
             "depth_m": self.depth.mean_m(),
             "depth_std_m": self.depth.spread_m(),
@@ -133,7 +141,7 @@ class BareWallStatistics:
             intrinsics=self._intrinsics,
             serial=serial,
             settings=dict(settings),
-            celsius={name: float(np.mean(values)) for name, values in series.items()},
+            celsius=self.celsius(),
             celsius_span={name: max(values) - min(values) for name, values in series.items()},
         )
 

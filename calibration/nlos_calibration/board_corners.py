@@ -1,4 +1,4 @@
-"""Where a board's corners are in infrared images: a mean over frames, contrast made even, OpenCV's detector.
+"""Where a board's corners are in images: a mean over frames, contrast made even, OpenCV's detector.
 
 One detection in the mean of many frames, not the mean of many detections: noise falls alike, but dim corners are found
 that no single frame shows, and what the image's pixels do to a corner is in the residuals instead of being averaged
@@ -6,7 +6,7 @@ over copies of itself.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,11 +16,18 @@ from nlos_calibration.board import Board
 from nlos_calibration.errors import BoardRefusedError
 
 Array = NDArray[np.float64]
+Light = Literal["infrared", "colour"]
 
 MIN_CORNERS = 8
 """Fewer leave hardly a residual to judge the pose by."""
 BRIGHTEST_QUANTILE = 0.9995
 CONTRAST_LIMIT, CONTRAST_TILES = 4.0, (8, 8)
+UNSEEN: dict[Light, str] = {
+    "infrared": "put it where the view is bright, print it with toner (dye ink is white in infrared), and lower the "
+    "laser's power if it is washed out",
+    "colour": "put it where the colour camera sees it too, and light the room evenly, without gloss on the paper",
+}
+"""What to do where no marker is read."""
 
 
 @dataclass(frozen=True)
@@ -33,25 +40,8 @@ class Corners:
     """(n, 2); x, y in pixel centres."""
 
 
-class IrMean:
-    """The mean infrared image over frames of a camera that stands still."""
-
-    def __init__(self, height: int, width: int) -> None:
-        self.frames = 0
-        self._sum = np.zeros((height, width))
-
-    def add(self, ir: NDArray[np.uint8]) -> None:
-        """Take one frame (height, width) in."""
-        self._sum += ir
-        self.frames += 1
-
-    def mean(self) -> Array:
-        """(height, width), in counts; zero before the first frame."""
-        return self._sum / max(self.frames, 1)
-
-
-def find_corners(image: NDArray[np.floating] | NDArray[np.uint8], board: Board) -> Corners:
-    """The corners of `board` in an image (height, width) of any gain.
+def find_corners(image: NDArray[np.floating] | NDArray[np.uint8], board: Board, light: Light = "infrared") -> Corners:
+    """The corners of `board` in an image (height, width) of any gain; `light` is for the advice in a refusal.
 
     Raises BoardRefusedError where fewer than MIN_CORNERS are found, or where the image is mirrored.
     """
@@ -61,7 +51,7 @@ def find_corners(image: NDArray[np.floating] | NDArray[np.uint8], board: Board) 
         return corners
     if len(_detect(np.ascontiguousarray(even[:, ::-1]), board)[0].ids) >= MIN_CORNERS:
         raise BoardRefusedError("the board is seen mirrored: the image is flipped, or the print is; put neither right")
-    raise BoardRefusedError(_too_few(len(corners.ids), markers, board))
+    raise BoardRefusedError(_too_few(len(corners.ids), markers, board, light))
 
 
 def even_contrast(image: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -82,13 +72,10 @@ def _detect(image: NDArray[np.uint8], board: Board) -> tuple[Corners, int]:
     return Corners(np.asarray(ids, np.int64).ravel(), np.asarray(pixels, np.float64).reshape(-1, 2)), count
 
 
-def _too_few(corners: int, markers: int, board: Board) -> str:
+def _too_few(corners: int, markers: int, board: Board, light: Light) -> str:
     size = f"{board.squares_x} x {board.squares_y} squares of {board.square_mm:g} mm"
     if markers == 0:
-        return (
-            f"no board of {size} is seen in infrared: put it where the view is bright, print it with toner (dye ink is "
-            "white in infrared), and lower the laser's power if it is washed out"
-        )
+        return f"no board of {size} is seen in {light}: {UNSEEN[light]}"
     return (
         f"{corners} corners of a board of {size} are seen ({markers} markers), {MIN_CORNERS} needed: bring more of it "
         "into the near, bright side of the view, or average more frames"

@@ -54,10 +54,10 @@ class PrintErrors:
 
 @dataclass(frozen=True)
 class BoardFit:
-    """The plane of a board in the lidar frame."""
+    """The plane of a board in the frame of what saw it: the lidar's, or a camera's until it is moved there."""
 
     slopes: Array
-    """(3,); -normal / distance_m, the normal towards the lidar."""
+    """(3,); -normal / distance_m, the normal towards it."""
     covariance: Array
     """(3, 3) of the slopes."""
     corners: int
@@ -70,23 +70,31 @@ class BoardFit:
     """How far the middle of the sheet stands off the wall."""
 
 
-def fit_board(corners: Corners, board: Board, intrinsics: Intrinsics, printed: PrintErrors | None = None) -> BoardFit:
-    """The plane of `board` from its corners in an image of the lidar's pinhole.
+def fit_board(
+    corners: Corners,
+    board: Board,
+    intrinsics: Intrinsics,
+    printed: PrintErrors | None = None,
+    focal_std: float = 0.0,
+) -> BoardFit:
+    """The plane of `board` from its corners in the image of a pinhole, in the frame of that camera.
 
-    Raises BoardRefusedError where the corners do not lie as on a flat print of the right proportions, and where they
-    leave the plane open.
+    `focal_std` is the relative uncertainty of its focal length. Raises BoardRefusedError where the corners do not lie
+    as on a flat print of the right proportions, and where they leave the plane open.
     """
     printed = printed or PrintErrors()
     seen = _seen(corners, board, intrinsics, printed)
     pose = solve_pose(seen)
     _check_fit(pose)
-    pose = refine_pose(replace(seen, variance_px2=_variance_px2(pose.errors_px, UNKNOWNS)), pose.parameters)
+    seen = replace(seen, variance_px2=_variance_px2(pose.errors_px, UNKNOWNS))
+    pose = refine_pose(seen, pose.parameters)
     _check_print(pose)
     slopes, covariance = pose.slopes()
+    by_focal = _by_focal(seen, pose, focal_std)
     _check_certain(slopes, covariance)
     return BoardFit(
         slopes=slopes,
-        covariance=covariance + printed.scale_std**2 * np.outer(slopes, slopes),
+        covariance=covariance + printed.scale_std**2 * np.outer(slopes, slopes) + np.outer(by_focal, by_focal),
         corners=len(seen.pixels),
         residual_px=float(np.sqrt(np.mean(pose.errors_px**2))),
         stretch=float(np.expm1(pose.parameters[6])),
@@ -102,7 +110,7 @@ def _seen(corners: Corners, board: Board, intrinsics: Intrinsics, printed: Print
     return SeenCorners(
         points_m=points_m,
         pixels=pixels,
-        camera=np.array([[intrinsics.fx, 0.0, intrinsics.ppx], [0.0, intrinsics.fy, intrinsics.ppy], [0.0, 0.0, 1.0]]),
+        camera=intrinsics.matrix,
         size_m=np.array(board.size_mm) * 1e-3,
         print_std=np.array([printed.stretch_std, printed.bow_std_m, printed.bow_std_m]),
         variance_px2=_plane_variance_px2(points_m, pixels),
@@ -150,6 +158,14 @@ def _variance_px2(errors_px: Array, spent: int) -> float:
     return max(float((errors_px**2).sum()) / (errors_px.size - spent - 2), SIGMA_FLOOR_PX**2)
 
 
+def _by_focal(seen: SeenCorners, pose: BoardPose, focal_std: float) -> Array:
+    """How the slopes (3,) change where the focal length is longer by its uncertainty."""
+    if focal_std == 0.0:
+        return np.zeros(3)
+    longer = seen.camera + np.diag(np.diag(seen.camera)) * focal_std * np.array([1.0, 1.0, 0.0])
+    return refine_pose(replace(seen, camera=longer), pose.parameters).slopes()[0] - pose.slopes()[0]
+
+
 def _check_fit(pose: BoardPose) -> None:
     free = pose.errors_px.size - 8
     if pose.chi2 > free + MISFIT_CHI2:
@@ -164,7 +180,7 @@ def _check_print(pose: BoardPose) -> None:
     if abs(stretch) > MAX_STRETCH:
         raise BoardRefusedError(
             f"the squares do not fit: they are seen {100.0 * stretch:+.1f} % wider than high; print without "
-            "stretching, and use the lidar's own intrinsics",
+            "stretching, and use the intrinsics of what saw it",
         )
     if float(np.abs(bows_m).max()) > MAX_BOW_M:
         raise BoardRefusedError(

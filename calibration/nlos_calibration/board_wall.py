@@ -8,19 +8,23 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from nlos_calibration.board import Board
-from nlos_calibration.board_corners import find_corners
-from nlos_calibration.board_plane import BoardFit, fit_board
+from nlos_calibration.board_corners import Light
+from nlos_calibration.board_plane import BoardFit
+from nlos_calibration.board_view import BoardView, find_in_view
 from nlos_calibration.combine import Combined, Plane, Used, combine
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import wall_from_plane
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.rig import Finite, Positive, Record
+from nlos_calibration.rig import Finite, NotNegative, Positive, Record
 from nlos_calibration.uncertainty import WallMeasures, measures_of
 from nlos_calibration.verdict import Verdict, out_of_range
 from nlos_calibration.wall import WallFit
 
 Array = NDArray[np.float64]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+COLOUR_IS_OFF = (
+    "the colour camera's pose against the lidar, which is the factory's and may have moved: look in infrared to see"
+)
+"""A further cause of a disagreement, where the board was seen in colour."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,7 @@ class BoardRecord(Record):
     printed: Board
     measured: bool
     """Whether the squares' size was measured on the print, or is that of the drawing."""
+    seen_in: Light = "infrared"
     corners: Annotated[int, Field(gt=0)]
     residual_px: NotNegative
     stretch: Finite
@@ -66,23 +71,21 @@ class BoardRecord(Record):
 
 
 def wall_with_board(
-    depth: WallFit | WallRefusedError,
-    infrared: Array,
-    board: Board,
-    intrinsics: Intrinsics,
-    *,
-    measured: bool,
+    depth: WallFit | WallRefusedError, view: BoardView, board: Board, *, measured: bool
 ) -> tuple[WallFit | WallByBoard, BoardRecord]:
-    """The wall from its depth, or the reason why that was refused, and from a board in the mean infrared image.
+    """The wall from its depth, or the reason why that was refused, and from a view of a board.
 
     `measured` says that the board's squares were. Raises BoardRefusedError where the board says nothing.
     """
-    fit = fit_board(find_corners(infrared, board), board, intrinsics)
+    fit = find_in_view(view, board)
     plane = Plane(fit.slopes, fit.covariance)
+    record = _record(fit, board, view.light, measured=measured)
     if isinstance(depth, WallRefusedError):
-        return _by_board(plane, depth), _record(fit, board, measured, None, str(depth))
+        return _by_board(plane, depth), record.model_copy(update={"depth_refused": str(depth)})
     both = combine(Plane(-depth.wall_from_lidar[2, :3] / depth.distance_m, depth.covariance), plane, measured=measured)
-    return _by_both(depth, both), _record(fit, board, measured, both, "")
+    if both.causes and view.light == "colour":
+        both = replace(both, causes=(*both.causes, COLOUR_IS_OFF))
+    return _by_both(depth, both), record.model_copy(update=_compared(both))
 
 
 def _by_board(plane: Plane, refusal: WallRefusedError) -> WallByBoard:
@@ -116,20 +119,28 @@ def _conflict(both: Combined) -> str:
     )
 
 
-def _record(fit: BoardFit, board: Board, measured: bool, both: Combined | None, refusal: str) -> BoardRecord:
-    apart = both.disagreement if both else None
+def _record(fit: BoardFit, board: Board, light: Light, *, measured: bool) -> BoardRecord:
+    """What the board said, where there is no depth to compare it with."""
     return BoardRecord(
         **vars(measures_of(fit.slopes, fit.covariance)),
         printed=board,
         measured=measured,
+        seen_in=light,
         corners=fit.corners,
         residual_px=fit.residual_px,
         stretch=fit.stretch,
         bow_m=fit.bow_m,
-        used=both.used if both else "board",
-        disagreement_m=apart.distance_m if apart else None,
-        disagreement_deg=apart.angle_deg if apart else None,
-        disagreement_sigmas=apart.sigmas if apart else None,
-        causes=both.causes if both else (),
-        depth_refused=refusal,
+        used="board",
     )
+
+
+def _compared(both: Combined) -> dict[str, object]:
+    """What the record says of the comparison with the depth."""
+    apart = both.disagreement
+    return {
+        "used": both.used,
+        "disagreement_m": apart.distance_m,
+        "disagreement_deg": apart.angle_deg,
+        "disagreement_sigmas": apart.sigmas,
+        "causes": both.causes,
+    }

@@ -3,6 +3,7 @@
 CalibrationError (ValueError)    exit 1   root
 ├── WallRefusedError             exit 1   what the lidar saw is not a bare wall we can trust
 ├── BoardRefusedError            exit 1   there is no board in the image whose plane we can trust
+├── OccluderRefusedError         exit 1   there is no occluder in the view whose place we can trust
 └── RecordFileError              exit 4   a rig or wall record that cannot be read
 """
 
@@ -19,6 +20,10 @@ class WallRefusedError(CalibrationError):
 
 class BoardRefusedError(CalibrationError):
     """There is no board in the image whose plane can be trusted; the message says why."""
+
+
+class OccluderRefusedError(CalibrationError):
+    """There is no occluder in the view whose place can be trusted; the message says why."""
 
 
 class RecordFileError(CalibrationError):

@@ -86,10 +86,17 @@ def fit_plane(points_m: Array, generator: np.random.Generator, noise: MeanNoise 
     return fit_depth(rays, depth_m, generator, noise)
 
 
-def fit_depth(rays: Array, depth_m: Array, generator: np.random.Generator, noise: MeanNoise | None = None) -> PlaneFit:
+def fit_depth(
+    rays: Array,
+    depth_m: Array,
+    generator: np.random.Generator,
+    noise: MeanNoise | None = None,
+    min_extent: float = MIN_RAY_EXTENT,
+) -> PlaneFit:
     """Fit the plane that most of the depths (N,) along rays (N, 3) of unit z lie on, but for NaN and what is behind.
 
-    `noise` is that of the depths; one sample's where it is not given. Raises WallRefusedError where there are too few
+    `noise` is that of the depths; one sample's where it is not given. A plane that is seen narrower than `min_extent`
+    counts as a line. Raises WallRefusedError where there are too few
     depths, where no plane holds half of them, and where they are seen along a line (collinear, or a wall seen edge on).
     """
     valid = np.isfinite(depth_m) & (depth_m >= MIN_DEPTH_M)
@@ -101,7 +108,7 @@ def fit_depth(rays: Array, depth_m: Array, generator: np.random.Generator, noise
     slopes, _, inside = _refit(points, slopes, scale)
     _check_majority(inside, points, slopes)
     agreed = points if inside.all() else points.at(inside)
-    _check_extent(agreed.few().rays)
+    _check_extent(agreed.few().rays, min_extent)
     inliers = valid.copy()
     inliers[valid] = inside
     return _plane(slopes, agreed, float(inside.mean()), inliers)
@@ -222,12 +229,12 @@ def _check_majority(inside: Mask, points: _Points, slopes: Array) -> None:
     )
 
 
-def _check_extent(rays: Array) -> None:
+def _check_extent(rays: Array, min_extent: float) -> None:
     """Refuse inliers seen in a line; percentiles, since a few chance inliers beside a line do not make a plane."""
     centred = rays[:, :2] - rays[:, :2].mean(axis=0)
     narrow = np.linalg.eigh(centred.T @ centred)[1][:, 0]
     low, high = np.percentile(centred @ narrow, (10.0, 90.0))
-    if high - low < MIN_RAY_EXTENT:
+    if high - low < min_extent:
         raise WallRefusedError(_in_a_line(float(high - low)))
 
 

@@ -25,6 +25,11 @@ class Intrinsics:
         ppx, ppy = (self.ppx + 0.5) * sx - 0.5, (self.ppy + 0.5) * sy - 0.5
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, ppx, ppy)
 
+    @property
+    def matrix(self) -> Array:
+        """The same for OpenCV: (3, 3)."""
+        return np.array([[self.fx, 0.0, self.ppx], [0.0, self.fy, self.ppy], [0.0, 0.0, 1.0]])
+
     def rays(self) -> Array:
         """Rays (height, width, 3) in the lidar frame with unit z: a point is depth_m * ray."""
         x = (np.arange(self.width) - self.ppx) / self.fx

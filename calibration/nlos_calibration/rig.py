@@ -6,7 +6,7 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from math import degrees, radians
 from pathlib import Path
-from typing import Annotated, Self, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
 import tomli_w
@@ -19,6 +19,7 @@ from nlos_calibration.projection import Intrinsics
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 R = TypeVar("R", bound=BaseModel)
 
 
@@ -61,6 +62,21 @@ class Occluder(Record):
 
     x_m: Finite
     z_min_m: Positive
+
+
+class OccluderRecord(Record):
+    """The occluder as it was found, or as somebody says it stands; `rig.occluder` is its half plane."""
+
+    source: Literal["detected", "entered"]
+    x_m: Finite
+    """Wall x of its edge."""
+    gap_m: Positive
+    """Between its edge and the wall: the aperture."""
+    x_std_m: NotNegative | None = None
+    """None, as gap_std_m and tilt_deg, where it was entered."""
+    gap_std_m: NotNegative | None = None
+    tilt_deg: Finite | None = None
+    """Of its sheet against the plane x = x_m, about wall y; positive leans away from the lidar's foot."""
 
 
 class LidarPose(Record):

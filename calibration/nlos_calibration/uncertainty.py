@@ -10,6 +10,9 @@ from nlos_calibration.geometry import angles_from_normal
 
 Array = NDArray[np.float64]
 
+INTERVAL_STDS = 1.96
+"""Half the width of a 95 % interval, in standard uncertainties."""
+
 
 @dataclass(frozen=True)
 class WallMeasures:

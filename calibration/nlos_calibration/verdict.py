@@ -89,15 +89,15 @@ def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
     problems: list[str] = []
     low, high = DISTANCE_RANGE_M
     if not low - TOLERANCE_M <= distance_m <= high + TOLERANCE_M:
-        away = _at_least(100.0 * (low - distance_m)), "back"
-        move = away if distance_m < low else (_at_least(100.0 * (distance_m - high)), "closer")
+        away = at_least(100.0 * (low - distance_m)), "back"
+        move = away if distance_m < low else (at_least(100.0 * (distance_m - high)), "closer")
         problems.append(
             f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar {move[0]} cm {move[1]}"
         )
     low, high = FACING_RANGE_DEG
     if not low - TOLERANCE_DEG <= facing_deg <= high + TOLERANCE_DEG:
-        aside = _at_least(low - facing_deg), "aside"
-        turn = aside if facing_deg < low else (_at_least(facing_deg - high), "towards the wall")
+        aside = at_least(low - facing_deg), "aside"
+        turn = aside if facing_deg < low else (at_least(facing_deg - high), "towards the wall")
         plural = "" if turn[0] == 1 else "s"
         problems.append(
             f"{facing_deg:.1f} degrees is outside {low:.0f} to {high:.0f}: turn the lidar {turn[0]} degree{plural} "
@@ -106,6 +106,6 @@ def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
     return problems
 
 
-def _at_least(amount: float) -> int:
+def at_least(amount: float) -> int:
     """The whole number that suffices; what lies a thousandth above one does not ask for the next."""
     return max(ceil(amount - 1e-3), 1)

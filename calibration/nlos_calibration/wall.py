@@ -64,7 +64,7 @@ def wall_depth(wall_from_lidar: Array, intrinsics: Intrinsics) -> Array:
 
 
 def fit_wall(
-    depth_m: Array,
+    depth_m: NDArray[np.floating],
     intrinsics: Intrinsics,
     generator: np.random.Generator,
     noise: MeanNoise | None = None,
@@ -76,7 +76,7 @@ def fit_wall(
     `origin_m` behind the zero of depth on the optical axis (`range_offset`). Raises WallRefusedError where the depth is
     not that of one bare, flat wall.
     """
-    depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan)
+    depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan).astype(np.float64)
     _check_depth(depth_m)
     rays = intrinsics.rays()
     plane = fit_depth(rays.reshape(-1, 3), depth_m.ravel(), generator, noise)

@@ -9,14 +9,26 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from nlos_calibration.board_wall import BoardRecord, WallByBoard
+from nlos_calibration.footprint import footprint
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.range_offset import Cause
-from nlos_calibration.rig import Finite, LidarPose, PinholeRecord, Positive, Record, Rig, load_rig, read_record
+from nlos_calibration.rig import (
+    Finite,
+    LidarPose,
+    NotNegative,
+    Occluder,
+    OccluderRecord,
+    PinholeRecord,
+    Positive,
+    Record,
+    Rig,
+    load_rig,
+    read_record,
+)
 from nlos_calibration.verdict import Verdict
 from nlos_calibration.wall import WallFit
 
 Row = tuple[Finite, Finite, Finite, Finite]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 POSE_TOLERANCE = 1e-6
 VERSION = 3
 """2 adds to 1 what is None, empty or 0 by default: uncertainties, flatness, device, board, reference, offset; and 3
@@ -28,21 +40,6 @@ def _upgraded(version: Any) -> Any:
     if isinstance(version, int) and version > VERSION:
         raise ValueError(f"written by a newer nlos-cam, this one reads up to {VERSION}: update it, or measure again")
     return VERSION if version in (1, 2) else version
-
-
-class OccluderRecord(Record):
-    """The occluder as it was found, or as somebody says it stands; `rig.occluder` is its half plane."""
-
-    source: Literal["detected", "entered"]
-    x_m: Finite
-    """Wall x of its edge."""
-    gap_m: Positive
-    """Between its edge and the wall: the aperture."""
-    x_std_m: NotNegative | None = None
-    """None, as gap_std_m and tilt_deg, where it was entered."""
-    gap_std_m: NotNegative | None = None
-    tilt_deg: Finite | None = None
-    """Of its sheet against the plane x = x_m, about wall y; positive leans away from the lidar's foot."""
 
 
 class WallRecord(Record):
@@ -116,18 +113,32 @@ def wall_record(
     camera: str,
     frames: int,
     created: date,
+    occluder: OccluderRecord | None = None,
     others: Mapping[str, object] | None = None,
 ) -> WallRecord:
     """The record of `fit`; its rig is the paper's with the measured pose and the camera's intrinsics.
 
-    `others` are further fields: the device's, the board's, the reference's, the range offset's.
+    An `occluder` stands where it says, else where the paper's does. `others` are further fields: the device's, the
+    board's, the reference's, the range offset's.
     """
+    rig = with_occluder(_rig(fit, intrinsics), occluder)
+    seen = footprint(fit.wall_from_lidar, intrinsics, rig.wall)
+    measured = {name: value for name, value in vars(fit).items() if name in WallRecord.model_fields}
+    measured |= {"wall_from_lidar": fit.wall_from_lidar.tolist(), "footprint_share": seen.share, "occluder": occluder}
+    measured |= others or {}
+    return WallRecord.model_validate(measured | {"camera": camera, "frames": frames, "created": created, "rig": rig})
+
+
+def _rig(fit: WallFit | WallByBoard, intrinsics: Intrinsics) -> Rig:
     lidar = LidarPose(distance_m=fit.distance_m, yaw_deg=fit.yaw_deg, pitch_deg=fit.pitch_deg)
     pinhole = PinholeRecord.model_validate(vars(intrinsics))
-    rig = load_rig("paper-rig").model_copy(update={"name": "measured", "lidar": lidar, "intrinsics": pinhole})
-    measured = {name: value for name, value in vars(fit).items() if name in WallRecord.model_fields}
-    measured |= {"wall_from_lidar": fit.wall_from_lidar.tolist(), **(others or {})}
-    return WallRecord.model_validate(measured | {"camera": camera, "frames": frames, "created": created, "rig": rig})
+    return load_rig("paper-rig").model_copy(update={"name": "measured", "lidar": lidar, "intrinsics": pinhole})
+
+
+def with_occluder(rig: Rig, occluder: OccluderRecord | None) -> Rig:
+    """The same rig with the occluder where it was found, if it was."""
+    found = occluder and Occluder(x_m=occluder.x_m, z_min_m=occluder.gap_m)
+    return rig.model_copy(update={"occluder": found}) if found else rig
 
 
 def load_wall(path: Path) -> WallRecord:

@@ -3,7 +3,7 @@
 import json
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -28,8 +28,8 @@ class CheckpointRecord(BaseModel):
 
     rig_name: str
     rig_checksum: str
-    input: str = "raw maps"
-    """What the compressor eats: raw maps, or difference maps (bare wall subtracted)."""
+    input: Literal["raw maps", "difference maps"] = "raw maps"
+    """What the compressor eats; difference maps are the maps less the bare wall's."""
     vae_recipe: Recipe
     compressor_recipe: Recipe | None = None
     """None for a VAE alone."""

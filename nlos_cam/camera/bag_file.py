@@ -10,6 +10,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from nlos_calibration.projection import Intrinsics
 from numpy.typing import NDArray
 
@@ -156,6 +157,30 @@ class BagFile:
             names = {match[0]: match[2] for match in found if int(match[1]) == sensor}
             self._options[sensor] = RecordedOptions(self._container, names)
         return self._options[sensor].at(time_ns)
+
+    def lens(self, stream: str) -> tuple[str, NDArray[np.float64]]:
+        """The distortion model of a stream, by the SDK's name, and its coefficients."""
+        return bag_messages.lens_of(self._first(f"{self.streams[stream].topic}/info/camera_info"))
+
+    def pose(self, stream: str, other: str) -> NDArray[np.float64]:
+        """Where another stream's camera is in the frame of a stream's: stream_from_other (4, 4).
+
+        Raises RecordingError where the recording does not tell.
+        """
+        mine, others = self._poses(stream), self._poses(other)
+        if not (groups := mine.keys() & others.keys()):
+            raise RecordingError(f"{self.path} does not tell where {other} is seen from, against {stream}")
+        group = min(groups)
+        return mine[group] @ np.linalg.inv(others[group])
+
+    def _poses(self, stream: str) -> dict[str, NDArray[np.float64]]:
+        """stream_from_reference (4, 4) by group: streams of one group have one reference."""
+        start, poses = f"{self.streams[stream].topic}/tf/", dict[str, NDArray[np.float64]]()
+        for topic, entries in self._entries.items():
+            if topic.startswith(start) and entries:
+                with self._container.told_at(entries[0]):
+                    poses[topic.removeprefix(start)] = bag_messages.pose_of(self._container.read(topic, entries[0]))
+        return poses
 
     def depth_unit_m(self) -> float:
         """Metres per depth count. Raises RecordingError where the recording does not tell."""

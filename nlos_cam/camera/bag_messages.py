@@ -38,6 +38,7 @@ STREAM_INFO = "uint32 fps\nstring encoding\nbool is_recommended\n"
 HAS_TAIL = b"\x01\x00\x00\x001"
 """The frame_id of an image that has its depth unit after it, against its definition; since librealsense 2.49."""
 TAIL_BYTES, FRAME_ID_AT = 4, 12
+UNIT_TOLERANCE = 1e-3
 
 
 @cache
@@ -98,6 +99,24 @@ def pixels(image: Any, encoding: str, intrinsics: Intrinsics) -> NDArray[Any]:
 def intrinsics_of(info: Any) -> Intrinsics:
     """The pinhole of a CameraInfo."""
     return Intrinsics(info.width, info.height, *(float(info.K[i]) for i in (0, 4, 2, 5)))
+
+
+def lens_of(info: Any) -> tuple[str, NDArray[np.float64]]:
+    """The distortion of a CameraInfo: its model by the SDK's name, and its coefficients."""
+    return sdk_name(info.distortion_model), np.asarray(info.D, np.float64)
+
+
+def pose_of(transform: Any) -> NDArray[np.float64]:
+    """A Transform as a matrix (4, 4). Raises ValueError where its quaternion turns nothing."""
+    turn, shift = transform.rotation, transform.translation
+    x, y, z, w = quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+    if not abs(float(np.linalg.norm(quaternion)) - 1.0) < UNIT_TOLERANCE:
+        raise ValueError(f"a rotation by the quaternion {quaternion.tolist()}")
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    pose = np.eye(4)
+    pose[:3, :3] += 2.0 * w * across + 2.0 * across @ across
+    pose[:3, 3] = shift.x, shift.y, shift.z
+    return pose
 
 
 @dataclass(frozen=True)

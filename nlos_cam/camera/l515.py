@@ -115,7 +115,7 @@ class L515Camera(LiveCamera):
     ) -> None:
         sdk = sdk or load_sdk()
         self._context = shared_context(sdk)
-        device, info = _find(sdk, self._context, serial)
+        device, info = find_l515(sdk, self._context, serial)
         size = USB2_SIZE if info.usb_type.startswith("2") else USB3_SIZE
         if size == USB2_SIZE:
             log.warning("%s is on USB %s: only 320 x 240; turn the plug round or use a USB 3 cable", uri, info.usb_type)
@@ -200,8 +200,8 @@ class L515Camera(LiveCamera):
         return None
 
 
-def _find(sdk: Any, context: Any, serial: str) -> tuple[Any, DeviceInfo]:
-    """The one L515 that is meant. Raises CameraNotFoundError with what to check."""
+def find_l515(sdk: Any, context: Any, serial: str) -> tuple[Any, DeviceInfo]:
+    """The one L515 that is meant, by serial number, or the only one. Raises CameraNotFoundError with what to check."""
     there = connected(sdk, context)
     lidars = [(device, info) for device, info in there if "L515" in info.name]
     chosen = [(device, info) for device, info in lidars if serial in {"", info.serial}]

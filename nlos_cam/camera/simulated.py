@@ -32,9 +32,9 @@ class SimulatedCamera(LiveCamera):
     """A world seen through librealsense's software device, 30 frames/s, with the `faults` that it is given.
 
     The world begins when the camera is entered, and goes on whatever befalls the device. The device does not model:
-    start-up and warm-up, options (depth units apart) and presets, other resolutions, the colour camera and the motion
-    sensors, per-frame metadata, clock drift and jitter, and no fault that it is not given. The world's docstrings say
-    what the images do not model.
+    the seconds that a start takes, options and presets (it tells its depth unit and its temperatures), other
+    resolutions, the colour camera and the motion sensors, per-frame metadata, clock drift and jitter, and no fault that
+    it is not given; one that is unplugged does not cool. The world's docstrings say what the images do not model.
     """
 
     def __init__(
@@ -66,8 +66,11 @@ class SimulatedCamera(LiveCamera):
     def _plug_in(self, instant: int) -> None:
         self._model = model = FaultyDevice(self._faults, instant)
         self._instants: dict[int, int] = {}
-        pinhole, other_size, own_clock = self._world.rig.pinhole, model.has_other_size, model.has_own_clock
-        self._lidar = SoftwareLidar(pinhole, load_sdk(), has_other_size=other_size, has_own_clock=own_clock)
+        pinhole, celsius = self._world.rig.pinhole, self._world.celsius(instant)
+        other_size, own_clock = model.has_other_size, model.has_own_clock
+        self._lidar = SoftwareLidar(
+            pinhole, load_sdk(), celsius=celsius, has_other_size=other_size, has_own_clock=own_clock
+        )
 
     def _prepare(self, sensor: Any) -> None:
         """Nothing to set."""
@@ -109,6 +112,11 @@ class SimulatedCamera(LiveCamera):
     def _truth_depth_m(self, number: int) -> Float32 | None:
         instant = self._instants.get(number)
         return None if instant is None else self._world.truth_depth_m(instant)
+
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        """What the device tells, its temperatures those of the world's instant: the SDK keeps the first."""
+        told, celsius = super().telemetry(ending), self._world.celsius(self._instant())
+        return {name: celsius.get(name, value) for name, value in told.items()}
 
     def _run(self, inbox: Inbox, first: int) -> None:
         try:

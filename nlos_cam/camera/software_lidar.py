@@ -1,6 +1,6 @@
 """A lidar that librealsense takes for a device, and that delivers what is pushed into it."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,18 @@ class SoftwareLidar:
     """An `rs.software_device` with the L515's depth sensor: same sensor name, streams, formats and depth unit.
 
     It streams at one size; one that `has_other_size` can also be made to deliver frames of half the rows and columns.
-    Its timestamps are the host's time, unless it `has_own_clock`.
+    Its timestamps are the host's time, unless it `has_own_clock`. Its options are its depth unit and the temperatures
+    `celsius`, by the SDK's names, which stay as they are given.
     """
 
     def __init__(
-        self, intrinsics: Intrinsics, sdk: Any, *, has_other_size: bool = False, has_own_clock: bool = False
+        self,
+        intrinsics: Intrinsics,
+        sdk: Any,
+        *,
+        celsius: Mapping[str, float] | None = None,
+        has_other_size: bool = False,
+        has_own_clock: bool = False,
     ) -> None:
         self._sdk = sdk
         domains = sdk.timestamp_domain
@@ -33,6 +40,8 @@ class SoftwareLidar:
         self.device.register_info(sdk.camera_info.product_line, "L500")
         self._sensor: Any = self.device.add_sensor(SENSOR_NAME)
         self._sensor.add_read_only_option(sdk.option.depth_units, DEPTH_UNIT_M)
+        for name, value in (celsius or {}).items():
+            self._sensor.add_read_only_option(getattr(sdk.option, name), value)
         sizes = [intrinsics, intrinsics.scaled(intrinsics.width // 2, intrinsics.height // 2)]
         self._profiles: dict[tuple[str, tuple[int, ...]], Any] = {}
         for size in sizes if has_other_size else sizes[:1]:

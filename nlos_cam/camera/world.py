@@ -1,7 +1,7 @@
 """The world that a simulated camera sees: a scene's loop of poses, rendered ahead and cached; the sensor is live."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -9,6 +9,7 @@ import numpy as np
 from nlos_calibration.rig import Rig
 
 from nlos_cam.cache import cache_folder
+from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.frames import Float32
 from nlos_cam.render.renderer import MultiBounce
 from nlos_cam.render.scan import render_scan
@@ -19,10 +20,18 @@ Loop = tuple[list[MultiBounce], list[Float32]]
 """Echoes of each frame, and hidden depth in the middle of its scan."""
 OnProgress = Callable[[int, int], None]
 """Called with poses done and poses in all."""
+CELSIUS_ABOVE = {
+    "ldd_temperature": 0.0,
+    "mc_temperature": -3.0,
+    "ma_temperature": -1.0,
+    "apd_temperature": -5.0,
+    "humidity_temperature": -8.0,
+}
+"""Against the laser driver's, whose temperature is the sensor's. The names are the SDK's; the figures are chosen."""
 
 
 class World:
-    """A loop of instants. Frame numbers beyond the loop start it again, with other noise."""
+    """A loop of instants. Frame numbers beyond the loop start it again, with other noise; the device warms on."""
 
     def __init__(self, scene: SceneFile, echoes: list[MultiBounce], truths: list[Float32 | None]) -> None:
         self.scene = scene
@@ -37,7 +46,19 @@ class World:
     def images(self, number: int) -> SensedImages:
         """What the device delivers as frame `number`; the same number gives the same bits."""
         generator = np.random.default_rng([number, len(self._echoes)])
-        return self._sensor.expose(self._echoes[number % len(self._echoes)], generator)
+        echoes = self._echoes[number % len(self._echoes)]
+        return self._sensor.expose(echoes, generator, celsius=self._celsius(number))
+
+    def celsius(self, number: int) -> Mapping[str, float]:
+        """The device's temperatures at frame `number`, by the names of the options that tell them.
+
+        All warm as one body: they differ by what is always the same, and none comes later than the others.
+        """
+        return {name: self._celsius(number) + above for name, above in CELSIUS_ABOVE.items()}
+
+    def _celsius(self, number: int) -> float:
+        """The sensor's own; it was started at frame 0."""
+        return self.scene.sensor.celsius_at(number / FRAMES_PER_S)
 
     def truth_depth_m(self, number: int) -> Float32 | None:
         """The hidden depth (64, 64) at frame `number`; None where nothing is hidden."""

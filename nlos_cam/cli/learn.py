@@ -113,6 +113,10 @@ def evaluate(
     """Judge the reconstruction on objects never trained on, beside the trivial baselines."""
     folder, started = output_path(out, "evaluation", "", overwrite=overwrite), time.perf_counter()
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
+    if reconstructor.record.input != "raw maps":
+        raise SceneError(
+            f"these weights eat {reconstructor.record.input}, and datasets hold raw maps: use other weights"
+        )
     plan = dataset.DatasetPlan(rig_named(reconstructor.record.rig_name), dataset.TEST_SEED)
     if data:
         maps, plan = dataset.read(data)

@@ -1,27 +1,33 @@
-"""What the viewer draws: the layout, the bench in 3D, and each moment, as Rerun data."""
+"""What the viewer draws: the bench in 3D, the calibration if there is one, and each moment, as Rerun data."""
 
 import uuid
 from typing import Any
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
+from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
 from nlos_cam.objects.depth_image import object_box
-from nlos_cam.view.pictures import depth_span_m, hidden_rgb, infrared_grey, lidar_rgb, surface
+from nlos_cam.view.layout import TIMELINE, layout
+from nlos_cam.view.pictures import (
+    PICTURE_WIDTH,
+    change_span_m,
+    depth_span_m,
+    difference_rgb,
+    hidden_rgb,
+    infrared_grey,
+    lidar_rgb,
+    surface,
+)
 from nlos_cam.view.viewer import Moment
+from nlos_cam.view.wall_drawing import bench_drawings, wall_names, wall_pictures
+from nlos_cam.view.wall_text import calibration_text
 
 APPLICATION = "nlos-cam"
-TIMELINE = "time"
-PLOT_WINDOW_S = 20.0
-HIDDEN_SHARES, BENCH_SHARE, BOTTOM_PLOT_SHARE = (1.25, 1.0), 1.25, 1.2
-"""Widths of the views, side by side."""
-LIDAR_WIDTH = 320
-"""Depth and IR are thinned to about this many columns."""
 WALL_RGBA, OCCLUDER_RGBA, LIGHT_RGBA = (120, 130, 140, 70), (90, 150, 255, 90), (255, 210, 80, 200)
-BOX_RGB, LATENCY_RGB, PAGE_RGB = (150, 150, 150), (80, 200, 120), (13, 16, 17)
+BOX_RGB, LATENCY_RGB = (150, 150, 150), (80, 200, 120)
 OCCLUDER_HEIGHT_M = 0.3
 """How much is drawn of what has no end."""
 
@@ -29,18 +35,23 @@ OCCLUDER_HEIGHT_M = 0.3
 class Drawing:
     """One browser's recording: `draw` gives the bytes to send it."""
 
-    def __init__(self, rig: Rig, first: Moment) -> None:
-        self._rig, self._box = rig, object_box(rig)
+    def __init__(self, rig: Rig, first: Moment, measured: MeasuredWall | None = None) -> None:
+        self._rig, self._box, self._measured = rig, object_box(rig), measured
+        self._told = ""
+        self._difference_span_m = change_span_m(first.difference.depth_m) if measured and first.difference else None
         self._begun_s = first.published_s
         self._span_m = depth_span_m(first.frame.depth_m)
         self._recording = rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4())
         self._bytes = self._recording.binary_stream()
         self._recording.set_log_tick_enabled(False)
         self._recording.set_log_time_enabled(False)
-        self._recording.send_blueprint(layout(rig, with_truth=first.frame.truth_depth_m is not None))
+        names = wall_names(measured, self._difference_span_m) if measured else None
+        self._recording.send_blueprint(layout(rig, with_truth=first.frame.truth_depth_m is not None, wall=names))
         line = rr.SeriesLines(colors=[LATENCY_RGB], names=["latency"])
         self._log("latency/milliseconds", line, static=True)
         self._draw_bench()
+        if measured:
+            self._draw_wall(measured)
 
     def draw(self, moment: Moment, *, with_lidar: bool) -> bytes:
         """Draw a moment, and its lidar pictures if asked to; returns what the browser has yet to be sent."""
@@ -52,9 +63,9 @@ class Drawing:
             self._log("truth", rr.Image(hidden_rgb(truth_depth_m, self._box)))
         self._draw_surface(hidden_depth_m)
         if with_lidar:
-            step = max(1, moment.frame.ir.shape[1] // LIDAR_WIDTH)
-            self._log("lidar/depth", rr.Image(lidar_rgb(moment.frame.depth_m[::step, ::step], *self._span_m)))
-            self._log("lidar/infrared", rr.Image(infrared_grey(moment.frame.ir[::step, ::step])))
+            self._draw_lidar_pictures(moment)
+        if self._measured:
+            self._tell(calibration_text(self._measured.record, moment.warnings))
         return self._bytes.read() or b""
 
     def close(self) -> None:
@@ -62,6 +73,25 @@ class Drawing:
 
     def _log(self, path: str, thing: Any, *, static: bool = False) -> None:
         self._recording.log(path, thing, static=static)
+
+    def _draw_lidar_pictures(self, moment: Moment) -> None:
+        step = max(1, moment.frame.ir.shape[1] // PICTURE_WIDTH)
+        self._log("lidar/depth", rr.Image(lidar_rgb(moment.frame.depth_m[::step, ::step], *self._span_m)))
+        self._log("lidar/infrared", rr.Image(infrared_grey(moment.frame.ir[::step, ::step])))
+        if moment.difference is not None and self._difference_span_m is not None:
+            self._log("lidar/difference", rr.Image(difference_rgb(moment.difference.depth_m, self._difference_span_m)))
+
+    def _draw_wall(self, measured: MeasuredWall) -> None:
+        for path, drawing in bench_drawings(measured):
+            self._log(path, drawing, static=True)
+        for name, picture in wall_pictures(measured).items():
+            self._log(f"wall/{name}", rr.Image(picture), static=True)
+
+    def _tell(self, text: str) -> None:
+        """Show the calibration's page, if it says something else than before."""
+        if text != self._told:
+            self._told = text
+            self._log("calibration", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     def _draw_surface(self, depth_m: NDArray[np.float32]) -> None:
         mesh = surface(depth_m, self._box)
@@ -106,45 +136,6 @@ class Drawing:
         self._log(
             "bench/light", rr.LineStrips3D([_light_path(self._rig)], colors=[LIGHT_RGBA], radii=0.002), static=True
         )
-
-
-def layout(rig: Rig, *, with_truth: bool) -> rrb.Blueprint:
-    """What a newcomer sees: the reconstruction first, then what it was made from."""
-    hidden = [rrb.Spatial2DView(origin="reconstruction", name="Reconstruction (bright: near the wall)")]
-    if with_truth:
-        hidden.append(rrb.Spatial2DView(origin="truth", name="Truth (known in simulation)"))
-    bench = rrb.Spatial3DView(
-        origin="bench", name="Bench (drag to turn)", line_grid=False, eye_controls=_eye(rig), background=PAGE_RGB
-    )
-    window = rrb.VisibleTimeRange(
-        TIMELINE,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-PLOT_WINDOW_S),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
-    quiet = rrb.PlotLegend(visible=False)
-    plot = rrb.TimeSeriesView(origin="latency", name="Latency (milliseconds)", time_ranges=[window], plot_legend=quiet)
-    lidar = [
-        rrb.Spatial2DView(origin="lidar/depth", name="Lidar depth (red: near)"),
-        rrb.Spatial2DView(origin="lidar/infrared", name="Lidar infrared"),
-    ]
-    return rrb.Blueprint(
-        rrb.Vertical(
-            rrb.Horizontal(*hidden, bench, column_shares=[*HIDDEN_SHARES[: len(hidden)], BENCH_SHARE]),
-            rrb.Horizontal(*lidar, plot, column_shares=[1, 1, BOTTOM_PLOT_SHARE]),
-            row_shares=[3, 2],
-        ),
-        rrb.TimePanel(timeline=TIMELINE, play_state="following"),
-        collapse_panels=True,
-        auto_views=False,
-    )
-
-
-def _eye(rig: Rig) -> rrb.EyeControls3D:
-    """From above and behind the lidar, looking at the wall between lidar and box."""
-    box = object_box(rig)
-    middle = np.array([box.x_max_m / 2 + 0.03, 0.0, rig.lidar.distance_m / 2])
-    position = middle + np.array([-0.36, 0.42, 0.72])
-    return rrb.EyeControls3D(position=position, look_target=middle, eye_up=(0.0, 1.0, 0.0))
 
 
 def _seen_of_wall(rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

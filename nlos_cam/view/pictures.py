@@ -1,6 +1,7 @@
 """Maps as pictures and surfaces: pure functions from arrays to arrays."""
 
 from dataclasses import dataclass
+from math import floor, log10
 
 import cv2
 import numpy as np
@@ -13,10 +14,18 @@ from nlos_cam.objects.depth_image import cell_centres_m, image_from_depth
 Rgb = NDArray[np.uint8]
 BACKGROUND_RGB = (13, 16, 17)
 """The page's own dark: what has no surface has no colour."""
+PICTURE_WIDTH = 320
+"""What the lidar sees pixel by pixel is thinned to about this many columns."""
 DARKEST = 60
 """Where in the colour map the farthest surface starts, so that it stands out from the background."""
 JUMP_M = 0.03
 """Neighbours that differ by more are not one surface."""
+DIVERGING_RGB = (255, 150, 60), (70, 155, 130), (50, 160, 255)
+"""Red, green and blue of what is nearer, as expected, and farther."""
+SATURATED_RGB = (255, 0, 200)
+ROUND_STEPS = 1.0, 2.0, 3.0, 5.0, 10.0
+CHANGED_M, FEW_CHANGED, QUIET_SPAN_M = 0.01, 0.02, 0.02
+"""Less is noise and ripples; where few cells differ by more, the span shows these."""
 
 
 def hidden_rgb(depth_m: Float32, box: ObjectBox) -> Rgb:
@@ -47,6 +56,45 @@ def depth_span_m(depth_m: Float32) -> tuple[float, float]:
         return 0.0, 1.0
     near_m, far_m = np.percentile(seen, [1, 99])
     return float(near_m), float(far_m)
+
+
+def difference_rgb(further: NDArray[np.floating], span: float) -> Rgb:
+    """What is farther than expected as a picture: blue, and nearer red, grey as expected; NaN is dark."""
+    share = np.clip(np.nan_to_num(further) / span, -1.0, 1.0)
+    rgb = np.stack([np.interp(share, (-1.0, 0.0, 1.0), stops) for stops in DIVERGING_RGB], axis=-1).astype(np.uint8)
+    rgb[np.isnan(further)] = BACKGROUND_RGB
+    return rgb
+
+
+def noise_rgb(noise: NDArray[np.floating], span: float) -> Rgb:
+    """A spread as a picture, bright where it is large; NaN is dark."""
+    rgb = _coloured(DARKEST + np.clip(np.nan_to_num(noise) / span, 0.0, 1.0) * (255 - DARKEST), cv2.COLORMAP_INFERNO)
+    rgb[np.isnan(noise)] = BACKGROUND_RGB
+    return rgb
+
+
+def saturated_rgb(ir: NDArray[np.floating], saturated: NDArray[np.floating]) -> Rgb:
+    """Mean IR counts in grey, and in its own colour what was ever saturated."""
+    rgb = np.repeat(infrared_grey(np.nan_to_num(ir).astype(np.uint8))[..., np.newaxis], 3, axis=-1)
+    rgb[saturated > 0.0] = SATURATED_RGB
+    return rgb
+
+
+def round_span(values: NDArray[np.floating], percent: float = 95.0, otherwise: float = 1.0) -> float:
+    """The next of 1, 2, 3, 5, 10 times a power of ten, above most magnitudes; `otherwise` where all are zero or NaN."""
+    seen = np.abs(values[np.isfinite(values)])
+    most = float(np.percentile(seen, percent)) if seen.size else 0.0
+    if most <= 0.0:
+        return otherwise
+    power = 10.0 ** floor(log10(most))
+    return float(f"{next(step * power for step in ROUND_STEPS if most <= step * power * (1 + 1e-6)):g}")
+
+
+def change_span_m(difference_m: Float32) -> float:
+    """A round span that most of what has changed lies in; an occluder, far before the wall, may lie beyond."""
+    changed_m = difference_m[np.abs(difference_m) > CHANGED_M]  # without NaN
+    few = changed_m.size < FEW_CHANGED * difference_m.size
+    return QUIET_SPAN_M if few else round_span(changed_m, percent=75.0)
 
 
 @dataclass(frozen=True)

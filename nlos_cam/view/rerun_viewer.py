@@ -5,6 +5,7 @@ from collections.abc import Callable
 from threading import Event
 from typing import Self
 
+from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Rig
 
 from nlos_cam.view.assets import page_assets
@@ -23,9 +24,11 @@ WAIT_S = 0.5
 class RerunViewer:
     """Serves the view while entered. Nobody watching costs nothing: drawing is done for each browser, in its thread."""
 
-    def __init__(self, rig: Rig, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, rig: Rig, measured: MeasuredWall | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.address: str | None = None
-        self._rig, self._clock = rig, clock
+        self._rig, self._measured, self._clock = rig, measured, clock
         self._moments = Latest[Moment]()
         self._closed = Event()
 
@@ -54,7 +57,7 @@ class RerunViewer:
                 if newest is None:
                     continue
                 count, moment = newest
-                drawing = drawing or Drawing(self._rig, moment)
+                drawing = drawing or Drawing(self._rig, moment, self._measured)
                 send(drawing.draw(moment, with_lidar=drawn % LIDAR_EVERY == 0))
                 drawn += 1
                 self._closed.wait(max(0.0, begun_s + DRAW_PERIOD_S - self._clock()))

@@ -11,6 +11,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam import frame_reader
+from nlos_cam.bench import Bench
 from nlos_cam.camera import Recording, inbox
 from nlos_cam.camera.replay import ReplayCamera
 from nlos_cam.camera.replay_sdk import SdkReplayCamera
@@ -19,6 +20,7 @@ from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
 from nlos_cam.live import run_live
 from nlos_cam.live_report import LiveReport
+from nlos_cam.processing import Processing
 from nlos_cam.render.fault_record import Fault
 from nlos_cam.render.sensor import SensedImages
 from nlos_cam.view.viewer import Moment, NullViewer
@@ -88,7 +90,8 @@ def instant_of(frame: Frame) -> int:
 def live(camera: SimulatedCamera, last: int = LAST, **options: Any) -> tuple[list[Moment], LiveReport]:
     viewer = ListViewer()
     with camera:
-        report = run_live(Until(camera, last), RIG, network, viewer, stop=Event(), **options)  # type: ignore[arg-type]
+        processing = Processing(Bench(RIG), network)
+        report = run_live(Until(camera, last), processing, viewer, stop=Event(), **options)  # type: ignore[arg-type]
     assert report.frames == len(viewer.moments)
     return viewer.moments, report
 
@@ -202,7 +205,7 @@ def test_stopping_ends_a_wait_for_a_device_that_is_gone(camera: Make, monkeypatc
     timer = Timer(1.0, stop.set)
     timer.start()
     with gone:
-        report = run_live(gone, RIG, network, NullViewer(), stop=stop)
+        report = run_live(gone, Processing(Bench(RIG), network), NullViewer(), stop=stop)
     assert report.frames == 5
     timer.join()
 

@@ -51,7 +51,7 @@ frames = 1_000_000
 
 
 class FakeNetwork:
-    runtime, record = "nothing at all", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum)
+    runtime, record = "nothing at all", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
 
     def __call__(self, *_: np.ndarray) -> np.ndarray:
         return np.full((1, 64, 64), 0.5, np.float32)
@@ -79,7 +79,7 @@ def run(folder: Path, faults: str, *options: str) -> int:
 def test_live_goes_on_and_counts_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path, PASSING, "--seconds", "4", "--json") == 0
     report = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms", "counts"}
+    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings"}
     assert {"duplicate", "wrong_size", "incomplete", "blank", "replugged", "dropped_camera"} <= set(report["counts"])
     assert report["counts"]["replugged"] == 1
     assert 0 < report["counts"]["blank"] <= 10

@@ -12,16 +12,18 @@ from typing import Any
 from fake_lidar import FakeFrame, FakeLidar, FakeProfile, Named
 
 SIZES = [(1024, 768), (640, 480), (320, 240)]
+COLOUR_SIZES = [(1920, 1080), (1280, 720), (960, 540), (640, 480)]
 GONE = "failed to set power state"
 
 
 class FakeSensor:
-    """A handle on the lidar's depth sensor."""
+    """A handle on the lidar's depth sensor, or on its colour sensor."""
 
-    def __init__(self, lidar: FakeLidar, generation: int) -> None:
+    def __init__(self, lidar: FakeLidar, generation: int, *, colour: bool = False) -> None:
         self.lidar, self.generation = lidar, generation
-        sizes = [(320, 240)] if lidar.info.get("usb_type_descriptor", "").startswith("2") else SIZES
-        self.profiles = [FakeProfile(stream, size, lidar) for size in sizes for stream in lidar.streams]
+        smallest = slice(-1, None) if lidar.info.get("usb_type_descriptor", "").startswith("2") else slice(None)
+        sizes, streams = (COLOUR_SIZES, ("color",)) if colour else (SIZES, lidar.streams)
+        self.profiles = [FakeProfile(stream, size, lidar) for size in sizes[smallest] for stream in streams]
 
     def _check(self) -> None:
         if not self.lidar.plugged or self.generation != self.lidar.generation:
@@ -91,7 +93,8 @@ class FakeDevice:
     def query_sensors(self) -> list[FakeSensor]:
         if self.generation != self.lidar.generation:
             raise RuntimeError(GONE)
-        return [FakeSensor(self.lidar, self.generation)]
+        depth = FakeSensor(self.lidar, self.generation)
+        return [depth, FakeSensor(self.lidar, self.generation, colour=True)] if self.lidar.colour else [depth]
 
     def hardware_reset(self) -> None:
         """It leaves the bus and comes back, with its calibration."""

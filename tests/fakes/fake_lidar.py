@@ -12,6 +12,9 @@ from nlos_cam.camera.l515 import NEAR_WALL
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.render.sensor import DEPTH_UNIT_M
 
+COLOUR_FROM_DEPTH = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.6, 0.8, 0.014], [0.0, -0.8, 0.6, -0.007]])
+"""Where the colour camera is: far from the L515's, so that nothing passes by chance."""
+LENS = [0.15, -0.5, -0.001, 0.0006, 0.47]
 Named = SimpleNamespace  # a member of one of the SDK's enumerations
 PACE_S = 0.002
 
@@ -39,7 +42,7 @@ class FakeProfile:
         return Named(name=self.stream)
 
     def format(self) -> Named:
-        return Named(name=FORMATS[self.stream])
+        return Named(name="rgb8" if self.stream == "color" else FORMATS[self.stream])
 
     def fps(self) -> int:
         return 30
@@ -57,7 +60,17 @@ class FakeProfile:
         width, height = self.size
         if self.lidar.uncalibrated:
             raise RuntimeError(f"intrinsics for resolution {width},{height} doesn't exist")
-        return SimpleNamespace(width=width, height=height, fx=460.0, fy=461.0, ppx=width / 2, ppy=height / 2)
+        made = SimpleNamespace(width=width, height=height, fx=460.0, fy=461.0, ppx=width / 2, ppy=height / 2)
+        made.model, made.coeffs = Named(name="none"), [0.0] * 5
+        if self.stream == "color":
+            made.model, made.coeffs = Named(name=self.lidar.lens_model), LENS
+        return made
+
+    def get_extrinsics_to(self, other: "FakeProfile") -> SimpleNamespace:
+        """From colour to depth, the only ones that are asked for."""
+        assert (self.stream, other.stream) == ("color", "depth")
+        turn, shift = COLOUR_FROM_DEPTH[:, :3], COLOUR_FROM_DEPTH[:, 3]
+        return SimpleNamespace(rotation=turn.ravel().tolist(), translation=(-turn.T @ shift).tolist())
 
 
 @dataclass(frozen=True)
@@ -125,6 +138,10 @@ class FakeLidar:
         self.saturated_share: Callable[[float], float] = lambda _: 0.0
         """Share of infrared pixels at 255, by laser power."""
         self.zero_ms = 0.0
+        self.colour: Callable[[int], int] | None = None
+        """What its colour camera sees, one grey, by frame number; None where it has no such camera. Of two sensors one
+        runs at a time."""
+        self.lens_model = "brown_conrady"
         self._callback: Callable[[FakeFrame], None] | None = None
         self._stopping, self._thread = Event(), None
 
@@ -171,13 +188,17 @@ class FakeLidar:
             self.flaps, self.back_after = self.flaps - 1, 2
             self.unplug()
 
-    def deliver(self, numbers: range, streams: tuple[str, ...] = tuple(FORMATS)) -> None:
+    def deliver(self, numbers: range, streams: tuple[str, ...] = (*FORMATS, "color")) -> None:
         for number in numbers:
             for profile in self.opened:
                 if self._callback and profile.stream in streams:
-                    self._callback(FakeFrame(profile, number, self.zero_ms + number * 1000 / 30, self._pixels(profile)))
+                    self._callback(
+                        FakeFrame(profile, number, self.zero_ms + number * 1000 / 30, self._pixels(profile, number))
+                    )
 
-    def _pixels(self, profile: FakeProfile) -> np.ndarray:
+    def _pixels(self, profile: FakeProfile, number: int) -> np.ndarray:
+        if profile.stream == "color" and self.colour:
+            return np.full((*profile.size[::-1], 3), self.colour(number), np.uint8)
         pixels = np.full(profile.size[::-1], 240, np.uint16 if profile.stream == "depth" else np.uint8)
         if profile.stream == "infrared":
             share = self.saturated_share(self.options.get("laser_power", 0.0))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from nlos_cam.camera import Camera, Recording, open_camera
+from nlos_cam.camera.colour import look_in_colour
 from nlos_cam.camera.l515 import NEAR_WALL, L515Camera, list_devices
 from nlos_cam.camera.replay import ReplayCamera, verify
 
@@ -71,6 +72,16 @@ def test_the_wall_is_seen_near_and_unsaturated(camera: Camera) -> None:
     assert np.count_nonzero(~np.isnan(frame.depth_m)) > 0.5 * frame.depth_m.size
     assert np.count_nonzero(frame.ir == 255) < 0.001 * frame.ir.size
     assert frame.settings["laser_power"] > 0
+
+
+def test_colour_is_looked_at_before_depth_and_leaves_it_alone(camera: Camera) -> None:
+    view = look_in_colour(camera.uri, 10)
+    assert view.image.shape == (view.intrinsics.height, view.intrinsics.width)
+    assert 5.0 < view.image.mean() < 250.0
+    assert view.distortion.any()
+    assert 0.005 < np.linalg.norm(view.lidar_from_camera[:3, 3]) < 0.03
+    with camera:
+        assert next(iter(camera)).depth_m.shape == (480, 640)
 
 
 def test_temperatures_are_told_from_five_seconds_after_the_start(camera: Camera) -> None:

@@ -1,10 +1,20 @@
 import importlib
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from datetime import date
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
+from nlos_calibration.bare_wall import BareWall
+from nlos_calibration.geometry import normal_from_angles, wall_from_plane
+from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.range_noise import depth_noise_m
+from nlos_calibration.rig import load_rig
+from nlos_calibration.wall import fit_wall, wall_depth
+from nlos_calibration.wall_record import wall_record
 from rosbags.rosbag1 import Reader, Writer
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -67,3 +77,37 @@ def noise_bag_uncompressed(noise_bag: Path, tmp_path_factory: pytest.TempPathFac
     """The same frames, where no checksum guards them."""
     target = tmp_path_factory.mktemp("bags") / "uncompressed.bag"
     return rewrite(noise_bag, target, lambda _, time_ns, raw: [(time_ns, raw)])
+
+
+def exact_wall(
+    distance_m: float = 0.2, yaw_deg: float = 40.0, pitch_deg: float = 3.0, *, width: int = 64, **others: Any
+) -> MeasuredWall:
+    """A wall as it is measured without noise, by 60 frames of an even light; `others` are fields of its record."""
+    pinhole = load_rig("paper-rig").pinhole.scaled(width, 3 * width // 4)
+    pose = wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m)
+    depth_m = wall_depth(pose, pinhole)
+    depth_m[depth_m > 9.0] = np.nan
+    fit = fit_wall(depth_m, pinhole, np.random.default_rng(0))
+    blank, cells = np.zeros(depth_m.shape, np.float32), np.zeros((64, 80), np.float32)
+    reference = BareWall(
+        depth_m=depth_m.astype(np.float32),
+        depth_std_m=depth_noise_m(depth_m).astype(np.float32),
+        ir=blank + np.float32(48.0),
+        ir_std=blank,
+        saturated=blank,
+        inliers=np.isfinite(depth_m),
+        map_depth_m=cells,
+        map_depth_std_m=cells,
+        map_intensity=cells,
+        map_intensity_std=cells,
+        frames=60,
+        intrinsics=pinhole,
+    )
+    fields = {"noise_scale": 1.0, **others}
+    record = wall_record(fit, pinhole, camera="l515:f0246262", frames=60, created=date(2026, 1, 31), others=fields)
+    return MeasuredWall(record, reference)
+
+
+@pytest.fixture(scope="session")
+def measured() -> Callable[..., MeasuredWall]:
+    return exact_wall

@@ -5,7 +5,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from nlos_calibration.board import BOARDS
-from nlos_calibration.board_corners import MIN_CORNERS, IrMean, even_contrast, find_corners
+from nlos_calibration.board_corners import MIN_CORNERS, even_contrast, find_corners
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
@@ -91,6 +91,11 @@ def test_an_image_without_a_board_is_refused(value: int) -> None:
         find_corners(np.full((480, 640), value, np.uint8), A4)
 
 
+def test_the_advice_is_for_the_light_that_was_looked_in() -> None:
+    with pytest.raises(BoardRefusedError, match=r"no board .* in colour: .* light the room"):
+        find_corners(np.zeros((480, 640), np.uint8), A4, "colour")
+
+
 def test_too_little_of_a_board_is_refused_with_what_was_seen(views: ModuleType, clean: Array) -> None:
     noisy = views.frames_of(clean, np.random.default_rng(1), 30).mean(axis=0)
     noisy[:, 150:] = 0.0
@@ -101,13 +106,3 @@ def test_too_little_of_a_board_is_refused_with_what_was_seen(views: ModuleType, 
 def test_another_board_is_not_taken_for_this_one(clean: Array) -> None:
     with pytest.raises(BoardRefusedError):
         find_corners(clean, BOARDS["a3"].model_copy(update={"dictionary": "DICT_4X4_250", "squares_x": 5}))
-
-
-def test_the_mean_is_that_of_the_frames() -> None:
-    frames = np.random.default_rng(0).integers(0, 256, (7, 4, 5), np.uint8)
-    mean = IrMean(4, 5)
-    np.testing.assert_array_equal(mean.mean(), np.zeros((4, 5)))
-    for frame in frames:
-        mean.add(frame)
-    np.testing.assert_allclose(mean.mean(), frames.mean(axis=0))
-    assert mean.frames == 7

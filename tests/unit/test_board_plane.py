@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from nlos_calibration.board import BOARDS
@@ -82,6 +84,14 @@ def test_the_scales_uncertainty_is_one_of_the_distance_alone() -> None:
     )
     assert ruled.distance_std_m == pytest.approx(np.hypot(exact.distance_std_m, 0.01 * exact.distance_m))
     assert ruled.yaw_std_deg == pytest.approx(exact.yaw_std_deg)
+
+
+def test_a_focal_length_that_is_off_moves_the_plane_as_far_as_its_uncertainty_says() -> None:
+    exact, unsure = (fit_board(corners(sigma_px=0.0), A4, PINHOLE, focal_std=std) for std in (0.0, 1e-4))
+    longer = replace(PINHOLE, fx=PINHOLE.fx * 1.0001, fy=PINHOLE.fy * 1.0001)
+    change = fit_board(corners(sigma_px=0.0), A4, longer).slopes - exact.slopes
+    np.testing.assert_allclose(unsure.covariance - exact.covariance, np.outer(change, change), rtol=0.02, atol=1e-11)
+    assert np.linalg.norm(change) > 1e-5
 
 
 @pytest.mark.parametrize("stretch", [-0.01, 0.005])

@@ -6,13 +6,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 from nlos_calibration.board import BOARDS
+from nlos_calibration.board_corners import Light
+from nlos_calibration.board_view import BoardView
 from nlos_calibration.board_wall import WallByBoard, wall_with_board
 from nlos_calibration.errors import BoardRefusedError, WallRefusedError
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 TOOLS = Path(__file__).parents[2] / "tools"
 RIG = load_rig("bare-wall")
@@ -25,11 +24,12 @@ def views(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("board_view")
 
 
-def infrared(views: ModuleType, scale: float = 1.0) -> Array:
+def infrared(views: ModuleType, scale: float = 1.0) -> BoardView:
     """The mean of 20 frames of a board of that scale on the wall of the rig."""
     seen = views.View(RIG.wall_from_lidar, PINHOLE)
     placed = replace(views.at_near_edge(A4, seen), scale=scale)
-    return views.frames_of(views.clean_view(A4, seen, placed), np.random.default_rng(0), 20).mean(axis=0)
+    frames = views.frames_of(views.clean_view(A4, seen, placed), np.random.default_rng(0), 20)
+    return BoardView(frames.mean(axis=0), PINHOLE)
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def depth(views: ModuleType) -> WallFit:
 
 
 def test_depth_and_board_that_agree_are_used_together(views: ModuleType, depth: WallFit) -> None:
-    fit, record = wall_with_board(depth, infrared(views), A4, PINHOLE, measured=False)
+    fit, record = wall_with_board(depth, infrared(views), A4, measured=False)
     assert isinstance(fit, WallFit)
     assert (fit.verdict, record.used, record.causes, record.depth_refused) == ("good", "both", (), "")
     assert "agree" in fit.advice
@@ -56,7 +56,7 @@ def test_depth_and_board_that_agree_are_used_together(views: ModuleType, depth: 
 
 @pytest.mark.parametrize(("measured", "used"), [(False, "depth"), (True, "board")])
 def test_a_board_printed_at_97_percent_is_noticed(views: ModuleType, depth: WallFit, measured: bool, used: str) -> None:
-    fit, record = wall_with_board(depth, infrared(views, 0.97), A4, PINHOLE, measured=measured)
+    fit, record = wall_with_board(depth, infrared(views, 0.97), A4, measured=measured)
     assert isinstance(fit, WallFit)
     assert (fit.verdict, record.used) == ("doubtful", used)
     assert record.disagreement_m == pytest.approx(0.2 / 0.97 - 0.2, abs=5e-4)
@@ -66,15 +66,25 @@ def test_a_board_printed_at_97_percent_is_noticed(views: ModuleType, depth: Wall
     assert fit.distance_m == pytest.approx(expected_m, abs=5e-4)
 
 
+@pytest.mark.parametrize("light", ["infrared", "colour"])
+def test_a_disagreement_in_colour_may_be_the_colour_cameras(views: ModuleType, depth: WallFit, light: Light) -> None:
+    fit, record = wall_with_board(depth, replace(infrared(views, 0.97), light=light), A4, measured=False)
+    assert record.seen_in == light
+    for told in (fit.advice, record.causes[-1]):
+        assert ("the colour camera's pose" in told) is (light == "colour")
+    _, agreed = wall_with_board(depth, replace(infrared(views), light=light), A4, measured=False)
+    assert (agreed.seen_in, agreed.causes) == (light, ())
+
+
 def test_squares_measured_at_97_percent_bring_the_two_together(views: ModuleType, depth: WallFit) -> None:
-    _, record = wall_with_board(depth, infrared(views, 0.97), A4.measured(29.1), PINHOLE, measured=True)
+    _, record = wall_with_board(depth, infrared(views, 0.97), A4.measured(29.1), measured=True)
     assert record.used == "both"
     assert record.printed.square_mm == 29.1
 
 
 def test_where_depth_is_refused_the_board_is_used_and_doubted(views: ModuleType) -> None:
     refusal = WallRefusedError("the wall is not flat: take another")
-    fit, record = wall_with_board(refusal, infrared(views), A4, PINHOLE, measured=False)
+    fit, record = wall_with_board(refusal, infrared(views), A4, measured=False)
     assert isinstance(fit, WallByBoard)
     assert (fit.verdict, record.used, record.depth_refused) == ("doubtful", "board", str(refusal))
     assert str(refusal) in fit.advice
@@ -86,18 +96,18 @@ def test_where_depth_is_refused_the_board_is_used_and_doubted(views: ModuleType)
 
 def test_a_doubt_of_the_depths_stays(views: ModuleType, depth: WallFit) -> None:
     doubted = replace(depth, verdict="doubtful", advice="half of the view differs")
-    fit, _ = wall_with_board(doubted, infrared(views), A4, PINHOLE, measured=False)
+    fit, _ = wall_with_board(doubted, infrared(views), A4, measured=False)
     assert (fit.verdict, fit.advice) == ("doubtful", "half of the view differs")
 
 
 def test_a_wall_out_of_range_is_so_by_both(views: ModuleType) -> None:
     """The pinhole of another lidar, as it were: all the same, but twice as far away."""
     refusal = WallRefusedError("none")
-    fit, _ = wall_with_board(refusal, infrared(views), A4.measured(60.0), PINHOLE, measured=True)
+    fit, _ = wall_with_board(refusal, infrared(views), A4.measured(60.0), measured=True)
     assert fit.distance_m == pytest.approx(0.4, abs=0.005)
     assert "move the lidar 10 cm closer" in fit.advice
 
 
 def test_without_a_board_there_is_a_refusal(depth: WallFit) -> None:
     with pytest.raises(BoardRefusedError, match="no board"):
-        wall_with_board(depth, np.full((480, 640), 40.0), A4, PINHOLE, measured=False)
+        wall_with_board(depth, BoardView(np.full((480, 640), 40.0), PINHOLE), A4, measured=False)

@@ -107,6 +107,19 @@ def test_options_and_names_are_those_that_the_sdk_tells(bag: BagFile) -> None:
     assert bag.sensor_name("depth") in {"L500 Depth Sensor", "Stereo Module"}
 
 
+def test_lenses_and_poses_are_those_that_the_sdk_tells(bag: BagFile) -> None:
+    sensors = load_sdk().context().load_device(str(bag.path)).as_playback().query_sensors()
+    cameras = {profile.stream_type().name: profile for one in sensors for profile in one.get_stream_profiles()}
+    for stream, camera in cameras.items():
+        told = camera.as_video_stream_profile().get_intrinsics()
+        model, coefficients = bag.lens(stream)
+        assert (model, list(coefficients)) == (told.model.name, told.coeffs)
+        for other, seen_from in cameras.items():
+            pose, extrinsics = bag.pose(stream, other), seen_from.get_extrinsics_to(camera)
+            np.testing.assert_allclose(pose[:3, :3], np.reshape(extrinsics.rotation, (3, 3)).T, atol=1e-6)
+            np.testing.assert_allclose(pose[:3, 3], extrinsics.translation, atol=1e-7)
+
+
 def test_frames_come_in_the_order_in_which_they_were_recorded(bag: BagFile) -> None:
     places = list(bag.order(bag.streams))
     assert all(one.time_ns <= other.time_ns for one, other in pairwise(places))

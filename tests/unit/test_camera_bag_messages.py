@@ -1,11 +1,22 @@
 import struct
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from nlos_calibration.projection import Intrinsics
 
-from nlos_cam.camera.bag_messages import ENCODINGS, depth_unit_m, metadata, parse, pixels, sdk_name, timestamp_s
+from nlos_cam.camera.bag_messages import (
+    ENCODINGS,
+    depth_unit_m,
+    lens_of,
+    metadata,
+    parse,
+    pixels,
+    pose_of,
+    sdk_name,
+    timestamp_s,
+)
 from nlos_cam.camera.sdk import load_sdk
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -84,3 +95,29 @@ def test_metadata_are_numbers_by_name_and_a_clock() -> None:
     assert found.domain == "system_time"
     assert found.values == {"system_time": 15.25, "frame_counter": 169.0}
     assert not metadata([]).domain
+
+
+def transform(x: float, y: float, z: float, w: float) -> SimpleNamespace:
+    shift = SimpleNamespace(x=0.1, y=0.2, z=-0.3)
+    return SimpleNamespace(rotation=SimpleNamespace(x=x, y=y, z=z, w=w), translation=shift)
+
+
+def test_a_transform_is_a_pose_whichever_sign_its_quaternion_has() -> None:
+    axis, angle = np.array([0.6, 0.0, -0.8]), 0.7
+    expected = np.eye(4)
+    expected[:3, :3], expected[:3, 3] = cv2.Rodrigues(axis * angle)[0], [0.1, 0.2, -0.3]
+    quaternion = np.append(np.sin(angle / 2) * axis, np.cos(angle / 2))
+    for sign in (1.0, -1.0):
+        np.testing.assert_allclose(pose_of(transform(*(sign * quaternion))), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0), (float("nan"), 0.0, 0.0, 1.0)])
+def test_a_quaternion_that_turns_nothing_is_an_error(quaternion: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="a rotation by the quaternion"):
+        pose_of(transform(*quaternion))
+
+
+def test_a_lens_is_a_model_and_its_coefficients() -> None:
+    model, coefficients = lens_of(SimpleNamespace(distortion_model="Brown Conrady", D=[0.1, 0.2, 0.3, 0.4, 0.5]))
+    assert model in load_sdk().distortion.__members__
+    np.testing.assert_array_equal(coefficients, [0.1, 0.2, 0.3, 0.4, 0.5])

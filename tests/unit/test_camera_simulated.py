@@ -28,6 +28,22 @@ class BusyClock:
         return stop.wait(0.001)
 
 
+class SetClock:
+    """A clock that stands until it is set."""
+
+    def __init__(self) -> None:
+        self.time_s = 0.0
+
+    def now(self) -> float:
+        return self.time_s
+
+    def wait(self, stop: Event, seconds: float) -> bool:
+        due_s = self.time_s + seconds
+        while self.time_s < due_s and not stop.wait(0.001):
+            pass
+        return stop.is_set()
+
+
 def numbers_recorded(path: Path, world: Any, clock: Any, frames: int) -> list[int]:
     with SimulatedCamera("sim", world, clock=clock, recording=Recording(path, frames=frames)) as camera:
         assert all(frame is not None for frame in camera)
@@ -45,6 +61,23 @@ def test_frames_carry_the_truth_of_their_number(noise_world: Any, hurried_clock:
     with SimulatedCamera("sim", noise_world(), clock=hurried_clock()) as camera:
         for frame in islice(camera, 6):
             np.testing.assert_array_equal(frame.truth_depth_m, noise_world().truth_depth_m(frame.frame_number))
+
+
+def test_it_tells_the_temperatures_of_the_instant_while_it_streams(noise_world: Any) -> None:
+    clock = SetClock()
+    with SimulatedCamera("sim", noise_world(), clock=clock) as camera:
+        assert next(iter(camera)).settings["ldd_temperature"] == 20.0  # as it started
+        for instant in (0, 30, 45):
+            clock.time_s = (instant + 0.5) / 30
+            assert camera.telemetry("_temperature") == {"ldd_temperature": 20.0 + instant}
+        assert set(camera.telemetry()) >= {"depth_units", "ldd_temperature"}
+    assert camera.telemetry() == camera.telemetry("_temperature") == {}
+
+
+def test_a_recording_holds_the_temperature_that_it_began_with(noise_bag: Path) -> None:
+    with ReplayCamera(noise_bag) as replayed:
+        assert next(iter(replayed)).settings["ldd_temperature"] == 20.0
+        assert replayed.telemetry("_temperature") == {"ldd_temperature": 20.0}
 
 
 def test_a_world_that_fails_fails_its_reader(noise_world: Any, hurried_clock: Any) -> None:

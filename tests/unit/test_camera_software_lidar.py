@@ -8,15 +8,17 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera.session import read_settings
 from nlos_cam.camera.software_lidar import SoftwareLidar
 from nlos_cam.camera.streams import intrinsics_of, is_needed, stream_name
 
 PINHOLE = load_rig("paper-rig").pinhole
+CELSIUS = {"ldd_temperature": 41.5, "apd_temperature": 36.25}
 
 
 @pytest.fixture(scope="module")
 def lidar() -> SoftwareLidar:
-    return SoftwareLidar(PINHOLE, load_sdk())
+    return SoftwareLidar(PINHOLE, load_sdk(), celsius=CELSIUS)
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +37,13 @@ def test_it_has_the_l515s_depth_sensor_and_unit(lidar: SoftwareLidar) -> None:
     [sensor] = lidar.device.query_sensors()
     assert sensor.get_info(load_sdk().camera_info.name) == "L500 Depth Sensor"
     assert sensor.as_depth_sensor().get_depth_scale() == pytest.approx(0.00025)
+
+
+def test_it_tells_the_temperatures_that_it_is_given(lidar: SoftwareLidar) -> None:
+    [sensor] = lidar.device.query_sensors()
+    assert read_settings(sensor, "_temperature") == CELSIUS
+    [cold] = SoftwareLidar(PINHOLE, load_sdk()).device.query_sensors()
+    assert read_settings(cold, "_temperature") == {}
 
 
 def test_it_has_the_three_streams_in_the_formats_we_read(profiles: dict[str, Any]) -> None:

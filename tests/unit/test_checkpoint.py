@@ -157,7 +157,7 @@ def test_a_corrupt_record_is_named(folder: Path, content: bytes) -> None:
         load_record(folder)
 
 
-@pytest.mark.parametrize(("field", "value"), [("rig_name", None), ("colour", "red")])
+@pytest.mark.parametrize(("field", "value"), [("rig_name", None), ("colour", "red"), ("input", "pictures")])
 def test_a_wrong_field_of_the_record_is_named(folder: Path, field: str, value: str | None) -> None:
     facts = RECORD.model_dump(mode="json")
     if value is None:

@@ -1,6 +1,7 @@
 import json
 from collections.abc import Callable, Iterator
 from datetime import datetime
+from io import StringIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 import typer
 from nlos_calibration.errors import CalibrationError, WallRefusedError
-from nlos_calibration.rig import load_rig
+from nlos_calibration.measured_wall import load_measured
+from nlos_calibration.rig import Occluder, OccluderRecord, load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import load_wall
 
@@ -33,6 +35,9 @@ class FakeCamera:
         depth_m[40:80, 40:100] *= patch
         self.depth_m = depth_m.astype(np.float32)
 
+    def telemetry(self, ending: str = "") -> dict[str, float]:
+        return {"ldd_temperature": 40.0} if "ldd_temperature".endswith(ending) else {}
+
     def __enter__(self) -> Self:
         return self
 
@@ -48,6 +53,11 @@ class FakeCamera:
         for number in range(self.frames):
             self.taken += 1
             yield Frame(self.depth_m, counts, counts, number / 30.0, number, self.intrinsics, {"laser_power": 80.0})
+
+
+@pytest.fixture
+def pressed_enter(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", StringIO("\n"))
 
 
 @pytest.fixture
@@ -77,6 +87,7 @@ def test_the_record_and_the_json_say_the_same(call: Call, tmp_path: Path, capsys
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     record = load_wall(out)
     assert result.pop("out") == str(out)
+    assert result.pop("report") == str(tmp_path / "wall.html")
     assert result == record.model_dump(mode="json", include=set(result))
     assert set(result) >= {"distance_m", "facing_deg", "residual_m", "inlier_fraction", "verdict", "frames"}
     assert set(result) >= {"distance_std_m", "facing_std_deg", "yaw_std_deg", "pitch_std_deg", "range_offset_m"}
@@ -108,6 +119,38 @@ def test_the_device_is_in_the_record(call: Call, tmp_path: Path) -> None:
     call("--wall", "--camera", "l515", "--out", str(tmp_path / "w.toml"))
     record = load_wall(tmp_path / "w.toml")
     assert (record.serial, record.firmware, record.settings) == ("f0246262", "1.5.8.1", {"laser_power": 80.0})
+    assert record.temperatures_c == {"ldd_temperature": 40.0}
+
+
+def test_the_bare_wall_lies_beside_its_record(call: Call, tmp_path: Path) -> None:
+    camera = call("--wall", "--camera", "l515", "--out", str(tmp_path / "w.toml"))
+    measured = load_measured(tmp_path / "w.toml")
+    assert measured.record.reference == "w.npz"
+    assert measured.reference is not None
+    assert (measured.reference.frames, measured.reference.settings) == (10, {"laser_power": 80.0})
+    np.testing.assert_allclose(measured.reference.depth_m, camera.depth_m, rtol=1e-6)
+    assert measured.reference.inliers.mean() == pytest.approx(measured.record.inlier_fraction)
+    assert measured.record.footprint_share == 1.0
+
+
+def test_an_occluder_that_was_entered_is_the_rigs(
+    call: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "w.toml"
+    call("--wall", "--camera", "sim", "--occluder-x-m", "0.25", "--occluder-gap-m", "0.08", "--out", str(out))
+    record = load_wall(out)
+    assert record.rig.occluder == Occluder(x_m=0.25, z_min_m=0.08)
+    assert record.occluder == OccluderRecord(source="entered", x_m=0.25, gap_m=0.08)
+    assert "0.250 m from the foot, 0.080 m off the wall (entered)" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("pressed_enter")
+def test_watching_ends_with_enter_and_then_the_wall_is_measured(
+    call: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call("--wall", "--watch", "--camera", "sim", "--out", str(tmp_path / "w.toml"))
+    assert "0.2000 m" in capsys.readouterr().err
+    assert load_wall(tmp_path / "w.toml").frames == 10
 
 
 def test_a_tape_moves_the_wall_to_where_it_says(call: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -153,6 +196,7 @@ def test_an_existing_record_is_kept_unless_asked(call: Call, tmp_path: Path) -> 
     with pytest.raises(OutputExistsError):
         call("--wall", "--camera", "sim:bare-wall", "--out", str(out))
     assert out.read_text(encoding="utf-8") == "mine"
+    assert list(tmp_path.iterdir()) == [out]
     call("--wall", "--camera", "sim:bare-wall", "--out", str(out), "--overwrite")
     assert load_wall(out).verdict == "good"
 
@@ -164,6 +208,14 @@ def test_without_out_a_dated_name_in_this_folder(call: Call, tmp_path: Path, mon
     assert load_wall(path).verdict == "good"
 
 
+@pytest.mark.parametrize("name", ["wall.npz", "wall.html"])
+def test_what_lies_beside_is_kept_unless_asked(call: Call, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine", encoding="utf-8")
+    with pytest.raises(OutputExistsError, match=name):
+        call("--wall", "--camera", "sim:bare-wall", "--out", str(tmp_path / "wall.toml"))
+    assert (tmp_path / name).read_text(encoding="utf-8") == "mine"
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -172,6 +224,8 @@ def test_without_out_a_dated_name_in_this_folder(call: Call, tmp_path: Path, mon
         ["--wall", "--camera", "sim", "--bag", "run.bag"],
         ["--wall", "--camera", "sim", "--frames", "0"],
         ["--wall", "--camera", "sim", "--tape-m", "0"],
+        ["--wall", "--camera", "sim", "--occluder-x-m", "0.2"],
+        ["--wall", "--camera", "sim", "--occluder-gap-m", "0.1"],
     ],
 )
 def test_wrong_usage_is_told(call: Call, arguments: list[str]) -> None:

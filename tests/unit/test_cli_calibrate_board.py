@@ -45,6 +45,10 @@ class BoardWorld:
     def truth_depth_m(self, number: int) -> np.ndarray:
         return np.full((64, 64), number, np.float32)
 
+    def celsius(self, number: int) -> dict[str, float]:
+        del number
+        return {"ldd_temperature": 40.0}
+
 
 @pytest.fixture
 def record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, hurried_clock: Any) -> Record:

@@ -193,7 +193,7 @@ def test_datasets_of_two_rigs_are_refused(
 class Guesser:
     """A network that answers everything with the same plate."""
 
-    runtime, record = "none", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum)
+    runtime, record = "none", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
 
     def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
         assert depth_m.shape == intensity.shape == (1, 64, 80)

@@ -7,36 +7,33 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from datetime import date
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
 
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.rig import dump_toml, load_rig
-from nlos_calibration.wall import WallFit
-from nlos_calibration.wall_record import wall_record
+from fake_wall import RIG, SERIAL, SMALL, write_wall
 
 from nlos_cam.cli import live as commands
 from nlos_cam.cli.main import main
 from nlos_cam.frames import Frame
 from nlos_cam.view import rerun_viewer
 
-RIG = load_rig("paper-rig")
-SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
+
+def record_of(eats: str) -> SimpleNamespace:
+    return SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input=eats)
 
 
 class FakeNetwork:
-    runtime, record = "nothing at all", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum)
+    runtime, record = "nothing at all", record_of("raw maps")
 
     def __call__(self, *_: np.ndarray) -> np.ndarray:
         return np.full((1, 64, 64), 0.5, np.float32)
 
 
 class FakeCamera:
-    intrinsics, rig, incomplete, dropped = SMALL, None, 0, 0
+    intrinsics, rig, identity, incomplete, dropped = SMALL, None, {"serial": SERIAL}, 0, 0
 
     def __init__(self, uri: str, on_frame: Callable[[int], None]) -> None:
         self.uri, self._on_frame = uri, on_frame
@@ -98,39 +95,14 @@ def interrupt_at(number: int) -> Callable[[int], None]:
     return on_frame
 
 
-def write_wall(path: Path) -> None:
-    pose, facing = RIG.wall_from_lidar, RIG.facing_deg
-    fit = WallFit(
-        0.2,
-        45.0,
-        0.0,
-        facing,
-        *(0.0,) * 4,
-        pose,
-        np.zeros((3, 3)),
-        1e-4,
-        1.0,
-        0.99,
-        np.ones((1, 1), bool),
-        0.0,
-        0.0,
-        0.0,
-        "good",
-        "fine",
-        (),
-    )
-    record = wall_record(fit, SMALL, camera="sim:bare-wall", frames=9, created=date(2026, 1, 2))
-    path.write_text(dump_toml(record), encoding="utf-8")
-
-
 @pytest.mark.usefixtures("opened")
 def test_live_ends_with_one_object_that_scripts_depend_on(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["live", "--camera", "bag:fake", "--no-view", "--json"]) == 0
     report, _ = told(capsys)
-    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms", "counts"}
+    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings"}
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
-    assert set(report["stages_ms"]) == {"wait", "maps", "network", "view"}
+    assert set(report["stages_ms"]) == {"wait", "maps", "bench", "network", "view"}
 
 
 @pytest.mark.usefixtures("opened")
@@ -185,7 +157,7 @@ def test_a_wall_other_than_the_networks_is_used_and_noted(tmp_path: Path, capsys
     write_wall(tmp_path / "wall.toml")
     run = ["replay", "run.bag", "--out", "out", "--json"]
     assert main([*run, "--wall", "wall.toml"]) == 0
-    assert "rig measured is another one" in told(capsys)[1].replace("\n", " ")
+    assert "unlike the rig of the networks, this one has" in told(capsys)[1].replace("\n", " ")
     with np.load(tmp_path / "out" / "reconstruction.npz") as file:
         assert str(file["rig_name"]) == "measured"
     assert main([*run, "--wall", "none.toml", "--overwrite"]) == 4
@@ -195,7 +167,7 @@ def test_a_wall_other_than_the_networks_is_used_and_noted(tmp_path: Path, capsys
 def test_replay_writes_its_folder_and_one_object(opened: Opened, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", "run.bag", "--out", "out", "--json"]) == 0
     report, progress = told(capsys)
-    assert set(report) == {"frames", "seconds", "out"}
+    assert set(report) == {"frames", "seconds", "out", "warnings"}
     assert (report["frames"], report["out"]) == (20, "out")
     assert "another" not in progress
     assert opened.calls == [("bag:run.bag", {"reader": "plain"})]

@@ -121,3 +121,34 @@ def test_infrared_saturates_by_the_laser_power() -> None:
     sensor.open([profile for profile in sensor.get_stream_profiles() if profile.stream == "infrared"][:1])
     sensor.start(got.append)
     assert np.mean(got[0].get_data() == 255) == pytest.approx(0.5)
+
+
+def test_its_colour_camera_is_told_as_the_sdks_are() -> None:
+    sdk, lidar = load_sdk(), FakeLidar()
+    assert len(FakeDevice(lidar, 0).query_sensors()) == 1
+    lidar.colour = lambda number: number
+    depth, colour = FakeDevice(lidar, 0).query_sensors()
+    profile = colour.get_stream_profiles()[1]
+    assert hasattr(sdk.stream, profile.stream_type().name)
+    assert hasattr(sdk.format, profile.format().name)
+    made = profile.get_intrinsics()
+    assert vars(made).keys() <= set(dir(sdk.intrinsics()))
+    assert made.model.name in sdk.distortion.__members__
+    extrinsics = profile.get_extrinsics_to(depth.get_stream_profiles()[0])
+    assert vars(extrinsics).keys() <= set(dir(sdk.extrinsics()))
+    turn = np.reshape(extrinsics.rotation, (3, 3)).T
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1.0)
+
+
+def test_its_colour_camera_gives_what_it_sees() -> None:
+    lidar, got = FakeLidar(runs=(3,)), list[FakeFrame]()
+    lidar.colour = lambda number: 50 * number
+    _, colour = FakeDevice(lidar, 0).query_sensors()
+    colour.open(colour.get_stream_profiles()[-1:])
+    colour.start(got.append)
+    assert lidar.finish_run()
+    colour.stop()
+    assert [(frame.get_data().shape, int(frame.get_data().mean())) for frame in got] == [
+        ((480, 640, 3), 50 * number) for number in range(3)
+    ]

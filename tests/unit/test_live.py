@@ -1,20 +1,23 @@
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from threading import Event
 from typing import Self
 
 import numpy as np
 import pytest
+from fake_wall import WallCamera, measured_wall
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
 from nlos_cam import frame_reader
+from nlos_cam.bench import Bench
 from nlos_cam.errors import CameraLostError, SceneError
-from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import Frame
-from nlos_cam.live import paced, run_live, steps, warm_up
+from nlos_cam.live import paced, run_live, warm_up
 from nlos_cam.live_report import LiveReport
+from nlos_cam.processing import Processing
 from nlos_cam.view.viewer import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
@@ -24,6 +27,10 @@ SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 
 def network(*_: np.ndarray) -> np.ndarray:
     return np.full((1, 64, 64), 0.5, np.float32)
+
+
+def processing(by: Callable[..., np.ndarray] = network) -> Processing:
+    return Processing(Bench(RIG), by)
 
 
 def frame(number: int, offset_s: float = 0.0) -> Frame:
@@ -74,13 +81,15 @@ def test_a_recording_is_paced_by_its_timestamps() -> None:
     assert list(paced([frame(0)], stop, lambda: 0.0)) == []
 
 
-def test_steps_times_every_stage_with_the_clock_it_is_given() -> None:
-    ticks = iter(range(10_000))
-    with FrameReader(FakeCamera(3), keeps_all=True, stop=Event(), clock=lambda: 0.0) as reader:
-        done = list(steps(reader, RIG, network, lambda: float(next(ticks))))
-    assert [step.frame.frame_number for step in done] == [0, 1, 2]
-    for step in done:
-        assert step.stages_s == {"wait": 1.0, "maps": 1.0, "network": 1.0}
+class Hurried:
+    """A clock that a recording is never ahead of."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        self.now_s += 1.0
+        return self.now_s
 
 
 class ListViewer(NullViewer):
@@ -126,10 +135,10 @@ def lockstep_camera(count: int, offset_s: float) -> tuple[FakeCamera, Metronome,
 @pytest.mark.parametrize(("offset_s", "delivery_ms"), [(0.0, 5.0), (1e6, 0.0), (-1e6, 0.0)])
 def test_latency_is_told_on_any_clock(offset_s: float, delivery_ms: float) -> None:
     camera, clock, viewer = lockstep_camera(31, offset_s)
-    report = run_live(camera, RIG, network, viewer, stop=Event(), clock=clock)
+    report = run_live(camera, processing(), viewer, stop=Event(), clock=clock)
     assert report.frames == len(viewer.moments) == 31
     assert report.dropped == 0
-    assert set(report.stages_ms) == {"wait", "maps", "network", "view"}
+    assert set(report.stages_ms) == {"wait", "maps", "bench", "network", "view"}
     assert set(report.latency_ms) == {"p50", "p95", "p99"}
     assert report.latency_ms["p50"] <= report.latency_ms["p95"] <= report.latency_ms["p99"]
     assert report.latency_ms["p50"] == pytest.approx(delivery_ms, abs=1.0)
@@ -138,14 +147,14 @@ def test_latency_is_told_on_any_clock(offset_s: float, delivery_ms: float) -> No
 
 def test_the_viewer_sees_every_frame_in_order() -> None:
     viewer = ListViewer()
-    run_live(FakeCamera(20), RIG, network, viewer, stop=Event(), recorded=True)
+    run_live(FakeCamera(20), processing(), viewer, stop=Event(), recorded=True)
     assert [moment.frame.frame_number for moment in viewer.moments] == list(range(20))
     assert all(moment.latency_s >= 0.0 for moment in viewer.moments)
 
 
 def test_a_run_ends_after_the_seconds_it_is_given() -> None:
     camera, clock, viewer = lockstep_camera(1000, 0.0)
-    report = run_live(camera, RIG, network, viewer, stop=Event(), seconds=1.0, clock=clock)
+    report = run_live(camera, processing(), viewer, stop=Event(), seconds=1.0, clock=clock)
     assert report.frames == pytest.approx(31, abs=2)
 
 
@@ -156,8 +165,29 @@ def test_warming_up_runs_the_way_of_a_frame_once_and_takes_none_from_the_camera(
         seen.append(depth_m.shape)
         return network(depth_m, intensity)
 
-    warm_up(FakeCamera(0), load_rig("paper-rig"), noting)
+    warm_up(FakeCamera(0), processing(noting))
     assert seen == [(1, 64, 80)]
+
+
+def test_a_lidar_that_moves_is_warned_of_while_it_is_elsewhere(tmp_path: Path) -> None:
+    told, viewer = list[tuple[str, bool]](), ListViewer()
+    camera, method = WallCamera(150, moved=range(30, 80)), Processing(Bench(RIG, measured_wall(tmp_path)), network)
+    report = run_live(
+        camera,
+        method,
+        viewer,
+        stop=Event(),
+        recorded=True,
+        clock=Hurried(),
+        on_warning=lambda *about: told.append(about),
+    )
+    [(warning, frames)] = report.warnings.items()
+    assert [begins for _, begins in told] == [True, False]
+    assert told[1][0] == warning
+    warned = [moment.frame.frame_number for moment in viewer.moments if moment.warnings]
+    assert len(warned) == frames
+    assert warned[0] in range(30, 80)
+    assert warned[-1] in range(79, 150)
 
 
 def failing_at(*numbers: int) -> Callable[..., np.ndarray]:
@@ -174,23 +204,16 @@ def failing_at(*numbers: int) -> Callable[..., np.ndarray]:
 
 def test_a_frame_that_comes_to_no_result_is_counted_and_survived(caplog: pytest.LogCaptureFixture) -> None:
     viewer = ListViewer()
-    report = run_live(FakeCamera(10), RIG, failing_at(3, 4), viewer, stop=Event(), recorded=True)
+    report = run_live(FakeCamera(10), processing(failing_at(3, 4)), viewer, stop=Event(), recorded=True)
     assert [moment.frame.frame_number for moment in viewer.moments] == [0, 1, 2, 5, 6, 7, 8, 9]
     assert (report.counts, report.dropped) == ({"failed": 2}, 2)
     assert "frame 3 came to no result (ZeroDivisionError: an odd frame)" in caplog.text
 
 
 def test_an_error_that_is_not_the_frames_ends_the_run_at_once() -> None:
+    bare = Processing(Bench(load_rig("bare-wall")), network)
     with pytest.raises(SceneError, match="object_box"):
-        run_live(FakeCamera(9), load_rig("bare-wall"), network, ListViewer(), stop=Event(), recorded=True)
-
-
-def test_a_recording_is_not_reconstructed_past_an_error() -> None:
-    with (
-        pytest.raises(ZeroDivisionError, match="an odd frame"),
-        FrameReader(FakeCamera(9), keeps_all=True, stop=Event()) as reader,
-    ):
-        list(steps(reader, RIG, failing_at(3)))
+        run_live(FakeCamera(9), bare, ListViewer(), stop=Event(), recorded=True)
 
 
 def test_what_the_camera_raises_is_raised_once_the_report_is_told() -> None:
@@ -201,7 +224,7 @@ def test_what_the_camera_raises_is_raised_once_the_report_is_told() -> None:
     camera, until_then = FakeCamera(None, fail_at_two), list[LiveReport]()
     camera.counts = Counter(restarted=3)
     with pytest.raises(CameraLostError, match="unplugged"):
-        run_live(camera, RIG, network, NullViewer(), stop=Event(), recorded=True, on_error=until_then.append)
+        run_live(camera, processing(), NullViewer(), stop=Event(), recorded=True, on_error=until_then.append)
     [report] = until_then
     assert (report.frames, report.counts) == (2, {"restarted": 3})
 
@@ -222,6 +245,6 @@ def test_a_run_ends_after_its_seconds_also_where_no_frame_comes_any_more(monkeyp
             assert left.wait(10.0)
 
     camera = Silent(None, on_frame)
-    report = run_live(camera, RIG, network, viewer, stop=Event(), seconds=500.0, clock=lambda: now_s[-1])
+    report = run_live(camera, processing(), viewer, stop=Event(), seconds=500.0, clock=lambda: now_s[-1])
     assert left.is_set()
     assert report.frames <= 5

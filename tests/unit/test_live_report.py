@@ -8,7 +8,7 @@ from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.errors import NlosCamError, SceneError
 from nlos_cam.frames import Frame, maps_from_frame
-from nlos_cam.live_report import MOST_FAILED, LiveReport, Step, Tally
+from nlos_cam.live_report import MOST_FAILED, Held, LiveReport, Step, Tally, Warned
 from nlos_cam.reconstruct import Reconstruction
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
@@ -79,6 +79,39 @@ def test_frames_that_fail_are_borne_until_they_are_many_in_a_row() -> None:
     with pytest.raises(NlosCamError, match=f"{MOST_FAILED} frames in a row .*ZeroDivisionError: an odd frame"):
         tally.fail(frame(99), ZeroDivisionError("an odd frame"), MOST_FAILED)
     assert tally.failed == MOST_FAILED
+
+
+def warned(number: int, *warnings: str) -> Step:
+    one = frame(number)
+    return Step(one, maps_from_frame(one), NOTHING, 0.0, {}, warnings=warnings)
+
+
+def test_a_warning_is_told_when_it_begins_and_when_it_ends_and_its_frames_are_counted() -> None:
+    told = list[tuple[str, bool]]()
+    found = Warned(lambda *about: told.append(about))
+    for step in (warned(7), warned(8, "hot"), warned(9, "hot", "moved"), warned(11, "moved"), warned(12)):
+        found.add(step)
+    assert told == [("hot", True), ("moved", True), ("hot", False), ("moved", False)]
+    assert found.held == [Held("hot", 2, 8, 9), Held("moved", 2, 9, 11)]
+    found.add(warned(20, "hot"))
+    assert told[-1] == ("hot", True)
+    assert found.held[0] == Held("hot", 3, 8, 20)
+
+
+def test_a_warning_whose_figures_change_is_the_same_one() -> None:
+    told = list[tuple[str, bool]]()
+    found = Warned(lambda *about: told.append(about))
+    for step in (warned(1, "46.5 degrees"), warned(2, "48 degrees"), warned(3, "48 degrees", "48 mm"), warned(4)):
+        found.add(step)
+    assert told == [("46.5 degrees", True), ("48 mm", True), ("48 degrees", False), ("48 mm", False)]
+    assert found.frames() == {"48 degrees": 3, "48 mm": 1}
+
+
+def test_a_report_says_for_how_many_frames_each_warning_held() -> None:
+    tally = Tally()
+    for step in (warned(1), warned(2, "hot"), warned(3, "hot")):
+        tally.add(step, view_s=0.0)
+    assert reported(tally).warnings == {"hot": 2}
 
 
 def test_an_error_that_is_not_the_frames_is_not_borne() -> None:

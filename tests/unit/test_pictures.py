@@ -1,15 +1,24 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.view.pictures import (
     BACKGROUND_RGB,
     JUMP_M,
+    QUIET_SPAN_M,
+    SATURATED_RGB,
+    change_span_m,
     depth_span_m,
+    difference_rgb,
     hidden_rgb,
     infrared_grey,
     lidar_rgb,
+    noise_rgb,
+    round_span,
+    saturated_rgb,
     surface,
 )
 
@@ -89,3 +98,52 @@ def test_no_triangle_crosses_a_jump_or_touches_the_background() -> None:
 def test_nothing_has_no_surface() -> None:
     mesh = surface(NOTHING, BOX)
     assert len(mesh.points_m) == len(mesh.triangles) == len(mesh.rgb) == 0
+
+
+def test_nearer_is_red_farther_blue_as_expected_grey_and_nothing_dark() -> None:
+    near, same, far, beyond, nothing = difference_rgb(np.array([-0.01, 0.0, 0.01, 9.0, np.nan]), 0.01).astype(int)
+    assert near[0] > 2 * near[2]
+    assert far[2] > 2 * far[0]
+    assert np.ptp(same) < 30
+    np.testing.assert_array_equal(beyond, far)
+    assert tuple(nothing) == BACKGROUND_RGB
+
+
+def test_a_difference_turns_redder_the_nearer_it_is() -> None:
+    redness = np.diff(difference_rgb(np.linspace(-1, 1, 21), 1.0)[:, [2, 0]].astype(int), axis=1)[:, 0]
+    assert (np.diff(redness) < 0).all()
+
+
+def test_noise_is_brighter_the_larger_and_nothing_is_darker_than_none() -> None:
+    brightness = noise_rgb(np.array([[np.nan, 0.0, 1.0, 2.0, 3.0]]), 2.0)[0].sum(axis=-1).astype(int)
+    assert (np.diff(brightness[:4]) > 0).all()
+    assert brightness[4] == brightness[3]
+
+
+def test_only_the_saturated_has_a_colour() -> None:
+    rgb = saturated_rgb(np.array([[0.0, 40.0, 255.0, np.nan]]), np.array([[0.0, 0.0, 0.01, 0.0]]))[0]
+    assert tuple(rgb[2]) == SATURATED_RGB
+    assert (np.ptp(rgb[[0, 1, 3]], axis=-1) == 0).all()
+
+
+@given(st.floats(1e-6, 1e6))
+def test_a_span_is_round_and_little_more_than_what_it_spans(value: float) -> None:
+    span = round_span(np.array([value, -value, np.nan]))
+    assert value <= span * (1 + 1e-5)
+    assert span <= value * 2 * (1 + 1e-5)
+    assert f"{span:e}"[0] in "1235"
+    assert float(f"{span:.0e}") == span
+
+
+def test_a_span_of_nothing_is_what_was_asked_for() -> None:
+    assert round_span(np.array([np.nan, np.nan])) == 1.0
+    assert round_span(np.zeros(3), otherwise=0.5) == 0.5
+
+
+def test_the_span_of_a_change_is_of_what_has_changed() -> None:
+    off_m = np.full((64, 80), 0.0003, np.float32)
+    off_m[3] = np.nan
+    assert change_span_m(off_m) == QUIET_SPAN_M
+    off_m[:, 40:60] = 0.28
+    off_m[:, 78:] = -1.5
+    assert change_span_m(off_m) == pytest.approx(0.3)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import normal_from_angles
-from nlos_calibration.plane import MIN_POINTS, fit_plane
+from nlos_calibration.plane import MIN_POINTS, fit_depth, fit_plane
 from nlos_calibration.range_noise import MeanNoise, depth_noise_m
 from numpy.typing import NDArray
 
@@ -173,3 +173,12 @@ def test_the_points_are_not_changed(generator: np.random.Generator) -> None:
     before = points.copy()
     fit_plane(points, generator)
     np.testing.assert_array_equal(points, before)
+
+
+def test_a_narrow_strip_is_a_plane_where_the_caller_says_so(generator: np.random.Generator) -> None:
+    normal = normal_from_angles(np.radians(40.0), 0.0)
+    rays = np.column_stack([generator.uniform([0.55, -0.5], [0.6, 0.5], (3000, 2)), np.ones(3000)])
+    depth_m = 0.2 / -(rays @ normal)
+    with pytest.raises(WallRefusedError, match="seen in a line"):
+        fit_depth(rays, depth_m, generator)
+    assert angle_deg(fit_depth(rays, depth_m, generator, min_extent=0.02).normal, normal) < 1e-3

@@ -30,3 +30,10 @@ def test_scaling_keeps_the_edges_of_the_field(size: tuple[int, int]) -> None:
 def test_a_cells_ray_is_the_mean_of_its_pixels_rays() -> None:
     cells = PINHOLE.scaled(80, 60).rays()
     np.testing.assert_allclose(PINHOLE.rays().reshape(60, 8, 80, 8, 3).mean(axis=(1, 3)), cells, atol=1e-12)
+
+
+def test_opencvs_matrix_projects_alike() -> None:
+    points = PINHOLE.rays()[::97, ::89].reshape(-1, 3) * 0.7
+    seen = points @ PINHOLE.matrix.T
+    columns, rows = np.meshgrid(np.arange(640)[::89], np.arange(480)[::97])
+    np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], np.column_stack([columns.ravel(), rows.ravel()]), atol=1e-9)

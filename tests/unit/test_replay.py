@@ -1,3 +1,4 @@
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -6,12 +7,15 @@ from typing import Self
 
 import numpy as np
 import pytest
+from fake_wall import WallCamera, measured_wall, wall_frame
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.bench import Bench
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.replay import REPORT, RESULT, SHEET, Samples, replay
+from nlos_cam.processing import Processing
+from nlos_cam.replay import DIFFERENCE, REPORT, RESULT, SHEET, Samples, replay
 
 RIG = load_rig("paper-rig")
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
@@ -46,7 +50,9 @@ class Recorded:
 def test_every_frame_is_written_with_its_number_time_and_place(tmp_path: Path) -> None:
     counted = []
     out = tmp_path / "out"
-    report = replay(Recorded(40), RIG, network, out, stop=Event(), on_frame=lambda: counted.append(1))
+    report = replay(
+        Recorded(40), Processing(Bench(RIG), network), out, stop=Event(), on_frame=lambda: counted.append(1)
+    )
     assert (report.frames, report.out, len(counted)) == (40, str(out), 40)
     with np.load(out / RESULT) as file:
         assert file["depth_m"].shape == (40, 64, 64)
@@ -68,7 +74,7 @@ def test_every_frame_is_written_with_its_number_time_and_place(tmp_path: Path) -
 
 def test_two_replays_are_equal_to_the_bit(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        replay(Recorded(12), RIG, network, tmp_path / name, stop=Event())
+        replay(Recorded(12), Processing(Bench(RIG), network), tmp_path / name, stop=Event())
     for file in (RESULT, SHEET, REPORT):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
@@ -81,21 +87,21 @@ def test_an_interrupted_replay_keeps_what_is_done_and_says_so(tmp_path: Path) ->
         if len(done) == 7:
             stop.set()
 
-    report = replay(Recorded(1000), RIG, network, tmp_path / "out", stop=stop, on_frame=on_frame)
+    report = replay(Recorded(1000), Processing(Bench(RIG), network), tmp_path / "out", stop=stop, on_frame=on_frame)
     assert report.frames == 7
     assert "Interrupted" in (tmp_path / "out" / REPORT).read_text()
 
 
 def test_a_recording_without_frames_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no frame"):
-        replay(Recorded(0), RIG, network, tmp_path / "out", stop=Event())
+        replay(Recorded(0), Processing(Bench(RIG), network), tmp_path / "out", stop=Event())
     assert list(tmp_path.iterdir()) == []
 
 
 def test_only_files_of_the_same_name_are_replaced(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("keep me")
     (tmp_path / REPORT).write_text("old")
-    replay(Recorded(2), RIG, network, tmp_path, stop=Event())
+    replay(Recorded(2), Processing(Bench(RIG), network), tmp_path, stop=Event())
     assert (tmp_path / "mine.txt").read_text() == "keep me"
     assert "Replay" in (tmp_path / REPORT).read_text()
 
@@ -103,8 +109,52 @@ def test_only_files_of_the_same_name_are_replaced(tmp_path: Path) -> None:
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
     with pytest.raises(OutputExistsError, match="is a file"):
-        replay(Recorded(2), RIG, network, tmp_path / "out", stop=Event())
+        replay(Recorded(2), Processing(Bench(RIG), network), tmp_path / "out", stop=Event())
     assert (tmp_path / "out").read_text() == "mine"
+
+
+def replay_wall(tmp_path: Path, camera: WallCamera, out: str = "out") -> Path:
+    method = Processing(Bench(RIG, measured_wall(tmp_path)), network)
+    replay(camera, method, tmp_path / out, stop=Event())
+    return tmp_path / out
+
+
+def test_difference_maps_are_written_with_what_they_were_formed_from(tmp_path: Path) -> None:
+    out = replay_wall(tmp_path, WallCamera(9))
+    reference = measured_wall(tmp_path)
+    assert reference.reference is not None
+    with np.load(out / DIFFERENCE) as file:
+        assert set(file) == {
+            *("depth_m", "intensity", "frame_number", "timestamp_s"),
+            *("rig_name", "rig_checksum", "reference_sha256"),
+        }
+        assert file["depth_m"].shape == file["intensity"].shape == (9, 64, 80)
+        assert file["depth_m"].dtype == file["intensity"].dtype == np.float32
+        np.testing.assert_array_equal(file["frame_number"], np.arange(9))
+        np.testing.assert_allclose(file["timestamp_s"], np.arange(9) / 30)
+        assert str(file["reference_sha256"]) == reference.record.reference_sha256
+        assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
+        expected_m = wall_frame(5).depth_m - reference.reference.map_depth_m
+        np.testing.assert_array_equal(file["depth_m"][5], expected_m)
+    assert f"mean of 20 frames: in `{DIFFERENCE}`" in (out / REPORT).read_text()
+
+
+def test_a_replay_without_a_reference_leaves_no_difference_maps_of_another(tmp_path: Path) -> None:
+    out = replay_wall(tmp_path, WallCamera(2))
+    replay(WallCamera(2), Processing(Bench(RIG), network), out, stop=Event())
+    assert not (out / DIFFERENCE).exists()
+    assert "difference" not in (out / REPORT).read_text()
+
+
+def test_a_report_tells_warnings_with_their_frames_the_same_each_time(tmp_path: Path) -> None:
+    texts = []
+    for out in ("a", "b"):
+        camera = WallCamera(150, moved=range(30, 80), celsius=80.0)
+        texts.append((replay_wall(tmp_path, camera, out) / REPORT).read_text())
+    assert texts[0] == texts[1]
+    warnings = re.findall(r"- warning, (\d+) frames from (\d+) to (\d+): ", texts[0])
+    assert ("150", "0", "149") in warnings
+    assert any(int(first) in range(30, 80) for _, first, _ in warnings)
 
 
 @pytest.mark.parametrize("count", [1, 5, 6, 7, 100, 1001])

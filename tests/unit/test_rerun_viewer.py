@@ -6,6 +6,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from measured_walls import exact_wall
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import Frame
@@ -75,3 +76,18 @@ def test_showing_costs_nothing_when_nobody_watches(viewer: RerunViewer) -> None:
     for number in range(1000):
         viewer.show(moment(number))
     assert threading.active_count() <= 3
+
+
+def test_a_measured_wall_reaches_each_browser(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
+    with RerunViewer(RIG, exact_wall()) as viewer:
+        viewer.show(moment(0))
+        for _ in range(2):
+            with closing(connected(viewer)) as browser:
+                browser.request("GET", "/live.rrd")
+                with closing(browser.getresponse()) as answer:
+                    received = b""
+                    while b"bench/measured/footprint" not in received:
+                        chunk = answer.read1()
+                        assert chunk, "the stream ended without the footprint"
+                        received += chunk

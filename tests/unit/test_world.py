@@ -1,4 +1,4 @@
-"""The simulated camera's world: numbers to bits, loops, and a cache that changes nothing."""
+"""The simulated camera's world: numbers to bits, loops, warming, and a cache that changes nothing."""
 
 from pathlib import Path
 
@@ -16,6 +16,19 @@ rig = "paper-rig"
 object = { category = "cup", seed = 1 }
 motion = { poses = 2, approach_m = 0.1 }
 """
+WARMING = """
+name = "warming"
+rig = "bare-wall"
+
+[sensor]
+drift_m_per_celsius = 0.0005
+
+[sensor.warm_up]
+from_celsius = 25.0
+to_celsius = 45.0
+time_constant_s = 600.0
+"""
+EXAMPLE = Path(__file__).parents[2] / "examples" / "warming.toml"
 NAMES = ("depth_z16", "ir", "confidence")
 
 
@@ -92,6 +105,52 @@ def test_the_same_scene_with_another_sensor_is_not_rendered_again(
     other.write_text(scene.read_text(encoding="utf-8") + "sensor = { dead_share = 0.5 }\n", encoding="utf-8")
     harmed = open_world(str(other)).images(0)
     assert (harmed.depth_z16 > 0).sum() < 0.7 * (world.images(0).depth_z16 > 0).sum()
+
+
+@pytest.fixture
+def warming(tmp_path: Path) -> World:
+    """A bare wall whose device warms from 25 to 45 degrees, with its depth shifted by 10 mm all the way."""
+    (tmp_path / "warming.toml").write_text(WARMING, encoding="utf-8")
+    return open_world(str(tmp_path / "warming.toml"))
+
+
+def _depth_m(world: World, number: int) -> float:
+    depth_m = world.images(number).frame(world.rig.pinhole).depth_m
+    return float(np.nanmean(depth_m))
+
+
+def test_the_device_warms_by_the_true_number_though_the_loop_begins_again(warming: World) -> None:
+    assert warming.scene.poses == 1
+    after = [warming.celsius(round(30 * 60 * minutes)) for minutes in (0, 10, 100)]
+    ldd = [celsius["ldd_temperature"] for celsius in after]
+    assert ldd == pytest.approx([25.0, 45 - 20 / np.e, 45.0], abs=0.01)
+    for celsius in after:
+        assert set(celsius) == {f"{part}_temperature" for part in ("ldd", "mc", "ma", "apd", "humidity")}
+        assert {name: celsius[name] - after[0][name] for name in celsius} == pytest.approx(
+            dict.fromkeys(celsius, celsius["ldd_temperature"] - 25.0)
+        )
+
+
+def test_the_images_drift_with_the_temperature_that_is_told(warming: World) -> None:
+    cold_m, later_m, warm_m = (_depth_m(warming, number) for number in (0, 18_000, 180_000))
+    told = warming.celsius(18_000)["ldd_temperature"]
+    assert warm_m - cold_m == pytest.approx(0.0005 * 20, abs=2e-5)
+    assert later_m - warm_m == pytest.approx(0.0005 * (told - 45), abs=2e-5)
+    assert _equal(warming.images(18_000), warming.images(18_000))
+
+
+def test_without_a_warm_up_the_temperatures_are_steady(world: World) -> None:
+    assert world.celsius(0) == world.celsius(1_000_000)
+
+
+def test_the_packaged_example_warms_and_is_the_bare_wall_otherwise() -> None:
+    example, bare = open_world(str(EXAMPLE)), open_world("bare-wall")
+    assert example.scene.checksum == bare.scene.checksum
+    assert example.celsius(0)["ldd_temperature"] < example.celsius(9000)["ldd_temperature"]
+    apart = example.images(0).depth_z16.astype(int) - bare.images(0).depth_z16
+    both = (example.images(0).depth_z16 > 0) & (bare.images(0).depth_z16 > 0)
+    assert 1e-3 < np.abs(apart[both]).mean() * 0.00025 < 0.02
+    np.testing.assert_array_equal(example.images(0).ir, bare.images(0).ir)
 
 
 def test_a_pulse_of_some_width_is_kept_with_the_direct_return_mixed_in(tmp_path: Path) -> None:

@@ -1,0 +1,157 @@
+"""Whether pose, range, settings or temperature have left the bare wall's reference, told while frames come."""
+
+from collections.abc import Mapping
+from math import isclose
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos_calibration.bare_wall import BareWall
+from nlos_calibration.drift_window import Drift, DriftWindow
+from nlos_calibration.errors import CalibrationError
+from nlos_calibration.projection import Intrinsics
+from nlos_calibration.wall_track import WallTrack
+
+Array = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+SURE_SIGMAS = 4.0
+"""A drift is told that is beyond a tolerance by so many standard uncertainties."""
+ENDS_AT = 0.7
+"""What is told stays told until it is below this share of what it took, so that it does not flicker."""
+BLIND_FRAMES, BLIND_ENDS = 300, 10
+"""So many frames without a pose are told (10 s; objects pass by); each frame with one counts for so many."""
+MIN_PIXELS = 30
+"""To watch; with fewer the pose is not looked after."""
+TOLERANCE_C = 5.0
+"""Nobody has published how the range of an L515 moves with its temperatures, so this is a guess: warming up shows, a
+room's ups and downs do not. What the range then does is told from the depth itself."""
+ABSOLUTE_ZERO_C = -273.15
+"""What is below is no temperature: an L515 says -9999 until it has measured the photodiode's."""
+HOST_OPTIONS = frozenset({"error_polling_enabled", "frames_queue_size", "global_time_enabled", "host_performance"})
+"""How the host is served; nothing of it is in the depth."""
+MEASURED = "_temperature", "noise_estimation"
+"""Endings of the options that are measurements."""
+ALIKE = 1e-5
+"""Relative: a device keeps its settings as single floats."""
+PIXEL_TOLERANCE = 0.1
+"""Of intrinsics: 0.01 degrees."""
+
+
+def settings_changed(reference: BareWall, settings: Mapping[str, float]) -> tuple[str, ...]:
+    """The options that are not as they were at the bare wall, with both values.
+
+    Measurements are no settings, and an option that only one of both tells of is no change.
+    """
+    then = {name: value for name, value in reference.settings.items() if name in settings}
+    changed = [name for name, value in then.items() if not isclose(value, settings[name], rel_tol=ALIKE)]
+    told = sorted(name for name in changed if not name.endswith(MEASURED) and name not in HOST_OPTIONS)
+    return tuple(f"{name} was {then[name]:g} and is {settings[name]:g}" for name in told)
+
+
+def check_camera(reference: BareWall, intrinsics: Intrinsics) -> None:
+    """Raise CalibrationError where a camera's frames cannot be held against the reference."""
+    then = reference.intrinsics
+    _check_size((intrinsics.height, intrinsics.width), then)
+    pairs = [(name, getattr(then, name), getattr(intrinsics, name)) for name in ("fx", "fy", "ppx", "ppy")]
+    told = [f"{name} {was:.2f}, now {now:.2f}" for name, was, now in pairs if not abs(now - was) <= PIXEL_TOLERANCE]
+    if told:
+        raise CalibrationError(
+            f"the bare wall was measured with other intrinsics ({'; '.join(told)}): take the lidar that it was "
+            "measured with, or calibrate the wall again",
+        )
+
+
+def _check_size(shape: tuple[int, ...], then: Intrinsics) -> None:
+    if shape != (then.height, then.width):
+        size = " x ".join(str(pixels) for pixels in reversed(shape))
+        raise CalibrationError(
+            f"a frame of {size} pixels cannot be held against a bare wall of {then.width} x {then.height}: open the "
+            "camera at that size, or calibrate the wall again",
+        )
+
+
+class DriftCheck:
+    """Holds the frames of a stream against the bare wall's reference. Time is counted in frames, 30 in a second."""
+
+    def __init__(self, reference: BareWall, wall_from_lidar: Array) -> None:
+        self.drift: Drift | None = None
+        """Over the last second; None while too few frames show the wall."""
+        self._reference = reference
+        self._track, self._window = WallTrack(reference, wall_from_lidar), DriftWindow(reference.frames)
+        self._watches = len(self._track.pixels) >= MIN_PIXELS
+        self._told: Drift | None = None
+        self._blind, self._blindness = 0, ""
+        self._settings: Mapping[str, float] = {}
+        self._about_settings: tuple[str, ...] = ()
+        self._about_celsius: dict[str, str] = {}
+
+    @property
+    def wall_share(self) -> float:
+        """Of the pixels that are watched, those that showed the wall over the last second."""
+        return self._window.share
+
+    def look(self, depth_m: Float32, settings: Mapping[str, float]) -> None:
+        """Take a frame (height, width) in, NaN where there is no return, and the settings it was taken with.
+
+        Raises CalibrationError for a frame of another size.
+        """
+        _check_size(depth_m.shape, self._reference.intrinsics)
+        if settings != self._settings:
+            self._settings = dict(settings)
+            self._about_settings = settings_changed(self._reference, settings)
+        if self._watches:
+            self._window.add(self._track.follow(depth_m), self._track.share)
+            self.drift = self._window.drift()
+            self._tell_drift()
+            self._tell_blindness()
+
+    def look_at(self, celsius: Mapping[str, float]) -> None:
+        """Take a reading of the device's temperatures in, by the SDK's name; what is not named stays as it was."""
+        for name, now_c in celsius.items():
+            if name in self._reference.celsius and now_c > ABSOLUTE_ZERO_C:
+                self._about_celsius[name] = self._about_temperature(name, now_c)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to tell now, a line each; they stay as they are while nothing changes. Empty while all is well."""
+        lines = [str(self._told) if self._told else "", self._blindness, *self._about_celsius.values()]
+        if self._about_settings:
+            changes = ", ".join(self._about_settings)
+            lines.append(f"settings have changed since the wall was measured: {changes}: calibrate the wall again")
+        if not self._watches:
+            lines.append(
+                f"the bare wall's reference has {len(self._track.pixels)} good pixels to watch, {MIN_PIXELS} needed: a "
+                "lidar that moves would not be noticed: calibrate the wall again"
+            )
+        return tuple(line for line in lines if line)
+
+    def _tell_drift(self) -> None:
+        """Begin, renew or end what is told of the pose; while the wall is hidden, what was told stays."""
+        if self.drift is None:
+            return
+        if self._told is None:
+            self._told = self.drift if self.drift.tolerances(SURE_SIGMAS) > 1.0 else None
+        elif self.drift.tolerances() < ENDS_AT:
+            self._told = None
+        elif self._told.apart(self.drift):
+            self._told = self.drift
+
+    def _tell_blindness(self) -> None:
+        sees = self.drift is not None and self.drift.sharp
+        self._blind = max(self._blind - BLIND_ENDS, 0) if sees else min(self._blind + 1, BLIND_FRAMES)
+        if self._blind == 0:
+            self._blindness = ""
+        elif self._blind == BLIND_FRAMES and not self._blindness:
+            self._blindness = (
+                f"{self.wall_share:.0%} of the wall is seen where it was calibrated, too little to notice a lidar that "
+                "moves: look once with nothing hidden; if this stays, it has moved far: calibrate the wall again"
+            )
+
+    def _about_temperature(self, name: str, now_c: float) -> str:
+        then_c, span_c = self._reference.celsius[name], self._reference.celsius_span.get(name, 0.0)
+        least_c = max(TOLERANCE_C, span_c) * (ENDS_AT if self._about_celsius.get(name) else 1.0)
+        if abs(now_c - then_c) <= least_c:
+            return ""
+        about = f"{name} is {now_c:.0f} degrees C and was {then_c:.0f} when the wall was measured: "
+        return about + ("let the lidar warm up" if now_c < then_c else "calibrate the wall again")

@@ -1,0 +1,84 @@
+"""What is made of each frame of a camera: maps, their difference from the bare wall, warnings, the hidden depth."""
+
+import time
+from collections.abc import Callable, Generator, Iterable
+
+from nlos_calibration.errors import CalibrationError
+
+from nlos_cam.bench import Bench
+from nlos_cam.camera.base import Camera
+from nlos_cam.frame_reader import Arrival, FrameReader
+from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.live_report import Step
+from nlos_cam.map_mean import MapMean
+from nlos_cam.reconstruct import Clock, Network, reconstruct
+from nlos_cam.thermometer import Thermometer, thermometer_of
+
+OnFailure = Callable[[Frame, Exception, int], None]
+"""Called with a frame that came to no result, why, and how many have in a row; raises to end there."""
+
+
+def _refuse(frame: Frame, error: Exception, in_a_row: int) -> None:
+    del frame, in_a_row
+    raise error
+
+
+class Processing:
+    """What is made of a camera's frames, in their order: maps, their difference from the bare wall, the hidden depth.
+
+    Maps are the mean over the last `average` frames. Raises CalibrationError where the networks eat difference maps and
+    there is no bare wall to form them from.
+    """
+
+    def __init__(self, bench: Bench, network: Network, *, eats_difference: bool = False, average: int = 1) -> None:
+        if eats_difference and bench.reference is None:
+            raise CalibrationError(
+                "these weights eat difference maps: give --wall with a reference (calibrate the wall again)"
+            )
+        self.bench, self.network = bench, network
+        self._eats_difference, self._mean = eats_difference, MapMean(average)
+
+    def step(self, arrival: Arrival, clock: Clock, begun_s: float) -> Step:
+        """All of it, for one frame that is waited for since `begun_s`."""
+        got_s = clock()
+        maps = maps_from_frame(arrival.frame)
+        mapped_s = clock()
+        maps = self._mean.add(maps)
+        look = self.bench.look(arrival.frame, maps)
+        looked_s = clock()
+        eaten = look.difference if self._eats_difference and look.difference else self.bench.corrected(maps)
+        reconstruction = reconstruct(eaten, self.bench.rig, self.network, clock)
+        stages_s = {"wait": got_s - begun_s, "maps": mapped_s - got_s, "bench": looked_s - mapped_s}
+        stages_s |= reconstruction.timings_s
+        return Step(arrival.frame, maps, reconstruction, clock(), stages_s, look.difference, look.warnings)
+
+
+def read_along(frames: Iterable[Frame], camera: Camera, bench: Bench) -> tuple[Iterable[Frame], Thermometer | None]:
+    """The same frames, and the camera's thermometer, read as they pass, where the bench needs one."""
+    if bench.reference is None:
+        return frames, None
+    thermometer = thermometer_of(camera)
+    return thermometer.watch(frames), thermometer
+
+
+def steps(
+    reader: FrameReader,
+    processing: Processing,
+    clock: Clock = time.time,
+    on_failure: OnFailure = _refuse,
+    thermometer: Thermometer | None = None,
+) -> Generator[Step]:
+    """Reconstruct every frame that the reader gives, in order."""
+    begun_s, in_a_row = clock(), 0
+    for arrival in reader:
+        try:
+            if thermometer and (celsius := thermometer.at(arrival.frame)):
+                processing.bench.look_at(celsius)
+            step = processing.step(arrival, clock, begun_s)
+        except Exception as error:  # noqa: BLE001  whatever an odd frame leads to, who called decides
+            in_a_row += 1
+            on_failure(arrival.frame, error, in_a_row)
+        else:
+            in_a_row = 0
+            yield step
+        begun_s = clock()

@@ -1,0 +1,216 @@
+"""The report's drawing of the bench, to scale, from above and from the side."""
+
+from dataclasses import dataclass
+from math import atan2, cos, degrees, hypot, radians, sin
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from nlos_calibration.rig import ObjectBox, Rig
+from nlos_calibration.wall_record import WallRecord
+from numpy.typing import NDArray
+
+from nlos_cam.wall_pictures import Picture, figure_of, png
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+Limits = tuple[float, float]
+Style = dict[str, Any]
+
+WALL, LIDAR, EDGE, VIEW, OCCLUDER, OBJECT = "0.35", "#08306b", "#4292c6", "#9ecae1", "#000000", "#d95f02"
+FAR_M, MARGIN_M = 2.5, 0.12
+FARTHEST_DRAWN_M, HIGHEST_DRAWN_M = 0.9, 0.35
+"""From the foot: an optical axis that meets the wall beyond leaves the picture."""
+WIDTH_IN = 11.0
+X, Y, Z = 0, 1, 2
+NAMES = {X: "x along the wall (m)", Y: "y up (m)", Z: "z from the wall (m)"}
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A view along one axis of the wall frame: which axes go across and up the page."""
+
+    across: int
+    up: int
+    turned: bool
+    """Whether the axis that goes up the page is drawn downwards."""
+
+
+ABOVE, BESIDE = _Side(X, Z, turned=True), _Side(Z, Y, turned=False)
+
+
+def bench_picture(record: WallRecord) -> Picture:
+    """The bench from above and from the side, both to one scale."""
+    limits = drawn_limits(record.rig)
+    wide, tall, deep = (high - low for low, high in limits)
+    figure = figure_of(WIDTH_IN, 0.86 * WIDTH_IN * max(tall, deep) / (wide + deep) + 0.9)
+    above, beside = figure.subplots(1, 2, width_ratios=(wide, deep))
+    for axis, side in ((above, ABOVE), (beside, BESIDE)):
+        _draw(axis, side, record, limits)
+    _dimension(above, record)
+    above.set_title(f"from above: {record.distance_m:.3f} m away, facing {record.facing_deg:.1f}°", fontsize=11)
+    beside.set_title(f"from the side: pitch {record.pitch_deg:+z.1f}°", fontsize=11)
+    caption = (
+        "To scale, both alike. The lidar looks along the dash-dotted line; the blue area is its field of view, the "
+        "occluder taken away. Its dashed edges never meet the wall. Light goes from the lidar to the wall, past "
+        f"the occluder's edge to the hidden object, and back the same way. {_occluder_told(record)}"
+    )
+    return Picture("The bench", caption, png(figure))
+
+
+def _occluder_told(record: WallRecord) -> str:
+    if record.rig.occluder is None:
+        return "This rig has no occluder."
+    if record.occluder is None:
+        return "The occluder is dashed: it is drawn where the paper has it, nobody has measured it here."
+    return f"The occluder was {record.occluder.source}."
+
+
+def drawn_limits(rig: Rig) -> tuple[Limits, Limits, Limits]:
+    """What part of x, y and z is drawn: all that the bench has, and the optical axis as far as there is room."""
+    reached = _reached(rig)
+    highest = float(np.clip(reached[Y], -HIGHEST_DRAWN_M, HIGHEST_DRAWN_M))
+    x, y, z = [0.0, reached[X]], [highest, -0.15, 0.15], [rig.lidar.distance_m + 0.05]
+    for extent in (rig.object_box, rig.relay):
+        if extent is not None:
+            x += [extent.x_min_m, extent.x_max_m]
+            y += [extent.y_min_m, extent.y_max_m]
+    if rig.object_box is not None:
+        z.append(rig.object_box.z_far_m)
+    if rig.occluder is not None:
+        x.append(rig.occluder.x_m)
+        z.append(rig.occluder.z_min_m + 0.1)
+    return (min(x) - MARGIN_M, max(x) + MARGIN_M), (min(y) - 0.05, max(y) + 0.05), (-0.04, max(z) + 0.04)
+
+
+def _reached(rig: Rig) -> Array:
+    """Where the optical axis meets the wall, or how far along it there is room."""
+    along, distance_m = rig.wall_from_lidar[:3, 2], rig.lidar.distance_m
+    aside = hypot(along[X], along[Y])
+    reach_m = min(distance_m / -along[Z], FARTHEST_DRAWN_M / aside if aside > 0.0 else FAR_M)
+    return np.array([0.0, 0.0, distance_m]) + reach_m * along
+
+
+def _draw(axis: "Axes", side: _Side, record: WallRecord, limits: tuple[Limits, Limits, Limits]) -> None:
+    rig = record.rig
+    axis.set(xlim=limits[side.across], ylim=limits[side.up][:: -1 if side.turned else 1], aspect="equal")
+    axis.set(xlabel=NAMES[side.across], ylabel=NAMES[side.up])
+    _view(axis, side, rig)
+    _wall(axis, side)
+    if rig.occluder is not None and side is ABOVE:
+        _occluder_from_above(axis, record, limits[Z][1])
+    elif rig.occluder is not None:
+        _occluder_from_the_side(axis, record, limits[Y][1])
+    if rig.object_box is not None:
+        _object(axis, side, rig.object_box)
+    place = rig.wall_from_lidar[:3, 3][[side.across, side.up]]
+    axis.plot(*place, marker="s", markersize=9, color=LIDAR, zorder=5)
+    style: Style = {"ha": "center", "va": "center", "color": LIDAR, "fontsize": 10}
+    axis.annotate("lidar", tuple(place), xytext=(0, -15), textcoords="offset points", **style)
+
+
+def _wall(axis: "Axes", side: _Side) -> None:
+    from matplotlib.patches import Rectangle
+
+    style: Style = {"facecolor": "0.85", "edgecolor": WALL, "hatch": "///", "linewidth": 1.5}
+    across = Rectangle((-FAR_M, -1.0), 2.0 * FAR_M, 1.0, **style)
+    axis.add_patch(across if side is ABOVE else Rectangle((-1.0, -FAR_M), 1.0, 2.0 * FAR_M, **style))
+
+
+def _view(axis: "Axes", side: _Side, rig: Rig) -> None:
+    """The frustum: its corner rays, what lies between them, the optical axis."""
+    pose, drawn = rig.wall_from_lidar, [side.across, side.up]
+    start, corners = pose[:3, 3], [start := pose[:3, 3]]
+    for edge in _corner_rays(rig) @ pose[:3, :3].T:
+        end = start + edge * min(start[Z] / -edge[Z] if edge[Z] < 0.0 else FAR_M, FAR_M)
+        corners += [end, end * np.array([1.0, 1.0, 0.0])]  # what passes over a far part of the wall covers it
+        line = "-" if edge[Z] < 0.0 else "--"
+        axis.plot(*np.stack([start, end])[:, drawn].T, color=EDGE, linewidth=1.0, linestyle=line)
+    outline = cv2.convexHull(np.array(corners, np.float32)[:, drawn])[:, 0]
+    axis.fill(*outline.T, color=VIEW, alpha=0.3, linewidth=0.0, zorder=0)
+    path = np.stack([start, _reached(rig)])
+    axis.plot(*path[:, drawn].T, color=LIDAR, linewidth=1.3, linestyle="-.")
+
+
+def _corner_rays(rig: Rig) -> Array:
+    edges = rig.pinhole.scaled(1, 1)
+    x, y = (np.array([-0.5, 0.5]) - edges.ppx) / edges.fx, (np.array([-0.5, 0.5]) - edges.ppy) / edges.fy
+    return np.array([[x[i], y[j], 1.0] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
+
+
+def _occluder_style(record: WallRecord) -> tuple[str, str]:
+    """How its line is drawn, and what it is called: whether somebody knows where it stands."""
+    return ("-", "occluder") if record.occluder is not None else ("--", "occluder (paper's)")
+
+
+def _occluder_from_above(axis: "Axes", record: WallRecord, low_m: float) -> None:
+    """Its sheet with its lean, and the gap before the wall."""
+    occluder, (line, label) = record.rig.occluder, _occluder_style(record)
+    if occluder is None:
+        return
+    lean = radians((record.occluder.tilt_deg if record.occluder else None) or 0.0)
+    top = np.array([occluder.x_m, occluder.z_min_m])
+    end = top + FAR_M * np.array([sin(lean), cos(lean)])
+    axis.plot(*np.stack([top, end]).T, color=OCCLUDER, linewidth=4.0 if record.occluder else 2.0, linestyle=line)
+    arrow: Style = {"arrowstyle": "<->", "color": OCCLUDER, "shrinkA": 0, "shrinkB": 0}
+    axis.annotate("", (occluder.x_m, 0.0), xytext=tuple(top), arrowprops=arrow)
+    axis.text(occluder.x_m + 0.01, 0.5 * occluder.z_min_m, f"gap {occluder.z_min_m:.3f} m", fontsize=9, va="center")
+    place = occluder.x_m + 0.02, low_m - 0.01
+    axis.text(*place, label, fontsize=9, rotation=90, ha="left", va="bottom")
+
+
+def _occluder_from_the_side(axis: "Axes", record: WallRecord, high_m: float) -> None:
+    occluder, (line, label) = record.rig.occluder, _occluder_style(record)
+    if occluder is None:
+        return
+    if record.occluder is not None:
+        axis.axvspan(occluder.z_min_m, FAR_M, color=OCCLUDER, alpha=0.12, linewidth=0.0)
+    axis.axvline(occluder.z_min_m, color=OCCLUDER, linewidth=1.5, linestyle=line)
+    axis.text(occluder.z_min_m + 0.01, high_m - 0.01, label, fontsize=9, va="top")
+
+
+def _object(axis: "Axes", side: _Side, box: ObjectBox) -> None:
+    from matplotlib.colors import to_rgba
+    from matplotlib.patches import Rectangle
+
+    spans = {X: (box.x_min_m, box.x_max_m), Y: (box.y_min_m, box.y_max_m), Z: (box.z_near_m, box.z_far_m)}
+    (left, right), (low, high) = spans[side.across], spans[side.up]
+    style: Style = {"facecolor": to_rgba(OBJECT, 0.2), "edgecolor": OBJECT, "linewidth": 1.5}
+    axis.add_patch(Rectangle((left, low), right - left, high - low, **style))
+    # in a corner: from the side, the lidar stands before the box
+    style: Style = {"ha": "right", "va": "bottom" if side.turned else "top", "color": "#8c3b00", "fontsize": 9}
+    axis.text(right - 0.008, high - 0.008, "hidden object", **style)
+
+
+def _dimension(axis: "Axes", record: WallRecord) -> None:
+    """The perpendicular with its length, and the angle between it and the optical axis, in the view from above."""
+    from matplotlib.patches import Arc
+
+    distance_m, along = record.rig.lidar.distance_m, record.rig.wall_from_lidar[:3, 2]
+    arrow: Style = {"arrowstyle": "<->", "color": LIDAR, "shrinkA": 0, "shrinkB": 5}
+    axis.annotate("", (0.0, 0.0), xytext=(0.0, distance_m), arrowprops=arrow)
+    axis.plot(0.0, 0.0, marker="o", markersize=5, color=LIDAR)
+    inner, outer = ("left", "right") if along[X] >= 0.0 else ("right", "left")
+    style: Style = {
+        "fontsize": 10,
+        "color": LIDAR,
+        "va": "center",
+        "bbox": {"facecolor": "white", "alpha": 0.8, "pad": 1.0},
+    }
+    aside_m = -0.012 if along[X] >= 0.0 else 0.012
+    axis.text(aside_m, 0.4 * distance_m, f"{distance_m:.3f} m", ha=outer, **style)
+    drawn_deg, radius_m = degrees(atan2(along[X], -along[Z])), 0.45 * distance_m
+    first_deg, last_deg = sorted((-90.0, drawn_deg - 90.0))
+    size_m = 2.0 * radius_m, 2.0 * radius_m
+    axis.add_patch(Arc((0.0, distance_m), *size_m, theta1=first_deg, theta2=last_deg, color=LIDAR))
+    middle = radians(0.5 * drawn_deg - 90.0)
+    place = 1.15 * radius_m * cos(middle), distance_m + 1.15 * radius_m * sin(middle)
+    axis.text(*place, _facing(record), ha=inner, **style)
+
+
+def _facing(record: WallRecord) -> str:
+    """The facing angle; and the yaw, which is what is seen from above, where it is another."""
+    same = abs(record.facing_deg - abs(record.yaw_deg)) <= 0.3
+    return f"{record.facing_deg:.1f}°" + ("" if same else f"\n(yaw {record.yaw_deg:+z.1f}°)")

@@ -1,0 +1,45 @@
+"""What `calibrate` leaves on disk: the record, the bare wall's reference beside it, and a report."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from nlos_calibration.bare_wall import BareWall, save_reference
+from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.rig import dump_toml
+from nlos_calibration.wall_record import WallRecord
+
+from nlos_cam.errors import OutputExistsError
+from nlos_cam.folders import file_when_whole
+from nlos_cam.wall_report import write_report
+
+
+@dataclass(frozen=True)
+class WallFiles:
+    """Three files of one name."""
+
+    record: Path
+    reference: Path
+    report: Path
+
+    @classmethod
+    def beside(cls, record: Path, *, overwrite: bool) -> "WallFiles":
+        """Those of a record. Raises OutputExistsError where one would be replaced and `overwrite` was not given."""
+        files = cls(record, record.with_suffix(".npz"), record.with_suffix(".html"))
+        if record in (files.reference, files.report):
+            raise OutputExistsError(f"{record} would be overwritten by what is written beside it: name it wall.toml")
+        for path in (files.reference, files.report):
+            if path.is_dir() or (path.exists() and not overwrite):
+                raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
+        return files
+
+
+def written(files: WallFiles, record: WallRecord, reference: BareWall | None) -> WallRecord:
+    """Write all there is; returns the record, which names its reference."""
+    if reference is not None:
+        with file_when_whole(files.reference) as part:
+            digest = save_reference(part, reference)
+        record = record.model_copy(update={"reference": files.reference.name, "reference_sha256": digest})
+    write_report(files.report, MeasuredWall(record, reference), files.record.name)
+    with file_when_whole(files.record) as part:
+        part.write_text(dump_toml(record), encoding="utf-8")
+    return record

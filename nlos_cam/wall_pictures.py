@@ -1,0 +1,216 @@
+"""The report's maps of the bare wall: residual, noise, saturation beside infrared, and how the residuals spread."""
+
+import io
+from dataclasses import dataclass
+from math import floor, log10
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from nlos_calibration.bare_wall import FULL_SCALE, BareWall
+from nlos_calibration.range_noise import depth_noise_m
+from nlos_calibration.wall_record import WallRecord
+from numpy.typing import NDArray
+
+from nlos_cam.wall_residual import block_side, expected_std_m, in_blocks, most_of_block, residual_m
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+DPI = 100
+STRAY, STRIPE, NO_RETURN = (0.72, 0.72, 0.72, 1.0), (0.35, 0.35, 0.35, 1.0), (0.9, 0.9, 0.9, 1.0)
+STRIPE_BLOCKS = 4
+LEVELS = 21
+"""Of colour: noise in more of them makes files large. Odd, so that the middle one is white."""
+LEAST_RESIDUAL_MM = 0.5
+"""A finer scale would make the noise of a good wall look like trouble."""
+ROUND = 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0
+SPREAD_POINTS = 500
+"""Pixels of which the expected spread is drawn."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture of the report, or the reason why there is none."""
+
+    title: str
+    caption: str
+    """What it shows, how to read it; all there is to say where `png` is None."""
+    png: bytes | None = None
+
+
+def figure_of(width_in: float, height_in: float) -> "Figure":
+    """An empty figure that arranges its own parts."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+
+
+def png(figure: "Figure") -> bytes:
+    """The figure as a PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def wall_maps(record: WallRecord, reference: BareWall) -> list[Picture]:
+    """The pictures that the reference's maps give."""
+    return [
+        _residuals(record, reference),
+        _spread(record, reference),
+        _noise(reference),
+        _infrared(reference),
+    ]
+
+
+def _residuals(record: WallRecord, reference: BareWall) -> Picture:
+    title = "Is the wall flat, and is the plane on it?"
+    off_mm = 1e3 * residual_m(record, reference)
+    known = np.isfinite(off_mm)
+    if not known.any():
+        return Picture(title, "No pixel has depth in half of the frames: there is no distance from the plane to draw.")
+    stray = known & ~reference.inliers
+    drawn = np.where(stray, np.nan, off_mm)
+    side = block_side(drawn.shape[1])
+    limit_mm = max(_limit(np.abs(in_blocks(drawn, side))), LEAST_RESIDUAL_MM)
+    figure = figure_of(8.6, 5.4)
+    axis = figure.add_subplot()
+    scale: dict[str, Any] = {"extend": "both", "cmap": "RdBu_r", "vmin": -limit_mm, "vmax": limit_mm}
+    _map(axis, drawn, "mm behind the plane (negative: before it)", **scale)
+    _shade(axis, stray, ~known)
+    axis.set_title("distance of the mean depth from the plane, normal to the wall", fontsize=10)
+    shares = f"Left out of the plane (striped): {_percent(stray)} of the pixels; without return: {_percent(~known)}."
+    how = (
+        "Even, pale speckle is noise on a flat wall. Broad red or blue areas are a bent wall or ripples of the lidar; "
+        f"a patch with a sharp edge is something that stands before the wall. Each dot is the mean of {side} x {side} "
+        "pixels. "
+    )
+    if record.residual_m is None:
+        shares += " The depth was refused and the plane is the board's: this is how far they are apart."
+    return Picture(title, how + shares, png(figure))
+
+
+def _spread(record: WallRecord, reference: BareWall) -> Picture:
+    title = "Do the residuals look like noise alone?"
+    used = reference.inliers & np.isfinite(reference.depth_m)
+    off_mm, sigma_mm = 1e3 * residual_m(record, reference)[used], 1e3 * expected_std_m(record, reference)[used]
+    if len(off_mm) < 2:
+        return Picture(title, "No pixel is on the plane: there are no residuals to count.")
+    rms_mm, expected_mm = (float(np.sqrt(np.mean(values**2))) for values in (off_mm, sigma_mm))
+    reach_mm = 4.0 * max(rms_mm, expected_mm)
+    some_mm = sigma_mm[:: max(len(sigma_mm) // SPREAD_POINTS, 1), np.newaxis]
+    at_mm = np.linspace(-reach_mm, reach_mm, 241)
+    normal = np.exp(-0.5 * (at_mm / some_mm) ** 2) / (np.sqrt(2.0 * np.pi) * some_mm)
+    figure = figure_of(8.6, 3.4)
+    axis = figure.add_subplot()
+    axis.hist(off_mm, bins=80, range=(-reach_mm, reach_mm), density=True, color="#9ecae1", label="measured")
+    axis.plot(at_mm, normal.mean(axis=0), color="#b2182b", label="expected of the lidar's noise")
+    axis.axvline(0.0, color="0.4", linewidth=0.8)
+    axis.set(xlabel="mm behind the plane", ylabel="share of pixels per mm", xlim=(-reach_mm, reach_mm))
+    axis.legend(frameon=False)
+    caption = (
+        f"The pixels that the plane rests on are {rms_mm:.3f} mm RMS off it; noise, averaged over {reference.frames} "
+        f"frames, would leave {expected_mm:.3f} mm. Bars much wider than the line, or beside it, are no noise: "
+        "ripples of the lidar, a wall that is not flat, or another plane."
+    )
+    return Picture(title, caption, png(figure))
+
+
+def _noise(reference: BareWall) -> Picture:
+    title = "Is the lidar as quiet as it should be?"
+    std_m = reference.depth_std_m.astype(np.float64)
+    if not np.isfinite(std_m).any():
+        return Picture(title, "No pixel has two samples of depth: its noise is not known.")
+    ratio = std_m / depth_noise_m(reference.depth_m.astype(np.float64))
+    figure = figure_of(11.0, 3.9)
+    left, right = figure.subplots(1, 2)
+    _map(left, 1e3 * std_m, "mm", extend="max", cmap="viridis", vmin=0.0, vmax=_limit(1e3 * std_m))
+    _shade(left, np.zeros_like(reference.inliers), ~np.isfinite(std_m))
+    left.set_title("noise of one depth sample (standard deviation)", fontsize=10)
+    times = np.log2(np.maximum(ratio, 2.0**-9))
+    bar = _map(right, times, "times the nominal noise", extend="both", cmap="PuOr_r", vmin=-2.0, vmax=2.0)
+    bar.set_ticks([-2.0, -1.0, 0.0, 1.0, 2.0], labels=["¼", "½", "1", "2", "4"])
+    _shade(right, np.zeros_like(reference.inliers), ~np.isfinite(ratio))
+    right.set_title("against 0.5 mm + 2 mm per metre, the nominal", fontsize=10)
+    typical = "" if not np.isfinite(ratio).any() else f" Typical here: {np.nanmedian(ratio):.2f} times the nominal."
+    caption = (
+        "Left: how much one pixel's depth jumps from frame to frame. Right: white is as expected, orange is noisier "
+        "(weak returns, a cold lidar, light from elsewhere)."
+    )
+    return Picture(title, caption + typical, png(figure))
+
+
+def _infrared(reference: BareWall) -> Picture:
+    title = "Is there too much light anywhere?"
+    ir, share = reference.ir.astype(np.float64), 100.0 * reference.saturated.astype(np.float64)
+    if not np.isfinite(ir).any():
+        return Picture(title, "There is no infrared image.")
+    blinded = share > 0.0
+    figure = figure_of(11.0, 3.9) if blinded.any() else figure_of(6.2, 4.0)
+    axes = figure.subplots(1, 2 if blinded.any() else 1, squeeze=False)[0]
+    high = min(_limit(ir), float(FULL_SCALE))
+    _map(axes[0], ir, "IR counts of 255", levels=3 * LEVELS, cmap="gray", vmin=0.0, vmax=high)
+    axes[0].set_title("mean infrared image", fontsize=10)
+    if not blinded.any():
+        words = f"No pixel is saturated: the brightest is {np.nanmax(ir):.0f} of 255 counts on average."
+        return Picture(title, words, png(figure))
+    _map(axes[1], share, "% of the frames", cmap="magma", vmin=0.0, vmax=100.0)
+    axes[1].set_title("saturated: at full scale", fontsize=10)
+    words = (
+        f"{_percent(blinded)} of the pixels were at full scale in some frame, {_percent(share >= 50.0)} in half of "
+        "them. There the lidar is blinded and its depth is not to be trusted: lower the laser power or the gain."
+    )
+    return Picture(title, words, png(figure))
+
+
+def _map(
+    axis: "Axes", values: Array, label: str, *, extend: Any = "neither", levels: int = LEVELS, **style: Any
+) -> "Colorbar":
+    """Draw an image of the sensor in blocks, and return its colour bar."""
+    from matplotlib import colormaps
+
+    height, width = values.shape
+    style |= {"cmap": colormaps[style["cmap"]].resampled(levels), "interpolation": "nearest"}
+    extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+    image = axis.imshow(in_blocks(values, block_side(width)), extent=extent, **style)
+    bar = axis.figure.colorbar(image, ax=axis, label=label, extend=extend)
+    axis.set(xlabel="column (pixels), as the lidar sees it", ylabel="row (pixels)")
+    return bar
+
+
+def _shade(axis: "Axes", stray: NDArray[np.bool_], absent: NDArray[np.bool_]) -> None:
+    """Stripe what was left out of the plane, grey what has no return, and say so."""
+    from matplotlib.patches import Patch
+
+    height, width = stray.shape
+    side = block_side(width)
+    stray_blocks, absent_blocks = most_of_block(stray, side), most_of_block(absent, side)
+    rows, columns = np.indices(stray_blocks.shape)
+    paint = np.zeros((*stray_blocks.shape, 4))
+    paint[stray_blocks] = STRAY
+    paint[stray_blocks & ((rows + columns) // STRIPE_BLOCKS % 2 == 0)] = STRIPE
+    paint[absent_blocks] = NO_RETURN
+    axis.imshow(paint, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
+    told = [Patch(facecolor=STRAY, edgecolor=STRIPE, hatch="///", label="left out of the plane")] * bool(stray.any())
+    told += [Patch(facecolor=NO_RETURN, edgecolor="0.6", label="no return")] * bool(absent.any())
+    if told:
+        axis.legend(handles=told, loc="lower right", fontsize=8, framealpha=0.95)
+
+
+def _percent(mask: NDArray[np.bool_]) -> str:
+    """A share in words that does not round a few pixels to none."""
+    share = 100.0 * float(mask.mean())
+    return "none" if share == 0.0 else "less than 0.1 %" if share < 0.1 else f"{share:.1f} %"
+
+
+def _limit(values: Array) -> float:
+    """Where a scale ends that holds 99 % of the values: the next round number; 0.1 where there are none above 0."""
+    known = values[np.isfinite(values)]
+    most = float(np.percentile(known, 99.0)) if len(known) else 0.0
+    if most <= 0.0:
+        return 0.1
+    power = 10.0 ** floor(log10(most))
+    return next(step * power for step in ROUND if step * power >= most * (1.0 - 1e-9))

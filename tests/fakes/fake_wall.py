@@ -1,0 +1,101 @@
+"""A measured wall, small and made up: frames of it, a reference from some of them, and its record on disk."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from nlos_calibration.bare_wall import BareWall, BareWallStatistics, save_reference
+from nlos_calibration.measured_wall import MeasuredWall, load_measured
+from nlos_calibration.projection import Intrinsics
+from nlos_calibration.rig import dump_toml, load_rig
+from nlos_calibration.wall import WallFit, wall_depth
+from nlos_calibration.wall_record import wall_record
+
+from nlos_cam.frames import Frame, maps_from_frame
+
+RIG = load_rig("paper-rig")
+SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
+SERIAL = "f0246262"
+NOISE_M = 5e-4
+WALL_M = wall_depth(RIG.wall_from_lidar, SMALL)
+WALL_M[~(WALL_M < 0.6)] = np.nan
+"""(64, 80); as the paper's lidar sees a bare wall, as far as 0.6 m."""
+FIT = WallFit(
+    *(0.2, 45.0, 0.0, RIG.facing_deg),
+    *(0.0,) * 4,
+    RIG.wall_from_lidar,
+    np.zeros((3, 3)),
+    *(1e-4, 1.0, 0.99),
+    np.isfinite(WALL_M),
+    *(0.0, 0.0, 0.0),
+    "good",
+    "fine",
+    (),
+)
+
+
+def wall_frame(number: int, nearer_m: float = 0.0) -> Frame:
+    """A frame of the bare wall, noisy; its depth all nearer by so much."""
+    generator = np.random.default_rng(number)
+    depth_m = (WALL_M - nearer_m + generator.normal(0.0, NOISE_M, WALL_M.shape)).astype(np.float32)
+    ir = generator.integers(20, 40, WALL_M.shape, np.uint8)
+    return Frame(depth_m, ir, ir, number / 30, number, SMALL, {"laser_power": 40.0})
+
+
+def bare_wall(frames: int = 20) -> BareWall:
+    statistics = BareWallStatistics(SMALL)
+    for number in range(frames):
+        frame = wall_frame(number)
+        maps = maps_from_frame(frame)
+        statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
+    statistics.look_at({"ldd_temperature": 40.0})
+    return statistics.reference(FIT.inliers, serial=SERIAL, settings={"laser_power": 40.0})
+
+
+def write_wall(path: Path, reference: BareWall | None = None, intrinsics: Intrinsics = SMALL, **others: Any) -> Path:
+    """A record, and the reference beside it if there is one."""
+    if reference:
+        npz = path.with_suffix(".npz")
+        others |= {"reference": npz.name, "reference_sha256": save_reference(npz, reference)}
+    about: dict[str, Any] = {"camera": "sim:bare-wall", "frames": 20, "created": date(2026, 1, 2)}
+    record = wall_record(FIT, intrinsics, **about, others={"serial": SERIAL, **others})
+    path.write_text(dump_toml(record), encoding="utf-8")
+    return path
+
+
+def measured_wall(folder: Path) -> MeasuredWall:
+    return load_measured(write_wall(folder / "wall.toml", bare_wall()))
+
+
+class WallCamera:
+    """Frames of the bare wall; those of the numbers in `moved` are of a lidar 10 mm nearer."""
+
+    intrinsics, rig, incomplete, dropped = SMALL, None, 0, 0
+
+    def __init__(self, frames: int, moved: range = range(0), celsius: float = 40.0, period_s: float = 1 / 30) -> None:
+        self.uri, self.identity, self.counts = "bag:fake.bag", {"serial": SERIAL}, Counter[str]()
+        self._frames, self._moved, self._celsius, self._period_s = frames, moved, celsius, period_s
+        self.asked = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Frame]:
+        for number in range(self._frames):
+            frame = wall_frame(number, 0.01 if number in self._moved else 0.0)
+            yield replace(frame, timestamp_s=number * self._period_s)
+
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        self.asked += 1
+        return {f"ldd{ending}": self._celsius}
+
+
+def other_intrinsics(**changes: float) -> Intrinsics:
+    return replace(SMALL, **changes)

@@ -1,0 +1,75 @@
+"""A colour camera beside a SoftwareLidar, in the same software device; and recordings of both."""
+
+import gc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nlos_calibration.projection import Intrinsics
+from numpy.typing import NDArray
+
+from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.render.sensor import SensedImages
+
+BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "yuyv": 2, "uyvy": 2}
+
+
+class SoftwareColour:
+    """The L515's RGB sensor as librealsense sees it: delivers what is pushed into it while it streams."""
+
+    def __init__(
+        self,
+        lidar: SoftwareLidar,
+        pinhole: Intrinsics,
+        lens: NDArray[np.float64],
+        lidar_from_colour: NDArray[np.float64],
+        form: str = "rgb8",
+    ) -> None:
+        self._sdk, self._bytes = load_sdk(), BYTES_PER_PIXEL[form]
+        self.sensor: Any = lidar.device.add_sensor("RGB Camera")
+        made = self._sdk.video_stream()
+        made.type, made.index, made.uid = self._sdk.stream.color, 0, 100
+        made.width, made.height, made.fps = pinhole.width, pinhole.height, FRAMES_PER_S
+        made.bpp, made.fmt = self._bytes, getattr(self._sdk.format, form)
+        made.intrinsics = lidar._sdk_intrinsics(pinhole)
+        made.intrinsics.model, made.intrinsics.coeffs = self._sdk.distortion.brown_conrady, lens.tolist()
+        self.profile: Any = self._sdk.video_stream_profile(self.sensor.add_video_stream(made, True))
+        for other in lidar._profiles.values():
+            self.profile.register_extrinsics_to(other, self._extrinsics(lidar_from_colour))
+            other.register_extrinsics_to(self.profile, self._extrinsics(np.linalg.inv(lidar_from_colour)))
+
+    def _extrinsics(self, pose: NDArray[np.float64]) -> Any:
+        made = self._sdk.extrinsics()
+        made.rotation, made.translation = pose[:3, :3].T.ravel().tolist(), pose[:3, 3].tolist()
+        return made
+
+    def push(self, number: int, pixels: NDArray[np.uint8]) -> None:
+        """Deliver one frame, only while the sensor streams: as many bytes per pixel as its format has."""
+        frame = self._sdk.software_video_frame()  # a new one each time: a pushed frame belongs to the SDK
+        frame.pixels, frame.bpp, frame.stride = np.ascontiguousarray(pixels), self._bytes, pixels.shape[1] * self._bytes
+        frame.timestamp, frame.frame_number = 1e12 + number * 1e3 / FRAMES_PER_S, number
+        frame.domain, frame.profile = self._sdk.timestamp_domain.global_time, self.profile
+        self.sensor.on_video_frame(frame)
+
+
+def record_with_colour(
+    path: Path, lidar: SoftwareLidar, colour: SoftwareColour, images: list[SensedImages], seen: list[NDArray[np.uint8]]
+) -> Path:
+    """A recording of depth, infrared and confidence, then of colour, as librealsense writes it."""
+    recorder = load_sdk().recorder(str(path), lidar.device)
+    for sensor in (lidar._sensor, colour.sensor):
+        sensor.open(sensor.get_stream_profiles())
+        sensor.start(lambda _: None)
+    for number, instant in enumerate(images):
+        lidar.push(number, 1e9 + number / FRAMES_PER_S, instant)
+    for number, pixels in enumerate(seen):
+        colour.push(number, pixels)
+    recorder.pause()  # what came is written before this returns
+    for sensor in (lidar._sensor, colour.sensor):
+        sensor.stop()
+        sensor.close()
+    del recorder
+    gc.collect()
+    return path

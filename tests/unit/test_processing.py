@@ -1,0 +1,105 @@
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from fake_wall import RIG, WallCamera, measured_wall, wall_frame
+from nlos_calibration.errors import CalibrationError
+
+from nlos_cam.bench import Bench
+from nlos_cam.frame_reader import FrameReader
+from nlos_cam.live_report import Step
+from nlos_cam.processing import Processing, read_along, steps
+from nlos_cam.reconstruct import Clock
+
+
+def network(*_: np.ndarray) -> np.ndarray:
+    return np.full((1, 64, 64), 0.5, np.float32)
+
+
+def all_steps(processing: Processing, camera: WallCamera, clock: Clock = lambda: 0.0) -> list[Step]:
+    frames, thermometer = read_along(camera, camera, processing.bench)
+    with FrameReader(frames, keeps_all=True, stop=Event(), clock=lambda: 0.0) as reader:
+        return list(steps(reader, processing, clock, thermometer=thermometer))
+
+
+def test_every_stage_is_timed_with_the_clock_it_is_given() -> None:
+    ticks = iter(range(10_000))
+    done = all_steps(Processing(Bench(RIG), network), WallCamera(3), lambda: float(next(ticks)))
+    assert [step.frame.frame_number for step in done] == [0, 1, 2]
+    for step in done:
+        assert step.stages_s == {"wait": 1.0, "maps": 1.0, "bench": 1.0, "network": 1.0}
+
+
+def test_networks_eat_the_mean_of_raw_maps_or_of_their_difference(tmp_path: Path) -> None:
+    bench, eaten = Bench(RIG, measured_wall(tmp_path)), list[np.ndarray]()
+
+    def noting(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+        eaten.append(depth_m[0])
+        return network()
+
+    for eats_difference in (False, True):
+        done = all_steps(Processing(bench, noting, eats_difference=eats_difference, average=4), WallCamera(6))
+    mean_m = np.mean([wall_frame(number).depth_m for number in range(2, 6)], axis=0)
+    assert bench.reference is not None
+    np.testing.assert_allclose(eaten[5], mean_m, atol=1e-6)
+    np.testing.assert_allclose(eaten[11], mean_m - bench.reference.map_depth_m, atol=1e-6)
+    assert done[5].frame.frame_number == 5
+    assert done[5].difference is not None
+    np.testing.assert_array_equal(done[5].difference.depth_m, eaten[11])
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 0.0045])
+def test_raw_maps_are_corrected_by_the_measured_offset(tmp_path: Path, offset_m: float) -> None:
+    measured, eaten = measured_wall(tmp_path), list[np.ndarray]()
+    measured = replace(measured, record=measured.record.model_copy(update={"range_offset_m": offset_m}))
+
+    def noting(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+        eaten.append(depth_m[0])
+        return network()
+
+    (step,) = all_steps(Processing(Bench(RIG, measured), noting), WallCamera(1))
+    np.testing.assert_array_equal(eaten[0], step.maps.depth_m + np.float32(offset_m))
+
+
+def test_networks_that_eat_difference_maps_need_a_reference() -> None:
+    with pytest.raises(CalibrationError, match="these weights eat difference maps: give --wall with a reference"):
+        Processing(Bench(RIG), network, eats_difference=True)
+
+
+def test_what_drifts_is_looked_for_in_the_frame_and_not_in_the_mean(tmp_path: Path) -> None:
+    processing = Processing(Bench(RIG, measured_wall(tmp_path)), network, average=1000)
+    done = all_steps(processing, WallCamera(100, moved=range(50, 100)))
+    assert not any(step.warnings for step in done[:50])
+    assert done[-1].warnings
+
+
+def test_a_temperature_is_warned_of_from_the_frame_on_that_it_was_read_at(tmp_path: Path) -> None:
+    bench = Bench(RIG, measured_wall(tmp_path))
+    done = all_steps(Processing(bench, network), WallCamera(3, celsius=80.0))
+    assert all("ldd_temperature is 80 degrees" in "".join(step.warnings) for step in done)
+
+
+def test_a_camera_is_asked_from_time_to_time_where_there_is_a_reference_to_hold_it_against(tmp_path: Path) -> None:
+    asked = {}
+    for known in (None, measured_wall(tmp_path)):
+        camera = WallCamera(25, period_s=1.0)
+        all_steps(Processing(Bench(RIG, known), network), camera)
+        asked[known is not None] = camera.asked
+    assert asked == {False: 0, True: 3}
+
+
+def failing_at(number: int) -> Iterator[np.ndarray]:
+    """Images of a network that fails on one of its frames, counted from 0."""
+    for count in range(10_000):
+        if count == number:
+            raise ZeroDivisionError("an odd frame")
+        yield network()
+
+
+def test_a_failure_is_raised_unless_somebody_takes_it() -> None:
+    images = failing_at(3)
+    with pytest.raises(ZeroDivisionError, match="an odd frame"):
+        all_steps(Processing(Bench(RIG), lambda *_: next(images)), WallCamera(9))

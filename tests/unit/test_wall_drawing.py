@@ -1,0 +1,171 @@
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from measured_walls import HEIGHT, WIDTH, exact_wall
+from nlos_calibration.bare_wall import BareWall
+from nlos_calibration.geometry import normal_from_angles, wall_from_plane
+from nlos_calibration.measured_wall import MeasuredWall
+
+from nlos_cam.view.pictures import BACKGROUND_RGB, SATURATED_RGB
+from nlos_cam.view.wall_drawing import (
+    MOST_POINTS,
+    OFF_WALL_M,
+    bench_drawings,
+    every_nth,
+    outline_m,
+    wall_names,
+    wall_pictures,
+    wall_points_m,
+)
+
+SHAPE = HEIGHT, WIDTH
+NOTHING = np.full(SHAPE, np.nan, np.float32)
+PATHS = {
+    f"bench/measured/{name}"
+    for name in ("footprint", "distance", "distance/end", "axis", "axis/end", "frame", "points")
+}
+
+
+def reference_of(wall: MeasuredWall) -> BareWall:
+    assert wall.reference is not None
+    return wall.reference
+
+
+def points(drawing: Any) -> np.ndarray:
+    return np.array(drawing.positions.as_arrow_array().to_pylist())
+
+
+def with_record(wall: MeasuredWall, **fields: Any) -> MeasuredWall:
+    return dataclasses.replace(wall, record=wall.record.model_copy(update=fields))
+
+
+def test_an_exact_reference_lies_on_the_plane_within_the_footprint() -> None:
+    wall = exact_wall()
+    points_m = wall_points_m(wall.record, reference_of(wall))
+    np.testing.assert_allclose(points_m[..., 2], 0.0, atol=1e-6)
+    outline = outline_m(wall)
+    assert (points_m[..., :2].min(axis=(0, 1)) > outline.min(axis=0) - 0.01).all()
+    assert (points_m[..., :2].max(axis=(0, 1)) < outline.max(axis=0) + 0.01).all()
+
+
+@pytest.mark.parametrize("cause", ["origin", "depth"])
+def test_points_lie_on_the_plane_once_the_range_offset_is_allowed_for(cause: str) -> None:
+    offset_m, wall = 0.0045, exact_wall()
+    depth_m = reference_of(wall).depth_m
+    if cause == "depth":
+        short = exact_wall(depth_m=depth_m - np.float32(offset_m))
+    else:  # the zero of depth lies nearer to the wall: what is seen is a wall at that distance
+        seen_m = 0.2 - offset_m * np.cos(np.pi / 4)
+        short = exact_wall(depth_m=depth_m * np.float32(seen_m / 0.2))
+    offset = with_record(short, range_offset_m=offset_m, range_offset_cause=cause)
+    np.testing.assert_allclose(wall_points_m(offset.record, reference_of(offset))[..., 2], 0.0, atol=1e-6)
+    assert np.abs(wall_points_m(wall.record, reference_of(short))[..., 2]).max() > 0.003
+
+
+@given(st.integers(1, 700), st.integers(1, 700), st.integers(1, 9000))
+def test_thinning_keeps_no_more_than_asked_for_and_not_far_fewer(height: int, width: int, most: int) -> None:
+    kept = np.zeros((height, width), np.bool_)[every_nth((height, width), most)]
+    assert 1 <= kept.size <= most
+    if min(height, width) >= 50 and most >= 50:
+        assert kept.size > min(most, height * width) / 8
+
+
+def test_the_outline_is_closed_and_stays_on_the_wall() -> None:
+    wall = exact_wall()
+    outline, extent = outline_m(wall), wall.record.rig.wall
+    np.testing.assert_array_equal(outline[0], outline[-1])
+    assert (outline >= [extent.x_min_m - 1e-6, extent.y_min_m - 1e-6]).all()
+    assert (outline <= [extent.x_max_m + 1e-6, extent.y_max_m + 1e-6]).all()
+
+
+def test_beams_that_never_meet_the_wall_leave_the_outline_finite() -> None:
+    yaw = np.radians(75.0)
+    pose = wall_from_plane(normal_from_angles(yaw, 0.0), 0.2)
+    wall = with_record(exact_wall(), wall_from_lidar=pose.tolist(), yaw_deg=75.0, facing_deg=75.0)
+    outline = outline_m(wall)
+    assert len(outline) > 3
+    assert np.isfinite(outline).all()
+    assert outline[:, 0].max() == pytest.approx(wall.record.rig.wall.x_max_m, abs=0.5)
+
+
+def test_a_lidar_that_sees_past_the_wall_has_no_outline() -> None:
+    wall = exact_wall()
+    far = wall.record.rig.wall.model_copy(update={"x_min_m": -1.0, "x_max_m": -0.9})
+    rig = wall.record.rig.model_copy(update={"wall": far})
+    past = with_record(wall, rig=rig)
+    assert len(outline_m(past)) == 0
+    assert "bench/measured/footprint" not in dict(bench_drawings(past))
+
+
+def test_distance_and_angle_are_told_beside_their_lines() -> None:
+    drawings = dict(bench_drawings(exact_wall()))
+    assert set(drawings) == PATHS
+    assert drawings["bench/measured/distance/end"].labels.as_arrow_array().to_pylist() == ["0.2000 m"]
+    assert drawings["bench/measured/axis/end"].labels.as_arrow_array().to_pylist() == ["45.0 degrees"]
+    np.testing.assert_allclose(points(drawings["bench/measured/distance/end"]), [[0.0, 0.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(points(drawings["bench/measured/axis/end"]), [[0.2, 0.0, 0.0]], atol=1e-6)
+
+
+def test_a_wall_without_a_reference_still_shows_its_pose_and_footprint() -> None:
+    wall = exact_wall(reference=None)
+    assert set(dict(bench_drawings(wall))) == PATHS - {"bench/measured/points"}
+    assert wall_pictures(wall) == {}
+    assert wall_names(wall, None).pictures() == []
+
+
+def test_a_reference_without_a_return_is_drawn_without_points() -> None:
+    wall = exact_wall(depth_m=NOTHING, depth_std_m=NOTHING, ir=NOTHING, inliers=np.zeros(SHAPE, np.bool_))
+    assert set(dict(bench_drawings(wall))) == PATHS - {"bench/measured/points"}
+    pictures = wall_pictures(wall)
+    assert (pictures["residual"] == BACKGROUND_RGB).all()
+    assert (pictures["noise"] == BACKGROUND_RGB).all()
+    assert "1 mm" in wall_names(wall, None).noise
+
+
+def test_points_with_holes_and_strays_are_the_others_only() -> None:
+    depth_m = reference_of(exact_wall()).depth_m.copy()
+    chance = np.random.default_rng(0).random(SHAPE)
+    depth_m[chance < 0.6], depth_m[chance > 0.9] = np.nan, 2.0
+    wall = exact_wall(depth_m=depth_m)
+    drawn_m = points(dict(bench_drawings(wall))["bench/measured/points"])
+    near = np.abs(wall_points_m(wall.record, reference_of(wall))[..., 2]) <= OFF_WALL_M
+    assert 0 < len(drawn_m) <= MOST_POINTS
+    assert 0 < near.sum() < depth_m.size / 2
+    assert np.isfinite(drawn_m).all()
+    assert np.abs(drawn_m[:, 2]).max() <= OFF_WALL_M
+
+
+def test_what_was_ever_saturated_is_marked_in_the_bench_and_in_its_picture() -> None:
+    saturated = np.zeros(SHAPE, np.float32)
+    saturated[31, 17] = 0.1
+    wall = exact_wall(saturated=saturated)
+    marked_m = points(dict(bench_drawings(wall))["bench/measured/saturated"])
+    np.testing.assert_allclose(marked_m, [wall_points_m(wall.record, reference_of(wall))[31, 17]], atol=1e-6)
+    is_marked = (wall_pictures(wall)["saturated"] == SATURATED_RGB).all(axis=-1)
+    assert np.argwhere(is_marked).tolist() == [[31, 17]]
+
+
+def test_a_single_saturated_pixel_survives_the_thinning_of_a_large_picture() -> None:
+    shape = 480, 641
+    saturated = np.zeros(shape, np.float32)
+    saturated[301, 17] = 1.0
+    large = reference_of(exact_wall()).intrinsics.scaled(641, 480)
+    blank = np.full(shape, 0.3, np.float32)
+    fields = {"depth_m": blank, "depth_std_m": blank, "ir": blank, "saturated": saturated}
+    wall = exact_wall()
+    reference = dataclasses.replace(reference_of(wall), **fields, inliers=blank > 0, intrinsics=large)
+    picture = wall_pictures(dataclasses.replace(wall, reference=reference))["saturated"]
+    assert picture.shape == (240, 321, 3)
+    assert np.argwhere((picture == SATURATED_RGB).all(axis=-1)).tolist() == [[150, 8]]
+
+
+def test_names_state_their_scales() -> None:
+    names = wall_names(exact_wall(), 0.3)
+    assert names.difference == "Change (red: 30 cm nearer)"
+    assert names.residual == "Residual (±2 mm)"
+    assert names.noise == "Noise (to 0.5 mm)"
+    assert wall_names(exact_wall(), None).difference == ""
