@@ -8,7 +8,7 @@ from difference_noise import REFERENCE_CELSIUS, Pattern, biased, rms
 from difference_scenes import Bench, Signal
 from difference_sight import Mask, Sight, Track
 from difference_snr import Cells, frames_for_cells, frames_for_filter, hours, ratio
-from difference_waveform import Array
+from difference_waveform import Array, chips_peak, gaussian_peak
 
 from nlos_cam.frames import Float32
 
@@ -31,7 +31,12 @@ def lambertian(sight: Sight, benches: list[Bench], later: list[Float32], track: 
         },
         "lit_cells": float(np.mean([at.sum() / cells.sum() for at in chosen])),
         "depth_um": _percentiles(depth_um),
-        "depth_um_of_chips": _percentiles([1e6 * np.abs(benches[1].chips_depth_m(one)[cells]) for one in later]),
+        **{
+            f"depth_um_{name}": _percentiles(
+                [1e6 * np.abs(benches[1].first_order_m(one, peak)[cells]) for one in later]
+            )
+            for name, peak in (("first_order", gaussian_peak(benches[1].pulse_ns)), ("of_chips", chips_peak()))
+        },
         "depth_um_of_best_cell": {
             "least": min(float(one.max()) for one in depth_um),
             "median": float(np.median([one.max() for one in depth_um])),

@@ -61,6 +61,7 @@ def paper(sight: Sight, bench: Bench, signals: list[Signal], track: Track) -> di
     for which, some in ((which, parts[which.__name__]) for which in (merged, switched)):
         if some:
             told[which.__name__] = _strength(some, which, sight.cells)
+            told[which.__name__]["intensity"] = sight.intensity_ratios(some, which, USUAL_FRAMES)
             for name, left_m in (("by_frames", usual_m), ("by_frames_steady", sight.left_m(usual, 0.0))):
                 told[which.__name__][name] = [{"frames": n, **sight.ratios(some, which, left_m, n)} for n in FRAMES]
     if some := parts["merged"]:

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from difference_waveform import Array, chips_shift_m, pulse_sigma_m, received
+from difference_waveform import Array, Peak, first_order, pulse_sigma_m, received
 from nlos_calibration.rig import Rig, load_rig
 from numpy.typing import NDArray
 
@@ -94,10 +94,10 @@ class Bench:
         wins = some.max(1) > direct
         return np.where(wins, (some.argmax(1) + 0.5) * bin_m, path_m), np.where(wins, some.max(1), direct)
 
-    def chips_depth_m(self, later: Float32) -> Array:
-        """Change of depth (64, 80), to first order, if the peak is that of chips instead (`chips_shift_m`)."""
+    def first_order_m(self, later: Float32, peak: Peak) -> Array:
+        """Change of depth (64, 80) that weak later light makes to such a peak."""
         direct, path_m = self.beams.direct[self.on_wall], 2 * self.beams.length_m[self.on_wall]
-        shift_m = chips_shift_m(direct, path_m, later[self.on_wall].astype(np.float64), self.rig.device.bin_m)
+        shift_m = first_order(direct, path_m, later[self.on_wall].astype(np.float64), self.rig.device.bin_m, peak)
         return self._map(shift_m / 2 * self.beams.cos_axis[self.on_wall])
 
     def merges(self, path_m: Array) -> NDArray[np.bool_]:

@@ -62,10 +62,23 @@ class Sight:
         return Cells(signal.counts[chosen], self.noise.counts[chosen], np.zeros(int(chosen.sum())))
 
     def ratios(self, signals: list[Signal], which: Which, left_m: dict[str, Array], frames: int) -> dict[str, Any]:
-        """Signal to noise of each kind of map after so many frames: the median over the objects."""
-        told: dict[str, Any] = {}
-        for name in MAPS:
-            averaged = effective(frames, np.inf if name == "raw" else REFERENCE_FRAMES)
-            every = [astuple(ratio(self.of(one, which, left_m[name]), averaged)) for one in signals]
-            told[name] = asdict(Ratio(*np.median(every, axis=0).tolist()))
-        return told
+        """Signal to noise of the depth of each kind of map after so many frames: the median over the objects."""
+        return {
+            name: _median([ratio(self.of(one, which, left_m[name]), _averaged(name, frames)) for one in signals])
+            for name in MAPS
+        }
+
+    def intensity_ratios(self, signals: list[Signal], which: Which, frames: int) -> dict[str, Any]:
+        """The same of the intensity, which has nothing to level."""
+        return {
+            name: _median([ratio(self.counts_of(one, which), _averaged(name, frames)) for one in signals])
+            for name in MAPS[:2]
+        }
+
+
+def _averaged(name: str, frames: int) -> float:
+    return effective(frames) if name == "raw" else effective(frames, REFERENCE_FRAMES)
+
+
+def _median(ratios: list[Ratio]) -> dict[str, float]:
+    return asdict(Ratio(*np.median([astuple(one) for one in ratios], axis=0).tolist()))

@@ -67,7 +67,8 @@ def _paper(one: dict[str, Any]) -> Iterable[str]:
             part = one[kind]
             yield (
                 f"{name}; {kind}: {part['cells']:.0f} cells, RMS {part['rms_um']:.3g} um, "
-                f"median {part['median_um']:.3g} um, {part['rms_counts']:.2g} counts"
+                f"median {part['median_um']:.3g} um, {part['rms_counts']:.2g} counts; IR: "
+                f"{part['intensity']['raw']['rms']:.2g} raw, {part['intensity']['difference']['rms']:.2g} difference"
             )
             yield _table(f"frames | {ratios}", [[f"{row['frames']}", *_ratios(row)] for row in part["by_frames"]])
     if "by_bias" in one:
@@ -102,7 +103,8 @@ def _lambertian(told: dict[str, Any]) -> Iterable[str]:
     sharp, percents = told["without_pulse"], ("p50", "p95", "p99", "p100")
     changes = {
         "depth, um": told["depth_um"],
-        "depth, um, were the peak that of chips": told["depth_um_of_chips"],
+        "depth, um, to first order": told["depth_um_first_order"],
+        "depth, um, to first order, of chips": told["depth_um_of_chips"],
         "IR, counts": told["counts"],
         "margin, without a pulse": sharp["margin"],
     }

@@ -5,6 +5,8 @@ at half height and of height 1, so that a lone echo is as high as its light; the
 found between the samples. A lidar that correlates chips of 1 ns has a peak of that width, but a sharper one.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from math import erf, exp, pi, sqrt
 
 import numpy as np
@@ -36,32 +38,46 @@ def centres_m(bins: int, bin_m: float) -> Array:
     return (np.arange(bins, dtype=np.float64) + 0.5) * bin_m
 
 
-def first_order(direct: Array, path_m: Array, later: Array, bin_m: float, sigma_m: float) -> tuple[Array, Array]:
-    """By how much weak later light shifts the peak (n,), in metres of path, and raises it (n,), relative.
+@dataclass(frozen=True)
+class Peak:
+    """What weak later light meets: g of a lone echo, of height 1."""
 
-    `later` (n, bins) comes beside a direct return (n,) of path_m (n,). Where D g'(t) + sum h_k g'(t - dL_k) is 0, to
-    first order in h / D: t = sum h_k g'(-dL_k) / (-D g''(0)) = sum h_k dL_k g(dL_k) / D, since g' = -t g / s^2. The
-    peak is higher by sum h_k g(dL_k) / D. Errors are of second order: of the relative rise.
-    """
-    off_m = centres_m(later.shape[1], bin_m) - path_m[:, None]
-    weight = later * pulse(off_m, sigma_m) / direct[:, None]
-    return (weight * off_m).sum(1), weight.sum(1)
+    slope: Callable[[Array], Array]
+    """g' at paths before the peak, as a function of how far before it; positive there."""
+    bend: float
+    """-g'' at the peak."""
 
 
-def chips_shift_m(direct: Array, path_m: Array, later: Array, bin_m: float) -> Array:
-    """The first-order shift (n,) of a sharper peak: of correlated chips of CHIP_NS, rounded by the laser's rise.
+def gaussian_peak(pulse_ns: float) -> Peak:
+    """That of `received`: g' = -t g / s^2."""
+    sigma_m = pulse_sigma_m(pulse_ns)
+    return Peak(lambda off_m: off_m / sigma_m**2 * pulse(off_m, sigma_m), 1 / sigma_m**2)
 
-    A triangle, whose cusp nothing weak moves, smeared by a Gaussian: g'(t) = (N(t + T) - 2 N(t) + N(t - T)) / T with N
-    the normal distribution, and g''(0) = -2 (n(0) - n(T)) / T with n its density.
+
+def chips_peak() -> Peak:
+    """A sharper one: chips of CHIP_NS that are correlated, a triangle, smeared by a Gaussian as the laser rises.
+
+    g'(t) = (N(t + T) - 2 N(t) + N(t - T)) / T with N the normal distribution; -g''(0) = 2 (n(0) - n(T)) / T with n its
+    density.
     """
     chip_m = CHIP_NS * 1e-9 * SPEED_OF_LIGHT_M_PER_S
     sigma_m = RISE_NS * 1e-9 * SPEED_OF_LIGHT_M_PER_S / 2.563  # from 10 to 90 %
     places_m = np.linspace(-2 * chip_m, 2 * chip_m, 4001)
     normal = np.array([0.5 * (1 + erf(at / sigma_m / sqrt(2))) for at in places_m])
-    slope = sum(k * np.interp(places_m + at, places_m, normal) for k, at in ((1, chip_m), (-2, 0.0), (1, -chip_m)))
+    before = (np.interp(places_m + at, places_m, normal) for at in (chip_m, 0.0, -chip_m))
+    slope = np.array([1.0, -2.0, 1.0]) @ np.stack(list(before))
     bend = 2 * (1 - exp(-0.5 * (chip_m / sigma_m) ** 2)) / (sqrt(2 * pi) * sigma_m)
+    return Peak(lambda off_m: np.interp(-off_m, places_m, slope) / chip_m, bend / chip_m)
+
+
+def first_order(direct: Array, path_m: Array, later: Array, bin_m: float, peak: Peak) -> Array:
+    """By how much weak later light (n, bins) shifts the peak (n,) of a direct return (n,), in metres of path.
+
+    D g'(t) + sum h_k g'(t - dL_k) = 0 has, to first order in h / D, the root t = sum h_k g'(-dL_k) / (-D g''(0)); of a
+    Gaussian that is sum h_k dL_k g(dL_k) / D. It errs by a share as large as the peak's relative rise.
+    """
     off_m = centres_m(later.shape[1], bin_m) - path_m[:, None]
-    return (later * np.interp(-off_m, places_m, slope)).sum(1) / (direct * bend)
+    return (later * peak.slope(off_m)).sum(1) / (direct * peak.bend)
 
 
 def received(direct: Array, path_m: Array, later: Array, bin_m: float, sigma_m: float) -> tuple[Array, Array]:
