@@ -51,7 +51,17 @@ class Bench:
         if self.reference is None or self._drift is None:
             return Look(None, self.notes)
         self._drift.look(frame.depth_m, frame.settings)
-        return Look(difference_of(maps, self.reference), self.notes + self._drift.warnings)
+        return Look(self._levelled(difference_of(maps, self.reference)), self.notes + self._drift.warnings)
+
+    def _levelled(self, difference: LidarMaps) -> LidarMaps:
+        """The difference less what the range has drifted by over the last second, if it has drifted alike everywhere.
+
+        That is most of what a change of temperature leaves (docs/calibration.md).
+        """
+        drift = self._drift.drift if self._drift else None
+        if drift is None or not drift.uniform:
+            return difference
+        return replace(difference, depth_m=difference.depth_m - np.float32(drift.range_m))
 
     def corrected(self, maps: LidarMaps) -> LidarMaps:
         """The maps with what the lidar's depth lacks, where that was measured (`range_offset`)."""

@@ -36,7 +36,7 @@ class World:
     def __init__(self, scene: SceneFile, echoes: list[MultiBounce], truths: list[Float32 | None]) -> None:
         self.scene = scene
         self._echoes, self._truths = echoes, truths
-        self._sensor = Sensor(scene.rig, scene.sensor)
+        self._sensor = Sensor(scene.rig, scene.sensor, scene.radiometry)
 
     @property
     def rig(self) -> Rig:

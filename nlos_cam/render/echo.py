@@ -101,15 +101,26 @@ def spread(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
     """Histograms (n, bins) as a pulse of that width makes them; longer by its tail, none of the light is lost."""
     if pulse_ns == 0:
         return histogram
-    sigma = pulse_bins(pulse_ns, bin_m)
-    half = int(np.ceil(4 * sigma)) + 1
-    edges = np.arange(-half, half + 2) - 0.5
-    kernel = np.diff([_normal(edge / sigma) for edge in edges])
-    kernel /= kernel.sum()
+    kernel = _pulse(pulse_ns, bin_m)
+    half = len(kernel) // 2
     size = histogram.shape[1] + 2 * half
     spectrum = np.fft.rfft(histogram.astype(np.float64), size, axis=1) * np.fft.rfft(kernel, size)
     wide = np.fft.irfft(spectrum, size, axis=1)[:, half:]  # what would come before time 0 is cut
     return np.maximum(wide, 0).astype(np.float32)
+
+
+def peak_share(pulse_ns: float, bin_m: float) -> float:
+    """What the strongest bin holds of a return that came alone."""
+    return float(_pulse(pulse_ns, bin_m).max()) if pulse_ns else 1.0
+
+
+def _pulse(pulse_ns: float, bin_m: float) -> Array:
+    """The pulse over the bins around its middle, in all 1."""
+    sigma = pulse_bins(pulse_ns, bin_m)
+    half = int(np.ceil(4 * sigma)) + 1
+    edges = np.arange(-half, half + 2) - 0.5
+    kernel = np.diff([_normal(edge / sigma) for edge in edges])
+    return kernel / kernel.sum()
 
 
 def _normal(x: float) -> float:

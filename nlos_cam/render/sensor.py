@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Float32, Frame
-from nlos_cam.render.beams import cast
+from nlos_cam.render.beams import Beams, cast
+from nlos_cam.render.echo import peak_share
 from nlos_cam.render.effects import Effect, included
 from nlos_cam.render.renderer import MultiBounce
+from nlos_cam.render.scene import Radiometry
 from nlos_cam.render.sensor_bias import DepthBias
 from nlos_cam.render.sensor_chain import Bytes, Chain, Echoes, Optics, expose, signal_surety
 from nlos_cam.render.sensor_effects import sensor_effects
@@ -45,11 +47,12 @@ class SensedImages:
 class Sensor:
     """A sensor on a rig: what depends on neither the object nor the frame is worked out once."""
 
-    def __init__(self, rig: Rig, model: SensorModel) -> None:
+    def __init__(self, rig: Rig, model: SensorModel, radiometry: Radiometry = "paper") -> None:
         self.rig = rig
-        verdicts = sensor_effects(model)
-        self._chain = _chain(rig, model, verdicts)
-        self._optics = _optics(rig, self._chain, model.dead_share if included(verdicts, "dead pixels") else 0.0)
+        verdicts, lambertian = sensor_effects(model), radiometry == "lambertian"
+        self._chain = _chain(rig, model, verdicts, lambertian=lambertian)
+        direct = cast(rig, rig.pinhole, lambertian=lambertian)
+        self._optics = _optics(direct, self._chain, model.dead_share if included(verdicts, "dead pixels") else 0.0)
         self._echoes_only = self._optics._replace(direct=np.zeros_like(self._optics.direct))
         self._bias = DepthBias((rig.intrinsics.height, rig.intrinsics.width), model, verdicts)
         self._lights = included(verdicts, "shot noise") or included(verdicts, "read noise")
@@ -75,14 +78,15 @@ class Sensor:
         return generator.standard_normal(self._optics.direct.size, np.float32) if wanted else NO_DEVIATES
 
 
-def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...]) -> Chain:
+def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...], *, lambertian: bool) -> Chain:
     """The stages' constants, with 0 for each stage that the verdicts leave out."""
 
     def called_for(name: str, value: float) -> float:
         return value if included(verdicts, name) else 0.0
 
     bare = rig.model_copy(update={"occluder": None})
-    brightest = float(cast(bare, bare.pinhole).direct.max())
+    brightest = float(cast(bare, bare.pinhole, lambertian=lambertian).direct.max())
+    brightest *= peak_share(model.pulse_ns, rig.device.bin_m)  # the waveform's peak, as a renderer with a pulse has it
     return Chain(
         gain=model.bare_wall_counts / brightest if brightest > 0 else 0.0,
         ambient_counts=called_for("ambient light", model.ambient_counts),
@@ -93,8 +97,7 @@ def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...]) -> Chain:
     )
 
 
-def _optics(rig: Rig, chain: Chain, dead_share: float) -> Optics:
-    beams = cast(rig, rig.pinhole)
+def _optics(beams: Beams, chain: Chain, dead_share: float) -> Optics:
     direct = beams.direct.astype(np.float32)
     surety, length_m = signal_surety(direct, chain), beams.length_m.astype(np.float32)
     dead = np.random.default_rng(0).random(direct.size if dead_share else 0) < dead_share

@@ -62,6 +62,18 @@ def test_the_bare_wall_differs_from_itself_by_its_noise_alone(tmp_path: Path) ->
     assert abs(difference.intensity[difference.valid].mean()) < 0.5
 
 
+def test_a_drift_of_the_whole_range_is_taken_out_of_the_difference(tmp_path: Path) -> None:
+    bench = Bench(RIG, measured_wall(tmp_path))
+    levels_m = list[float]()
+    for number in range(100, 160):
+        frame = wall_frame(number, nearer_m=0.0006)
+        difference = bench.look(frame, maps_from_frame(frame)).difference
+        assert difference is not None
+        levels_m.append(float(difference.depth_m[difference.valid].mean()))
+    assert levels_m[0] == pytest.approx(-0.0006, abs=1e-4)
+    assert np.mean(levels_m[-20:]) == pytest.approx(0.0, abs=1e-4)
+
+
 def test_a_difference_is_what_was_added_to_the_wall_valid_where_both_are() -> None:
     reference = bare_wall()
     added_m, added = np.random.default_rng(0).normal(0.0, 0.01, (2, 64, 80)).astype(np.float32)

@@ -11,7 +11,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.objects.hidden import object_depth
 from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
-from nlos_cam.render.scene import Scene
+from nlos_cam.render.scene import Radiometry, Scene
 from nlos_cam.render.sensor import SensedImages, Sensor, cell_of_pixels
 from nlos_cam.render.sensor_model import DEPTH_UNIT_M, MOST_CONFIDENT, SATURATED, SensorModel
 
@@ -50,6 +50,15 @@ def test_the_gain_puts_the_brightest_bare_wall_return_at_its_counts(counts: floa
     model = QUIET.model_copy(update={"bare_wall_counts": counts})
     for rig in (RIG, BARE):
         assert Sensor(rig, model).expose(NO_ECHO, _generator()).ir.max() == counts
+
+
+@pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
+@pytest.mark.parametrize("pulse_ns", [0.0, 1.0])
+def test_the_gain_holds_for_any_pulse_and_radiometry(radiometry: Radiometry, pulse_ns: float) -> None:
+    scene = Scene(BARE, None, radiometry=radiometry, pulse_ns=pulse_ns)
+    model = QUIET.model_copy(update={"pulse_ns": pulse_ns})
+    images = Sensor(BARE, model, radiometry).expose(render(scene, "draft").multi, _generator())
+    assert images.ir.max() == pytest.approx(48, abs=2)
 
 
 def test_the_gain_does_not_depend_on_what_stands_before_the_wall() -> None:
