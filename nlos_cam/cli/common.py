@@ -20,6 +20,7 @@ from nlos_cam.errors import OutputExistsError
 Json = Annotated[bool, typer.Option("--json", help="End stdout with one JSON object; progress goes to stderr.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what --out names, if it exists.")]
 
+PAPER_RIG = "paper-rig"
 INTERRUPTED = 130
 """The exit code after Ctrl-C or a request to terminate."""
 

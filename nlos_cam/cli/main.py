@@ -23,9 +23,9 @@ COMMANDS = {
     "replay": "live",
     "render": "render",
     "tradeoff": "tradeoff",
-    "dataset": "learn",
-    "train": "learn",
-    "evaluate": "learn",
+    "dataset": "dataset",
+    "train": "train",
+    "evaluate": "evaluate",
 }
 """Each command, and the file of this package that holds it, which adds its own through `register(app)`."""
 

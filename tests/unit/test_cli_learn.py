@@ -15,7 +15,7 @@ from nlos_calibration.rig import load_rig
 from nlos_models.checkpoint import load_pipeline, load_vae
 
 from nlos_cam import dataset
-from nlos_cam.cli import learn
+from nlos_cam.cli import evaluate
 from nlos_cam.cli.main import main
 
 RIG = load_rig("paper-rig")
@@ -205,7 +205,7 @@ class Guesser:
 @pytest.fixture
 def guessing(monkeypatch: pytest.MonkeyPatch) -> None:
     original = dataset.procedural_images
-    monkeypatch.setattr(learn, "load_reconstructor", lambda *_: Guesser())
+    monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: Guesser())
     monkeypatch.setattr(dataset, "procedural_images", lambda seed, count, box: original(seed, min(count, 5), box))
 
 
