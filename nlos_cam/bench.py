@@ -56,7 +56,7 @@ class Bench:
     def _levelled(self, difference: LidarMaps) -> LidarMaps:
         """The difference less what the range has drifted by over the last second, if it has drifted alike everywhere.
 
-        That is most of what a change of temperature leaves (docs/calibration.md).
+        That is most of what a change of temperature leaves (docs/calibration-measured.md).
         """
         drift = self._drift.drift if self._drift else None
         if drift is None or not drift.uniform:

@@ -1,4 +1,4 @@
-"""The study of difference maps as tables for docs/calibration.md."""
+"""The study of difference maps as tables for docs/calibration-measured.md."""
 
 from collections.abc import Iterable
 from typing import Any

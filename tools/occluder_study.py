@@ -2,7 +2,7 @@
 
 Simulated recordings at 160 x 120 (the sensor's: 320 x 240) over the paper's distances and angles, pitched, with sheets
 about where the paper's stands: noise, pixels that mix sheet and wall, outliers, and the simulated camera's own sensor.
-Prints the tables of docs/calibration.md. `--runs` is how many of each setting (1).
+Prints the tables of docs/calibration-measured.md. `--runs` is how many of each setting (1).
 """
 
 import argparse

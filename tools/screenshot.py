@@ -1,8 +1,10 @@
-"""The README's picture: docs/images/live.png, the live view of the simulated camera in a headless Chromium.
+"""The docs' pictures of the live view of the simulated camera, in a headless Chromium: docs/images/live.png.
 
-Run from the repository: `python tools/screenshot.py`. Needs Chromium and the dev extra.
+Run from the repository: `python tools/screenshot.py`; with `--wall bench.toml` docs/images/live_calibrated.png, the view of
+a bench that was calibrated on sim:bare-wall and sim:examples/empty.toml. Needs Chromium and the dev extra.
 """
 
+import argparse
 import re
 import shutil
 import signal
@@ -12,7 +14,7 @@ from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
-OUT = Path("docs/images/live.png")
+IMAGES = Path("docs/images")
 SOFTWARE_GL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 DRAW_MS = 60_000
 """Drawn in software, the page loads in half of that, and its plot has filled."""
@@ -20,14 +22,19 @@ DRAW_MS = 60_000
 
 def main() -> None:
     """Start the live view, look at it for a minute, and keep what is seen."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--wall", help="the record of a calibrated bench")
+    wall = parser.parse_args().wall
+    out = IMAGES / ("live_calibrated.png" if wall else "live.png")
     program = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()", "live", "--camera", "sim"]
+    program += ["--wall", wall] if wall else []
     with subprocess.Popen(program, stderr=subprocess.PIPE, text=True) as live:
         try:
-            _take(_address(live), OUT)
+            _take(_address(live), out)
         finally:
             live.send_signal(signal.SIGINT)
             live.communicate(timeout=60)
-    print(f"wrote {OUT}")
+    print(f"wrote {out}")
 
 
 def _address(live: subprocess.Popen[str]) -> str:

@@ -2,7 +2,7 @@
 
 Simulated recordings over the paper's distances and angles, to either side and pitched: noise, outliers, flicker, walls
 of which part is missing, ripples of the lidar, the simulated camera's own sensor, and walls that are not one flat wall.
-Prints the tables of docs/calibration.md. `--runs` is how many of each setting (60).
+Prints the tables of docs/calibration-measured.md. `--runs` is how many of each setting (60).
 """
 
 import argparse
@@ -133,7 +133,7 @@ def _others(found: Found) -> Iterator[dict[str, Any]]:
 
 
 def as_markdown(table: dict[str, list[dict[str, Any]]]) -> str:
-    """The tables for docs/calibration.md."""
+    """The tables for docs/calibration-measured.md."""
     head = (
         "| {} | runs | refused | doubtful | distance p50 / p95 / max, mm | facing p50 / p95 / max, degrees "
         "| inside 95 %: distance, facing, yaw, pitch | wrong | wrong and good |\n" + "|---" * 9 + "|"

@@ -39,10 +39,12 @@ def _rows(record: WallRecord) -> list[tuple[str, str]]:
     if record.range_offset_std_m is not None:
         told = f"{1e3 * record.range_offset_m:+z.1f} mm{_interval(record.range_offset_std_m, 'mm', 1e3)}"
         rows.append((f"offset of {record.range_offset_cause}", told))
+    if record.occluder is not None:
+        rows.append(("occluder", f"{record.occluder.x_m:.3f} m, gap {record.occluder.gap_m:.3f} m"))
     rows.append(("date", f"{record.created.isoformat()}, {record.frames} frames"))
     if record.temperatures_c:
-        each = (f"{name.removesuffix('_temperature')} {c:.1f}" for name, c in record.temperatures_c.items())
-        rows.append(("temperature", ", ".join(each) + " °C"))
+        coldest, warmest = min(record.temperatures_c.values()), max(record.temperatures_c.values())
+        rows.append(("temperature", f"{coldest:.1f} to {warmest:.1f} °C" if warmest > coldest else f"{warmest:.1f} °C"))
     return rows
 
 

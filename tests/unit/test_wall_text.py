@@ -5,6 +5,7 @@ import pytest
 from measured_walls import exact_wall
 from nlos_calibration.board import BOARDS
 from nlos_calibration.board_wall import BoardRecord
+from nlos_calibration.rig import OccluderRecord
 from nlos_calibration.wall_record import load_wall
 
 from nlos_cam.view.wall_text import ALL_IS_WELL, calibration_text
@@ -44,7 +45,7 @@ def test_what_was_measured_is_told_with_its_interval() -> None:
     assert row(text, "facing") == "45.00° ± 0.020°"
     assert row(text, "yaw") == "+45.00° ± 0.020°"
     assert row(text, "pitch") == "+0.00° ± 0.039°"
-    assert row(text, "temperature") == "ldd 41.7 °C"
+    assert row(text, "temperature") == "41.7 °C"
     assert row(text, "date") == "2026-11-22, 30 frames"
 
 
@@ -88,3 +89,12 @@ def test_older_records_are_told_too(version: int) -> None:
     told = row(calibration_text(dataclasses.replace(exact_wall(), record=record).record), "distance")
     assert told.startswith("0.2000 m")
     assert ("±" in told) == (record.distance_std_m is not None)
+
+
+def test_the_occluder_and_the_span_of_the_temperatures_are_told() -> None:
+    occluder = OccluderRecord(source="entered", x_m=0.21, gap_m=0.09)
+    warm = {"ldd_temperature": 40.0, "apd_temperature": 35.5}
+    text = calibration_text(RECORD.model_copy(update={"occluder": occluder, "temperatures_c": warm}))
+    assert row(text, "occluder") == "0.210 m, gap 0.090 m"
+    assert row(text, "temperature") == "35.5 to 40.0 °C"
+    assert "occluder" not in calibration_text(RECORD)
