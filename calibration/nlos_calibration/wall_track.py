@@ -3,6 +3,7 @@
 from math import asin, atan2, degrees, hypot, inf, sqrt
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +26,8 @@ HOME_SHARE, HOME_SIGMAS = 0.5, 6.0
 """Where at least this share of those that agree agrees with the reference as well, only pixels count at which the plane
 is so near to it: seen at a grazing angle, a detour of some centimetres is a wall turned by a degree, and the few pixels
 that show the wall itself hardly object."""
+HIDDEN_SHARE, PATCH_SHARE = 0.5, 0.5
+"""Where less than the first of the pixels show the wall, those count about which the second of the returns does."""
 NEAR_M, NEAR_DEG = 0.01, 4.0
 FARTHEST_M, FARTHEST_DEG = 0.1, 20.0
 """A wall that moved by more is not looked for: at right angles to it stands the occluder."""
@@ -93,6 +96,9 @@ class WallTrack:
         self._rows = rays * self._per_inverse_m[:, np.newaxis]
         self._columns = np.ascontiguousarray(self._rows.T)
         self._nearest = np.argsort(np.argsort(depth_m)) / max(len(depth_m), 1)
+        rows, columns = np.divmod(self.pixels, width)
+        self._cells = rows * GRID[0] // height * GRID[1] + columns * GRID[1] // width
+        self._grid = np.zeros(GRID, np.float32)
         self._slopes = -wall_from_lidar[2, :3] / wall_from_lidar[2, 3]
         self._pose = _pose(self._slopes)
         self._change, self._widened, self._searches, self._lost = np.zeros(3), 1.0, 0, 0
@@ -109,6 +115,8 @@ class WallTrack:
         off = (off - self._inverse) * self._per_inverse_m
         errors, near = self._begin(off)
         weight = self._weights(errors) if near is None else self._weights(errors) * near
+        if self.share < HIDDEN_SHARE and self._widened == 1.0:
+            weight *= self._in_patches(np.abs(errors) < INSIDE_SIGMAS, returned)
         weighted = self._columns * weight
         information = weighted @ self._rows
         information.flat[::4] += RIDGE
@@ -145,12 +153,18 @@ class WallTrack:
             weight *= self._nearest <= SEARCHES[(self._searches - 1) % len(SEARCHES)][1]
         return weight
 
+    def _in_patches(self, inside: NDArray[np.bool_], returned: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which pixels have enough that show the wall about them: what only crosses it does so in a line."""
+        self._grid.flat[self._cells] = inside - PATCH_SHARE * returned
+        return cv2.blur(self._grid, (3, 3), borderType=cv2.BORDER_CONSTANT).flat[self._cells] >= 0.0
+
     def _sight(self, seen_m: Array, weight: Array) -> Sight | None:
         distance_m, yaw_deg, pitch_deg = _pose(self._slopes + self._change)
         distance_m, yaw_deg, pitch_deg = distance_m - self._pose[0], yaw_deg - self._pose[1], pitch_deg - self._pose[2]
         turn_deg = hypot(yaw_deg, pitch_deg)
         far = abs(distance_m) > NEAR_M or turn_deg > NEAR_DEG
-        if abs(distance_m) > FARTHEST_M or turn_deg > FARTHEST_DEG or self.share < (FAR_SHARE if far else MIN_SHARE):
+        lost = abs(distance_m) > FARTHEST_M or turn_deg > FARTHEST_DEG or not weight.any()
+        if lost or self.share < (FAR_SHARE if far else MIN_SHARE):
             self._lost += 1
             return None
         self._lost = 0
