@@ -3,6 +3,7 @@
 from math import asin, atan2, degrees, hypot, inf, sqrt
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,19 +19,18 @@ NOISY = 3.0
 """A pixel whose spread is so many times what the others' noise lets expect is not watched."""
 INSIDE_SIGMAS, GATE_SIGMAS = 3.0, 4.5
 """Within the first a pixel is the wall's; beyond the second it has no weight (Tukey's biweight)."""
-MIN_SHARE, FAR_SHARE = 0.05, 0.25
-"""Of the pixels, how many must agree on a wall: near where it was, and elsewhere. A sheet, or light that went by way of
-a hidden object, is a wall to some pixels as well, but not near where the wall was."""
+MIN_SHARE = 0.05
+"""Of the pixels, how many must agree on a wall."""
 HOME_SHARE, HOME_SIGMAS = 0.5, 6.0
 """Where at least this share of those that agree agrees with the reference as well, only pixels count at which the plane
 is so near to it: seen at a grazing angle, a detour of some centimetres is a wall turned by a degree, and the few pixels
 that show the wall itself hardly object."""
-NEAR_M, NEAR_DEG = 0.01, 4.0
+HIDDEN_SHARE, PATCH_SHARE = 0.5, 0.5
+"""Where less than the first of the pixels show the wall, those count about which the second of the returns does."""
 FARTHEST_M, FARTHEST_DEG = 0.1, 20.0
 """A wall that moved by more is not looked for: at right angles to it stands the occluder."""
-SEARCHES = ((8.0, 1.0), (64.0, 1.0), (64.0, 0.25))
-"""How often the gate is widened at first, and the share of the pixels (the nearest, where the direct return is the
-strongest) that a search begins with; in turn, until one finds the wall."""
+WIDENED = 8.0
+"""The gate at first, in a search for a wall that is lost."""
 NARROWING = 0.7
 """Of the gate, in each frame of a search."""
 PATIENCE = 8
@@ -92,10 +92,12 @@ class WallTrack:
         self._per_inverse_m = self._per_m * depth_m**2
         self._rows = rays * self._per_inverse_m[:, np.newaxis]
         self._columns = np.ascontiguousarray(self._rows.T)
-        self._nearest = np.argsort(np.argsort(depth_m)) / max(len(depth_m), 1)
+        rows, columns = np.divmod(self.pixels, width)
+        self._cells = rows * GRID[0] // height * GRID[1] + columns * GRID[1] // width
+        self._grid = np.zeros(GRID, np.float32)
         self._slopes = -wall_from_lidar[2, :3] / wall_from_lidar[2, 3]
         self._pose = _pose(self._slopes)
-        self._change, self._widened, self._searches, self._lost = np.zeros(3), 1.0, 0, 0
+        self._change, self._widened, self._lost = np.zeros(3), 1.0, 0
         self.share = 0.0
         """Of the pixels, those that showed the wall in the last frame."""
 
@@ -108,7 +110,9 @@ class WallTrack:
         off = np.divide(1.0, seen_m, out=np.full(len(seen_m), NOWHERE), where=returned)
         off = (off - self._inverse) * self._per_inverse_m
         errors, near = self._begin(off)
-        weight = self._weights(errors) if near is None else self._weights(errors) * near
+        weight = np.maximum(1.0 - (errors / (GATE_SIGMAS * self._widened)) ** 2, 0.0) ** 2 * near
+        if self.share < HIDDEN_SHARE and self._widened == 1.0:
+            weight *= self._in_patches(np.abs(errors) < INSIDE_SIGMAS, returned)
         weighted = self._columns * weight
         information = weighted @ self._rows
         information.flat[::4] += RIDGE
@@ -119,38 +123,36 @@ class WallTrack:
             return None
         return self._sight(np.where(returned, seen_m, self._depth_m), weight)
 
-    def _begin(self, off: Array) -> tuple[Array, NDArray[np.bool_] | None]:
+    def _begin(self, off: Array) -> tuple[Array, NDArray[np.bool_] | float]:
         """The errors from the plane to begin with: the last frame's, the reference's or a search's.
 
-        And which pixels may count, None for all.
+        And which pixels may count, 1 for all.
         """
         if self._lost == PATIENCE:
-            self._widened, self._change, self._lost = SEARCHES[self._searches % len(SEARCHES)][0], np.zeros(3), 0
-            self._searches += 1
+            self._widened, self._change, self._lost = WIDENED, np.zeros(3), 0
         predicted = self._rows @ self._change
         errors = off - predicted
         inside, at_home = np.abs(errors) < INSIDE_SIGMAS, np.abs(off) < INSIDE_SIGMAS
         self.share, home = _share(inside), _share(at_home)
         if self._widened > 1.0 or home < max(MIN_SHARE, HOME_SHARE * self.share):
-            return errors, None
+            return errors, 1.0
         near = np.abs(predicted) < HOME_SIGMAS
         if _share(inside & near) < HOME_SHARE * home:
             self._change, self.share = np.zeros(3), home
-            return off, None
+            return off, 1.0
         return errors, near
 
-    def _weights(self, errors: Array) -> Array:
-        weight = np.maximum(1.0 - (errors / (GATE_SIGMAS * self._widened)) ** 2, 0.0) ** 2
-        if self._widened > 1.0:
-            weight *= self._nearest <= SEARCHES[(self._searches - 1) % len(SEARCHES)][1]
-        return weight
+    def _in_patches(self, inside: NDArray[np.bool_], returned: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which pixels have enough that show the wall about them: what only crosses it does so in a line."""
+        self._grid.flat[self._cells] = inside - PATCH_SHARE * returned
+        return cv2.blur(self._grid, (3, 3), borderType=cv2.BORDER_CONSTANT).flat[self._cells] >= 0.0
 
     def _sight(self, seen_m: Array, weight: Array) -> Sight | None:
         distance_m, yaw_deg, pitch_deg = _pose(self._slopes + self._change)
         distance_m, yaw_deg, pitch_deg = distance_m - self._pose[0], yaw_deg - self._pose[1], pitch_deg - self._pose[2]
         turn_deg = hypot(yaw_deg, pitch_deg)
-        far = abs(distance_m) > NEAR_M or turn_deg > NEAR_DEG
-        if abs(distance_m) > FARTHEST_M or turn_deg > FARTHEST_DEG or self.share < (FAR_SHARE if far else MIN_SHARE):
+        lost = abs(distance_m) > FARTHEST_M or turn_deg > FARTHEST_DEG or not weight.any()
+        if lost or self.share < MIN_SHARE:
             self._lost += 1
             return None
         self._lost = 0

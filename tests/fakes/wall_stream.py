@@ -81,14 +81,19 @@ class WallStream:
         return told
 
 
-def detours(places: Array, share: float, seed: int) -> Hide:
-    """Light that went by way of an object that moves: a share of the pixels is 3 to 40 cm farther, smoothly."""
+def detours(places: Array, share: float, seed: int, *, beyond: bool = False) -> Hide:
+    """Light that went by way of an object that moves: a share of the pixels is 3 to 40 cm farther, smoothly.
+
+    They are here and there, or `beyond` a line that only sways.
+    """
     generator = np.random.default_rng(seed)
     waves = generator.uniform(1, 6, (4, 2)) * generator.choice([-1, 1], (4, 2))
     phases, speeds = generator.uniform(0, 2 * np.pi, 4), generator.uniform(0.02, 0.2, 4)
 
     def hide(depth_m: Array, number: int) -> Array:
         where, length, *_ = np.sin(places @ waves.T + phases + speeds * number).T.reshape(2, 2, -1).sum(axis=1)
+        if beyond:
+            where = places[:, 0] + 0.05 * np.sin(3.0 * places[:, 1] + speeds[0] * number)
         far = where > np.quantile(where, 1.0 - share)
         return depth_m + far * (0.03 + 0.37 * (length + 2.0) / 4.0)
 

@@ -50,6 +50,24 @@ def test_what_is_hidden_or_in_the_way_is_never_told_as_a_move(pose: Pose, share:
         assert stream.show(pose, 100, hide) is None
 
 
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("pose", [POSES[0], (0.3, 75.0, -8.0)])
+def test_a_little_of_the_wall_is_not_drawn_to_what_lies_beyond(pose: Pose, seed: int) -> None:
+    """Seen at a grazing angle, a detour of centimetres is a wall turned by a degree."""
+    stream = WallStream(pose, seed=seed)
+    assert stream.show(pose, 200, detours(stream.places, 0.9, seed, beyond=True)) is None
+    assert stream.check.wall_share == pytest.approx(0.1, abs=0.05)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("pose", [POSES[0], (0.3, 65.0, -8.0)])
+def test_what_crosses_the_wall_is_not_taken_for_it(pose: Pose, seed: int) -> None:
+    """Detours behind an occluder come out at any depth, the wall's among them."""
+    stream = WallStream(pose, seed=seed)
+    hide = both(sheet(stream.places, 0.3), detours(stream.places, 0.8, seed, beyond=seed % 2 == 0))
+    assert stream.show(pose, 200, hide) is None
+
+
 @poses
 @shifts
 def test_a_knock_is_told_and_told_right(pose: Pose, shift: Pose) -> None:
