@@ -99,7 +99,7 @@ def check_intrinsics(measured: Intrinsics, given: Intrinsics) -> None:
             "halves the size), or calibrate the wall again"
         )
     apart = _apart_pixels(measured, given)
-    if apart > MOST_APART_PIXELS:
+    if not apart <= MOST_APART_PIXELS:  # NaN is not
         raise CalibrationError(
             f"the wall was measured with other intrinsics (fx {measured.fx:.2f}, ppx {measured.ppx:.2f}) than the "
             f"camera's (fx {given.fx:.2f}, ppx {given.ppx:.2f}), {apart:.1f} pixels apart: calibrate the wall with "

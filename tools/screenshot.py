@@ -1,7 +1,8 @@
 """The docs' pictures of the live view of the simulated camera, in a headless Chromium: docs/images/live.png.
 
-Run from the repository: `python tools/screenshot.py`; with `--wall bench.toml` docs/images/live_calibrated.png, the view of
-a bench that was calibrated on sim:bare-wall and sim:examples/empty.toml. Needs Chromium and the dev extra.
+Run from the repository: `python tools/screenshot.py`. With `--wall bench.toml` it is
+docs/images/live_calibrated.png, of a bench that was calibrated on sim:bare-wall and sim:examples/empty.toml.
+Needs Chromium and the dev extra.
 """
 
 import argparse

@@ -34,8 +34,6 @@ MEASURED = "_temperature", "noise_estimation"
 """Endings of the options that are measurements."""
 ALIKE = 1e-5
 """Relative: a device keeps its settings as single floats."""
-PIXEL_TOLERANCE = 0.1
-"""Of intrinsics: 0.01 degrees."""
 
 
 def settings_changed(reference: BareWall, settings: Mapping[str, float]) -> tuple[str, ...]:
@@ -47,19 +45,6 @@ def settings_changed(reference: BareWall, settings: Mapping[str, float]) -> tupl
     changed = [name for name, value in then.items() if not isclose(value, settings[name], rel_tol=ALIKE)]
     told = sorted(name for name in changed if not name.endswith(MEASURED) and name not in HOST_OPTIONS)
     return tuple(f"{name} was {then[name]:g} and is {settings[name]:g}" for name in told)
-
-
-def check_camera(reference: BareWall, intrinsics: Intrinsics) -> None:
-    """Raise CalibrationError where a camera's frames cannot be held against the reference."""
-    then = reference.intrinsics
-    _check_size((intrinsics.height, intrinsics.width), then)
-    pairs = [(name, getattr(then, name), getattr(intrinsics, name)) for name in ("fx", "fy", "ppx", "ppy")]
-    told = [f"{name} {was:.2f}, now {now:.2f}" for name, was, now in pairs if not abs(now - was) <= PIXEL_TOLERANCE]
-    if told:
-        raise CalibrationError(
-            f"the bare wall was measured with other intrinsics ({'; '.join(told)}): take the lidar that it was "
-            "measured with, or calibrate the wall again",
-        )
 
 
 def _check_size(shape: tuple[int, ...], then: Intrinsics) -> None:
