@@ -34,7 +34,8 @@ def rest_row(name: str, found: list[Rest]) -> dict[str, Any]:
         "warned_per_10000": 1e4 * warned / frames,
         "of_which_too_little_is_seen": 1e4 * sum(one.blind_frames for one in found) / frames,
         "streams_with_a_warning": sum(one.warned_frames > 0 for one in found),
-        "wall_share": float(np.median([one.wall_share for one in found])),
+        "seen_median": float(np.median([one.seen_share for one in found])),
+        "seen_least": min(one.seen_share for one in found),
     }
 
 
@@ -86,14 +87,11 @@ def look_ms() -> float:
 
 def as_markdown(rests: list[dict[str, Any]], knocks: list[dict[str, Any]]) -> str:
     """The tables for the docs."""
+    told = "with a warning, per 10,000 | of these, that too little of the wall is seen"
     lines = [
-        "| the lidar stands | wall seen | frames | with a warning, per 10,000 | streams with one |",
-        "|---" * 5 + "|",
-        *(
-            f"| {one['name']} | {one['wall_share']:.0%} | {one['frames']} | {one['warned_per_10000']:.1f} | "
-            f"{one['streams_with_a_warning']} of {one['streams']} |"
-            for one in rests
-        ),
+        f"| the lidar stands | wall not hidden: median, least | frames | {told} | streams with one |",
+        "|---" * 6 + "|",
+        *(_rest_line(one) for one in rests),
         "",
         f"| it moved: told / tried, after frames | {' | '.join(KNOCKED)} | right at first, a second later |",
         "|---" * (len(KNOCKED) + 2) + "|",
@@ -103,6 +101,13 @@ def as_markdown(rests: list[dict[str, Any]], knocks: list[dict[str, Any]]) -> st
         cells = [_cell(of[look]) if look in of else "" for look in KNOCKED]
         lines.append(f"| {name} | {' | '.join(cells)} | {_right([of[look] for look in HALF_HIDDEN if look in of])} |")
     return "\n".join(lines)
+
+
+def _rest_line(one: dict[str, Any]) -> str:
+    seen = f"{one['seen_median']:.0%}, {one['seen_least']:.0%}"
+    warned = f"{one['warned_per_10000']:.1f} | {one['of_which_too_little_is_seen']:.1f}"
+    streams = f"{one['streams_with_a_warning']} of {one['streams']}"
+    return f"| {one['name']} | {seen} | {one['frames']} | {warned} | {streams} |"
 
 
 def _cell(one: dict[str, Any]) -> str:
@@ -125,9 +130,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--every", type=int, default=1, help="take one in so many streams")
     every = parser.parse_args().every
-    start = time.perf_counter()
+    start = time.process_time()
     rests, knocks = study(every)
-    facts = {"look_ms": look_ms(), "minutes": (time.perf_counter() - start) / 60, "every": every}
+    facts = {"look_ms": look_ms(), "processor_minutes": (time.process_time() - start) / 60, "every": every}
     table = {"at_rest": rests, "knocks": knocks}
     (DOCS / "drift_study.json").write_text(json.dumps(facts | table, indent=2) + "\n", encoding="utf-8")
     print(as_markdown(rests, knocks), facts, sep="\n\n")

@@ -109,8 +109,8 @@ class Rest:
     warned_frames: int
     blind_frames: int
     """Of these, those with no warning but that too little of the wall is seen."""
-    wall_share: float
-    """At the end."""
+    seen_share: float
+    """Of the watched pixels, those that nothing hid, where the most was hidden."""
 
 
 @dataclass(frozen=True)
@@ -138,15 +138,17 @@ def poses() -> Iterator[tuple[int, Pose]]:
 def at_rest(pose: Pose, look: Look, seed: int) -> Rest:
     """What is told of a lidar that stands; what is in the way is another one every few seconds."""
     stream = WallStream(pose, seed=seed)
-    depth_m, hide, warned, blind = stream.depth_from(pose), _nothing, 0, 0
+    depth_m, hide, warned, blind, seen = stream.depth_from(pose), _nothing, 0, 0, 1.0
     for number in range(AT_REST_FRAMES):
         if number % CHANGES_EVERY == 0:
             hide = look.hide(stream.places, seed + 1001 * (1 + number // CHANGES_EVERY))
-        stream.look(hide(depth_m, number))
+        shown_m = hide(depth_m, number)
+        seen = min(seen, float(np.mean(shown_m == depth_m)))
+        stream.look(shown_m)
         lines = stream.check.warnings
         warned += bool(lines)
         blind += bool(lines) and all(TOLD_OF_BLINDNESS in line for line in lines)
-    return Rest(warned, blind, stream.check.wall_share)
+    return Rest(warned, blind, seen)
 
 
 def knock(pose: Pose, look: Look, shift: Shift, seed: int) -> Knock:
