@@ -1,6 +1,7 @@
 """A measured bare wall and frames of it afterwards, without a camera; only watched pixels have depth, to be fast."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from nlos_calibration.bare_wall import BareWall
@@ -38,7 +39,7 @@ def sensed(depth_m: Array, generator: np.random.Generator) -> Array:
     return np.where(generator.random(depth_m.shape) < DEAD, np.nan, np.round(noisy_m / 0.00025) * 0.00025)
 
 
-def measured(pose: Pose, intrinsics: Intrinsics, generator: np.random.Generator, **facts: object) -> BareWall:
+def measured(pose: Pose, intrinsics: Intrinsics, generator: np.random.Generator, **facts: Any) -> BareWall:
     """The reference that `BareWallStatistics` would come to, drawn at once; `facts` replace fields."""
     depth_m = wall_depth(wall_from_lidar(pose), intrinsics)
     inliers = depth_m < WALL_ENDS_M
@@ -48,8 +49,9 @@ def measured(pose: Pose, intrinsics: Intrinsics, generator: np.random.Generator,
     images = {"depth_m": mean_m, "depth_std_m": noise_m} | dict.fromkeys(("ir", "ir_std"), np.full(depth_m.shape, 40.0))
     maps = dict.fromkeys(("map_depth_m", "map_depth_std_m", "map_intensity", "map_intensity_std"), np.zeros((64, 80)))
     arrays = images | maps | {"saturated": np.zeros(depth_m.shape)}
-    fields = {name: array.astype(np.float32) for name, array in arrays.items()}
-    return BareWall(**(fields | {"inliers": inliers, "frames": REFERENCE_FRAMES, "intrinsics": intrinsics} | facts))
+    fields: dict[str, Any] = {name: array.astype(np.float32) for name, array in arrays.items()}
+    fields |= {"inliers": inliers, "frames": REFERENCE_FRAMES, "intrinsics": intrinsics}
+    return BareWall(**(fields | facts))
 
 
 class WallStream:
@@ -72,13 +74,22 @@ class WallStream:
 
     def show(self, pose: Pose, count: int = 1, hide: Hide = lambda depth_m, _: depth_m) -> int | None:
         """Look at `count` frames from a pose; after how many the first warning was there, None if there was none."""
-        depth_m, told = wall_depth(wall_from_lidar(pose), self.intrinsics).ravel()[self.pixels], None
+        depth_m, told = self.depth_from(pose), None
         for number in range(1, count + 1):
-            self._frame.ravel()[self.pixels] = sensed(hide(depth_m, self.frames), self._generator)
-            self.check.look(self._frame, {})
-            self.frames += 1
+            self.look(hide(depth_m, self.frames))
             told = number if told is None and self.check.warnings else told
         return told
+
+    def depth_from(self, pose: Pose) -> Array:
+        """Of the watched pixels (N,), without noise; NaN where a beam never meets the wall."""
+        depth_m = wall_depth(wall_from_lidar(pose), self.intrinsics).ravel()[self.pixels]
+        return np.where(np.isfinite(depth_m), depth_m, np.nan)
+
+    def look(self, depth_m: Array) -> None:
+        """Take in a frame of these depths of the watched pixels (N,), which gets its noise here."""
+        self._frame.ravel()[self.pixels] = sensed(depth_m, self._generator)
+        self.check.look(self._frame, {})
+        self.frames += 1
 
 
 def detours(places: Array, share: float, seed: int, *, beyond: bool = False) -> Hide:
@@ -98,6 +109,11 @@ def detours(places: Array, share: float, seed: int, *, beyond: bool = False) -> 
         return depth_m + far * (0.03 + 0.37 * (length + 2.0) / 4.0)
 
     return hide
+
+
+def both(first: Hide, second: Hide) -> Hide:
+    """The second on top of the first."""
+    return lambda depth_m, number: second(first(depth_m, number), number)
 
 
 def sheet(places: Array, nearest: float) -> Hide:
