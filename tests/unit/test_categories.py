@@ -55,18 +55,8 @@ def test_its_own_units_are_about_its_own_size(category: str) -> None:
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_every_setting_changes_the_thing(category: str) -> None:
-    kind = CATEGORIES[category]
-    middle = [0.5] * len(kind.settings)
-    thing = kind.make(**kind.drawn(middle))
-    for n in range(len(middle)):
-        other = kind.make(**kind.drawn([*middle[:n], 0.95, *middle[n + 1 :]]))
-        assert other.shape != thing.shape or np.abs(other - thing).max() > 0.005
-
-
-@pytest.mark.parametrize("category", CATEGORIES)
-def test_settings_outside_its_picture_are_left_out(category: str) -> None:
-    """Settings that differ give pictures that differ: none is hidden behind another part."""
+def test_every_setting_shows_in_the_picture(category: str) -> None:
+    """None changes only what is hidden behind another part."""
     kind, pose = CATEGORIES[category], random_pose(np.random.default_rng(4), BOX)
     pose, middle = replace(pose, size_m=0.2, x_m=0, y_m=0), [0.5] * len(kind.settings)
     picture = orthographic_depth(place(kind.make(**kind.drawn(middle)), pose, BOX), BOX)
