@@ -24,7 +24,7 @@ from nlos_cam.render.scene import Radiometry, Scene
 from nlos_cam.render.sensor_model import SensorModel
 from nlos_cam.render.surface import Material
 
-RENDERING_VERSION = 2
+RENDERING_VERSION = 3
 """Raised with any change of what a scene renders to, so that cached worlds are rendered anew."""
 
 
