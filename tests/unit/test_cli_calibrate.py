@@ -90,7 +90,7 @@ def test_the_record_and_the_json_say_the_same(call: Call, tmp_path: Path, capsys
     assert result.pop("out") == str(out)
     assert result.pop("report") == str(tmp_path / "wall.html")
     assert result == record.model_dump(mode="json", include=set(result))
-    assert set(result) >= {"distance_m", "facing_deg", "residual_m", "inlier_fraction", "verdict", "frames"}
+    assert set(result) >= {"distance_m", "facing_deg", "residual_m", "inlier_fraction", "verdict", "advice", "frames"}
     assert set(result) >= {"distance_std_m", "facing_std_deg", "yaw_std_deg", "pitch_std_deg", "range_offset_m"}
     assert (result["distance_m"], result["facing_deg"]) == pytest.approx((0.2, 45.0), abs=1e-6)
     assert (record.camera, record.frames, record.verdict) == ("sim:bare-wall", 10, "good")
