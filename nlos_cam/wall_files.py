@@ -1,5 +1,6 @@
 """What `calibrate` leaves on disk: the record, the bare wall's reference beside it, and a report."""
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,12 +35,16 @@ class WallFiles:
 
 
 def written(files: WallFiles, record: WallRecord, reference: BareWall | None) -> WallRecord:
-    """Write all there is; returns the record, which names its reference."""
-    if reference is not None:
-        with file_when_whole(files.reference) as part:
-            digest = save_reference(part, reference)
-        record = record.model_copy(update={"reference": files.reference.name, "reference_sha256": digest})
-    write_report(files.report, MeasuredWall(record, reference), files.record.name)
-    with file_when_whole(files.record) as part:
+    """Write all there is; returns the record, which names its reference.
+
+    Each is whole before one takes its place, so that what ends this early leaves earlier ones that belong together.
+    """
+    with ExitStack() as whole:
+        part = whole.enter_context(file_when_whole(files.record))
+        if reference is not None:
+            digest = save_reference(whole.enter_context(file_when_whole(files.reference)), reference)
+            record = record.model_copy(update={"reference": files.reference.name, "reference_sha256": digest})
+        report = whole.enter_context(file_when_whole(files.report))
+        write_report(report, MeasuredWall(record, reference), files.record.name)
         part.write_text(dump_toml(record), encoding="utf-8")
     return record

@@ -1,12 +1,15 @@
 """From what was seen of a bare wall to its fit, by depth, tape and printed board, and what the record says of it."""
 
+from dataclasses import replace
+from math import hypot
+
 import numpy as np
 from nlos_calibration.board import Board
 from nlos_calibration.board_view import BoardView
 from nlos_calibration.board_wall import WallByBoard, wall_with_board
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.measured_wall import MeasuredWall, points_m
-from nlos_calibration.occluder import find_occluder
+from nlos_calibration.measured_wall import MeasuredWall, depth_lacks_m, points_m, wall_from_zero
+from nlos_calibration.occluder import OccluderFit, find_occluder
 from nlos_calibration.range_offset import tape_the_wall
 from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall import WallFit, fit_wall
@@ -66,8 +69,8 @@ def by_occluder(seen: Seen, bare: MeasuredWall) -> tuple[WallRecord, NDArray[np.
     """
     record, statistics = bare.record, seen.statistics.depth
     check_intrinsics(record.rig.pinhole, seen.intrinsics)
-    offset_m = record.range_offset_m if record.range_offset_cause == "depth" else 0.0
-    depth_m, noise, pose = statistics.mean_m() + offset_m, statistics.noise(), np.array(record.wall_from_lidar)
+    offset_m = depth_lacks_m(record)
+    depth_m, noise, pose = statistics.mean_m() + offset_m, statistics.noise(), wall_from_zero(record)
     surely = {"distance_std_m": record.distance_std_m or 0.0, "yaw_std_deg": record.yaw_std_deg or 0.0}
     found = find_occluder(depth_m, noise, seen.intrinsics, pose, np.random.default_rng(0), **surely)
     off_m = np.abs(points_m(record, depth_m - offset_m, seen.intrinsics)[..., 2])
@@ -75,13 +78,28 @@ def by_occluder(seen: Seen, bare: MeasuredWall) -> tuple[WallRecord, NDArray[np.
     origin_m = record.range_offset_m - offset_m
     wall = fit_wall(beside, seen.intrinsics, np.random.default_rng(0), noise, origin_m)
     _check_stands(record, wall)
+    found = replace(found, x_std_m=hypot(found.x_std_m, _offset_moves_m(record, found)))
     return with_occluder(record, found), wall.inliers
 
 
+def _offset_moves_m(record: WallRecord, found: OccluderFit) -> float:
+    """The standard uncertainty that the range offset's gives the occluder's place; the gap has it by the distance's.
+
+    An origin moves along the optical axis, and a depth along its ray; the wall, which turns with it, takes some back.
+    """
+    pose = np.array(record.wall_from_lidar)
+    edge_m, axis = np.array([found.x_m, 0.0, found.gap_m]) - pose[:3, 3], pose[:3, 2]
+    per_offset = edge_m[0] / (edge_m @ axis) if record.range_offset_cause == "depth" else axis[0]
+    return abs(float(per_offset)) * (record.range_offset_std_m or 0.0)
+
+
 def _check_stands(record: WallRecord, wall: WallFit) -> None:
-    apart_m, apart_deg = wall.distance_m - record.distance_m, wall.facing_deg - record.facing_deg
-    if max(abs(apart_m) / TOLERANCE_M, abs(apart_deg) / TOLERANCE_DEG) > 1.0:
+    """Yaw and pitch each: on a wall faced obliquely, a lidar that nods faces it as before."""
+    apart_m = wall.distance_m - record.distance_m
+    yaw_deg, pitch_deg = wall.yaw_deg - record.yaw_deg, wall.pitch_deg - record.pitch_deg
+    if max(abs(apart_m) / TOLERANCE_M, abs(yaw_deg) / TOLERANCE_DEG, abs(pitch_deg) / TOLERANCE_DEG) > 1.0:
         raise WallRefusedError(
-            f"the lidar has moved since the bare wall was measured: the wall is {1e3 * apart_m:+.1f} mm farther and "
-            f"turned by {apart_deg:+.2f} degrees: calibrate the bare wall again, then put the occluder back"
+            f"the lidar has moved since the bare wall was measured: the wall is {1e3 * abs(apart_m):.1f} mm "
+            f"{'farther' if apart_m > 0 else 'nearer'}, the lidar turned by {yaw_deg:+z.2f} degrees in yaw and "
+            f"{pitch_deg:+z.2f} in pitch: calibrate the bare wall again, then put the occluder back"
         )

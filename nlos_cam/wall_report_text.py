@@ -5,6 +5,7 @@ from html import escape
 
 from nlos_calibration.board_wall import BoardRecord
 from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.rig_verdict import GAP_RANGE_M
 from nlos_calibration.uncertainty import INTERVAL_STDS
 from nlos_calibration.verdict import DISTANCE_RANGE_M, FACING_RANGE_DEG, TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall_record import WallRecord
@@ -17,8 +18,6 @@ VERDICTS = {
     "doubtful": "? Doubtful: the wall may be elsewhere than measured",
 }
 """Words and a sign beside the colour, for those who do not see it."""
-GAP_RANGE_M = 0.05, 0.20
-"""The paper's (SI 1)."""
 LEAST_TOLD = 0.001
 Row = tuple[str, str, str]
 """What, how much, what that means."""

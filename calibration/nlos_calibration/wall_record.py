@@ -139,17 +139,22 @@ def _rig(fit: WallFit | WallByBoard, intrinsics: Intrinsics) -> Rig:
 
 
 def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
-    """The record with an occluder that was found since; what the wall itself leaves in doubt stays."""
+    """The record with an occluder that was found since; what the wall itself leaves in doubt stays.
+
+    What was said of the occluder before, the paper's or an earlier one, goes.
+    """
     found = {name: value for name, value in vars(fit).items() if name in OccluderRecord.model_fields}
     occluder = OccluderRecord(source="detected", **found)
     rig = rig_with_occluder(record.rig, occluder.x_m, occluder.gap_m)
-    wall = record.verdict, record.advice
-    if record.verdict != "doubtful":
+    pose = np.array(record.wall_from_lidar)
+    if record.verdict == "doubtful":
+        assumed = judge_rig(record.rig, footprint(pose, record.rig.pinhole, record.rig.wall), record.occluder)
+        wall = record.verdict, record.advice.removesuffix("".join(f"; {problem}" for problem in assumed))
+    else:
         wall = range_verdict(record.distance_m, record.facing_deg)
-    seen = footprint(np.array(record.wall_from_lidar), rig.pinhole, rig.wall)
-    verdict, advice = combined(*wall, judge_rig(rig, seen, occluder))
+    verdict, advice = combined(*wall, judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder))
     changed = {"occluder": occluder, "rig": rig, "verdict": verdict, "advice": advice}
-    told = {"warnings": (*record.warnings, *fit.warnings)}
+    told = {"warnings": tuple(dict.fromkeys((*record.warnings, *fit.warnings)))}
     return WallRecord.model_validate(record.model_dump() | changed | told)
 
 

@@ -71,6 +71,7 @@ TOLD = {
     "residual_m",
     "inlier_fraction",
     "verdict",
+    "advice",
     "warnings",
     "frames",
     "reference",

@@ -1,6 +1,7 @@
 """What every command shares: where output goes, how a result or an error is told, what is never overwritten."""
 
 import json as json_module
+import os
 import signal
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -113,7 +114,7 @@ def _on_signals(act: Callable[[], None]) -> Generator[None]:
 def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) -> Path:
     """Where to write: `out`, or a dated name in the current folder; no suffix means a folder, which may be there empty.
 
-    Raises OutputExistsError where that would replace something and `overwrite` was not given.
+    Raises OutputExistsError where that would replace something and `overwrite` was not given, or cannot be written.
     """
     path = out or Path(f"{stem}-{datetime.now().astimezone():%Y%m%d-%H%M%S}{suffix}")
     if suffix and path.is_dir():
@@ -122,4 +123,6 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
         raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
     if not path.parent.is_dir():
         raise OutputExistsError(f"the folder of {path} does not exist: create {path.parent} first")
+    if not os.access(path.parent, os.W_OK):
+        raise OutputExistsError(f"the folder of {path} cannot be written to: choose another, or change its permissions")
     return path

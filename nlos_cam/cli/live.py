@@ -133,7 +133,7 @@ def _processing(bench: Bench, weights: Path | None, average: int) -> Processing:
     eats_difference = network.record.input == "difference maps"
     processing = Processing(bench, network, eats_difference=eats_difference, average=average)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
-    for note in _rig_notes(network.record, rig):
+    for note in [*_rig_notes(network.record, rig), *_reference_note(bench)]:
         say(f"note: {note}")
     return processing
 
@@ -151,6 +151,13 @@ def _rig_notes(trained: CheckpointRecord, rig: Rig) -> list[str]:
     return (
         [f"unlike the rig of the networks, this one has {'; '.join(difference)}: they err more"] if difference else []
     )
+
+
+def _reference_note(bench: Bench) -> list[str]:
+    if not bench.measured or bench.reference:
+        return []
+    told = "no difference maps are formed, and a lidar that moves is not noticed: calibrate the wall again"
+    return [f"this wall's record has no reference: {told}"]
 
 
 def _viewer(bench: Bench, *, no_view: bool) -> Viewer:

@@ -7,6 +7,7 @@ from nlos_calibration.uncertainty import INTERVAL_STDS
 from nlos_calibration.wall_record import WallRecord
 
 ALL_IS_WELL = "nothing has drifted since the calibration"
+NOT_WATCHED = "not watched: the record has no reference of the bare wall; calibrate the wall again"
 
 
 def calibration_text(record: WallRecord, warnings: Sequence[str] = ()) -> str:
@@ -14,7 +15,7 @@ def calibration_text(record: WallRecord, warnings: Sequence[str] = ()) -> str:
     rows = [f"| {what} | {told} |" for what, told in _rows(record)]
     parts = [
         f"**{record.verdict.upper()}**: {record.advice}",
-        _now(warnings),
+        _now(warnings, watched=bool(record.reference)),
         "\n".join(["| measured | with its 95 % interval |", "|---|---|", *rows]),
         *([f"Board: {_board(record.board)}"] if record.board else []),
         *(f"Note: {note}" for note in record.warnings),
@@ -22,9 +23,9 @@ def calibration_text(record: WallRecord, warnings: Sequence[str] = ()) -> str:
     return "\n\n".join(parts)
 
 
-def _now(warnings: Sequence[str]) -> str:
+def _now(warnings: Sequence[str], *, watched: bool) -> str:
     if not warnings:
-        return f"**Now**: {ALL_IS_WELL}"
+        return f"**Now**: {ALL_IS_WELL if watched else NOT_WATCHED}"
     return "\n".join(["> [!WARNING]", *(f"> - {warning}" for warning in warnings)])
 
 

@@ -90,7 +90,7 @@ def test_the_record_and_the_json_say_the_same(call: Call, tmp_path: Path, capsys
     assert result.pop("out") == str(out)
     assert result.pop("report") == str(tmp_path / "wall.html")
     assert result == record.model_dump(mode="json", include=set(result))
-    assert set(result) >= {"distance_m", "facing_deg", "residual_m", "inlier_fraction", "verdict", "frames"}
+    assert set(result) >= {"distance_m", "facing_deg", "residual_m", "inlier_fraction", "verdict", "advice", "frames"}
     assert set(result) >= {"distance_std_m", "facing_std_deg", "yaw_std_deg", "pitch_std_deg", "range_offset_m"}
     assert (result["distance_m"], result["facing_deg"]) == pytest.approx((0.2, 45.0), abs=1e-6)
     assert (record.camera, record.frames, record.verdict) == ("sim:bare-wall", 10, "good")
@@ -209,13 +209,14 @@ def test_a_source_without_frames_is_refused(call: Call, tmp_path: Path) -> None:
         call("--wall", "--camera", "sim", "--out", str(tmp_path / "wall.toml"), frames=0)
 
 
-def test_an_existing_record_is_kept_unless_asked(call: Call, tmp_path: Path) -> None:
-    out = tmp_path / "wall.toml"
-    out.write_text("mine", encoding="utf-8")
-    with pytest.raises(OutputExistsError):
+@pytest.mark.parametrize("name", ["wall.toml", "wall.npz", "wall.html"])
+def test_what_is_there_is_kept_unless_asked(call: Call, tmp_path: Path, name: str) -> None:
+    out, mine = tmp_path / "wall.toml", tmp_path / name
+    mine.write_text("mine", encoding="utf-8")
+    with pytest.raises(OutputExistsError, match=name):
         call("--wall", "--camera", "sim:bare-wall", "--out", str(out))
-    assert out.read_text(encoding="utf-8") == "mine"
-    assert list(tmp_path.iterdir()) == [out]
+    assert mine.read_text(encoding="utf-8") == "mine"
+    assert list(tmp_path.iterdir()) == [mine]
     call("--wall", "--camera", "sim:bare-wall", "--out", str(out), "--overwrite")
     assert load_wall(out).verdict == "good"
 
@@ -225,14 +226,6 @@ def test_without_out_a_dated_name_in_this_folder(call: Call, tmp_path: Path, mon
     call("--wall", "--camera", "sim:bare-wall")
     (path,) = tmp_path.glob("wall-*.toml")
     assert load_wall(path).verdict == "good"
-
-
-@pytest.mark.parametrize("name", ["wall.npz", "wall.html"])
-def test_what_lies_beside_is_kept_unless_asked(call: Call, tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_text("mine", encoding="utf-8")
-    with pytest.raises(OutputExistsError, match=name):
-        call("--wall", "--camera", "sim:bare-wall", "--out", str(tmp_path / "wall.toml"))
-    assert (tmp_path / name).read_text(encoding="utf-8") == "mine"
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,16 @@ def test_weights_that_eat_difference_maps_are_fed_those_or_refused(
 
 
 @pytest.mark.usefixtures("network")
+def test_a_record_without_a_reference_is_told_to_watch_nothing(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    write_wall(tmp_path / "old.toml")
+    for name, notes in (("old.toml", 1), ("wall.toml", 0)):
+        assert main(["replay", "a.bag", "--wall", name, "--out", "out", "--overwrite", "--json"]) == 0
+        assert told(capsys)[1].count("note: this wall's record has no reference") == notes
+
+
+@pytest.mark.usefixtures("network")
 def test_a_camera_of_another_size_is_refused_before_it_streams(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -137,7 +137,7 @@ def test_the_text_is_sent_again_only_when_it_says_something_else(logged: list[st
     moments = [differing(0), differing(1), differing(2, "drifted"), differing(3, "drifted"), differing(4)]
     texts = drawn(moments, measured=exact_wall())
     assert logged.count("calibration") == 3
-    assert [b"drifted since" in text for text in texts] == [True, False, False, False, True]
+    assert [b"**Now**" in text for text in texts] == [True, False, False, False, True]
 
 
 def test_what_is_sent_of_a_moment_grows_by_the_difference_only() -> None:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,22 @@ def test_what_is_written_belongs_together(tmp_path: Path, wall: BareWall) -> Non
     assert measured.record == record
     assert measured.reference is not None
     np.testing.assert_array_equal(measured.reference.depth_m, wall.depth_m)
+
+
+def test_what_ends_the_writing_leaves_the_earlier_files(
+    tmp_path: Path, wall: BareWall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = WallFiles.beside(tmp_path / "wall.toml", overwrite=False)
+    written(files, load_wall(RECORD), wall)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nlos_cam.wall_files.write_report", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        written(files, load_wall(RECORD), replace(wall, depth_m=wall.depth_m + np.float32(0.1)))
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_without_a_reference_none_is_named(tmp_path: Path) -> None:

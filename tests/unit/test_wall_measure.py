@@ -101,8 +101,27 @@ def test_a_gap_out_of_the_papers_range_is_advised_on(bare: MeasuredWall) -> None
 
 def test_a_lidar_that_moved_meanwhile_is_noticed(bare: MeasuredWall) -> None:
     moved = BENCH.model_copy(update={"lidar": LidarPose(distance_m=0.203, yaw_deg=45.0)})
-    with pytest.raises(WallRefusedError, match=r"the lidar has moved since .*: the wall is \+3\.0 mm farther"):
+    with pytest.raises(WallRefusedError, match=r"the lidar has moved since .*: the wall is 3\.0 mm farther"):
         by_occluder(bench_seen(moved), bare)
+
+
+def test_a_lidar_that_nodded_meanwhile_is_noticed(bare: MeasuredWall) -> None:
+    """It faces a wall at 45 degrees as before, to 0.01 degrees."""
+    nodded = BENCH.model_copy(update={"lidar": LidarPose(distance_m=0.2, yaw_deg=45.0, pitch_deg=1.0)})
+    with pytest.raises(WallRefusedError, match=r"turned by \S+ degrees in yaw and \+1\.00 in pitch"):
+        by_occluder(bench_seen(nodded), bare)
+
+
+def test_an_origin_before_the_glass_does_not_move_the_occluder(seen: Seen) -> None:
+    """The beams meet 4 sqrt(2) mm before the glass at 45 degrees: x and distance of the glass are 4 mm from theirs."""
+    fit, facts = by_depth(seen, 0.204)
+    assert facts["range_offset_cause"] == "origin"
+    record = wall_record(fit, INTRINSICS, camera="sim", frames=10, created=date(2026, 1, 2), others=facts)
+    told, _ = by_occluder(bench_seen(BENCH), MeasuredWall(record, None))
+    assert told.occluder is not None
+    assert told.occluder.x_m == pytest.approx(0.204, abs=2e-4)
+    assert told.occluder.gap_m == pytest.approx(0.1, abs=0.002)
+    assert told.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
 
 
 def test_another_camera_is_noticed(bare: MeasuredWall) -> None:

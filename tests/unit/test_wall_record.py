@@ -1,3 +1,4 @@
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -5,10 +6,11 @@ import numpy as np
 import pytest
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
+from nlos_calibration.occluder import OccluderFit
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import ObjectBox, Occluder, dump_toml, load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
-from nlos_calibration.wall_record import VERSION, WallRecord, load_wall, wall_record
+from nlos_calibration.wall_record import VERSION, WallRecord, load_wall, wall_record, with_occluder
 
 PINHOLE = Intrinsics(160, 120, 114.0, 115.0, 80.5, 59.0)
 VERSION_1, VERSION_2 = Path(__file__).parent / "wall_v1.toml", Path(__file__).parent / "wall_v2.toml"
@@ -55,6 +57,17 @@ def test_a_record_may_name_device_reference_and_offset(tmp_path: Path, record: W
     path = tmp_path / "wall.toml"
     path.write_text(dump_toml(record.model_copy(update=others)), encoding="utf-8")
     assert load_wall(path).model_dump(include=set(others)) == others
+
+
+def test_an_occluder_takes_the_place_of_the_one_assumed(record: WallRecord) -> None:
+    """A wall of which noise leaves little sure, and a sheet too near to it, found twice."""
+    doubt = {"verdict": "doubtful", "advice": "average more frames"}
+    fit = OccluderFit(0.2, 1e-4, 0.03, 1e-3, 0.0, 0.1, 0.0, 0.0, 1e-4, np.zeros((2, 2), np.bool_), ("a stray",))
+    first = with_occluder(record.model_copy(update=doubt), fit)
+    assert first.verdict == "doubtful"
+    assert first.advice.startswith("average more frames; the occluder has a gap of 0.030 m")
+    again = with_occluder(first, replace(fit, gap_m=0.1))
+    assert (again.advice, again.warnings) == ("average more frames", ("a stray",))
 
 
 def test_version_1_is_read_as_what_it_says_and_no_more() -> None:

@@ -8,9 +8,9 @@ from nlos_calibration.board_wall import BoardRecord
 from nlos_calibration.rig import OccluderRecord
 from nlos_calibration.wall_record import load_wall
 
-from nlos_cam.view.wall_text import ALL_IS_WELL, calibration_text
+from nlos_cam.view.wall_text import ALL_IS_WELL, NOT_WATCHED, calibration_text
 
-RECORD = exact_wall().record
+RECORD = exact_wall().record.model_copy(update={"reference": "wall.npz", "reference_sha256": "0" * 64})
 BOARD = BoardRecord(
     printed=BOARDS["a4"],
     measured=True,
@@ -52,6 +52,12 @@ def test_what_was_measured_is_told_with_its_interval() -> None:
 def test_an_interval_below_a_thousandth_is_rounded_up_to_it() -> None:
     sure = RECORD.model_copy(update={"facing_std_deg": 1e-7})
     assert row(calibration_text(sure), "facing") == "45.00° ± 0.001°"
+
+
+def test_without_a_reference_nothing_is_said_to_be_well() -> None:
+    text = calibration_text(RECORD.model_copy(update={"reference": "", "reference_sha256": ""}))
+    assert NOT_WATCHED in text
+    assert ALL_IS_WELL not in text
 
 
 def test_what_is_wrong_now_takes_the_place_of_all_being_well() -> None:
