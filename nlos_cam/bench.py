@@ -8,7 +8,7 @@ import numpy as np
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.drift import DriftCheck
 from nlos_calibration.errors import CalibrationError
-from nlos_calibration.measured_wall import MeasuredWall, load_measured
+from nlos_calibration.measured_wall import MeasuredWall, load_measured, wall_from_zero
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig, load_rig
 from nlos_calibration.wall_record import WallRecord
@@ -39,7 +39,7 @@ class Bench:
         self.reference: BareWall | None = measured.reference if measured else None
         self._drift: DriftCheck | None = None
         if measured and measured.reference:
-            self._drift = DriftCheck(measured.reference, np.array(measured.record.wall_from_lidar))
+            self._drift = DriftCheck(measured.reference, wall_from_zero(measured.record))
 
     def look_at(self, celsius: Mapping[str, float]) -> None:
         """Take one reading of the device's temperatures in."""

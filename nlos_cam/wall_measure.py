@@ -7,7 +7,8 @@ import numpy as np
 from nlos_calibration.board import Board
 from nlos_calibration.board_view import BoardView
 from nlos_calibration.board_wall import WallByBoard, wall_with_board
-from nlos_calibration.errors import WallRefusedError
+from nlos_calibration.drift import settings_changed
+from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.measured_wall import MeasuredWall, depth_lacks_m, points_m, wall_from_zero
 from nlos_calibration.occluder import OccluderFit, find_occluder
 from nlos_calibration.range_offset import tape_the_wall
@@ -69,6 +70,11 @@ def by_occluder(seen: Seen, bare: MeasuredWall) -> tuple[WallRecord, NDArray[np.
     """
     record, statistics = bare.record, seen.statistics.depth
     check_intrinsics(record.rig.pinhole, seen.intrinsics)
+    if record.serial and seen.serial and record.serial != seen.serial:
+        raise CalibrationError(
+            f"the bare wall was measured with the camera {record.serial}, this is {seen.serial}: take that one, or "
+            "calibrate the bare wall with this one"
+        )
     offset_m = depth_lacks_m(record)
     depth_m, noise, pose = statistics.mean_m() + offset_m, statistics.noise(), wall_from_zero(record)
     surely = {"distance_std_m": record.distance_std_m or 0.0, "yaw_std_deg": record.yaw_std_deg or 0.0}
@@ -79,7 +85,9 @@ def by_occluder(seen: Seen, bare: MeasuredWall) -> tuple[WallRecord, NDArray[np.
     wall = fit_wall(beside, seen.intrinsics, np.random.default_rng(0), noise, origin_m)
     _check_stands(record, wall)
     found = replace(found, x_std_m=hypot(found.x_std_m, _offset_moves_m(record, found)))
-    return with_occluder(record, found), wall.inliers
+    changes = settings_changed(bare.reference, seen.settings) if bare.reference else ()
+    notes = [f"settings have changed since the bare wall was measured: {', '.join(changes)}"] if changes else []
+    return with_occluder(record, replace(found, warnings=(*found.warnings, *notes))), wall.inliers
 
 
 def _offset_moves_m(record: WallRecord, found: OccluderFit) -> float:

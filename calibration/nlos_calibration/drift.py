@@ -100,7 +100,7 @@ class DriftCheck:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What to tell now, a line each; they stay as they are while nothing changes. Empty while all is well."""
-        lines = [str(self._told) if self._told else "", self._blindness, *self._about_celsius.values()]
+        lines = [str(self._told) if self._told else "", self._blindness, self._about_temperatures()]
         if self._about_settings:
             changes = ", ".join(self._about_settings)
             lines.append(f"settings have changed since the wall was measured: {changes}: calibrate the wall again")
@@ -132,6 +132,12 @@ class DriftCheck:
                 f"{self.wall_share:.0%} of the wall is seen where it was calibrated, too little to notice a lidar that "
                 "moves: look once with nothing hidden; if this stays, it has moved far: calibrate the wall again"
             )
+
+    def _about_temperatures(self) -> str:
+        """Of several that are off, the first: they are of one device."""
+        told = [line for line in self._about_celsius.values() if line]
+        others = f" ({len(told) - 1} more of its temperatures are off)" if len(told) > 1 else ""
+        return told[0] + others if told else ""
 
     def _about_temperature(self, name: str, now_c: float) -> str:
         then_c, span_c = self._reference.celsius[name], self._reference.celsius_span.get(name, 0.0)

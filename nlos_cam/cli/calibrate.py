@@ -115,6 +115,8 @@ def calibrate(
     by_hand = _entered(occluder_x_m, occluder_gap_m)
     if occluder and (board or tape_m is not None or by_hand):
         raise typer.BadParameter("--occluder finds the occluder beside a wall that was measured: give it alone")
+    if occluder and watch:
+        raise typer.BadParameter("--watch shows the bare wall: position the lidar with it, then add the occluder")
     bare = load_measured(occluder) if occluder else None
     files = WallFiles.beside(output_path(out, "wall", ".toml", overwrite=overwrite), overwrite=overwrite)
     if watch:

@@ -1,5 +1,6 @@
 """`nlos-cam`: arguments in, one call, an exit code out."""
 
+import errno
 import importlib
 import json
 import sys
@@ -9,7 +10,7 @@ from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
 from nlos_cam.cli.common import INTERRUPTED, interrupted_by_signals, stderr, stop_on_signals
-from nlos_cam.errors import NlosCamError
+from nlos_cam.errors import DiskFullError, NlosCamError
 
 COMMANDS = {
     "devices": "devices",
@@ -28,6 +29,9 @@ COMMANDS = {
     "evaluate": "evaluate",
 }
 """Each command, and the file of this package that holds it, which adds its own through `register(app)`."""
+
+DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
+"""The disk's, not ours: full, over its quota, read-only, broken."""
 
 
 def build_app(asked: str = "") -> typer.Typer:
@@ -62,10 +66,19 @@ def main(arguments: list[str]) -> int:
         stderr.print(error.format_message(), soft_wrap=True, markup=False)
         return error.exit_code
     except (NlosCamError, CalibrationError, ModelError) as error:
-        stderr.print(f"[bold red]error:[/] {_escaped(error)}", soft_wrap=True)
-        if "--json" in arguments:
-            print(json.dumps({"error": {"type": type(error).__name__, "message": str(error)}}))  # noqa: T201
-        return error.exit_code
+        return _told(error, as_json="--json" in arguments)
+    except OSError as error:
+        if error.errno not in DISK_ERRORS:
+            raise
+        what = f"{error.filename or 'a file'} cannot be written ({error.strerror}): free some space or choose another"
+        return _told(DiskFullError(f"{what} folder"), as_json="--json" in arguments)
+
+
+def _told(error: NlosCamError | CalibrationError | ModelError, *, as_json: bool) -> int:
+    stderr.print(f"[bold red]error:[/] {_escaped(error)}", soft_wrap=True)
+    if as_json:
+        print(json.dumps({"error": {"type": type(error).__name__, "message": str(error)}}))  # noqa: T201
+    return error.exit_code
 
 
 def _escaped(error: Exception) -> str:

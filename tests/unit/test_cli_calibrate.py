@@ -98,9 +98,8 @@ def test_the_record_and_the_json_say_the_same(call: Call, tmp_path: Path, capsys
 
 
 def test_no_more_frames_are_taken_than_asked_for(call: Call, tmp_path: Path) -> None:
-    out = tmp_path / "wall.toml"
-    camera = call("--wall", "--camera", "sim", "--frames", "3", "--out", str(out))
-    assert camera.taken == load_wall(out).frames == 3
+    camera = call("--wall", "--camera", "sim", "--frames", "3", "--out", str(tmp_path / "wall.toml"))
+    assert camera.taken == load_wall(tmp_path / "wall.toml").frames == 3
 
 
 def test_a_recording_is_opened_by_its_path(call: Call, tmp_path: Path) -> None:
@@ -240,6 +239,7 @@ def test_without_out_a_dated_name_in_this_folder(call: Call, tmp_path: Path, mon
         ["--wall", "--camera", "sim", "--occluder-gap-m", "0.1"],
         ["--wall", "--camera", "sim", "--occluder", "wall.toml"],
         ["--occluder", "wall.toml", "--camera", "sim", "--board"],
+        ["--occluder", "wall.toml", "--camera", "sim", "--watch"],
         ["--occluder", "wall.toml", "--camera", "sim", "--tape-m", "0.2"],
         ["--wall", "--camera", "sim", "--board-in", "colour"],
     ],

@@ -1,5 +1,6 @@
 """The command line's frame: one call, an exit code, one line for an error, one object for a machine."""
 
+import errno
 import json
 import os
 import signal
@@ -91,6 +92,17 @@ def test_a_foreseen_error_has_its_code_and_one_line(
     assert main(["act", "--json"]) == code
     last = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert last == {"error": {"type": kind.__name__, "message": message}}
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
+def test_a_disk_that_does_not_take_it_is_one_line(
+    does: Callable[[Act], None], capsys: pytest.CaptureFixture[str], code: int
+) -> None:
+    does(_raise(OSError(code, os.strerror(code), "out/F.npz")))
+    assert main(["act", "--json"]) == 1
+    last = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert last["error"]["type"] == "DiskFullError"
+    assert f"out/F.npz cannot be written ({os.strerror(code)})" in last["error"]["message"]
 
 
 def test_ctrl_c_is_130(does: Callable[[Act], None], capsys: pytest.CaptureFixture[str]) -> None:

@@ -94,6 +94,13 @@ def test_a_temperature_at_the_limit_does_not_flicker(check: DriftCheck) -> None:
     assert check.warnings == ()
 
 
+def test_of_several_temperatures_the_first_is_told_and_how_many_more(check: DriftCheck) -> None:
+    check.look_at({"ldd_temperature": 80.0, "apd_temperature": 80.0})
+    (warning,) = check.warnings
+    assert warning.startswith("ldd_temperature is 80")
+    assert "(1 more of its temperatures are off)" in warning
+
+
 def test_what_is_no_temperature_of_the_reference_is_not_told(check: DriftCheck) -> None:
     check.look_at({"apd_temperature": -9999.0, "another_temperature": 99.0, "ldd_temperature": float("nan")})
     assert check.warnings == ()

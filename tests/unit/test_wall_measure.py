@@ -1,3 +1,4 @@
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -127,6 +128,15 @@ def test_an_origin_before_the_glass_does_not_move_the_occluder(seen: Seen) -> No
 def test_another_camera_is_noticed(bare: MeasuredWall) -> None:
     with pytest.raises(CalibrationError, match="measured at 160x120, the camera gives 80x60"):
         by_occluder(bench_seen(BENCH, RIG.pinhole.scaled(80, 60)), bare)
+
+
+def test_another_device_is_refused_and_other_settings_are_noted(bare: MeasuredWall, seen: Seen) -> None:
+    now = replace(bench_seen(BENCH), serial="f2", settings={"laser_power": 40.0})
+    with pytest.raises(CalibrationError, match="measured with the camera f1, this is f2"):
+        by_occluder(now, replace(bare, record=bare.record.model_copy(update={"serial": "f1"})))
+    then = replace(seen, settings={"laser_power": 80.0}).reference(np.ones((120, 160), np.bool_))
+    record, _ = by_occluder(now, replace(bare, reference=then))
+    assert record.warnings[-1].endswith("laser_power was 80 and is 40")
 
 
 def test_no_occluder_is_told(seen: Seen, bare: MeasuredWall) -> None:
