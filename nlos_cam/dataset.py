@@ -19,21 +19,22 @@ from threading import Thread
 from nlos_models.data import MapSet
 
 from nlos_cam.dataset_lock import only_builder
-from nlos_cam.dataset_plan import DatasetPlan, Objects, RigSpread, differences
+from nlos_cam.dataset_plan import DatasetPlan, Objects, RigSpread
 from nlos_cam.dataset_reader import MAP_CHANNELS, Dataset, open_dataset, read
-from nlos_cam.dataset_samples import Samples, joined, make_samples, mesh_folder, procedural_images, sense_object
-from nlos_cam.dataset_shards import PARTS, SHARDS, check_all, head_of, shard_path, store
+from nlos_cam.dataset_samples import Samples, joined, make_samples, objects_of, procedural_images, sense_object
+from nlos_cam.dataset_shards import PARTS, SHARDS, Shard, check_all, head_of, shard_path, store
 from nlos_cam.errors import OutputExistsError, RecordingError, WorkersLostError
 
 __all__ = [
     "MAP_CHANNELS",
+    "Built",
     "Dataset",
     "DatasetPlan",
     "MapSet",
     "Objects",
     "RigSpread",
     "build",
-    "mesh_folder",
+    "objects_of",
     "open_dataset",
     "procedural_images",
     "read",
@@ -126,20 +127,23 @@ def _split(seeds: range, size: int) -> Iterator[range]:
 def _survey(folder: Path, plan: DatasetPlan, on_check: OnProgress) -> dict[Path, str]:
     """Shards whose content is not what was written, and why. Raises RecordingError for those of another plan."""
     paths, damaged = sorted(folder.glob(SHARDS)), dict[Path, str]()
-    for number, path in enumerate(paths):
-        on_check(number, len(paths))
+    for number, path in enumerate(paths, 1):
         try:
             head = head_of(path)
-            others = differences(head.provenance, plan)
             check_all(head)
         except RecordingError as error:
             damaged[path] = str(error)
-            continue
-        if others:
-            raise RecordingError(f"{path} is of a dataset with another {', '.join(others)}: choose another --out")
-        if (head.seeds.start - plan.first_seed) % SHARD or len(head.seeds) > SHARD:
-            raise RecordingError(f"{path} holds {len(head.seeds)} objects, not up to {SHARD}: choose another --out")
+        else:
+            _check_same(head, plan)
+        on_check(number, len(paths))
     return damaged
+
+
+def _check_same(head: Shard, plan: DatasetPlan) -> None:
+    if others := head.plan.differences(plan):
+        raise RecordingError(f"{head.path} is of a dataset with another {', '.join(others)}: choose another --out")
+    if (head.seeds.start - plan.first_seed) % SHARD or len(head.seeds) > SHARD:
+        raise RecordingError(f"{head.path} holds {len(head.seeds)} objects, not up to {SHARD}: choose another --out")
 
 
 def _holds(folder: Path, seeds: range, damaged: Container[Path]) -> bool:

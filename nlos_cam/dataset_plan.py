@@ -1,15 +1,16 @@
 """What a dataset holds apart from how many: rig and how far it varies, sensor, surface, objects; kept as JSON."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from nlos_calibration.rig import NotNegative, ObjectBox, Record, Rig
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from nlos_cam.errors import RecordingError, SceneError
+from nlos_cam.errors import SceneError
 from nlos_cam.objects.categories import CATEGORIES
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.render.patches import JUMP_M
@@ -18,8 +19,16 @@ from nlos_cam.render.scene_file import RENDERING_VERSION, SceneFile
 from nlos_cam.render.sensor_model import SensorModel
 from nlos_cam.render.surface import Material
 
-FIRST_CATEGORIES = tuple("airplane bell birdhouse boat bowl car cup hat lamp rocket table tower".split())
-"""Those of datasets from before their plan named them."""
+OBJECTS_VERSION = 2
+"""Raised with any change of what a seed makes of its categories."""
+FIRST_OBJECTS = {
+    "version": 1,
+    "categories": (
+        *("airplane", "bell", "birdhouse", "boat", "bowl", "car"),
+        *("cup", "hat", "lamp", "rocket", "table", "tower"),
+    ),
+}
+"""Those of datasets from before their plan told."""
 SCENE_COLUMNS = (
     "lidar_distance_m",
     "lidar_yaw_deg",
@@ -90,17 +99,21 @@ class Objects:
     """A seed picks by position."""
     meshes: tuple[tuple[str, str], ...] = ()
     """(path in the folder, SHA-256), in order; with any of them there are no categories."""
+    backgrounds: float = 0.0
+    """Share of the procedural objects that have a post or a panel beside them."""
+    version: int = OBJECTS_VERSION
     folder: Path | None = field(default=None, compare=False)
     """Where the meshes are on this machine."""
 
     @classmethod
-    def without(cls, left_out: tuple[str, ...]) -> Self:
+    def without(cls, left_out: Sequence[str], backgrounds: float = 0.0) -> Self:
         """Every category but these. Raises SceneError for one that is not known, or if none is left."""
-        if unknown := [name for name in left_out if name not in CATEGORIES]:
-            raise SceneError(f"no object category {unknown[0]!r}: choose some of {', '.join(CATEGORIES)}")
+        for name in left_out:
+            if name not in CATEGORIES:
+                raise SceneError(f"no object category {name!r}: choose some of {', '.join(CATEGORIES)}")
         if not (kept := tuple(name for name in CATEGORIES if name not in left_out)):
-            raise SceneError("every category is left out: keep at least one")
-        return cls(kept)
+            raise SceneError("every object category is left out: keep at least one")
+        return cls(kept, backgrounds=backgrounds)
 
 
 @dataclass(frozen=True)
@@ -116,6 +129,7 @@ class DatasetPlan:
     radiometry: Radiometry = "paper"
     jump_m: float = JUMP_M
     material: Material = field(default_factory=Material)
+    rendering_version: int = RENDERING_VERSION
 
     @classmethod
     def of_scene(cls, scene: SceneFile, first_seed: int, **others: Any) -> Self:
@@ -140,7 +154,7 @@ class DatasetPlan:
     def provenance(self) -> str:
         """Everything that decides the bits, as JSON."""
         facts: dict[str, Any] = _PLAN.dump_python(self, mode="json", exclude={"objects": {"folder"}})
-        return json.dumps({**facts, "rig_checksum": self.rig.checksum, "rendering_version": RENDERING_VERSION})
+        return json.dumps({**facts, "rig_checksum": self.rig.checksum})
 
     @classmethod
     def from_provenance(cls, text: str) -> "DatasetPlan":
@@ -149,11 +163,16 @@ class DatasetPlan:
         Raises ValueError for what is no plan, or one that a newer nlos-cam wrote.
         """
         facts: dict[str, Any] = json.loads(text)
-        known = {"rig_checksum", "rendering_version", *(one.name for one in fields(cls))}
+        known = {"rig_checksum", *(one.name for one in fields(cls))}
         if newer := sorted(set(facts) - known):
             raise ValueError(f"its plan has {newer[0]!r}, which this nlos-cam does not know: update it")
-        facts.setdefault("objects", {"categories": FIRST_CATEGORIES})
+        facts.setdefault("objects", FIRST_OBJECTS)
         return _PLAN.validate_python(facts)
+
+    def differences(self, other: "DatasetPlan") -> list[str]:
+        """In what the plans differ, by name; empty where they make the same bits."""
+        names = [one.name for one in fields(self)]
+        return [name.replace("_", " ") for name in names if getattr(self, name) != getattr(other, name)]
 
     def check(self) -> None:
         """Raise SceneError where nothing could be made by this plan."""
@@ -164,19 +183,6 @@ class DatasetPlan:
 
 
 _PLAN = TypeAdapter(DatasetPlan)
-
-
-def differences(provenance: str, plan: DatasetPlan) -> list[str]:
-    """What a written plan has different, by name; empty where it makes the same bits.
-
-    Raises RecordingError where it cannot be understood.
-    """
-    try:
-        other, version = DatasetPlan.from_provenance(provenance), json.loads(provenance)["rendering_version"]
-    except (ValueError, KeyError, ValidationError) as error:
-        raise RecordingError(f"its plan cannot be read: {' '.join(str(error).split()):.200}") from error
-    named = [one.name.replace("_", " ") for one in fields(plan) if getattr(plan, one.name) != getattr(other, one.name)]
-    return named if version == RENDERING_VERSION else [*named, "rendering version"]
 
 
 def scene_row(rig: Rig, sensor: SensorModel) -> list[float]:

@@ -106,9 +106,9 @@ def open_dataset(folder: Path) -> Dataset:
     """A folder's dataset. Raises RecordingError where there is none, or one whose shards do not belong together."""
     if not (shards := shards_of(folder)):
         raise RecordingError(f"no dataset in {folder}: it holds no shard-*.h5; make one with `nlos-cam dataset build`")
-    plan = _plan_of(shards[0])
+    plan = shards[0].plan
     for shard in shards[1:]:
-        if shard.provenance != shards[0].provenance and _plan_of(shard) != plan:
+        if shard.provenance != shards[0].provenance and shard.plan != plan:
             raise RecordingError(
                 f"{shard.path} is of another dataset than {shards[0].path.name}: take one of them away"
             )
@@ -119,15 +119,6 @@ def read(folder: Path) -> tuple[MapSet, DatasetPlan]:
     """All maps and images of a dataset, in the order of the seeds, and the plan they were built by."""
     dataset = open_dataset(folder)
     return dataset.arrays(), dataset.plan
-
-
-def _plan_of(shard: Shard) -> DatasetPlan:
-    try:
-        return DatasetPlan.from_provenance(shard.provenance)
-    except ValueError as error:
-        raise RecordingError(
-            f"{shard.path} has a plan that cannot be read: {' '.join(str(error).split()):.200}"
-        ) from error
 
 
 def _maps(shard: Shard) -> list[NDArray[Any]]:

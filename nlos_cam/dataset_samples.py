@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from nlos_cam.dataset_plan import DatasetPlan, Objects, scene_row
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps, maps_from_frame
-from nlos_cam.objects.categories import CATEGORIES
+from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
 from nlos_cam.objects.depth_image import image_from_depth
-from nlos_cam.objects.files import MESH_SUFFIXES, read_mesh, upright
-from nlos_cam.objects.hidden import Triangles, object_depth, place, random_pose
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.files import MeshFile, read_mesh
+from nlos_cam.objects.hidden import object_depth, object_depths
+from nlos_cam.objects.mesh_folder import folder_objects, mesh_depth
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Radiometry, Scene
 from nlos_cam.render.sensor import Sensor
@@ -29,10 +28,15 @@ scene (n, 6), category (n,)."""
 
 
 def procedural_images(
-    first_seed: int, count: int, box: ObjectBox, categories: Sequence[str] = tuple(CATEGORIES)
+    first_seed: int,
+    count: int,
+    box: ObjectBox,
+    categories: Sequence[str] | None = None,
+    *,
+    backgrounds: float = 0.0,
 ) -> Half:
-    """Images (count, 64, 64) of random objects, without rendering: all that a VAE needs."""
-    depths = (object_depth(seed, box, categories)[1] for seed in range(first_seed, first_seed + count))
+    """Images (count, 64, 64) of random objects, without rendering: all that a VAE needs; see `object_depth`."""
+    depths = object_depths(range(first_seed, first_seed + count), box, categories, backgrounds=backgrounds)
     return np.stack([image_from_depth(depth, box).astype(np.float16) for depth in depths])
 
 
@@ -70,35 +74,26 @@ def joined(parts: Sequence[Samples]) -> Samples:
 def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Float32]:
     """One random object: its category or its mesh's path, and its depth map (64, 64) in metres, NaN background."""
     if not objects.meshes:
-        return object_depth(seed, box, objects.categories)
-    if objects.folder is None:
+        return object_depth(seed, box, objects.categories, backgrounds=objects.backgrounds)
+    if (folder := objects.folder) is None:
         raise SceneError("this dataset hides meshes: name their folder with --objects")
-    generator = np.random.default_rng([seed, OBJECT_PIXELS])
-    name, sha256 = objects.meshes[int(generator.integers(len(objects.meshes)))]
-    triangles = _triangles(objects.folder / name, sha256)
-    depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
-    if np.isnan(depth_m).all():
-        raise SceneError(f"{objects.folder / name} shows the wall nothing in some pose: take it out of the folder")
-    return name, depth_m
+    checksums = {folder / name: sha256 for name, sha256 in objects.meshes}
+    path, depth_m = mesh_depth(seed, [*checksums], box, read=lambda path: _unchanged(path, checksums[path]))
+    return path.relative_to(folder).as_posix(), depth_m
 
 
-def mesh_folder(folder: Path) -> Objects:
+def objects_of(folder: Path) -> Objects:
     """The meshes of a folder and its subfolders. Raises SceneError where there is none, or one cannot be placed."""
-    if not folder.is_dir():
-        raise SceneError(f"no folder {folder}: give --objects procedural, or a folder of meshes")
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
-    if not paths:
-        raise SceneError(f"no mesh in {folder} or its subfolders: put some {', '.join(MESH_SUFFIXES)} files there")
-    named = tuple((path.relative_to(folder).as_posix(), read_mesh(path).sha256) for path in paths)
-    return Objects((), named, folder.resolve())
+    meshes = [(path.relative_to(folder).as_posix(), read_mesh(path).sha256) for path in folder_objects(folder)]
+    return Objects((), tuple(meshes), folder=folder.resolve())
 
 
 @lru_cache(maxsize=16)
-def _triangles(path: Path, sha256: str) -> Triangles:
+def _unchanged(path: Path, sha256: str) -> MeshFile:
     mesh = read_mesh(path)
     if mesh.sha256 != sha256:
         raise SceneError(f"{path} changed since the dataset was begun: put it back, or choose another --out")
-    return upright(mesh.triangles, "y")
+    return mesh
 
 
 @lru_cache(maxsize=1)

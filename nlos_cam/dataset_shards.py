@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import nlos_cam
-from nlos_cam.dataset_plan import SCENE_COLUMNS
+from nlos_cam.dataset_plan import SCENE_COLUMNS, DatasetPlan
 from nlos_cam.dataset_samples import Samples
 from nlos_cam.errors import DiskFullError, RecordingError
 
@@ -33,6 +33,15 @@ class Shard:
     seeds: range
     provenance: str
     """The plan it was made by, as JSON."""
+
+    @property
+    def plan(self) -> DatasetPlan:
+        """The same. Raises RecordingError where this nlos-cam cannot read it."""
+        try:
+            return DatasetPlan.from_provenance(self.provenance)
+        except ValueError as error:
+            problem = " ".join(str(error).split())
+            raise RecordingError(f"{self.path} has a plan that cannot be read: {problem:.200}") from error
 
 
 def shard_path(folder: Path, first_seed: int) -> Path:
