@@ -4,17 +4,14 @@ Workers make samples, one process writes them: a shard is written beside its pla
 again makes only what is missing or damaged. A sample depends on its seed alone, so any workers make the same shards.
 """
 
-import os
-import signal
 import time
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
-from multiprocessing import active_children, get_context, parent_process
+from multiprocessing import active_children, get_context
 from pathlib import Path
-from threading import Thread
 
 from nlos_models.data import MapSet
 
@@ -23,6 +20,7 @@ from nlos_cam.dataset_plan import DatasetPlan, Objects, RigSpread
 from nlos_cam.dataset_reader import MAP_CHANNELS, Dataset, open_dataset, read
 from nlos_cam.dataset_samples import Samples, joined, make_samples, objects_of, procedural_images, sense_object
 from nlos_cam.dataset_shards import PARTS, SHARDS, Shard, check_all, head_of, shard_path, store
+from nlos_cam.dataset_worker import begin_worker
 from nlos_cam.errors import OutputExistsError, RecordingError, WorkersLostError
 
 __all__ = [
@@ -189,30 +187,21 @@ def processes(workers: int) -> Farm:
 
 
 def _in_pool(plan: DatasetPlan, pieces: Sequence[range], workers: int) -> Made:
-    others = set(active_children())
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin_worker) as pool:
+    others, broken = set(active_children()), None
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=begin_worker) as pool:
         futures = {pool.submit(make_samples, plan, piece): piece for piece in pieces}
         try:
             for future in as_completed(futures):
-                yield futures.pop(future), future.result()
+                piece, error = futures.pop(future), future.exception()
+                if isinstance(error, BrokenProcessPool):
+                    broken = error  # of those that were made before, some are still to come
+                else:
+                    yield piece, future.result()
         except BaseException:
             for future in futures:
                 future.cancel()
             for child in set(active_children()) - others:  # what they have begun would take seconds
                 child.terminate()
             raise
-
-
-def _begin_worker() -> None:
-    import numba
-
-    numba.set_num_threads(1)  # one object per process is faster than several threads per object
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the parent ends its workers
-    Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A parent that is killed ends nobody: its workers would wait for work for ever."""
-    if parent := parent_process():
-        parent.join()
-        os._exit(1)
+    if broken:
+        raise broken

@@ -10,6 +10,7 @@ from typing import Any
 import nlos_cam
 from nlos_cam.dataset_plan import DatasetPlan
 from nlos_cam.dataset_samples import Samples, make_samples
+from nlos_cam.dataset_worker import one_thread
 from nlos_cam.errors import NlosCamError, SceneError, WorkersLostError
 
 TRIES = 5
@@ -70,11 +71,9 @@ class RayFarm:
 
 def make_piece(plan: DatasetPlan, piece: range, version: str) -> Samples:
     """What a worker does. Raises SceneError where its machine has another nlos-cam than the one who asks."""
-    import numba
-
     if version != nlos_cam.__version__:
         raise SceneError(f"a worker has nlos-cam {nlos_cam.__version__}, not {version}: install the same everywhere")
-    numba.set_num_threads(1)  # one object per process is faster than several threads per object
+    one_thread()
     return make_samples(plan, piece)
 
 

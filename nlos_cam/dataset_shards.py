@@ -21,6 +21,8 @@ from nlos_cam.dataset_samples import Samples
 from nlos_cam.errors import DiskFullError, RecordingError
 
 SHARDS, PARTS = "shard-*.h5", "shard-*.part"
+FIRST_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category")
+"""Those of every shard; scene came with the checksums."""
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """No space, a quota, a limit on the size of files."""
 
@@ -89,8 +91,8 @@ def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
 def check_all(head: Shard) -> None:
     """Read everything. Raises RecordingError where the shard is damaged."""
     with opened(head.path) as file:
-        names = list(file)
-    read_arrays(head, names)
+        names = {*map(str, file), *FIRST_ARRAYS, *(["scene"] if "plan_sha256" in file.attrs else [])}
+    read_arrays(head, sorted(names))
 
 
 def store(path: Path, samples: Samples, provenance: str, command: str) -> None:
