@@ -198,8 +198,6 @@ def _in_pool(plan: DatasetPlan, pieces: Sequence[range], workers: int) -> Made:
                 else:
                     yield piece, future.result()
         except BaseException:
-            for future in futures:
-                future.cancel()
             for child in set(active_children()) - others:  # what they have begun would take seconds
                 child.terminate()
             raise

@@ -1,6 +1,7 @@
-"""Objects per second of `dataset build` by workers, with the CPU's time: docs/dataset_scaling.json (count, most workers).
+"""Objects per second of `dataset build` by workers, with the CPU's time: docs/dataset_scaling.json.
 
-Wall time begins when the first object is done, so that it is the rate of a long build and not the start of processes.
+Arguments: objects, most workers. Wall time is taken between the workers' first pieces and their last, so that it is the
+rate of a long build, not the start of processes.
 Run it on a machine that does nothing else.
 """
 
@@ -27,12 +28,12 @@ class Speed:
     workers: int
     objects: int
     wall_s: float
-    """Of the objects after the first that were done."""
+    """While all workers worked."""
     objects_per_s: float
     cpu_s_per_object: float
     """Of all processes, their start with it."""
     scaling: float
-    """Rate by workers over the rate of one."""
+    """The rate of each worker over that of one alone; 1 is perfect."""
 
 
 def measure(count: int, workers: int, alone: float | None = None) -> Speed:
@@ -45,9 +46,9 @@ def measure(count: int, workers: int, alone: float | None = None) -> Speed:
             moments.append((time.perf_counter(), done))
 
         build(DatasetPlan(load_rig("paper-rig"), 0), count, Path(folder), workers=workers, on_progress=on_progress)
-    started, rest = warm(moments, workers)
-    rate = rest / started
-    return Speed(workers, count, started, rate, (_cpu_s() - before) / count, rate / (alone or rate) / workers)
+    wall_s, objects = warm(moments, workers)
+    rate = objects / wall_s
+    return Speed(workers, count, wall_s, rate, (_cpu_s() - before) / count, rate / (alone or rate) / workers)
 
 
 def warm(moments: list[tuple[float, int]], workers: int) -> tuple[float, int]:

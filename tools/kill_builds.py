@@ -1,7 +1,8 @@
-"""Dataset builds killed at random moments, against one that was not: docs/dataset_kills.json (count, kills, seed).
+"""Dataset builds killed at random moments, against one that was not: docs/dataset_kills.json.
 
-Each kill takes the builder alone, with SIGKILL, and the next run goes on in the same folder. Exits with 1 where any
-array differs by a bit, a finished shard was lost, or a worker outlived its builder.
+Arguments: objects, kills, seed, objects in a shard. Each kill takes the builder alone, with SIGKILL, and the next run
+goes on in the same folder. Exits with 1 where any array differs by a bit, a finished shard was lost, or a worker
+outlived its builder.
 """
 
 import json
@@ -20,6 +21,7 @@ from nlos_cam.dataset_shards import FIRST_ARRAYS, PARTS, SHARDS
 from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
+DEFAULTS = (300, 10, 0, 100)
 GRACE_S = 10.0
 """For workers to notice that their builder is gone."""
 
@@ -40,10 +42,22 @@ class Kill:
     """Workers that outlived it."""
 
 
-def build_command(folder: Path, count: int) -> list[str]:
-    """A build of `count` objects."""
-    program = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()"]
-    return [*program, "dataset", "build", "--out", str(folder), "--count", str(count), "--workers", "2"]
+def build_command(folder: Path, count: int, shard: int) -> list[str]:
+    """A build of `count` objects, in shards that may be smaller than a user's."""
+    program = f"from nlos_cam import dataset; from nlos_cam.cli.main import run; dataset.SHARD = {shard}; run()"
+    return [
+        sys.executable,
+        "-c",
+        program,
+        "dataset",
+        "build",
+        "--out",
+        str(folder),
+        "--count",
+        str(count),
+        "--workers",
+        "2",
+    ]
 
 
 def finish(command: list[str]) -> float:
@@ -109,18 +123,24 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 def main() -> None:
     """Build once undisturbed, once with kills; compare, write, print."""
-    count, times, seed = (
-        int(sys.argv[i]) if len(sys.argv) > i else default for i, default in ((1, 300), (2, 10), (3, 0))
-    )
+    given = [int(argument) for argument in sys.argv[1:]]
+    count, times, seed, shard = (*given, *DEFAULTS[len(given) :])
     with tempfile.TemporaryDirectory() as name:
         whole, killed = Path(name) / "whole", Path(name) / "killed"
-        whole_s = finish(build_command(whole, count))
+        whole_s = finish(build_command(whole, count, shard))
         after_s = np.random.default_rng(seed).uniform(0, whole_s, times)
-        kills = [kill(build_command(killed, count), killed, float(moment)) for moment in after_s]
-        finish(build_command(killed, count))
+        kills = [kill(build_command(killed, count, shard), killed, float(moment)) for moment in after_s]
+        finish(build_command(killed, count, shard))
         wrong = differing(whole, killed)
     good = not wrong and not any(each.lost or each.left_running for each in kills)
-    result = {"machine": machine(), "objects": count, "seed": seed, "seconds_undisturbed": whole_s, "good": good}
+    result = {
+        "machine": machine(),
+        "objects": count,
+        "objects_in_a_shard": shard,
+        "seed": seed,
+        "seconds_undisturbed": whole_s,
+        "good": good,
+    }
     result |= {"arrays_that_differ": wrong, "kills": [asdict(each) for each in kills]}
     (DOCS / "dataset_kills.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     print("after s   shards before   after   half written   lost   workers left")

@@ -94,7 +94,8 @@ def test_the_scene_that_is_rendered_has_the_plans_pulse_radiometry_and_jump(monk
 
     def sense(scene: Scene, *_: object) -> LidarMaps:
         seen.append(scene)
-        return LidarMaps(*np.zeros((2, 64, 80), np.float32))
+        blank = np.zeros((64, 80), np.float32)
+        return LidarMaps(blank, blank, blank > 0)
 
     monkeypatch.setattr(dataset_samples, "sense_object", sense)
     make_samples(replace(PLAN, sensor=SensorModel(pulse_ns=1.0), radiometry="lambertian", jump_m=0.5), [0])
