@@ -21,7 +21,7 @@ from nlos_cam.dataset_shards import FIRST_ARRAYS, PARTS, SHARDS
 from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
-DEFAULTS = (300, 10, 0, 100)
+DEFAULTS = (300, 10, 0, 10)
 GRACE_S = 10.0
 """For workers to notice that their builder is gone."""
 
@@ -60,11 +60,23 @@ def build_command(folder: Path, count: int, shard: int) -> list[str]:
     ]
 
 
-def finish(command: list[str]) -> float:
-    """Run a build to its end; its seconds."""
-    started_s = time.monotonic()
-    subprocess.run(command, check=True, capture_output=True)
-    return time.monotonic() - started_s
+def finish(command: list[str], folder: Path) -> tuple[float, float]:
+    """Run a build to its end; seconds to its first shard, and in all."""
+    started_s, first_s = time.monotonic(), 0.0
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None:
+            if not first_s and any(folder.glob(SHARDS)):
+                first_s = time.monotonic() - started_s
+            time.sleep(0.02)
+    if process.returncode:
+        raise RuntimeError(f"the build ended with exit code {process.returncode}: {' '.join(command)}")
+    return first_s, time.monotonic() - started_s
+
+
+def moments(first_s: float, whole_s: float, times: int, seed: int) -> list[float]:
+    """When to kill: some while workers start, most at work, of which all together do about as much as is to do."""
+    work_s = 2 * (whole_s - first_s) / times
+    return np.random.default_rng(seed).uniform(first_s / 2, first_s + work_s, times).tolist()
 
 
 def kill(command: list[str], folder: Path, after_s: float) -> Kill:
@@ -127,10 +139,10 @@ def main() -> None:
     count, times, seed, shard = (*given, *DEFAULTS[len(given) :])
     with tempfile.TemporaryDirectory() as name:
         whole, killed = Path(name) / "whole", Path(name) / "killed"
-        whole_s = finish(build_command(whole, count, shard))
-        after_s = np.random.default_rng(seed).uniform(0, whole_s, times)
-        kills = [kill(build_command(killed, count, shard), killed, float(moment)) for moment in after_s]
-        finish(build_command(killed, count, shard))
+        first_s, whole_s = finish(build_command(whole, count, shard), whole)
+        command = build_command(killed, count, shard)
+        kills = [kill(command, killed, moment) for moment in moments(first_s, whole_s, times, seed)]
+        finish(command, killed)
         wrong = differing(whole, killed)
     good = not wrong and not any(each.lost or each.left_running for each in kills)
     result = {

@@ -72,6 +72,21 @@ def test_a_build_command_is_the_programs(kills: ModuleType, tmp_path: Path) -> N
     assert command[3:] == ["dataset", "build", "--out", str(tmp_path), "--count", "30", "--workers", "2"]
 
 
+def test_a_build_that_fails_is_told_and_one_that_ends_is_timed(kills: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="exit code 3"):
+        kills.finish([sys.executable, "-c", "raise SystemExit(3)"], tmp_path)
+    folder = _dataset(tmp_path / "one")
+    first_s, whole_s = kills.finish([sys.executable, "-c", "import time; time.sleep(0.3)"], folder)
+    assert 0 < first_s < 0.3 <= whole_s
+
+
+def test_kills_come_while_it_starts_and_while_it_works(kills: ModuleType) -> None:
+    moments = np.array(kills.moments(10.0, 60.0, 200, 0))
+    assert 5 <= moments.min() < 6
+    assert 10 < moments.max() <= 10.5
+    assert kills.moments(10.0, 60.0, 5, 0) == kills.moments(10.0, 60.0, 5, 0)
+
+
 def test_only_the_time_in_which_all_work_counts(tool: Callable[[str], ModuleType]) -> None:
     scaling = tool("dataset_scaling")
     starts, steady, ends = [(0.0, 0)], [(20.0 + k, 10 * (k + 1)) for k in range(12)], [(50.0, 130)]
