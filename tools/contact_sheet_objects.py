@@ -35,7 +35,7 @@ def fixed(box: ObjectBox) -> dict[str, list[Float32]]:
     }
 
 
-def draw(path: Path, images: dict[str, list[Float32]]) -> None:
+def draw(path: Path, images: dict[str, list[Float32]]) -> Figure:
     """One line per category with its name, two categories side by side."""
     wide = max(len(row) for row in images.values())
     lines = -(-len(images) // SIDE_BY_SIDE)
@@ -51,6 +51,7 @@ def draw(path: Path, images: dict[str, list[Float32]]) -> None:
             if k == 0:
                 axis.set_title(name, loc="left", fontsize=8, pad=2)
     figure.savefig(path, dpi=DPI)
+    return figure
 
 
 def main(folder: Path) -> None:

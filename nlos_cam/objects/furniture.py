@@ -58,7 +58,7 @@ def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float
 
 
 @category(
-    width=Setting(0.66, 0.86, held_out=(0.74, 0.795)),
+    width=Setting(0.62, 0.78, held_out=(0.68, 0.725)),
     depth=Setting(0.42, 0.56),
     window=Setting(0.26, 0.4, held_out=(0.31, 0.355)),
     knobs=Setting(3, 6),
@@ -82,7 +82,7 @@ def oven(width: float, depth: float, window: float, knobs: float, tip: float) ->
 @category(
     width=Setting(0.46, 0.62, held_out=(0.52, 0.565)),
     depth=Setting(0.3, 0.42),
-    woofer=Setting(0.35, 0.45, held_out=(0.385, 0.42)),
+    woofer=Setting(0.35, 0.45, held_out=(0.39, 0.415)),
     tweeter=Setting(0.2, 0.28),
 )
 def soundbox(width: float, depth: float, woofer: float, tweeter: float) -> Triangles:

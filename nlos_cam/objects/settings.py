@@ -31,7 +31,7 @@ class Setting:
     def drawn(self, unit: float) -> float:
         """The value at a share `unit` in [0, 1] of all that training draws from."""
         pieces = self.trained
-        value = self.low + sum(high - low for low, high in pieces) * unit
+        value = pieces[0][0] + sum(high - low for low, high in pieces) * unit
         if len(pieces) == 1 or value <= pieces[0][1]:
             return value
         return max(pieces[1][0], value + (pieces[1][0] - pieces[0][1]))
