@@ -1,13 +1,9 @@
 """Builds: the same shards for any workers, in any order and after any stop; damage is made anew, others are refused."""
 
 import os
-from collections.abc import Callable
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
-from multiprocessing import active_children
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +11,8 @@ from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
 
 from nlos_cam import dataset
-from nlos_cam.dataset import Built, DatasetPlan, build, open_dataset, processes
+from nlos_cam.dataset import Built, DatasetPlan, build, open_dataset
 from nlos_cam.dataset_lock import LOCK, only_builder
-from nlos_cam.dataset_samples import make_samples
 from nlos_cam.dataset_shards import SHARDS, store
 from nlos_cam.errors import (
     DiskFullError,
@@ -25,12 +20,12 @@ from nlos_cam.errors import (
     OutputExistsError,
     RecordingError,
     SceneError,
-    WorkersLostError,
 )
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft")
 COUNT, SHARD, PIECE = 23, 5, 2
 LAST = "shard-000000060.h5"
+"""The one with three objects."""
 
 
 @pytest.fixture(autouse=True)
@@ -210,65 +205,6 @@ def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("here")
     with pytest.raises(OutputExistsError, match="choose another --out"):
         _build(tmp_path / "file")
-
-
-class InThisProcess:
-    """Stands for a pool of processes, which may be killed after some pieces."""
-
-    dies_after: list[int]
-
-    def __init__(self, workers: int, **_: object) -> None:
-        self.workers, self.left = workers, self.dies_after.pop(0)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def submit(self, work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        if self.left:
-            self.left -= 1
-            future.set_result(work(*arguments))
-        else:
-            future.set_exception(BrokenProcessPool("killed"))
-        return future
-
-
-@pytest.fixture
-def dying(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    def dies(*after: int) -> None:
-        monkeypatch.setattr(InThisProcess, "dies_after", [*after], raising=False)
-        monkeypatch.setattr(dataset, "ProcessPoolExecutor", InThisProcess)
-        monkeypatch.setattr(dataset, "make_samples", lambda _, piece: samples_of(piece))
-
-    return dies
-
-
-def test_a_killed_worker_is_replaced(tmp_path: Path, whole: dict[str, bytes], dying: Callable[..., None]) -> None:
-    dying(1, 4, 100)
-    _build(tmp_path / "other", farm=processes(2))
-    assert _bytes(tmp_path / "other") == whole
-
-
-def test_workers_that_die_at_once_end_the_build_with_what_is_kept(
-    tmp_path: Path, whole: dict[str, bytes], dying: Callable[..., None]
-) -> None:
-    dying(7, 0)
-    with pytest.raises(WorkersLostError, match=r"finished shards are kept.*fewer --workers"):
-        _build(tmp_path / "other", farm=processes(2))
-    assert 0 < len(_bytes(tmp_path / "other")) <= 2
-    dying(100)
-    _build(tmp_path / "other", farm=processes(2))
-    assert _bytes(tmp_path / "other") == whole
-
-
-def test_real_processes_make_what_this_one_makes_and_leave_nobody(tmp_path: Path) -> None:
-    build(PLAN, 4, tmp_path, workers=2, on_progress=lambda *_: None)
-    for name, values in make_samples(PLAN, range(40, 44)).items():
-        np.testing.assert_array_equal(open_dataset(tmp_path).column(name), values)
-    assert not active_children()
 
 
 def test_seeds_of_the_three_kinds_are_far_apart() -> None:
