@@ -1,6 +1,6 @@
 """Hidden objects from a folder of meshes: which files it holds, and one of them at a random pose for each seed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +8,7 @@ from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import OBJECT_PIXELS, Float32
-from nlos_cam.objects.files import MESH_SUFFIXES, Up, read_mesh, upright
+from nlos_cam.objects.files import MESH_SUFFIXES, MeshFile, Up, read_mesh, upright
 from nlos_cam.objects.hidden import nothing_to_see, place, random_pose
 from nlos_cam.objects.raster import orthographic_depth
 
@@ -30,15 +30,22 @@ def folder_objects(folder: Path) -> list[Path]:
     return seen
 
 
-def mesh_depth(seed: int, meshes: Sequence[Path], box: ObjectBox, up: Up = "y") -> tuple[Path, Float32]:
+def mesh_depth(
+    seed: int,
+    meshes: Sequence[Path],
+    box: ObjectBox,
+    up: Up = "y",
+    *,
+    read: Callable[[Path], MeshFile] = read_mesh,
+) -> tuple[Path, Float32]:
     """One of the meshes and its depth map (64, 64) in metres, NaN background; the seed picks it and its pose.
 
-    It is placed as procedural objects are, whatever the unit of its file. Raises SceneError, which names the file, for
-    one that cannot be read or shows no surface.
+    It is placed as procedural objects are, whatever the unit of its file. `read` may keep what it has read. Raises
+    SceneError, which names the file, for one that cannot be read or shows no surface.
     """
     generator = np.random.default_rng([seed, OBJECT_PIXELS])
     path = meshes[int(generator.integers(len(meshes)))]
-    triangles = upright(read_mesh(path).triangles, up)
+    triangles = upright(read(path).triangles, up)
     depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
     if np.isnan(depth_m).all():
         raise nothing_to_see(str(path), box)
