@@ -1,0 +1,1 @@
+"""The objects that a label alone tells: the test objects, by name."""
