@@ -14,7 +14,7 @@ from nlos_cam.camera.replay import ReplayCamera, open_lidar_bag
 from nlos_cam.camera.sidecar import Sidecar, load_sidecar, sidecar_path
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
-from nlos_cam.labelled_truth import truth_depth_m
+from nlos_cam.labelled_truth import fixed_objects, truth_depth_m
 from nlos_cam.objects.depth_image import image_from_depth, object_box
 
 FRAMES_EACH = 8
@@ -23,6 +23,10 @@ FRAMES_EACH = 8
 OnProgress = Callable[[int, int], None]
 Known = Callable[[ObjectBox], Mapping[str, Float32]]
 """The objects that a label alone tells, by name: their depths (64, 64) over a box."""
+
+
+def _say_nothing(done: int, total: int) -> None:
+    del done, total
 
 
 @dataclass(frozen=True)
@@ -61,11 +65,11 @@ def recordings_in(folder: Path) -> list[Path]:
 
 def read_labelled(
     recordings: Sequence[Path],
-    known: Known,
     *,
+    known: Known = fixed_objects,
     wall: Path | None = None,
     frames: int = FRAMES_EACH,
-    on_progress: OnProgress = lambda done, total: None,
+    on_progress: OnProgress = _say_nothing,
 ) -> Labelled:
     """The maps of `frames` single frames of each recording, evenly spread over it, with what was hidden meanwhile.
 
@@ -75,8 +79,15 @@ def read_labelled(
     a label, a truth or a frame, and for recordings of two benches.
     """
     read: list[_Recorded] = []
+    objects: dict[str, Mapping[str, Float32]] = {}
+
+    def objects_of(rig: Rig) -> Mapping[str, Float32]:
+        if rig.checksum not in objects:
+            objects[rig.checksum] = known(object_box(rig))
+        return objects[rig.checksum]
+
     for path in recordings:
-        read.append(_read(path, known, wall, frames))
+        read.append(_read(path, objects_of, wall, frames))
         if read[0].rig != read[-1].rig:
             raise RecordingError(
                 f"{read[0].path} and {path} are of two benches (rigs {_told(read[0].rig)} and {_told(read[-1].rig)}): "
@@ -90,7 +101,7 @@ def _told(rig: Rig) -> str:
     return f"{rig.name} {rig.checksum}"
 
 
-def _read(path: Path, known: Known, wall: Path | None, frames: int) -> _Recorded:
+def _read(path: Path, objects_of: Callable[[Rig], Mapping[str, Float32]], wall: Path | None, frames: int) -> _Recorded:
     sidecar = load_sidecar(sidecar_path(path))
     if not sidecar.label:
         raise RecordingError(
@@ -100,7 +111,7 @@ def _read(path: Path, known: Known, wall: Path | None, frames: int) -> _Recorded
     chosen = spread(open_lidar_bag(path).streams["depth"].frames, frames)
     with ReplayCamera(path) as camera:
         bench = _bench(path, sidecar, wall, camera)
-        truth_m = truth_depth_m(path, sidecar.label, bench.rig, known(object_box(bench.rig)))
+        truth_m = truth_depth_m(path, sidecar.label, bench.rig, objects_of(bench.rig))
         taken = (maps_from_frame(frame) for number, frame in enumerate(camera) if number in chosen)
         maps = [bench.corrected(some) for some in taken if some.valid.any()]
     if not maps:
@@ -110,7 +121,9 @@ def _read(path: Path, known: Known, wall: Path | None, frames: int) -> _Recorded
 
 def spread(count: int, wanted: int) -> frozenset[int]:
     """`wanted` of the numbers below `count`, evenly spread; all of them if they are fewer."""
-    return frozenset(((np.arange(wanted) + 0.5) * count / wanted).astype(int).tolist() if wanted < count else range(count))
+    return frozenset(
+        ((np.arange(wanted) + 0.5) * count / wanted).astype(int).tolist() if wanted < count else range(count)
+    )
 
 
 def _bench(path: Path, sidecar: Sidecar, wall: Path | None, camera: ReplayCamera) -> Bench:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration.rig import Rig, first_problem
+from nlos_calibration.rig import ObjectBox, Rig, first_problem
 from pydantic import ValidationError
 
 from nlos_cam.errors import RecordingError
@@ -14,11 +14,17 @@ from nlos_cam.frames import OBJECT_PIXELS, Float32
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.files import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, read_depth_map
 from nlos_cam.objects.hidden import nothing_to_see
+from nlos_cam.objects.test_set import test_set
 from nlos_cam.render.hidden_record import HiddenObject
 from nlos_cam.render.scene_file import SceneFile
 
 TRUTH_SUFFIX = ".truth.toml"
 """Of a file with the fields of a scene file's [object]: what it is, and how it stands in the rig's object box."""
+
+
+def fixed_objects(box: ObjectBox) -> Mapping[str, Float32]:
+    """The test objects, whose label alone tells them: their depths (64, 64) over a box, by name."""
+    return {thing.name: thing.depth_m for thing in test_set(box)}
 
 
 def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Float32]) -> Float32:

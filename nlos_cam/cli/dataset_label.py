@@ -7,12 +7,12 @@ import typer
 
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, tracked
 from nlos_cam.labelled import FRAMES_EACH, read_labelled, recordings_in
-from nlos_cam.labelled_objects import known_objects
 from nlos_cam.labelled_shards import write_shards
 
 Recordings = Annotated[Path, typer.Argument(metavar="DIR", help="A folder of recordings, each with its label.")]
 Wall = Annotated[
-    Path | None, typer.Option("--wall", help="The bench's wall record, the one that `live` is given: corrects the maps.")
+    Path | None,
+    typer.Option("--wall", help="The bench's wall record, the one that `live` is given: corrects the maps."),
 ]
 Each = Annotated[int, typer.Option("--frames", min=1, help="Of each recording, evenly spread over it.")]
 
@@ -38,7 +38,7 @@ def label(
     folder = output_path(out, "dataset", "", overwrite=overwrite)
     found = recordings_in(recordings)
     with tracked("reading recordings") as on_progress:
-        labelled = read_labelled(found, known_objects, wall=wall, frames=frames, on_progress=on_progress)
+        labelled = read_labelled(found, wall=wall, frames=frames, on_progress=on_progress)
     write_shards(labelled, folder)
     labels = sorted(set(labelled.label))
     rig = {"rig_name": labelled.rig.name, "rig_checksum": labelled.rig.checksum}

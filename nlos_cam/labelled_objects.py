@@ -1,1 +1,0 @@
-"""The objects that a label alone tells: the test objects, by name."""
