@@ -1,8 +1,8 @@
-"""The 54 test objects as labelled recordings of a simulated bench, in two folders: to adapt to, and held out.
+"""The 54 test objects as labelled recordings of a simulated bench: to adapt to, to watch the training by, held out.
 
 `python tools/transfer_bench.py DIR [--scene examples/bench.toml] [--frames 8]` goes on where it was stopped. 54
-recordings of 8 frames of 640 x 480 take 0.3 GB and some minutes. Frames of a bench at rest differ by their noise alone,
-so 8 of them are as much as training can use; a person's recordings of a few seconds have more.
+recordings of 8 frames of 640 x 480 take 0.4 GB and two minutes. Frames of a bench at rest differ by their noise alone,
+so that more of them would add little; a person's recordings of a few seconds have more.
 """
 
 import argparse
@@ -20,6 +20,7 @@ from nlos_cam.camera.takes import Job, Takes, settle
 from nlos_cam.camera.world import World
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
+from nlos_cam.objects.categories import CATEGORIES
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.test_set import FixedObject, test_set
 from nlos_cam.render.renderer import render
@@ -28,9 +29,10 @@ from nlos_cam.render.scene_file import SceneFile, load_scene
 from nlos_cam.render.sensor import SensedImages
 
 SCENE = Path(__file__).parents[1] / "examples" / "bench.toml"
-ADAPTATION, HELD_OUT = "adaptation", "held-out"
-HELD_OUT_NUMBER = 3
-"""Of each category's objects, this one is never adapted to: what is held out are whole objects."""
+ADAPTATION, VALIDATION, HELD_OUT = "adaptation", "validation", "held-out"
+"""30 objects, 6 that training's schedule looks at, and 18 that judge: no object is in two parts."""
+HELD_OUT_NUMBER, VALIDATION_NUMBER, VALIDATION_EVERY = 3, 2, 3
+"""Of each category's three objects, one is held out; of every third category, another is for validation."""
 FRAMES = 8
 BETWEEN_S = 30.0
 """From the start of one recording to that of the next: somebody changes the object, and the lidar warms on."""
@@ -82,14 +84,18 @@ class Take:
             return False
 
 
+def part_of(thing: FixedObject) -> str:
+    """Which of the three parts an object is in."""
+    if thing.number == HELD_OUT_NUMBER:
+        return HELD_OUT
+    looked_at = sorted(CATEGORIES).index(thing.category) % VALIDATION_EVERY == 0
+    return VALIDATION if looked_at and thing.number == VALIDATION_NUMBER else ADAPTATION
+
+
 def takes(things: Sequence[FixedObject], folder: Path) -> list[Take]:
     """One take of each object, in order: F/adaptation/cup-1.bag, F/held-out/cup-3.bag, ..."""
-
-    def part(thing: FixedObject) -> str:
-        return HELD_OUT if thing.number == HELD_OUT_NUMBER else ADAPTATION
-
     apart = round(BETWEEN_S * FRAMES_PER_S)
-    return [Take(thing, folder / part(thing) / f"{thing.name}.bag", k * apart) for k, thing in enumerate(things)]
+    return [Take(thing, folder / part_of(thing) / f"{thing.name}.bag", k * apart) for k, thing in enumerate(things)]
 
 
 def record(take: Take, scene: SceneFile, frames: int) -> None:
