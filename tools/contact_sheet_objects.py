@@ -16,7 +16,7 @@ from nlos_cam.objects.test_set import test_set
 
 VARIATIONS = 5
 SIDE_BY_SIDE = 2
-INCHES, DPI = 1.0, 110
+INCHES, DPI = 0.85, 100
 
 
 def variations(category: str, box: ObjectBox) -> list[Float32]:

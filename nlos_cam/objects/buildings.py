@@ -30,9 +30,10 @@ def birdhouse(width: float, height: float, depth: float, gable: float, hole: flo
     turn=Setting(0.0, 1.0),
 )
 def tower(radius: float, flare: float, turn: float) -> Triangles:
-    """A round tower with battlements and a gate."""
+    """A round tower with battlements."""
     head = radius * flare
+    merlon = 0.45 * head
     shaft = lathe([(0, 0.35), (head, 0.35), (head, 0.22), (radius, 0.14), (radius * 1.1, -0.5), (0, -0.5)])
     around = np.linspace(0, 2 * np.pi, 6, endpoint=False) + turn
-    crown = [at(box(0.13, 0.14, 0.13), 0.9 * head * np.cos(a), 0.42, 0.9 * head * np.sin(a)) for a in around]
+    crown = [at(box(merlon, 0.15, merlon), 0.85 * head * np.cos(a), 0.42, 0.85 * head * np.sin(a)) for a in around]
     return joined(shaft, *crown)

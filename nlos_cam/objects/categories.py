@@ -16,7 +16,6 @@ _FURNITURE = computer, cupboard, oven, soundbox, table
 _BUILDINGS = birdhouse, tower
 
 CATEGORIES: dict[str, Category] = {
-    kind.name: kind
-    for kind in sorted((*_VEHICLES, *_HOUSEHOLD, *_FURNITURE, *_BUILDINGS), key=lambda kind: kind.name)
+    kind.name: kind for kind in sorted((*_VEHICLES, *_HOUSEHOLD, *_FURNITURE, *_BUILDINGS), key=lambda kind: kind.name)
 }
 """By name, in the order of the alphabet: a seed picks the same thing everywhere."""

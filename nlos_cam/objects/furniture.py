@@ -6,9 +6,9 @@ from nlos_cam.objects.solids import (
     at,
     box,
     disc,
-    ellipsoid,
     frame,
     joined,
+    knob,
     lathe,
     pierced,
     ring,
@@ -49,8 +49,8 @@ def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float
     case = joined(frame(width, 0.9, 0.05, depth), at(box(width, 0.9, 0.03), z=depth / 2))
     boards = [at(box(width - 0.04, 0.04, depth * 0.85), y=0.9 * (k / rows - 0.5), z=0.03) for k in range(1, rows)]
     middle = box(0.04, 0.9, depth)
-    door = joined(at(box(leaf, 0.88, 0.04), leaf / 2), at(ellipsoid(0.035, 0.035, 0.05), leaf * 0.85, z=-0.05))
-    shut = at(turned(door * (-1, 1, 1), (0, 1, 0), 0), width / 2, z=-depth / 2 - 0.02)
+    door = joined(at(box(leaf, 0.88, 0.04), leaf / 2), at(knob(0.035, 0.05), leaf * 0.85, z=-0.05))
+    shut = at(door * (-1, 1, 1), width / 2, z=-depth / 2 - 0.02)
     wide = at(turned(door, (0, 1, 0), ajar), -width / 2, z=-depth / 2 - 0.02)
     cornice = at(box(width + 0.08, 0.06, depth + 0.06), y=0.47)
     legs = [at(box(0.08, 0.1, 0.08), s * (width / 2 - 0.05), -0.5, z * depth / 3) for s in SIDES for z in SIDES]
@@ -69,9 +69,7 @@ def oven(width: float, depth: float, window: float, knobs: float, tip: float) ->
     front, count = -depth / 2, int(knobs)
     door = at(frame(width, 0.6, (0.6 - window) / 2, 0.14), y=-0.2, z=front + 0.07)
     body = joined(at(box(width, 0.6, depth - 0.14), y=-0.2, z=0.07), at(box(width, 0.26, depth), y=0.23))
-    dials = [
-        at(disc(0.05, 0.1), width * ((k + 0.5) / count - 0.5), 0.23, front - 0.05) for k in range(count)
-    ]
+    dials = [at(disc(0.05, 0.1), width * ((k + 0.5) / count - 0.5), 0.23, front - 0.05) for k in range(count)]
     handle = at(box(width * 0.7, 0.05, 0.05), 0, 0.03, front - 0.08)
     rings = [
         at(lathe([(0.05, 0), (0.05, 0.06), (0.12, 0.06), (0.12, 0)]), s * width / 4, 0.36, z * depth / 4)
@@ -84,21 +82,21 @@ def oven(width: float, depth: float, window: float, knobs: float, tip: float) ->
 @category(
     width=Setting(0.46, 0.62, held_out=(0.52, 0.565)),
     depth=Setting(0.3, 0.42),
-    woofer=Setting(0.34, 0.44, held_out=(0.375, 0.41)),
-    tweeter=Setting(0.17, 0.26),
+    woofer=Setting(0.35, 0.45, held_out=(0.385, 0.42)),
+    tweeter=Setting(0.2, 0.28),
 )
 def soundbox(width: float, depth: float, woofer: float, tweeter: float) -> Triangles:
     """A loudspeaker: a tall box, a large cone below and a small one above, each with its rim and its cap."""
     low, high = _speaker(width, 0.6, woofer * width), _speaker(width, 0.4, tweeter * width)
     fronts = joined(at(low, y=-0.2), at(high, y=0.3))
-    return joined(at(fronts, z=-depth / 2), at(box(width, 1.0, depth - 0.16), z=0.08))
+    return joined(at(fronts, z=-depth / 2), at(box(width, 1.0, depth - 0.28), z=0.14))
 
 
 def _speaker(width: float, height: float, radius: float) -> Triangles:
-    """A front plate whose middle plane is 0.1 behind the wall's side, with a cone of some radius sunk into it."""
-    cone = turned(lathe([(radius, 0.0), (radius * 0.4, -0.15), (0, -0.15)]), (1, 0, 0), -90)
-    cap = at(ellipsoid(radius * 0.4, radius * 0.4, 0.08), z=0.16)
-    return joined(at(pierced(width, height, radius, 0.2), z=0.1), ring(radius, 0.03), cone, cap)
+    """A front plate facing the wall at z = 0, with a cone of some radius sunk into it."""
+    cone = turned(lathe([(radius, 0.0), (radius * 0.4, -0.25), (0, -0.25)]), (1, 0, 0), -90)
+    cap = at(knob(radius * 0.4, 0.1), z=0.25)
+    return joined(at(pierced(width, height, radius, 0.28), z=0.14), ring(radius, 0.03), cone, cap)
 
 
 @category(

@@ -10,6 +10,7 @@ from trimesh.transformations import euler_matrix
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.objects.backgrounds import with_background
 from nlos_cam.objects.categories import CATEGORIES
 from nlos_cam.objects.raster import orthographic_depth, share_outside
 from nlos_cam.objects.solids import Triangles
@@ -122,21 +123,27 @@ def random_pose(generator: np.random.Generator, box: ObjectBox) -> Pose:
     return pose_from(generator.random(POSE_UNITS).tolist(), box)
 
 
-def object_depth(seed: int, box: ObjectBox, categories: Sequence[str] | None = None) -> tuple[str, Float32]:
+def object_depth(
+    seed: int, box: ObjectBox, categories: Sequence[str] | None = None, *, backgrounds: float = 0.0
+) -> tuple[str, Float32]:
     """One random object: its category and its depth map (64, 64) in metres, NaN background; the seed decides all.
 
-    `categories` are those it is one of; without them, any. Raises SceneError where there is none, or an unknown one.
+    `categories` are those it is one of; without them, any. `backgrounds` is the share of objects that have a post or a
+    panel beside them: the objects stay the same. Raises SceneError where there is no category, or an unknown one.
     """
     generator = np.random.default_rng([seed, OBJECT_PIXELS])
     category = str(generator.choice(_known(CATEGORIES if categories is None else categories)))
     triangles = category_triangles(category, int(generator.integers(2**31)))
-    return category, orthographic_depth(place(triangles, random_pose(generator, box), box), box)
+    depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
+    return category, with_background(depth_m, box, generator) if generator.random() < backgrounds else depth_m
 
 
-def object_depths(seeds: Sequence[int], box: ObjectBox, categories: Sequence[str] | None = None) -> Iterator[Float32]:
+def object_depths(
+    seeds: Sequence[int], box: ObjectBox, categories: Sequence[str] | None = None, *, backgrounds: float = 0.0
+) -> Iterator[Float32]:
     """Depth maps (64, 64) of many random objects, in the order of their seeds; see `object_depth`."""
     for seed in seeds:
-        yield object_depth(seed, box, categories)[1]
+        yield object_depth(seed, box, categories, backgrounds=backgrounds)[1]
 
 
 def _known(categories: Iterable[str]) -> list[str]:

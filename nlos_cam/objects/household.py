@@ -1,7 +1,7 @@
 """Generators of small things of the house: baskets, bell, bowl, cup, hat, lamp."""
 
 from nlos_cam.objects.settings import Setting, category
-from nlos_cam.objects.solids import Triangles, arch, at, box, ellipsoid, joined, lathe, ring, tipped
+from nlos_cam.objects.solids import Triangles, arch, at, box, joined, knob, lathe, ring, tipped
 
 
 @category(
@@ -32,13 +32,13 @@ def bell(rim: float, waist: float) -> Triangles:
     """A bell with a flared rim, a crown and a clapper."""
     crown = [(0, 0.34), (waist * 0.7, 0.32), (waist, 0.2)]
     shell = lathe([*crown, (waist * 1.1, -0.1), (rim * 0.8, -0.28), (rim, -0.4), (0, -0.4)])
-    return joined(shell, at(ring(0.1, 0.045), 0, 0.42), at(ellipsoid(0.09, 0.09, 0.09), 0, -0.44))
+    return joined(shell, at(ring(0.1, 0.045), 0, 0.42), at(knob(0.09, 0.09), 0, -0.44))
 
 
 @category(
     depth=Setting(0.28, 0.42, held_out=(0.33, 0.37)),
     foot=Setting(0.16, 0.24, held_out=(0.19, 0.215)),
-    tip=Setting(28, 50),
+    tip=Setting(20, 42),
 )
 def bowl(depth: float, foot: float, tip: float) -> Triangles:
     """Tipped towards the wall, so that its hollow shows above its side and foot."""

@@ -12,7 +12,7 @@ from nlos_cam.objects.solids import Triangles
 
 @dataclass(frozen=True)
 class Setting:
-    """One proportion of a thing, in units of the thing's own size, degrees or a count."""
+    """One proportion of a thing, in units of the thing's own size, degrees or a count (its whole part)."""
 
     low: float
     high: float

@@ -17,12 +17,13 @@ Point = tuple[float, float]
 
 def at(triangles: Triangles, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Triangles:
     """The solid moved by (x, y, z)."""
-    return triangles + (x, y, z)
+    return triangles + np.array([x, y, z])
 
 
 def turned(triangles: Triangles, axis: Sequence[float], angle_deg: float) -> Triangles:
     """The solid turned about an axis through the origin."""
-    return triangles @ transformations.rotation_matrix(np.radians(angle_deg), axis)[:3, :3].T
+    turn = np.asarray(transformations.rotation_matrix(np.radians(angle_deg), axis))
+    return triangles @ turn[:3, :3].T
 
 
 def tipped(triangles: Triangles, angle_deg: float) -> Triangles:
@@ -42,7 +43,12 @@ def box(width: float, height: float, depth: float) -> Triangles:
 
 def ellipsoid(rx: float, ry: float, rz: float) -> Triangles:
     """An ellipsoid centred on the origin."""
-    return _unit_sphere() * (rx, ry, rz)
+    return _unit_sphere(3) * (rx, ry, rz)
+
+
+def knob(radius: float, reach: float) -> Triangles:
+    """A small round thing centred on the origin that reaches so far towards the wall: a quarter as fine as others."""
+    return _unit_sphere(2) * (radius, radius, reach)
 
 
 def lathe(profile: Sequence[Point]) -> Triangles:
@@ -86,10 +92,10 @@ def slab(corners: Sequence[Point], thickness: float) -> Triangles:
 
 def bar(start: Point, end: Point, width: float, thickness: float) -> Triangles:
     """A straight bar in the x-y plane from one point to another."""
-    run = np.subtract(end, start)
-    (x, y), across = start, np.array([-run[1], run[0]]) * width / 2 / np.hypot(*run)
-    corners = [(x, y) - across, (x, y) + across, end + across, end - across]
-    return slab([(float(u), float(v)) for u, v in corners], thickness)
+    (x0, y0), (x1, y1) = start, end
+    share = width / 2 / np.hypot(x1 - x0, y1 - y0)
+    u, v = (y0 - y1) * share, (x1 - x0) * share
+    return slab([(x0 - u, y0 - v), (x0 + u, y0 + v), (x1 + u, y1 + v), (x1 - u, y1 - v)], thickness)
 
 
 def pierced(width: float, height: float, hole: float, thickness: float) -> Triangles:
@@ -118,8 +124,8 @@ def _unit_box() -> Triangles:
 
 
 @cache
-def _unit_sphere() -> Triangles:
-    return np.asarray(trimesh.creation.icosphere(subdivisions=3).triangles, np.float64)
+def _unit_sphere(subdivisions: int) -> Triangles:
+    return np.asarray(trimesh.creation.icosphere(subdivisions).triangles, np.float64)
 
 
 def _quilt(points: NDArray[np.float64]) -> Triangles:

@@ -57,5 +57,5 @@ def _objects(box: ObjectBox) -> Iterator[FixedObject]:
 
 
 def _even(number: int, step: int, count: int) -> float:
-    """The middle of one of `count` equal parts of [0, 1]: each number takes another, where step has no part of count."""
+    """The middle of one of `count` equal parts of [0, 1]: another for each number if step and count are coprime."""
     return (number * step % count + 0.5) / count

@@ -1,7 +1,7 @@
 """Generators of what drives, sails and flies: airplane, boat, car, motorcycle, rocket."""
 
 from nlos_cam.objects.settings import Setting, category
-from nlos_cam.objects.solids import Triangles, arch, at, bar, box, disc, ellipsoid, joined, lathe, ring, slab
+from nlos_cam.objects.solids import Triangles, arch, at, bar, box, disc, ellipsoid, joined, knob, lathe, ring, slab
 
 SIDES = (-1, 1)
 
@@ -79,7 +79,7 @@ def motorcycle(wheel: float, tyre: float, base: float, rake: float, bars: float,
     guards = [at(arch(wheel + 0.05, 0.03, 150), s * base, axle) * (1, 1, 2) for s in SIDES]
     fork = [at(bar((base, axle), (head, 0.16), 0.05, 0.05), z=z) for z in (-0.09, 0.09)]
     handle = at(joined(box(0.05, 0.05, 2 * bars), bar((0, 0), (-0.12, 0.04), 0.04, 0.3)), head, 0.18)
-    lamp = at(ellipsoid(0.06, 0.06, 0.08), head + 0.06, 0.1)
+    lamp = at(knob(0.06, 0.08), head + 0.06, 0.1)
     frame = [bar((-base, axle), (0.02, -0.16), 0.05, 0.16), bar((-0.1, -0.2), (head, 0.08), 0.06, 0.08)]
     engine = joined(at(box(0.22, 0.17, 0.2), -0.01, -0.17), at(disc(0.07, 0.3), 0.0, -0.17))
     seat = slab([(-0.4, 0.08), (-0.36, 0.0), (0.0, -0.02), (0.0, 0.05), (-0.24, 0.05)], 0.2)
