@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 
+import numpy as np
+
 from nlos_cam.camera.record import Recording
 from nlos_cam.camera.replay import verify
 from nlos_cam.camera.sidecar import load_sidecar, sidecar_path
@@ -76,10 +78,18 @@ class Take:
     """Frames."""
 
     @property
+    def truth(self) -> Path:
+        """What was hidden, beside the recording: labels stay true when a generator of objects changes."""
+        return self.path.with_suffix(".npy")
+
+    @property
     def is_whole(self) -> bool:
-        """Whether it was made already."""
+        """Whether it was made already, of the object as it is now."""
+        if not (self.path.is_file() and self.truth.is_file()):
+            return False
+        same = np.array_equal(np.load(self.truth), self.thing.depth_m, equal_nan=True)
         try:
-            return self.path.is_file() and load_sidecar(sidecar_path(self.path)).state == "complete"
+            return same and load_sidecar(sidecar_path(self.path)).state == "complete"
         except RecordingError:
             return False
 
@@ -101,6 +111,8 @@ def takes(things: Sequence[FixedObject], folder: Path) -> list[Take]:
 def record(take: Take, scene: SceneFile, frames: int) -> None:
     """Make one recording and its sidecar, and read it back. Raises the error that ended it, if one did."""
     take.path.parent.mkdir(parents=True, exist_ok=True)
+    sidecar_path(take.path).unlink(missing_ok=True)  # until it is there, nothing is whole
+    np.save(take.truth, take.thing.depth_m)
     bare = scene.bare
     shown = Scene(scene.rig, take.thing.depth_m, bare.surface, scene.radiometry, scene.jump_m, bare.pulse_ns)
     recording = Recording(take.path, frames=frames)

@@ -39,7 +39,7 @@ def label(
     found = recordings_in(recordings)
     with tracked("reading recordings") as on_progress:
         labelled = read_labelled(found, wall=wall, frames=frames, on_progress=on_progress)
-    write_shards(labelled, folder)
+    write_shards(labelled, folder, f"nlos-cam dataset label {recordings} --out {out} --frames {frames}")
     labels = sorted(set(labelled.label))
     rig = {"rig_name": labelled.rig.name, "rig_checksum": labelled.rig.checksum}
     result = {"out": str(folder), "samples": len(labelled.label), "recordings": len(found), "labels": labels, **rig}

@@ -31,6 +31,10 @@ def test_what_is_read_is_what_was_written(tmp_path: Path, count: int) -> None:
     maps, plan = dataset.read(tmp_path)
     for name in ("depth_m", "intensity", "image"):
         np.testing.assert_array_equal(getattr(maps, name), getattr(labelled.maps, name))
+    kept = dataset.open_dataset(tmp_path)
+    assert tuple(kept.column("category")) == labelled.label
+    np.testing.assert_array_equal(kept.column("object_depth_m"), labelled.object_depth_m)
+    assert np.isnan(kept.column("scene")).any(axis=0).sum() == 1  # the gain is not known
     assert plan.rig == RIG
     assert plan.accuracy == RECORDED
 
