@@ -1,9 +1,10 @@
 """Error on the simulated bench against the number of recordings that were adapted to: docs/transfer_curve.json, .png.
 
-`python tools/transfer_curve.py DIR RUNS --recipe models/recipes/transfer.toml [--weights W] [--scratch models/recipes/
-scratch.toml]`; DIR is that of `transfer_bench.py`, RUNS keeps the runs and goes on where it was stopped. Judged by one
-frame of each of 18 objects that no run has seen; `train` itself looks at 6 others. With --scratch the same recordings
-also train a compressor from nothing, onto the latent of the weights' VAE.
+`python tools/transfer_curve.py DIR RUNS --recipe models/recipes/paper-rig-transfer.toml [--weights W]
+[--scratch models/recipes/paper-rig-compressor-scratch.toml]`; DIR is that of `transfer_bench.py`, RUNS keeps the runs
+and goes on where it was stopped. Judged by one frame of each of 18 objects that no run has seen; `train` itself looks
+at 6 others. With --scratch the same recordings also train a compressor from nothing, onto the latent of the weights'
+VAE.
 """
 
 import argparse
