@@ -23,6 +23,7 @@ from nlos_cam.render.sensor_bias import DepthBias
 from nlos_cam.render.sensor_chain import Bytes, Chain, Echoes, Optics, expose, signal_surety
 from nlos_cam.render.sensor_effects import sensor_effects
 from nlos_cam.render.sensor_model import DEPTH_UNIT_M, SensorModel
+from nlos_cam.render.sensor_texture import texture
 
 NO_DEVIATES = np.zeros(0, np.float32)
 
@@ -52,9 +53,12 @@ class Sensor:
         verdicts, lambertian = sensor_effects(model), radiometry == "lambertian"
         self._chain = _chain(rig, model, verdicts, lambertian=lambertian)
         direct = cast(rig, rig.pinhole, lambertian=lambertian)
-        self._optics = _optics(direct, self._chain, model.dead_share if included(verdicts, "dead pixels") else 0.0)
+        shape = (rig.intrinsics.height, rig.intrinsics.width)
+        reflectance = texture(shape, model.wall_texture if included(verdicts, "wall texture") else 0.0)
+        dead_share = model.dead_share if included(verdicts, "dead pixels") else 0.0
+        self._optics = _optics(direct, self._chain, dead_share, reflectance)
         self._echoes_only = self._optics._replace(direct=np.zeros_like(self._optics.direct))
-        self._bias = DepthBias((rig.intrinsics.height, rig.intrinsics.width), model, verdicts)
+        self._bias = DepthBias(shape, model, verdicts)
         self._lights = included(verdicts, "shot noise") or included(verdicts, "read noise")
         self._ranges = included(verdicts, "range noise")
 
@@ -97,11 +101,11 @@ def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...], *, lamber
     )
 
 
-def _optics(beams: Beams, chain: Chain, dead_share: float) -> Optics:
+def _optics(beams: Beams, chain: Chain, dead_share: float, reflectance: Float32) -> Optics:
     direct = beams.direct.astype(np.float32)
     surety, length_m = signal_surety(direct, chain), beams.length_m.astype(np.float32)
     dead = np.random.default_rng(0).random(direct.size if dead_share else 0) < dead_share
-    return Optics(direct, surety, length_m, beams.cos_axis.astype(np.float32), dead)
+    return Optics(direct, surety, length_m, beams.cos_axis.astype(np.float32), dead, reflectance)
 
 
 def _echoes(multi: MultiBounce, chain: Chain) -> Echoes:

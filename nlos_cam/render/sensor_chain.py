@@ -1,6 +1,6 @@
 """The sensor's stages, in the order in which light meets them, and the loop that leads each pixel through them.
 
-    echo (S5) -> gain -> ambient light -> shot and read noise -> saturation -> 8 bits            IR
+    echo (S5) -> wall texture -> gain -> ambient light -> shot and read noise -> saturation -> 8 bits            IR
     signal above the noise, winner above the second -> 4 bits                                    confidence
     path / 2 x cos(beam, optical axis) -> bias -> range noise -> 0.25 mm -> dead pixels          depth
 
@@ -45,6 +45,8 @@ class Optics(NamedTuple):
     cos_axis: Float32
     dead: NDArray[np.bool_]
     """Empty where no pixel is dead."""
+    texture: Float32
+    """Factors of the light; empty for an even wall."""
 
 
 class Echoes(NamedTuple):
@@ -85,16 +87,21 @@ def quantise(value: float, most: int) -> int:
 
 
 @numba.njit(cache=True)
+def sure(counts: float, chain: Chain) -> float:
+    """From 0 to 1, how far a signal stands above the noise: as if dimmed by what ambient light adds to it."""
+    if chain.ambient_counts > 0:
+        noise = noise_counts(counts + chain.ambient_counts, chain)
+        if noise > 0:
+            counts *= noise_counts(counts, chain) / noise
+    return 1 - np.exp(-counts / SURE_COUNTS)
+
+
+@numba.njit(cache=True)
 def signal_surety(intensity: Float32, chain: Chain) -> Array:
-    """From 0 to 1 (n,), how far signals (n,) stand above the noise: as if dimmed by what ambient light adds to it."""
+    """`sure` of intensities (n,), in units of I0."""
     surety = np.empty(intensity.size)
     for i in range(intensity.size):
-        counts = chain.gain * intensity[i]
-        if chain.ambient_counts > 0:
-            noise = noise_counts(counts + chain.ambient_counts, chain)
-            if noise > 0:
-                counts *= noise_counts(counts, chain) / noise
-        surety[i] = 1 - np.exp(-counts / SURE_COUNTS)
+        surety[i] = sure(chain.gain * intensity[i], chain)
     return surety
 
 
@@ -115,7 +122,11 @@ def expose(
         intensity, surety, length_m, second = compete(optics, i, echoes, cell[i])
         if intensity <= 0:
             continue
-        light = chain.gain * intensity + chain.ambient_counts
+        counts = chain.gain * intensity
+        if optics.texture.size:
+            counts *= optics.texture[i]
+            surety = sure(counts, chain)
+        light = counts + chain.ambient_counts
         if light_deviates.size:
             light += light_deviates[i] * noise_counts(light, chain)
         ir[i] = quantise(saturate(light, chain), SATURATED)

@@ -15,6 +15,7 @@ def sensor_effects(model: SensorModel) -> tuple[Effect, ...]:
     its unit.
     """
     return (
+        _texture(model),
         Effect("gain", included=True, reason=f"the bare wall reads {model.bare_wall_counts:g} counts; {IR}", bound=1.0),
         _ambient(model),
         _shot(model),
@@ -34,6 +35,13 @@ def sensor_effects(model: SensorModel) -> tuple[Effect, ...]:
 
 def _verdict(name: str, needed: bool, why: str, bound: float) -> Effect:
     return Effect(name, needed, why, bound) if needed else Effect(name, needed, "the model has none", 0.0)
+
+
+def _texture(model: SensorModel) -> Effect:
+    """Of a factor of mean 1, normal by its logarithm, E|factor - 1| = 2 erf(strength / sqrt(8)) < strength."""
+    strength = model.wall_texture
+    why = f"the wall's reflectance varies by {100 * strength:g} %; {IR}"
+    return _verdict("wall texture", strength > 0, why, strength)
 
 
 def _ambient(model: SensorModel) -> Effect:

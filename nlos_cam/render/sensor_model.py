@@ -1,4 +1,4 @@
-"""What a sensor is like: gain, pulse, ambient light, noise, bias as a validated record, and the device's constants."""
+"""What a sensor is like, and the wall to it: gain, pulse, texture, ambient light, noise, bias as a validated record."""
 
 from math import exp
 from typing import Annotated, Self
@@ -46,6 +46,8 @@ class SensorModel(Record):
     """IR counts of the brightest bare-wall return: fixes the gain."""
     pulse_ns: float = Field(default=0.0, ge=0, le=100, allow_inf_nan=False)
     """Full width of the laser's pulse at half its maximum. 1 ns is 0.3 m of path; 0 is a pulse shorter than any bin."""
+    wall_texture: float = Field(default=0.0, ge=0, le=1)
+    """Standard deviation, over the view, of the logarithm of the wall's reflectance; its mean is the even wall's."""
     ambient_counts: float = Field(default=0.0, ge=0, lt=SATURATED, allow_inf_nan=False)
     """Steady light on the detector beside the echo. The device subtracts its mean: the data sheet calls the IR the
     intensity of the reflected laser, not the scene's. Left of it are its shot noise, the counts it takes of the 8

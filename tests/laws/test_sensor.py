@@ -15,6 +15,7 @@ from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor import SensedImages, Sensor
 from nlos_cam.render.sensor_bias import PATCHES_SEED, RIPPLES_SEED, WAVES, patches, ripples
 from nlos_cam.render.sensor_model import DEPTH_UNIT_M, MOST_CONFIDENT, SATURATED, SensorModel, WarmUp
+from nlos_cam.render.sensor_texture import texture
 
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 RICH = SensorModel(ambient_counts=40, read_noise_counts=1.5, dead_share=0)
@@ -29,6 +30,7 @@ BIASED = RICH.model_copy(
 )
 BIAS_FIELDS = {"range_offset_m", "ripple_m", "patch_drift_m", "drift_m_per_celsius", "warm_up"}
 CELSIUS = 30.0
+ROUGH = BIASED.model_copy(update={"wall_texture": 0.3})
 FRAMES = 100
 
 
@@ -85,7 +87,9 @@ def _bias_m(model: SensorModel) -> np.ndarray:
     return model.ripple_m * wave - model.range_offset_m + drift_m
 
 
-@pytest.mark.parametrize("model", [SensorModel(), RICH, BIASED, QUIET], ids=["default", "rich", "biased", "quiet"])
+@pytest.mark.parametrize(
+    "model", [SensorModel(), RICH, BIASED, ROUGH, QUIET], ids=["default", "rich", "biased", "rough", "quiet"]
+)
 def test_fast_is_slow(rendering: Rendering, model: SensorModel) -> None:
     """The same chain written as plain array steps, in float64."""
     fast, beams, generator = (
@@ -98,7 +102,7 @@ def test_fast_is_slow(rendering: Rendering, model: SensorModel) -> None:
     )
     one, other = (generator.standard_normal(peak.size, np.float32) if model != QUIET else 0 for _ in range(2))
     intensity, second = np.maximum(peak, beams.direct), np.maximum(np.minimum(peak, beams.direct), runner_up)
-    counts = 48 / BRIGHTEST * intensity
+    counts = 48 / BRIGHTEST * intensity * (texture((64, 80), model.wall_texture) if model.wall_texture else 1)
     read, shot = model.read_noise_counts**2, model.shot_noise**2
     alone, noise = (np.sqrt(read + shot * (counts + light)) for light in (0, model.ambient_counts))
     seen = np.minimum(counts + model.ambient_counts + one * noise, SATURATED) - model.ambient_counts
@@ -205,6 +209,7 @@ ODD = np.array([0, -0.0, -1, 1e-38, 1e-6, 1e-3, 1, 1e6, 1e38, np.nan, np.inf, -n
     model=st.builds(
         SensorModel,
         bare_wall_counts=st.sampled_from([1e-300, 48.0, 1e6]),
+        wall_texture=st.sampled_from([0.0, 5e-324, 1.0]),
         ambient_counts=st.sampled_from([0.0, 5e-324, 40.0, 254.9]),
         shot_noise=st.sampled_from([0.0, 1e-200, 0.3, 255.0]),
         read_noise_counts=st.sampled_from([0.0, 1e-200, 0.7, 255.0]),

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nlos_cam.render.sensor_chain import Chain, Echoes, Optics, compete, noise_counts, quantise, saturate, signal_surety
+from nlos_cam.render.sensor_texture import EVEN
 
 NO_STAGE = Chain(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 NOISY = NO_STAGE._replace(read_variance=0.49, shot_variance=0.09)
@@ -35,7 +36,7 @@ def test_what_is_no_number_is_nothing_and_what_is_too_much_is_the_most(value: fl
 def test_the_stronger_return_wins_and_a_tie_goes_to_the_direct_one(
     own: float, peak: float, outcome: tuple[float, ...]
 ) -> None:
-    optics = Optics(*(np.array([value], np.float32) for value in (own, 0.25, 3.0, 1.0)), np.zeros(0, np.bool_))
+    optics = Optics(*(np.array([value], np.float32) for value in (own, 0.25, 3.0, 1.0)), np.zeros(0, np.bool_), EVEN)
     echoes = Echoes(*(np.array([0.0, value], np.float32) for value in (peak, 0.75, 0.5, 8.0)))
     assert compete(optics, 0, echoes, 1) == outcome
 

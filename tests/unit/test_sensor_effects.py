@@ -19,6 +19,7 @@ FULL = load_rig("bare-wall")
 SMALL = FULL.intrinsics.model_copy(update=vars(FULL.pinhole.scaled(WIDTH, HEIGHT)))
 BARE = FULL.model_copy(update={"intrinsics": SMALL})
 CHAIN = (
+    "wall texture",
     "gain",
     "ambient light",
     "shot noise",
@@ -36,6 +37,7 @@ FORMAT = {"gain", "saturation", "quantisation"}
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 WARM_UP, COLD = WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600), 25.0
 HAS = {
+    "wall texture": {"wall_texture": 0.2},
     "ambient light": {"ambient_counts": 60.0, "shot_noise": 0.3},
     "shot noise": {"shot_noise": 0.3},
     "read noise": {"read_noise_counts": 0.7},
@@ -49,6 +51,7 @@ HAS = {
 WORST_AT = {"drift": COLD}
 """The warm device, unless said."""
 LACKS = {
+    "wall texture": {"wall_texture": 0.0},
     "ambient light": {"ambient_counts": 0.0},
     "shot noise": {"shot_noise": 0.0},
     "read noise": {"read_noise_counts": 0.0},
@@ -62,7 +65,7 @@ LACKS = {
 BIASED = SensorModel(
     range_offset_m=0.0045, ripple_m=0.001, patch_drift_m=0.0005, drift_m_per_celsius=0.0001, warm_up=WARM_UP
 )
-RICH = BIASED.model_copy(update={"ambient_counts": 60.0, "dead_share": 0.05})
+RICH = BIASED.model_copy(update={"ambient_counts": 60.0, "dead_share": 0.05, "wall_texture": 0.3})
 
 
 def _flat(counts: float) -> MultiBounce:
@@ -142,7 +145,7 @@ def _ir_change(model: SensorModel, name: str, counts: float, monkeypatch: pytest
     return float(np.abs(with_it - without).mean()), next(e.bound for e in sensor_effects(model) if e.name == name)
 
 
-@pytest.mark.parametrize("name", ["ambient light", "shot noise", "read noise"])
+@pytest.mark.parametrize("name", ["wall texture", "ambient light", "shot noise", "read noise"])
 @pytest.mark.parametrize("counts", [1.0, 5.0, 30.0, 120.0, 195.0, 250.0])
 def test_the_ir_changes_by_no_more_than_the_bound(name: str, counts: float, monkeypatch: pytest.MonkeyPatch) -> None:
     change, bound = _ir_change(RICH, name, counts, monkeypatch)
@@ -153,6 +156,9 @@ def test_a_bound_of_the_ir_is_near_what_its_worst_case_changes(monkeypatch: pyte
     noisy = QUIET.model_copy(update={"read_noise_counts": 2.0})
     change, bound = _ir_change(noisy, "read noise", 30.0, monkeypatch)  # the same at 1 count, were it not cut at 0
     assert bound / 2 < change <= bound
+    rough = QUIET.model_copy(update={"wall_texture": 0.2})
+    change, bound = _ir_change(rough, "wall texture", 100.0, monkeypatch)
+    assert 100 * bound / 2 < change <= 100 * bound
     lit = QUIET.model_copy(update={"ambient_counts": 60.0})
     change, bound = _ir_change(lit, "ambient light", 300.0, monkeypatch)
     assert change == pytest.approx(255 * bound)

@@ -9,6 +9,7 @@ from nlos_cam.render.sensor_model import SATURATED, STEADY_CELSIUS, SensorModel,
 
 MOST = {
     "pulse_ns": 100.0,
+    "wall_texture": 1.0,
     "ambient_counts": 254.9,
     "range_noise_m": 10.0,
     "range_noise_per_m": 1.0,
@@ -38,9 +39,9 @@ def test_a_model_that_cannot_be_names_its_field(field: str, value: float) -> Non
         SensorModel.model_validate({field: value})
 
 
-def test_unless_asked_there_is_neither_a_pulse_nor_ambient_light_nor_a_bias() -> None:
+def test_unless_asked_there_is_no_pulse_no_texture_no_ambient_light_and_no_bias() -> None:
     bias = dict.fromkeys(("range_offset_m", "ripple_m", "patch_drift_m", "drift_m_per_celsius"), 0.0)
-    assert SensorModel() == SensorModel(pulse_ns=0, ambient_counts=0, warm_up=None, **bias)
+    assert SensorModel() == SensorModel(pulse_ns=0, wall_texture=0, ambient_counts=0, warm_up=None, **bias)
 
 
 @pytest.mark.parametrize("field", ["range_offset_m", "drift_m_per_celsius"])
