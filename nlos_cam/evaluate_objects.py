@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import h5py
 import numpy as np
@@ -26,25 +27,38 @@ QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, s
 """A sensor without noise or dead pixels; saturation and quantisation stay."""
 
 
+class Subject(Protocol):
+    """An object to judge on; those of the test set are such."""
+
+    @property
+    def name(self) -> str:
+        """What tables and pictures call it."""
+        ...
+
+    @property
+    def category(self) -> str:
+        """Its kind."""
+        ...
+
+    @property
+    def depth_m(self) -> Float32:
+        """(64, 64); NaN for background."""
+        ...
+
+
 @dataclass(frozen=True)
-class Subject:
-    """An object to judge on."""
+class SeededObject:
+    """A random object."""
 
     name: str
     category: str
     depth_m: Float32
-    """(64, 64); NaN for background."""
 
 
-def seeded_subjects(first_seed: int, count: int, box: ObjectBox) -> list[Subject]:
+def seeded_objects(first_seed: int, count: int, box: ObjectBox) -> list[SeededObject]:
     """Random objects by their seeds."""
     made = [object_depth(seed, box) for seed in range(first_seed, first_seed + count)]
-    return [Subject(f"{category} {first_seed + k}", category, depth) for k, (category, depth) in enumerate(made)]
-
-
-def fixed_subjects(box: ObjectBox) -> list[Subject]:
-    """The 54 test objects, three of a category."""
-    return seeded_subjects(20_000_000, 54, box)
+    return [SeededObject(f"{category} {first_seed + k}", category, depth) for k, (category, depth) in enumerate(made)]
 
 
 def categories_in(folder: Path) -> list[str]:

@@ -30,6 +30,11 @@ from nlos_cam.frames import Float32
 SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
 SILHOUETTE_ERROR, DEPTH_ERROR = "1 - silhouette IoU", "foreground RMSE, mm"
 
+READ_WITH_CARE = (
+    "Means over objects; intervals by bootstrap over objects. Foreground RMSE is over pixels that are surface in both, "
+    "so an answer that finds little of an object is not told by it: read it beside the silhouette IoU."
+)
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -134,8 +139,7 @@ def as_markdown(figures: Mapping[str, Any]) -> str:
         f"# Reconstruction of {figures['objects']} hidden objects",
         f"{figures['what']}. Weights: {figures['weights']}; rig: {figures['rig']}; {figures['runtime']}.",
         "\n".join([head, "| --- " * (3 + len(names)) + "|", *(_row(figures, metric, names) for metric in BARS)]),
-        "Means over objects; intervals by bootstrap over objects. Foreground RMSE is over pixels that are surface in "
-        "both, so an answer that finds little of an object is not told by it: read it beside the silhouette IoU.",
+        READ_WITH_CARE,
         _against_nearest(figures["advantage_over_nearest_neighbour"]),
         _where(figures["where_the_error_is"]),
         "![truth, reconstruction, difference](sheet.png)",

@@ -1,6 +1,5 @@
 """Error against what a surface is like (SI 6): its size, its detail, and where on the image the error sits."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2

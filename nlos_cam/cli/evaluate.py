@@ -3,7 +3,7 @@
 import os
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -20,6 +20,7 @@ from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals,
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate_report import Judgement, as_figures, in_words, write
 from nlos_cam.frames import Float32
+from nlos_cam.objects.test_set import test_set
 
 SHIPPED = "the shipped ones"
 
@@ -78,7 +79,7 @@ def evaluate(
     judgement = Judgement(
         names, categories, truth, image, trivial.baselines(maps, images, training_maps), plan.box, facts
     )
-    figures = as_figures(judgement) | {"seconds": time.perf_counter() - started}
+    figures: dict[str, Any] = as_figures(judgement) | {"seconds": time.perf_counter() - started}
     write(folder, judgement, figures)
     text = f"silhouette IoU {in_words(figures['silhouette_iou'])} on {len(truth)} objects: {folder / 'report.md'}"
     finish({**figures, "out": str(folder)}, as_json=json, text=text)
@@ -87,7 +88,7 @@ def evaluate(
 def _test_objects(rig: Rig, count: int | None) -> tuple[list[str], list[str], MapSet]:
     """Names, categories and maps of the 54, or of so many random objects."""
     box = dataset.DatasetPlan(rig, dataset.TEST_SEED).box
-    subjects = objects.seeded_subjects(dataset.TEST_SEED, count, box) if count else objects.fixed_subjects(box)
+    subjects = objects.seeded_objects(dataset.TEST_SEED, count, box) if count else test_set(box)
     with tracked("rendering test objects") as on_progress:
         echoes = objects.echoes_of(subjects, rig, on_progress)
     maps = objects.as_map_set(objects.sense(echoes, rig), objects.truth_of(subjects, box))
