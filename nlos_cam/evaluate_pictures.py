@@ -1,4 +1,4 @@
-"""Pictures of a judgement: the sheet of SI 6's Figure S2, bars per category, error against surface, worst and best."""
+"""Pictures of a judgement: the sheet of SI 6's Figure S2, metrics per category, error against surface, worst and best."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -74,26 +74,23 @@ def draw_categories(path: Path, categories: Mapping[str, Figures], overall: Figu
     ordered = sorted(categories, key=lambda name: categories[name]["silhouette_iou"].value or 0.0)
     figure = _figure((13, 1.4 + 0.24 * len(ordered)))
     for axis, (metric, label) in zip(figure.subplots(1, 4, sharey=True), LABELS.items(), strict=True):
-        _bars(axis, [categories[name][metric] for name in ordered])
+        _points(axis, [categories[name][metric] for name in ordered])
         if (mean := overall[metric].value) is not None:
             axis.axvline(mean, color="black", linewidth=1, label=f"all objects: {mean:.3g}")
         axis.axvline(BARS[metric], color="tab:green", linestyle="--", linewidth=1, label=f"wanted: {BARS[metric]:g}")
         better = "less" if metric in SMALLER_IS_BETTER else "more"
         axis.set(title=label, xlabel=f"{better} is better", yticks=range(len(ordered)), yticklabels=ordered)
         axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.6 / (1 + 0.24 * len(ordered))))
-        axis.grid(axis="x", alpha=0.3)
+        axis.grid(alpha=0.3)
     figure.savefig(path, dpi=90)
 
 
-def _bars(axis: Any, figures: Sequence[Interval]) -> None:
-    known = [(k, figure) for k, figure in enumerate(figures) if figure.value is not None]
-    for k, figure in known:
-        axis.barh(k, figure.value, color="tab:blue", alpha=0.55)
-        axis.plot([figure.low, figure.high], [k, k], color="tab:blue", linewidth=2)
-    ends = [end for _, figure in known for end in (figure.low, figure.high) if end is not None]
-    if ends:
-        room = 0.1 * (max(ends) - min(ends)) + 1e-3
-        axis.set_xlim(max(0.0, min(ends) - room), max(ends) + room)
+def _points(axis: Any, figures: Sequence[Interval]) -> None:
+    """Estimates and intervals; no bars, since the axis does not begin at 0."""
+    for k, figure in enumerate(figures):
+        if figure.value is not None:
+            axis.plot([figure.low, figure.high], [k, k], color="tab:blue", linewidth=2, alpha=0.6)
+            axis.plot(figure.value, k, "o", color="tab:blue")
 
 
 def draw_against_surface(
