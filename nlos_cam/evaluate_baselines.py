@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def training_maps(plan: dataset.DatasetPlan, cache: Path, workers: int, on_progr
 
     A build that was cut short goes on where it was. The folder is named by a checksum of rig, sensor and objects.
     """
-    plan = dataset.DatasetPlan(plan.rig, dataset.TRAINING_SEED, plan.sensor, plan.accuracy)
+    plan = replace(plan, first_seed=dataset.TRAINING_SEED, objects=dataset.Objects())
     folder = cache / "neighbours" / f"{_checksum(plan)}-{NEIGHBOURS}"
     dataset.build(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
     return dataset.read(folder)[0]

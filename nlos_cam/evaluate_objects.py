@@ -2,10 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
-import h5py
 import numpy as np
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_models.data import MapSet
@@ -59,17 +57,6 @@ def seeded_objects(first_seed: int, count: int, box: ObjectBox) -> list[SeededOb
     """Random objects by their seeds."""
     made = [object_depth(seed, box) for seed in range(first_seed, first_seed + count)]
     return [SeededObject(f"{category} {first_seed + k}", category, depth) for k, (category, depth) in enumerate(made)]
-
-
-def categories_in(folder: Path) -> list[str]:
-    """The category of every object of a dataset, in the order of `dataset.read`."""
-    categories: list[str] = []
-    for shard in sorted(folder.glob("shard-*.h5")):
-        with h5py.File(shard) as file:
-            stored = file["category"]
-            assert isinstance(stored, h5py.Dataset)  # noqa: S101  pyright: h5py cannot say what a name holds
-            categories += [str(category) for category in stored.asstr()[:]]
-    return categories
 
 
 def truth_of(subjects: Sequence[Subject], box: ObjectBox) -> Float32:

@@ -1,4 +1,4 @@
-"""Pictures of a judgement: the sheet of SI 6's Figure S2, metrics per category, error against surface, worst and best."""
+"""Pictures of a judgement: SI 6's Figure S2 as a sheet, metrics per category, error against surface, worst and best."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -62,8 +62,7 @@ def evaluate(
         raise SceneError(f"these weights eat {record.input}, and test maps are raw maps: use other weights")
     with interrupted_by_signals():
         if data:
-            maps, plan = dataset.read(data)
-            names, categories = _labels(data, len(maps.image))
+            names, categories, maps, plan = _stored(data)
         else:
             plan = dataset.DatasetPlan(rig_named(rig or record.rig_name), dataset.TEST_SEED)
             names, categories, maps = _test_objects(plan.rig, count)
@@ -95,9 +94,12 @@ def _test_objects(rig: Rig, count: int | None) -> tuple[list[str], list[str], Ma
     return [subject.name for subject in subjects], [subject.category for subject in subjects], maps
 
 
-def _labels(data: Path, count: int) -> tuple[list[str], list[str]]:
-    categories = objects.categories_in(data)
-    return [f"{category} {k}" for k, category in enumerate(categories[:count])], categories
+def _stored(folder: Path) -> tuple[list[str], list[str], MapSet, dataset.DatasetPlan]:
+    """Names, categories and maps of a dataset, and its plan."""
+    opened = dataset.open_dataset(folder)
+    categories = [str(category) for category in opened.column("category")]
+    names = [f"{category} {seed}" for category, seed in zip(categories, opened.column("seed"), strict=True)]
+    return names, categories, opened.arrays(), opened.plan
 
 
 def _training_set(
