@@ -155,9 +155,7 @@ def main() -> None:
     box = object_box(rig_named(load_pipeline(folder)[1].rig_name))
     subjects = test_set(box)
     seen = seeded_objects(TRAINING_SEED, len(subjects), box)
-    rows: list[Row] = []
-    for row in [*experiments(folder, subjects, seen, asked.frames)]:
-        rows.append(row)
+    rows = [*experiments(folder, subjects, seen, asked.frames)]
     if asked.weights[1:]:
         rows += learning_curve(asked.weights, subjects)
     table = {"objects": len(subjects), "rows": [asdict(row) for row in rows]}

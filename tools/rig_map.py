@@ -1,9 +1,10 @@
-"""Where weights work: `evaluate`'s figures over the rigs that SI 1 allows: docs/rig_map.json and docs/images/rig_map.png.
+"""Where weights work: `evaluate`'s figures over the rigs of SI 1: docs/rig_map.json and docs/images/rig_map.png.
 
 `--weights DIR`, once or more: other weights than the shipped ones, side by side. The lidar moves (0.15 to 0.30 m from
-the wall, 15 to 75 degrees to its normal); occluder and object box stay. Cells that are done are kept: a second run goes on.
+the wall, 15 to 75 degrees to its normal); occluder and object box stay. A second run keeps the cells that are done.
 """
 
+import hashlib
 import json
 from argparse import ArgumentParser
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 from nlos_calibration.object_sight import lidar_sees
 from nlos_calibration.rig import Rig, load_rig
+from nlos_models.checkpoint import shipped_folder
 from nlos_models.inference import Reconstructor, load_reconstructor
 
 from nlos_cam.cache import cache_folder
@@ -41,7 +43,7 @@ def cell_at(rig: Rig, subjects: Sequence[Subject], networks: Mapping[str, Recons
     """The figures of all networks on one rig."""
     box = object_box(rig)
     truth = truth_of(subjects, box)
-    maps = as_map_set(sense(echoes_of(subjects, rig, lambda *_: None), rig), truth)
+    maps = as_map_set(sense(echoes_of(subjects, rig, _untold), rig), truth)
     found = {name: judge(reconstruct_all(network, maps), truth, box) for name, network in networks.items()}
     return {
         "distance_m": rig.lidar.distance_m,
@@ -51,6 +53,10 @@ def cell_at(rig: Rig, subjects: Sequence[Subject], networks: Mapping[str, Recons
         "share_of_cells_with_a_return": float(np.mean(~np.isnan(maps.depth_m))),
         "weights": {name: _plain(figures) for name, figures in found.items()},
     }
+
+
+def _untold(done: int, total: int) -> None:
+    del done, total
 
 
 def _plain(figures: Figures) -> dict[str, dict[str, float | None]]:
@@ -63,23 +69,35 @@ def measured(
     subjects: Sequence[Subject],
     networks: Mapping[str, Reconstructor],
     path: Path,
+    made_of: str,
 ) -> list[Cell]:
-    """All cells of a grid; each is written down when it is done, and those of these weights and rig are kept."""
-    cells = [cell for cell in _kept(path) if cell["weights"].keys() == networks.keys()]
+    """All cells of a grid, each written down when it is done; those that are there are kept if `made_of` is alike."""
+    cells = _kept(path, made_of)
     with tracked("rigs") as on_progress:
         for distance_m, yaw_deg in grid:
             there = rig_at(rig, distance_m, yaw_deg)
             if not any(cell["rig_checksum"] == there.checksum for cell in cells):
                 cells.append(cell_at(there, subjects, networks))
-                path.write_text(
-                    json.dumps({"objects": len(subjects), "cells": cells}, indent=1) + "\n", encoding="utf-8"
-                )
+                table = {"objects": len(subjects), "made_of": made_of, "cells": cells}
+                path.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
             on_progress(len(cells), len(grid))
     return cells
 
 
-def _kept(path: Path) -> list[Cell]:
-    return json.loads(path.read_text(encoding="utf-8"))["cells"] if path.exists() else []
+def _kept(path: Path, made_of: str) -> list[Cell]:
+    table = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return table["cells"] if table.get("made_of") == made_of else []
+
+
+def checksum(folders: Mapping[str, Path | None], subjects: Sequence[Subject]) -> str:
+    """Of weights and objects: cells of others are no use."""
+    digest = hashlib.sha256("".join(folders).encode())
+    for folder in folders.values():
+        for file in sorted((folder or shipped_folder()).glob("*.safetensors")):
+            digest.update(file.read_bytes())
+    for subject in subjects:
+        digest.update(subject.depth_m.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def draw(path: Path, cells: Sequence[Cell], rig: Rig) -> None:
@@ -135,7 +153,9 @@ def main() -> None:
     networks = {name: load_reconstructor(folder, cache_folder() / "onnx") for name, folder in folders.items()}
     rig = load_rig(asked.rig)
     grid = [(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG]
-    cells = measured(rig, grid, test_set(object_box(rig)), networks, asked.out / "rig_map.json")
+    subjects = test_set(object_box(rig))
+    made_of = checksum(folders, subjects)
+    cells = measured(rig, grid, subjects, networks, asked.out / "rig_map.json", made_of)
     (asked.out / "images").mkdir(exist_ok=True)
     draw(asked.out / "images" / "rig_map.png", cells, rig)
     for cell in cells:
