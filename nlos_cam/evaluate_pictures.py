@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, Figures, Interval, Values
 from nlos_cam.evaluate_surface import Bin
@@ -15,6 +16,13 @@ MOST_ON_A_SHEET = 54
 GALLERY = 6
 DIFFERENCE_V = 0.5
 """The difference that has the full colour; 0.1 is 31 mm in the paper's box."""
+Scale = tuple[str, float, float]
+"""A map of colours, and the values at its ends."""
+VALUE: Scale = ("magma", 0.0, 1.0)
+DIFFERENCE: Scale = ("coolwarm", -DIFFERENCE_V, DIFFERENCE_V)
+TILE, HEAD = 70, 16
+"""Pixels from one object's picture to the next, and above them for its name."""
+BLOCK = HEAD + 3 * TILE
 ROWS = "truth", "reconstruction", "difference"
 LABELS = {
     "silhouette_iou": "silhouette IoU",
@@ -28,19 +36,23 @@ def draw_sheet(path: Path, image: Float32, truth: Float32, titles: Sequence[str]
     """Truth, reconstruction and difference of up to 54 objects, evenly chosen where there are more (Figure S2)."""
     shown = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), MOST_ON_A_SHEET)).astype(int))
     columns = min(SHEET_COLUMNS, len(shown))
-    blocks = [shown[k : k + columns] for k in range(0, len(shown), columns)]
-    figure = _figure((0.9 * columns + 1.3, 2.95 * len(blocks) + 0.2))
-    axes = figure.subplots(3 * len(blocks), columns, squeeze=False)
-    drawn: list[Any] = []
-    for axis in axes.ravel():
-        axis.set_axis_off()
-    for at, block in enumerate(blocks):
-        for column, k in enumerate(block):
-            drawn = _three(axes[3 * at : 3 * at + 3, column], image[k], truth[k])
-            axes[3 * at, column].set_title(titles[k], fontsize=8, pad=2)
-        for offset, name in enumerate(ROWS):
-            axes[3 * at + offset, 0].text(-8, 32, name, fontsize=8, rotation=90, ha="center", va="center")
-    _colour_bars(figure, axes, drawn)
+    figure = _figure((0.8 * columns + 1.6, 2.7 * -(-len(shown) // columns) + 0.2))
+    axis = figure.subplots()
+    _mosaic(axis, image[shown], truth[shown], [titles[int(k)] for k in shown], columns)
+    _colour_bars(figure, axis)
+    figure.savefig(path, dpi=100)
+
+
+def draw_gallery(path: Path, image: Float32, truth: Float32, titles: Sequence[str], iou: Values) -> None:
+    """The objects with the lowest silhouette IoU above those with the highest, with their figures."""
+    order = np.argsort(iou, kind="stable")
+    count = min(GALLERY, len(order))
+    figure = _figure((1.5 * count + 2, 10.4))
+    axes = figure.subplots(2, 1)
+    for axis, chosen, title in zip(axes, (order[:count], order[::-1][:count]), ("worst", "best"), strict=True):
+        _mosaic(axis, image[chosen], truth[chosen], [f"{titles[int(k)]}: {iou[k]:.2f}" for k in chosen], count)
+        axis.set_title(f"{title} silhouettes (IoU)", fontsize=11)
+    _colour_bars(figure, list(axes))
     figure.savefig(path, dpi=90)
 
 
@@ -50,23 +62,49 @@ def _figure(size: tuple[float, float]) -> Any:
     return Figure(figsize=size, layout="constrained")
 
 
-def _three(axes: Any, image: Float32, truth: Float32) -> list[Any]:
-    """Truth, reconstruction, difference, one below the other or side by side."""
-    looks = (
-        (truth, "magma", (0, 1)),
-        (image, "magma", (0, 1)),
-        (image - truth, "coolwarm", (-DIFFERENCE_V, DIFFERENCE_V)),
-    )
-    return [
-        axis.imshow(picture, cmap=colours, vmin=low, vmax=high)
-        for axis, (picture, colours, (low, high)) in zip(axes, looks, strict=True)
-    ]
+def _mosaic(axis: Any, image: Float32, truth: Float32, titles: Sequence[str], columns: int) -> None:
+    """Truth, reconstruction and difference one below the other, object beside object, as one picture."""
+    axis.imshow(mosaic(image, truth, columns))
+    axis.set_axis_off()
+    for k, title in enumerate(titles):
+        block, column = divmod(k, columns)
+        axis.text(column * TILE + 32, block * BLOCK + HEAD - 3, title, fontsize=6.5, ha="center", va="bottom")
+    for block in range(-(-len(titles) // columns)):
+        for row, name in enumerate(ROWS):
+            middle = block * BLOCK + HEAD + row * TILE + 32
+            axis.text(-4, middle, name, fontsize=7, rotation=90, ha="right", va="center")
 
 
-def _colour_bars(figure: Any, axes: Any, drawn: Sequence[Any]) -> None:
-    some, label = list(axes.ravel()), {"fontsize": 8}
-    figure.colorbar(drawn[0], ax=some, fraction=0.015, pad=0.005).set_label("v: 0 background, 1 near the wall", **label)
-    figure.colorbar(drawn[2], ax=some, fraction=0.015, pad=0.005).set_label("difference in v: red is too near", **label)
+def mosaic(image: Float32, truth: Float32, columns: int) -> NDArray[np.uint8]:
+    """The coloured tiles (rows, columns, 3) of images (n, 64, 64): blocks of HEAD and three rows of TILE pixels."""
+    canvas = np.full((-(-len(truth) // columns) * BLOCK, columns * TILE, 3), 255, np.uint8)
+    rows = _coloured(truth, VALUE), _coloured(image, VALUE), _coloured(image - truth, DIFFERENCE)
+    for k in range(len(truth)):
+        block, column = divmod(k, columns)
+        for row, tiles in enumerate(rows):
+            top, left = block * BLOCK + HEAD + row * TILE, column * TILE
+            canvas[top : top + 64, left : left + 64] = tiles[k]
+    return canvas
+
+
+def _mappable(scale: Scale) -> Any:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    name, low, high = scale
+    return ScalarMappable(Normalize(low, high), name)
+
+
+def _coloured(images: Float32, scale: Scale) -> NDArray[np.uint8]:
+    """Images (n, 64, 64) as colours (n, 64, 64, 3)."""
+    mapped = _mappable(scale)
+    return mapped.cmap(mapped.norm(images), bytes=True)[..., :3]
+
+
+def _colour_bars(figure: Any, axes: Any) -> None:
+    words = (VALUE, "v: 0 background, 1 near the wall"), (DIFFERENCE, "difference in v: red is too near")
+    for scale, label in words:
+        figure.colorbar(_mappable(scale), ax=axes, fraction=0.015, pad=0.005).set_label(label, fontsize=8)
 
 
 def draw_categories(path: Path, categories: Mapping[str, Figures], overall: Figures) -> None:
@@ -118,24 +156,3 @@ def _curve(axis: Any, bins: Sequence[Bin]) -> None:
         axis.plot([one.low, one.high], [error.value] * 2, color="tab:red", linewidth=2, label=label)
         axis.plot([(one.low + one.high) / 2] * 2, [error.low, error.high], color="tab:red", linewidth=1)
         label = None
-
-
-def draw_gallery(path: Path, image: Float32, truth: Float32, titles: Sequence[str], iou: Values) -> None:
-    """The objects with the lowest silhouette IoU above those with the highest, with their figures."""
-    order = np.argsort(iou, kind="stable")
-    count = min(GALLERY, len(order))
-    figure = _figure((1.75 * count + 1.2, 10.6))
-    parts = figure.subfigures(2, 1)
-    for part, chosen, title in zip(parts, (order[:count], order[::-1][:count]), ("worst", "best"), strict=True):
-        part.suptitle(f"{title} silhouettes", fontsize=11)
-        axes = part.subplots(3, count, squeeze=False)
-        drawn: list[Any] = []
-        for column, k in enumerate(chosen):
-            drawn = _three(axes[:, column], image[k], truth[k])
-            axes[0, column].set_title(f"{titles[k]}\nIoU {iou[k]:.2f}", fontsize=9)
-        for axis in axes.ravel():
-            axis.set_axis_off()
-        for axis, name in zip(axes[:, 0], ROWS, strict=True):
-            axis.text(-5, 32, name, fontsize=9, rotation=90, ha="center", va="center")
-        _colour_bars(part, axes, drawn)
-    figure.savefig(path, dpi=90)

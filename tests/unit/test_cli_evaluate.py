@@ -42,7 +42,7 @@ def _maps(plan: DatasetPlan, count: int) -> dataset.MapSet:
 
 @pytest.fixture(autouse=True)
 def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
-    """A guesser for the weights, few training objects, which are made and not rendered; the plans asked for are kept."""
+    """A guesser for the weights, a few training objects that are not rendered; the plans asked for are kept."""
     asked: list[DatasetPlan] = []
 
     def training_maps(plan: DatasetPlan, *_: object) -> dataset.MapSet:
