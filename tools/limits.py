@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from nlos_calibration.wall_record import rig_named
-from nlos_models.checkpoint import load_pipeline, load_vae, shipped_folder
+from nlos_models.checkpoint import load_pipeline, load_record, load_vae, shipped_folder
 from nlos_models.losses import latent_error
 from nlos_models.pipeline import Pipeline
 from nlos_models.res_vae import ResVae
@@ -86,7 +86,7 @@ def experiments(
 ) -> Iterator[Row]:
     """One row for each; `seen` are objects that the weights were trained on."""
     network = Network(folder)
-    rig = rig_named(load_pipeline(folder)[1].rig_name)
+    rig = rig_named(load_record(folder).rig_name)
     box = object_box(rig)
     truth, seen_truth = truth_of(subjects, box), truth_of(seen, box)
     with tracked("rendering") as on_progress:
@@ -119,7 +119,7 @@ def experiments(
 def learning_curve(folders: Sequence[Path], subjects: Sequence[Subject]) -> Iterator[Row]:
     """One row for each folder of weights, from few training objects to many, on the rig of each."""
     for folder in sorted(folders, key=_objects):
-        record, network = load_pipeline(folder)[1], Network(folder)
+        record, network = load_record(folder), Network(folder)
         rig = rig_named(record.rig_name)
         with tracked(f"rendering for {folder.name}") as on_progress:
             maps = sense(echoes_of(subjects, rig, on_progress), rig)
@@ -130,7 +130,7 @@ def learning_curve(folders: Sequence[Path], subjects: Sequence[Subject]) -> Iter
 
 
 def _objects(folder: Path) -> int:
-    recipe = load_pipeline(folder)[1].compressor_recipe
+    recipe = load_record(folder).compressor_recipe
     return recipe.objects if recipe else 0
 
 
@@ -152,7 +152,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=DOCS / "limits.json")
     asked = parser.parse_args()
     folder: Path = asked.weights[0] if asked.weights else shipped_folder()
-    box = object_box(rig_named(load_pipeline(folder)[1].rig_name))
+    box = object_box(rig_named(load_record(folder).rig_name))
     subjects = test_set(box)
     seen = seeded_objects(TRAINING_SEED, len(subjects), box)
     rows = [*experiments(folder, subjects, seen, asked.frames)]
