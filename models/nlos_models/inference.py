@@ -33,16 +33,19 @@ class Reconstructor(Protocol):
 
 
 class TorchReconstructor:
-    """The pipeline as torch runs it; the definition that the others are held against."""
+    """The pipeline as torch runs it; in float32 the definition that the others are held against."""
 
-    def __init__(self, pipeline: Pipeline, record: CheckpointRecord, device: str) -> None:
+    def __init__(
+        self, pipeline: Pipeline, record: CheckpointRecord, device: str, dtype: torch.dtype = torch.float32
+    ) -> None:
         self.record, self.runtime = record, f"torch on {device}"
-        self._pipeline, self._device = pipeline.to(device).eval(), device
+        self._pipeline, self._device, self._dtype = pipeline.to(device).eval(), device, dtype
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
-        with torch.inference_mode():
+        mixed = torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
+        with torch.inference_mode(), mixed:
             maps = [torch.from_numpy(np.ascontiguousarray(m)).to(self._device) for m in (depth_m, intensity)]
-            return self._pipeline(*maps).cpu().numpy()
+            return self._pipeline(*maps).float().cpu().numpy()
 
 
 class OnnxReconstructor:
@@ -71,10 +74,15 @@ def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
     pipeline, record = load_pipeline(folder)
     if torch.cuda.is_available():
         return TorchReconstructor(pipeline, record, "cuda")
+    return OnnxReconstructor(exported(pipeline, cache), record)
+
+
+def exported(pipeline: Pipeline, cache: Path) -> Path:
+    """The pipeline's ONNX file in the folder `cache`, written unless it is there."""
     model = cache / f"{_checksum(pipeline)}.onnx"
     if not model.exists():
         export_onnx(pipeline, model)
-    return OnnxReconstructor(model, record)
+    return model
 
 
 def export_onnx(pipeline: Pipeline, path: Path) -> None:

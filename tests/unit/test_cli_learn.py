@@ -1,21 +1,18 @@
-"""`train`, `evaluate`: from objects to weights to figures, in the small."""
+"""`train`: from objects to weights, in the small."""
 
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Self
 
-import numpy as np
 import pytest
 import torch
 from nlos_calibration.rig import load_rig
 from nlos_models.checkpoint import load_pipeline, load_vae
 
 from nlos_cam import dataset
-from nlos_cam.cli import evaluate
 from nlos_cam.cli.main import main
 
 RIG = load_rig("paper-rig")
@@ -160,61 +157,3 @@ def test_datasets_of_two_rigs_are_refused(
     monkeypatch.setattr(dataset, "read", read)
     assert _train_compressor(made, tmp_path / "run") == 1
     assert "different rigs" in _last(capsys)["error"]["message"]
-
-
-class Guesser:
-    """A network that answers everything with the same plate."""
-
-    runtime, record = "none", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
-
-    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
-        assert depth_m.shape == intensity.shape == (1, 64, 80)
-        image = np.zeros((1, 64, 64), np.float32)
-        image[:, 16:48, 16:48] = 0.6
-        return image
-
-
-@pytest.fixture
-def guessing(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = dataset.procedural_images
-    monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: Guesser())
-    monkeypatch.setattr(dataset, "procedural_images", lambda seed, count, box: original(seed, min(count, 5), box))
-
-
-@pytest.mark.usefixtures("guessing")
-def test_evaluate_judges_beside_the_baselines(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out, data = tmp_path / "figures", str(made / "held-out")
-    arguments = ["evaluate", "--out", str(out), "--dataset", data, "--training", str(made / "data"), "--json"]
-    assert main(arguments) == 0
-    result = _last(capsys)
-    metrics = {"silhouette_iou", "accuracy_mean_abs", "accuracy_within_2_percent", "foreground_rmse_mm"}
-    assert set(result) == {*metrics, "baselines", "objects", "seconds", "out"}
-    assert result["objects"] == 2
-    assert set(result["baselines"]) == {"all_background", "mean_object", "nearest_neighbour"}
-    for figures in (result, *result["baselines"].values()):
-        for name in metrics:
-            assert set(figures[name]) == {"value", "low", "high"}
-    iou = result["silhouette_iou"]
-    assert 0 < iou["low"] <= iou["value"] <= iou["high"] <= 1
-    assert result["baselines"]["all_background"]["silhouette_iou"]["value"] == 0
-    assert result["baselines"]["all_background"]["foreground_rmse_mm"]["value"] is None
-    written = json.loads((out / "figures.json").read_text(encoding="utf-8"))
-    assert written == {name: value for name, value in result.items() if name != "out"}
-    assert (out / "sheet.png").read_bytes().startswith(b"\x89PNG")
-    assert main(arguments) == 1
-    assert _last(capsys)["error"]["type"] == "OutputExistsError"
-    assert main([*arguments, "--overwrite"]) == 0
-
-
-@pytest.mark.usefixtures("guessing")
-def test_evaluate_renders_test_objects_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--out", str(tmp_path / "figures"), "--count", "1", "--json"]) == 0
-    result = _last(capsys)
-    assert result["objects"] == 1
-    assert set(result["baselines"]) == {"all_background", "mean_object"}
-
-
-def test_evaluate_without_weights_is_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--out", str(tmp_path / "f"), "--weights", str(tmp_path / "none"), "--json"]) == 4
-    assert _last(capsys)["error"]["type"] == "CheckpointError"
-    assert not (tmp_path / "f").exists()

@@ -1,4 +1,4 @@
-"""`tradeoff render`: a folder of table and plot, kept as far as it got, never over what is there."""
+"""`tradeoff render` and `reconstruct`: a folder of table and plot, kept as far as it got, never over what is there."""
 
 import json
 import signal
@@ -139,3 +139,54 @@ def test_what_is_there_is_overwritten_only_when_asked(tmp_path: Path, capsys: py
 def test_it_is_a_group_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tradeoff", "--help"]) == 0
     assert "render" in capsys.readouterr().out
+
+
+@pytest.fixture
+def plates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two runtimes that answer with a plate, for any weights."""
+
+    class Plate:
+        def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+            assert depth_m.shape == intensity.shape
+            return np.full((1, 64, 64), 0.5, np.float32)
+
+    made = {name: lambda _: Plate() for name in ("torch float32, cpu", "ONNX Runtime float32")}
+    monkeypatch.setattr(command.reconstruction, "runtimes", lambda *_: made)
+    monkeypatch.setattr(command.reconstruction, "LEAST_CALLS", 2)
+
+
+@pytest.mark.usefixtures("plates")
+def test_reconstruct_becomes_a_table_and_a_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "cost"
+    assert main(["tradeoff", "reconstruct", "--count", "1", "--out", str(out), "--json"]) == 0
+    result = _last(capsys)
+    assert {path.name for path in out.iterdir()} == FILES
+    assert json.loads((out / "tradeoff.json").read_text()) == {k: v for k, v in result.items() if k != "out"}
+    assert (result["complete"], result["objects"], len(result["settings"])) == (True, 1, 6)
+    assert result["recommended"]["name"] in {row["name"] for row in result["settings"]}
+
+
+@pytest.mark.usefixtures("plates")
+def test_reconstruct_keeps_what_was_measured_until_a_signal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = command.reconstruction.measure
+
+    def cut_short(*arguments: Any) -> Iterator[Any]:
+        for at, row in enumerate(whole(*arguments)):
+            if at == 2:
+                signal.raise_signal(signal.SIGINT)
+            yield row
+
+    monkeypatch.setattr(command.reconstruction, "measure", cut_short)
+    assert main(["tradeoff", "reconstruct", "--count", "1", "--out", str(tmp_path / "cost"), "--json"]) == 130
+    result = _last(capsys)
+    assert (result["complete"], len(result["settings"])) == (False, 2)
+    assert {path.name for path in (tmp_path / "cost").iterdir()} == FILES
+
+
+def test_weights_that_cannot_be_read_are_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = str(tmp_path / "none")
+    assert main(["tradeoff", "reconstruct", "--weights", missing, "--out", str(tmp_path / "cost"), "--json"]) == 4
+    assert _last(capsys)["error"]["type"] == "CheckpointError"
+    assert not list(tmp_path.iterdir())

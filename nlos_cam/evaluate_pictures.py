@@ -1,0 +1,158 @@
+"""Pictures of a judgement: SI 6's Figure S2 as a sheet, metrics per category, error against surface, worst and best."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, Figures, Interval, Values
+from nlos_cam.evaluate_surface import Bin
+from nlos_cam.frames import Float32
+
+SHEET_COLUMNS = 18
+MOST_ON_A_SHEET = 54
+GALLERY = 6
+DIFFERENCE_V = 0.5
+"""The difference that has the full colour; 0.1 is 31 mm in the paper's box."""
+Scale = tuple[str, float, float]
+"""A map of colours, and the values at its ends."""
+VALUE: Scale = ("magma", 0.0, 1.0)
+DIFFERENCE: Scale = ("coolwarm", -DIFFERENCE_V, DIFFERENCE_V)
+TILE, HEAD = 70, 16
+"""Pixels from one object's picture to the next, and above them for its name."""
+BLOCK = HEAD + 3 * TILE
+ROWS = "truth", "reconstruction", "difference"
+LABELS = {
+    "silhouette_iou": "silhouette IoU",
+    "accuracy_mean_abs": "accuracy, mean abs",
+    "accuracy_within_2_percent": "accuracy within 2 %",
+    "foreground_rmse_mm": "foreground RMSE, mm",
+}
+
+
+def draw_sheet(path: Path, image: Float32, truth: Float32, titles: Sequence[str]) -> None:
+    """Truth, reconstruction and difference of up to 54 objects, evenly chosen where there are more (Figure S2)."""
+    shown = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), MOST_ON_A_SHEET)).astype(int))
+    columns = min(SHEET_COLUMNS, len(shown))
+    figure = _figure((0.8 * columns + 1.6, 2.7 * -(-len(shown) // columns) + 0.2))
+    axis = figure.subplots()
+    _mosaic(axis, image[shown], truth[shown], [titles[int(k)] for k in shown], columns)
+    _colour_bars(figure, axis)
+    figure.savefig(path, dpi=100)
+
+
+def draw_gallery(path: Path, image: Float32, truth: Float32, titles: Sequence[str], iou: Values) -> None:
+    """The objects with the lowest silhouette IoU above those with the highest, with their figures."""
+    order = np.argsort(iou, kind="stable")
+    count = min(GALLERY, len(order))
+    figure = _figure((1.5 * count + 2, 10.4))
+    axes = figure.subplots(2, 1)
+    for axis, chosen, title in zip(axes, (order[:count], order[::-1][:count]), ("worst", "best"), strict=True):
+        _mosaic(axis, image[chosen], truth[chosen], [f"{titles[int(k)]}: {iou[k]:.2f}" for k in chosen], count)
+        axis.set_title(f"{title} silhouettes (IoU)", fontsize=11)
+    _colour_bars(figure, list(axes))
+    figure.savefig(path, dpi=90)
+
+
+def _figure(size: tuple[float, float]) -> Any:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained")
+
+
+def _mosaic(axis: Any, image: Float32, truth: Float32, titles: Sequence[str], columns: int) -> None:
+    """Truth, reconstruction and difference one below the other, object beside object, as one picture."""
+    axis.imshow(mosaic(image, truth, columns))
+    axis.set_axis_off()
+    for k, title in enumerate(titles):
+        block, column = divmod(k, columns)
+        axis.text(column * TILE + 32, block * BLOCK + HEAD - 3, title, fontsize=6.5, ha="center", va="bottom")
+    for block in range(-(-len(titles) // columns)):
+        for row, name in enumerate(ROWS):
+            middle = block * BLOCK + HEAD + row * TILE + 32
+            axis.text(-4, middle, name, fontsize=7, rotation=90, ha="right", va="center")
+
+
+def mosaic(image: Float32, truth: Float32, columns: int) -> NDArray[np.uint8]:
+    """The coloured tiles (rows, columns, 3) of images (n, 64, 64): blocks of HEAD and three rows of TILE pixels."""
+    canvas = np.full((-(-len(truth) // columns) * BLOCK, columns * TILE, 3), 255, np.uint8)
+    rows = _coloured(truth, VALUE), _coloured(image, VALUE), _coloured(image - truth, DIFFERENCE)
+    for k in range(len(truth)):
+        block, column = divmod(k, columns)
+        for row, tiles in enumerate(rows):
+            top, left = block * BLOCK + HEAD + row * TILE, column * TILE
+            canvas[top : top + 64, left : left + 64] = tiles[k]
+    return canvas
+
+
+def _mappable(scale: Scale) -> Any:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    name, low, high = scale
+    return ScalarMappable(Normalize(low, high), name)
+
+
+def _coloured(images: Float32, scale: Scale) -> NDArray[np.uint8]:
+    """Images (n, 64, 64) as colours (n, 64, 64, 3)."""
+    mapped = _mappable(scale)
+    return mapped.cmap(mapped.norm(images), bytes=True)[..., :3]
+
+
+def _colour_bars(figure: Any, axes: Any) -> None:
+    words = (VALUE, "v: 0 background, 1 near the wall"), (DIFFERENCE, "difference in v: red is too near")
+    for scale, label in words:
+        figure.colorbar(_mappable(scale), ax=axes, fraction=0.015, pad=0.005).set_label(label, fontsize=8)
+
+
+def draw_categories(path: Path, categories: Mapping[str, Figures], overall: Figures) -> None:
+    """Each metric per category with its interval, beside the mean of all objects and the bar."""
+    ordered = sorted(categories, key=lambda name: categories[name]["silhouette_iou"].value or 0.0)
+    figure = _figure((13, 1.4 + 0.24 * len(ordered)))
+    for axis, (metric, label) in zip(figure.subplots(1, 4, sharey=True), LABELS.items(), strict=True):
+        _points(axis, [categories[name][metric] for name in ordered])
+        if (mean := overall[metric].value) is not None:
+            axis.axvline(mean, color="black", linewidth=1, label=f"all objects: {mean:.3g}")
+        axis.axvline(BARS[metric], color="tab:green", linestyle="--", linewidth=1, label=f"wanted: {BARS[metric]:g}")
+        better = "less" if metric in SMALLER_IS_BETTER else "more"
+        axis.set(title=label, xlabel=f"{better} is better", yticks=range(len(ordered)), yticklabels=ordered)
+        axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.6 / (1 + 0.24 * len(ordered))))
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=90)
+
+
+def _points(axis: Any, figures: Sequence[Interval]) -> None:
+    """Estimates and intervals; no bars, since the axis does not begin at 0."""
+    for k, figure in enumerate(figures):
+        if figure.value is not None:
+            axis.plot([figure.low, figure.high], [k, k], color="tab:blue", linewidth=2, alpha=0.6)
+            axis.plot(figure.value, k, "o", color="tab:blue")
+
+
+def draw_against_surface(
+    path: Path, like: Mapping[str, Values], errors: Mapping[str, Values], curves: Mapping[str, Mapping[str, list[Bin]]]
+) -> None:
+    """Every object's error against each measure of its surface, and the mean over bins of equally many objects."""
+    figure = _figure((11, 7.5))
+    axes = figure.subplots(len(errors), len(like), squeeze=False)
+    for row, (error_name, error) in zip(axes, errors.items(), strict=True):
+        for axis, (like_name, value) in zip(row, like.items(), strict=True):
+            axis.plot(value, error, "o", markersize=4, alpha=0.5, color="tab:blue", label="an object")
+            _curve(axis, curves[like_name][error_name])
+            axis.set(xlabel=like_name, ylabel=error_name, ylim=(0, None))
+            axis.grid(alpha=0.3)
+    axes[0, 0].legend(fontsize=8)
+    figure.savefig(path, dpi=90)
+
+
+def _curve(axis: Any, bins: Sequence[Bin]) -> None:
+    label = "mean of a bin, 95 % interval"
+    for one in bins:
+        error = one.error
+        if error.value is None:
+            continue
+        axis.plot([one.low, one.high], [error.value] * 2, color="tab:red", linewidth=2, label=label)
+        axis.plot([(one.low + one.high) / 2] * 2, [error.low, error.high], color="tab:red", linewidth=1)
+        label = None

@@ -1,0 +1,201 @@
+"""A judgement as a folder that a person reads in a minute: report.md, pictures, figures.json, objects.csv."""
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nlos_calibration.rig import ObjectBox
+
+from nlos_cam import evaluate_pictures as pictures
+from nlos_cam import evaluate_surface as surfaces
+from nlos_cam.evaluate import (
+    BARS,
+    SMALLER_IS_BETTER,
+    Figures,
+    Interval,
+    PerObject,
+    Values,
+    advantage,
+    bars_met,
+    over_objects,
+    per_category,
+    per_object,
+)
+from nlos_cam.frames import Float32
+
+SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
+SILHOUETTE_ERROR, DEPTH_ERROR = "1 - silhouette IoU", "foreground RMSE, mm"
+
+READ_WITH_CARE = (
+    "Means over objects; intervals by bootstrap over objects. Foreground RMSE is over pixels that are surface in both, "
+    "so an answer that finds little of an object is not told by it: read it beside the silhouette IoU."
+)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """All that was judged: the images of one reconstructor and of the baselines, against the truth."""
+
+    names: Sequence[str]
+    categories: Sequence[str]
+    truth: Float32
+    """(n, 64, 64)."""
+    image: Float32
+    guesses: Mapping[str, Float32]
+    box: ObjectBox
+    facts: Mapping[str, Any]
+    """What was judged on what, in words: goes to the figures as it is."""
+
+    @property
+    def ours(self) -> PerObject:
+        """Every metric of every object."""
+        return per_object(self.image, self.truth, self.box)
+
+    @property
+    def like(self) -> dict[str, Values]:
+        """What the true surfaces are like."""
+        return {
+            SIZE: surfaces.surface_cm2(self.truth, self.box),
+            DETAIL: surfaces.detail_per_cm(self.truth, self.box),
+        }
+
+    @property
+    def errors(self) -> dict[str, Values]:
+        """The two errors that are held against the surface."""
+        ours = self.ours
+        return {SILHOUETTE_ERROR: 1 - ours["silhouette_iou"], DEPTH_ERROR: ours["foreground_rmse_mm"]}
+
+
+def as_figures(judgement: Judgement) -> dict[str, Any]:
+    """All figures, ready for JSON."""
+    ours = judgement.ours
+    theirs = {name: per_object(guess, judgement.truth, judgement.box) for name, guess in judgement.guesses.items()}
+    overall = over_objects(ours)
+    nearest = theirs.get("nearest_neighbour")
+    return {
+        **_plain(overall),
+        "baselines": {name: _plain(over_objects(values)) for name, values in theirs.items()},
+        "advantage_over_nearest_neighbour": _plain(advantage(ours, nearest)) if nearest else None,
+        "bars": bars_met(overall),
+        "per_category": {name: _plain(figures) for name, figures in per_category(ours, judgement.categories).items()},
+        "rank_correlation": {
+            f"{error_name} with {like_name}": asdict(surfaces.rank_correlation(like, error))
+            for error_name, error in judgement.errors.items()
+            for like_name, like in judgement.like.items()
+        },
+        "where_the_error_is": {
+            name: asdict(zone) for name, zone in surfaces.where_the_error_is(judgement.image, judgement.truth).items()
+        },
+        "objects": len(judgement.truth),
+        **judgement.facts,
+    }
+
+
+def _plain(figures: Figures) -> dict[str, dict[str, float | None]]:
+    return {name: asdict(figure) for name, figure in figures.items()}
+
+
+def write(folder: Path, judgement: Judgement, figures: Mapping[str, Any]) -> None:
+    """The whole folder, which is made if it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "figures.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    _write_objects(folder / "objects.csv", judgement)
+    _draw(folder, judgement)
+    (folder / "report.md").write_text(as_markdown(figures), encoding="utf-8")
+
+
+def _write_objects(path: Path, judgement: Judgement) -> None:
+    """One row for each object; an empty field where it has no value."""
+    columns = {**judgement.ours, "surface_cm2": judgement.like[SIZE], "detail_per_cm": judgement.like[DETAIL]}
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["name", "category", *columns])
+        for k, (name, category) in enumerate(zip(judgement.names, judgement.categories, strict=True)):
+            values = [float(column[k]) for column in columns.values()]
+            rows.writerow([name, category, *("" if np.isnan(value) else f"{value:.6g}" for value in values)])
+
+
+def _draw(folder: Path, judgement: Judgement) -> None:
+    image, truth, names, ours = judgement.image, judgement.truth, judgement.names, judgement.ours
+    pictures.draw_sheet(folder / "sheet.png", image, truth, names)
+    pictures.draw_gallery(folder / "gallery.png", image, truth, names, ours["silhouette_iou"])
+    pictures.draw_categories(folder / "categories.png", per_category(ours, judgement.categories), over_objects(ours))
+    curves = {
+        like_name: {error_name: surfaces.curve(like, error) for error_name, error in judgement.errors.items()}
+        for like_name, like in judgement.like.items()
+    }
+    pictures.draw_against_surface(folder / "surface.png", judgement.like, judgement.errors, curves)
+
+
+def as_markdown(figures: Mapping[str, Any]) -> str:
+    """The report, from the figures alone."""
+    names = list(figures["baselines"])
+    head = "| metric | ours (95 % interval) | wanted | " + " | ".join(name.replace("_", " ") for name in names) + " |"
+    parts = [
+        f"# Reconstruction of {figures['objects']} hidden objects",
+        f"{figures['what']}. Weights: {figures['weights']}; rig: {figures['rig']}; {figures['runtime']}.",
+        "\n".join([head, "| --- " * (3 + len(names)) + "|", *(_row(figures, metric, names) for metric in BARS)]),
+        READ_WITH_CARE,
+        _against_nearest(figures["advantage_over_nearest_neighbour"]),
+        _where(figures["where_the_error_is"]),
+        "![truth, reconstruction, difference](sheet.png)",
+        _categories(figures["per_category"]),
+        "![each metric per category](categories.png)",
+        _surface(figures["rank_correlation"]),
+        "![error against size and detail](surface.png)",
+        "![worst and best silhouettes](gallery.png)",
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def in_words(figure: Mapping[str, float | None] | Interval) -> str:
+    """A figure and its interval."""
+    plain = asdict(figure) if isinstance(figure, Interval) else figure
+    value, low, high = (plain[name] for name in ("value", "low", "high"))
+    return "none" if value is None else f"{value:.3g} ({low:.3g} to {high:.3g})"
+
+
+def _row(figures: Mapping[str, Any], metric: str, names: Sequence[str]) -> str:
+    bar, verdict = figures["bars"][metric], "met" if figures["bars"][metric]["met"] else "not met"
+    wanted = f"{'at most' if metric in SMALLER_IS_BETTER else 'at least'} {bar['bar']:g}: {verdict}"
+    others = [in_words(figures["baselines"][name][metric]).split(" ")[0] for name in names]
+    return f"| {metric} | {in_words(figures[metric])} | {wanted} | {' | '.join(others)} |"
+
+
+def _against_nearest(figures: Mapping[str, Any] | None) -> str:
+    if not figures:
+        return ""
+    told = [f"{metric} {in_words(figure)}" for metric, figure in figures.items()]
+    return f"Better than the nearest training object, object by object (positive is better), by: {'; '.join(told)}."
+
+
+def _where(zones: Mapping[str, Any]) -> str:
+    if zones["core"]["share_of_error"] is None:
+        return "There is no error."
+    told = [
+        f"{name} {100 * zone['share_of_error']:.0f} % (of the pixels {100 * zone['share_of_pixels']:.0f} %)"
+        for name, zone in zones.items()
+    ]
+    return (
+        f"Where the absolute error is, the rim being two pixels on either side of the true outline: {', '.join(told)}."
+    )
+
+
+def _categories(categories: Mapping[str, Any]) -> str:
+    ordered = sorted(categories, key=lambda name: categories[name]["silhouette_iou"]["value"] or 0.0)
+    told = [f"{name} {categories[name]['silhouette_iou']['value']:.2f}" for name in ordered]
+    if len(told) < 6:
+        return f"Silhouette IoU by category: {', '.join(told)}."
+    return (
+        f"Silhouette IoU by category: worst {', '.join(told[:3])}; best {', '.join(told[-3:])}. With three objects a "
+        "category's interval is rather too narrow than too wide."
+    )
+
+
+def _surface(correlations: Mapping[str, Any]) -> str:
+    told = [f"{name} {in_words(figure)}" for name, figure in correlations.items()]
+    return f"SI 6 finds least error on large or smooth surfaces. Rank correlations here: {'; '.join(told)}."

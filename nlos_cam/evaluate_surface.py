@@ -1,0 +1,118 @@
+"""Error against what a surface is like (SI 6): its size, its detail, and where on the image the error sits."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from nlos_calibration.rig import ObjectBox
+from nlos_models.metrics import surface
+from numpy.typing import NDArray
+
+from nlos_cam.evaluate import Interval, Values, interval, mm_per_v, resampled
+from nlos_cam.frames import Float32
+
+STEP_MM = 10.0
+"""Neighbouring surface pixels that differ by more in depth have an edge between them."""
+RIM_PIXELS = 2.0
+BINS = 4
+ZONES = ("core", "rim inside", "rim outside", "far background")
+
+
+def surface_cm2(truth: Float32, box: ObjectBox) -> Values:
+    """How large the surface of images (n, 64, 64) is, seen from the wall, (n,)."""
+    width_cm, height_cm = _pitch_cm(truth, box)
+    return width_cm * height_cm * surface(truth).sum((-2, -1))
+
+
+def detail_per_cm(truth: Float32, box: ObjectBox) -> Values:
+    """Length of the edges (outline, holes, steps in depth) for each area of surface, (n,); a large plate has least.
+
+    A square plate of side a has 4 / a. NaN where there is no surface.
+    """
+    width_cm, height_cm = _pitch_cm(truth, box)
+    padded = np.pad(truth, ((0, 0), (1, 1), (1, 1)))
+    seen, step = surface(padded), STEP_MM / mm_per_v(box)
+    beside, below = (
+        (np.diff(seen, axis=axis) | (_both(seen, axis) & (np.abs(np.diff(padded, axis=axis)) > step))).sum((-2, -1))
+        for axis in (2, 1)
+    )
+    area = surface_cm2(truth, box)
+    return np.where(area > 0, (beside * height_cm + below * width_cm) / np.maximum(area, 1e-9), np.nan)
+
+
+def _both(seen: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
+    first, second = (np.take(seen, np.arange(start, seen.shape[axis] - 1 + start), axis) for start in (0, 1))
+    return first & second
+
+
+def _pitch_cm(truth: Float32, box: ObjectBox) -> tuple[float, float]:
+    """Width and height of a pixel."""
+    rows, columns = truth.shape[-2:]
+    return 100 * (box.x_max_m - box.x_min_m) / columns, 100 * (box.y_max_m - box.y_min_m) / rows
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Objects that are alike, and their error."""
+
+    low: float
+    high: float
+    objects: int
+    error: Interval
+
+
+def curve(like: Values, error: Values, bins: int = BINS) -> list[Bin]:
+    """Error over bins of equally many objects, from those with least of what `like` measures to those with most."""
+    order = np.argsort(like, kind="stable")
+    parts = [part for part in np.array_split(order, bins) if part.size]
+    return [Bin(float(like[p].min()), float(like[p].max()), len(p), interval(error[p])) for p in parts]
+
+
+def rank_correlation(like: Values, error: Values) -> Interval:
+    """Spearman's: 1 where the error grows with what `like` measures, -1 where it falls; objects without one left out.
+
+    None where fewer than three objects have both, or one of the two never varies.
+    """
+    kept = ~(np.isnan(like) | np.isnan(error))
+    if kept.sum() < 3 or np.ptp(like[kept]) == 0 or np.ptp(error[kept]) == 0:
+        return Interval(None, None, None)
+    ranks = np.stack([np.argsort(np.argsort(values[kept])).astype(np.float64) for values in (like, error)])
+    low, high = np.nanquantile(_correlation(ranks[:, resampled(ranks.shape[1])]), [0.025, 0.975])
+    return Interval(float(_correlation(ranks[:, None])[0]), float(low), float(high))
+
+
+def _correlation(pairs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pearson's over the last axis of (2, m, n), as (m,)."""
+    x, y = pairs - pairs.mean(-1, keepdims=True)
+    scale = np.sqrt((x**2).sum(-1) * (y**2).sum(-1))
+    return np.where(scale > 0, (x * y).sum(-1) / np.maximum(scale, 1e-12), np.nan)
+
+
+@dataclass(frozen=True)
+class Zone:
+    """A part of all images together."""
+
+    share_of_pixels: float
+    share_of_error: float | None
+    """Of the sum of |v - v_true|; None where there is no error at all."""
+
+
+def where_the_error_is(image: Float32, truth: Float32) -> dict[str, Zone]:
+    """How the absolute error divides: well inside the true surface, its rim of two pixels, and outside likewise."""
+    zones = np.stack([_zones(mask) for mask in surface(truth)])
+    error = np.abs(image.astype(np.float64) - truth)
+    total = error.sum()
+    return {
+        name: Zone(float((zones == k).mean()), float(error[zones == k].sum() / total) if total > 0 else None)
+        for k, name in enumerate(ZONES)
+    }
+
+
+def _zones(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The index in ZONES of every pixel; beyond the image is background."""
+    inside, outside = (
+        cv2.distanceTransform(np.pad(part.astype(np.uint8), 1, constant_values=beyond), cv2.DIST_L2, 5)[1:-1, 1:-1]
+        for part, beyond in ((mask, 0), (~mask, 1))
+    )
+    near_surface = outside <= RIM_PIXELS if mask.any() else np.zeros_like(mask)
+    return np.where(mask, np.where(inside > RIM_PIXELS, 0, 1), np.where(near_surface, 2, 3))

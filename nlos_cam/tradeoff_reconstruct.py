@@ -1,0 +1,226 @@
+"""What accuracy costs in time when reconstructing: number formats, runtimes, threads and averaged frames."""
+
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from nlos_calibration.rig import ObjectBox, Rig
+from nlos_models.checkpoint import load_pipeline
+from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, exported
+from nlos_models.quantise import quantise
+
+from nlos_cam import dataset
+from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, Figures, judge
+from nlos_cam.evaluate_objects import Subject, as_map_set, echoes_of, seeded_objects, sense, truth_of
+from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.render.renderer import MultiBounce
+
+FRAMES = 1, 4, 16
+THREADS = 1, 2
+CALIBRATING = 32
+"""Training objects that the ranges of 8-bit activations are learnt from."""
+LEAST_CALLS = 50
+"""Few objects are reconstructed again and again, until there are so many calls to take the median of."""
+AS_GOOD = {
+    "silhouette_iou": 0.005,
+    "accuracy_mean_abs": 0.001,
+    "accuracy_within_2_percent": 0.005,
+    "foreground_rmse_mm": 0.5,
+}
+"""What the recommended setting may lose against float32 in torch."""
+
+OnProgress = Callable[[int, int], None]
+Make = Callable[[int], Reconstructor]
+"""A reconstructor for a number of threads."""
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to reconstruct."""
+
+    name: str
+    weights: str
+    runtime: str
+    threads: int
+    frames: int
+    """Averaged, as `live --average` does."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured of a setting."""
+
+    setting: Setting
+    milliseconds: float
+    """Of one call on one object's maps: the median."""
+    milliseconds_p90: float
+    figures: Figures
+
+    @property
+    def wait_ms(self) -> float:
+        """Until so many frames have come, at the camera's rate."""
+        return 1000 * self.setting.frames / FRAMES_PER_S
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Objects in front of the sensor: what every setting is measured on."""
+
+    rig: Rig
+    box: ObjectBox
+    truth: Float32
+    echoes: list[MultiBounce]
+
+    @classmethod
+    def of(cls, subjects: Sequence[Subject], rig: Rig, box: ObjectBox, on_progress: OnProgress) -> "Bench":
+        """Render the objects."""
+        return cls(rig, box, truth_of(subjects, box), echoes_of(subjects, rig, on_progress))
+
+
+def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dict[str, Make]:
+    """Every runtime and number format of some weights, by name. 8-bit ranges are learnt from training objects."""
+    pipeline, record = load_pipeline(weights)
+    model = exported(pipeline, cache)
+
+    def onnx(path: Path) -> Make:
+        return lambda threads: OnnxReconstructor(path, record, threads)
+
+    def in_torch(device: str, dtype: torch.dtype) -> Make:
+        def make(threads: int) -> Reconstructor:
+            del threads  # torch has one number of them for all networks, which `measure` sets
+            return TorchReconstructor(load_pipeline(weights)[0], record, device, dtype)
+
+        return make
+
+    formats = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    dynamic, static = (model.with_suffix(f".{kind}.onnx") for kind in ("dynamic", "static"))
+    if not dynamic.exists():
+        quantise(model, dynamic)
+    if not static.exists():
+        quantise(model, static, calibration(rig, box))
+    return {
+        **{f"torch {name}, {device}": in_torch(device, dtype) for device in devices for name, dtype in formats.items()},
+        "ONNX Runtime float32": onnx(model),
+        "ONNX Runtime int8 weights": onnx(dynamic),
+        "ONNX Runtime int8": onnx(static),
+    }
+
+
+def calibration(rig: Rig, box: ObjectBox) -> Iterator[tuple[Float32, Float32]]:
+    """Maps of training objects, one at a time."""
+    subjects = seeded_objects(dataset.TRAINING_SEED, CALIBRATING, box)
+    for maps in sense(echoes_of(subjects, rig, _untold), rig):
+        yield maps.depth_m[None], maps.intensity[None]
+
+
+def _untold(done: int, total: int) -> None:
+    del done, total
+
+
+def settings(weights: Sequence[str], runtime_names: Sequence[str]) -> list[Setting]:
+    """All that is measured: every runtime on one frame, and more frames on the one that `live` uses."""
+    singles = [
+        Setting(f"{runtime}, {_threads(threads)}", name, runtime, threads, 1)
+        for name in weights
+        for runtime in runtime_names
+        for threads in THREADS
+        if "cuda" not in runtime or threads == THREADS[0]
+    ]
+    averaged = [
+        Setting(f"ONNX Runtime float32, {frames} frames", name, "ONNX Runtime float32", 1, frames)
+        for name in weights
+        for frames in FRAMES[1:]
+    ]
+    return singles + averaged
+
+
+def _threads(count: int) -> str:
+    return f"{count} thread{'s' if count > 1 else ''}"
+
+
+def measure(
+    asked: Sequence[Setting],
+    makes: Mapping[str, Mapping[str, Make]],
+    bench: Bench,
+    clock: Clock = time.perf_counter,
+) -> Iterator[Row]:
+    """One row for each setting, as they are measured; `makes` has the runtimes of each weights by name."""
+    seen: dict[int, list[LidarMaps]] = {}
+    for setting in asked:
+        if setting.frames not in seen:
+            seen[setting.frames] = sense(bench.echoes, bench.rig, frames=setting.frames)
+        with _torch_threads(setting.threads):
+            reconstructor = makes[setting.weights][setting.runtime](setting.threads)
+            image, seconds = _timed(reconstructor, seen[setting.frames], bench.truth, clock)
+        middle, late = 1000 * np.quantile(seconds, [0.5, 0.9])
+        yield Row(setting, float(middle), float(late), judge(image, bench.truth, bench.box))
+
+
+@contextmanager
+def _torch_threads(count: int) -> Generator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _timed(
+    reconstructor: Reconstructor, maps: Sequence[LidarMaps], truth: Float32, clock: Clock
+) -> tuple[Float32, list[float]]:
+    """Images of all maps, and the seconds of every call but the first, which allocates."""
+    both = as_map_set(maps, truth)
+    reconstructor(both.depth_m[:1], both.intensity[:1])
+    images: list[Float32] = []
+    seconds: list[float] = []
+    for _ in range(-(-LEAST_CALLS // len(truth))):
+        images.clear()
+        for depth_m, intensity in zip(both.depth_m, both.intensity, strict=True):
+            started = clock()
+            images.append(reconstructor(depth_m[None], intensity[None]))
+            seconds.append(clock() - started)
+    return np.concatenate(images), seconds
+
+
+def losses(row: Row, base: Row) -> dict[str, float]:
+    """By how much a row is worse than another, by metric; infinite where it has no value."""
+    worse: dict[str, float] = {}
+    for name in BARS:
+        mine, its = row.figures[name].value, base.figures[name].value
+        sign = 1 if name in SMALLER_IS_BETTER else -1
+        worse[name] = float("inf") if mine is None or its is None else sign * (mine - its)
+    return worse
+
+
+def recommended(rows: Sequence[Row]) -> Row | None:
+    """The quickest setting of one frame that loses nothing to speak of against the first row; None without rows."""
+    if not rows:
+        return None
+    base = rows[0]
+    kept = [
+        row
+        for row in rows
+        if row.setting.frames == 1 and all(loss <= AS_GOOD[name] for name, loss in losses(row, base).items())
+    ]
+    return min(kept, key=lambda row: row.milliseconds, default=base)
+
+
+def pareto_front(rows: Sequence[Row]) -> list[Row]:
+    """The rows of one frame of which no other is both quicker and better in silhouette, from quick to slow."""
+    front: list[Row] = []
+    for row in sorted((row for row in rows if row.setting.frames == 1), key=lambda row: row.milliseconds):
+        if not front or _iou(row) > _iou(front[-1]):
+            front.append(row)
+    return front
+
+
+def _iou(row: Row) -> float:
+    return row.figures["silhouette_iou"].value or 0.0

@@ -1,0 +1,140 @@
+"""`evaluate`: a folder of report, figures and pictures, from the test set, from seeds or from a dataset."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam import dataset, evaluate_baselines
+from nlos_cam.cli import evaluate
+from nlos_cam.cli.main import main
+from nlos_cam.dataset import DatasetPlan
+from nlos_cam.objects.test_set import test_set
+
+RIG = load_rig("paper-rig")
+METRICS = {"silhouette_iou", "accuracy_mean_abs", "accuracy_within_2_percent", "foreground_rmse_mm"}
+
+
+class Guesser:
+    """A network that answers everything with the same plate."""
+
+    runtime = "none"
+
+    def __init__(self, eats: str = "raw maps") -> None:
+        self.record = SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input=eats)
+
+    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+        assert depth_m.shape == intensity.shape == (1, 64, 80)
+        image = np.zeros((1, 64, 64), np.float32)
+        image[:, 16:48, 16:48] = 0.6
+        return image
+
+
+def _maps(plan: DatasetPlan, count: int) -> dataset.MapSet:
+    images = dataset.procedural_images(plan.first_seed, count, plan.box)
+    wide = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8)))
+    return dataset.MapSet(wide + 0.3, 40 * wide, images)
+
+
+@pytest.fixture(autouse=True)
+def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
+    """A guesser for the weights, a few training objects that are not rendered; the plans asked for are kept."""
+    asked: list[DatasetPlan] = []
+
+    def training_maps(plan: DatasetPlan, *_: object) -> dataset.MapSet:
+        asked.append(plan)
+        return _maps(DatasetPlan(plan.rig, dataset.TRAINING_SEED), 4)
+
+    monkeypatch.setattr(evaluate_baselines, "training_maps", training_maps)
+    monkeypatch.setattr(evaluate_baselines, "NEIGHBOURS", 4)
+    monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: Guesser())
+    return asked
+
+
+@pytest.fixture
+def stored(monkeypatch: pytest.MonkeyPatch) -> str:
+    """The name of a dataset."""
+    plan = DatasetPlan(RIG, dataset.HELD_OUT_SEED)
+    columns = {"category": np.array(["cup", "hat", "cup"], object), "seed": np.arange(3)}
+    kept = SimpleNamespace(plan=plan, arrays=lambda: _maps(plan, 3), column=columns.__getitem__)
+    monkeypatch.setattr(dataset, "open_dataset", lambda _: kept)
+    monkeypatch.setattr(dataset, "read", lambda _: (_maps(plan, 3), plan))
+    return "held-out"
+
+
+def _last(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def test_a_dataset_is_judged_beside_the_baselines_and_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], stored: str
+) -> None:
+    out = tmp_path / "figures"
+    arguments = ["evaluate", "--out", str(out), "--dataset", stored, "--training", stored, "--json"]
+    assert main(arguments) == 0
+    result = _last(capsys)
+    assert {*METRICS, "baselines", "per_category", "objects", "seconds", "out"} < set(result)
+    assert result["objects"] == 3
+    assert set(result["baselines"]) == {"all_background", "mean_object", "nearest_neighbour"}
+    assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1  # it is the set itself
+    assert set(result["per_category"]) == {"cup", "hat"}
+    written = json.loads((out / "figures.json").read_text(encoding="utf-8"))
+    assert written == {name: value for name, value in result.items() if name != "out"}
+    assert (out / "sheet.png").read_bytes().startswith(b"\x89PNG")
+    assert main(arguments) == 1
+    assert _last(capsys)["error"]["type"] == "OutputExistsError"
+    assert main([*arguments, "--overwrite"]) == 0
+
+
+def test_without_a_dataset_the_test_set_is_judged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, guessing: list[DatasetPlan]
+) -> None:
+    monkeypatch.setattr(evaluate, "test_set", lambda box: test_set(box)[:2])
+    assert main(["evaluate", "--out", str(tmp_path / "figures"), "--json"]) == 0
+    result = _last(capsys)
+    assert result["objects"] == 2
+    assert (result["rig"], guessing[0].rig) == (RIG.name, RIG)
+    assert list(result["per_category"]) == [test_set(DatasetPlan(RIG, 0).box)[0].category]
+    assert "nearest_neighbour" in result["baselines"]
+
+
+def test_seeded_objects_are_judged_without_the_nearest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], guessing: list[DatasetPlan]
+) -> None:
+    arguments = ["evaluate", "--out", str(tmp_path / "figures"), "--count", "1", "--no-nearest", "--json"]
+    assert main(arguments) == 0
+    result = _last(capsys)
+    assert result["objects"] == 1
+    assert set(result["baselines"]) == {"all_background", "mean_object"}
+    assert result["advantage_over_nearest_neighbour"] is None
+    assert not guessing
+
+
+@pytest.mark.parametrize("more", [["--count", "3"], ["--rig", "paper-rig"]])
+def test_a_dataset_brings_its_own_objects_and_rig(tmp_path: Path, stored: str, more: list[str]) -> None:
+    assert main(["evaluate", "--out", str(tmp_path / "figures"), "--dataset", stored, *more]) == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_weights_of_another_input_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: Guesser("difference maps"))
+    assert main(["evaluate", "--out", str(tmp_path / "figures"), "--json"]) == 1
+    assert "difference maps" in _last(capsys)["error"]["message"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_evaluate_without_weights_is_4(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from nlos_models.inference import load_reconstructor
+
+    monkeypatch.setattr(evaluate, "load_reconstructor", load_reconstructor)
+    assert main(["evaluate", "--out", str(tmp_path / "f"), "--weights", str(tmp_path / "none"), "--json"]) == 4
+    assert _last(capsys)["error"]["type"] == "CheckpointError"
+    assert not (tmp_path / "f").exists()

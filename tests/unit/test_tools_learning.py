@@ -1,0 +1,115 @@
+"""Small versions of the tools that tell what limits a figure, where weights work, and how they compare."""
+
+import importlib
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+from nlos_models.checkpoint import load_record, shipped_folder
+
+from nlos_cam.evaluate import BARS
+from nlos_cam.evaluate_objects import seeded_objects
+from nlos_cam.objects.depth_image import object_box
+
+TOOLS = Path(__file__).parents[2] / "tools"
+RIG = load_rig("paper-rig")
+BOX = object_box(RIG)
+Tool = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def tool(monkeypatch: pytest.MonkeyPatch) -> Tool:
+    monkeypatch.syspath_prepend(TOOLS)
+    return importlib.import_module
+
+
+def test_each_experiment_on_one_object_has_its_figures(tool: Tool) -> None:
+    limits = tool("limits")
+    some = seeded_objects(0, 1, BOX)
+    rows = {row.name: row for row in limits.experiments(shipped_folder(), some, some, frames=(2,))}
+    assert list(rows)[:2] == ["as evaluated", "VAE alone"]
+    assert {"noise off", "2 frames", "training's objects"} < set(rows)
+    assert rows["noise off"].latent_error != rows["as evaluated"].latent_error > 0
+    text = limits.as_markdown(list(rows.values()))
+    assert len(text.splitlines()) == 2 + len(rows)
+    assert rows["VAE alone"].figures["silhouette_iou"].value > 0.5  # the truth's own latent, decoded
+
+
+def test_a_learning_curve_has_one_row_for_each_weights_from_few_objects_to_many(tool: Tool) -> None:
+    limits = tool("limits")
+    (row,) = limits.learning_curve([shipped_folder()], seeded_objects(0, 1, BOX))
+    recipe = load_record(shipped_folder()).compressor_recipe
+    assert recipe is not None
+    assert row.name == f"{recipe.objects} objects"
+    assert set(row.figures) == set(BARS)
+
+
+class Plate:
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+        assert depth_m.shape == intensity.shape
+        self.calls += 1
+        return np.full((1, 64, 64), 0.5, np.float32)
+
+
+def test_a_map_of_rigs_keeps_the_cells_that_are_done_of_the_same_weights(tool: Tool, tmp_path: Path) -> None:
+    rig_map = tool("rig_map")
+    some, plate, path = seeded_objects(0, 1, BOX), Plate(), tmp_path / "rig_map.json"
+    grid = [(0.2, 45.0), (0.3, 15.0)]
+    rig_map.measured(RIG, grid[:1], some, {"plate": plate}, path, "these")
+    cells = rig_map.measured(RIG, grid, some, {"plate": plate}, path, "these")
+    assert plate.calls == 2
+    assert [(cell["distance_m"], cell["yaw_deg"]) for cell in cells] == grid
+    assert json.loads(path.read_text(encoding="utf-8"))["cells"] == cells
+    rig_map.measured(RIG, grid[:1], some, {"plate": plate}, path, "others")
+    assert plate.calls == 3
+    rig_map.draw(tmp_path / "map.png", cells, RIG)
+    assert 5_000 < (tmp_path / "map.png").stat().st_size < 200_000
+
+
+def test_the_lidar_alone_moves_over_the_map(tool: Tool) -> None:
+    there = tool("rig_map").rig_at(RIG, 0.3, 15.0)
+    assert (there.lidar.distance_m, there.lidar.yaw_deg) == (0.3, 15.0)
+    assert (there.occluder, there.object_box, there.intrinsics) == (RIG.occluder, RIG.object_box, RIG.intrinsics)
+
+
+def test_cells_of_other_weights_or_objects_are_told_apart(tool: Tool) -> None:
+    checksum = tool("rig_map").checksum
+    some, others = seeded_objects(0, 1, BOX), seeded_objects(1, 1, BOX)
+    assert checksum({"a": None}, some) == checksum({"a": None}, some)
+    assert len({checksum({"a": None}, some), checksum({"b": None}, some), checksum({"a": None}, others)}) == 3
+
+
+def test_the_comparisons_row_is_filled_in_from_figures(
+    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    comparison = tool("comparison")
+    figure = {"value": 0.625, "low": 0.5, "high": 0.75}
+    figures: dict[str, Any] = {"objects": 54, **dict.fromkeys(BARS, figure)}
+    cost = {
+        "machine": "a machine",
+        "settings": [{"name": "quick", "milliseconds": 7.4}],
+        "recommended": {"name": "quick"},
+    }
+    for name, table in (("figures.json", figures), ("tradeoff_reconstruct.json", cost)):
+        (tmp_path / name).write_text(json.dumps(table), encoding="utf-8")
+    page = (TOOLS.parent / "docs" / "comparison.md").read_text(encoding="utf-8")
+    (tmp_path / "comparison.md").write_text(page.replace("nlos-cam, measured", "stale"), encoding="utf-8")
+    monkeypatch.setattr(comparison, "DOCS", tmp_path)
+    monkeypatch.setattr(sys, "argv", ["comparison.py", "--check"])
+    assert comparison.main() == 1
+    monkeypatch.setattr(sys, "argv", ["comparison.py"])
+    assert comparison.main() == 0
+    text = (tmp_path / "comparison.md").read_text(encoding="utf-8")
+    assert "33 ms (one frame) | 7 ms (quick; a machine)" in text
+    assert "silhouette_iou 0.625 (0.5 to 0.75)" in text
+    monkeypatch.setattr(sys, "argv", ["comparison.py", "--check"])
+    assert comparison.main() == 0
