@@ -35,7 +35,7 @@ def train_compressor(
     Raises CheckpointError for a VAE of depth, SceneError where datasets and recipe disagree.
     """
     vae, record = load_vae(vae_folder)
-    if not record.vae_recipe.colour:
+    if not record.colour:
         raise CheckpointError(f"{vae_folder} holds a VAE of depth images: train one by a recipe with colour = true")
     maps, rig = read_colour(data)
     held_out, other = read_colour(held_out_data)

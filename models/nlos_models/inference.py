@@ -69,7 +69,7 @@ def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
     Raises CheckpointError where the weights cannot be read, or are for colour.
     """
     pipeline, record = load_pipeline(folder)
-    if record.vae_recipe.colour:
+    if record.colour:
         raise CheckpointError(
             f"{folder} holds weights for full colour, which is simulation only (the L515's laser is infrared): "
             "name weights for depth; tools/colour_demo.py shows these"

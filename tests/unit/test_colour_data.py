@@ -13,7 +13,6 @@ from nlos_cam.colour_objects import colour_object
 from nlos_cam.dataset import DatasetPlan
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Float32, maps_from_frame
-from nlos_cam.objects.depth_image import object_box
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor import Sensor
@@ -23,7 +22,6 @@ from nlos_cam.render.surface import Surface
 RIG = load_rig("paper-rig")
 QUIET = SensorModel(range_noise_m=0.0, range_noise_per_m=0.0, read_noise_counts=0.0, shot_noise=0.0, dead_share=0.0)
 PLAN = DatasetPlan(RIG, 40, accuracy="draft")
-CUP = 3
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +36,11 @@ def noisy() -> Sensor:
 
 @pytest.fixture(scope="module")
 def shape() -> Float32:
-    """A thing so large and near that its light wins in many cells."""
-    return colour_object(CUP, object_box(RIG)).depth_m
+    """A tilted slab without its upper left corner, so large and near that its light wins in many cells."""
+    depth_m = np.full((64, 64), np.nan, np.float32)
+    depth_m[8:56, 4:52] = np.linspace(0.14, 0.2, 48, dtype=np.float32)
+    depth_m[:20, :20] = np.nan
+    return depth_m
 
 
 @pytest.fixture(scope="module")
