@@ -11,6 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+from nlos_models.colour import colour_pipeline, colour_vae
 from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
 from nlos_models.pipeline import Pipeline
@@ -36,6 +37,11 @@ class CheckpointRecord(BaseModel):
     figures: dict[str, float] = {}
     """Held-out figures at the end of training."""
 
+    @property
+    def colour(self) -> bool:
+        """Whether these are weights of full colour, which is simulation only."""
+        return any(recipe is not None and recipe.colour for recipe in (self.vae_recipe, self.compressor_recipe))
+
 
 def save_vae(folder: Path, vae: ResVae, record: CheckpointRecord) -> None:
     """Write encoder and decoder, with their record, into a folder."""
@@ -50,17 +56,18 @@ def save_pipeline(folder: Path, pipeline: Pipeline, record: CheckpointRecord) ->
 
 def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
     """A Res-VAE in eval mode. Raises CheckpointError where a tensor is missing, left over or of another shape."""
-    vae = ResVae()
+    record = load_record(folder)
+    vae = colour_vae() if record.colour else ResVae()
     for name, module in (("encoder", vae.encoder), ("decoder", vae.decoder)):
         _load(folder / f"{name}.safetensors", module)
-    return vae.eval(), load_record(folder)
+    return vae.eval(), record
 
 
 def load_pipeline(folder: Path | None = None) -> tuple[Pipeline, CheckpointRecord]:
     """Compressor and decoder in eval mode, from a folder or as shipped. Raises CheckpointError as `load_vae` does."""
     folder = folder or shipped_folder()
     record = load_record(folder)
-    pipeline = Pipeline(Compressor(), Decoder())
+    pipeline = colour_pipeline() if record.colour else Pipeline(Compressor(), Decoder())
     for name in ("compressor", "preprocess", "decoder"):
         _load(folder / f"{name}.safetensors", getattr(pipeline, name))
     return pipeline.eval(), record

@@ -9,7 +9,8 @@ STAGES = ((1, 16, 1, 1), (6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2), (6, 96, 3,
 DROPOUT = 0.5
 
 
-def _conv_norm(channels_in: int, channels_out: int, kernel: int, stride: int = 1, groups: int = 1) -> list[nn.Module]:
+def conv_norm(channels_in: int, channels_out: int, kernel: int, stride: int = 1, groups: int = 1) -> list[nn.Module]:
+    """A convolution that keeps the size but for its stride, and its batch norm."""
     padding = kernel // 2
     conv = nn.Conv2d(channels_in, channels_out, kernel, stride, padding, groups=groups, bias=False)
     return [conv, nn.BatchNorm2d(channels_out)]
@@ -21,9 +22,9 @@ class InvertedResidual(nn.Module):
     def __init__(self, channels_in: int, channels_out: int, stride: int, expansion: int) -> None:
         super().__init__()
         hidden = channels_in * expansion
-        layers = [*_conv_norm(channels_in, hidden, 1), nn.ReLU6()] if expansion > 1 else []
-        layers += [*_conv_norm(hidden, hidden, 3, stride, groups=hidden), nn.ReLU6()]
-        self.layers = nn.Sequential(*layers, *_conv_norm(hidden, channels_out, 1))
+        layers = [*conv_norm(channels_in, hidden, 1), nn.ReLU6()] if expansion > 1 else []
+        layers += [*conv_norm(hidden, hidden, 3, stride, groups=hidden), nn.ReLU6()]
+        self.layers = nn.Sequential(*layers, *conv_norm(hidden, channels_out, 1))
         self.residual = stride == 1 and channels_in == channels_out
 
     def forward(self, x: Tensor) -> Tensor:
@@ -32,13 +33,13 @@ class InvertedResidual(nn.Module):
 
 
 def _features() -> nn.Sequential:
-    layers: list[nn.Module] = [*_conv_norm(INPUT_CHANNELS, STEM, 3, stride=2), nn.ReLU6()]
+    layers: list[nn.Module] = [*conv_norm(INPUT_CHANNELS, STEM, 3, stride=2), nn.ReLU6()]
     channels = STEM
     for expansion, out, repeats, stride in STAGES:
         for repeat in range(repeats):
             layers.append(InvertedResidual(channels, out, stride if repeat == 0 else 1, expansion))
             channels = out
-    return nn.Sequential(*layers, *_conv_norm(channels, HEAD, 1), nn.ReLU6())
+    return nn.Sequential(*layers, *conv_norm(channels, HEAD, 1), nn.ReLU6())
 
 
 class Compressor(nn.Module):

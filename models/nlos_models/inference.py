@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
-from nlos_models.errors import ModelError
+from nlos_models.errors import CheckpointError, ModelError
 from nlos_models.pipeline import Pipeline
 
 Float32 = NDArray[np.float32]
@@ -69,9 +69,14 @@ def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
     """The shipped weights (None), or a checkpoint folder's, on the best device at hand.
 
     The ONNX file is exported once into the folder `cache`, named by a checksum of weights and code.
-    Raises CheckpointError where the weights cannot be read.
+    Raises CheckpointError where the weights cannot be read, or are for colour.
     """
     pipeline, record = load_pipeline(folder)
+    if record.colour:
+        raise CheckpointError(
+            f"{folder} holds weights for full colour, which is simulation only (the L515's laser is infrared): "
+            "name weights for depth; tools/colour_demo.py shows these"
+        )
     if torch.cuda.is_available():
         return TorchReconstructor(pipeline, record, "cuda")
     return OnnxReconstructor(exported(pipeline, cache), record)

@@ -15,6 +15,8 @@ class Recipe(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     task: Literal["vae", "compressor"]
+    colour: bool = False
+    """RGB albedo in the place of depth; simulation only, since the L515's laser is infrared."""
     seed: int = 0
     objects: int = Field(gt=0)
     """Training objects, by seeds 0, 1, ...; held-out ones come from other seeds."""

@@ -1,7 +1,8 @@
-"""Res-VAE: depth images (n, 1, 64, 64) in [0, 1] to a latent of 256 and back (SI 3, Table S1 and its mirror).
+"""Res-VAE: images (n, channels, 64, 64) in [0, 1] to a latent and back (SI 3, Table S1 and its mirror).
 
-Chosen where the paper is silent: ReLU between convolutions, a sigmoid at the output, the encoder as the decoder's
-mirror (average pooling where that upsamples, 1 x 1 convolutions for mean and log-variance).
+Depth has one channel and a latent of 256; colour, three and 512: then 512 channels enter Table S1. Chosen where
+the paper is silent: ReLU between convolutions, a sigmoid at the output, the encoder as the decoder's mirror (average
+pooling where that upsamples, 1 x 1 convolutions for mean and log-variance).
 """
 
 import torch
@@ -9,13 +10,18 @@ from torch import Tensor, nn
 
 LATENT = 256
 UP_BLOCKS = ((256, 256, 512), (512, 256, 512), (512, 128, 256), (256, 64, 128), (128, 32, 64), (64, 16, 32))
-"""Table S1: channels in, within and out of each residual block."""
+"""Table S1: channels in, within and out of each residual block; a latent of another size enters the first."""
 LOG_VARIANCE_LIMIT = 10.0
 """exp() of what lies beyond overflows float16."""
 
 
 def _conv(channels_in: int, channels_out: int) -> nn.Conv2d:
     return nn.Conv2d(channels_in, channels_out, kernel_size=3, stride=1, padding=1)
+
+
+def _up_blocks(latent: int) -> list[tuple[int, int, int]]:
+    (_, within, out), *rest = UP_BLOCKS
+    return [(latent, within, out), *rest]
 
 
 class ResBlock(nn.Module):
@@ -39,32 +45,32 @@ class ResBlock(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Latents (n, 256) to images (n, 1, 64, 64) in [0, 1] (Table S1)."""
+    """Latents (n, latent) to images (n, channels, 64, 64) in [0, 1] (Table S1)."""
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
-        up = [ResBlock(*channels, nn.Upsample(scale_factor=2, mode="nearest")) for channels in UP_BLOCKS]
+        up = [ResBlock(*block, nn.Upsample(scale_factor=2, mode="nearest")) for block in _up_blocks(latent)]
         self.blocks = nn.Sequential(*up)
-        self.output = _conv(UP_BLOCKS[-1][-1], 1)
+        self.output = _conv(UP_BLOCKS[-1][-1], channels)
 
     def forward(self, latent: Tensor) -> Tensor:
-        """(n, 256) to (n, 1, 64, 64)."""
+        """(n, latent) to (n, channels, 64, 64)."""
         return torch.sigmoid(self.output(self.blocks(latent[:, :, None, None])))
 
 
 class Encoder(nn.Module):
-    """Images (n, 1, 64, 64) to the mean and log-variance, each (n, 256), of their latent."""
+    """Images (n, channels, 64, 64) to the mean and log-variance, each (n, latent), of their latent."""
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
-        self.input = _conv(1, UP_BLOCKS[-1][-1])
-        down = [ResBlock(out, within, into, nn.AvgPool2d(2)) for into, within, out in reversed(UP_BLOCKS)]
+        self.input = _conv(channels, UP_BLOCKS[-1][-1])
+        down = [ResBlock(out, within, into, nn.AvgPool2d(2)) for into, within, out in reversed(_up_blocks(latent))]
         self.blocks = nn.Sequential(*down)
-        self.mean = nn.Conv2d(LATENT, LATENT, 1)
-        self.log_variance = nn.Conv2d(LATENT, LATENT, 1)
+        self.mean = nn.Conv2d(latent, latent, 1)
+        self.log_variance = nn.Conv2d(latent, latent, 1)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """(n, 1, 64, 64) to two (n, 256)."""
+        """(n, channels, 64, 64) to two (n, latent)."""
         features = self.blocks(torch.relu(self.input(image)))
         log_variance = self.log_variance(features).clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
         return self.mean(features).flatten(1), log_variance.flatten(1)
@@ -73,12 +79,12 @@ class Encoder(nn.Module):
 class ResVae(nn.Module):
     """Encoder, reparametrisation, decoder."""
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
-        self.encoder = Encoder()
-        self.decoder = Decoder()
+        self.encoder = Encoder(channels, latent)
+        self.decoder = Decoder(channels, latent)
 
     def forward(self, image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Images (n, 1, 64, 64) and standard normal noise (n, 256) to image, mean and log-variance."""
+        """Images (n, channels, 64, 64) and standard normal noise (n, latent) to image, mean and log-variance."""
         mean, log_variance = self.encoder(image)
         return self.decoder(mean + noise * torch.exp(0.5 * log_variance)), mean, log_variance

@@ -19,9 +19,10 @@ LEAST_V = 0.1
 
 
 def cut_silhouette(image: Tensor) -> Tensor:
-    """Decoded images (n, 1, h, w) as hidden images: 0 for background, else 0.1 to 1."""
-    brightest = functional.max_pool2d(image, WINDOW, stride=1, padding=WINDOW // 2)
-    kept = (image >= KEPT_SHARE * brightest) & (image >= LEAST_V)
+    """Decoded images (n, channels, h, w) as hidden images: 0 for background; a pixel's brightest channel tells."""
+    bright = image.amax(1, keepdim=True)
+    brightest = functional.max_pool2d(bright, WINDOW, stride=1, padding=WINDOW // 2)
+    kept = (bright >= KEPT_SHARE * brightest) & (bright >= LEAST_V)
     return torch.where(kept, image, torch.zeros_like(image))
 
 

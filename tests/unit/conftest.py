@@ -15,6 +15,7 @@ from nlos_calibration.range_noise import depth_noise_m
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import wall_record
+from nlos_models import colour_resnet, res_vae
 from rosbags.rosbag1 import Reader, Writer
 
 from nlos_cam.frames import Float32
@@ -129,3 +130,15 @@ def straight_view() -> Callable[..., Float32]:
         return orthographic_depth(place(kind.make(**settings), Pose(size_m=0.24, front_m=0.0), box), box)
 
     return view
+
+
+@pytest.fixture(scope="module")
+def narrow_networks() -> Iterator[None]:
+    """Res-VAE and ResNet50 with a sixteenth of their channels: all that their widths decide is time."""
+    with pytest.MonkeyPatch.context() as patch:
+        (into, within, out), *rest = res_vae.UP_BLOCKS
+        narrow = [(into, within // 16, out // 16), *(tuple(width // 16 for width in block) for block in rest)]
+        patch.setattr(res_vae, "UP_BLOCKS", tuple(narrow))
+        stages = tuple((within // 16, *others) for within, *others in colour_resnet.STAGES)
+        patch.setattr(colour_resnet, "STAGES", stages)
+        yield

@@ -2,10 +2,12 @@
 
 import pytest
 import torch
+from nlos_models.checkpoint import load_pipeline, shipped_folder
 from nlos_models.compressor import Compressor
 from nlos_models.pipeline import Pipeline
 from nlos_models.res_vae import Decoder
 from nlos_models.silhouette import LEAST_V
+from safetensors.torch import load_file
 
 
 @pytest.fixture(scope="module")
@@ -50,3 +52,13 @@ def test_maps_that_are_not_contiguous_give_the_same(pipeline: Pipeline) -> None:
     turned = pipeline.latent(depth.transpose(1, 2), intensity.transpose(1, 2))
     copied = pipeline.latent(depth.transpose(1, 2).contiguous(), intensity.transpose(1, 2).contiguous())
     torch.testing.assert_close(turned, copied, atol=1e-5, rtol=1e-4)
+
+
+def test_the_shipped_weights_are_loaded_bit_for_bit() -> None:
+    loaded, _ = load_pipeline()
+    for part in ("compressor", "preprocess", "decoder"):
+        stored = load_file(shipped_folder() / f"{part}.safetensors")
+        tensors = getattr(loaded, part).state_dict()
+        assert tensors.keys() == stored.keys()
+        for name, tensor in stored.items():
+            assert torch.equal(tensors[name], tensor.to(tensors[name].dtype)), name

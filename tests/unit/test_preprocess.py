@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from nlos_models.data import flip_some
-from nlos_models.preprocess import Preprocess, channel_statistics, split_and_stack
+from nlos_models.preprocess import Preprocess, channel_statistics, split_and_stack, stacked_channels
 from torch import Tensor
 
 
@@ -130,3 +130,41 @@ def test_maps_after_training_on_a_constant_are_finite() -> None:
     preprocess = Preprocess().eval()
     preprocess.learn(split_and_stack(*_hard("constant and saturated")))
     assert torch.isfinite(preprocess(*_maps())).all()
+
+
+def _colour_maps(n: int = 3) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(5)
+    depth, intensity = _maps(n=n)
+    return depth, torch.stack([intensity, *(50 * torch.rand(2, n, 64, 80, generator=generator))], dim=1)
+
+
+def test_three_intensities_follow_the_depth_as_one_does() -> None:
+    depth, intensity = _colour_maps()
+    stacked = split_and_stack(depth, intensity)
+    assert stacked.shape == (3, stacked_channels(3), 64, 40)
+    for colour in range(3):
+        of_one = split_and_stack(depth, intensity[:, colour])
+        chosen = stacked[:, [0, 1, 2 + 2 * colour, 3 + 2 * colour]]
+        torch.testing.assert_close(chosen, of_one, rtol=0, atol=0, equal_nan=True)
+
+
+def test_exchanging_colours_exchanges_their_channels() -> None:
+    depth, intensity = _colour_maps()
+    before, after = split_and_stack(depth, intensity), split_and_stack(depth, intensity[:, [2, 0, 1]])
+    torch.testing.assert_close(after, before[:, [0, 1, 6, 7, 2, 3, 4, 5]], rtol=0, atol=0, equal_nan=True)
+
+
+def test_mirrored_colours_are_stacked_and_resized_as_mirrored() -> None:
+    maps, preprocess = _colour_maps(), Preprocess(intensities=3).eval()
+    preprocess.learn(split_and_stack(*maps))
+    straight, mirrored = preprocess(*maps), preprocess(*(m.flip(-2) for m in maps))
+    torch.testing.assert_close(mirrored, straight.flip(-2), atol=1e-4, rtol=0)
+
+
+def test_in_colour_noise_falls_on_the_left_of_depth_and_of_every_intensity() -> None:
+    torch.manual_seed(0)
+    maps, preprocess = _colour_maps(), Preprocess(left_noise=0.2, intensities=3)
+    difference = preprocess.train()(*maps) - preprocess.eval()(*maps)
+    assert [bool((difference[:, channel] != 0).any()) for channel in range(8)] == [True, False] * 4
+    left = difference[:, ::2].transpose(0, 1).flatten(1)
+    assert (torch.corrcoef(left) - torch.eye(4)).abs().max() < 0.1  # each has noise of its own

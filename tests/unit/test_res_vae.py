@@ -37,6 +37,16 @@ def test_the_decoder_is_table_s1(vae: ResVae) -> None:
     assert _convolutions(vae.decoder.output) == ((32, 1),)
 
 
+def test_another_latent_enters_the_first_block_and_other_channels_leave_the_last() -> None:
+    with torch.device("meta"):
+        vae = ResVae(channels=3, latent=512)
+    blocks = tuple(_convolutions(block) for block in vae.decoder.blocks)
+    assert blocks == (((512, 256), (256, 512), (512, 512)), *TABLE_S1[1:])
+    assert _convolutions(vae.decoder.output) == ((32, 3),)
+    assert _convolutions(vae.encoder.input) == ((3, 32),)
+    assert _convolutions(vae.encoder.mean) == _convolutions(vae.encoder.log_variance) == ((512, 512),)
+
+
 def test_the_encoder_is_the_decoders_mirror(vae: ResVae) -> None:
     def ends(block: nn.Module) -> tuple[int, int]:
         assert isinstance(block, ResBlock)

@@ -66,3 +66,14 @@ def test_a_plateau_and_a_blurred_edge_of_it_come_out_level() -> None:
     lifted = lift_edges(image)
     torch.testing.assert_close(lifted[..., 10:40, 20:48], image[..., 10:40, 20:48])
     assert (lifted[..., 15:35, 50:52] > 0.7).all()
+
+
+def test_of_colours_the_brightest_channel_tells_for_all() -> None:
+    image = torch.zeros(1, 3, 64, 64)
+    image[0, :, 10:40, 10:40] = torch.tensor([0.9, 0.02, 0.5])[:, None, None]
+    image[0, :, 10:40, 40:43] = torch.tensor([0.3, 0.35, 0.3])[:, None, None]
+    cut = cut_silhouette(image)
+    assert torch.equal(cut[..., 10:40, 10:40], image[..., 10:40, 10:40])
+    assert (cut[..., 40:43] == 0).all()
+    turned = cut_silhouette(image[:, [1, 2, 0]])
+    assert torch.equal(turned, cut[:, [1, 2, 0]])

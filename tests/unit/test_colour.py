@@ -1,0 +1,64 @@
+"""The networks of colour: their sizes, and what they make of maps that a bench may well deliver."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from nlos_models.colour import CHANNELS, LATENT, colour_pipeline, colour_vae
+from nlos_models.pipeline import Pipeline
+from nlos_models.preprocess import split_and_stack
+from torch import Tensor
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> Pipeline:
+    torch.manual_seed(0)
+    return colour_pipeline()
+
+
+def _hard(name: str, n: int = 1) -> tuple[Tensor, Tensor]:
+    depth, intensity = torch.full((n, 64, 80), 0.3), torch.full((n, CHANNELS, 64, 80), 10.0)
+    if name == "all zero":
+        depth, intensity = torch.zeros_like(depth), torch.zeros_like(intensity)
+    if name == "saturated":
+        intensity[:] = 255.0
+    if name == "half invalid":
+        depth[:, :, :40] = torch.nan
+    if name == "all invalid":
+        depth[:] = torch.nan
+    return depth, intensity
+
+
+def test_the_vae_is_64_by_64_by_3_with_a_latent_of_512() -> None:
+    assert (CHANNELS, LATENT) == (3, 512)
+    with torch.device("meta"):
+        vae = colour_vae()
+        image, mean, log_variance = vae(torch.empty(2, 3, 64, 64), torch.empty(2, 512))
+    assert image.shape == (2, 3, 64, 64)
+    assert mean.shape == log_variance.shape == (2, 512)
+    counts = [sum(p.numel() for p in part.parameters()) for part in (vae.encoder, vae.decoder)]
+    assert counts == [12_715_344, 12_188_083]
+
+
+@pytest.mark.parametrize("name", ["constant", "all zero", "saturated", "half invalid", "all invalid"])
+def test_hard_maps_give_finite_gradients_and_a_possible_image(pipeline: Pipeline, name: str) -> None:
+    maps = _hard(name)
+    pipeline.preprocess.learn(split_and_stack(*maps))
+    pipeline.train().zero_grad()
+    pipeline.latent(*maps).square().sum().backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in pipeline.compressor.parameters())
+    with torch.inference_mode():
+        image = pipeline.eval()(*maps)
+    bright = image.amax(1, keepdim=True)
+    assert image.shape == (1, CHANNELS, 64, 64)
+    assert torch.isfinite(image).all()
+    assert (image <= 1).all()
+    assert ((bright == 0) | (bright >= 0.1)).all()

@@ -1,0 +1,47 @@
+"""Judging in colour: figures of perfect and trivial images, guesses without a network, and the picture."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.image import imread
+
+from nlos_cam.colour_evaluate import colour_guesses, draw_colour_sheet, judge_colour
+from nlos_cam.frames import Float32
+
+
+def _squares(colours: list[tuple[float, float, float]]) -> Float32:
+    images = np.zeros((len(colours), 3, 64, 64), np.float32)
+    for image, colour in zip(images, colours, strict=True):
+        image[:, 20:40, 20:40] = np.array(colour)[:, None, None]
+    return images
+
+
+TRUTH = _squares([(1.0, 0.1, 0.1), (0.1, 1.0, 0.1)])
+
+
+def test_the_truth_is_perfect_and_nothing_has_no_colour() -> None:
+    perfect = judge_colour(TRUTH, TRUTH)
+    assert perfect["silhouette_iou"] == perfect["accuracy_mean_abs"] == {"value": 1.0, "low": 1.0, "high": 1.0}
+    assert perfect["colour_error"] == {"value": 0.0, "low": 0.0, "high": 0.0}
+    nothing = judge_colour(np.zeros_like(TRUTH), TRUTH)
+    assert nothing["silhouette_iou"]["value"] == 0.0
+    assert nothing["colour_error"] == {"value": None, "low": None, "high": None}
+
+
+def test_guesses_are_what_their_names_say() -> None:
+    guesses = colour_guesses(TRUTH, TRUTH)
+    assert (guesses["all_background"] == 0).all()
+    np.testing.assert_allclose(guesses["mean_object"][1], TRUTH.mean(0))
+    shown = guesses["mean_colour"]
+    np.testing.assert_array_equal(shown > 0, TRUTH > 0)
+    np.testing.assert_allclose(shown[:, :, 30, 30], [[0.55, 0.55, 0.1]] * 2, rtol=1e-6)
+
+
+def test_the_picture_shows_the_colours_of_truth_and_reconstruction(tmp_path: Path) -> None:
+    draw_colour_sheet(tmp_path / "sheet.png", TRUTH[::-1], TRUTH)
+    pixels = imread(tmp_path / "sheet.png")[..., :3].reshape(-1, 3)
+    red, green, yellow = ((np.abs(pixels - colour) < 0.05).all(1).sum() for colour in
+        ((1.0, 0.1, 0.1), (0.1, 1.0, 0.1), (0.9, 0.9, 0.0)))  # fmt: skip
+    assert red > 100  # once as truth, once as reconstruction
+    assert abs(int(red) - int(green)) < 0.05 * red
+    assert yellow > 100  # their difference, twice
