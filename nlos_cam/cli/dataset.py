@@ -1,4 +1,4 @@
-"""`dataset build`: objects and renderer to training maps."""
+"""`dataset build|label`: objects and renderer, or labelled recordings, to training maps."""
 
 import os
 import shlex
@@ -12,6 +12,7 @@ from rich.text import Text
 
 from nlos_cam import dataset
 from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say
+from nlos_cam.cli.dataset_label import add_label
 from nlos_cam.render.accuracy import accuracy_named
 from nlos_cam.render.scene_file import load_scene
 
@@ -52,10 +53,10 @@ RayAddress = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add the commands."""
     data = typer.Typer(help="Training data.")
-    data.callback()(lambda: None)  # else typer leaves out the name of an only command
     data.command("build")(build)
+    add_label(data)
     app.add_typer(data, name="dataset")
 
 
