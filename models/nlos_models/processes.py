@@ -69,8 +69,8 @@ def _end_all() -> None:
 
 
 def seed_of(*parts: int) -> int:
-    """A seed of its own for every tuple of numbers."""
-    return int(np.random.SeedSequence(parts).generate_state(1, np.uint64)[0] >> np.uint64(1))
+    """A seed of its own for every tuple of numbers; their count goes in, as numpy ignores zeros at the end."""
+    return int(np.random.SeedSequence([*parts, len(parts)]).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def share_of(batch: Any, rank: int, world: int) -> Any:

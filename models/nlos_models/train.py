@@ -173,7 +173,7 @@ class _Run:
         asked = self.running.stop()
         if self.fabric.world_size == 1:
             return asked
-        if self.step % STEPS_BETWEEN_WORDS:
+        if (self.epoch * self.steps + self.step) % STEPS_BETWEEN_WORDS:
             return False
         return bool(self._over_all(torch.tensor(float(asked), device=self.fabric.device), "sum"))
 
