@@ -1,7 +1,12 @@
-"""A few images of plates, and maps that show them as no lidar would: enough for a network to learn from."""
+"""Images of plates, maps that show them as no lidar would, and networks that learn from them in a moment."""
 
 import numpy as np
+import torch
 from nlos_models.data import Half, MapSet
+from torch import Tensor, nn
+from torch.nn import functional
+
+LATENT = 256
 
 
 def small_images(count: int, seed: int) -> Half:
@@ -19,3 +24,53 @@ def small_maps(count: int, seed: int) -> MapSet:
     intensity = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8))) * 50
     depth = np.where(intensity > 0, intensity / 100, np.float32(np.nan)).astype(np.float32)
     return MapSet(depth, intensity, images)
+
+
+class SmallEncoder(nn.Module):
+    """Stands for Encoder: coarse pixels, a batch norm, two linear maps."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(64)
+        self.mean, self.log_variance = nn.Linear(64, LATENT), nn.Linear(64, LATENT)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        features = self.norm(functional.avg_pool2d(image, 8).flatten(1))
+        return self.mean(features), self.log_variance(features).clamp(-2, 2)
+
+
+class SmallDecoder(nn.Module):
+    """Stands for Decoder: a batch norm, and one linear map to coarse pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm, self.output = nn.BatchNorm1d(LATENT), nn.Linear(LATENT, 64)
+
+    def forward(self, latent: Tensor) -> Tensor:
+        coarse = self.output(self.norm(latent)).view(-1, 1, 8, 8)
+        return torch.sigmoid(functional.interpolate(coarse, scale_factor=8))
+
+
+class SmallVae(nn.Module):
+    """Stands for ResVae."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder, self.decoder = SmallEncoder(), SmallDecoder()
+
+    def forward(self, image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        mean, log_variance = self.encoder(image)
+        return self.decoder(mean + noise * torch.exp(0.5 * log_variance)), mean, log_variance
+
+
+class SmallCompressor(nn.Module):
+    """Stands for Compressor: features with a batch norm, then dropout and a linear classifier."""
+
+    def __init__(self, dropout: float = 0.5) -> None:
+        super().__init__()
+        conv = nn.Conv2d(4, 4, 5, stride=5)
+        self.features = nn.Sequential(conv, nn.BatchNorm2d(4), nn.ReLU(), nn.AvgPool2d(4), nn.Flatten())
+        self.classifier = nn.Sequential(nn.Dropout(dropout), nn.Linear(100, LATENT))
+
+    def forward(self, stacked: Tensor) -> Tensor:
+        return self.classifier(self.features(stacked))
