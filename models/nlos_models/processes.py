@@ -11,21 +11,26 @@ from lightning_fabric import Fabric
 from torch import Tensor
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
-from nlos_models.errors import TrainingError
+from nlos_models.errors import RecipeError, TrainingError
+from nlos_models.recipe import Recipe
 
 Accelerator = Literal["auto", "cpu", "cuda"]
-Precision = Literal["32-true", "bf16-mixed"]
 
 
-def open_fabric(precision: Precision, *, accelerator: Accelerator = "auto", devices: int = 1) -> Fabric:
-    """A fabric on one device, or on several processes (one for each GPU, or on a CPU). TrainingError if not there."""
+def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: int = 1) -> Fabric:
+    """A fabric on one device, or on several processes: one for each GPU, or on a CPU.
+
+    Raises TrainingError where there are not so many GPUs, RecipeError where they cannot share a batch evenly.
+    """
+    if recipe.batch % devices:
+        raise RecipeError(f"a batch of {recipe.batch} is not shared by {devices} processes evenly: change one of them")
     if accelerator == "auto":
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
     there = torch.cuda.device_count()
     if accelerator == "cuda" and devices > there:
         raise TrainingError(f"{devices} GPUs asked for, {there} there: choose fewer --devices, or --accelerator cpu")
     strategy = "ddp_spawn" if devices > 1 else "auto"
-    return Fabric(accelerator=accelerator, devices=devices, strategy=strategy, precision=precision)
+    return Fabric(accelerator=accelerator, devices=devices, strategy=strategy, precision=recipe.precision)
 
 
 def launched(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:

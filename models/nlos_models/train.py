@@ -58,7 +58,7 @@ class Running:
 
     def on(self, recipe: Recipe) -> Fabric:
         """The fabric, or one device's."""
-        return self.fabric or open_fabric(recipe.precision)
+        return self.fabric or open_fabric(recipe)
 
 
 class _Step(nn.Module):
@@ -113,8 +113,6 @@ class _Run:
         self.recipe, self.steps, self.folder, self.running = recipe, steps, folder, running
         self.fabric = running.on(recipe)
         self.leads = self.fabric.is_global_zero
-        if recipe.batch % self.fabric.world_size:
-            raise RecipeError(f"a batch of {recipe.batch} is not shared by {self.fabric.world_size} processes evenly")
         self.module = module
         free = [p for p in module.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(free, recipe.learning_rate, recipe.betas)

@@ -32,8 +32,8 @@ HeldOut = Annotated[Path, typer.Option("--held-out", help="Maps to judge by, of 
 Wall = Annotated[
     Path | None, typer.Option("--wall", help="The bare wall for difference maps (wall.toml); else it is rendered.")
 ]
-Budget = Annotated[float, typer.Option("--budget", help="Share of the recipe's budget, for comparisons: 0.1.")]
-Objects = Annotated[int | None, typer.Option("--objects", help="Train on so many, not on as many as the recipe says.")]
+Budget = Annotated[float, typer.Option("--budget", min=1e-4, max=1.0, help="Share of the recipe's budget.")]
+Objects = Annotated[int | None, typer.Option("--objects", min=2, help="Train on so many, not on the recipe's.")]
 Devices = Annotated[int, typer.Option("--devices", min=1, help="Processes: one for each GPU, or on the CPU.")]
 On = Annotated[Accelerator, typer.Option("--accelerator", help="auto is a GPU if there is one.")]
 TensorBoard = Annotated[bool, typer.Option("--tensorboard", help="Log for TensorBoard too, beside log.csv.")]
@@ -60,7 +60,7 @@ def vae(
 ) -> None:
     """Train a Res-VAE on procedural objects (SI 3)."""
     recipe = RecipeChoice(recipe_file, budget, objects).read("vae")
-    fabric = open_fabric(recipe.precision, accelerator=accelerator, devices=devices)
+    fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
     rig = rig_named(PAPER_RIG)
     box = dataset.DatasetPlan(rig, 0).box
     say(f"making {recipe.objects + recipe.held_out} objects")
@@ -90,7 +90,7 @@ def compressor(
 ) -> None:
     """Train a compressor onto the latent of a trained VAE (SI 4), or as the recipe's `steps` say."""
     recipe = RecipeChoice(recipe_file, budget, objects).read("compressor")
-    fabric = open_fabric(recipe.precision, accelerator=accelerator, devices=devices)
+    fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
     start, record = _start(recipe, vae_folder, weights)
     maps = read_maps(recipe, data, held_out_data, wall)
     record = _tied(record, maps, recipe).model_copy(update={"compressor_recipe": recipe})
@@ -119,7 +119,7 @@ def transfer(
 ) -> None:
     """Train synthetic weights on, on a bench's recordings (SI 4): all layers, then the classifier alone."""
     recipe = RecipeChoice(recipe_file, objects=objects).read("transfer")
-    fabric = open_fabric(recipe.precision, accelerator=accelerator, devices=devices)
+    fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
     pipeline, record = _synthetic(weights, partial=partial)
     _same_input(recipe, record)
     maps = read_maps(recipe, data, held_out_data, wall)

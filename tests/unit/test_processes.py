@@ -40,9 +40,9 @@ def test_seeds_differ_by_every_number_and_its_place() -> None:
 
 
 def test_two_processes_end_with_the_weights_of_one(tmp_path: Path) -> None:
-    made: dict[str, Any] = launched(open_fabric("32-true", accelerator="cpu", devices=2), on_two, tmp_path)
+    made: dict[str, Any] = launched(open_fabric(small_recipe(), accelerator="cpu", devices=2), on_two, tmp_path)
     alone = SmallRun(small_recipe(epochs=3, schedule="one-cycle"), tmp_path / "alone", plain=True)
-    figures = alone.go(fabric=open_fabric("32-true", accelerator="cpu"))
+    figures = alone.go(fabric=open_fabric(small_recipe(), accelerator="cpu"))
     together = SmallRun(alone.recipe, tmp_path / "whole", plain=True)
     for name, tensor in alone.net.state_dict().items():
         torch.testing.assert_close(torch.tensor(made["net"][name]), tensor, rtol=1e-4, atol=1e-6)
@@ -54,27 +54,26 @@ def test_two_processes_end_with_the_weights_of_one(tmp_path: Path) -> None:
     assert made["again"] == made["net"]
 
 
-def test_a_batch_that_cannot_be_shared_evenly_is_refused(tmp_path: Path) -> None:
-    fabric: Any = SimpleNamespace(world_size=3, is_global_zero=True)
+def test_a_batch_that_cannot_be_shared_evenly_is_refused() -> None:
     with pytest.raises(RecipeError, match="a batch of 4 is not shared by 3 processes evenly"):
-        SmallRun(small_recipe(), tmp_path).go(fabric=fabric)
+        open_fabric(small_recipe(), accelerator="cpu", devices=3)
 
 
 def test_more_gpus_than_there_are_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     with pytest.raises(TrainingError, match="2 GPUs asked for, 0 there"):
-        open_fabric("32-true", accelerator="cuda", devices=2)
+        open_fabric(small_recipe(), accelerator="cuda", devices=2)
 
 
 def _fabric(world_size: int, launch: Callable[..., Any]) -> Any:
     return SimpleNamespace(world_size=world_size, launch=launch)
 
 
-def _stop(fabric: Any) -> None:
+def _stop(_: Any) -> None:
     raise KeyboardInterrupt
 
 
-def _refuse(fabric: Any) -> None:
+def _refuse(_: Any) -> None:
     raise RecipeError("no such recipe")
 
 
@@ -98,7 +97,7 @@ def test_what_no_process_foresaw_is_not_hidden() -> None:
 
 
 def test_a_process_that_died_is_one_line() -> None:
-    def launch(guarded: object) -> None:
+    def launch(_: object) -> None:
         raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -9, "SIGKILL")
 
     with pytest.raises(TrainingError, match=r"ended early \(process 1 terminated with signal SIGKILL\)"):

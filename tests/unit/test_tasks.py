@@ -168,9 +168,7 @@ def test_turns_are_quarters_and_with_the_mirror_make_all_eight() -> None:
     assert any(torch.equal(view, image[0].flip(-1)) for view in eight)  # SI 3's horizontal flip
 
 
-def test_a_vae_is_shown_turned_images_where_the_recipe_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_vae_is_shown_turned_images_where_the_recipe_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     quarters: list[int] = []
 
     def noted(images: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:

@@ -122,9 +122,7 @@ def test_a_run_of_another_recipe_is_refused(tmp_path: Path) -> None:
         _trained(tmp_path, learning_rate=0.5)
 
 
-def test_the_best_epoch_is_handed_on_where_the_recipe_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_best_epoch_is_handed_on_where_the_recipe_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     judged: dict[float, dict[str, torch.Tensor]] = {}
 
     def score(run: SmallRun) -> dict[str, float]:
