@@ -59,8 +59,12 @@ class Recipe(BaseModel):
             raise ValueError(f"steps {self.steps!r} is for a compressor: a transfer keeps the decoder")
         if self.task != "vae" and not self.latent_weight + self.image_weight:
             raise ValueError("latent_weight and image_weight are both 0: there is nothing to learn by")
-        if self.steps == "one" and (self.latent_weight or not self.image_weight):
-            raise ValueError("steps 'one' knows no latent to aim at: set latent_weight = 0 and an image_weight")
+        if self.steps == "one" and self.latent_weight:
+            raise ValueError("steps 'one' knows no latent to aim at: set latent_weight = 0")
+        if self.steps != "two" and not self.image_weight:
+            raise ValueError(
+                f"steps {self.steps!r} trains a decoder, which learns by images alone: set an image_weight"
+            )
         return self
 
     def scaled(self, share: float) -> Self:

@@ -74,6 +74,7 @@ def test_on_fewer_objects_the_batch_is_never_larger_than_all() -> None:
         ("transfer", 'steps = "one"\nlatent_weight = 0\nimage_weight = 1', "a transfer keeps the decoder"),
         ("compressor", "latent_weight = 0", "nothing to learn by"),
         ("compressor", 'steps = "one"\nimage_weight = 1', "no latent to aim at"),
+        ("compressor", 'steps = "two-then-joint"', "set an image_weight"),
     ],
 )
 def test_a_recipe_at_odds_with_itself_is_one_line(tmp_path: Path, task: str, lines: str, words: str) -> None:
