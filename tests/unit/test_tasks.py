@@ -155,7 +155,7 @@ def test_joint_training_goes_on_from_two_step_weights_and_moves_both_networks_bu
 @pytest.mark.parametrize(("steps", "words"), [("two", "--vae"), ("two-then-joint", "--weights")])
 def test_a_start_without_what_the_steps_need_is_one_line(tmp_path: Path, steps: str, words: str) -> None:
     with pytest.raises(TrainingError, match=words):
-        _train(_recipe("compressor", steps=steps), Start(), tmp_path)
+        _train(_recipe("compressor", steps=steps, image_weight=1.0), Start(), tmp_path)
 
 
 def test_turns_are_quarters_and_with_the_mirror_make_all_eight() -> None:
