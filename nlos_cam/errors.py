@@ -4,6 +4,8 @@
     ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be rendered
     ├── OutputExistsError (FileExistsError)  exit 1   --out is there and --overwrite was not given
     ├── DiskFullError (OSError)      exit 1   too little room for what is to be written, or none left
+    ├── FolderBusyError (BlockingIOError)  exit 1   another process writes to the folder
+    ├── WorkersLostError (ChildProcessError)  exit 1   workers that cannot be had, or that die again and again
     ├── CameraError (OSError)        exit 3   a device that is missing or does not do as asked
     │   ├── CameraNotFoundError      exit 3   no such device
     │   └── CameraLostError          exit 3   it was there, and vanished or fell silent
@@ -30,6 +32,14 @@ class OutputExistsError(NlosCamError, FileExistsError):
 
 class DiskFullError(NlosCamError, OSError):
     """A disk with too little room for what is to be written, or with none left."""
+
+
+class FolderBusyError(NlosCamError, BlockingIOError):
+    """A folder that another process writes to."""
+
+
+class WorkersLostError(NlosCamError, ChildProcessError):
+    """Workers that cannot be had, or that die again and again."""
 
 
 class CameraError(NlosCamError, OSError):

@@ -1,36 +1,64 @@
-"""Draw a contact sheet of the procedural categories: `python tools/contact_sheet_objects.py OUT.png`."""
+"""Draw the hidden objects: `python tools/contact_sheet_objects.py DIR` makes objects.png and test_objects.png."""
 
 import sys
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
-from nlos_calibration.rig import load_rig
+from matplotlib.figure import Figure
+from nlos_calibration.rig import ObjectBox, load_rig
 
-from nlos_cam.dataset import DatasetPlan
+from nlos_cam.frames import Float32
 from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import image_from_depth
+from nlos_cam.objects.depth_image import image_from_depth, object_box
 from nlos_cam.objects.hidden import category_triangles, place, random_pose
 from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.test_set import test_set
 
-COLUMNS = 6
+VARIATIONS = 5
+SIDE_BY_SIDE = 2
+INCHES, DPI = 0.85, 100
 
 
-def main(out: Path) -> None:
-    """One row per category, six variations each."""
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
+def variations(category: str, box: ObjectBox) -> list[Float32]:
+    """Images of a category as training sees it, each at another seed and pose."""
+    poses = [random_pose(np.random.default_rng([k, *category.encode()]), box) for k in range(VARIATIONS)]
+    placed = [place(category_triangles(category, k), pose, box) for k, pose in enumerate(poses)]
+    return [image_from_depth(orthographic_depth(triangles, box), box) for triangles in placed]
 
-    box = DatasetPlan(load_rig("paper-rig"), 0).box
-    figure, axes = plt.subplots(len(CATEGORIES), COLUMNS, figsize=(COLUMNS, len(CATEGORIES)), layout="constrained")
-    for row, category in zip(axes, CATEGORIES, strict=True):
-        for seed, axis in enumerate(row):
-            pose = random_pose(np.random.default_rng(seed), box)
-            depth_m = orthographic_depth(place(category_triangles(category, seed), pose, box), box)
-            axis.imshow(image_from_depth(depth_m, box), vmin=0, vmax=1, cmap="magma")
-            axis.axis("off")
-        row[0].set_title(category, loc="left", fontsize=8)
-    figure.savefig(out, dpi=110)
+
+def fixed(box: ObjectBox) -> dict[str, list[Float32]]:
+    """Images of the test set, by category."""
+    objects = test_set(box)
+    return {
+        name: [image_from_depth(thing.depth_m, box) for thing in objects if thing.category == name]
+        for name in CATEGORIES
+    }
+
+
+def draw(path: Path, images: dict[str, list[Float32]]) -> Figure:
+    """One line per category with its name, two categories side by side."""
+    wide = max(len(row) for row in images.values())
+    lines = -(-len(images) // SIDE_BY_SIDE)
+    figure = Figure(figsize=(INCHES * SIDE_BY_SIDE * wide, 1.25 * INCHES * lines), layout="constrained")
+    axes = figure.subplots(lines, SIDE_BY_SIDE * wide)
+    for axis in axes.ravel():
+        axis.axis("off")
+    for number, (name, row) in enumerate(images.items()):
+        side, line = divmod(number, lines)
+        for k, image in enumerate(row):
+            axis = axes[line, side * wide + k]
+            axis.imshow(image, vmin=0, vmax=1, cmap="magma")
+            if k == 0:
+                axis.set_title(name, loc="left", fontsize=8, pad=2)
+    figure.savefig(path, dpi=DPI)
+    return figure
+
+
+def main(folder: Path) -> None:
+    """Both sheets, for the paper's rig."""
+    box = object_box(load_rig("paper-rig"))
+    draw(folder / "objects.png", {name: variations(name, box) for name in CATEGORIES})
+    draw(folder / "test_objects.png", fixed(box))
 
 
 if __name__ == "__main__":

@@ -63,12 +63,17 @@ class MapBatch(NamedTuple):
     """(b,); which of them are mirrored."""
 
 
+def as_batch(maps: MapSet, row: NDArray[np.int64], mirrored: NDArray[np.bool_]) -> MapBatch:
+    """Samples (b,) of a set, those that are flagged mirrored."""
+    depth, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
+    image, flips = torch.from_numpy(maps.image.astype(np.float32))[:, None], torch.from_numpy(mirrored)
+    depth, intensity, image = flip_some([depth, intensity, image], flips)
+    return MapBatch(depth, intensity, image, torch.from_numpy(row), flips)
+
+
 def map_batches(maps: MapSet, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
     """One epoch of maps and images, shuffled and mirrored at random."""
     for index in shuffled(len(maps.image), batch, generator):
-        rows = index.numpy()
-        depth, intensity = torch.from_numpy(maps.depth_m[rows]), torch.from_numpy(maps.intensity[rows])
-        image = torch.from_numpy(maps.image[rows].astype(np.float32))[:, None]
-        mirrored = torch.rand(len(rows), generator=generator) < 0.5
-        depth, intensity, image = flip_some([depth, intensity, image], mirrored)
-        yield MapBatch(depth, intensity, image, index, mirrored)
+        row = index.numpy()
+        chosen = MapSet(maps.depth_m[row], maps.intensity[row], maps.image[row])
+        yield as_batch(chosen, row, (torch.rand(len(row), generator=generator) < 0.5).numpy())

@@ -12,7 +12,15 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from nlos_cam.errors import OutputExistsError
@@ -46,9 +54,9 @@ def show(table: Table) -> None:
 
 
 @contextmanager
-def progress() -> Generator[Progress]:
-    """A progress bar on stderr."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+def progress(*others: ProgressColumn) -> Generator[Progress]:
+    """A progress bar on stderr, with further columns."""
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *others, TimeElapsedColumn()
     with Progress(*columns, TimeRemainingColumn(), console=stderr, transient=True) as bar:
         yield bar
 

@@ -1,14 +1,54 @@
 """`dataset build`: objects and renderer to training maps."""
 
 import os
+import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from nlos_calibration.wall_record import rig_named
+from rich.progress import ProgressColumn, Task
+from rich.text import Text
 
 from nlos_cam import dataset
-from nlos_cam.cli.common import PAPER_RIG, Json, finish, tracked
+from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say
+from nlos_cam.render.accuracy import accuracy_named
+from nlos_cam.render.scene_file import load_scene
+
+PROCEDURAL = "procedural"
+
+Out = Annotated[Path, typer.Option("--out", help="The dataset's folder; shards that are there are kept.")]
+Count = Annotated[int, typer.Option("--count", min=1, help="Objects in all.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the first object; the others follow.")]
+RigName = Annotated[
+    str | None, typer.Option("--rig", help=f"A packaged rig's name, or a rig's TOML file.  [default: {PAPER_RIG}]")
+]
+SceneToml = Annotated[
+    Path | None, typer.Option("--scene", help="A scene.toml: its rig, sensor, radiometry and material, not its object.")
+]
+HiddenObjects = Annotated[
+    str, typer.Option("--objects", help=f"`{PROCEDURAL}`, or a folder of meshes (.obj, .stl, .ply) and its subfolders.")
+]
+LeftOut = Annotated[str, typer.Option("--without", help="Categories to leave out, by comma: hat,boat.")]
+Backgrounds = Annotated[
+    float, typer.Option("--backgrounds", min=0, max=1, help="Share of objects with a post or a panel beside them.")
+]
+SpreadMm = Annotated[
+    float, typer.Option("--rig-spread-mm", min=0, help="Each object's lidar and occluder are moved by up to this.")
+]
+SpreadDeg = Annotated[
+    float,
+    typer.Option("--rig-spread-deg", min=0, help="Each object's lidar is turned by up to this, in yaw and pitch."),
+]
+GainSpread = Annotated[
+    float, typer.Option("--gain-spread-percent", min=0, help="Each object's intensity gain differs by up to this.")
+]
+Stop = Annotated[str, typer.Option("--accuracy", help="draft, standard or fine.")]
+Workers = Annotated[int, typer.Option("--workers", min=1, help="Processes on this machine.")]
+RayAddress = Annotated[
+    str | None,
+    typer.Option("--ray", help="A Ray cluster does the work instead: auto, HOST:PORT, ray://HOST:PORT, local."),
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -20,15 +60,95 @@ def register(app: typer.Typer) -> None:
 
 
 def build(
-    out: Annotated[Path, typer.Option("--out", help="The dataset's folder; shards that are there are kept.")],
-    count: Annotated[int, typer.Option("--count", min=1, help="Objects in all.")],
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first object; the others follow.")] = 0,
-    rig: Annotated[str, typer.Option("--rig", help="A packaged rig's name, or a rig's TOML file.")] = PAPER_RIG,
-    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = os.cpu_count() or 1,
+    context: typer.Context,
+    out: Out,
+    count: Count,
+    seed: Seed = 0,
+    rig: RigName = None,
+    scene: SceneToml = None,
+    objects: HiddenObjects = PROCEDURAL,
+    without: LeftOut = "",
+    backgrounds: Backgrounds = 0.0,
+    rig_spread_mm: SpreadMm = 0.0,
+    rig_spread_deg: SpreadDeg = 0.0,
+    gain_spread_percent: GainSpread = 0.0,
+    accuracy: Stop = "standard",
+    workers: Workers = os.cpu_count() or 1,
+    ray: RayAddress = None,
     json: Json = False,
 ) -> None:
     """Render random objects into HDF5 shards; run it again after a stop and it goes on."""
-    plan = dataset.DatasetPlan(rig_named(rig), seed)
-    with tracked("rendering objects") as on_progress:
-        dataset.build(plan, count, out, workers=workers, on_progress=on_progress)
-    finish({"objects": count, "out": str(out)}, as_json=json, text=f"{count} objects in {out}")
+    kinds = _objects(objects, without, backgrounds)
+    spread = dataset.RigSpread(
+        place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100
+    )
+    others = {"accuracy": accuracy_named(accuracy).name, "objects": kinds, "spread": spread}
+    plan = _plan(rig, scene, seed, others)
+    built = _watched(plan, count, out, workers, ray, _command(context))
+    rate = built.made / built.seconds if built.made else None
+    facts = {"objects": built.objects, "made": built.made, "damaged": [str(path) for path in built.damaged]}
+    result = {**facts, "seconds": built.seconds, "objects_per_s": rate, "out": str(out)}
+    told = f", {built.made} made now at {rate:.1f} objects/s" if rate else ""
+    finish(result, as_json=json, text=f"{built.objects} objects in {out}{told}")
+
+
+def _objects(objects: str, without: str, backgrounds: float) -> dataset.Objects:
+    if objects == PROCEDURAL:
+        return dataset.Objects.without([name.strip() for name in without.split(",") if name.strip()], backgrounds)
+    if without or backgrounds:
+        raise typer.BadParameter("--without and --backgrounds are for procedural objects: leave them out")
+    return dataset.objects_of(Path(objects))
+
+
+def _plan(rig: str | None, scene: Path | None, seed: int, others: dict[str, Any]) -> dataset.DatasetPlan:
+    if scene is None:
+        return dataset.DatasetPlan(rig_named(rig or PAPER_RIG), seed, **others)
+    if rig is not None:
+        raise typer.BadParameter(f"{scene} has a rig of its own: leave out --rig")
+    return dataset.DatasetPlan.of_scene(load_scene(scene), seed, **others)
+
+
+def _command(context: typer.Context) -> str:
+    """The command as it could be given again, every option with its value."""
+    given = {name: value for name, value in context.params.items() if value is not None and name != "json"}
+    options = [part for name, value in given.items() for part in (f"--{name.replace('_', '-')}", str(value))]
+    return shlex.join(["nlos-cam", "dataset", "build", *options])
+
+
+class Rate(ProgressColumn):
+    """Objects per second, once it is known."""
+
+    def render(self, task: Task) -> Text:
+        """The column's text."""
+        return Text(f"{task.speed:.1f}/s" if task.speed else "")
+
+
+def _watched(
+    plan: dataset.DatasetPlan, count: int, out: Path, workers: int, ray: str | None, command: str
+) -> dataset.Built:
+    farm = None
+    if ray:
+        from nlos_cam.dataset_ray import cluster
+
+        farm = cluster(ray)
+    with progress(Rate()) as bar:
+        tasks = [bar.add_task(name, total=None, visible=False) for name in ("checking shards", "rendering objects")]
+
+        def shown(which: int, done: int, total: int) -> None:
+            bar.update(tasks[which], completed=done, total=total, visible=which == 1 or done < total)
+
+        try:
+            return dataset.build(
+                plan,
+                count,
+                out,
+                workers=workers,
+                on_progress=lambda done, total: shown(1, done, total),
+                on_check=lambda done, total: shown(0, done, total),
+                tell=say,
+                command=command,
+                farm=farm,
+            )
+        except KeyboardInterrupt:
+            say(f"stopped: finished shards are kept in {out}; give the same command to go on")
+            raise

@@ -1,19 +1,22 @@
 """A hidden object placed in the object box, and its depth map as the wall sees it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from math import radians
 
 import numpy as np
 from nlos_calibration.rig import ObjectBox
-from numpy.typing import NDArray
 from trimesh.transformations import euler_matrix
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.objects.backgrounds import with_background
 from nlos_cam.objects.categories import CATEGORIES
 from nlos_cam.objects.raster import orthographic_depth, share_outside
+from nlos_cam.objects.solids import Triangles
 
-Triangles = NDArray[np.float64]
+POSE_UNITS = 7
+"""Numbers that decide a pose."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,8 @@ class Pose:
 
 def category_triangles(category: str, seed: int) -> Triangles:
     """The triangles (n, 3, 3) of one variation of a category, in its own units. Raises SceneError if unknown."""
-    if category not in CATEGORIES:
-        raise SceneError(f"no object category {category!r}: choose one of {', '.join(CATEGORIES)}")
-    mesh = CATEGORIES[category](np.random.default_rng(seed))
-    return np.asarray(mesh.triangles, np.float64)
+    kind = CATEGORIES[_known([category])[0]]
+    return kind.make(**kind.drawn(np.random.default_rng(seed).random(len(kind.settings))))
 
 
 @dataclass(frozen=True)
@@ -96,26 +97,60 @@ def _room_m(pose: Pose, box: ObjectBox) -> float:
     return room_m
 
 
-def random_pose(generator: np.random.Generator, box: ObjectBox) -> Pose:
-    """A pose that keeps the whole object in the box: sizes of half to nine tenths of it, tilts to 20 degrees."""
+def pose_from(units: Sequence[float], box: ObjectBox) -> Pose:
+    """The pose that seven numbers in [0, 1] mean; it keeps the whole object in the box.
+
+    In turn: size (55 to 90 % of the box), tilts (to 15 and 20 degrees), turn (to 35), place, and distance (the object's
+    front is in the nearest 35 % of the box). Random poses are even over all of these.
+    """
+    size, tilt_x, tilt_y, turn_z, right, up, front = units
     width_m = min(box.x_max_m - box.x_min_m, box.y_max_m - box.y_min_m)
-    size_m = width_m * generator.uniform(0.55, 0.9)
-    tilt_x, tilt_y, turn_z = np.radians(generator.uniform([-15, -20, -35], [15, 20, 35]))
+    size_m = width_m * (0.55 + 0.35 * size)
     spare_m = (width_m - size_m) / 2
-    x_m, y_m = generator.uniform(-spare_m, spare_m, 2)
-    front_m = generator.uniform(0.0, 0.35) * (box.z_far_m - box.z_near_m)
-    return Pose(tilt_x, tilt_y, turn_z, size_m, x_m, y_m, front_m)
+    return Pose(
+        tilt_x_rad=radians(30 * tilt_x - 15),
+        tilt_y_rad=radians(40 * tilt_y - 20),
+        turn_z_rad=radians(70 * turn_z - 35),
+        size_m=size_m,
+        x_m=spare_m * (2 * right - 1),
+        y_m=spare_m * (2 * up - 1),
+        front_m=0.35 * front * (box.z_far_m - box.z_near_m),
+    )
 
 
-def object_depth(seed: int, box: ObjectBox, categories: Sequence[str] = tuple(CATEGORIES)) -> tuple[str, Float32]:
-    """One random object: its category and its depth map (64, 64) in metres, NaN background; the seed decides all."""
+def random_pose(generator: np.random.Generator, box: ObjectBox) -> Pose:
+    """A pose that keeps the whole object in the box, even over all that `pose_from` makes."""
+    return pose_from(generator.random(POSE_UNITS).tolist(), box)
+
+
+def object_depth(
+    seed: int, box: ObjectBox, categories: Sequence[str] | None = None, *, backgrounds: float = 0.0
+) -> tuple[str, Float32]:
+    """One random object: its category and its depth map (64, 64) in metres, NaN background; the seed decides all.
+
+    `categories` are those it is one of; without them, any. `backgrounds` is the share of objects that have a post or a
+    panel beside them: the objects stay the same. Raises SceneError where there is no category, or an unknown one.
+    """
     generator = np.random.default_rng([seed, OBJECT_PIXELS])
-    category = str(generator.choice(list(categories)))
+    category = str(generator.choice(_known(CATEGORIES if categories is None else categories)))
     triangles = category_triangles(category, int(generator.integers(2**31)))
-    return category, orthographic_depth(place(triangles, random_pose(generator, box), box), box)
+    depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
+    return category, with_background(depth_m, box, generator) if generator.random() < backgrounds else depth_m
 
 
-def object_depths(seeds: Sequence[int], box: ObjectBox) -> Iterator[Float32]:
-    """Depth maps (64, 64) of many random objects, in the order of their seeds."""
+def object_depths(
+    seeds: Sequence[int], box: ObjectBox, categories: Sequence[str] | None = None, *, backgrounds: float = 0.0
+) -> Iterator[Float32]:
+    """Depth maps (64, 64) of many random objects, in the order of their seeds; see `object_depth`."""
     for seed in seeds:
-        yield object_depth(seed, box)[1]
+        yield object_depth(seed, box, categories, backgrounds=backgrounds)[1]
+
+
+def _known(categories: Iterable[str]) -> list[str]:
+    names = list(categories)
+    if not names:
+        raise SceneError(f"no object category is left: choose some of {', '.join(CATEGORIES)}")
+    for name in names:
+        if name not in CATEGORIES:
+            raise SceneError(f"no object category {name!r}: choose one of {', '.join(CATEGORIES)}")
+    return names

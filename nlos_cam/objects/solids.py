@@ -1,7 +1,7 @@
-"""The few solids that objects are made of, as trimesh meshes; y is up, the wall looks along +z."""
+"""The few solids that objects are made of, as triangles (n, 3, 3); y is up, the wall looks along +z."""
 
 from collections.abc import Sequence
-from typing import cast
+from functools import cache
 
 import numpy as np
 import trimesh
@@ -10,47 +10,75 @@ from trimesh import transformations
 
 SECTIONS = 28
 
-Mesh = trimesh.Trimesh
-Vector = Sequence[float]
+Triangles = NDArray[np.float64]
+"""(n, 3, 3): triangles, corners, (x, y, z)."""
+Point = tuple[float, float]
 
 
-def at(mesh: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Mesh:
-    """The mesh moved by (x, y, z)."""
-    return mesh.apply_translation([x, y, z])
+def at(triangles: Triangles, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Triangles:
+    """The solid moved by (x, y, z)."""
+    return triangles + np.array([x, y, z])
 
 
-def turned(mesh: Mesh, axis: Vector, angle_deg: float) -> Mesh:
-    """The mesh turned about an axis through the origin."""
-    return mesh.apply_transform(transformations.rotation_matrix(np.radians(angle_deg), axis))
+def turned(triangles: Triangles, axis: Sequence[float], angle_deg: float) -> Triangles:
+    """The solid turned about an axis through the origin."""
+    turn = np.asarray(transformations.rotation_matrix(np.radians(angle_deg), axis))
+    return triangles @ turn[:3, :3].T
 
 
-def joined(*parts: Mesh) -> Mesh:
-    """One mesh of several; inner faces stay, since only the front is ever seen."""
-    return cast("Mesh", trimesh.util.concatenate(parts))
+def tipped(triangles: Triangles, angle_deg: float) -> Triangles:
+    """The solid with its top tipped towards the wall, as if seen from above by so much."""
+    return turned(triangles, (1, 0, 0), -angle_deg)
 
 
-def box(width: float, height: float, depth: float) -> Mesh:
+def joined(*parts: Triangles) -> Triangles:
+    """One solid of several; inner faces stay, since only the front is ever seen."""
+    return np.concatenate(parts)
+
+
+def box(width: float, height: float, depth: float) -> Triangles:
     """A box centred on the origin."""
-    return trimesh.creation.box(extents=(width, height, depth))
+    return _unit_box() * (width, height, depth)
 
 
-def ellipsoid(rx: float, ry: float, rz: float) -> Mesh:
+def ellipsoid(rx: float, ry: float, rz: float) -> Triangles:
     """An ellipsoid centred on the origin."""
-    return trimesh.creation.icosphere(subdivisions=3).apply_scale((rx, ry, rz))
+    return _unit_sphere(3) * (rx, ry, rz)
 
 
-def ring(radius: float, tube: float) -> Mesh:
-    """A torus in the x-y plane."""
-    return trimesh.creation.torus(radius, tube, major_sections=SECTIONS, minor_sections=12)
+def knob(radius: float, reach: float) -> Triangles:
+    """A small round thing centred on the origin that reaches so far towards the wall: a quarter as fine as others."""
+    return _unit_sphere(2) * (radius, radius, reach)
 
 
-def lathe(profile: Sequence[tuple[float, float]]) -> Mesh:
+def lathe(profile: Sequence[Point]) -> Triangles:
     """The solid that a profile of (radius, height) sweeps about the y axis."""
-    mesh = trimesh.creation.revolve(np.asarray(profile, float), sections=SECTIONS)
-    return turned(mesh, (1, 0, 0), -90)
+    angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)[:, None]
+    radius, height = np.asarray(profile, float).T
+    return _quilt(np.stack(np.broadcast_arrays(radius * np.cos(angle), height, radius * np.sin(angle)), axis=-1))
 
 
-def slab(corners: Sequence[tuple[float, float]], thickness: float) -> Mesh:
+def disc(radius: float, thickness: float) -> Triangles:
+    """A disc centred on the origin that faces the wall."""
+    half = thickness / 2
+    return turned(lathe([(0, -half), (radius, -half), (radius, half), (0, half)]), (1, 0, 0), -90)
+
+
+def ring(radius: float, tube: float) -> Triangles:
+    """A torus in the x-y plane."""
+    return arch(radius, tube, 360)
+
+
+def arch(radius: float, tube: float, angle_deg: float = 180.0) -> Triangles:
+    """The part of a torus in the x-y plane from the +x axis on, counter-clockwise seen with y up."""
+    along = np.linspace(0, np.radians(angle_deg), SECTIONS + 1)[:, None]
+    around = np.linspace(0, 2 * np.pi, 13)
+    distance = radius + tube * np.cos(around)
+    points = distance * np.cos(along), distance * np.sin(along), tube * np.sin(around)
+    return _quilt(np.stack(np.broadcast_arrays(*points), axis=-1))
+
+
+def slab(corners: Sequence[Point], thickness: float) -> Triangles:
     """A convex polygon of (x, y) corners in the x-y plane, given a thickness along z."""
     outline: NDArray[np.float64] = np.asarray(corners, float)
     n = len(outline)
@@ -59,4 +87,48 @@ def slab(corners: Sequence[tuple[float, float]], thickness: float) -> Mesh:
     fan = [(0, k, k + 1) for k in range(1, n - 1)]
     sides = [(k, (k + 1) % n, n + k) for k in range(n)] + [(n + k, (k + 1) % n, n + (k + 1) % n) for k in range(n)]
     faces = fan + [(n + a, n + b, n + c) for a, b, c in fan] + sides
-    return Mesh(np.vstack([front, back]), faces, process=False)
+    return np.vstack([front, back])[np.asarray(faces)]
+
+
+def bar(start: Point, end: Point, width: float, thickness: float) -> Triangles:
+    """A straight bar in the x-y plane from one point to another."""
+    (x0, y0), (x1, y1) = start, end
+    share = width / 2 / np.hypot(x1 - x0, y1 - y0)
+    u, v = (y0 - y1) * share, (x1 - x0) * share
+    return slab([(x0 - u, y0 - v), (x0 + u, y0 + v), (x1 + u, y1 + v), (x1 - u, y1 - v)], thickness)
+
+
+def pierced(width: float, height: float, hole: float, thickness: float) -> Triangles:
+    """A plate centred on the origin that faces the wall, with a round hole of radius `hole` in its middle."""
+    angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    edge = circle / np.abs(circle / (width / 2, height / 2)).max(axis=1, keepdims=True)
+    corners = np.array([[x, y] for x in (-1, 1) for y in (-1, 1)]) * (width / 2, height / 2)
+    for corner in corners:  # the nearest ray runs into the corner, or the plate would lack it
+        edge[np.linalg.norm(edge - corner, axis=1).argmin()] = corner
+    loops = [(hole * circle, -1), (edge, -1), (edge, 1), (hole * circle, 1), (hole * circle, -1)]
+    rings = [np.column_stack([loop, np.full(len(loop), side * thickness / 2)]) for loop, side in loops]
+    return _quilt(np.stack(rings, axis=1))
+
+
+def frame(width: float, height: float, border: float, thickness: float) -> Triangles:
+    """A rectangular frame centred on the origin that faces the wall: its border lies within the width and height."""
+    rail, post = box(width, border, thickness), box(border, height, thickness)
+    up, aside = (height - border) / 2, (width - border) / 2
+    return joined(at(rail, y=up), at(rail, y=-up), at(post, aside), at(post, -aside))
+
+
+@cache
+def _unit_box() -> Triangles:
+    return np.asarray(trimesh.creation.box().triangles, np.float64)
+
+
+@cache
+def _unit_sphere(subdivisions: int) -> Triangles:
+    return np.asarray(trimesh.creation.icosphere(subdivisions).triangles, np.float64)
+
+
+def _quilt(points: NDArray[np.float64]) -> Triangles:
+    """The surface through a grid of points (rows, columns, 3): two triangles for every four neighbours."""
+    a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
+    return np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(-1, 3, 3)

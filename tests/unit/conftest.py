@@ -17,6 +17,12 @@ from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import wall_record
 from rosbags.rosbag1 import Reader, Writer
 
+from nlos_cam.frames import Float32
+from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.hidden import Pose, place
+from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.settings import Category
+
 TOOLS = Path(__file__).parents[2] / "tools"
 DATA = "data/realsense_d435_depth_color_640x480.bag"
 
@@ -111,3 +117,15 @@ def exact_wall(
 @pytest.fixture(scope="session")
 def measured() -> Callable[..., MeasuredWall]:
     return exact_wall
+
+
+@pytest.fixture(scope="session")
+def straight_view() -> Callable[..., Float32]:
+    """The depth map of a category with its settings in the middle, but for those given, filling the paper's box."""
+    box = object_box(load_rig("paper-rig"))
+
+    def view(kind: Category, **changed: float) -> Float32:
+        settings = kind.drawn([0.5] * len(kind.settings)) | changed
+        return orthographic_depth(place(kind.make(**settings), Pose(size_m=0.24, front_m=0.0), box), box)
+
+    return view

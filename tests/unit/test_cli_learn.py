@@ -1,4 +1,4 @@
-"""`dataset build`, `train`, `evaluate`: from objects to weights to figures, in the small."""
+"""`train`, `evaluate`: from objects to weights to figures, in the small."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -84,34 +84,6 @@ def _train_compressor(made: Path, out: Path, **changes: str) -> int:
     names = {"recipe": "compressor.toml", "vae": "vae", "dataset": "data", "held-out": "held-out"} | changes
     options = [part for name, value in names.items() for part in (f"--{name}", str(made / value))]
     return main(["train", "compressor", *options, "--out", str(out), "--json"])
-
-
-def test_build_says_what_it_built_and_goes_on_where_it_was(
-    made: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(dataset, "_build_shard", lambda *_: pytest.fail("built again"))
-    out = str(made / "data")
-    assert main(["dataset", "build", "--out", out, "--count", "4", "--json"]) == 0
-    assert _last(capsys) == {"objects": 4, "out": out}
-    maps, plan = dataset.read(made / "data")
-    assert len(maps.image) == 4
-    assert (plan.rig, plan.first_seed) == (RIG, 0)
-
-
-def test_build_into_another_plans_folder_is_4(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["dataset", "build", "--out", str(made / "data"), "--count", "4", "--seed", "7", "--json"]) == 4
-    assert _last(capsys)["error"]["type"] == "RecordingError"
-
-
-def test_build_needs_a_rig_with_a_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["dataset", "build", "--out", str(tmp_path / "d"), "--count", "1", "--workers", "1"]
-    assert main([*arguments, "--rig", "bare-wall"]) == 1
-    assert "object_box" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("count", ["0", "-1", "many"])
-def test_build_of_no_objects_is_wrong_usage(tmp_path: Path, count: str) -> None:
-    assert main(["dataset", "build", "--out", str(tmp_path / "d"), "--count", count]) == 2
 
 
 def test_a_trained_vae_has_weights_a_log_and_a_record(made: Path) -> None:

@@ -1,33 +1,224 @@
-"""Datasets: the same arrays for any number of workers and after any stop; other plans and broken shards are refused."""
+"""Builds: the same shards for any workers, in any order and after any stop; damage is made anew, others are refused."""
 
+import os
 from collections.abc import Callable
 from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from multiprocessing import active_children
 from pathlib import Path
 from typing import Any, Self
 
-import h5py
 import numpy as np
 import pytest
+from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
-from nlos_models.data import MapSet
 
 from nlos_cam import dataset
-from nlos_cam.dataset import DatasetPlan, build, procedural_images, read, sense_object
-from nlos_cam.errors import RecordingError, SceneError
-from nlos_cam.objects.depth_image import image_from_depth
-from nlos_cam.objects.hidden import object_depth
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.dataset import Built, DatasetPlan, build, open_dataset, processes
+from nlos_cam.dataset_lock import LOCK, only_builder
+from nlos_cam.dataset_samples import make_samples
+from nlos_cam.dataset_shards import SHARDS, store
+from nlos_cam.errors import (
+    DiskFullError,
+    FolderBusyError,
+    OutputExistsError,
+    RecordingError,
+    SceneError,
+    WorkersLostError,
+)
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft")
-COUNT, SHARD = 6, 2
+COUNT, SHARD, PIECE = 23, 5, 2
+LAST = "shard-000000060.h5"
+
+
+@pytest.fixture(autouse=True)
+def _small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset, "SHARD", SHARD)
+    monkeypatch.setattr(dataset, "PIECE", PIECE)
+
+
+def _build(folder: Path, farm: FakeFarm | None = None, count: int = COUNT, **others: Any) -> Built:
+    options = {"workers": 1, "on_progress": lambda *_: None, "farm": farm or FakeFarm(), **others}
+    return build(options.pop("plan", PLAN), count, folder, **options)
+
+
+def _bytes(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("*") if not path.name.startswith(".")}
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> dict[str, bytes]:
+    """The shards of a build that nothing disturbed."""
+    _build(tmp_path / "whole")
+    return _bytes(tmp_path / "whole")
+
+
+def test_it_holds_the_samples_of_its_seeds_in_order(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    built = _build(tmp_path, on_progress=lambda done, total: seen.append((done, total)))
+    found = open_dataset(tmp_path)
+    assert (built.objects, built.made, built.damaged) == (COUNT, COUNT, ())
+    assert (len(found), found.plan) == (COUNT, PLAN)
+    for name, values in samples_of(range(40, 40 + COUNT)).items():
+        np.testing.assert_array_equal(found.column(name), values)
+    assert [done for done, _ in seen] == [0, 2, 4, 5, 7, 9, 10, 12, 14, 15, 17, 19, 20, 22, 23]
+    assert {total for _, total in seen} == {COUNT}
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_any_order_makes_the_same_shards(tmp_path: Path, whole: dict[str, bytes], order: int) -> None:
+    _build(tmp_path / "other", FakeFarm(order))
+    assert _bytes(tmp_path / "other") == whole
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 3, 7, 11, 13])
+@pytest.mark.parametrize("order", [None, 3])
+def test_a_stop_anywhere_costs_no_finished_shard(
+    tmp_path: Path, whole: dict[str, bytes], after: int, order: int | None
+) -> None:
+    """And the second run makes what is missing, nothing twice."""
+    folder, farm = tmp_path / "stopped", FakeFarm(order, fails_after=after)
+    with pytest.raises(KeyboardInterrupt):
+        _build(folder, farm)
+    assert farm.closed
+    kept = _bytes(folder)
+    assert kept.items() <= whole.items()
+    if order is None:
+        assert len(kept) == after // 3  # three pieces make a shard
+    rest = FakeFarm()
+    built = _build(folder, rest)
+    assert _bytes(folder) == whole
+    again = [seed for piece in rest.made for seed in piece]
+    assert len(again) == len(set(again)) == built.made == COUNT - sum(3 if name == LAST else 5 for name in kept)
+
+
+def test_the_error_of_an_object_is_the_error_of_the_build(tmp_path: Path) -> None:
+    farm = FakeFarm(fails_after=4, error=SceneError("cup.stl shows nothing"))
+    with pytest.raises(SceneError, match=r"cup\.stl"):
+        _build(tmp_path, farm)
+    assert farm.closed
+    assert len(_bytes(tmp_path)) == 1
+
+
+def test_what_a_kill_left_half_written_is_cleaned_away_and_never_counted(
+    tmp_path: Path, whole: dict[str, bytes]
+) -> None:
+    folder = tmp_path / "killed"
+    _build(folder, count=10)
+    content = (folder / "shard-000000040.h5").read_bytes()
+    (folder / "shard-000000045.h5").rename(folder / "shard-000000045.part")
+    (folder / "shard-000000050.part").write_bytes(content[:100])
+    assert len(open_dataset(folder)) == 5
+    _build(folder)
+    assert _bytes(folder) == whole
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.99])
+def test_a_damaged_shard_is_made_anew_and_told(tmp_path: Path, whole: dict[str, bytes], keep: float) -> None:
+    folder, told = tmp_path / "whole", list[str]()
+    path = folder / "shard-000000045.h5"
+    path.write_bytes(whole[path.name][: int(keep * len(whole[path.name]))])
+    built = _build(folder, tell=told.append)
+    assert told == [f"{path} is damaged: it is made anew"]
+    assert (built.made, built.damaged) == (5, (path,))
+    assert _bytes(folder) == whole
+
+
+def test_a_damaged_shard_beyond_the_count_is_told_and_left(tmp_path: Path, whole: dict[str, bytes]) -> None:
+    del whole
+    folder, told = tmp_path / "whole", list[str]()
+    (folder / "shard-000000060.h5").write_bytes(b"")
+    built = _build(folder, count=10, tell=told.append)
+    assert (built.made, built.damaged) == (0, ())
+    assert len(told) == 1
+    assert "shard-000000060.h5 is damaged" in told[0]
+
+
+def test_a_whole_dataset_is_left_alone(tmp_path: Path, whole: dict[str, bytes]) -> None:
+    farm, checked = FakeFarm(), list[tuple[int, int]]()
+    built = _build(tmp_path / "whole", farm, on_check=lambda done, total: checked.append((done, total)))
+    assert (farm.made, built.made) == ([], 0)
+    assert checked == [(k, 5) for k in range(1, 6)]
+    assert _bytes(tmp_path / "whole") == whole
+
+
+@pytest.mark.parametrize("first", [1, 5, 7, 22])
+def test_a_dataset_grows_to_the_count_asked_for(tmp_path: Path, whole: dict[str, bytes], first: int) -> None:
+    """7 objects leave a shard half full: asking for more must not take it for a whole one."""
+    _build(tmp_path / "grown", count=first)
+    assert len(open_dataset(tmp_path / "grown")) == first
+    assert _build(tmp_path / "grown").made == COUNT - first // 5 * 5
+    assert _bytes(tmp_path / "grown") == whole
+
+
+def test_another_plan_is_refused_and_says_in_what(tmp_path: Path, whole: dict[str, bytes]) -> None:
+    other = replace(PLAN, accuracy="fine", rig=PLAN.rig.model_copy(update={"name": "other"}))
+    with pytest.raises(RecordingError, match=r"another rig, accuracy: choose another --out"):
+        _build(tmp_path / "whole", plan=other)
+    assert _bytes(tmp_path / "whole") == whole
+
+
+def test_a_newer_programs_shard_is_not_taken_for_a_damaged_one(tmp_path: Path) -> None:
+    newer = PLAN.provenance.replace('{"rig"', '{"lens": 1, "rig"', 1)
+    store(tmp_path / "shard-000000040.h5", samples_of(range(40, 45)), newer, "")
+    before = _bytes(tmp_path)
+    with pytest.raises(RecordingError, match="'lens', which this nlos-cam does not know: update it"):
+        _build(tmp_path)
+    assert _bytes(tmp_path) == before
+
+
+def test_shards_of_another_size_are_refused(
+    tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset, "SHARD", 4)
+    with pytest.raises(RecordingError, match="holds 5 objects, not up to 4"):
+        _build(tmp_path / "whole")
+    assert _bytes(tmp_path / "whole") == whole
+
+
+def test_two_builds_at_once_are_refused(tmp_path: Path) -> None:
+    with only_builder(tmp_path), pytest.raises(FolderBusyError, match=f"process {os.getpid()}"):
+        _build(tmp_path)
+    _build(tmp_path)
+    assert (tmp_path / LOCK).exists()
+
+
+def test_a_full_disk_keeps_the_shards_so_far(
+    tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stores: list[Path] = []
+
+    def full(path: Path, *others: Any) -> None:
+        stores.append(path)
+        if len(stores) == 3:
+            raise DiskFullError(f"no room for {path}")
+        store(path, *others)
+
+    monkeypatch.setattr(dataset, "store", full)
+    farm = FakeFarm()
+    with pytest.raises(DiskFullError):
+        _build(tmp_path / "full", farm)
+    assert farm.closed
+    assert len(list((tmp_path / "full").glob(SHARDS))) == 2
+    _build(tmp_path / "full")
+    assert _bytes(tmp_path / "full") == whole
+
+
+def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("here")
+    with pytest.raises(OutputExistsError, match="choose another --out"):
+        _build(tmp_path / "file")
 
 
 class InThisProcess:
-    """Stands for a pool of processes: starting those takes seconds, and one test does."""
+    """Stands for a pool of processes, which may be killed after some pieces."""
 
-    def __init__(self, *_: object, **__: object) -> None:
-        pass
+    dies_after: list[int]
+
+    def __init__(self, workers: int, **_: object) -> None:
+        self.workers, self.left = workers, self.dies_after.pop(0)
 
     def __enter__(self) -> Self:
         return self
@@ -37,167 +228,47 @@ class InThisProcess:
 
     def submit(self, work: Callable[..., Any], *arguments: Any) -> Future[Any]:
         future: Future[Any] = Future()
-        future.set_result(work(*arguments))
+        if self.left:
+            self.left -= 1
+            future.set_result(work(*arguments))
+        else:
+            future.set_exception(BrokenProcessPool("killed"))
         return future
 
 
-@pytest.fixture(autouse=True)
-def _small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "SHARD", SHARD)
-
-
 @pytest.fixture
-def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "ProcessPoolExecutor", InThisProcess)
+def dying(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    def dies(*after: int) -> None:
+        monkeypatch.setattr(InThisProcess, "dies_after", [*after], raising=False)
+        monkeypatch.setattr(dataset, "ProcessPoolExecutor", InThisProcess)
+        monkeypatch.setattr(dataset, "make_samples", lambda _, piece: samples_of(piece))
+
+    return dies
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("dataset")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "SHARD", SHARD)
-        patch.setattr(dataset, "ProcessPoolExecutor", InThisProcess)
-        build(PLAN, COUNT, folder, workers=1, on_progress=lambda *_: None)
-    return folder
+def test_a_killed_worker_is_replaced(tmp_path: Path, whole: dict[str, bytes], dying: Callable[..., None]) -> None:
+    dying(1, 4, 100)
+    _build(tmp_path / "other", farm=processes(2))
+    assert _bytes(tmp_path / "other") == whole
 
 
-@pytest.fixture
-def copied(built: Path, tmp_path: Path) -> Path:
-    for shard in built.iterdir():
-        (tmp_path / shard.name).write_bytes(shard.read_bytes())
-    return tmp_path
+def test_workers_that_die_at_once_end_the_build_with_what_is_kept(
+    tmp_path: Path, whole: dict[str, bytes], dying: Callable[..., None]
+) -> None:
+    dying(7, 0)
+    with pytest.raises(WorkersLostError, match=r"finished shards are kept.*fewer --workers"):
+        _build(tmp_path / "other", farm=processes(2))
+    assert 0 < len(_bytes(tmp_path / "other")) <= 2
+    dying(100)
+    _build(tmp_path / "other", farm=processes(2))
+    assert _bytes(tmp_path / "other") == whole
 
 
-def _rebuild(folder: Path, count: int = COUNT, plan: DatasetPlan = PLAN) -> list[tuple[int, int]]:
-    seen: list[tuple[int, int]] = []
-    build(plan, count, folder, workers=1, on_progress=lambda done, total: seen.append((done, total)))
-    return seen
-
-
-def _assert_same(one: MapSet, other: MapSet) -> None:
-    for name in dataset.MAP_CHANNELS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
-def test_two_processes_make_the_same_arrays(built: Path, tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    build(PLAN, COUNT, tmp_path, workers=2, on_progress=lambda done, total: seen.append((done, total)))
-    _assert_same(read(tmp_path)[0], read(built)[0])
-    assert seen == [(0, 6), (2, 6), (4, 6), (6, 6)]
-
-
-def test_it_holds_the_objects_of_its_seeds_in_order(built: Path) -> None:
-    maps, plan = read(built)
-    assert plan == PLAN
-    assert maps.depth_m.shape == maps.intensity.shape == (COUNT, 64, 80)
-    assert maps.image.shape == (COUNT, 64, 64)
-    assert maps.image.dtype == np.float16
-    np.testing.assert_array_equal(maps.image, procedural_images(PLAN.first_seed, COUNT, PLAN.box))
-    sensor = Sensor(PLAN.rig, PLAN.sensor)
-    for k in (0, COUNT - 1):
-        seed = PLAN.first_seed + k
-        sensed = sense_object(object_depth(seed, PLAN.box)[1], sensor, seed, "draft")
-        np.testing.assert_array_equal(maps.depth_m[k], sensed.depth_m)
-        np.testing.assert_array_equal(maps.intensity[k], sensed.intensity)
-
-
-def test_a_shard_says_what_it_is(built: Path) -> None:
-    shards = sorted(built.iterdir())
-    assert len(shards) == COUNT // SHARD
-    with h5py.File(shards[1]) as file:
-        assert file.attrs["plan"] == PLAN.provenance
-        assert file["seed"][:].tolist() == [42, 43]
-        names = [category.decode() for category in file["category"][:]]
-        assert names == [object_depth(seed, PLAN.box)[0] for seed in (42, 43)]
-        for image, depth in zip(file["image"], file["object_depth_m"], strict=True):
-            np.testing.assert_array_equal(image, image_from_depth(depth, PLAN.box).astype(np.float16))
-
-
-@pytest.mark.usefixtures("in_this_process")
-def test_a_missing_shard_is_made_again_and_the_others_are_kept(built: Path, copied: Path) -> None:
-    first, second, third = sorted(copied.iterdir())
-    second.unlink()
-    (copied / f"{second.stem}.part").write_bytes(b"a kill left this")
-    times = first.stat().st_mtime_ns, third.stat().st_mtime_ns
-    assert _rebuild(copied) == [(4, 6), (6, 6)]
-    assert (first.stat().st_mtime_ns, third.stat().st_mtime_ns) == times
-    assert sorted(copied.iterdir()) == [first, second, third]
-    _assert_same(read(copied)[0], read(built)[0])
-
-
-@pytest.mark.usefixtures("in_this_process")
-def test_a_whole_dataset_is_left_alone(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "_build_shard", lambda *_: pytest.fail("built again"))
-    assert _rebuild(copied) == [(6, 6)]
-
-
-@pytest.mark.usefixtures("in_this_process")
-def test_a_dataset_grows_to_the_count_asked_for(built: Path, tmp_path: Path) -> None:
-    """3 objects leave a shard half full: asking for 6 must not take it for a whole one."""
-    _rebuild(tmp_path, count=3)
-    assert len(read(tmp_path)[0].image) == 3
-    _rebuild(tmp_path, count=6)
-    _assert_same(read(tmp_path)[0], read(built)[0])
-
-
-@pytest.mark.usefixtures("in_this_process")
-@pytest.mark.parametrize("change", ["rig", "first_seed", "sensor", "accuracy"])
-def test_another_plan_is_refused(copied: Path, change: str) -> None:
-    rig, sensor, seed, accuracy = PLAN.rig, PLAN.sensor, PLAN.first_seed, PLAN.accuracy
-    if change == "rig":
-        rig = rig.model_copy(update={"name": "other"})
-    if change == "sensor":
-        sensor = SensorModel(shot_noise=0)
-    other = DatasetPlan(rig, seed + (change == "first_seed"), sensor, "fine" if change == "accuracy" else accuracy)
-    before = sorted(copied.iterdir())
-    with pytest.raises(RecordingError, match="choose another --out"):
-        _rebuild(copied, plan=other)
-    assert sorted(copied.iterdir()) == before
-
-
-@pytest.mark.parametrize("harm", ["empty", "text", "truncated", "channel"])
-def test_a_corrupt_shard_says_which_and_what_to_do(copied: Path, harm: str) -> None:
-    shard = sorted(copied.iterdir())[1]
-    if harm == "channel":
-        with h5py.File(shard, "a") as file:
-            del file["intensity"]
-    else:
-        whole = shard.read_bytes()
-        shard.write_bytes({"empty": b"", "text": b"not HDF5 at all", "truncated": whole[: len(whole) // 2]}[harm])
-    with pytest.raises(RecordingError, match=rf"{shard.name}.*delete it and build again"):
-        read(copied)
-
-
-@pytest.mark.usefixtures("in_this_process")
-def test_a_corrupt_first_shard_stops_a_build_with_the_same_words(copied: Path) -> None:
-    shard = min(copied.iterdir())
-    shard.write_bytes(b"")
-    with pytest.raises(RecordingError, match=rf"{shard.name}.*delete it and build again"):
-        _rebuild(copied)
-
-
-def test_no_dataset_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="nlos-cam dataset build"):
-        read(tmp_path)
-
-
-def test_a_failing_object_ends_the_build_with_its_error(tmp_path: Path) -> None:
-    """Through a real pool: the error of a worker is the error of the build."""
-    with pytest.raises(SceneError, match="no accuracy 'wrong'"):
-        build(DatasetPlan(PLAN.rig, 0, accuracy="wrong"), 2, tmp_path, workers=1, on_progress=lambda *_: None)
-    assert not list(tmp_path.glob("*.h5"))
-
-
-def test_a_rig_without_a_box_has_nowhere_to_hide_objects() -> None:
-    with pytest.raises(SceneError, match="object_box"):
-        _ = DatasetPlan(load_rig("bare-wall"), 0).box
-
-
-def test_the_noise_of_an_object_is_its_own() -> None:
-    sensor, depth = Sensor(PLAN.rig, PLAN.sensor), object_depth(0, PLAN.box)[1]
-    first, again, other = (sense_object(depth, sensor, seed, "draft") for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first.depth_m, again.depth_m)
-    assert not np.array_equal(first.depth_m, other.depth_m, equal_nan=True)
+def test_real_processes_make_what_this_one_makes_and_leave_nobody(tmp_path: Path) -> None:
+    build(PLAN, 4, tmp_path, workers=2, on_progress=lambda *_: None)
+    for name, values in make_samples(PLAN, range(40, 44)).items():
+        np.testing.assert_array_equal(open_dataset(tmp_path).column(name), values)
+    assert not active_children()
 
 
 def test_seeds_of_the_three_kinds_are_far_apart() -> None:

@@ -7,7 +7,17 @@ from nlos_calibration.rig import ObjectBox, load_rig
 from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.hidden import Pose, category_triangles, fit, object_depth, object_depths, place, random_pose
+from nlos_cam.objects.hidden import (
+    POSE_UNITS,
+    Pose,
+    category_triangles,
+    fit,
+    object_depth,
+    object_depths,
+    place,
+    pose_from,
+    random_pose,
+)
 
 BOX = load_rig("paper-rig").object_box
 CUP = category_triangles("cup", 0)
@@ -90,11 +100,53 @@ def test_training_held_out_and_test_objects_are_different_objects() -> None:
 
 
 def test_every_category_comes_up() -> None:
-    assert {object_depth(seed, BOX)[0] for seed in range(80)} == set(CATEGORIES)
+    assert {object_depth(seed, BOX)[0] for seed in range(250)} == set(CATEGORIES)
 
 
 def test_a_choice_of_categories_is_kept_to() -> None:
     assert {object_depth(seed, BOX, ("cup", "hat"))[0] for seed in range(12)} == {"cup", "hat"}
+    for seed, depth in zip((5, 6), object_depths((5, 6), BOX, ["boat"]), strict=True):
+        np.testing.assert_array_equal(depth, object_depth(seed, BOX, ["boat"])[1])
+
+
+def test_all_categories_and_no_choice_are_the_same() -> None:
+    for seed in range(5):
+        np.testing.assert_array_equal(object_depth(seed, BOX, tuple(CATEGORIES))[1], object_depth(seed, BOX)[1])
+
+
+def test_no_category_and_an_unknown_one_are_refused() -> None:
+    with pytest.raises(SceneError, match="no object category is left"):
+        object_depth(0, BOX, ())
+    with pytest.raises(SceneError, match="'teapot'"):
+        object_depth(0, BOX, ("cup", "teapot"))
+
+
+def test_a_share_of_backgrounds_is_a_share_and_leaves_the_objects_as_they_are() -> None:
+    """The more, the more: each has its own from some share on, and keeps it."""
+    seeds = range(40)
+    alone, some, each = (list(object_depths(seeds, BOX, backgrounds=share)) for share in (0.0, 0.3, 1.0))
+    has = [not np.array_equal(a, s, equal_nan=True) for a, s in zip(alone, some, strict=True)]
+    assert 4 <= sum(has) <= 20
+    for thing, with_some, with_each, seed_has in zip(alone, some, each, has, strict=True):
+        surface = ~np.isnan(thing)
+        np.testing.assert_array_equal(with_each[surface], thing[surface])
+        np.testing.assert_array_equal(with_some, with_each if seed_has else thing)
+
+
+def test_a_pose_of_seven_numbers_reaches_the_ends_of_training_and_keeps_in_the_box() -> None:
+    least, most = pose_from([0.0] * POSE_UNITS, BOX), pose_from([1.0] * POSE_UNITS, BOX)
+    assert (least.size_m, most.size_m) == (pytest.approx(0.55 * 0.25), pytest.approx(0.9 * 0.25))
+    assert (least.turn_z_rad, most.turn_z_rad) == (pytest.approx(-np.radians(35)), pytest.approx(np.radians(35)))
+    assert (least.front_m, most.front_m) == (0, pytest.approx(0.35 * 0.28))
+    for pose in (least, most):
+        assert abs(pose.x_m) + pose.size_m / 2 == pytest.approx(0.125)
+        assert abs(pose.y_m) + pose.size_m / 2 == pytest.approx(0.125)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_random_pose_is_seven_random_numbers(seed: int) -> None:
+    units = np.random.default_rng(seed).random(POSE_UNITS).tolist()
+    assert random_pose(np.random.default_rng(seed), BOX) == pose_from(units, BOX)
 
 
 def test_depths_are_within_the_box() -> None:

@@ -1,55 +1,147 @@
-"""The solids have the sizes and the axes that they say."""
+"""The solids have the sizes and the axes that they say, and are closed where a solid is."""
 
 import numpy as np
 import pytest
 
-from nlos_cam.objects.solids import Mesh, at, box, ellipsoid, joined, lathe, ring, slab, turned
+from nlos_cam.objects.solids import (
+    Triangles,
+    arch,
+    at,
+    bar,
+    box,
+    disc,
+    ellipsoid,
+    frame,
+    joined,
+    knob,
+    lathe,
+    pierced,
+    ring,
+    slab,
+    tipped,
+    turned,
+)
 
 
-def _extents(mesh: Mesh) -> list[float]:
-    return pytest.approx(np.ptp(mesh.vertices, axis=0).tolist(), rel=0.02)
+def _extents(solid: Triangles) -> list[float]:
+    return pytest.approx(np.ptp(solid.reshape(-1, 3), axis=0).tolist(), rel=0.02)
+
+
+def _middle(solid: Triangles) -> np.ndarray:
+    points = solid.reshape(-1, 3)
+    return (points.min(0) + points.max(0)) / 2
+
+
+def _area(solid: Triangles) -> float:
+    return float(np.linalg.norm(np.cross(solid[:, 1] - solid[:, 0], solid[:, 2] - solid[:, 0]), axis=1).sum() / 2)
 
 
 def test_sizes_are_along_the_axes_named() -> None:
     assert _extents(box(0.1, 0.2, 0.3)) == [0.1, 0.2, 0.3]
     assert _extents(ellipsoid(0.1, 0.2, 0.3)) == [0.2, 0.4, 0.6]
+    assert _extents(knob(0.1, 0.3)) == [0.2, 0.2, 0.6]
     assert _extents(ring(0.2, 0.05)) == [0.5, 0.5, 0.1]
+    assert _extents(disc(0.2, 0.05)) == [0.4, 0.4, 0.05]
+    assert _extents(frame(0.5, 0.4, 0.1, 0.05)) == [0.5, 0.4, 0.05]
+    assert _extents(pierced(0.5, 0.4, 0.1, 0.05)) == [0.5, 0.4, 0.05]
     assert _extents(slab([(0, 0), (0.4, 0), (0.4, 0.3), (0, 0.3)], 0.1)) == [0.4, 0.3, 0.1]
 
 
 def test_solids_are_centred_where_they_should_be() -> None:
-    for solid in (box(0.1, 0.2, 0.3), ellipsoid(0.1, 0.2, 0.3), ring(0.2, 0.05)):
-        np.testing.assert_allclose(solid.bounds.sum(0), 0, atol=1e-3)
-    flat = slab([(0, 0), (0.4, 0), (0.4, 0.3)], 0.1)
-    np.testing.assert_allclose(flat.bounds, [[0, 0, -0.05], [0.4, 0.3, 0.05]])
+    for solid in (
+        box(0.1, 0.2, 0.3),
+        ellipsoid(0.1, 0.2, 0.3),
+        knob(0.1, 0.3),
+        ring(0.2, 0.05),
+        disc(0.2, 0.05),
+        frame(0.5, 0.4, 0.1, 0.05),
+        pierced(0.5, 0.4, 0.1, 0.05),
+    ):
+        np.testing.assert_allclose(_middle(solid), 0, atol=1e-3)
+    flat = slab([(0, 0), (0.4, 0), (0.4, 0.3)], 0.1).reshape(-1, 3)
+    np.testing.assert_allclose([flat.min(0), flat.max(0)], [[0, 0, -0.05], [0.4, 0.3, 0.05]])
 
 
 def test_a_lathe_turns_its_profile_about_y() -> None:
-    mesh = lathe([(0, -0.2), (0.3, -0.2), (0.1, 0.5), (0, 0.5)])
-    x, y, z = mesh.vertices.T
+    x, y, z = lathe([(0, -0.2), (0.3, -0.2), (0.1, 0.5), (0, 0.5)]).reshape(-1, 3).T
     assert (y.min(), y.max()) == (pytest.approx(-0.2), pytest.approx(0.5))
     radius = np.hypot(x, z)
     assert radius[np.isclose(y, -0.2)].max() == pytest.approx(0.3)
     assert radius[np.isclose(y, 0.5)].max() == pytest.approx(0.1)
 
 
-def test_a_slab_is_closed() -> None:
-    mesh = slab([(0, 0), (0.4, 0), (0.5, 0.2), (0.4, 0.3), (0, 0.3)], 0.1)
-    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+@pytest.mark.parametrize("angle", [90.0, 180.0, 270.0])
+def test_an_arch_is_its_share_of_a_ring_from_the_x_axis_on(angle: float) -> None:
+    part = arch(0.4, 0.05, angle)
+    assert _area(part) == pytest.approx(_area(ring(0.4, 0.05)) * angle / 360, rel=0.01)
+    assert part[..., 0].max() == pytest.approx(0.45)
+    assert arch(0.4, 0.05, 180)[..., 1].min() == pytest.approx(0, abs=1e-9)
+    x, y, z = part.reshape(-1, 3).T
+    np.testing.assert_allclose(np.hypot(np.hypot(x, y) - 0.4, z), 0.05)
+
+
+@pytest.mark.parametrize(
+    "solid",
+    [
+        box(1, 2, 3),
+        ellipsoid(0.1, 0.2, 0.3),
+        ring(0.3, 0.1),
+        disc(0.3, 0.1),
+        pierced(0.5, 0.4, 0.1, 0.05),
+        slab([(0, 0), (0.4, 0), (0.5, 0.2), (0.4, 0.3), (0, 0.3)], 0.1),
+        lathe([(0, 0), (0.3, 0), (0.2, 0.5), (0, 0.5)]),
+        bar((0, 0), (1, 1), 0.1, 0.2),
+    ],
+)
+def test_a_solid_is_closed(solid: Triangles) -> None:
+    """Every edge belongs to two triangles, but for those that a lathe's axis makes points."""
+    corners, index = np.unique(np.round(solid.reshape(-1, 3), 9), axis=0, return_inverse=True)
+    faces = index.reshape(-1, 3)
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     _, times = np.unique(edges, axis=0, return_counts=True)
+    assert len(corners) > 4
     assert (times == 2).all()
-    assert mesh.area == pytest.approx(2 * 0.135 + 0.1 * (1.1 + np.hypot(0.1, 0.2) + np.hypot(0.1, 0.1)))
+
+
+def test_a_slab_has_the_area_of_its_sides() -> None:
+    solid = slab([(0, 0), (0.4, 0), (0.5, 0.2), (0.4, 0.3), (0, 0.3)], 0.1)
+    assert _area(solid) == pytest.approx(2 * 0.135 + 0.1 * (1.1 + np.hypot(0.1, 0.2) + np.hypot(0.1, 0.1)))
+
+
+@pytest.mark.parametrize(("width", "height", "hole"), [(0.5, 0.5, 0.1), (0.5, 0.2, 0.08), (0.3, 0.9, 0.14)])
+def test_a_pierced_plate_is_a_rectangle_but_for_its_hole(width: float, height: float, hole: float) -> None:
+    sides = 2 * (width + height) * 0.1 + 2 * np.pi * hole * 0.1
+    assert _area(pierced(width, height, hole, 0.1)) == pytest.approx(
+        2 * (width * height - np.pi * hole**2) + sides, rel=0.02
+    )
+
+
+def test_a_bar_runs_from_point_to_point() -> None:
+    solid = bar((0.1, 0.2), (0.4, 0.6), 0.06, 0.1)
+    assert _area(solid) == pytest.approx(2 * (0.5 * 0.06 + 0.5 * 0.1 + 0.06 * 0.1))
+    np.testing.assert_allclose(_middle(solid), [0.25, 0.4, 0], atol=1e-12)
+
+
+def test_a_frame_is_open_in_its_middle() -> None:
+    x, y, _ = frame(0.6, 0.4, 0.1, 0.2).reshape(-1, 3).T
+    assert ((np.abs(x) > 0.2 - 1e-9) | (np.abs(y) > 0.1 - 1e-9)).all()
 
 
 def test_moving_and_turning() -> None:
-    np.testing.assert_allclose(at(box(1, 1, 1), 1, 2, 3).bounds.mean(0), [1, 2, 3])
-    np.testing.assert_allclose(turned(at(box(1, 1, 1), x=2), (0, 0, 1), 90).bounds.mean(0), [0, 2, 0], atol=1e-12)
+    np.testing.assert_allclose(_middle(at(box(1, 1, 1), 1, 2, 3)), [1, 2, 3])
+    np.testing.assert_allclose(_middle(turned(at(box(1, 1, 1), x=2), (0, 0, 1), 90)), [0, 2, 0], atol=1e-12)
     there_and_back = turned(turned(box(1, 2, 3), (1, 0, 0), 35), (1, 0, 0), -35)
-    np.testing.assert_allclose(there_and_back.vertices, box(1, 2, 3).vertices, atol=1e-12)
+    np.testing.assert_allclose(there_and_back, box(1, 2, 3), atol=1e-12)
+
+
+def test_tipping_brings_the_top_to_the_wall() -> None:
+    top = tipped(at(box(0.1, 0.1, 0.1), y=1), 30)
+    np.testing.assert_allclose(_middle(top), [0, np.cos(np.radians(30)), -0.5], atol=1e-12)
 
 
 def test_joining_keeps_every_triangle() -> None:
     parts = box(1, 1, 1), at(ellipsoid(1, 1, 1), 5), ring(1, 0.1)
-    mesh = joined(*parts)
-    assert len(mesh.faces) == sum(len(part.faces) for part in parts)
-    assert mesh.bounds[1, 0] == pytest.approx(6, abs=0.01)
+    solid = joined(*parts)
+    assert len(solid) == sum(len(part) for part in parts)
+    assert solid[..., 0].max() == pytest.approx(6, abs=0.01)

@@ -143,7 +143,7 @@ def test_the_expected_maps_are_the_renderers_but_for_its_bins(
 
 def test_without_noise_the_chain_gives_the_expected_difference(scenes: ModuleType, noise: ModuleType) -> None:
     bench = scenes.Bench(scenes.paper_rig(5e-3), "paper", 1.0)
-    later = next(scenes.later_light(bench.rig, "paper", [2]))
+    later = next(scenes.later_light(bench.rig, "paper", [5]))
     quiet = noise.SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
     sensor = noise.Sensor(bench.rig, quiet)
     with_m, without_m = (noise.maps_of(sensor, bench.multi(light), [0])[0][0] for light in (later, None))

@@ -1,0 +1,192 @@
+"""What a dataset holds apart from how many: rig and how far it varies, sensor, surface, objects; kept as JSON."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from nlos_calibration.rig import NotNegative, ObjectBox, Record, Rig
+from pydantic import TypeAdapter
+
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.categories import CATEGORIES
+from nlos_cam.objects.depth_image import object_box
+from nlos_cam.render.patches import JUMP_M
+from nlos_cam.render.scene import Radiometry
+from nlos_cam.render.scene_file import RENDERING_VERSION, SceneFile
+from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.surface import Material
+
+OBJECTS_VERSION = 2
+"""Raised with any change of what a seed makes of its categories."""
+FIRST_OBJECTS = {
+    "version": 1,
+    "categories": (
+        *("airplane", "bell", "birdhouse", "boat", "bowl", "car"),
+        *("cup", "hat", "lamp", "rocket", "table", "tower"),
+    ),
+}
+"""Those of datasets from before their plan told."""
+SCENE_COLUMNS = (
+    "lidar_distance_m",
+    "lidar_yaw_deg",
+    "lidar_pitch_deg",
+    "occluder_x_m",
+    "occluder_gap_m",
+    "bare_wall_counts",
+)
+"""What may differ from object to object; NaN where there is no occluder."""
+_RIG_STREAM = 2
+"""Of an object's random numbers: its noise has stream 1."""
+
+
+class RigSpread(Record):
+    """How far the rig of each object lies from the plan's, at most: drawn evenly, by the object's seed."""
+
+    place_m: NotNegative = 0.0
+    """Of the lidar's distance, the occluder's place and its gap."""
+    angle_deg: NotNegative = 0.0
+    """Of yaw and pitch."""
+    gain_share: NotNegative = 0.0
+    """Of the counts of the brightest bare-wall return."""
+
+    def check(self, rig: Rig) -> None:
+        """Raise SceneError where a draw could leave what a rig can be."""
+        least_m = min(rig.lidar.distance_m, rig.occluder.z_min_m if rig.occluder else rig.lidar.distance_m)
+        if self.place_m >= least_m:
+            raise SceneError(f"a spread of {self.place_m * 1e3:g} mm reaches the wall: keep it below {least_m * 1e3:g}")
+        box, occluder = object_box(rig), rig.occluder
+        if occluder and occluder.x_m <= box.x_min_m < occluder.x_m + self.place_m:
+            free_mm = (box.x_min_m - occluder.x_m) * 1e3
+            raise SceneError(
+                f"a spread of {self.place_m * 1e3:g} mm moves the occluder into the object box: {free_mm:g} mm are free"
+            )
+        if self.angle_deg + max(abs(rig.lidar.yaw_deg), abs(rig.lidar.pitch_deg)) >= 90:
+            raise SceneError(f"a spread of {self.angle_deg:g} degrees turns the lidar away from the wall: lower it")
+        if self.gain_share >= 1:
+            raise SceneError(f"a gain spread of {self.gain_share:.0%} leaves no light: keep it below 100 %")
+
+    def drawn(self, rig: Rig, sensor: SensorModel, seed: int) -> tuple[Rig, SensorModel]:
+        """The rig and the sensor that one object is seen with; without a spread they are the given ones."""
+        if self == RigSpread():
+            return rig, sensor
+        distance, yaw, pitch, place, gap, gain = np.random.default_rng([seed, _RIG_STREAM]).uniform(-1, 1, 6).tolist()
+        lidar = rig.lidar.model_copy(
+            update={
+                "distance_m": rig.lidar.distance_m + self.place_m * distance,
+                "yaw_deg": rig.lidar.yaw_deg + self.angle_deg * yaw,
+                "pitch_deg": rig.lidar.pitch_deg + self.angle_deg * pitch,
+            }
+        )
+        occluder = rig.occluder and rig.occluder.model_copy(
+            update={
+                "x_m": rig.occluder.x_m + self.place_m * place,
+                "z_min_m": rig.occluder.z_min_m + self.place_m * gap,
+            }
+        )
+        counts = sensor.bare_wall_counts * (1 + self.gain_share * gain)
+        drawn = rig.model_copy(update={"lidar": lidar, "occluder": occluder})
+        return drawn, sensor.model_copy(update={"bare_wall_counts": counts})
+
+
+@dataclass(frozen=True)
+class Objects:
+    """What is hidden: procedural objects of some categories, or meshes of a folder, named by their content."""
+
+    categories: tuple[str, ...] = tuple(CATEGORIES)
+    """A seed picks by position."""
+    meshes: tuple[tuple[str, str], ...] = ()
+    """(path in the folder, SHA-256), in order; with any of them there are no categories."""
+    backgrounds: float = 0.0
+    """Share of the procedural objects that have a post or a panel beside them."""
+    version: int = OBJECTS_VERSION
+    folder: Path | None = field(default=None, compare=False)
+    """Where the meshes are on this machine."""
+
+    @classmethod
+    def without(cls, left_out: Sequence[str], backgrounds: float = 0.0) -> Self:
+        """Every category but these. Raises SceneError for one that is not known, or if none is left."""
+        for name in left_out:
+            if name not in CATEGORIES:
+                raise SceneError(f"no object category {name!r}: choose some of {', '.join(CATEGORIES)}")
+        if not (kept := tuple(name for name in CATEGORIES if name not in left_out)):
+            raise SceneError("every object category is left out: keep at least one")
+        return cls(kept, backgrounds=backgrounds)
+
+
+@dataclass(frozen=True)
+class DatasetPlan:
+    """What a dataset holds, apart from how many."""
+
+    rig: Rig
+    first_seed: int
+    sensor: SensorModel = field(default_factory=SensorModel)
+    accuracy: str = "standard"
+    objects: Objects = field(default_factory=Objects)
+    spread: RigSpread = field(default_factory=RigSpread)
+    radiometry: Radiometry = "paper"
+    jump_m: float = JUMP_M
+    material: Material = field(default_factory=Material)
+    rendering_version: int = RENDERING_VERSION
+
+    @classmethod
+    def of_scene(cls, scene: SceneFile, first_seed: int, **others: Any) -> Self:
+        """A plan with a scene's rig, sensor, radiometry and its object's material; the object itself gives way."""
+        material = scene.hidden.material if scene.hidden else Material()
+        return cls(
+            scene.rig,
+            first_seed,
+            scene.sensor,
+            radiometry=scene.radiometry,
+            jump_m=scene.jump_m,
+            material=material,
+            **others,
+        )
+
+    @property
+    def box(self) -> ObjectBox:
+        """The rig's object box; SceneError where it has none."""
+        return object_box(self.rig)
+
+    @property
+    def provenance(self) -> str:
+        """Everything that decides the bits, as JSON."""
+        facts: dict[str, Any] = _PLAN.dump_python(self, mode="json", exclude={"objects": {"folder"}})
+        return json.dumps({**facts, "rig_checksum": self.rig.checksum})
+
+    @classmethod
+    def from_provenance(cls, text: str) -> "DatasetPlan":
+        """The plan that was written down; what an older nlos-cam did not know is at its default.
+
+        Raises ValueError for what is no plan, or one that a newer nlos-cam wrote.
+        """
+        facts: dict[str, Any] = json.loads(text)
+        known = {"rig_checksum", *(one.name for one in fields(cls))}
+        if newer := sorted(set(facts) - known):
+            raise ValueError(f"its plan has {newer[0]!r}, which this nlos-cam does not know: update it")
+        facts.setdefault("objects", FIRST_OBJECTS)
+        return _PLAN.validate_python(facts)
+
+    def differences(self, other: "DatasetPlan") -> list[str]:
+        """In what the plans differ, by name; empty where they make the same bits."""
+        names = [one.name for one in fields(self)]
+        return [name.replace("_", " ") for name in names if getattr(self, name) != getattr(other, name)]
+
+    def check(self) -> None:
+        """Raise SceneError where nothing could be made by this plan."""
+        _ = self.box
+        self.spread.check(self.rig)
+        if np.ndim(self.material.albedo):
+            raise SceneError("the scene's object has three albedos, and datasets hold one intensity: give it one")
+
+
+_PLAN = TypeAdapter(DatasetPlan)
+
+
+def scene_row(rig: Rig, sensor: SensorModel) -> list[float]:
+    """SCENE_COLUMNS of one object."""
+    nowhere = float("nan")
+    occluder = (rig.occluder.x_m, rig.occluder.z_min_m) if rig.occluder else (nowhere, nowhere)
+    return [rig.lidar.distance_m, rig.lidar.yaw_deg, rig.lidar.pitch_deg, *occluder, sensor.bare_wall_counts]

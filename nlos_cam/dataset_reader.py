@@ -1,0 +1,125 @@
+"""A dataset to read: whole, or streamed in shuffled batches when it is larger than memory."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nlos_models.data import MapBatch, MapSet, as_batch
+from numpy.typing import NDArray
+
+from nlos_cam.dataset_plan import DatasetPlan
+from nlos_cam.dataset_shards import Shard, read_arrays, shards_of
+from nlos_cam.errors import RecordingError, SceneError
+
+MAP_CHANNELS = ("depth_m", "intensity", "image")
+BUFFER = 40
+"""Shards that are shuffled together and kept in memory (twice as many while one batch spans two such sets)."""
+
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """The shards of a folder, in the order of their seeds; nothing but their heads is in memory."""
+
+    folder: Path
+    plan: DatasetPlan
+    shards: tuple[Shard, ...]
+
+    def __len__(self) -> int:
+        return sum(len(shard.seeds) for shard in self.shards)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """Any array of all samples: seed (n,), category (n,), scene (n, 6), object_depth_m (n, 64, 64), or a map."""
+        return np.concatenate([read_arrays(shard, [name])[0] for shard in self.shards])
+
+    def arrays(self) -> MapSet:
+        """All maps and images, in memory."""
+        return MapSet(*(np.concatenate(parts) for parts in zip(*map(_maps, self.shards), strict=True)))
+
+    def chunks(self) -> Iterator[MapSet]:
+        """All maps and images in their order, a shard at a time: for what is worked out in one pass."""
+        for shard in self.shards:
+            yield MapSet(*_maps(shard))
+
+    def batches(self, seed: int, epoch: int, batch: int, *, rank: int = 0, world: int = 1) -> Iterator[MapBatch]:
+        """One epoch of batches, shuffled and mirrored at random, by seed and epoch alone; `row` counts in the dataset.
+
+        Of `world` processes each gets its share of every batch: together they see the batches that one would. The
+        last, smaller batch is left out. Raises SceneError where a batch cannot be shared evenly.
+        """
+        if batch % world or not 0 <= rank < world <= len(self):
+            raise SceneError(f"a batch of {batch} cannot be shared by {world} processes: make it a multiple of that")
+        generator = np.random.default_rng([seed, epoch])
+        blocks = self._shuffled_blocks(generator)
+        order = np.concatenate([rows for _, rows in blocks])
+        mirrored = generator.random(len(order)) < 0.5
+        window = _Window(self, [shards for shards, _ in blocks])
+        for start in range(0, len(order) - min(batch, len(order)) + 1, batch):
+            rows = order[start : start + batch][rank::world]
+            yield as_batch(window.take(rows), rows, mirrored[start : start + batch][rank::world])
+
+    def _shuffled_blocks(self, generator: np.random.Generator) -> list[tuple[NDArray[np.int64], Rows]]:
+        """Shards in random order, BUFFER at a time, each with all their rows in random order."""
+        rows_of = [np.arange(end - len(shard.seeds), end) for shard, end in zip(self.shards, self.ends, strict=True)]
+        order = generator.permutation(len(self.shards))
+        blocks = [order[k : k + BUFFER] for k in range(0, len(order), BUFFER)]
+        rows = [np.concatenate([rows_of[shard] for shard in some]) for some in blocks]
+        return [(some, generator.permutation(own)) for some, own in zip(blocks, rows, strict=True)]
+
+    @property
+    def ends(self) -> list[int]:
+        """The row after each shard's last."""
+        return [*accumulate(len(shard.seeds) for shard in self.shards)]
+
+
+class _Window:
+    """The shards in memory: each is read once an epoch, and let go when its block is through."""
+
+    def __init__(self, dataset: Dataset, blocks: list[NDArray[np.int64]]) -> None:
+        self._dataset, self._ends = dataset, dataset.ends
+        self._block = {int(shard): number for number, shards in enumerate(blocks) for shard in shards}
+        self._held: dict[int, list[NDArray[Any]]] = {}
+
+    def take(self, rows: Rows) -> MapSet:
+        """The maps and images of some rows, in their order."""
+        shards = np.searchsorted(self._ends, rows, side="right")
+        wanted = [int(shard) for shard in np.unique(shards)]
+        oldest = min((self._block[shard] for shard in wanted), default=0)
+        self._held = {shard: maps for shard, maps in self._held.items() if self._block[shard] >= oldest}
+        for shard in wanted:
+            if shard not in self._held:
+                self._held[shard] = _maps(self._dataset.shards[shard])
+        found = [np.empty((len(rows), *of.shape[1:]), of.dtype) for of in self._held[wanted[0]]]
+        for shard in wanted:
+            here = shards == shard
+            within = rows[here] - (self._ends[shard] - len(self._dataset.shards[shard].seeds))
+            for target, source in zip(found, self._held[shard], strict=True):
+                target[here] = source[within]
+        return MapSet(*found)
+
+
+def open_dataset(folder: Path) -> Dataset:
+    """A folder's dataset. Raises RecordingError where there is none, or one whose shards do not belong together."""
+    if not (shards := shards_of(folder)):
+        raise RecordingError(f"no dataset in {folder}: it holds no shard-*.h5; make one with `nlos-cam dataset build`")
+    plan = shards[0].plan
+    for shard in shards[1:]:
+        if shard.provenance != shards[0].provenance and shard.plan != plan:
+            raise RecordingError(
+                f"{shard.path} is of another dataset than {shards[0].path.name}: take one of them away"
+            )
+    return Dataset(folder, plan, tuple(shards))
+
+
+def read(folder: Path) -> tuple[MapSet, DatasetPlan]:
+    """All maps and images of a dataset, in the order of the seeds, and the plan they were built by."""
+    dataset = open_dataset(folder)
+    return dataset.arrays(), dataset.plan
+
+
+def _maps(shard: Shard) -> list[NDArray[Any]]:
+    return read_arrays(shard, MAP_CHANNELS)

@@ -1,0 +1,167 @@
+"""A shard: some samples, their plan and the checksum of every array in one HDF5 file that is whole or not there."""
+
+import errno
+import hashlib
+import os
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+import nlos_cam
+from nlos_cam.dataset_plan import SCENE_COLUMNS, DatasetPlan
+from nlos_cam.dataset_samples import Samples
+from nlos_cam.errors import DiskFullError, RecordingError
+
+SHARDS, PARTS = "shard-*.h5", "shard-*.part"
+FIRST_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category")
+"""Those of every shard; scene came with the checksums."""
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+"""No space, a quota, a limit on the size of files."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A shard's head."""
+
+    path: Path
+    seeds: range
+    provenance: str
+    """The plan it was made by, as JSON."""
+
+    @property
+    def plan(self) -> DatasetPlan:
+        """The same. Raises RecordingError where this nlos-cam cannot read it."""
+        try:
+            return DatasetPlan.from_provenance(self.provenance)
+        except ValueError as error:
+            problem = " ".join(str(error).split())
+            raise RecordingError(f"{self.path} has a plan that cannot be read: {problem:.200}") from error
+
+
+def shard_path(folder: Path, first_seed: int) -> Path:
+    """Where the shard that begins with a seed is, or would be: names sort as seeds do."""
+    return folder / f"shard-{first_seed:09d}.h5"
+
+
+def shards_of(folder: Path) -> list[Shard]:
+    """The heads of a folder's shards, in the order of their seeds. Raises RecordingError for one that is damaged."""
+    heads = sorted((head_of(path) for path in folder.glob(SHARDS)), key=lambda head: head.seeds.start)
+    for one, following in pairwise(heads):
+        if following.seeds.start < one.seeds.stop:
+            raise RecordingError(
+                f"{following.path} holds objects that {one.path.name} holds too: they are of two datasets; delete one"
+            )
+    return heads
+
+
+def head_of(path: Path) -> Shard:
+    """What a shard says of itself. Raises RecordingError where it cannot be read."""
+    with opened(path) as file:
+        plan, seeds = str(file.attrs["plan"]), _checked(path, "seed", file["seed"])
+        if file.attrs.get("plan_sha256", "") not in {"", _digest(plan.encode())}:
+            raise _damaged(path, "its plan is not what was written")
+        if (
+            seeds.ndim != 1
+            or not len(seeds)
+            or (np.diff(seeds) != 1).any()
+            or shard_path(path.parent, seeds[0]) != path
+        ):
+            raise _damaged(path, "its seeds are not those of its name, one after the other")
+        return Shard(path, range(int(seeds[0]), int(seeds[-1]) + 1), plan)
+
+
+def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
+    """Arrays of a shard, each checked against its checksum where it has one. Raises RecordingError if it differs."""
+    with opened(head.path) as file:
+        found = [_checked(head.path, name, file[name]) for name in names]
+    for name, values in zip(names, found, strict=True):
+        if len(values) != len(head.seeds):
+            raise _damaged(head.path, f"{name} has {len(values)} rows for {len(head.seeds)} objects")
+    return found
+
+
+def check_all(head: Shard) -> None:
+    """Read everything. Raises RecordingError where the shard is damaged."""
+    with opened(head.path) as file:
+        names = {*map(str, file), *FIRST_ARRAYS, *(["scene"] if "plan_sha256" in file.attrs else [])}
+    read_arrays(head, sorted(names))
+
+
+def store(path: Path, samples: Samples, provenance: str, command: str) -> None:
+    """Write a shard beside its place, and rename it when it is on the disk.
+
+    Raises DiskFullError where it does not fit; what was there stays.
+    """
+    part = path.with_suffix(".part")
+    try:
+        with part.open("wb") as file:
+            file.write(_as_bytes(samples, provenance, command))
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        if error.errno in NO_ROOM:
+            raise DiskFullError(
+                f"no room for {path} ({error.strerror}): what was made so far is kept; make room and build again"
+            ) from error
+        raise
+
+
+def _as_bytes(samples: Samples, provenance: str, command: str) -> bytes:
+    memory = BytesIO()
+    with h5py.File(memory, "w") as file:
+        seeds = samples["seed"]
+        file.attrs.update({"plan": provenance, "plan_sha256": _digest(provenance.encode()), "command": command})
+        file.attrs["package_version"] = nlos_cam.__version__
+        file.attrs.update({"first_seed": int(seeds[0]), "last_seed": int(seeds[-1])})
+        for name, values in samples.items():
+            if values.dtype == object:
+                stored = file.create_dataset(name, data=values, dtype=h5py.string_dtype())
+            else:
+                stored = file.create_dataset(name, data=values, compression="gzip", compression_opts=1)
+            stored.attrs["sha256"] = content_checksum(values)
+        file["scene"].attrs["columns"] = SCENE_COLUMNS
+    return memory.getvalue()
+
+
+def content_checksum(values: NDArray[Any]) -> str:
+    """SHA-256 of an array: of its type, its shape and its values."""
+    kind = f"{values.dtype.str} {values.shape} ".encode()
+    content = "\0".join(values).encode() if values.dtype == object else np.ascontiguousarray(values).tobytes()
+    return _digest(kind + content)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+@contextmanager
+def opened(path: Path) -> Generator[h5py.File]:
+    """A shard to read from. Raises RecordingError where it, or what is asked of it inside, cannot be read."""
+    try:
+        with h5py.File(path) as file:
+            yield file
+    except RecordingError:
+        raise
+    except (OSError, KeyError, ValueError, RuntimeError) as error:  # whatever HDF5 makes of damage
+        raise _damaged(path, f"cannot be read as a shard: {' '.join(str(error).split())}") from error
+
+
+def _checked(path: Path, name: str, stored: Any) -> NDArray[Any]:
+    values: NDArray[Any] = stored.asstr()[:] if h5py.check_string_dtype(stored.dtype) else stored[:]
+    if stored.attrs.get("sha256", "") not in {"", content_checksum(values)}:
+        raise _damaged(path, f"{name} is not what was written")
+    return values
+
+
+def _damaged(path: Path, why: str) -> RecordingError:
+    return RecordingError(f"{path} is damaged ({why}): build again to make it anew, or delete it")

@@ -1,0 +1,126 @@
+"""A Ray cluster as a farm: every piece once, few ahead, one clear line for what goes wrong."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_farm import samples_of
+from nlos_calibration.rig import load_rig
+
+import nlos_cam
+from nlos_cam import dataset_ray
+from nlos_cam.dataset_plan import DatasetPlan
+from nlos_cam.dataset_ray import AHEAD, RayFarm, cluster, make_piece
+from nlos_cam.errors import SceneError, WorkersLostError
+
+PLAN = DatasetPlan(load_rig("paper-rig"), 0)
+PIECES = [range(k, k + 2) for k in range(0, 40, 2)]
+TOOL = Path(__file__).parents[2] / "tools" / "kill_ray_workers.py"
+
+
+class RayError(Exception):
+    cause: Exception | None = None
+
+
+class FakeRay:
+    """As much of Ray as the farm uses, in this process; pieces come back last first."""
+
+    def __init__(self, fails: RayError | None = None) -> None:
+        self.exceptions = SimpleNamespace(RayError=RayError)
+        self.fails, self.running, self.most_waiting = fails, False, 0
+
+    def init(self, address: str, **_: object) -> None:
+        if address == "nowhere":
+            raise ConnectionError("could not\nfind any running Ray instance")
+        self.running = True
+
+    def shutdown(self) -> None:
+        self.running = False
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 2.0}
+
+    def remote(self, **options: object) -> Callable[..., Any]:
+        assert options == {"num_cpus": 1, "max_retries": dataset_ray.TRIES}
+        return lambda work: SimpleNamespace(remote=lambda *arguments: (work, arguments))
+
+    def wait(self, waiting: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
+        assert num_returns == 1
+        self.most_waiting = max(self.most_waiting, len(waiting))
+        return waiting[-1:], waiting[:-1]
+
+    def get(self, ready: tuple[Callable[..., Any], tuple[Any, ...]]) -> Any:
+        if self.fails:
+            raise self.fails
+        return ready[0](*ready[1])
+
+
+@pytest.fixture(autouse=True)
+def _nothing_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset_ray, "make_samples", lambda _, piece: samples_of(piece))
+    monkeypatch.setattr(dataset_ray, "one_thread", lambda: None)
+
+
+def test_every_piece_is_made_once_and_few_are_asked_for_ahead() -> None:
+    ray = FakeRay()
+    made = dict(RayFarm(ray, "auto")(PLAN, PIECES))
+    assert sorted(made, key=lambda piece: piece.start) == PIECES
+    for piece, samples in made.items():
+        np.testing.assert_array_equal(samples["depth_m"], samples_of(piece)["depth_m"])
+    assert ray.most_waiting == 2 * AHEAD
+    assert not ray.running
+
+
+def test_a_farm_that_is_closed_lets_go_of_the_cluster() -> None:
+    ray = FakeRay()
+    making = RayFarm(ray, "auto")(PLAN, PIECES)
+    next(making)
+    assert ray.running
+    making.close()
+    assert not ray.running
+
+
+def test_nothing_to_make_asks_for_no_cluster() -> None:
+    assert list(RayFarm(FakeRay(), "nowhere")(PLAN, [])) == []
+
+
+def test_no_cluster_is_one_clear_line() -> None:
+    with pytest.raises(WorkersLostError, match=r"no Ray cluster at 'nowhere' \(could not find .*ray start --head"):
+        list(RayFarm(FakeRay(), "nowhere")(PLAN, PIECES))
+
+
+def test_a_workers_error_is_told_as_it_was_and_a_lost_one_as_lost() -> None:
+    lost, failed = RayError("the worker\ndied"), RayError("a long traceback")
+    failed.cause = SceneError("cup.stl is empty")
+    with pytest.raises(SceneError, match=r"^cup\.stl is empty$"):
+        list(RayFarm(FakeRay(failed), "auto")(PLAN, PIECES))
+    ray = FakeRay(lost)
+    with pytest.raises(WorkersLostError, match=r"gave up \(the worker died\): finished shards are kept"):
+        list(RayFarm(ray, "auto")(PLAN, PIECES))
+    assert not ray.running
+
+
+def test_a_worker_of_another_version_is_refused() -> None:
+    assert make_piece(PLAN, range(1), nlos_cam.__version__).keys() == samples_of(range(1)).keys()
+    with pytest.raises(SceneError, match=f"has nlos-cam {nlos_cam.__version__}, not 9.9: install the same everywhere"):
+        make_piece(PLAN, range(1), "9.9")
+
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(WorkersLostError, match=r"pip install 'nlos-cam\[many\]'"):
+        cluster("auto")
+
+
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray (the extra `many`)")
+def test_a_local_cluster_makes_the_same_shards_though_a_worker_is_killed() -> None:
+    """In a process of its own, since Ray leaves threads."""
+    done = subprocess.run([sys.executable, str(TOOL), "8"], capture_output=True, text=True, check=False, timeout=280)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 worker killed, 8 objects equal" in done.stdout

@@ -1,0 +1,56 @@
+"""A worker has one thread, leaves Ctrl-C to its parent, and ends with it."""
+
+import signal
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numba
+import pytest
+
+from nlos_cam import dataset_worker
+
+PARENT = """
+import multiprocessing, time
+from threading import Thread
+from nlos_cam.dataset_worker import end_with_parent
+def wait(connection):
+    Thread(target=end_with_parent, daemon=True).start()
+    connection.send("ready")
+    time.sleep(60)
+if __name__ == "__main__":
+    mine, other = multiprocessing.get_context("fork").Pipe()
+    child = multiprocessing.get_context("fork").Process(target=wait, args=(other,))
+    child.start()
+    mine.recv()
+    print(child.pid, flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_worker_ends_with_a_parent_that_is_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline().strip().isdigit()
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+        assert parent.stdout.read() == ""  # to its end: the worker held this pipe, and let go of it
+
+
+def test_a_worker_without_a_parent_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset_worker, "parent_process", lambda: None)
+    monkeypatch.setattr(dataset_worker, "os", SimpleNamespace(_exit=lambda _: pytest.fail("ended")))
+    dataset_worker.end_with_parent()
+
+
+def test_a_worker_has_one_thread_and_is_deaf_to_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset_worker, "parent_process", lambda: None)
+    threads, handler = numba.get_num_threads(), signal.getsignal(signal.SIGINT)
+    try:
+        dataset_worker.begin_worker()
+        assert numba.get_num_threads() == 1
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        numba.set_num_threads(threads)
+        signal.signal(signal.SIGINT, handler)

@@ -1,0 +1,102 @@
+"""The tools around datasets: what they call equal is equal, and what they time is the steady part."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from fake_farm import samples_of
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.dataset import DatasetPlan
+from nlos_cam.dataset_shards import shard_path, store
+
+PLAN = DatasetPlan(load_rig("paper-rig"), 0)
+BUILDS = "import sys, time; open(sys.argv[1] + '/shard-000000000.part', 'wb').write(b'x'); time.sleep(60)"
+
+
+@pytest.fixture
+def kills(tool: Callable[[str], ModuleType]) -> ModuleType:
+    return tool("kill_builds")
+
+
+def _dataset(folder: Path, harm: str = "") -> Path:
+    folder.mkdir()
+    samples = samples_of(range(3))
+    if harm == "category":
+        samples = {**samples, harm: samples[harm][::-1]}
+    elif harm:
+        values = samples[harm].copy()
+        values.reshape(-1).view(np.uint8)[-1] ^= 1
+        samples = {**samples, harm: values}
+    store(shard_path(folder, 0), samples, PLAN.provenance, "")
+    return folder
+
+
+@pytest.mark.parametrize("harm", ["", "depth_m", "intensity", "image", "object_depth_m", "scene", "category"])
+def test_one_bit_makes_a_difference(kills: ModuleType, tmp_path: Path, harm: str) -> None:
+    found = kills.differing(_dataset(tmp_path / "one"), _dataset(tmp_path / "other", harm))
+    assert found == ([harm] if harm else [])
+
+
+def test_a_kill_sees_what_was_left_half_written(kills: ModuleType, tmp_path: Path) -> None:
+    folder = _dataset(tmp_path / "one")
+    found = kills.kill([sys.executable, "-c", BUILDS, str(folder)], folder, 1.0)
+    assert (found.shards_before, found.shards_after, found.lost, found.left_running) == (1, 1, 0, 0)
+    assert found.parts == 1
+
+
+def test_a_lost_or_changed_shard_is_seen(kills: ModuleType, tmp_path: Path) -> None:
+    folder = _dataset(tmp_path / "one")
+    cut = "import sys; open(sys.argv[1], 'wb').write(b'x')"
+    found = kills.kill([sys.executable, "-c", cut, str(shard_path(folder, 0))], folder, 60.0)
+    assert found.lost == 1
+
+
+def test_children_are_found_and_their_end_is_seen(kills: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kills, "GRACE_S", 0.1)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        assert child.pid in kills.children_of(os.getpid())
+        assert kills._still_running([child.pid]) == 1
+        child.kill()
+    assert kills._still_running([child.pid]) == 0
+
+
+def test_a_build_command_is_the_programs(kills: ModuleType, tmp_path: Path) -> None:
+    command = kills.build_command(tmp_path, 30, 10)
+    assert "dataset.SHARD = 10" in command[2]
+    assert command[3:] == ["dataset", "build", "--out", str(tmp_path), "--count", "30", "--workers", "2"]
+
+
+def test_a_build_that_fails_is_told_and_one_that_ends_is_timed(kills: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="exit code 3"):
+        kills.finish([sys.executable, "-c", "raise SystemExit(3)"], tmp_path)
+    folder = _dataset(tmp_path / "one")
+    first_s, whole_s = kills.finish([sys.executable, "-c", "import time; time.sleep(0.3)"], folder)
+    assert 0 < first_s < 0.3 <= whole_s
+
+
+def test_kills_come_while_it_starts_and_while_it_works(kills: ModuleType) -> None:
+    moments = np.array(kills.moments(10.0, 60.0, 200, 0))
+    assert 5 <= moments.min() < 6
+    assert 10 < moments.max() <= 10.5
+    assert kills.moments(10.0, 60.0, 5, 0) == kills.moments(10.0, 60.0, 5, 0)
+
+
+def test_only_the_time_in_which_all_work_counts(tool: Callable[[str], ModuleType]) -> None:
+    scaling = tool("dataset_scaling")
+    starts, steady, ends = [(0.0, 0)], [(20.0 + k, 10 * (k + 1)) for k in range(12)], [(50.0, 130)]
+    assert scaling.warm([*starts, *steady, *ends], 1) == (30.0, 120)
+    assert scaling.warm([*starts, *steady, *ends], 2) == (10.0, 100)
+
+
+def test_ray_workers_are_those_below_a_process(tool: Callable[[str], ModuleType]) -> None:
+    ray_tool = tool("kill_ray_workers")
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        assert child.pid in ray_tool._descendants(os.getpid())
+        assert child.pid not in ray_tool._descendants(child.pid)
+        child.kill()

@@ -1,0 +1,169 @@
+"""Dataset builds killed at random moments, against one that was not: docs/dataset_kills.json.
+
+Arguments: objects, kills, seed, objects in a shard. Each kill takes the builder alone, with SIGKILL, and the next run
+goes on in the same folder. Exits with 1 where any array differs by a bit, a finished shard was lost, or a worker
+outlived its builder.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nlos_cam.dataset_reader import open_dataset
+from nlos_cam.dataset_shards import FIRST_ARRAYS, PARTS, SHARDS
+from nlos_cam.render.tradeoff_report import machine
+
+DOCS = Path(__file__).parents[1] / "docs"
+DEFAULTS = (300, 10, 0, 10)
+GRACE_S = 10.0
+"""For workers to notice that their builder is gone."""
+
+
+@dataclass(frozen=True)
+class Kill:
+    """One builder's end."""
+
+    after_s: float
+    """From its start."""
+    shards_before: int
+    shards_after: int
+    parts: int
+    """Files that were being written."""
+    lost: int
+    """Shards that were there before and are not, or not as they were."""
+    left_running: int
+    """Workers that outlived it."""
+
+
+def build_command(folder: Path, count: int, shard: int) -> list[str]:
+    """A build of `count` objects, in shards that may be smaller than a user's."""
+    program = f"from nlos_cam import dataset; from nlos_cam.cli.main import run; dataset.SHARD = {shard}; run()"
+    return [
+        sys.executable,
+        "-c",
+        program,
+        "dataset",
+        "build",
+        "--out",
+        str(folder),
+        "--count",
+        str(count),
+        "--workers",
+        "2",
+    ]
+
+
+def finish(command: list[str], folder: Path) -> tuple[float, float]:
+    """Run a build to its end; seconds to its first shard, and in all."""
+    started_s, first_s = time.monotonic(), 0.0
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None:
+            if not first_s and any(folder.glob(SHARDS)):
+                first_s = time.monotonic() - started_s
+            time.sleep(0.02)
+    if process.returncode:
+        raise RuntimeError(f"the build ended with exit code {process.returncode}: {' '.join(command)}")
+    return first_s, time.monotonic() - started_s
+
+
+def moments(first_s: float, whole_s: float, times: int, seed: int) -> list[float]:
+    """When to kill: some while workers start, most at work, of which all together do about as much as is to do."""
+    work_s = 2 * (whole_s - first_s) / times
+    return np.random.default_rng(seed).uniform(first_s / 2, first_s + work_s, times).tolist()
+
+
+def kill(command: list[str], folder: Path, after_s: float) -> Kill:
+    """Start a build, kill it after so long, and see what it left."""
+    before = _shards(folder)
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            process.wait(after_s)
+        except subprocess.TimeoutExpired:
+            workers = children_of(process.pid)
+            process.kill()
+        else:
+            workers = []  # it was quicker
+    left = _still_running(workers)
+    after = _shards(folder)
+    lost = sum(after.get(name) != content for name, content in before.items())
+    return Kill(after_s, len(before), len(after), len(list(folder.glob(PARTS))), lost, left)
+
+
+def _shards(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob(SHARDS)}
+
+
+def children_of(process: int) -> list[int]:
+    """Its children, as /proc has them."""
+    tasks = Path(f"/proc/{process}/task").glob("*/children")
+    return [int(child) for task in tasks for child in task.read_text(encoding="utf-8").split()]
+
+
+def _still_running(processes: list[int]) -> int:
+    deadline_s = time.monotonic() + GRACE_S
+    while (left := sum(_runs(process) for process in processes)) and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    return left
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def differing(one: Path, other: Path) -> list[str]:
+    """Arrays of two datasets that differ in any bit."""
+    left, right = open_dataset(one), open_dataset(other)
+    return [name for name in (*FIRST_ARRAYS, "scene") if not _same(left.column(name), right.column(name))]
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    if one.dtype == object:
+        return one.tolist() == other.tolist()
+    return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+
+
+def main() -> None:
+    """Build once undisturbed, once with kills; compare, write, print."""
+    given = [int(argument) for argument in sys.argv[1:]]
+    count, times, seed, shard = (*given, *DEFAULTS[len(given) :])
+    with tempfile.TemporaryDirectory() as name:
+        whole, killed = Path(name) / "whole", Path(name) / "killed"
+        first_s, whole_s = finish(build_command(whole, count, shard), whole)
+        command = build_command(killed, count, shard)
+        kills = [kill(command, killed, moment) for moment in moments(first_s, whole_s, times, seed)]
+        finish(command, killed)
+        wrong = differing(whole, killed)
+    good = not wrong and not any(each.lost or each.left_running for each in kills)
+    result = {
+        "machine": machine(),
+        "objects": count,
+        "objects_in_a_shard": shard,
+        "seed": seed,
+        "seconds_undisturbed": whole_s,
+        "good": good,
+    }
+    result |= {"arrays_that_differ": wrong, "kills": [asdict(each) for each in kills]}
+    (DOCS / "dataset_kills.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    print("after s   shards before   after   half written   lost   workers left")
+    for each in kills:
+        print(
+            f"{each.after_s:7.2f}   {each.shards_before:13}   {each.shards_after:5}   {each.parts:12}   "
+            f"{each.lost:4}   {each.left_running:12}"
+        )
+    print(f"{times} kills, {count} objects: {'equal bit for bit' if good else f'NOT equal: {wrong}'}")
+    sys.exit(0 if good else 1)
+
+
+if __name__ == "__main__":
+    main()
