@@ -36,6 +36,10 @@ class Recipe(BaseModel):
     image_weight: float = Field(default=0.0, ge=0)
     augmentation: Literal["mirror", "turns"] = "mirror"
     """About y = 0, the one symmetry that the rig has; or, for a VAE alone, by quarters of a turn too (SI 3)."""
+    left_out: list[str] = Field(default_factory=list[str])
+    """Categories of objects that a VAE is not shown; a dataset's own plan says which a compressor is."""
+    backgrounds: float = Field(default=0.0, ge=0, le=1)
+    """Of a VAE's objects: the share that has a post or a panel beside it."""
     keep: Literal["last", "best"] = "last"
     """Which epoch's weights are handed on; the best has the least held-out loss."""
     steps: Literal["two", "one", "two-then-joint"] = "two"

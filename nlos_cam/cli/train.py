@@ -32,6 +32,7 @@ HeldOut = Annotated[Path, typer.Option("--held-out", help="Maps to judge by, of 
 Wall = Annotated[
     Path | None, typer.Option("--wall", help="The bare wall for difference maps (wall.toml); else it is rendered.")
 ]
+Stream = Annotated[bool, typer.Option("--stream", help="Read the maps as they are needed: for more than memory holds.")]
 Budget = Annotated[float, typer.Option("--budget", min=1e-4, max=1.0, help="Share of the recipe's budget.")]
 Objects = Annotated[int | None, typer.Option("--objects", min=2, help="Train on so many, not on the recipe's.")]
 Devices = Annotated[int, typer.Option("--devices", min=1, help="Processes: one for each GPU, or on the CPU.")]
@@ -64,8 +65,11 @@ def vae(
     rig = rig_named(PAPER_RIG)
     box = dataset.DatasetPlan(rig, 0).box
     say(f"making {recipe.objects + recipe.held_out} objects")
-    images = dataset.procedural_images(dataset.TRAINING_SEED, recipe.objects, box)
-    held_out = dataset.procedural_images(dataset.HELD_OUT_SEED, recipe.held_out, box)
+    kinds, besides = dataset.Objects.without(recipe.left_out).categories, recipe.backgrounds
+    images, held_out = (
+        dataset.procedural_images(seed, count, box, kinds, backgrounds=besides)
+        for seed, count in ((dataset.TRAINING_SEED, recipe.objects), (dataset.HELD_OUT_SEED, recipe.held_out))
+    )
     record = CheckpointRecord(rig_name=rig.name, rig_checksum=rig.checksum, vae_recipe=recipe)
     figures = launched(fabric, run_vae, Job(recipe, out, record, tensorboard), images, held_out)
     finish({"out": str(out), **figures}, as_json=json, text=f"weights in {out}: {figures}")
@@ -81,6 +85,7 @@ def compressor(
     ] = None,
     weights: Annotated[Path | None, typer.Option("--weights", help="Two-step weights, for `two-then-joint`.")] = None,
     wall: Wall = None,
+    stream: Stream = False,
     budget: Budget = 1.0,
     objects: Objects = None,
     devices: Devices = 1,
@@ -92,7 +97,7 @@ def compressor(
     recipe = RecipeChoice(recipe_file, budget, objects).read("compressor")
     fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
     start, record = _start(recipe, vae_folder, weights)
-    maps = read_maps(recipe, data, held_out_data, wall)
+    maps = read_maps(recipe, data, held_out_data, wall, stream=stream)
     record = _tied(record, maps, recipe).model_copy(update={"compressor_recipe": recipe})
     job = Job(recipe, out, record, tensorboard)
     figures = launched(fabric, run_compressor, job, start, maps.training, maps.held_out)

@@ -1,8 +1,11 @@
 """Images of plates, maps that show them as no lidar would, and networks that learn from them in a moment."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 import torch
-from nlos_models.data import Half, MapSet
+from nlos_models.data import Half, MapBatch, MapSet, map_batches
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -24,6 +27,30 @@ def small_maps(count: int, seed: int) -> MapSet:
     intensity = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8))) * 50
     depth = np.where(intensity > 0, intensity / 100, np.float32(np.nan)).astype(np.float32)
     return MapSet(depth, intensity, images)
+
+
+class SmallDataset:
+    """Stands for a dataset on the disk, of two shards."""
+
+    def __init__(self, maps: MapSet, plan: Any) -> None:
+        self._maps, self.plan = maps, plan
+
+    def __len__(self) -> int:
+        return len(self._maps.image)
+
+    def arrays(self) -> MapSet:
+        return self._maps
+
+    def column(self, name: str) -> Any:
+        return getattr(self._maps, name)
+
+    def chunks(self) -> Iterator[MapSet]:
+        maps, half = self._maps, len(self) // 2
+        for part in (slice(half), slice(half, None)):
+            yield MapSet(maps.depth_m[part], maps.intensity[part], maps.image[part])
+
+    def batches(self, seed: int, epoch: int, batch: int) -> Iterator[MapBatch]:
+        return map_batches(self._maps, batch, torch.Generator().manual_seed(seed + epoch))
 
 
 class SmallEncoder(nn.Module):

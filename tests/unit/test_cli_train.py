@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -13,12 +12,14 @@ import torch
 from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint, tasks
 from nlos_models.checkpoint import load_pipeline, load_record
+from nlos_models.data import Half
 from safetensors.torch import load_file, save_file
-from small_maps import SmallCompressor, SmallDecoder, SmallEncoder, SmallVae, small_images, small_maps
+from small_maps import SmallCompressor, SmallDataset, SmallDecoder, SmallEncoder, SmallVae, small_images, small_maps
 
 from nlos_cam import dataset
 from nlos_cam.cli import train, train_data, train_runs
 from nlos_cam.cli.main import main
+from nlos_cam.objects.categories import CATEGORIES
 
 RIG = load_rig("paper-rig")
 COUNTS = {"data": 8, "held-out": 4}
@@ -45,8 +46,8 @@ def _small_networks_and_data() -> Iterator[None]:
             for name, small in networks.items():
                 patch.setattr(module, name, small, raising=False)
         plan = dataset.DatasetPlan(RIG, 0)
-        patch.setattr(dataset, "read", lambda folder: (small_maps(COUNTS[folder.name], len(folder.name)), plan))
-        patch.setattr(dataset, "procedural_images", lambda seed, count, _: small_images(count, seed))
+        patch.setattr(dataset, "open_dataset", lambda of: SmallDataset(small_maps(COUNTS[of.name], len(of.name)), plan))
+        patch.setattr(dataset, "procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
         yield
     torch.set_num_threads(before)
 
@@ -102,6 +103,22 @@ def test_a_tenth_of_the_budget_and_fewer_objects_are_on_record(go: Go, tmp_path:
     assert "0.5 of the budget" in recipe.deviations[-1]
 
 
+def test_a_vae_is_shown_the_kinds_that_its_recipe_does_not_leave_out(
+    go: Go, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[set[str]] = []
+
+    def images(seed: int, count: int, _: object, kinds: tuple[str, ...], *, backgrounds: float) -> Half:
+        shown.append({*kinds, f"{backgrounds}"})
+        return small_images(count, seed)
+
+    monkeypatch.setattr(dataset, "procedural_images", images)
+    (folder / "vae.toml").write_text(RECIPES["vae"] + 'left_out = ["car", "boat"]\nbackgrounds = 0.25\n')
+    assert go("vae")[0] == 0
+    (folder / "vae.toml").write_text(RECIPES["vae"])
+    assert shown == [{*CATEGORIES, "0.25"} - {"car", "boat"}] * 2
+
+
 def test_an_interrupted_run_is_130_says_so_and_goes_on_to_the_same_weights(
     go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,6 +149,11 @@ def test_the_shipped_vae_is_aimed_at_where_none_is_named(
     monkeypatch.setattr(train, "shipped_folder", lambda: folder / "vae")
     assert go("two")[0] == 0
     assert _same_file("compressor", tmp_path / "out", folder / "two")
+
+
+def test_a_stream_trains_too(go: Go, folder: Path, tmp_path: Path) -> None:
+    assert go("two", "--vae", str(folder / "vae"), "--stream")[0] == 0
+    assert _same_file("preprocess", tmp_path / "out", folder / "two")
 
 
 def test_one_step_weights_have_neither_a_vae_nor_an_encoder(go: Go, tmp_path: Path) -> None:
@@ -236,15 +258,3 @@ def test_weights_that_eat_other_maps_than_the_recipe_says_are_refused(
     code, answer = go("transfer", "--weights", str(folder / "two"))
     assert code == 1
     assert "eat difference maps, the recipe says raw maps" in answer["error"]["message"]
-
-
-def test_recordings_of_two_rigs_are_refused(go: Go, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = dataset.read
-
-    def read(path: Path) -> tuple[dataset.MapSet, dataset.DatasetPlan]:
-        maps, plan = original(path)
-        return maps, replace(plan, rig=RIG.model_copy(update={"name": path.name}))
-
-    monkeypatch.setattr(dataset, "read", read)
-    code, answer = go("transfer", "--weights", str(folder / "two"))
-    assert (code, "different rigs" in answer["error"]["message"]) == (1, True)
