@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from nlos_models.data import Half, MapBatch, MapSet, map_batches
 from torch import Tensor, nn
@@ -101,3 +102,11 @@ class SmallCompressor(nn.Module):
 
     def forward(self, stacked: Tensor) -> Tensor:
         return self.classifier(self.features(stacked))
+
+
+def use_small_networks(patch: pytest.MonkeyPatch, *modules: object) -> None:
+    """Let modules make small networks where they would make the real ones."""
+    networks = {"ResVae": SmallVae, "Encoder": SmallEncoder, "Decoder": SmallDecoder, "Compressor": SmallCompressor}
+    for module in modules:
+        for name, small in networks.items():
+            patch.setattr(module, name, small, raising=False)

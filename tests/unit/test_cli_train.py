@@ -1,4 +1,4 @@
-"""`train`: recipes and data to weights with their record, on networks that learn in a moment."""
+"""`train`: recipes and data to weights with their record, on small networks."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -14,7 +14,7 @@ from nlos_models import checkpoint, tasks
 from nlos_models.checkpoint import load_pipeline, load_record
 from nlos_models.data import Half
 from safetensors.torch import load_file, save_file
-from small_maps import SmallCompressor, SmallDataset, SmallDecoder, SmallEncoder, SmallVae, small_images, small_maps
+from small_maps import SmallDataset, small_images, small_maps, use_small_networks
 
 from nlos_cam import dataset
 from nlos_cam.cli import train, train_data, train_runs
@@ -34,17 +34,15 @@ RECIPES = {
     "transfer": 'task = "transfer"\nstatistics = "own"\nall_layers_epochs = 1\n' + BASE + LOSS,
 }
 Answer = dict[str, Any]
+Go = Callable[..., tuple[int, Answer]]
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _small_networks_and_data() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
-    networks = {"ResVae": SmallVae, "Encoder": SmallEncoder, "Decoder": SmallDecoder, "Compressor": SmallCompressor}
     with pytest.MonkeyPatch.context() as patch:
-        for module in (tasks, checkpoint, train):
-            for name, small in networks.items():
-                patch.setattr(module, name, small, raising=False)
+        use_small_networks(patch, tasks, checkpoint, train)
         plan = dataset.DatasetPlan(RIG, 0)
         patch.setattr(dataset, "open_dataset", lambda of: SmallDataset(small_maps(COUNTS[of.name], len(of.name)), plan))
         patch.setattr(dataset, "procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
@@ -70,7 +68,7 @@ def _arguments(folder: Path, recipe: str, out: Path, *options: str) -> list[str]
 
 
 @pytest.fixture
-def go(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, Answer]]:
+def go(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Go:
     def run(recipe: str, *options: str) -> tuple[int, Answer]:
         code = main(_arguments(folder, recipe, tmp_path / "out", *options))
         lines = capsys.readouterr().out.splitlines()
@@ -84,13 +82,9 @@ def _same_file(part: str, one: Path, other: Path) -> bool:
     return mine == its
 
 
-Go = Callable[..., tuple[int, Answer]]
-
-
 def test_a_vaes_answer_is_its_folder_and_figures(go: Go, tmp_path: Path) -> None:
     code, answer = go("vae", "--tensorboard")
-    assert code == 0
-    assert set(answer) == {"out", "held_out_loss", "held_out_iou"}
+    assert (code, set(answer)) == (0, {"out", "held_out_loss", "held_out_iou"})
     assert (tmp_path / "out" / "tensorboard").is_dir()
     assert load_record(tmp_path / "out").figures["held_out_loss"] == answer["held_out_loss"]
 
@@ -158,8 +152,7 @@ def test_a_stream_trains_too(go: Go, folder: Path, tmp_path: Path) -> None:
 
 def test_one_step_weights_have_neither_a_vae_nor_an_encoder(go: Go, tmp_path: Path) -> None:
     assert go("one")[0] == 0
-    record = load_record(tmp_path / "out")
-    assert record.vae_recipe is None
+    assert load_record(tmp_path / "out").vae_recipe is None
     assert not (tmp_path / "out" / "encoder.safetensors").exists()
     load_pipeline(tmp_path / "out")
 
@@ -190,8 +183,7 @@ def test_difference_maps_are_what_the_weights_eat_then(
 
 def test_a_transfer_tells_before_and_after_and_keeps_the_decoder(go: Go, folder: Path, tmp_path: Path) -> None:
     code, answer = go("transfer", "--weights", str(folder / "two"))
-    assert code == 0
-    assert set(answer) == {"out", "held_out_loss", "held_out_iou", "before"}
+    assert (code, set(answer)) == (0, {"out", "held_out_loss", "held_out_iou", "before"})
     assert answer["before"]["held_out_loss"] != answer["held_out_loss"]
     record = load_record(tmp_path / "out")
     assert record.transfer_recipe is not None
@@ -212,8 +204,7 @@ def test_weights_of_another_architecture_are_4_or_taken_in_part_with_a_report(
     tensors["classifier.1.weight"] = torch.zeros(7, 100)
     save_file({**tensors, "more": torch.zeros(1)}, other / "compressor.safetensors")
     code, answer = go("transfer", "--weights", str(other))
-    assert code == 4
-    assert "does not fit this network" in answer["error"]["message"]
+    assert (code, "does not fit this network" in answer["error"]["message"]) == (4, True)
     told: list[str] = []
     monkeypatch.setattr(train, "say", told.append)
     assert go("transfer", "--weights", str(other), "--partial")[0] == 0
@@ -255,6 +246,5 @@ def test_weights_that_eat_other_maps_than_the_recipe_says_are_refused(
     pipeline, record = load_pipeline(folder / "two")
     other = record.model_copy(update={"input": "difference maps"})
     monkeypatch.setattr(train, "load_pipeline", lambda _: (pipeline, other))
-    code, answer = go("transfer", "--weights", str(folder / "two"))
-    assert code == 1
-    assert "eat difference maps, the recipe says raw maps" in answer["error"]["message"]
+    code, answer = go("transfer", "--weights", "two")
+    assert (code, "eat difference maps, the recipe says raw maps" in answer["error"]["message"]) == (1, True)

@@ -13,7 +13,7 @@ from nlos_models.preprocess import channel_statistics, split_and_stack
 from nlos_models.recipe import Recipe
 from nlos_models.sources import InMemory
 from nlos_models.tasks import Start, train_compressor, train_vae, turn_some
-from small_maps import SmallCompressor, SmallDecoder, SmallVae, small_images, small_maps
+from small_maps import SmallCompressor, SmallVae, small_images, small_maps, use_small_networks
 
 COUNT, BATCH = 16, 8
 
@@ -27,8 +27,7 @@ def _small_networks_on_one_thread() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        for name, small in (("ResVae", SmallVae), ("Decoder", SmallDecoder), ("Compressor", SmallCompressor)):
-            patch.setattr(tasks, name, small)
+        use_small_networks(patch, tasks)
         yield
     torch.set_num_threads(before)
 
