@@ -3,7 +3,7 @@
 import json
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import NamedTuple
 
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -15,8 +15,8 @@ from nlos_models.colour import colour_pipeline, colour_vae
 from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
 from nlos_models.pipeline import Pipeline
-from nlos_models.recipe import Recipe
-from nlos_models.res_vae import Decoder, ResVae
+from nlos_models.recipe import MapKind, Recipe
+from nlos_models.res_vae import Decoder, Encoder, ResVae
 
 RECORD = "checkpoint.json"
 SHIPPED = "paper-rig"
@@ -29,11 +29,14 @@ class CheckpointRecord(BaseModel):
 
     rig_name: str
     rig_checksum: str
-    input: Literal["raw maps", "difference maps"] = "raw maps"
+    input: MapKind = "raw maps"
     """What the compressor eats; difference maps are the maps less the bare wall's."""
-    vae_recipe: Recipe
+    vae_recipe: Recipe | None = None
+    """None for a compressor and decoder that were trained in one step."""
     compressor_recipe: Recipe | None = None
     """None for a VAE alone."""
+    transfer_recipe: Recipe | None = None
+    """None for weights that saw synthetic maps alone."""
     figures: dict[str, float] = {}
     """Held-out figures at the end of training."""
 
@@ -43,15 +46,35 @@ class CheckpointRecord(BaseModel):
         return any(recipe is not None and recipe.colour for recipe in (self.vae_recipe, self.compressor_recipe))
 
 
+class LoadReport(NamedTuple):
+    """What of a file of weights fitted a network, by tensors' names; what did not, the network kept its own for."""
+
+    loaded: list[str]
+    missing: list[str]
+    """In the network, and not in the file."""
+    left_over: list[str]
+    """In the file, and not in the network."""
+    misshapen: list[str]
+
+    def __str__(self) -> str:
+        left = {name: names for name, names in self._asdict().items() if name != "loaded" and names}
+        told = [f"{len(names)} {name.replace('_', ' ')} ({', '.join(names[:3])})" for name, names in left.items()]
+        return f"{len(self.loaded)} tensors loaded; " + (", ".join(told) or "all fit")
+
+
 def save_vae(folder: Path, vae: ResVae, record: CheckpointRecord) -> None:
     """Write encoder and decoder, with their record, into a folder."""
     _save(folder, {"encoder": vae.encoder, "decoder": vae.decoder}, record)
 
 
-def save_pipeline(folder: Path, pipeline: Pipeline, record: CheckpointRecord) -> None:
-    """Write compressor, decoder and the preprocessing's statistics, with their record, into a folder."""
+def save_pipeline(folder: Path, pipeline: Pipeline, record: CheckpointRecord, encoder: Encoder | None = None) -> None:
+    """Write compressor, decoder and the preprocessing's statistics, with their record, into a folder.
+
+    The encoder, if there is one, goes along: who trains these weights on aims at its latent.
+    """
     names = ("compressor", "preprocess", "decoder")
-    _save(folder, {name: getattr(pipeline, name) for name in names}, record)
+    parts = {name: getattr(pipeline, name) for name in names}
+    _save(folder, {**parts, "encoder": encoder} if encoder else parts, record)
 
 
 def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
@@ -65,12 +88,46 @@ def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
 
 def load_pipeline(folder: Path | None = None) -> tuple[Pipeline, CheckpointRecord]:
     """Compressor and decoder in eval mode, from a folder or as shipped. Raises CheckpointError as `load_vae` does."""
-    folder = folder or shipped_folder()
+    return _load_pipeline(folder or shipped_folder(), ("compressor", "preprocess", "decoder"))
+
+
+def load_pipeline_partly(folder: Path) -> tuple[Pipeline, CheckpointRecord, LoadReport]:
+    """The same, where the compressor may lack tensors, or hold other ones; what it lacks is as torch's seed has it.
+
+    Raises CheckpointError where no tensor of the compressor fits, or one of the rest does not.
+    """
+    pipeline, record = _load_pipeline(folder, ("preprocess", "decoder"))
+    return pipeline, record, load_fitting(folder / "compressor.safetensors", pipeline.compressor)
+
+
+def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[Pipeline, CheckpointRecord]:
     record = load_record(folder)
     pipeline = colour_pipeline() if record.colour else Pipeline(Compressor(), Decoder())
-    for name in ("compressor", "preprocess", "decoder"):
+    for name in names:
         _load(folder / f"{name}.safetensors", getattr(pipeline, name))
     return pipeline.eval(), record
+
+
+def load_encoder(folder: Path | None = None) -> Encoder | None:
+    """The encoder beside a pipeline's weights, in eval mode, or None where they were trained without one."""
+    path = (folder or shipped_folder()) / "encoder.safetensors"
+    if not path.exists():
+        return None
+    encoder = Encoder()
+    _load(path, encoder)
+    return encoder.eval()
+
+
+def load_fitting(path: Path, module: nn.Module) -> LoadReport:
+    """Load the tensors of a file that a network has in the same shape. Raises CheckpointError where there are none."""
+    tensors, own = _tensors(path), module.state_dict()
+    shared = sorted(tensors.keys() & own.keys())
+    fitting = [name for name in shared if tensors[name].shape == own[name].shape]
+    if not fitting:
+        raise CheckpointError(f"{path} holds no tensor that fits this network: name other weights")
+    module.load_state_dict({name: tensors[name] for name in fitting}, strict=False)
+    missing, left_over = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
+    return LoadReport(fitting, missing, left_over, sorted(set(shared) - set(fitting)))
 
 
 def shipped_folder() -> Path:
@@ -94,12 +151,14 @@ def load_record(folder: Path) -> CheckpointRecord:
 
 def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    for name, module in parts.items():
-        save_file(
-            {key: _half(key, tensor) for key, tensor in module.state_dict().items()}, folder / f"{name}.safetensors"
-        )
     text = json.dumps(record.model_dump(mode="json"), indent=2)
-    (folder / RECORD).write_text(text + "\n", encoding="utf-8")
+    try:
+        for name, module in parts.items():
+            tensors = {key: _half(key, tensor) for key, tensor in module.state_dict().items()}
+            save_file(tensors, folder / f"{name}.safetensors")
+        (folder / RECORD).write_text(text + "\n", encoding="utf-8")
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{folder} cannot take the weights ({error}): make room and run again") from error
 
 
 def _half(name: str, tensor: torch.Tensor) -> torch.Tensor:
@@ -112,12 +171,16 @@ def _half(name: str, tensor: torch.Tensor) -> torch.Tensor:
 
 
 def _load(path: Path, module: nn.Module) -> None:
+    tensors = _tensors(path)
     try:
-        tensors: dict[str, Any] = load_file(path)
-        module.load_state_dict(
-            {key: value.float() if value.is_floating_point() else value for key, value in tensors.items()}
-        )
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path} cannot be read as weights: {error}") from error
+        module.load_state_dict(tensors)
     except RuntimeError as error:
         raise CheckpointError(f"{path} does not fit this network: {str(error).splitlines()[-1].strip()}") from error
+
+
+def _tensors(path: Path) -> dict[str, torch.Tensor]:
+    try:
+        tensors = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path} cannot be read as weights: {error}") from error
+    return {key: value.float() if value.is_floating_point() else value for key, value in tensors.items()}

@@ -1,6 +1,7 @@
 """Errors of the models package.
 
 ModelError (ValueError)          exit 1   root
+├── TrainingError                exit 1   a run that cannot go on; what it did so far is kept
 ├── CheckpointError              exit 4   weights that cannot be read or do not fit the model
 └── RecipeError                  exit 4   a training recipe that cannot be read
 """
@@ -10,6 +11,10 @@ class ModelError(ValueError):
     """Root of the errors that the models foresaw."""
 
     exit_code = 1
+
+
+class TrainingError(ModelError):
+    """A training run that cannot go on; what it did so far is kept."""
 
 
 class CheckpointError(ModelError):

@@ -2,11 +2,13 @@
 
 import tomllib
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from nlos_models.errors import RecipeError
+
+MapKind = Literal["raw maps", "difference maps"]
 
 
 class Recipe(BaseModel):
@@ -14,15 +16,17 @@ class Recipe(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    task: Literal["vae", "compressor"]
+    task: Literal["vae", "compressor", "transfer"]
     colour: bool = False
     """RGB albedo in the place of depth; simulation only, since the L515's laser is infrared."""
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
     objects: int = Field(gt=0)
-    """Training objects, by seeds 0, 1, ...; held-out ones come from other seeds."""
+    """Training objects: for a VAE by seeds 0, 1, ..., else the first of a dataset's; held-out ones are others."""
     held_out: int = Field(gt=0)
     epochs: int = Field(gt=0)
+    """At most; of a transfer, those of the classifier alone."""
     batch: int = Field(gt=1)
+    """Over all processes."""
     learning_rate: float = Field(gt=0)
     betas: tuple[float, float] = (0.5, 0.999)
     schedule: Literal["one-cycle", "plateau"] = "plateau"
@@ -30,17 +34,63 @@ class Recipe(BaseModel):
     kl_weight: float = 0.05
     left_noise: float = 0.2
     dropout: float = Field(default=0.5, ge=0, lt=1)
-    latent_weight: float = 1.0
-    image_weight: float = 0.0
+    latent_weight: float = Field(default=1.0, ge=0)
+    image_weight: float = Field(default=0.0, ge=0)
+    augmentation: Literal["mirror", "turns"] = "mirror"
+    """About y = 0, the one symmetry that the rig has; or, for a VAE alone, by quarters of a turn too (SI 3)."""
+    left_out: list[str] = Field(default_factory=list[str])
+    """Categories of objects that a VAE is not shown; a dataset's own plan says which a compressor is."""
+    backgrounds: float = Field(default=0.0, ge=0, le=1)
+    """Of a VAE's objects: the share that has a post or a panel beside it."""
+    keep: Literal["last", "best"] = "last"
+    """Which epoch's weights are handed on; the best has the least held-out loss."""
+    steps: Literal["two", "one", "two-then-joint"] = "two"
+    """A compressor onto a VAE's latent; or one and a decoder from scratch; or both together, from two-step weights."""
+    maps: MapKind = "raw maps"
+    """What the compressor eats; difference maps are the maps less the bare wall's."""
+    all_layers_epochs: int = Field(default=4, ge=0)
+    """Of a transfer: its first phase (SI 4: 3 to 5)."""
+    statistics: Literal["kept", "own"] = "kept"
+    """Of a transfer: maps are normalised as the synthetic ones were, or by the recordings' own mean and spread."""
     deviations: list[str] = Field(default_factory=list[str])
     """Where this recipe leaves the supporting information, and why."""
 
-    @field_validator("batch")
-    @classmethod
-    def _no_more_than_objects(cls, batch: int, info: ValidationInfo) -> int:
-        if batch > info.data.get("objects", batch):
-            raise ValueError(f"a batch must not be larger than objects ({info.data['objects']})")
-        return batch
+    @model_validator(mode="after")
+    def _agrees_with_itself(self) -> Self:
+        if self.batch > self.objects:
+            raise ValueError(f"a batch of {self.batch} is larger than objects ({self.objects})")
+        if self.augmentation == "turns" and self.task != "vae":
+            raise ValueError("augmentation 'turns' is for a VAE: maps of the rig have the mirror's symmetry alone")
+        if self.task == "transfer" and self.steps != "two":
+            raise ValueError(f"steps {self.steps!r} is for a compressor: a transfer keeps the decoder")
+        if self.task != "vae" and not self.latent_weight + self.image_weight:
+            raise ValueError("latent_weight and image_weight are both 0: there is nothing to learn by")
+        if self.steps == "one" and self.latent_weight:
+            raise ValueError("steps 'one' knows no latent to aim at: set latent_weight = 0")
+        if self.steps != "two" and not self.image_weight:
+            raise ValueError(
+                f"steps {self.steps!r} trains a decoder, which learns by images alone: set an image_weight"
+            )
+        return self
+
+    def scaled(self, share: float) -> Self:
+        """The same at a share of its budget (objects x epochs): fewer epochs, and fewer objects where one is too many.
+
+        Raises RecipeError where the share is not above 0 and at most 1.
+        """
+        if not 0 < share <= 1:
+            raise RecipeError(f"a budget of {share:g} is none: choose a share above 0 and at most 1")
+        epochs = max(1, round(self.epochs * share))
+        objects = max(self.batch, round(self.objects * min(1.0, self.epochs * share / epochs)))
+        why = f"{share:g} of the budget: {epochs} epochs of {objects} objects, not {self.epochs} of {self.objects}"
+        deviations = [*self.deviations, why] if share < 1 else self.deviations
+        return self.model_copy(update={"epochs": epochs, "objects": objects, "deviations": deviations})
+
+    def of_objects(self, objects: int) -> Self:
+        """The same on another number of objects; a batch is never larger than that. RecipeError below two."""
+        if objects < 2:
+            raise RecipeError(f"{objects} objects are too few to train on: give at least 2")
+        return self.model_copy(update={"objects": objects, "batch": min(self.batch, objects)})
 
 
 def load_recipe(path: Path) -> Recipe:
@@ -50,6 +100,7 @@ def load_recipe(path: Path) -> Recipe:
     except ValidationError as error:
         problem = error.errors()[0]
         field = ".".join(str(part) for part in problem["loc"])
-        raise RecipeError(f"{path}: {field}: {problem['msg']} (got {problem['input']!r:.80})") from error
+        value = f" (got {problem['input']!r:.80})" if field else ""
+        raise RecipeError(": ".join(part for part in (str(path), field, problem["msg"]) if part) + value) from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise RecipeError(f"{path} cannot be read as a recipe: {error}") from error

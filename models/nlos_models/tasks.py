@@ -1,5 +1,6 @@
 """The two steps of the method as training tasks: first the VAE on images, then the compressor onto its latent."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -7,128 +8,104 @@ import torch
 from torch import Tensor
 
 from nlos_models.compressor import Compressor
-from nlos_models.data import Half, MapBatch, MapSet, image_batches, map_batches
-from nlos_models.losses import image_error, kl_divergence, latent_error
-from nlos_models.metrics import silhouette_iou
+from nlos_models.data import Float32, Half, MapSet, image_batches
+from nlos_models.errors import TrainingError
+from nlos_models.losses import image_error, kl_divergence
 from nlos_models.pipeline import Pipeline
-from nlos_models.preprocess import split_and_stack
 from nlos_models.recipe import Recipe
-from nlos_models.res_vae import LATENT, ResVae
+from nlos_models.remap import Remapping, figures_of, in_channels_last, parts_of, set_for_training
+from nlos_models.res_vae import LATENT, Decoder, ResVae
 from nlos_models.silhouette import cut_silhouette
-from nlos_models.train import OnStep, fit
-
-SCORING_BATCH = 100
+from nlos_models.sources import MapSource
+from nlos_models.train import OnStep, Running, fit
 
 
 def train_vae(
-    recipe: Recipe,
-    images: Half,
-    held_out: Half,
-    folder: Path,
-    on_step: OnStep,
+    recipe: Recipe, images: Half, held_out: Half, folder: Path, on_step: OnStep, running: Running | None = None
 ) -> tuple[ResVae, dict[str, float]]:
     """Train a Res-VAE on images (n, 64, 64) in [0, 1] (SI 3); a second call resumes.
 
     Returns the network in eval mode and its held-out figures.
     """
     torch.manual_seed(recipe.seed)
-    vae = ResVae().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub lacks it)
+    vae = in_channels_last(ResVae())
 
     def loss(image: Tensor) -> Tensor:
+        if recipe.augmentation == "turns":
+            image = turn_some(image, torch.randint(4, (len(image),), device=image.device))
         image = image.contiguous(memory_format=torch.channels_last)
         rebuilt, mean, log_variance = vae(image, torch.randn(len(image), LATENT, device=image.device))
         return image_error(rebuilt, image) + recipe.kl_weight * kl_divergence(mean, log_variance)
 
-    def score() -> dict[str, float]:
-        return _figures(np.concatenate([_rebuild(vae, part) for part in _parts(held_out)]), held_out)
-
-    fit(
+    figures = fit(
         vae,
         recipe=recipe,
         steps_per_epoch=len(images) // recipe.batch,
         batches=lambda generator: image_batches(images, recipe.batch, generator),
         loss=loss,
-        score=score,
+        score=lambda: figures_of(np.concatenate([_rebuilt(vae, part) for part in parts_of(held_out)]), held_out),
         folder=folder,
         on_step=on_step,
+        running=running,
     )
-    return vae.eval(), score()
+    return vae.cpu().eval(), figures
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a compressor's training sets out from."""
+
+    vae: ResVae | None = None
+    """Whose latent is aimed at, and whose decoder is used; None for steps "one"."""
+    pipeline: Pipeline | None = None
+    """Two-step weights, for steps "two-then-joint"; its decoder is the VAE's."""
 
 
 def train_compressor(
     recipe: Recipe,
-    vae: ResVae,
-    maps: MapSet,
+    start: Start,
+    maps: MapSource,
     held_out: MapSet,
     folder: Path,
     on_step: OnStep,
+    running: Running | None = None,
 ) -> tuple[Pipeline, dict[str, float]]:
-    """Train a compressor onto the latent of a trained, frozen VAE (SI 4); a second call resumes.
+    """Train a compressor as the recipe's `steps` say (SI 4: onto the latent of a frozen VAE); a second call resumes.
 
-    Returns the network in eval mode and its held-out figures.
+    Returns the network in eval mode and its held-out figures. Raises TrainingError where the start does not hold what
+    these steps need.
     """
     torch.manual_seed(recipe.seed)
-    pipeline = Pipeline(Compressor(recipe.dropout), vae.decoder, recipe.left_noise)
-    pipeline.preprocess.learn(split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)))
-    pipeline = pipeline.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub lacks it)
-    vae.requires_grad_(requires_grad=False).eval()
+    pipeline = _set_out(recipe, start)
+    remapping = Remapping(pipeline, start.vae.encoder if start.vae else None, maps, held_out)
+    if recipe.steps != "two-then-joint":
+        remapping.learn_statistics()
+    frozen = [pipeline.decoder] if recipe.steps == "two" else []
+    figures = remapping.fit(recipe, frozen, folder, on_step, running or Running())
+    return pipeline.cpu().eval(), figures
 
-    targets = [_latents(vae, maps.image), _latents(vae, maps.image[:, ::-1])]  # as they are, and mirrored
 
-    def loss(batch: MapBatch) -> Tensor:
-        vae.eval()
-        latent = pipeline.latent(batch.depth_m, batch.intensity)
-        straight, mirrored = (pair[batch.row.cpu()].to(latent.device) for pair in targets)
-        mean, log_variance = torch.where(batch.mirrored[:, None, None], mirrored, straight).unbind(1)
-        value = recipe.latent_weight * latent_error(latent, mean, log_variance)
-        if recipe.image_weight:
-            value = value + recipe.image_weight * image_error(vae.decoder(latent), batch.image)
-        return value
+def _set_out(recipe: Recipe, start: Start) -> Pipeline:
+    if recipe.steps == "one":
+        return Pipeline(Compressor(recipe.dropout), Decoder(), recipe.left_noise)
+    if recipe.steps == "two-then-joint":
+        if start.pipeline is None:
+            raise TrainingError("steps 'two-then-joint' go on from two-step weights: name them (--weights)")
+        set_for_training(start.pipeline, recipe)
+        return start.pipeline
+    if start.vae is None:
+        raise TrainingError("steps 'two' need a trained VAE: name one (--vae)")
+    return Pipeline(Compressor(recipe.dropout), start.vae.decoder, recipe.left_noise)
 
-    def score() -> dict[str, float]:
-        return _figures(run(pipeline, held_out), held_out.image)
 
-    fit(
-        pipeline,
-        recipe=recipe,
-        steps_per_epoch=len(maps.image) // recipe.batch,
-        batches=lambda generator: map_batches(maps, recipe.batch, generator),
-        loss=loss,
-        score=score,
-        folder=folder,
-        on_step=on_step,
-    )
-    return pipeline.eval(), score()
+def turn_some(images: Tensor, quarters: Tensor) -> Tensor:
+    """Turn each of images (n, 1, 64, 64) by so many quarters (n,); with the mirror, SI 3's turns and flips."""
+    turned = torch.stack([images.rot90(k, (-2, -1)) for k in range(4)])
+    return turned[quarters, torch.arange(len(images), device=images.device)]
 
 
 @torch.inference_mode()
-def run(pipeline: Pipeline, maps: MapSet) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    """Images (n, 64, 64) that the pipeline makes of maps, in eval mode."""
-    parts = [slice(k, k + SCORING_BATCH) for k in range(0, len(maps.image), SCORING_BATCH)]
-    device = next(pipeline.parameters()).device
-    depth, intensity = (torch.from_numpy(m).to(device) for m in (maps.depth_m, maps.intensity))
-    return np.concatenate([pipeline(depth[part], intensity[part]).float().cpu().numpy() for part in parts])
-
-
-@torch.no_grad()
-def _latents(vae: ResVae, images: Half | np.ndarray) -> Tensor:  # pyright: ignore[reportMissingTypeArgument]
-    """Mean and log-variance (n, 2, 256) of images (n, 64, 64)."""
-    parts = (torch.from_numpy(part.astype(np.float32))[:, None] for part in _parts(images))
-    return torch.cat([torch.stack(vae.encoder(part), dim=1) for part in parts])
-
-
-def _parts(images: Half) -> list[Half]:
-    return [images[k : k + SCORING_BATCH] for k in range(0, len(images), SCORING_BATCH)]
-
-
-@torch.inference_mode()
-def _rebuild(vae: ResVae, images: Half) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+def _rebuilt(vae: ResVae, images: Half) -> Float32:
     device = next(vae.parameters()).device
     mean, _ = vae.encoder(torch.from_numpy(images.astype(np.float32)).to(device)[:, None])
     return cut_silhouette(vae.decoder(mean))[:, 0].float().cpu().numpy()
-
-
-def _figures(image: np.ndarray[tuple[int, ...], np.dtype[np.float32]], truth: Half | np.ndarray) -> dict[str, float]:  # pyright: ignore[reportMissingTypeArgument]
-    truth = truth.astype(np.float32)
-    error = float(np.square(image - truth).sum((1, 2)).mean())
-    return {"held_out_loss": error, "held_out_iou": float(np.mean(silhouette_iou(image, truth)))}

@@ -1,17 +1,27 @@
-"""The training loop: epochs of batches, a log, a checkpoint after each epoch that a killed run resumes from."""
+"""The training loop: epochs of batches on one or many processes; killed at any moment, it goes on to the same weights.
 
-import csv
+The order of the batches depends on the recipe's seed and the epoch alone, the noise of a step on these, the step and
+the process: no state of a random generator needs to be kept. Each process takes its share of every batch, so that
+several differ from one only in their noise, their batch norms' samples, and the order of sums.
+"""
+
+import math
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from nlos_models.errors import RecipeError
+from nlos_models.errors import RecipeError, TrainingError
+from nlos_models.processes import open_fabric, seed_of, share_of
 from nlos_models.recipe import Recipe
+from nlos_models.run_files import Tell, read_best, read_last, write_best, write_last, write_log
+from nlos_models.tensorboard import Board
 
 Batches = Callable[[torch.Generator], Iterable[Any]]
 """One epoch of batches, shuffled by the generator."""
@@ -22,27 +32,45 @@ OnStep = Callable[[int, int], None]
 
 PLATEAU_FACTOR, PLATEAU_PATIENCE, SMALLEST_RATE = 0.3, 5, 1e-8
 """SI 3 and 4: the learning rate falls by this factor after this many epochs without progress, and ends the run."""
+STEPS_BETWEEN_WORDS = 10
+"""After how many steps several processes agree on whether to stop."""
 
 
-def _schedule(recipe: Recipe, optimizer: torch.optim.Optimizer, steps: int) -> Any:
-    if recipe.schedule == "one-cycle":
-        return torch.optim.lr_scheduler.OneCycleLR(
-            optimizer,
-            recipe.learning_rate,
-            total_steps=steps,
-            pct_start=0.15,
-            cycle_momentum=False,
-        )
-    return torch.optim.lr_scheduler.ReduceLROnPlateau(optimizer, factor=PLATEAU_FACTOR, patience=PLATEAU_PATIENCE)
+def _to_nobody(told: object) -> None:
+    del told
 
 
-def _log(path: Path, row: dict[str, float]) -> None:
-    fresh = not path.exists()
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(row))
-        if fresh:
-            writer.writeheader()
-        writer.writerow(row)
+@dataclass(frozen=True)
+class Running:
+    """How a run is run; none of it changes what comes out, but for the number of processes."""
+
+    fabric: Fabric | None = None
+    """Launched; None takes the best one device at hand."""
+    stop: Callable[[], bool] = lambda: False
+    """Asked after each step; where it says so, the run is saved and ends by KeyboardInterrupt."""
+    tell: Tell = _to_nobody
+    on_epoch: Callable[[dict[str, float]], None] = _to_nobody
+    """Called with each new row of the log."""
+    checkpoint_s: float = 300.0
+    """How often a state is saved within an epoch."""
+    tensorboard: bool = False
+    clock: Callable[[], float] = time.monotonic
+
+    def on(self, recipe: Recipe) -> Fabric:
+        """The fabric, or one device's."""
+        return self.fabric or open_fabric(recipe)
+
+
+class _Step(nn.Module):
+    """A loss as a module's forward: what several processes need, to average the gradients behind it."""
+
+    def __init__(self, module: nn.Module, loss: Loss) -> None:
+        super().__init__()
+        self.module, self._loss = module, loss
+
+    def forward(self, batch: Any) -> Tensor:
+        """The loss of one batch."""
+        return self._loss(batch)
 
 
 def fit(
@@ -55,72 +83,163 @@ def fit(
     score: Score,
     folder: Path,
     on_step: OnStep,
-    fabric: Fabric | None = None,
-) -> None:
-    """Train `module` in place; `loss` must run it. The folder keeps last.ckpt and log.csv; a second call resumes.
+    running: Running | None = None,
+) -> dict[str, float]:
+    """Train `module` in place and return the figures of the epoch it is left at; `loss` must run it.
 
-    An epoch is repeatable: its shuffle and noise depend on the recipe's seed and the epoch alone.
+    The folder keeps last.ckpt, previous.ckpt, best.ckpt and log.csv; a second call goes on where it was. `score` gives
+    at least held_out_loss. Raises TrainingError where the run cannot go on, KeyboardInterrupt where it was stopped.
     """
-    fabric = fabric or Fabric(accelerator="auto", devices=1, precision=recipe.precision)
-    module.to(fabric.device)
-    optimizer = torch.optim.Adam(
-        [p for p in module.parameters() if p.requires_grad], recipe.learning_rate, recipe.betas
-    )
-    schedule = _schedule(recipe, optimizer, recipe.epochs * steps_per_epoch)
-    networks = {"module": module, "optimizer": optimizer, "schedule": schedule}
-    state: dict[str, Any] = {**networks, "epoch": 0, "recipe": recipe.model_dump_json()}
-    folder.mkdir(parents=True, exist_ok=True)
-    _resume(fabric, folder / "last.ckpt", state)
-    for epoch in range(state["epoch"], recipe.epochs):
-        if optimizer.param_groups[0]["lr"] < SMALLEST_RATE:
-            break
-        started = time.perf_counter()
-        torch.manual_seed(recipe.seed * 100_003 + epoch)
-        generator = torch.Generator().manual_seed(recipe.seed * 100_003 + epoch)
-        module.train()
-
-        def advance(step: int, before: int = epoch * steps_per_epoch) -> None:
-            on_step(before + step, recipe.epochs * steps_per_epoch)
-
-        mean_loss = _one_epoch(fabric, batches(generator), loss, optimizer, schedule, advance)
-        module.eval()
-        figures = score()
-        rate = optimizer.param_groups[0]["lr"]
-        if recipe.schedule == "plateau":
-            schedule.step(figures["held_out_loss"])
-        seconds = time.perf_counter() - started
-        _log(folder / "log.csv", {"epoch": epoch, "rate": rate, "loss": mean_loss, **figures, "seconds": seconds})
-        state["epoch"] = epoch + 1
-        fabric.save(folder / "last.ckpt.part", state)
-        (folder / "last.ckpt.part").replace(folder / "last.ckpt")
+    if steps_per_epoch < 1:
+        raise RecipeError(f"fewer training objects than a batch of {recipe.batch}: choose more, or a smaller batch")
+    run = _Run(module, recipe, steps_per_epoch, loss, folder, running or Running())
+    board = Board(folder, run.epoch) if run.leads and run.running.tensorboard else None
+    try:
+        while run.goes_on:
+            run.train(batches, on_step)
+            run.judge(score, board)
+    finally:
+        if board:
+            board.close()
+    return run.hand_on()
 
 
-def _resume(fabric: Fabric, checkpoint: Path, state: dict[str, Any]) -> None:
-    """Load the last epoch's state, if there is one. Raises RecipeError where another recipe made it."""
-    wanted = state["recipe"]
-    if checkpoint.exists():
-        fabric.load(checkpoint, state)
-    if state["recipe"] != wanted:
-        raise RecipeError(f"{checkpoint.parent} holds a run of another recipe: choose another --out")
+class _Run:
+    """Everything that a checkpoint holds, and the steps that change it."""
+
+    def __init__(
+        self, module: nn.Module, recipe: Recipe, steps: int, loss: Loss, folder: Path, running: Running
+    ) -> None:
+        self.recipe, self.steps, self.folder, self.running = recipe, steps, folder, running
+        self.fabric = running.on(recipe)
+        self.leads = self.fabric.is_global_zero
+        self.module = module
+        free = [p for p in module.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(free, recipe.learning_rate, recipe.betas)
+        self._forward, self._optimizer = self.fabric.setup(_Step(module, loss), self.optimizer)
+        self.schedule = _schedule(recipe, self.optimizer, recipe.epochs * steps)
+        self.epoch, self.step, self.rows = 0, 0, list[dict[str, float]]()
+        self.total = torch.zeros((), device=self.fabric.device)
+        if self.leads:
+            folder.mkdir(parents=True, exist_ok=True)
+        self._resume()
+        self._saved_s = running.clock()
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether there is an epoch left to train."""
+        return self.epoch < self.recipe.epochs and self._rate >= SMALLEST_RATE
+
+    @property
+    def _rate(self) -> float:
+        return self.optimizer.param_groups[0]["lr"]
+
+    def train(self, batches: Batches, on_step: OnStep) -> None:
+        """The steps of an epoch that are still to do."""
+        self.started_s = self.running.clock()
+        self.module.train()
+        generator = torch.Generator().manual_seed(seed_of(self.recipe.seed, self.epoch))
+        for batch in islice(batches(generator), self.step, None):
+            self._advance(batch)
+            if self.leads:
+                on_step(self.epoch * self.steps + self.step, self.recipe.epochs * self.steps)
+            self._pause()
+
+    def _advance(self, batch: Any) -> None:
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        torch.manual_seed(seed_of(self.recipe.seed, self.epoch, self.step, rank))
+        value = self._forward(self.fabric.to_device(share_of(batch, rank, world)))
+        self._optimizer.zero_grad(set_to_none=True)
+        self.fabric.backward(value)
+        self._optimizer.step()
+        if self.recipe.schedule == "one-cycle":
+            self.schedule.step()
+        self.total += value.detach().float()
+        self.step += 1
+
+    def _pause(self) -> None:
+        """Save where that is due; end where it is asked for."""
+        stop = self._agree_to_stop()
+        if self.leads and (stop or self.running.clock() - self._saved_s >= self.running.checkpoint_s):
+            self._save()
+        if stop:
+            if self.leads:
+                self.running.tell(f"stopped in epoch {self.epoch}: the same command goes on from step {self.step}")
+            raise KeyboardInterrupt
+
+    def _agree_to_stop(self) -> bool:
+        asked = self.running.stop()
+        if self.fabric.world_size == 1:
+            return asked
+        if (self.epoch * self.steps + self.step) % STEPS_BETWEEN_WORDS:
+            return False
+        return bool(self._over_all(torch.tensor(float(asked), device=self.fabric.device), "sum"))
+
+    def _over_all(self, value: Tensor, how: str) -> Tensor:
+        """The mean or sum of a number over the processes."""
+        return cast("Tensor", self.fabric.all_reduce(value, reduce_op=how))
+
+    def judge(self, score: Score, board: Board | None) -> None:
+        """End the epoch: figures, log, schedule, checkpoints. Raises TrainingError where the loss is not a number."""
+        loss = float(self._over_all(self.total / max(self.step, 1), "mean"))
+        if not math.isfinite(loss):
+            raise TrainingError(f"the loss is {loss} in epoch {self.epoch}: choose a smaller learning_rate")
+        self.module.eval()
+        figures: dict[str, float] = self.fabric.broadcast(score() if self.leads else {})
+        row = {"epoch": self.epoch, "rate": self._rate, "loss": loss, **figures}
+        best = all(figures["held_out_loss"] < earlier["held_out_loss"] for earlier in self.rows)
+        self.rows.append({**row, "seconds": self.running.clock() - self.started_s})
+        if self.recipe.schedule == "plateau":
+            self.schedule.step(figures["held_out_loss"])
+        self.epoch, self.step, self.total = self.epoch + 1, 0, torch.zeros_like(self.total)
+        if self.leads:
+            self._keep(board, best=best)
+
+    def _keep(self, board: Board | None, *, best: bool) -> None:
+        if best:
+            write_best(self.folder, {"epoch": self.epoch - 1, "module": self.module.state_dict()})
+        write_log(self.folder, self.rows)
+        self._save()
+        if board:
+            board.add(self.rows[-1])
+        self.running.on_epoch(self.rows[-1])
+
+    def hand_on(self) -> dict[str, float]:
+        """Bring the module to the epoch that the recipe keeps; that epoch's figures."""
+        row = self.rows[-1]
+        if self.recipe.keep == "best":
+            self.fabric.barrier()  # the leader may still be writing it
+            best = read_best(self.folder)
+            self.module.load_state_dict(best["module"])
+            row = self.rows[best["epoch"]]
+        return {name: value for name, value in row.items() if name not in {"epoch", "rate", "loss", "seconds"}}
+
+    def _save(self) -> None:
+        parts = {name: getattr(self, name).state_dict() for name in ("module", "optimizer", "schedule")}
+        facts = {"epoch": self.epoch, "step": self.step, "total": self.total, "rows": self.rows}
+        write_last(self.folder, {**parts, **facts, "recipe": self.recipe.model_dump_json()})
+        self._saved_s = self.running.clock()
+
+    def _resume(self) -> None:
+        """Take the last state up, if there is one. Raises RecipeError where another recipe made it."""
+        state = read_last(self.folder, self.running.tell)
+        if state is None:
+            return
+        if state["recipe"] != self.recipe.model_dump_json():
+            raise RecipeError(f"{self.folder} holds a run of another recipe: choose another --out")
+        for name in ("module", "optimizer", "schedule"):
+            getattr(self, name).load_state_dict(state[name])
+        self.epoch, self.step, self.rows = state["epoch"], state["step"], state["rows"]
+        self.total = state["total"].to(self.fabric.device)
 
 
-def _one_epoch(
-    fabric: Fabric,
-    batches: Iterable[Any],
-    loss: Loss,
-    optimizer: torch.optim.Optimizer,
-    schedule: Any,
-    advance: Callable[[int], None],
-) -> float:
-    total, count = 0.0, 0
-    for batch in batches:
-        with fabric.autocast():
-            value = loss(fabric.to_device(batch))
-        optimizer.zero_grad(set_to_none=True)
-        value.backward()
-        optimizer.step()
-        if isinstance(schedule, torch.optim.lr_scheduler.OneCycleLR):
-            schedule.step()
-        total, count = total + value.item(), count + 1
-        advance(count)
-    return total / max(count, 1)
+def _schedule(recipe: Recipe, optimizer: torch.optim.Optimizer, steps: int) -> Any:
+    if recipe.schedule == "one-cycle":
+        return torch.optim.lr_scheduler.OneCycleLR(
+            optimizer,
+            recipe.learning_rate,
+            total_steps=steps,
+            pct_start=0.15,
+            cycle_momentum=False,
+        )
+    return torch.optim.lr_scheduler.ReduceLROnPlateau(optimizer, factor=PLATEAU_FACTOR, patience=PLATEAU_PATIENCE)

@@ -1,20 +1,45 @@
-"""`train vae|compressor`: recipes to weights."""
+"""`train vae|compressor|transfer`: recipes to weights."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from nlos_calibration.wall_record import rig_named
-from nlos_models.checkpoint import CheckpointRecord, load_vae, save_pipeline, save_vae
-from nlos_models.recipe import Recipe, load_recipe
-from nlos_models.tasks import train_compressor, train_vae
+from nlos_models.checkpoint import (
+    CheckpointRecord,
+    load_encoder,
+    load_pipeline,
+    load_pipeline_partly,
+    load_vae,
+    shipped_folder,
+)
+from nlos_models.pipeline import Pipeline
+from nlos_models.processes import Accelerator, launched, open_fabric
+from nlos_models.recipe import Recipe
+from nlos_models.res_vae import ResVae
+from nlos_models.tasks import Start
+from nlos_models.train import OnStep
 
-from nlos_cam import dataset
+from nlos_cam import colour_train, dataset
 from nlos_cam.cli.common import PAPER_RIG, Json, finish, say, tracked
+from nlos_cam.cli.train_data import RecipeChoice, TrainingMaps, read_maps
+from nlos_cam.cli.train_runs import Job, run_compressor, run_transfer, run_vae
 from nlos_cam.errors import SceneError
 
 RecipeFile = Annotated[Path, typer.Option("--recipe", help="A training recipe (models/recipes).", show_default=False)]
 RunFolder = Annotated[Path, typer.Option("--out", help="The run's folder: log, checkpoints, weights. Resumes there.")]
+Maps = Annotated[Path, typer.Option("--dataset", help="Training maps, from `dataset build` or of recordings.")]
+HeldOut = Annotated[Path, typer.Option("--held-out", help="Maps to judge by, of other objects.")]
+Wall = Annotated[
+    Path | None, typer.Option("--wall", help="The bare wall for difference maps (wall.toml); else it is rendered.")
+]
+Stream = Annotated[bool, typer.Option("--stream", help="Read the maps as they are needed: for more than memory holds.")]
+Budget = Annotated[float, typer.Option("--budget", min=1e-4, max=1.0, help="Share of the recipe's budget.")]
+Objects = Annotated[int | None, typer.Option("--objects", min=2, help="Train on so many, not on the recipe's.")]
+Devices = Annotated[int, typer.Option("--devices", min=1, help="Processes: one for each GPU, or on the CPU.")]
+On = Annotated[Accelerator, typer.Option("--accelerator", help="auto is a GPU if there is one.")]
+TensorBoard = Annotated[bool, typer.Option("--tensorboard", help="Log for TensorBoard too, beside log.csv.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -22,55 +47,150 @@ def register(app: typer.Typer) -> None:
     train = typer.Typer(help="Training.")
     train.command("vae")(vae)
     train.command("compressor")(compressor)
+    train.command("transfer")(transfer)
     app.add_typer(train, name="train")
 
 
-def vae(recipe_file: RecipeFile, out: RunFolder, json: Json = False) -> None:
+def vae(
+    recipe_file: RecipeFile,
+    out: RunFolder,
+    budget: Budget = 1.0,
+    objects: Objects = None,
+    devices: Devices = 1,
+    accelerator: On = "auto",
+    tensorboard: TensorBoard = False,
+    json: Json = False,
+) -> None:
     """Train a Res-VAE on procedural objects (SI 3)."""
-    recipe = _recipe(recipe_file, "vae")
+    recipe = RecipeChoice(recipe_file, budget, objects).read("vae")
     rig = rig_named(PAPER_RIG)
+    if recipe.colour:
+        _told(out, _in_colour(lambda on_step: colour_train.train_vae(recipe, rig, out, on_step)), as_json=json)
+        return
+    fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
     box = dataset.DatasetPlan(rig, 0).box
     say(f"making {recipe.objects + recipe.held_out} objects")
-    images = dataset.procedural_images(dataset.TRAINING_SEED, recipe.objects, box)
-    held_out = dataset.procedural_images(dataset.HELD_OUT_SEED, recipe.held_out, box)
-    with tracked("training the VAE") as on_step:
-        trained, figures = train_vae(recipe, images, held_out, out, on_step)
-    save_vae(
-        out, trained, CheckpointRecord(rig_name=rig.name, rig_checksum=rig.checksum, vae_recipe=recipe, figures=figures)
+    kinds, besides = dataset.Objects.without(recipe.left_out).categories, recipe.backgrounds
+    images, held_out = (
+        dataset.procedural_images(seed, count, box, kinds, backgrounds=besides)
+        for seed, count in ((dataset.TRAINING_SEED, recipe.objects), (dataset.HELD_OUT_SEED, recipe.held_out))
     )
-    finish({"out": str(out), **figures}, as_json=json, text=f"weights in {out}: {figures}")
+    record = CheckpointRecord(rig_name=rig.name, rig_checksum=rig.checksum, vae_recipe=recipe)
+    figures = launched(fabric, run_vae, Job(recipe, out, record, tensorboard), images, held_out)
+    _told(out, figures, as_json=json)
 
 
 def compressor(
     recipe_file: RecipeFile,
     out: RunFolder,
-    vae_folder: Annotated[Path, typer.Option("--vae", help="The folder of a trained VAE.")],
-    data: Annotated[Path, typer.Option("--dataset", help="Training maps, from `dataset build`.")],
-    held_out_data: Annotated[Path, typer.Option("--held-out", help="Maps to judge by, of other seeds.")],
+    data: Maps,
+    held_out_data: HeldOut,
+    vae_folder: Annotated[
+        Path | None, typer.Option("--vae", help="A trained VAE; the shipped one unless given.")
+    ] = None,
+    weights: Annotated[Path | None, typer.Option("--weights", help="Two-step weights, for `two-then-joint`.")] = None,
+    wall: Wall = None,
+    stream: Stream = False,
+    budget: Budget = 1.0,
+    objects: Objects = None,
+    devices: Devices = 1,
+    accelerator: On = "auto",
+    tensorboard: TensorBoard = False,
     json: Json = False,
 ) -> None:
-    """Train a compressor onto the latent of a trained VAE (SI 4)."""
-    recipe = _recipe(recipe_file, "compressor")
-    trained_vae, record = load_vae(vae_folder)
-    maps, plan = dataset.read(data)
-    held_out, other = dataset.read(held_out_data)
-    if len(maps.image) != recipe.objects:
-        raise SceneError(
-            f"{data} holds {len(maps.image)} objects, the recipe asks for {recipe.objects}: build that many"
-        )
-    if plan.rig != other.rig:
-        raise SceneError(f"{data} and {held_out_data} were rendered for different rigs: build one of them again")
-    with tracked("training the compressor") as on_step:
-        pipeline, figures = train_compressor(recipe, trained_vae, maps, held_out, out, on_step)
-    tied = {"rig_name": plan.rig.name, "rig_checksum": plan.rig.checksum}
-    made_by = record.model_copy(update={**tied, "compressor_recipe": recipe, "figures": figures})
-    save_pipeline(out, pipeline, made_by)
-    save_vae(out, trained_vae, made_by)
-    finish({"out": str(out), **figures}, as_json=json, text=f"weights in {out}: {figures}")
+    """Train a compressor onto the latent of a trained VAE (SI 4), or as the recipe's `steps` say."""
+    recipe = RecipeChoice(recipe_file, budget, objects).read("compressor")
+    if recipe.colour:
+        if vae_folder is None:
+            raise typer.BadParameter("no VAE of colour is shipped: train one, and give its folder with --vae")
+        sources = vae_folder, data, held_out_data
+        figures = _in_colour(lambda on_step: colour_train.train_compressor(recipe, *sources, out, on_step))
+        _told(out, figures, as_json=json)
+        return
+    fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
+    start, record = _start(recipe, vae_folder, weights)
+    maps = read_maps(recipe, data, held_out_data, wall, stream=stream)
+    record = _tied(record, maps, recipe).model_copy(update={"compressor_recipe": recipe})
+    job = Job(recipe, out, record, tensorboard)
+    figures = launched(fabric, run_compressor, job, start, maps.training, maps.held_out)
+    _told(out, figures, as_json=json)
 
 
-def _recipe(path: Path, task: str) -> Recipe:
-    recipe = load_recipe(path)
-    if recipe.task != task:
-        raise SceneError(f"{path} is a recipe for {recipe.task!r}, not {task!r}: choose another --recipe")
-    return recipe
+def _in_colour(run: Callable[[OnStep], dict[str, float]]) -> dict[str, float]:
+    """Train in colour, in this process."""
+    with tracked("training in colour") as on_step:
+        return run(on_step)
+
+
+def _told(out: Path, figures: dict[str, float], *, as_json: bool) -> None:
+    finish({"out": str(out), **figures}, as_json=as_json, text=f"weights in {out}: {figures}")
+
+
+def transfer(
+    recipe_file: RecipeFile,
+    out: RunFolder,
+    data: Maps,
+    held_out_data: HeldOut,
+    weights: Annotated[
+        Path | None, typer.Option("--weights", help="Where to start; the shipped weights unless given.")
+    ] = None,
+    partial: Annotated[
+        bool, typer.Option("--partial", help="Take what fits of a compressor that does not quite, and say what did.")
+    ] = False,
+    wall: Wall = None,
+    objects: Objects = None,
+    devices: Devices = 1,
+    accelerator: On = "auto",
+    tensorboard: TensorBoard = False,
+    json: Json = False,
+) -> None:
+    """Train synthetic weights on, on a bench's recordings (SI 4): all layers, then the classifier alone."""
+    recipe = RecipeChoice(recipe_file, objects=objects).read("transfer")
+    fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
+    pipeline, record = _synthetic(weights, partial=partial)
+    _same_input(recipe, record)
+    maps = read_maps(recipe, data, held_out_data, wall)
+    record = _tied(record, maps, recipe).model_copy(update={"transfer_recipe": recipe})
+    job, encoder = Job(recipe, out, record, tensorboard), load_encoder(weights)
+    figures = launched(fabric, run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
+    told = f"weights in {out}: {figures['after']}, from {figures['before']}"
+    finish({"out": str(out), **figures["after"], "before": figures["before"]}, as_json=json, text=told)
+
+
+def _start(recipe: Recipe, vae_folder: Path | None, weights: Path | None) -> tuple[Start, CheckpointRecord | None]:
+    """What the recipe's steps set out from, and its record; none where they set out from nothing."""
+    if recipe.steps == "one":
+        return Start(), None
+    if recipe.steps == "two":
+        trained, record = load_vae(vae_folder or shipped_folder())
+        return Start(trained), record
+    pipeline, record = load_pipeline(weights)
+    _same_input(recipe, record)
+    trained = ResVae()
+    if encoder := load_encoder(weights):
+        trained.encoder = encoder
+    elif recipe.latent_weight:
+        raise SceneError(f"{weights} has no encoder to aim at: set latent_weight = 0 in the recipe")
+    trained.decoder = pipeline.decoder
+    return Start(trained, pipeline), record
+
+
+def _synthetic(weights: Path | None, *, partial: bool) -> tuple[Pipeline, CheckpointRecord]:
+    if not partial:
+        return load_pipeline(weights)
+    pipeline, record, report = load_pipeline_partly(weights or shipped_folder())
+    say(f"compressor: {report}")
+    return pipeline, record
+
+
+def _same_input(recipe: Recipe, record: CheckpointRecord) -> None:
+    if record.input != recipe.maps:
+        raise SceneError(f"these weights eat {record.input}, the recipe says {recipe.maps}: change one of them")
+
+
+def _tied(record: CheckpointRecord | None, maps: TrainingMaps, recipe: Recipe) -> CheckpointRecord:
+    """The record of weights for the rig and the kind of these maps."""
+    rig = maps.plan.rig
+    tied = CheckpointRecord(rig_name=rig.name, rig_checksum=rig.checksum, input=recipe.maps)
+    recipes = ("vae_recipe", "compressor_recipe", "transfer_recipe")
+    return tied.model_copy(update={name: getattr(record, name) for name in recipes}) if record else tied

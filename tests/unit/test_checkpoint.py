@@ -5,12 +5,23 @@ from pathlib import Path
 
 import pytest
 import torch
-from nlos_models.checkpoint import CheckpointRecord, load_pipeline, load_record, load_vae, save_pipeline, save_vae
+from nlos_models import checkpoint
+from nlos_models.checkpoint import (
+    CheckpointRecord,
+    load_encoder,
+    load_fitting,
+    load_pipeline,
+    load_pipeline_partly,
+    load_record,
+    load_vae,
+    save_pipeline,
+    save_vae,
+)
 from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
-from nlos_models.res_vae import Decoder, ResVae
+from nlos_models.res_vae import Decoder, Encoder, ResVae
 from safetensors.torch import load_file, save_file
 from torch import nn
 
@@ -167,6 +178,64 @@ def test_a_wrong_field_of_the_record_is_named(folder: Path, field: str, value: s
     _replace(folder / "checkpoint.json", json.dumps(facts).encode())
     with pytest.raises(CheckpointError, match=field):
         load_record(folder)
+
+
+def test_the_encoder_goes_along_with_a_pipeline_if_there_is_one(saved: Path, tmp_path: Path) -> None:
+    assert load_encoder(saved) is None
+    encoder = _worn(Encoder())
+    save_pipeline(tmp_path, load_pipeline(saved)[0], RECORD, encoder)
+    loaded = load_encoder(tmp_path)
+    assert loaded is not None
+    assert not loaded.training
+    torch.testing.assert_close(loaded.state_dict(), encoder.state_dict(), rtol=1e-3, atol=1e-7)
+
+
+def test_the_shipped_weights_have_an_encoder_and_say_what_made_them() -> None:
+    _, record = load_pipeline()
+    assert load_encoder() is not None
+    assert record.vae_recipe is not None
+    assert (record.vae_recipe.augmentation, record.vae_recipe.keep) == ("mirror", "last")
+    assert record.transfer_recipe is None
+
+
+def test_what_fits_is_loaded_and_the_rest_reported(folder: Path) -> None:
+    path = folder / "decoder.safetensors"
+    tensors = load_file(path)
+    del tensors["output.bias"]
+    _change(path, {**tensors, "output.weight": torch.zeros(2), "output.more": torch.zeros(1)})
+    decoder = Decoder()
+    own = {name: tensor.clone() for name, tensor in decoder.state_dict().items()}
+    report = load_fitting(path, decoder)
+    assert report[1:] == (["output.bias"], ["output.more"], ["output.weight"])
+    assert set(report.loaded) == own.keys() - {"output.bias", "output.weight"}
+    assert str(report) == (
+        f"{len(report.loaded)} tensors loaded; 1 missing (output.bias), 1 left over (output.more), "
+        "1 misshapen (output.weight)"
+    )
+    for name, tensor in decoder.state_dict().items():
+        wanted = tensors[name].float() if name in report.loaded else own[name].float()
+        assert torch.equal(tensor.float(), wanted), name
+
+
+def test_a_pipeline_is_loaded_in_part_only_where_its_compressor_is_the_one_that_does_not_fit(folder: Path) -> None:
+    _, record, report = load_pipeline_partly(folder)
+    assert record == RECORD
+    assert str(report) == f"{len(report.loaded)} tensors loaded; all fit"
+    _change(folder / "compressor.safetensors", {"nothing": torch.zeros(1)})
+    with pytest.raises(CheckpointError, match="no tensor that fits"):
+        load_pipeline_partly(folder)
+    _change(folder / "decoder.safetensors", {"nothing": torch.zeros(1)})
+    with pytest.raises(CheckpointError, match=r"decoder\.safetensors does not fit"):
+        load_pipeline_partly(folder)
+
+
+def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "save_file", full)
+    with pytest.raises(CheckpointError, match=r"cannot take the weights .*No space left.*: make room"):
+        save_vae(tmp_path, ResVae(), RECORD)
 
 
 @pytest.mark.parametrize("value", [1e6, float("nan"), float("inf")])

@@ -115,13 +115,13 @@ def test_a_trained_compressor_is_a_pipeline_with_the_vaes_decoder(
 def test_the_weights_are_tied_to_the_rig_that_the_maps_were_rendered_for(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other, original = RIG.model_copy(update={"name": "other"}), dataset.read
+    other, original = RIG.model_copy(update={"name": "other"}), dataset.open_dataset
 
-    def read(folder: Path) -> tuple[dataset.MapSet, dataset.DatasetPlan]:
-        maps, plan = original(folder)
-        return maps, replace(plan, rig=other)
+    def opened(folder: Path) -> dataset.Dataset:
+        found = original(folder)
+        return replace(found, plan=replace(found.plan, rig=other))
 
-    monkeypatch.setattr(dataset, "read", read)
+    monkeypatch.setattr(dataset, "open_dataset", opened)
     assert _train_compressor(made, tmp_path / "run") == 0
     _, record = load_pipeline(tmp_path / "run")
     assert (record.rig_name, record.rig_checksum) == (other.name, other.checksum)
@@ -148,12 +148,12 @@ def test_what_does_not_fit_together_is_refused(
 def test_datasets_of_two_rigs_are_refused(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = dataset.read
+    original = dataset.open_dataset
 
-    def read(folder: Path) -> tuple[dataset.MapSet, dataset.DatasetPlan]:
-        maps, plan = original(folder)
-        return maps, replace(plan, rig=RIG.model_copy(update={"name": folder.name}))
+    def opened(folder: Path) -> dataset.Dataset:
+        found = original(folder)
+        return replace(found, plan=replace(found.plan, rig=RIG.model_copy(update={"name": folder.name})))
 
-    monkeypatch.setattr(dataset, "read", read)
+    monkeypatch.setattr(dataset, "open_dataset", opened)
     assert _train_compressor(made, tmp_path / "run") == 1
     assert "different rigs" in _last(capsys)["error"]["message"]

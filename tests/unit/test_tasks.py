@@ -4,30 +4,31 @@ import csv
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from nlos_models import tasks
-from nlos_models.compressor import Compressor
-from nlos_models.data import MapSet, map_batches
+from nlos_models.errors import TrainingError
 from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import channel_statistics, split_and_stack
 from nlos_models.recipe import Recipe
-from nlos_models.res_vae import ResVae
-from nlos_models.tasks import run, train_compressor, train_vae
+from nlos_models.sources import InMemory
+from nlos_models.tasks import Start, train_compressor, train_vae, turn_some
+from small_maps import SmallCompressor, SmallVae, small_images, small_maps, use_small_networks
 
 COUNT, BATCH = 16, 8
 
 
-class Stopped(Exception):  # noqa: N818  a stand-in for Ctrl-C
+class Stopped(Exception):  # noqa: N818  a stand-in for a fault
     """Someone pulled the plug."""
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
+def _small_networks_on_one_thread() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
-    yield
+    with pytest.MonkeyPatch.context() as patch:
+        use_small_networks(patch, tasks)
+        yield
     torch.set_num_threads(before)
 
 
@@ -36,28 +37,8 @@ def _recipe(task: str, **changes: object) -> Recipe:
     return Recipe.model_validate(facts | {"schedule": "one-cycle"} | changes)
 
 
-def _images(count: int, seed: int) -> np.ndarray:
-    generator, images = np.random.default_rng(seed), np.zeros((count, 64, 64), np.float16)
-    for image in images:
-        row, column = generator.integers(8, 30, 2)
-        image[row : row + 24, column : column + 24] = generator.uniform(0.3, 1)
-    return images
-
-
-def _maps(count: int, seed: int) -> MapSet:
-    images = _images(count, seed)
-    intensity = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8))) * 50
-    depth = np.where(intensity > 0, intensity / 100, np.float32(np.nan)).astype(np.float32)
-    return MapSet(depth, intensity, images)
-
-
 def _ignore(done: int, total: int) -> None:
     assert done <= total
-
-
-def _log(folder: Path) -> list[dict[str, str]]:
-    with (folder / "log.csv").open(encoding="utf-8") as file:
-        return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
 
 
 def _stop_at(step: int, total: int) -> None:
@@ -65,19 +46,32 @@ def _stop_at(step: int, total: int) -> None:
         raise Stopped
 
 
-Trained = tuple[ResVae, dict[str, float], Path]
+def _log(folder: Path) -> list[dict[str, str]]:
+    with (folder / "log.csv").open(encoding="utf-8") as file:
+        return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+
+
+Trained = tuple[SmallVae, dict[str, float], Path]
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     folder = tmp_path_factory.mktemp("vae")
-    vae, figures = train_vae(_recipe("vae"), _images(COUNT, 0), _images(4, 1), folder, _ignore)
+    vae, figures = train_vae(_recipe("vae"), small_images(COUNT, 0), small_images(4, 1), folder, _ignore)
     return vae, figures, folder
 
 
-def _assert_same(one: torch.nn.Module, other: torch.nn.Module) -> None:
-    for (name, mine), its in zip(one.state_dict().items(), other.state_dict().values(), strict=True):
-        assert torch.equal(mine, its), name
+def _train(recipe: Recipe, start: Start, folder: Path) -> tuple[Pipeline, dict[str, float]]:
+    return train_compressor(recipe, start, InMemory(small_maps(COUNT, 0)), small_maps(4, 1), folder, _ignore)
+
+
+def _copy(module: torch.nn.Module) -> dict[str, torch.Tensor]:
+    return {name: tensor.clone() for name, tensor in module.state_dict().items()}
+
+
+def _same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    assert one.keys() == other.keys()
+    return all(torch.equal(tensor, other[name]) for name, tensor in one.items())
 
 
 def test_the_vaes_loss_falls_and_its_figures_are_those_of_the_last_epoch(trained: Trained) -> None:
@@ -90,27 +84,24 @@ def test_the_vaes_loss_falls_and_its_figures_are_those_of_the_last_epoch(trained
 
 
 def test_a_stopped_and_resumed_vae_equals_an_uninterrupted_one(trained: Trained, tmp_path: Path) -> None:
-    data = _images(COUNT, 0), _images(4, 1)
+    data = small_images(COUNT, 0), small_images(4, 1)
     with pytest.raises(Stopped):
         train_vae(_recipe("vae"), *data, tmp_path, _stop_at)
     torch.manual_seed(99)
     vae, figures = train_vae(_recipe("vae"), *data, tmp_path, _ignore)
-    _assert_same(vae, trained[0])
+    assert _same(vae.state_dict(), trained[0].state_dict())
     assert figures == trained[1]
     assert _log(tmp_path) == _log(trained[2])
 
 
-@pytest.mark.parametrize("weights", [(1.0, 0.0), (0.05, 1.0)], ids=["latent", "latent and image"])
-def test_a_stopped_and_resumed_compressor_equals_an_uninterrupted_one(
-    trained: Trained, tmp_path: Path, weights: tuple[float, float]
-) -> None:
-    recipe = _recipe("compressor", latent_weight=weights[0], image_weight=weights[1])
-    data = _maps(COUNT, 0), _maps(4, 1)
-    whole, figures = train_compressor(recipe, trained[0], *data, tmp_path / "whole", _ignore)
+def test_a_stopped_and_resumed_compressor_equals_an_uninterrupted_one(trained: Trained, tmp_path: Path) -> None:
+    recipe, start = _recipe("compressor", latent_weight=0.05, image_weight=1.0), Start(trained[0])
+    whole, figures = _train(recipe, start, tmp_path / "whole")
+    data = InMemory(small_maps(COUNT, 0)), small_maps(4, 1)
     with pytest.raises(Stopped):
-        train_compressor(recipe, trained[0], *data, tmp_path / "stopped", _stop_at)
-    resumed, again = train_compressor(recipe, trained[0], *data, tmp_path / "stopped", _ignore)
-    _assert_same(resumed, whole)
+        train_compressor(recipe, start, *data, tmp_path / "stopped", _stop_at)
+    resumed, again = train_compressor(recipe, start, *data, tmp_path / "stopped", _ignore)
+    assert _same(resumed.state_dict(), whole.state_dict())
     assert figures == again
     log = _log(tmp_path / "whole")
     assert log == _log(tmp_path / "stopped")
@@ -118,13 +109,11 @@ def test_a_stopped_and_resumed_compressor_equals_an_uninterrupted_one(
 
 
 def test_the_compressor_learns_with_the_vae_frozen_and_its_own_statistics(trained: Trained, tmp_path: Path) -> None:
-    before = {name: tensor.clone() for name, tensor in trained[0].state_dict().items()}
-    maps = _maps(COUNT, 0)
+    before, maps = _copy(trained[0]), small_maps(COUNT, 0)
     recipe = _recipe("compressor", epochs=1, image_weight=1.0, left_noise=0.1)
-    pipeline, _ = train_compressor(recipe, trained[0], maps, _maps(4, 1), tmp_path, _ignore)
-    for name, tensor in trained[0].state_dict().items():
-        assert torch.equal(tensor, before[name]), name
-    _assert_same(pipeline.decoder, trained[0].decoder)
+    pipeline, _ = _train(recipe, Start(trained[0]), tmp_path)
+    assert _same(trained[0].state_dict(), before)
+    assert _same(pipeline.decoder.state_dict(), trained[0].decoder.state_dict())
     mean, spread = channel_statistics(split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)))
     assert torch.equal(pipeline.preprocess.mean, mean)
     assert torch.equal(pipeline.preprocess.spread, spread)
@@ -132,22 +121,63 @@ def test_the_compressor_learns_with_the_vae_frozen_and_its_own_statistics(traine
     assert not pipeline.training
 
 
-@torch.no_grad()
-def test_the_latents_worked_out_ahead_are_those_of_the_images_and_of_their_mirrors(
-    monkeypatch: pytest.MonkeyPatch,
+def test_one_step_trains_compressor_and_a_decoder_of_its_own_from_scratch(tmp_path: Path) -> None:
+    recipe = _recipe("compressor", steps="one", latent_weight=0, image_weight=1.0)
+    one, _ = _train(recipe, Start(), tmp_path / "one")
+    again, _ = _train(recipe.model_copy(update={"epochs": 1}), Start(), tmp_path / "less")
+    for part in ("compressor", "decoder"):
+        mine, its = (pipeline.get_submodule(part).state_dict() for pipeline in (one, again))
+        assert not _same(mine, its), part
+    log = _log(tmp_path / "one")
+    assert float(log[-1]["loss"]) < float(log[0]["loss"])
+
+
+def test_joint_training_goes_on_from_two_step_weights_and_moves_both_networks_but_not_the_encoder(
+    trained: Trained, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(tasks, "SCORING_BATCH", 3)
-    vae, maps = ResVae().eval(), _maps(8, 3)
-    straight, mirrored = tasks._latents(vae, maps.image), tasks._latents(vae, maps.image[:, ::-1])
-    for batch in map_batches(maps, 4, torch.Generator().manual_seed(0)):
-        chosen = torch.where(batch.mirrored[:, None, None], mirrored[batch.row], straight[batch.row])
-        torch.testing.assert_close(chosen, torch.stack(vae.encoder(batch.image), dim=1), atol=1e-5, rtol=1e-4)
+    vae = SmallVae()
+    vae.load_state_dict(_copy(trained[0]))
+    two = Pipeline(SmallCompressor(), vae.decoder)
+    two.preprocess.mean.fill_(0.25)
+    before, encoder = _copy(two), _copy(vae.encoder)
+    recipe = _recipe("compressor", steps="two-then-joint", epochs=1, image_weight=1.0, dropout=0.2, learning_rate=1e-6)
+    joint, _ = _train(recipe, Start(vae, two), tmp_path)
+    after = joint.state_dict()
+    for part in ("compressor.classifier.1.weight", "decoder.output.weight"):
+        assert not torch.equal(after[part], before[part])
+        torch.testing.assert_close(after[part], before[part], rtol=0, atol=1e-5)  # at this rate: from there, not anew
+    assert torch.equal(after["preprocess.mean"], before["preprocess.mean"])
+    assert _same(vae.encoder.state_dict(), encoder)
+    assert joint.compressor.classifier[0].p == 0.2
 
 
-def test_running_in_parts_equals_running_one_by_one(trained: Trained, monkeypatch: pytest.MonkeyPatch) -> None:
-    torch.manual_seed(0)
-    pipeline, maps = Pipeline(Compressor(), trained[0].decoder).eval(), _maps(5, 2)
-    whole = run(pipeline, maps)
-    assert whole.shape == (5, 64, 64)
-    monkeypatch.setattr(tasks, "SCORING_BATCH", 2)
-    np.testing.assert_allclose(run(pipeline, maps), whole, atol=1e-4)
+@pytest.mark.parametrize(("steps", "words"), [("two", "--vae"), ("two-then-joint", "--weights")])
+def test_a_start_without_what_the_steps_need_is_one_line(tmp_path: Path, steps: str, words: str) -> None:
+    with pytest.raises(TrainingError, match=words):
+        _train(_recipe("compressor", steps=steps, image_weight=1.0), Start(), tmp_path)
+
+
+def test_turns_are_quarters_and_with_the_mirror_make_all_eight() -> None:
+    image = torch.rand(1, 1, 4, 4)
+    turned = turn_some(image.expand(4, -1, -1, -1), torch.arange(4))
+    eight = [view for one in turned for view in (one, one.flip(-2))]
+    assert len({tuple(view.flatten().tolist()) for view in eight}) == 8
+    assert torch.equal(turned[0], image[0])
+    assert torch.equal(turned[2], image[0].flip(-1, -2))
+    assert any(torch.equal(view, image[0].flip(-1)) for view in eight)  # SI 3's horizontal flip
+
+
+def test_a_vae_is_shown_turned_images_where_the_recipe_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quarters: list[int] = []
+
+    def noted(images: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+        quarters.extend(turns.tolist())
+        return images
+
+    monkeypatch.setattr(tasks, "turn_some", noted)
+    data = small_images(COUNT, 0), small_images(4, 1)
+    train_vae(_recipe("vae", epochs=1, augmentation="mirror"), *data, tmp_path / "mirror", _ignore)
+    assert not quarters
+    train_vae(_recipe("vae", epochs=1, augmentation="turns"), *data, tmp_path / "turns", _ignore)
+    assert set(quarters) == {0, 1, 2, 3}
+    assert len(quarters) == COUNT

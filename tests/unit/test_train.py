@@ -1,22 +1,18 @@
 """The training loop on a network small enough to train in a moment: stop anywhere, resume, same bits."""
 
-import csv
+import multiprocessing
+import random
+import signal
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import pytest
 import torch
 from nlos_models import train
-from nlos_models.recipe import Recipe
-from nlos_models.train import fit
-from torch import Tensor, nn
-
-SAMPLES, BATCH = 24, 4
-STEPS = SAMPLES // BATCH
-
-
-class Stopped(Exception):  # noqa: N818  a stand-in for Ctrl-C
-    """Someone pulled the plug."""
+from nlos_models.errors import RecipeError, TrainingError
+from nlos_models.run_files import LAST
+from small_run import STEPS, Executioner, SmallRun, Stopped, be_killed, run_watched, small_recipe
 
 
 @pytest.fixture(autouse=True)
@@ -27,105 +23,119 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def _recipe(**changes: object) -> Recipe:
-    facts = {"task": "vae", "objects": SAMPLES, "held_out": 4, "epochs": 4, "batch": BATCH, "learning_rate": 1e-2}
-    return Recipe.model_validate(facts | changes)
+def _trained(folder: Path, **changes: object) -> SmallRun:
+    run = SmallRun(small_recipe(**changes), folder)
+    run.go()
+    return run
 
 
-class Run:
-    """A small regression with dropout and noise: everything that a resumed run could get wrong."""
-
-    def __init__(self, recipe: Recipe, folder: Path) -> None:
-        torch.manual_seed(7)
-        self.recipe, self.folder, self.steps = recipe, folder, []
-        self.x, self.scored = torch.rand(SAMPLES, 3), 0
-        self.y = self.x.sum(1, keepdim=True)
-        self.net = nn.Sequential(nn.Linear(3, 16), nn.BatchNorm1d(16), nn.ReLU(), nn.Dropout(0.1), nn.Linear(16, 1))
-
-    def _batches(self, generator: torch.Generator) -> Iterator[tuple[Tensor, Tensor]]:
-        order = torch.randperm(SAMPLES, generator=generator)
-        for k in range(STEPS):
-            index = order[k * BATCH : (k + 1) * BATCH]
-            yield self.x[index], self.y[index]
-
-    def _loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
-        x, y = batch
-        return (self.net(x + 0.01 * torch.randn(x.shape)) - y).square().mean()
-
-    def _score(self) -> dict[str, float]:
-        assert not self.net.training
-        with torch.inference_mode():
-            self.scored += 1
-            return {"held_out_loss": (self.net(self.x) - self.y).square().mean().item()}
-
-    def go(self, stop_at: int | None = None) -> "Run":
-        def on_step(done: int, total: int) -> None:
-            self.steps.append((done, total))
-            if done == stop_at:
-                raise Stopped
-
-        fit(
-            self.net,
-            recipe=self.recipe,
-            steps_per_epoch=STEPS,
-            batches=self._batches,
-            loss=self._loss,
-            score=self._score,
-            folder=self.folder,
-            on_step=on_step,
-        )
-        return self
-
-    @property
-    def log(self) -> list[dict[str, str]]:
-        with (self.folder / "log.csv").open(encoding="utf-8") as file:
-            return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
-
-
-def _assert_same(one: Run, other: Run) -> None:
+def _assert_same(one: SmallRun, other: SmallRun) -> None:
     for (name, mine), its in zip(one.net.state_dict().items(), other.net.state_dict().values(), strict=True):
         assert torch.equal(mine, its), name
     assert one.log == other.log
 
 
 @pytest.mark.parametrize("schedule", ["one-cycle", "plateau"])
-@pytest.mark.parametrize("stop_at", [1, STEPS, STEPS + 2, 3 * STEPS])
-def test_a_stopped_and_resumed_run_equals_an_uninterrupted_one(tmp_path: Path, schedule: str, stop_at: int) -> None:
-    recipe = _recipe(schedule=schedule)
-    whole = Run(recipe, tmp_path / "whole").go()
+@pytest.mark.parametrize("fail_at", [1, STEPS, STEPS + 2, 3 * STEPS])
+def test_a_run_that_failed_and_was_resumed_equals_an_uninterrupted_one(
+    tmp_path: Path, schedule: str, fail_at: int
+) -> None:
+    whole = _trained(tmp_path / "whole", schedule=schedule)
     with pytest.raises(Stopped):
-        Run(recipe, tmp_path / "stopped").go(stop_at)
+        SmallRun(whole.recipe, tmp_path / "failed").go(fail_at)
     torch.manual_seed(99)
-    _assert_same(Run(recipe, tmp_path / "stopped").go(), whole)
+    _assert_same(_trained(tmp_path / "failed", schedule=schedule), whole)
+
+
+def test_a_run_killed_at_random_moments_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    recipe = small_recipe(schedule="one-cycle", epochs=2)
+    clerk = Executioner()
+    whole = run_watched(recipe, tmp_path / "whole", clerk)
+    moments = random.Random(0).sample(range(2, clerk.seen // 2), 4)  # noqa: S311  each start goes on from the last
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["nlos_models.train", "pytest"])  # each process begins with them imported
+    ends: list[int | None] = []
+    for moment in moments:
+        child = context.Process(target=be_killed, args=(recipe.model_dump_json(), str(tmp_path / "killed"), moment))
+        child.start()
+        child.join()
+        ends.append(child.exitcode)
+    assert ends[:3] == [-signal.SIGKILL] * 3
+    assert (tmp_path / "killed" / LAST).exists()
+    resumed = SmallRun(recipe, tmp_path / "killed")
+    resumed.go()
+    _assert_same(resumed, whole)
+
+
+def test_a_run_asked_to_stop_says_where_and_goes_on_from_that_very_step(tmp_path: Path) -> None:
+    whole, calls, told = _trained(tmp_path / "whole"), count(1), list[str]()
+    run = SmallRun(whole.recipe, tmp_path / "stopped")
+    with pytest.raises(KeyboardInterrupt):
+        run.go(stop=lambda: next(calls) == STEPS + 2, tell=told.append)
+    assert told == ["stopped in epoch 1: the same command goes on from step 2"]
+    again = _trained(tmp_path / "stopped")
+    assert again.steps[0] == (STEPS + 3, 4 * STEPS)
+    _assert_same(again, whole)
+
+
+def test_a_state_is_saved_as_often_as_asked(tmp_path: Path) -> None:
+    seconds = count(0.0, 1.0)
+    run = SmallRun(small_recipe(epochs=1), tmp_path)
+    with pytest.raises(Stopped):
+        run.go(fail_at=5, clock=lambda: next(seconds), checkpoint_s=2.5)  # saved after steps 2 and 4
+    again = SmallRun(run.recipe, tmp_path)
+    again.go()
+    assert again.steps[0][0] in {3, 4, 5}
 
 
 def test_the_seed_decides_the_run(tmp_path: Path) -> None:
-    first, again = (Run(_recipe(), tmp_path / name).go() for name in ("first", "again"))
+    first, again = (_trained(tmp_path / name) for name in ("first", "again"))
     _assert_same(first, again)
-    other = Run(_recipe(seed=1), tmp_path / "other").go()
-    assert other.log != first.log
+    assert _trained(tmp_path / "other", seed=1).log != first.log
 
 
 def test_the_loss_falls(tmp_path: Path) -> None:
-    log = Run(_recipe(epochs=10), tmp_path).go().log
+    log = _trained(tmp_path, epochs=10).log
     assert [int(row["epoch"]) for row in log] == list(range(10))
     assert float(log[-1]["held_out_loss"]) < 0.5 * float(log[0]["held_out_loss"])
 
 
-def test_progress_counts_every_step_to_the_end(tmp_path: Path) -> None:
-    run = Run(_recipe(), tmp_path).go()
+def test_progress_counts_every_step_to_the_end_and_every_epoch(tmp_path: Path) -> None:
+    run, epochs = SmallRun(small_recipe(), tmp_path), list[dict[str, float]]()
+    run.go(on_epoch=epochs.append)
     assert run.steps == [(k + 1, 4 * STEPS) for k in range(4 * STEPS)]
+    assert [row["epoch"] for row in epochs] == [0, 1, 2, 3]
 
 
-def test_progress_of_a_resumed_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    with pytest.raises(Stopped):
-        Run(_recipe(), tmp_path).go(STEPS + 2)
-    assert Run(_recipe(), tmp_path).go().steps[0] == (STEPS + 1, 4 * STEPS)
+def test_a_finished_run_does_not_train_again_and_still_tells_its_figures(tmp_path: Path) -> None:
+    run = SmallRun(small_recipe(), tmp_path)
+    figures = run.go()
+    again = SmallRun(small_recipe(), tmp_path)
+    assert again.go() == figures == run.score()
+    assert again.steps == []
+    _assert_same(again, run)
 
 
-def test_a_finished_run_does_not_train_again(tmp_path: Path) -> None:
-    Run(_recipe(), tmp_path).go()
-    assert Run(_recipe(), tmp_path).go().steps == []
+def test_a_run_of_another_recipe_is_refused(tmp_path: Path) -> None:
+    _trained(tmp_path)
+    with pytest.raises(RecipeError, match="another recipe"):
+        _trained(tmp_path, learning_rate=0.5)
+
+
+def test_the_best_epoch_is_handed_on_where_the_recipe_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    judged: dict[float, dict[str, torch.Tensor]] = {}
+
+    def score(run: SmallRun) -> dict[str, float]:
+        loss = [3.0, 1.0, 2.0, 1.0][len(judged) % 4]
+        judged[len(judged)] = {name: tensor.clone() for name, tensor in run.net.state_dict().items()}
+        return {"held_out_loss": loss}
+
+    monkeypatch.setattr(SmallRun, "score", score)
+    best, last = (SmallRun(small_recipe(keep=keep), tmp_path / keep) for keep in ("best", "last"))
+    assert best.go() == {"held_out_loss": 1.0}
+    last.go()
+    torch.testing.assert_close(dict(best.net.state_dict()), judged[1], rtol=0, atol=0)  # the first of two equals
+    torch.testing.assert_close(dict(last.net.state_dict()), judged[3], rtol=0, atol=0)
 
 
 def test_a_run_whose_learning_rate_reached_its_end_stops_and_does_not_train_again(
@@ -133,21 +143,39 @@ def test_a_run_whose_learning_rate_reached_its_end_stops_and_does_not_train_agai
 ) -> None:
     monkeypatch.setattr(train, "PLATEAU_PATIENCE", 0)
     monkeypatch.setattr(train, "SMALLEST_RATE", 2e-3)
-    monkeypatch.setattr(Run, "_score", lambda _: {"held_out_loss": 1.0})
-    done = Run(_recipe(epochs=20), tmp_path).go().steps
+    monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": 1.0})
+    done = _trained(tmp_path, epochs=20).steps
     assert 2 * STEPS <= len(done) <= 5 * STEPS  # the rate falls to 1e-2, 3e-3 and 9e-4
-    assert Run(_recipe(epochs=20), tmp_path).go().steps == []
+    assert _trained(tmp_path, epochs=20).steps == []
+
+
+def test_a_run_that_diverges_ends_with_a_line_and_keeps_the_epochs_before(tmp_path: Path) -> None:
+    run = SmallRun(small_recipe(), tmp_path)
+    with pytest.raises(Stopped):
+        run.go(fail_at=STEPS + 1)
+    broken = SmallRun(small_recipe(), tmp_path)
+    broken.y = broken.y * float("nan")
+    with pytest.raises(TrainingError, match=r"loss is nan in epoch 1: choose a smaller learning_rate"):
+        broken.go()
+    _assert_same(_trained(tmp_path), _trained(tmp_path / "whole"))
 
 
 def test_frozen_parameters_stay(tmp_path: Path) -> None:
-    run = Run(_recipe(), tmp_path)
+    run = SmallRun(small_recipe(), tmp_path)
     frozen = run.net[0].weight.requires_grad_(requires_grad=False)
-    before, free = frozen.clone(), run.net[4].weight.detach().clone()
+    before, free = frozen.clone(), run.net[-1].weight.detach().clone()
     run.go()
     assert torch.equal(frozen, before)
-    assert not torch.equal(run.net[4].weight, free)
+    assert not torch.equal(run.net[-1].weight, free)
 
 
 def test_bfloat16_trains_too(tmp_path: Path) -> None:
-    log = Run(_recipe(precision="bf16-mixed", epochs=8), tmp_path).go().log
+    log = _trained(tmp_path, precision="bf16-mixed", epochs=8).log
     assert float(log[-1]["held_out_loss"]) < float(log[0]["held_out_loss"])
+
+
+def test_fewer_objects_than_a_batch_are_one_line(tmp_path: Path) -> None:
+    run = SmallRun(small_recipe(), tmp_path)
+    run.recipe = run.recipe.model_copy(update={"batch": 32})
+    with pytest.raises(RecipeError, match="fewer training objects than a batch of 32"):
+        run.go()

@@ -1,0 +1,150 @@
+"""What `train` reads before it starts: recipes, maps that fit them, and the bare wall for difference maps."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from nlos_calibration.bare_wall import Moments
+from nlos_calibration.measured_wall import load_measured
+from nlos_models.data import Half, MapBatch, MapSet
+from nlos_models.recipe import Recipe, load_recipe
+from nlos_models.sources import InMemory, MapSource, first_of, less_bare_wall
+
+from nlos_cam import dataset
+from nlos_cam.errors import SceneError
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Float32, maps_from_frame
+from nlos_cam.render.renderer import render
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.sensor import Sensor
+
+BARE_WALL_FRAMES = 60
+"""As many as `calibrate` takes."""
+
+BareMaps = tuple[Float32, Float32]
+"""Depth and intensity, each (64, 80)."""
+
+
+class TrainingMaps(NamedTuple):
+    """Maps to learn from and to be judged by, of one rig."""
+
+    training: MapSource
+    held_out: MapSet
+    plan: dataset.DatasetPlan
+
+
+class RecipeChoice(NamedTuple):
+    """A recipe's file, and how much of it is run."""
+
+    path: Path
+    budget: float = 1.0
+    objects: int | None = None
+
+    def read(self, task: str) -> Recipe:
+        """The recipe. Raises SceneError where it is another task's."""
+        recipe = load_recipe(self.path)
+        if recipe.task != task:
+            raise SceneError(f"{self.path} is a recipe for {recipe.task!r}, not {task!r}: choose another --recipe")
+        if self.objects is not None:
+            recipe = recipe.of_objects(self.objects)
+        return recipe.scaled(self.budget)
+
+
+@dataclass(frozen=True)
+class Streamed:
+    """A dataset on the disk as a source; `bare` is subtracted from its maps if there is one."""
+
+    dataset: dataset.Dataset
+    image: Half
+    """All images (n, 64, 64)."""
+    bare: BareMaps | None = None
+
+    def first(self, count: int) -> MapSet:
+        """The first `count` objects, in memory."""
+        parts, held = list[MapSet](), 0
+        for chunk in self.dataset.chunks():
+            parts.append(chunk)
+            if (held := held + len(chunk.image)) >= count:
+                break
+        arrays = (np.concatenate([getattr(part, name) for part in parts])[:count] for name in dataset.MAP_CHANNELS)
+        maps = MapSet(*arrays)
+        return less_bare_wall(maps, *self.bare) if self.bare else maps
+
+    def batches(self, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
+        """One epoch, by a seed that the generator gives."""
+        seed = int(torch.randint(2**62, (1,), generator=generator))
+        for made in self.dataset.batches(seed, 0, batch):
+            yield _less(made, self.bare) if self.bare else made
+
+
+def _less(batch: MapBatch, bare: BareMaps) -> MapBatch:
+    """A batch less the bare wall, which is mirrored where the sample is."""
+    depth_m, intensity = (
+        torch.where(batch.mirrored[:, None, None], plain.flip(-2), plain) for plain in map(torch.from_numpy, bare)
+    )
+    difference_m = batch.depth_m - depth_m
+    brighter = torch.where(torch.isnan(difference_m), 0.0, batch.intensity - intensity)
+    return batch._replace(depth_m=difference_m, intensity=brighter)
+
+
+def read_maps(
+    recipe: Recipe, data: Path, held_out_data: Path, wall: Path | None, *, stream: bool = False
+) -> TrainingMaps:
+    """The maps that a recipe asks for. Raises SceneError where they are too few, or of two rigs.
+
+    A stream is of a whole dataset, of which no more than some shards are in memory at a time.
+    """
+    training, judging = dataset.open_dataset(data), dataset.open_dataset(held_out_data)
+    plan, count = training.plan, len(training)
+    if count < recipe.objects:
+        raise SceneError(
+            f"{data} holds {count} objects, the recipe asks for {recipe.objects}: build that many, or give --objects"
+        )
+    if plan.rig != judging.plan.rig:
+        raise SceneError(f"{data} and {held_out_data} were rendered for different rigs: build one of them again")
+    if stream and count != recipe.objects:
+        raise SceneError(f"{data} holds {count} objects, and a stream is of all: give --objects {count}")
+    bare = _bare_wall(plan, wall) if recipe.maps == "difference maps" else None
+    held_out = first_of(judging.arrays(), recipe.held_out)
+    if bare:
+        held_out = less_bare_wall(held_out, *bare)
+    return TrainingMaps(_source(training, recipe.objects, bare, stream=stream), held_out, plan)
+
+
+def _source(training: dataset.Dataset, count: int, bare: BareMaps | None, *, stream: bool) -> MapSource:
+    if stream:
+        return Streamed(training, training.column("image"), bare)
+    maps = first_of(training.arrays(), count)
+    return InMemory(less_bare_wall(maps, *bare) if bare else maps)
+
+
+def _bare_wall(plan: dataset.DatasetPlan, wall: Path | None) -> BareMaps:
+    return measured_bare_wall(wall) if wall else render_bare_wall(plan)
+
+
+def measured_bare_wall(path: Path) -> BareMaps:
+    """Depth and intensity, each (64, 80), of a bench's bare wall, as `calibrate --wall` took it."""
+    wall = load_measured(path).reference
+    if wall is None:
+        raise SceneError(f"{path} has no reference to form difference maps from: calibrate the wall again")
+    return wall.map_depth_m, wall.map_intensity
+
+
+def render_bare_wall(plan: dataset.DatasetPlan, frames: int = BARE_WALL_FRAMES) -> BareMaps:
+    """Depth and intensity, each (64, 80), of a rig with nothing hidden: the mean of so many noisy frames.
+
+    Raises SceneError where the rig differs from object to object: then no one wall is that of all.
+    """
+    if plan.spread != dataset.RigSpread():
+        raise SceneError("this dataset's rig differs from object to object: difference maps need one rig, or --wall")
+    sensor = Sensor(plan.rig, plan.sensor, plan.radiometry)
+    echoes = render(Scene(plan.rig, radiometry=plan.radiometry), plan.accuracy).multi
+    depth, intensity = (Moments((MAP_ROWS, MAP_COLUMNS)) for _ in range(2))
+    for frame in range(frames):
+        images = sensor.expose(echoes, np.random.default_rng([frame, 2]))
+        maps = maps_from_frame(images.frame(plan.rig.pinhole))
+        depth.add(maps.depth_m)
+        intensity.add(np.where(maps.valid, maps.intensity, np.nan))
+    return depth.mean().astype(np.float32), intensity.mean().astype(np.float32)

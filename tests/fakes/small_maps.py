@@ -1,0 +1,112 @@
+"""Images of plates, maps that show them as no lidar would, and networks that learn from them in a moment."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nlos_models.data import Half, MapBatch, MapSet, map_batches
+from torch import Tensor, nn
+from torch.nn import functional
+
+LATENT = 256
+
+
+def small_images(count: int, seed: int) -> Half:
+    """Images (n, 64, 64): one bright square each."""
+    generator, images = np.random.default_rng(seed), np.zeros((count, 64, 64), np.float16)
+    for image in images:
+        row, column = generator.integers(8, 30, 2)
+        image[row : row + 24, column : column + 24] = generator.uniform(0.3, 1)
+    return images
+
+
+def small_maps(count: int, seed: int) -> MapSet:
+    """The same images, and maps (n, 64, 80) in which they are to be seen; no return beside them."""
+    images = small_images(count, seed)
+    intensity = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8))) * 50
+    depth = np.where(intensity > 0, intensity / 100, np.float32(np.nan)).astype(np.float32)
+    return MapSet(depth, intensity, images)
+
+
+class SmallDataset:
+    """Stands for a dataset on the disk, of two shards."""
+
+    def __init__(self, maps: MapSet, plan: Any) -> None:
+        self._maps, self.plan = maps, plan
+
+    def __len__(self) -> int:
+        return len(self._maps.image)
+
+    def arrays(self) -> MapSet:
+        return self._maps
+
+    def column(self, name: str) -> Any:
+        return getattr(self._maps, name)
+
+    def chunks(self) -> Iterator[MapSet]:
+        maps, half = self._maps, len(self) // 2
+        for part in (slice(half), slice(half, None)):
+            yield MapSet(maps.depth_m[part], maps.intensity[part], maps.image[part])
+
+    def batches(self, seed: int, epoch: int, batch: int) -> Iterator[MapBatch]:
+        return map_batches(self._maps, batch, torch.Generator().manual_seed(seed + epoch))
+
+
+class SmallEncoder(nn.Module):
+    """Stands for Encoder: coarse pixels, a batch norm, two linear maps."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(64)
+        self.mean, self.log_variance = nn.Linear(64, LATENT), nn.Linear(64, LATENT)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        features = self.norm(functional.avg_pool2d(image, 8).flatten(1))
+        return self.mean(features), self.log_variance(features).clamp(-2, 2)
+
+
+class SmallDecoder(nn.Module):
+    """Stands for Decoder: a batch norm, and one linear map to coarse pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm, self.output = nn.BatchNorm1d(LATENT), nn.Linear(LATENT, 64)
+
+    def forward(self, latent: Tensor) -> Tensor:
+        coarse = self.output(self.norm(latent)).view(-1, 1, 8, 8)
+        return torch.sigmoid(functional.interpolate(coarse, scale_factor=8))
+
+
+class SmallVae(nn.Module):
+    """Stands for ResVae."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder, self.decoder = SmallEncoder(), SmallDecoder()
+
+    def forward(self, image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        mean, log_variance = self.encoder(image)
+        return self.decoder(mean + noise * torch.exp(0.5 * log_variance)), mean, log_variance
+
+
+class SmallCompressor(nn.Module):
+    """Stands for Compressor: features with a batch norm, then dropout and a linear classifier."""
+
+    def __init__(self, dropout: float = 0.5) -> None:
+        super().__init__()
+        conv = nn.Conv2d(4, 4, 5, stride=5)
+        self.features = nn.Sequential(conv, nn.BatchNorm2d(4), nn.ReLU(), nn.AvgPool2d(4), nn.Flatten())
+        self.classifier = nn.Sequential(nn.Dropout(dropout), nn.Linear(100, LATENT))
+
+    def forward(self, stacked: Tensor) -> Tensor:
+        return self.classifier(self.features(stacked))
+
+
+def use_small_networks(patch: pytest.MonkeyPatch, *modules: object) -> None:
+    """Let modules make small networks where they would make the real ones."""
+    networks = {"ResVae": SmallVae, "Encoder": SmallEncoder, "Decoder": SmallDecoder, "Compressor": SmallCompressor}
+    for module in modules:
+        for name, small in networks.items():
+            patch.setattr(module, name, small, raising=False)

@@ -1,0 +1,144 @@
+"""A training run small enough to end in a moment, in this process, in one that is killed, or in several at once."""
+
+import csv
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning_fabric import Fabric
+from nlos_models import run_files
+from nlos_models.recipe import Recipe
+from nlos_models.train import Running, fit
+from torch import Tensor, nn
+
+SAMPLES, BATCH = 24, 4
+STEPS = SAMPLES // BATCH
+
+
+def small_recipe(**changes: object) -> Recipe:
+    """Four epochs of six steps, unless changed."""
+    facts = {"task": "vae", "objects": SAMPLES, "held_out": 4, "epochs": 4, "batch": BATCH, "learning_rate": 1e-2}
+    return Recipe.model_validate(facts | changes)
+
+
+class Stopped(Exception):  # noqa: N818  a stand-in for a fault
+    """Someone pulled the plug."""
+
+
+class SmallRun:
+    """A regression with noise and, unless `plain`, dropout and a batch norm: all that a resumed run could get wrong."""
+
+    def __init__(self, recipe: Recipe, folder: Path, *, plain: bool = False) -> None:
+        torch.manual_seed(7)
+        self.recipe, self.folder, self.steps, self.scored = recipe, folder, list[tuple[int, int]](), 0
+        self.x = torch.rand(SAMPLES, 3)
+        self.y = self.x.sum(1, keepdim=True)
+        middle = [] if plain else [nn.BatchNorm1d(16), nn.Dropout(0.1)]
+        self.noise = 0.0 if plain else 0.01
+        self.net = nn.Sequential(nn.Linear(3, 16), *middle, nn.ReLU(), nn.Linear(16, 1))
+
+    def _batches(self, generator: torch.Generator) -> Iterator[tuple[Tensor, Tensor]]:
+        order = torch.randperm(SAMPLES, generator=generator)
+        for index in order.split(self.recipe.batch):
+            yield self.x[index], self.y[index]
+
+    def _loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
+        x, y = batch
+        return (self.net(x + self.noise * torch.randn(x.shape)) - y).square().mean()
+
+    def score(self) -> dict[str, float]:
+        """The held-out loss."""
+        assert not self.net.training
+        self.scored += 1
+        with torch.inference_mode():
+            return {"held_out_loss": (self.net(self.x) - self.y).square().mean().item()}
+
+    def go(self, fail_at: int | None = None, **running: Any) -> dict[str, float]:
+        """Train to the end, or to a fault."""
+
+        def on_step(done: int, total: int) -> None:
+            self.steps.append((done, total))
+            if done == fail_at:
+                raise Stopped
+
+        return fit(
+            self.net,
+            recipe=self.recipe,
+            steps_per_epoch=SAMPLES // self.recipe.batch,
+            batches=self._batches,
+            loss=self._loss,
+            score=self.score,
+            folder=self.folder,
+            on_step=on_step,
+            running=Running(**running),
+        )
+
+    @property
+    def log(self) -> list[dict[str, str]]:
+        """The rows of log.csv, but for what depends on the clock."""
+        with (self.folder / "log.csv").open(encoding="utf-8") as file:
+            return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+
+
+class Executioner:
+    """Counts the moments of a run, and kills its process at one of them."""
+
+    def __init__(self, moment: int | None = None) -> None:
+        self.seen, self.moment = 0, moment
+
+    def __call__(self) -> None:
+        """One more moment."""
+        self.seen += 1
+        if self.seen == self.moment:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def run_watched(recipe: Recipe, folder: Path, executioner: Executioner) -> SmallRun:
+    """Train with a checkpoint after each step; a moment is before a step, while a file is written, before a rename."""
+    run, fsync, replace = SmallRun(recipe, folder), os.fsync, Path.replace
+
+    def watched_fsync(file: int) -> None:
+        os.ftruncate(file, os.fstat(file).st_size // 2) if executioner.seen + 1 == executioner.moment else None
+        executioner()
+        fsync(file)
+
+    def watched_replace(path: Path, target: Path) -> Path:
+        executioner()
+        return replace(path, target)
+
+    run_files.os.fsync, Path.replace = watched_fsync, watched_replace  # type: ignore[method-assign]
+    try:
+        run.go(stop=lambda: bool(executioner()), checkpoint_s=0.0)
+    finally:
+        run_files.os.fsync, Path.replace = fsync, replace  # type: ignore[method-assign]
+    return run
+
+
+def be_killed(recipe_json: str, folder: str, moment: int) -> None:
+    """What a process does that is killed at a moment of its run."""
+    torch.set_num_threads(1)
+    run_watched(Recipe.model_validate_json(recipe_json), Path(folder), Executioner(moment))
+
+
+def on_two(fabric: Fabric, folder: Path) -> dict[str, Any]:
+    """What each of several processes does: a run, and the same stopped by the other one's wish and gone on with."""
+    recipe = small_recipe(epochs=3, schedule="one-cycle")
+    whole = SmallRun(recipe, folder / "whole", plain=True)
+    figures = whole.go(fabric=fabric)
+    stopped, told = SmallRun(recipe, folder / "stopped", plain=True), list[str]()
+    try:
+        stopped.go(fabric=fabric, stop=lambda: fabric.global_rank == 1, tell=told.append)
+    except KeyboardInterrupt:
+        told.append("interrupted")
+    again = SmallRun(recipe, folder / "stopped", plain=True)
+    again.go(fabric=fabric)
+    return {
+        "figures": figures,
+        "net": {name: tensor.tolist() for name, tensor in whole.net.state_dict().items()},
+        "again": {name: tensor.tolist() for name, tensor in again.net.state_dict().items()},
+        "told": told,
+        "scored": float(fabric.all_reduce(torch.tensor(float(whole.scored)), reduce_op="sum")),
+    }

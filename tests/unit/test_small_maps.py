@@ -1,0 +1,35 @@
+"""What stands for the networks has their shapes and parts, and the small maps show the small images."""
+
+import numpy as np
+import pytest
+import torch
+from nlos_models.compressor import Compressor
+from nlos_models.res_vae import ResVae
+from small_maps import SmallCompressor, SmallVae, small_images, small_maps
+from torch import nn
+
+
+def _shapes(vae: nn.Module, compressor: nn.Module) -> list[torch.Size]:
+    rebuilt, mean, log_variance = vae.eval()(torch.rand(2, 1, 64, 64), torch.zeros(2, 256))
+    return [tensor.shape for tensor in (rebuilt, mean, log_variance, compressor.eval()(torch.rand(2, 4, 100, 100)))]
+
+
+@torch.no_grad()
+def test_small_networks_have_the_shapes_and_the_parts_of_the_real_ones() -> None:
+    assert _shapes(SmallVae(), SmallCompressor()) == _shapes(ResVae(), Compressor())
+    for compressor in (SmallCompressor(0.25), Compressor(0.25)):
+        dropout, linear = compressor.classifier
+        assert isinstance(compressor.features, nn.Module)
+        assert dropout.p == 0.25
+        assert linear.out_features == 256
+    for vae in (SmallVae(), ResVae()):
+        assert any(isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d) for part in vae.decoder.modules())
+        assert vae.decoder.output.weight.requires_grad
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_small_maps_show_their_images_and_nothing_else(seed: int) -> None:
+    maps = small_maps(3, seed)
+    np.testing.assert_array_equal(maps.image, small_images(3, seed))
+    np.testing.assert_array_equal(~np.isnan(maps.depth_m[:, :, 8:-8]), maps.image > 0)
+    assert not maps.intensity[np.isnan(maps.depth_m)].any()
