@@ -60,40 +60,35 @@ def build_command(folder: Path, count: int, shard: int) -> list[str]:
     ]
 
 
-def finish(command: list[str], folder: Path) -> tuple[float, float]:
-    """Run a build to its end; seconds to its first shard, and in all."""
-    started_s, first_s = time.monotonic(), 0.0
+def finish(command: list[str]) -> float:
+    """Run a build to its end; its seconds."""
+    started_s = time.monotonic()
+    subprocess.run(command, check=True, capture_output=True)
+    return time.monotonic() - started_s
+
+
+def plan_kills(count: int, shard: int, whole_s: float, times: int, seed: int) -> list[tuple[int, float]]:
+    """For each kill, the shards that it waits for and the seconds after them: together about as many as there are."""
+    generator, shards = np.random.default_rng(seed), -(-count // shard)
+    more = generator.integers(0, max(2, 2 * shards // times - 1), times)
+    return list(zip(more.tolist(), generator.uniform(0, whole_s / shards, times).tolist(), strict=True))
+
+
+def kill(command: list[str], folder: Path, shards: int, then_s: float) -> Kill:
+    """Start a build, kill it so long after it has stored so many shards more, and see what it left."""
+    before, started_s, workers = _shards(folder), time.monotonic(), list[int]()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        while process.poll() is None:
-            if not first_s and any(folder.glob(SHARDS)):
-                first_s = time.monotonic() - started_s
-            time.sleep(0.02)
-    if process.returncode:
-        raise RuntimeError(f"the build ended with exit code {process.returncode}: {' '.join(command)}")
-    return first_s, time.monotonic() - started_s
-
-
-def moments(first_s: float, whole_s: float, times: int, seed: int) -> list[float]:
-    """When to kill: some while workers start, most at work, of which all together do about as much as is to do."""
-    work_s = 2 * (whole_s - first_s) / times
-    return np.random.default_rng(seed).uniform(first_s / 2, first_s + work_s, times).tolist()
-
-
-def kill(command: list[str], folder: Path, after_s: float) -> Kill:
-    """Start a build, kill it after so long, and see what it left."""
-    before = _shards(folder)
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None and len(list(folder.glob(SHARDS))) < len(before) + shards:
+            time.sleep(0.005)
         try:
-            process.wait(after_s)
+            process.wait(then_s)
         except subprocess.TimeoutExpired:
             workers = children_of(process.pid)
             process.kill()
-        else:
-            workers = []  # it was quicker
-    left = _still_running(workers)
-    after = _shards(folder)
+    after_s, parts = time.monotonic() - started_s, len(list(folder.glob(PARTS)))
+    left, after = _still_running(workers), _shards(folder)
     lost = sum(after.get(name) != content for name, content in before.items())
-    return Kill(after_s, len(before), len(after), len(list(folder.glob(PARTS))), lost, left)
+    return Kill(after_s, len(before), len(after), parts, lost, left)
 
 
 def _shards(folder: Path) -> dict[str, bytes]:
@@ -139,10 +134,10 @@ def main() -> None:
     count, times, seed, shard = (*given, *DEFAULTS[len(given) :])
     with tempfile.TemporaryDirectory() as name:
         whole, killed = Path(name) / "whole", Path(name) / "killed"
-        first_s, whole_s = finish(build_command(whole, count, shard), whole)
+        whole_s = finish(build_command(whole, count, shard))
         command = build_command(killed, count, shard)
-        kills = [kill(command, killed, moment) for moment in moments(first_s, whole_s, times, seed)]
-        finish(command, killed)
+        kills = [kill(command, killed, *when) for when in plan_kills(count, shard, whole_s, times, seed)]
+        finish(command)
         wrong = differing(whole, killed)
     good = not wrong and not any(each.lost or each.left_running for each in kills)
     result = {

@@ -45,7 +45,7 @@ def test_one_bit_makes_a_difference(kills: ModuleType, tmp_path: Path, harm: str
 
 def test_a_kill_sees_what_was_left_half_written(kills: ModuleType, tmp_path: Path) -> None:
     folder = _dataset(tmp_path / "one")
-    found = kills.kill([sys.executable, "-c", BUILDS, str(folder)], folder, 1.0)
+    found = kills.kill([sys.executable, "-c", BUILDS, str(folder)], folder, 0, 1.0)
     assert (found.shards_before, found.shards_after, found.lost, found.left_running) == (1, 1, 0, 0)
     assert found.parts == 1
 
@@ -53,7 +53,7 @@ def test_a_kill_sees_what_was_left_half_written(kills: ModuleType, tmp_path: Pat
 def test_a_lost_or_changed_shard_is_seen(kills: ModuleType, tmp_path: Path) -> None:
     folder = _dataset(tmp_path / "one")
     cut = "import sys; open(sys.argv[1], 'wb').write(b'x')"
-    found = kills.kill([sys.executable, "-c", cut, str(shard_path(folder, 0))], folder, 60.0)
+    found = kills.kill([sys.executable, "-c", cut, str(shard_path(folder, 0))], folder, 0, 60.0)
     assert found.lost == 1
 
 
@@ -72,19 +72,25 @@ def test_a_build_command_is_the_programs(kills: ModuleType, tmp_path: Path) -> N
     assert command[3:] == ["dataset", "build", "--out", str(tmp_path), "--count", "30", "--workers", "2"]
 
 
-def test_a_build_that_fails_is_told_and_one_that_ends_is_timed(kills: ModuleType, tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="exit code 3"):
-        kills.finish([sys.executable, "-c", "raise SystemExit(3)"], tmp_path)
+def test_a_kill_waits_for_the_shards_that_it_is_to_see(kills: ModuleType, tmp_path: Path) -> None:
     folder = _dataset(tmp_path / "one")
-    first_s, whole_s = kills.finish([sys.executable, "-c", "import time; time.sleep(0.3)"], folder)
-    assert 0 < first_s < 0.3 <= whole_s
+    adds = "import sys, time; open(sys.argv[1] + '/shard-000000003.h5', 'wb').write(b'x'); time.sleep(60)"
+    found = kills.kill([sys.executable, "-c", adds, str(folder)], folder, 1, 0.0)
+    assert (found.shards_before, found.shards_after, found.lost) == (1, 2, 0)
 
 
-def test_kills_come_while_it_starts_and_while_it_works(kills: ModuleType) -> None:
-    moments = np.array(kills.moments(10.0, 60.0, 200, 0))
-    assert 5 <= moments.min() < 6
-    assert 10 < moments.max() <= 10.5
-    assert kills.moments(10.0, 60.0, 5, 0) == kills.moments(10.0, 60.0, 5, 0)
+def test_a_build_that_fails_is_told(kills: ModuleType) -> None:
+    with pytest.raises(subprocess.CalledProcessError):
+        kills.finish([sys.executable, "-c", "raise SystemExit(3)"])
+
+
+def test_kills_come_at_once_and_late_and_leave_work_to_the_last(kills: ModuleType) -> None:
+    planned = kills.plan_kills(300, 10, 60.0, 10, 0)
+    assert planned == kills.plan_kills(300, 10, 60.0, 10, 0)
+    shards = [more for more, _ in planned]
+    assert min(shards) == 0
+    assert 10 < sum(shards) < 30
+    assert all(0 <= then_s <= 2 for _, then_s in planned)
 
 
 def test_only_the_time_in_which_all_work_counts(tool: Callable[[str], ModuleType]) -> None:
