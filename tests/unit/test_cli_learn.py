@@ -134,7 +134,7 @@ def test_the_weights_are_tied_to_the_rig_that_the_maps_were_rendered_for(
         ({"recipe": "none.toml"}, 4, "none.toml"),
         ({"dataset": "held-out"}, 1, "holds 2 objects, the recipe asks for 4"),
         ({"dataset": "none"}, 4, "no dataset in"),
-        ({"vae": "data"}, 4, "encoder.safetensors"),
+        ({"vae": "data"}, 4, "no checkpoint in"),
     ],
 )
 def test_what_does_not_fit_together_is_refused(
