@@ -6,9 +6,8 @@ is the whole device, with the same gain and noise of its own.
 """
 
 import json
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +20,8 @@ from numpy.typing import NDArray
 
 from nlos_cam.colour_objects import TEXTURES, colour_object
 from nlos_cam.dataset import SHARD, DatasetPlan, OnProgress
+from nlos_cam.dataset_shards import opened
+from nlos_cam.dataset_worker import one_thread
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
 from nlos_cam.render.renderer import render
@@ -69,7 +70,7 @@ def build_colour(plan: DatasetPlan, count: int, folder: Path, *, workers: int, o
     missing = {path: seeds for path, seeds in jobs.items() if not _holds(path, seeds)}
     done = count - sum(len(seeds) for seeds in missing.values())
     on_progress(done, count)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=one_thread) as pool:
         futures = {pool.submit(build_shard, plan, path, seeds): len(seeds) for path, seeds in missing.items()}
         try:
             for future in as_completed(futures):
@@ -113,37 +114,21 @@ def read_colour(folder: Path) -> tuple[MapSet, Rig]:
         raise RecordingError(f"no dataset in colour in {folder}: it holds no {PATTERN}; make one first")
     parts: list[list[Float32]] = []
     for shard in shards:
-        with _opened(shard) as file:
+        with opened(shard) as file:
             parts.append([np.asarray(file[name]) for name in ("depth_m", "intensity", "image")])
     rig = Rig.model_validate(json.loads(_plan_of(shards[0]))["rig"])
     return MapSet(*(np.concatenate(stack) for stack in zip(*parts, strict=True))), rig
-
-
-def _one_thread() -> None:
-    import numba
-
-    numba.set_num_threads(1)  # one object per process is faster than several threads per object
 
 
 def _provenance(plan: DatasetPlan) -> str:
     return json.dumps({**json.loads(plan.provenance), "textures": list(TEXTURES)})
 
 
-@contextmanager
-def _opened(shard: Path) -> Generator[h5py.File]:
-    """A shard to read from. Raises RecordingError where it, or what is asked of it inside, cannot be read."""
-    try:
-        with h5py.File(shard) as file:
-            yield file
-    except (OSError, KeyError) as error:
-        raise RecordingError(f"{shard} cannot be read as a shard: {error}; delete it and build again") from error
-
-
 def _holds(shard: Path, seeds: Sequence[int]) -> bool:
     """Whether a shard is there with all of these objects: the last one of a smaller dataset has too few."""
     if not shard.exists():
         return False
-    with _opened(shard) as file:
+    with opened(shard) as file:
         return len(file["seed"]) >= len(seeds)  # pyright: ignore[reportArgumentType] (a data set, by our own hand)
 
 
@@ -154,5 +139,5 @@ def _agree(folder: Path, plan: DatasetPlan) -> None:
 
 
 def _plan_of(shard: Path) -> str:
-    with _opened(shard) as file:
+    with opened(shard) as file:
         return str(file.attrs["plan"])

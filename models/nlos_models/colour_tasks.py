@@ -1,7 +1,6 @@
 """The two steps of training in colour (simulation only): the VAE on albedo images, then ResNet50 onto its latent."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,11 +14,10 @@ from nlos_models.losses import image_error, kl_divergence, latent_error
 from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import split_and_stack
 from nlos_models.recipe import Recipe
+from nlos_models.remap import parts_of
 from nlos_models.res_vae import ResVae
 from nlos_models.silhouette import cut_silhouette
 from nlos_models.train import OnStep, fit
-
-SCORING_BATCH = 100
 
 Float32 = NDArray[np.float32]
 
@@ -101,7 +99,7 @@ def train_colour_compressor(
 def run_colour(pipeline: Pipeline, maps: MapSet) -> Float32:
     """Colour images (n, 3, 64, 64) that the pipeline makes of maps, in eval mode."""
     device = next(pipeline.parameters()).device
-    pairs = zip(_parts(maps.depth_m), _parts(maps.intensity), strict=True)
+    pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
     made = [pipeline(*(torch.from_numpy(part).to(device) for part in pair)) for pair in pairs]
     return torch.cat(made).float().cpu().numpy()
 
@@ -110,19 +108,15 @@ def run_colour(pipeline: Pipeline, maps: MapSet) -> Float32:
 def rebuild(vae: ResVae, images: Half | Float32) -> Float32:
     """What the VAE alone makes of colour images (n, 3, 64, 64), cut as the pipeline cuts."""
     device = next(vae.parameters()).device
-    means = (vae.encoder(torch.from_numpy(part.astype(np.float32)).to(device))[0] for part in _parts(images))
+    means = (vae.encoder(torch.from_numpy(part.astype(np.float32)).to(device))[0] for part in parts_of(images))
     return torch.cat([cut_silhouette(vae.decoder(mean)) for mean in means]).float().cpu().numpy()
 
 
 @torch.no_grad()
 def _latents(vae: ResVae, images: Half | Float32) -> Tensor:
     """Mean and log-variance (n, 2, latent) of colour images."""
-    parts = (torch.from_numpy(part.astype(np.float32)) for part in _parts(images))
+    parts = (torch.from_numpy(part.astype(np.float32)) for part in parts_of(images))
     return torch.cat([torch.stack(vae.encoder(part), dim=1) for part in parts])
-
-
-def _parts(stack: NDArray[Any]) -> list[NDArray[Any]]:
-    return [stack[k : k + SCORING_BATCH] for k in range(0, len(stack), SCORING_BATCH)]
 
 
 def _figures(image: Float32, truth: Half | Float32) -> dict[str, float]:
