@@ -42,6 +42,8 @@ class Recipe(BaseModel):
     """Categories of objects that a VAE is not shown; a dataset's own plan says which a compressor is."""
     backgrounds: float = Field(default=0.0, ge=0, le=1)
     """Of a VAE's objects: the share that has a post or a panel beside it."""
+    start: Literal["scratch", "weights"] = "scratch"
+    """Of a VAE or a compressor: random weights, or those of an earlier run (--weights)."""
     keep: Literal["last", "best"] = "last"
     """Which epoch's weights are handed on; the best has the least held-out loss."""
     steps: Literal["two", "one", "two-then-joint"] = "two"
@@ -67,6 +69,8 @@ class Recipe(BaseModel):
             raise ValueError("latent_weight and image_weight are both 0: there is nothing to learn by")
         if self.steps == "one" and self.latent_weight:
             raise ValueError("steps 'one' knows no latent to aim at: set latent_weight = 0")
+        if self.start == "weights" and (self.colour or self.task == "transfer" or self.steps != "two"):
+            raise ValueError("start 'weights' is for a VAE or a two-step compressor of depth: leave it out")
         if self.steps != "two" and not self.image_weight:
             raise ValueError(
                 f"steps {self.steps!r} trains a decoder, which learns by images alone: set an image_weight"

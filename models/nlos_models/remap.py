@@ -56,18 +56,19 @@ class Remapping:
             part.requires_grad_(requires_grad=False)
         pipeline = in_channels_last(self.pipeline).to(fabric.device)
         targets = self._targets(recipe, fabric)
+        latent_of, decoded = running.quick(pipeline.latent), running.quick(pipeline.decoder)
 
         def loss(batch: MapBatch) -> Tensor:
             for part in still:
                 part.eval()
-            latent = pipeline.latent(batch.depth_m, batch.intensity)
+            latent = latent_of(batch.depth_m, batch.intensity)
             value = torch.zeros((), device=latent.device)
             if targets:
                 straight, mirrored = (pair[batch.row] for pair in targets)
                 aim = torch.where(batch.mirrored[:, None, None], mirrored, straight)
                 value = value + recipe.latent_weight * latent_error(latent, *aim.unbind(1))
             if recipe.image_weight:
-                value = value + recipe.image_weight * image_error(pipeline.decoder(latent), batch.image)
+                value = value + recipe.image_weight * image_error(decoded(latent), batch.image)
             return value
 
         return fit(

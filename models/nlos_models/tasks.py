@@ -21,20 +21,27 @@ from nlos_models.train import OnStep, Running, fit
 
 
 def train_vae(
-    recipe: Recipe, images: Half, held_out: Half, folder: Path, on_step: OnStep, running: Running | None = None
+    recipe: Recipe,
+    images: Half,
+    held_out: Half,
+    folder: Path,
+    on_step: OnStep,
+    running: Running | None = None,
+    start: ResVae | None = None,
 ) -> tuple[ResVae, dict[str, float]]:
-    """Train a Res-VAE on images (n, 64, 64) in [0, 1] (SI 3); a second call resumes.
+    """Train a Res-VAE on images (n, 64, 64) in [0, 1] (SI 3), from `start` if there is one; a second call resumes.
 
     Returns the network in eval mode and its held-out figures.
     """
     torch.manual_seed(recipe.seed)
-    vae = in_channels_last(ResVae())
+    vae = in_channels_last(start or ResVae())
+    quick = (running or Running()).quick(vae)
 
     def loss(image: Tensor) -> Tensor:
         if recipe.augmentation == "turns":
             image = turn_some(image, torch.randint(4, (len(image),), device=image.device))
         image = image.contiguous(memory_format=torch.channels_last)
-        rebuilt, mean, log_variance = vae(image, torch.randn(len(image), LATENT, device=image.device))
+        rebuilt, mean, log_variance = quick(image, torch.randn(len(image), LATENT, device=image.device))
         return image_error(rebuilt, image) + recipe.kl_weight * kl_divergence(mean, log_variance)
 
     figures = fit(
@@ -58,7 +65,7 @@ class Start:
     vae: ResVae | None = None
     """Whose latent is aimed at, and whose decoder is used; None for steps "one"."""
     pipeline: Pipeline | None = None
-    """Two-step weights, for steps "two-then-joint"; its decoder is the VAE's."""
+    """Two-step weights, for steps "two-then-joint" (its decoder is the VAE's) or for a start from weights."""
 
 
 def train_compressor(
@@ -95,7 +102,10 @@ def _set_out(recipe: Recipe, start: Start) -> Pipeline:
         return start.pipeline
     if start.vae is None:
         raise TrainingError("steps 'two' need a trained VAE: name one (--vae)")
-    return Pipeline(Compressor(recipe.dropout), start.vae.decoder, recipe.left_noise)
+    compressor = start.pipeline.compressor if start.pipeline else Compressor(recipe.dropout)
+    pipeline = Pipeline(compressor, start.vae.decoder)
+    set_for_training(pipeline, recipe)
+    return pipeline
 
 
 def turn_some(images: Tensor, quarters: Tensor) -> Tensor:

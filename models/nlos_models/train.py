@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from lightning_fabric import Fabric
@@ -26,6 +26,7 @@ from nlos_models.tensorboard import Board
 Batches = Callable[[torch.Generator], Iterable[Any]]
 """One epoch of batches, shuffled by the generator."""
 Loss = Callable[[Any], Tensor]
+Network = TypeVar("Network", bound=Callable[..., Any])
 Score = Callable[[], dict[str, float]]
 OnStep = Callable[[int, int], None]
 """Called with the steps done and the steps in all."""
@@ -42,7 +43,7 @@ def _to_nobody(told: object) -> None:
 
 @dataclass(frozen=True)
 class Running:
-    """How a run is run; none of it changes what comes out, but for the number of processes."""
+    """How a run is run; none of it changes what comes out, but for the number of processes and rounding."""
 
     fabric: Fabric | None = None
     """Launched; None takes the best one device at hand."""
@@ -54,11 +55,17 @@ class Running:
     checkpoint_s: float = 300.0
     """How often a state is saved within an epoch."""
     tensorboard: bool = False
+    compiled: bool = False
+    """Whether networks run through torch.compile, which asks for a C++ compiler; sums then differ by rounding."""
     clock: Callable[[], float] = time.monotonic
 
     def on(self, recipe: Recipe) -> Fabric:
         """The fabric, or one device's."""
         return self.fabric or open_fabric(recipe)
+
+    def quick(self, network: Network) -> Network:
+        """The network, or part of one, as a step runs it."""
+        return cast("Network", torch.compile(network)) if self.compiled else network
 
 
 class _Step(nn.Module):

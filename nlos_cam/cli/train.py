@@ -39,6 +39,9 @@ Budget = Annotated[float, typer.Option("--budget", min=1e-4, max=1.0, help="Shar
 Objects = Annotated[int | None, typer.Option("--objects", min=2, help="Train on so many, not on the recipe's.")]
 Devices = Annotated[int, typer.Option("--devices", min=1, help="Processes: one for each GPU, or on the CPU.")]
 On = Annotated[Accelerator, typer.Option("--accelerator", help="auto is a GPU if there is one.")]
+Compiled = Annotated[
+    bool, typer.Option("--compile", help="Networks through torch.compile: faster; needs a C++ compiler.")
+]
 TensorBoard = Annotated[bool, typer.Option("--tensorboard", help="Log for TensorBoard too, beside log.csv.")]
 
 
@@ -54,11 +57,18 @@ def register(app: typer.Typer) -> None:
 def vae(
     recipe_file: RecipeFile,
     out: RunFolder,
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            "--weights", help='Where a recipe with start = "weights" starts; the shipped weights unless given.'
+        ),
+    ] = None,
     budget: Budget = 1.0,
     objects: Objects = None,
     devices: Devices = 1,
     accelerator: On = "auto",
     tensorboard: TensorBoard = False,
+    compiled: Compiled = False,
     json: Json = False,
 ) -> None:
     """Train a Res-VAE on procedural objects (SI 3)."""
@@ -76,7 +86,9 @@ def vae(
         for seed, count in ((dataset.TRAINING_SEED, recipe.objects), (dataset.HELD_OUT_SEED, recipe.held_out))
     )
     record = CheckpointRecord(rig_name=rig.name, rig_checksum=rig.checksum, vae_recipe=recipe)
-    figures = launched(fabric, run_vae, Job(recipe, out, record, tensorboard), images, held_out)
+    start = load_vae(weights or shipped_folder())[0] if recipe.start == "weights" else None
+    job = Job(recipe, out, record, tensorboard, compiled)
+    figures = launched(fabric, run_vae, job, start, images, held_out)
     _told(out, figures, as_json=json)
 
 
@@ -88,7 +100,9 @@ def compressor(
     vae_folder: Annotated[
         Path | None, typer.Option("--vae", help="A trained VAE; the shipped one unless given.")
     ] = None,
-    weights: Annotated[Path | None, typer.Option("--weights", help="Two-step weights, for `two-then-joint`.")] = None,
+    weights: Annotated[
+        Path | None, typer.Option("--weights", help='Two-step weights, for `two-then-joint` or start = "weights".')
+    ] = None,
     wall: Wall = None,
     stream: Stream = False,
     budget: Budget = 1.0,
@@ -96,6 +110,7 @@ def compressor(
     devices: Devices = 1,
     accelerator: On = "auto",
     tensorboard: TensorBoard = False,
+    compiled: Compiled = False,
     json: Json = False,
 ) -> None:
     """Train a compressor onto the latent of a trained VAE (SI 4), or as the recipe's `steps` say."""
@@ -111,7 +126,7 @@ def compressor(
     start, record = _start(recipe, vae_folder, weights)
     maps = read_maps(recipe, data, held_out_data, wall, stream=stream)
     record = _tied(record, maps, recipe).model_copy(update={"compressor_recipe": recipe})
-    job = Job(recipe, out, record, tensorboard)
+    job = Job(recipe, out, record, tensorboard, compiled)
     figures = launched(fabric, run_compressor, job, start, maps.training, maps.held_out)
     _told(out, figures, as_json=json)
 
@@ -142,6 +157,7 @@ def transfer(
     devices: Devices = 1,
     accelerator: On = "auto",
     tensorboard: TensorBoard = False,
+    compiled: Compiled = False,
     json: Json = False,
 ) -> None:
     """Train synthetic weights on, on a bench's recordings (SI 4): all layers, then the classifier alone."""
@@ -151,7 +167,7 @@ def transfer(
     _same_input(recipe, record)
     maps = read_maps(recipe, data, held_out_data, wall)
     record = _tied(record, maps, recipe).model_copy(update={"transfer_recipe": recipe})
-    job, encoder = Job(recipe, out, record, tensorboard), load_encoder(weights)
+    job, encoder = Job(recipe, out, record, tensorboard, compiled), load_encoder(weights)
     figures = launched(fabric, run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
     told = f"weights in {out}: {figures['after']}, from {figures['before']}"
     finish({"out": str(out), **figures["after"], "before": figures["before"]}, as_json=json, text=told)
@@ -163,7 +179,7 @@ def _start(recipe: Recipe, vae_folder: Path | None, weights: Path | None) -> tup
         return Start(), None
     if recipe.steps == "two":
         trained, record = load_vae(vae_folder or shipped_folder())
-        return Start(trained), record
+        return Start(trained, load_pipeline(weights)[0] if recipe.start == "weights" else None), record
     pipeline, record = load_pipeline(weights)
     _same_input(recipe, record)
     trained = ResVae()

@@ -11,7 +11,7 @@ from nlos_models.data import Half, MapSet
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
 from nlos_models.remap import figures_of, run
-from nlos_models.res_vae import Encoder
+from nlos_models.res_vae import Encoder, ResVae
 from nlos_models.sources import MapSource
 from nlos_models.tasks import Start, train_compressor, train_vae
 from nlos_models.train import OnStep, Running
@@ -31,16 +31,17 @@ class Job:
     record: CheckpointRecord
     """Of the weights to be, but for their figures."""
     tensorboard: bool = False
+    compiled: bool = False
 
     def made(self, figures: Figures) -> CheckpointRecord:
         """The record with the figures in."""
         return self.record.model_copy(update={"figures": figures})
 
 
-def run_vae(fabric: Fabric, job: Job, images: Half, held_out: Half) -> Figures:
+def run_vae(fabric: Fabric, job: Job, start: ResVae | None, images: Half, held_out: Half) -> Figures:
     """Train a VAE and save it; its held-out figures."""
     with _watched(fabric, job, "VAE") as (on_step, running):
-        vae, figures = train_vae(job.recipe, images, held_out, job.out, on_step, running)
+        vae, figures = train_vae(job.recipe, images, held_out, job.out, on_step, running, start)
     if fabric.is_global_zero:
         save_vae(job.out, vae, job.made(figures))
     return figures
@@ -81,4 +82,4 @@ def _watched(fabric: Fabric, job: Job, what: str) -> Generator[tuple[OnStep, Run
             told = f"epoch {row['epoch'] + 1:.0f} done, loss {row['loss']:.4g}, held out {row['held_out_loss']:.4g}"
             bar.update(task, description=f"training the {what}: {told}")
 
-        yield on_step, Running(fabric, stop.is_set, say, on_epoch, tensorboard=job.tensorboard)
+        yield on_step, Running(fabric, stop.is_set, say, on_epoch, tensorboard=job.tensorboard, compiled=job.compiled)
