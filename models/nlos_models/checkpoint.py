@@ -11,12 +11,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from nlos_models.colour import colour_pipeline, colour_vae
-from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
+from nlos_models.networks import SIMULATION_ONLY, new_pipeline, new_vae
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import MapKind, Recipe
-from nlos_models.res_vae import Decoder, Encoder, ResVae
+from nlos_models.res_vae import Encoder, ResVae
 
 RECORD = "checkpoint.json"
 SHIPPED = "paper-rig"
@@ -39,6 +38,8 @@ class CheckpointRecord(BaseModel):
     """None for weights that saw synthetic maps alone."""
     figures: dict[str, float] = {}
     """Held-out figures at the end of training."""
+    note: str = ""
+    """Where weights are of colour, that these are simulation only."""
 
     @property
     def colour(self) -> bool:
@@ -80,7 +81,7 @@ def save_pipeline(folder: Path, pipeline: Pipeline, record: CheckpointRecord, en
 def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
     """A Res-VAE in eval mode. Raises CheckpointError where a tensor is missing, left over or of another shape."""
     record = load_record(folder)
-    vae = colour_vae() if record.colour else ResVae()
+    vae = new_vae(colour=record.colour)
     for name, module in (("encoder", vae.encoder), ("decoder", vae.decoder)):
         _load(folder / f"{name}.safetensors", module)
     return vae.eval(), record
@@ -102,7 +103,7 @@ def load_pipeline_partly(folder: Path) -> tuple[Pipeline, CheckpointRecord, Load
 
 def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[Pipeline, CheckpointRecord]:
     record = load_record(folder)
-    pipeline = colour_pipeline() if record.colour else Pipeline(Compressor(), Decoder())
+    pipeline = new_pipeline(colour=record.colour)
     for name in names:
         _load(folder / f"{name}.safetensors", getattr(pipeline, name))
     return pipeline.eval(), record
@@ -110,10 +111,11 @@ def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[Pipeline, Chec
 
 def load_encoder(folder: Path | None = None) -> Encoder | None:
     """The encoder beside a pipeline's weights, in eval mode, or None where they were trained without one."""
-    path = (folder or shipped_folder()) / "encoder.safetensors"
+    folder = folder or shipped_folder()
+    path = folder / "encoder.safetensors"
     if not path.exists():
         return None
-    encoder = Encoder()
+    encoder = new_vae(colour=load_record(folder).colour).encoder
     _load(path, encoder)
     return encoder.eval()
 
@@ -151,7 +153,8 @@ def load_record(folder: Path) -> CheckpointRecord:
 
 def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(record.model_dump(mode="json"), indent=2)
+    facts = record.model_dump(mode="json", exclude={"note"})
+    text = json.dumps({**facts, "note": SIMULATION_ONLY} if record.colour else facts, indent=2)
     try:
         for name, module in parts.items():
             tensors = {key: _half(key, tensor) for key, tensor in module.state_dict().items()}

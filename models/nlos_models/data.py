@@ -20,9 +20,9 @@ class MapSet:
     depth_m: Float32
     """(n, 64, 80); NaN where there is no return."""
     intensity: Float32
-    """(n, 64, 80)."""
+    """(n, 64, 80), or in colour (n, 3, 64, 80)."""
     image: Half | Float32
-    """(n, 64, 64) in [0, 1]."""
+    """(n, 64, 64) in [0, 1], or in colour (n, 3, 64, 64)."""
 
 
 def shuffled(count: int, batch: int, generator: torch.Generator) -> Iterator[Tensor]:
@@ -41,10 +41,16 @@ def flip_some(tensors: list[Tensor], flips: Tensor) -> list[Tensor]:
     return [torch.where(chosen.view(-1, *[1] * (t.ndim - 1)), t.flip(-2), t) for t in tensors]
 
 
+def as_images(images: Half | Float32) -> Tensor:
+    """Images (n, 64, 64) as the (n, 1, 64, 64) of float32 that networks take; those in colour have their channels."""
+    tensor = torch.from_numpy(images.astype(np.float32))
+    return tensor[:, None] if tensor.ndim == 3 else tensor
+
+
 def image_batches(images: Half, batch: int, generator: torch.Generator) -> Iterator[Tensor]:
-    """One epoch of images (b, 1, 64, 64), shuffled and mirrored at random."""
+    """One epoch of images (b, 1 or 3, 64, 64), shuffled and mirrored at random."""
     for index in shuffled(len(images), batch, generator):
-        chosen = torch.from_numpy(images[index.numpy()].astype(np.float32))[:, None]
+        chosen = as_images(images[index.numpy()])
         yield flip_some([chosen], torch.rand(len(index), generator=generator) < 0.5)[0]
 
 
@@ -54,9 +60,9 @@ class MapBatch(NamedTuple):
     depth_m: Tensor
     """(b, 64, 80)."""
     intensity: Tensor
-    """(b, 64, 80)."""
+    """(b, 64, 80), or in colour (b, 3, 64, 80)."""
     image: Tensor
-    """(b, 1, 64, 64)."""
+    """(b, 1, 64, 64), or in colour (b, 3, 64, 64)."""
     row: Tensor
     """(b,); which samples of the set these are."""
     mirrored: Tensor
@@ -66,7 +72,7 @@ class MapBatch(NamedTuple):
 def as_batch(maps: MapSet, row: NDArray[np.int64], mirrored: NDArray[np.bool_]) -> MapBatch:
     """Samples (b,) of a set, those that are flagged mirrored."""
     depth, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
-    image, flips = torch.from_numpy(maps.image.astype(np.float32))[:, None], torch.from_numpy(mirrored)
+    image, flips = as_images(maps.image), torch.from_numpy(mirrored)
     depth, intensity, image = flip_some([depth, intensity, image], flips)
     return MapBatch(depth, intensity, image, torch.from_numpy(row), flips)
 

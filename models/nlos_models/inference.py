@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
 from nlos_models.errors import CheckpointError, ModelError
+from nlos_models.networks import SIMULATION_ONLY
 from nlos_models.pipeline import Pipeline
 
 Float32 = NDArray[np.float32]
@@ -74,8 +75,8 @@ def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
     pipeline, record = load_pipeline(folder)
     if record.colour:
         raise CheckpointError(
-            f"{folder} holds weights for full colour, which is simulation only (the L515's laser is infrared): "
-            "name weights for depth; tools/colour_demo.py shows these"
+            f"{folder} holds weights for full colour ({SIMULATION_ONLY}): name weights for depth; "
+            "tools/colour_demo.py judges these"
         )
     if torch.cuda.is_available():
         return TorchReconstructor(pipeline, record, "cuda")

@@ -5,17 +5,17 @@ from torch import Tensor
 
 
 def image_error(image: Tensor, truth: Tensor) -> Tensor:
-    """Squared error of images (n, 1, 64, 64): summed over pixels, averaged over the batch."""
+    """Squared error of images (n, channels, 64, 64): summed over pixels and channels, averaged over the batch."""
     return (image.float() - truth.float()).square().sum((1, 2, 3)).mean()
 
 
 def kl_divergence(mean: Tensor, log_variance: Tensor) -> Tensor:
-    """KL(q || N(0, 1)) of latents (n, 256): summed over entries, averaged over the batch."""
+    """KL(q || N(0, 1)) of latents (n, latent): summed over entries, averaged over the batch."""
     mean, log_variance = mean.float(), log_variance.float()
     return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()
 
 
 def latent_error(latent: Tensor, mean: Tensor, log_variance: Tensor) -> Tensor:
-    """Squared error of latents (n, 256) in units of the encoder's own doubt, so that empty entries weigh little."""
+    """Squared error of latents (n, latent) in units of the encoder's own doubt, so that empty entries weigh little."""
     weight = torch.exp(-log_variance.float()).clamp(max=100.0)
     return (weight * (latent.float() - mean.float()).square()).sum(1).mean()

@@ -69,8 +69,10 @@ class Recipe(BaseModel):
             raise ValueError("latent_weight and image_weight are both 0: there is nothing to learn by")
         if self.steps == "one" and self.latent_weight:
             raise ValueError("steps 'one' knows no latent to aim at: set latent_weight = 0")
-        if self.start == "weights" and (self.colour or self.task == "transfer" or self.steps != "two"):
-            raise ValueError("start 'weights' is for a VAE or a two-step compressor of depth: leave it out")
+        if self.start == "weights" and (self.task == "transfer" or self.steps != "two"):
+            raise ValueError("start 'weights' is for a VAE or a two-step compressor: leave it out")
+        if self.colour and (self.task == "transfer" or self.maps != "raw maps"):
+            raise ValueError("colour is simulation only, and of raw maps: no bench to transfer to, no difference maps")
         if self.steps != "two" and not self.image_weight:
             raise ValueError(
                 f"steps {self.steps!r} trains a decoder, which learns by images alone: set an image_weight"

@@ -11,7 +11,8 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from nlos_models.data import Float32, Half, MapBatch, MapSet
+from nlos_models.colour_metrics import colour_error, colour_silhouette_iou
+from nlos_models.data import Float32, Half, MapBatch, MapSet, as_images
 from nlos_models.errors import TrainingError
 from nlos_models.losses import image_error, latent_error
 from nlos_models.metrics import silhouette_iou
@@ -84,13 +85,13 @@ class Remapping:
         )
 
     def _targets(self, recipe: Recipe, fabric: Fabric) -> list[Tensor]:
-        """The latents (n, 2, 256) of the images as they are, and of their mirrors; none where none are aimed at."""
+        """The latents (n, 2, latent) of the images as they are, and of their mirrors; none where none are aimed at."""
         if not recipe.latent_weight:
             return []
         if self.encoder is None:
             raise TrainingError("these weights have no encoder to aim at: set latent_weight = 0, or name a VAE's")
         encoder = self.encoder.to(fabric.device).requires_grad_(requires_grad=False).eval()
-        return [latents_of(encoder, images) for images in (self.source.image, self.source.image[:, ::-1])]
+        return [latents_of(encoder, images) for images in (self.source.image, self.source.image[..., ::-1, :])]
 
 
 def in_channels_last(module: Module) -> Module:
@@ -107,14 +108,14 @@ def set_for_training(pipeline: Pipeline, recipe: Recipe) -> None:
 
 
 def statistics_of(source: MapSource) -> tuple[Tensor, Tensor]:
-    """Mean and spread, each (4,), of the channels that a source's maps are split into."""
+    """Mean and spread, each (channels,), of the channels that a source's maps are split into."""
     maps = source.first(STATISTICS_OBJECTS)
     return channel_statistics(split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)))
 
 
 @torch.inference_mode()
 def run(pipeline: Pipeline, maps: MapSet) -> Float32:
-    """Images (n, 64, 64) that the pipeline makes of maps, in eval mode."""
+    """Images (n, 64, 64) that the pipeline makes of maps, in eval mode; in colour (n, 3, 64, 64)."""
     device = next(pipeline.parameters()).device
     pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
     made = (pipeline(*(torch.from_numpy(part).to(device) for part in pair)) for pair in pairs)
@@ -123,9 +124,9 @@ def run(pipeline: Pipeline, maps: MapSet) -> Float32:
 
 @torch.no_grad()
 def latents_of(encoder: Encoder, images: Half | Float32) -> Tensor:
-    """Mean and log-variance (n, 2, 256) of images (n, 64, 64), where the encoder is."""
+    """Mean and log-variance (n, 2, latent) of images (n, 64, 64) or in colour, where the encoder is."""
     device = next(encoder.parameters()).device
-    parts = (torch.from_numpy(part.astype(np.float32))[:, None].to(device) for part in parts_of(images))
+    parts = (as_images(part).to(device) for part in parts_of(images))
     return torch.cat([torch.stack(encoder(part), dim=1) for part in parts])
 
 
@@ -135,7 +136,15 @@ def parts_of(arrays: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def figures_of(image: Float32, truth: Half | Float32) -> dict[str, float]:
-    """What a run is judged by: squared error, summed over pixels, and silhouette IoU, averaged over (n, 64, 64)."""
+    """What a run is judged by: squared error, summed over pixels, and silhouette IoU, averaged over (n, 64, 64).
+
+    Of images in colour (n, 3, 64, 64) also the error of colour: 1 where none shares a pixel with its truth.
+    """
     truth = truth.astype(np.float32)
-    error = float(np.square(image - truth).sum((1, 2)).mean())
-    return {"held_out_loss": error, "held_out_iou": float(np.mean(silhouette_iou(image, truth)))}
+    error = float(np.square(image - truth).sum(tuple(range(1, truth.ndim))).mean())
+    if truth.ndim == 3:
+        return {"held_out_loss": error, "held_out_iou": float(np.mean(silhouette_iou(image, truth)))}
+    colour = colour_error(image, truth)
+    seen = colour[~np.isnan(colour)]
+    figures = {"held_out_loss": error, "held_out_iou": float(np.mean(colour_silhouette_iou(image, truth)))}
+    return {**figures, "held_out_colour_error": float(seen.mean()) if seen.size else 1.0}

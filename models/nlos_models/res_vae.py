@@ -81,6 +81,7 @@ class ResVae(nn.Module):
 
     def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
+        self.latent = latent
         self.encoder = Encoder(channels, latent)
         self.decoder = Decoder(channels, latent)
 

@@ -7,14 +7,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlos_models.compressor import Compressor
-from nlos_models.data import Float32, Half, MapSet, image_batches
+from nlos_models.data import Float32, Half, MapSet, as_images, image_batches
 from nlos_models.errors import TrainingError
 from nlos_models.losses import image_error, kl_divergence
+from nlos_models.networks import new_pipeline, new_vae
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
 from nlos_models.remap import Remapping, figures_of, in_channels_last, parts_of, set_for_training
-from nlos_models.res_vae import LATENT, Decoder, ResVae
+from nlos_models.res_vae import ResVae
 from nlos_models.silhouette import cut_silhouette
 from nlos_models.sources import MapSource
 from nlos_models.train import OnStep, Running, fit
@@ -29,19 +29,19 @@ def train_vae(
     running: Running | None = None,
     start: ResVae | None = None,
 ) -> tuple[ResVae, dict[str, float]]:
-    """Train a Res-VAE on images (n, 64, 64) in [0, 1] (SI 3), from `start` if there is one; a second call resumes.
+    """Train a Res-VAE on images (n, 64, 64), or in colour (n, 3, 64, 64), in [0, 1] (SI 3); a second call resumes.
 
-    Returns the network in eval mode and its held-out figures.
+    It sets out from `start` if there is one. Returns the network in eval mode and its held-out figures.
     """
     torch.manual_seed(recipe.seed)
-    vae = in_channels_last(start or ResVae())
+    vae = in_channels_last(start or new_vae(colour=recipe.colour))
     quick = (running or Running()).quick(vae)
 
     def loss(image: Tensor) -> Tensor:
         if recipe.augmentation == "turns":
             image = turn_some(image, torch.randint(4, (len(image),), device=image.device))
         image = image.contiguous(memory_format=torch.channels_last)
-        rebuilt, mean, log_variance = quick(image, torch.randn(len(image), LATENT, device=image.device))
+        rebuilt, mean, log_variance = quick(image, torch.randn(len(image), vae.latent, device=image.device))
         return image_error(rebuilt, image) + recipe.kl_weight * kl_divergence(mean, log_variance)
 
     figures = fit(
@@ -50,7 +50,7 @@ def train_vae(
         steps_per_epoch=len(images) // recipe.batch,
         batches=lambda generator: image_batches(images, recipe.batch, generator),
         loss=loss,
-        score=lambda: figures_of(np.concatenate([_rebuilt(vae, part) for part in parts_of(held_out)]), held_out),
+        score=lambda: figures_of(rebuilt(vae, held_out), held_out),
         folder=folder,
         on_step=on_step,
         running=running,
@@ -94,7 +94,7 @@ def train_compressor(
 
 def _set_out(recipe: Recipe, start: Start) -> Pipeline:
     if recipe.steps == "one":
-        return Pipeline(Compressor(recipe.dropout), Decoder(), recipe.left_noise)
+        return new_pipeline(colour=recipe.colour, dropout=recipe.dropout, left_noise=recipe.left_noise)
     if recipe.steps == "two-then-joint":
         if start.pipeline is None:
             raise TrainingError("steps 'two-then-joint' go on from two-step weights: name them (--weights)")
@@ -102,20 +102,23 @@ def _set_out(recipe: Recipe, start: Start) -> Pipeline:
         return start.pipeline
     if start.vae is None:
         raise TrainingError("steps 'two' need a trained VAE: name one (--vae)")
-    compressor = start.pipeline.compressor if start.pipeline else Compressor(recipe.dropout)
-    pipeline = Pipeline(compressor, start.vae.decoder)
+    pipeline = new_pipeline(start.vae.decoder, colour=recipe.colour)
+    if start.pipeline:
+        pipeline.compressor = start.pipeline.compressor
     set_for_training(pipeline, recipe)
     return pipeline
 
 
 def turn_some(images: Tensor, quarters: Tensor) -> Tensor:
-    """Turn each of images (n, 1, 64, 64) by so many quarters (n,); with the mirror, SI 3's turns and flips."""
+    """Turn each of images (n, channels, 64, 64) by so many quarters (n,); with the mirror, SI 3's turns and flips."""
     turned = torch.stack([images.rot90(k, (-2, -1)) for k in range(4)])
     return turned[quarters, torch.arange(len(images), device=images.device)]
 
 
 @torch.inference_mode()
-def _rebuilt(vae: ResVae, images: Half) -> Float32:
+def rebuilt(vae: ResVae, images: Half | Float32) -> Float32:
+    """What a VAE alone makes of images (n, 64, 64) or (n, 3, 64, 64), cut as the pipeline cuts."""
     device = next(vae.parameters()).device
-    mean, _ = vae.encoder(torch.from_numpy(images.astype(np.float32)).to(device)[:, None])
-    return cut_silhouette(vae.decoder(mean))[:, 0].float().cpu().numpy()
+    means = (vae.encoder(as_images(part).to(device))[0] for part in parts_of(images))
+    made = np.concatenate([cut_silhouette(vae.decoder(mean)).float().cpu().numpy() for mean in means])
+    return made.reshape(images.shape)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nlos_models import networks
 from nlos_models.data import Half, MapBatch, MapSet, map_batches
 from torch import Tensor, nn
 from torch.nn import functional
@@ -82,6 +83,8 @@ class SmallDecoder(nn.Module):
 class SmallVae(nn.Module):
     """Stands for ResVae."""
 
+    latent = LATENT
+
     def __init__(self) -> None:
         super().__init__()
         self.encoder, self.decoder = SmallEncoder(), SmallDecoder()
@@ -105,8 +108,8 @@ class SmallCompressor(nn.Module):
 
 
 def use_small_networks(patch: pytest.MonkeyPatch, *modules: object) -> None:
-    """Let modules make small networks where they would make the real ones."""
-    networks = {"ResVae": SmallVae, "Encoder": SmallEncoder, "Decoder": SmallDecoder, "Compressor": SmallCompressor}
-    for module in modules:
-        for name, small in networks.items():
+    """Let networks be made small, and by modules that make their own."""
+    small_ones = {"ResVae": SmallVae, "Encoder": SmallEncoder, "Decoder": SmallDecoder, "Compressor": SmallCompressor}
+    for module in (networks, *modules):
+        for name, small in small_ones.items():
             patch.setattr(module, name, small, raising=False)

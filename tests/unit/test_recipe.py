@@ -75,6 +75,8 @@ def test_on_fewer_objects_the_batch_is_never_larger_than_all() -> None:
         ("compressor", "latent_weight = 0", "nothing to learn by"),
         ("compressor", 'steps = "one"\nimage_weight = 1', "no latent to aim at"),
         ("compressor", 'steps = "two-then-joint"', "set an image_weight"),
+        ("transfer", "colour = true", "no bench to transfer to"),
+        ("compressor", 'colour = true\nmaps = "difference maps"', "no difference maps"),
     ],
 )
 def test_a_recipe_at_odds_with_itself_is_one_line(tmp_path: Path, task: str, lines: str, words: str) -> None:

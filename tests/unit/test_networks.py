@@ -1,10 +1,10 @@
-"""The networks of colour: their sizes, and what they make of maps that a bench may well deliver."""
+"""The networks of depth and colour: their sizes, and what those of colour make of hard maps."""
 
 from collections.abc import Iterator
 
 import pytest
 import torch
-from nlos_models.colour import CHANNELS, LATENT, colour_pipeline, colour_vae
+from nlos_models.networks import CHANNELS, COLOUR_LATENT, new_pipeline, new_vae
 from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import split_and_stack
 from torch import Tensor
@@ -21,7 +21,7 @@ def _one_thread() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def pipeline() -> Pipeline:
     torch.manual_seed(0)
-    return colour_pipeline()
+    return new_pipeline(colour=True)
 
 
 def _hard(name: str, n: int = 1) -> tuple[Tensor, Tensor]:
@@ -37,15 +37,32 @@ def _hard(name: str, n: int = 1) -> tuple[Tensor, Tensor]:
     return depth, intensity
 
 
-def test_the_vae_is_64_by_64_by_3_with_a_latent_of_512() -> None:
-    assert (CHANNELS, LATENT) == (3, 512)
+def test_the_colour_vae_is_64_by_64_by_3_with_a_latent_of_512() -> None:
+    assert (CHANNELS, COLOUR_LATENT) == (3, 512)
     with torch.device("meta"):
-        vae = colour_vae()
+        vae = new_vae(colour=True)
         image, mean, log_variance = vae(torch.empty(2, 3, 64, 64), torch.empty(2, 512))
     assert image.shape == (2, 3, 64, 64)
     assert mean.shape == log_variance.shape == (2, 512)
     counts = [sum(p.numel() for p in part.parameters()) for part in (vae.encoder, vae.decoder)]
     assert counts == [12_715_344, 12_188_083]
+
+
+@pytest.mark.parametrize(
+    ("colour", "channels", "latent", "parameters"), [(False, 4, 256, 2_552_096), (True, 8, 512, 24_572_800)]
+)
+def test_a_pipeline_is_of_depth_or_of_colour(colour: bool, channels: int, latent: int, parameters: int) -> None:
+    with torch.device("meta"):
+        vae = new_vae(colour=colour)
+        made = new_pipeline(vae.decoder, colour=colour, dropout=0.3, left_noise=0.1)
+        own = new_pipeline(colour=colour)
+    assert made.decoder is vae.decoder
+    assert own.decoder.state_dict().keys() == vae.decoder.state_dict().keys()
+    assert vae.latent == latent
+    assert made.preprocess.mean.shape == (channels,)
+    assert sum(p.numel() for p in made.compressor.parameters()) == parameters
+    assert [m.p for m in made.compressor.modules() if isinstance(m, torch.nn.Dropout)] == [0.3]
+    assert made.preprocess.left_noise == 0.1
 
 
 @pytest.mark.parametrize("name", ["constant", "all zero", "saturated", "half invalid", "all invalid"])

@@ -1,4 +1,4 @@
-"""Training in colour on a few images: the loss falls, the VAE stays frozen, a pipeline comes back from its folder."""
+"""Both steps of training in colour, on a few images: what their shapes could break; depth's tests hold the rest."""
 
 import csv
 from pathlib import Path
@@ -6,14 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models.checkpoint import CheckpointRecord, load_pipeline, load_vae, save_pipeline, save_vae
-from nlos_models.colour_tasks import rebuild, run_colour, train_colour_compressor, train_colour_vae
+from nlos_models.checkpoint import CheckpointRecord, load_encoder, load_pipeline, load_vae, save_pipeline, save_vae
 from nlos_models.data import Half, MapSet
 from nlos_models.errors import CheckpointError
 from nlos_models.inference import load_reconstructor
+from nlos_models.networks import SIMULATION_ONLY
+from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import channel_statistics, split_and_stack
 from nlos_models.recipe import Recipe, load_recipe
+from nlos_models.remap import figures_of, run
 from nlos_models.res_vae import ResVae
+from nlos_models.sources import InMemory
+from nlos_models.tasks import Start, rebuilt, train_compressor, train_vae
 
 pytestmark = pytest.mark.usefixtures("narrow_networks")
 
@@ -48,10 +52,14 @@ def _ignore(done: int, total: int) -> None:
     assert done <= total
 
 
+def _compressor(recipe: Recipe, start: Start, folder: Path) -> tuple[Pipeline, dict[str, float]]:
+    return train_compressor(recipe, start, InMemory(_maps(COUNT, 0)), _maps(2, 1), folder, _ignore)
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     folder = tmp_path_factory.mktemp("vae")
-    vae, figures = train_colour_vae(_recipe("vae"), _images(COUNT, 0), _images(2, 1), folder, _ignore)
+    vae, figures = train_vae(_recipe("vae"), _images(COUNT, 0), _images(2, 1), folder, _ignore)
     return vae, figures, folder
 
 
@@ -62,11 +70,11 @@ def test_the_vaes_loss_falls_and_its_figures_are_those_of_colour(trained: Traine
     assert float(log[-1]["loss"]) < float(log[0]["loss"])
     assert set(figures) == {"held_out_loss", "held_out_iou", "held_out_colour_error"}
     assert not vae.training
-    assert rebuild(vae, _images(2, 1)).shape == (2, 3, 64, 64)
+    assert rebuilt(vae, _images(2, 1)).shape == (2, 3, 64, 64)
 
 
 def test_a_finished_run_is_not_trained_again(trained: Trained) -> None:
-    vae, figures = train_colour_vae(_recipe("vae"), _images(COUNT, 0), _images(2, 1), trained[2], _ignore)
+    vae, figures = train_vae(_recipe("vae"), _images(COUNT, 0), _images(2, 1), trained[2], _ignore)
     for name, tensor in vae.state_dict().items():
         assert torch.equal(tensor, trained[0].state_dict()[name]), name
     assert figures == trained[1]
@@ -78,7 +86,8 @@ def test_the_compressor_learns_with_the_vae_frozen_and_comes_back_from_its_folde
     before = {name: tensor.clone() for name, tensor in trained[0].state_dict().items()}
     maps, held_out = _maps(COUNT, 0), _maps(2, 1)
     recipe = _recipe("compressor", epochs=1, latent_weight=0.03, image_weight=1.0)
-    pipeline, _ = train_colour_compressor(recipe, trained[0], maps, held_out, tmp_path, _ignore)
+    pipeline, figures = _compressor(recipe, Start(trained[0]), tmp_path)
+    assert figures == figures_of(run(pipeline, held_out), held_out.image)
     for name, tensor in trained[0].state_dict().items():
         assert torch.equal(tensor, before[name]), name
     mean, spread = channel_statistics(split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)))
@@ -87,14 +96,17 @@ def test_the_compressor_learns_with_the_vae_frozen_and_comes_back_from_its_folde
     record = CheckpointRecord(
         rig_name="paper-rig", rig_checksum="0", vae_recipe=_recipe("vae"), compressor_recipe=recipe
     )
-    save_pipeline(tmp_path, pipeline, record)
+    save_pipeline(tmp_path, pipeline, record, trained[0].encoder)
     loaded, told = load_pipeline(tmp_path)
-    assert told == record
+    assert told == record.model_copy(update={"note": SIMULATION_ONLY})
+    encoder = load_encoder(tmp_path)
+    assert encoder is not None
+    torch.testing.assert_close(encoder.state_dict(), trained[0].encoder.state_dict(), rtol=1e-3, atol=1e-6)
     latents = [torch.from_numpy(m) for m in (held_out.depth_m, held_out.intensity)]
     with torch.inference_mode():
         torch.testing.assert_close(loaded.latent(*latents), pipeline.latent(*latents), atol=0.02, rtol=0.02)
-    assert run_colour(loaded, held_out).shape == (2, 3, 64, 64)
-    with pytest.raises(CheckpointError, match="full colour, which is simulation only"):
+    assert run(loaded, held_out).shape == (2, 3, 64, 64)
+    with pytest.raises(CheckpointError, match=r"full colour \(simulation only"):
         load_reconstructor(tmp_path, tmp_path / "onnx")
 
 
@@ -108,8 +120,33 @@ def test_a_colour_vae_comes_back_and_weights_of_depth_are_refused_for_it(trained
         load_vae(tmp_path)
 
 
+def test_one_step_has_a_decoder_in_colour_of_its_own_and_goes_on_from_weights(trained: Trained, tmp_path: Path) -> None:
+    one = _recipe("compressor", steps="one", latent_weight=0, image_weight=1.0, epochs=1)
+    first, figures = _compressor(one, Start(), tmp_path / "one")
+    assert first.decoder.output.out_channels == 3
+    assert set(figures) == {"held_out_loss", "held_out_iou", "held_out_colour_error"}
+    still = _recipe("compressor", start="weights", epochs=1, learning_rate=1e-7, image_weight=1.0, schedule="plateau")
+    weight = first.compressor.get_submodule("classifier.1").state_dict()["weight"].clone()
+    on, _ = _compressor(still, Start(trained[0], first), tmp_path / "on")
+    after = on.compressor.get_submodule("classifier.1").state_dict()["weight"]
+    torch.testing.assert_close(after, weight, rtol=0, atol=1e-6)
+    assert on.decoder is trained[0].decoder
+
+
+def test_colours_that_share_no_pixel_with_the_truth_are_as_wrong_as_can_be() -> None:
+    truth = _images(2, 0)
+    assert figures_of(truth.astype(np.float32), truth) == {
+        "held_out_loss": 0.0,
+        "held_out_iou": 1.0,
+        "held_out_colour_error": 0.0,
+    }
+    nothing = figures_of(np.zeros_like(truth, np.float32), truth)
+    assert (nothing["held_out_iou"], nothing["held_out_colour_error"]) == (0.0, 1.0)
+
+
 @pytest.mark.parametrize("task", ["vae", "compressor"])
-def test_the_recipes_of_colour_are_si_3s(task: str) -> None:
-    recipe = load_recipe(RECIPES / f"colour-{task}.toml")
-    assert (recipe.task, recipe.colour, recipe.kl_weight, recipe.schedule) == (task, True, 0.03, "plateau")
+@pytest.mark.parametrize(("scale", "schedule"), [("", "plateau"), ("-small", "one-cycle")])
+def test_the_recipes_of_colour_have_si_3s_weight_at_either_scale(task: str, scale: str, schedule: str) -> None:
+    recipe = load_recipe(RECIPES / f"colour-{task}{scale}.toml")
+    assert (recipe.task, recipe.colour, recipe.kl_weight, recipe.schedule) == (task, True, 0.03, schedule)
     assert recipe.deviations
