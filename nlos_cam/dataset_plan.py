@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 from nlos_calibration.rig import NotNegative, ObjectBox, Record, Rig
+from nlos_models.networks import SIMULATION_ONLY
 from pydantic import TypeAdapter
 
 from nlos_cam.errors import SceneError
@@ -130,6 +131,8 @@ class DatasetPlan:
     jump_m: float = JUMP_M
     material: Material = field(default_factory=Material)
     rendering_version: int = RENDERING_VERSION
+    textures: tuple[str, ...] = ()
+    """What objects are painted with; with any of them the dataset is in colour, which is simulation only."""
 
     @classmethod
     def of_scene(cls, scene: SceneFile, first_seed: int, **others: Any) -> Self:
@@ -154,6 +157,10 @@ class DatasetPlan:
     def provenance(self) -> str:
         """Everything that decides the bits, as JSON."""
         facts: dict[str, Any] = _PLAN.dump_python(self, mode="json", exclude={"objects": {"folder"}})
+        if self.textures:
+            facts["note"] = SIMULATION_ONLY
+        else:
+            del facts["textures"]  # older readers know none
         return json.dumps({**facts, "rig_checksum": self.rig.checksum})
 
     @classmethod
@@ -163,7 +170,7 @@ class DatasetPlan:
         Raises ValueError for what is no plan, or one that a newer nlos-cam wrote.
         """
         facts: dict[str, Any] = json.loads(text)
-        known = {"rig_checksum", *(one.name for one in fields(cls))}
+        known = {"rig_checksum", "note", *(one.name for one in fields(cls))}
         if newer := sorted(set(facts) - known):
             raise ValueError(f"its plan has {newer[0]!r}, which this nlos-cam does not know: update it")
         facts.setdefault("objects", FIRST_OBJECTS)
@@ -178,6 +185,8 @@ class DatasetPlan:
         """Raise SceneError where nothing could be made by this plan."""
         _ = self.box
         self.spread.check(self.rig)
+        if self.textures and self.material.albedo != 1:
+            raise SceneError("the scene's object has an albedo, and in colour textures give each its own: leave it out")
         if np.ndim(self.material.albedo):
             raise SceneError("the scene's object has three albedos, and datasets hold one intensity: give it one")
 

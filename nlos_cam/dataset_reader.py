@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from nlos_models.data import MapBatch, MapSet, as_batch
+from nlos_models.networks import SIMULATION_ONLY
 from numpy.typing import NDArray
 
 from nlos_cam.dataset_plan import DatasetPlan
@@ -102,8 +103,11 @@ class _Window:
         return MapSet(*found)
 
 
-def open_dataset(folder: Path) -> Dataset:
-    """A folder's dataset. Raises RecordingError where there is none, or one whose shards do not belong together."""
+def open_dataset(folder: Path, *, colour: bool = False) -> Dataset:
+    """A folder's dataset, of depth or in colour.
+
+    Raises RecordingError where there is none, one of the other kind, or one whose shards do not belong together.
+    """
     if not (shards := shards_of(folder)):
         raise RecordingError(f"no dataset in {folder}: it holds no shard-*.h5; make one with `nlos-cam dataset build`")
     plan = shards[0].plan
@@ -112,6 +116,10 @@ def open_dataset(folder: Path) -> Dataset:
             raise RecordingError(
                 f"{shard.path} is of another dataset than {shards[0].path.name}: take one of them away"
             )
+    if plan.textures and not colour:
+        raise RecordingError(f"{folder} holds a dataset in colour ({SIMULATION_ONLY}): name one of depth")
+    if colour and not plan.textures:
+        raise RecordingError(f"{folder} holds a dataset of depth: make one with `nlos-cam dataset build --colour`")
     return Dataset(folder, plan, tuple(shards))
 
 

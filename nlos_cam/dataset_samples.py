@@ -1,6 +1,7 @@
 """Seeds to samples: a hidden object, its rig, its rendering and its noise, each by the object's seed alone."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,16 @@ from nlos_cam.objects.depth_image import image_from_depth
 from nlos_cam.objects.files import MeshFile, read_mesh
 from nlos_cam.objects.hidden import object_depth, object_depths
 from nlos_cam.objects.mesh_folder import folder_objects, mesh_depth
+from nlos_cam.objects.textures import Coat, image_from_albedo, painted
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Radiometry, Scene
 from nlos_cam.render.sensor import Sensor
 from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.surface import Surface
 
 Samples = Mapping[str, NDArray[Any]]
 """By name, one row for each object: depth_m and intensity (n, 64, 80), image and object_depth_m (n, 64, 64), seed (n,),
-scene (n, 6), category (n,)."""
+scene (n, 6), category (n,). In colour intensity is (n, 3, 64, 80), image (n, 3, 64, 64), and there is texture (n,)."""
 
 
 def procedural_images(
@@ -34,36 +37,77 @@ def procedural_images(
     categories: Sequence[str] | None = None,
     *,
     backgrounds: float = 0.0,
+    textures: Sequence[str] = (),
 ) -> Half:
-    """Images (count, 64, 64) of random objects, without rendering: all that a VAE needs; see `object_depth`."""
-    depths = object_depths(range(first_seed, first_seed + count), box, categories, backgrounds=backgrounds)
-    return np.stack([image_from_depth(depth, box).astype(np.float16) for depth in depths])
+    """Images (count, 64, 64) of random objects, without rendering: all that a VAE needs; see `object_depth`.
+
+    With textures, in colour: (count, 3, 64, 64).
+    """
+    seeds = range(first_seed, first_seed + count)
+    depths = object_depths(seeds, box, categories, backgrounds=backgrounds)
+    pairs = zip(seeds, depths, strict=True)
+    return np.stack([_image(depth, box, _coat(seed, depth, textures)).astype(np.float16) for seed, depth in pairs])
 
 
-def sense_object(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard") -> LidarMaps:
+def sense_object(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard", exposure: int = 0) -> LidarMaps:
     """The maps of one hidden object, rendered, through the sensor's chain and the same reduction as live frames."""
     echoes = render(scene, accuracy).multi
-    images = sensor.expose(echoes, np.random.default_rng([seed, 1]))
+    images = sensor.expose(echoes, np.random.default_rng([seed, 1, exposure]))  # numpy: [seed, 1, 0] is [seed, 1]
     return maps_from_frame(images.frame(sensor.rig.pinhole))
+
+
+def sense_colour(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard") -> LidarMaps:
+    """The same of an object whose albedo has three channels: intensity is (3, 64, 80). Simulation only.
+
+    The lidar that this simulates has three lasers and one detector: each instant is exposed once in white (every laser
+    at a third of its power), which gives the depth, and once in red, green and blue, which give the intensities. Each
+    exposure is the whole device, with the same gain and noise of its own.
+    """
+    albedo = np.asarray(scene.surface.albedo)
+    lights = (albedo.mean(-1), *np.moveaxis(albedo, -1, 0))
+    seen = (replace(scene, surface=Surface(light, scene.surface.brdf)) for light in lights)
+    white, *colours = (sense_object(one, sensor, seed, accuracy, exposure) for exposure, one in enumerate(seen))
+    return replace(white, intensity=np.stack([maps.intensity for maps in colours]))
 
 
 def make_samples(plan: DatasetPlan, seeds: Sequence[int]) -> Samples:
     """The samples of some seeds: the same bits wherever and in whatever order they are made."""
     made = [hidden_object(plan.objects, seed, plan.box) for seed in seeds]
     seen = [plan.spread.drawn(plan.rig, plan.sensor, seed) for seed in seeds]
+    coats = [_coat(seed, depth_m, plan.textures) for seed, (_, depth_m) in zip(seeds, made, strict=True)]
     maps = [
-        sense_object(_scene(plan, depth_m, rig, model), _sensor_of(plan, rig, model), seed, plan.accuracy)
-        for (_, depth_m), (rig, model), seed in zip(made, seen, seeds, strict=True)
+        _sensed(plan, depth_m, coat, rig, model, seed)
+        for (_, depth_m), coat, (rig, model), seed in zip(made, coats, seen, seeds, strict=True)
     ]
+    images = [_image(depth, plan.box, coat) for (_, depth), coat in zip(made, coats, strict=True)]
+    textures = [coat.texture for coat in coats if coat]
     return {
         "depth_m": np.stack([m.depth_m for m in maps]),
         "intensity": np.stack([m.intensity for m in maps]),
-        "image": np.stack([image_from_depth(depth, plan.box) for _, depth in made]).astype(np.float16),
+        "image": np.stack(images).astype(np.float16),
         "object_depth_m": np.stack([depth for _, depth in made]),
         "seed": np.asarray(seeds, np.int64),
         "scene": np.array([scene_row(rig, model) for rig, model in seen]),
         "category": np.array([category for category, _ in made], object),
+        **({"texture": np.array(textures, object)} if textures else {}),
     }
+
+
+def _coat(seed: int, depth_m: Float32, textures: Sequence[str]) -> Coat | None:
+    return painted(seed, depth_m, textures) if textures else None
+
+
+def _image(depth_m: Float32, box: ObjectBox, coat: Coat | None) -> Float32:
+    return image_from_albedo(coat.albedo, depth_m) if coat else image_from_depth(depth_m, box)
+
+
+def _sensed(
+    plan: DatasetPlan, depth_m: Float32, coat: Coat | None, rig: Rig, model: SensorModel, seed: int
+) -> LidarMaps:
+    scene, sensor = _scene(plan, depth_m, rig, model), _sensor_of(plan, rig, model)
+    if coat is None:
+        return sense_object(scene, sensor, seed, plan.accuracy)
+    return sense_colour(replace(scene, surface=Surface(coat.albedo, plan.material.brdf)), sensor, seed, plan.accuracy)
 
 
 def joined(parts: Sequence[Samples]) -> Samples:

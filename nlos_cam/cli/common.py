@@ -41,8 +41,10 @@ def say(text: str) -> None:
     stderr.print(text, soft_wrap=True)
 
 
-def finish(result: dict[str, Any], *, as_json: bool, text: str) -> None:
-    """End a command: one JSON object on stdout, or a sentence for a person."""
+def finish(result: dict[str, Any], *, as_json: bool, text: str, note: str = "") -> None:
+    """End a command: one JSON object on stdout, or a sentence for a person; a note is in either."""
+    if note:
+        result, text = {**result, "note": note}, f"{text} ({note})"
     if as_json:
         print(json_module.dumps(result), flush=True)  # noqa: T201  stdout is the machine's
     else:

@@ -7,12 +7,14 @@ from typing import Annotated, Any
 
 import typer
 from nlos_calibration.wall_record import rig_named
+from nlos_models.networks import SIMULATION_ONLY
 from rich.progress import ProgressColumn, Task
 from rich.text import Text
 
 from nlos_cam import dataset
 from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say
 from nlos_cam.cli.dataset_label import add_label
+from nlos_cam.objects.textures import TEXTURES
 from nlos_cam.render.accuracy import accuracy_named
 from nlos_cam.render.scene_file import load_scene
 
@@ -34,6 +36,7 @@ LeftOut = Annotated[str, typer.Option("--without", help="Categories to leave out
 Backgrounds = Annotated[
     float, typer.Option("--backgrounds", min=0, max=1, help="Share of objects with a post or a panel beside them.")
 ]
+Colour = Annotated[bool, typer.Option("--colour", help="Painted objects seen in red, green and blue; simulation only.")]
 SpreadMm = Annotated[
     float, typer.Option("--rig-spread-mm", min=0, help="Each object's lidar and occluder are moved by up to this.")
 ]
@@ -70,6 +73,7 @@ def build(
     objects: HiddenObjects = PROCEDURAL,
     without: LeftOut = "",
     backgrounds: Backgrounds = 0.0,
+    colour: Colour = False,
     rig_spread_mm: SpreadMm = 0.0,
     rig_spread_deg: SpreadDeg = 0.0,
     gain_spread_percent: GainSpread = 0.0,
@@ -84,13 +88,15 @@ def build(
         place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100
     )
     others = {"accuracy": accuracy_named(accuracy).name, "objects": kinds, "spread": spread}
+    others |= {"textures": tuple(TEXTURES) if colour else ()}
     plan = _plan(rig, scene, seed, others)
     built = _watched(plan, count, out, workers, ray, _command(context))
     rate = built.made / built.seconds if built.made else None
     facts = {"objects": built.objects, "made": built.made, "damaged": [str(path) for path in built.damaged]}
     result = {**facts, "seconds": built.seconds, "objects_per_s": rate, "out": str(out)}
     told = f", {built.made} made now at {rate:.1f} objects/s" if rate else ""
-    finish(result, as_json=json, text=f"{built.objects} objects in {out}{told}")
+    note = SIMULATION_ONLY if colour else ""
+    finish(result, as_json=json, text=f"{built.objects} objects in {out}{told}", note=note)
 
 
 def _objects(objects: str, without: str, backgrounds: float) -> dataset.Objects:
@@ -112,8 +118,10 @@ def _plan(rig: str | None, scene: Path | None, seed: int, others: dict[str, Any]
 def _command(context: typer.Context) -> str:
     """The command as it could be given again, every option with its value."""
     given = {name: value for name, value in context.params.items() if value is not None and name != "json"}
-    options = [part for name, value in given.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    return shlex.join(["nlos-cam", "dataset", "build", *options])
+    flags = [f"--{name}" for name, value in given.items() if value is True]
+    pairs = {name: value for name, value in given.items() if not isinstance(value, bool)}
+    options = [part for name, value in pairs.items() for part in (f"--{name.replace('_', '-')}", str(value))]
+    return shlex.join(["nlos-cam", "dataset", "build", *options, *flags])
 
 
 class Rate(ProgressColumn):

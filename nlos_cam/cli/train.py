@@ -1,6 +1,5 @@
 """`train vae|compressor|transfer`: recipes to weights."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -11,21 +10,23 @@ from nlos_models.checkpoint import (
     load_encoder,
     load_pipeline,
     load_pipeline_partly,
+    load_record,
     load_vae,
     shipped_folder,
 )
+from nlos_models.networks import SIMULATION_ONLY, new_vae
 from nlos_models.pipeline import Pipeline
 from nlos_models.processes import Accelerator, launched, open_fabric
 from nlos_models.recipe import Recipe
 from nlos_models.res_vae import ResVae
 from nlos_models.tasks import Start
-from nlos_models.train import OnStep
 
-from nlos_cam import colour_train, dataset
-from nlos_cam.cli.common import PAPER_RIG, Json, finish, say, tracked
+from nlos_cam import dataset
+from nlos_cam.cli.common import PAPER_RIG, Json, finish, say
 from nlos_cam.cli.train_data import RecipeChoice, TrainingMaps, read_maps
 from nlos_cam.cli.train_runs import Job, run_compressor, run_transfer, run_vae
 from nlos_cam.errors import SceneError
+from nlos_cam.objects.textures import TEXTURES
 
 RecipeFile = Annotated[Path, typer.Option("--recipe", help="A training recipe (models/recipes).", show_default=False)]
 RunFolder = Annotated[Path, typer.Option("--out", help="The run's folder: log, checkpoints, weights. Resumes there.")]
@@ -74,22 +75,20 @@ def vae(
     """Train a Res-VAE on procedural objects (SI 3)."""
     recipe = RecipeChoice(recipe_file, budget, objects).read("vae")
     rig = rig_named(PAPER_RIG)
-    if recipe.colour:
-        _told(out, _in_colour(lambda on_step: colour_train.train_vae(recipe, rig, out, on_step)), as_json=json)
-        return
     fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
+    start = _vae(recipe, weights)[0] if recipe.start == "weights" else None
     box = dataset.DatasetPlan(rig, 0).box
     say(f"making {recipe.objects + recipe.held_out} objects")
     kinds, besides = dataset.Objects.without(recipe.left_out).categories, recipe.backgrounds
+    textures = tuple(TEXTURES) if recipe.colour else ()
     images, held_out = (
-        dataset.procedural_images(seed, count, box, kinds, backgrounds=besides)
+        dataset.procedural_images(seed, count, box, kinds, backgrounds=besides, textures=textures)
         for seed, count in ((dataset.TRAINING_SEED, recipe.objects), (dataset.HELD_OUT_SEED, recipe.held_out))
     )
     record = CheckpointRecord(rig_name=rig.name, rig_checksum=rig.checksum, vae_recipe=recipe)
-    start = load_vae(weights or shipped_folder())[0] if recipe.start == "weights" else None
     job = Job(recipe, out, record, tensorboard, compiled)
     figures = launched(fabric, run_vae, job, start, images, held_out)
-    _told(out, figures, as_json=json)
+    _told(recipe, out, figures, as_json=json)
 
 
 def compressor(
@@ -115,30 +114,18 @@ def compressor(
 ) -> None:
     """Train a compressor onto the latent of a trained VAE (SI 4), or as the recipe's `steps` say."""
     recipe = RecipeChoice(recipe_file, budget, objects).read("compressor")
-    if recipe.colour:
-        if vae_folder is None:
-            raise typer.BadParameter("no VAE of colour is shipped: train one, and give its folder with --vae")
-        sources = vae_folder, data, held_out_data
-        figures = _in_colour(lambda on_step: colour_train.train_compressor(recipe, *sources, out, on_step))
-        _told(out, figures, as_json=json)
-        return
     fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
     start, record = _start(recipe, vae_folder, weights)
     maps = read_maps(recipe, data, held_out_data, wall, stream=stream)
     record = _tied(record, maps, recipe).model_copy(update={"compressor_recipe": recipe})
     job = Job(recipe, out, record, tensorboard, compiled)
     figures = launched(fabric, run_compressor, job, start, maps.training, maps.held_out)
-    _told(out, figures, as_json=json)
+    _told(recipe, out, figures, as_json=json)
 
 
-def _in_colour(run: Callable[[OnStep], dict[str, float]]) -> dict[str, float]:
-    """Train in colour, in this process."""
-    with tracked("training in colour") as on_step:
-        return run(on_step)
-
-
-def _told(out: Path, figures: dict[str, float], *, as_json: bool) -> None:
-    finish({"out": str(out), **figures}, as_json=as_json, text=f"weights in {out}: {figures}")
+def _told(recipe: Recipe, out: Path, figures: dict[str, float], *, as_json: bool) -> None:
+    note = SIMULATION_ONLY if recipe.colour else ""
+    finish({"out": str(out), **figures}, as_json=as_json, text=f"weights in {out}: {figures}", note=note)
 
 
 def transfer(
@@ -164,7 +151,7 @@ def transfer(
     recipe = RecipeChoice(recipe_file, objects=objects).read("transfer")
     fabric = open_fabric(recipe, accelerator=accelerator, devices=devices)
     pipeline, record = _synthetic(weights, partial=partial)
-    _same_input(recipe, record)
+    _same_kind(recipe, record, weights)
     maps = read_maps(recipe, data, held_out_data, wall)
     record = _tied(record, maps, recipe).model_copy(update={"transfer_recipe": recipe})
     job, encoder = Job(recipe, out, record, tensorboard, compiled), load_encoder(weights)
@@ -178,11 +165,10 @@ def _start(recipe: Recipe, vae_folder: Path | None, weights: Path | None) -> tup
     if recipe.steps == "one":
         return Start(), None
     if recipe.steps == "two":
-        trained, record = load_vae(vae_folder or shipped_folder())
-        return Start(trained, load_pipeline(weights)[0] if recipe.start == "weights" else None), record
-    pipeline, record = load_pipeline(weights)
-    _same_input(recipe, record)
-    trained = ResVae()
+        trained, record = _vae(recipe, vae_folder)
+        return Start(trained, _weights(recipe, weights)[0] if recipe.start == "weights" else None), record
+    pipeline, record = _weights(recipe, weights)
+    trained = new_vae(colour=recipe.colour)
     if encoder := load_encoder(weights):
         trained.encoder = encoder
     elif recipe.latent_weight:
@@ -199,7 +185,27 @@ def _synthetic(weights: Path | None, *, partial: bool) -> tuple[Pipeline, Checkp
     return pipeline, record
 
 
-def _same_input(recipe: Recipe, record: CheckpointRecord) -> None:
+def _vae(recipe: Recipe, folder: Path | None) -> tuple[ResVae, CheckpointRecord]:
+    _same_colour(recipe, load_record(folder or shipped_folder()), folder)
+    return load_vae(folder or shipped_folder())
+
+
+def _weights(recipe: Recipe, folder: Path | None) -> tuple[Pipeline, CheckpointRecord]:
+    _same_kind(recipe, load_record(folder or shipped_folder()), folder)
+    return load_pipeline(folder)
+
+
+def _same_colour(recipe: Recipe, record: CheckpointRecord, folder: Path | None) -> None:
+    if record.colour != recipe.colour:
+        holds, wants = (f"in colour ({SIMULATION_ONLY})" if one.colour else "of depth" for one in (record, recipe))
+        raise SceneError(
+            f"{folder or 'what is shipped'} holds weights {holds}, the recipe is {wants}: name others with --vae or "
+            "--weights"
+        )
+
+
+def _same_kind(recipe: Recipe, record: CheckpointRecord, folder: Path | None) -> None:
+    _same_colour(recipe, record, folder)
     if record.input != recipe.maps:
         raise SceneError(f"these weights eat {record.input}, the recipe says {recipe.maps}: change one of them")
 

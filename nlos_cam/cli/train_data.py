@@ -96,7 +96,7 @@ def read_maps(
 
     A stream is of a whole dataset, of which no more than some shards are in memory at a time.
     """
-    training, judging = dataset.open_dataset(data), dataset.open_dataset(held_out_data)
+    training, judging = (dataset.open_dataset(of, colour=recipe.colour) for of in (data, held_out_data))
     plan, count = training.plan, len(training)
     if count < recipe.objects:
         raise SceneError(

@@ -8,6 +8,7 @@ from pathlib import Path
 from lightning_fabric import Fabric
 from nlos_models.checkpoint import CheckpointRecord, save_pipeline, save_vae
 from nlos_models.data import Half, MapSet
+from nlos_models.networks import SIMULATION_ONLY
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
 from nlos_models.remap import figures_of, run
@@ -73,6 +74,7 @@ def run_transfer(
 def _watched(fabric: Fabric, job: Job, what: str) -> Generator[tuple[OnStep, Running]]:
     """The leading process's progress bar; Ctrl-C or a request to terminate ends the run after the step, saved."""
     with progress() as bar, stop_on_signals() as stop:
+        what += f" in colour ({SIMULATION_ONLY})" if job.recipe.colour else ""
         task = bar.add_task(f"training the {what}", total=None, visible=fabric.is_global_zero)
 
         def on_step(done: int, total: int) -> None:

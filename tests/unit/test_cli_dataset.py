@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
+from nlos_models.networks import SIMULATION_ONLY
 from rich.progress import Progress
 
 from nlos_cam import dataset
@@ -14,6 +15,7 @@ from nlos_cam.cli.dataset import Rate
 from nlos_cam.cli.main import main
 from nlos_cam.dataset_shards import head_of
 from nlos_cam.objects.categories import CATEGORIES
+from nlos_cam.objects.textures import TEXTURES
 
 RIG = load_rig("paper-rig")
 
@@ -66,6 +68,15 @@ def test_its_options_are_the_plans(tmp_path: Path) -> None:
     assert plan.spread == dataset.RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
     assert set(CATEGORIES) - set(plan.objects.categories) == {"hat", "boat"}
     assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed) == (0.25, "draft", 7)
+
+
+def test_in_colour_it_says_that_it_is_a_simulation_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _build(tmp_path, "--colour") == 0
+    assert _last(capsys)["note"] == SIMULATION_ONLY
+    found = dataset.open_dataset(tmp_path, colour=True)
+    assert found.plan.textures == tuple(TEXTURES)
+    assert _build(tmp_path) == 4
+    assert "another textures" in _last(capsys)["error"]["message"]
 
 
 def test_a_shard_has_the_command_that_makes_it(tmp_path: Path) -> None:

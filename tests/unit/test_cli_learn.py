@@ -117,8 +117,8 @@ def test_the_weights_are_tied_to_the_rig_that_the_maps_were_rendered_for(
 ) -> None:
     other, original = RIG.model_copy(update={"name": "other"}), dataset.open_dataset
 
-    def opened(folder: Path) -> dataset.Dataset:
-        found = original(folder)
+    def opened(folder: Path, *, colour: bool) -> dataset.Dataset:
+        found = original(folder, colour=colour)
         return replace(found, plan=replace(found.plan, rig=other))
 
     monkeypatch.setattr(dataset, "open_dataset", opened)
@@ -150,8 +150,8 @@ def test_datasets_of_two_rigs_are_refused(
 ) -> None:
     original = dataset.open_dataset
 
-    def opened(folder: Path) -> dataset.Dataset:
-        found = original(folder)
+    def opened(folder: Path, *, colour: bool) -> dataset.Dataset:
+        found = original(folder, colour=colour)
         return replace(found, plan=replace(found.plan, rig=RIG.model_copy(update={"name": folder.name})))
 
     monkeypatch.setattr(dataset, "open_dataset", opened)

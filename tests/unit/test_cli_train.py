@@ -21,7 +21,7 @@ from nlos_cam.cli import train, train_data, train_runs
 from nlos_cam.cli.main import main
 from nlos_cam.objects.categories import CATEGORIES
 
-RIG = load_rig("paper-rig")
+PLAN = dataset.DatasetPlan(load_rig("paper-rig"), 0)
 COUNTS = {"data": 8, "held-out": 4}
 BASE = "objects = 8\nheld_out = 4\nepochs = 2\nbatch = 4\nlearning_rate = 1e-3\n"
 LOSS = "latent_weight = 0.05\nimage_weight = 1.0\n"
@@ -43,8 +43,8 @@ def _small_networks_and_data() -> Iterator[None]:
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         use_small_networks(patch, tasks, checkpoint, train)
-        plan = dataset.DatasetPlan(RIG, 0)
-        patch.setattr(dataset, "open_dataset", lambda of: SmallDataset(small_maps(COUNTS[of.name], len(of.name)), plan))
+        sets = {name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in COUNTS.items()}
+        patch.setattr(dataset, "open_dataset", lambda of, **_: sets[of.name])
         patch.setattr(dataset, "procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
         yield
     torch.set_num_threads(before)
@@ -102,7 +102,7 @@ def test_a_vae_is_shown_the_kinds_that_its_recipe_does_not_leave_out(
 ) -> None:
     shown: list[set[str]] = []
 
-    def images(seed: int, count: int, _: object, kinds: tuple[str, ...], *, backgrounds: float) -> Half:
+    def images(seed: int, count: int, _: object, kinds: tuple[str, ...], *, backgrounds: float, **__: object) -> Half:
         shown.append({*kinds, f"{backgrounds}"})
         return small_images(count, seed)
 
@@ -133,7 +133,7 @@ def test_two_step_weights_know_both_recipes_and_take_the_encoder_along(folder: P
     record = load_record(folder / "two")
     assert record.vae_recipe is not None
     assert record.compressor_recipe is not None
-    assert (record.rig_checksum, record.input) == (RIG.checksum, "raw maps")
+    assert (record.rig_checksum, record.input) == (PLAN.rig.checksum, "raw maps")
     assert _same_file("encoder", folder / "two", folder / "vae")
 
 

@@ -36,14 +36,15 @@ def test_a_recipe_of_another_task_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_recipe_takes_the_first_objects_of_larger_sets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "open_dataset", lambda of: SmallDataset(small_maps(6, len(of.name)), PLAN))
+    monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
     maps = read_maps(RECIPE, Path("data"), Path("other"), None)
     np.testing.assert_array_equal(maps.training.image, small_maps(6, 4).image[:4])
     np.testing.assert_array_equal(maps.held_out.image, small_maps(6, 5).image[:2])
 
 
 def test_maps_of_two_rigs_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def opened(folder: Path) -> SmallDataset:
+    def opened(folder: Path, *, colour: bool) -> SmallDataset:
+        assert not colour
         return SmallDataset(small_maps(6, 0), replace(PLAN, rig=PLAN.rig.model_copy(update={"name": folder.name})))
 
     monkeypatch.setattr(dataset, "open_dataset", opened)
@@ -81,7 +82,7 @@ def test_difference_maps_are_less_the_measured_wall_if_one_is_named_else_the_ren
     def bare(intensity: float) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
         return lambda _: (np.zeros((64, 80), np.float32), np.full((64, 80), intensity, np.float32))
 
-    monkeypatch.setattr(dataset, "open_dataset", lambda _: SmallDataset(small_maps(4, 0), PLAN))
+    monkeypatch.setattr(dataset, "open_dataset", lambda _, **__: SmallDataset(small_maps(4, 0), PLAN))
     monkeypatch.setattr(train_data, "render_bare_wall", bare(1.0))
     monkeypatch.setattr(train_data, "measured_bare_wall", bare(2.0))
     recipe = RECIPE.model_copy(update={"maps": "difference maps"})
@@ -123,7 +124,7 @@ def test_a_stream_gives_the_maps_that_memory_does_differences_too_and_the_same_f
 
 
 def test_a_stream_is_of_all_of_a_dataset(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "open_dataset", lambda _: SmallDataset(small_maps(6, 0), PLAN))
+    monkeypatch.setattr(dataset, "open_dataset", lambda _, **__: SmallDataset(small_maps(6, 0), PLAN))
     with pytest.raises(SceneError, match="a stream is of all: give --objects 6"):
         read_maps(RECIPE, Path("data"), Path("other"), None, stream=True)
     maps = read_maps(RECIPE.of_objects(6), Path("data"), Path("other"), None, stream=True)

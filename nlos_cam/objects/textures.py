@@ -1,70 +1,43 @@
-"""Hidden objects in colour, by seed (simulation only: the L515's laser is infrared), and the image of their albedo."""
+"""What a seed paints a hidden object with, and the image of its albedo (simulation only: the L515 sees no colour)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from colorsys import hsv_to_rgb
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from nlos_calibration.rig import ObjectBox
-from nlos_models.data import Half
+from nlos_models.colour_metrics import BLACK_V
 from numpy.typing import NDArray
 
 from nlos_cam.frames import Float32
-from nlos_cam.objects.hidden import object_depth
 
-BLACK_V = 0.1
-"""v of a surface that reflects nothing in a channel; background is 0."""
 SATURATION, VALUE = (0.5, 0.9), (0.7, 1.0)
 """Of colours, as hue, saturation and value have them: no surface is so dark that it passes for background."""
 TEXTURE_STREAM = 3
-"""Keeps a texture's random numbers apart from those of its object's shape."""
+"""Keeps a texture's random numbers apart from those of its object's shape, noise and rig."""
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator
 
 
-@dataclass(frozen=True)
-class ColourObject:
-    """One hidden object and what it is painted with."""
+class Coat(NamedTuple):
+    """What an object is painted with."""
 
-    category: str
     texture: str
-    depth_m: Float32
-    """(64, 64); NaN for background."""
     albedo: Float32
     """(64, 64, 3) in red, green and blue; background cells have one too, which nothing sees."""
 
-    @property
-    def image(self) -> Float32:
-        """The colour image (3, 64, 64)."""
-        return image_from_albedo(self.albedo, self.depth_m)
 
-
-def colour_object(seed: int, box: ObjectBox) -> ColourObject:
-    """One random object in random colours; the seed decides all, and the shape is `object_depth`'s of that seed."""
-    category, depth_m = object_depth(seed, box)
+def painted(seed: int, depth_m: Float32, textures: Sequence[str]) -> Coat:
+    """One of the textures in random colours, on an object's depth map (64, 64); the seed decides all."""
     generator = np.random.default_rng([seed, TEXTURE_STREAM])
-    texture = str(generator.choice(list(TEXTURES)))
-    albedo = TEXTURES[texture](generator, depth_m).astype(np.float32)
-    return ColourObject(category, texture, depth_m, albedo)
-
-
-def colour_images(first_seed: int, count: int, box: ObjectBox) -> Half:
-    """Images (count, 3, 64, 64) of random objects, without rendering: all that a VAE needs."""
-    seeds = range(first_seed, first_seed + count)
-    return np.stack([colour_object(seed, box).image.astype(np.float16) for seed in seeds])
+    texture = str(generator.choice(list(textures)))
+    return Coat(texture, TEXTURES[texture](generator, depth_m).astype(np.float32))
 
 
 def image_from_albedo(albedo: NDArray[np.floating], depth_m: NDArray[np.floating]) -> Float32:
     """Albedo (64, 64, 3) as v (3, 64, 64): 0 where depth (64, 64) is NaN, else 0.1 (black) to 1 in each channel."""
     v = np.moveaxis(BLACK_V + (1 - BLACK_V) * np.asarray(albedo), -1, 0)
     return np.where(np.isnan(depth_m), 0.0, v).astype(np.float32)
-
-
-def albedo_from_image(v: NDArray[np.floating]) -> Float32:
-    """The way back: v (..., 3, 64, 64) as albedo (..., 64, 64, 3), NaN where no channel reaches half of black's v."""
-    albedo = np.clip((np.moveaxis(v, -3, -1) - BLACK_V) / (1 - BLACK_V), 0.0, 1.0)
-    return np.where(v.max(-3)[..., None] < BLACK_V / 2, np.nan, albedo).astype(np.float32)
 
 
 def _colours(generator: Generator, count: int) -> Array:

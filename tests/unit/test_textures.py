@@ -1,32 +1,26 @@
-"""Objects in colour: repeatable by seed, never dark enough for background, and there and back as images."""
+"""What objects are painted with: repeatable by seed, and never dark enough for background."""
 
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
+from nlos_models.colour_metrics import BLACK_V
 from nlos_models.silhouette import KEPT_SHARE
 
-from nlos_cam.colour_objects import (
-    BLACK_V,
-    TEXTURES,
-    albedo_from_image,
-    colour_images,
-    colour_object,
-    image_from_albedo,
-)
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
 from nlos_cam.render.surface import Surface
 
 BOX = object_box(load_rig("paper-rig"))
 
 
-def test_the_seed_decides_all_and_the_shape_is_that_of_depth() -> None:
-    one, again, other = colour_object(5, BOX), colour_object(5, BOX), colour_object(6, BOX)
+def test_the_seed_decides_all() -> None:
+    depth_m = object_depth(5, BOX)[1]
+    one, again, other = (painted(seed, depth_m, [*TEXTURES]) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one.albedo, again.albedo)
+    assert one.texture == again.texture
     assert not np.array_equal(one.albedo, other.albedo)
-    category, depth_m = object_depth(5, BOX)
-    assert one.category == category
-    np.testing.assert_array_equal(one.depth_m, depth_m)
+    assert painted(5, depth_m, ["stripes"]).texture == "stripes"
 
 
 @pytest.mark.parametrize("name", TEXTURES)
@@ -57,28 +51,18 @@ def test_layers_of_nothing_are_an_albedo_too() -> None:
 
 
 def test_seeds_come_in_every_texture() -> None:
-    assert {colour_object(seed, BOX).texture for seed in range(40)} == set(TEXTURES)
+    depth_m = object_depth(1, BOX)[1]
+    assert {painted(seed, depth_m, [*TEXTURES]).texture for seed in range(40)} == set(TEXTURES)
 
 
-def test_an_albedo_is_an_image_and_back() -> None:
-    one = colour_object(2, BOX)
-    image = one.image
-    hidden = np.isnan(one.depth_m)
+def test_an_image_is_the_albedo_on_the_surface_and_0_beside_it() -> None:
+    depth_m = object_depth(2, BOX)[1]
+    albedo = painted(2, depth_m, [*TEXTURES]).albedo
+    image, hidden = image_from_albedo(albedo, depth_m), np.isnan(depth_m)
     assert image.shape == (3, 64, 64)
     assert (image[:, hidden] == 0).all()
-    assert image[:, ~hidden].min() >= BLACK_V
-    back = albedo_from_image(image)
-    assert np.isnan(back[hidden]).all()
-    np.testing.assert_allclose(back[~hidden], one.albedo[~hidden], atol=1e-6)
+    np.testing.assert_allclose(image[:, ~hidden].T, BLACK_V + (1 - BLACK_V) * albedo[~hidden], atol=1e-6)
 
 
 def test_black_is_not_background() -> None:
-    image = image_from_albedo(np.zeros((64, 64, 3)), np.full((64, 64), 0.2))
-    np.testing.assert_allclose(albedo_from_image(image), 0, atol=1e-6)
-
-
-def test_images_for_a_vae_are_those_of_the_objects_in_order() -> None:
-    images = colour_images(7, 2, BOX)
-    assert images.dtype == np.float16
-    for image, seed in zip(images, (7, 8), strict=True):
-        np.testing.assert_array_equal(image, colour_object(seed, BOX).image.astype(np.float16))
+    np.testing.assert_allclose(image_from_albedo(np.zeros((64, 64, 3)), np.full((64, 64), 0.2)), BLACK_V, atol=1e-6)
