@@ -1,24 +1,57 @@
 """Judge reconstructions in colour (simulation only): figures by name, beside what needs no network, and a picture."""
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_models.colour_metrics import brightness, colour_metrics
-from nlos_models.data import Half
+from nlos_calibration.rig import Rig
+from nlos_models.colour_metrics import SMALLER_IS_BETTER, brightness, colour_metrics
+from nlos_models.data import Half, MapSet
 from nlos_models.metrics import surface
+from nlos_models.networks import SIMULATION_ONLY
 
+from nlos_cam.dataset_samples import sense_colour
 from nlos_cam.evaluate import interval
 from nlos_cam.frames import Float32
+from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.sensor import Sensor
+from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.surface import Surface
 
-SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
 ROWS = ("truth", "reconstruction", "difference")
 
+Figure = dict[str, float | None]
+"""value, low and high: a mean over objects, and its bootstrap 95 % interval."""
 
-def judge_colour(image: Float32, truth: Float32) -> dict[str, dict[str, float | None]]:
-    """Every metric of colour images (n, 3, 64, 64) against the truth, as {value, low, high}."""
+
+def painted_maps(
+    depths_m: Sequence[Float32], rig: Rig, first_seed: int, accuracy: str, on_progress: Callable[[int, int], None]
+) -> MapSet:
+    """The maps of objects (64, 64), each painted by a seed of its own, with the sensor's noise; and their images."""
+    sensor, maps, images = Sensor(rig, SensorModel()), list[tuple[Float32, Float32]](), list[Float32]()
+    for seed, depth_m in enumerate(depths_m, first_seed):
+        albedo = painted(seed, depth_m, [*TEXTURES]).albedo
+        seen = sense_colour(Scene(rig, depth_m, Surface(albedo)), sensor, seed, accuracy)
+        maps.append((seen.depth_m, seen.intensity))
+        images.append(image_from_albedo(albedo, depth_m))
+        on_progress(len(images), len(depths_m))
+    depth, intensity = (np.stack(one) for one in zip(*maps, strict=True))
+    return MapSet(depth, intensity, np.stack(images))
+
+
+def judge_colour(image: Float32, truth: Float32) -> dict[str, Figure]:
+    """Every metric of colour images (n, 3, 64, 64) against the truth."""
     return {name: asdict(interval(values)) for name, values in colour_metrics(image, truth).items()}
+
+
+def better_than(guess: Float32, image: Float32, truth: Float32) -> dict[str, Figure]:
+    """By how much images are better than a guess, object by object: positive is better, also where less is better."""
+    ours, its = colour_metrics(image, truth), colour_metrics(guess, truth)
+    signs = {name: -1 if name in SMALLER_IS_BETTER else 1 for name in ours}
+    return {name: asdict(interval(sign * (ours[name] - its[name]))) for name, sign in signs.items()}
 
 
 def colour_guesses(image: Float32, training: Half | Float32) -> dict[str, Float32]:
@@ -33,18 +66,31 @@ def colour_guesses(image: Float32, training: Half | Float32) -> dict[str, Float3
     }
 
 
-def draw_colour_sheet(path: Path, image: Float32, truth: Float32, columns: int = 10) -> None:
-    """Truth, reconstruction and the size of their difference in each channel, object by object, in colour."""
-    from matplotlib.figure import Figure
+def figures_of_colour(
+    image: Float32, truth: Float32, others: Mapping[str, Float32], training: Half | Float32
+) -> dict[str, Any]:
+    """All figures of images (n, 3, 64, 64), ready for JSON, beside those of others and of trivial guesses."""
+    guesses = colour_guesses(image, training)
+    return {
+        "note": SIMULATION_ONLY,
+        "objects": len(truth),
+        **judge_colour(image, truth),
+        "baselines": {name: judge_colour(guess, truth) for name, guess in {**others, **guesses}.items()},
+        "better_than": {name: better_than(guesses[name], image, truth) for name in ("mean_object", "mean_colour")},
+    }
 
-    count = min(columns, len(truth))
-    figure = Figure(figsize=(count + 0.3, len(ROWS) + 0.6), layout="constrained")
-    axes: Any = figure.subplots(len(ROWS), count, squeeze=False)
-    looks = truth[:count], image[:count], np.abs(image[:count] - truth[:count])
-    for row, (title, pictures) in enumerate(zip(ROWS, looks, strict=True)):
+
+def draw_colour_sheet(path: Path, image: Float32, truth: Float32) -> None:
+    """Truth, reconstruction and the size of their difference in each channel, object by object, in colour."""
+    from matplotlib.figure import Figure as Canvas
+
+    count = len(truth)
+    canvas = Canvas(figsize=(count + 0.3, len(ROWS) + 0.6), layout="constrained")
+    axes: Any = canvas.subplots(len(ROWS), count, squeeze=False)
+    for row, (title, pictures) in enumerate(zip(ROWS, (truth, image, np.abs(image - truth)), strict=True)):
         for axis, picture in zip(axes[row], pictures, strict=True):
             axis.imshow(np.clip(np.moveaxis(picture, 0, -1), 0, 1))
             axis.axis("off")
         axes[row, 0].set_title(title, fontsize=7, loc="left", pad=2)
-    figure.suptitle(SIMULATION_ONLY, fontsize=8)
-    figure.savefig(path, dpi=100)
+    canvas.suptitle(SIMULATION_ONLY, fontsize=8)
+    canvas.savefig(path, dpi=100)

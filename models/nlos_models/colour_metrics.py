@@ -6,6 +6,7 @@ from nlos_models.metrics import Images, Values, accuracy_mean_abs, silhouette_io
 
 BLACK_V = 0.1
 """v of a channel that a surface does not reflect at all; background is 0."""
+SMALLER_IS_BETTER = frozenset({"root_mean_square_error", "colour_error"})
 
 
 def brightness(image: Images) -> Images:
@@ -23,6 +24,11 @@ def colour_accuracy_mean_abs(image: Images, truth: Images) -> Values:
     return accuracy_mean_abs(image, truth).mean(-1)
 
 
+def root_mean_square_error(image: Images, truth: Images) -> Values:
+    """RMS of v - v_true over all pixels and channels, (n,): of all that is the same for every object, the mean wins."""
+    return np.sqrt(np.square(image.astype(np.float64) - truth).mean((-3, -2, -1)))
+
+
 def colour_error(image: Images, truth: Images) -> Values:
     """Mean |albedo - its truth| over channels and pixels that are surface in both, (n,); NaN where they share none."""
     both = surface(brightness(image)) & surface(brightness(truth))
@@ -37,5 +43,6 @@ def colour_metrics(image: Images, truth: Images) -> dict[str, Values]:
     return {
         "silhouette_iou": colour_silhouette_iou(image, truth),
         "accuracy_mean_abs": colour_accuracy_mean_abs(image, truth),
+        "root_mean_square_error": root_mean_square_error(image, truth),
         "colour_error": colour_error(image, truth),
     }

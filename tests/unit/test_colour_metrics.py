@@ -8,6 +8,7 @@ from nlos_models.colour_metrics import (
     colour_error,
     colour_metrics,
     colour_silhouette_iou,
+    root_mean_square_error,
 )
 from nlos_models.metrics import Images
 
@@ -24,6 +25,7 @@ def test_the_truth_itself_is_perfect() -> None:
     assert {name: value.item() for name, value in values.items()} == {
         "silhouette_iou": 1.0,
         "accuracy_mean_abs": 1.0,
+        "root_mean_square_error": 0.0,
         "colour_error": 0.0,
     }
 
@@ -33,6 +35,7 @@ def test_a_wrong_colour_is_an_error_of_colour_and_not_of_silhouette() -> None:
     assert colour_silhouette_iou(image, truth) == 1.0
     assert colour_error(image, truth) == pytest.approx(0.3 / 3, rel=1e-5)
     assert colour_accuracy_mean_abs(image, truth) == pytest.approx(1 - 0.25 * 0.9 * 0.3 / 3, rel=1e-5)
+    assert root_mean_square_error(image, truth) == pytest.approx(np.sqrt(0.25 / 3) * 0.9 * 0.3, rel=1e-5)
 
 
 def test_a_wrong_silhouette_is_no_error_of_colour() -> None:

@@ -1,21 +1,28 @@
-"""The demonstration of colour: its recipes, with numbers of one's own."""
+"""The demonstration of colour: the commands that it gives fit each other and its recipes."""
 
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 
 import pytest
+from nlos_models.recipe import load_recipe
 
 Tool = Callable[[str], ModuleType]
 
 
-def test_a_recipe_keeps_what_is_not_changed_and_never_has_a_batch_larger_than_its_objects(tool: Tool) -> None:
-    recipe_named = tool("colour_demo").recipe_named
-    whole = recipe_named("compressor")
-    assert recipe_named("compressor", objects=None, epochs=None) == whole
-    small = recipe_named("compressor", objects=10, epochs=2)
-    assert (small.objects, small.epochs, small.batch, small.seed) == (10, 2, 10, whole.seed)
-
-
-def test_a_number_that_is_none_is_refused(tool: Tool) -> None:
-    with pytest.raises(ValueError, match="epochs"):
-        tool("colour_demo").recipe_named("vae", epochs=0)
+@pytest.mark.parametrize("small", [False, True])
+def test_the_sets_are_as_large_as_the_recipe_asks_and_the_second_step_takes_what_the_first_ones_made(
+    tool: Tool,
+    small: bool,
+) -> None:
+    *builds, vae, compressor = tool("colour_demo").commands(Path("out"), "draft", 3, small=small)
+    options = [dict(zip(command[3:][::2], command[3:][1::2], strict=True)) for command in builds]
+    assert all(command[:3] == ["dataset", "build", "--colour"] for command in builds)
+    first, second = (dict(zip(made[2::2], made[3::2], strict=True)) for made in (vae, compressor))
+    recipe = load_recipe(Path(second["--recipe"]))
+    assert load_recipe(Path(first["--recipe"])).task == "vae"
+    assert [int(option["--count"]) for option in options] == [recipe.objects, recipe.held_out]
+    assert [option["--out"] for option in options] == [second["--dataset"], second["--held-out"]]
+    assert second["--vae"] == first["--out"]
+    assert len({option["--seed"] for option in options}) == 2
+    assert all((option["--accuracy"], option["--workers"]) == ("draft", "3") for option in options)
