@@ -104,6 +104,16 @@ def test_only_the_time_in_which_all_work_counts(tool: Callable[[str], ModuleType
     assert scaling.warm([*starts, *steady, *ends], 2) == (10.0, 100)
 
 
+@pytest.mark.parametrize("pieces", [12, 13, 14, 15])
+@pytest.mark.parametrize("apart_s", [0.0, 0.4])
+def test_two_workers_in_step_or_not_have_twice_the_rate_of_one(
+    tool: Callable[[str], ModuleType], pieces: int, apart_s: float
+) -> None:
+    made = [(3.0 + k // 2 + apart_s * (k % 2), 10 * (k + 1)) for k in range(pieces)]
+    seconds, objects = tool("dataset_scaling").warm([(0.0, 0), *made], 2)
+    assert objects / seconds == pytest.approx(20)
+
+
 def test_ray_workers_are_those_below_a_process(tool: Callable[[str], ModuleType]) -> None:
     ray_tool = tool("kill_ray_workers")
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
