@@ -17,7 +17,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from nlos_models.compiled import Network, compiled
+from nlos_models.compiled import Network, compiled, compiling
 from nlos_models.errors import RecipeError, TrainingError
 from nlos_models.processes import open_fabric, seed_of, share_of
 from nlos_models.recipe import Recipe
@@ -156,9 +156,10 @@ class _Run:
     def _advance(self, batch: Any) -> None:
         rank, world = self.fabric.global_rank, self.fabric.world_size
         torch.manual_seed(seed_of(self.recipe.seed, self.epoch, self.step, rank))
-        value = self._forward(self.fabric.to_device(share_of(batch, rank, world)))
-        self._optimizer.zero_grad(set_to_none=True)
-        self.fabric.backward(value)
+        with compiling():
+            value = self._forward(self.fabric.to_device(share_of(batch, rank, world)))
+            self._optimizer.zero_grad(set_to_none=True)
+            self.fabric.backward(value)
         self._optimizer.step()
         if self.recipe.schedule == "one-cycle":
             self.schedule.step()

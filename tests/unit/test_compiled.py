@@ -5,10 +5,11 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from nlos_models.compiled import compiled
+from nlos_models.compiled import compiled, compiling
 from nlos_models.errors import TrainingError
 from torch import Tensor, nn
 from torch._inductor import config
+from torch._inductor.exc import InductorError
 
 needs_compiler = pytest.mark.skipif(
     not any(shutil.which(name) for name in config.cpp.cxx if name), reason="torch.compile needs a C++ compiler here"
@@ -51,12 +52,13 @@ def test_a_compiled_part_makes_the_loss_and_the_gradients_of_the_plain_one_noise
     torch.testing.assert_close(*found)
 
 
-def test_without_a_compiler_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch, "compile", lambda network, **_: torch._dynamo.optimize(_no_compiler)(network))
-    with pytest.raises(
-        TrainingError, match=r"--compile does not work here \(No g\+\+\): install a C\+\+ compiler"
-    ) as caught:
-        compiled(nn.Linear(3, 2))(torch.rand(1, 3))
+def test_a_network_that_cannot_be_compiled_is_one_line() -> None:
+    network = torch.compile(nn.Linear(3, 2), backend=_no_compiler)
+    with (
+        pytest.raises(TrainingError, match=r"--compile does not work here \(No g\+\+\): install a C") as caught,
+        compiling(),
+    ):
+        network(torch.rand(1, 3))
     assert "\n" not in str(caught.value)
 
 
@@ -64,7 +66,12 @@ def _no_compiler(*_: object) -> None:
     raise RuntimeError("No g++\nand a page of other words")
 
 
-def test_what_a_network_itself_raises_is_not_blamed_on_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch, "compile", lambda network, **_: network)
-    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"):
-        compiled(nn.Linear(3, 2))(torch.rand(1, 4))
+def test_gradients_that_cannot_be_compiled_are_one_line() -> None:
+    error = InductorError(RuntimeError("No g++\nand more"), None)
+    with pytest.raises(TrainingError, match=r"does not work here \(.*No g\+\+\)"), compiling():
+        raise error
+
+
+def test_what_a_network_itself_raises_is_not_blamed_on_the_compiler() -> None:
+    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"), compiling():
+        nn.Linear(3, 2)(torch.rand(1, 4))
