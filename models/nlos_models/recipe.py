@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from nlos_models.errors import RecipeError
 
 MapKind = Literal["raw maps", "difference maps"]
+DEPTH_ONLY = ("start", "steps", "maps", "surface_weight", "augmentation", "left_out", "backgrounds")
+"""What only training on depth heeds: in a recipe of colour it would do nothing."""
 
 
 class Recipe(BaseModel):
@@ -27,7 +29,8 @@ class Recipe(BaseModel):
     """At most; of a transfer, those of the classifier alone."""
     batch: int = Field(gt=1)
     """Over all processes."""
-    learning_rate: float = Field(gt=0)
+    learning_rate: float = Field(gt=1e-8)
+    """Above the rate at which a plateau's run ends (SI 3 and 4)."""
     betas: tuple[float, float] = (0.5, 0.999)
     schedule: Literal["one-cycle", "plateau"] = "plateau"
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
@@ -36,6 +39,8 @@ class Recipe(BaseModel):
     dropout: float = Field(default=0.5, ge=0, lt=1)
     latent_weight: float = Field(default=1.0, ge=0)
     image_weight: float = Field(default=0.0, ge=0)
+    surface_weight: float = Field(default=1.0, ge=1)
+    """How much a pixel of surface counts in an image's error beside one of background (`losses.image_error`)."""
     augmentation: Literal["mirror", "turns"] = "mirror"
     """About y = 0, the one symmetry that the rig has; or, for a VAE alone, by quarters of a turn too (SI 3)."""
     left_out: list[str] = Field(default_factory=list[str])
@@ -51,9 +56,10 @@ class Recipe(BaseModel):
     maps: MapKind = "raw maps"
     """What the compressor eats; difference maps are the maps less the bare wall's."""
     all_layers_epochs: int = Field(default=4, ge=0)
-    """Of a transfer: its first phase (SI 4: 3 to 5)."""
-    statistics: Literal["kept", "own"] = "kept"
-    """Of a transfer: maps are normalised as the synthetic ones were, or by the recordings' own mean and spread."""
+    """Of a transfer: its first phase (SI 4: 3 to 5); `keep` says which of its epochs the second one sets out from."""
+    statistics: Literal["kept", "own", "own intensity"] = "kept"
+    """Of a transfer: maps are normalised as the synthetic ones were, or (their intensity alone) by the recordings' own
+    mean and spread."""
     deviations: list[str] = Field(default_factory=list[str])
     """Where this recipe leaves the supporting information, and why."""
 
@@ -69,8 +75,12 @@ class Recipe(BaseModel):
             raise ValueError("latent_weight and image_weight are both 0: there is nothing to learn by")
         if self.steps == "one" and self.latent_weight:
             raise ValueError("steps 'one' knows no latent to aim at: set latent_weight = 0")
-        if self.start == "weights" and (self.colour or self.task == "transfer" or self.steps != "two"):
-            raise ValueError("start 'weights' is for a VAE or a two-step compressor of depth: leave it out")
+        if self.start == "weights" and (self.task == "transfer" or self.steps != "two"):
+            raise ValueError("start 'weights' is for a VAE or a two-step compressor: leave it out")
+        if self.colour and (odd := [name for name in DEPTH_ONLY if getattr(self, name) != default_of(name)]):
+            raise ValueError(f"a recipe of colour knows no {' and no '.join(odd)}: leave it out")
+        if self.colour and self.task == "transfer":
+            raise ValueError("no lidar sees colour, so there is nothing to transfer to: leave colour out")
         if self.steps != "two" and not self.image_weight:
             raise ValueError(
                 f"steps {self.steps!r} trains a decoder, which learns by images alone: set an image_weight"
@@ -95,6 +105,11 @@ class Recipe(BaseModel):
         if objects < 2:
             raise RecipeError(f"{objects} objects are too few to train on: give at least 2")
         return self.model_copy(update={"objects": objects, "batch": min(self.batch, objects)})
+
+
+def default_of(field: str) -> object:
+    """What a recipe that does not name a field has."""
+    return Recipe.model_fields[field].get_default(call_default_factory=True)
 
 
 def load_recipe(path: Path) -> Recipe:

@@ -11,6 +11,18 @@ def test_the_image_error_sums_pixels_and_averages_samples() -> None:
     assert image_error(image, truth).item() == pytest.approx((1 + 0.25) / 2)
 
 
+@pytest.mark.parametrize(("share", "weight"), [(0.75, 1.0), (0.75, 4.0), (0.25, 2.0)])
+def test_the_best_answer_to_doubt_lies_nearer_to_the_surface_the_more_surface_counts(
+    share: float, weight: float
+) -> None:
+    v, truth = 0.6, torch.zeros(4, 1, 8, 8)
+    truth[: round(4 * share)] = v
+    best = weight * share * v / (1 - share + weight * share)
+    losses = [image_error(torch.full_like(truth, best + off), truth, weight).item() for off in (-0.01, 0.0, 0.01)]
+    assert min(losses) == losses[1]
+    assert losses[0] == pytest.approx(losses[2], rel=1e-4)
+
+
 def test_kl_is_0_for_the_standard_normal_and_positive_elsewhere() -> None:
     zero = torch.zeros(3, 256)
     assert kl_divergence(zero, zero).item() == 0

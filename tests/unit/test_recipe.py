@@ -75,6 +75,13 @@ def test_on_fewer_objects_the_batch_is_never_larger_than_all() -> None:
         ("compressor", "latent_weight = 0", "nothing to learn by"),
         ("compressor", 'steps = "one"\nimage_weight = 1', "no latent to aim at"),
         ("compressor", 'steps = "two-then-joint"', "set an image_weight"),
+        ("transfer", 'start = "weights"', "start 'weights' is for a VAE or a two-step compressor"),
+        ("compressor", 'start = "weights"\nsteps = "one"\nlatent_weight = 0\nimage_weight = 1', "start 'weights'"),
+        ("compressor", 'start = "weights"\nsteps = "two-then-joint"\nimage_weight = 1', "start 'weights'"),
+        ("vae", 'colour = true\nstart = "weights"', "colour knows no start: leave it out"),
+        ("compressor", 'colour = true\nmaps = "difference maps"', "colour knows no maps"),
+        ("vae", 'colour = true\nleft_out = ["car"]\nbackgrounds = 0.5', "no left_out and no backgrounds"),
+        ("transfer", "colour = true", "nothing to transfer to"),
     ],
 )
 def test_a_recipe_at_odds_with_itself_is_one_line(tmp_path: Path, task: str, lines: str, words: str) -> None:
@@ -101,6 +108,7 @@ def test_a_recipe_survives_its_record() -> None:
         ("batch = 1", "batch"),
         ("epochs = 0", "epochs"),
         ("learning_rate = -1.0", "learning_rate"),
+        ("learning_rate = 1e-8", "learning_rate"),
         ('task = "guess"', "task"),
         ('schedule = "cosine"', "schedule"),
         ("dropout = 1.0", "dropout"),
