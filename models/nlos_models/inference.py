@@ -111,8 +111,11 @@ def export_onnx(pipeline: Pipeline, path: Path) -> None:
         )
     if program is None:
         raise ModelError("torch's exporter returned no ONNX program: install a torch between 2.6 and 2.13")
-    program.save(part, external_data=False)
-    part.replace(path)
+    try:
+        program.save(part, external_data=False)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _checksum(pipeline: Pipeline) -> str:

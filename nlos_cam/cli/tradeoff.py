@@ -18,6 +18,7 @@ from nlos_cam.cli.hidden_object import hidden_depth
 from nlos_cam.dataset import TEST_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate_objects import seeded_objects
+from nlos_cam.folders import renamed_when_whole
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.test_set import test_set
 from nlos_cam.render.scene import Scene
@@ -89,8 +90,9 @@ def reconstruct(
     interrupted = _collect(reconstruction.measure(asked, makes, bench), rows, len(asked))
     table = reconstruction_report.facts(rows, len(asked), len(bench.truth), machine())
     if rows:
-        _write_files(folder, table, reconstruction_report.as_markdown(table))
-        reconstruction_report.draw(folder / "tradeoff.png", rows)
+        with renamed_when_whole(folder) as part:
+            _write_files(part, table, reconstruction_report.as_markdown(table))
+            reconstruction_report.draw(part / "tradeoff.png", rows)
     text = f"{len(rows)} of {len(asked)} settings measured: {folder}" if rows else "nothing was measured"
     finish({**table, "out": str(folder) if rows else None}, as_json=json, text=text)
     if interrupted:
@@ -140,13 +142,12 @@ def _collect(measured: Iterator[R], rows: list[R], planned: int) -> bool:
 
 
 def _write_files(folder: Path, table: dict[str, Any], text: str) -> None:
-    folder.mkdir(exist_ok=True)
     (folder / "tradeoff.json").write_text(dumps(table, indent=2) + "\n", encoding="utf-8")
     (folder / "tradeoff.md").write_text(text, encoding="utf-8")
 
 
 def _write(folder: Path, table: dict[str, Any], rows: list[Row], name: str) -> None:
-    _write_files(folder, table, as_markdown(table))
-    draw(
-        folder / "tradeoff.png", rows, f"{name}: {table['patches']} patches, {table['beams_on_wall']} beams on the wall"
-    )
+    title = f"{name}: {table['patches']} patches, {table['beams_on_wall']} beams on the wall"
+    with renamed_when_whole(folder) as part:
+        _write_files(part, table, as_markdown(table))
+        draw(part / "tradeoff.png", rows, title)

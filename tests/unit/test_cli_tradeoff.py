@@ -136,6 +136,14 @@ def test_what_is_there_is_overwritten_only_when_asked(tmp_path: Path, capsys: py
     assert precious.read_text() != "precious"
 
 
+def test_a_file_is_no_folder_even_when_asked_to_overwrite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    precious = tmp_path / "cost"
+    precious.write_text("precious")
+    assert main(["tradeoff", "render", "--out", str(precious), "--overwrite", "--json"]) == 1
+    assert _last(capsys)["error"]["type"] == "OutputExistsError"
+    assert precious.read_text() == "precious"
+
+
 def test_it_is_a_group_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tradeoff", "--help"]) == 0
     assert "render" in capsys.readouterr().out
