@@ -9,7 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from nlos_models.errors import RecipeError
 
 MapKind = Literal["raw maps", "difference maps"]
-DEPTH_ONLY = ("start", "steps", "maps", "surface_weight", "augmentation", "left_out", "backgrounds")
+ImageLoss = Literal["squared", "absolute"]
+DEPTH_ONLY = ("start", "steps", "maps", "surface_weight", "image_loss", "augmentation", "left_out", "backgrounds")
 """What only training on depth heeds: in a recipe of colour it would do nothing."""
 
 
@@ -41,6 +42,8 @@ class Recipe(BaseModel):
     image_weight: float = Field(default=0.0, ge=0)
     surface_weight: float = Field(default=1.0, ge=1)
     """How much a pixel of surface counts in an image's error beside one of background (`losses.image_error`)."""
+    image_loss: ImageLoss = "squared"
+    """What an image's error is the sum of: the mean of what could be there answers the one, its median the other."""
     augmentation: Literal["mirror", "turns"] = "mirror"
     """About y = 0, the one symmetry that the rig has; or, for a VAE alone, by quarters of a turn too (SI 3)."""
     left_out: list[str] = Field(default_factory=list[str])

@@ -68,7 +68,7 @@ class Remapping:
                 aim = torch.where(batch.mirrored[:, None, None], mirrored, straight)
                 value = value + recipe.latent_weight * latent_error(latent, *aim.unbind(1))
             if recipe.image_weight:
-                error = image_error(decoded(latent), batch.image, recipe.surface_weight)
+                error = image_error(decoded(latent), batch.image, recipe.surface_weight, recipe.image_loss)
                 value = value + recipe.image_weight * error
             return value
 

@@ -23,6 +23,14 @@ def test_the_best_answer_to_doubt_lies_nearer_to_the_surface_the_more_surface_co
     assert losses[0] == pytest.approx(losses[2], rel=1e-4)
 
 
+@pytest.mark.parametrize(("share", "weight", "best"), [(0.75, 1.0, 0.6), (0.25, 1.0, 0.0), (0.25, 4.0, 0.6)])
+def test_absolute_error_answers_doubt_with_the_surface_or_with_nothing(share: float, weight: float, best: float) -> None:
+    truth = torch.zeros(4, 1, 8, 8)
+    truth[: round(4 * share)] = 0.6
+    losses = {v: image_error(torch.full_like(truth, v), truth, weight, "absolute").item() for v in (0.0, 0.2, 0.4, 0.6)}
+    assert min(losses, key=lambda v: losses[v]) == best
+
+
 def test_kl_is_0_for_the_standard_normal_and_positive_elsewhere() -> None:
     zero = torch.zeros(3, 256)
     assert kl_divergence(zero, zero).item() == 0
