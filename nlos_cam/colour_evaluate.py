@@ -10,7 +10,7 @@ from nlos_calibration.rig import Rig
 from nlos_models.colour_metrics import SMALLER_IS_BETTER, brightness, colour_metrics
 from nlos_models.data import Half, MapSet
 from nlos_models.metrics import surface
-from nlos_models.networks import SIMULATION_ONLY
+from nlos_models.recipe import SIMULATION_ONLY
 
 from nlos_cam.dataset_samples import sense_colour
 from nlos_cam.evaluate import interval

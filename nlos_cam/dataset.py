@@ -18,7 +18,7 @@ from nlos_models.data import MapSet
 from nlos_cam.dataset_lock import only_builder
 from nlos_cam.dataset_plan import DatasetPlan, Objects, RigSpread
 from nlos_cam.dataset_reader import MAP_CHANNELS, Dataset, open_dataset, read
-from nlos_cam.dataset_samples import Samples, joined, make_samples, objects_of, procedural_images, sense_object
+from nlos_cam.dataset_samples import Samples, joined, make_samples, objects_of, procedural_images, sense_object, silent
 from nlos_cam.dataset_shards import PARTS, SHARDS, Shard, check_all, head_of, shard_path, store
 from nlos_cam.dataset_worker import begin_worker
 from nlos_cam.errors import OutputExistsError, RecordingError, WorkersLostError
@@ -65,10 +65,6 @@ class Built:
     """Shards that were made anew because their content was not what was written."""
 
 
-def _silent(*_: object) -> None:
-    pass
-
-
 def build(
     plan: DatasetPlan,
     count: int,
@@ -76,8 +72,8 @@ def build(
     *,
     workers: int,
     on_progress: OnProgress,
-    on_check: OnProgress = _silent,
-    tell: Callable[[str], None] = _silent,
+    on_check: OnProgress = silent,
+    tell: Callable[[str], None] = silent,
     command: str = "",
     farm: Farm | None = None,
 ) -> Built:

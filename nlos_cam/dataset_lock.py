@@ -8,20 +8,27 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from nlos_cam.errors import FolderBusyError
+from nlos_cam.errors import FolderBusyError, OutputExistsError
 
 LOCK, NOTE = ".build.lock", ".builder"
 
 
 @contextmanager
 def only_builder(folder: Path) -> Generator[None]:
-    """Hold a folder's lock. Raises FolderBusyError, with the holder's process id, where another process has it."""
+    """Hold a folder's lock. Raises FolderBusyError, with the holder's process id, where another process has it.
+
+    Raises OutputExistsError where nothing may be written there.
+    """
     lock, note = FileLock(folder / LOCK), folder / NOTE
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
         raise FolderBusyError(
             f"{folder} is being built by {_holder(note)}: wait for it, or choose another --out"
+        ) from error
+    except PermissionError as error:
+        raise OutputExistsError(
+            f"{folder} cannot be written to: choose another --out, or change its permissions"
         ) from error
     try:
         with suppress(OSError):  # a full disk is told where it matters

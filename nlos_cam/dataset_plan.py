@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 from nlos_calibration.rig import NotNegative, ObjectBox, Record, Rig
-from nlos_models.networks import SIMULATION_ONLY
+from nlos_models.recipe import SIMULATION_ONLY
 from pydantic import TypeAdapter
 
 from nlos_cam.errors import SceneError

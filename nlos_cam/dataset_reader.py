@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from nlos_models.data import MapBatch, MapSet, as_batch
-from nlos_models.networks import SIMULATION_ONLY
+from nlos_models.recipe import SIMULATION_ONLY
 from numpy.typing import NDArray
 
 from nlos_cam.dataset_plan import DatasetPlan

@@ -1,6 +1,9 @@
-"""Seeds to samples: a hidden object, its rig, its rendering and its noise, each by the object's seed alone."""
+"""Seeds to samples: a hidden object, its rig, its rendering and its noise, each by the object's seed alone.
 
-from collections.abc import Mapping, Sequence
+Torch is not imported here: every worker would wait for it, and has no use for it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -8,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from nlos_calibration.rig import ObjectBox, Rig
-from nlos_models.data import Half
 from numpy.typing import NDArray
 
 from nlos_cam.dataset_plan import DatasetPlan, Objects, scene_row
@@ -30,6 +32,10 @@ Samples = Mapping[str, NDArray[Any]]
 scene (n, 6), category (n,). In colour intensity is (n, 3, 64, 80), image (n, 3, 64, 64), and there is texture (n,)."""
 
 
+def silent(*_: object) -> None:
+    """Tell nobody how far it is."""
+
+
 def procedural_images(
     first_seed: int,
     count: int,
@@ -38,7 +44,7 @@ def procedural_images(
     *,
     backgrounds: float = 0.0,
     textures: Sequence[str] = (),
-) -> Half:
+) -> NDArray[np.float16]:
     """Images (count, 64, 64) of random objects, without rendering: all that a VAE needs; see `object_depth`.
 
     With textures, in colour: (count, 3, 64, 64).
@@ -121,15 +127,28 @@ def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Flo
         return object_depth(seed, box, objects.categories, backgrounds=objects.backgrounds)
     if (folder := objects.folder) is None:
         raise SceneError("this dataset hides meshes: name their folder with --objects")
-    checksums = {folder / name: sha256 for name, sha256 in objects.meshes}
-    path, depth_m = mesh_depth(seed, [*checksums], box, read=lambda path: _unchanged(path, checksums[path]))
-    return path.relative_to(folder).as_posix(), depth_m
+    (name, _), depth_m = mesh_depth(seed, objects.meshes, box, read=lambda mesh: _unchanged(folder / mesh[0], mesh[1]))
+    return name, depth_m
 
 
-def objects_of(folder: Path) -> Objects:
-    """The meshes of a folder and its subfolders. Raises SceneError where there is none, or one cannot be placed."""
-    meshes = [(path.relative_to(folder).as_posix(), read_mesh(path).sha256) for path in folder_objects(folder)]
+def objects_of(folder: Path, on_progress: Callable[[int, int], None] = silent) -> Objects:
+    """The meshes of a folder and its subfolders. Raises SceneError where there is none, or one that cannot be used.
+
+    It reads them all: `on_progress` hears how many are done, and how many there are.
+    """
+    found, meshes = folder_objects(folder), list[tuple[str, str]]()
+    for path in found:
+        meshes.append((_told(path.relative_to(folder)), read_mesh(path).sha256))
+        on_progress(len(meshes), len(found))
     return Objects((), tuple(meshes), folder=folder.resolve())
+
+
+def _told(path: Path) -> str:
+    """A mesh as shards tell it. Raises SceneError for a name that no shard can hold."""
+    try:
+        return path.as_posix().encode().decode()
+    except UnicodeEncodeError as error:
+        raise SceneError(f"the name of the mesh {path.as_posix()!a} is not UTF-8: rename it") from error
 
 
 @lru_cache(maxsize=16)

@@ -108,12 +108,13 @@ def store(path: Path, samples: Samples, provenance: str, command: str) -> None:
             os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
-        part.unlink(missing_ok=True)
         if error.errno in NO_ROOM:
             raise DiskFullError(
                 f"no room for {path} ({error.strerror}): what was made so far is kept; make room and build again"
             ) from error
         raise
+    finally:  # after Ctrl-C, too
+        part.unlink(missing_ok=True)
 
 
 def _as_bytes(samples: Samples, provenance: str, command: str) -> bytes:
@@ -152,7 +153,7 @@ def opened(path: Path) -> Generator[h5py.File]:
             yield file
     except RecordingError:
         raise
-    except (OSError, KeyError, ValueError, RuntimeError) as error:  # whatever HDF5 makes of damage
+    except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:  # what damage makes
         raise _damaged(path, f"cannot be read as a shard: {' '.join(str(error).split())}") from error
 
 

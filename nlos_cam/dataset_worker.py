@@ -8,6 +8,7 @@ from threading import Thread
 
 def begin_worker() -> None:
     """Make this process a worker; what it prepares lasts as long as it does."""
+    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"  # numpy is still to be imported
     one_thread()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the parent ends its workers
     Thread(target=end_with_parent, daemon=True).start()

@@ -1,7 +1,7 @@
 """Judge images of hidden objects: every metric by name with its interval, per category, and against the baselines."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,11 @@ def per_object(image: Float32, truth: Float32, box: ObjectBox) -> PerObject:
         "accuracy_within_2_percent": metrics.accuracy_within_2_percent(image, truth),
         "foreground_rmse_mm": metrics.foreground_rmse_mm(image, truth, mm_per_v(box)),
     }
+
+
+def plain(figures: Figures) -> dict[str, dict[str, float | None]]:
+    """Figures ready for JSON: {value, low, high} by the metric's name."""
+    return {name: asdict(figure) for name, figure in figures.items()}
 
 
 def over_objects(values: Mapping[str, Values]) -> Figures:

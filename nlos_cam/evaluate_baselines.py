@@ -1,48 +1,100 @@
 """What a reconstructor has to beat: answers that need no network, among them the nearest training object."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
 from nlos_models.data import Half, MapSet
-from nlos_models.preprocess import channel_statistics, split_and_stack
-from numpy.typing import NDArray
+from nlos_models.preprocess import SMALLEST_SPREAD, channel_statistics, split_and_stack
+from torch import Tensor
 
-import nlos_cam.objects
 from nlos_cam import dataset
 from nlos_cam.frames import Float32
 
 NEIGHBOURS = 2000
 """Training objects that the nearest one is searched among, unless a training set is given."""
+TOLD_BY = 200
+"""Of them, those that tell whether objects are still made as they were: every category is among them."""
 
 OnProgress = Callable[[int, int], None]
 
 
-def baselines(maps: MapSet, training_images: Half | Float32, training: MapSet | None) -> dict[str, Float32]:
-    """Images (n, 64, 64) that need no network; the nearest neighbour only where training maps are at hand."""
-    shape = (len(maps.image), *training_images.shape[1:])
-    mean = training_images.astype(np.float32).mean(0)
-    guesses = {
-        "all_background": np.zeros(shape, np.float32),
-        "mean_object": np.broadcast_to(mean, shape).astype(np.float32),
-    }
-    if training is not None:
-        guesses["nearest_neighbour"] = training.image[_nearest(maps, training)].astype(np.float32)
-    return guesses
+class TrainingMaps(Protocol):
+    """Training objects as a rig sees them; a dataset is such."""
+
+    def __len__(self) -> int: ...
+
+    def chunks(self) -> Iterator[MapSet]:
+        """All of them, a part at a time."""
+        ...
 
 
-def _nearest(maps: MapSet, training: MapSet) -> NDArray[np.int64]:
-    """The training sample (n,) whose normalised maps are nearest in the sense of least squares."""
-    stacks = [split_and_stack(torch.from_numpy(m.depth_m), torch.from_numpy(m.intensity)) for m in (maps, training)]
-    mean, spread = channel_statistics(stacks[1])
-    flat = [torch.nan_to_num((s - mean[:, None, None]) / spread[:, None, None]).flatten(1) for s in stacks]
-    return torch.cdist(flat[0], flat[1]).argmin(1).numpy()
+def without_maps(count: int, mean: Float32) -> dict[str, Float32]:
+    """Images (count, 64, 64) that look at no map: background alone, and the mean of training's images (64, 64)."""
+    shape = (count, *mean.shape)
+    return {"all_background": np.zeros(shape, np.float32), "mean_object": np.broadcast_to(mean, shape)}
 
 
-def training_maps(plan: dataset.DatasetPlan, cache: Path, workers: int, on_progress: OnProgress) -> MapSet:
+def mean_image(images: Half) -> Float32:
+    """The mean (64, 64) of images (n, 64, 64)."""
+    return images.mean(0, dtype=np.float64).astype(np.float32)
+
+
+def with_nearest(maps: MapSet, training: TrainingMaps, on_progress: OnProgress) -> dict[str, Float32]:
+    """The same, and the image of the training object nearest to each of some maps; a part at a time is in memory.
+
+    Nearest by least squares between raw maps, of all cells of depth and intensity, each channel (left, right) less its
+    mean and over its spread in the first NEIGHBOURS training objects. A cell without a return is an average one.
+    """
+    search, total, done = _Search(maps, *_statistics(training)), np.zeros(maps.image.shape[1:]), 0
+    for chunk in training.chunks():
+        search.look_at(chunk)
+        total += chunk.image.sum(0, dtype=np.float64)
+        done += len(chunk.image)
+        on_progress(done, len(training))
+    mean = (total / done).astype(np.float32)
+    return {**without_maps(len(maps.image), mean), "nearest_neighbour": search.image}
+
+
+class _Search:
+    """The nearest to each of some maps, among all that were looked at."""
+
+    def __init__(self, maps: MapSet, mean: Tensor, spread: Tensor) -> None:
+        self._mean, self._scale = mean[:, None, None], spread.clamp(min=SMALLEST_SPREAD)[:, None, None]
+        self._sought = self._normalised(maps)
+        self._distance = torch.full((len(maps.image),), torch.inf)
+        self.image = np.zeros(maps.image.shape, np.float32)
+        """(n, 64, 64)."""
+
+    def look_at(self, training: MapSet) -> None:
+        """Take what is nearer than all before."""
+        distance, which = torch.cdist(self._sought, self._normalised(training)).min(1)
+        nearer = distance < self._distance
+        self.image[nearer.numpy()] = training.image[which[nearer].numpy()]
+        self._distance = torch.minimum(distance, self._distance)
+
+    def _normalised(self, maps: MapSet) -> Tensor:
+        return torch.nan_to_num((_stacked(maps) - self._mean) / self._scale).flatten(1)
+
+
+def _stacked(maps: MapSet) -> Tensor:
+    return split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
+
+
+def _statistics(training: TrainingMaps) -> tuple[Tensor, Tensor]:
+    parts = list[Tensor]()
+    for chunk in training.chunks():
+        parts.append(_stacked(chunk))
+        if sum(map(len, parts)) >= NEIGHBOURS:
+            break
+    return channel_statistics(torch.cat(parts))
+
+
+def training_maps(plan: dataset.DatasetPlan, cache: Path, workers: int, on_progress: OnProgress) -> dataset.Dataset:
     """The first NEIGHBOURS training objects as this plan's rig and sensor see them, built once into a cache folder.
 
     A build that was cut short goes on where it was. The folder is named by a checksum of rig, sensor and objects.
@@ -50,12 +102,11 @@ def training_maps(plan: dataset.DatasetPlan, cache: Path, workers: int, on_progr
     plan = replace(plan, first_seed=dataset.TRAINING_SEED, objects=dataset.Objects())
     folder = cache / "neighbours" / f"{_checksum(plan)}-{NEIGHBOURS}"
     dataset.build(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
-    return dataset.read(folder)[0]
+    return dataset.open_dataset(folder)
 
 
 def _checksum(plan: dataset.DatasetPlan) -> str:
-    """Of the plan, and of the code that makes objects: another shape of cup is another training set."""
+    """Of the plan, and of what its objects look like: another shape of cup is another training set."""
     digest = hashlib.sha256(plan.provenance.encode())
-    for source in sorted(Path(nlos_cam.objects.__path__[0]).glob("*.py")):
-        digest.update(source.read_bytes())
+    digest.update(dataset.procedural_images(plan.first_seed, TOLD_BY, plan.box).tobytes())
     return digest.hexdigest()[:16]

@@ -15,7 +15,6 @@ from nlos_cam import evaluate_surface as surfaces
 from nlos_cam.evaluate import (
     BARS,
     SMALLER_IS_BETTER,
-    Figures,
     Interval,
     PerObject,
     Values,
@@ -24,7 +23,9 @@ from nlos_cam.evaluate import (
     over_objects,
     per_category,
     per_object,
+    plain,
 )
+from nlos_cam.folders import renamed_when_whole
 from nlos_cam.frames import Float32
 
 SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
@@ -49,6 +50,8 @@ class Judgement:
     box: ObjectBox
     facts: Mapping[str, Any]
     """What was judged on what, in words: goes to the figures as it is."""
+    left_out: Sequence[str] = ()
+    """Categories that training kept out."""
 
     @property
     def ours(self) -> PerObject:
@@ -77,11 +80,12 @@ def as_figures(judgement: Judgement) -> dict[str, Any]:
     overall = over_objects(ours)
     nearest = theirs.get("nearest_neighbour")
     return {
-        **_plain(overall),
-        "baselines": {name: _plain(over_objects(values)) for name, values in theirs.items()},
-        "advantage_over_nearest_neighbour": _plain(advantage(ours, nearest)) if nearest else None,
+        **plain(overall),
+        "baselines": {name: plain(over_objects(values)) for name, values in theirs.items()},
+        "advantage_over_nearest_neighbour": plain(advantage(ours, nearest)) if nearest else None,
         "bars": bars_met(overall),
-        "per_category": {name: _plain(figures) for name, figures in per_category(ours, judgement.categories).items()},
+        "per_category": {name: plain(figures) for name, figures in per_category(ours, judgement.categories).items()},
+        "shown_and_left_out": _by_shown(judgement),
         "rank_correlation": {
             f"{error_name} with {like_name}": asdict(surfaces.rank_correlation(like, error))
             for error_name, error in judgement.errors.items()
@@ -95,17 +99,21 @@ def as_figures(judgement: Judgement) -> dict[str, Any]:
     }
 
 
-def _plain(figures: Figures) -> dict[str, dict[str, float | None]]:
-    return {name: asdict(figure) for name, figure in figures.items()}
+def _by_shown(judgement: Judgement) -> dict[str, Any] | None:
+    """The figures of the kinds that training kept out, and of the others; None where it kept none of these out."""
+    if not set(judgement.left_out) & set(judgement.categories):
+        return None
+    shown = ["left out" if category in judgement.left_out else "shown" for category in judgement.categories]
+    return {name: plain(figures) for name, figures in per_category(judgement.ours, shown).items()}
 
 
 def write(folder: Path, judgement: Judgement, figures: Mapping[str, Any]) -> None:
-    """The whole folder, which is made if it is not there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "figures.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
-    _write_objects(folder / "objects.csv", judgement)
-    _draw(folder, judgement)
-    (folder / "report.md").write_text(as_markdown(figures), encoding="utf-8")
+    """The whole folder, in a folder that is there; what was in it is replaced once all is written."""
+    with renamed_when_whole(folder) as part:
+        (part / "figures.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        _write_objects(part / "objects.csv", judgement)
+        _draw(part, judgement)
+        (part / "report.md").write_text(as_markdown(figures), encoding="utf-8")
 
 
 def _write_objects(path: Path, judgement: Judgement) -> None:
@@ -135,12 +143,15 @@ def as_markdown(figures: Mapping[str, Any]) -> str:
     """The report, from the figures alone."""
     names = list(figures["baselines"])
     head = "| metric | ours (95 % interval) | wanted | " + " | ".join(name.replace("_", " ") for name in names) + " |"
+    weights = f"{figures['weights']} ({figures['input']})"
     parts = [
         f"# Reconstruction of {figures['objects']} hidden objects",
-        f"{figures['what']}. Weights: {figures['weights']}; rig: {figures['rig']}; {figures['runtime']}.",
+        f"{figures['what']}. Weights: {weights}; rig: {figures['rig']}; {figures['runtime']}.",
+        *(f"**Note**: {note}." for note in figures["notes"]),
         "\n".join([head, "| --- " * (3 + len(names)) + "|", *(_row(figures, metric, names) for metric in BARS)]),
         READ_WITH_CARE,
-        _against_nearest(figures["advantage_over_nearest_neighbour"]),
+        _against_nearest(figures["advantage_over_nearest_neighbour"], figures["training_objects"]),
+        _shown(figures["shown_and_left_out"]),
         _where(figures["where_the_error_is"]),
         "![truth, reconstruction, difference](sheet.png)",
         _categories(figures["per_category"]),
@@ -166,11 +177,22 @@ def _row(figures: Mapping[str, Any], metric: str, names: Sequence[str]) -> str:
     return f"| {metric} | {in_words(figures[metric])} | {wanted} | {' | '.join(others)} |"
 
 
-def _against_nearest(figures: Mapping[str, Any] | None) -> str:
+def _against_nearest(figures: Mapping[str, Any] | None, among: int | None) -> str:
     if not figures:
         return ""
     told = [f"{metric} {in_words(figure)}" for metric, figure in figures.items()]
-    return f"Better than the nearest training object, object by object (positive is better), by: {'; '.join(told)}."
+    return (
+        f"The nearest neighbour is, of {among} training objects, the one whose maps are nearest (least squares over "
+        "all cells, each channel in units of its spread); the mean object is their mean. Better than the nearest, "
+        f"object by object where both have a value (positive is better), by: {'; '.join(told)}."
+    )
+
+
+def _shown(figures: Mapping[str, Any] | None) -> str:
+    if not figures:
+        return ""
+    told = [f"{name} {in_words(group['silhouette_iou'])}" for name, group in figures.items()]
+    return f"Silhouette IoU of kinds that training was shown, and of those that it was not: {'; '.join(told)}."
 
 
 def _where(zones: Mapping[str, Any]) -> str:
@@ -191,8 +213,8 @@ def _categories(categories: Mapping[str, Any]) -> str:
     if len(told) < 6:
         return f"Silhouette IoU by category: {', '.join(told)}."
     return (
-        f"Silhouette IoU by category: worst {', '.join(told[:3])}; best {', '.join(told[-3:])}. With three objects a "
-        "category's interval is rather too narrow than too wide."
+        f"Silhouette IoU by category: worst {', '.join(told[:3])}; best {', '.join(told[-3:])}. Of few objects (the "
+        "test set has three of each) an interval is rather too narrow than too wide."
     )
 
 

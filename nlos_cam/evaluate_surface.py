@@ -71,14 +71,20 @@ def curve(like: Values, error: Values, bins: int = BINS) -> list[Bin]:
 def rank_correlation(like: Values, error: Values) -> Interval:
     """Spearman's: 1 where the error grows with what `like` measures, -1 where it falls; objects without one left out.
 
-    None where fewer than three objects have both, or one of the two never varies.
+    None where fewer than three objects have both, or one of the two never varies. Resamples keep the ranks of all.
     """
     kept = ~(np.isnan(like) | np.isnan(error))
     if kept.sum() < 3 or np.ptp(like[kept]) == 0 or np.ptp(error[kept]) == 0:
         return Interval(None, None, None)
-    ranks = np.stack([np.argsort(np.argsort(values[kept])).astype(np.float64) for values in (like, error)])
+    ranks = np.stack([_ranks(values[kept]) for values in (like, error)])
     low, high = np.nanquantile(_correlation(ranks[:, resampled(ranks.shape[1])]), [0.025, 0.975])
     return Interval(float(_correlation(ranks[:, None])[0]), float(low), float(high))
+
+
+def _ranks(values: Values) -> Values:
+    """From 0; equal values share the mean of theirs."""
+    _, which, count = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - (count + 1) / 2)[which]
 
 
 def _correlation(pairs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +18,7 @@ def renamed_when_whole(out: Path) -> Generator[Path]:
     """
     if out.exists() and not out.is_dir():
         raise OutputExistsError(f"{out} is a file: choose a folder's name for --out")
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
-    part.mkdir()
+    part = Path(tempfile.mkdtemp(".part", f".{out.name}.", out.parent))  # a process that died may have had our number
     try:
         yield part
         out.mkdir(exist_ok=True)

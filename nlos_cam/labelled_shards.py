@@ -8,6 +8,8 @@ from nlos_cam.dataset import SHARD, DatasetPlan
 from nlos_cam.dataset_plan import scene_row
 from nlos_cam.dataset_samples import Samples
 from nlos_cam.dataset_shards import SHARDS, shard_path, store
+from nlos_cam.errors import DiskFullError
+from nlos_cam.folders import renamed_when_whole
 from nlos_cam.labelled import Labelled
 
 RECORDED = "recorded"
@@ -22,15 +24,20 @@ def plan_of(labelled: Labelled) -> DatasetPlan:
 def write_shards(labelled: Labelled, folder: Path, command: str = "") -> None:
     """Write the samples as a dataset, in place of the shards that are there; a seed is a sample's number.
 
-    Raises DiskFullError where they do not fit.
+    Those go when all of the new ones are on the disk. Raises DiskFullError where these do not fit, OutputExistsError
+    where `folder` is a file.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    for shard in folder.glob(SHARDS):
-        shard.unlink()
     provenance, samples = plan_of(labelled).provenance, _samples(labelled)
-    for start in range(0, len(labelled.label), SHARD):
-        part = {name: values[start : start + SHARD] for name, values in samples.items()}
-        store(shard_path(folder, start), part, provenance, command)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with renamed_when_whole(folder) as whole:
+        for start in range(0, len(labelled.label), SHARD):
+            part = {name: values[start : start + SHARD] for name, values in samples.items()}
+            try:
+                store(shard_path(whole, start), part, provenance, command)
+            except DiskFullError as error:
+                raise DiskFullError(f"no room for the dataset {folder}: what was there is kept; make room") from error
+        for shard in folder.glob(SHARDS):  # so that no stop leaves shards of both
+            shard.unlink()
 
 
 def _samples(labelled: Labelled) -> Samples:

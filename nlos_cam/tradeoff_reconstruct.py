@@ -100,7 +100,7 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
 
     formats = {"float32": torch.float32, "bfloat16": torch.bfloat16}
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    dynamic, static = (model.with_suffix(f".{kind}.onnx") for kind in ("dynamic", "static"))
+    dynamic, static = (model.with_suffix(f".{kind}.onnx") for kind in ("dynamic", f"static-{rig.checksum}"))
     if not dynamic.exists():
         quantise(model, dynamic)
     if not static.exists():

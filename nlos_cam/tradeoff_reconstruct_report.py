@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nlos_cam.evaluate import BARS
+from nlos_cam.evaluate import BARS, plain
 from nlos_cam.tradeoff_reconstruct import AS_GOOD, FRAMES, Row, losses, pareto_front, recommended
 
 HEAD = (
@@ -31,13 +31,13 @@ def facts(rows: Sequence[Row], planned: int, objects: int, machine: str) -> dict
                 "milliseconds": row.milliseconds,
                 "milliseconds_p90": row.milliseconds_p90,
                 "wait_ms": row.wait_ms,
-                **{name: asdict(figure) for name, figure in row.figures.items()},
+                **plain(row.figures),
                 "loses_accuracy": any(loss > AS_GOOD[name] for name, loss in losses(row, rows[0]).items()),
             }
             for row in rows
         ],
         "recommended": {"name": pick.setting.name, "weights": pick.setting.weights} if pick else None,
-        "pareto_front": [row.setting.name for row in pareto_front(rows)],
+        "pareto_front": [{"name": row.setting.name, "weights": row.setting.weights} for row in pareto_front(rows)],
     }
 
 
@@ -48,19 +48,22 @@ def as_markdown(table: Mapping[str, Any]) -> str:
         f"{table['machine']}; {table['objects']} objects.{whole}",
         "\n".join([HEAD, *map(_line, table["settings"])]),
         NOTES,
-        f"Recommended: {table['recommended']['name']} (the quickest of one frame that loses no accuracy)."
+        f"Recommended: {_called(table['recommended'])} (the quickest of one frame that loses no accuracy)."
         if table["recommended"]
         else "Nothing was measured.",
     ]
     return "\n\n".join(parts) + "\n"
 
 
+def _called(setting: Mapping[str, Any]) -> str:
+    return setting["name"] if setting["weights"] == "shipped" else f"{setting['weights']}: {setting['name']}"
+
+
 def _line(row: Mapping[str, Any]) -> str:
     values = [row[name]["value"] for name in BARS]
     told = ["none" if value is None else f"{value:.3f}" if value < 1 else f"{value:.1f}" for value in values]
-    name = row["name"] if row["weights"] == "shipped" else f"{row['weights']}: {row['name']}"
     times = f"{row['milliseconds']:.1f}", f"{row['milliseconds_p90']:.1f}", f"{row['wait_ms']:.0f}"
-    return f"| {' | '.join([name, *times, *told, 'yes' if row['loses_accuracy'] else 'no'])} |"
+    return f"| {' | '.join([_called(row), *times, *told, 'yes' if row['loses_accuracy'] else 'no'])} |"
 
 
 def draw(path: Path, rows: Sequence[Row]) -> None:

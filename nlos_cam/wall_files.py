@@ -11,7 +11,7 @@ from nlos_calibration.wall_record import WallRecord
 
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.folders import file_when_whole
-from nlos_cam.wall_report import write_report
+from nlos_cam.wall_report import report
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def written(files: WallFiles, record: WallRecord, reference: BareWall | None) ->
         if reference is not None:
             digest = save_reference(whole.enter_context(file_when_whole(files.reference)), reference)
             record = record.model_copy(update={"reference": files.reference.name, "reference_sha256": digest})
-        report = whole.enter_context(file_when_whole(files.report))
-        write_report(report, MeasuredWall(record, reference), files.record.name)
+        told = whole.enter_context(file_when_whole(files.report))
+        told.write_text(report(MeasuredWall(record, reference), files.record.name), encoding="utf-8")
         part.write_text(dump_toml(record), encoding="utf-8")
     return record

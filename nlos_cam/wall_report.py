@@ -1,11 +1,8 @@
 """The report beside a wall's record: one HTML file that says whether the bench is right, and what to move if not."""
 
-from pathlib import Path
-
 from nlos_calibration.measured_wall import MeasuredWall
 
 from nlos_cam import wall_report_text as text
-from nlos_cam.folders import file_when_whole
 from nlos_cam.wall_bench_picture import bench_picture
 from nlos_cam.wall_footprint_picture import footprint_picture
 from nlos_cam.wall_pictures import Picture, wall_maps
@@ -14,14 +11,8 @@ from nlos_cam.wall_report_html import page, pictured
 NO_MAPS = Picture("Maps of the wall", "This record names no reference of the bare wall: there are no maps to draw.")
 
 
-def write_report(path: Path, wall: MeasuredWall, record_file: str) -> None:
-    """Write the report (HTML) on a wall whose record is called `record_file`; it is at `path` once it is whole."""
-    with file_when_whole(path) as part:
-        part.write_text(report(wall, record_file), encoding="utf-8")
-
-
 def report(wall: MeasuredWall, record_file: str) -> str:
-    """The report as HTML that needs no other file and no network."""
+    """The report on a wall whose record is called `record_file`, as HTML that needs no other file and no network."""
     record = wall.record
     maps = [NO_MAPS] if wall.reference is None else wall_maps(record, wall.reference)
     under = f"{record.created}, {record.camera}, {record.frames} frames of the bare wall"

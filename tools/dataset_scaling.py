@@ -52,8 +52,12 @@ def measure(count: int, workers: int, alone: float | None = None) -> Speed:
 
 
 def warm(moments: list[tuple[float, int]], workers: int) -> tuple[float, int]:
-    """Seconds and objects from when every worker has made a piece to when the first runs out of pieces."""
-    (first_s, first), (last_s, last) = moments[workers], moments[-workers]
+    """Seconds and objects from when every worker has made a piece to when the first runs out of pieces.
+
+    As many pieces for each worker: those of workers in step come at once, and half of them would not tell their rate.
+    """
+    rounds = (len(moments) - 2 * workers) // workers
+    (first_s, first), (last_s, last) = moments[workers], moments[workers + rounds * workers]
     return last_s - first_s, last - first
 
 

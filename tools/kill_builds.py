@@ -1,8 +1,8 @@
 """Dataset builds killed at random moments, against one that was not: docs/dataset_kills.json.
 
 Arguments: objects, kills, seed, objects in a shard. Each kill takes the builder alone, with SIGKILL, and the next run
-goes on in the same folder. Exits with 1 where any array differs by a bit, a finished shard was lost, or a worker
-outlived its builder.
+goes on in the same folder. Exits with 1 where any array differs by a bit, a finished shard was lost, a worker outlived
+its builder, or a build was through before its kill.
 """
 
 import json
@@ -40,6 +40,8 @@ class Kill:
     """Shards that were there before and are not, or not as they were."""
     left_running: int
     """Workers that outlived it."""
+    killed: bool
+    """Not so where it was through before."""
 
 
 def build_command(folder: Path, count: int, shard: int) -> list[str]:
@@ -68,27 +70,29 @@ def finish(command: list[str]) -> float:
 
 
 def plan_kills(count: int, shard: int, whole_s: float, times: int, seed: int) -> list[tuple[int, float]]:
-    """For each kill, the shards that it waits for and the seconds after them: together about as many as there are."""
+    """For each kill, the shards that it waits for in all and the seconds after them: evenly over all but the last."""
     generator, shards = np.random.default_rng(seed), -(-count // shard)
-    more = generator.integers(0, max(2, 2 * shards // times - 1), times)
-    return list(zip(more.tolist(), generator.uniform(0, whole_s / shards, times).tolist(), strict=True))
+    done = np.sort(generator.uniform(0, shards - 1, times))
+    return [(int(moment), moment % 1 * whole_s / shards) for moment in done.tolist()]
 
 
 def kill(command: list[str], folder: Path, shards: int, then_s: float) -> Kill:
-    """Start a build, kill it so long after it has stored so many shards more, and see what it left."""
+    """Start a build, kill it so long after so many shards are there, and see what it left."""
+    killed = False
     before, started_s, workers = _shards(folder), time.monotonic(), list[int]()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        while process.poll() is None and len(list(folder.glob(SHARDS))) < len(before) + shards:
+        while process.poll() is None and len(list(folder.glob(SHARDS))) < shards:
             time.sleep(0.005)
         try:
             process.wait(then_s)
         except subprocess.TimeoutExpired:
             workers = children_of(process.pid)
             process.kill()
+            killed = True
     after_s, parts = time.monotonic() - started_s, len(list(folder.glob(PARTS)))
     left, after = _still_running(workers), _shards(folder)
     lost = sum(after.get(name) != content for name, content in before.items())
-    return Kill(after_s, len(before), len(after), parts, lost, left)
+    return Kill(after_s, len(before), len(after), parts, lost, left, killed)
 
 
 def _shards(folder: Path) -> dict[str, bytes]:
@@ -139,7 +143,7 @@ def main() -> None:
         kills = [kill(command, killed, *when) for when in plan_kills(count, shard, whole_s, times, seed)]
         finish(command)
         wrong = differing(whole, killed)
-    good = not wrong and not any(each.lost or each.left_running for each in kills)
+    good = not wrong and all(each.killed and not each.lost and not each.left_running for each in kills)
     result = {
         "machine": machine(),
         "objects": count,
@@ -156,7 +160,8 @@ def main() -> None:
             f"{each.after_s:7.2f}   {each.shards_before:13}   {each.shards_after:5}   {each.parts:12}   "
             f"{each.lost:4}   {each.left_running:12}"
         )
-    print(f"{times} kills, {count} objects: {'equal bit for bit' if good else f'NOT equal: {wrong}'}")
+    verdict = "equal bit for bit" if good else f"NOT good, arrays that differ: {wrong}"
+    print(f"{sum(each.killed for each in kills)} kills, {count} objects: {verdict}")
     sys.exit(0 if good else 1)
 
 

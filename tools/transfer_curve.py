@@ -147,6 +147,7 @@ def main() -> None:
     parser.add_argument("--recipe", type=Path, required=True)
     parser.add_argument("--weights", type=Path, help="where to start; the shipped weights unless given")
     parser.add_argument("--scratch", type=Path, help="a recipe for `train compressor`, on the same recordings")
+    parser.add_argument("--out", type=Path, default=DOCS, help="where the figures and their picture go")
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
     asked = parser.parse_args()
     trainers = {
@@ -159,11 +160,16 @@ def main() -> None:
     points: list[Point] = []
     for point in curve(asked.folder, asked.runs, trainers, asked.weights, asked.counts):
         points.append(point)
-        rmse, iou = (point.figures[name]["value"] for name in ("foreground_rmse_mm", "silhouette_iou"))
-        print(f"{point.trainer}, {point.recordings} recordings: RMSE {rmse} mm, silhouette IoU {iou}", flush=True)
-    told = {"frames_each": FRAMES, "points": [asdict(point) for point in points]}
-    (DOCS / "transfer_curve.json").write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
-    draw(points, DOCS / "images" / "transfer_curve.png")
+        rmse_mm, far_mm, iou = (
+            point.figures[name]["value"] for name in ("foreground_rmse_mm", "foreground_too_far_mm", "silhouette_iou")
+        )
+        told = f"RMSE {rmse_mm} mm, {far_mm} mm too far, silhouette IoU {iou}"
+        print(f"{point.trainer}, {point.recordings} recordings: {told}", flush=True)
+    reached = {"frames_each": FRAMES, "points": [asdict(point) for point in points]}
+    pictures = asked.out / "images"
+    pictures.mkdir(parents=True, exist_ok=True)
+    (asked.out / "transfer_curve.json").write_text(json.dumps(reached, indent=2) + "\n", encoding="utf-8")
+    draw(points, pictures / "transfer_curve.png")
 
 
 if __name__ == "__main__":

@@ -6,45 +6,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
 from nlos_models.errors import CheckpointError
-from nlos_models.networks import SIMULATION_ONLY, new_pipeline, new_vae
+from nlos_models.networks import new_pipeline, new_vae
 from nlos_models.pipeline import Pipeline
-from nlos_models.recipe import MapKind, Recipe
+from nlos_models.record import CheckpointRecord
 from nlos_models.res_vae import Encoder, ResVae
 
 RECORD = "checkpoint.json"
 SHIPPED = "paper-rig"
-
-
-class CheckpointRecord(BaseModel):
-    """What the tensors cannot say."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    rig_name: str
-    rig_checksum: str
-    input: MapKind = "raw maps"
-    """What the compressor eats; difference maps are the maps less the bare wall's."""
-    vae_recipe: Recipe | None = None
-    """None for a compressor and decoder that were trained in one step."""
-    compressor_recipe: Recipe | None = None
-    """None for a VAE alone."""
-    transfer_recipe: Recipe | None = None
-    """None for weights that saw synthetic maps alone."""
-    figures: dict[str, float] = {}
-    """Held-out figures at the end of training."""
-    note: str = ""
-    """Where weights are of colour, that these are simulation only."""
-
-    @property
-    def colour(self) -> bool:
-        """Whether these are weights of full colour, which is simulation only."""
-        return any(recipe is not None and recipe.colour for recipe in (self.vae_recipe, self.compressor_recipe))
 
 
 class LoadReport(NamedTuple):
@@ -152,10 +126,10 @@ def load_record(folder: Path) -> CheckpointRecord:
 
 
 def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    facts = record.model_dump(mode="json", exclude={"note"})
-    text = json.dumps({**facts, "note": SIMULATION_ONLY} if record.colour else facts, indent=2)
+    without = None if record.note else {"note"}  # older readers of depth know none
+    text = json.dumps(record.model_dump(mode="json", exclude=without), indent=2)
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         for name, module in parts.items():
             tensors = {key: _half(key, tensor) for key, tensor in module.state_dict().items()}
             save_file(tensors, folder / f"{name}.safetensors")

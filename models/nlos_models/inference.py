@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
 from nlos_models.errors import CheckpointError, ModelError
-from nlos_models.networks import SIMULATION_ONLY
 from nlos_models.pipeline import Pipeline
+from nlos_models.recipe import SIMULATION_ONLY
 
 Float32 = NDArray[np.float32]
 
@@ -73,14 +73,19 @@ def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
     Raises CheckpointError where the weights cannot be read, or are for colour.
     """
     pipeline, record = load_pipeline(folder)
+    refuse_colour(record, folder)
+    if torch.cuda.is_available():
+        return TorchReconstructor(pipeline, record, "cuda")
+    return OnnxReconstructor(exported(pipeline, cache), record)
+
+
+def refuse_colour(record: CheckpointRecord, folder: Path | None) -> None:
+    """Raise CheckpointError for weights of full colour: what runs here, and is exported, reconstructs depth."""
     if record.colour:
         raise CheckpointError(
             f"{folder} holds weights for full colour ({SIMULATION_ONLY}): name weights for depth; "
             "tools/colour_demo.py judges these"
         )
-    if torch.cuda.is_available():
-        return TorchReconstructor(pipeline, record, "cuda")
-    return OnnxReconstructor(exported(pipeline, cache), record)
 
 
 def exported(pipeline: Pipeline, cache: Path) -> Path:
@@ -92,7 +97,12 @@ def exported(pipeline: Pipeline, cache: Path) -> Path:
 
 
 def export_onnx(pipeline: Pipeline, path: Path) -> None:
-    """Write the whole pipeline, preprocessing included, as one ONNX file with a free batch size."""
+    """Write the whole pipeline, preprocessing included, as one ONNX file with a free batch size.
+
+    Raises ModelError for one of full colour.
+    """
+    if pipeline.intensities > 1:
+        raise ModelError(f"networks of full colour ({SIMULATION_ONLY}) are not exported: use them in torch")
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.stem}.{os.getpid()}.part.onnx")
     example = (torch.ones(2, *MAP_SHAPE), torch.ones(2, *MAP_SHAPE))
@@ -112,8 +122,11 @@ def export_onnx(pipeline: Pipeline, path: Path) -> None:
         )
     if program is None:
         raise ModelError("torch's exporter returned no ONNX program: install a torch between 2.6 and 2.13")
-    program.save(part, external_data=False)
-    part.replace(path)
+    try:
+        program.save(part, external_data=False)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _checksum(pipeline: Pipeline) -> str:

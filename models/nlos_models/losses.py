@@ -3,10 +3,20 @@
 import torch
 from torch import Tensor
 
+from nlos_models.recipe import ImageLoss
 
-def image_error(image: Tensor, truth: Tensor) -> Tensor:
-    """Squared error of images (n, channels, 64, 64): summed over pixels and channels, averaged over the batch."""
-    return (image.float() - truth.float()).square().sum((1, 2, 3)).mean()
+
+def image_error(image: Tensor, truth: Tensor, surface_weight: float = 1.0, kind: ImageLoss = "squared") -> Tensor:
+    """Error of images (n, channels, 64, 64): summed over pixels and channels, averaged over the batch.
+
+    What is surface with probability p at v is, by squared error, best answered with w p v / (1 - p + w p), where w is
+    `surface_weight`: at 1 doubt of the outline is told as distance, above it less so. By absolute error it is best
+    answered with v where w p > 1 - p and with 0 elsewhere: doubt stays doubt.
+    """
+    truth = truth.float()
+    off = image.float() - truth
+    error = off.square() if kind == "squared" else off.abs()
+    return torch.where(truth > 0, surface_weight * error, error).sum((1, 2, 3)).mean()
 
 
 def kl_divergence(mean: Tensor, log_variance: Tensor) -> Tensor:

@@ -8,6 +8,8 @@ Values = NDArray[np.float64]
 
 BACKGROUND_BELOW_V = 0.05
 CLOSE = 0.02
+LEAST_V = 0.1
+"""v of the farthest surface (z_far)."""
 
 
 def surface(image: Images) -> NDArray[np.bool_]:
@@ -33,8 +35,12 @@ def silhouette_iou(image: Images, truth: Images) -> Values:
 
 
 def foreground_rmse_mm(image: Images, truth: Images, mm_per_v: float) -> Values:
-    """RMSE of depth over pixels that are surface in both, (n,); NaN where they share none."""
+    """RMSE of depth over pixels that are surface in both, (n,); NaN where they share none.
+
+    Depth is what `live` shows: a v between background's and LEAST_V is at z_far.
+    """
     both = surface(image) & surface(truth)
-    squares = np.where(both, np.square(image.astype(np.float64) - truth), 0.0).sum((-2, -1))
+    apart = np.maximum(image.astype(np.float64), LEAST_V) - np.maximum(truth, LEAST_V)
+    squares = np.where(both, np.square(apart), 0.0).sum((-2, -1))
     count = both.sum((-2, -1))
     return np.where(count > 0, mm_per_v * np.sqrt(squares / np.maximum(count, 1)), np.nan)

@@ -11,8 +11,6 @@ from nlos_models.pipeline import Pipeline
 from nlos_models.res_vae import Decoder, ResVae
 
 CHANNELS = 3
-SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
-"""What all that is in colour says of itself."""
 
 
 def new_vae(*, colour: bool) -> ResVae:

@@ -16,6 +16,7 @@ class Pipeline(nn.Module):
 
     def __init__(self, compressor: nn.Module, decoder: Decoder, left_noise: float = 0.2, intensities: int = 1) -> None:
         super().__init__()
+        self.intensities = intensities
         self.preprocess = Preprocess(left_noise, intensities)
         self.compressor = compressor
         self.decoder = decoder

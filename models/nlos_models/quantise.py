@@ -38,12 +38,12 @@ def quantise(model: Path, path: Path, samples: Iterable[Sample] | None = None) -
             quantization.quantize_static(
                 plain, part, _reader(samples), op_types_to_quantize=list(QUANTISED), per_channel=True
             )
+        part.replace(path)
     except (RuntimeError, ValueError, OSError) as error:
-        part.unlink(missing_ok=True)
         raise ModelError(f"{model} cannot be made 8-bit: {error}; use it as it is") from error
     finally:
+        part.unlink(missing_ok=True)
         logging.getLogger().removeFilter(_no_advice)
-    part.replace(path)
 
 
 def _no_advice(record: logging.LogRecord) -> bool:

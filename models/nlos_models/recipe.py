@@ -9,6 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from nlos_models.errors import RecipeError
 
 MapKind = Literal["raw maps", "difference maps"]
+ImageLoss = Literal["squared", "absolute"]
+SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
+"""What all that is in colour says of itself."""
 
 
 class Recipe(BaseModel):
@@ -18,7 +21,7 @@ class Recipe(BaseModel):
 
     task: Literal["vae", "compressor", "transfer"]
     colour: bool = False
-    """RGB albedo in the place of depth; simulation only, since the L515's laser is infrared."""
+    """RGB albedo in the place of depth, in simulation only."""
     seed: int = Field(default=0, ge=0)
     objects: int = Field(gt=0)
     """Training objects: for a VAE by seeds 0, 1, ..., else the first of a dataset's; held-out ones are others."""
@@ -27,7 +30,8 @@ class Recipe(BaseModel):
     """At most; of a transfer, those of the classifier alone."""
     batch: int = Field(gt=1)
     """Over all processes."""
-    learning_rate: float = Field(gt=0)
+    learning_rate: float = Field(gt=1e-8)
+    """Above the rate at which a plateau's run ends (SI 3 and 4)."""
     betas: tuple[float, float] = (0.5, 0.999)
     schedule: Literal["one-cycle", "plateau"] = "plateau"
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
@@ -36,6 +40,10 @@ class Recipe(BaseModel):
     dropout: float = Field(default=0.5, ge=0, lt=1)
     latent_weight: float = Field(default=1.0, ge=0)
     image_weight: float = Field(default=0.0, ge=0)
+    surface_weight: float = Field(default=1.0, ge=1)
+    """How much a pixel of surface counts in an image's error beside one of background (`losses.image_error`)."""
+    image_loss: ImageLoss = "squared"
+    """What an image's error is the sum of: the mean of what could be there answers the one, its median the other."""
     augmentation: Literal["mirror", "turns"] = "mirror"
     """About y = 0, the one symmetry that the rig has; or, for a VAE alone, by quarters of a turn too (SI 3)."""
     left_out: list[str] = Field(default_factory=list[str])
@@ -51,9 +59,10 @@ class Recipe(BaseModel):
     maps: MapKind = "raw maps"
     """What the compressor eats; difference maps are the maps less the bare wall's."""
     all_layers_epochs: int = Field(default=4, ge=0)
-    """Of a transfer: its first phase (SI 4: 3 to 5)."""
-    statistics: Literal["kept", "own"] = "kept"
-    """Of a transfer: maps are normalised as the synthetic ones were, or by the recordings' own mean and spread."""
+    """Of a transfer: its first phase (SI 4: 3 to 5); `keep` says which of its epochs the second one sets out from."""
+    statistics: Literal["kept", "own", "own intensity"] = "kept"
+    """Of a transfer: maps are normalised as the synthetic ones were, or (their intensity alone) by the recordings' own
+    mean and spread."""
     deviations: list[str] = Field(default_factory=list[str])
     """Where this recipe leaves the supporting information, and why."""
 

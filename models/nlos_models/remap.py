@@ -38,11 +38,11 @@ class Remapping:
     source: MapSource
     held_out: MapSet
 
-    def learn_statistics(self) -> None:
-        """Normalise maps by those of the source."""
+    def learn_statistics(self, channels: slice = slice(None)) -> None:
+        """Normalise maps, or some of the channels that they are split into, by those of the source."""
         mean, spread = statistics_of(self.source)
-        self.pipeline.preprocess.mean.copy_(mean)
-        self.pipeline.preprocess.spread.copy_(spread)
+        self.pipeline.preprocess.mean[channels] = mean[channels]
+        self.pipeline.preprocess.spread[channels] = spread[channels]
 
     def fit(
         self, recipe: Recipe, frozen: Iterable[nn.Module], folder: Path, on_step: OnStep, running: Running
@@ -69,7 +69,8 @@ class Remapping:
                 aim = torch.where(batch.mirrored[:, None, None], mirrored, straight)
                 value = value + recipe.latent_weight * latent_error(latent, *aim.unbind(1))
             if recipe.image_weight:
-                value = value + recipe.image_weight * image_error(decoded(latent), batch.image)
+                error = image_error(decoded(latent), batch.image, recipe.surface_weight, recipe.image_loss)
+                value = value + recipe.image_weight * error
             return value
 
         return fit(

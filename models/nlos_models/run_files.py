@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from nlos_models.errors import CheckpointError, TrainingError
 
@@ -65,6 +66,16 @@ def read_best(folder: Path) -> State:
     if state is None:
         raise CheckpointError(f"{folder / BEST} is missing or damaged: train again into another --out")
     return state
+
+
+def digest_of(*parts: nn.Module | str | None) -> str:
+    """A word for networks, down to their last bit, and whatever else a run sets out from."""
+    digest = hashlib.sha256()
+    for part in parts:
+        tensors = part.state_dict() if isinstance(part, nn.Module) else {str(part): torch.zeros(0)}
+        for name, tensor in tensors.items():
+            digest.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _packed(state: State) -> bytes:

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from nlos_models.metrics import LEAST_V
+
 WINDOW = 13
 """Pixels; about 5 cm in the paper's box."""
 LIFT_WINDOW = 7
 """Pixels; about as wide as silhouettes are blurred."""
 KEPT_SHARE = 0.4
-LEAST_V = 0.1
-"""v of the farthest surface (z_far)."""
 
 
 def cut_silhouette(image: Tensor) -> Tensor:

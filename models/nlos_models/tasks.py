@@ -42,7 +42,8 @@ def train_vae(
             image = turn_some(image, torch.randint(4, (len(image),), device=image.device))
         image = image.contiguous(memory_format=torch.channels_last)
         rebuilt, mean, log_variance = quick(image, torch.randn(len(image), vae.latent, device=image.device))
-        return image_error(rebuilt, image) + recipe.kl_weight * kl_divergence(mean, log_variance)
+        error = image_error(rebuilt, image, recipe.surface_weight, recipe.image_loss)
+        return error + recipe.kl_weight * kl_divergence(mean, log_variance)
 
     figures = fit(
         vae,

@@ -11,28 +11,27 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
+from nlos_models.compiled import Network, compiled, compiling
 from nlos_models.errors import RecipeError, TrainingError
 from nlos_models.processes import open_fabric, seed_of, share_of
 from nlos_models.recipe import Recipe
 from nlos_models.run_files import Tell, read_best, read_last, write_best, write_last, write_log
+from nlos_models.schedule import has_ended, schedule_of
 from nlos_models.tensorboard import Board
 
 Batches = Callable[[torch.Generator], Iterable[Any]]
 """One epoch of batches, shuffled by the generator."""
 Loss = Callable[[Any], Tensor]
-Network = TypeVar("Network", bound=Callable[..., Any])
 Score = Callable[[], dict[str, float]]
 OnStep = Callable[[int, int], None]
 """Called with the steps done and the steps in all."""
 
-PLATEAU_FACTOR, PLATEAU_PATIENCE, SMALLEST_RATE = 0.3, 5, 1e-8
-"""SI 3 and 4: the learning rate falls by this factor after this many epochs without progress, and ends the run."""
 STEPS_BETWEEN_WORDS = 10
 """After how many steps several processes agree on whether to stop."""
 
@@ -56,7 +55,9 @@ class Running:
     """How often a state is saved within an epoch."""
     tensorboard: bool = False
     compiled: bool = False
-    """Whether networks run through torch.compile, which asks for a C++ compiler; sums then differ by rounding."""
+    """Whether networks run through torch.compile, which asks for a C++ compiler."""
+    origin: str = ""
+    """What the run sets out from, in a word (`run_files.digest_of`); that of another origin is not gone on with."""
     clock: Callable[[], float] = time.monotonic
 
     def on(self, recipe: Recipe) -> Fabric:
@@ -65,7 +66,7 @@ class Running:
 
     def quick(self, network: Network) -> Network:
         """The network, or part of one, as a step runs it."""
-        return cast("Network", torch.compile(network)) if self.compiled else network
+        return compiled(network) if self.compiled else network
 
 
 class _Step(nn.Module):
@@ -124,7 +125,7 @@ class _Run:
         free = [p for p in module.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(free, recipe.learning_rate, recipe.betas)
         self._forward, self._optimizer = self.fabric.setup(_Step(module, loss), self.optimizer)
-        self.schedule = _schedule(recipe, self.optimizer, recipe.epochs * steps)
+        self.schedule = schedule_of(recipe, self.optimizer, recipe.epochs * steps)
         self.epoch, self.step, self.rows = 0, 0, list[dict[str, float]]()
         self.total = torch.zeros((), device=self.fabric.device)
         if self.leads:
@@ -135,7 +136,7 @@ class _Run:
     @property
     def goes_on(self) -> bool:
         """Whether there is an epoch left to train."""
-        return self.epoch < self.recipe.epochs and self._rate >= SMALLEST_RATE
+        return self.epoch < self.recipe.epochs and not has_ended(self.recipe, self._rate)
 
     @property
     def _rate(self) -> float:
@@ -155,9 +156,10 @@ class _Run:
     def _advance(self, batch: Any) -> None:
         rank, world = self.fabric.global_rank, self.fabric.world_size
         torch.manual_seed(seed_of(self.recipe.seed, self.epoch, self.step, rank))
-        value = self._forward(self.fabric.to_device(share_of(batch, rank, world)))
-        self._optimizer.zero_grad(set_to_none=True)
-        self.fabric.backward(value)
+        with compiling():
+            value = self._forward(self.fabric.to_device(share_of(batch, rank, world)))
+            self._optimizer.zero_grad(set_to_none=True)
+            self.fabric.backward(value)
         self._optimizer.step()
         if self.recipe.schedule == "one-cycle":
             self.schedule.step()
@@ -193,6 +195,10 @@ class _Run:
             raise TrainingError(f"the loss is {loss} in epoch {self.epoch}: choose a smaller learning_rate")
         self.module.eval()
         figures: dict[str, float] = self.fabric.broadcast(score() if self.leads else {})
+        if not math.isfinite(figures["held_out_loss"]):
+            raise TrainingError(
+                f"the held-out loss is not a number in epoch {self.epoch}: choose a smaller learning_rate"
+            )
         row = {"epoch": self.epoch, "rate": self._rate, "loss": loss, **figures}
         best = all(figures["held_out_loss"] < earlier["held_out_loss"] for earlier in self.rows)
         self.rows.append({**row, "seconds": self.running.clock() - self.started_s})
@@ -224,29 +230,20 @@ class _Run:
     def _save(self) -> None:
         parts = {name: getattr(self, name).state_dict() for name in ("module", "optimizer", "schedule")}
         facts = {"epoch": self.epoch, "step": self.step, "total": self.total, "rows": self.rows}
-        write_last(self.folder, {**parts, **facts, "recipe": self.recipe.model_dump_json()})
+        made_of = {"recipe": self.recipe.model_dump_json(), "origin": self.running.origin}
+        write_last(self.folder, {**parts, **facts, **made_of})
         self._saved_s = self.running.clock()
 
     def _resume(self) -> None:
-        """Take the last state up, if there is one. Raises RecipeError where another recipe made it."""
+        """Take the last state up, if there is one. Raises RecipeError where another recipe or origin made it."""
         state = read_last(self.folder, self.running.tell)
         if state is None:
             return
-        if state["recipe"] != self.recipe.model_dump_json():
+        if Recipe.model_validate_json(state["recipe"]) != self.recipe:
             raise RecipeError(f"{self.folder} holds a run of another recipe: choose another --out")
+        if state.get("origin", self.running.origin) != self.running.origin:  # an older run does not tell
+            raise RecipeError(f"{self.folder} holds a run from other weights or of another rig: choose another --out")
         for name in ("module", "optimizer", "schedule"):
             getattr(self, name).load_state_dict(state[name])
         self.epoch, self.step, self.rows = state["epoch"], state["step"], state["rows"]
         self.total = state["total"].to(self.fabric.device)
-
-
-def _schedule(recipe: Recipe, optimizer: torch.optim.Optimizer, steps: int) -> Any:
-    if recipe.schedule == "one-cycle":
-        return torch.optim.lr_scheduler.OneCycleLR(
-            optimizer,
-            recipe.learning_rate,
-            total_steps=steps,
-            pct_start=0.15,
-            cycle_momentum=False,
-        )
-    return torch.optim.lr_scheduler.ReduceLROnPlateau(optimizer, factor=PLATEAU_FACTOR, patience=PLATEAU_PATIENCE)

@@ -14,6 +14,8 @@ from nlos_models.train import OnStep, Running
 
 ALL_LAYERS, CLASSIFIER = "all-layers", "classifier"
 """Each phase's folder in the run's."""
+CHANNELS = {"own": slice(None), "own intensity": slice(2, None)}
+"""Which channels take the recordings' statistics; depth is in metres on every bench, intensity in a device's counts."""
 
 
 def train_transfer(
@@ -35,13 +37,13 @@ def train_transfer(
     running = running or Running()
     set_for_training(pipeline, recipe)
     remapping = Remapping(pipeline, encoder, maps, held_out)
-    if recipe.statistics == "own":
-        remapping.learn_statistics()
+    if recipe.statistics != "kept":
+        remapping.learn_statistics(CHANNELS[recipe.statistics])
     steps = len(maps.image) // recipe.batch
     before = recipe.all_layers_epochs * steps
     total = before + recipe.epochs * steps
     if recipe.all_layers_epochs:
-        first = recipe.model_copy(update={"epochs": recipe.all_layers_epochs, "keep": "last"})
+        first = recipe.model_copy(update={"epochs": recipe.all_layers_epochs})
         remapping.fit(first, [pipeline.decoder], folder / ALL_LAYERS, lambda done, _: on_step(done, total), running)
     frozen = [pipeline.decoder, pipeline.compressor.get_submodule("features")]
     figures = remapping.fit(recipe, frozen, folder / CLASSIFIER, lambda done, _: on_step(before + done, total), running)

@@ -1,18 +1,18 @@
 """`dataset build|label`: objects and renderer, or labelled recordings, to training maps."""
 
 import os
-import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from nlos_calibration.wall_record import rig_named
-from nlos_models.networks import SIMULATION_ONLY
+from nlos_models.recipe import SIMULATION_ONLY
 from rich.progress import ProgressColumn, Task
 from rich.text import Text
 
 from nlos_cam import dataset
-from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say
+from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say, tracked
+from nlos_cam.cli.dataset_command import command_of
 from nlos_cam.cli.dataset_label import add_label
 from nlos_cam.objects.textures import TEXTURES
 from nlos_cam.render.accuracy import accuracy_named
@@ -90,7 +90,7 @@ def build(
     others = {"accuracy": accuracy_named(accuracy).name, "objects": kinds, "spread": spread}
     others |= {"textures": tuple(TEXTURES) if colour else ()}
     plan = _plan(rig, scene, seed, others)
-    built = _watched(plan, count, out, workers, ray, _command(context))
+    built = _watched(plan, count, out, workers, ray, command_of(context, "build"))
     rate = built.made / built.seconds if built.made else None
     facts = {"objects": built.objects, "made": built.made, "damaged": [str(path) for path in built.damaged]}
     result = {**facts, "seconds": built.seconds, "objects_per_s": rate, "out": str(out)}
@@ -104,7 +104,8 @@ def _objects(objects: str, without: str, backgrounds: float) -> dataset.Objects:
         return dataset.Objects.without([name.strip() for name in without.split(",") if name.strip()], backgrounds)
     if without or backgrounds:
         raise typer.BadParameter("--without and --backgrounds are for procedural objects: leave them out")
-    return dataset.objects_of(Path(objects))
+    with tracked("reading meshes") as on_progress:
+        return dataset.objects_of(Path(objects), on_progress)
 
 
 def _plan(rig: str | None, scene: Path | None, seed: int, others: dict[str, Any]) -> dataset.DatasetPlan:
@@ -113,15 +114,6 @@ def _plan(rig: str | None, scene: Path | None, seed: int, others: dict[str, Any]
     if rig is not None:
         raise typer.BadParameter(f"{scene} has a rig of its own: leave out --rig")
     return dataset.DatasetPlan.of_scene(load_scene(scene), seed, **others)
-
-
-def _command(context: typer.Context) -> str:
-    """The command as it could be given again, every option with its value."""
-    given = {name: value for name, value in context.params.items() if value is not None and name != "json"}
-    flags = [f"--{name}" for name, value in given.items() if value is True]
-    pairs = {name: value for name, value in given.items() if not isinstance(value, bool)}
-    options = [part for name, value in pairs.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    return shlex.join(["nlos-cam", "dataset", "build", *options, *flags])
 
 
 class Rate(ProgressColumn):

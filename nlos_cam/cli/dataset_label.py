@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, tracked
+from nlos_cam.cli.dataset_command import command_of
 from nlos_cam.labelled import FRAMES_EACH, read_labelled, recordings_in
 from nlos_cam.labelled_shards import write_shards
 
@@ -23,6 +24,7 @@ def add_label(data: typer.Typer) -> None:
 
 
 def label(
+    context: typer.Context,
     recordings: Recordings,
     out: Annotated[Path, typer.Option("--out", help="The dataset's folder.")],
     wall: Wall = None,
@@ -39,7 +41,7 @@ def label(
     found = recordings_in(recordings)
     with tracked("reading recordings") as on_progress:
         labelled = read_labelled(found, wall=wall, frames=frames, on_progress=on_progress)
-    write_shards(labelled, folder, f"nlos-cam dataset label {recordings} --out {out} --frames {frames}")
+    write_shards(labelled, folder, command_of(context, "label"))
     labels = sorted(set(labelled.label))
     rig = {"rig_name": labelled.rig.name, "rig_checksum": labelled.rig.checksum}
     result = {"out": str(folder), "samples": len(labelled.label), "recordings": len(found), "labels": labels, **rig}

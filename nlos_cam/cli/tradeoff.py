@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 from nlos_calibration.wall_record import rig_named
 from nlos_models.checkpoint import load_record, shipped_folder
+from nlos_models.inference import refuse_colour
 
 from nlos_cam import tradeoff_reconstruct as reconstruction
 from nlos_cam import tradeoff_reconstruct_report as reconstruction_report
@@ -18,6 +19,7 @@ from nlos_cam.cli.hidden_object import hidden_depth
 from nlos_cam.dataset import TEST_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate_objects import seeded_objects
+from nlos_cam.folders import renamed_when_whole
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.test_set import test_set
 from nlos_cam.render.scene import Scene
@@ -89,8 +91,9 @@ def reconstruct(
     interrupted = _collect(reconstruction.measure(asked, makes, bench), rows, len(asked))
     table = reconstruction_report.facts(rows, len(asked), len(bench.truth), machine())
     if rows:
-        _write_files(folder, table, reconstruction_report.as_markdown(table))
-        reconstruction_report.draw(folder / "tradeoff.png", rows)
+        with renamed_when_whole(folder) as part:
+            _write_files(part, table, reconstruction_report.as_markdown(table))
+            reconstruction_report.draw(part / "tradeoff.png", rows)
     text = f"{len(rows)} of {len(asked)} settings measured: {folder}" if rows else "nothing was measured"
     finish({**table, "out": str(folder) if rows else None}, as_json=json, text=text)
     if interrupted:
@@ -98,8 +101,13 @@ def reconstruct(
 
 
 def _bench(folders: dict[str, Path | None], count: int | None) -> reconstruction.Bench:
-    """The objects on the rig of all these weights. Raises SceneError where they are for different rigs."""
+    """The objects on the rig of all these weights.
+
+    Raises SceneError where they are for different rigs, CheckpointError where some are of full colour.
+    """
     records = {name: load_record(path or shipped_folder()) for name, path in folders.items()}
+    for name, record in records.items():
+        refuse_colour(record, folders[name])
     rigs = {record.rig_name for record in records.values()}
     if len(rigs) > 1:
         raise SceneError(f"these weights are for different rigs ({', '.join(sorted(rigs))}): compare those of one rig")
@@ -140,13 +148,12 @@ def _collect(measured: Iterator[R], rows: list[R], planned: int) -> bool:
 
 
 def _write_files(folder: Path, table: dict[str, Any], text: str) -> None:
-    folder.mkdir(exist_ok=True)
     (folder / "tradeoff.json").write_text(dumps(table, indent=2) + "\n", encoding="utf-8")
     (folder / "tradeoff.md").write_text(text, encoding="utf-8")
 
 
 def _write(folder: Path, table: dict[str, Any], rows: list[Row], name: str) -> None:
-    _write_files(folder, table, as_markdown(table))
-    draw(
-        folder / "tradeoff.png", rows, f"{name}: {table['patches']} patches, {table['beams_on_wall']} beams on the wall"
-    )
+    title = f"{name}: {table['patches']} patches, {table['beams_on_wall']} beams on the wall"
+    with renamed_when_whole(folder) as part:
+        _write_files(part, table, as_markdown(table))
+        draw(part / "tradeoff.png", rows, title)

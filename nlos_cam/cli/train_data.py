@@ -10,7 +10,7 @@ import torch
 from nlos_calibration.bare_wall import Moments
 from nlos_calibration.measured_wall import load_measured
 from nlos_models.data import Half, MapBatch, MapSet
-from nlos_models.recipe import Recipe, load_recipe
+from nlos_models.recipe import Recipe
 from nlos_models.sources import InMemory, MapSource, first_of, less_bare_wall
 
 from nlos_cam import dataset
@@ -34,22 +34,9 @@ class TrainingMaps(NamedTuple):
     held_out: MapSet
     plan: dataset.DatasetPlan
 
-
-class RecipeChoice(NamedTuple):
-    """A recipe's file, and how much of it is run."""
-
-    path: Path
-    budget: float = 1.0
-    objects: int | None = None
-
-    def read(self, task: str) -> Recipe:
-        """The recipe. Raises SceneError where it is another task's."""
-        recipe = load_recipe(self.path)
-        if recipe.task != task:
-            raise SceneError(f"{self.path} is a recipe for {recipe.task!r}, not {task!r}: choose another --recipe")
-        if self.objects is not None:
-            recipe = recipe.of_objects(self.objects)
-        return recipe.scaled(self.budget)
+    def told(self, recipe: Recipe) -> Recipe:
+        """The recipe with as many objects to judge by as there are, which may be fewer than it asks for."""
+        return recipe.model_copy(update={"held_out": len(self.held_out.image)})
 
 
 @dataclass(frozen=True)
@@ -92,10 +79,14 @@ def _less(batch: MapBatch, bare: BareMaps) -> MapBatch:
 def read_maps(
     recipe: Recipe, data: Path, held_out_data: Path, wall: Path | None, *, stream: bool = False
 ) -> TrainingMaps:
-    """The maps that a recipe asks for. Raises SceneError where they are too few, or of two rigs.
+    """The maps that a recipe asks for. Raises SceneError where they are too few, of two rigs, or one and the same.
 
     A stream is of a whole dataset, of which no more than some shards are in memory at a time.
     """
+    if wall and recipe.maps == "raw maps":
+        raise SceneError(f"raw maps have nothing taken off, so that {wall} would do nothing: leave --wall out")
+    if data.resolve() == held_out_data.resolve():
+        raise SceneError(f"{data} is to learn from and to be judged by: give --held-out a dataset of other objects")
     training, judging = (dataset.open_dataset(of, colour=recipe.colour) for of in (data, held_out_data))
     plan, count = training.plan, len(training)
     if count < recipe.objects:

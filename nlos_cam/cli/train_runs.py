@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lightning_fabric import Fabric
-from nlos_models.checkpoint import CheckpointRecord, save_pipeline, save_vae
+from nlos_calibration.rig import Rig
+from nlos_models.checkpoint import RECORD, load_record, save_pipeline, save_vae
 from nlos_models.data import Half, MapSet
-from nlos_models.networks import SIMULATION_ONLY
 from nlos_models.pipeline import Pipeline
-from nlos_models.recipe import Recipe
+from nlos_models.recipe import SIMULATION_ONLY, Recipe
+from nlos_models.record import CheckpointRecord
 from nlos_models.remap import figures_of, run
 from nlos_models.res_vae import Encoder, ResVae
 from nlos_models.sources import MapSource
@@ -19,6 +20,8 @@ from nlos_models.train import OnStep, Running
 from nlos_models.transfer import train_transfer
 
 from nlos_cam.cli.common import progress, say, stop_on_signals
+from nlos_cam.cli.train_options import RunOptions
+from nlos_cam.errors import OutputExistsError
 
 Figures = dict[str, float]
 
@@ -33,10 +36,24 @@ class Job:
     """Of the weights to be, but for their figures."""
     tensorboard: bool = False
     compiled: bool = False
+    origin: str = ""
+    """See `Running`."""
 
     def made(self, figures: Figures) -> CheckpointRecord:
         """The record with the figures in."""
         return self.record.model_copy(update={"figures": figures})
+
+
+def job_of(run: RunOptions, recipe: Recipe, rig: Rig, before: list[Recipe], origin: str, *starts: Path | None) -> Job:
+    """The job of a recipe after earlier runs. Raises OutputExistsError where it would write over other weights."""
+    if run.out.exists() and not run.out.is_dir():
+        raise OutputExistsError(f"{run.out} is a file, not a run's folder: choose another --out")
+    if run.out.resolve() in {start.resolve() for start in starts if start}:
+        raise OutputExistsError(f"{run.out} is where this run starts from: choose another --out")
+    record = CheckpointRecord.of([*before, recipe], (rig.name, rig.checksum), recipe.maps)
+    if (run.out / RECORD).exists() and load_record(run.out).model_copy(update={"figures": {}}) != record:
+        raise OutputExistsError(f"{run.out} holds weights that another run made: choose another --out")
+    return Job(recipe, run.out, record, run.tensorboard, run.compiled, origin)
 
 
 def run_vae(fabric: Fabric, job: Job, start: ResVae | None, images: Half, held_out: Half) -> Figures:
@@ -84,4 +101,5 @@ def _watched(fabric: Fabric, job: Job, what: str) -> Generator[tuple[OnStep, Run
             told = f"epoch {row['epoch'] + 1:.0f} done, loss {row['loss']:.4g}, held out {row['held_out_loss']:.4g}"
             bar.update(task, description=f"training the {what}: {told}")
 
-        yield on_step, Running(fabric, stop.is_set, say, on_epoch, tensorboard=job.tensorboard, compiled=job.compiled)
+        options = {name: getattr(job, name) for name in ("tensorboard", "compiled", "origin")}
+        yield on_step, Running(fabric, stop.is_set, say, on_epoch, **options)

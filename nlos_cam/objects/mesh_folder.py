@@ -2,15 +2,20 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import OBJECT_PIXELS, Float32
-from nlos_cam.objects.files import MESH_SUFFIXES, MeshFile, Up, read_mesh, upright
-from nlos_cam.objects.hidden import nothing_to_see, place, random_pose
+from nlos_cam.objects.files import MESH_SUFFIXES, MeshFile, Up, upright
+from nlos_cam.objects.hidden import place, random_pose
 from nlos_cam.objects.raster import orthographic_depth
+
+POSES = 20
+"""Poses that a mesh is tried at before it counts as one that shows nothing: a sheet may be seen edge on."""
+Mesh = TypeVar("Mesh")
 
 
 def folder_objects(folder: Path) -> list[Path]:
@@ -32,21 +37,26 @@ def folder_objects(folder: Path) -> list[Path]:
 
 def mesh_depth(
     seed: int,
-    meshes: Sequence[Path],
+    meshes: Sequence[Mesh],
     box: ObjectBox,
     up: Up = "y",
     *,
-    read: Callable[[Path], MeshFile] = read_mesh,
-) -> tuple[Path, Float32]:
+    read: Callable[[Mesh], MeshFile],
+) -> tuple[Mesh, Float32]:
     """One of the meshes and its depth map (64, 64) in metres, NaN background; the seed picks it and its pose.
 
-    It is placed as procedural objects are, whatever the unit of its file. `read` may keep what it has read. Raises
-    SceneError, which names the file, for one that cannot be read or shows no surface.
+    It is placed as procedural objects are, whatever the unit of its file; where a pose shows no surface, at the next.
+    Only the mesh that is picked is read. Raises SceneError, which names the file, for one that shows none at all.
     """
     generator = np.random.default_rng([seed, OBJECT_PIXELS])
-    path = meshes[int(generator.integers(len(meshes)))]
-    triangles = upright(read(path).triangles, up)
-    depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
-    if np.isnan(depth_m).all():
-        raise nothing_to_see(str(path), box)
-    return path, depth_m
+    picked = meshes[int(generator.integers(len(meshes)))]
+    mesh = read(picked)
+    triangles = upright(mesh.triangles, up)
+    for _ in range(POSES):
+        depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
+        if not np.isnan(depth_m).all():
+            return picked, depth_m
+    raise SceneError(
+        f"{mesh.path} shows no surface from any of {POSES} poses: it is thinner than a cell of the depth map; take it "
+        "out of the folder, or make it thicker"
+    )

@@ -1,13 +1,16 @@
 """Images of plates, maps that show them as no lidar would, and networks that learn from them in a moment."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from nlos_models import networks
+from nlos_models import checkpoint, networks
 from nlos_models.data import Half, MapBatch, MapSet, map_batches
+from nlos_models.pipeline import Pipeline
+from nlos_models.recipe import Recipe
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -113,3 +116,17 @@ def use_small_networks(patch: pytest.MonkeyPatch, *modules: object) -> None:
     for module in (networks, *modules):
         for name, small in small_ones.items():
             patch.setattr(module, name, small, raising=False)
+
+
+def untrained_weights(folder: Path, *, rig: Any, seed: int = 0, **recipe: Any) -> None:
+    """Write weights of small networks (see `use_small_networks`) that were trained on nothing, by a recipe."""
+    facts = {"objects": 10, "held_out": 2, "epochs": 1, "batch": 2, "learning_rate": 1e-3, "image_weight": 1.0}
+    facts |= {"latent_weight": 0.0} if recipe.get("steps") == "one" else {}
+    made = Recipe.model_validate({"task": "compressor", **facts, **recipe})
+    record = checkpoint.CheckpointRecord(
+        rig_name=rig.name, rig_checksum=rig.checksum, input=made.maps, compressor_recipe=made
+    )
+    torch.manual_seed(seed)
+    pipeline = Pipeline(SmallCompressor(), SmallDecoder())  # type: ignore[arg-type]
+    encoder = None if made.steps == "one" else SmallEncoder()
+    checkpoint.save_pipeline(folder, pipeline, record, encoder)  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
-from nlos_models.networks import SIMULATION_ONLY
+from nlos_models.recipe import SIMULATION_ONLY
 from rich.progress import Progress
 
 from nlos_cam import dataset
@@ -86,8 +86,9 @@ def test_a_shard_has_the_command_that_makes_it(tmp_path: Path) -> None:
     shard = dataset.open_dataset(tmp_path / "a b").shards[0]
     with h5py.File(shard.path) as file:
         command = str(file.attrs["command"])
-    assert command.startswith(f"nlos-cam dataset build --out '{tmp_path}/a b' --count 4 --without hat --workers 1")
-    assert "json" not in command
+    assert command.startswith(f"nlos-cam dataset build --out '{tmp_path}/a b' --count 4 --seed 0 ")
+    assert " --without hat " in command
+    assert command.endswith(" --workers 1")
 
 
 def test_a_scene_gives_rig_and_sensor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

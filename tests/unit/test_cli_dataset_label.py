@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import typer
@@ -54,6 +55,13 @@ def test_it_makes_a_dataset_of_single_frames_and_says_so(run: Run, recordings: P
     assert (told["rig_name"], told["rig_checksum"]) == (plan.rig.name, plan.rig.checksum)
     assert [len(np.unique(image)) for image in maps.image] == [1] * 6
     assert maps.image[0, 0, 0] > maps.image[5, 0, 0]
+
+
+def test_its_shards_have_the_command_that_makes_them(run: Run, recordings: Path, tmp_path: Path) -> None:
+    run(recordings, "--out", out := tmp_path / "my data", "--frames", 1)
+    with h5py.File(dataset.open_dataset(out).shards[0].path) as file:
+        command = str(file.attrs["command"])
+    assert command == f"nlos-cam dataset label {recordings} --out '{out}' --frames 1"
 
 
 def test_it_replaces_nothing_unless_asked(run: Run, recordings: Path, tmp_path: Path) -> None:

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
+from nlos_models.data import MapSet
+from small_maps import SmallDataset
 
 from nlos_cam import dataset, evaluate_baselines
-from nlos_cam.cli import evaluate
+from nlos_cam.cli import evaluate, evaluate_maps
 from nlos_cam.cli.main import main
 from nlos_cam.dataset import DatasetPlan
 from nlos_cam.objects.test_set import test_set
@@ -20,24 +22,40 @@ METRICS = {"silhouette_iou", "accuracy_mean_abs", "accuracy_within_2_percent", "
 
 
 class Guesser:
-    """A network that answers everything with the same plate."""
+    """A network that answers everything with the same plate, and keeps the depth that it was shown."""
 
     runtime = "none"
 
     def __init__(self, eats: str = "raw maps") -> None:
-        self.record = SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input=eats)
+        recipe = SimpleNamespace(left_out=["cup"])
+        self.record = SimpleNamespace(
+            rig_name=RIG.name, rig_checksum=RIG.checksum, input=eats, vae_recipe=recipe, compressor_recipe=None
+        )
+        self.seen: list[np.ndarray] = []
 
     def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
         assert depth_m.shape == intensity.shape == (1, 64, 80)
+        self.seen.append(depth_m)
         image = np.zeros((1, 64, 64), np.float32)
         image[:, 16:48, 16:48] = 0.6
         return image
 
 
-def _maps(plan: DatasetPlan, count: int) -> dataset.MapSet:
+def _maps(plan: DatasetPlan, count: int) -> MapSet:
     images = dataset.procedural_images(plan.first_seed, count, plan.box)
     wide = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8)))
-    return dataset.MapSet(wide + 0.3, 40 * wide, images)
+    return MapSet(wide + 0.3, 40 * wide, images)
+
+
+class Stored(SmallDataset):
+    """Stands for a dataset on the disk, of two cups and a hat."""
+
+    def __init__(self, plan: DatasetPlan, count: int) -> None:
+        super().__init__(_maps(plan, count), plan)
+        self.folder = Path("stored")
+
+    def column(self, name: str) -> Any:
+        return {"category": np.array(["cup", "hat", "cup"], object), "seed": np.arange(3)}[name]
 
 
 @pytest.fixture(autouse=True)
@@ -45,9 +63,9 @@ def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
     """A guesser for the weights, a few training objects that are not rendered; the plans asked for are kept."""
     asked: list[DatasetPlan] = []
 
-    def training_maps(plan: DatasetPlan, *_: object) -> dataset.MapSet:
+    def training_maps(plan: DatasetPlan, *_: object) -> Stored:
         asked.append(plan)
-        return _maps(DatasetPlan(plan.rig, dataset.TRAINING_SEED), 4)
+        return Stored(DatasetPlan(plan.rig, dataset.TRAINING_SEED), 4)
 
     monkeypatch.setattr(evaluate_baselines, "training_maps", training_maps)
     monkeypatch.setattr(evaluate_baselines, "NEIGHBOURS", 4)
@@ -58,11 +76,7 @@ def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
 @pytest.fixture
 def stored(monkeypatch: pytest.MonkeyPatch) -> str:
     """The name of a dataset."""
-    plan = DatasetPlan(RIG, dataset.HELD_OUT_SEED)
-    columns = {"category": np.array(["cup", "hat", "cup"], object), "seed": np.arange(3)}
-    kept = SimpleNamespace(plan=plan, arrays=lambda: _maps(plan, 3), column=columns.__getitem__)
-    monkeypatch.setattr(dataset, "open_dataset", lambda _: kept)
-    monkeypatch.setattr(dataset, "read", lambda _: (_maps(plan, 3), plan))
+    monkeypatch.setattr(dataset, "open_dataset", lambda _: Stored(DatasetPlan(RIG, dataset.HELD_OUT_SEED), 3))
     return "held-out"
 
 
@@ -82,6 +96,9 @@ def test_a_dataset_is_judged_beside_the_baselines_and_kept(
     assert set(result["baselines"]) == {"all_background", "mean_object", "nearest_neighbour"}
     assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1  # it is the set itself
     assert set(result["per_category"]) == {"cup", "hat"}
+    assert set(result["shown_and_left_out"]) == {"shown", "left out"}
+    assert result["training_objects"] == 3
+    assert result["notes"] == ["the weights' VAE was never shown cup"]
     written = json.loads((out / "figures.json").read_text(encoding="utf-8"))
     assert written == {name: value for name, value in result.items() if name != "out"}
     assert (out / "sheet.png").read_bytes().startswith(b"\x89PNG")
@@ -93,7 +110,7 @@ def test_a_dataset_is_judged_beside_the_baselines_and_kept(
 def test_without_a_dataset_the_test_set_is_judged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, guessing: list[DatasetPlan]
 ) -> None:
-    monkeypatch.setattr(evaluate, "test_set", lambda box: test_set(box)[:2])
+    monkeypatch.setattr(evaluate_maps, "test_set", lambda box: test_set(box)[:2])
     assert main(["evaluate", "--out", str(tmp_path / "figures"), "--json"]) == 0
     result = _last(capsys)
     assert result["objects"] == 2
@@ -114,18 +131,41 @@ def test_seeded_objects_are_judged_without_the_nearest(
     assert not guessing
 
 
-@pytest.mark.parametrize("more", [["--count", "3"], ["--rig", "paper-rig"]])
-def test_a_dataset_brings_its_own_objects_and_rig(tmp_path: Path, stored: str, more: list[str]) -> None:
-    assert main(["evaluate", "--out", str(tmp_path / "figures"), "--dataset", stored, *more]) == 2
+@pytest.mark.parametrize(
+    "more",
+    [
+        ["--dataset", "held-out", "--count", "3"],
+        ["--dataset", "held-out", "--rig", "paper-rig"],
+        ["--training", "held-out", "--no-nearest"],
+    ],
+)
+def test_options_that_contradict_each_other_are_wrong_usage(tmp_path: Path, stored: str, more: list[str]) -> None:
+    assert stored in more
+    assert main(["evaluate", "--out", str(tmp_path / "figures"), *more]) == 2
     assert not list(tmp_path.iterdir())
 
 
-def test_weights_of_another_input_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_weights_that_eat_difference_maps_are_given_them_and_the_baselines_the_raw_ones(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, stored: str
 ) -> None:
-    monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: Guesser("difference maps"))
-    assert main(["evaluate", "--out", str(tmp_path / "figures"), "--json"]) == 1
-    assert "difference maps" in _last(capsys)["error"]["message"]
+    network = Guesser("difference maps")
+    monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: network)
+    bare = np.full((64, 80), 0.25, np.float32), np.zeros((64, 80), np.float32)
+    monkeypatch.setattr(evaluate_maps, "render_bare_wall", lambda _: bare)
+    arguments = ["evaluate", "--dataset", stored, "--training", stored, "--out", str(tmp_path / "figures"), "--json"]
+    assert main(arguments) == 0
+    result, raw = _last(capsys), _maps(DatasetPlan(RIG, dataset.HELD_OUT_SEED), 3)
+    np.testing.assert_allclose(np.concatenate(network.seen), raw.depth_m - 0.25, atol=1e-6)
+    assert result["input"] == "difference maps"
+    assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1
+
+
+def test_a_wall_is_refused_by_weights_that_eat_raw_maps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], stored: str
+) -> None:
+    arguments = ["evaluate", "--dataset", stored, "--wall", "wall.toml", "--out", str(tmp_path / "figures"), "--json"]
+    assert main(arguments) == 1
+    assert "leave out --wall" in _last(capsys)["error"]["message"]
     assert not list(tmp_path.iterdir())
 
 

@@ -9,8 +9,7 @@ import pytest
 import torch
 from nlos_calibration.rig import load_rig
 from nlos_models.checkpoint import load_pipeline, load_record
-from nlos_models.networks import SIMULATION_ONLY
-from nlos_models.recipe import load_recipe
+from nlos_models.recipe import SIMULATION_ONLY, load_recipe
 
 from nlos_cam import dataset
 from nlos_cam.cli.main import main
@@ -36,12 +35,13 @@ Go = Callable[..., tuple[int, Answer]]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recipes, a dataset in colour and one of depth, and a VAE in colour."""
+    """Recipes, datasets in colour and of depth with what they are judged by, and a VAE in colour."""
     folder, threads = tmp_path_factory.mktemp("colour"), torch.get_num_threads()
     for name, textures in (("data", tuple(TEXTURES)), ("depth", ())):
-        plan = dataset.DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft", textures=textures)
-        (folder / name).mkdir()
-        store(shard_path(folder / name, 40), make_samples(plan, range(40, 42)), plan.provenance, "")
+        for seed, of in ((40, name), (50, f"{name}-held-out")):
+            plan = dataset.DatasetPlan(load_rig("paper-rig"), seed, accuracy="draft", textures=textures)
+            (folder / of).mkdir()
+            store(shard_path(folder / of, seed), make_samples(plan, range(seed, seed + 2)), plan.provenance, "")
     for name, text in RECIPES.items():
         (folder / f"{name}.toml").write_text(text + BASE, encoding="utf-8")
     torch.set_num_threads(1)
@@ -52,8 +52,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def go(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Go:
-    def train(recipe: str, data: str = "data", **options: str) -> tuple[int, Answer]:
-        maps = ["--dataset", str(folder / data), "--held-out", str(folder / data)]
+    def train(recipe: str, *flags: str, data: str = "data", **options: str) -> tuple[int, Answer]:
+        maps = ["--dataset", str(folder / data), "--held-out", str(folder / f"{data}-held-out"), *flags]
         named = [part for name, value in options.items() for part in (f"--{name}", str(folder / value))]
         task, out = recipe.split("-", maxsplit=1)[0], tmp_path / "out"
         code = main(["train", task, "--recipe", f"{folder / recipe}.toml", "--out", str(out), *maps, *named, "--json"])
@@ -72,11 +72,24 @@ def test_both_steps_leave_a_pipeline_that_loads_says_what_it_is_and_goes_on(
     assert record.colour
     assert record.note == SIMULATION_ONLY
     assert record.vae_recipe == load_record(folder / "vae").vae_recipe
+    assert go("compressor", vae="vae") == (code, answer)  # it was through
     (tmp_path / "out").rename(folder / "first")
     assert go("compressor-on", vae="vae", weights="first")[0] == 0
+    assert [run.start for run in load_record(tmp_path / "out").runs] == ["scratch", "scratch", "weights"]
     assert go("transfer-of-depth", data="depth", weights="first")[1]["error"]["message"].startswith(
         f"{folder / 'first'} holds weights in colour (simulation only"
     )
+
+
+def test_a_stream_in_colour_trains_on_the_maps_that_memory_does(go: Go, tmp_path: Path) -> None:
+    assert go("compressor", "--stream", "--tensorboard", vae="vae")[0] == 0
+    streamed, record = load_pipeline(tmp_path / "out")
+    assert (tmp_path / "out" / "tensorboard").is_dir()
+    (tmp_path / "out").rename(tmp_path / "streamed")
+    assert go("compressor", vae="vae")[0] == 0
+    held, same = load_pipeline(tmp_path / "out")
+    assert torch.equal(streamed.preprocess.mean, held.preprocess.mean)
+    assert record.runs == same.runs
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,8 @@ def test_the_weights_are_tied_to_the_rig_that_the_maps_were_rendered_for(
     [
         ({"recipe": "vae.toml"}, 1, "a recipe for 'vae'"),
         ({"recipe": "none.toml"}, 4, "none.toml"),
-        ({"dataset": "held-out"}, 1, "holds 2 objects, the recipe asks for 4"),
+        ({"dataset": "held-out", "held-out": "data"}, 1, "holds 2 objects, the recipe asks for 4"),
+        ({"held-out": "data"}, 1, "is to learn from and to be judged by"),
         ({"dataset": "none"}, 4, "no dataset in"),
         ({"vae": "data"}, 4, "no checkpoint in"),
     ],

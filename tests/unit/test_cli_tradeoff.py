@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from nlos_models.recipe import Recipe
+from nlos_models.record import CheckpointRecord
 
 from nlos_cam.cli import tradeoff as command
 from nlos_cam.cli.main import main
@@ -136,6 +138,14 @@ def test_what_is_there_is_overwritten_only_when_asked(tmp_path: Path, capsys: py
     assert precious.read_text() != "precious"
 
 
+def test_a_file_is_no_folder_even_when_asked_to_overwrite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    precious = tmp_path / "cost"
+    precious.write_text("precious")
+    assert main(["tradeoff", "render", "--out", str(precious), "--overwrite", "--json"]) == 1
+    assert _last(capsys)["error"]["type"] == "OutputExistsError"
+    assert precious.read_text() == "precious"
+
+
 def test_it_is_a_group_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tradeoff", "--help"]) == 0
     assert "render" in capsys.readouterr().out
@@ -190,3 +200,15 @@ def test_weights_that_cannot_be_read_are_4(tmp_path: Path, capsys: pytest.Captur
     assert main(["tradeoff", "reconstruct", "--weights", missing, "--out", str(tmp_path / "cost"), "--json"]) == 4
     assert _last(capsys)["error"]["type"] == "CheckpointError"
     assert not list(tmp_path.iterdir())
+
+
+def test_weights_of_full_colour_are_refused_before_anything_is_rendered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = Recipe(task="vae", colour=True, objects=2, held_out=1, epochs=1, batch=2, learning_rate=1e-3)
+    record = CheckpointRecord.of([recipe], ("paper-rig", "0"))
+    (tmp_path / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
+    out = tmp_path / "cost"
+    assert main(["tradeoff", "reconstruct", "--weights", str(tmp_path), "--out", str(out), "--json"]) == 4
+    assert f"{tmp_path} holds weights for full colour (simulation only" in _last(capsys)["error"]["message"]
+    assert not out.exists()

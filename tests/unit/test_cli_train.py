@@ -1,6 +1,7 @@
 """`train`: recipes and data to weights with their record, on small networks."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -17,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from small_maps import SmallDataset, small_images, small_maps, use_small_networks
 
 from nlos_cam import dataset
-from nlos_cam.cli import train, train_data, train_runs
+from nlos_cam.cli import train_data, train_runs, train_start
 from nlos_cam.cli.main import main
 from nlos_cam.objects.categories import CATEGORIES
 
@@ -42,7 +43,7 @@ def _small_networks_and_data() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        use_small_networks(patch, tasks, checkpoint, train)
+        use_small_networks(patch, tasks, checkpoint, train_start)
         sets = {name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in COUNTS.items()}
         patch.setattr(dataset, "open_dataset", lambda of, **_: sets[of.name])
         patch.setattr(dataset, "procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
@@ -131,8 +132,7 @@ def test_an_interrupted_run_is_130_says_so_and_goes_on_to_the_same_weights(
 
 def test_two_step_weights_know_both_recipes_and_take_the_encoder_along(folder: Path) -> None:
     record = load_record(folder / "two")
-    assert record.vae_recipe is not None
-    assert record.compressor_recipe is not None
+    assert [run.task for run in record.runs] == ["vae", "compressor"]
     assert (record.rig_checksum, record.input) == (PLAN.rig.checksum, "raw maps")
     assert _same_file("encoder", folder / "two", folder / "vae")
 
@@ -140,7 +140,7 @@ def test_two_step_weights_know_both_recipes_and_take_the_encoder_along(folder: P
 def test_the_shipped_vae_is_aimed_at_where_none_is_named(
     go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train, "shipped_folder", lambda: folder / "vae")
+    monkeypatch.setattr(train_start, "shipped_folder", lambda: folder / "vae")
     assert go("two")[0] == 0
     assert _same_file("compressor", tmp_path / "out", folder / "two")
 
@@ -186,8 +186,7 @@ def test_a_transfer_tells_before_and_after_and_keeps_the_decoder(go: Go, folder:
     assert (code, set(answer)) == (0, {"out", "held_out_loss", "held_out_iou", "before"})
     assert answer["before"]["held_out_loss"] != answer["held_out_loss"]
     record = load_record(tmp_path / "out")
-    assert record.transfer_recipe is not None
-    assert record.compressor_recipe == load_record(folder / "two").compressor_recipe
+    assert record.runs == [*load_record(folder / "two").runs, record.transfer_recipe]
     assert _same_file("decoder", tmp_path / "out", folder / "two")
     assert _same_file("encoder", tmp_path / "out", folder / "two")
     assert (tmp_path / "out" / "all-layers" / "log.csv").exists()
@@ -196,17 +195,14 @@ def test_a_transfer_tells_before_and_after_and_keeps_the_decoder(go: Go, folder:
 def test_weights_of_another_architecture_are_4_or_taken_in_part_with_a_report(
     go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    for path in (folder / "two").glob("*.*"):
-        (other / path.name).write_bytes(path.read_bytes())
+    other = Path(shutil.copytree(folder / "two", tmp_path / "other"))
     tensors = load_file(other / "compressor.safetensors")
     tensors["classifier.1.weight"] = torch.zeros(7, 100)
     save_file({**tensors, "more": torch.zeros(1)}, other / "compressor.safetensors")
     code, answer = go("transfer", "--weights", str(other))
     assert (code, "does not fit this network" in answer["error"]["message"]) == (4, True)
     told: list[str] = []
-    monkeypatch.setattr(train, "say", told.append)
+    monkeypatch.setattr(train_start, "say", told.append)
     assert go("transfer", "--weights", str(other), "--partial")[0] == 0
     assert told == ["compressor: 8 tensors loaded; 1 left over (more), 1 misshapen (classifier.1.weight)"]
 
@@ -222,6 +218,9 @@ def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
         ("vae", ["--accelerator", "cuda", "--devices", "4"], 1, "4 GPUs asked for, 0 there"),
         ("vae", ["--devices", "3"], 4, "not shared by 3 processes"),
         ("transfer", ["--weights", "none"], 4, "no checkpoint in none"),
+        ("vae", ["--weights", "w"], 1, 'start = "scratch", so that --weights would do nothing'),
+        ("two", ["--weights", "w"], 1, "starts from scratch, so that --weights would do nothing"),
+        ("joint", ["--weights", "w", "--vae", "v"], 1, "so that --vae would do nothing"),
         ("transfer", ["--objects", "9"], 1, "holds 8 objects, the recipe asks for 9"),
     ],
 )
@@ -240,11 +239,9 @@ def test_no_budget_objects_or_devices_are_wrong_usage(go: Go, options: list[str]
     assert go("vae", *options)[0] == 2
 
 
-def test_weights_that_eat_other_maps_than_the_recipe_says_are_refused(
-    go: Go, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pipeline, record = load_pipeline(folder / "two")
-    other = record.model_copy(update={"input": "difference maps"})
-    monkeypatch.setattr(train, "load_pipeline", lambda _: (pipeline, other))
-    code, answer = go("transfer", "--weights", "two")
+def test_weights_that_eat_other_maps_than_the_recipe_says_are_refused(go: Go, folder: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(folder / "two", tmp_path / "other"))
+    record = load_record(other).model_copy(update={"input": "difference maps"})
+    (other / checkpoint.RECORD).write_text(record.model_dump_json(), encoding="utf-8")
+    code, answer = go("transfer", "--weights", str(other))
     assert (code, "eat difference maps, the recipe says raw maps" in answer["error"]["message"]) == (1, True)

@@ -16,7 +16,7 @@ from small_maps import SmallDataset, small_maps
 
 from nlos_cam import dataset
 from nlos_cam.cli import train_data
-from nlos_cam.cli.train_data import RecipeChoice, Streamed, measured_bare_wall, read_maps, render_bare_wall
+from nlos_cam.cli.train_data import Streamed, measured_bare_wall, read_maps, render_bare_wall
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.render.renderer import render
@@ -27,19 +27,30 @@ PLAN = dataset.DatasetPlan(load_rig("paper-rig"), 0)
 RECIPE = Recipe(task="compressor", objects=4, held_out=2, epochs=1, batch=2, learning_rate=1e-3)
 
 
-def test_a_recipe_of_another_task_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "r.toml"
-    path.write_text('task = "vae"\nobjects = 4\nheld_out = 2\nepochs = 2\nbatch = 2\nlearning_rate = 1e-3\n')
-    with pytest.raises(SceneError, match="a recipe for 'vae', not 'transfer'"):
-        RecipeChoice(path).read("transfer")
-    assert RecipeChoice(path, budget=0.5, objects=3).read("vae").objects == 3
-
-
 def test_a_recipe_takes_the_first_objects_of_larger_sets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
     maps = read_maps(RECIPE, Path("data"), Path("other"), None)
     np.testing.assert_array_equal(maps.training.image, small_maps(6, 4).image[:4])
     np.testing.assert_array_equal(maps.held_out.image, small_maps(6, 5).image[:2])
+
+
+def test_a_record_tells_how_many_objects_there_were_to_judge_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
+    recipe = RECIPE.model_copy(update={"held_out": 400})
+    assert read_maps(recipe, Path("data"), Path("other"), None).told(recipe).held_out == 6
+    assert read_maps(RECIPE, Path("data"), Path("other"), None).told(RECIPE) == RECIPE
+
+
+def test_a_dataset_to_be_judged_by_what_it_teaches_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
+    with pytest.raises(SceneError, match="give --held-out a dataset of other objects"):
+        read_maps(RECIPE, Path("data"), Path("other/../data"), None)
+
+
+def test_a_wall_for_raw_maps_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
+    with pytest.raises(SceneError, match=r"wall\.toml would do nothing: leave --wall out"):
+        read_maps(RECIPE, Path("data"), Path("other"), Path("wall.toml"))
 
 
 def test_maps_of_two_rigs_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.image import imread
 from nlos_calibration.rig import load_rig
-from nlos_models.networks import SIMULATION_ONLY
+from nlos_models.recipe import SIMULATION_ONLY
 
 from nlos_cam.colour_evaluate import (
     better_than,

@@ -6,9 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
-from nlos_cam.dataset_lock import NOTE, only_builder
-from nlos_cam.errors import FolderBusyError
+from nlos_cam.dataset_lock import LOCK, NOTE, only_builder
+from nlos_cam.errors import FolderBusyError, OutputExistsError
 
 HOLD = """
 import sys
@@ -46,3 +47,12 @@ def test_the_lock_of_a_killed_process_is_taken_over(tmp_path: Path) -> None:
         holder.kill()
     with only_builder(tmp_path):
         assert str(os.getpid()) in (tmp_path / NOTE).read_text(encoding="utf-8")
+
+
+def test_a_folder_that_may_not_be_written_to_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_: FileLock, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", str(tmp_path / LOCK))
+
+    monkeypatch.setattr(FileLock, "acquire", refused)
+    with pytest.raises(OutputExistsError, match=f"{tmp_path} cannot be written to"), only_builder(tmp_path):
+        pass

@@ -1,5 +1,8 @@
 """Samples: the maps of the objects of their seeds, seen with the rigs of their seeds; left out is left out."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -146,6 +149,24 @@ def test_meshes_that_moved_are_the_same_and_those_that_changed_are_refused(meshe
 def test_meshes_without_their_folder_are_asked_for(meshes: Path) -> None:
     with pytest.raises(SceneError, match="name their folder with --objects"):
         hidden_object(replace(objects_of(meshes), folder=None), 0, BOX)
+
+
+def test_reading_meshes_tells_how_far_it_is(meshes: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    objects_of(meshes, lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 2), (2, 2)]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes here")
+def test_a_mesh_whose_name_no_shard_can_hold_is_refused_before_anything_is_made(meshes: Path) -> None:
+    (meshes / "cube.stl").rename(meshes / os.fsdecode(b"caf\xe9.stl"))
+    with pytest.raises(SceneError, match=r"caf\\udce9\.stl' is not UTF-8: rename it"):
+        objects_of(meshes)
+
+
+def test_workers_do_not_wait_for_torch() -> None:
+    program = "import sys, nlos_cam.dataset_samples; raise SystemExit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
 def test_an_empty_folder_is_told(tmp_path: Path) -> None:

@@ -92,6 +92,28 @@ def test_a_shard_under_another_name_is_damaged(tmp_path: Path) -> None:
         shards_of(tmp_path)
 
 
+@pytest.mark.parametrize("other", ["group", "type", "words"])
+def test_what_is_no_array_of_seeds_is_damage(tmp_path: Path, other: str) -> None:
+    path = _stored(tmp_path)
+    with h5py.File(path, "a") as file:
+        del file["seed"]
+        if other == "group":
+            file.create_group("seed")
+        else:
+            file["seed"] = np.dtype(int) if other == "type" else np.array(["a", "b"], h5py.string_dtype())
+    assert _is_damaged(path)
+
+
+def test_ctrl_c_leaves_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _stored(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_shards_that_hold_the_same_objects_are_refused(tmp_path: Path) -> None:
     _stored(tmp_path)
     _stored(tmp_path, range(42, 44))

@@ -1,5 +1,6 @@
 """A worker has one thread, leaves Ctrl-C to its parent, and ends with it."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 
 from nlos_cam import dataset_worker
 
+BLAS = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 PARENT = """
 import multiprocessing, time
 from threading import Thread
@@ -46,11 +48,20 @@ def test_a_worker_without_a_parent_goes_on(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_worker_has_one_thread_and_is_deaf_to_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dataset_worker, "parent_process", lambda: None)
+    for name in BLAS:
+        monkeypatch.setenv(name, "2")
     threads, handler = numba.get_num_threads(), signal.getsignal(signal.SIGINT)
     try:
         dataset_worker.begin_worker()
         assert numba.get_num_threads() == 1
+        assert {os.environ[name] for name in BLAS} == {"1"}
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         numba.set_num_threads(threads)
         signal.signal(signal.SIGINT, handler)
+
+
+def test_when_a_worker_begins_no_library_has_counted_the_processors_yet() -> None:
+    """BLAS counts them when numpy is imported, which is when its first piece comes."""
+    program = "import sys, nlos_cam.cli.main, nlos_cam.dataset_worker; raise SystemExit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

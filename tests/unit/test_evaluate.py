@@ -16,6 +16,7 @@ from nlos_cam.evaluate import (
     over_objects,
     per_category,
     per_object,
+    plain,
 )
 from nlos_cam.objects.depth_image import depth_from_image, object_box
 
@@ -45,6 +46,21 @@ def test_depth_errors_are_in_millimetres_of_the_box(images: np.ndarray) -> None:
     off = np.where(images > 0.2, images - 0.05, images).astype(np.float32)
     moved_m = depth_from_image(off, BOX) - depth_from_image(images, BOX)
     assert 1000 * np.nanmax(moved_m) == pytest.approx(0.05 * mm_per_v(BOX), rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_depth_error_is_that_of_the_depth_that_live_shows(images: np.ndarray, seed: int) -> None:
+    guess = np.random.default_rng(seed).random(images.shape).astype(np.float32)
+    guess[:, ::2] *= 0.15  # background, and what is too far away to be
+    apart_mm = 1000 * (depth_from_image(guess, BOX).astype(np.float64) - depth_from_image(images, BOX))
+    expected = np.sqrt(np.nanmean(np.square(apart_mm), axis=(1, 2)))
+    np.testing.assert_allclose(per_object(guess, images, BOX)["foreground_rmse_mm"], expected, rtol=1e-4)
+
+
+def test_plain_figures_have_three_numbers_each(images: np.ndarray) -> None:
+    figures = judge(0.99 * images, images, BOX)
+    for name, figure in plain(figures).items():
+        assert figure == {end: getattr(figures[name], end) for end in ("value", "low", "high")}
 
 
 def test_an_interval_contains_its_mean_and_is_repeatable() -> None:

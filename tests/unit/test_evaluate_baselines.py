@@ -1,5 +1,6 @@
 """Baselines answer every object; the nearest neighbour of a training object is that object; maps are built once."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from nlos_models.data import MapSet
 
 from nlos_cam import dataset, evaluate_baselines
 from nlos_cam.dataset import DatasetPlan, procedural_images
-from nlos_cam.evaluate_baselines import baselines, training_maps
+from nlos_cam.evaluate_baselines import mean_image, training_maps, with_nearest, without_maps
 from nlos_cam.objects.depth_image import object_box
 
 RIG = load_rig("paper-rig")
@@ -30,9 +31,27 @@ def _maps(images: np.ndarray, seed: int = 0) -> MapSet:
     return MapSet(depth.astype(np.float32), 50 * wide, images)
 
 
+class Chunked:
+    """Training maps in parts of so many."""
+
+    def __init__(self, maps: MapSet, size: int) -> None:
+        self._maps, self._size = maps, size
+
+    def __len__(self) -> int:
+        return len(self._maps.image)
+
+    def chunks(self) -> Iterator[MapSet]:
+        for start in range(0, len(self), self._size):
+            part = slice(start, start + self._size)
+            yield MapSet(self._maps.depth_m[part], self._maps.intensity[part], self._maps.image[part])
+
+
+def _quiet(*_: int) -> None:
+    pass
+
+
 def test_baselines_answer_every_object(images: np.ndarray) -> None:
-    training, judged = _maps(images), _maps(images[:5], seed=1)
-    guesses = baselines(judged, images.astype(np.float16), training)
+    guesses = with_nearest(_maps(images[:5], seed=1), Chunked(_maps(images), 12), _quiet)
     assert set(guesses) == {"all_background", "mean_object", "nearest_neighbour"}
     for guess in guesses.values():
         assert guess.shape == (5, 64, 64)
@@ -41,28 +60,64 @@ def test_baselines_answer_every_object(images: np.ndarray) -> None:
     np.testing.assert_allclose(guesses["mean_object"][3], images.mean(0), atol=1e-3)
 
 
-def test_the_nearest_neighbour_finds_the_object_itself(images: np.ndarray) -> None:
+@pytest.mark.parametrize("size", [1, 5, 12])
+def test_the_nearest_neighbour_finds_the_object_itself_in_whatever_part_it_is(images: np.ndarray, size: int) -> None:
     order = np.array([7, 2, 11, 0])
-    guesses = baselines(_maps(images[order], seed=1), images.astype(np.float16), _maps(images))
+    told: list[tuple[int, int]] = []
+    training = Chunked(_maps(images), size)
+    guesses = with_nearest(_maps(images[order], seed=1), training, lambda done, total: told.append((done, total)))
     np.testing.assert_array_equal(guesses["nearest_neighbour"], images[order])
+    assert (len(told), told[-1]) == (-(-12 // size), (12, 12))
 
 
-def test_without_training_maps_there_is_no_nearest_neighbour(images: np.ndarray) -> None:
-    assert set(baselines(_maps(images), images.astype(np.float16), None)) == {"all_background", "mean_object"}
+def test_depth_weighs_as_much_as_intensity_whatever_their_units(images: np.ndarray) -> None:
+    training, sought = _maps(images), _maps(images[:4], seed=1)
+    faint = [replace(maps, intensity=maps.intensity * 1e-6) for maps in (training, sought)]
+    found = [
+        with_nearest(mine, Chunked(its, 12), _quiet)["nearest_neighbour"] for its, mine in ((training, sought), faint)
+    ]
+    np.testing.assert_array_equal(*found)
+
+
+def test_a_channel_that_never_varies_tells_nothing_and_breaks_nothing(images: np.ndarray) -> None:
+    training, sought = _maps(images), _maps(images[:4], seed=1)
+    dark = [replace(maps, intensity=np.zeros_like(maps.intensity)) for maps in (training, sought)]
+    found = with_nearest(dark[1], Chunked(dark[0], 12), _quiet)["nearest_neighbour"]
+    np.testing.assert_array_equal(found, images[:4])
+
+
+def test_without_maps_there_is_no_nearest_neighbour(images: np.ndarray) -> None:
+    mean = mean_image(images.astype(np.float16))
+    np.testing.assert_allclose(mean, images.mean(0), atol=1e-3)
+    guesses = without_maps(5, mean)
+    assert set(guesses) == {"all_background", "mean_object"}
+    assert {guess.shape for guess in guesses.values()} == {(5, 64, 64)}
 
 
 def test_training_maps_are_kept_by_what_decides_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[tuple[DatasetPlan, int, Path]] = []
+    shapes = {"images": np.zeros((2, 64, 64), np.float16)}
     monkeypatch.setattr(dataset, "build", lambda plan, count, folder, **_: built.append((plan, count, folder)))
-    monkeypatch.setattr(dataset, "read", lambda folder: (folder, None))
+    monkeypatch.setattr(dataset, "open_dataset", lambda folder: folder)
+    monkeypatch.setattr(dataset, "procedural_images", lambda *_: shapes["images"])
     monkeypatch.setattr(evaluate_baselines, "NEIGHBOURS", 7)
     plan = DatasetPlan(RIG, dataset.TEST_SEED, objects=dataset.Objects(("cup",)))
     elsewhere = RIG.model_copy(update={"lidar": LidarPose(distance_m=0.3, yaw_deg=45)})
     for one in (plan, plan, replace(plan, rig=elsewhere), replace(plan, first_seed=5)):
-        training_maps(one, tmp_path, 1, lambda *_: None)
-    first, again, moved, other_seed = (folder for _, _, folder in built)
+        training_maps(one, tmp_path, 1, _quiet)
+    shapes["images"] = shapes["images"] + np.float16(0.5)
+    training_maps(plan, tmp_path, 1, _quiet)
+    first, again, moved, other_seed, other_shapes = (folder for _, _, folder in built)
     assert first == again == other_seed
-    assert moved != first
+    assert len({first, moved, other_shapes}) == 3
     assert first.parent.parent == tmp_path
     assert built[0][1] == 7
     assert (built[0][0].first_seed, built[0][0].objects) == (dataset.TRAINING_SEED, dataset.Objects())
+
+
+def test_every_category_is_among_those_that_tell_whether_objects_are_still_made_as_they_were() -> None:
+    from nlos_cam.objects.categories import CATEGORIES
+    from nlos_cam.objects.hidden import object_depth
+
+    seen = {object_depth(seed, object_box(RIG))[0] for seed in range(evaluate_baselines.TOLD_BY)}
+    assert seen == set(CATEGORIES)

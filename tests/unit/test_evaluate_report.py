@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,22 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
+from nlos_cam import evaluate_report
 from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate import BARS
 from nlos_cam.evaluate_report import Judgement, as_figures, as_markdown, in_words, write
 from nlos_cam.objects.depth_image import object_box
 
 BOX = object_box(load_rig("paper-rig"))
-FACTS = {"what": "Some objects", "weights": "mine", "rig": "paper-rig", "runtime": "none"}
+FACTS = {
+    "what": "Some objects",
+    "weights": "mine",
+    "rig": "paper-rig",
+    "runtime": "none",
+    "input": "raw maps",
+    "training_objects": 99,
+    "notes": ["they are few"],
+}
 FILES = {"report.md", "figures.json", "objects.csv", "sheet.png", "gallery.png", "categories.png", "surface.png"}
 
 
@@ -63,6 +73,8 @@ def test_the_report_tells_every_metric_and_what_is_not_reached() -> None:
     assert "nearest neighbour" in text
     for picture in (name for name in FILES if name.endswith(".png")):
         assert f"({picture})" in text
+    assert "of 99 training objects" in text
+    assert "**Note**: they are few." in text
     assert "nearest" not in as_markdown(_strict(as_figures(_judgement(guesses=False))))
 
 
@@ -78,6 +90,34 @@ def test_the_folder_is_whole_for_any_number_of_objects(tmp_path: Path, count: in
     assert [row["name"] for row in rows] == judgement.names
     mean = np.mean([float(row["silhouette_iou"]) for row in rows])
     assert mean == pytest.approx(figures["silhouette_iou"]["value"], rel=1e-4)
+
+
+def test_kinds_that_training_left_out_are_told_apart() -> None:
+    whole = _judgement()
+    assert as_figures(whole)["shown_and_left_out"] is None
+    assert "was not" not in as_markdown(_strict(as_figures(whole)))
+    blind = np.array([kind == "kind 1" for kind in whole.categories])[:, None, None]
+    guessed = replace(whole, image=np.where(blind, 0, whole.image), left_out=["kind 1", "kind 9"])
+    figures = _strict(as_figures(guessed))
+    by = figures["shown_and_left_out"]
+    assert by["left out"]["silhouette_iou"]["value"] == 0
+    assert by["shown"]["silhouette_iou"]["value"] > figures["silhouette_iou"]["value"] > 0
+    assert "was not: " in as_markdown(figures)
+
+
+def test_what_ends_the_writing_leaves_the_earlier_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    judgement = _judgement(2)
+    write(tmp_path / "out", judgement, as_figures(judgement))
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate_report.pictures, "draw_gallery", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "out", judgement, as_figures(_judgement(3)))
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_an_object_without_a_value_has_an_empty_field_and_is_no_zero(tmp_path: Path) -> None:

@@ -64,6 +64,10 @@ def test_a_rank_correlation_is_of_the_order_alone() -> None:
     assert rank_correlation(like, -(like**3)).value == pytest.approx(-1)
     none = rank_correlation(like, np.random.default_rng(2).random(54))
     assert none.low < 0 < none.high
+    coarse = np.round(4 * like)  # equal values have one rank, whatever order they come in
+    assert rank_correlation(coarse, coarse**3).value == pytest.approx(1)
+    order = np.random.default_rng(3).permutation(54)
+    assert rank_correlation(coarse[order], like[order]).value == pytest.approx(rank_correlation(coarse, like).value)
     with_gaps = np.where(like > 0.9, np.nan, like)
     assert rank_correlation(like, with_gaps).value == pytest.approx(1)
     assert rank_correlation(like, np.ones(54)).value is None

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import pytest
@@ -43,3 +44,12 @@ def test_a_file_of_that_name_is_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(OutputExistsError, match="is a file"), renamed_when_whole(tmp_path / "out"):
         pass
     assert (tmp_path / "out").read_text() == "precious"
+
+
+def test_what_a_killed_process_of_our_number_left_is_no_obstacle(tmp_path: Path) -> None:
+    """In containers every process may have the same number."""
+    (tmp_path / f".out.{os.getpid()}.part").mkdir()
+    with renamed_when_whole(tmp_path / "out") as part, renamed_when_whole(tmp_path / "out") as other:
+        (part / "a.txt").write_text("a")
+        (other / "b.txt").write_text("b")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.txt", "b.txt"]

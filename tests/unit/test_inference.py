@@ -8,13 +8,13 @@ import torch
 from nlos_models import inference
 from nlos_models.checkpoint import CheckpointRecord, save_pipeline
 from nlos_models.compressor import Compressor
-from nlos_models.errors import CheckpointError
+from nlos_models.errors import CheckpointError, ModelError
 from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, load_reconstructor
+from nlos_models.metrics import LEAST_V
 from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import split_and_stack
 from nlos_models.recipe import Recipe
 from nlos_models.res_vae import Decoder
-from nlos_models.silhouette import LEAST_V
 
 RECORD = CheckpointRecord(
     rig_name="paper-rig",
@@ -112,6 +112,27 @@ def test_a_second_load_exports_nothing(
     again, maps = load_reconstructor(*folders), _maps(1)
     np.testing.assert_array_equal(again(*maps), pair[0](*maps))
     assert [path.suffix for path in folders[1].iterdir()] == [".onnx"]
+
+
+def test_what_ends_an_export_leaves_nothing(
+    tmp_path: Path, pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Program:
+        def save(self, path: Path, **_: object) -> None:
+            path.write_bytes(b"half of it")
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch.onnx, "export", lambda *_, **__: Program())
+    with pytest.raises(KeyboardInterrupt):
+        inference.export_onnx(pipeline, tmp_path / "network.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_networks_of_full_colour_are_not_exported(pipeline: Pipeline, tmp_path: Path) -> None:
+    colour = Pipeline(pipeline.compressor, Decoder(3, 512), intensities=3)
+    with pytest.raises(ModelError, match=r"full colour \(simulation only.* are not exported"):
+        inference.exported(colour, tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_exports_name_changes_with_the_weights(pipeline: Pipeline) -> None:

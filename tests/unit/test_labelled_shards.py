@@ -1,14 +1,16 @@
 """Labelled samples as a dataset: what is read is what was written."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 from nlos_models.data import MapSet
 
-from nlos_cam import dataset
-from nlos_cam.errors import RecordingError
+from nlos_cam import dataset, labelled_shards
+from nlos_cam.dataset_shards import store
+from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.labelled import Labelled
 from nlos_cam.labelled_shards import RECORDED, write_shards
 
@@ -43,6 +45,24 @@ def test_a_smaller_dataset_leaves_nothing_of_a_larger_one(tmp_path: Path) -> Non
     for count in (dataset.SHARD + 7, 4):
         write_shards(_labelled(count), tmp_path)
     assert len(dataset.read(tmp_path)[0].image) == 4
+
+
+def test_a_full_disk_keeps_the_dataset_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, stored = tmp_path / "data", list[Path]()
+    write_shards(_labelled(dataset.SHARD + 7), out)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+
+    def full(path: Path, *others: Any) -> None:
+        stored.append(path)
+        if len(stored) == 2:
+            raise DiskFullError(f"no room for {path}")
+        store(path, *others)
+
+    monkeypatch.setattr(labelled_shards, "store", full)
+    with pytest.raises(DiskFullError, match=f"no room for the dataset {out}: what was there is kept"):
+        write_shards(_labelled(dataset.SHARD + 9), out)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert list(tmp_path.iterdir()) == [out]
 
 
 def test_nothing_rendered_is_mixed_into_what_was_recorded(tmp_path: Path) -> None:

@@ -3,12 +3,35 @@
 import pytest
 import torch
 from nlos_models.losses import image_error, kl_divergence, latent_error
+from nlos_models.recipe import ImageLoss
 
 
 def test_the_image_error_sums_pixels_and_averages_samples() -> None:
     image, truth = torch.zeros(2, 1, 64, 64), torch.zeros(2, 1, 64, 64)
     image[0, 0, 3, 4], image[0, 0, 5, 6] = 1.0, 0.5
     assert image_error(image, truth).item() == pytest.approx((1 + 0.25) / 2)
+
+
+@pytest.mark.parametrize(("share", "weight"), [(0.75, 1.0), (0.75, 4.0), (0.25, 2.0)])
+def test_the_best_answer_to_doubt_lies_nearer_to_the_surface_the_more_surface_counts(
+    share: float, weight: float
+) -> None:
+    v, truth = 0.6, torch.zeros(4, 1, 8, 8)
+    truth[: round(4 * share)] = v
+    best = weight * share * v / (1 - share + weight * share)
+    losses = [image_error(torch.full_like(truth, best + off), truth, weight).item() for off in (-0.01, 0.0, 0.01)]
+    assert min(losses) == losses[1]
+    assert losses[0] == pytest.approx(losses[2], rel=1e-4)
+
+
+@pytest.mark.parametrize(("share", "weight", "best"), [(0.75, 1.0, 0.6), (0.25, 1.0, 0.0), (0.25, 4.0, 0.6)])
+def test_absolute_error_answers_doubt_with_the_surface_or_with_nothing(
+    share: float, weight: float, best: float
+) -> None:
+    truth = torch.zeros(4, 1, 8, 8)
+    truth[: round(4 * share)] = 0.6
+    losses = {v: image_error(torch.full_like(truth, v), truth, weight, "absolute").item() for v in (0.0, 0.2, 0.4, 0.6)}
+    assert min(losses, key=lambda v: losses[v]) == best
 
 
 def test_kl_is_0_for_the_standard_normal_and_positive_elsewhere() -> None:
@@ -49,3 +72,12 @@ def test_losses_stay_finite_at_the_ends_of_the_log_variance(limit: float, precis
 def test_half_precision_images_are_summed_in_single_precision() -> None:
     image, truth = torch.ones(1, 1, 64, 64, dtype=torch.bfloat16), torch.zeros(1, 1, 64, 64)
     assert image_error(image, truth).item() == 4096
+
+
+@pytest.mark.parametrize("kind", ["squared", "absolute"])
+def test_the_error_in_colour_is_that_of_its_channels_together(kind: ImageLoss) -> None:
+    generator = torch.Generator().manual_seed(0)
+    image, truth = (torch.rand(2, 3, 64, 64, generator=generator) for _ in range(2))
+    truth *= truth.amax(1, keepdim=True) > 0.5
+    channels = sum(image_error(image[:, [k]], truth[:, [k]], 2.0, kind) for k in range(3))
+    torch.testing.assert_close(image_error(image, truth, 2.0, kind), channels)

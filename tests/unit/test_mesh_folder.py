@@ -5,11 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from nlos_calibration.rig import load_rig
+from nlos_calibration.rig import ObjectBox, load_rig
 
 from nlos_cam.errors import SceneError
+from nlos_cam.objects import mesh_folder
 from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.mesh_folder import folder_objects, mesh_depth
+from nlos_cam.objects.files import MeshFile, read_mesh
+from nlos_cam.objects.hidden import Pose, random_pose
+from nlos_cam.objects.mesh_folder import POSES, folder_objects, mesh_depth
 
 BOX = object_box(load_rig("paper-rig"))
 TORUS = trimesh.creation.torus(30, 10, major_sections=16, minor_sections=8)
@@ -52,11 +55,11 @@ def test_a_missing_folder_and_a_file_are_no_folders(tmp_path: Path) -> None:
 
 def test_a_seed_is_one_mesh_at_one_pose_inside_the_box(tmp_path: Path) -> None:
     meshes = [_save(tmp_path / "a.stl"), _save(tmp_path / "b.ply", trimesh.creation.box((3, 2, 1)))]
-    made = [mesh_depth(seed, meshes, BOX) for seed in range(12)]
+    made = [mesh_depth(seed, meshes, BOX, read=read_mesh) for seed in range(12)]
     assert {path for path, _ in made} == set(meshes)
     assert len({depth.tobytes() for _, depth in made}) == 12
     for seed, (path, depth) in enumerate(made):
-        again = mesh_depth(seed, meshes, BOX)
+        again = mesh_depth(seed, meshes, BOX, read=read_mesh)
         assert again[0] == path
         np.testing.assert_array_equal(again[1], depth)
         assert depth.shape == (64, 64)
@@ -67,21 +70,47 @@ def test_a_seed_is_one_mesh_at_one_pose_inside_the_box(tmp_path: Path) -> None:
 def test_its_unit_does_not_matter_and_which_axis_is_up_does(tmp_path: Path) -> None:
     millimetres = _save(tmp_path / "mm.stl")
     metres = _save(tmp_path / "m.stl", TORUS.copy().apply_scale(0.001))
-    first, other = (mesh_depth(5, [path], BOX)[1] for path in (millimetres, metres))
+    first, other = (mesh_depth(5, [path], BOX, read=read_mesh)[1] for path in (millimetres, metres))
     assert (np.isfinite(first) != np.isfinite(other)).sum() <= 3
     both = np.isfinite(first) & np.isfinite(other)
     np.testing.assert_allclose(first[both], other[both], atol=1e-3)
-    lying = mesh_depth(5, [millimetres], BOX, up="z")[1]
+    lying = mesh_depth(5, [millimetres], BOX, up="z", read=read_mesh)[1]
     assert (np.isfinite(lying) != np.isfinite(first)).sum() > 100
 
 
 def test_a_broken_mesh_is_named(tmp_path: Path) -> None:
     (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
     with pytest.raises(SceneError, match=r"broken\.ply"):
-        mesh_depth(0, folder_objects(tmp_path), BOX)
+        mesh_depth(0, folder_objects(tmp_path), BOX, read=read_mesh)
 
 
 def test_a_mesh_that_shows_nothing_is_named(tmp_path: Path) -> None:
     needle = trimesh.Trimesh([[0, 0, 0], [0, 1, 0], [1e-5, 0.5, 0]], [[0, 1, 2]], process=False)
-    with pytest.raises(SceneError, match=r"needle\.ply shows no surface"):
-        mesh_depth(0, [_save(tmp_path / "needle.ply", needle)], BOX)
+    with pytest.raises(SceneError, match=r"needle\.ply shows no surface .*out of the folder"):
+        mesh_depth(0, [_save(tmp_path / "needle.ply", needle)], BOX, read=read_mesh)
+
+
+def test_only_the_mesh_that_is_picked_is_read() -> None:
+    """However many a folder holds, and whatever names them."""
+    read: list[str] = []
+
+    def ball(name: str) -> MeshFile:
+        read.append(name)
+        return MeshFile(Path(name), "", np.asarray(TORUS.triangles, np.float64))
+
+    names = [f"mesh-{k}" for k in range(1000)]
+    assert [mesh_depth(seed, names, BOX, read=ball)[0] for seed in range(4)] == read
+
+
+def test_a_sheet_that_is_seen_edge_on_gets_another_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    poses: list[Pose] = []
+
+    def first_along_the_sight(generator: np.random.Generator, box: ObjectBox) -> Pose:
+        poses.append(Pose() if not poses else random_pose(generator, box))
+        return poses[-1]
+
+    monkeypatch.setattr(mesh_folder, "random_pose", first_along_the_sight)
+    lying = np.array([[[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[1, 0, 0], [1, 0, 1], [0, 0, 1]]], np.float64)
+    _, depth_m = mesh_depth(3, ["sheet"], BOX, read=lambda name: MeshFile(Path(name), "", lying))
+    assert 1 < len(poses) <= POSES
+    assert np.isfinite(depth_m).any()

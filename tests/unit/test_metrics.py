@@ -60,6 +60,11 @@ def test_rmse_is_over_shared_pixels_in_mm() -> None:
     assert metrics.foreground_rmse_mm(image, _square(0.5), 300.0)[0] == pytest.approx(30, rel=1e-5)
 
 
+def test_nothing_is_farther_than_the_farthest_surface() -> None:
+    assert metrics.foreground_rmse_mm(_square(0.06), _square(metrics.LEAST_V), 300.0)[0] == pytest.approx(0, abs=1e-6)
+    assert metrics.foreground_rmse_mm(_square(0.06), _square(0.2), 300.0)[0] == pytest.approx(30, rel=1e-5)
+
+
 def test_there_is_one_value_per_object() -> None:
     image = np.concatenate([_square(0.5), EMPTY, _square(0.2)])
     truth = np.concatenate([_square(0.5)] * 3)

@@ -68,3 +68,16 @@ def test_what_cannot_be_quantised_is_told_and_leaves_nothing(tmp_path: Path, mod
     with pytest.raises(ModelError, match="cannot be made 8-bit"):
         quantise(model, tmp_path / "small.onnx", [])
     assert not list(tmp_path.iterdir())
+
+
+def test_what_ends_the_writing_leaves_nothing(tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from onnxruntime import quantization
+
+    def interrupted(_: object, path: Path, **__: object) -> None:
+        path.write_bytes(b"half of it")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(quantization, "quantize_dynamic", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        quantise(model, tmp_path / "small.onnx")
+    assert not list(tmp_path.iterdir())

@@ -78,6 +78,21 @@ def test_the_latent_and_the_image_each_count_by_their_weights(tmp_path: Path) ->
     assert losses[2] == pytest.approx(2 * losses[0] + 3 * losses[1], rel=1e-4)
 
 
+def test_surface_counts_as_much_as_the_recipe_says(tmp_path: Path) -> None:
+    losses = []
+    for weight in (1.0, 2.0, 3.0):
+        torch.manual_seed(3)
+        vae = SmallVae().eval()
+        changes = {"latent_weight": 0.0, "image_weight": 1.0, "batch": 8, "dropout": 0.0, "left_noise": 0.0}
+        recipe = RECIPE.model_copy(update={**changes, "surface_weight": weight})
+        task = Remapping(Pipeline(SmallCompressor(), vae.decoder), None, InMemory(small_maps(8, 0)), small_maps(4, 1))
+        rows: list[dict[str, float]] = []
+        task.fit(recipe, [vae.decoder], tmp_path / f"{weight}", _ignore, Running(on_epoch=rows.append))
+        losses.append(rows[0]["loss"])
+    assert losses[2] - losses[1] == pytest.approx(losses[1] - losses[0], rel=1e-4)
+    assert losses[1] > losses[0]
+
+
 def test_aiming_at_a_latent_without_an_encoder_is_one_line(tmp_path: Path) -> None:
     pipeline = Pipeline(SmallCompressor(), SmallVae().decoder)
     task = Remapping(pipeline, None, InMemory(small_maps(8, 0)), small_maps(4, 1))

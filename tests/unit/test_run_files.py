@@ -1,5 +1,6 @@
 """A run's files: whole or not there, the one before where the last is damaged, and what a full disk leaves."""
 
+import copy
 import errno
 import os
 from pathlib import Path
@@ -8,7 +9,18 @@ from typing import NoReturn
 import pytest
 import torch
 from nlos_models.errors import CheckpointError, TrainingError
-from nlos_models.run_files import BEST, LAST, LOG, PREVIOUS, read_best, read_last, write_best, write_last, write_log
+from nlos_models.run_files import (
+    BEST,
+    LAST,
+    LOG,
+    PREVIOUS,
+    digest_of,
+    read_best,
+    read_last,
+    write_best,
+    write_last,
+    write_log,
+)
 
 
 def _state(step: int) -> dict[str, object]:
@@ -106,3 +118,13 @@ def test_the_log_is_a_table_with_a_row_an_epoch(tmp_path: Path) -> None:
     write_log(tmp_path, [{"epoch": 0, "loss": 2.5}])
     write_log(tmp_path, [{"epoch": 0, "loss": 2.5}, {"epoch": 1, "loss": 1.5}])
     assert (tmp_path / LOG).read_text(encoding="utf-8").splitlines() == ["epoch,loss", "0,2.5", "1,1.5"]
+
+
+def test_a_digest_is_of_every_bit_of_what_a_run_sets_out_from() -> None:
+    torch.manual_seed(0)
+    net, words = torch.nn.Linear(3, 2), {digest_of(), digest_of("a"), digest_of("b"), digest_of(None)}
+    words.add(before := digest_of(net))
+    assert digest_of(copy.deepcopy(net)) == before
+    net.bias.data[0] += 1e-3
+    words |= {digest_of(net), digest_of(net, "a"), digest_of("a", net), digest_of(torch.nn.Linear(3, 2).half())}
+    assert len(words) == 9

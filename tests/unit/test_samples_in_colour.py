@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from nlos_models.networks import SIMULATION_ONLY
+from nlos_models.recipe import SIMULATION_ONLY
 
 from nlos_cam.dataset_plan import DatasetPlan, RigSpread
 from nlos_cam.dataset_samples import hidden_object, make_samples, procedural_images, sense_colour, sense_object

@@ -1,11 +1,15 @@
 """What stands for the networks has their shapes and parts, and the small maps show the small images."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from nlos_calibration.rig import load_rig
+from nlos_models import checkpoint
 from nlos_models.compressor import Compressor
 from nlos_models.res_vae import ResVae
-from small_maps import SmallCompressor, SmallVae, small_images, small_maps
+from small_maps import SmallCompressor, SmallVae, small_images, small_maps, untrained_weights, use_small_networks
 from torch import nn
 
 
@@ -33,3 +37,22 @@ def test_small_maps_show_their_images_and_nothing_else(seed: int) -> None:
     np.testing.assert_array_equal(maps.image, small_images(3, seed))
     np.testing.assert_array_equal(~np.isnan(maps.depth_m[:, :, 8:-8]), maps.image > 0)
     assert not maps.intensity[np.isnan(maps.depth_m)].any()
+
+
+@pytest.mark.parametrize("steps", ["two", "one"])
+def test_untrained_weights_are_a_checkpoint_of_small_networks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: str
+) -> None:
+    rig = load_rig("paper-rig")
+    for seed in (0, 1):
+        untrained_weights(tmp_path / str(seed), rig=rig, seed=seed, steps=steps, maps="difference maps")
+    use_small_networks(monkeypatch, checkpoint)
+    (one, record), (other, _) = (checkpoint.load_pipeline(tmp_path / name) for name in "01")
+    assert (record.rig_checksum, record.input) == (rig.checksum, "difference maps")
+    assert record.compressor_recipe.steps == steps
+    assert (checkpoint.load_encoder(tmp_path / "0") is None) == (steps == "one")
+    maps = torch.rand(2, 64, 80), torch.rand(2, 64, 80)
+    with torch.inference_mode():
+        made = [pipeline.latent(*maps) for pipeline in (one, other)]
+    assert made[0].shape == (2, 256)
+    assert not torch.allclose(*made)

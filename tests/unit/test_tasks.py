@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from nlos_models import tasks
+from nlos_models import tasks, train
 from nlos_models.errors import TrainingError
 from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import channel_statistics, split_and_stack
 from nlos_models.recipe import Recipe
 from nlos_models.sources import InMemory
 from nlos_models.tasks import Start, train_compressor, train_vae, turn_some
+from nlos_models.train import Running
 from small_maps import SmallCompressor, SmallVae, small_images, small_maps, use_small_networks
 
 COUNT, BATCH = 16, 8
@@ -149,6 +150,46 @@ def test_joint_training_goes_on_from_two_step_weights_and_moves_both_networks_bu
     assert torch.equal(after["preprocess.mean"], before["preprocess.mean"])
     assert _same(vae.encoder.state_dict(), encoder)
     assert joint.compressor.classifier[0].p == 0.2
+
+
+def test_a_vae_goes_on_from_the_weights_that_it_starts_from(trained: Trained, tmp_path: Path) -> None:
+    start, data = SmallVae(), (small_images(COUNT, 0), small_images(4, 1))
+    start.load_state_dict(before := _copy(trained[0]))
+    recipe = _recipe("vae", start="weights", epochs=1, learning_rate=1e-7)
+    vae, figures = train_vae(recipe, *data, tmp_path, _ignore, start=start)
+    for name, tensor in vae.named_parameters():  # at this rate: from there, not anew
+        torch.testing.assert_close(tensor.data, before[name], rtol=0, atol=1e-5)
+    assert not _same(vae.state_dict(), before)
+    assert figures["held_out_loss"] == pytest.approx(trained[1]["held_out_loss"], rel=0.05)
+
+
+def test_a_compressor_goes_on_from_the_weights_that_it_starts_from_before_the_vaes_own_decoder(
+    trained: Trained, tmp_path: Path
+) -> None:
+    earlier = Pipeline(SmallCompressor(), SmallVae().decoder)
+    before = _copy(earlier.compressor)
+    recipe = _recipe("compressor", start="weights", epochs=1, image_weight=1.0, learning_rate=1e-7, dropout=0.2)
+    pipeline, _ = _train(recipe, Start(trained[0], earlier), tmp_path)
+    for name, tensor in pipeline.compressor.named_parameters():
+        torch.testing.assert_close(tensor.data, before[name], rtol=0, atol=1e-5)
+    assert _same(pipeline.decoder.state_dict(), trained[0].decoder.state_dict())
+    assert pipeline.compressor.classifier[0].p == 0.2
+
+
+def test_compiled_networks_are_those_that_are_trained(
+    trained: Trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled: list[object] = []
+    monkeypatch.setattr(train, "compiled", lambda network: compiled.append(network) or network)
+    plain, quick = Running(), Running(compiled=True)
+    data, vaes = (small_images(COUNT, 0), small_images(4, 1)), list[SmallVae]()
+    for running in (plain, quick):
+        vaes.append(train_vae(_recipe("vae", epochs=1), *data, tmp_path / str(len(vaes)), _ignore, running)[0])
+    assert compiled == [vaes[1]]
+    assert _same(vaes[0].state_dict(), vaes[1].state_dict())
+    recipe, maps = _recipe("compressor", epochs=1, image_weight=1.0), InMemory(small_maps(COUNT, 0))
+    made, _ = train_compressor(recipe, Start(trained[0]), maps, small_maps(4, 1), tmp_path / "c", _ignore, quick)
+    assert compiled[1:] == [made.latent, made.decoder]
 
 
 @pytest.mark.parametrize(("steps", "words"), [("two", "--vae"), ("two-then-joint", "--weights")])

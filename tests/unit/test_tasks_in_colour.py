@@ -10,10 +10,9 @@ from nlos_models.checkpoint import CheckpointRecord, load_encoder, load_pipeline
 from nlos_models.data import Half, MapSet
 from nlos_models.errors import CheckpointError
 from nlos_models.inference import load_reconstructor
-from nlos_models.networks import SIMULATION_ONLY
 from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import channel_statistics, split_and_stack
-from nlos_models.recipe import Recipe, load_recipe
+from nlos_models.recipe import SIMULATION_ONLY, Recipe, load_recipe
 from nlos_models.remap import figures_of, run
 from nlos_models.res_vae import ResVae
 from nlos_models.sources import InMemory

@@ -5,14 +5,17 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from nlos_models.checkpoint import load_record, shipped_folder
+from nlos_models import checkpoint
+from nlos_models.checkpoint import shipped_folder
+from small_maps import untrained_weights, use_small_networks
 
+from nlos_cam.cli import evaluate_maps
 from nlos_cam.evaluate import BARS
 from nlos_cam.evaluate_objects import seeded_objects
 from nlos_cam.objects.depth_image import object_box
@@ -29,6 +32,12 @@ def tool(monkeypatch: pytest.MonkeyPatch) -> Tool:
     return importlib.import_module
 
 
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks that take no time, wherever weights are loaded."""
+    use_small_networks(monkeypatch, checkpoint)
+
+
 def test_each_experiment_on_one_object_has_its_figures(tool: Tool) -> None:
     limits = tool("limits")
     some = seeded_objects(0, 1, BOX)
@@ -41,18 +50,21 @@ def test_each_experiment_on_one_object_has_its_figures(tool: Tool) -> None:
     assert rows["VAE alone"].figures["silhouette_iou"].value > 0.5  # the truth's own latent, decoded
 
 
-def test_a_learning_curve_has_one_row_for_each_weights_from_few_objects_to_many(tool: Tool) -> None:
-    limits = tool("limits")
-    (row,) = limits.learning_curve([shipped_folder()], seeded_objects(0, 1, BOX))
-    recipe = load_record(shipped_folder()).compressor_recipe
-    assert recipe is not None
-    assert row.name == f"{recipe.objects} objects"
-    assert set(row.figures) == set(BARS)
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("steps", ["one", "two-then-joint"])
+def test_what_needs_the_vaes_latent_is_left_out_where_the_decoder_does_not_speak_it(
+    tool: Tool, tmp_path: Path, steps: str
+) -> None:
+    untrained_weights(tmp_path / "w", rig=RIG, steps=steps, maps="difference maps")
+    some = seeded_objects(0, 1, BOX)
+    rows = {row.name: row for row in tool("limits").experiments(tmp_path / "w", some, some, frames=())}
+    assert list(rows) == ["as evaluated", "no silhouette step", "noise off", "training's objects"]
+    assert {row.latent_error for row in rows.values()} == {None}
 
 
 class Plate:
-    def __init__(self) -> None:
-        self.calls = 0
+    def __init__(self, eats: str = "raw maps") -> None:
+        self.calls, self.record = 0, SimpleNamespace(input=eats)
 
     def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
         assert depth_m.shape == intensity.shape
@@ -73,6 +85,24 @@ def test_a_map_of_rigs_keeps_the_cells_that_are_done_of_the_same_weights(tool: T
     assert plate.calls == 3
     rig_map.draw(tmp_path / "map.png", cells, RIG)
     assert 5_000 < (tmp_path / "map.png").stat().st_size < 200_000
+    assert {path.name for path in tmp_path.iterdir()} == {"rig_map.json", "map.png"}
+
+
+def test_a_map_of_a_network_that_finds_nothing_says_so(tool: Tool, tmp_path: Path) -> None:
+    none = {"value": None, "low": None, "high": None}
+    cell = {"distance_m": 0.2, "yaw_deg": 45.0, "weights": {"blind": dict.fromkeys(BARS, none)}}
+    tool("rig_map").draw(tmp_path / "map.png", [cell], RIG)
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_on_every_rig_difference_maps_are_less_its_own_bare_wall(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig_map, asked = tool("rig_map"), list[Any]()
+    bare = np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32)
+    monkeypatch.setattr(evaluate_maps, "render_bare_wall", lambda plan: (asked.append(plan.rig), bare)[1])
+    networks = {"raw": Plate(), "difference": Plate("difference maps")}
+    there = rig_map.rig_at(RIG, 0.3, 15.0)
+    assert set(rig_map.cell_at(there, seeded_objects(0, 1, BOX), networks)["weights"]) == set(networks)
+    assert asked == [there]
 
 
 def test_the_lidar_alone_moves_over_the_map(tool: Tool) -> None:
@@ -96,8 +126,11 @@ def test_the_comparisons_row_is_filled_in_from_figures(
     figures: dict[str, Any] = {"objects": 54, **dict.fromkeys(BARS, figure)}
     cost = {
         "machine": "a machine",
-        "settings": [{"name": "quick", "milliseconds": 7.4}],
-        "recommended": {"name": "quick"},
+        "settings": [
+            {"name": "quick", "weights": "small", "milliseconds": 3.1},
+            {"name": "quick", "weights": "large", "milliseconds": 7.4},
+        ],
+        "recommended": {"name": "quick", "weights": "large"},
     }
     for name, table in (("figures.json", figures), ("tradeoff_reconstruct.json", cost)):
         (tmp_path / name).write_text(json.dumps(table), encoding="utf-8")

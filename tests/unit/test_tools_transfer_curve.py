@@ -151,4 +151,6 @@ def test_figures_of_exact_images_are_perfect_and_those_of_nothing_are_not(tool: 
     assert nothing["silhouette_iou"]["value"] == 0
     assert nothing["foreground_rmse_mm"]["value"] is None
     assert near["foreground_rmse_mm"]["value"] == pytest.approx(0.1 * 280 / 0.9, rel=1e-3)
+    assert near["foreground_too_far_mm"]["value"] == pytest.approx(-0.1 * 280 / 0.9, rel=1e-3)
+    assert nothing["foreground_too_far_mm"]["value"] is None
     assert exact["objects"] == 1

@@ -137,6 +137,16 @@ def test_table_and_plot_hold_what_was_measured(tmp_path: Path, measured: int) ->
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_of_several_weights_it_is_told_whose_setting_is_recommended() -> None:
+    small, large = (
+        [replace(row, setting=replace(row.setting, weights=name)) for row in ROWS] for name in ("small", "large")
+    )
+    table = facts([*large, *small], 8, 54, "a machine")
+    assert table["recommended"] == {"name": "quick", "weights": "large"}
+    assert {"name": "quicker", "weights": "large"} in table["pareto_front"]
+    assert "Recommended: large: quick " in as_markdown(table)
+
+
 def test_nothing_measured_is_told_as_such() -> None:
     table = facts([], 4, 54, "a machine")
     assert (table["recommended"], table["settings"], table["complete"]) == (None, [], False)

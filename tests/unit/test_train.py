@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from nlos_models import train
+from nlos_models import schedule
 from nlos_models.errors import RecipeError, TrainingError
-from nlos_models.run_files import LAST
+from nlos_models.run_files import BEST, LAST, read_last, write_last
 from small_run import STEPS, Executioner, SmallRun, Stopped, be_killed, run_watched, small_recipe
 
 
@@ -122,6 +122,18 @@ def test_a_run_of_another_recipe_is_refused(tmp_path: Path) -> None:
         _trained(tmp_path, learning_rate=0.5)
 
 
+def test_a_run_from_another_origin_is_refused_and_one_that_does_not_tell_is_not(tmp_path: Path) -> None:
+    run = SmallRun(small_recipe(epochs=1), tmp_path)
+    run.go(origin="these weights")
+    with pytest.raises(RecipeError, match="a run from other weights"):
+        SmallRun(run.recipe, tmp_path).go(origin="those weights")
+    state = read_last(tmp_path, pytest.fail)
+    assert state is not None
+    del state["origin"]
+    write_last(tmp_path, state)
+    SmallRun(run.recipe, tmp_path).go(origin="those weights")
+
+
 def test_the_best_epoch_is_handed_on_where_the_recipe_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     judged: dict[float, dict[str, torch.Tensor]] = {}
 
@@ -141,8 +153,8 @@ def test_the_best_epoch_is_handed_on_where_the_recipe_says_so(tmp_path: Path, mo
 def test_a_run_whose_learning_rate_reached_its_end_stops_and_does_not_train_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train, "PLATEAU_PATIENCE", 0)
-    monkeypatch.setattr(train, "SMALLEST_RATE", 2e-3)
+    monkeypatch.setattr(schedule, "PLATEAU_PATIENCE", 0)
+    monkeypatch.setattr(schedule, "SMALLEST_RATE", 2e-3)
     monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": 1.0})
     done = _trained(tmp_path, epochs=20).steps
     assert 2 * STEPS <= len(done) <= 5 * STEPS  # the rate falls to 1e-2, 3e-3 and 9e-4
@@ -160,6 +172,13 @@ def test_a_run_that_diverges_ends_with_a_line_and_keeps_the_epochs_before(tmp_pa
     _assert_same(_trained(tmp_path), _trained(tmp_path / "whole"))
 
 
+def test_a_held_out_loss_that_is_no_number_is_never_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": float("nan")})
+    with pytest.raises(TrainingError, match="held-out loss is not a number in epoch 0"):
+        _trained(tmp_path)
+    assert not (tmp_path / BEST).exists()
+
+
 def test_frozen_parameters_stay(tmp_path: Path) -> None:
     run = SmallRun(small_recipe(), tmp_path)
     frozen = run.net[0].weight.requires_grad_(requires_grad=False)
@@ -167,6 +186,10 @@ def test_frozen_parameters_stay(tmp_path: Path) -> None:
     run.go()
     assert torch.equal(frozen, before)
     assert not torch.equal(run.net[-1].weight, free)
+
+
+def test_one_cycle_runs_to_its_end_however_small_its_rate(tmp_path: Path) -> None:
+    assert len(_trained(tmp_path, schedule="one-cycle", learning_rate=1e-7).log) == 4  # it begins at 4e-9
 
 
 def test_bfloat16_trains_too(tmp_path: Path) -> None:

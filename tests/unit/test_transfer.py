@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from nlos_models import transfer
+from nlos_models import remap, transfer
 from nlos_models.errors import RecipeError
 from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import channel_statistics, split_and_stack
@@ -105,13 +105,33 @@ def test_the_phases_have_the_epochs_and_rates_of_the_recipe(tmp_path: Path) -> N
     assert bench.steps == [(k + 1, 5 * STEPS) for k in range(5 * STEPS)]
 
 
-@pytest.mark.parametrize("statistics", ["kept", "own"])
-def test_maps_are_normalised_as_the_recipe_says(tmp_path: Path, statistics: str) -> None:
+def test_the_second_phase_sets_out_from_the_first_ones_best_epoch_where_that_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    losses, found = iter([2.0, 1.0, 3.0, *[9.0] * 9]), list[dict[str, torch.Tensor]]()
+    bench = Bench(tmp_path)
+
+    def figures(*_: object) -> dict[str, float]:
+        found.append(bench.state)
+        return {"held_out_loss": next(losses)}
+
+    monkeypatch.setattr(remap, "figures_of", figures)
+    bench.go(_recipe(all_layers_epochs=3, epochs=1, keep="best", dropout=0.0))
+    after_best, last = (_changed(found[k], bench.state) for k in (1, 2))
+    assert after_best == {"compressor.classifier.1.weight", "compressor.classifier.1.bias"}
+    assert last > after_best
+
+
+@pytest.mark.parametrize(("statistics", "own"), [("kept", []), ("own", [0, 1, 2, 3]), ("own intensity", [2, 3])])
+def test_maps_are_normalised_as_the_recipe_says(tmp_path: Path, statistics: str, own: list[int]) -> None:
     bench = Bench(tmp_path)
     stacked = split_and_stack(torch.from_numpy(bench.maps.depth_m), torch.from_numpy(bench.maps.intensity))
-    wanted = channel_statistics(stacked)[0] if statistics == "own" else torch.full((4,), 0.25)
+    wanted = [torch.full((4,), 0.25), torch.ones(4)]
+    for values, theirs in zip(wanted, channel_statistics(stacked), strict=True):
+        values[own] = theirs[own]
     bench.go(_recipe(statistics=statistics, all_layers_epochs=0, epochs=1))
-    assert torch.equal(bench.pipeline.preprocess.mean, wanted)
+    assert torch.equal(bench.pipeline.preprocess.mean, wanted[0])
+    assert torch.equal(bench.pipeline.preprocess.spread, wanted[1])
 
 
 def test_the_recipes_dropout_and_noise_are_used(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from nlos_calibration.wall_record import load_wall
 
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.wall_files import WallFiles, written
+from nlos_cam.wall_report import report
 
 RECORD = Path(__file__).parent / "wall_v2.toml"
 
@@ -30,6 +31,8 @@ def test_what_is_written_belongs_together(tmp_path: Path, wall: BareWall) -> Non
     assert measured.record == record
     assert measured.reference is not None
     np.testing.assert_array_equal(measured.reference.depth_m, wall.depth_m)
+    assert files.report.read_text(encoding="utf-8") == report(measured, "wall.toml")
+    assert {path.name for path in tmp_path.iterdir()} == {"wall.toml", "wall.npz", "wall.html"}
 
 
 def test_what_ends_the_writing_leaves_the_earlier_files(
@@ -42,7 +45,7 @@ def test_what_ends_the_writing_leaves_the_earlier_files(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nlos_cam.wall_files.write_report", interrupted)
+    monkeypatch.setattr("nlos_cam.wall_files.report", interrupted)
     with pytest.raises(KeyboardInterrupt):
         written(files, load_wall(RECORD), replace(wall, depth_m=wall.depth_m + np.float32(0.1)))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -2,15 +2,12 @@ import base64
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 from nlos_calibration.measured_wall import MeasuredWall
 
-from nlos_cam import wall_report
-from nlos_cam.wall_report import report, write_report
+from nlos_cam.wall_report import report
 
 Measured = Callable[..., MeasuredWall]
 VOID = {"meta", "img", "rect", "path"}
@@ -114,21 +111,3 @@ def test_a_report_of_nothing_but_noise_is_no_larger_than_it_may_be(measured: Mea
         saturated=noise.uniform(0.0, 1.0, shape).astype(np.float32),
     )
     assert len(report(MeasuredWall(wall.record, loud), "wall.toml")) < 1_500_000
-
-
-def test_the_file_is_the_report(tmp_path: Path, measured: Measured) -> None:
-    write_report(tmp_path / "wall.html", measured(), "wall.toml")
-    assert (tmp_path / "wall.html").read_text(encoding="utf-8") == report(measured(), "wall.toml")
-    assert [each.name for each in tmp_path.iterdir()] == ["wall.html"]
-
-
-def test_a_report_that_fails_leaves_the_one_that_is_there(
-    tmp_path: Path, measured: Measured, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "wall.html"
-    path.write_text("the last one", encoding="utf-8")
-    monkeypatch.setattr(wall_report, "report", lambda *_: "\ud800")  # no UTF-8 has it
-    with pytest.raises(UnicodeEncodeError):
-        write_report(path, measured(), "wall.toml")
-    assert path.read_text(encoding="utf-8") == "the last one"
-    assert [each.name for each in tmp_path.iterdir()] == ["wall.html"]

@@ -1,0 +1,119 @@
+"""What weights are judged on: the test objects or a dataset, as maps that the weights eat, on the rig of either."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from nlos_calibration.errors import RecordFileError
+from nlos_calibration.rig import Rig
+from nlos_calibration.wall_record import rig_named
+from nlos_models.checkpoint import CheckpointRecord
+from nlos_models.data import MapSet
+from nlos_models.sources import less_bare_wall
+
+from nlos_cam import dataset
+from nlos_cam import evaluate_baselines as trivial
+from nlos_cam import evaluate_objects as objects
+from nlos_cam.cache import cache_folder
+from nlos_cam.cli.common import tracked
+from nlos_cam.cli.train_data import BareMaps, measured_bare_wall, render_bare_wall
+from nlos_cam.errors import SceneError
+from nlos_cam.frames import Float32
+from nlos_cam.objects.test_set import test_set
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Objects to judge on."""
+
+    what: str
+    """In words, for the report."""
+    names: list[str]
+    categories: list[str]
+    maps: MapSet
+    """Raw ones, whatever the weights eat: the baselines look at these."""
+    plan: dataset.DatasetPlan
+
+
+def rig_of(record: CheckpointRecord) -> Rig:
+    """The rig that weights were trained for. Raises SceneError where it is neither packaged nor a file that is here."""
+    try:
+        return rig_named(record.rig_name)
+    except RecordFileError as error:
+        raise SceneError(
+            f"these weights are for the rig {record.rig_name!r}, which is not at hand ({error}): name one with --rig"
+        ) from error
+
+
+def fresh_objects(rig: Rig, count: int | None = None) -> Judged:
+    """The 54, or so many random objects, through the noise of the simulated camera on a rig."""
+    plan = dataset.DatasetPlan(rig, dataset.TEST_SEED)
+    subjects = objects.seeded_objects(plan.first_seed, count, plan.box) if count else test_set(plan.box)
+    with tracked("rendering test objects") as on_progress:
+        echoes = objects.echoes_of(subjects, rig, on_progress)
+    maps = objects.as_map_set(objects.sense(echoes, rig), objects.truth_of(subjects, plan.box))
+    kind = "random objects" if count else "fixed test objects"
+    what = f"{len(subjects)} {kind} that training never draws, through the sensor's noise"
+    return Judged(what, [one.name for one in subjects], [one.category for one in subjects], maps, plan)
+
+
+def stored_objects(folder: Path) -> Judged:
+    """Those of a dataset."""
+    opened = dataset.open_dataset(folder)
+    categories = [str(category) for category in opened.column("category")]
+    names = [f"{category} {seed}" for category, seed in zip(categories, opened.column("seed"), strict=True)]
+    return Judged(f"Maps of {folder}", names, categories, opened.arrays(), opened.plan)
+
+
+def bare_wall_for(record: CheckpointRecord, plan: dataset.DatasetPlan, wall: Path | None = None) -> BareMaps | None:
+    """The bare wall that weights want their maps less of, as `train` took it; None where they eat raw maps.
+
+    Raises SceneError for a measured wall that would be of no use.
+    """
+    if record.input == "raw maps":
+        if wall:
+            raise SceneError(f"these weights eat raw maps, and {wall} is for difference maps: leave out --wall")
+        return None
+    return measured_bare_wall(wall) if wall else render_bare_wall(plan)
+
+
+def as_eaten(maps: MapSet, bare: BareMaps | None) -> MapSet:
+    """Raw maps as weights eat them."""
+    return less_bare_wall(maps, *bare) if bare else maps
+
+
+def guesses(
+    judged: Judged, training: Path | None, *, nearest: bool
+) -> tuple[dict[str, Float32], dataset.Dataset | None]:
+    """The baselines' images, and the training objects that the nearest was looked for among, if it is wanted."""
+    if not nearest:
+        images = dataset.procedural_images(dataset.TRAINING_SEED, trivial.NEIGHBOURS, judged.plan.box)
+        return trivial.without_maps(len(judged.names), trivial.mean_image(images)), None
+    if training:
+        opened = dataset.open_dataset(training)
+    else:
+        with tracked("rendering training objects for the nearest neighbour, once") as on_progress:
+            opened = trivial.training_maps(judged.plan, cache_folder(), os.cpu_count() or 1, on_progress)
+    with tracked("looking for the nearest") as on_progress:
+        return trivial.with_nearest(judged.maps, opened, on_progress), opened
+
+
+def notes_on(record: CheckpointRecord, judged: Judged, training: dataset.Dataset | None) -> list[str]:
+    """What a reader has to know to read the figures."""
+    rig, told = judged.plan.rig, list[str]()
+    if record.rig_checksum != rig.checksum:
+        told.append(
+            f"the weights were trained for the rig {record.rig_name}, and these maps are of another, {rig.name}"
+        )
+    if training and training.plan.rig.checksum != rig.checksum:
+        told.append(
+            f"the nearest neighbour is of {training.folder}, whose maps are of another rig than those judged on"
+        )
+    if unseen := sorted(set(left_out_of(record)) & set(judged.categories)):
+        told.append(f"the weights' VAE was never shown {', '.join(unseen)}")
+    return told
+
+
+def left_out_of(record: CheckpointRecord) -> list[str]:
+    """The categories of objects that weights' VAE was not shown."""
+    return record.vae_recipe.left_out if record.vae_recipe else []
