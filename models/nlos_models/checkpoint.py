@@ -77,7 +77,7 @@ def load_pipeline_partly(folder: Path) -> tuple[Pipeline, CheckpointRecord, Load
 
 def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[Pipeline, CheckpointRecord]:
     record = load_record(folder)
-    pipeline = new_pipeline(colour=record.colour)
+    pipeline = new_pipeline(colour=record.colour, width=record.width)
     for name in names:
         _load(folder / f"{name}.safetensors", getattr(pipeline, name))
     return pipeline.eval(), record

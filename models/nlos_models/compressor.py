@@ -32,10 +32,16 @@ class InvertedResidual(nn.Module):
         return x + self.layers(x) if self.residual else self.layers(x)
 
 
-def _features() -> nn.Sequential:
-    layers: list[nn.Module] = [*conv_norm(INPUT_CHANNELS, STEM, 3, stride=2), nn.ReLU6()]
-    channels = STEM
+def thinned(channels: int, width: float) -> int:
+    """So many of a layer's channels as a network of this width has: MobileNetV2's rule, in eights."""
+    return max(8, int(channels * width + 4) // 8 * 8)
+
+
+def _features(width: float) -> nn.Sequential:
+    channels = thinned(STEM, width)
+    layers: list[nn.Module] = [*conv_norm(INPUT_CHANNELS, channels, 3, stride=2), nn.ReLU6()]
     for expansion, out, repeats, stride in STAGES:
+        out = thinned(out, width)  # noqa: PLW2901  as many as this width has
         for repeat in range(repeats):
             layers.append(InvertedResidual(channels, out, stride if repeat == 0 else 1, expansion))
             channels = out
@@ -43,11 +49,11 @@ def _features() -> nn.Sequential:
 
 
 class Compressor(nn.Module):
-    """Split-and-stack maps (n, 4, 100, 100) to latents (n, 256)."""
+    """Split-and-stack maps (n, 4, 100, 100) to latents (n, 256); of another width, all but the last layer is so."""
 
-    def __init__(self, dropout: float = DROPOUT) -> None:
+    def __init__(self, dropout: float = DROPOUT, width: float = 1.0) -> None:
         super().__init__()
-        self.features = _features()
+        self.features = _features(width)
         self.classifier = nn.Sequential(nn.Dropout(dropout), nn.Linear(HEAD, OUTPUTS))
 
     def forward(self, stacked: Tensor) -> Tensor:

@@ -19,9 +19,14 @@ def new_vae(*, colour: bool) -> ResVae:
 
 
 def new_pipeline(
-    decoder: Decoder | None = None, *, colour: bool, dropout: float = DROPOUT, left_noise: float = 0.2
+    decoder: Decoder | None = None,
+    *,
+    colour: bool,
+    dropout: float = DROPOUT,
+    left_noise: float = 0.2,
+    width: float = 1.0,
 ) -> Pipeline:
     """A new compressor before a decoder, a new one unless given: MobileNetV2, or in colour ResNet50 (SI 4)."""
     if not colour:
-        return Pipeline(Compressor(dropout), decoder or Decoder(), left_noise)
+        return Pipeline(Compressor(dropout, width), decoder or Decoder(), left_noise)
     return Pipeline(ResNet50(dropout=dropout), decoder or Decoder(CHANNELS, COLOUR_LATENT), left_noise, CHANNELS)

@@ -38,6 +38,8 @@ class Recipe(BaseModel):
     kl_weight: float = 0.05
     left_noise: float = 0.2
     dropout: float = Field(default=0.5, ge=0, lt=1)
+    width: float = Field(default=1.0, gt=0, le=2)
+    """Of a compressor's layers, as a share of Table S2's channels."""
     latent_weight: float = Field(default=1.0, ge=0)
     image_weight: float = Field(default=0.0, ge=0)
     surface_weight: float = Field(default=1.0, ge=1)
@@ -82,6 +84,8 @@ class Recipe(BaseModel):
             raise ValueError("start 'weights' is for a VAE or a two-step compressor: leave it out")
         if self.colour and (self.task == "transfer" or self.maps != "raw maps"):
             raise ValueError("colour is simulation only, and of raw maps: no bench to transfer to, no difference maps")
+        if self.width != 1 and (self.colour or self.task != "compressor"):
+            raise ValueError("width is of a compressor of depth: leave it out")
         if self.steps != "two" and not self.image_weight:
             raise ValueError(
                 f"steps {self.steps!r} trains a decoder, which learns by images alone: set an image_weight"

@@ -61,6 +61,11 @@ class CheckpointRecord(BaseModel):
         return [recipe for recipe in self.runs if recipe.task == "vae" or recipe.steps == "two-then-joint"]
 
     @property
+    def width(self) -> float:
+        """Of the compressor's layers, as a share of Table S2's."""
+        return self.compressor_recipe.width if self.compressor_recipe else 1.0
+
+    @property
     def colour(self) -> bool:
         """Whether these are weights of full colour, which is simulation only."""
         return _in_colour(self.vae_recipe, self.compressor_recipe)

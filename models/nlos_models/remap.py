@@ -91,8 +91,11 @@ class Remapping:
             return []
         if self.encoder is None:
             raise TrainingError("these weights have no encoder to aim at: set latent_weight = 0, or name a VAE's")
-        encoder = self.encoder.to(fabric.device).requires_grad_(requires_grad=False).eval()
-        return [latents_of(encoder, images) for images in (self.source.image, self.source.image[..., ::-1, :])]
+        encoder = in_channels_last(self.encoder).to(fabric.device).requires_grad_(requires_grad=False).eval()
+        with fabric.autocast():
+            return [
+                latents_of(encoder, images).float() for images in (self.source.image, self.source.image[..., ::-1, :])
+            ]
 
 
 def in_channels_last(module: Module) -> Module:

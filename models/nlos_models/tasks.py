@@ -95,7 +95,9 @@ def train_compressor(
 
 def _set_out(recipe: Recipe, start: Start) -> Pipeline:
     if recipe.steps == "one":
-        return new_pipeline(colour=recipe.colour, dropout=recipe.dropout, left_noise=recipe.left_noise)
+        return new_pipeline(
+            colour=recipe.colour, dropout=recipe.dropout, left_noise=recipe.left_noise, width=recipe.width
+        )
     if recipe.steps == "two-then-joint":
         if start.pipeline is None:
             raise TrainingError("steps 'two-then-joint' go on from two-step weights: name them (--weights)")
@@ -103,7 +105,7 @@ def _set_out(recipe: Recipe, start: Start) -> Pipeline:
         return start.pipeline
     if start.vae is None:
         raise TrainingError("steps 'two' need a trained VAE: name one (--vae)")
-    pipeline = new_pipeline(start.vae.decoder, colour=recipe.colour)
+    pipeline = new_pipeline(start.vae.decoder, colour=recipe.colour, width=recipe.width)
     if start.pipeline:
         pipeline.compressor = start.pipeline.compressor
     set_for_training(pipeline, recipe)

@@ -74,6 +74,10 @@ def _fits(recipe: Recipe, folder: Path | None) -> None:
     record = _same_colour(recipe, folder)
     if record.input != recipe.maps:
         raise SceneError(f"these weights eat {record.input}, the recipe says {recipe.maps}: change one of them")
+    if recipe.task == "compressor" and record.width != recipe.width:
+        raise SceneError(
+            f"these weights are {record.width:g} wide, the recipe says {recipe.width:g}: change one of them"
+        )
 
 
 def _same_colour(recipe: Recipe, folder: Path | None) -> CheckpointRecord:

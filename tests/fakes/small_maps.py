@@ -98,9 +98,9 @@ class SmallVae(nn.Module):
 
 
 class SmallCompressor(nn.Module):
-    """Stands for Compressor: features with a batch norm, then dropout and a linear classifier."""
+    """Stands for Compressor of any width: features with a batch norm, then dropout and a linear classifier."""
 
-    def __init__(self, dropout: float = 0.5) -> None:
+    def __init__(self, dropout: float = 0.5, width: float = 1.0) -> None:  # noqa: ARG002  small is small
         super().__init__()
         conv = nn.Conv2d(4, 4, 5, stride=5)
         self.features = nn.Sequential(conv, nn.BatchNorm2d(4), nn.ReLU(), nn.AvgPool2d(4), nn.Flatten())

@@ -85,6 +85,16 @@ def test_a_pipeline_comes_back_within_float16_and_its_statistics_exactly(tmp_pat
         torch.testing.assert_close(back, tensor, rtol=0 if exact else 1e-3, atol=0 if exact else 1e-7)
 
 
+def test_a_narrower_compressor_is_loaded_as_narrow_as_it_was_trained(tmp_path: Path) -> None:
+    facts = {"objects": 10, "held_out": 1, "epochs": 1, "batch": 2, "learning_rate": 1e-3}
+    narrow = Recipe.model_validate({"task": "compressor", "width": 0.5, **facts})
+    save_pipeline(tmp_path, Pipeline(Compressor(width=0.5), Decoder()), CheckpointRecord.of([narrow], ("a", "b")))
+    loaded, record = load_pipeline(tmp_path)
+    assert record.width == 0.5
+    fewer, all_of_them = (sum(p.numel() for p in one.parameters()) for one in (loaded.compressor, Compressor()))
+    assert fewer < all_of_them / 2
+
+
 def test_saving_a_loaded_checkpoint_gives_the_same_bits(saved: Path, tmp_path: Path) -> None:
     save_pipeline(tmp_path, *load_pipeline(saved))
     names = sorted(path.name for path in saved.iterdir())

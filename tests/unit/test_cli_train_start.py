@@ -90,6 +90,12 @@ def test_weights_that_eat_other_maps_are_refused(weights: Path, recipe: Recipe) 
         _start(other, weights)
 
 
+@pytest.mark.parametrize("recipe", GOING_ON[:2])
+def test_weights_of_another_width_are_refused(weights: Path, recipe: Recipe) -> None:
+    with pytest.raises(SceneError, match=r"these weights are 1 wide, the recipe says 0\.5: change one of them"):
+        _start(recipe.model_copy(update={"width": 0.5}), weights)
+
+
 @pytest.mark.parametrize("recipe", GOING_ON)
 def test_weights_of_colour_are_refused(weights: Path, recipe: Recipe) -> None:
     record = CheckpointRecord.of([_recipe("vae", colour=True)], RIG).model_dump_json()

@@ -35,6 +35,17 @@ def test_the_inverted_residuals_are_table_s2(compressor: Compressor) -> None:
     assert found == expected
 
 
+@pytest.mark.parametrize("width", [0.35, 0.5, 1.4])
+def test_a_narrower_one_has_fewer_channels_by_eights_and_the_same_latent(width: float) -> None:
+    compressor = Compressor(width=width).eval()
+    blocks = [m for m in compressor.features if isinstance(m, InvertedResidual)]
+    out = [[c for c in block.modules() if isinstance(c, nn.Conv2d)][-1].out_channels for block in blocks]
+    full = [16, *[24] * 2, *[32] * 3, *[64] * 4, *[96] * 3, *[160] * 3, 320]
+    assert all(mine % 8 == 0 and abs(mine - width * its) <= 8 for mine, its in zip(out, full, strict=True))
+    with torch.inference_mode():
+        assert compressor(torch.randn(1, 4, 100, 100)).shape == (1, 256)
+
+
 def test_it_is_added_to_its_input_only_where_the_shapes_agree() -> None:
     assert InvertedResidual(16, 16, 1, 6).residual
     assert not InvertedResidual(16, 24, 1, 6).residual

@@ -21,7 +21,7 @@ def _shapes(vae: nn.Module, compressor: nn.Module) -> list[torch.Size]:
 @torch.no_grad()
 def test_small_networks_have_the_shapes_and_the_parts_of_the_real_ones() -> None:
     assert _shapes(SmallVae(), SmallCompressor()) == _shapes(ResVae(), Compressor())
-    for compressor in (SmallCompressor(0.25), Compressor(0.25)):
+    for compressor in (SmallCompressor(0.25, 0.5), Compressor(0.25, 0.5)):
         dropout, linear = compressor.classifier
         assert isinstance(compressor.features, nn.Module)
         assert dropout.p == 0.25
