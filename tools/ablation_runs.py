@@ -1,8 +1,8 @@
 """The trainings that tools/ablations.py holds side by side, each at a fixed tenth of the shipped compressor's budget.
 
-`python tools/ablation_runs.py RUNS --vae DIR --dataset DIR --held-out DIR [--only NAME ...]`: all of them, or those named; a
+`python tools/ablation_runs.py RUNS --vae DIR --dataset DIR --held-out DIR [--only NAME ...]`: all, or those named; a
 second call goes on where it was stopped, and leaves alone what is done. Each way differs from "two" as CHANGES says and
-in nothing else: the same objects in the same order, as many maps in all.
+in nothing else: the same objects in the same order.
 """
 
 import argparse
