@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -25,11 +26,9 @@ from nlos_models.res_vae import Decoder, Encoder, ResVae
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+RECIPE = Recipe(task="vae", objects=10, held_out=1, epochs=1, batch=2, learning_rate=1e-3)
 RECORD = CheckpointRecord(
-    rig_name="paper-rig",
-    rig_checksum="0123456789ab",
-    vae_recipe=Recipe(task="vae", objects=10, held_out=1, epochs=1, batch=2, learning_rate=1e-3),
-    figures={"held_out_iou": 0.5},
+    rig_name="paper-rig", rig_checksum="0123456789ab", vae_recipe=RECIPE, figures={"held_out_iou": 0.5}
 )
 PARTS = ("compressor", "preprocess", "decoder")
 
@@ -86,13 +85,10 @@ def test_a_pipeline_comes_back_within_float16_and_its_statistics_exactly(tmp_pat
 
 
 def test_a_narrower_compressor_is_loaded_as_narrow_as_it_was_trained(tmp_path: Path) -> None:
-    facts = {"objects": 10, "held_out": 1, "epochs": 1, "batch": 2, "learning_rate": 1e-3}
-    narrow = Recipe.model_validate({"task": "compressor", "width": 0.5, **facts})
+    narrow = RECIPE.model_copy(update={"task": "compressor", "width": 0.5})
     save_pipeline(tmp_path, Pipeline(Compressor(width=0.5), Decoder()), CheckpointRecord.of([narrow], ("a", "b")))
-    loaded, record = load_pipeline(tmp_path)
-    assert record.width == 0.5
-    fewer, all_of_them = (sum(p.numel() for p in one.parameters()) for one in (loaded.compressor, Compressor()))
-    assert fewer < all_of_them / 2
+    loaded, _ = load_pipeline(tmp_path)
+    assert 2 * sum(p.numel() for p in loaded.compressor.parameters()) < 2_552_096
 
 
 def test_saving_a_loaded_checkpoint_gives_the_same_bits(saved: Path, tmp_path: Path) -> None:
@@ -240,10 +236,7 @@ def test_a_pipeline_is_loaded_in_part_only_where_its_compressor_is_the_one_that_
 
 
 def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(checkpoint, "save_file", full)
+    monkeypatch.setattr(checkpoint, "save_file", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(CheckpointError, match=r"cannot take the weights .*No space left.*: make room"):
         save_vae(tmp_path, ResVae(), RECORD)
 
