@@ -14,10 +14,10 @@ from typing import Any
 
 from named_weights import by_name, errors_told, named
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
+from nlos_models.inference import refuse_colour
 from nlos_models.remap import run
 
 from nlos_cam.cli.evaluate_maps import Judged, as_eaten, bare_wall_for, fresh_objects, rig_of
-from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, PerObject, advantage, over_objects, per_object, plain
 from nlos_cam.evaluate_pictures import LABELS
 from nlos_cam.evaluate_report import in_words
@@ -54,14 +54,13 @@ class Trained:
 def judged(folders: Mapping[str, Path], count: int | None = None) -> list[Trained]:
     """All weights, on the test objects or on so many random ones; objects of one rig are rendered once.
 
-    Raises SceneError for weights of full colour, CheckpointError for what holds none.
+    Raises CheckpointError for weights of full colour, and for what holds none.
     """
     by_rig: dict[str, Judged] = {}
     found = list[Trained]()
     for name, folder in folders.items():
         pipeline, record = load_pipeline(folder)
-        if record.colour:
-            raise SceneError(f"{folder} holds weights for full colour: name weights for depth")
+        refuse_colour(record, folder)
         rig = rig_of(record)
         if rig.checksum not in by_rig:
             by_rig[rig.checksum] = fresh_objects(rig, count)

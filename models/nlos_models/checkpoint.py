@@ -77,6 +77,8 @@ def load_pipeline_partly(folder: Path) -> tuple[Pipeline, CheckpointRecord, Load
 
 def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[Pipeline, CheckpointRecord]:
     record = load_record(folder)
+    if not (folder / "compressor.safetensors").exists() and (folder / "encoder.safetensors").exists():
+        raise CheckpointError(f"{folder} holds a VAE alone, with no compressor: name weights of `train compressor`")
     pipeline = new_pipeline(colour=record.colour, width=record.width)
     for name in names:
         _load(folder / f"{name}.safetensors", getattr(pipeline, name))

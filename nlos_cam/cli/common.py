@@ -129,6 +129,8 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
     path = out or Path(f"{stem}-{datetime.now().astimezone():%Y%m%d-%H%M%S}{suffix}")
     if suffix and path.is_dir():
         raise OutputExistsError(f"{path} is a folder: name a {suffix} file in it")
+    if not suffix and path.exists() and not path.is_dir():
+        raise OutputExistsError(f"{path} is a file, and a folder is what is written: choose another name")
     if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
         raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
     if not path.parent.is_dir():

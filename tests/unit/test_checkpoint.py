@@ -158,7 +158,7 @@ def test_a_tensor_that_does_not_fit_is_named(folder: Path, harm: str) -> None:
 
 def test_a_vae_is_no_pipeline(tmp_path: Path) -> None:
     save_vae(tmp_path, ResVae(), RECORD)
-    with pytest.raises(CheckpointError, match="compressor"):
+    with pytest.raises(CheckpointError, match="a VAE alone, with no compressor: name weights of"):
         load_pipeline(tmp_path)
 
 

@@ -1,3 +1,5 @@
+"""Where commands write: nowhere that would lose something."""
+
 import os
 from pathlib import Path
 
@@ -5,6 +7,14 @@ import pytest
 
 from nlos_cam.cli.common import output_path
 from nlos_cam.errors import OutputExistsError
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_file_does_not_give_way_to_a_folder(tmp_path: Path, *, overwrite: bool) -> None:
+    out = tmp_path / "figures"
+    out.write_text("mine", encoding="utf-8")
+    with pytest.raises(OutputExistsError, match="figures is a file, and a folder is what is written"):
+        output_path(out, "figures", "", overwrite=overwrite)
 
 
 def test_a_folder_that_cannot_be_written_to_is_told_before_anything_is_measured(
