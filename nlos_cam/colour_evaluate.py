@@ -1,7 +1,6 @@
 """Judge reconstructions in colour (simulation only): figures by name, beside what needs no network, and a picture."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from nlos_models.metrics import surface
 from nlos_models.recipe import SIMULATION_ONLY
 
 from nlos_cam.dataset_samples import sense_colour
-from nlos_cam.evaluate import interval
+from nlos_cam.evaluate import advantage, over_objects, plain
 from nlos_cam.frames import Float32
 from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
 from nlos_cam.render.scene import Scene
@@ -44,14 +43,12 @@ def painted_maps(
 
 def judge_colour(image: Float32, truth: Float32) -> dict[str, Figure]:
     """Every metric of colour images (n, 3, 64, 64) against the truth."""
-    return {name: asdict(interval(values)) for name, values in colour_metrics(image, truth).items()}
+    return plain(over_objects(colour_metrics(image, truth)))
 
 
 def better_than(guess: Float32, image: Float32, truth: Float32) -> dict[str, Figure]:
     """By how much images are better than a guess, object by object: positive is better, also where less is better."""
-    ours, its = colour_metrics(image, truth), colour_metrics(guess, truth)
-    signs = {name: -1 if name in SMALLER_IS_BETTER else 1 for name in ours}
-    return {name: asdict(interval(sign * (ours[name] - its[name]))) for name, sign in signs.items()}
+    return plain(advantage(colour_metrics(image, truth), colour_metrics(guess, truth), SMALLER_IS_BETTER))
 
 
 def colour_guesses(image: Float32, training: Half | Float32) -> dict[str, Float32]:

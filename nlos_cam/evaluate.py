@@ -1,6 +1,6 @@
 """Judge images of hidden objects: every metric by name with its interval, per category, and against the baselines."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -10,7 +10,6 @@ from nlos_models import metrics
 from numpy.typing import NDArray
 
 from nlos_cam.frames import Float32
-from nlos_cam.objects.depth_image import FARTHEST_V
 
 Values = NDArray[np.float64]
 """One value for each object (n,); NaN where an object has none."""
@@ -44,7 +43,7 @@ Figures = dict[str, Interval]
 
 def mm_per_v(box: ObjectBox) -> float:
     """Millimetres of depth that one unit of v stands for."""
-    return 1000 * (box.z_far_m - box.z_near_m) / (1 - FARTHEST_V)
+    return 1000 * (box.z_far_m - box.z_near_m) / (1 - metrics.LEAST_V)
 
 
 def per_object(image: Float32, truth: Float32, box: ObjectBox) -> PerObject:
@@ -81,13 +80,15 @@ def per_category(values: Mapping[str, Values], categories: Sequence[str]) -> dic
     }
 
 
-def advantage(ours: Mapping[str, Values], theirs: Mapping[str, Values]) -> Figures:
+def advantage(
+    ours: Mapping[str, Values], theirs: Mapping[str, Values], smaller_is_better: Collection[str] = SMALLER_IS_BETTER
+) -> Figures:
     """By how much ours is better, object by object: positive is better, also where less is better.
 
     An interval that excludes 0 tells them apart; objects that either has no value for are left out.
     """
     return {
-        name: interval((-1 if name in SMALLER_IS_BETTER else 1) * (value - theirs[name]))
+        name: interval((-1 if name in smaller_is_better else 1) * (value - theirs[name]))
         for name, value in ours.items()
     }
 

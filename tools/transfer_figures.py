@@ -19,12 +19,12 @@ from nlos_models.inference import Reconstructor, load_reconstructor
 from numpy.typing import NDArray
 from transfer_bench import ADAPTATION, HELD_OUT, VALIDATION, part_of
 
+from nlos_cam import evaluate
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
-from nlos_cam.evaluate import interval
 from nlos_cam.frames import Float32, maps_from_frame
 from nlos_cam.labelled import read_labelled, recordings_in
-from nlos_cam.objects.depth_image import FARTHEST_V, image_from_depth, object_box
+from nlos_cam.objects.depth_image import image_from_depth, object_box
 from nlos_cam.objects.test_set import test_set
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
@@ -46,7 +46,7 @@ def judge(reconstructor: Reconstructor, maps: MapSet, mm_per_v: float) -> dict[s
         "foreground_rmse_mm": metrics.foreground_rmse_mm(image, truth, mm_per_v),
         "foreground_too_far_mm": mm_per_v * too_far(image, truth),
     }
-    return {"objects": len(truth), **{name: asdict(interval(value)) for name, value in values.items()}}
+    return {"objects": len(truth), **{name: asdict(evaluate.interval(value)) for name, value in values.items()}}
 
 
 def too_far(image: Float32, truth: Float32) -> NDArray[np.float64]:
@@ -68,8 +68,7 @@ def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:
 
 def mm_per_v() -> float:
     """Of the paper's object box; the bench's is as deep."""
-    box = object_box(load_rig("paper-rig"))
-    return 1000 * (box.z_far_m - box.z_near_m) / (1 - FARTHEST_V)
+    return evaluate.mm_per_v(object_box(load_rig("paper-rig")))
 
 
 def on_paper_rig(on_progress: OnProgress) -> dict[str, MapSet]:

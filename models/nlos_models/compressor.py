@@ -40,8 +40,8 @@ def thinned(channels: int, width: float) -> int:
 def _features(width: float) -> nn.Sequential:
     channels = thinned(STEM, width)
     layers: list[nn.Module] = [*conv_norm(INPUT_CHANNELS, channels, 3, stride=2), nn.ReLU6()]
-    for expansion, out, repeats, stride in STAGES:
-        out = thinned(out, width)  # noqa: PLW2901  as many as this width has
+    for expansion, full, repeats, stride in STAGES:
+        out = thinned(full, width)
         for repeat in range(repeats):
             layers.append(InvertedResidual(channels, out, stride if repeat == 0 else 1, expansion))
             channels = out

@@ -105,9 +105,8 @@ def _set_out(recipe: Recipe, start: Start) -> Pipeline:
         return start.pipeline
     if start.vae is None:
         raise TrainingError("steps 'two' need a trained VAE: name one (--vae)")
-    pipeline = new_pipeline(start.vae.decoder, colour=recipe.colour, width=recipe.width)
-    if start.pipeline:
-        pipeline.compressor = start.pipeline.compressor
+    pipeline = start.pipeline or new_pipeline(start.vae.decoder, colour=recipe.colour, width=recipe.width)
+    pipeline.decoder = start.vae.decoder
     set_for_training(pipeline, recipe)
     return pipeline
 

@@ -34,6 +34,20 @@ def small_maps(count: int, seed: int) -> MapSet:
     return MapSet(depth, intensity, images)
 
 
+def hard_maps(name: str, channels: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+    """Depth (1, 64, 80) and intensity (1, *channels, 64, 80) that a bench may well deliver, each in one extreme."""
+    depth, intensity = torch.full((1, 64, 80), 0.3), torch.full((1, *channels, 64, 80), 10.0)
+    if name == "all zero":
+        depth, intensity = torch.zeros_like(depth), torch.zeros_like(intensity)
+    if name == "saturated":
+        intensity[:] = 255.0
+    if name == "half invalid":
+        depth[:, :, :40] = torch.nan
+    if name == "all invalid":
+        depth[:] = torch.nan
+    return depth, intensity
+
+
 class SmallDataset:
     """Stands for a dataset on the disk, of two shards."""
 

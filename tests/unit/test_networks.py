@@ -7,7 +7,7 @@ import torch
 from nlos_models.networks import CHANNELS, COLOUR_LATENT, new_pipeline, new_vae
 from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import split_and_stack
-from torch import Tensor
+from small_maps import hard_maps
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -22,19 +22,6 @@ def _one_thread() -> Iterator[None]:
 def pipeline() -> Pipeline:
     torch.manual_seed(0)
     return new_pipeline(colour=True)
-
-
-def _hard(name: str, n: int = 1) -> tuple[Tensor, Tensor]:
-    depth, intensity = torch.full((n, 64, 80), 0.3), torch.full((n, CHANNELS, 64, 80), 10.0)
-    if name == "all zero":
-        depth, intensity = torch.zeros_like(depth), torch.zeros_like(intensity)
-    if name == "saturated":
-        intensity[:] = 255.0
-    if name == "half invalid":
-        depth[:, :, :40] = torch.nan
-    if name == "all invalid":
-        depth[:] = torch.nan
-    return depth, intensity
 
 
 def test_the_colour_vae_is_64_by_64_by_3_with_a_latent_of_512() -> None:
@@ -67,7 +54,7 @@ def test_a_pipeline_is_of_depth_or_of_colour(colour: bool, channels: int, latent
 
 @pytest.mark.parametrize("name", ["constant", "all zero", "saturated", "half invalid", "all invalid"])
 def test_hard_maps_give_finite_gradients_and_a_possible_image(pipeline: Pipeline, name: str) -> None:
-    maps = _hard(name)
+    maps = hard_maps(name, (CHANNELS,))
     pipeline.preprocess.learn(split_and_stack(*maps))
     pipeline.train().zero_grad()
     pipeline.latent(*maps).square().sum().backward()

@@ -8,6 +8,7 @@ from nlos_models.metrics import LEAST_V
 from nlos_models.pipeline import Pipeline
 from nlos_models.res_vae import Decoder
 from safetensors.torch import load_file
+from small_maps import hard_maps
 
 
 @pytest.fixture(scope="module")
@@ -16,25 +17,12 @@ def pipeline() -> Pipeline:
     return Pipeline(Compressor(), Decoder()).eval()
 
 
-def _hard(name: str) -> tuple[torch.Tensor, torch.Tensor]:
-    depth, intensity = torch.full((1, 64, 80), 0.3), torch.full((1, 64, 80), 10.0)
-    if name == "all zero":
-        depth, intensity = torch.zeros_like(depth), torch.zeros_like(intensity)
-    if name == "saturated":
-        intensity[:] = 255.0
-    if name == "half invalid":
-        depth[:, :, :40] = torch.nan
-    if name == "all invalid":
-        depth[:] = torch.nan
-    return depth, intensity
-
-
 @torch.inference_mode()
 @pytest.mark.parametrize("name", ["constant", "all zero", "saturated", "half invalid", "all invalid"])
 @pytest.mark.parametrize("bfloat16", [False, True])
 def test_hard_maps_give_a_possible_hidden_image(pipeline: Pipeline, name: str, bfloat16: bool) -> None:
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-        image = pipeline(*_hard(name))
+        image = pipeline(*hard_maps(name))
     assert image.shape == (1, 64, 64)
     assert ((image == 0) | ((image >= LEAST_V) & (image <= 1))).all()
 

@@ -9,7 +9,15 @@ from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint
 from nlos_models.compressor import Compressor
 from nlos_models.res_vae import ResVae
-from small_maps import SmallCompressor, SmallVae, small_images, small_maps, untrained_weights, use_small_networks
+from small_maps import (
+    SmallCompressor,
+    SmallVae,
+    hard_maps,
+    small_images,
+    small_maps,
+    untrained_weights,
+    use_small_networks,
+)
 from torch import nn
 
 
@@ -56,3 +64,12 @@ def test_untrained_weights_are_a_checkpoint_of_small_networks(
         made = [pipeline.latent(*maps) for pipeline in (one, other)]
     assert made[0].shape == (2, 256)
     assert not torch.allclose(*made)
+
+
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_hard_maps_are_as_hard_as_they_are_called(channels: tuple[int, ...]) -> None:
+    names = ["constant", "all zero", "saturated", "half invalid", "all invalid"]
+    depth, intensity = zip(*(hard_maps(name, channels) for name in names), strict=True)
+    assert [float(d.isnan().float().mean()) for d in depth] == [0, 0, 0, 0.5, 1]
+    assert [float(i.max()) for i in intensity] == [10, 0, 255, 10, 10]
+    assert {i.shape for i in intensity} == {(1, *channels, 64, 80)}
