@@ -12,7 +12,9 @@ from nlos_cam.camera.base import Camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import Frame, LidarMaps
+from nlos_cam.physics_check import Check
 from nlos_cam.reconstruct import Reconstruction
+from nlos_cam.verdict import Verdict
 
 MOST_FAILED = 30
 """Frames in a row that come to no result: so many are not the frames' fault."""
@@ -36,6 +38,10 @@ class Step:
     difference: LidarMaps | None = None
     """The maps less the bare wall's; None without a reference."""
     warnings: tuple[str, ...] = ()
+    verdict: Verdict | None = None
+    """None from networks that do not tell."""
+    check: Check | None = None
+    """The newest physics check, of this frame or an earlier one."""
 
 
 OnWarning = Callable[[str, bool], None]

@@ -1,10 +1,13 @@
 """What the streaming loop asks of a viewer, and the viewer that shows nothing."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Protocol, Self
 
 from nlos_cam.frames import Frame, LidarMaps
+from nlos_cam.physics_check import Check
 from nlos_cam.reconstruct import Reconstruction
+from nlos_cam.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,16 @@ class Moment:
     """The maps less the bare wall's; None without a reference."""
     warnings: tuple[str, ...] = ()
     """What the person at the bench should know now, such as that the lidar has moved."""
+    verdict: Verdict | None = None
+    """None from networks that do not tell."""
+    check: Check | None = None
+    """The newest physics check, of this frame or an earlier one; None until there is one."""
+    stages_s: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Seconds by stage."""
+    dropped: int = 0
+    """Frames lost up to now, whoever lost them."""
+    celsius: Mapping[str, float] = field(default_factory=dict[str, float])
+    """The device's last temperatures, by name; empty where none were read."""
 
 
 class Viewer(Protocol):
