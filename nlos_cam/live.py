@@ -26,7 +26,7 @@ def warm_up(camera: Camera, processing: Processing) -> None:
     shape = camera.intrinsics.height, camera.intrinsics.width
     dark, flat = np.zeros(shape, np.uint8), np.full(shape, USUAL_DEPTH_M, np.float32)
     frame = Frame(flat, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics)
-    reconstruct(maps_from_frame(frame), processing.bench.rig, processing.network)
+    reconstruct(maps_from_frame(frame), processing.bench.rig, processing.network, doubter=processing.doubter)
 
 
 def run_live(

@@ -9,6 +9,7 @@ from nlos_calibration.errors import RecordFileError
 from nlos_calibration.rig import Rig, load_rig
 from nlos_calibration.rig_difference import rig_difference
 from nlos_models.checkpoint import CheckpointRecord
+from nlos_models.doubt_inference import load_doubter
 from nlos_models.inference import load_reconstructor
 from rich.markup import escape
 
@@ -35,6 +36,8 @@ from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
 from nlos_cam.sightings import in_words
 from nlos_cam.view.viewer import NullViewer, Viewer
+
+NO_DOUBT = "these weights have no doubt network (`train doubt`): no uncertainty is told, and no verdict"
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:scene.toml, bag:run.bag.")]
 Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it (wall.toml).")]
@@ -131,9 +134,10 @@ def _processing(bench: Bench, weights: Path | None, average: int) -> Processing:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
     network, rig = load_reconstructor(weights, cache_folder() / "onnx"), bench.rig
     eats_difference = network.record.input == "difference maps"
-    processing = Processing(bench, network, eats_difference=eats_difference, average=average)
+    doubter = load_doubter(weights, cache_folder() / "onnx")
+    processing = Processing(bench, network, eats_difference=eats_difference, average=average, doubter=doubter)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
-    for note in [*_rig_notes(network.record, rig), *_reference_note(bench)]:
+    for note in [*_rig_notes(network.record, rig), *_reference_note(bench), *([] if doubter else [NO_DOUBT])]:
         say(f"note: {note}")
     return processing
 
