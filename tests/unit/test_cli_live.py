@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,6 +44,10 @@ class FakeCamera:
 
     def __exit__(self, *_: object) -> None:
         pass
+
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        del ending
+        return {}
 
     def __iter__(self) -> Iterator[Frame]:
         depth_m, ir = np.full((64, 80), 0.3, np.float32), np.full((64, 80), 9, np.uint8)
@@ -99,10 +103,13 @@ def interrupt_at(number: int) -> Callable[[int], None]:
 def test_live_ends_with_one_object_that_scripts_depend_on(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["live", "--camera", "bag:fake", "--no-view", "--json"]) == 0
     report, _ = told(capsys)
-    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings"}
+    assert set(report) == {
+        *("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings"),
+        *("stages_percentiles_ms", "verdicts", "stalled_s"),
+    }
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
-    assert set(report["stages_ms"]) == {"wait", "maps", "bench", "network", "view"}
+    assert set(report["stages_ms"]) == {"delivery", "wait", "queue", "maps", "bench", "network", "view"}
 
 
 @pytest.mark.usefixtures("opened")
@@ -167,7 +174,7 @@ def test_a_wall_other_than_the_networks_is_used_and_noted(tmp_path: Path, capsys
 def test_replay_writes_its_folder_and_one_object(opened: Opened, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", "run.bag", "--out", "out", "--json"]) == 0
     report, progress = told(capsys)
-    assert set(report) == {"frames", "seconds", "out", "warnings"}
+    assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts"}
     assert (report["frames"], report["out"]) == (20, "out")
     assert "another" not in progress
     assert opened.calls == [("bag:run.bag", {"reader": "plain"})]
