@@ -212,8 +212,20 @@ def test_replay_needs_no_sdk(noise_bag: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("opened")
-def test_a_recording_by_another_name_is_refused() -> None:
-    assert main(["live", "--camera", "sim", "--no-view", "--record", "run.txt"]) == 2
+@pytest.mark.parametrize("option", ["--record", "--log"])
+def test_a_recording_or_log_by_another_name_is_refused(option: str) -> None:
+    assert main(["live", "--camera", "sim", "--no-view", option, "run.txt"]) == 2
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_log_has_a_line_for_each_frame_and_replaces_nothing_unasked(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["live", "--camera", "bag:fake", "--no-view", "--log", "log.csv", "--json"]
+    assert main(arguments) == 0
+    frames = told(capsys)[0]["frames"]
+    header, *lines = Path("log.csv").read_text(encoding="utf-8").splitlines()
+    assert [int(line.split(",")[0]) for line in lines] == list(range(frames))
+    assert {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"} <= set(header.split(","))
+    assert main(arguments) == 1
 
 
 @pytest.mark.parametrize("command", [("live", "--no-view", "--camera", "sim"), ("replay", "a.bag")])
