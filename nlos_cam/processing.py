@@ -61,10 +61,12 @@ class Processing:
         looked_s = clock()
         eaten = look.difference if self._eats_difference and look.difference else self.bench.corrected(maps)
         reconstruction = reconstruct(eaten, self.bench.rig, self.network, clock, self.doubter)
-        stages_s = {"wait": got_s - begun_s, "maps": mapped_s - got_s, "bench": looked_s - mapped_s}
+        stages_s = {"wait": got_s - begun_s, "queue": got_s - arrival.arrived_s}
+        stages_s |= {"maps": mapped_s - got_s, "bench": looked_s - mapped_s}
         stages_s |= reconstruction.timings_s
         shown, verdict = self._judge.look(reconstruction, signs_of(arrival.frame, look))
-        return Step(arrival.frame, maps, shown, clock(), stages_s, look.difference, look.warnings, verdict)
+        made = shown, clock(), stages_s, look.difference, look.warnings, verdict
+        return Step(arrival.frame, maps, *made, arrived_s=arrival.arrived_s)
 
 
 def limits_of(doubter: Doubter) -> Limits:
@@ -78,10 +80,8 @@ def signs_of(frame: Frame, look: Look) -> Signs:
     return Signs(saturated="saturated" in names, invalid="blank" in names or "half_invalid" in names, moved=look.moved)
 
 
-def read_along(frames: Iterable[Frame], camera: Camera, bench: Bench) -> tuple[Iterable[Frame], Thermometer | None]:
-    """The same frames, and the camera's thermometer, read as they pass, where the bench needs one."""
-    if bench.reference is None:
-        return frames, None
+def read_along(frames: Iterable[Frame], camera: Camera) -> tuple[Iterable[Frame], Thermometer]:
+    """The same frames, and the camera's thermometer, read as they pass."""
     thermometer = thermometer_of(camera)
     return thermometer.watch(frames), thermometer
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from nlos_models.data import MapSet
 from nlos_models.inference import load_reconstructor
 from transfer_bench import ADAPTATION, FRAMES, HELD_OUT, VALIDATION
-from transfer_figures import DOCS, judge, mm_per_v
+from transfer_figures import DOCS, judge, paper_box
 
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.main import main as nlos_cam
@@ -117,7 +117,7 @@ def _reached(lesson: Lesson, trainer: Trainer, held_out: MapSet) -> dict[str, An
 
 
 def _judged(weights: Path | None, maps: MapSet) -> dict[str, Any]:
-    return judge(load_reconstructor(weights, cache_folder() / "onnx"), maps, mm_per_v())
+    return judge(load_reconstructor(weights, cache_folder() / "onnx"), maps, paper_box())
 
 
 def draw(points: Sequence[Point], path: Path) -> None:

@@ -7,12 +7,11 @@ each recording one frame is judged, as `live` shows it.
 import argparse
 import json
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration.rig import load_rig
+from nlos_calibration.rig import ObjectBox, load_rig
 from nlos_models import metrics
 from nlos_models.data import MapSet
 from nlos_models.inference import Reconstructor, load_reconstructor
@@ -22,6 +21,7 @@ from transfer_bench import ADAPTATION, HELD_OUT, VALIDATION, part_of
 from nlos_cam import evaluate
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
+from nlos_cam.evaluate_objects import reconstruct_all
 from nlos_cam.frames import Float32, maps_from_frame
 from nlos_cam.labelled import read_labelled, recordings_in
 from nlos_cam.objects.depth_image import image_from_depth, object_box
@@ -36,17 +36,12 @@ PARTS = ADAPTATION, VALIDATION, HELD_OUT
 OnProgress = Callable[[int, int], None]
 
 
-def judge(reconstructor: Reconstructor, maps: MapSet, mm_per_v: float) -> dict[str, Any]:
+def judge(reconstructor: Reconstructor, maps: MapSet, box: ObjectBox) -> dict[str, Any]:
     """The metrics by name over samples, each {value, low, high}, and how many samples there were."""
     image, truth = reconstruct_all(reconstructor, maps), maps.image.astype(np.float32)
-    values = {
-        "silhouette_iou": metrics.silhouette_iou(image, truth),
-        "accuracy_mean_abs": metrics.accuracy_mean_abs(image, truth),
-        "accuracy_within_2_percent": metrics.accuracy_within_2_percent(image, truth),
-        "foreground_rmse_mm": metrics.foreground_rmse_mm(image, truth, mm_per_v),
-        "foreground_too_far_mm": mm_per_v * too_far(image, truth),
-    }
-    return {"objects": len(truth), **{name: asdict(evaluate.interval(value)) for name, value in values.items()}}
+    too_far_mm = evaluate.mm_per_v(box) * too_far(image, truth)
+    values = {**evaluate.per_object(image, truth, box), "foreground_too_far_mm": too_far_mm}
+    return {"objects": len(truth), **evaluate.plain(evaluate.over_objects(values))}
 
 
 def too_far(image: Float32, truth: Float32) -> NDArray[np.float64]:
@@ -60,15 +55,9 @@ def too_far(image: Float32, truth: Float32) -> NDArray[np.float64]:
     return np.where(count > 0, sums / np.maximum(count, 1), np.nan)
 
 
-def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:
-    """Images (n, 64, 64), one sample at a time, as live does it."""
-    pairs = zip(maps.depth_m, maps.intensity, strict=True)
-    return np.concatenate([reconstructor(depth[None], intensity[None]) for depth, intensity in pairs])
-
-
-def mm_per_v() -> float:
-    """Of the paper's object box; the bench's is as deep."""
-    return evaluate.mm_per_v(object_box(load_rig("paper-rig")))
+def paper_box() -> ObjectBox:
+    """The paper's object box; the bench's is as deep."""
+    return object_box(load_rig("paper-rig"))
 
 
 def on_paper_rig(on_progress: OnProgress) -> dict[str, MapSet]:
@@ -100,9 +89,9 @@ def main() -> None:
         rigs = {"paper-rig": on_paper_rig(on_progress)}
     with tracked("reading recordings") as on_progress:
         rigs["bench"] = on_bench(asked.folder, on_progress)
+    box = paper_box()
     figures = {
-        rig: {part: judge(reconstructor, maps, mm_per_v()) for part, maps in parts.items()}
-        for rig, parts in rigs.items()
+        rig: {part: judge(reconstructor, maps, box) for part, maps in parts.items()} for rig, parts in rigs.items()
     }
     told = {"weights": str(asked.weights or "shipped"), **figures}
     asked.out.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")

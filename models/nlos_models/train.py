@@ -242,7 +242,7 @@ class _Run:
         if Recipe.model_validate_json(state["recipe"]) != self.recipe:
             raise RecipeError(f"{self.folder} holds a run of another recipe: choose another --out")
         if state.get("origin", self.running.origin) != self.running.origin:  # an older run does not tell
-            raise RecipeError(f"{self.folder} holds a run from other weights or of another rig: choose another --out")
+            raise RecipeError(f"{self.folder} holds a run from other weights or of other objects: choose another --out")
         for name in ("module", "optimizer", "schedule"):
             getattr(self, name).load_state_dict(state[name])
         self.epoch, self.step, self.rows = state["epoch"], state["step"], state["rows"]

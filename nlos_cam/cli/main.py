@@ -68,10 +68,19 @@ def main(arguments: list[str]) -> int:
     except (NlosCamError, CalibrationError, ModelError) as error:
         return _told(error, as_json="--json" in arguments)
     except OSError as error:
-        if error.errno not in DISK_ERRORS:
+        if error.errno not in DISK_ERRORS and error.filename is None:
             raise
-        what = f"{error.filename or 'a file'} cannot be written ({error.strerror}): free some space or choose another"
-        return _told(DiskFullError(f"{what} folder"), as_json="--json" in arguments)
+        return _told(_of_a_file(error), as_json="--json" in arguments)
+
+
+def _of_a_file(error: OSError) -> NlosCamError:
+    """What the system said about a file, in a line."""
+    if error.errno not in DISK_ERRORS:
+        return NlosCamError(
+            f"{error.filename}: {error.strerror}: look whether it is there, and who may read and write it"
+        )
+    what = f"{error.filename or 'a file'} cannot be written ({error.strerror}): free some space or choose another"
+    return DiskFullError(f"{what} folder")
 
 
 def _told(error: NlosCamError | CalibrationError | ModelError, *, as_json: bool) -> int:

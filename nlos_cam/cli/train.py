@@ -83,7 +83,7 @@ def compressor(
     fabric = run.fabric(recipe)
     start, runs = compressor_start(recipe, vae_folder, weights)
     maps = read_maps(recipe, data, held_out_data, wall, stream=stream)
-    origin = digest_of(start.vae, start.pipeline, maps.plan.rig.checksum)
+    origin = digest_of(start.vae, start.pipeline, maps.digest)
     job = job_of(run, maps.told(recipe), maps.plan.rig, runs, origin, weights, vae_folder)
     _tell(run, recipe, launched(fabric, run_compressor, job, start, maps.training, maps.held_out))
 
@@ -104,7 +104,7 @@ def transfer(
     pipeline, runs = transfer_start(recipe, weights, partial=partial)
     encoder = load_encoder(weights)
     maps = read_maps(recipe, data, held_out_data, wall)
-    origin = digest_of(pipeline, encoder, maps.plan.rig.checksum)
+    origin = digest_of(pipeline, encoder, maps.digest)
     job = job_of(run, maps.told(recipe), maps.plan.rig, runs, origin, weights)
     figures = launched(fabric, run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
     told = f"weights in {run.out}: {figures['after']}, from {figures['before']}"

@@ -1,5 +1,6 @@
 """What `train` reads before it starts: recipes, maps that fit them, and the bare wall for difference maps."""
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,11 @@ class TrainingMaps(NamedTuple):
     training: MapSource
     held_out: MapSet
     plan: dataset.DatasetPlan
+
+    @property
+    def digest(self) -> str:
+        """A word for the rig and for the objects to learn from: a run on others is another run."""
+        return hashlib.sha256(self.plan.rig.checksum.encode() + self.training.image.tobytes()).hexdigest()
 
     def told(self, recipe: Recipe) -> Recipe:
         """The recipe with as many objects to judge by as there are, which may be fewer than it asks for."""

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,6 +44,9 @@ class FakeCamera:
 
     def __exit__(self, *_: object) -> None:
         pass
+
+    def telemetry(self, _: str = "") -> Mapping[str, float]:
+        return {}
 
     def __iter__(self) -> Iterator[Frame]:
         depth_m, ir = np.full((64, 80), 0.3, np.float32), np.full((64, 80), 9, np.uint8)
@@ -99,10 +102,11 @@ def interrupt_at(number: int) -> Callable[[int], None]:
 def test_live_ends_with_one_object_that_scripts_depend_on(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["live", "--camera", "bag:fake", "--no-view", "--json"]) == 0
     report, _ = told(capsys)
-    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings"}
+    fields = ("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings")
+    assert set(report) == {*fields, "stages_percentiles_ms", "verdicts", "stalled_s"}
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
-    assert set(report["stages_ms"]) == {"wait", "maps", "bench", "network", "view"}
+    assert set(report["stages_ms"]) == {"delivery", "wait", "queue", "maps", "bench", "network", "view"}
 
 
 @pytest.mark.usefixtures("opened")
@@ -167,7 +171,7 @@ def test_a_wall_other_than_the_networks_is_used_and_noted(tmp_path: Path, capsys
 def test_replay_writes_its_folder_and_one_object(opened: Opened, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", "run.bag", "--out", "out", "--json"]) == 0
     report, progress = told(capsys)
-    assert set(report) == {"frames", "seconds", "out", "warnings"}
+    assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts"}
     assert (report["frames"], report["out"]) == (20, "out")
     assert "another" not in progress
     assert opened.calls == [("bag:run.bag", {"reader": "plain"})]
@@ -205,8 +209,20 @@ def test_replay_needs_no_sdk(noise_bag: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("opened")
-def test_a_recording_by_another_name_is_refused() -> None:
-    assert main(["live", "--camera", "sim", "--no-view", "--record", "run.txt"]) == 2
+@pytest.mark.parametrize("option", ["--record", "--log"])
+def test_a_recording_or_log_by_another_name_is_refused(option: str) -> None:
+    assert main(["live", "--camera", "sim", "--no-view", option, "run.txt"]) == 2
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_log_has_a_line_for_each_frame_and_replaces_nothing_unasked(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["live", "--camera", "bag:fake", "--no-view", "--log", "log.csv", "--json"]
+    assert main(arguments) == 0
+    frames = told(capsys)[0]["frames"]
+    header, *lines = Path("log.csv").read_text(encoding="utf-8").splitlines()
+    assert [int(line.split(",")[0]) for line in lines] == list(range(frames))
+    assert {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"} <= set(header.split(","))
+    assert main(arguments) == 1
 
 
 @pytest.mark.parametrize("command", [("live", "--no-view", "--camera", "sim"), ("replay", "a.bag")])
@@ -220,3 +236,15 @@ def test_ctrl_c_while_a_camera_opens_begins_no_run(
     opened.on_open = swallow
     assert main([*command, "--json"]) == 130
     assert capsys.readouterr().out == ""
+
+
+def test_a_budget_is_told_kept_or_not_and_chooses_the_mean_itself(
+    opened: Opened, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commands, "loader", lambda _: lambda _: FakeNetwork())
+    arguments = ["live", "--camera", "bag:fake", "--no-view", "--json", "--budget-ms", "100000"]
+    assert main(arguments) == 0
+    report, said = told(capsys)
+    assert report["budget"]["kept"] and "budget 100000 ms: " in said  # noqa: PT018  one law
+    assert main([*arguments, "--average", "4"]) == 2
+    assert len(opened.calls) == 1

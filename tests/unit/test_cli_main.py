@@ -105,6 +105,23 @@ def test_a_disk_that_does_not_take_it_is_one_line(
     assert f"out/F.npz cannot be written ({os.strerror(code)})" in last["error"]["message"]
 
 
+@pytest.mark.parametrize("code", [errno.EACCES, errno.ENOENT, errno.EISDIR])
+def test_what_the_system_says_about_a_file_is_one_line(
+    does: Callable[[Act], None], capsys: pytest.CaptureFixture[str], code: int
+) -> None:
+    does(_raise(OSError(code, os.strerror(code), "out/F.npz")))
+    assert main(["act", "--json"]) == 1
+    last = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert last["error"]["type"] == "NlosCamError"
+    assert last["error"]["message"].startswith(f"out/F.npz: {os.strerror(code)}: ")
+
+
+def test_an_error_of_the_system_without_a_file_is_a_bug_of_ours(does: Callable[[Act], None]) -> None:
+    does(_raise(OSError(errno.EINVAL, os.strerror(errno.EINVAL))))
+    with pytest.raises(OSError, match=os.strerror(errno.EINVAL)):
+        main(["act"])
+
+
 def test_ctrl_c_is_130(does: Callable[[Act], None], capsys: pytest.CaptureFixture[str]) -> None:
     does(_raise(KeyboardInterrupt()))
     assert main(["act"]) == 130

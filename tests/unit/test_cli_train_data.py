@@ -34,6 +34,16 @@ def test_a_recipe_takes_the_first_objects_of_larger_sets(monkeypatch: pytest.Mon
     np.testing.assert_array_equal(maps.held_out.image, small_maps(6, 5).image[:2])
 
 
+def test_maps_of_other_objects_or_of_another_rig_have_another_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    def digest(seed: int, name: str) -> str:
+        plan = replace(PLAN, rig=PLAN.rig.model_copy(update={"name": name}))
+        monkeypatch.setattr(dataset, "open_dataset", lambda *_, **__: SmallDataset(small_maps(6, seed), plan))
+        return read_maps(RECIPE, Path("data"), Path("other"), None).digest
+
+    assert digest(1, "a") == digest(1, "a")
+    assert len({digest(1, "a"), digest(2, "a"), digest(1, "b")}) == 3
+
+
 def test_a_record_tells_how_many_objects_there_were_to_judge_by(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
     recipe = RECIPE.model_copy(update={"held_out": 400})

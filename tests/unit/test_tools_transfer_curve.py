@@ -143,7 +143,7 @@ def test_figures_of_exact_images_are_perfect_and_those_of_nothing_are_not(tool: 
     image = np.where(np.indices((2, 64, 64))[2] > 20, np.float32(0.5), np.float32(0.0))
     maps = MapSet(np.zeros((2, 64, 80), np.float32), np.zeros((2, 64, 80), np.float32), image)
     exact, nothing, near = (
-        figures.judge(lambda *_, made=made: made, MapSet(*(m[:1] for m in vars(maps).values())), figures.mm_per_v())
+        figures.judge(lambda *_, made=made: made, MapSet(*(m[:1] for m in vars(maps).values())), figures.paper_box())
         for made in (image[:1], 0 * image[:1], image[:1] + np.float32(0.1) * (image[:1] > 0))
     )
     assert exact["silhouette_iou"]["value"] == exact["accuracy_within_2_percent"]["value"] == 1
