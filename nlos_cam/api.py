@@ -116,8 +116,9 @@ class Stream:
     def __init__(
         self, camera: Camera, processing: Processing, *, keeps_all: bool, notes: tuple[str, ...] = (), clock: Clock
     ) -> None:
-        self.camera, self.notes = camera, notes
-        """The notes say what does not fit between the networks and this bench; believe less where there are any."""
+        self.camera = camera
+        self.notes = notes
+        """What does not fit between the networks and this bench: believe less where there is any."""
         self._processing, self._keeps_all, self._clock = processing, keeps_all, clock
         self._box = object_box(self.rig)
         self._tally, self._inside = Tally(), ExitStack()
