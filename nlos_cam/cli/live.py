@@ -8,14 +8,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from nlos_calibration.errors import RecordFileError
-from nlos_calibration.rig import Rig, load_rig
-from nlos_calibration.rig_difference import rig_difference
-from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.inference import Reconstructor, load_reconstructor
+from nlos_models.inference import Reconstructor
 
 from nlos_cam.bench import Bench, open_bench
-from nlos_cam.cache import cache_folder
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
 from nlos_cam.camera.table import Reader
@@ -38,6 +33,7 @@ from nlos_cam.frame_log import SUFFIXES, FrameLog
 from nlos_cam.live import run_live, warm_up
 from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
+from nlos_cam.set_up import load_networks, misfits, set_up
 from nlos_cam.undisturbed import undisturbed
 from nlos_cam.view.viewer import Moment
 
@@ -166,42 +162,16 @@ def _chosen(
     if budget_ms is None:
         return _processing(bench, weights, average), None
     options = options_here(tradeoff, weights)
-    network, choice = within_budget(budget_ms, options, partial(_made, bench), loader(weights), timer(camera))
+    network, choice = within_budget(budget_ms, options, partial(set_up, bench), loader(weights), timer(camera))
     say(choice.told())
     return _processing(bench, weights, choice.option.frames, network), choice
 
 
 def _processing(bench: Bench, weights: Path | None, average: int, network: Reconstructor | None = None) -> Processing:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
-    network = network or load_reconstructor(weights, cache_folder() / "onnx")
-    processing = _made(bench, network, average)
+    network = network or load_networks(weights)
+    processing = set_up(bench, network, average)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
-    for note in [*_rig_notes(network.record, bench.rig), *_reference_note(bench)]:
+    for note in misfits(bench, network.record):
         say(f"note: {note}")
     return processing
-
-
-def _made(bench: Bench, network: Reconstructor, average: int) -> Processing:
-    return Processing(bench, network, eats_difference=network.record.input == "difference maps", average=average)
-
-
-def _rig_notes(trained: CheckpointRecord, rig: Rig) -> list[str]:
-    """How the bench differs from the one that the networks were trained for."""
-    try:
-        theirs = load_rig(trained.rig_name)
-    except RecordFileError:  # trained for a rig of a file that is not here
-        theirs = None
-    if theirs is None or theirs.checksum != trained.rig_checksum:
-        unlike = trained.rig_checksum != rig.checksum
-        return [f"the networks were trained for another rig than {rig.name}: what they show is off"] if unlike else []
-    difference = rig_difference(rig, theirs)
-    return (
-        [f"unlike the rig of the networks, this one has {'; '.join(difference)}: they err more"] if difference else []
-    )
-
-
-def _reference_note(bench: Bench) -> list[str]:
-    if not bench.measured or bench.reference:
-        return []
-    told = "no difference maps are formed, and a lidar that moves is not noticed: calibrate the wall again"
-    return [f"this wall's record has no reference: {told}"]
