@@ -59,11 +59,11 @@ def run_live(
 
     reader = FrameReader(frames, keeps_all=recorded, stop=stop, clock=clock, enough=enough, let_go=leave)
     try:
-        with reader:
+        with reader, processing.checks:
             for step in steps(reader, processing, clock, tally.fail, thermometer):
                 latency_s = step.published_s - step.frame.timestamp_s - reader.offset_s
                 made = step.reconstruction, step.published_s, latency_s, step.difference, step.warnings
-                viewer.show(Moment(step.frame, *made))
+                viewer.show(Moment(step.frame, *made, check=step.check))
                 tally.add(step, clock() - step.published_s)
     except Exception:
         on_error(tally.report(camera, reader))

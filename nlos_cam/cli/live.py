@@ -31,6 +31,8 @@ from nlos_cam.cli.common import (
 )
 from nlos_cam.live import run_live, warm_up
 from nlos_cam.live_report import LiveReport
+from nlos_cam.physics_check import Checks
+from nlos_cam.physics_check_runner import BackgroundChecks
 from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
 from nlos_cam.sightings import in_words
@@ -77,7 +79,7 @@ def live(
         with tracked("rendering the scene ahead") as on_progress:
             opened = open_camera(camera, on_progress=on_progress, recording=recording)
         bench = open_bench(wall, opened)
-        processing = _processing(bench, weights, average)
+        processing = _processing(bench, weights, average, BackgroundChecks(bench.rig, on_error=_warn_once))
         warm_up(opened, processing)
     with stop_on_signals() as stop, _viewer(bench, no_view=no_view) as viewer, opened as source:
         say(
@@ -117,7 +119,10 @@ def replay_bag(
     path = output_path(out, "replay", "", overwrite=overwrite)
     with interrupted_by_signals():
         opened = open_camera(f"bag:{bag}", reader=reader)
-        processing = _processing(open_bench(wall, opened), weights, average)
+        bench = open_bench(wall, opened)
+        from nlos_cam.physics_check_render import EveryFrames  # the renderer takes a second to import
+
+        processing = _processing(bench, weights, average, EveryFrames(bench.rig, on_error=_warn_once))
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
         report = replay(source, processing, path, stop=stop, on_frame=lambda: bar.advance(task), on_warning=_warn)
@@ -127,11 +132,11 @@ def replay_bag(
         raise typer.Exit(INTERRUPTED)
 
 
-def _processing(bench: Bench, weights: Path | None, average: int) -> Processing:
+def _processing(bench: Bench, weights: Path | None, average: int, checks: Checks) -> Processing:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
     network, rig = load_reconstructor(weights, cache_folder() / "onnx"), bench.rig
     eats_difference = network.record.input == "difference maps"
-    processing = Processing(bench, network, eats_difference=eats_difference, average=average)
+    processing = Processing(bench, network, eats_difference=eats_difference, average=average, checks=checks)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
     for note in [*_rig_notes(network.record, rig), *_reference_note(bench)]:
         say(f"note: {note}")
@@ -170,6 +175,10 @@ def _viewer(bench: Bench, *, no_view: bool) -> Viewer:
 
 def _warn(warning: str, begins: bool) -> None:
     say(f"[yellow]warning:[/] {escape(warning)}" if begins else f"no longer: {escape(warning)}")
+
+
+def _warn_once(warning: str) -> None:
+    _warn(warning, begins=True)
 
 
 def _told(report: LiveReport) -> str:
