@@ -11,6 +11,7 @@ from nlos_cam.frame_reader import Arrival, FrameReader
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.live_report import Step
 from nlos_cam.map_mean import MapMean
+from nlos_cam.physics_check import Checks, NoChecks
 from nlos_cam.reconstruct import Clock, Network, reconstruct
 from nlos_cam.thermometer import Thermometer, thermometer_of
 
@@ -26,16 +27,26 @@ def _refuse(frame: Frame, error: Exception, in_a_row: int) -> None:
 class Processing:
     """What is made of a camera's frames, in their order: maps, their difference from the bare wall, the hidden depth.
 
-    Maps are the mean over the last `average` frames. Raises CalibrationError where the networks eat difference maps and
+    Maps are the mean over the last `average` frames. The newest of the `checks`, which whoever goes over the frames
+    enters, goes along with each. Raises CalibrationError where the networks eat difference maps and
     there is no bare wall to form them from.
     """
 
-    def __init__(self, bench: Bench, network: Network, *, eats_difference: bool = False, average: int = 1) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        network: Network,
+        *,
+        eats_difference: bool = False,
+        average: int = 1,
+        checks: Checks | None = None,
+    ) -> None:
         if eats_difference and bench.reference is None:
             raise CalibrationError(
                 "these weights eat difference maps: give --wall with a reference (calibrate the wall again)"
             )
         self.bench, self.network = bench, network
+        self.checks = checks or NoChecks()
         self._eats_difference, self._mean = eats_difference, MapMean(average)
 
     def step(self, arrival: Arrival, clock: Clock, begun_s: float) -> Step:
@@ -51,8 +62,9 @@ class Processing:
         stages_s = {"wait": got_s - begun_s, "queue": got_s - arrival.arrived_s}
         stages_s |= {"maps": mapped_s - got_s, "bench": looked_s - mapped_s}
         stages_s |= reconstruction.timings_s
+        self.checks.offer(arrival.frame.frame_number, self.bench.corrected(maps), reconstruction.depth_m)
         made = reconstruction, clock(), stages_s, look.difference, look.warnings
-        return Step(arrival.frame, maps, *made, arrived_s=arrival.arrived_s)
+        return Step(arrival.frame, maps, *made, check=self.checks.newest, arrived_s=arrival.arrived_s)
 
 
 def read_along(frames: Iterable[Frame], camera: Camera) -> tuple[Iterable[Frame], Thermometer]:

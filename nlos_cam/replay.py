@@ -23,6 +23,7 @@ from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.live_report import OnWarning, Step, Warned, frames_by_verdict, say_nothing
 from nlos_cam.objects.depth_image import object_box
+from nlos_cam.physics_check import UNEXPLAINED
 from nlos_cam.processing import Processing, read_along, steps
 from nlos_cam.reconstruct import Clock
 from nlos_cam.sightings import in_words
@@ -92,6 +93,8 @@ class _Results:
         self.numbers: list[int] = []
         self.with_surface = 0
         self.verdicts: Counter[Verdict] = Counter()
+        self.checks: dict[int, float] = {}
+        """Scores by the number of the frame that was checked."""
         self.samples, self.warned = Samples(SHEET_FRAMES), Warned(on_warning)
 
     def add(self, step: Step) -> None:
@@ -103,6 +106,8 @@ class _Results:
         self.timestamps_s.append(step.frame.timestamp_s)
         self.numbers.append(step.frame.frame_number)
         self.with_surface += bool(np.isfinite(depth_m).any())
+        if step.check:
+            self.checks[step.check.frame_number] = step.check.score
         self.samples.add(step)
         self.warned.add(step)
         if step.verdict:
@@ -129,7 +134,7 @@ def replay(
     with renamed_when_whole(out) as part, ExitStack() as files:
         results = _Results(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
         frames, thermometer = read_along(camera, camera)
-        with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader:
+        with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader, processing.checks:
             for step in steps(reader, processing, clock, thermometer=thermometer):
                 results.add(step)
                 on_frame()
@@ -166,6 +171,8 @@ def _hidden(results: _Results, rig: Rig) -> dict[str, Any]:
         "pitch_m": np.array([pitch_x_m, -pitch_y_m]),  # wall (x, y) from one column, one row to the next
         "z_near_m": box.z_near_m,
         "z_far_m": box.z_far_m,
+        "check_frame_number": np.array([*results.checks], np.int64),
+        "check_score": np.array([*results.checks.values()], np.float64),
     }
 
 
@@ -189,6 +196,7 @@ def _report(camera: Camera, bench: Bench, results: _Results, *, stopped: bool) -
         f"- rig: {rig.name} {rig.checksum}, {rig.lidar.distance_m:.3f} m to the wall, {rig.facing_deg:.1f} degrees",
         f"- maps: {MAP_ROWS} x {MAP_COLUMNS}; hidden depth: {OBJECT_PIXELS} x {OBJECT_PIXELS} in `{RESULT}`",
         *(f"- verdict, {frames} frames: {verdict}" for verdict, frames in frames_by_verdict(results.verdicts).items()),
+        *_checks_told(results.checks),
         *_bench_told(bench, results.warned),
         "",
         f"![some frames]({SHEET})",
@@ -196,6 +204,14 @@ def _report(camera: Camera, bench: Bench, results: _Results, *, stopped: bool) -
     if stopped:
         lines.insert(2, "**Interrupted: the frames below are those done until then.**\n")
     return "\n".join(lines) + "\n"
+
+
+def _checks_told(scores: Mapping[int, float]) -> list[str]:
+    if not scores:
+        return []
+    flagged = sum(score >= UNEXPLAINED for score in scores.values())
+    told = f"score {np.median(list(scores.values())):.2f} (median; 0 explains what the lidar saw, 1 explains nothing)"
+    return [f"- physics check of {len(scores)} frames: {told}, {flagged} at {UNEXPLAINED:g} or more"]
 
 
 def _bench_told(bench: Bench, warned: Warned) -> list[str]:

@@ -10,6 +10,7 @@ from nlos_models.inference import Reconstructor, load_reconstructor
 
 from nlos_cam.bench import Bench
 from nlos_cam.cache import cache_folder
+from nlos_cam.physics_check import Checks
 from nlos_cam.processing import Processing
 
 
@@ -18,9 +19,10 @@ def load_networks(weights: Path | None = None) -> Reconstructor:
     return load_reconstructor(weights, cache_folder() / "onnx")
 
 
-def set_up(bench: Bench, network: Reconstructor, average: int = 1) -> Processing:
+def set_up(bench: Bench, network: Reconstructor, average: int = 1, checks: Checks | None = None) -> Processing:
     """What these networks make of frames of this bench: raw maps or difference maps, as the networks eat."""
-    return Processing(bench, network, eats_difference=network.record.input == "difference maps", average=average)
+    eats_difference = network.record.input == "difference maps"
+    return Processing(bench, network, eats_difference=eats_difference, average=average, checks=checks)
 
 
 def misfits(bench: Bench, trained: CheckpointRecord) -> list[str]:

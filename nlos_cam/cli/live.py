@@ -31,6 +31,8 @@ from nlos_cam.cli.live_told import told, warn
 from nlos_cam.cli.live_view import NoView, Open, ViewHost, ViewPort, tell_of_view, viewer_of
 from nlos_cam.frame_log import SUFFIXES, FrameLog
 from nlos_cam.live import run_live, warm_up
+from nlos_cam.physics_check import Checks
+from nlos_cam.physics_check_runner import BackgroundChecks
 from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
 from nlos_cam.set_up import load_networks, misfits, set_up
@@ -85,7 +87,8 @@ def live(
         with tracked("rendering the scene ahead") as on_progress:
             opened = open_camera(camera, on_progress=on_progress, recording=recording)
         bench = open_bench(wall, opened)
-        processing, choice = _chosen(opened, bench, weights, average, budget_ms, tradeoff)
+        checks = BackgroundChecks(bench.rig, on_error=_warn_once)
+        processing, choice = _chosen(opened, bench, weights, average, budget_ms, tradeoff, checks)
         warm_up(opened, processing)
     viewer = viewer_of(bench, no_view=no_view, host=view_host, port=view_port)
     with stop_on_signals() as stop, viewer, _logging(frame_log) as on_moment, undisturbed(), opened as source:
@@ -125,7 +128,10 @@ def replay_bag(
     path = output_path(out, "replay", "", overwrite=overwrite)
     with interrupted_by_signals():
         opened = open_camera(f"bag:{bag}", reader=reader)
-        processing = _processing(open_bench(wall, opened), weights, average)
+        bench = open_bench(wall, opened)
+        from nlos_cam.physics_check_render import EveryFrames  # the renderer takes a second to import
+
+        processing = _processing(bench, weights, average, EveryFrames(bench.rig, on_error=_warn_once))
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
         report = replay(source, processing, path, stop=stop, on_frame=lambda: bar.advance(task), on_warning=warn)
@@ -156,21 +162,33 @@ def _logging(path: Path | None) -> Generator[Callable[[Moment], None]]:
 
 
 def _chosen(
-    camera: Camera, bench: Bench, weights: Path | None, average: int, budget_ms: float | None, tradeoff: Path | None
+    camera: Camera,
+    bench: Bench,
+    weights: Path | None,
+    average: int,
+    budget_ms: float | None,
+    tradeoff: Path | None,
+    checks: Checks,
 ) -> tuple[Processing, Choice | None]:
     """What is made of frames: as is usual, or within a budget, which then was chosen so."""
     if budget_ms is None:
-        return _processing(bench, weights, average), None
+        return _processing(bench, weights, average, checks), None
     options = options_here(tradeoff, weights)
     network, choice = within_budget(budget_ms, options, partial(set_up, bench), loader(weights), timer(camera))
     say(choice.told())
-    return _processing(bench, weights, choice.option.frames, network), choice
+    return _processing(bench, weights, choice.option.frames, checks, network), choice
 
 
-def _processing(bench: Bench, weights: Path | None, average: int, network: Reconstructor | None = None) -> Processing:
+def _warn_once(warning: str) -> None:
+    warn(warning, begins=True)
+
+
+def _processing(
+    bench: Bench, weights: Path | None, average: int, checks: Checks, network: Reconstructor | None = None
+) -> Processing:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
     network = network or load_networks(weights)
-    processing = set_up(bench, network, average)
+    processing = set_up(bench, network, average, checks)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
     for note in misfits(bench, network.record):
         say(f"note: {note}")
