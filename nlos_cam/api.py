@@ -36,7 +36,7 @@ from nlos_cam.live_report import Step, Tally
 from nlos_cam.objects.depth_image import cell_centres_m, object_box
 from nlos_cam.processing import Processing, read_along, steps
 from nlos_cam.reconstruct import Clock
-from nlos_cam.set_up import load_networks, misfits, set_up
+from nlos_cam.set_up import load_doubt, load_networks, misfits, set_up
 from nlos_cam.verdict import Verdict
 
 
@@ -180,8 +180,9 @@ def open_stream(
     """
     camera = open_camera(uri, on_progress=on_progress)
     bench = open_bench(Path(wall) if wall else None, camera)
-    network = load_networks(Path(weights) if weights else None)
-    processing = set_up(bench, network, average)
+    folder = Path(weights) if weights else None
+    network, doubter = load_networks(folder), load_doubt(folder)
+    processing = set_up(bench, network, average, doubter=doubter)
     warm_up(camera, processing)
-    notes = tuple(misfits(bench, network.record))
+    notes = tuple(misfits(bench, network.record, doubter))
     return Stream(camera, processing, keeps_all=uri.startswith("bag:"), notes=notes, clock=clock)

@@ -27,6 +27,8 @@ class Look:
     difference: LidarMaps | None
     """The maps less the bare wall's, valid where both are; None without a reference."""
     warnings: tuple[str, ...]
+    moved: bool = False
+    """Whether the lidar has moved, or no longer sees the wall where it was."""
 
 
 class Bench:
@@ -51,7 +53,8 @@ class Bench:
         if self.reference is None or self._drift is None:
             return Look(None, self.notes)
         self._drift.look(frame.depth_m, frame.settings)
-        return Look(self._levelled(difference_of(maps, self.reference)), self.notes + self._drift.warnings)
+        difference = self._levelled(difference_of(maps, self.reference))
+        return Look(difference, self.notes + self._drift.warnings, self._drift.moved)
 
     def _levelled(self, difference: LidarMaps) -> LidarMaps:
         """The difference less what the range has drifted by over the last second, if it has drifted alike everywhere.

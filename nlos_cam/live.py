@@ -27,7 +27,8 @@ def warm_up(camera: Camera, processing: Processing, clock: Clock = time.perf_cou
     shape = camera.intrinsics.height, camera.intrinsics.width
     dark, flat = np.zeros(shape, np.uint8), np.full(shape, USUAL_DEPTH_M, np.float32)
     frame = Frame(flat, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics)
-    return reconstruct(maps_from_frame(frame), processing.bench.rig, processing.network, clock).timings_s
+    made = reconstruct(maps_from_frame(frame), processing.bench.rig, processing.network, clock, processing.doubter)
+    return made.timings_s
 
 
 def run_live(

@@ -2,12 +2,14 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from nlos_calibration.rig import ObjectBox, Rig
+from nlos_models.doubt_inference import Doubter
 from numpy.typing import NDArray
 
+from nlos_cam.doubt import Doubt, doubt_of
 from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps
 from nlos_cam.objects.depth_image import depth_from_image, object_box
 
@@ -25,9 +27,22 @@ class Reconstruction:
     wall_from_object: NDArray[np.float64]
     """(4, 4); the object frame has the wall's axes and its origin on the wall, before the middle of the box."""
     uncertainty_m: Float32 | None
-    """(64, 64); None from networks that do not tell."""
+    """(64, 64), finite everywhere: the expected absolute error of `depth_m`, were there a surface; None from networks
+    that do not tell."""
     timings_s: Mapping[str, float]
     """Seconds by stage."""
+    doubt: Doubt | None = None
+    """None from networks that do not tell."""
+
+    @property
+    def shows(self) -> bool:
+        """Whether there is any surface."""
+        return bool(np.isfinite(self.depth_m).any())
+
+    @property
+    def hidden(self) -> "Reconstruction":
+        """The same without its surface: nothing is shown."""
+        return replace(self, depth_m=np.full_like(self.depth_m, np.nan))
 
 
 def pose_of(box: ObjectBox) -> NDArray[np.float64]:
@@ -37,8 +52,14 @@ def pose_of(box: ObjectBox) -> NDArray[np.float64]:
     return pose
 
 
-def reconstruct(maps: LidarMaps, rig: Rig, network: Network, clock: Clock = time.perf_counter) -> Reconstruction:
-    """The hidden depth behind one frame's maps. Raises SceneError for a rig without an object box.
+def reconstruct(
+    maps: LidarMaps,
+    rig: Rig,
+    network: Network,
+    clock: Clock = time.perf_counter,
+    doubter: Doubter | None = None,
+) -> Reconstruction:
+    """The hidden depth behind one frame's maps, and its doubt. Raises SceneError for a rig without an object box.
 
     Maps without any return tell nothing, so nothing is made of them: the networks, which take a cell without a return
     for an average one, would show an average object.
@@ -46,7 +67,13 @@ def reconstruct(maps: LidarMaps, rig: Rig, network: Network, clock: Clock = time
     box = object_box(rig)
     begun_s = clock()
     if maps.valid.any():
-        depth_m = depth_from_image(network(maps.depth_m[np.newaxis], maps.intensity[np.newaxis])[0], box)
+        image = network(maps.depth_m[np.newaxis], maps.intensity[np.newaxis])[0]
     else:
-        depth_m = np.full((OBJECT_PIXELS, OBJECT_PIXELS), np.nan, np.float32)
-    return Reconstruction(depth_m, pose_of(box), None, {"network": clock() - begun_s})
+        image = np.zeros((OBJECT_PIXELS, OBJECT_PIXELS), np.float32)
+    made_s = clock()
+    found = Reconstruction(depth_from_image(image, box), pose_of(box), None, {"network": made_s - begun_s})
+    if doubter is None:
+        return found
+    doubt = doubt_of(doubter, maps, image, box)
+    timings_s = {**found.timings_s, "doubt": clock() - made_s}
+    return replace(found, uncertainty_m=doubt.error_m, timings_s=timings_s, doubt=doubt)

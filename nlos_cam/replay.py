@@ -91,6 +91,8 @@ class _Results:
         self.difference_m, self.difference_intensity = (_Stack(new_file(), MAP_ROWS, MAP_COLUMNS) for _ in range(2))
         self.timestamps_s: list[float] = []
         self.numbers: list[int] = []
+        self.uncertainty_m = _Stack(new_file(), OBJECT_PIXELS, OBJECT_PIXELS)
+        self.told: list[str] = []
         self.with_surface = 0
         self.verdicts: Counter[Verdict] = Counter()
         self.checks: dict[int, float] = {}
@@ -100,6 +102,9 @@ class _Results:
     def add(self, step: Step) -> None:
         depth_m = step.reconstruction.depth_m
         self.hidden_m.add(depth_m)
+        uncertainty_m = step.reconstruction.uncertainty_m
+        self.uncertainty_m.add(np.full_like(depth_m, np.nan) if uncertainty_m is None else uncertainty_m)
+        self.told.append(step.verdict or "")
         if step.difference:
             self.difference_m.add(step.difference.depth_m)
             self.difference_intensity.add(step.difference.intensity)
@@ -167,6 +172,8 @@ def _hidden(results: _Results, rig: Rig) -> dict[str, Any]:
     pitch_y_m = (box.y_max_m - box.y_min_m) / OBJECT_PIXELS
     return {
         "depth_m": results.hidden_m.all(),
+        "uncertainty_m": results.uncertainty_m.all(),
+        "verdict": np.array(results.told, np.str_),
         "origin_m": np.array([box.x_min_m + pitch_x_m / 2, box.y_max_m - pitch_y_m / 2]),  # wall (x, y) of pixel (0, 0)
         "pitch_m": np.array([pitch_x_m, -pitch_y_m]),  # wall (x, y) from one column, one row to the next
         "z_near_m": box.z_near_m,

@@ -76,6 +76,14 @@ class DriftCheck:
         """Of the pixels that are watched, those that showed the wall over the last second."""
         return self._window.share
 
+    @property
+    def moved(self) -> bool:
+        """Whether it is told that the lidar has moved, or that it no longer sees the wall; a range that drifts is not.
+
+        As with `warnings`, the answer does not flicker.
+        """
+        return bool(self._blindness) or (self._told is not None and not self._told.uniform)
+
     def look(self, depth_m: Float32, settings: Mapping[str, float]) -> None:
         """Take a frame (height, width) in, NaN where there is no return, and the settings it was taken with.
 

@@ -1,6 +1,7 @@
 """Checkpoints: tensors in float16 safetensors, one file per network, beside one JSON record of what made them."""
 
 import json
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +20,8 @@ from nlos_models.res_vae import Encoder, ResVae
 
 RECORD = "checkpoint.json"
 SHIPPED = "paper-rig"
+FULL = frozenset({"mean", "spread", "bare_depth_m", "bare_intensity"})
+"""Tensors that stay in float32."""
 
 
 class LoadReport(NamedTuple):
@@ -57,7 +60,7 @@ def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
     record = load_record(folder)
     vae = new_vae(colour=record.colour)
     for name, module in (("encoder", vae.encoder), ("decoder", vae.decoder)):
-        _load(folder / f"{name}.safetensors", module)
+        load_part(folder / f"{name}.safetensors", module)
     return vae.eval(), record
 
 
@@ -81,7 +84,7 @@ def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[Pipeline, Chec
         raise CheckpointError(f"{folder} holds a VAE alone, with no compressor: name weights of `train compressor`")
     pipeline = new_pipeline(colour=record.colour, width=record.width)
     for name in names:
-        _load(folder / f"{name}.safetensors", getattr(pipeline, name))
+        load_part(folder / f"{name}.safetensors", getattr(pipeline, name))
     return pipeline.eval(), record
 
 
@@ -92,7 +95,7 @@ def load_encoder(folder: Path | None = None) -> Encoder | None:
     if not path.exists():
         return None
     encoder = new_vae(colour=load_record(folder).colour).encoder
-    _load(path, encoder)
+    load_part(path, encoder)
     return encoder.eval()
 
 
@@ -130,18 +133,24 @@ def load_record(folder: Path) -> CheckpointRecord:
 def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -> None:
     without = None if record.note else {"note"}  # older readers of depth know none
     text = json.dumps(record.model_dump(mode="json", exclude=without), indent=2)
+    save_parts(folder, parts, {RECORD: text})
+
+
+def save_parts(folder: Path, parts: Mapping[str, nn.Module], texts: Mapping[str, str]) -> None:
+    """Write networks as NAME.safetensors, and texts by their files' names, into a folder. Raises CheckpointError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, module in parts.items():
             tensors = {key: _half(key, tensor) for key, tensor in module.state_dict().items()}
             save_file(tensors, folder / f"{name}.safetensors")
-        (folder / RECORD).write_text(text + "\n", encoding="utf-8")
+        for name, text in texts.items():
+            (folder / name).write_text(text + "\n", encoding="utf-8")
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{folder} cannot take the weights ({error}): make room and run again") from error
 
 
 def _half(name: str, tensor: torch.Tensor) -> torch.Tensor:
-    if not tensor.is_floating_point() or "running" in name or name in {"mean", "spread"}:
+    if not tensor.is_floating_point() or "running" in name or name in FULL:
         return tensor.contiguous()  # statistics are few, and float16 would flush the smallest to zero
     half = tensor.half().contiguous()
     if not torch.isfinite(half).all():
@@ -149,7 +158,8 @@ def _half(name: str, tensor: torch.Tensor) -> torch.Tensor:
     return half
 
 
-def _load(path: Path, module: nn.Module) -> None:
+def load_part(path: Path, module: nn.Module) -> None:
+    """Fill a network from a file. Raises CheckpointError where a tensor is missing, left over or of another shape."""
     tensors = _tensors(path)
     try:
         module.load_state_dict(tensors)

@@ -4,12 +4,14 @@ import hashlib
 import logging
 import os
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
 from nlos_models.errors import CheckpointError, ModelError
@@ -53,17 +55,22 @@ class OnnxReconstructor:
     """The pipeline exported to ONNX and run by ONNX Runtime: about five times faster than torch at batch 1."""
 
     def __init__(self, model: Path, record: CheckpointRecord, threads: int = 1) -> None:
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.log_severity_level = 3
         self.record, self.runtime = record, "ONNX Runtime on cpu"
-        self._session: Any = onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
+        self._session = open_session(model, threads)
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
         inputs = {"depth_m": np.ascontiguousarray(depth_m), "intensity": np.ascontiguousarray(intensity)}
         return self._session.run(None, inputs)[0]
+
+
+def open_session(model: Path, threads: int = 1) -> Any:
+    """An ONNX file ready to run on the CPU."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
 
 
 def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
@@ -90,7 +97,7 @@ def refuse_colour(record: CheckpointRecord, folder: Path | None) -> None:
 
 def exported(pipeline: Pipeline, cache: Path) -> Path:
     """The pipeline's ONNX file in the folder `cache`, written unless it is there."""
-    model = cache / f"{_checksum(pipeline)}.onnx"
+    model = cache / f"{checksum_of(pipeline)}.onnx"
     if not model.exists():
         export_onnx(pipeline, model)
     return model
@@ -103,20 +110,24 @@ def export_onnx(pipeline: Pipeline, path: Path) -> None:
     """
     if pipeline.intensities > 1:
         raise ModelError(f"networks of full colour ({SIMULATION_ONLY}) are not exported: use them in torch")
+    write_onnx(pipeline, path, {"depth_m": MAP_SHAPE, "intensity": MAP_SHAPE}, ["image"])
+
+
+def write_onnx(network: nn.Module, path: Path, inputs: Mapping[str, tuple[int, int]], outputs: list[str]) -> None:
+    """Write a network of inputs (n, rows, columns), by name, as one ONNX file with a free n."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.stem}.{os.getpid()}.part.onnx")
-    example = (torch.ones(2, *MAP_SHAPE), torch.ones(2, *MAP_SHAPE))
     for noisy in ("onnxscript", "torch.onnx"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter warns of its own internals
         program = torch.onnx.export(
-            pipeline.eval(),
-            example,
+            network.eval(),
+            tuple(torch.ones(2, *shape) for shape in inputs.values()),
             dynamo=True,
-            input_names=["depth_m", "intensity"],
-            output_names=["image"],
-            dynamic_shapes=({0: torch.export.Dim("n")}, {0: torch.export.Dim("n")}),
+            input_names=list(inputs),
+            output_names=outputs,
+            dynamic_shapes=tuple({0: torch.export.Dim("n")} for _ in inputs),
             opset_version=OPSET,
             verbose=False,
         )
@@ -129,11 +140,11 @@ def export_onnx(pipeline: Pipeline, path: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def _checksum(pipeline: Pipeline) -> str:
+def checksum_of(network: nn.Module) -> str:
     """Of all that decides what an exported network computes: exporter, weights, and this package's own code."""
     digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
-    for name, tensor in sorted(pipeline.state_dict().items()):
+    for name, tensor in sorted(network.state_dict().items()):
         digest.update(name.encode() + tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]

@@ -19,7 +19,7 @@ class Recipe(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    task: Literal["vae", "compressor", "transfer"]
+    task: Literal["vae", "compressor", "transfer", "doubt"]
     colour: bool = False
     """RGB albedo in the place of depth, in simulation only."""
     seed: int = Field(default=0, ge=0)
@@ -65,6 +65,10 @@ class Recipe(BaseModel):
     statistics: Literal["kept", "own", "own intensity"] = "kept"
     """Of a transfer: maps are normalised as the synthetic ones were, or (their intensity alone) by the recordings' own
     mean and spread."""
+    outliers: int = Field(default=0, ge=0)
+    """Of a doubt network, beside the objects: of each kind that is unlike them, so many."""
+    empties: int = Field(default=0, ge=0)
+    """Of a doubt network: views of benches with nothing hidden."""
     deviations: list[str] = Field(default_factory=list[str])
     """Where this recipe leaves the supporting information, and why."""
 
@@ -90,6 +94,12 @@ class Recipe(BaseModel):
             raise ValueError(
                 f"steps {self.steps!r} trains a decoder, which learns by images alone: set an image_weight"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _doubts_by_what_it_needs(self) -> Self:
+        if (self.outliers > 0, self.empties > 0) != ((self.task == "doubt"),) * 2:
+            raise ValueError("a doubt network learns by outliers and empties, and no other does: set both, or none")
         return self
 
     def scaled(self, share: float) -> Self:

@@ -11,6 +11,7 @@ import typer
 from nlos_models.inference import Reconstructor
 
 from nlos_cam.bench import Bench, open_bench
+from nlos_cam.budget import SHIPPED
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
 from nlos_cam.camera.table import Reader
@@ -35,7 +36,7 @@ from nlos_cam.physics_check import Checks
 from nlos_cam.physics_check_runner import BackgroundChecks
 from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
-from nlos_cam.set_up import load_networks, misfits, set_up
+from nlos_cam.set_up import load_doubt, load_networks, misfits, set_up
 from nlos_cam.undisturbed import undisturbed
 from nlos_cam.view.viewer import Moment
 
@@ -174,9 +175,11 @@ def _chosen(
     if budget_ms is None:
         return _processing(bench, weights, average, checks), None
     options = options_here(tradeoff, weights)
-    network, choice = within_budget(budget_ms, options, partial(set_up, bench), loader(weights), timer(camera))
+    making = partial(set_up, bench, doubter=load_doubt(weights))  # takes as long whatever it watches
+    network, choice = within_budget(budget_ms, options, making, loader(weights), timer(camera))
     say(choice.told())
-    return _processing(bench, weights, choice.option.frames, checks, network), choice
+    chosen = weights if choice.option.weights == SHIPPED else Path(choice.option.weights)
+    return _processing(bench, chosen, choice.option.frames, checks, network), choice
 
 
 def _warn_once(warning: str) -> None:
@@ -187,9 +190,9 @@ def _processing(
     bench: Bench, weights: Path | None, average: int, checks: Checks, network: Reconstructor | None = None
 ) -> Processing:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
-    network = network or load_networks(weights)
-    processing = set_up(bench, network, average, checks)
+    network, doubter = network or load_networks(weights), load_doubt(weights)
+    processing = set_up(bench, network, average, doubter=doubter, checks=checks)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
-    for note in misfits(bench, network.record):
+    for note in misfits(bench, network.record, doubter):
         say(f"note: {note}")
     return processing

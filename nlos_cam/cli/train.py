@@ -1,4 +1,4 @@
-"""`train vae|compressor|transfer`: recipes to weights."""
+"""`train vae|compressor|transfer|doubt`: recipes to weights."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,14 +12,13 @@ from nlos_models.run_files import digest_of
 
 from nlos_cam import dataset
 from nlos_cam.cli.common import PAPER_RIG, finish, say
-from nlos_cam.cli.train_data import read_maps
+from nlos_cam.cli.train_data import HeldOut, Maps, read_maps
+from nlos_cam.cli.train_doubt import doubt
 from nlos_cam.cli.train_options import Budget, RunOptions, refuse_ignored, with_run_options
 from nlos_cam.cli.train_runs import job_of, run_compressor, run_transfer, run_vae
 from nlos_cam.cli.train_start import compressor_start, transfer_start, vae_start
 from nlos_cam.objects.textures import TEXTURES
 
-Maps = Annotated[Path, typer.Option("--dataset", help="Training maps, from `dataset build` or of recordings.")]
-HeldOut = Annotated[Path, typer.Option("--held-out", help="Maps to judge by, of other objects.")]
 Wall = Annotated[
     Path | None, typer.Option("--wall", help="The bare wall for difference maps (wall.toml); else it is rendered.")
 ]
@@ -32,7 +31,7 @@ Weights = Annotated[
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     train = typer.Typer(help="Training.")
-    for command in (vae, compressor, transfer):
+    for command in (vae, compressor, transfer, doubt):
         train.command(command.__name__)(with_run_options(command))
     app.add_typer(train, name="train")
 

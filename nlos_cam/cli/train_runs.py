@@ -58,7 +58,7 @@ def job_of(run: RunOptions, recipe: Recipe, rig: Rig, before: list[Recipe], orig
 
 def run_vae(fabric: Fabric, job: Job, start: ResVae | None, images: Half, held_out: Half) -> Figures:
     """Train a VAE and save it; its held-out figures."""
-    with _watched(fabric, job, "VAE") as (on_step, running):
+    with watched_run(fabric, job, "VAE") as (on_step, running):
         vae, figures = train_vae(job.recipe, images, held_out, job.out, on_step, running, start)
     if fabric.is_global_zero:
         save_vae(job.out, vae, job.made(figures))
@@ -67,7 +67,7 @@ def run_vae(fabric: Fabric, job: Job, start: ResVae | None, images: Half, held_o
 
 def run_compressor(fabric: Fabric, job: Job, start: Start, maps: MapSource, held_out: MapSet) -> Figures:
     """Train a compressor and save it with its decoder; its held-out figures."""
-    with _watched(fabric, job, "compressor") as (on_step, running):
+    with watched_run(fabric, job, "compressor") as (on_step, running):
         pipeline, figures = train_compressor(job.recipe, start, maps, held_out, job.out, on_step, running)
     if fabric.is_global_zero:
         encoder = start.vae.encoder if start.vae and job.recipe.steps != "one" else None
@@ -80,7 +80,7 @@ def run_transfer(
 ) -> dict[str, Figures]:
     """Train weights on, on recordings, and save them; their held-out figures before and after."""
     before = figures_of(run(pipeline.to(fabric.device).eval(), held_out), held_out.image)
-    with _watched(fabric, job, "transfer") as (on_step, running):
+    with watched_run(fabric, job, "transfer") as (on_step, running):
         pipeline, after = train_transfer(job.recipe, pipeline, encoder, maps, held_out, job.out, on_step, running)
     if fabric.is_global_zero:
         save_pipeline(job.out, pipeline, job.made(after), encoder)
@@ -88,8 +88,8 @@ def run_transfer(
 
 
 @contextmanager
-def _watched(fabric: Fabric, job: Job, what: str) -> Generator[tuple[OnStep, Running]]:
-    """The leading process's progress bar; Ctrl-C or a request to terminate ends the run after the step, saved."""
+def watched_run(fabric: Fabric, job: Job, what: str) -> Generator[tuple[OnStep, Running]]:
+    """A run's progress bar, of the leading process; Ctrl-C or a request to terminate ends it after the step, saved."""
     with progress() as bar, stop_on_signals() as stop:
         what += f" in colour ({SIMULATION_ONLY})" if job.recipe.colour else ""
         task = bar.add_task(f"training the {what}", total=None, visible=fabric.is_global_zero)

@@ -1,0 +1,168 @@
+"""What a doubt network learns from and is judged by: seeds to ordinary objects, empty benches and outliers, on disk."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+from nlos_calibration.rig import Rig
+from numpy.typing import NDArray
+
+from nlos_cam.folders import file_when_whole
+from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps, maps_from_frame
+from nlos_cam.objects.depth_image import image_from_depth, object_box
+from nlos_cam.outliers import TO_JUDGE, TO_LEARN, Sight, ordinary, outlier
+from nlos_cam.render.renderer import Rendering, render
+from nlos_cam.render.sensor import Sensor
+from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.varied_bench import SLIGHT, varied, varied_empty
+
+EMPTY, ORDINARY = "empty", "ordinary"
+PIECE = 100
+"""Samples in a file: what a kill can cost."""
+BESIDE_M = 0.01
+"""Depth this far from the bare wall's is that of what is hidden: the width of a path-length bin."""
+BENCH = 20
+"""Samples in a row that are of one bench, whose sensor is worked out once."""
+VERSION = 1
+"""Raised with any change of what a seed makes."""
+_STREAM = 5
+"""Keeps these random numbers apart from those of datasets."""
+
+OnProgress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class DoubtSamples:
+    """Maps, and what was hidden."""
+
+    depth_m: Float32
+    """(n, 64, 80); NaN where there is no return."""
+    intensity: Float32
+    """(n, 64, 80)."""
+    image: NDArray[np.float16]
+    """(n, 64, 64); the truth, 0 for background."""
+    cells: NDArray[np.int32]
+    """(n,); in how many cells of the maps what is hidden is the strongest return: in none it cannot be seen."""
+    kind: NDArray[np.str_]
+    """(n,); EMPTY, ORDINARY, or an outlier's."""
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def where(self, chosen: NDArray[np.bool_]) -> "DoubtSamples":
+        """Those that are chosen (n,)."""
+        return DoubtSamples(**{name: values[chosen] for name, values in vars(self).items()})
+
+
+def make_samples(
+    kind: str, seeds: Sequence[int], rig: Rig, sensor: SensorModel, accuracy: str = "draft"
+) -> DoubtSamples:
+    """Samples of one kind, the same bits for the same seeds: BENCH in a row are of one bench.
+
+    Ordinary objects and outliers are on benches that lie slightly off, every second one on the given one; empty ones
+    may lie widely off.
+    """
+    sights = [_sight(kind, seed, rig, sensor) for seed in seeds]
+    rendered = [render(sight.scene, accuracy) for sight in sights]
+    maps = [_sensed(*each) for each in zip(sights, rendered, seeds, strict=True)]
+    return DoubtSamples(
+        np.stack([one.depth_m for one in maps]),
+        np.stack([one.intensity for one in maps]),
+        np.stack([_truth(sight) for sight in sights]),
+        np.array([_cells(*each) for each in zip(sights, rendered, strict=True)], np.int32),
+        np.array([kind] * len(seeds)),
+    )
+
+
+def _sensed(sight: Sight, rendered: Rendering, seed: int) -> LidarMaps:
+    sensor = _sensor(sight)
+    images = sensor.expose(rendered.multi, np.random.default_rng([seed, _STREAM, 2]))
+    return maps_from_frame(images.frame(sensor.rig.pinhole))
+
+
+def _truth(sight: Sight) -> NDArray[np.float16]:
+    nothing = np.full((OBJECT_PIXELS, OBJECT_PIXELS), np.nan, np.float32)
+    hidden_m = nothing if sight.depth_m is None else sight.depth_m
+    return image_from_depth(hidden_m, object_box(sight.rig)).astype(np.float16)
+
+
+def _cells(sight: Sight, rendered: Rendering) -> int:
+    """In how many cells the depth is not the bare wall's."""
+    bare_m = render(replace(sight.scene, object_depth_m=None)).depth_m
+    return int(np.count_nonzero(np.abs(rendered.depth_m - bare_m) > BESIDE_M))
+
+
+def _sight(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Sight:
+    of_bench = np.random.default_rng([seed // BENCH, _STREAM, 0])
+    if kind == EMPTY:
+        return Sight(*varied_empty(rig, sensor, of_bench))
+    bench = varied(rig, sensor, SLIGHT, of_bench) if seed // BENCH % 2 else (rig, sensor)
+    generator = np.random.default_rng([seed, _STREAM, 1])
+    return outlier(KINDS[kind], generator, Sight(*bench))
+
+
+KINDS = {ORDINARY: ordinary, **TO_LEARN, **TO_JUDGE}
+
+
+class _Last:
+    """The sensor that was made last: benches come in rows."""
+
+    key: tuple[Rig, SensorModel] | None = None
+    sensor: Sensor | None = None
+
+
+def _sensor(sight: Sight) -> Sensor:
+    key = sight.rig, sight.sensor
+    if _Last.sensor is None or _Last.key != key:
+        _Last.key, _Last.sensor = key, Sensor(*key)
+    return _Last.sensor
+
+
+def samples_on_disk(
+    folder: Path,
+    counts: Mapping[str, int],
+    first_seed: int,
+    rig: Rig,
+    sensor: SensorModel,
+    *,
+    accuracy: str = "draft",
+    on_progress: OnProgress = lambda _done, _total: None,
+) -> DoubtSamples:
+    """So many samples of each kind; what the folder has of them is read, what it lacks is made and kept there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    about = f"v{VERSION}-{rig.checksum}-{accuracy}"
+    done, total, parts = 0, sum(counts.values()), list[DoubtSamples]()
+    for kind, seeds in _pieces(counts, first_seed):
+        path = folder / f"{about}-{kind.replace(' ', '_')}-{seeds.start}-{len(seeds)}.npz"
+        if (part := _read(path)) is None:
+            part = make_samples(kind, seeds, rig, sensor, accuracy)
+            _write(path, part)
+        parts.append(part)
+        on_progress(done := done + len(seeds), total)
+    return joined(parts)
+
+
+def joined(parts: Sequence[DoubtSamples]) -> DoubtSamples:
+    """Samples one after the other."""
+    names = [one.name for one in fields(DoubtSamples)]
+    return DoubtSamples(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def _pieces(counts: Mapping[str, int], first_seed: int) -> Iterator[tuple[str, range]]:
+    for kind, count in counts.items():
+        for start in range(first_seed, first_seed + count, PIECE):
+            yield kind, range(start, min(start + PIECE, first_seed + count))
+
+
+def _read(path: Path) -> DoubtSamples | None:
+    """The samples of a file; None where there is none."""
+    if not path.exists():
+        return None
+    with np.load(path) as file:
+        return DoubtSamples(**file)
+
+
+def _write(path: Path, samples: DoubtSamples) -> None:
+    with file_when_whole(path) as part, part.open("wb") as file:
+        np.savez(file, **vars(samples))

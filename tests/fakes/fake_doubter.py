@@ -1,0 +1,24 @@
+"""Stands for a doubt network: says what it is told to, and keeps what it was asked."""
+
+from collections.abc import Callable
+
+import numpy as np
+from nlos_models.doubt_inference import SaidOf
+from nlos_models.doubt_weights import DoubtRecord
+from nlos_models.recipe import Recipe
+
+RECIPE = Recipe(task="doubt", objects=8, outliers=4, empties=4, held_out=4, epochs=1, batch=4, learning_rate=1e-3)
+Says = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[float, float]]
+"""Of maps and an image (n, ...): how probable nothing and outside are."""
+
+
+class FakeDoubter:
+    def __init__(self, says: Says = lambda *_: (0.0, 0.0), error_v: float = 0.1) -> None:
+        self.record = DoubtRecord(watches="0123456789ab", recipe=RECIPE, learnt=[])
+        self.asked: list[tuple[np.ndarray, ...]] = []
+        self._says, self._error_v = says, error_v
+
+    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray, image: np.ndarray) -> SaidOf:
+        self.asked.append((depth_m, intensity, image))
+        nothing, outside = (np.array([p], np.float32) for p in self._says(depth_m, intensity, image))
+        return SaidOf(nothing, outside, np.full_like(image, self._error_v), (image > 0).astype(np.float32))

@@ -1,0 +1,57 @@
+"""A doubt network that was trained on nothing, on disk beside weights of no network at all, and sets to learn from."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from fake_doubter import RECIPE
+from nlos_models.doubt_network import DoubtNetwork
+from nlos_models.doubt_training import DoubtSet
+from nlos_models.doubt_weights import WATCHED, DoubtRecord, checksum_of_watched, save_doubt
+
+DARK_V = 0.3
+
+
+def watched_weights(folder: Path, seed: int = 0) -> Path:
+    """Files by the names of a pipeline's, of random bytes."""
+    folder.mkdir()
+    generator = np.random.default_rng(seed)
+    for name in (*WATCHED, "checkpoint.json"):
+        (folder / name).write_bytes(generator.bytes(64))
+    return folder
+
+
+def untrained_doubt(folder: Path, watched: Path, seed: int = 0) -> DoubtRecord:
+    """Write a doubt network of random weights, with batch norms that have seen something."""
+    torch.manual_seed(seed)
+    network = DoubtNetwork()
+    with torch.no_grad():
+        for _ in range(20):
+            network.train()(torch.rand(8, 64, 80), 40 * torch.rand(8, 64, 80), torch.rand(8, 64, 64))
+    record = DoubtRecord(
+        watches=checksum_of_watched(watched),
+        recipe=RECIPE,
+        learnt=["small"],
+        temperatures=(0.5, 2.0),
+        error_scale=1.5,
+        nothing_above=0.4,
+        outside_above=0.3,
+    )
+    save_doubt(folder, network.eval(), record, watched)
+    return record
+
+
+def small_doubt_set(count: int, seed: int) -> DoubtSet:
+    """Squares: half of the samples have none, half of the others are told to be outside, and are brighter.
+
+    Maps have the truth in their middle; images are the truth, a dark square's (v = 0.3) off by a tenth.
+    """
+    generator = np.random.default_rng(seed)
+    truth, intensity = np.zeros((count, 64, 64), np.float16), np.full((count, 64, 80), 10.0, np.float32)
+    nothing, outside = np.arange(count) % 4 < 2, np.arange(count) % 4 == 3
+    for k in np.flatnonzero(~nothing):
+        row, column = generator.integers(2, 40, 2)
+        truth[k, row : row + 20, column : column + 20] = DARK_V if generator.random() < 0.5 else 0.8
+        intensity[k, row : row + 20, column + 8 : column + 28] += 20.0 if outside[k] else 5.0
+    made = np.where(truth > 0, truth + np.where(truth < 0.5, 0.1, 0.01), 0.0).astype(np.float16)
+    return DoubtSet(np.full((count, 64, 80), 0.3, np.float32), intensity, made, truth, nothing, outside)
