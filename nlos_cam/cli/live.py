@@ -29,10 +29,12 @@ from nlos_cam.cli.common import (
     stop_on_signals,
     tracked,
 )
+from nlos_cam.cli.view import SaveReplayView, SaveView, Stills, Video, saved_as, saving
 from nlos_cam.live import run_live, warm_up
 from nlos_cam.live_report import LiveReport
 from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
+from nlos_cam.replay_looks import Looks
 from nlos_cam.sightings import in_words
 from nlos_cam.view.viewer import NullViewer, Viewer
 
@@ -65,6 +67,7 @@ def live(
     record: RecordTo = None,
     weights: Weights = None,
     average: Average = 1,
+    save_view: SaveView = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -73,13 +76,15 @@ def live(
         raise typer.BadParameter(f"--record {record}: a recording's name ends in .bag")
     path = output_path(record, "live", ".bag", overwrite=overwrite) if record else None
     recording = Recording(path, optional=True) if path else None
+    view_path = saved_as(save_view, overwrite=overwrite)
     with interrupted_by_signals():
         with tracked("rendering the scene ahead") as on_progress:
             opened = open_camera(camera, on_progress=on_progress, recording=recording)
         bench = open_bench(wall, opened)
         processing = _processing(bench, weights, average)
         warm_up(opened, processing)
-    with stop_on_signals() as stop, _viewer(bench, no_view=no_view) as viewer, opened as source:
+    viewers = saving(_viewer(bench, no_view=no_view), bench, view_path)
+    with stop_on_signals() as stop, viewers as viewer, opened as source:
         say(
             f"live view: {viewer.address}  (Ctrl-C ends it)"
             if viewer.address
@@ -98,6 +103,8 @@ def live(
         )
     if recording:
         say(f"recorded {recording.sets} frames to {recording.path}")
+    if view_path:
+        say(f"saved the view: nlos-cam view {view_path}")
     finish(asdict(report), as_json=json, text=_told(report))
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)
@@ -110,6 +117,9 @@ def replay_bag(
     weights: Weights = None,
     average: Average = 1,
     reader: ReadBy = "plain",
+    save_view: SaveReplayView = False,
+    stills: Stills = 0,
+    video: Video = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -120,7 +130,15 @@ def replay_bag(
         processing = _processing(open_bench(wall, opened), weights, average)
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
-        report = replay(source, processing, path, stop=stop, on_frame=lambda: bar.advance(task), on_warning=_warn)
+        report = replay(
+            source,
+            processing,
+            path,
+            stop=stop,
+            on_frame=lambda: bar.advance(task),
+            on_warning=_warn,
+            looks=Looks(processing.bench, view=save_view, stills=stills, video=video),
+        )
     text = f"{report.frames} frames in {report.seconds:.1f} s: {path / REPORT}"
     finish(asdict(report), as_json=json, text=text)
     if stop.is_set():

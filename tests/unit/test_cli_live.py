@@ -153,6 +153,26 @@ def test_record_hands_a_recording_to_the_camera_and_replaces_nothing_unasked(
 
 
 @pytest.mark.usefixtures("opened")
+def test_the_view_is_saved_where_asked_for_and_replaces_nothing_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["live", "--camera", "bag:fake", "--no-view", "--save-view", "view.rrd", "--json"]
+    assert main(arguments) == 0
+    assert "nlos-cam view view.rrd" in told(capsys)[1]
+    assert (tmp_path / "view.rrd").stat().st_size > 10_000
+    assert main(arguments) == 1
+    assert main([*arguments, "--overwrite"]) == 0
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_replay_leaves_its_view_stills_and_video_where_asked_for(tmp_path: Path) -> None:
+    assert main(["replay", "run.bag", "--out", "out", "--save-view", "--stills", "2", "--video"]) == 0
+    made = {file.suffix for file in (tmp_path / "out").iterdir()}
+    assert {".rrd", ".webm"} < made
+    assert len(list((tmp_path / "out").glob("still-*.png"))) == 2
+
+
+@pytest.mark.usefixtures("opened")
 def test_a_wall_other_than_the_networks_is_used_and_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_wall(tmp_path / "wall.toml")
     run = ["replay", "run.bag", "--out", "out", "--json"]
