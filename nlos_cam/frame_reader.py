@@ -35,7 +35,8 @@ class FrameReader:
 
     When the queue is full it drops the oldest frame and counts it by number, or, if it `keeps_all`, waits. Iterating
     ends where the frames end, when `stop` is set, or when it is `enough`, also while no frame comes; their source's
-    exception is raised to whoever iterates. On leaving, a source that keeps the thread waiting is told to `let_go`.
+    exception is raised to whoever iterates, whose `on_wait` is called ten times a second while no frame comes. On
+    leaving, a source that keeps the thread waiting is told to `let_go`.
     """
 
     def __init__(
@@ -47,12 +48,15 @@ class FrameReader:
         clock: Clock = time.time,
         enough: Callable[[], bool] = lambda: False,
         let_go: Callable[[], None] = lambda: None,
+        on_wait: Callable[[], None] = lambda: None,
     ) -> None:
         self.dropped: list[int] = []
         """Frame numbers."""
+        self.newest_s: float | None = None
+        """When the newest frame arrived; None before the first."""
         self._least_delay_s = float("inf")
         self._frames, self._keeps_all, self._clock = frames, keeps_all, clock
-        self._stop, self._enough, self._let_go = stop, enough, let_go
+        self._stop, self._enough, self._let_go, self._on_wait = stop, enough, let_go, on_wait
         self._left = False
         self._queue: deque[Arrival] = deque()
         self._changed = Condition()
@@ -85,17 +89,20 @@ class FrameReader:
             yield arrival
 
     def _next(self) -> Arrival | None:
-        with self._changed:
-            while not (self._queue or self._ended or self._is_done):
-                self._changed.wait(POLL_S)
-            if self._is_done:
-                return None
-            if self._queue:
-                self._changed.notify_all()
-                return self._queue.popleft()
-            if self._error is not None:
-                raise self._error
-            return None
+        while True:
+            with self._changed:
+                if not (self._queue or self._ended or self._is_done):
+                    self._changed.wait(POLL_S)
+                if self._is_done:
+                    return None
+                if self._queue:
+                    self._changed.notify_all()
+                    return self._queue.popleft()
+                if self._error is not None:
+                    raise self._error
+                if self._ended:
+                    return None
+            self._on_wait()
 
     def _read(self) -> None:
         try:
@@ -117,6 +124,7 @@ class FrameReader:
             if len(self._queue) == QUEUE_FRAMES:
                 self.dropped.append(self._queue.popleft().frame.frame_number)
             self._queue.append(arrival)
+            self.newest_s = arrival.arrived_s
             self._least_delay_s = min(self._least_delay_s, arrival.arrived_s - arrival.frame.timestamp_s)
             self._changed.notify_all()
             return not self._unwanted

@@ -107,7 +107,7 @@ def _mean_near(bits: Int32, depth_m: Float32, counts: NDArray[np.uint8], median_
     return np.float32(total) / np.float32(near)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)  # meanwhile another thread may take the next frame
 def _reduce_cells(
     depth_bits: Int32,
     ir: NDArray[np.uint8],

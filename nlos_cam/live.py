@@ -10,6 +10,7 @@ from nlos_cam.camera.base import Camera
 from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.live_report import LiveReport, OnWarning, Tally, say_nothing
+from nlos_cam.moments import Moments
 from nlos_cam.processing import Processing, read_along, steps
 from nlos_cam.reconstruct import Clock, reconstruct
 from nlos_cam.sightings import watched
@@ -40,15 +41,17 @@ def run_live(
     clock: Clock = time.time,
     on_error: Callable[[LiveReport], None] = lambda _: None,
     on_warning: OnWarning = say_nothing,
+    on_moment: Callable[[Moment], None] = lambda _: None,
 ) -> LiveReport:
     """Reconstruct an entered camera's frames and show them, until it ends, `stop` is set, or `seconds` have passed.
 
     One that is `recorded` loses no frame and is shown at the speed it was recorded. A camera that keeps the loop's end
-    waiting is left. A frame that comes to no result is counted. `on_warning` hears when a warning begins and ends.
+    waiting is left. A frame that comes to no result is counted. While none comes, the last is shown again, as stalled.
+    `on_warning` hears when a warning begins and ends, `on_moment` of each frame's result once it is shown.
     Raises what the camera raises, and NlosCamError where none comes to a result, once `on_error` has had the report.
     """
     tally = Tally(on_warning)
-    frames, thermometer = read_along(camera, camera, processing.bench)
+    frames, thermometer = read_along(camera, camera)
     frames = watched(paced(frames, stop, clock) if recorded else frames, tally.seen)
 
     def enough() -> bool:
@@ -57,18 +60,28 @@ def run_live(
     def leave() -> None:
         camera.__exit__(None, None, None)
 
-    reader = FrameReader(frames, keeps_all=recorded, stop=stop, clock=clock, enough=enough, let_go=leave)
+    def look_up() -> None:
+        if tally.stall.look(clock(), reader.newest_s):
+            moments.stalled()
+
+    def report() -> LiveReport:
+        tally.stall.close(clock())
+        return tally.report(camera, reader)
+
+    reader = FrameReader(
+        frames, keeps_all=recorded, stop=stop, clock=clock, enough=enough, let_go=leave, on_wait=look_up
+    )
+    moments = Moments(viewer, lambda: sum(tally.lost(camera, reader).values()), reader, thermometer, clock)
     try:
         with reader:
             for step in steps(reader, processing, clock, tally.fail, thermometer):
-                latency_s = step.published_s - step.frame.timestamp_s - reader.offset_s
-                made = step.reconstruction, step.published_s, latency_s, step.difference, step.warnings
-                viewer.show(Moment(step.frame, *made))
+                moment = moments.show(step)
                 tally.add(step, clock() - step.published_s)
+                on_moment(moment)
     except Exception:
-        on_error(tally.report(camera, reader))
+        on_error(report())
         raise
-    return tally.report(camera, reader)
+    return report()
 
 
 def paced(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]:

@@ -2,11 +2,9 @@
 
 import logging
 import re
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-
-import numpy as np
+from dataclasses import dataclass, field, replace
 
 from nlos_cam.camera.base import Camera
 from nlos_cam.errors import NlosCamError
@@ -14,12 +12,15 @@ from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.physics_check import Check
 from nlos_cam.reconstruct import Reconstruction
+from nlos_cam.stage_times import Percentiles, StageTimes, percentiles_ms
+from nlos_cam.stall import StallWatch
 from nlos_cam.verdict import Verdict
 
 MOST_FAILED = 30
 """Frames in a row that come to no result: so many are not the frames' fault."""
-REMEMBERED = 100_000
-"""Latencies are told of the last frames only (55 minutes at 30 frames/s): memory stays bounded."""
+OUTSIDE_LATENCY = "wait", "view"
+"""Stages before a frame's arrival and after its result: the others are parts of its latency."""
+LATENCY, DELIVERY = "latency", "delivery"
 
 FIGURES = re.compile(r"\d+(\.\d+)?")
 
@@ -42,6 +43,8 @@ class Step:
     """None from networks that do not tell."""
     check: Check | None = None
     """The newest physics check, of this frame or an earlier one."""
+    arrived_s: float | None = None
+    """When the loop's reader had the frame."""
 
 
 OnWarning = Callable[[str, bool], None]
@@ -107,27 +110,35 @@ class LiveReport:
     latency_ms: Mapping[str, float]
     """p50, p95 and p99 from timestamp to result; `FrameReader.offset_s` tells how clocks are matched."""
     stages_ms: Mapping[str, float]
-    """Median by stage: wait (for a frame), maps, bench (their difference and what has drifted), network, view (handing
-    over to it)."""
+    """Median by stage: delivery (from the frame's timestamp until the loop's reader has it), wait (for a frame), queue
+    (until its turn), maps, bench (their difference and what has drifted), network, view (handing over to it)."""
     counts: Mapping[str, int]
     """By name, those that are not 0: what the camera counts, incomplete and dropped_camera; dropped_loop, for which the
-    loop was too slow; failed, which came to no result; blank, half_invalid, saturated (see `sightings`)."""
+    loop was too slow; failed, which came to no result; blank, half_invalid, saturated (see `sightings`); stalls."""
     warnings: Mapping[str, int] = field(default_factory=dict[str, int])
     """Of the bench, and the frames that each held for."""
+    stages_percentiles_ms: Mapping[str, Percentiles] = field(default_factory=dict[str, Percentiles])
+    """By stage; all but OUTSIDE_LATENCY are parts of the latency."""
+    verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
+    """By verdict, the frames that it was passed on; empty from networks that pass none."""
+    stalled_s: float = 0.0
+    """For how long, in all, the camera gave no frame; see `stall`."""
 
 
 class Tally:
-    """Collects what LiveReport tells."""
+    """Collects what LiveReport tells, in memory that does not grow with the frames."""
 
     def __init__(self, on_warning: OnWarning = say_nothing) -> None:
         self.warned = Warned(on_warning)
+        self.stall = StallWatch(on_warning)
         self.frames = 0
         self.failed = 0
         """Frames of which no result could be made."""
         self.seen: Counter[str] = Counter()
         """What was amiss with frames, by name."""
-        self._ages_s: deque[float] = deque(maxlen=REMEMBERED)
-        self._stages_s: deque[Mapping[str, float]] = deque(maxlen=REMEMBERED)
+        self.verdicts: Counter[Verdict] = Counter()
+        self._times = StageTimes()
+        """With latency and delivery as by two clocks, the frames' and the loop's."""
         self._first_s = self._last_s = 0.0
 
     def add(self, step: Step, view_s: float) -> None:
@@ -135,9 +146,14 @@ class Tally:
             self._first_s = step.published_s
         self.frames += 1
         self._last_s = step.published_s
-        self._ages_s.append(step.published_s - step.frame.timestamp_s)
-        self._stages_s.append({**step.stages_s, "view": view_s})
+        ages_s = {LATENCY: step.published_s - step.frame.timestamp_s}
+        if step.arrived_s is not None:
+            ages_s[DELIVERY] = step.arrived_s - step.frame.timestamp_s
+            self.stall.came(step.arrived_s)
+        self._times.add({**ages_s, **step.stages_s, "view": view_s})
         self.warned.add(step)
+        if step.verdict:
+            self.verdicts[step.verdict] += 1
 
     def fail(self, frame: Frame, error: Exception, in_a_row: int) -> None:
         """Count a frame that came to no result. Raises an error that is not the frame's, and after MOST_FAILED."""
@@ -154,15 +170,35 @@ class Tally:
         """Since the first result."""
         return now_s - self._first_s if self.frames else 0.0
 
+    def lost(self, camera: Camera, reader: FrameReader) -> dict[str, int]:
+        """Frames that the camera took and that came to no result, by who lost them."""
+        lost = {"incomplete": camera.incomplete, "dropped_camera": camera.dropped, "dropped_loop": len(reader.dropped)}
+        return {**lost, "failed": self.failed}
+
     def report(self, camera: Camera, reader: FrameReader) -> LiveReport:
-        latencies_ms = (np.array(self._ages_s) - reader.offset_s) * 1e3 if self.frames else np.zeros(1)
-        latency_ms = {f"p{share}": float(np.percentile(latencies_ms, share)) for share in (50, 95, 99)}
-        names = self._stages_s[0] if self._stages_s else {}
-        stages_ms = {name: float(np.median([s[name] for s in self._stages_s])) * 1e3 for name in names}
+        stages = self._percentiles_ms(reader.offset_s)
+        latency_ms = stages.pop(LATENCY)
+        stages_ms = {name: stage["p50"] for name, stage in stages.items()}
         lasted_s = self.lasted_s(self._last_s)
         fps = (self.frames - 1) / lasted_s if lasted_s > 0 else 0.0
-        lost = {"incomplete": camera.incomplete, "dropped_camera": camera.dropped, "dropped_loop": len(reader.dropped)}
-        counts = {**camera.counts, **lost, "failed": self.failed, **self.seen}
-        dropped = sum(lost.values()) + self.failed
+        lost = self.lost(camera, reader)
+        counts = {**camera.counts, **lost, **self.seen, "stalls": self.stall.stalls}
         told = {name: count for name, count in counts.items() if count}
-        return LiveReport(self.frames, fps, dropped, latency_ms, stages_ms, told, self.warned.frames())
+        report = LiveReport(self.frames, fps, sum(lost.values()), latency_ms, stages_ms, told, self.warned.frames())
+        return replace(
+            report,
+            stages_percentiles_ms=stages,
+            verdicts=frames_by_verdict(self.verdicts),
+            stalled_s=self.stall.stalled_s,
+        )
+
+    def _percentiles_ms(self, offset_s: float) -> dict[str, Percentiles]:
+        """Of the latency and each stage, by the loop's clock, which is `offset_s` later than the frames'."""
+        offsets_s = {LATENCY: offset_s, DELIVERY: offset_s}
+        names = [LATENCY, *(name for name in self._times.stages if name != LATENCY)]
+        return {name: percentiles_ms(self._times.of(name) - offsets_s.get(name, 0.0)) for name in names}
+
+
+def frames_by_verdict(verdicts: Counter[Verdict]) -> dict[str, int]:
+    """Those that were passed, in the order in which they overrule each other."""
+    return {verdict.value: verdicts[verdict] for verdict in Verdict if verdicts[verdict]}

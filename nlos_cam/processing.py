@@ -48,15 +48,15 @@ class Processing:
         looked_s = clock()
         eaten = look.difference if self._eats_difference and look.difference else self.bench.corrected(maps)
         reconstruction = reconstruct(eaten, self.bench.rig, self.network, clock)
-        stages_s = {"wait": got_s - begun_s, "maps": mapped_s - got_s, "bench": looked_s - mapped_s}
+        stages_s = {"wait": got_s - begun_s, "queue": got_s - arrival.arrived_s}
+        stages_s |= {"maps": mapped_s - got_s, "bench": looked_s - mapped_s}
         stages_s |= reconstruction.timings_s
-        return Step(arrival.frame, maps, reconstruction, clock(), stages_s, look.difference, look.warnings)
+        made = reconstruction, clock(), stages_s, look.difference, look.warnings
+        return Step(arrival.frame, maps, *made, arrived_s=arrival.arrived_s)
 
 
-def read_along(frames: Iterable[Frame], camera: Camera, bench: Bench) -> tuple[Iterable[Frame], Thermometer | None]:
-    """The same frames, and the camera's thermometer, read as they pass, where the bench needs one."""
-    if bench.reference is None:
-        return frames, None
+def read_along(frames: Iterable[Frame], camera: Camera) -> tuple[Iterable[Frame], Thermometer]:
+    """The same frames, and the camera's thermometer, read as they pass."""
     thermometer = thermometer_of(camera)
     return thermometer.watch(frames), thermometer
 

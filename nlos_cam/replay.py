@@ -1,6 +1,7 @@
 """A whole recording to files: every frame's hidden depth, its difference maps, a contact sheet and a short report."""
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -20,13 +21,14 @@ from nlos_cam.errors import RecordingError
 from nlos_cam.folders import renamed_when_whole
 from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.live_report import OnWarning, Step, Warned, say_nothing
+from nlos_cam.live_report import OnWarning, Step, Warned, frames_by_verdict, say_nothing
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.processing import Processing, read_along, steps
 from nlos_cam.reconstruct import Clock
 from nlos_cam.replay_looks import Looks
 from nlos_cam.samples import Samples
 from nlos_cam.sightings import in_words
+from nlos_cam.verdict import Verdict
 
 RESULT, DIFFERENCE, SHEET, REPORT = "reconstruction.npz", "difference.npz", "frames.png", "report.md"
 SHEET_FRAMES = 6
@@ -42,6 +44,8 @@ class ReplayReport:
     out: str
     warnings: Mapping[str, int] = field(default_factory=dict[str, int])
     """Of the bench, and the frames that each held for."""
+    verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
+    """By verdict, the frames that it was passed on; empty from networks that pass none."""
 
 
 class _Stack:
@@ -69,6 +73,7 @@ class _Results:
         self.timestamps_s: list[float] = []
         self.numbers: list[int] = []
         self.with_surface = 0
+        self.verdicts: Counter[Verdict] = Counter()
         self.samples, self.warned = Samples(SHEET_FRAMES), Warned(on_warning)
 
     def add(self, step: Step) -> None:
@@ -82,6 +87,8 @@ class _Results:
         self.with_surface += bool(np.isfinite(depth_m).any())
         self.samples.add(step)
         self.warned.add(step)
+        if step.verdict:
+            self.verdicts[step.verdict] += 1
 
 
 def replay(
@@ -105,11 +112,11 @@ def replay(
     with renamed_when_whole(out) as part, ExitStack() as files:
         results = _Results(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
         looking = files.enter_context((looks or Looks(bench)).into(part))
-        frames, thermometer = read_along(camera, camera, bench)
+        frames, thermometer = read_along(camera, camera)
         with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader:
             for step in steps(reader, processing, clock, thermometer=thermometer):
                 results.add(step)
-                looking.add(step)
+                looking.add(step, thermometer.celsius)
                 on_frame()
         if not results.numbers:
             raise RecordingError(f"{camera.uri} holds no frame with depth, infrared and confidence: record it again")
@@ -120,7 +127,8 @@ def replay(
         (part / REPORT).write_text(_report(camera, bench, results, stopped=stop.is_set()), encoding="utf-8")
     if not bench.reference:
         (out / DIFFERENCE).unlink(missing_ok=True)
-    return ReplayReport(len(results.numbers), clock() - begun_s, str(out), results.warned.frames())
+    told = results.warned.frames(), frames_by_verdict(results.verdicts)
+    return ReplayReport(len(results.numbers), clock() - begun_s, str(out), *told)
 
 
 def _of_frames(results: _Results, rig: Rig) -> dict[str, Any]:
@@ -165,6 +173,7 @@ def _report(camera: Camera, bench: Bench, results: _Results, *, stopped: bool) -
         f"- frames with a hidden surface: {results.with_surface} ({results.with_surface / frames:.0%})",
         f"- rig: {rig.name} {rig.checksum}, {rig.lidar.distance_m:.3f} m to the wall, {rig.facing_deg:.1f} degrees",
         f"- maps: {MAP_ROWS} x {MAP_COLUMNS}; hidden depth: {OBJECT_PIXELS} x {OBJECT_PIXELS} in `{RESULT}`",
+        *(f"- verdict, {frames} frames: {verdict}" for verdict, frames in frames_by_verdict(results.verdicts).items()),
         *_bench_told(bench, results.warned),
         "",
         f"![some frames]({SHEET})",

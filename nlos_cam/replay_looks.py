@@ -1,9 +1,10 @@
 """What a replay leaves to look at, where it was asked for: its view as a file, still pictures, a video."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from nlos_cam.bench import Bench
 from nlos_cam.live_report import Step
@@ -54,16 +55,16 @@ class Looking:
     def __init__(self, viewers: list[Viewer], samples: Samples | None) -> None:
         self._viewers, self.samples = viewers, samples
 
-    def add(self, step: Step) -> None:
+    def add(self, step: Step, celsius: Mapping[str, float]) -> None:
         if self._viewers:
-            moment = moment_of(step)
+            moment = moment_of(step, celsius)
             for viewer in self._viewers:
                 viewer.show(moment)
         if self.samples:
             self.samples.add(step)
 
 
-def moment_of(step: Step) -> Moment:
+def moment_of(step: Step, celsius: Mapping[str, float] = MappingProxyType({})) -> Moment:
     """A step of a recording at the time when it was recorded; its latency is what its own stages took."""
     took_s = sum(seconds for name, seconds in step.stages_s.items() if name != "wait")
     return Moment(
@@ -76,4 +77,5 @@ def moment_of(step: Step) -> Moment:
         verdict=step.verdict,
         check=step.check,
         stages_s=step.stages_s,
+        celsius=celsius,
     )

@@ -26,6 +26,8 @@ class Thermometer:
     def __init__(self, read: Callable[[float], Celsius], every_s: float = LOOK_S) -> None:
         self._read, self._every_s = read, every_s
         self._readings: deque[tuple[int, Celsius]] = deque()
+        self.celsius: Celsius = {}
+        """The last reading that `at` gave."""
 
     def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The same frames."""
@@ -42,7 +44,7 @@ class Thermometer:
         """The last reading up to this frame, once; None if there is no new one. May be called by another thread."""
         newest: Celsius | None = None
         while self._readings and self._readings[0][0] <= frame.frame_number:
-            newest = self._readings.popleft()[1]
+            newest = self.celsius = self._readings.popleft()[1]
         return newest
 
 

@@ -24,6 +24,9 @@ MOST_LATE = FRAMES_PER_S
 JOIN_TIMEOUT_S = 5.0
 RESET_INSTANTS = FRAMES_PER_S
 """How long a device that is reset is gone."""
+EXPOSED_AHEAD_S = 0.5 / FRAMES_PER_S
+"""A frame is exposed from so long before it is due, or as much longer as exposing takes: a real device needs no
+processor for it, and the one that was delivered last is being reconstructed before then."""
 REMEMBERED = 1000
 """Frames of which the instant is known, for their truth; a reader is never as late as that."""
 
@@ -126,9 +129,13 @@ class SimulatedCamera(LiveCamera):
 
     def _deliver(self, instant: int) -> None:
         """Expose each instant ahead, and hand over what the device makes of it when it is due."""
-        start_s = self._start_s or 0.0
+        start_s, ahead_s = self._start_s or 0.0, EXPOSED_AHEAD_S
         while True:
-            images, due_s = self._world.images(instant), start_s + instant / FRAMES_PER_S
+            due_s = start_s + instant / FRAMES_PER_S
+            if self._clock.wait(self._stopping, due_s - ahead_s - self._clock.now()):
+                return
+            begun_s, images = self._clock.now(), self._world.images(instant)
+            ahead_s = max(EXPOSED_AHEAD_S, 2 * (self._clock.now() - begun_s))
             if self._clock.wait(self._stopping, due_s - self._clock.now()):
                 return
             for delivery in self._model.hand_over(instant, due_s, images):

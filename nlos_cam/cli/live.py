@@ -1,5 +1,7 @@
 """`nlos-cam live` and `nlos-cam replay`: frames in, hidden depth out."""
 
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +12,6 @@ from nlos_calibration.rig import Rig, load_rig
 from nlos_calibration.rig_difference import rig_difference
 from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.inference import load_reconstructor
-from rich.markup import escape
 
 from nlos_cam.bench import Bench, open_bench
 from nlos_cam.cache import cache_folder
@@ -29,14 +30,16 @@ from nlos_cam.cli.common import (
     stop_on_signals,
     tracked,
 )
-from nlos_cam.cli.view import SaveReplayView, SaveView, Stills, Video, saved_as, saving
+from nlos_cam.cli.live_told import told, warn
+from nlos_cam.cli.live_view import NoView, Open, ViewHost, ViewPort, tell_of_view, viewer_of
+from nlos_cam.cli.view import SUFFIX, SaveReplayView, SaveView, Stills, Video, saving
+from nlos_cam.frame_log import SUFFIXES, FrameLog
 from nlos_cam.live import run_live, warm_up
-from nlos_cam.live_report import LiveReport
 from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
 from nlos_cam.replay_looks import Looks
-from nlos_cam.sightings import in_words
-from nlos_cam.view.viewer import NullViewer, Viewer
+from nlos_cam.undisturbed import undisturbed
+from nlos_cam.view.viewer import Moment
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:scene.toml, bag:run.bag.")]
 Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it (wall.toml).")]
@@ -46,11 +49,11 @@ Average = Annotated[
     int,
     typer.Option("--average", min=1, max=1000, help="Average the maps of so many frames; what moves meanwhile smears."),
 ]
-NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 RecordTo = Annotated[Path | None, typer.Option("--record", help="Also record the camera's streams (F.bag).")]
 ReadBy = Annotated[Reader, typer.Option("--reader", help="Who reads the file: plain (we), or sdk (librealsense).")]
 BagFile = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording with depth, infrared and confidence.")]
 Out = Annotated[Path | None, typer.Option("--out", help="The folder to write.")]
+Log = Annotated[Path | None, typer.Option("--log", help="Write one line for each frame: F.csv, or F.jsonl.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -64,7 +67,11 @@ def live(
     wall: Wall = None,
     seconds: Seconds = None,
     no_view: NoView = False,
+    view_port: ViewPort = None,
+    view_host: ViewHost = None,
+    open_view: Open = False,
     record: RecordTo = None,
+    log: Log = None,
     weights: Weights = None,
     average: Average = 1,
     save_view: SaveView = None,
@@ -72,24 +79,19 @@ def live(
     json: Json = False,
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
-    if record is not None and record.suffix != ".bag":
-        raise typer.BadParameter(f"--record {record}: a recording's name ends in .bag")
-    path = output_path(record, "live", ".bag", overwrite=overwrite) if record else None
+    path = _named(record, "--record", "a recording", (".bag",), overwrite=overwrite)
+    frame_log = _named(log, "--log", "a log", SUFFIXES, overwrite=overwrite)
     recording = Recording(path, optional=True) if path else None
-    view_path = saved_as(save_view, overwrite=overwrite)
+    view_path = _named(save_view, "--save-view", "a saved view", (SUFFIX,), overwrite=overwrite)
     with interrupted_by_signals():
         with tracked("rendering the scene ahead") as on_progress:
             opened = open_camera(camera, on_progress=on_progress, recording=recording)
         bench = open_bench(wall, opened)
         processing = _processing(bench, weights, average)
         warm_up(opened, processing)
-    viewers = saving(_viewer(bench, no_view=no_view), bench, view_path)
-    with stop_on_signals() as stop, viewers as viewer, opened as source:
-        say(
-            f"live view: {viewer.address}  (Ctrl-C ends it)"
-            if viewer.address
-            else "running without a view (Ctrl-C ends it)"
-        )
+    viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, view_path)
+    with stop_on_signals() as stop, viewer, _logging(frame_log) as on_moment, undisturbed(), opened as source:
+        tell_of_view(viewer, host=view_host, port=view_port, open_it=open_view)
         report = run_live(
             source,
             processing,
@@ -98,14 +100,15 @@ def live(
             seconds=seconds,
             recorded=camera.startswith("bag:"),
             clock=WallClock().now,
-            on_error=lambda until_then: say(_told(until_then)),
-            on_warning=_warn,
+            on_error=lambda until_then: say(told(until_then)),
+            on_warning=warn,
+            on_moment=on_moment,
         )
     if recording:
         say(f"recorded {recording.sets} frames to {recording.path}")
     if view_path:
         say(f"saved the view: nlos-cam view {view_path}")
-    finish(asdict(report), as_json=json, text=_told(report))
+    finish(asdict(report), as_json=json, text=told(report))
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)
 
@@ -136,13 +139,33 @@ def replay_bag(
             path,
             stop=stop,
             on_frame=lambda: bar.advance(task),
-            on_warning=_warn,
+            on_warning=warn,
             looks=Looks(processing.bench, view=save_view, stills=stills, video=video),
         )
     text = f"{report.frames} frames in {report.seconds:.1f} s: {path / REPORT}"
     finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)
+
+
+def _named(path: Path | None, option: str, what: str, suffixes: tuple[str, ...], *, overwrite: bool) -> Path | None:
+    """Where something is written, if it is. Raises typer.BadParameter for a name that is not of its kind."""
+    if path is None:
+        return None
+    if path.suffix not in suffixes:
+        raise typer.BadParameter(f"{option} {path}: {what}'s name ends in {' or '.join(suffixes)}")
+    return output_path(path, "live", path.suffix, overwrite=overwrite)
+
+
+@contextmanager
+def _logging(path: Path | None) -> Generator[Callable[[Moment], None]]:
+    """What is called with each frame's moment: a log's `add`, if there is a path to write it to."""
+    if path is None:
+        yield lambda _: None
+        return
+    with FrameLog(path) as frame_log:
+        yield frame_log.add
+    say(f"logged each frame to {path}")
 
 
 def _processing(bench: Bench, weights: Path | None, average: int) -> Processing:
@@ -176,28 +199,3 @@ def _reference_note(bench: Bench) -> list[str]:
         return []
     told = "no difference maps are formed, and a lidar that moves is not noticed: calibrate the wall again"
     return [f"this wall's record has no reference: {told}"]
-
-
-def _viewer(bench: Bench, *, no_view: bool) -> Viewer:
-    if no_view:
-        return NullViewer()
-    from nlos_cam.view.rerun_viewer import RerunViewer
-
-    return RerunViewer(bench.rig, bench.measured)
-
-
-def _warn(warning: str, begins: bool) -> None:
-    say(f"[yellow]warning:[/] {escape(warning)}" if begins else f"no longer: {escape(warning)}")
-
-
-def _told(report: LiveReport) -> str:
-    latency, stages = report.latency_ms, report.stages_ms
-    told = ", ".join(f"{name} {value:.1f}" for name, value in stages.items())
-    seen = in_words(report.counts)
-    return (
-        f"{report.frames} frames, {report.fps:.1f} per second, {report.dropped} dropped\n"
-        f"latency  {latency['p50']:.0f} ms median, {latency['p95']:.0f} ms p95, {latency['p99']:.0f} ms p99\n"
-        f"stages   {told} (median ms)"
-        + (f"\nseen     {seen}" if seen else "")
-        + "".join(f"\nwarning  {frames} frames: {escape(text)}" for text, frames in report.warnings.items())
-    )

@@ -6,7 +6,9 @@ from typing import Annotated
 import typer
 
 from nlos_cam.bench import Bench
-from nlos_cam.cli.common import INTERRUPTED, interrupted_by_signals, output_path, say, stop_on_signals
+from nlos_cam.cli.common import INTERRUPTED, interrupted_by_signals, stop_on_signals
+from nlos_cam.cli.live_view import Open, ViewHost, ViewPort, tell_of_view
+from nlos_cam.view.assets import LOOPBACK
 from nlos_cam.view.viewer import Viewer, Viewers
 
 SUFFIX = ".rrd"
@@ -16,7 +18,6 @@ Stills = Annotated[int, typer.Option("--stills", min=0, max=100, help="Also writ
 Video = Annotated[bool, typer.Option("--video", help="Also write DIR/replay.webm.")]
 ViewFile = Annotated[Path, typer.Argument(metavar="F.RRD", help="What --save-view wrote.")]
 Seconds = Annotated[float | None, typer.Option("--seconds", min=0.1, help="Stop after so long; else at Ctrl-C.")]
-Port = Annotated[int, typer.Option("--port", min=0, max=65535, help="The port to serve at, if it is free.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -24,26 +25,23 @@ def register(app: typer.Typer) -> None:
     app.command("view")(view)
 
 
-def view(file: ViewFile, seconds: Seconds = None, port: Port = 9090) -> None:
+def view(
+    file: ViewFile,
+    seconds: Seconds = None,
+    view_port: ViewPort = None,
+    view_host: ViewHost = None,
+    open_view: Open = False,
+) -> None:
     """Look at a saved view in a browser, with play, pause and scrubbing."""
     from nlos_cam.view.recorded import RecordedView
 
     with interrupted_by_signals():
-        recorded = RecordedView(file, port)
+        recorded = RecordedView(file, host=view_host or LOOPBACK, port=view_port)
     with stop_on_signals() as stop, recorded:
-        say(f"saved view: {recorded.address}  (Ctrl-C ends it)")
+        tell_of_view(recorded, host=view_host, port=view_port, open_it=open_view)
         stop.wait(seconds)
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)
-
-
-def saved_as(path: Path | None, *, overwrite: bool) -> Path | None:
-    """Where a live view is saved, if it is. Raises OutputExistsError, and a wrong usage for another kind of name."""
-    if path is None:
-        return None
-    if path.suffix != SUFFIX:
-        raise typer.BadParameter(f"--save-view {path}: a saved view's name ends in {SUFFIX}")
-    return output_path(path, "view", SUFFIX, overwrite=overwrite)
 
 
 def saving(viewer: Viewer, bench: Bench, path: Path | None) -> Viewer:

@@ -96,7 +96,7 @@ def sure(counts: float, chain: Chain) -> float:
     return 1 - np.exp(-counts / SURE_COUNTS)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def signal_surety(intensity: Float32, chain: Chain) -> Array:
     """`sure` of intensities (n,), in units of I0."""
     surety = np.empty(intensity.size)
@@ -105,7 +105,7 @@ def signal_surety(intensity: Float32, chain: Chain) -> Array:
     return surety
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)  # a simulated camera exposes while others reconstruct
 def expose(
     optics: Optics,
     echoes: Echoes,

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import BinaryIO, Self
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.view.assets import page_assets
+from nlos_cam.view.assets import LOOPBACK, page_assets
+from nlos_cam.view.rerun_viewer import PREFERRED_PORT
 from nlos_cam.view.server import Send, ViewServer
 
 MAGIC = b"RRF2"
@@ -19,9 +20,10 @@ CHUNK_BYTES = 1 << 18
 class RecordedView:
     """Serves a file that a `SavedView` wrote while entered, up to where it is whole. Raises RecordingError."""
 
-    def __init__(self, path: Path, preferred_port: int) -> None:
+    def __init__(self, path: Path, *, host: str = LOOPBACK, port: int | None = None) -> None:
+        """At this `port` or nowhere; without one, at 9090 or where there is room."""
         self.address: str | None = None
-        self._path, self._preferred_port = path, preferred_port
+        self._path, self._host, self._port = path, host, port
         try:
             with path.open("rb") as file:
                 begins = file.read(len(MAGIC))
@@ -31,7 +33,8 @@ class RecordedView:
             raise RecordingError(f"{path} is no saved view: make one with `live --save-view` or `replay --save-view`")
 
     def __enter__(self) -> Self:
-        self._server = ViewServer(page_assets(recorded=True), self._stream, self._preferred_port)
+        assets, port = page_assets(recorded=True), PREFERRED_PORT if self._port is None else self._port
+        self._server = ViewServer(assets, self._stream, port, host=self._host, exact=self._port is not None)
         self.address = self._server.address
         return self
 

@@ -8,7 +8,7 @@ from typing import Self
 from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Rig
 
-from nlos_cam.view.assets import page_assets
+from nlos_cam.view.assets import LOOPBACK, page_assets
 from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.latest import Latest
 from nlos_cam.view.server import Send, ViewServer
@@ -25,15 +25,24 @@ class RerunViewer:
     """Serves the view while entered. Nobody watching costs nothing: drawing is done for each browser, in its thread."""
 
     def __init__(
-        self, rig: Rig, measured: MeasuredWall | None = None, clock: Callable[[], float] = time.monotonic
+        self,
+        rig: Rig,
+        measured: MeasuredWall | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        host: str = LOOPBACK,
+        port: int | None = None,
     ) -> None:
+        """At this `port` or nowhere; without one, at 9090 or where there is room."""
         self.address: str | None = None
+        self._host, self._port = host, port
         self._rig, self._measured, self._clock = rig, measured, clock
         self._moments = Latest[Moment]()
         self._closed = Event()
 
     def __enter__(self) -> Self:
-        self._server = ViewServer(page_assets(), self._stream, PREFERRED_PORT)
+        port = PREFERRED_PORT if self._port is None else self._port
+        self._server = ViewServer(page_assets(), self._stream, port, host=self._host, exact=self._port is not None)
         self.address = self._server.address
         return self
 

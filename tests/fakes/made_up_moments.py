@@ -1,7 +1,9 @@
 """Moments of a run that never was, with everything in them that a view can show."""
 
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from nlos_calibration.rig import load_rig
@@ -54,3 +56,25 @@ def full_moment(number: int, verdict: Verdict = Verdict.SEEN, size: tuple[int, i
         dropped=number // 50,
         celsius={"ldd_temperature": 40.0 + number / 100, "mc_temperature": 35.0},
     )
+
+
+class Recorded:
+    """A recording of so many frames of theirs."""
+
+    def __init__(self, count: int) -> None:
+        self.uri, self.rig, self.identity = "bag:fake.bag", None, {"serial": ""}
+        self.intrinsics, self.incomplete, self.dropped = full_moment(0).frame.intrinsics, 0, 0
+        self.counts: Counter[str] = Counter()
+        self._count = count
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (full_moment(number).frame for number in range(self._count))
+
+    def telemetry(self, *_: str) -> dict[str, float]:
+        return {"ldd_temperature": 41.0}

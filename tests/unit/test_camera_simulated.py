@@ -8,7 +8,7 @@ import pytest
 
 from nlos_cam.camera.record import Recording
 from nlos_cam.camera.replay import ReplayCamera
-from nlos_cam.camera.simulated import MOST_LATE, SimulatedCamera
+from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MOST_LATE, SimulatedCamera
 
 
 class BusyClock:
@@ -55,6 +55,27 @@ def test_frames_are_due_every_thirtieth_of_a_second(noise_world: Any, hurried_cl
     with SimulatedCamera("sim", noise_world(), clock=hurried_clock(1e9)) as camera:
         for frame in islice(camera, 6):
             assert frame.timestamp_s == pytest.approx(1e9 + frame.frame_number / 30, abs=1e-6)
+
+
+@pytest.mark.parametrize(("takes_s", "ahead_s"), [(0.001, EXPOSED_AHEAD_S), (0.012, 0.024)])
+def test_a_frame_is_exposed_late_but_in_time(
+    noise_world: Any, hurried_clock: Any, takes_s: float, ahead_s: float
+) -> None:
+    clock, begun_s = hurried_clock(0.0), dict[int, float]()
+
+    class Timed(noise_world):
+        def images(self, number: int) -> Any:
+            begun_s[number] = clock.now()
+            clock.time_s += takes_s
+            return super().images(number)
+
+    camera = SimulatedCamera("sim", Timed(), clock=clock)
+    zero_s = clock.now()
+    with camera:
+        for _ in zip(range(6), camera, strict=False):
+            pass
+    for number in range(2, 6):
+        assert zero_s + number / 30 - begun_s[number] == pytest.approx(ahead_s, abs=1e-6)
 
 
 def test_frames_carry_the_truth_of_their_number(noise_world: Any, hurried_clock: Any) -> None:

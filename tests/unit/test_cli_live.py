@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,6 +44,10 @@ class FakeCamera:
 
     def __exit__(self, *_: object) -> None:
         pass
+
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        del ending
+        return {}
 
     def __iter__(self) -> Iterator[Frame]:
         depth_m, ir = np.full((64, 80), 0.3, np.float32), np.full((64, 80), 9, np.uint8)
@@ -99,10 +103,13 @@ def interrupt_at(number: int) -> Callable[[int], None]:
 def test_live_ends_with_one_object_that_scripts_depend_on(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["live", "--camera", "bag:fake", "--no-view", "--json"]) == 0
     report, _ = told(capsys)
-    assert set(report) == {"frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings"}
+    assert set(report) == {
+        *("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings"),
+        *("stages_percentiles_ms", "verdicts", "stalled_s"),
+    }
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
-    assert set(report["stages_ms"]) == {"wait", "maps", "bench", "network", "view"}
+    assert set(report["stages_ms"]) == {"delivery", "wait", "queue", "maps", "bench", "network", "view"}
 
 
 @pytest.mark.usefixtures("opened")
@@ -153,26 +160,6 @@ def test_record_hands_a_recording_to_the_camera_and_replaces_nothing_unasked(
 
 
 @pytest.mark.usefixtures("opened")
-def test_the_view_is_saved_where_asked_for_and_replaces_nothing_unasked(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["live", "--camera", "bag:fake", "--no-view", "--save-view", "view.rrd", "--json"]
-    assert main(arguments) == 0
-    assert "nlos-cam view view.rrd" in told(capsys)[1]
-    assert (tmp_path / "view.rrd").stat().st_size > 10_000
-    assert main(arguments) == 1
-    assert main([*arguments, "--overwrite"]) == 0
-
-
-@pytest.mark.usefixtures("opened")
-def test_a_replay_leaves_its_view_stills_and_video_where_asked_for(tmp_path: Path) -> None:
-    assert main(["replay", "run.bag", "--out", "out", "--save-view", "--stills", "2", "--video"]) == 0
-    made = {file.suffix for file in (tmp_path / "out").iterdir()}
-    assert {".rrd", ".webm"} < made
-    assert len(list((tmp_path / "out").glob("still-*.png"))) == 2
-
-
-@pytest.mark.usefixtures("opened")
 def test_a_wall_other_than_the_networks_is_used_and_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_wall(tmp_path / "wall.toml")
     run = ["replay", "run.bag", "--out", "out", "--json"]
@@ -187,7 +174,7 @@ def test_a_wall_other_than_the_networks_is_used_and_noted(tmp_path: Path, capsys
 def test_replay_writes_its_folder_and_one_object(opened: Opened, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", "run.bag", "--out", "out", "--json"]) == 0
     report, progress = told(capsys)
-    assert set(report) == {"frames", "seconds", "out", "warnings"}
+    assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts"}
     assert (report["frames"], report["out"]) == (20, "out")
     assert "another" not in progress
     assert opened.calls == [("bag:run.bag", {"reader": "plain"})]
@@ -225,8 +212,20 @@ def test_replay_needs_no_sdk(noise_bag: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("opened")
-def test_a_recording_by_another_name_is_refused() -> None:
-    assert main(["live", "--camera", "sim", "--no-view", "--record", "run.txt"]) == 2
+@pytest.mark.parametrize("option", ["--record", "--log"])
+def test_a_recording_or_log_by_another_name_is_refused(option: str) -> None:
+    assert main(["live", "--camera", "sim", "--no-view", option, "run.txt"]) == 2
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_log_has_a_line_for_each_frame_and_replaces_nothing_unasked(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["live", "--camera", "bag:fake", "--no-view", "--log", "log.csv", "--json"]
+    assert main(arguments) == 0
+    frames = told(capsys)[0]["frames"]
+    header, *lines = Path("log.csv").read_text(encoding="utf-8").splitlines()
+    assert [int(line.split(",")[0]) for line in lines] == list(range(frames))
+    assert {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"} <= set(header.split(","))
+    assert main(arguments) == 1
 
 
 @pytest.mark.parametrize("command", [("live", "--no-view", "--camera", "sim"), ("replay", "a.bag")])

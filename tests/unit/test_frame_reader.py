@@ -111,3 +111,19 @@ def test_it_is_enough_also_while_no_frame_comes() -> None:
     with FrameReader(source, keeps_all=True, stop=Event(), enough=enough, let_go=release.set) as reader:
         assert list(reader) == []
         release.set()
+
+
+def test_a_wait_is_heard_of_while_no_frame_comes_and_only_then() -> None:
+    release, waits = Event(), list[float | None]()
+
+    def on_wait() -> None:
+        waits.append(reader.newest_s)
+        release.set()
+
+    source = frames(4, lambda number: number == 3 and release.wait(10.0))
+    with FrameReader(source, keeps_all=True, stop=Event(), clock=lambda: 7.0, on_wait=on_wait) as reader:
+        numbers = [arrival.frame.frame_number for arrival in reader]
+    assert numbers == [0, 1, 2, 3]
+    assert waits
+    assert waits[-1] == 7.0
+    assert FrameReader([], keeps_all=True, stop=Event()).newest_s is None

@@ -1,9 +1,9 @@
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from threading import Event
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from nlos_cam.bench import Bench
 from nlos_cam.errors import CameraLostError, SceneError
 from nlos_cam.frames import Frame
 from nlos_cam.live import paced, run_live, warm_up
-from nlos_cam.live_report import LiveReport
+from nlos_cam.live_report import OUTSIDE_LATENCY, LiveReport
 from nlos_cam.processing import Processing
 from nlos_cam.view.viewer import Moment, NullViewer
 
@@ -52,6 +52,9 @@ class FakeCamera:
 
     def __exit__(self, *_: object) -> None:
         pass
+
+    def telemetry(self, _: str = "") -> Mapping[str, float]:
+        return {}
 
     def __iter__(self) -> Iterator[Frame]:
         number = 0
@@ -138,11 +141,16 @@ def test_latency_is_told_on_any_clock(offset_s: float, delivery_ms: float) -> No
     report = run_live(camera, processing(), viewer, stop=Event(), clock=clock)
     assert report.frames == len(viewer.moments) == 31
     assert report.dropped == 0
-    assert set(report.stages_ms) == {"wait", "maps", "bench", "network", "view"}
+    assert set(report.stages_ms) == {"delivery", "wait", "queue", "maps", "bench", "network", "view"}
     assert set(report.latency_ms) == {"p50", "p95", "p99"}
     assert report.latency_ms["p50"] <= report.latency_ms["p95"] <= report.latency_ms["p99"]
+    assert {name: times["p50"] for name, times in report.stages_percentiles_ms.items()} == report.stages_ms
+    assert report.stages_ms["delivery"] == pytest.approx(delivery_ms, abs=1.0)
     assert report.latency_ms["p50"] == pytest.approx(delivery_ms, abs=1.0)
     assert report.fps == pytest.approx(30.0, rel=0.04)
+    for moment in viewer.moments[-5:]:  # once the fastest delivery is known
+        parts_s = sum(seconds for stage, seconds in moment.stages_s.items() if stage not in OUTSIDE_LATENCY)
+        assert 0.0 <= parts_s <= moment.latency_s + 1e-6
 
 
 def test_the_viewer_sees_every_frame_in_order() -> None:
@@ -160,27 +168,15 @@ def test_a_run_ends_after_the_seconds_it_is_given() -> None:
 
 def test_warming_up_runs_the_way_of_a_frame_once_and_takes_none_from_the_camera() -> None:
     seen: list[tuple[int, ...]] = []
-
-    def noting(depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
-        seen.append(depth_m.shape)
-        return network(depth_m, intensity)
-
-    warm_up(FakeCamera(0), processing(noting))
+    warm_up(FakeCamera(0), processing(lambda depth_m, _: seen.append(depth_m.shape) or network()))
     assert seen == [(1, 64, 80)]
 
 
 def test_a_lidar_that_moves_is_warned_of_while_it_is_elsewhere(tmp_path: Path) -> None:
     told, viewer = list[tuple[str, bool]](), ListViewer()
     camera, method = WallCamera(150, moved=range(30, 80)), Processing(Bench(RIG, measured_wall(tmp_path)), network)
-    report = run_live(
-        camera,
-        method,
-        viewer,
-        stop=Event(),
-        recorded=True,
-        clock=Hurried(),
-        on_warning=lambda *about: told.append(about),
-    )
+    run: Any = {"stop": Event(), "recorded": True, "clock": Hurried(), "on_warning": lambda *about: told.append(about)}
+    report = run_live(camera, method, viewer, **run)
     [(warning, frames)] = report.warnings.items()
     assert [begins for _, begins in told] == [True, False]
     assert told[1][0] == warning
@@ -203,9 +199,12 @@ def failing_at(*numbers: int) -> Callable[..., np.ndarray]:
 
 
 def test_a_frame_that_comes_to_no_result_is_counted_and_survived(caplog: pytest.LogCaptureFixture) -> None:
-    viewer = ListViewer()
-    report = run_live(FakeCamera(10), processing(failing_at(3, 4)), viewer, stop=Event(), recorded=True)
+    viewer, logged = ListViewer(), list[Moment]()
+    camera, method = FakeCamera(10), processing(failing_at(3, 4))
+    report = run_live(camera, method, viewer, stop=Event(), recorded=True, on_moment=logged.append)
     assert [moment.frame.frame_number for moment in viewer.moments] == [0, 1, 2, 5, 6, 7, 8, 9]
+    assert [moment.dropped for moment in viewer.moments] == [0, 0, 0, 2, 2, 2, 2, 2]
+    assert logged == viewer.moments
     assert (report.counts, report.dropped) == ({"failed": 2}, 2)
     assert "frame 3 came to no result (ZeroDivisionError: an odd frame)" in caplog.text
 

@@ -1,4 +1,5 @@
 from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +11,7 @@ from nlos_cam.errors import NlosCamError, SceneError
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.live_report import MOST_FAILED, Held, LiveReport, Step, Tally, Warned
 from nlos_cam.reconstruct import Reconstruction
+from nlos_cam.verdict import Verdict
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})
@@ -49,6 +51,26 @@ def test_rate_latency_and_stages_are_those_of_the_frames() -> None:
     assert report.fps == pytest.approx(30.0)
     assert report.latency_ms == pytest.approx({"p50": 3.0, "p95": 3.0, "p99": 3.0}, abs=1e-6)
     assert report.stages_ms == pytest.approx({"wait": 1.0, "network": 160.0, "view": 2.0})
+
+
+def test_each_verdict_is_counted_by_frames() -> None:
+    tally, passed = Tally(), [Verdict.SEEN, None, Verdict.NOTHING, Verdict.SEEN, Verdict.WALL_MOVED]
+    for number, verdict in enumerate(passed):
+        tally.add(replace(warned(number), verdict=verdict), view_s=0.0)
+    verdicts = reported(tally).verdicts
+    assert verdicts == {"object seen": 2, "nothing there": 1, "wall moved": 1}
+    assert list(verdicts) == [verdict.value for verdict in Verdict if verdict in passed]
+
+
+def test_delivery_is_told_by_the_loops_clock_and_a_step_without_an_arrival_has_none() -> None:
+    tally = Tally()
+    for number in range(9):
+        step = warned(number)
+        tally.add(replace(step, published_s=number / 30 + 0.012, arrived_s=number / 30 + 0.007), view_s=0.0)
+    report = reported(tally, offset_s=0.005)
+    assert report.stages_percentiles_ms["delivery"] == pytest.approx({"p50": 2.0, "p95": 2.0, "p99": 2.0}, abs=1e-6)
+    assert report.latency_ms["p99"] == pytest.approx(7.0, abs=1e-6)
+    assert "delivery" not in reported(tally_of([0.1])).stages_ms
 
 
 def test_a_run_lasts_from_its_first_result() -> None:

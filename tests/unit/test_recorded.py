@@ -30,7 +30,7 @@ def test_each_browser_gets_the_whole_file_and_its_end(saved: Path, monkeypatch: 
         return {"/": ("text/html", b"page")}
 
     monkeypatch.setattr(recorded, "page_assets", assets)
-    with RecordedView(saved, 0) as view:
+    with RecordedView(saved) as view:
         for _ in range(2):
             with closing(HTTPConnection(urlsplit(view.address or "").netloc, timeout=10.0)) as browser:
                 browser.request("GET", "/live.rrd")
@@ -63,7 +63,7 @@ def test_a_whole_file_is_whole_and_one_that_has_hardly_begun_has_nothing(saved: 
 
 def test_what_is_no_saved_view_is_told(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"none\.rrd cannot be read \(No such file"):
-        RecordedView(tmp_path / "none.rrd", 0)
+        RecordedView(tmp_path / "none.rrd")
     (tmp_path / "other.rrd").write_text("something else")
     with pytest.raises(RecordingError, match="is no saved view: make one with"):
-        RecordedView(tmp_path / "other.rrd", 0)
+        RecordedView(tmp_path / "other.rrd")

@@ -1,16 +1,14 @@
-from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from made_up_moments import RIG, bump, full_moment
+from made_up_moments import RIG, Recorded, bump, full_moment
 
 from nlos_cam.bench import Bench
-from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.frames import maps_from_frame
 from nlos_cam.live_report import Step
 from nlos_cam.objects.depth_image import image_from_depth, object_box
 from nlos_cam.processing import Processing
@@ -24,25 +22,6 @@ NAMES = {REPORT, RESULT, SHEET}
 def network(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
     """Shows the same hill whatever the lidar sees."""
     return np.repeat(image_from_depth(bump(0), object_box(RIG))[np.newaxis], len(depth_m), axis=0)
-
-
-class Recorded:
-    """A recording of so many frames."""
-
-    uri, intrinsics, incomplete, dropped = "bag:fake.bag", full_moment(0).frame.intrinsics, 0, 0
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-        self.counts: Counter[str] = Counter()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (full_moment(number).frame for number in range(self._count))
 
 
 def replayed(out: Path, count: int, **asked: Any) -> set[str]:
@@ -95,7 +74,7 @@ def test_there_are_as_many_stills_as_asked_for_or_frames(tmp_path: Path, count: 
 def test_an_error_leaves_no_thread_and_draws_no_stills(tmp_path: Path) -> None:
     step = Step(full_moment(0).frame, maps_from_frame(full_moment(0).frame), full_moment(0).reconstruction, 0.0, {})
     looks = Looks(BENCH, view=True, stills=2).into(tmp_path)
-    looks.__enter__().add(step)
+    looks.__enter__().add(step, {})
     assert not looks.__exit__(ZeroDivisionError, ZeroDivisionError(), None), "it goes on to whoever replays"
     assert {file.name for file in tmp_path.iterdir()} == {VIEW}
 
@@ -104,7 +83,15 @@ def test_a_step_is_shown_at_its_own_time_with_all_that_is_known_of_it() -> None:
     full = full_moment(42)
     stages_s = {"wait": 9.0, "maps": 0.001, "network": 0.01}
     known = full.difference, (), full.verdict, full.check
-    shown = moment_of(Step(full.frame, maps_from_frame(full.frame), full.reconstruction, 77.0, stages_s, *known))
+    shown = moment_of(
+        Step(full.frame, maps_from_frame(full.frame), full.reconstruction, 77.0, stages_s, *known),
+        full.celsius,
+    )
     assert shown.published_s == full.frame.timestamp_s
     assert shown.latency_s == pytest.approx(0.011)
-    assert (shown.difference, shown.verdict, shown.check) == (full.difference, full.verdict, full.check)
+    assert (shown.difference, shown.verdict, shown.check, shown.celsius) == (
+        full.difference,
+        full.verdict,
+        full.check,
+        full.celsius,
+    )

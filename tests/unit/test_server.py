@@ -1,20 +1,24 @@
+import socket
 from collections.abc import Iterator
 from contextlib import closing
-from http.client import HTTPConnection, HTTPResponse
+from http.client import HTTPConnection, HTTPException, HTTPResponse
 from threading import Event
 from urllib.parse import urlsplit
 
 import pytest
 
+from nlos_cam.errors import NlosCamError
+from nlos_cam.view import server as server_module
 from nlos_cam.view.assets import LOOPBACK
 from nlos_cam.view.server import Send, ViewServer
 
+EVERYWHERE = "0.0.0.0"  # noqa: S104  on purpose: what it exposes is tested
 ASSETS = {"/": ("text/html", b"<p>page</p>"), "/file.wasm": ("application/wasm", bytes(5_000_000))}
 
 
-def ask(address: str, path: str) -> HTTPResponse:
+def ask(address: str, path: str, *, method: str = "GET", host: str | None = None) -> HTTPResponse:
     connection = HTTPConnection(urlsplit(address).netloc, timeout=10.0)
-    connection.request("GET", path)
+    connection.request(method, path, headers={} if host is None else {"Host": host})
     return connection.getresponse()
 
 
@@ -56,6 +60,54 @@ def test_files_come_whole_with_their_type_and_nothing_may_come_from_elsewhere(se
             assert answer.headers["Content-Type"] == kind
             assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
             assert answer.read() == content
+
+
+def test_connections_beyond_the_room_are_closed_and_those_before_live_on(
+    streams: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_module, "MOST_CONNECTIONS", 1)
+    server = ViewServer(ASSETS, streams, 0)
+    with closing(ask(server.address, "/live.rrd")) as first:
+        with pytest.raises((HTTPException, OSError)):
+            ask(server.address, "/")
+        assert first.read(2000) == b"x" * 2000
+        streams.end.set()
+    server.close()
+
+
+def test_closing_cuts_browsers_that_neither_read_nor_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "CLOSE_AFTER_S", 0.01)
+    server = ViewServer(ASSETS, lambda send: [send(bytes(1 << 20)) for _ in range(1000)] and None, 0)
+    place = urlsplit(server.address)
+    with socket.create_connection((place.hostname, place.port)) as silent, socket.socket() as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.connect((place.hostname, place.port))
+        deaf.sendall(b"GET /live.rrd HTTP/1.0\r\nHost: localhost\r\n\r\n")
+        assert deaf.recv(12) == b"HTTP/1.0 200"
+        server.close()
+        assert silent.recv(1) == b""
+
+
+def test_a_port_that_is_asked_for_exactly_is_not_replaced(server: ViewServer, streams: Streams) -> None:
+    busy = urlsplit(server.address).port or 0
+    with pytest.raises(NlosCamError, match=rf"cannot be served at http://127.0.0.1:{busy}/ .* another --view-port"):
+        ViewServer(ASSETS, streams, busy, exact=True)
+
+
+def test_everywhere_it_is_found_on_this_machine_by_any_address_and_by_no_other_name(streams: Streams) -> None:
+    everywhere = ViewServer(ASSETS, streams, 0, host=EVERYWHERE)
+    try:
+        assert urlsplit(everywhere.address).hostname == LOOPBACK
+        for host, status in (("192.168.3.4:9090", 200), ("evil.example", 403)):
+            with closing(ask(everywhere.address, "/", host=host)) as answer:
+                assert answer.status == status
+    finally:
+        everywhere.close()
+
+
+def test_an_address_that_is_not_this_machines_is_told(streams: Streams) -> None:
+    with pytest.raises(NlosCamError, match=r"cannot be served at http://192.0.2.1:0/"):
+        ViewServer(ASSETS, streams, 0, host="192.0.2.1")
 
 
 def test_an_unknown_path_is_not_found(server: ViewServer) -> None:

@@ -1,0 +1,79 @@
+"""A log of a live run: one line for each frame, written as they come."""
+
+import csv
+import json
+import logging
+from pathlib import Path
+from typing import IO, Any, Self
+
+from nlos_cam.view.viewer import Moment
+
+SUFFIXES = ".csv", ".jsonl"
+FLUSHED_EVERY_S = 1.0
+"""So much is lost at most where the process is killed."""
+
+log = logging.getLogger(__name__)
+
+
+def line_of(moment: Moment) -> dict[str, Any]:
+    """What a line tells of a moment; milliseconds, and None for what is not known."""
+    return {
+        "frame_number": moment.frame.frame_number,
+        "timestamp_s": round(moment.frame.timestamp_s, 6),
+        "published_s": round(moment.published_s, 6),
+        "latency_ms": round(1e3 * moment.latency_s, 3),
+        **{f"{stage}_ms": round(1e3 * seconds, 3) for stage, seconds in moment.stages_s.items()},
+        "dropped": moment.dropped,
+        "verdict": moment.verdict.value if moment.verdict else None,
+        "check_score": round(moment.check.score, 4) if moment.check else None,
+        "celsius": max(moment.celsius.values(), default=None),
+    }
+
+
+class FrameLog:
+    """A file of lines while entered: .csv with a header, or one JSON object a line (.jsonl).
+
+    The columns of a .csv are those of its first line. A disk that takes no more ends the log, with a warning, not the
+    run. Raises OSError on entering where the file cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: IO[str] | None = None
+        self._table: csv.DictWriter[str] | None = None
+        self._flushed_s = float("-inf")
+
+    def __enter__(self) -> Self:
+        self._file = self._path.open("w", encoding="utf-8", newline="")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        file, self._file = self._file, None
+        if file is None:
+            return
+        try:
+            file.close()
+        except OSError as error:
+            log.warning("%s: the log's end is lost (%s)", self._path, error.strerror)
+
+    def add(self, moment: Moment) -> None:
+        """Write one line."""
+        if self._file is None:
+            return
+        try:
+            self._write(self._file, line_of(moment))
+            if moment.published_s - self._flushed_s >= FLUSHED_EVERY_S:
+                self._file.flush()
+                self._flushed_s = moment.published_s
+        except OSError as error:
+            log.warning("%s: the log ends at frame %d (%s)", self._path, moment.frame.frame_number, error.strerror)
+            self.__exit__()
+
+    def _write(self, file: IO[str], line: dict[str, Any]) -> None:
+        if self._path.suffix == ".jsonl":
+            file.write(json.dumps(line) + "\n")
+            return
+        if self._table is None:
+            self._table = csv.DictWriter(file, line.keys(), extrasaction="ignore", lineterminator="\n")
+            self._table.writeheader()
+        self._table.writerow(line)

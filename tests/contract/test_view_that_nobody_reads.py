@@ -1,0 +1,83 @@
+"""The live loop with a browser that asks for the stream and then takes nothing of it: frames go on meanwhile."""
+
+import socket
+from collections.abc import Iterator, Mapping
+from threading import Event
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.bench import Bench
+from nlos_cam.frames import Frame
+from nlos_cam.live import run_live
+from nlos_cam.processing import Processing
+from nlos_cam.view import rerun_viewer
+from nlos_cam.view.rerun_viewer import RerunViewer
+from nlos_cam.view.server import Send
+
+RIG = load_rig("paper-rig")
+MEANWHILE = 100
+"""Frames that one and the same piece of the stream is not taken for."""
+PATIENCE = 100_000
+
+
+class Noted(RerunViewer):
+    """Counts the pieces of its streams that a browser was given, and those that it took."""
+
+    given = taken = 0
+
+    def _stream(self, send: Send) -> None:
+        def noting(content: bytes) -> None:
+            self.given += 1
+            send(content)
+            self.taken += 1
+
+        super()._stream(noting)
+
+
+class Camera:
+    """Gives frames of noise until a browser has kept a piece of the stream waiting for so many of them."""
+
+    uri, intrinsics, incomplete, dropped = "fake", RIG.pinhole, 0, 0
+
+    def __init__(self, viewer: Noted) -> None:
+        self.counts: Any = {}
+        self._viewer = viewer
+        self.kept_waiting = 0
+
+    def telemetry(self, _: str = "") -> Mapping[str, float]:
+        return {}
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Frame]:
+        generator, waited_for = np.random.default_rng(0), -1
+        shape = RIG.pinhole.height, RIG.pinhole.width
+        noise_m, ir = generator.random(shape, np.float32), generator.integers(0, 255, shape, np.uint8)
+        for number in range(PATIENCE):
+            waits = self._viewer.given > self._viewer.taken == waited_for
+            self.kept_waiting = self.kept_waiting + 1 if waits else 0
+            waited_for = self._viewer.taken
+            if self.kept_waiting == MEANWHILE:
+                return
+            yield Frame(noise_m, ir, ir, number / 1000, number, RIG.pinhole)
+
+
+def test_the_loop_never_waits_for_a_browser_that_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
+    monkeypatch.setattr(rerun_viewer, "DRAW_PERIOD_S", 0.0)
+    with Noted(RIG) as viewer, socket.socket() as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        place = urlsplit(viewer.address or "")
+        deaf.connect((place.hostname, place.port))
+        deaf.sendall(b"GET /live.rrd HTTP/1.0\r\nHost: localhost\r\n\r\n")
+        camera: Any = Camera(viewer)
+        method = Processing(Bench(RIG), lambda *_: np.full((1, 64, 64), 0.5, np.float32))
+        report = run_live(camera, method, viewer, stop=Event(), recorded=True)
+    assert camera.kept_waiting == MEANWHILE
+    assert report.frames > MEANWHILE
+    assert report.dropped == 0
