@@ -26,6 +26,8 @@ from nlos_cam.objects.depth_image import object_box
 from nlos_cam.physics_check import UNEXPLAINED
 from nlos_cam.processing import Processing, read_along, steps
 from nlos_cam.reconstruct import Clock
+from nlos_cam.replay_looks import Looks
+from nlos_cam.samples import Samples
 from nlos_cam.sightings import in_words
 from nlos_cam.verdict import Verdict
 
@@ -45,26 +47,6 @@ class ReplayReport:
     """Of the bench, and the frames that each held for."""
     verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
     """By verdict, the frames that it was passed on; empty from networks that pass none."""
-
-
-class Samples:
-    """Steps spread evenly over a run of unknown length: every n-th is kept, and n doubles as the run goes on."""
-
-    def __init__(self, most: int) -> None:
-        self._most, self._stride, self._seen = most, 1, 0
-        self._kept: list[Step] = []
-
-    def add(self, step: Step) -> None:
-        if self._seen % self._stride == 0:
-            self._kept.append(step)
-        self._seen += 1
-        if len(self._kept) > 2 * self._most:
-            self._kept, self._stride = self._kept[::2], self._stride * 2
-
-    def chosen(self) -> list[Step]:
-        """At most `most` steps, first and last kept one included."""
-        count = min(self._most, len(self._kept))
-        return [self._kept[i] for i in np.linspace(0, len(self._kept) - 1, count).round().astype(int)]
 
 
 class _Stack:
@@ -127,6 +109,7 @@ def replay(
     stop: Event,
     on_frame: Callable[[], None] = lambda: None,
     on_warning: OnWarning = say_nothing,
+    looks: Looks | None = None,
     clock: Clock = time.time,
 ) -> ReplayReport:
     """Reconstruct every frame of an entered recording into the folder `out`; its files of the same names are replaced.
@@ -138,10 +121,12 @@ def replay(
     begun_s, bench = clock(), processing.bench
     with renamed_when_whole(out) as part, ExitStack() as files:
         results = _Results(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
+        looking = files.enter_context((looks or Looks(bench)).into(part))
         frames, thermometer = read_along(camera, camera)
         with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader, processing.checks:
             for step in steps(reader, processing, clock, thermometer=thermometer):
                 results.add(step)
+                looking.add(step, thermometer.celsius)
                 on_frame()
         if not results.numbers:
             raise RecordingError(f"{camera.uri} holds no frame with depth, infrared and confidence: record it again")

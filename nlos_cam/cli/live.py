@@ -30,12 +30,14 @@ from nlos_cam.cli.common import (
 from nlos_cam.cli.live_budget import BudgetMs, Choice, Tradeoff, loader, options_here, timer, within_budget
 from nlos_cam.cli.live_told import told, warn
 from nlos_cam.cli.live_view import NoView, Open, ViewHost, ViewPort, tell_of_view, viewer_of
+from nlos_cam.cli.view import SUFFIX, SaveReplayView, SaveView, Stills, Video, saving
 from nlos_cam.frame_log import SUFFIXES, FrameLog
 from nlos_cam.live import run_live, warm_up
 from nlos_cam.physics_check import Checks
 from nlos_cam.physics_check_runner import BackgroundChecks
 from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
+from nlos_cam.replay_looks import Looks
 from nlos_cam.set_up import load_doubt, load_networks, misfits, set_up
 from nlos_cam.undisturbed import undisturbed
 from nlos_cam.view.viewer import Moment
@@ -75,6 +77,7 @@ def live(
     average: Average = 1,
     budget_ms: BudgetMs = None,
     tradeoff: Tradeoff = None,
+    save_view: SaveView = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -84,6 +87,7 @@ def live(
     path = _named(record, "--record", "a recording", (".bag",), overwrite=overwrite)
     frame_log = _named(log, "--log", "a log", SUFFIXES, overwrite=overwrite)
     recording = Recording(path, optional=True) if path else None
+    view_path = _named(save_view, "--save-view", "a saved view", (SUFFIX,), overwrite=overwrite)
     with interrupted_by_signals():
         with tracked("rendering the scene ahead") as on_progress:
             opened = open_camera(camera, on_progress=on_progress, recording=recording)
@@ -91,7 +95,7 @@ def live(
         checks = BackgroundChecks(bench.rig, on_error=_warn_once)
         processing, choice = _chosen(opened, bench, weights, average, budget_ms, tradeoff, checks)
         warm_up(opened, processing)
-    viewer = viewer_of(bench, no_view=no_view, host=view_host, port=view_port)
+    viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, view_path)
     with stop_on_signals() as stop, viewer, _logging(frame_log) as on_moment, undisturbed(), opened as source:
         tell_of_view(viewer, host=view_host, port=view_port, open_it=open_view)
         report = run_live(
@@ -108,6 +112,8 @@ def live(
         )
     if recording:
         say(f"recorded {recording.sets} frames to {recording.path}")
+    if view_path:
+        say(f"saved the view: nlos-cam view {view_path}")
     budget = {"budget": choice.outcome(report)} if choice else {}
     text = [told(report), *([choice.outcome_told(report)] if choice else [])]
     finish({**asdict(report), **budget}, as_json=json, text="\n".join(text))
@@ -122,6 +128,9 @@ def replay_bag(
     weights: Weights = None,
     average: Average = 1,
     reader: ReadBy = "plain",
+    save_view: SaveReplayView = False,
+    stills: Stills = 0,
+    video: Video = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -135,7 +144,15 @@ def replay_bag(
         processing = _processing(bench, weights, average, EveryFrames(bench.rig, on_error=_warn_once))
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
-        report = replay(source, processing, path, stop=stop, on_frame=lambda: bar.advance(task), on_warning=warn)
+        report = replay(
+            source,
+            processing,
+            path,
+            stop=stop,
+            on_frame=lambda: bar.advance(task),
+            on_warning=warn,
+            looks=Looks(processing.bench, view=save_view, stills=stills, video=video),
+        )
     text = f"{report.frames} frames in {report.seconds:.1f} s: {path / REPORT}"
     finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
