@@ -19,6 +19,9 @@ SURE_SIGMAS = 4.0
 """A drift is told that is beyond a tolerance by so many standard uncertainties."""
 ENDS_AT = 0.7
 """What is told stays told until it is below this share of what it took, so that it does not flicker."""
+MOST_RANGE_DRIFT_M = 0.005
+"""What a temperature may do to the range, by the data sheet's accuracy; beyond it the lidar has moved straight back or
+forth."""
 BLIND_FRAMES, BLIND_ENDS = 300, 10
 """So many frames without a pose are told (10 s; objects pass by); each frame with one counts for so many."""
 MIN_PIXELS = 30
@@ -78,11 +81,13 @@ class DriftCheck:
 
     @property
     def moved(self) -> bool:
-        """Whether it is told that the lidar has moved, or that it no longer sees the wall; a range that drifts is not.
+        """Whether it is told that the lidar has moved, or no longer sees the wall; a range that drifts a little is not.
 
         As with `warnings`, the answer does not flicker.
         """
-        return bool(self._blindness) or (self._told is not None and not self._told.uniform)
+        if (told := self._told) is None:
+            return bool(self._blindness)
+        return not told.uniform or abs(told.range_m) > MOST_RANGE_DRIFT_M
 
     def look(self, depth_m: Float32, settings: Mapping[str, float]) -> None:
         """Take a frame (height, width) in, NaN where there is no return, and the settings it was taken with.

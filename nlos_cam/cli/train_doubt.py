@@ -114,4 +114,5 @@ def _check(recipe: Recipe, pipeline: Reconstructor, training: dataset.Dataset, j
     if not training.plan.rig.checksum == judging.plan.rig.checksum == pipeline.record.rig_checksum:
         raise SceneError("maps, held-out maps and weights are not all of one rig: name others, or build the maps again")
     if len(training) < recipe.objects:
-        raise SceneError(f"{training.folder} holds {len(training)} objects, the recipe asks for {recipe.objects}")
+        told = f"the dataset holds {len(training)} objects, the recipe asks for {recipe.objects}"
+        raise SceneError(f"{told}: build that many, or give --objects")

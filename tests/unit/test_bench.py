@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +10,7 @@ from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.bench import Bench, difference_of, open_bench
+from nlos_cam.bench import Bench, Look, difference_of, open_bench
 from nlos_cam.frames import LidarMaps, maps_from_frame
 
 
@@ -103,6 +104,25 @@ def test_a_lidar_that_stays_is_no_cause_for_a_warning_and_one_that_moves_is(tmp_
     measured = measured_wall(tmp_path)
     assert last_warnings(Bench(RIG, measured)) == ()
     assert last_warnings(Bench(RIG, measured), nearer_m=0.01) != ()
+
+
+@pytest.mark.parametrize(("nearer_m", "moved"), [(0.0, False), (0.002, False), (0.01, True)])
+def test_a_range_that_drifts_a_little_has_not_moved_the_lidar_and_by_a_centimetre_it_has(
+    tmp_path: Path, nearer_m: float, moved: bool
+) -> None:
+    bench, looks = Bench(RIG, measured_wall(tmp_path)), list[Look]()
+    for number in range(40):
+        frame = wall_frame(number + 500, nearer_m)
+        looks.append(bench.look(frame, maps_from_frame(frame)))
+    assert looks[-1].moved == moved
+    assert bool(looks[-1].warnings) == (nearer_m > 0)
+
+
+def test_a_lidar_that_no_longer_sees_the_wall_has_moved(tmp_path: Path) -> None:
+    bench, frame = Bench(RIG, measured_wall(tmp_path)), wall_frame(0)
+    looks = [bench.look(replace(frame, depth_m=frame.depth_m + 1.0), maps_from_frame(frame)) for _ in range(300)]
+    assert not looks[0].moved
+    assert looks[-1].moved
 
 
 def test_a_lidar_that_is_hotter_by_far_is_a_cause_for_a_warning(tmp_path: Path) -> None:

@@ -5,14 +5,16 @@ from threading import Event
 
 import numpy as np
 import pytest
+from fake_doubter import FakeDoubter
 from fake_wall import RIG, WallCamera, measured_wall, wall_frame
 from nlos_calibration.errors import CalibrationError
 
-from nlos_cam.bench import Bench
+from nlos_cam.bench import Bench, Look
 from nlos_cam.frame_reader import FrameReader
 from nlos_cam.live_report import Step
-from nlos_cam.processing import Processing, read_along, steps
+from nlos_cam.processing import Processing, read_along, signs_of, steps
 from nlos_cam.reconstruct import Clock
+from nlos_cam.verdict import Signs, Verdict
 
 
 def network(*_: np.ndarray) -> np.ndarray:
@@ -105,3 +107,51 @@ def test_a_failure_is_raised_unless_somebody_takes_it() -> None:
     images = failing_at(3)
     with pytest.raises(ZeroDivisionError, match="an odd frame"):
         all_steps(Processing(Bench(RIG), lambda *_: next(images)), WallCamera(9))
+
+
+def test_where_nothing_is_hidden_a_step_shows_nothing_and_says_so() -> None:
+    doubter = FakeDoubter(lambda *_: (0.9, 0.0))
+    done = all_steps(Processing(Bench(RIG), network, doubter=doubter), WallCamera(3))
+    assert [step.verdict for step in done] == [Verdict.NOTHING] * 3
+    assert not any(step.reconstruction.shows for step in done)
+
+
+def test_where_something_is_it_is_shown_with_its_uncertainty() -> None:
+    (step,) = all_steps(Processing(Bench(RIG), network, doubter=FakeDoubter()), WallCamera(1))
+    assert step.verdict == Verdict.SEEN
+    assert step.reconstruction.shows
+    assert step.reconstruction.uncertainty_m is not None
+
+
+def test_doubt_is_of_what_the_networks_ate(tmp_path: Path) -> None:
+    bench, eaten, doubter = Bench(RIG, measured_wall(tmp_path)), list[np.ndarray](), FakeDoubter()
+
+    def noting(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+        eaten.append(depth_m)
+        return network()
+
+    all_steps(Processing(bench, noting, eats_difference=True, average=3, doubter=doubter), WallCamera(4))
+    for mine, its in zip(doubter.asked, eaten, strict=True):
+        np.testing.assert_array_equal(mine[0], its)
+
+
+def test_a_lidar_that_moved_is_the_verdict_whatever_the_networks_say(tmp_path: Path) -> None:
+    doubter = FakeDoubter(lambda *_: (0.0, 0.9))
+    processing = Processing(Bench(RIG, measured_wall(tmp_path)), network, doubter=doubter)
+    done = all_steps(processing, WallCamera(100, moved=range(50, 100)))
+    assert {step.verdict for step in done[:50]} == {Verdict.OUTSIDE}
+    assert done[-1].verdict == Verdict.WALL_MOVED
+
+
+@pytest.mark.parametrize(
+    ("change", "signs"),
+    [
+        ({}, Signs()),
+        ({"depth_m": np.full((64, 80), np.nan, np.float32)}, Signs(invalid=True)),
+        ({"depth_m": np.where(np.arange(80) < 40, np.float32(0.3), np.nan) * np.ones((64, 1))}, Signs(invalid=True)),
+        ({"ir": np.full((64, 80), 255, np.uint8)}, Signs(saturated=True)),
+    ],
+)
+def test_what_is_amiss_with_a_frame_is_a_sign(change: dict[str, np.ndarray], signs: Signs) -> None:
+    whole = replace(wall_frame(0), depth_m=np.full((64, 80), 0.3, np.float32))
+    assert signs_of(replace(whole, **change), Look(None, ())) == signs

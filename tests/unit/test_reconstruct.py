@@ -2,6 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
+from fake_doubter import FakeDoubter
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
@@ -57,6 +58,34 @@ def test_the_time_is_taken_from_the_clock_it_is_given() -> None:
     found = reconstruct(some_maps(), RIG, lambda *_: np.zeros((1, 64, 64), np.float32), lambda: float(next(ticks)))
     assert found.timings_s == {"network": 1.0}
     assert found.uncertainty_m is None
+
+
+def test_with_a_doubt_network_there_is_an_uncertainty_and_its_time_is_a_stage_of_its_own() -> None:
+    ticks, doubter = itertools.count(), FakeDoubter(lambda *_: (0.25, 0.5), error_v=0.1)
+    image = np.full((1, 64, 64), 0.5, np.float32)
+    found = reconstruct(some_maps(), RIG, lambda *_: image, lambda: float(next(ticks)), doubter)
+    assert found.timings_s == {"network": 1.0, "doubt": 1.0}
+    assert found.doubt is not None
+    assert (found.doubt.nothing, found.doubt.outside) == (0.25, 0.5)
+    assert found.uncertainty_m is found.doubt.error_m
+    np.testing.assert_array_equal(doubter.asked[0][2], image)
+
+
+def test_of_maps_without_any_return_there_is_doubt_too() -> None:
+    doubter, blank = FakeDoubter(), np.full((64, 80), np.nan, np.float32)
+    maps = LidarMaps(blank, np.zeros((64, 80), np.float32), ~np.isnan(blank))
+    found = reconstruct(maps, RIG, lambda *_: np.ones((1, 64, 64), np.float32), doubter=doubter)
+    assert not found.shows
+    assert found.uncertainty_m is not None
+    assert not doubter.asked[0][2].any()
+
+
+def test_what_is_hidden_shows_nothing_and_is_the_same_otherwise() -> None:
+    found = reconstruct(some_maps(), RIG, lambda *_: np.full((1, 64, 64), 0.5, np.float32), doubter=FakeDoubter())
+    assert found.shows
+    assert not found.hidden.shows
+    assert found.hidden.uncertainty_m is found.uncertainty_m
+    assert found.hidden.doubt is found.doubt
 
 
 def test_a_rig_without_a_box_is_refused_by_name() -> None:

@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 import pytest
+from fake_doubter import FakeDoubter
 from fake_wall import WallCamera, measured_wall, wall_frame
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
@@ -74,6 +75,24 @@ def test_every_frame_is_written_with_its_number_time_and_place(tmp_path: Path) -
     assert (out / SHEET).read_bytes().startswith(b"\x89PNG")
     assert "frames: 40" in (out / REPORT).read_text()
     assert "seen: 2 duplicate, 1 out of order" in (out / REPORT).read_text()
+
+
+def test_each_frames_uncertainty_and_verdict_are_written_beside_its_depth(tmp_path: Path) -> None:
+    says = iter([(0.0, 0.0), (0.9, 0.0), (0.0, 0.9)])
+    doubter = FakeDoubter(lambda *_: next(says), error_v=0.1)
+    replay(Recorded(3), Processing(Bench(RIG), network, doubter=doubter), tmp_path / "out", stop=Event())
+    with np.load(tmp_path / "out" / RESULT) as file:
+        assert file["verdict"].tolist() == ["object seen", "nothing there", "outside the trained range"]
+        assert np.isfinite(file["depth_m"]).any((1, 2)).tolist() == [True, False, True]
+        assert file["uncertainty_m"].shape == (3, 64, 64)
+        np.testing.assert_allclose(file["uncertainty_m"], 0.1 * 0.28 / 0.9, rtol=1e-5)
+
+
+def test_without_a_doubt_network_verdicts_are_empty_and_uncertainties_are_not_a_number(tmp_path: Path) -> None:
+    replay(Recorded(2), Processing(Bench(RIG), network), tmp_path / "out", stop=Event())
+    with np.load(tmp_path / "out" / RESULT) as file:
+        assert file["verdict"].tolist() == ["", ""]
+        assert np.isnan(file["uncertainty_m"]).all()
 
 
 def test_two_replays_are_equal_to_the_bit(tmp_path: Path) -> None:
