@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: live test check
+.PHONY: live test check docs
 
 live: .venv/.live
 	$(BIN)/nlos-cam live --camera sim
@@ -15,6 +15,10 @@ test: .venv/.test
 check: .venv/.test
 	$(BIN)/python tools/check.py
 
+# The docs as a site, in site/; a link that leads nowhere ends it.
+docs: .venv/.docs
+	$(BIN)/python tools/docs.py
+
 $(BIN)/python:
 	$(PYTHON) -m venv .venv
 
@@ -24,4 +28,8 @@ $(BIN)/python:
 
 .venv/.test: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@
+
+.venv/.docs: $(BIN)/python pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
 	touch $@

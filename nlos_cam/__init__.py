@@ -1,3 +1,21 @@
 """See around a corner with a consumer lidar."""
 
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from nlos_cam.api import Glimpse, Stream
+    from nlos_cam.api import open_stream as open  # noqa: A004  as gzip.open: always called by its module's name
+
 __version__ = "0.1.0"
+__all__ = ["Glimpse", "Stream", "__version__", "open"]
+
+LATE = {"Glimpse": "Glimpse", "Stream": "Stream", "open": "open_stream"}
+"""Each name, and what it is called in `nlos_cam.api`, which is imported when one of them is first asked for."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in LATE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module("nlos_cam.api"), LATE[name])

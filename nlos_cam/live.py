@@ -74,7 +74,7 @@ def run_live(
     )
     moments = Moments(viewer, lambda: sum(tally.lost(camera, reader).values()), reader, thermometer, clock)
     try:
-        with reader:
+        with reader, processing.checks:
             for step in steps(reader, processing, clock, tally.fail, thermometer):
                 moment = moments.show(step)
                 tally.add(step, clock() - step.published_s)

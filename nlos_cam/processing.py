@@ -12,6 +12,7 @@ from nlos_cam.frame_reader import Arrival, FrameReader
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.live_report import Step
 from nlos_cam.map_mean import MapMean
+from nlos_cam.physics_check import UNEXPLAINED, Check, Checks, NoChecks
 from nlos_cam.reconstruct import Clock, Network, reconstruct
 from nlos_cam.sightings import amiss
 from nlos_cam.thermometer import Thermometer, thermometer_of
@@ -30,8 +31,9 @@ class Processing:
     """What is made of a camera's frames, in their order: maps, their difference from the bare wall, the hidden depth.
 
     Maps are the mean over the last `average` frames. With a doubt network each reconstruction has an uncertainty and a
-    verdict, and shows nothing where nothing is hidden. Raises CalibrationError where the networks eat difference maps
-    and there is no bare wall to form them from.
+    verdict, and shows nothing where nothing is hidden. The newest of the `checks`, which whoever goes over the frames
+    enters, goes along with each. Raises CalibrationError where the networks eat difference maps and there is no bare
+    wall to form them from.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class Processing:
         eats_difference: bool = False,
         average: int = 1,
         doubter: Doubter | None = None,
+        checks: Checks | None = None,
     ) -> None:
         if eats_difference and bench.reference is None:
             raise CalibrationError(
@@ -49,6 +52,7 @@ class Processing:
             )
         self.bench, self.network, self.doubter = bench, network, doubter
         self._judge = Judge(limits_of(doubter) if doubter else None)
+        self.checks = checks or NoChecks()
         self._eats_difference, self._mean = eats_difference, MapMean(average)
 
     def step(self, arrival: Arrival, clock: Clock, begun_s: float) -> Step:
@@ -64,20 +68,22 @@ class Processing:
         stages_s = {"wait": got_s - begun_s, "queue": got_s - arrival.arrived_s}
         stages_s |= {"maps": mapped_s - got_s, "bench": looked_s - mapped_s}
         stages_s |= reconstruction.timings_s
-        shown, verdict = self._judge.look(reconstruction, signs_of(arrival.frame, look))
+        shown, verdict = self._judge.look(reconstruction, signs_of(arrival.frame, look, self.checks.newest))
+        self.checks.offer(arrival.frame.frame_number, self.bench.corrected(maps), shown.depth_m)
         made = shown, clock(), stages_s, look.difference, look.warnings, verdict
-        return Step(arrival.frame, maps, *made, arrived_s=arrival.arrived_s)
+        return Step(arrival.frame, maps, *made, check=self.checks.newest, arrived_s=arrival.arrived_s)
 
 
 def limits_of(doubter: Doubter) -> Limits:
     """The limits that a doubt network was calibrated with."""
-    return Limits(doubter.record.nothing_above, doubter.record.outside_above)
+    return Limits(doubter.record.nothing_above, doubter.record.outside_above, UNEXPLAINED)
 
 
-def signs_of(frame: Frame, look: Look) -> Signs:
-    """What is amiss with a frame itself, and with its bench."""
+def signs_of(frame: Frame, look: Look, check: Check | None) -> Signs:
+    """What is amiss with a frame itself, with its bench, and with what was made of the last frame that was checked."""
     names = amiss(frame)
-    return Signs(saturated="saturated" in names, invalid="blank" in names or "half_invalid" in names, moved=look.moved)
+    invalid = "blank" in names or "half_invalid" in names
+    return Signs("saturated" in names, invalid, look.moved, check)
 
 
 def read_along(frames: Iterable[Frame], camera: Camera) -> tuple[Iterable[Frame], Thermometer]:

@@ -23,8 +23,11 @@ from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.live_report import OnWarning, Step, Warned, frames_by_verdict, say_nothing
 from nlos_cam.objects.depth_image import object_box
+from nlos_cam.physics_check import UNEXPLAINED
 from nlos_cam.processing import Processing, read_along, steps
 from nlos_cam.reconstruct import Clock
+from nlos_cam.replay_looks import Looks
+from nlos_cam.samples import Samples
 from nlos_cam.sightings import in_words
 from nlos_cam.verdict import Verdict
 
@@ -44,26 +47,6 @@ class ReplayReport:
     """Of the bench, and the frames that each held for."""
     verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
     """By verdict, the frames that it was passed on; empty from networks that pass none."""
-
-
-class Samples:
-    """Steps spread evenly over a run of unknown length: every n-th is kept, and n doubles as the run goes on."""
-
-    def __init__(self, most: int) -> None:
-        self._most, self._stride, self._seen = most, 1, 0
-        self._kept: list[Step] = []
-
-    def add(self, step: Step) -> None:
-        if self._seen % self._stride == 0:
-            self._kept.append(step)
-        self._seen += 1
-        if len(self._kept) > 2 * self._most:
-            self._kept, self._stride = self._kept[::2], self._stride * 2
-
-    def chosen(self) -> list[Step]:
-        """At most `most` steps, first and last kept one included."""
-        count = min(self._most, len(self._kept))
-        return [self._kept[i] for i in np.linspace(0, len(self._kept) - 1, count).round().astype(int)]
 
 
 class _Stack:
@@ -94,6 +77,8 @@ class _Results:
         self.told: list[str] = []
         self.with_surface = 0
         self.verdicts: Counter[Verdict] = Counter()
+        self.checks: dict[int, float] = {}
+        """Scores by the number of the frame that was checked."""
         self.samples, self.warned = Samples(SHEET_FRAMES), Warned(on_warning)
 
     def add(self, step: Step) -> None:
@@ -108,6 +93,8 @@ class _Results:
         self.timestamps_s.append(step.frame.timestamp_s)
         self.numbers.append(step.frame.frame_number)
         self.with_surface += bool(np.isfinite(depth_m).any())
+        if step.check:
+            self.checks[step.check.frame_number] = step.check.score
         self.samples.add(step)
         self.warned.add(step)
         if step.verdict:
@@ -122,6 +109,7 @@ def replay(
     stop: Event,
     on_frame: Callable[[], None] = lambda: None,
     on_warning: OnWarning = say_nothing,
+    looks: Looks | None = None,
     clock: Clock = time.time,
 ) -> ReplayReport:
     """Reconstruct every frame of an entered recording into the folder `out`; its files of the same names are replaced.
@@ -133,10 +121,12 @@ def replay(
     begun_s, bench = clock(), processing.bench
     with renamed_when_whole(out) as part, ExitStack() as files:
         results = _Results(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
+        looking = files.enter_context((looks or Looks(bench)).into(part))
         frames, thermometer = read_along(camera, camera)
-        with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader:
+        with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader, processing.checks:
             for step in steps(reader, processing, clock, thermometer=thermometer):
                 results.add(step)
+                looking.add(step, thermometer.celsius)
                 on_frame()
         if not results.numbers:
             raise RecordingError(f"{camera.uri} holds no frame with depth, infrared and confidence: record it again")
@@ -173,6 +163,8 @@ def _hidden(results: _Results, rig: Rig) -> dict[str, Any]:
         "pitch_m": np.array([pitch_x_m, -pitch_y_m]),  # wall (x, y) from one column, one row to the next
         "z_near_m": box.z_near_m,
         "z_far_m": box.z_far_m,
+        "check_frame_number": np.array([*results.checks], np.int64),
+        "check_score": np.array([*results.checks.values()], np.float64),
     }
 
 
@@ -196,6 +188,7 @@ def _report(camera: Camera, bench: Bench, results: _Results, *, stopped: bool) -
         f"- rig: {rig.name} {rig.checksum}, {rig.lidar.distance_m:.3f} m to the wall, {rig.facing_deg:.1f} degrees",
         f"- maps: {MAP_ROWS} x {MAP_COLUMNS}; hidden depth: {OBJECT_PIXELS} x {OBJECT_PIXELS} in `{RESULT}`",
         *(f"- verdict, {frames} frames: {verdict}" for verdict, frames in frames_by_verdict(results.verdicts).items()),
+        *_checks_told(results.checks),
         *_bench_told(bench, results.warned),
         "",
         f"![some frames]({SHEET})",
@@ -203,6 +196,14 @@ def _report(camera: Camera, bench: Bench, results: _Results, *, stopped: bool) -
     if stopped:
         lines.insert(2, "**Interrupted: the frames below are those done until then.**\n")
     return "\n".join(lines) + "\n"
+
+
+def _checks_told(scores: Mapping[int, float]) -> list[str]:
+    if not scores:
+        return []
+    flagged = sum(score >= UNEXPLAINED for score in scores.values())
+    told = f"score {np.median(list(scores.values())):.2f} (median; 0 explains what the lidar saw, 1 explains nothing)"
+    return [f"- physics check of {len(scores)} frames: {told}, {flagged} at {UNEXPLAINED:g} or more"]
 
 
 def _bench_told(bench: Bench, warned: Warned) -> list[str]:

@@ -1,4 +1,4 @@
-"""The one gate: formatting, lint, types, import layers. `make check` runs it; CI does."""
+"""The one gate: formatting, lint, types, import layers, the map of files, the docs. `make check` runs it; CI does."""
 
 import subprocess
 import sys
@@ -12,6 +12,7 @@ GATES = (
     ("pyright",),
     ("lint-imports",),
     ("python", "tools/file_map.py", "--check"),
+    ("python", "tools/docs.py", "--check"),
 )
 LONGEST_FILE = 250
 
@@ -20,7 +21,7 @@ def too_long() -> list[str]:
     """Source files above the house's limit."""
     files = [
         path
-        for folder in ("nlos_cam", "calibration", "models", "tools", "tests")
+        for folder in ("nlos_cam", "calibration", "models", "tools", "examples", "tests")
         for path in (ROOT / folder).rglob("*.py")
     ]
     lengths = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in files}

@@ -24,7 +24,7 @@ Out = Annotated[Path, typer.Option("--out", help="The dataset's folder; shards t
 Count = Annotated[int, typer.Option("--count", min=1, help="Objects in all.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the first object; the others follow.")]
 RigName = Annotated[
-    str | None, typer.Option("--rig", help=f"A packaged rig's name, or a rig's TOML file.  [default: {PAPER_RIG}]")
+    str | None, typer.Option("--rig", show_default=PAPER_RIG, help="A packaged rig's name, or a rig's TOML file.")
 ]
 SceneToml = Annotated[
     Path | None, typer.Option("--scene", help="A scene.toml: its rig, sensor, radiometry and material, not its object.")
@@ -48,7 +48,9 @@ GainSpread = Annotated[
     float, typer.Option("--gain-spread-percent", min=0, help="Each object's intensity gain differs by up to this.")
 ]
 Stop = Annotated[str, typer.Option("--accuracy", help="draft, standard or fine.")]
-Workers = Annotated[int, typer.Option("--workers", min=1, help="Processes on this machine.")]
+Workers = Annotated[
+    int, typer.Option("--workers", min=1, show_default="as many as cores", help="Processes on this machine.")
+]
 RayAddress = Annotated[
     str | None,
     typer.Option("--ray", help="A Ray cluster does the work instead: auto, HOST:PORT, ray://HOST:PORT, local."),

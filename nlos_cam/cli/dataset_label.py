@@ -34,8 +34,9 @@ def label(
 ) -> None:
     """Make a dataset of labelled recordings of known objects: maps of single frames, and what was hidden meanwhile.
 
-    A label is the name of a test object, or of files beside the recordings: LABEL.truth.toml (a scene file's [object];
-    of the mesh LABEL.stl, .obj or .ply, unless it names another), or LABEL.npy (a depth map).
+    A label is the name of a test object, or of files beside the recordings: LABEL.truth.toml (with the
+    fields of a scene file's object; of the mesh LABEL.stl, .obj or .ply, unless it names another), or LABEL.npy (a
+    depth map).
     """
     folder = output_path(out, "dataset", "", overwrite=overwrite)
     found = recordings_in(recordings)

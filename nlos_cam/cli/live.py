@@ -8,16 +8,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from nlos_calibration.errors import RecordFileError
-from nlos_calibration.rig import Rig, load_rig
-from nlos_calibration.rig_difference import rig_difference
-from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.doubt_inference import Doubter, load_doubter
-from nlos_models.inference import Reconstructor, load_reconstructor
+from nlos_models.inference import Reconstructor
 
 from nlos_cam.bench import Bench, open_bench
 from nlos_cam.budget import SHIPPED
-from nlos_cam.cache import cache_folder
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
 from nlos_cam.camera.table import Reader
@@ -36,14 +30,17 @@ from nlos_cam.cli.common import (
 from nlos_cam.cli.live_budget import BudgetMs, Choice, Tradeoff, loader, options_here, timer, within_budget
 from nlos_cam.cli.live_told import told, warn
 from nlos_cam.cli.live_view import NoView, Open, ViewHost, ViewPort, tell_of_view, viewer_of
+from nlos_cam.cli.view import SUFFIX, SaveReplayView, SaveView, Stills, Video, saving
 from nlos_cam.frame_log import SUFFIXES, FrameLog
 from nlos_cam.live import run_live, warm_up
+from nlos_cam.physics_check import Checks
+from nlos_cam.physics_check_runner import BackgroundChecks
 from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
+from nlos_cam.replay_looks import Looks
+from nlos_cam.set_up import load_doubt, load_networks, misfits, set_up
 from nlos_cam.undisturbed import undisturbed
 from nlos_cam.view.viewer import Moment
-
-NO_DOUBT = "these weights have no doubt network (`train doubt`): no uncertainty is told, and no verdict"
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:scene.toml, bag:run.bag.")]
 Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it (wall.toml).")]
@@ -80,6 +77,7 @@ def live(
     average: Average = 1,
     budget_ms: BudgetMs = None,
     tradeoff: Tradeoff = None,
+    save_view: SaveView = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -89,13 +87,15 @@ def live(
     path = _named(record, "--record", "a recording", (".bag",), overwrite=overwrite)
     frame_log = _named(log, "--log", "a log", SUFFIXES, overwrite=overwrite)
     recording = Recording(path, optional=True) if path else None
+    view_path = _named(save_view, "--save-view", "a saved view", (SUFFIX,), overwrite=overwrite)
     with interrupted_by_signals():
         with tracked("rendering the scene ahead") as on_progress:
             opened = open_camera(camera, on_progress=on_progress, recording=recording)
         bench = open_bench(wall, opened)
-        processing, choice = _chosen(opened, bench, weights, average, budget_ms, tradeoff)
+        checks = BackgroundChecks(bench.rig, on_error=_warn_once)
+        processing, choice = _chosen(opened, bench, weights, average, budget_ms, tradeoff, checks)
         warm_up(opened, processing)
-    viewer = viewer_of(bench, no_view=no_view, host=view_host, port=view_port)
+    viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, view_path)
     with stop_on_signals() as stop, viewer, _logging(frame_log) as on_moment, undisturbed(), opened as source:
         tell_of_view(viewer, host=view_host, port=view_port, open_it=open_view)
         report = run_live(
@@ -112,6 +112,8 @@ def live(
         )
     if recording:
         say(f"recorded {recording.sets} frames to {recording.path}")
+    if view_path:
+        say(f"saved the view: nlos-cam view {view_path}")
     budget = {"budget": choice.outcome(report)} if choice else {}
     text = [told(report), *([choice.outcome_told(report)] if choice else [])]
     finish({**asdict(report), **budget}, as_json=json, text="\n".join(text))
@@ -126,6 +128,9 @@ def replay_bag(
     weights: Weights = None,
     average: Average = 1,
     reader: ReadBy = "plain",
+    save_view: SaveReplayView = False,
+    stills: Stills = 0,
+    video: Video = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -133,10 +138,21 @@ def replay_bag(
     path = output_path(out, "replay", "", overwrite=overwrite)
     with interrupted_by_signals():
         opened = open_camera(f"bag:{bag}", reader=reader)
-        processing = _processing(open_bench(wall, opened), weights, average)
+        bench = open_bench(wall, opened)
+        from nlos_cam.physics_check_render import EveryFrames  # the renderer takes a second to import
+
+        processing = _processing(bench, weights, average, EveryFrames(bench.rig, on_error=_warn_once))
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
-        report = replay(source, processing, path, stop=stop, on_frame=lambda: bar.advance(task), on_warning=warn)
+        report = replay(
+            source,
+            processing,
+            path,
+            stop=stop,
+            on_frame=lambda: bar.advance(task),
+            on_warning=warn,
+            looks=Looks(processing.bench, view=save_view, stills=stills, video=video),
+        )
     text = f"{report.frames} frames in {report.seconds:.1f} s: {path / REPORT}"
     finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
@@ -164,53 +180,36 @@ def _logging(path: Path | None) -> Generator[Callable[[Moment], None]]:
 
 
 def _chosen(
-    camera: Camera, bench: Bench, weights: Path | None, average: int, budget_ms: float | None, tradeoff: Path | None
+    camera: Camera,
+    bench: Bench,
+    weights: Path | None,
+    average: int,
+    budget_ms: float | None,
+    tradeoff: Path | None,
+    checks: Checks,
 ) -> tuple[Processing, Choice | None]:
     """What is made of frames: as is usual, or within a budget, which then was chosen so."""
     if budget_ms is None:
-        return _processing(bench, weights, average), None
+        return _processing(bench, weights, average, checks), None
     options = options_here(tradeoff, weights)
-    making = partial(_made, bench, load_doubter(weights, cache_folder() / "onnx"))  # takes as long whatever it watches
+    making = partial(set_up, bench, doubter=load_doubt(weights))  # takes as long whatever it watches
     network, choice = within_budget(budget_ms, options, making, loader(weights), timer(camera))
     say(choice.told())
     chosen = weights if choice.option.weights == SHIPPED else Path(choice.option.weights)
-    return _processing(bench, chosen, choice.option.frames, network), choice
+    return _processing(bench, chosen, choice.option.frames, checks, network), choice
 
 
-def _processing(bench: Bench, weights: Path | None, average: int, network: Reconstructor | None = None) -> Processing:
+def _warn_once(warning: str) -> None:
+    warn(warning, begins=True)
+
+
+def _processing(
+    bench: Bench, weights: Path | None, average: int, checks: Checks, network: Reconstructor | None = None
+) -> Processing:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
-    network = network or load_reconstructor(weights, cache_folder() / "onnx")
-    doubter = load_doubter(weights, cache_folder() / "onnx")
-    processing = _made(bench, doubter, network, average)
+    network, doubter = network or load_networks(weights), load_doubt(weights)
+    processing = set_up(bench, network, average, doubter=doubter, checks=checks)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
-    notes = [*_rig_notes(network.record, bench.rig), *_reference_note(bench), *([] if doubter else [NO_DOUBT])]
-    for note in notes:
+    for note in misfits(bench, network.record, doubter):
         say(f"note: {note}")
     return processing
-
-
-def _made(bench: Bench, doubter: Doubter | None, network: Reconstructor, average: int) -> Processing:
-    eats_difference = network.record.input == "difference maps"
-    return Processing(bench, network, eats_difference=eats_difference, average=average, doubter=doubter)
-
-
-def _rig_notes(trained: CheckpointRecord, rig: Rig) -> list[str]:
-    """How the bench differs from the one that the networks were trained for."""
-    try:
-        theirs = load_rig(trained.rig_name)
-    except RecordFileError:  # trained for a rig of a file that is not here
-        theirs = None
-    if theirs is None or theirs.checksum != trained.rig_checksum:
-        unlike = trained.rig_checksum != rig.checksum
-        return [f"the networks were trained for another rig than {rig.name}: what they show is off"] if unlike else []
-    difference = rig_difference(rig, theirs)
-    return (
-        [f"unlike the rig of the networks, this one has {'; '.join(difference)}: they err more"] if difference else []
-    )
-
-
-def _reference_note(bench: Bench) -> list[str]:
-    if not bench.measured or bench.reference:
-        return []
-    told = "no difference maps are formed, and a lidar that moves is not noticed: calibrate the wall again"
-    return [f"this wall's record has no reference: {told}"]

@@ -3,7 +3,7 @@
 import os
 import sys
 import webbrowser
-from typing import Annotated
+from typing import Annotated, Protocol
 from urllib.parse import urlsplit
 
 import typer
@@ -37,7 +37,14 @@ def viewer_of(bench: Bench, *, no_view: bool, host: str | None = None, port: int
     return RerunViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port)
 
 
-def tell_of_view(viewer: Viewer, *, host: str | None, port: int | None, open_it: bool) -> None:
+class Addressed(Protocol):
+    """What a browser can find: a live view, or a saved one."""
+
+    @property
+    def address(self) -> str | None: ...
+
+
+def tell_of_view(viewer: Addressed, *, host: str | None, port: int | None, open_it: bool) -> None:
     """Say where the view is, who else can see it, and open it if that is wanted."""
     if not viewer.address:
         say("running without a view (Ctrl-C ends it)")

@@ -22,6 +22,7 @@ COMMANDS = {
     "board": "board",
     "live": "live",
     "replay": "live",
+    "view": "view",
     "render": "render",
     "tradeoff": "tradeoff",
     "dataset": "dataset",

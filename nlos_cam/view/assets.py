@@ -21,13 +21,18 @@ Assets = Mapping[str, tuple[str, bytes]]
 """Content type and bytes by path."""
 
 
-def page_assets() -> Assets:
-    """Everything the page loads, so that no browser fetches anything from elsewhere.
+LIVE, RECORDED = b'data-time="live"', b'data-time="recorded"'
+"""How the page knows whether it shows the panel of time."""
+
+
+def page_assets(*, recorded: bool = False) -> Assets:
+    """Everything the page loads, so that no browser fetches anything from elsewhere; what is `recorded` has a time.
 
     The viewer's own server hands out its compiled files; it is asked for them once, and stopped. Its page loads fonts
     from the internet and its data port listens on every interface, so neither is used. Raises NlosCamError.
     """
     page = (resources.files("nlos_cam.view") / "page.html").read_bytes()
+    page = page.replace(LIVE, RECORDED) if recorded else page
     with _viewer_files_server() as port:
         files = {path: (kind, _fetch(port, path)) for path, kind in VIEWER_FILES.items()}
     return {"/": ("text/html; charset=utf-8", page), **files}

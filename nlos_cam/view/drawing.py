@@ -9,77 +9,141 @@ from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
+from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_image import object_box
-from nlos_cam.view.layout import TIMELINE, layout
+from nlos_cam.view.bench_drawing import bench_parts
+from nlos_cam.view.layout import FRAME_TIMELINE, TIMELINE, Shown, layout
 from nlos_cam.view.pictures import (
     PICTURE_WIDTH,
+    RESIDUAL_SPAN_M,
     change_span_m,
+    confidence_rgb,
     depth_span_m,
     difference_rgb,
+    encoded,
+    faded,
     hidden_rgb,
     infrared_grey,
     lidar_rgb,
     surface,
+    uncertainty_rgb,
 )
+from nlos_cam.view.plots import Plots
+from nlos_cam.view.verdict_picture import NOTED_PIXELS, banner_rgb, may_be_believed, noted_rgb
 from nlos_cam.view.viewer import Moment
 from nlos_cam.view.wall_drawing import bench_drawings, wall_names, wall_pictures
 from nlos_cam.view.wall_text import calibration_text
 
 APPLICATION = "nlos-cam"
-WALL_RGBA, OCCLUDER_RGBA, LIGHT_RGBA = (120, 130, 140, 70), (90, 150, 255, 90), (255, 210, 80, 200)
-BOX_RGB, LATENCY_RGB = (150, 150, 150), (80, 200, 120)
-OCCLUDER_HEIGHT_M = 0.3
-"""How much is drawn of what has no end."""
+MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg"}
+NEVER = "never drawn"
+"""What no verdict equals, None included."""
+
+
+def new_recording(batcher: rr.ChunkBatcherConfig | None = None) -> rr.RecordingStream:
+    """A recording of its own, whose only times are those that `Drawing` sets."""
+    recording = rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4(), batcher_config=batcher)
+    recording.set_log_tick_enabled(False)
+    recording.set_log_time_enabled(False)
+    return recording
 
 
 class Drawing:
-    """One browser's recording: `draw` gives the bytes to send it."""
+    """Draws moments into a recording, which is one browser's or one file's.
 
-    def __init__(self, rig: Rig, first: Moment, measured: MeasuredWall | None = None) -> None:
-        self._rig, self._box, self._measured = rig, object_box(rig), measured
-        self._told = ""
+    Of a `saved` one the lidar's pictures are smaller, and the panel of time opens with it.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        rig: Rig,
+        first: Moment,
+        measured: MeasuredWall | None = None,
+        *,
+        saved: bool = False,
+    ) -> None:
+        self._box, self._measured, self._saved = object_box(rig), measured, saved
+        self._told, self._verdict, self._checked = "", NEVER, -1
         self._difference_span_m = change_span_m(first.difference.depth_m) if measured and first.difference else None
         self._begun_s = first.published_s
         self._span_m = depth_span_m(first.frame.depth_m)
-        self._recording = rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4())
-        self._bytes = self._recording.binary_stream()
-        self._recording.set_log_tick_enabled(False)
-        self._recording.set_log_time_enabled(False)
+        self._recording = recording
         names = wall_names(measured, self._difference_span_m) if measured else None
-        self._recording.send_blueprint(layout(rig, with_truth=first.frame.truth_depth_m is not None, wall=names))
-        line = rr.SeriesLines(colors=[LATENCY_RGB], names=["latency"])
-        self._log("latency/milliseconds", line, static=True)
-        self._draw_bench()
+        shown = Shown(with_truth=first.frame.truth_depth_m is not None, wall=names, scrubbed=saved)
+        self._recording.send_blueprint(layout(rig, shown))
+        self._plots = Plots(self._log, first)
+        for path, part in bench_parts(rig):
+            self._log(path, part, static=True)
         if measured:
             self._draw_wall(measured)
 
-    def draw(self, moment: Moment, *, with_lidar: bool) -> bytes:
-        """Draw a moment, and its lidar pictures if asked to; returns what the browser has yet to be sent."""
+    def draw(self, moment: Moment, *, with_lidar: bool, with_surface: bool = True) -> None:
+        """Draw a moment, and what is large of it if asked to: the lidar's pictures, the surface in 3D."""
         self._recording.set_time(TIMELINE, duration=moment.published_s - self._begun_s)
-        self._log("latency/milliseconds", rr.Scalars([moment.latency_s * 1e3]))
-        hidden_depth_m, truth_depth_m = moment.reconstruction.depth_m, moment.frame.truth_depth_m
-        self._log("reconstruction", rr.Image(hidden_rgb(hidden_depth_m, self._box)))
-        if truth_depth_m is not None:
-            self._log("truth", rr.Image(hidden_rgb(truth_depth_m, self._box)))
-        self._draw_surface(hidden_depth_m)
+        self._recording.set_time(FRAME_TIMELINE, sequence=moment.frame.frame_number)
+        self._plots.draw(moment)
+        self._draw_verdict(moment)
+        self._draw_hidden(moment)
+        if with_surface:
+            self._draw_surface(moment.reconstruction.depth_m, believed=may_be_believed(moment.verdict))
         if with_lidar:
             self._draw_lidar_pictures(moment)
         if self._measured:
             self._tell(calibration_text(self._measured.record, moment.warnings))
-        return self._bytes.read() or b""
-
-    def close(self) -> None:
-        self._recording.disconnect()
 
     def _log(self, path: str, thing: Any, *, static: bool = False) -> None:
         self._recording.log(path, thing, static=static)
 
+    def _picture(self, path: str, picture: NDArray[np.uint8], suffix: str = ".png") -> None:
+        """Log a picture, small ones without loss: compressed, it costs less to send than to send whole."""
+        self._log(path, rr.EncodedImage(contents=encoded(picture, suffix), media_type=MEDIA_TYPES[suffix]))
+
+    def _draw_verdict(self, moment: Moment) -> None:
+        """Show the verdict in its panel, if it is another than before; a picture with a note on it is larger."""
+        if moment.verdict == self._verdict:
+            return
+        self._verdict = moment.verdict
+        self._picture("verdict", banner_rgb(moment.verdict))
+        scale = 1.0 if may_be_believed(moment.verdict) else OBJECT_PIXELS / NOTED_PIXELS
+        self._log("reconstruction", rr.Transform3D(scale=[scale, scale, 1.0]))
+
+    def _draw_hidden(self, moment: Moment) -> None:
+        depth_m, truth_m = moment.reconstruction.depth_m, moment.frame.truth_depth_m
+        uncertainty_m, rgb = moment.reconstruction.uncertainty_m, hidden_rgb(depth_m, self._box)
+        if moment.verdict is None or may_be_believed(moment.verdict):
+            self._picture("reconstruction", rgb)
+        else:
+            self._picture("reconstruction", noted_rgb(rgb, moment.verdict), ".jpg")
+        if uncertainty_m is not None:
+            self._picture("uncertainty", uncertainty_rgb(uncertainty_m, depth_m))
+        if truth_m is not None:
+            self._picture("truth", hidden_rgb(truth_m, self._box))
+
+    def _draw_surface(self, depth_m: NDArray[np.float32], *, believed: bool) -> None:
+        mesh = surface(depth_m, self._box)
+        if len(mesh.triangles) == 0:
+            self._log("bench/hidden", rr.Clear(recursive=False))
+            return
+        drawn = rr.Mesh3D(
+            vertex_positions=mesh.points_m,
+            triangle_indices=mesh.triangles,
+            vertex_normals=mesh.normals,
+            vertex_colors=mesh.rgb if believed else faded(mesh.rgb),
+        )
+        self._log("bench/hidden", drawn)
+
     def _draw_lidar_pictures(self, moment: Moment) -> None:
-        step = max(1, moment.frame.ir.shape[1] // PICTURE_WIDTH)
-        self._log("lidar/depth", rr.Image(lidar_rgb(moment.frame.depth_m[::step, ::step], *self._span_m)))
-        self._log("lidar/infrared", rr.Image(infrared_grey(moment.frame.ir[::step, ::step])))
+        step = max(1, moment.frame.ir.shape[1] // PICTURE_WIDTH) * (2 if self._saved else 1)
+        thinned = slice(None, None, step), slice(None, None, step)
+        self._picture("lidar/depth", lidar_rgb(moment.frame.depth_m[thinned], *self._span_m), ".jpg")
+        self._picture("lidar/infrared", infrared_grey(moment.frame.ir[thinned]), ".jpg")
+        self._picture("lidar/confidence", confidence_rgb(moment.frame.confidence[thinned]), ".jpg")
         if moment.difference is not None and self._difference_span_m is not None:
-            self._log("lidar/difference", rr.Image(difference_rgb(moment.difference.depth_m, self._difference_span_m)))
+            self._picture("lidar/difference", difference_rgb(moment.difference.depth_m, self._difference_span_m))
+        if moment.check and moment.check.frame_number != self._checked:
+            self._checked = moment.check.frame_number
+            self._picture("physics/residual", difference_rgb(moment.check.residual_depth_m, RESIDUAL_SPAN_M))
 
     def _draw_wall(self, measured: MeasuredWall) -> None:
         for path, drawing in bench_drawings(measured):
@@ -92,75 +156,3 @@ class Drawing:
         if text != self._told:
             self._told = text
             self._log("calibration", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
-
-    def _draw_surface(self, depth_m: NDArray[np.float32]) -> None:
-        mesh = surface(depth_m, self._box)
-        if len(mesh.triangles) == 0:
-            self._log("bench/hidden", rr.Clear(recursive=False))
-            return
-        drawn = rr.Mesh3D(
-            vertex_positions=mesh.points_m,
-            triangle_indices=mesh.triangles,
-            vertex_colors=mesh.rgb,
-        )
-        self._log("bench/hidden", drawn)
-
-    def _draw_bench(self) -> None:
-        """Wall, lidar, occluder and box in the wall frame: none of them moves."""
-        rig, box = self._rig, self._box
-        wall_low, wall_high = _seen_of_wall(rig)
-        self._log("bench/wall", _rectangle(_on_wall(wall_low, wall_high), WALL_RGBA), static=True)
-        if rig.occluder is not None:
-            x_m, low_m = rig.occluder.x_m, rig.occluder.z_min_m
-            ends_m = low_m, low_m + OCCLUDER_HEIGHT_M
-            corners = [(x_m, y_m, z_m) for y_m, z_m in _around((wall_low[1], wall_high[1]), ends_m)]
-            self._log("bench/occluder", _rectangle(corners, OCCLUDER_RGBA), static=True)
-        low = np.array([box.x_min_m, box.y_min_m, box.z_near_m])
-        high = np.array([box.x_max_m, box.y_max_m, box.z_far_m])
-        edges = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[BOX_RGB], radii=0.001, fill_mode="MajorWireframe")
-        self._log("bench/box", edges, static=True)
-        self._draw_lidar()
-
-    def _draw_lidar(self) -> None:
-        pose, pinhole = self._rig.wall_from_lidar, self._rig.pinhole
-        self._log("bench/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]), static=True)
-        camera = rr.Pinhole(
-            focal_length=(pinhole.fx, pinhole.fy),
-            principal_point=(pinhole.ppx, pinhole.ppy),
-            resolution=(pinhole.width, pinhole.height),
-            camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=0.12,
-        )
-        self._log("bench/lidar/view", camera, static=True)
-        self._log("bench/lidar/body", rr.Points3D([[0, 0, 0]], radii=0.012, labels=["lidar"]), static=True)
-        self._log(
-            "bench/light", rr.LineStrips3D([_light_path(self._rig)], colors=[LIGHT_RGBA], radii=0.002), static=True
-        )
-
-
-def _seen_of_wall(rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners of the part of the wall that is drawn: what matters to light, not the endless plane."""
-    relay, margin_m = rig.relay, 0.1
-    low = np.array([relay.x_min_m - margin_m, relay.y_min_m, 0.0])
-    return low, np.array([relay.x_max_m + margin_m, relay.y_max_m, 0.0])
-
-
-def _light_path(rig: Rig) -> NDArray[np.float64]:
-    """The way of one three-bounce echo (5, 3): lidar, wall, hidden object, wall, lidar."""
-    box, eye = object_box(rig), rig.wall_from_lidar[:3, 3]
-    middle = np.array([(box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2, box.z_near_m])
-    there, back = (np.array([middle[0] * 0.6, y_m, 0.0]) for y_m in (-0.04, 0.04))
-    return np.stack([eye, there, middle, back, eye])
-
-
-def _on_wall(low: NDArray[np.float64], high: NDArray[np.float64]) -> list[tuple[float, float, float]]:
-    return [(x_m, y_m, 0.0) for x_m, y_m in _around((low[0], high[0]), (low[1], high[1]))]
-
-
-def _around(first: tuple[float, float], second: tuple[float, float]) -> list[tuple[float, float]]:
-    (a, b), (c, d) = first, second
-    return [(a, c), (b, c), (b, d), (a, d)]
-
-
-def _rectangle(corners: list[tuple[float, float, float]], rgba: tuple[int, int, int, int]) -> rr.Mesh3D:
-    return rr.Mesh3D(vertex_positions=corners, triangle_indices=[(0, 1, 2), (0, 2, 3)], albedo_factor=rgba)

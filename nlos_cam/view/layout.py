@@ -7,17 +7,17 @@ import rerun.blueprint as rrb
 from nlos_calibration.rig import Rig
 
 from nlos_cam.objects.depth_image import object_box
-from nlos_cam.view.pictures import BACKGROUND_RGB
+from nlos_cam.view.pictures import BACKGROUND_RGB, MOST_UNCERTAIN_M, RESIDUAL_SPAN_M
+from nlos_cam.view.verdict_picture import BANNER_HEIGHT, BANNER_WIDTH
 
-TIMELINE = "time"
+TIMELINE, FRAME_TIMELINE = "time", "frame"
 PLOT_WINDOW_S = 20.0
-HIDDEN_SHARES, BENCH_SHARE, BOTTOM_PLOT_SHARE = (1.25, 1.0), 1.25, 1.2
-"""Widths of the views, side by side."""
-MEASURED_SHARES, MEASURED_BENCH_SHARE = (1.2, 1.0), 2.0
-LIDAR_SHARES, TEXT_SHARE = (1.0, 1.0, 1.15), 1.25
-"""The same where a wall was measured: the bench has more to show."""
+ROW_SHARES, HIDDEN_SHARE, BENCH_SHARE = (3.0, 2.0), 1.4, 1.0
+BANNER_SHARE, PICTURES_SHARE = 1.0, 4.0
+TRUTH_SHARE, LIDAR_SHARE, PLOT_SHARE = 0.8, 1.1, 1.2
+"""Heights of the views above each other, widths of those side by side."""
 MEASURED_AWAY = 1.2
-"""How much farther the eye is then: the footprint reaches beyond the bench."""
+"""How much farther the eye is from a measured wall: the footprint reaches beyond the bench."""
 
 
 @dataclass(frozen=True)
@@ -35,49 +35,85 @@ class WallNames:
         return [_picture(f"wall/{path}", name) for path, name in named.items() if name]
 
 
-def layout(rig: Rig, *, with_truth: bool, wall: WallNames | None = None) -> rrb.Blueprint:
-    """What a newcomer sees: the reconstruction first, then what it was made from; `wall` where one was measured."""
-    hidden = [_picture("reconstruction", "Reconstruction (bright: near the wall)")]
-    if with_truth:
-        hidden.append(_picture("truth", "Truth (known in simulation)"))
-    lidar = [_picture("lidar/depth", "Lidar depth (red: near)"), _picture("lidar/infrared", "Lidar infrared")]
-    top, bottom = (
-        _rows(hidden, _bench(rig), lidar, _plot()) if wall is None else _measured_rows(hidden, rig, lidar, wall)
+@dataclass(frozen=True)
+class Shown:
+    """What there is to show."""
+
+    with_truth: bool = False
+    """What is hidden is known, as in simulation."""
+    wall: WallNames | None = None
+    """Where a wall was measured."""
+    scrubbed: bool = False
+    """Whether it has an end, and time can be gone back in."""
+
+
+def layout(rig: Rig, shown: Shown) -> rrb.Blueprint:
+    """What a newcomer sees: verdict, reconstruction, its uncertainty and the bench; below, what they were made from."""
+    hidden = rrb.Horizontal(
+        _picture("reconstruction", "Reconstruction (bright: near the wall)"),
+        _picture("uncertainty", f"Uncertainty (bright: {1e3 * MOST_UNCERTAIN_M:g} mm)"),
     )
+    found = rrb.Vertical(_banner(), hidden, row_shares=[BANNER_SHARE, PICTURES_SHARE])
+    top = rrb.Horizontal(found, _bench_tabs(rig, shown.wall), column_shares=[HIDDEN_SHARE, BENCH_SHARE])
     return rrb.Blueprint(
-        rrb.Vertical(top, bottom, row_shares=[3, 2]),
-        rrb.TimePanel(timeline=TIMELINE, play_state="following"),
-        collapse_panels=True,
+        rrb.Vertical(top, _bottom(shown), row_shares=ROW_SHARES),
+        _time_panel(scrubbed=shown.scrubbed),
+        collapse_panels=not shown.scrubbed,
         auto_views=False,
     )
 
 
-Pictures = list[rrb.Spatial2DView]
-Rows = tuple[rrb.Horizontal, rrb.Horizontal]
+def _time_panel(*, scrubbed: bool) -> rrb.TimePanel:
+    if not scrubbed:
+        return rrb.TimePanel(timeline=TIMELINE, play_state="following")
+    return rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="playing", loop_mode="all")
 
 
-def _rows(hidden: Pictures, bench: rrb.Spatial3DView, lidar: Pictures, plot: rrb.TimeSeriesView) -> Rows:
-    return (
-        rrb.Horizontal(*hidden, bench, column_shares=[*HIDDEN_SHARES[: len(hidden)], BENCH_SHARE]),
-        rrb.Horizontal(*lidar, plot, column_shares=[1, 1, BOTTOM_PLOT_SHARE]),
+def _banner() -> rrb.Spatial2DView:
+    bounds = rrb.VisualBounds2D(x_range=[0, BANNER_WIDTH], y_range=[0, BANNER_HEIGHT])
+    return rrb.Spatial2DView(
+        origin="verdict", name="Verdict", titlebar=False, background=BACKGROUND_RGB, visual_bounds=bounds
     )
 
 
-def _measured_rows(hidden: Pictures, rig: Rig, lidar: Pictures, wall: WallNames) -> Rows:
-    """The same, with the wall's pictures in tabs behind the bench, and the calibration's text before the plot."""
-    bench = rrb.Tabs(_bench(rig, MEASURED_AWAY), *wall.pictures(), active_tab=0)
-    text = rrb.TextDocumentView(origin="calibration", name="Calibration")
-    seen = [*lidar, _picture("lidar/difference", wall.difference)] if wall.difference else lidar
-    return (
-        rrb.Horizontal(*hidden, bench, column_shares=[*MEASURED_SHARES[: len(hidden)], MEASURED_BENCH_SHARE]),
-        rrb.Horizontal(
-            *seen, rrb.Tabs(text, _plot(), active_tab=0), column_shares=[*LIDAR_SHARES[: len(seen)], TEXT_SHARE]
-        ),
+def _bench_tabs(rig: Rig, wall: WallNames | None) -> rrb.Tabs | rrb.Spatial3DView:
+    if wall is None:
+        return _bench(rig)
+    return rrb.Tabs(_bench(rig, MEASURED_AWAY), *wall.pictures(), active_tab=0)
+
+
+def _bottom(shown: Shown) -> rrb.Horizontal:
+    """Truth, what the lidar sees, and plots; what was measured of a wall comes before what can be seen without."""
+    wall = shown.wall
+    truth = [_picture("truth", "Truth (simulated)")] if shown.with_truth else []
+    change = [_picture("lidar/difference", wall.difference)] if wall and wall.difference else []
+    text = [rrb.TextDocumentView(origin="calibration", name="Calibration")] if wall else []
+    residual = _picture("physics/residual", f"Physics ±{1e3 * RESIDUAL_SPAN_M:g} mm")
+    depth = rrb.Tabs(_picture("lidar/depth", "Depth"), _picture("lidar/confidence", "Confidence"), active_tab=0)
+    light = rrb.Tabs(*change, _picture("lidar/infrared", "Infrared"), residual, active_tab=0)
+    plots = rrb.Tabs(*text, *_plots(scrubbed=shown.scrubbed), active_tab=0)
+    shares = [*([TRUTH_SHARE] if truth else []), LIDAR_SHARE, LIDAR_SHARE, PLOT_SHARE]
+    return rrb.Horizontal(*truth, depth, light, plots, column_shares=shares)
+
+
+def _plots(*, scrubbed: bool) -> list[rrb.TimeSeriesView]:
+    named = {"latency": "Latency", "drops": "Drops", "temperature": "°C", "physics/score": "Physics"}
+    return [_plot(origin, name, scrubbed=scrubbed) for origin, name in named.items()]
+
+
+def _plot(origin: str, name: str, *, scrubbed: bool) -> rrb.TimeSeriesView:
+    """The last seconds of what goes on; all of what has an end."""
+    window = rrb.VisibleTimeRange(
+        TIMELINE,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-PLOT_WINDOW_S),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
     )
+    legend = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
+    return rrb.TimeSeriesView(origin=origin, name=name, time_ranges=None if scrubbed else [window], plot_legend=legend)
 
 
 def _picture(origin: str, name: str) -> rrb.Spatial2DView:
-    return rrb.Spatial2DView(origin=origin, name=name)
+    return rrb.Spatial2DView(origin=origin, name=name, background=BACKGROUND_RGB)
 
 
 def _bench(rig: Rig, away: float = 1.0) -> rrb.Spatial3DView:
@@ -88,16 +124,6 @@ def _bench(rig: Rig, away: float = 1.0) -> rrb.Spatial3DView:
         eye_controls=_eye(rig, away),
         background=BACKGROUND_RGB,
     )
-
-
-def _plot() -> rrb.TimeSeriesView:
-    window = rrb.VisibleTimeRange(
-        TIMELINE,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-PLOT_WINDOW_S),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
-    quiet = rrb.PlotLegend(visible=False)
-    return rrb.TimeSeriesView(origin="latency", name="Latency (milliseconds)", time_ranges=[window], plot_legend=quiet)
 
 
 def _eye(rig: Rig, away: float) -> rrb.EyeControls3D:

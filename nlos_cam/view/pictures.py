@@ -26,6 +26,13 @@ SATURATED_RGB = (255, 0, 200)
 ROUND_STEPS = 1.0, 2.0, 3.0, 5.0, 10.0
 CHANGED_M, FEW_CHANGED, QUIET_SPAN_M = 0.01, 0.02, 0.02
 """Less is noise and ripples; where few cells differ by more, the span shows these."""
+MOST_UNCERTAIN_M = 0.03
+"""What is drawn brightest: the object box is 0.28 m deep."""
+RESIDUAL_SPAN_M = 0.02
+"""Of the physics check; the lidar's own noise is a tenth of it."""
+MOST_CONFIDENT = 15
+FADED = 0.35
+"""The share of its colour that is left to what may not be believed."""
 
 
 def hidden_rgb(depth_m: Float32, box: ObjectBox) -> Rgb:
@@ -47,6 +54,42 @@ def lidar_rgb(depth_m: Float32, near_m: float, far_m: float) -> Rgb:
 def infrared_grey(ir: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """IR counts (height, width) under a square root: weak and strong returns are both visible."""
     return np.sqrt(ir * np.float32(255.0)).astype(np.uint8)
+
+
+def confidence_rgb(confidence: NDArray[np.uint8]) -> Rgb:
+    """Confidence 0 to 15 (height, width) as a picture, dark to bright."""
+    return _coloured(np.minimum(confidence, MOST_CONFIDENT) * (255.0 / MOST_CONFIDENT), cv2.COLORMAP_BONE)
+
+
+def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> Rgb:
+    """How uncertain the hidden depth is (64, 64) as a picture, bright where it is; dark where there is no surface."""
+    share = np.clip(np.nan_to_num(uncertainty_m, nan=np.inf) / MOST_UNCERTAIN_M, 0.0, 1.0)
+    rgb = _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_VIRIDIS)
+    rgb[np.isnan(depth_m)] = BACKGROUND_RGB
+    return rgb
+
+
+def relief_rgb(depth_m: Float32, box: ObjectBox) -> Rgb:
+    """Hidden depth (64, 64) as if lit from the top left, where the surface faces."""
+    pitch_m = (box.x_max_m - box.x_min_m) / depth_m.shape[1]
+    down, right = np.gradient(np.nan_to_num(depth_m, nan=box.z_far_m), pitch_m)
+    facing = (1.0 - 0.7 * right - 0.7 * down) / np.sqrt((1.0 + right**2 + down**2) * (1.0 + 2 * 0.7**2))
+    shade = 0.25 + 0.75 * np.clip(facing, 0.0, 1.0)[..., np.newaxis]
+    rgb = (hidden_rgb(depth_m, box) * shade).astype(np.uint8)
+    rgb[np.isnan(depth_m)] = BACKGROUND_RGB
+    return rgb
+
+
+def faded(rgb: Rgb) -> Rgb:
+    """The same picture (..., 3) with little colour left, for what may not be believed."""
+    grey = rgb.mean(axis=-1, keepdims=True)
+    return np.rint(grey + FADED * (rgb - grey)).astype(np.uint8)
+
+
+def encoded(picture: NDArray[np.uint8], suffix: str) -> bytes:
+    """A picture (height, width[, 3]) as a file of its own, ".png" or ".jpg"."""
+    turned = np.ascontiguousarray(picture[..., ::-1]) if picture.ndim == 3 else picture
+    return cv2.imencode(suffix, turned)[1].tobytes()
 
 
 def depth_span_m(depth_m: Float32) -> tuple[float, float]:
@@ -107,6 +150,8 @@ class Surface:
     """(m, 3)."""
     rgb: Rgb
     """(n, 3)."""
+    normals: NDArray[np.float32]
+    """(n, 3); away from the wall, of length 1."""
 
 
 def surface(depth_m: Float32, box: ObjectBox) -> Surface:
@@ -120,7 +165,18 @@ def surface(depth_m: Float32, box: ObjectBox) -> Surface:
     triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
     used, triangles = np.unique(triangles, return_inverse=True)
     rgb = hidden_rgb(depth_m, box).reshape(-1, 3)
-    return Surface(points.reshape(-1, 3)[used], triangles.reshape(-1, 3).astype(np.uint32), rgb[used])
+    points, triangles = points.reshape(-1, 3)[used], triangles.reshape(-1, 3).astype(np.uint32)
+    return Surface(points, triangles, rgb[used], _normals(points, triangles))
+
+
+def _normals(points_m: NDArray[np.float32], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """The mean of the normals of the triangles that meet in each point, weighted by their areas."""
+    a, b, c = (points_m[triangles[:, corner]] for corner in range(3))
+    across = np.cross(c - a, b - a)  # towards +z: the rows run down, the columns right
+    total = np.zeros_like(points_m)
+    for corner in range(3):
+        np.add.at(total, triangles[:, corner], across)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
 def _coloured(values: NDArray[np.floating], colour_map: int) -> Rgb:

@@ -9,7 +9,7 @@ from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Rig
 
 from nlos_cam.view.assets import LOOPBACK, page_assets
-from nlos_cam.view.drawing import Drawing
+from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.latest import Latest
 from nlos_cam.view.server import Send, ViewServer
 from nlos_cam.view.viewer import Moment
@@ -56,8 +56,12 @@ class RerunViewer:
         self._moments.put(moment)
 
     def _stream(self, send: Send) -> None:
-        """Draw for one browser until it leaves, which `send` tells by an OSError, or the viewer closes."""
-        drawing: Drawing | None = None
+        """Draw for one browser until it leaves, which `send` tells by an OSError, or the viewer closes.
+
+        While a slow browser keeps `send` waiting nothing is drawn for it: it skips moments, and memory stays as it is.
+        """
+        recording = new_recording()
+        stream, drawing = recording.binary_stream(), None
         count = drawn = 0
         try:
             while not self._closed.is_set():
@@ -66,10 +70,10 @@ class RerunViewer:
                 if newest is None:
                     continue
                 count, moment = newest
-                drawing = drawing or Drawing(self._rig, moment, self._measured)
-                send(drawing.draw(moment, with_lidar=drawn % LIDAR_EVERY == 0))
+                drawing = drawing or Drawing(recording, self._rig, moment, self._measured)
+                drawing.draw(moment, with_lidar=drawn % LIDAR_EVERY == 0)
+                send(stream.read() or b"")
                 drawn += 1
                 self._closed.wait(max(0.0, begun_s + DRAW_PERIOD_S - self._clock()))
         finally:
-            if drawing is not None:
-                drawing.close()
+            recording.disconnect()

@@ -1,6 +1,7 @@
 """What the streaming loop asks of a viewer, and the viewer that shows nothing."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Protocol, Self
 
@@ -64,3 +65,30 @@ class NullViewer:
 
     def show(self, moment: Moment) -> None:
         pass
+
+
+class Viewers:
+    """Several viewers as one: each sees every moment."""
+
+    def __init__(self, viewers: Sequence[Viewer]) -> None:
+        self._viewers = viewers
+        self._entered = ExitStack()
+
+    @property
+    def address(self) -> str | None:
+        """The first that there is."""
+        return next((viewer.address for viewer in self._viewers if viewer.address), None)
+
+    def __enter__(self) -> Self:
+        with ExitStack() as entered:
+            for viewer in self._viewers:
+                entered.enter_context(viewer)
+            self._entered = entered.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._entered.close()
+
+    def show(self, moment: Moment) -> None:
+        for viewer in self._viewers:
+            viewer.show(moment)

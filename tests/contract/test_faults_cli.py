@@ -67,7 +67,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
         return camera
 
     monkeypatch.setattr(commands, "open_camera", opened)
-    monkeypatch.setattr(commands, "load_reconstructor", lambda *_: FakeNetwork())
+    monkeypatch.setattr(commands, "load_networks", lambda *_: FakeNetwork())
 
 
 def run(folder: Path, faults: str, *options: str) -> int:

@@ -16,6 +16,7 @@ from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import wall_record
 from nlos_models import colour_resnet, res_vae
+from rerun.chunk import RrdReader
 from rosbags.rosbag1 import Reader, Writer
 
 from nlos_cam.frames import Float32
@@ -142,3 +143,15 @@ def narrow_networks() -> Iterator[None]:
         stages = tuple((within // 16, *others) for within, *others in colour_resnet.STAGES)
         patch.setattr(colour_resnet, "STAGES", stages)
         yield
+
+
+@pytest.fixture
+def chunks_of() -> Callable[[Path], list[Any]]:
+    """The chunks of a saved view's recording, as Rerun's own reader gives them."""
+
+    def read(path: Path) -> list[Any]:
+        reader = RrdReader(path)
+        assert len(reader.recordings()) == 1
+        return reader.stream(store=reader.recordings()[0]).to_chunks()
+
+    return read

@@ -26,6 +26,13 @@ def test_the_viewers_files_come_whole_and_their_server_is_gone(monkeypatch: pyte
     assert [server.returncode is None for server in started] == [False]
 
 
+def test_the_page_of_what_is_recorded_shows_its_time_and_the_live_one_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(assets, "_fetch", lambda *_: b"")
+    live, recorded = (page_assets(recorded=recorded)["/"][1] for recorded in (False, True))
+    assert b'data-time="live"' in live
+    assert live.replace(b'data-time="live"', b'data-time="recorded"') == recorded != live
+
+
 def test_our_page_names_no_other_host() -> None:
     page = (resources.files("nlos_cam.view") / "page.html").read_text(encoding="utf-8")
     assert re.findall(r"https?:|//[a-z]", page) == []

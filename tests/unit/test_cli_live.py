@@ -73,7 +73,7 @@ class Opened:
 def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Opened]:
     opened = Opened()
     monkeypatch.setattr(commands, "open_camera", opened)
-    monkeypatch.setattr(commands, "load_reconstructor", lambda *_: FakeNetwork())
+    monkeypatch.setattr(commands, "load_networks", lambda *_: FakeNetwork())
     monkeypatch.chdir(tmp_path)
     before = signal.getsignal(signal.SIGINT)
     yield opened

@@ -1,90 +1,41 @@
 import dataclasses
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rerun as rr
+from made_up_moments import NOTHING, RIG, SHEET, full_moment, moment
 from measured_walls import exact_wall
 from nlos_calibration.measured_wall import MeasuredWall
-from nlos_calibration.rig import load_rig
 
-from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.reconstruct import Reconstruction, pose_of
-from nlos_cam.view.drawing import Drawing
+from nlos_cam.verdict import Verdict
+from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.viewer import Moment
 
-RIG = load_rig("paper-rig")
-NOTHING = np.full((64, 64), np.nan, np.float32)
-SHEET = np.full((64, 64), 0.2, np.float32)
-
-
-def moment(number: int, hidden_m: np.ndarray, truth_m: np.ndarray | None = None) -> Moment:
-    depth_m = np.random.default_rng(number).uniform(0.2, 1.0, (480, 640)).astype(np.float32)
-    ir = np.full((480, 640), 40, np.uint8)
-    frame = Frame(depth_m, ir, ir, number / 30, number, RIG.pinhole, truth_depth_m=truth_m)
-    return Moment(frame, Reconstruction(hidden_m, pose_of(object_box(RIG)), None, {}), number / 30, 0.02)
-
-
-def drawn(moments: list[Moment], *, with_lidar: bool = False, measured: MeasuredWall | None = None) -> list[bytes]:
-    drawing = Drawing(RIG, moments[0], measured)
-    try:
-        return [drawing.draw(each, with_lidar=with_lidar) for each in moments]
-    finally:
-        drawing.close()
-
-
-def test_each_browsers_bytes_begin_a_recording_of_their_own() -> None:
-    for _ in range(2):
-        first, second = drawn([moment(0, SHEET), moment(1, SHEET)])
-        assert first.startswith(b"RRF2")
-        assert len(first) > len(second) > 0  # layout and bench are sent once
-
-
-@pytest.mark.parametrize("path", ["reconstruction", "truth", "bench/hidden", "latency/milliseconds", "bench/occluder"])
-def test_what_a_newcomer_should_see_is_in_the_recording(path: str) -> None:
-    (content,) = drawn([moment(0, SHEET, SHEET)])
-    assert path.encode() in content
-
-
-def test_lidar_pictures_go_out_when_asked_for_and_only_then() -> None:
-    (without,), (with_lidar,) = drawn([moment(0, SHEET)]), drawn([moment(0, SHEET)], with_lidar=True)
-    assert len(with_lidar) > len(without) + 50_000
-
-
-def test_no_truth_and_no_surface_are_drawn_too() -> None:
-    assert all(drawn([moment(0, SHEET), moment(1, NOTHING), moment(2, SHEET, NOTHING)]))
-
-
-def test_a_rig_without_an_occluder_is_drawn() -> None:
-    drawing = Drawing(RIG.model_copy(update={"occluder": None}), moment(0, SHEET))
-    assert b"bench/occluder" not in drawing.draw(moment(0, SHEET), with_lidar=False)
-    drawing.close()
-
-
-def test_an_odd_frame_size_is_drawn() -> None:
-    odd = moment(0, SHEET)
-    small = dataclasses.replace(odd.frame, depth_m=odd.frame.depth_m[:241, :321], ir=odd.frame.ir[:241, :321])
-    assert drawn([dataclasses.replace(odd, frame=small)], with_lidar=True)[0]
-
-
-PATHS = {
-    "bench/box",
-    "bench/hidden",
-    "bench/lidar",
-    "bench/lidar/body",
-    "bench/lidar/view",
-    "bench/light",
-    "bench/occluder",
-    "bench/wall",
-    "latency/milliseconds",
-    "lidar/depth",
-    "lidar/infrared",
-    "reconstruction",
-    "truth",
-}
+SIZE = 480, 640
+BENCH = {f"bench/{name}" for name in ("box", "light", "lidar", "lidar/body", "lidar/view", "occluder", "wall")}
+FIGURES = {"latency", "drops", "physics/score"}
+LIDAR = {"lidar/depth", "lidar/infrared", "lidar/confidence"}
+PLAIN = BENCH | FIGURES | LIDAR | {"bench/hidden", "reconstruction", "verdict"}
+FULL = PLAIN | {"truth", "uncertainty", "temperature", "physics/residual"}
 POSE = {f"bench/measured/{name}" for name in ("footprint", "distance", "distance/end", "axis", "axis/end", "frame")}
 REFERENCE = {"bench/measured/points", "wall/residual", "wall/noise", "wall/saturated"}
+
+
+def drawn(moments: list[Moment], *, measured: MeasuredWall | None = None, rig: Any = RIG, **options: bool) -> list[int]:
+    """The bytes that each moment takes; the first, with bench and layout."""
+    recording = new_recording()
+    stream = recording.binary_stream()
+    drawing = Drawing(recording, rig, moments[0], measured)
+    sizes = []
+    for each in moments:
+        drawing.draw(each, **({"with_lidar": False} | options))
+        sizes.append(len(stream.read() or b""))
+    recording.disconnect()
+    return sizes
 
 
 def ignore(*things: object) -> None:
@@ -92,54 +43,144 @@ def ignore(*things: object) -> None:
 
 
 @pytest.fixture
-def logged(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The paths that are logged, in their order; the layout, which goes another way, is left out."""
-    paths: list[str] = []
+def logged(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
+    """The paths and things that are logged, in their order; the layout, which goes another way, is left out."""
+    noted: list[tuple[str, Any]] = []
     log = rr.RecordingStream.log
 
-    def noted(self: rr.RecordingStream, path: str, *things: Any, **options: bool) -> None:
-        paths.append(path)
+    def note(self: rr.RecordingStream, path: str, *things: Any, **options: bool) -> None:
+        noted.extend((path, thing) for thing in things)
         log(self, path, *things, **options)
 
-    monkeypatch.setattr(rr.RecordingStream, "log", noted)
+    monkeypatch.setattr(rr.RecordingStream, "log", note)
     monkeypatch.setattr(rr.RecordingStream, "send_blueprint", ignore)
-    return paths
+    return noted
+
+
+def counts(logged: list[tuple[str, Any]]) -> Counter[str]:
+    return Counter(path for path, _ in logged)
+
+
+def test_layout_and_bench_are_sent_once() -> None:
+    first, second, third = drawn([moment(number) for number in range(3)])
+    assert first > second > 0
+    assert third == pytest.approx(second, rel=0.2)
+
+
+def test_all_that_a_moment_holds_is_drawn_and_of_a_bare_one_what_there_is(logged: list[tuple[str, Any]]) -> None:
+    drawn([full_moment(0)], with_lidar=True)
+    assert set(counts(logged)) == FULL
+    del logged[:]
+    drawn([moment(0)], with_lidar=True)
+    assert set(counts(logged)) == PLAIN
+
+
+def test_what_is_large_goes_out_when_asked_for_and_only_then(logged: list[tuple[str, Any]]) -> None:
+    drawn([full_moment(0), full_moment(1)], with_surface=False)
+    assert not (LIDAR | {"bench/hidden", "physics/residual"}) & set(counts(logged))
+    assert counts(logged)["reconstruction"] > 0
+
+
+def test_no_surface_clears_the_one_before(logged: list[tuple[str, Any]]) -> None:
+    drawn([moment(0, SHEET), moment(1, NOTHING), moment(2, SHEET)])
+    assert [type(thing) for path, thing in logged if path == "bench/hidden"] == [rr.Mesh3D, rr.Clear, rr.Mesh3D]
+
+
+def test_a_rig_without_an_occluder_is_drawn(logged: list[tuple[str, Any]]) -> None:
+    drawn([moment(0)], rig=RIG.model_copy(update={"occluder": None}))
+    assert set(counts(logged)) == PLAIN - LIDAR - {"bench/occluder"}
+
+
+def test_an_odd_frame_size_is_drawn() -> None:
+    assert drawn([full_moment(0, size=(241, 321))], with_lidar=True)[0]
+
+
+def test_a_verdict_is_sent_again_only_when_it_is_another(logged: list[tuple[str, Any]]) -> None:
+    verdicts = [Verdict.SEEN, Verdict.SEEN, Verdict.OUTSIDE, Verdict.OUTSIDE, Verdict.SEEN]
+    drawn([full_moment(number, verdict) for number, verdict in enumerate(verdicts)])
+    assert counts(logged)["verdict"] == 3
+
+
+def picture_of(thing: rr.EncodedImage) -> np.ndarray:
+    import cv2
+
+    assert thing.blob is not None
+    return cv2.imdecode(np.frombuffer(thing.blob.as_arrow_array()[0].values.to_numpy(), np.uint8), 1)[..., ::-1]
+
+
+@pytest.mark.parametrize("verdict", list(Verdict))
+def test_only_what_may_be_believed_is_drawn_plainly(verdict: Verdict, logged: list[tuple[str, Any]]) -> None:
+    drawn([full_moment(0, verdict)])
+    picture, scale = (
+        next(thing for path, thing in logged if path == "reconstruction" and isinstance(thing, kind))
+        for kind in (rr.EncodedImage, rr.Transform3D)
+    )
+    shape, factor = picture_of(picture).shape, scale.scale.as_arrow_array().to_pylist()[0][0]
+    assert shape == ((64, 64, 3) if verdict is Verdict.SEEN else (512, 512, 3))
+    assert shape[0] * factor == 64, "it takes as much room whatever is written on it"
+
+
+def test_a_doubted_surface_is_pale_in_3d(logged: list[tuple[str, Any]]) -> None:
+    drawn([full_moment(0), full_moment(0, Verdict.OUTSIDE)])
+    meshes = [thing for path, thing in logged if path == "bench/hidden"]
+    rgb = [
+        np.array(mesh.vertex_colors.as_arrow_array().to_pylist(), np.uint32).view(np.uint8).reshape(-1, 4)
+        for mesh in meshes
+    ]
+    seen, doubted = (np.ptp(colours[:, 1:].astype(int), axis=1).mean() for colours in rgb)
+    assert doubted < 0.5 * seen
+
+
+def test_a_physics_check_is_drawn_once_however_many_frames_it_stands_for(logged: list[tuple[str, Any]]) -> None:
+    drawn([full_moment(number) for number in (28, 29, 30, 31)], with_lidar=True)
+    assert counts(logged)["physics/residual"] == 2
+    assert sum(path == "physics/score" and isinstance(thing, rr.Scalars) for path, thing in logged) == 2
 
 
 def differing(number: int, *warnings: str) -> Moment:
-    off_m = np.full((64, 80), 0.2, np.float32)
-    off_m[0] = np.nan
-    difference = LidarMaps(off_m, off_m, np.isfinite(off_m))
-    return dataclasses.replace(moment(number, SHEET, SHEET), difference=difference, warnings=warnings)
+    return dataclasses.replace(full_moment(number), warnings=warnings)
 
 
-def test_without_a_measured_wall_nothing_of_one_is_sent(logged: list[str]) -> None:
-    drawn([moment(0, SHEET, SHEET)], with_lidar=True)
-    assert set(logged) == PATHS
-    del logged[:]
+def test_without_a_measured_wall_nothing_of_one_is_sent(logged: list[tuple[str, Any]]) -> None:
     drawn([differing(0, "it has drifted")], with_lidar=True)
-    assert set(logged) == PATHS
+    assert set(counts(logged)) == FULL
 
 
-def test_a_measured_wall_is_drawn_once_and_its_difference_with_the_lidars_pictures(logged: list[str]) -> None:
-    drawn([differing(0), differing(1), differing(2)], with_lidar=True, measured=exact_wall())
-    assert set(logged) == PATHS | POSE | REFERENCE | {"calibration", "lidar/difference"}
-    assert {path for path in POSE | REFERENCE if logged.count(path) != 1} == set()
-    assert logged.count("lidar/difference") == 3
+def test_a_measured_wall_is_drawn_once_and_its_difference_with_the_lidars_pictures(
+    logged: list[tuple[str, Any]],
+) -> None:
+    drawn([differing(number) for number in range(3)], with_lidar=True, measured=exact_wall())
+    number = counts(logged)
+    assert set(number) == FULL | POSE | REFERENCE | {"calibration", "lidar/difference"}
+    assert {path for path in POSE | REFERENCE if number[path] != 1} == set()
+    assert number["lidar/difference"] == 3
 
 
-def test_a_wall_without_a_reference_shows_pose_and_text(logged: list[str]) -> None:
-    assert drawn([moment(0, SHEET, SHEET)], with_lidar=True, measured=exact_wall(reference=None))[0]
-    assert set(logged) == PATHS | POSE | {"calibration"}
+def test_a_wall_without_a_reference_shows_pose_and_text(logged: list[tuple[str, Any]]) -> None:
+    drawn([moment(0)], with_lidar=True, measured=exact_wall(reference=None))
+    assert set(counts(logged)) == PLAIN | POSE | {"calibration"}
 
 
-def test_the_text_is_sent_again_only_when_it_says_something_else(logged: list[str]) -> None:
+def test_the_text_is_sent_again_only_when_it_says_something_else(logged: list[tuple[str, Any]]) -> None:
     moments = [differing(0), differing(1), differing(2, "drifted"), differing(3, "drifted"), differing(4)]
-    texts = drawn(moments, measured=exact_wall())
-    assert logged.count("calibration") == 3
-    assert [b"**Now**" in text for text in texts] == [True, False, False, False, True]
+    drawn(moments, measured=exact_wall())
+    assert counts(logged)["calibration"] == 3
 
 
-def test_what_is_sent_of_a_moment_grows_by_the_difference_only() -> None:
-    plain, measured = (drawn([differing(0), differing(1)], measured=wall)[1] for wall in (None, exact_wall()))
-    assert len(measured) == pytest.approx(len(plain), abs=200)
+def test_a_saved_drawing_can_be_read_back_by_time_and_by_frame(
+    tmp_path: Path, chunks_of: Callable[[Path], list[Any]]
+) -> None:
+    recording = new_recording()
+    recording.save(tmp_path / "view.rrd")
+    drawing = Drawing(recording, RIG, full_moment(7), saved=True)
+    for number in (7, 9, 12):
+        drawing.draw(full_moment(number), with_lidar=True)
+    recording.disconnect()
+    rows: Counter[str] = Counter()
+    for chunk in chunks_of(tmp_path / "view.rrd"):
+        if not chunk.is_static:
+            assert chunk.timeline_names == ["time", "frame"]
+            rows[chunk.entity_path] += chunk.num_rows
+    assert rows["/reconstruction"] >= 3
+    assert {rows[f"/{path}"] for path in (*LIDAR, "uncertainty", "truth", "drops", "bench/hidden")} == {3}
+    assert (tmp_path / "view.rrd").stat().st_size > 10_000

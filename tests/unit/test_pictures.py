@@ -1,25 +1,35 @@
+import io
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from nlos_calibration.rig import load_rig
+from PIL import Image
 
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.view.pictures import (
     BACKGROUND_RGB,
+    FADED,
     JUMP_M,
+    MOST_UNCERTAIN_M,
     QUIET_SPAN_M,
     SATURATED_RGB,
     change_span_m,
+    confidence_rgb,
     depth_span_m,
     difference_rgb,
+    encoded,
+    faded,
     hidden_rgb,
     infrared_grey,
     lidar_rgb,
     noise_rgb,
+    relief_rgb,
     round_span,
     saturated_rgb,
     surface,
+    uncertainty_rgb,
 )
 
 BOX = object_box(load_rig("paper-rig"))
@@ -147,3 +157,65 @@ def test_the_span_of_a_change_is_of_what_has_changed() -> None:
     off_m[:, 40:60] = 0.28
     off_m[:, 78:] = -1.5
     assert change_span_m(off_m) == pytest.approx(0.3)
+
+
+def test_uncertainty_is_brighter_the_larger_and_shown_only_where_there_is_a_surface() -> None:
+    depth_m = flat(0.2)
+    depth_m[0] = np.nan
+    spread_m = np.linspace(0.0, 2 * MOST_UNCERTAIN_M, 64, dtype=np.float32) * np.ones((64, 1), np.float32)
+    rgb = uncertainty_rgb(spread_m, depth_m)
+    assert (rgb[0] == BACKGROUND_RGB).all()
+    brightness = rgb[1].sum(axis=-1).astype(int)
+    assert (np.diff(brightness) >= -3).all()
+    assert brightness[0] > sum(BACKGROUND_RGB)
+    assert (rgb[1, 40:] == rgb[1, 63]).all()
+
+
+def test_an_uncertainty_that_is_not_known_is_the_largest() -> None:
+    depth_m, unknown_m = flat(0.2), NOTHING
+    assert (uncertainty_rgb(unknown_m, depth_m) == uncertainty_rgb(flat(1.0), depth_m)).all()
+
+
+def test_confidence_is_brighter_the_higher() -> None:
+    rgb = confidence_rgb(np.arange(16, dtype=np.uint8)[None])[0].astype(int)
+    assert (np.diff(rgb.sum(axis=-1)) > 0).all()
+    np.testing.assert_array_equal(confidence_rgb(np.full((1, 1), 200, np.uint8))[0, 0], rgb[15])
+
+
+def test_what_is_faded_keeps_its_brightness_and_loses_its_colour() -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (9, 9, 3)).astype(np.uint8)
+    pale = faded(rgb).astype(float)
+    np.testing.assert_allclose(pale.mean(axis=-1), rgb.mean(axis=-1), atol=1.0)
+    np.testing.assert_allclose(np.ptp(pale, axis=-1), FADED * np.ptp(rgb.astype(float), axis=-1), atol=1.5)
+
+
+@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 3)])
+def test_a_picture_is_a_file_of_its_own_that_says_the_same(shape: tuple[int, ...]) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(encoded(picture, ".png")))), picture)
+    smooth = np.full(shape, 90, np.uint8)
+    near = np.asarray(Image.open(io.BytesIO(encoded(smooth, ".jpg")))).astype(int)
+    assert np.abs(near - smooth).max() <= 2
+
+
+def test_a_sheets_normals_lead_away_from_the_wall_and_are_the_planes() -> None:
+    x = np.linspace(0.0, 1.0, 64, dtype=np.float32)
+    slope_m = 0.2 + 0.05 * x * np.ones((64, 1), np.float32)
+    mesh = surface(slope_m, BOX)
+    across = 0.05 / (0.25 * 63 / 64)
+    expected = np.array([-across, 0.0, 1.0]) / np.hypot(across, 1.0)
+    np.testing.assert_allclose(mesh.normals, np.broadcast_to(expected, mesh.normals.shape), atol=1e-4)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_normals_are_of_length_one(seed: int) -> None:
+    depth_m = (0.2 + np.random.default_rng(seed).uniform(0, 0.01, (64, 64))).astype(np.float32)
+    np.testing.assert_allclose(np.linalg.norm(surface(depth_m, BOX).normals, axis=1), 1.0, atol=1e-5)
+
+
+def test_a_relief_is_lit_from_the_top_left_and_dark_where_there_is_nothing() -> None:
+    y, x = np.mgrid[:64, :64]
+    hill_m = (0.3 - 0.1 * np.exp(-((x - 32) ** 2 + (y - 32) ** 2) / 200)).astype(np.float32)
+    brightness = relief_rgb(hill_m, BOX).sum(axis=-1).astype(int)
+    assert brightness[24, 24] > brightness[40, 40]
+    assert (relief_rgb(NOTHING, BOX) == BACKGROUND_RGB).all()

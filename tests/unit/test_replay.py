@@ -16,7 +16,7 @@ from nlos_cam.bench import Bench
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.processing import Processing
-from nlos_cam.replay import DIFFERENCE, REPORT, RESULT, SHEET, Samples, replay
+from nlos_cam.replay import DIFFERENCE, REPORT, RESULT, SHEET, replay
 
 RIG = load_rig("paper-rig")
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
@@ -178,15 +178,3 @@ def test_a_report_tells_warnings_with_their_frames_the_same_each_time(tmp_path: 
     warnings = re.findall(r"- warning, (\d+) frames from (\d+) to (\d+): ", texts[0])
     assert ("150", "0", "149") in warnings
     assert any(int(first) in range(30, 80) for _, first, _ in warnings)
-
-
-@pytest.mark.parametrize("count", [1, 5, 6, 7, 100, 1001])
-def test_samples_are_few_ordered_and_spread(count: int) -> None:
-    samples = Samples(6)
-    for number in range(count):
-        samples.add(number)  # type: ignore[arg-type]
-    chosen = samples.chosen()
-    assert len(chosen) == min(count, 6)
-    assert chosen[0] == 0
-    assert chosen == sorted(set(chosen))
-    assert chosen[-1] >= 0.7 * (count - 1)

@@ -2,28 +2,17 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing
 from http.client import HTTPConnection
+from threading import Event
 from urllib.parse import urlsplit
 
-import numpy as np
 import pytest
+from made_up_moments import RIG, full_moment, moment
 from measured_walls import exact_wall
-from nlos_calibration.rig import load_rig
 
-from nlos_cam.frames import Frame
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.reconstruct import Reconstruction, pose_of
 from nlos_cam.view import rerun_viewer
+from nlos_cam.view.drawing import Drawing
 from nlos_cam.view.rerun_viewer import RerunViewer
 from nlos_cam.view.viewer import Moment
-
-RIG = load_rig("paper-rig")
-
-
-def moment(number: int) -> Moment:
-    depth_m, ir = np.full((64, 80), 0.3, np.float32), np.full((64, 80), 40, np.uint8)
-    frame = Frame(depth_m, ir, ir, number / 30, number, RIG.pinhole.scaled(80, 64))
-    hidden_m = np.full((64, 64), 0.2, np.float32)
-    return Moment(frame, Reconstruction(hidden_m, pose_of(object_box(RIG)), None, {}), number / 30, 0.02)
 
 
 @pytest.fixture
@@ -91,3 +80,55 @@ def test_a_measured_wall_reaches_each_browser(monkeypatch: pytest.MonkeyPatch) -
                         chunk = answer.read1()
                         assert chunk, "the stream ended without the footprint"
                         received += chunk
+
+
+class Starved:
+    """A browser that takes what it is sent only when let."""
+
+    def __init__(self) -> None:
+        self.asked, self.let, self.taken = Event(), Event(), []
+
+    def __call__(self, content: bytes) -> None:
+        self.asked.set()
+        if not self.let.wait(10.0):
+            raise TimeoutError
+        self.taken.append(content)
+
+
+def test_nothing_is_drawn_or_kept_for_a_browser_that_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
+    drawn = []
+    draw = Drawing.draw
+
+    def noted(self: Drawing, each: Moment, **options: bool) -> None:
+        drawn.append(each.frame.frame_number)
+        draw(self, each, **options)
+
+    monkeypatch.setattr(Drawing, "draw", noted)
+    browser = Starved()
+    with RerunViewer(RIG) as viewer:
+        thread = threading.Thread(target=viewer._stream, args=(browser,))
+        thread.start()
+        viewer.show(full_moment(0))
+        assert browser.asked.wait(10.0)
+        for number in range(1, 500):
+            viewer.show(moment(number))
+        assert drawn == [0]
+        browser.let.set()
+        viewer.show(moment(500))
+        while len(drawn) < 2:
+            Event().wait(0.01)
+    thread.join(10.0)
+    assert drawn[1] >= 499, "it sees the newest, and not those that it missed"
+    assert len(browser.taken) == len(drawn)
+
+
+def test_a_page_that_is_opened_again_begins_anew(viewer: RerunViewer) -> None:
+    viewer.show(full_moment(0))
+    for _ in range(3):
+        with closing(connected(viewer)) as browser:
+            browser.request("GET", "/live.rrd")
+            with closing(browser.getresponse()) as answer:
+                received = b""
+                while b"bench/wall" not in received or b"uncertainty" not in received:
+                    received += answer.read1()

@@ -1,0 +1,28 @@
+"""The bare wall from a recording, and its record: `python examples/calibrate_bag.py RUN.BAG [WALL.toml]`"""
+
+import sys
+from datetime import datetime
+from pathlib import Path
+
+from nlos_calibration.wall_record import wall_record
+
+from nlos_cam.camera import open_camera
+from nlos_cam.wall_files import WallFiles, written
+from nlos_cam.wall_look import look
+from nlos_cam.wall_measure import by_depth
+
+
+def main(bag: Path, out: Path) -> None:
+    """Fit the wall over 60 frames, say where it is and how surely, and write record, reference and report."""
+    with open_camera(f"bag:{bag}") as camera:
+        seen = look(camera, 60)
+    fit, facts = by_depth(seen)
+    about = {"camera": seen.camera, "frames": seen.statistics.depth.frames}
+    today, others = datetime.now().astimezone().date(), seen.facts() | facts
+    record = wall_record(fit, seen.intrinsics, **about, created=today, others=others)
+    written(WallFiles.beside(out, overwrite=False), record, seen.reference(fit.inliers))
+    print(f"{1e3 * record.distance_m:.1f} mm to the wall, {record.facing_deg:.2f} degrees: {record.verdict}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else Path("wall.toml"))

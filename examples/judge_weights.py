@@ -1,0 +1,31 @@
+"""How well weights do, kind by kind: `python examples/judge_weights.py [OBJECTS [WEIGHTS]]`"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from nlos_calibration.rig import load_rig
+from nlos_models.metrics import silhouette_iou
+
+from nlos_cam.evaluate_objects import as_map_set, echoes_of, seeded_objects, sense, truth_of
+from nlos_cam.objects.depth_image import object_box
+from nlos_cam.set_up import load_networks
+
+FIRST_SEED = 20_000_000
+"""Training draws none from here on."""
+
+
+def main(count: int = 36, weights: Path | None = None) -> None:
+    """Print the mean silhouette IoU of each kind among random objects that training never draws."""
+    network, rig = load_networks(weights), load_rig("paper-rig")
+    objects = seeded_objects(FIRST_SEED, count, object_box(rig))
+    truth = truth_of(objects, object_box(rig))
+    maps = as_map_set(sense(echoes_of(objects, rig, lambda *_: None), rig), truth)
+    iou = silhouette_iou(network(maps.depth_m, maps.intensity), truth)
+    kinds = np.array([one.category for one in objects])
+    for kind in sorted(set(kinds)):
+        print(f"{kind:12s} {iou[kinds == kind].mean():.2f} over {np.sum(kinds == kind)}")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:2]), *map(Path, sys.argv[2:3]))

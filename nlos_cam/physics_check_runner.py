@@ -1,0 +1,160 @@
+"""Physics checks beside a streaming loop, in a process of little urgency that never holds the loop up."""
+
+import os
+import pickle
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from threading import Condition, Thread
+from typing import IO, Self
+
+from nlos_calibration.rig import Rig
+
+from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.physics_check import Check, failure, log_warning
+from nlos_cam.reconstruct import Clock
+from nlos_cam.render.accuracy import Stop
+
+PERIOD_S = 1.0
+WORKER = sys.executable, "-m", "nlos_cam.physics_check_worker"
+END_WITHIN_S = 2.0
+"""What has not ended by then is killed."""
+
+
+class BackgroundChecks:
+    """Checks the newest frame about once a period, in a process of its own while entered.
+
+    `offer` returns at once. What is due while another is worked on waits, one frame at most: a newer one takes its
+    place. Where checks fail, or the process ends, `on_error` hears of the first time, and the loop goes on.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        *,
+        period_s: float = PERIOD_S,
+        accuracy: Stop = "standard",
+        clock: Clock = time.monotonic,
+        on_error: Callable[[str], None] = log_warning,
+        command: Sequence[str] = WORKER,
+    ) -> None:
+        self.newest: Check | None = None
+        self.dropped = 0
+        """Frames that were due, and that a newer one took the place of."""
+        self._about, self._period_s, self._clock = (rig, accuracy), period_s, clock
+        self._on_error, self._said, self._command = on_error, False, command
+        self._due_s = -float("inf")
+        self._next: tuple[int, LidarMaps, Float32] | None = None
+        self._changed, self._ended = Condition(), False
+        self.process: subprocess.Popen[bytes] | None = None
+        """None where it could not be started."""
+        self._thread = Thread(target=self._run, name="physics check", daemon=True)
+
+    def __enter__(self) -> Self:
+        try:
+            self.process = _started(self._command)
+        except OSError as error:
+            self._over(f"their process cannot be started ({error.strerror})")
+        else:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        if self.process:
+            _end(self.process)
+            self._thread.join(END_WITHIN_S)
+
+    def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
+        """Have this frame checked if one is due."""
+        if (now_s := self._clock()) < self._due_s:
+            return
+        self._due_s = now_s + self._period_s
+        with self._changed:
+            if self._ended:
+                return
+            self.dropped += self._next is not None
+            self._next = frame_number, maps, depth_m
+            self._changed.notify_all()
+
+    @property
+    def waits(self) -> bool:
+        """Whether a frame waits to be checked."""
+        return self._next is not None
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing will be checked any more."""
+        return self._ended
+
+    def _run(self) -> None:
+        if (process := self.process) is None:
+            return
+        with suppress(OSError), process:  # closing a pipe that nobody reads any more is one
+            try:
+                self._ask(process)
+            except (OSError, EOFError, pickle.PickleError):
+                _end(process)
+                self._over(f"their process ended ({process.returncode})")
+
+    def _over(self, why: str) -> None:
+        """There are no more checks, and never again a frame that waits for one."""
+        self._say(f"no more physics checks: {why}")
+        with self._changed:
+            self._ended, self._next = True, None
+
+    def _ask(self, process: subprocess.Popen[bytes]) -> None:
+        asked, told = process.stdin, process.stdout
+        if asked is None or told is None:
+            return
+        _send(asked, self._about)
+        while (frame := self._taken()) is not None:
+            _send(asked, frame)
+            answer = pickle.load(told)  # noqa: S301  of our own process, through a pipe that nobody else has
+            if isinstance(answer, Check):
+                self.newest = answer
+            else:
+                self._say(failure(frame[0], str(answer)))
+
+    def _taken(self) -> tuple[int, LidarMaps, Float32] | None:
+        """The frame that is next, once there is one; None when it is over."""
+        with self._changed:
+            while self._next is None and not self._ended:
+                self._changed.wait()
+            frame, self._next = self._next, None
+            return None if self._ended else frame
+
+    def _say(self, text: str) -> None:
+        if not (self._said or self._ended):
+            self._said = True
+            self._on_error(text)
+
+
+def _started(command: Sequence[str]) -> subprocess.Popen[bytes]:
+    """The process, on one core, where a Ctrl-C at the terminal does not reach it, with the modules that we see."""
+    one_thread = {f"{name}_NUM_THREADS": "1" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
+    path = os.pathsep.join(entry for entry in sys.path if entry)
+    group, flags = 0, 0
+    if sys.platform == "win32":
+        group, flags = None, subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.BELOW_NORMAL_PRIORITY_CLASS
+    env, pipe = {**os.environ, **one_thread, "PYTHONPATH": path}, subprocess.PIPE
+    return subprocess.Popen([*command], stdin=pipe, stdout=pipe, env=env, process_group=group, creationflags=flags)
+
+
+def _send(to: IO[bytes], what: object) -> None:
+    pickle.dump(what, to)
+    to.flush()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Have it end, and wait until it has."""
+    process.terminate()
+    try:
+        process.wait(END_WITHIN_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

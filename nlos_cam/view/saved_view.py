@@ -1,0 +1,106 @@
+"""A viewer that writes what a browser would see to a file (.rrd), to be looked at later, from beginning to end."""
+
+from collections import deque
+from datetime import timedelta
+from pathlib import Path
+from threading import Condition, Thread
+from typing import Self
+
+import rerun as rr
+from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.rig import Rig
+
+from nlos_cam.view.drawing import Drawing, new_recording
+from nlos_cam.view.viewer import Moment
+
+PERIOD_S = 0.1
+"""Between moments that are kept, by their own clock."""
+LIDAR_EVERY, SURFACE_EVERY = 5, 2
+SLACK_S = 0.01
+"""Frames come at 30 per second: every third is kept, and not every fourth because of a thousandth."""
+QUEUE_MOMENTS = 4
+BATCH_S = 1.0
+"""What a kill may cost of the end."""
+MOST_BYTES = 2 << 30
+"""A file ends there, an hour or more on: browsers cannot load more."""
+
+
+class SavedView:
+    """Writes to `path` while entered, in a thread of its own: ten moments per second.
+
+    Of five of them it writes the surface in 3D, of two the lidar's pictures. A moment for which there is no room in the
+    queue is left out, or, where it `keeps_all`, waited for. What is at `path` is replaced. After a kill the file is
+    without its last second, and can be looked at.
+    """
+
+    address: str | None = None
+
+    def __init__(self, path: Path, rig: Rig, measured: MeasuredWall | None = None, *, keeps_all: bool = False) -> None:
+        self.kept = 0
+        """Moments written."""
+        self.left_out = 0
+        """Moments that were due and did not fit."""
+        self.full = False
+        """Whether the file has ended before the run."""
+        self._path, self._rig, self._measured, self._keeps_all = path, rig, measured, keeps_all
+        self._queue: deque[Moment] = deque()
+        self._changed = Condition()
+        self._ended = False
+        self._due_s = float("-inf")
+        self._error: Exception | None = None
+        self._thread = Thread(target=self._write, name="saved view")
+
+    def __enter__(self) -> Self:
+        self._path.open("wb").close()  # a path that cannot be written to is an error now, not in the thread
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._thread.join()
+        if self._error:
+            raise self._error
+
+    def show(self, moment: Moment) -> None:
+        """Queue a moment if one is due."""
+        if self.full or moment.published_s < self._due_s:
+            return
+        self._due_s = moment.published_s + PERIOD_S - SLACK_S
+        with self._changed:
+            while self._keeps_all and len(self._queue) == QUEUE_MOMENTS and self._thread.is_alive():
+                self._changed.wait(BATCH_S)
+            if len(self._queue) == QUEUE_MOMENTS:
+                self.left_out += 1
+                return
+            self._queue.append(moment)
+            self._changed.notify_all()
+
+    def _next(self) -> Moment | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._queue or self._ended)
+            self._changed.notify_all()
+            return self._queue.popleft() if self._queue else None
+
+    def _write(self) -> None:
+        try:
+            self._draw_all()
+        except Exception as error:  # noqa: BLE001  whatever it was, who entered raises it
+            self._error = error
+
+    def _draw_all(self) -> None:
+        recording = new_recording(rr.ChunkBatcherConfig(flush_tick=timedelta(seconds=BATCH_S)))
+        recording.save(self._path)
+        try:
+            drawing: Drawing | None = None
+            while (moment := self._next()) is not None:
+                if self.full:
+                    continue
+                drawing = drawing or Drawing(recording, self._rig, moment, self._measured, saved=True)
+                kept = self.kept
+                drawing.draw(moment, with_lidar=kept % LIDAR_EVERY == 0, with_surface=kept % SURFACE_EVERY == 0)
+                self.kept += 1
+                self.full = self._path.stat().st_size > MOST_BYTES
+        finally:
+            recording.disconnect()

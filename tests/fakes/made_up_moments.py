@@ -1,0 +1,80 @@
+"""Moments of a run that never was, with everything in them that a view can show."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.frames import Frame, LidarMaps
+from nlos_cam.objects.depth_image import object_box
+from nlos_cam.physics_check import Check
+from nlos_cam.reconstruct import Reconstruction, pose_of
+from nlos_cam.verdict import Verdict
+from nlos_cam.view.viewer import Moment
+
+RIG = load_rig("paper-rig")
+NOTHING = np.full((64, 64), np.nan, np.float32)
+SHEET = np.full((64, 64), 0.2, np.float32)
+
+
+def bump(number: int) -> np.ndarray:
+    """A round hill that goes from left to right, a pixel each frame; nothing around it."""
+    y, x = np.mgrid[:64, :64]
+    height = 1.0 - np.hypot(x - 20 - number % 24, y - 32) / 16
+    return np.where(height > 0, 0.3 - 0.1 * np.sqrt(np.clip(height, 0.0, 1.0)), np.nan).astype(np.float32)
+
+
+def moment(
+    number: int, hidden_m: np.ndarray | None = None, *, size: tuple[int, int] = (64, 80), **fields: Any
+) -> Moment:
+    """Frame `number`, of which only the reconstruction is known; `fields` replace the moment's."""
+    depth_m = np.random.default_rng(number).uniform(0.2, 1.0, size).astype(np.float32)
+    ir = np.full(size, 40, np.uint8)
+    frame = Frame(depth_m, ir, ir % 16, number / 30, number, RIG.pinhole.scaled(size[1], size[0]))
+    hidden = SHEET if hidden_m is None else hidden_m
+    made = Reconstruction(hidden, pose_of(object_box(RIG)), None, {})
+    return replace(Moment(frame, made, number / 30, 0.02), **fields)
+
+
+def full_moment(number: int, verdict: Verdict = Verdict.SEEN, size: tuple[int, int] = (64, 80)) -> Moment:
+    """All that a moment can hold."""
+    hidden_m = NOTHING if verdict is Verdict.NOTHING else bump(number)
+    plain = moment(number, hidden_m, size=size)
+    cells = np.random.default_rng(number).normal(0.0, 0.01, (64, 80)).astype(np.float32)
+    spread_m = np.linspace(0.0, 0.04, 64, dtype=np.float32) * np.ones((64, 1), np.float32)
+    return replace(
+        plain,
+        frame=replace(plain.frame, truth_depth_m=bump(number + 2)),
+        reconstruction=replace(plain.reconstruction, uncertainty_m=spread_m),
+        difference=LidarMaps(cells, cells, np.isfinite(cells)),
+        verdict=verdict,
+        check=Check(number - number % 30, cells, cells, 0.2 + 0.1 * (number % 3), 0.5),
+        stages_s={"wait": 0.02, "maps": 0.002, "bench": 0.0001, "network": 0.009 + 0.001 * (number % 4)},
+        dropped=number // 50,
+        celsius={"ldd_temperature": 40.0 + number / 100, "mc_temperature": 35.0},
+    )
+
+
+class Recorded:
+    """A recording of so many frames of theirs."""
+
+    def __init__(self, count: int) -> None:
+        self.uri, self.rig, self.identity = "bag:fake.bag", None, {"serial": ""}
+        self.intrinsics, self.incomplete, self.dropped = full_moment(0).frame.intrinsics, 0, 0
+        self.counts: Counter[str] = Counter()
+        self._count = count
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (full_moment(number).frame for number in range(self._count))
+
+    def telemetry(self, *_: str) -> dict[str, float]:
+        return {"ldd_temperature": 41.0}

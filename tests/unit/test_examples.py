@@ -1,0 +1,124 @@
+"""Every script in examples/ does what it says, in the small."""
+
+import re
+import runpy
+import sys
+from collections.abc import Callable, Generator, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trimesh
+from nlos_calibration.measured_wall import load_measured
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.camera import Recording
+from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera.world import open_world
+from nlos_cam.dataset import DatasetPlan, Samples, build
+from nlos_cam.dataset_samples import make_samples
+from nlos_cam.render.scene_file import load_scene
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SCENE = 'name = "still"\nrig = "paper-rig"\nobject = { category = "cup", seed = 4, size_m = 0.17 }\n'
+Run = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    made = tmp_path_factory.mktemp("examples")
+    (made / "still.toml").write_text(SCENE, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)
+        yield made
+
+
+@pytest.fixture
+def run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run one as a person would, in an empty folder; returns what it prints."""
+    assert folder.is_dir()
+
+    def call(name: str, *arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", [name, *arguments])
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        return capsys.readouterr().out
+
+    return call
+
+
+@pytest.fixture
+def recording(folder: Path, hurried_clock: Any) -> Callable[[str, int], Path]:
+    """So many frames of a scene, recorded in no time."""
+
+    def make(name: str, frames: int) -> Path:
+        path = folder / f"{Path(name).stem}.bag"
+        recording = Recording(path, frames=frames)
+        with SimulatedCamera(f"sim:{name}", open_world(name), clock=hurried_clock(), recording=recording) as camera:
+            for _ in camera:
+                pass
+        return path
+
+    return make
+
+
+def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Callable[[str, int], Path], folder: Path) -> None:
+    bag, box = recording("still.toml", 3), load_rig("paper-rig").object_box
+    assert box is not None
+    lines = run("live_depth", f"bag:{bag}").splitlines()
+    assert len(lines) == 3
+    for line in lines:
+        _, x_m, y_m, z_m = (float(figure) for figure in re.findall(r"-?[\d.]+", line))
+        assert box.x_min_m < x_m < box.x_max_m
+        assert abs(y_m) < 0.05
+        assert box.z_near_m < z_m < box.z_far_m
+    told = run("point_cloud", str(bag), "cup.ply")
+    points = trimesh.load(folder / "cup.ply").vertices
+    assert told == f"cup.ply: {len(points)} points of 3 frames\n"
+    assert points[:, 2].min() >= box.z_near_m - 1e-6
+
+
+def test_hide_and_seek_overlaps_more_than_chance(run: Run) -> None:
+    told = run("hide_and_seek", "cup", "4")
+    overlap, off_mm = (int(figure) for figure in re.findall(r"(\d+)(?:%| mm)", told))
+    assert overlap > 40
+    assert off_mm < 60
+
+
+def test_calibrate_bag_writes_a_record_that_can_be_read(
+    run: Run, recording: Callable[[str, int], Path], folder: Path
+) -> None:
+    bag = recording("bare-wall", 6)
+    assert run("calibrate_bag", str(bag)).startswith("200.0 mm to the wall, 45.00 degrees: good")
+    measured = load_measured(folder / "wall.toml")
+    assert measured.record.frames == 6
+    assert measured.reference is not None
+
+
+def test_judge_weights_tells_each_kind(run: Run) -> None:
+    lines = run("judge_weights", "3").splitlines()
+    counted = [re.fullmatch(r"\S+ +([01]\.\d\d) over (\d)", line) for line in lines]
+    assert sum(int(found[2]) for found in counted if found) == 3
+
+
+def in_this_process(plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tuple[range, Samples]]:
+    for piece in pieces:
+        yield piece, make_samples(plan, piece)
+
+
+def test_own_training_learns(run: Run, folder: Path) -> None:
+    plan = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")
+    build(plan, 24, folder / "data", workers=1, on_progress=lambda *_: None, farm=in_this_process)
+    told = run("own_training", "data", "3")
+    losses = [float(line.split()[-1]) for line in told.splitlines()]
+    assert len(losses) == 3
+    assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_example_scene_can_be_read(path: Path) -> None:
+    assert load_scene(path).poses >= 1
+
+
+def test_every_script_is_run_here() -> None:
+    text = Path(__file__).read_text(encoding="utf-8")
+    assert [path.stem for path in EXAMPLES.glob("*.py") if f'run("{path.stem}"' not in text] == []
