@@ -61,8 +61,8 @@ def make_samples(
 ) -> DoubtSamples:
     """Samples of one kind, the same bits for the same seeds: BENCH in a row are of one bench.
 
-    Ordinary objects and outliers are on benches that lie slightly off, every second one on the given one; empty ones
-    may lie widely off.
+    Ordinary objects, of which datasets have those on the given bench, are on benches that lie slightly off, outliers
+    on every second such; empty benches may lie widely off.
     """
     sights = [_sight(kind, seed, rig, sensor) for seed in seeds]
     rendered = [render(sight.scene, accuracy) for sight in sights]
@@ -98,7 +98,8 @@ def _sight(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Sight:
     of_bench = np.random.default_rng([seed // BENCH, _STREAM, 0])
     if kind == EMPTY:
         return Sight(*varied_empty(rig, sensor, of_bench))
-    bench = varied(rig, sensor, SLIGHT, of_bench) if seed // BENCH % 2 else (rig, sensor)
+    slight = kind == ORDINARY or seed // BENCH % 2
+    bench = varied(rig, sensor, SLIGHT, of_bench) if slight else (rig, sensor)
     generator = np.random.default_rng([seed, _STREAM, 1])
     return outlier(KINDS[kind], generator, Sight(*bench))
 

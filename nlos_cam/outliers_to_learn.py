@@ -102,37 +102,38 @@ def other_sensor(generator: Generator, sight: Sight) -> Sight:
 
 def warped(generator: Generator, sight: Sight) -> Sight:
     """A thing bent out of shape: every pixel is taken from up to a sixth of the box away, smoothly."""
-    seen, steps = ordinary(generator, sight), np.arange(OBJECT_PIXELS, dtype=np.float32)
+    whole_m, steps = placed(generator, object_box(sight.rig)), np.arange(OBJECT_PIXELS, dtype=np.float32)
     x, y = np.meshgrid(steps, steps)
     off = [(smooth_pattern(generator, 5) - np.float32(0.5)) * np.float32(OBJECT_PIXELS / 3) for _ in range(2)]
-    bent = cv2.remap(seen.depth_m, x + off[0], y + off[1], cv2.INTER_NEAREST, borderValue=float("nan"))
-    return replace(seen, depth_m=bent.astype(np.float32))
+    bent = cv2.remap(whole_m, x + off[0], y + off[1], cv2.INTER_NEAREST, borderValue=float("nan"))
+    return replace(sight, depth_m=bent.astype(np.float32))
 
 
 def inside_out(generator: Generator, sight: Sight) -> Sight:
     """A thing whose far parts are near and whose near parts are far, and twice as deep."""
-    seen, box = ordinary(generator, sight), object_box(sight.rig)
-    depth_m = np.nanmin(seen.depth_m) + 2 * (np.nanmax(seen.depth_m) - seen.depth_m)
-    return replace(seen, depth_m=np.minimum(depth_m, np.float32(1.5 * box.z_far_m)))
+    box = object_box(sight.rig)
+    whole_m = placed(generator, box)
+    depth_m = np.nanmin(whole_m) + 2 * (np.nanmax(whole_m) - whole_m)
+    return replace(sight, depth_m=np.minimum(depth_m, np.float32(1.5 * box.z_far_m)))
 
 
 def cut_out(generator: Generator, sight: Sight) -> Sight:
     """The silhouette of a thing, flat, with holes in it."""
-    seen = ordinary(generator, sight)
+    whole_m = placed(generator, object_box(sight.rig))
     holes = smooth_pattern(generator, int(generator.integers(4, 10))) > generator.uniform(0.45, 0.75)
-    flat = np.where(holes | np.isnan(seen.depth_m), np.nan, np.nanmedian(seen.depth_m))
-    return replace(seen, depth_m=flat.astype(np.float32))
+    flat = np.where(holes | np.isnan(whole_m), np.nan, np.nanmedian(whole_m))
+    return replace(sight, depth_m=flat.astype(np.float32))
 
 
 def scrambled(generator: Generator, sight: Sight) -> Sight:
     """A thing cut into 3 x 3 or 4 x 4 tiles, which are shuffled."""
-    seen, n = ordinary(generator, sight), int(generator.choice([3, 4]))
+    whole_m, n = placed(generator, object_box(sight.rig)), int(generator.choice([3, 4]))
     side = OBJECT_PIXELS // n
-    tiles = [seen.depth_m[i * side : (i + 1) * side, j * side : (j + 1) * side] for i in range(n) for j in range(n)]
+    tiles = [whole_m[i * side : (i + 1) * side, j * side : (j + 1) * side] for i in range(n) for j in range(n)]
     order = generator.permutation(n * n)
-    whole = np.block([[tiles[order[i * n + j]] for j in range(n)] for i in range(n)])
+    mixed_m = np.block([[tiles[order[i * n + j]] for j in range(n)] for i in range(n)])
     margin = OBJECT_PIXELS - n * side
-    return replace(seen, depth_m=np.pad(whole, (0, margin), constant_values=np.nan).astype(np.float32))
+    return replace(sight, depth_m=np.pad(mixed_m, (0, margin), constant_values=np.nan).astype(np.float32))
 
 
 TO_LEARN: Mapping[str, Kind] = {

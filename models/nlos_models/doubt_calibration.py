@@ -12,8 +12,9 @@ from nlos_models.doubt_training import Bools, DoubtSet, said_of
 
 Array = NDArray[np.float64]
 
-TEMPERATURES = np.geomspace(0.2, 5.0, 65)
-MOST_FALSE_ALARMS = 0.03
+TEMPERATURES = np.geomspace(1.0, 5.0, 65)
+"""Never below 1: where all are told apart, the likeliest is 0, which says no more than that."""
+MOST_FALSE_ALARMS = 0.05
 """Of ordinary objects, the share that may be told to be outside the trained range: what it costs to find those that
 are."""
 MOST_FALSE_OBJECTS = 0.001
@@ -49,7 +50,7 @@ def shared_errors(made: NDArray[np.floating], truth: NDArray[np.floating]) -> tu
 
 
 def calibrated(network: DoubtNetwork, held_out: DoubtSet) -> Calibration:
-    """A network's calibration: errors by ordinary objects, verdicts by all; the mirrored maps are taken along.
+    """A network's calibration: errors by ordinary objects, verdicts by all.
 
     The set needs objects of each sort: ordinary, outside, and none.
     """
@@ -65,7 +66,7 @@ def calibrated(network: DoubtNetwork, held_out: DoubtSet) -> Calibration:
         hot,
         error_scale(expected, error),
         min(0.5, float(np.quantile(nothing[held_out.nothing], MOST_FALSE_OBJECTS))),
-        min(0.5, float(np.quantile(outside[usual], 1 - MOST_FALSE_ALARMS))),
+        float(np.quantile(outside[usual], 1 - MOST_FALSE_ALARMS)),
     )
 
 

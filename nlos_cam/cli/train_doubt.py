@@ -52,7 +52,7 @@ def doubt(
     about = DoubtRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=list(TO_LEARN))
     if run.out.resolve() == watched.resolve() or (run.out / DOUBT_RECORD).exists():
         raise OutputExistsError(f"{run.out} holds weights already: choose another --out")
-    counts = {EMPTY: recipe.empties, **dict.fromkeys((ORDINARY, *TO_LEARN), recipe.outliers)}
+    counts = counts_of(recipe)
     fewer = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
     sets = [
         _whole_set(pipeline, first_of(maps.arrays(), most), _made(run.out / SAMPLES, some, seed, maps.plan))
@@ -64,6 +64,15 @@ def doubt(
     job = Job(recipe, run.out, pipeline.record, run.tensorboard, run.compiled, about.watches)
     figures = launched(fabric, run_doubt, job, about, watched, *sets)
     finish({"out": str(run.out), **figures}, as_json=run.json, text=f"weights with their doubt in {run.out}: {figures}")
+
+
+def counts_of(recipe: Recipe) -> dict[str, int]:
+    """How many samples are rendered of each kind.
+
+    On benches that lie slightly off, as many ordinary objects as outliers: else what lies off would itself be a sign.
+    """
+    of_each = dict.fromkeys(TO_LEARN, recipe.outliers)
+    return {EMPTY: recipe.empties, ORDINARY: sum(of_each.values()) // 2, **of_each}
 
 
 def run_doubt(

@@ -23,12 +23,17 @@ def test_the_unit_of_errors_does_not_matter() -> None:
     assert error_scale(1000 * expected, 1000 * error) == pytest.approx(error_scale(expected, error))
 
 
-@pytest.mark.parametrize("true", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("true", [1.0, 2.0, 3.0])
 def test_a_networks_overconfidence_is_found(true: float) -> None:
     generator = np.random.default_rng(3)
     logits = generator.normal(0.0, 2.0, 50_000)
     truth = generator.random(50_000) < 1 / (1 + np.exp(-logits))
     assert temperature(true * logits, truth) == pytest.approx(true, rel=0.1)
+
+
+def test_where_all_are_told_apart_probabilities_stay_as_the_network_says() -> None:
+    truth = np.arange(100) % 2 == 0
+    assert temperature(np.where(truth, 9.0, -9.0), truth) == 1.0
 
 
 def test_errors_are_of_pixels_that_both_have() -> None:

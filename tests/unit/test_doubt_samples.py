@@ -37,9 +37,14 @@ def test_the_same_seed_is_the_same_sample_in_whatever_company(some: dict[str, Do
     np.testing.assert_array_equal(alone.intensity[0], some[ORDINARY].intensity[1])
 
 
-def test_every_second_bench_of_ordinary_objects_is_the_given_one() -> None:
-    sights = [doubt_samples._sight(ORDINARY, seed, RIG, SENSOR) for seed in (0, BENCH - 1, BENCH)]
-    assert [sight.rig == RIG for sight in sights] == [True, True, False]
+def test_ordinary_objects_and_every_second_bench_of_outliers_lie_slightly_off() -> None:
+    seeds = 0, BENCH - 1, BENCH
+    rigs = {
+        kind: [doubt_samples._sight(kind, seed, RIG, SENSOR).rig for seed in seeds] for kind in (ORDINARY, "plates")
+    }
+    assert [rig == RIG for rig in rigs["plates"]] == [True, True, False]
+    assert RIG not in rigs[ORDINARY]
+    assert rigs[ORDINARY][0] == rigs[ORDINARY][1] != rigs[ORDINARY][2] == rigs["plates"][2]
 
 
 def test_what_is_on_disk_is_read_and_only_what_is_missing_is_made(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from fake_doubter import RECIPE
-from nlos_models.doubt_calibration import calibrated
+from nlos_models.doubt_calibration import MOST_FALSE_ALARMS, calibrated
 from nlos_models.doubt_network import DoubtNetwork, DoubtOutput
 from nlos_models.doubt_training import (
     DoubtBatch,
@@ -81,9 +81,15 @@ def test_a_stopped_run_goes_on_to_the_same_weights(trained: tuple[DoubtNetwork, 
 def test_calibration_of_a_trained_network_has_limits_that_keep_their_rates(
     trained: tuple[DoubtNetwork, Path],
 ) -> None:
-    fitted = calibrated(trained[0], small_doubt_set(64, 3))
-    assert 0 < fitted.nothing_above <= 0.5
-    assert 0 < fitted.outside_above <= 0.5
+    some = small_doubt_set(200, 3)
+    fitted, said = calibrated(trained[0], some), said_of(trained[0], some)
+    nothing, outside = (
+        torch.sigmoid(logits / t).numpy() for logits, t in zip(said[:2], fitted.temperatures, strict=True)
+    )
+    usual = ~some.nothing & ~some.outside
+    assert (outside[usual] > fitted.outside_above + 1e-6).mean() <= MOST_FALSE_ALARMS + 1 / usual.sum()
+    assert (nothing[some.nothing] < fitted.nothing_above).mean() <= 1 / some.nothing.sum()
+    assert fitted.nothing_above <= 0.5
     assert fitted.error_scale > 0
 
 

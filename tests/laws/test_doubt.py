@@ -1,0 +1,100 @@
+"""What doubt promises of the shipped weights, through all that `live` does with a frame."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+from nlos_models.doubt_inference import load_doubter
+from nlos_models.inference import load_reconstructor
+
+from nlos_cam.bench import Bench
+from nlos_cam.cache import cache_folder
+from nlos_cam.evaluate_objects import echoes_of, sense
+from nlos_cam.frame_reader import Arrival
+from nlos_cam.frames import Frame, LidarMaps
+from nlos_cam.live_report import Step
+from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.test_set import test_set
+from nlos_cam.outliers import TO_LEARN, outlier
+from nlos_cam.processing import Processing
+from nlos_cam.render.renderer import render
+from nlos_cam.render.sensor import Sensor
+from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.sights import Sight, ordinary
+from nlos_cam.varied_bench import varied_empty
+from nlos_cam.verdict import Verdict
+
+RIG = load_rig("paper-rig")
+
+
+@pytest.fixture(scope="module")
+def processing() -> Processing:
+    cache = cache_folder() / "onnx"
+    doubter = load_doubter(None, cache)
+    assert doubter is not None
+    return Processing(Bench(RIG), load_reconstructor(None, cache), doubter=doubter)
+
+
+def frames_of(sight: Sight, count: int, seed: int) -> list[Frame]:
+    """Frames of one instant, with other noise in each."""
+    sensor, echoes = Sensor(sight.rig, sight.sensor), render(sight.scene, "draft").multi
+    noises = (np.random.default_rng([seed, number]) for number in range(count))
+    return [sensor.expose(echoes, noise).frame(sight.rig.pinhole) for noise in noises]
+
+
+def steps_of(processing: Processing, frames: Sequence[Frame]) -> list[Step]:
+    return [processing.step(Arrival(frame, 0.0), lambda: 0.0, 0.0) for frame in frames]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_an_empty_bench_never_shows_an_object(processing: Processing, seed: int) -> None:
+    bench = varied_empty(RIG, SensorModel(), np.random.default_rng([seed, 77]))
+    for step in steps_of(processing, frames_of(Sight(*bench), 3, seed)):
+        assert step.verdict == Verdict.NOTHING
+        assert not step.reconstruction.shows
+
+
+def test_test_objects_are_seen_and_errors_are_expected_where_they_are_large(processing: Processing) -> None:
+    subjects = test_set(object_box(RIG))[::3]
+    expected, observed, verdicts = list[float](), list[float](), list[Verdict | None]()
+    for subject, maps in zip(subjects, sense(echoes_of(subjects, RIG, lambda *_: None), RIG), strict=True):
+        frame = frame_of(maps)
+        step = steps_of(processing, [frame] * 5)[-1]
+        verdicts.append(step.verdict)
+        uncertainty_m, off_m = step.reconstruction.uncertainty_m, step.reconstruction.depth_m - subject.depth_m
+        assert uncertainty_m is not None
+        assert np.isfinite(uncertainty_m).all()
+        assert uncertainty_m.min() > 0
+        there = ~np.isnan(off_m)
+        expected.append(float(uncertainty_m[there].mean()))
+        observed.append(float(np.abs(off_m[there]).mean()))
+    ranks = [np.argsort(np.argsort(values)) for values in (expected, observed)]
+    assert np.corrcoef(*ranks)[0, 1] > 0.2
+    assert np.mean(expected) == pytest.approx(np.mean(observed), rel=0.4)
+    assert Verdict.NOTHING not in verdicts
+    assert verdicts.count(Verdict.SEEN) >= 15
+
+
+def frame_of(maps: LidarMaps) -> Frame:
+    """A frame of one pixel for each cell, whose maps are these."""
+    ir = np.clip(np.round(maps.intensity), 0, 255).astype(np.uint8)
+    return Frame(maps.depth_m, ir, ir, 0.0, 0, RIG.pinhole.scaled(80, 64))
+
+
+@pytest.mark.parametrize("name", ["plates", "other rig", "other sensor", "large"])
+def test_outliers_of_the_plainest_kinds_are_told(processing: Processing, name: str) -> None:
+    told = list[Verdict | None]()
+    for seed in range(8):
+        sight = outlier(TO_LEARN[name], np.random.default_rng([seed, 78]), Sight(RIG, SensorModel()))
+        told.append(steps_of(processing, frames_of(sight, 5, seed))[-1].verdict)
+    assert told.count(Verdict.OUTSIDE) + told.count(Verdict.SATURATED) >= 6
+
+
+def test_an_object_that_comes_and_goes_is_told_with_its_first_frame_and_gone_with_the_next(
+    processing: Processing,
+) -> None:
+    sight = ordinary(np.random.default_rng(5), Sight(RIG, SensorModel()))
+    with_it, without = frames_of(sight, 1, 0), frames_of(Sight(RIG, SensorModel()), 1, 0)
+    told = [step.reconstruction.shows for step in steps_of(processing, [*without, *with_it, *without])]
+    assert told == [False, True, False]
