@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from nlos_cam.folders import file_when_whole
 from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps, maps_from_frame
 from nlos_cam.objects.depth_image import image_from_depth, object_box
-from nlos_cam.outliers import TO_JUDGE, TO_LEARN, Sight, ordinary, outlier
+from nlos_cam.outliers import TO_JUDGE, TO_LEARN, outlier
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.sensor import Sensor
 from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.sights import Sight, ordinary
 from nlos_cam.varied_bench import SLIGHT, varied, varied_empty
 
 EMPTY, ORDINARY = "empty", "ordinary"
