@@ -1,8 +1,8 @@
 """The docs' stills and video of a replay: docs/images/gallery-*.png and replay.webm, of simulated scenes.
 
-Run from the repository: `python tools/replay_pictures.py`. The scenes are rendered ahead, and kept; frames come as fast as they
-are reconstructed, so that none is dropped on a slow machine. Those of your own recording:
-`nlos-cam replay F.bag --stills 4 --video`.
+Run from the repository: `python tools/replay_pictures.py`. The scenes are rendered ahead, and kept; frames come as fast
+as they are reconstructed, so that none is dropped on a slow machine. Those of your own recording: `nlos-cam replay
+F.bag --stills 4 --video`.
 """
 
 import argparse
