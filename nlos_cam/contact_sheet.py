@@ -6,13 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.live_report import Step
+from nlos_cam.view.pictures import MOST_UNCERTAIN_M
 
 USUAL_PERCENT = 95
 Images = list[NDArray[np.float32]]
 
 
 def draw_sheet(path: Path, chosen: list[Step]) -> None:
-    """A picture of some frames, one column each: lidar depth, infrared, difference if there is one, hidden depth."""
+    """A picture of some frames, one column each with its verdict: lidar depth, infrared, difference, hidden depth.
+
+    And its uncertainty; what there is none of is left out.
+    """
     from matplotlib.figure import Figure
 
     looks = _looks(chosen)
@@ -24,7 +28,7 @@ def draw_sheet(path: Path, chosen: list[Step]) -> None:
         for axis in axes:
             axis.set_axis_off()
     for axis, step in zip(rows[0], chosen, strict=True):
-        axis.set_title(f"frame {step.frame.frame_number}")
+        axis.set_title("\n".join([f"frame {step.frame.frame_number}", *([step.verdict] if step.verdict else [])]))
     figure.savefig(path, dpi=80)
 
 
@@ -33,11 +37,17 @@ def _looks(chosen: list[Step]) -> dict[str, tuple[str, tuple[float, float], Imag
     depths_m, intensities = [step.maps.depth_m for step in chosen], [step.maps.intensity for step in chosen]
     differences_mm = [1e3 * step.difference.depth_m for step in chosen if step.difference]
     hidden_m = [step.reconstruction.depth_m for step in chosen]
+    uncertainties_mm = [
+        np.where(np.isnan(made.depth_m), np.float32(np.nan), 1e3 * made.uncertainty_m)
+        for made in (step.reconstruction for step in chosen)
+        if made.uncertainty_m is not None
+    ]
     looks = {
         "lidar depth (m)": ("turbo_r", _limits(depths_m), depths_m),
         "infrared (counts)": ("gray", _limits(intensities), intensities),
         "difference (mm)": ("coolwarm", _even_limits(differences_mm), differences_mm),
         "hidden depth (m)": ("inferno_r", _limits(hidden_m), hidden_m),
+        "uncertainty (mm)": ("viridis", (0.0, 1e3 * MOST_UNCERTAIN_M), uncertainties_mm),
     }
     return {title: look for title, look in looks.items() if look[2]}
 

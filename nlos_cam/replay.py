@@ -137,6 +137,7 @@ def replay(
         (part / REPORT).write_text(_report(camera, bench, results, stopped=stop.is_set()), encoding="utf-8")
     if not bench.reference:
         (out / DIFFERENCE).unlink(missing_ok=True)
+    looking.forget_others(out)
     told = results.warned.frames(), frames_by_verdict(results.verdicts)
     return ReplayReport(len(results.numbers), clock() - begun_s, str(out), *told)
 

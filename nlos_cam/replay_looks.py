@@ -11,7 +11,7 @@ from nlos_cam.live_report import Step
 from nlos_cam.samples import Samples
 from nlos_cam.view.viewer import Moment, Viewer
 
-VIEW, VIDEO, STILL = "view.rrd", "replay.webm", "still-{:06d}.png"
+VIEW, VIDEO, STILL, STILLS = "view.rrd", "replay.webm", "still-{:06d}.png", "still-*.png"
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Looks:
             yield looking
         if looking.samples:
             self._draw_stills(folder, [moment_of(step) for step in looking.samples.chosen()])
+        looking.made = {path.name for path in _looks_in(folder)}
 
     def _draw_stills(self, folder: Path, moments: list[Moment]) -> None:
         from nlos_cam.view.still import Still
@@ -54,6 +55,14 @@ class Looking:
 
     def __init__(self, viewers: list[Viewer], samples: Samples | None) -> None:
         self._viewers, self.samples = viewers, samples
+        self.made: set[str] = set()
+        """The names of what there is to look at, once all of it is drawn."""
+
+    def forget_others(self, out: Path) -> None:
+        """Remove from a folder what an earlier replay left to look at: it is of other frames."""
+        for path in _looks_in(out):
+            if path.name not in self.made:
+                path.unlink()
 
     def add(self, step: Step, celsius: Mapping[str, float]) -> None:
         if self._viewers:
@@ -62,6 +71,10 @@ class Looking:
                 viewer.show(moment)
         if self.samples:
             self.samples.add(step)
+
+
+def _looks_in(folder: Path) -> list[Path]:
+    return [folder / name for name in (VIEW, VIDEO) if (folder / name).exists()] + list(folder.glob(STILLS))
 
 
 def moment_of(step: Step, celsius: Mapping[str, float] = MappingProxyType({})) -> Moment:

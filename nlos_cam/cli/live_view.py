@@ -44,7 +44,9 @@ class Addressed(Protocol):
     def address(self) -> str | None: ...
 
 
-def tell_of_view(viewer: Addressed, *, host: str | None, port: int | None, open_it: bool) -> None:
+def tell_of_view(
+    viewer: Addressed, *, host: str | None, port: int | None, open_it: bool, what: str = "live view"
+) -> None:
     """Say where the view is, who else can see it, and open it if that is wanted."""
     if not viewer.address:
         say("running without a view (Ctrl-C ends it)")
@@ -52,7 +54,7 @@ def tell_of_view(viewer: Addressed, *, host: str | None, port: int | None, open_
     from nlos_cam.view.rerun_viewer import PREFERRED_PORT
 
     taken = port is None and urlsplit(viewer.address).port != PREFERRED_PORT
-    say(f"live view: {viewer.address}  (Ctrl-C ends it{f'; port {PREFERRED_PORT} is taken' if taken else ''})")
+    say(f"{what}: {viewer.address}  (Ctrl-C ends it{f'; port {PREFERRED_PORT} is taken' if taken else ''})")
     if host and (told := exposed(host, urlsplit(viewer.address).port or 0)):
         say(f"[yellow]note:[/] {told}")
     if open_it and not opened_in_browser(viewer.address):

@@ -38,7 +38,7 @@ def view(
     with interrupted_by_signals():
         recorded = RecordedView(file, host=view_host or LOOPBACK, port=view_port)
     with stop_on_signals() as stop, recorded:
-        tell_of_view(recorded, host=view_host, port=view_port, open_it=open_view)
+        tell_of_view(recorded, host=view_host, port=view_port, open_it=open_view, what="saved view")
         stop.wait(seconds)
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)

@@ -66,7 +66,7 @@ def layout(rig: Rig, shown: Shown) -> rrb.Blueprint:
 def _time_panel(*, scrubbed: bool) -> rrb.TimePanel:
     if not scrubbed:
         return rrb.TimePanel(timeline=TIMELINE, play_state="following")
-    return rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="playing", loop_mode="all")
+    return rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="paused", loop_mode="all")
 
 
 def _banner() -> rrb.Spatial2DView:

@@ -11,6 +11,7 @@ from nlos_cam.contact_sheet import _even_limits, _limits, draw_sheet
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.live_report import Step
 from nlos_cam.reconstruct import Reconstruction
+from nlos_cam.verdict import Verdict
 
 
 def step(number: int, difference: LidarMaps | None = None) -> Step:
@@ -35,6 +36,17 @@ def test_a_sheet_has_a_row_for_each_look_and_a_column_for_each_frame(
     assert titles(tmp_path, [step(3), step(9)], monkeypatch) == ["frame 3", "frame 9", *plain]
     differing = [step(number, maps_from_frame(wall_frame(number))) for number in (3, 9)]
     assert titles(tmp_path, differing, monkeypatch)[2:] == [*plain[:2], "difference (mm)", plain[2]]
+
+
+def test_a_verdict_and_an_uncertainty_are_on_the_sheet_where_there_are_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = step(3)
+    spread_m = np.full((64, 64), 0.01, np.float32)
+    told = replace(plain, verdict=Verdict.OUTSIDE, reconstruction=replace(plain.reconstruction, uncertainty_m=spread_m))
+    said = titles(tmp_path, [told], monkeypatch)
+    assert said[0] == "frame 3\noutside the trained range"
+    assert said[-1] == "uncertainty (mm)"
 
 
 def test_it_is_a_picture(tmp_path: Path) -> None:

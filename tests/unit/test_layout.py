@@ -45,12 +45,12 @@ def test_what_has_no_name_has_no_view() -> None:
     assert [name for name in views(wall=WallNames()) if name not in views()] == ["Calibration"]
 
 
-def test_what_has_an_end_plays_from_its_beginning_in_sight_of_its_time() -> None:
+def test_what_has_an_end_waits_at_its_beginning_in_sight_of_its_time() -> None:
     live, saved = (layout(RIG, Shown(scrubbed=scrubbed)) for scrubbed in (False, True))
     assert (live.time_panel.play_state, live.time_panel.loop_mode) == ("following", None)
     assert (saved.time_panel.state, saved.time_panel.play_state, saved.time_panel.loop_mode) == (
         "collapsed",
-        "playing",
+        "paused",
         "all",
     )
     assert live.collapse_panels

@@ -10,6 +10,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam import physics_check_render
 from nlos_cam.bench import Bench
 from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.live import run_live
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.hidden import object_depth
 from nlos_cam.physics_check_render import EveryFrames, check
@@ -17,6 +18,7 @@ from nlos_cam.processing import Processing
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.replay import REPORT, RESULT, replay
+from nlos_cam.view.viewer import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
 EMPTY = np.full((64, 64), np.nan, np.float32)
@@ -142,3 +144,16 @@ def test_what_comes_back_from_the_bare_bench_is_rendered_once(monkeypatch: pytes
     check(seen(None), EMPTY, RIG)
     monkeypatch.setattr(physics_check_render, "render", lambda *_: pytest.fail("rendered again"))
     check(seen(None), EMPTY, RIG)
+
+
+def test_a_live_loop_shows_the_newest_check_with_each_frame() -> None:
+    shown = list[int]()
+
+    class Viewer(NullViewer):
+        def show(self, moment: Moment) -> None:
+            assert moment.check is not None
+            shown.append(moment.check.frame_number)
+
+    processing = Processing(Bench(RIG), network, checks=EveryFrames(RIG, every=2, accuracy="draft"))
+    run_live(WallCamera(5, period_s=0.0), processing, Viewer(), stop=Event(), recorded=True)
+    assert shown == [0, 0, 2, 2, 4]

@@ -12,6 +12,7 @@ from nlos_calibration.errors import CalibrationError
 from nlos_cam.bench import Bench, Look
 from nlos_cam.frame_reader import FrameReader
 from nlos_cam.live_report import Step
+from nlos_cam.physics_check import Check
 from nlos_cam.processing import Processing, read_along, signs_of, steps
 from nlos_cam.reconstruct import Clock
 from nlos_cam.verdict import Signs, Verdict
@@ -154,4 +155,6 @@ def test_a_lidar_that_moved_is_the_verdict_whatever_the_networks_say(tmp_path: P
 )
 def test_what_is_amiss_with_a_frame_is_a_sign(change: dict[str, np.ndarray], signs: Signs) -> None:
     whole = replace(wall_frame(0), depth_m=np.full((64, 80), 0.3, np.float32))
-    assert signs_of(replace(whole, **change), Look(None, ())) == signs
+    assert signs_of(replace(whole, **change), Look(None, ()), None) == signs
+    check = Check(0, np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32), score=1.0, seconds=0.0)
+    assert signs_of(replace(whole, **change), Look(None, ()), check) == replace(signs, check=check)

@@ -65,6 +65,14 @@ def test_looks_change_nothing_of_the_result(tmp_path: Path) -> None:
         assert (tmp_path / "plain" / file).read_bytes() == (tmp_path / "looked" / file).read_bytes()
 
 
+def test_what_an_earlier_replay_left_to_look_at_goes_and_nothing_else(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    replayed(out, 40, view=True, stills=4)
+    (out / "mine.png").write_text("keep me")
+    made = replayed(out, 9, stills=1)
+    assert made == NAMES | {"mine.png", "still-000000.png"}
+
+
 @pytest.mark.parametrize("count", [1, 2, 40])
 def test_there_are_as_many_stills_as_asked_for_or_frames(tmp_path: Path, count: int) -> None:
     made = replayed(tmp_path / "out", count, stills=4) - NAMES
