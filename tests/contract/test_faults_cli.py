@@ -68,6 +68,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(commands, "open_camera", opened)
     monkeypatch.setattr(commands, "load_networks", lambda *_: FakeNetwork())
+    monkeypatch.setattr(commands, "load_doubt", lambda *_: None)
 
 
 def run(folder: Path, faults: str, *options: str) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_doubter import FakeDoubter
 from fake_wall import RIG, SERIAL, WallCamera, bare_wall, write_wall
 from nlos_calibration.errors import RecordFileError
 from nlos_models.errors import CheckpointError
@@ -39,6 +40,7 @@ class HalfSurface:
 def opened(monkeypatch: pytest.MonkeyPatch) -> Callable[..., api.Stream]:
     """The stream of a camera that is given, by networks that need no time."""
     monkeypatch.setattr(api, "load_networks", lambda *_: HalfSurface())
+    monkeypatch.setattr(api, "load_doubt", lambda *_: FakeDoubter())
 
     def make(camera: Camera, uri: str = "bag:fake.bag", **options: Any) -> api.Stream:
         monkeypatch.setattr(api, "open_camera", lambda *_, **__: camera)

@@ -13,11 +13,13 @@ from typing import Any, Self
 
 import numpy as np
 import pytest
+from fake_doubter import FakeDoubter
 from fake_wall import RIG, SERIAL, SMALL, write_wall
 
 from nlos_cam.cli import live as commands
 from nlos_cam.cli.main import main
 from nlos_cam.frames import Frame
+from nlos_cam.verdict import Verdict
 from nlos_cam.view import rerun_viewer
 
 
@@ -74,6 +76,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Opened]:
     opened = Opened()
     monkeypatch.setattr(commands, "open_camera", opened)
     monkeypatch.setattr(commands, "load_networks", lambda *_: FakeNetwork())
+    monkeypatch.setattr(commands, "load_doubt", lambda *_: FakeDoubter())
     monkeypatch.chdir(tmp_path)
     before = signal.getsignal(signal.SIGINT)
     yield opened
@@ -105,8 +108,9 @@ def test_live_ends_with_one_object_that_scripts_depend_on(capsys: pytest.Capture
     fields = ("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings")
     assert set(report) == {*fields, "stages_percentiles_ms", "verdicts", "stalled_s"}
     assert (report["frames"], report["dropped"]) == (20, 0)
+    assert report["verdicts"] == {Verdict.SEEN.value: 20}
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
-    assert set(report["stages_ms"]) == {"delivery", "wait", "queue", "maps", "bench", "network", "view"}
+    assert set(report["stages_ms"]) == {"delivery", "wait", "queue", "maps", "bench", "network", "doubt", "view"}
 
 
 @pytest.mark.usefixtures("opened")

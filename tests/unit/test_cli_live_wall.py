@@ -34,6 +34,7 @@ class FakeNetwork:
 def network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeNetwork:
     found = FakeNetwork()
     monkeypatch.setattr(commands, "load_networks", lambda *_: found)
+    monkeypatch.setattr(commands, "load_doubt", lambda *_: None)
     monkeypatch.chdir(tmp_path)
     write_wall(tmp_path / "wall.toml", bare_wall())
     use(monkeypatch, WallCamera(150, moved=range(30, 80)))
