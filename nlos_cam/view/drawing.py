@@ -29,7 +29,7 @@ from nlos_cam.view.pictures import (
     uncertainty_rgb,
 )
 from nlos_cam.view.plots import Plots
-from nlos_cam.view.verdict_picture import NOTED_PIXELS, banner_rgb, may_be_believed, noted_rgb
+from nlos_cam.view.verdict_picture import NOTED_PIXELS, as_believed, banner_rgb, may_be_believed
 from nlos_cam.view.viewer import Moment
 from nlos_cam.view.wall_drawing import bench_drawings, wall_names, wall_pictures
 from nlos_cam.view.wall_text import calibration_text
@@ -51,7 +51,7 @@ def new_recording(batcher: rr.ChunkBatcherConfig | None = None) -> rr.RecordingS
 class Drawing:
     """Draws moments into a recording, which is one browser's or one file's.
 
-    Of a `saved` one the lidar's pictures are smaller, and the panel of time opens with it.
+    Of a `saved` one pictures are compressed and the lidar's smaller, and the panel of time opens with it.
     """
 
     def __init__(
@@ -96,8 +96,14 @@ class Drawing:
         self._recording.log(path, thing, static=static)
 
     def _picture(self, path: str, picture: NDArray[np.uint8], suffix: str = ".png") -> None:
-        """Log a picture, small ones without loss: compressed, it costs less to send than to send whole."""
-        self._log(path, rr.EncodedImage(contents=encoded(picture, suffix), media_type=MEDIA_TYPES[suffix]))
+        """Log a picture; in a file compressed, small ones without loss.
+
+        All of one path must be of one kind: Rerun takes such a sequence for a video, and would start it anew live.
+        """
+        if self._saved:
+            self._log(path, rr.EncodedImage(contents=encoded(picture, suffix), media_type=MEDIA_TYPES[suffix]))
+        else:
+            self._log(path, rr.Image(picture))
 
     def _draw_verdict(self, moment: Moment) -> None:
         """Show the verdict in its panel, if it is another than before; a picture with a note on it is larger."""
@@ -111,10 +117,7 @@ class Drawing:
     def _draw_hidden(self, moment: Moment) -> None:
         depth_m, truth_m = moment.reconstruction.depth_m, moment.frame.truth_depth_m
         uncertainty_m, rgb = moment.reconstruction.uncertainty_m, hidden_rgb(depth_m, self._box)
-        if moment.verdict is None or may_be_believed(moment.verdict):
-            self._picture("reconstruction", rgb)
-        else:
-            self._picture("reconstruction", noted_rgb(rgb, moment.verdict), ".jpg")
+        self._picture("reconstruction", as_believed(rgb, moment.verdict))
         if uncertainty_m is not None:
             self._picture("uncertainty", uncertainty_rgb(uncertainty_m, depth_m))
         if truth_m is not None:

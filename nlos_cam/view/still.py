@@ -19,7 +19,7 @@ from nlos_cam.view.pictures import (
     relief_rgb,
     uncertainty_rgb,
 )
-from nlos_cam.view.verdict_picture import PALE_RGB, banner_rgb, font, may_be_believed, noted_rgb
+from nlos_cam.view.verdict_picture import PALE_RGB, as_believed, banner_rgb, font
 from nlos_cam.view.viewer import Moment
 
 WIDTH, HEIGHT = 1280, 720
@@ -58,9 +58,7 @@ class Still:
 
     def _draw_hidden(self, page: "_Page", moment: Moment) -> None:
         depth_m, box = moment.reconstruction.depth_m, self._box
-        rgb = hidden_rgb(depth_m, box)
-        if moment.verdict is not None and not may_be_believed(moment.verdict):
-            rgb = noted_rgb(rgb, moment.verdict)
+        rgb = as_believed(hidden_rgb(depth_m, box), moment.verdict)
         page.picture(LARGE_AT, "Hidden around the corner: reconstruction", rgb, (LARGE, LARGE))
         scale = np.linspace(box.z_near_m, box.z_far_m, BAR_STEPS, dtype=np.float32)[:, np.newaxis]
         page.bar(LARGE_AT, LARGE, hidden_rgb(scale, box), f"{1e2 * box.z_near_m:.0f} cm", f"{1e2 * box.z_far_m:.0f} cm")

@@ -61,11 +61,13 @@ def banner_rgb(verdict: Verdict | None) -> Rgb:
     return np.asarray(image)
 
 
-def noted_rgb(rgb: Rgb, verdict: Verdict) -> Rgb:
-    """A reconstruction's picture (64, 64, 3) that may not be believed (512, 512, 3): faded, framed and named.
+def as_believed(rgb: Rgb, verdict: Verdict | None) -> Rgb:
+    """A reconstruction's picture (64, 64, 3) as it is; if it may not be believed (512, 512, 3): faded, framed, named.
 
     What is doubted is hatched too; what is nothing is not.
     """
+    if verdict is None or may_be_believed(verdict):
+        return rgb
     large = faded(rgb).repeat(NOTED_PIXELS // len(rgb), axis=0).repeat(NOTED_PIXELS // len(rgb), axis=1)
     note = note_rgba(verdict)
     alpha = note[..., 3:].astype(np.uint16)

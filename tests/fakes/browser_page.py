@@ -2,6 +2,7 @@
 
 import io
 import shutil
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -43,7 +44,7 @@ class Page:
         """Where it fetched from."""
         self.page = browser.new_page(viewport=SIZE)
         self.page.on("request", lambda request: self.hosts.add(urlsplit(request.url).hostname))
-        self.page.goto(address, wait_until="commit")
+        self.page.goto(address, wait_until="commit", timeout=1e3 * DRAW_TIMEOUT_S)
 
     def look(self) -> Pixels:
         """The page as it is now; a browser too busy drawing to hand out a picture is asked again."""
@@ -64,7 +65,10 @@ class Page:
         """Look until it holds; fails where it does not in time."""
         deadline_s = time.monotonic() + DRAW_TIMEOUT_S
         while not holds(seen := self.look()):
-            assert time.monotonic() < deadline_s, f"not within {DRAW_TIMEOUT_S:.0f} s: {what}"
+            if time.monotonic() > deadline_s:
+                picture = Path(tempfile.gettempdir()) / "page.png"
+                Image.fromarray(seen.astype(np.uint8)).save(picture)
+                pytest.fail(f"not within {DRAW_TIMEOUT_S:.0f} s: {what}; the page is in {picture}")
             self.page.wait_for_timeout(300)
         return seen
 

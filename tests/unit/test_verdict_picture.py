@@ -7,12 +7,12 @@ from nlos_cam.view.verdict_picture import (
     BANNER_HEIGHT,
     BANNER_WIDTH,
     LOOKS,
+    as_believed,
     banner_rgb,
     font,
     look_of,
     may_be_believed,
     note_rgba,
-    noted_rgb,
 )
 
 DOUBTED = [verdict for verdict in Verdict if verdict is not Verdict.SEEN]
@@ -55,7 +55,8 @@ def test_what_is_doubted_is_hatched_and_what_is_nothing_is_not() -> None:
 def test_a_picture_under_a_note_keeps_its_place_and_loses_its_colour() -> None:
     rgb = np.full((64, 64, 3), BACKGROUND_RGB, np.uint8)
     rgb[10:20, 30:40] = 255, 160, 0
-    noted = noted_rgb(rgb, Verdict.NOTHING).astype(int)
+    assert as_believed(rgb, None) is as_believed(rgb, Verdict.SEEN) is rgb
+    noted = as_believed(rgb, Verdict.NOTHING).astype(int)
     assert noted.shape == (512, 512, 3)
     inside, outside = noted[100, 300], noted[40, 40]
     assert inside.sum() > outside.sum() + 200
