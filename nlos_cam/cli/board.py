@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 from nlos_calibration.board import BOARDS, PAPER_MM, Paper
-from rich.markup import escape
 
 from nlos_cam.board_sheet import write_sheet
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path
@@ -28,7 +27,7 @@ def board(out: Out = None, paper: OnPaper = "a4", overwrite: Overwrite = False, 
     text = (
         f"{squares} on {paper}\n"
         "print at 100 % with a laser printer (dye ink is white in infrared), and measure the bar: 100 mm\n"
-        f"wrote {escape(str(path))}"
+        f"wrote {path}"
     )
     result = {"out": str(path), "paper": paper, "page_mm": list(PAPER_MM[paper]), **printed.model_dump()}
     finish(result, as_json=json, text=text)

@@ -131,7 +131,7 @@ def calibrate(
         record, inliers = _record(seen, fit, facts, by_hand), fit.inliers if isinstance(fit, WallFit) else None
     record = written(files, record, None if inliers is None else seen.reference(inliers))
     result = record.model_dump(mode="json", include=TOLD) | {"out": str(files.record), "report": str(files.report)}
-    finish(result, as_json=json, text=told(record, files))
+    finish(result, as_json=json, text=told(record, files), marked=True)
 
 
 def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path | None) -> str:

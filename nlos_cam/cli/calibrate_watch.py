@@ -46,7 +46,7 @@ def until_enter() -> Callable[[], bool]:
 
 def watch_until_enter(camera: Camera) -> None:
     """Show the wall until Enter is pressed."""
-    say("position the lidar; [bold]Enter[/] measures, Ctrl-C leaves")
+    say("position the lidar; [bold]Enter[/] measures, Ctrl-C leaves", marked=True)
     with camera as source:
         last = watch(source, until_enter())
     if last is not None:

@@ -87,9 +87,9 @@ def capture(
     with stop_on_signals() as stop:
         made = _make(Takes(source, recording, jobs, wall=measured), stop, each, pause_s)
         interrupted = stop.is_set() or made[-1].state == "interrupted"
-    finish(result(made, several=takes > 1), as_json=json, text=escape("\n".join(map(told, made))))
+    finish(result(made, several=takes > 1), as_json=json, text="\n".join(map(told, made)))
     if failure := ending(made[-1]):
-        say(f"[bold red]error:[/] {escape(str(failure))}")
+        say(f"[bold red]error:[/] {escape(str(failure))}", marked=True)
         raise typer.Exit(failure.exit_code)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
@@ -139,7 +139,7 @@ def _make(takes: Takes, stop: Event, each: int | None, pause_s: float | None) ->
             for take in recorded:
                 made.append(settle(take, partial(_read_back, bar, take.sets)))
                 if dropped := made[-1].summary.dropped:
-                    say(f"[yellow]{dropped} frames never came:[/] the recording has gaps")
+                    say(f"[yellow]{dropped} frames never came:[/] the recording has gaps", marked=True)
                 if made[-1].state != "complete" or stop.is_set():
                     break
                 if left := len(takes.jobs) - len(made):
@@ -164,7 +164,7 @@ def _read_back(bar: Progress, sets: int, path: Path) -> Verified | None:
 
 def _pause(bar: Progress, stop: Event, pause_s: float | None, text: str) -> None:
     """Wait so long, or for Enter on a terminal; Ctrl-C sets `stop`."""
-    say(escape(text))
+    say(text)
     if pause_s is not None or not sys.stdin.isatty():
         stop.wait(pause_s or 0.0)
         return

@@ -36,19 +36,22 @@ INTERRUPTED = 130
 stderr = Console(stderr=True, highlight=False)
 
 
-def say(text: str) -> None:
-    """Tell the person at the terminal; never on stdout, which belongs to results."""
-    stderr.print(text, soft_wrap=True)
+def say(text: str, *, marked: bool = False) -> None:
+    """Tell the person at the terminal, never on stdout, which belongs to results; `marked` with Rich's markup."""
+    stderr.print(text, soft_wrap=True, markup=marked)
 
 
-def finish(result: dict[str, Any], *, as_json: bool, text: str, note: str = "") -> None:
-    """End a command: one JSON object on stdout, or a sentence for a person; a note is in either."""
+def finish(result: dict[str, Any], *, as_json: bool, text: str, note: str = "", marked: bool = False) -> None:
+    """End a command: one JSON object on stdout, or a sentence for a person, `marked` where it has Rich's markup.
+
+    A note is in either.
+    """
     if note:
         result, text = {**result, "note": note}, f"{text} ({note})"
     if as_json:
         print(json_module.dumps(result), flush=True)  # noqa: T201  stdout is the machine's
     else:
-        Console(highlight=False).print(text, soft_wrap=True)
+        Console(highlight=False).print(text, soft_wrap=True, markup=marked)
 
 
 def show(table: Table) -> None:

@@ -28,7 +28,7 @@ def devices(json: Json = False) -> None:
     facts = gather()
     if not json:
         show(_table(facts))
-    finish(_result(facts), as_json=json, text=_told(facts))
+    finish(_result(facts), as_json=json, text=_told(facts), marked=True)
 
 
 def _result(facts: Facts) -> dict[str, Any]:

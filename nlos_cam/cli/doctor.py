@@ -32,7 +32,7 @@ def doctor(write_udev: WriteUdev = None, overwrite: Overwrite = False, json: Jso
         show(_table(checks))
     failures = sum(check.status == "failed" for check in checks)
     result = {"checks": [asdict(check) for check in checks], "ok": not failures}
-    finish(result, as_json=json, text=_told(checks, failures))
+    finish(result, as_json=json, text=_told(checks, failures), marked=True)
 
 
 def _write(path: Path) -> None:
@@ -40,7 +40,7 @@ def _write(path: Path) -> None:
         path.write_text(rules(), encoding="utf-8")
     except OSError as error:
         raise NlosCamError(f"{path} cannot be written ({error.strerror}): write it here, then install it") from error
-    say(f"wrote {escape(str(path))}; to put it in force, run, and plug the camera in again:\n  {install(str(path))}")
+    say(f"wrote {path!s}; to put it in force, run, and plug the camera in again:\n  {install(str(path))}")
 
 
 def _table(checks: Sequence[Check]) -> Table:

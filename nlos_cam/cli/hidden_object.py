@@ -7,7 +7,6 @@ import numpy as np
 import typer
 from nlos_calibration.rig import Rig, first_problem
 from pydantic import ValidationError
-from rich.markup import escape
 
 from nlos_cam.cli.common import say
 from nlos_cam.errors import SceneError
@@ -67,7 +66,7 @@ def _refuse(given: dict[str, Any], pointless: set[str], why: str) -> None:
 def _depth_map(path: Path) -> Float32:
     depth_m = read_depth_map(path)
     if np.isnan(depth_m).all():
-        say(escape(f"{path} is an empty object (all of it is NaN): it hides nothing"))
+        say(f"{path} is an empty object (all of it is NaN): it hides nothing")
     return depth_m
 
 
@@ -82,8 +81,8 @@ def _placed(fields: dict[str, Any], rig: Rig) -> Float32:
         raise nothing_to_see(thing.label, box)
     taken = fit(thing.triangles, scene.pose_at(thing, 0), box)
     if taken.outside:
-        say(escape(f"{thing.label}: {taken.outside:.0%} of its silhouette is outside the object box, and cut off"))
+        say(f"{thing.label}: {taken.outside:.0%} of its silhouette is outside the object box, and cut off")
     if taken.depth_m > taken.room_m:
         depths = f"{taken.depth_m:.3g} m deep, flattened to the {taken.room_m:.3g} m that the object box has for it"
-        say(escape(f"{thing.label}: {depths}"))
+        say(f"{thing.label}: {depths}")
     return depth_m

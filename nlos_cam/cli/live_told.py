@@ -9,7 +9,7 @@ from nlos_cam.sightings import in_words
 
 def warn(warning: str, begins: bool) -> None:
     """Tell that a warning begins, or ends."""
-    say(f"[yellow]warning:[/] {escape(warning)}" if begins else f"no longer: {escape(warning)}")
+    say(f"[yellow]warning:[/] {escape(warning)}" if begins else f"no longer: {escape(warning)}", marked=True)
 
 
 def told(report: LiveReport) -> str:
@@ -26,7 +26,7 @@ def told(report: LiveReport) -> str:
         lines.append(f"seen     {seen}")
     if report.stalled_s:
         lines.append(f"stalled  {report.stalled_s:.1f} s without a frame")
-    lines += [f"warning  {frames} frames: {escape(text)}" for text, frames in report.warnings.items()]
+    lines += [f"warning  {frames} frames: {text}" for text, frames in report.warnings.items()]
     return "\n".join(lines)
 
 

@@ -56,7 +56,7 @@ def tell_of_view(
     taken = port is None and urlsplit(viewer.address).port != PREFERRED_PORT
     say(f"{what}: {viewer.address}  (Ctrl-C ends it{f'; port {PREFERRED_PORT} is taken' if taken else ''})")
     if host and (told := exposed(host, urlsplit(viewer.address).port or 0)):
-        say(f"[yellow]note:[/] {told}")
+        say(f"[yellow]note:[/] {told}", marked=True)
     if open_it and not opened_in_browser(viewer.address):
         say(f"note: no browser could be opened here: open {viewer.address} in one")
 

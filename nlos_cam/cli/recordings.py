@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.repair import Repaired, repair
@@ -54,7 +53,7 @@ def repair_bag(bag: DamagedBag, out: NewBag = None, overwrite: Overwrite = False
         "damaged": len(found.damages),
         "out": str(path),
     }
-    finish(result, as_json=json, text=escape(_told_repair(found)))
+    finish(result, as_json=json, text=_told_repair(found))
 
 
 def _told_repair(found: Repaired) -> str:
@@ -94,4 +93,4 @@ def export_bag(
 
 def _told_export(made: Exported) -> str:
     written = ", ".join(f"{count} {name}" for name, count in made.frames.items())
-    return f"{written}\nwrote {escape(made.out)}"
+    return f"{written}\nwrote {made.out}"

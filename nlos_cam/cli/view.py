@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from nlos_cam.bench import Bench
-from nlos_cam.cli.common import INTERRUPTED, interrupted_by_signals, stop_on_signals
+from nlos_cam.cli.common import INTERRUPTED, Json, finish, interrupted_by_signals, stop_on_signals
 from nlos_cam.cli.live_view import Open, ViewHost, ViewPort, tell_of_view
 from nlos_cam.view.assets import LOOPBACK
 from nlos_cam.view.viewer import Viewer, Viewers
@@ -31,6 +31,7 @@ def view(
     view_port: ViewPort = None,
     view_host: ViewHost = None,
     open_view: Open = False,
+    json: Json = False,
 ) -> None:
     """Look at a saved view in a browser, with play, pause and scrubbing."""
     from nlos_cam.view.recorded import RecordedView
@@ -39,7 +40,9 @@ def view(
         recorded = RecordedView(file, host=view_host or LOOPBACK, port=view_port)
     with stop_on_signals() as stop, recorded:
         tell_of_view(recorded, host=view_host, port=view_port, open_it=open_view, what="saved view")
+        address = recorded.address
         stop.wait(seconds)
+    finish({"file": str(file), "address": address}, as_json=json, text=f"{file} was at {address}")
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nlos_cam.cli.common import output_path
+from nlos_cam.cli.common import finish, output_path, say
 from nlos_cam.errors import OutputExistsError
 
 
@@ -30,3 +30,12 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_anything_is_measured(
     monkeypatch.setattr(os, "access", access)
     with pytest.raises(OutputExistsError, match=r"wall\.toml cannot be written to"):
         output_path(out, "wall", ".toml", overwrite=True)
+
+
+def test_what_is_told_is_told_whole_unless_it_is_marked(capsys: pytest.CaptureFixture[str]) -> None:
+    finish({}, as_json=False, text="wrote runs/[bold]x")
+    finish({}, as_json=False, text="[bold]good[/]", marked=True)
+    say("kept in [red]")
+    told = capsys.readouterr()
+    assert told.out == "wrote runs/[bold]x\ngood\n"
+    assert told.err == "kept in [red]\n"

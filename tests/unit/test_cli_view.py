@@ -81,7 +81,8 @@ class FakeNetwork:
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(live, "open_camera", lambda *_, **__: Recorded(12))
-    monkeypatch.setattr(live, "load_reconstructor", lambda *_: FakeNetwork())
+    monkeypatch.setattr(live, "load_networks", lambda *_: FakeNetwork())
+    monkeypatch.setattr(live, "load_doubt", lambda *_: None)
     monkeypatch.chdir(tmp_path)
 
 

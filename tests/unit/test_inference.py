@@ -136,10 +136,10 @@ def test_networks_of_full_colour_are_not_exported(pipeline: Pipeline, tmp_path: 
 
 
 def test_the_exports_name_changes_with_the_weights(pipeline: Pipeline) -> None:
-    before = inference._checksum(pipeline)
-    assert inference._checksum(pipeline) == before
+    before = inference.checksum_of(pipeline)
+    assert inference.checksum_of(pipeline) == before
     other = Pipeline(pipeline.compressor, Decoder())
-    assert inference._checksum(other) != before
+    assert inference.checksum_of(other) != before
 
 
 def test_weights_that_are_not_there_are_a_checkpoint_error(tmp_path: Path) -> None:
