@@ -175,7 +175,7 @@ def test_without_a_limit_it_is_told_how_long_there_is_room(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[str] = []
-    monkeypatch.setattr(capture, "say", told.append)
+    monkeypatch.setattr(capture, "say", lambda text, **_: told.append(text))
     monkeypatch.setattr(capture, "free_bytes", lambda _: 200_000_000 + 64 * 48 * 4 * 30 * 90)
     monkeypatch.setattr(capture.Takes, "record", lambda *_: (one for one in [ended_at_once(tmp_path)]))
     assert run("--out", str(tmp_path / "a.bag"))["exit"] == 130
@@ -186,7 +186,7 @@ def test_an_error_that_ends_a_take_is_told_and_gives_the_exit_code(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[str] = []
-    monkeypatch.setattr(capture, "say", told.append)
+    monkeypatch.setattr(capture, "say", lambda text, **_: told.append(text))
     monkeypatch.setattr(capture, "verify", lambda *_, **__: Verified(3, 0, 0.1, {}))
     found = run("--frames", "5", "--out", str(tmp_path / "a.bag"))
     assert (found["exit"], found["state"], found["error"]["type"]) == (4, "damaged", "RecordingError")
@@ -196,7 +196,7 @@ def test_an_error_that_ends_a_take_is_told_and_gives_the_exit_code(
 def test_gaps_are_told(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(capture, "verify", lambda *_, **__: Verified(5, 2, 0.1, {}))
     told: list[str] = []
-    monkeypatch.setattr(capture, "say", told.append)
+    monkeypatch.setattr(capture, "say", lambda text, **_: told.append(text))
     assert run("--frames", "5", "--out", str(tmp_path / "a.bag"))["dropped"] == 2
     assert "2 frames never came" in told[0]
 

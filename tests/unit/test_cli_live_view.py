@@ -27,7 +27,7 @@ def no_assets(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     lines: list[str] = []
-    monkeypatch.setattr(live_view, "say", lines.append)
+    monkeypatch.setattr(live_view, "say", lambda text, **_: lines.append(text))
     return lines
 
 
