@@ -119,7 +119,7 @@ def _picture(origin: str, name: str) -> rrb.Spatial2DView:
 def _bench(rig: Rig, away: float = 1.0) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
         origin="bench",
-        name="Bench (drag to turn)",
+        name="Bench",
         line_grid=False,
         eye_controls=_eye(rig, away),
         background=BACKGROUND_RGB,

@@ -98,9 +98,9 @@ def test_each_panel_changes_with_its_part_of_a_moment_and_a_page_opened_again_sh
             feed.make = still
             if PLOTS not in regions:  # which remember
                 page.until(partial(is_alike, before, regions), "it is as before")
-        for panel, tabs in {DEPTH: 2, LIGHT: 2, PLOTS: 4}.items():
+        for panel, tabs in ((DEPTH, 2), (LIGHT, 2), (PLOTS, 4)):
             for tab in range(1, tabs):
-                page.open_tab(tab, panel)
+                page.open_tab(tab, panel, before)
                 page.until(partial(differs, before, [panel]), f"tab {tab} is open")
         page.close()
         page = Page(browser, viewer.address or "")
@@ -119,9 +119,10 @@ def test_the_calibrated_view_shows_what_changed_and_the_calibration(browser: Any
             lambda now: share_changed(before, now, LIGHT) > 0.2 and share_changed(before, now, PLOTS) > 0.002,
             "the change and the warning",
         )
+        closed = before
         for tab in (1, 2, 3):
             before = page.look()
-            page.open_tab(tab, BENCH)
+            page.open_tab(tab, BENCH, closed)
             page.until(
                 lambda now, before=before: share_changed(before, now, BENCH) > 0.05, f"picture {tab} of the wall"
             )

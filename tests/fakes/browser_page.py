@@ -22,6 +22,8 @@ SIZE = {"width": 1280, "height": 800}
 DRAW_TIMEOUT_S = 180.0
 BUTTONS_PX, TAB_GAP_PX, LEAST_TAB_PX, HEADER_PX = 105, 10, 24, 14
 """Of a panel's header: what its buttons take on the right, what parts its tabs, and what is no tab; its middle."""
+NOWHERE = 620, 107
+"""Where the mouse hovers over nothing: what it hovers over looks otherwise."""
 FEED_S = 0.25
 
 Pixels = np.ndarray
@@ -74,11 +76,12 @@ class Page:
 
     def click(self, x: float, y: float) -> None:
         self.page.mouse.click(x, y)
+        self.page.mouse.move(*NOWHERE)
 
-    def open_tab(self, number: int, region: Region) -> None:
-        """Open a tab of the panel that is below its header."""
+    def open_tab(self, number: int, region: Region, before: Pixels) -> None:
+        """Open a tab of the panel that is below its header, by where it was before any was clicked, and looked so."""
         top, left = region[0].start - HEADER_PX, region[1].start
-        middles = tab_middles(self.look()[top - 8 : top + 8, left : region[1].stop - BUTTONS_PX])
+        middles = tab_middles(before[top - 8 : top + 8, left : region[1].stop - BUTTONS_PX])
         assert len(middles) > number, f"only {len(middles)} tabs"
         self.click(left + middles[number], top)
 
