@@ -22,7 +22,7 @@ QUEUE_MOMENTS = 4
 BATCH_S = 1.0
 """What a kill may cost of the end."""
 MOST_BYTES = 2 << 30
-"""A file ends there, an hour or more on: browsers cannot load more."""
+"""A file ends there, two hours on: browsers cannot load more."""
 
 
 class SavedView:
