@@ -2,6 +2,7 @@
 
     NlosCamError                     exit 1   root; one clear line: what, the value, what to do
     ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be rendered
+    ├── BudgetError (ValueError)     exit 1   a delay that no setting keeps on this machine
     ├── OutputExistsError (FileExistsError)  exit 1   --out is there and --overwrite was not given
     ├── DiskFullError (OSError)      exit 1   too little room for what is to be written, or none left
     ├── FolderBusyError (BlockingIOError)  exit 1   another process writes to the folder
@@ -24,6 +25,10 @@ class NlosCamError(Exception):
 
 class SceneError(NlosCamError, ValueError):
     """A scene, an object or an accuracy that cannot be rendered."""
+
+
+class BudgetError(NlosCamError, ValueError):
+    """A delay that no setting keeps on this machine."""
 
 
 class OutputExistsError(NlosCamError, FileExistsError):

@@ -1,7 +1,7 @@
 """The streaming loop: each frame's way from a camera to a reconstruction and to a viewer, timed."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from threading import Event
 
 import numpy as np
@@ -19,15 +19,15 @@ from nlos_cam.view.viewer import Moment, Viewer
 USUAL_DEPTH_M = 0.3
 
 
-def warm_up(camera: Camera, processing: Processing) -> None:
-    """Reconstruct a frame that is all the same, before the camera is entered.
+def warm_up(camera: Camera, processing: Processing, clock: Clock = time.perf_counter) -> Mapping[str, float]:
+    """Reconstruct a frame that is all the same, before the camera is entered; seconds by stage.
 
     What is compiled or allocated on first use would otherwise hold up the first frame, and drop those after it.
     """
     shape = camera.intrinsics.height, camera.intrinsics.width
     dark, flat = np.zeros(shape, np.uint8), np.full(shape, USUAL_DEPTH_M, np.float32)
     frame = Frame(flat, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics)
-    reconstruct(maps_from_frame(frame), processing.bench.rig, processing.network)
+    return reconstruct(maps_from_frame(frame), processing.bench.rig, processing.network, clock).timings_s
 
 
 def run_live(

@@ -11,7 +11,7 @@ import torch
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_models.checkpoint import load_pipeline
 from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, exported
-from nlos_models.quantise import quantise
+from nlos_models.quantise import Sample, quantise
 
 from nlos_cam import dataset
 from nlos_cam.camera.streams import FRAMES_PER_S
@@ -84,12 +84,20 @@ class Bench:
 
 
 def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dict[str, Make]:
-    """Every runtime and number format of some weights, by name. 8-bit ranges are learnt from training objects."""
+    """Every runtime and number format of some weights, by name; 8-bit ones are quantised when they are first made.
+
+    Their ranges are learnt from training objects.
+    """
     pipeline, record = load_pipeline(weights)
     model = exported(pipeline, cache)
 
-    def onnx(path: Path) -> Make:
-        return lambda threads: OnnxReconstructor(path, record, threads)
+    def onnx(path: Path, samples: Callable[[], Iterator[Sample] | None] = lambda: None) -> Make:
+        def make(threads: int) -> Reconstructor:
+            if not path.exists():
+                quantise(model, path, samples())
+            return OnnxReconstructor(path, record, threads)
+
+        return make
 
     def in_torch(device: str, dtype: torch.dtype) -> Make:
         def make(threads: int) -> Reconstructor:
@@ -101,19 +109,15 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
     formats = {"float32": torch.float32, "bfloat16": torch.bfloat16}
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     dynamic, static = (model.with_suffix(f".{kind}.onnx") for kind in ("dynamic", f"static-{rig.checksum}"))
-    if not dynamic.exists():
-        quantise(model, dynamic)
-    if not static.exists():
-        quantise(model, static, calibration(rig, box))
     return {
         **{f"torch {name}, {device}": in_torch(device, dtype) for device in devices for name, dtype in formats.items()},
         "ONNX Runtime float32": onnx(model),
         "ONNX Runtime int8 weights": onnx(dynamic),
-        "ONNX Runtime int8": onnx(static),
+        "ONNX Runtime int8": onnx(static, lambda: calibration(rig, box)),
     }
 
 
-def calibration(rig: Rig, box: ObjectBox) -> Iterator[tuple[Float32, Float32]]:
+def calibration(rig: Rig, box: ObjectBox) -> Iterator[Sample]:
     """Maps of training objects, one at a time."""
     subjects = seeded_objects(dataset.TRAINING_SEED, CALIBRATING, box)
     for maps in sense(echoes_of(subjects, rig, _untold), rig):

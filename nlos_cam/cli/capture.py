@@ -17,7 +17,7 @@ from nlos_cam.camera.replay import Verified, verify
 from nlos_cam.camera.sidecar import sidecar_path, wall_of
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.camera.takes import Job, Take, Takes, settle
-from nlos_cam.cli.capture_told import ending, result, told
+from nlos_cam.cli.capture_told import ending, nothing, result, told
 from nlos_cam.cli.common import (
     INTERRUPTED,
     Json,
@@ -74,8 +74,14 @@ def capture(
     jobs = _jobs(_base(seconds, frames, takes, out), takes, label or [], overwrite=overwrite)
     measured = wall_of(wall) if wall else None
     recording = Recording(jobs[0].path, frames=frames, seconds=seconds, last=takes == 1)
-    with interrupted_by_signals(), tracked("rendering the world ahead") as on_progress:
-        source = open_camera(camera, on_progress=on_progress, recording=recording)
+    try:
+        with interrupted_by_signals(), tracked("rendering the world ahead") as on_progress:
+            source = open_camera(camera, on_progress=on_progress, recording=recording)
+    except KeyboardInterrupt:
+        finish(
+            nothing(jobs, several=takes > 1), as_json=json, text="interrupted before the first frame: nothing is kept"
+        )
+        raise typer.Exit(INTERRUPTED) from None
     each = frames or (round(seconds * FRAMES_PER_S) if seconds else None)
     _check_disk(source, jobs, each)
     with stop_on_signals() as stop:

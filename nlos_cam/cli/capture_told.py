@@ -1,10 +1,11 @@
 """What `nlos-cam capture` tells of its takes: JSON, a sentence, and the error that ended them."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from nlos_cam.camera.sidecar import Summary
-from nlos_cam.camera.takes import Take
+from nlos_cam.camera.sidecar import State, Summary, sidecar_path
+from nlos_cam.camera.takes import Job, Take
 from nlos_cam.errors import NlosCamError
 
 FIGURES = ("saturated_share", "invalid_share", "temporal_noise_mm")
@@ -12,27 +13,39 @@ FIGURES = ("saturated_share", "invalid_share", "temporal_noise_mm")
 
 def result(takes: Sequence[Take], *, several: bool) -> dict[str, Any]:
     """One take as it is, several as {"takes": [...]} with totals; with the error that ended them, if one did."""
-    each = [_one(take) for take in takes]
-    totals = {key: sum(one[key] or 0 for one in each) for key in ("frames", "dropped", "seconds")}
-    made: dict[str, Any] = {"takes": each} | totals if several else each[0]
+    made = _all([_one(take) for take in takes], several=several)
     if error := ending(takes[-1]):
         made["error"] = {"type": type(error).__name__, "message": str(error)}
     return made
 
 
+def nothing(jobs: Sequence[Job], *, several: bool) -> dict[str, Any]:
+    """The same where it was interrupted before the camera ran."""
+    none = Summary(frames=0, dropped=0, seconds=0.0, streams={}, events={})
+    return _all([_told_of(job, "interrupted", none, sidecar_path(job.path)) for job in jobs[:1]], several=several)
+
+
+def _all(each: list[dict[str, Any]], *, several: bool) -> dict[str, Any]:
+    totals = {key: sum(one[key] or 0 for one in each) for key in ("frames", "dropped", "seconds")}
+    return {"takes": each} | totals if several else each[0]
+
+
 def _one(take: Take) -> dict[str, Any]:
-    summary = take.summary
+    return _told_of(take.job, take.state, take.summary, take.sidecar.path)
+
+
+def _told_of(job: Job, state: State, summary: Summary, sidecar: Path) -> dict[str, Any]:
     made: dict[str, Any] = {
         "frames": summary.frames,
         "dropped": summary.dropped,
         "seconds": None if summary.seconds is None else round(summary.seconds, 3),
-        "out": str(take.job.path),
-        "state": take.state,
+        "out": str(job.path),
+        "state": state,
         "streams": summary.streams,
         **{key: getattr(summary, key) for key in FIGURES},
-        "sidecar": str(take.sidecar.path),
+        "sidecar": str(sidecar),
     }
-    return made if take.job.label is None else made | {"label": take.job.label}
+    return made if job.label is None else made | {"label": job.label}
 
 
 def ending(take: Take) -> NlosCamError | None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,11 +12,11 @@ from nlos_calibration.errors import RecordFileError
 from nlos_calibration.rig import Rig, load_rig
 from nlos_calibration.rig_difference import rig_difference
 from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.inference import load_reconstructor
+from nlos_models.inference import Reconstructor, load_reconstructor
 
 from nlos_cam.bench import Bench, open_bench
 from nlos_cam.cache import cache_folder
-from nlos_cam.camera import Recording, open_camera
+from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.clock import WallClock
 from nlos_cam.camera.table import Reader
 from nlos_cam.cli.common import (
@@ -30,6 +31,7 @@ from nlos_cam.cli.common import (
     stop_on_signals,
     tracked,
 )
+from nlos_cam.cli.live_budget import BudgetMs, Choice, Tradeoff, loader, options_here, timer, within_budget
 from nlos_cam.cli.live_told import told, warn
 from nlos_cam.cli.live_view import NoView, Open, ViewHost, ViewPort, tell_of_view, viewer_of
 from nlos_cam.cli.view import SUFFIX, SaveReplayView, SaveView, Stills, Video, saving
@@ -74,11 +76,15 @@ def live(
     log: Log = None,
     weights: Weights = None,
     average: Average = 1,
+    budget_ms: BudgetMs = None,
+    tradeoff: Tradeoff = None,
     save_view: SaveView = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
+    if budget_ms is not None and average > 1:
+        raise typer.BadParameter("--budget-ms chooses how many frames are averaged: leave --average away")
     path = _named(record, "--record", "a recording", (".bag",), overwrite=overwrite)
     frame_log = _named(log, "--log", "a log", SUFFIXES, overwrite=overwrite)
     recording = Recording(path, optional=True) if path else None
@@ -87,7 +93,7 @@ def live(
         with tracked("rendering the scene ahead") as on_progress:
             opened = open_camera(camera, on_progress=on_progress, recording=recording)
         bench = open_bench(wall, opened)
-        processing = _processing(bench, weights, average)
+        processing, choice = _chosen(opened, bench, weights, average, budget_ms, tradeoff)
         warm_up(opened, processing)
     viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, view_path)
     with stop_on_signals() as stop, viewer, _logging(frame_log) as on_moment, undisturbed(), opened as source:
@@ -108,7 +114,9 @@ def live(
         say(f"recorded {recording.sets} frames to {recording.path}")
     if view_path:
         say(f"saved the view: nlos-cam view {view_path}")
-    finish(asdict(report), as_json=json, text=told(report))
+    budget = {"budget": choice.outcome(report)} if choice else {}
+    text = [told(report), *([choice.outcome_told(report)] if choice else [])]
+    finish({**asdict(report), **budget}, as_json=json, text="\n".join(text))
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)
 
@@ -168,15 +176,30 @@ def _logging(path: Path | None) -> Generator[Callable[[Moment], None]]:
     say(f"logged each frame to {path}")
 
 
-def _processing(bench: Bench, weights: Path | None, average: int) -> Processing:
+def _chosen(
+    camera: Camera, bench: Bench, weights: Path | None, average: int, budget_ms: float | None, tradeoff: Path | None
+) -> tuple[Processing, Choice | None]:
+    """What is made of frames: as is usual, or within a budget, which then was chosen so."""
+    if budget_ms is None:
+        return _processing(bench, weights, average), None
+    options = options_here(tradeoff, weights)
+    network, choice = within_budget(budget_ms, options, partial(_made, bench), loader(weights), timer(camera))
+    say(choice.told())
+    return _processing(bench, weights, choice.option.frames, network), choice
+
+
+def _processing(bench: Bench, weights: Path | None, average: int, network: Reconstructor | None = None) -> Processing:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
-    network, rig = load_reconstructor(weights, cache_folder() / "onnx"), bench.rig
-    eats_difference = network.record.input == "difference maps"
-    processing = Processing(bench, network, eats_difference=eats_difference, average=average)
+    network = network or load_reconstructor(weights, cache_folder() / "onnx")
+    processing = _made(bench, network, average)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
-    for note in [*_rig_notes(network.record, rig), *_reference_note(bench)]:
+    for note in [*_rig_notes(network.record, bench.rig), *_reference_note(bench)]:
         say(f"note: {note}")
     return processing
+
+
+def _made(bench: Bench, network: Reconstructor, average: int) -> Processing:
+    return Processing(bench, network, eats_difference=network.record.input == "difference maps", average=average)
 
 
 def _rig_notes(trained: CheckpointRecord, rig: Rig) -> list[str]:

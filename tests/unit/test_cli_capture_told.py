@@ -1,3 +1,5 @@
+import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -6,7 +8,9 @@ import pytest
 from nlos_cam.camera.quality import Quality
 from nlos_cam.camera.replay import Verified
 from nlos_cam.camera.takes import Job, Take
+from nlos_cam.cli import capture
 from nlos_cam.cli.capture_told import ending, result, told
+from nlos_cam.cli.main import main
 from nlos_cam.errors import CameraLostError, DiskFullError
 
 STREAMS = {"depth": 30, "infrared": 30, "confidence": 30}
@@ -100,3 +104,21 @@ def test_a_take_that_ended_early_says_so(bag: Path) -> None:
 
 def test_noise_that_is_unknown_is_told_so(bag: Path) -> None:
     assert "noise in time unknown" in told(take(bag, quality=Quality(1, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize("takes", [1, 3])
+def test_an_interruption_before_the_camera_runs_is_told_with_the_same_fields(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, takes: int
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(capture, "open_camera", interrupted)
+    several = ["--takes", str(takes), "--frames", "2"] if takes > 1 else []
+    assert main(["capture", "--camera", "sim", "--out", str(tmp_path / "a.bag"), "--json", *several]) == 130
+    made = json.loads(capsys.readouterr().out)
+    fields = set(result([take(tmp_path / "a.bag")], several=takes > 1))
+    assert set(made) == fields
+    one = made["takes"][0] if takes > 1 else made
+    assert (one["frames"], one["state"], made["frames"]) == (0, "interrupted", 0)
+    assert list(tmp_path.iterdir()) == []

@@ -45,8 +45,7 @@ class FakeCamera:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def telemetry(self, ending: str = "") -> Mapping[str, float]:
-        del ending
+    def telemetry(self, _: str = "") -> Mapping[str, float]:
         return {}
 
     def __iter__(self) -> Iterator[Frame]:
@@ -103,10 +102,8 @@ def interrupt_at(number: int) -> Callable[[int], None]:
 def test_live_ends_with_one_object_that_scripts_depend_on(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["live", "--camera", "bag:fake", "--no-view", "--json"]) == 0
     report, _ = told(capsys)
-    assert set(report) == {
-        *("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings"),
-        *("stages_percentiles_ms", "verdicts", "stalled_s"),
-    }
+    fields = ("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings")
+    assert set(report) == {*fields, "stages_percentiles_ms", "verdicts", "stalled_s"}
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
     assert set(report["stages_ms"]) == {"delivery", "wait", "queue", "maps", "bench", "network", "view"}
@@ -239,3 +236,15 @@ def test_ctrl_c_while_a_camera_opens_begins_no_run(
     opened.on_open = swallow
     assert main([*command, "--json"]) == 130
     assert capsys.readouterr().out == ""
+
+
+def test_a_budget_is_told_kept_or_not_and_chooses_the_mean_itself(
+    opened: Opened, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commands, "loader", lambda _: lambda _: FakeNetwork())
+    arguments = ["live", "--camera", "bag:fake", "--no-view", "--json", "--budget-ms", "100000"]
+    assert main(arguments) == 0
+    report, said = told(capsys)
+    assert report["budget"]["kept"] and "budget 100000 ms: " in said  # noqa: PT018  one law
+    assert main([*arguments, "--average", "4"]) == 2
+    assert len(opened.calls) == 1

@@ -1,0 +1,40 @@
+"""Some live runs interrupted at random moments; tools/interrupt_live.py does the same fifty times."""
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+pytestmark = [
+    pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="lists processes as Linux does"),
+    pytest.mark.timeout(900),
+]
+EARLY_S, LATE_S = 0.5, 8.0
+"""After its code began: while it starts, and mostly while it runs."""
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[2] / "tools")
+        return importlib.import_module("interrupt_live")
+
+
+@pytest.mark.parametrize(
+    ("kind", "after_s", "view"),
+    [
+        ("ctrl-c", EARLY_S, True),
+        ("terminate", LATE_S, True),
+        ("viewer killed", LATE_S, True),
+        ("unplugged, then ctrl-c", LATE_S, False),
+    ],
+)
+def test_nothing_is_left_and_nothing_is_half_written(
+    tool: ModuleType, tmp_path: Path, kind: str, after_s: float, view: bool
+) -> None:
+    outcome = tool.interrupt(tool.Plan(0, kind, after_s, 5, view), tmp_path)
+    assert outcome.good, outcome
+    if kind == "viewer killed":
+        assert outcome.frames_recorded > 0
+        assert outcome.lines_logged > 0
