@@ -1,4 +1,7 @@
+import json
 import re
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -178,3 +181,18 @@ def test_a_report_tells_warnings_with_their_frames_the_same_each_time(tmp_path: 
     warnings = re.findall(r"- warning, (\d+) frames from (\d+) to (\d+): ", texts[0])
     assert ("150", "0", "149") in warnings
     assert any(int(first) in range(30, 80) for _, first, _ in warnings)
+
+
+WITHOUT_SDK = """
+import sys
+sys.modules["pyrealsense2"] = None
+from nlos_cam.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_replay_needs_no_sdk(noise_bag: Path, tmp_path: Path) -> None:
+    run = [sys.executable, "-c", WITHOUT_SDK, "replay", str(noise_bag), "--out", str(tmp_path / "out"), "--json"]
+    ended = subprocess.run(run, capture_output=True, text=True, timeout=250)  # noqa: PLW1510  the code is what is tested
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout.splitlines()[-1])["frames"] == 20
