@@ -63,13 +63,14 @@ class Processing:
         maps = self._mean.add(maps)
         look = self.bench.look(arrival.frame, maps)
         looked_s = clock()
-        eaten = look.difference if self._eats_difference and look.difference else self.bench.corrected(maps)
+        corrected = self.bench.corrected(maps)
+        eaten = look.difference if self._eats_difference and look.difference else corrected
         reconstruction = reconstruct(eaten, self.bench.rig, self.network, clock, self.doubter)
         stages_s = {"wait": got_s - begun_s, "queue": got_s - arrival.arrived_s}
         stages_s |= {"maps": mapped_s - got_s, "bench": looked_s - mapped_s}
         stages_s |= reconstruction.timings_s
         shown, verdict = self._judge.look(reconstruction, signs_of(arrival.frame, look, self.checks.newest))
-        self.checks.offer(arrival.frame.frame_number, self.bench.corrected(maps), shown.depth_m)
+        self.checks.offer(arrival.frame.frame_number, corrected, shown.depth_m)
         made = shown, clock(), stages_s, look.difference, look.warnings, verdict
         return Step(arrival.frame, maps, *made, check=self.checks.newest, arrived_s=arrival.arrived_s)
 
