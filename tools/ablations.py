@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from markdown_tables import as_lines, told
 from named_weights import by_name, errors_told, named
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
 from nlos_models.inference import refuse_colour
@@ -90,8 +91,8 @@ def as_markdown(table: Mapping[str, Any]) -> str:
     parts = [f"# Ways to train, on {table['objects']} test objects", _figures(table["compared"])]
     if others := table["compared"][1:]:
         head = f"Better than {table['against']} by"
-        rows = [[one["name"], *(_told(one["better_than_first"][metric]) for metric in BARS)] for one in others]
-        parts.append(_lines([head, *BARS], rows))
+        rows = [[one["name"], *(told(one["better_than_first"][metric]) for metric in BARS)] for one in others]
+        parts.append(as_lines([head, *BARS], rows))
     if table["learning_curve"]:
         parts += ["## With more objects", _figures(table["learning_curve"])]
     return "\n\n".join([*parts, NOTES, "![every metric, by the way to train](images/ablations.png)"]) + "\n"
@@ -100,18 +101,8 @@ def as_markdown(table: Mapping[str, Any]) -> str:
 def _figures(rows: Sequence[Mapping[str, Any]]) -> str:
     head = ["weights", "steps", "eats", "objects", "epochs", *BARS]
     facts = ("name", "steps", "input", "objects", "epochs")
-    told = [[*(str(row.get(fact, "")) for fact in facts), *(in_words(row[metric]) for metric in BARS)] for row in rows]
-    return _lines(head, told)
-
-
-def _lines(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in [head, ["---"] * len(head), *rows])
-
-
-def _told(figure: Mapping[str, float | None]) -> str:
-    low, high = figure["low"], figure["high"]
-    apart = low is not None and high is not None and not low <= 0 <= high
-    return f"**{in_words(figure)}**" if apart else in_words(figure)
+    lines = [[*(str(row.get(fact, "")) for fact in facts), *(in_words(row[metric]) for metric in BARS)] for row in rows]
+    return as_lines(head, lines)
 
 
 def draw(path: Path, table: Mapping[str, Any]) -> None:

@@ -14,9 +14,11 @@ import pytest
 from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint
 from nlos_models.checkpoint import shipped_folder
-from small_maps import untrained_weights, use_small_networks
+from small_maps import small_maps, untrained_weights, use_small_networks
 
 from nlos_cam.cli import evaluate_maps
+from nlos_cam.cli.evaluate_maps import Judged
+from nlos_cam.dataset import TEST_SEED, DatasetPlan
 from nlos_cam.evaluate import BARS
 from nlos_cam.evaluate_objects import seeded_objects
 from nlos_cam.objects.depth_image import object_box
@@ -157,3 +159,37 @@ def test_the_comparisons_row_is_filled_in_from_figures(
     assert "silhouette_iou 0.625 (0.5 to 0.75)" in text
     monkeypatch.setattr(sys, "argv", ["comparison.py", "--check"])
     assert comparison.main() == 0
+
+
+def test_what_leaving_a_kind_out_costs_is_told_of_it_and_of_all_others(tool: Tool) -> None:
+    unseen, levels = tool("unseen_kinds"), np.linspace(0.2, 0.8, 6)
+    kinds = ["airplane", "cup", "airplane", "cup", "table", "cup"]
+    with_them: dict[str, Any] = dict.fromkeys(BARS, levels)
+    worse = levels - np.array([0.1 if kind == "airplane" else 0.0 for kind in kinds])
+    rows = unseen.compared(dict.fromkeys(BARS, worse), with_them, kinds, ["airplane", "table"])
+    assert [(row["objects"], row["count"]) for row in rows] == [("airplane", 2), ("table", 1), ("all others", 3)]
+    costs = [row["without_better_by"]["silhouette_iou"]["value"] for row in rows]
+    assert costs == pytest.approx([-0.1, 0, 0])
+    text = unseen.as_markdown(rows)
+    assert "| airplane (2) | never seen |" in text
+    assert "**-0.1 (-0.1 to -0.1)**" in text
+    with pytest.raises(SystemExit, match="no boat among the maps"):
+        unseen.compared(with_them, with_them, kinds, ["boat"])
+
+
+def test_both_weights_are_judged_on_the_same_maps(
+    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unseen = tool("unseen_kinds")
+    use_small_networks(monkeypatch, checkpoint)
+    for name in ("without", "with"):
+        untrained_weights(tmp_path / name, rig=RIG)
+    kinds = ["airplane", "table", "cup"]
+    judged = Judged("some", kinds, kinds, small_maps(3, 0), DatasetPlan(RIG, TEST_SEED))
+    monkeypatch.setattr(unseen, "stored_objects", lambda _: judged)
+    argv = ["unseen_kinds.py", str(tmp_path / "without"), str(tmp_path / "with"), "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", argv)
+    unseen.main()
+    rows = json.loads((tmp_path / "unseen_kinds.json").read_text(encoding="utf-8"))["rows"]
+    assert {row["without_better_by"]["silhouette_iou"]["value"] for row in rows} == {0}  # they are the same weights
+    assert "| all others (1) | seen |" in capsys.readouterr().out
