@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import settings
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
@@ -19,12 +20,14 @@ from nlos_calibration.wall_record import wall_record
 from nlos_models import colour_resnet, res_vae
 from rerun.chunk import RrdReader
 from rosbags.rosbag1 import Reader, Writer
+from view_streams import ASSETS, Streams
 
 from nlos_cam.frames import Float32
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.hidden import Pose, place
 from nlos_cam.objects.raster import orthographic_depth
 from nlos_cam.objects.settings import Category
+from nlos_cam.view.server import ViewServer
 
 settings.register_profile("no clock", deadline=None)  # a machine that is busy fails no law
 settings.load_profile("no clock")
@@ -45,6 +48,28 @@ def tool() -> Iterator[Callable[[str], ModuleType]]:
 def noise_bags(tool: Callable[[str], ModuleType], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Forty frames of noise, recorded "packed" and "plain", and each of them "-unindexed" as a kill leaves it."""
     return tool("noise_recordings").make_all(tmp_path_factory.mktemp("noise"))
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """Of torch: small networks are slower on several, and sums come out in the same order."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def streams() -> Streams:
+    return Streams()
+
+
+@pytest.fixture
+def server(streams: Streams) -> Iterator[ViewServer]:
+    server = ViewServer(ASSETS, streams, 0)
+    yield server
+    streams.end.set()
+    server.close()
 
 
 @pytest.fixture

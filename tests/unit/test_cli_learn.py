@@ -1,7 +1,7 @@
 """`train`: from objects to weights, in the small."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,8 @@ from nlos_models.checkpoint import load_pipeline, load_vae
 
 from nlos_cam import dataset
 from nlos_cam.cli.main import main
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 RIG = load_rig("paper-rig")
 RECIPE = """
@@ -44,14 +46,6 @@ class InThisProcess:
         future: Future[Any] = Future()
         future.set_result(work(*arguments))
         return future
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def _recipe(folder: Path, task: str) -> str:

@@ -11,20 +11,19 @@ from torch import Tensor, nn
 from torch._inductor import config
 from torch._inductor.exc import InductorError
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 needs_compiler = pytest.mark.skipif(
     not any(shutil.which(name) for name in config.cpp.cxx if name), reason="torch.compile needs a C++ compiler here"
 )
 
 
 @pytest.fixture(autouse=True)
-def _one_thread_and_nothing_compiled() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+def _nothing_compiled() -> Iterator[None]:
     torch.compiler.reset()
     with config.patch(compile_threads=1):  # else torch keeps some for later
         yield
     torch.compiler.reset()
-    torch.set_num_threads(before)
 
 
 class Noisy(nn.Module):

@@ -1,6 +1,5 @@
 """Training: what is learnt from a small set, that it goes on where it was stopped, and what the loss leaves out."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +19,11 @@ from nlos_models.doubt_training import (
 from nlos_models.train import Running
 from small_doubt import DARK_V, small_doubt_set
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 QUICK = RECIPE.model_copy(
     update={"objects": 128, "epochs": 8, "batch": 16, "learning_rate": 5e-3, "schedule": "one-cycle"}
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """The networks of depth and colour: their sizes, and what those of colour make of hard maps."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from nlos_models.networks import CHANNELS, COLOUR_LATENT, new_pipeline, new_vae
@@ -9,13 +7,7 @@ from nlos_models.pipeline import Pipeline
 from nlos_models.preprocess import split_and_stack
 from small_maps import hard_maps
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

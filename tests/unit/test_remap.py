@@ -1,6 +1,5 @@
 """What training and transfer share: targets worked out ahead, running in parts, figures, frozen parts."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +15,14 @@ from nlos_models.sources import InMemory
 from nlos_models.train import Running
 from small_maps import SmallCompressor, SmallVae, small_images, small_maps
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 RECIPE = Recipe(task="compressor", objects=8, held_out=4, epochs=1, batch=4, learning_rate=1e-3)
 
 
 @pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+def _seeded() -> None:
     torch.manual_seed(3)
-    yield
-    torch.set_num_threads(before)
 
 
 def _ignore(done: int, total: int) -> None:

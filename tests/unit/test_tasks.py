@@ -16,6 +16,8 @@ from nlos_models.tasks import Start, train_compressor, train_vae, turn_some
 from nlos_models.train import Running
 from small_maps import SmallCompressor, SmallVae, small_images, small_maps, use_small_networks
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 COUNT, BATCH = 16, 8
 
 
@@ -24,13 +26,10 @@ class Stopped(Exception):  # noqa: N818  a stand-in for a fault
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _small_networks_on_one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+def _small_networks() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         use_small_networks(patch, tasks)
         yield
-    torch.set_num_threads(before)
 
 
 def _recipe(task: str, **changes: object) -> Recipe:

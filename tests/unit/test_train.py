@@ -3,7 +3,6 @@
 import multiprocessing
 import random
 import signal
-from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
@@ -14,13 +13,7 @@ from nlos_models.errors import RecipeError, TrainingError
 from nlos_models.run_files import BEST, LAST, read_last, write_last
 from small_run import STEPS, Executioner, SmallRun, Stopped, be_killed, run_watched, small_recipe
 
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def _trained(folder: Path, **changes: object) -> SmallRun:

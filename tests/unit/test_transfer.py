@@ -1,7 +1,6 @@
 """Transfer in two phases: what may change in each, what is kept, and a run that goes on where it was stopped."""
 
 import csv
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,20 +14,14 @@ from nlos_models.sources import InMemory
 from nlos_models.transfer import ALL_LAYERS, CLASSIFIER, train_transfer
 from small_maps import SmallCompressor, SmallVae, small_maps
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 COUNT, BATCH = 16, 8
 STEPS = COUNT // BATCH
 
 
 class Stopped(Exception):  # noqa: N818  a stand-in for a fault
     """Someone pulled the plug."""
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def _recipe(**changes: object) -> Recipe:
