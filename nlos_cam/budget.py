@@ -20,8 +20,8 @@ TRADEOFF = "tradeoff.json"
 """What `tradeoff reconstruct` writes; one lies beside the shipped weights."""
 SHIPPED = "shipped"
 PERIOD_MS = 1000 / FRAMES_PER_S
-HANDOVER_MS = 3.0
-"""From a frame's timestamp until the loop has it, and its reduction to maps: docs/live.md."""
+HANDOVER_MS = 2.4
+"""From a frame's timestamp until it is its turn: 95 % of both stages in docs/live.json."""
 BUSY_SHARE = 0.5
 """Of each frame's period: the rest is for the camera, the view and whatever else runs."""
 

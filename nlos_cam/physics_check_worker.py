@@ -13,6 +13,8 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import IO, Any
 
+from nlos_cam.precedence import as_any_other
+
 LEAST_URGENT = 19
 """`nice` of the process: it gets what the loop leaves."""
 
@@ -46,6 +48,7 @@ def _listen(asked: IO[bytes], questions: SimpleQueue[Any], leave: Callable[[], N
 
 def main() -> None:
     """Work for the parent, as little urgent as can be."""
+    as_any_other()
     if hasattr(os, "nice"):
         os.nice(LEAST_URGENT)
     told, sys.stdout = sys.stdout.buffer, sys.stderr  # what anybody prints is no answer

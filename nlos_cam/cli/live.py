@@ -35,6 +35,7 @@ from nlos_cam.frame_log import SUFFIXES, FrameLog
 from nlos_cam.live import run_live, warm_up
 from nlos_cam.physics_check import Checks
 from nlos_cam.physics_check_runner import BackgroundChecks
+from nlos_cam.precedence import precedence
 from nlos_cam.processing import Processing
 from nlos_cam.replay import REPORT, replay
 from nlos_cam.replay_looks import Looks
@@ -96,7 +97,14 @@ def live(
         processing, choice = _chosen(opened, bench, weights, average, budget_ms, tradeoff, checks)
         warm_up(opened, processing)
     viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, view_path)
-    with stop_on_signals() as stop, viewer, _logging(frame_log) as on_moment, undisturbed(), opened as source:
+    with (
+        stop_on_signals() as stop,
+        precedence(),
+        viewer,
+        _logging(frame_log) as on_moment,
+        undisturbed(),
+        opened as source,
+    ):
         tell_of_view(viewer, host=view_host, port=view_port, open_it=open_view)
         report = run_live(
             source,

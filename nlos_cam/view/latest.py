@@ -37,3 +37,11 @@ class Latest(Generic[T]):
             if self._closed or self._count <= count or self._value is None:
                 return None
             return self._count, self._value
+
+    def fresh(self, count: int, patience_s: float, timeout_s: float) -> tuple[int, T] | None:
+        """As `after`, but what is there already is passed over for the next one, if that comes within `patience_s`."""
+        with self._changed:
+            there = self._count
+            if there > count:
+                self._changed.wait_for(lambda: self._closed or self._count > there, patience_s)
+        return self.after(count, timeout_s)

@@ -8,6 +8,7 @@ from typing import Self
 from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Rig
 
+from nlos_cam.precedence import after_the_loop
 from nlos_cam.view.assets import LOOPBACK, page_assets
 from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.latest import Latest
@@ -18,6 +19,9 @@ PREFERRED_PORT = 9090
 DRAW_PERIOD_S = 1 / 12
 LIDAR_EVERY = 2
 """Lidar pictures, which are large, go out with every second drawing."""
+PATIENCE_S = 0.05
+"""For the next moment, where one is there: drawing that begins with a moment is done when the loop's next frame comes,
+and takes nothing from it."""
 WAIT_S = 0.5
 
 
@@ -60,13 +64,14 @@ class RerunViewer:
 
         While a slow browser keeps `send` waiting nothing is drawn for it: it skips moments, and memory stays as it is.
         """
+        after_the_loop()
         recording = new_recording()
         stream, drawing = recording.binary_stream(), None
         count = drawn = 0
         try:
             while not self._closed.is_set():
                 begun_s = self._clock()
-                newest = self._moments.after(count, WAIT_S)
+                newest = self._moments.fresh(count, PATIENCE_S, WAIT_S)
                 if newest is None:
                     continue
                 count, moment = newest
