@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import typer
+from kept_page import keep
 
 from nlos_cam.cli.main import build_app
 
@@ -75,13 +76,7 @@ def page() -> str:
 
 def main() -> int:
     """Write the page, or say that it is out of date."""
-    text, current = PAGE.read_text(encoding="utf-8") if PAGE.exists() else "", page()
-    if "--check" in sys.argv:
-        if current != text:
-            print(f"{PAGE.name} is out of date: run `python tools/commands.py`")
-        return int(current != text)
-    PAGE.write_text(current, encoding="utf-8")
-    return 0
+    return keep(PAGE, page())
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from kept_page import keep
+
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.evaluate import BARS
 from nlos_cam.evaluate_report import in_words
@@ -43,14 +45,7 @@ def main() -> int:
     figures, cost = (
         json.loads((DOCS / name).read_text(encoding="utf-8")) for name in ("figures.json", "tradeoff_reconstruct.json")
     )
-    text = page.read_text(encoding="utf-8")
-    current = MEASURED.sub(lambda _: row(figures, cost), text)
-    if "--check" in sys.argv:
-        if current != text:
-            print(f"{page.name} is out of date: run `python tools/comparison.py`")
-        return int(current != text)
-    page.write_text(current, encoding="utf-8")
-    return 0
+    return keep(page, MEASURED.sub(lambda _: row(figures, cost), page.read_text(encoding="utf-8")))
 
 
 if __name__ == "__main__":

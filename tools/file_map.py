@@ -5,6 +5,8 @@ import re
 import sys
 from pathlib import Path
 
+from kept_page import keep
+
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PARTS = {
@@ -38,14 +40,7 @@ def drawn_map() -> str:
 
 def main() -> int:
     """Write the map, or say that it is out of date."""
-    text = README.read_text(encoding="utf-8")
-    current = MAP.sub(lambda _: drawn_map(), text)
-    if "--check" in sys.argv:
-        if current != text:
-            print("the README's map is out of date: run `python tools/file_map.py`")
-        return int(current != text)
-    README.write_text(current, encoding="utf-8")
-    return 0
+    return keep(README, MAP.sub(lambda _: drawn_map(), README.read_text(encoding="utf-8")))
 
 
 if __name__ == "__main__":
