@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 
 TEMPERATURES = np.geomspace(1.0, 5.0, 65)
 """Never below 1: where all are told apart, the likeliest is 0, which says no more than that."""
-MOST_FALSE_ALARMS = 0.05
-"""Of ordinary objects, the share that may be told to be outside the trained range: what it costs to find those that
-are."""
+MOST_FALSE_ALARMS = 0.15
+"""Of ordinary objects, the share that may be told to be outside the trained range: what it costs to find nine in ten of
+those that are."""
 MOST_FALSE_OBJECTS = 0.001
 """Of empty benches, the share that may be told to hide something: a tenth of what is asked for."""
 

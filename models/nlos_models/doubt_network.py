@@ -56,17 +56,16 @@ class DoubtNetwork(nn.Module):
     bare_depth_m: Tensor
     bare_intensity: Tensor
 
-    def __init__(self, width: float = 1.0) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        fine, mid, wide = (round(channels * width) for channels in (16, 32, 64))
         self.register_buffer("bare_depth_m", torch.zeros(MAP_SHAPE))
         self.register_buffer("bare_intensity", torch.zeros(MAP_SHAPE))
-        self.maps = nn.Sequential(_down(5, fine), _down(fine, mid), _down(mid, wide), _down(wide, wide, stride=1))
-        self.image = nn.ModuleList([_down(1, fine), _down(fine, mid), _down(mid, wide)])
-        self.meet = _down(2 * wide, wide, stride=1)
-        self.ups = nn.ModuleList([_Up(wide, mid), _Up(mid, fine)])
-        self.pixels = nn.Conv2d(fine + 1, 2, 3, padding=1)
-        self.frame = nn.Sequential(nn.Linear(4 * wide, wide), nn.ReLU(), nn.Dropout(0.2), nn.Linear(wide, 2))
+        self.maps = nn.Sequential(_down(5, 16), _down(16, 32), _down(32, 64), _down(64, 64, stride=1))
+        self.image = nn.ModuleList([_down(1, 16), _down(16, 32), _down(32, 64)])
+        self.meet = _down(128, 64, stride=1)
+        self.ups = nn.ModuleList([_Up(64, 32), _Up(32, 16)])
+        self.pixels = nn.Conv2d(17, 2, 3, padding=1)
+        self.frame = nn.Sequential(nn.Linear(256, 64), nn.ReLU(), nn.Dropout(0.2), nn.Linear(64, 2))
 
     def learn_bare(self, depth_m: Tensor, intensity: Tensor) -> None:
         """Take the bare wall from maps (n, 64, 80) of benches with nothing hidden: each cell's median."""

@@ -109,7 +109,7 @@ def train_doubt(
 ) -> tuple[DoubtNetwork, dict[str, float]]:
     """Train a doubt network; a second call resumes. Returns it in eval mode, and its held-out loss."""
     torch.manual_seed(recipe.seed)
-    network = DoubtNetwork(recipe.width)
+    network = DoubtNetwork()
     bare = training.where(training.nothing)
     network.learn_bare(torch.from_numpy(bare.depth_m), torch.from_numpy(bare.intensity))
     network = in_channels_last(network)

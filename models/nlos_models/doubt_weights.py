@@ -73,7 +73,7 @@ def load_doubt(folder: Path) -> tuple[Told, DoubtRecord] | None:
             f"{folder / DOUBT_RECORD} is of other weights ({record.watches}) than those beside it ({found}): train it "
             "again with `train doubt`, or take it away"
         )
-    network = DoubtNetwork(record.recipe.width)
+    network = DoubtNetwork()
     load_part(folder / f"{DOUBT}.safetensors", network)
     return Told(network, record.temperatures, record.error_scale).eval(), record
 

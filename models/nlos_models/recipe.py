@@ -88,8 +88,8 @@ class Recipe(BaseModel):
             raise ValueError("start 'weights' is for a VAE or a two-step compressor: leave it out")
         if self.colour and (self.task == "transfer" or self.maps != "raw maps"):
             raise ValueError("colour is simulation only, and of raw maps: no bench to transfer to, no difference maps")
-        if self.width != 1 and (self.colour or self.task not in ("compressor", "doubt")):
-            raise ValueError("width is of a compressor of depth, or of its doubt network: leave it out")
+        if self.width != 1 and (self.colour or self.task != "compressor"):
+            raise ValueError("width is of a compressor of depth: leave it out")
         if self.steps != "two" and not self.image_weight:
             raise ValueError(
                 f"steps {self.steps!r} trains a decoder, which learns by images alone: set an image_weight"

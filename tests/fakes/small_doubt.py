@@ -21,16 +21,16 @@ def watched_weights(folder: Path, seed: int = 0) -> Path:
     return folder
 
 
-def untrained_doubt(folder: Path, watched: Path, seed: int = 0, width: float = 1.0) -> DoubtRecord:
+def untrained_doubt(folder: Path, watched: Path, seed: int = 0) -> DoubtRecord:
     """Write a doubt network of random weights, with batch norms that have seen something."""
     torch.manual_seed(seed)
-    network = DoubtNetwork(width)
+    network = DoubtNetwork()
     with torch.no_grad():
         for _ in range(20):
             network.train()(torch.rand(8, 64, 80), 40 * torch.rand(8, 64, 80), torch.rand(8, 64, 64))
     record = DoubtRecord(
         watches=checksum_of_watched(watched),
-        recipe=RECIPE.model_copy(update={"width": width}),
+        recipe=RECIPE,
         learnt=["small"],
         temperatures=(0.5, 2.0),
         error_scale=1.5,

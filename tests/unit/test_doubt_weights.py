@@ -25,14 +25,6 @@ def test_what_is_saved_is_loaded_in_eval_mode(tmp_path: Path, watched: Path) -> 
     assert float(told.error_scale) == 1.5
 
 
-@pytest.mark.parametrize("width", [0.5, 2.0])
-def test_a_network_of_another_width_is_loaded_as_its_recipe_has_it(tmp_path: Path, watched: Path, width: float) -> None:
-    untrained_doubt(tmp_path / "run", watched, width=width)
-    loaded = load_doubt(tmp_path / "run")
-    assert loaded is not None
-    assert loaded[0].network.pixels.in_channels == round(16 * width) + 1
-
-
 def test_the_folder_of_a_run_holds_the_weights_that_are_watched_too(tmp_path: Path, watched: Path) -> None:
     untrained_doubt(tmp_path / "run", watched)
     for name in (*WATCHED, "checkpoint.json"):
