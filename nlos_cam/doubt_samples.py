@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 from nlos_calibration.rig import Rig
@@ -23,9 +24,9 @@ PIECE = 100
 """Samples in a file: what a kill can cost."""
 BESIDE_M = 0.01
 """Depth this far from the bare wall's is that of what is hidden: the width of a path-length bin."""
-BENCH = 20
+BENCH = 10
 """Samples in a row that are of one bench, whose sensor is worked out once."""
-VERSION = 1
+VERSION = 2
 """Raised with any change of what a seed makes."""
 _STREAM = 5
 """Keeps these random numbers apart from those of datasets."""
@@ -66,7 +67,8 @@ def make_samples(
     """
     sights = [_sight(kind, seed, rig, sensor) for seed in seeds]
     rendered = [render(sight.scene, accuracy) for sight in sights]
-    maps = [_sensed(*each) for each in zip(sights, rendered, seeds, strict=True)]
+    noises = [_generator(kind, seed, 2) for seed in seeds]
+    maps = [_sensed(*each) for each in zip(sights, rendered, noises, strict=True)]
     return DoubtSamples(
         np.stack([one.depth_m for one in maps]),
         np.stack([one.intensity for one in maps]),
@@ -76,9 +78,14 @@ def make_samples(
     )
 
 
-def _sensed(sight: Sight, rendered: Rendering, seed: int) -> LidarMaps:
+def _generator(kind: str, seed: int, of: int) -> np.random.Generator:
+    """Other numbers for each kind: benches or noise that kinds share would tell outliers from ordinary objects."""
+    return np.random.default_rng([crc32(kind.encode()), seed, _STREAM, of])
+
+
+def _sensed(sight: Sight, rendered: Rendering, noise: np.random.Generator) -> LidarMaps:
     sensor = _sensor(sight)
-    images = sensor.expose(rendered.multi, np.random.default_rng([seed, _STREAM, 2]))
+    images = sensor.expose(rendered.multi, noise)
     return maps_from_frame(images.frame(sensor.rig.pinhole))
 
 
@@ -95,13 +102,12 @@ def _cells(sight: Sight, rendered: Rendering) -> int:
 
 
 def _sight(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Sight:
-    of_bench = np.random.default_rng([seed // BENCH, _STREAM, 0])
+    of_bench = _generator(kind, seed // BENCH, 0)
     if kind == EMPTY:
         return Sight(*varied_empty(rig, sensor, of_bench))
     slight = kind == ORDINARY or seed // BENCH % 2
     bench = varied(rig, sensor, SLIGHT, of_bench) if slight else (rig, sensor)
-    generator = np.random.default_rng([seed, _STREAM, 1])
-    return outlier(KINDS[kind], generator, Sight(*bench))
+    return outlier(KINDS[kind], _generator(kind, seed, 1), Sight(*bench))
 
 
 KINDS = {ORDINARY: ordinary, **TO_LEARN, **TO_JUDGE}

@@ -6,7 +6,6 @@ matt. A kind to judge by is never learnt from, so that what is unlike anything s
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import radians
 
 import numpy as np
 import trimesh
@@ -15,13 +14,13 @@ from trimesh.transformations import euler_matrix
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.backgrounds import panel
 from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import Pose, place, random_pose
+from nlos_cam.objects.hidden import Pose, place
 from nlos_cam.objects.raster import orthographic_depth
 from nlos_cam.outliers_to_learn import TO_LEARN
 from nlos_cam.render.surface import Surface, phong, retroreflective
 from nlos_cam.sights import Generator, Kind, Sight, ordinary, placed, smooth_pattern, width_m
 
-__all__ = ["TO_JUDGE", "TO_LEARN", "outlier"]
+__all__ = ["IN_SHAPE", "TO_JUDGE", "TO_LEARN", "outlier"]
 
 LOBES = phong(0.1, 0.9, 80.0), retroreflective(0.1, 0.9, 80.0)
 """Made once: each is compiled."""
@@ -67,22 +66,6 @@ def glossy(generator: Generator, sight: Sight) -> Sight:
     return replace(ordinary(generator, sight), surface=Surface(1.0, LOBES[int(generator.integers(2))]))
 
 
-def near(generator: Generator, sight: Sight) -> Sight:
-    """A thing that stands out of the box, 40 to 90 mm nearer to the wall."""
-    box = object_box(sight.rig)
-    depth_m = placed(generator, box, front_m=0.0) - np.float32(generator.uniform(0.04, 0.09))
-    return replace(sight, depth_m=depth_m)
-
-
-def half_out(generator: Generator, sight: Sight) -> Sight:
-    """A thing of ordinary size, 35 to 60 % of which lies beside the box."""
-    box = object_box(sight.rig)
-    pose = random_pose(generator, box)
-    out_m = (width_m(box) + pose.size_m) / 2 - pose.size_m * generator.uniform(0.4, 0.65)
-    angle = radians(90) * int(generator.integers(4))
-    return replace(sight, depth_m=placed(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle)))
-
-
 def two_tone(generator: Generator, sight: Sight) -> Sight:
     """A thing of which one half is nearly black."""
     seen = ordinary(generator, sight)
@@ -91,9 +74,26 @@ def two_tone(generator: Generator, sight: Sight) -> Sight:
 
 
 TO_JUDGE: Mapping[str, Kind] = {
-    kind.__name__.replace("_", " "): kind
-    for kind in (panels, noise_sheet, bars, rings, glossy, near, half_out, two_tone)
+    kind.__name__.replace("_", " "): kind for kind in (panels, noise_sheet, bars, rings, glossy, two_tone)
 }
+
+IN_SHAPE = frozenset(
+    (
+        "blobs",
+        "posts",
+        "plates",
+        "warped",
+        "inside out",
+        "cut out",
+        "scrambled",
+        "panels",
+        "noise sheet",
+        "bars",
+        "rings",
+    )
+)
+"""Kinds that are unlike training in their shape alone. All others are out of its range: of size, place, tilt, number,
+light, rig or sensor."""
 
 
 def outlier(kind: Kind, generator: Generator, sight: Sight) -> Sight:

@@ -9,6 +9,7 @@ import numpy as np
 from nlos_cam.frames import OBJECT_PIXELS, Float32
 from nlos_cam.objects.backgrounds import post
 from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.hidden import random_pose
 from nlos_cam.render.surface import Surface
 from nlos_cam.sights import Generator, Kind, Sight, ordinary, placed, smooth_pattern, width_m
 from nlos_cam.varied_bench import moved
@@ -30,6 +31,22 @@ def large(generator: Generator, sight: Sight) -> Sight:
 def far(generator: Generator, sight: Sight) -> Sight:
     """A thing 0.12 to 0.35 m farther from the wall, most of it beyond the box."""
     return replace(sight, depth_m=placed(generator, object_box(sight.rig)) + np.float32(generator.uniform(0.12, 0.35)))
+
+
+def near(generator: Generator, sight: Sight) -> Sight:
+    """A thing that stands out of the box, 40 to 90 mm nearer to the wall."""
+    box = object_box(sight.rig)
+    depth_m = placed(generator, box, front_m=0.0) - np.float32(generator.uniform(0.04, 0.09))
+    return replace(sight, depth_m=depth_m)
+
+
+def half_out(generator: Generator, sight: Sight) -> Sight:
+    """A thing of ordinary size, 35 to 60 % of which lies beside the box."""
+    box = object_box(sight.rig)
+    pose = random_pose(generator, box)
+    out_m = (width_m(box) + pose.size_m) / 2 - pose.size_m * generator.uniform(0.4, 0.65)
+    angle = np.radians(90) * int(generator.integers(4))
+    return replace(sight, depth_m=placed(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle)))
 
 
 def several(generator: Generator, sight: Sight) -> Sight:
@@ -139,7 +156,7 @@ def scrambled(generator: Generator, sight: Sight) -> Sight:
 TO_LEARN: Mapping[str, Kind] = {
     kind.__name__.replace("_", " "): kind
     for kind in (
-        *(small, large, far, several, blobs, dim, posts, tilted, plates, other_rig, other_sensor),
+        *(small, large, far, near, half_out, several, blobs, dim, posts, tilted, plates, other_rig, other_sensor),
         *(warped, inside_out, cut_out, scrambled),
     )
 }

@@ -10,7 +10,7 @@ import json
 import math
 from argparse import ArgumentParser
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from nlos_cam.evaluate_objects import echoes_of, sense, truth_of
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_image import depth_from_image, object_box
 from nlos_cam.objects.test_set import test_set
-from nlos_cam.outliers import TO_JUDGE, TO_LEARN
+from nlos_cam.outliers import IN_SHAPE, TO_JUDGE, TO_LEARN
 from nlos_cam.processing import limits_of
 from nlos_cam.reconstruct import Reconstruction, reconstruct
 from nlos_cam.render.sensor_model import SensorModel
@@ -193,10 +193,24 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
         else:
             sort = "learnt" if kind in TO_LEARN else "never_learnt"
             result.setdefault(sort, {})[kind] = of_outliers(told, made.cells)
-    for sort in ("learnt", "never_learnt"):
-        kinds = [kind["flagged"] for kind in result[sort].values() if kind["flagged"]]
-        result[f"{sort}_flagged"] = wilson(sum(k["count"] for k in kinds), sum(k["of"] for k in kinds))
-    return result
+    return result | flagged_by_sort(result["learnt"], result["never_learnt"])
+
+
+def flagged_by_sort(learnt: Mapping[str, Any], never_learnt: Mapping[str, Any]) -> dict[str, Any]:
+    """How often outliers are told to be outside: of all kinds of a sort, and of what is unlike in them."""
+    both = {**learnt, **never_learnt}
+    sorts = {
+        "learnt": learnt,
+        "never_learnt": never_learnt,
+        "learnt_out_of_range": {name: kind for name, kind in learnt.items() if name not in IN_SHAPE},
+        "out_of_range": {name: kind for name, kind in both.items() if name not in IN_SHAPE},
+        "unlike_in_shape": {name: kind for name, kind in both.items() if name in IN_SHAPE},
+    }
+    found = dict[str, Any]()
+    for sort, kinds in sorts.items():
+        flagged = [kind["flagged"] for kind in kinds.values() if kind["flagged"]]
+        found[f"{sort}_flagged"] = wilson(sum(one["count"] for one in flagged), sum(one["of"] for one in flagged))
+    return found
 
 
 def main() -> None:
@@ -220,7 +234,7 @@ def main() -> None:
     result["limits"] = {"nothing": pipeline.limits.nothing, "outside": pipeline.limits.outside}
     (asked.out / "doubt.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     draw_reliability(asked.out / "images" / "reliability.png", result)
-    print(json.dumps({name: result[name] for name in ("empty", "learnt_flagged", "never_learnt_flagged")}, indent=2))
+    print(json.dumps({name: found for name, found in result.items() if name == "empty" or "flagged" in name}, indent=2))
 
 
 if __name__ == "__main__":

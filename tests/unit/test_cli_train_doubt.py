@@ -121,7 +121,7 @@ def test_outliers_that_cannot_be_seen_are_not_learnt_from(go: Go, monkeypatch: p
     monkeypatch.setattr(train_doubt, "run_doubt", note)
     assert go()[0] == 0
     training = seen[0]
-    every = small_samples(Path(), {EMPTY: 14, ORDINARY: 52, **dict.fromkeys(TO_LEARN, 7)}, 0)
+    every = small_samples(Path(), {EMPTY: 14, ORDINARY: 7 * len(TO_LEARN) // 2, **dict.fromkeys(TO_LEARN, 7)}, 0)
     outliers = ~np.isin(every.kind, [EMPTY, ORDINARY])
     assert training.nothing.sum() == 14
     assert (~training.nothing & ~training.outside).sum() == 8 + ((every.kind == ORDINARY) & (every.cells > 0)).sum()

@@ -8,6 +8,7 @@ from nlos_calibration.rig import Rig, load_rig
 
 from nlos_cam import doubt_samples
 from nlos_cam.doubt_samples import BENCH, EMPTY, ORDINARY, DoubtSamples, make_samples, samples_on_disk
+from nlos_cam.outliers import TO_JUDGE, TO_LEARN
 from nlos_cam.render.sensor_model import SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
@@ -44,7 +45,16 @@ def test_ordinary_objects_and_every_second_bench_of_outliers_lie_slightly_off() 
     }
     assert [rig == RIG for rig in rigs["plates"]] == [True, True, False]
     assert RIG not in rigs[ORDINARY]
-    assert rigs[ORDINARY][0] == rigs[ORDINARY][1] != rigs[ORDINARY][2] == rigs["plates"][2]
+    assert rigs[ORDINARY][0] == rigs[ORDINARY][1] != rigs[ORDINARY][2]
+
+
+def test_no_two_kinds_share_a_bench_or_noise_which_would_tell_outliers_from_ordinary_objects() -> None:
+    kinds = [EMPTY, ORDINARY, *TO_LEARN, *TO_JUDGE]
+    for of in range(3):
+        assert len({doubt_samples._generator(kind, 3, of).bytes(8) for kind in kinds}) == len(kinds)
+    slight = [doubt_samples._sight(kind, BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)]
+    assert len({sight.rig.checksum for sight in slight}) == 3
+    assert len({sight.sensor.bare_wall_counts for sight in slight}) == 3
 
 
 def test_what_is_on_disk_is_read_and_only_what_is_missing_is_made(

@@ -7,7 +7,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects.depth_image import object_box
-from nlos_cam.outliers import LEAST_PIXELS, TO_JUDGE, TO_LEARN, outlier
+from nlos_cam.outliers import IN_SHAPE, LEAST_PIXELS, TO_JUDGE, TO_LEARN, outlier
 from nlos_cam.render.sensor_model import SensorModel
 from nlos_cam.sights import Sight, ordinary
 
@@ -44,6 +44,13 @@ def test_every_kind_shows_some_surface_before_the_wall_and_the_same_for_the_same
 
 def test_no_kind_is_both_learnt_from_and_judged_by() -> None:
     assert not set(TO_LEARN) & set(TO_JUDGE)
+
+
+def test_kinds_of_both_sorts_are_learnt_from_and_judged_by() -> None:
+    for kinds in (TO_LEARN, TO_JUDGE):
+        assert set(kinds) & IN_SHAPE
+        assert set(kinds) - IN_SHAPE
+    assert {*TO_LEARN, *TO_JUDGE} > IN_SHAPE
 
 
 OUTSIDE: dict[str, Callable[[Sight], bool]] = {

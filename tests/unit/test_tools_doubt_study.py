@@ -70,6 +70,23 @@ def test_only_outliers_that_can_be_seen_count_as_missed(study: ModuleType) -> No
     assert found["verdicts"] == {Verdict.SEEN.value: 2, Verdict.OUTSIDE.value: 1}
 
 
+def test_kinds_are_counted_by_what_is_unlike_in_them(study: ModuleType) -> None:
+    def kind(count: int, of: int) -> dict[str, object]:
+        return {"flagged": study.wilson(count, of)}
+
+    found = study.flagged_by_sort(
+        {"small": kind(9, 10), "posts": kind(1, 10)}, {"two tone": kind(3, 10), "rings": {"flagged": None}}
+    )
+    counts = {name: (one["count"], one["of"]) for name, one in found.items()}
+    assert counts == {
+        "learnt_flagged": (10, 20),
+        "never_learnt_flagged": (3, 10),
+        "learnt_out_of_range_flagged": (9, 10),
+        "out_of_range_flagged": (12, 20),
+        "unlike_in_shape_flagged": (1, 10),
+    }
+
+
 def test_the_plot_is_a_picture(tool: Callable[[str], ModuleType], tmp_path: Path) -> None:
     rows = {
         "reliability": [{"expected_mm": 1.0, "observed_mm": 2.0}],
