@@ -16,6 +16,7 @@ from markdown_tables import as_lines, told
 from named_weights import by_name, errors_told, named
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
 from nlos_models.inference import refuse_colour
+from nlos_models.pipeline import Pipeline
 from nlos_models.remap import run
 
 from nlos_cam.cli.evaluate_maps import Judged, as_eaten, bare_wall_for, fresh_objects, rig_of
@@ -66,9 +67,14 @@ def judged(folders: Mapping[str, Path], count: int | None = None) -> list[Traine
         if rig.checksum not in by_rig:
             by_rig[rig.checksum] = fresh_objects(rig, count)
         here = by_rig[rig.checksum]
-        image = run(pipeline, as_eaten(here.maps, bare_wall_for(record, here.plan)))
-        found.append(Trained(name, record, per_object(image, here.maps.image, here.plan.box)))
+        found.append(Trained(name, record, values_of(pipeline, record, here)))
     return found
+
+
+def values_of(pipeline: Pipeline, record: CheckpointRecord, judged: Judged) -> PerObject:
+    """Every metric of every object, by weights."""
+    image = run(pipeline, as_eaten(judged.maps, bare_wall_for(record, judged.plan)))
+    return per_object(image, judged.maps.image, judged.plan.box)
 
 
 def as_table(compared: Sequence[Trained], curve: Sequence[Trained]) -> dict[str, Any]:

@@ -11,27 +11,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ablations import values_of
 from markdown_tables import as_lines, told
 from named_weights import errors_told, named
 from nlos_models.checkpoint import load_pipeline
 from nlos_models.inference import refuse_colour
-from nlos_models.remap import run
 from numpy.typing import NDArray
 
-from nlos_cam.cli.evaluate_maps import Judged, as_eaten, bare_wall_for, stored_objects
-from nlos_cam.evaluate import BARS, PerObject, advantage, over_objects, per_object, plain
+from nlos_cam.cli.evaluate_maps import Judged, stored_objects
+from nlos_cam.evaluate import BARS, PerObject, advantage, over_objects, plain
 from nlos_cam.evaluate_report import in_words
 
 DOCS = Path(__file__).parents[1] / "docs"
 LEFT_OUT = "airplane,table"
 
 
-def values_of(folder: Path, judged: Judged) -> PerObject:
+def loaded_values(folder: Path, judged: Judged) -> PerObject:
     """Every metric of every object, by the weights of a folder."""
     pipeline, record = load_pipeline(folder)
     refuse_colour(record, folder)
-    image = run(pipeline, as_eaten(judged.maps, bare_wall_for(record, judged.plan)))
-    return per_object(image, judged.maps.image, judged.plan.box)
+    return values_of(pipeline, record, judged)
 
 
 def compared(
@@ -84,7 +83,7 @@ def main() -> None:
     asked = parser.parse_args()
     with errors_told():
         judged = stored_objects(asked.held_out)
-        values = [values_of(folder, judged) for _, folder in (asked.without, asked.with_them)]
+        values = [loaded_values(folder, judged) for _, folder in (asked.without, asked.with_them)]
     rows = compared(values[0], values[1], judged.categories, asked.left_out)
     table = {"left_out": asked.left_out, "rows": rows}
     (asked.out / "unseen_kinds.json").write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")

@@ -1,6 +1,5 @@
 """Small versions of the tools that tell what limits a figure, where weights work, and how they compare."""
 
-import importlib
 import json
 import shutil
 import sys
@@ -27,12 +26,6 @@ TOOLS = Path(__file__).parents[2] / "tools"
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
 Tool = Callable[[str], ModuleType]
-
-
-@pytest.fixture
-def tool(monkeypatch: pytest.MonkeyPatch) -> Tool:
-    monkeypatch.syspath_prepend(TOOLS)
-    return importlib.import_module
 
 
 @pytest.fixture
