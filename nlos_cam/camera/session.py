@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from math import inf
 from typing import Any
 
 from nlos_calibration.projection import Intrinsics
@@ -11,6 +12,7 @@ from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.si_units import frame_in_si
 from nlos_cam.camera.streams import (
     FRAMES_PER_S,
+    SAME_INSTANT_S,
     FrameSet,
     Sample,
     intrinsics_of,
@@ -78,6 +80,8 @@ class Session:
         self._preview = Inbox(lossless=False)
         """Of frames from before the settings hold."""
         self._listening = False
+        self._previewed_s = -inf
+        """When the newest sample was taken that came before the settings held."""
 
     def start(self, prepare: Callable[[Any], None] | None = None, ready: Callable[[], None] | None = None) -> None:
         """Let frames come, once `prepare` has had the running sensor; from `ready` on, none is lost.
@@ -110,8 +114,15 @@ class Session:
         self._preview.close()
 
     def _on_frame(self, frame: Any) -> None:
-        inbox = self.inbox if self._listening else self._preview
-        inbox.put(self._unwrapped(sample_from_sdk(frame), frame.get_frame_timestamp_domain().name))
+        sample = self._unwrapped(sample_from_sdk(frame), frame.get_frame_timestamp_domain().name)
+        inbox = self.inbox if self._is_heard(sample) else self._preview
+        inbox.put(sample)
+
+    def _is_heard(self, sample: Sample) -> bool:
+        """Whether it is delivered: not one of a set that had begun before, which would lack what came until then."""
+        if not self._listening:
+            self._previewed_s = max(self._previewed_s, sample.timestamp_s)
+        return self._listening and abs(sample.timestamp_s - self._previewed_s) > SAME_INSTANT_S
 
     def _unwrapped(self, sample: Sample, domain: str) -> Sample:
         """A sample on a clock that goes on: the device's own wraps every 71.6 minutes, for each stream by itself."""

@@ -97,6 +97,18 @@ def test_a_device_that_vanishes_while_it_is_prepared_is_an_error(preparing: Any)
         preparing(lambda _, lidar: lidar.unplug())
 
 
+def test_a_set_that_had_begun_before_the_settings_held_is_no_incomplete_one(fake_l515: Any) -> None:
+    lidar, inbox = fake_l515(usb="2.1"), Inbox(lossless=False)
+    session = Session(*find_streams(FakeDevice(lidar, 0)), inbox)
+    session.start(lambda _: None, ready=lambda: lidar.deliver(range(5, 6), streams=("depth",)))
+    lidar.deliver(range(5, 6), streams=("infrared", "confidence"))
+    lidar.deliver(range(6, 8))
+    found = [inbox.take(0.0), inbox.take(0.0), inbox.take(0.0)]
+    session.stop()
+    assert [one and one.number for one in found] == [6, 7, None]
+    assert inbox.incomplete == inbox.dropped == 0
+
+
 def test_telemetry_of_a_session_that_stopped_is_empty(fake_l515: Any) -> None:
     session = Session(*find_streams(FakeDevice(fake_l515(usb="2.1"), 0)), Inbox(lossless=False))
     assert session.telemetry()
