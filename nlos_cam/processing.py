@@ -1,7 +1,11 @@
 """What is made of each frame of a camera: maps, their difference from the bare wall, warnings, the hidden depth."""
 
+import os
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 
 from nlos_calibration.errors import CalibrationError
 from nlos_models.doubt_inference import Doubter
@@ -9,14 +13,19 @@ from nlos_models.doubt_inference import Doubter
 from nlos_cam.bench import Bench, Look
 from nlos_cam.camera.base import Camera
 from nlos_cam.frame_reader import Arrival, FrameReader
-from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.frames import Frame, LidarMaps, maps_from_frame
 from nlos_cam.live_report import Step
 from nlos_cam.map_mean import MapMean
 from nlos_cam.physics_check import UNEXPLAINED, Check, Checks, NoChecks
-from nlos_cam.reconstruct import Clock, Network, reconstruct
+from nlos_cam.reconstruct import Clock, Network, Reconstruction, reconstruct_all
 from nlos_cam.sightings import amiss
 from nlos_cam.thermometer import Thermometer, thermometer_of
 from nlos_cam.verdict import Judge, Limits, Signs
+
+FRAMES_TOGETHER = 4
+"""Where nobody waits for them, the networks take so many frames at once: two thirds of the time for each."""
+MOST_AHEAD = 2
+"""So many times as many are worked on while others are judged: for about as long as a physics check takes."""
 
 OnFailure = Callable[[Frame, Exception, int], None]
 """Called with a frame that came to no result, why, and how many have in a row; raises to end there."""
@@ -25,6 +34,19 @@ OnFailure = Callable[[Frame, Exception, int], None]
 def _refuse(frame: Frame, error: Exception, in_a_row: int) -> None:
     del frame, in_a_row
     raise error
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A frame, and what the networks eat of it."""
+
+    arrival: Arrival
+    maps: LidarMaps
+    look: Look
+    corrected: LidarMaps
+    """Raw maps with the range that the lidar is known to lack added."""
+    eaten: LidarMaps
+    stages_s: Mapping[str, float]
 
 
 class Processing:
@@ -57,22 +79,37 @@ class Processing:
 
     def step(self, arrival: Arrival, clock: Clock, begun_s: float) -> Step:
         """All of it, for one frame that is waited for since `begun_s`."""
+        seen = self.see(arrival, clock, begun_s)
+        (made,) = self.reconstruct([seen], clock)
+        return self.finish(seen, made, clock)
+
+    def see(self, arrival: Arrival, clock: Clock, begun_s: float) -> Seen:
+        """What the lidar saw, up to what the networks eat; frames in their order."""
         got_s = clock()
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
         maps = self._mean.add(maps)
         look = self.bench.look(arrival.frame, maps)
         looked_s = clock()
-        corrected = self.bench.corrected(maps)
-        eaten = look.difference if self._eats_difference and look.difference else corrected
-        reconstruction = reconstruct(eaten, self.bench.rig, self.network, clock, self.doubter)
         stages_s = {"wait": got_s - begun_s, "queue": got_s - arrival.arrived_s}
         stages_s |= {"maps": mapped_s - got_s, "bench": looked_s - mapped_s}
-        stages_s |= reconstruction.timings_s
-        shown, verdict = self._judge.look(reconstruction, signs_of(arrival.frame, look, self.checks.newest))
-        self.checks.offer(arrival.frame.frame_number, corrected, shown.depth_m)
-        made = shown, clock(), stages_s, look.difference, look.warnings, verdict
-        return Step(arrival.frame, maps, *made, check=self.checks.newest, arrived_s=arrival.arrived_s)
+        corrected = self.bench.corrected(maps)
+        eaten = look.difference if self._eats_difference and look.difference else corrected
+        return Seen(arrival, maps, look, corrected, eaten, stages_s)
+
+    def reconstruct(self, several: Sequence[Seen], clock: Clock) -> list[Reconstruction]:
+        """What the networks make of each, and of no other frame: what it takes does not change, nor is it changed."""
+        eaten = [seen.eaten for seen in several]
+        return reconstruct_all(eaten, self.bench.rig, self.network, clock, self.doubter)
+
+    def finish(self, seen: Seen, made: Reconstruction, clock: Clock) -> Step:
+        """What is shown of it, and what is said; frames in their order."""
+        frame, look = seen.arrival.frame, seen.look
+        shown, verdict = self._judge.look(made, signs_of(frame, look, self.checks.newest))
+        self.checks.offer(frame.frame_number, seen.corrected, shown.depth_m)
+        stages_s = {**seen.stages_s, **made.timings_s}
+        told = shown, clock(), stages_s, look.difference, look.warnings, verdict
+        return Step(frame, seen.maps, *told, check=self.checks.newest, arrived_s=seen.arrival.arrived_s)
 
 
 def limits_of(doubter: Doubter) -> Limits:
@@ -104,8 +141,7 @@ def steps(
     begun_s, in_a_row = clock(), 0
     for arrival in reader:
         try:
-            if thermometer and (celsius := thermometer.at(arrival.frame)):
-                processing.bench.look_at(celsius)
+            _follow(thermometer, arrival, processing)
             step = processing.step(arrival, clock, begun_s)
         except Exception as error:  # noqa: BLE001  whatever an odd frame leads to, who called decides
             in_a_row += 1
@@ -114,3 +150,50 @@ def steps(
             in_a_row = 0
             yield step
         begun_s = clock()
+
+
+def steps_ahead(
+    reader: FrameReader, processing: Processing, clock: Clock = time.time, thermometer: Thermometer | None = None
+) -> Generator[Step]:
+    """The same steps in the same order, for frames that nobody waits for: the networks take several at once.
+
+    Which ones does not depend on how fast they come, so the same frames give the same bits. What one leads to ends it.
+    """
+    ahead = deque[tuple[Sequence[Seen], Future[list[Reconstruction]]]]()
+    with ThreadPoolExecutor(os.cpu_count(), "networks") as threads:
+        for together in _lots(reader, processing, clock, thermometer):
+            ahead.append((together, threads.submit(processing.reconstruct, together, clock)))
+            if len(ahead) > MOST_AHEAD:
+                yield from _finished(*ahead.popleft(), processing, clock)
+        for lot in ahead:
+            yield from _finished(*lot, processing, clock)
+
+
+def _lots(
+    reader: FrameReader, processing: Processing, clock: Clock, thermometer: Thermometer | None
+) -> Generator[Sequence[Seen]]:
+    """What the lidar saw, FRAMES_TOGETHER at a time; fewer at the end."""
+    together, begun_s = list[Seen](), clock()
+    for arrival in reader:
+        _follow(thermometer, arrival, processing)
+        together.append(processing.see(arrival, clock, begun_s))
+        if len(together) == FRAMES_TOGETHER:
+            yield together
+            together = []
+        begun_s = clock()
+    if together:
+        yield together
+
+
+def _finished(
+    together: Sequence[Seen], making: Future[list[Reconstruction]], processing: Processing, clock: Clock
+) -> Generator[Step]:
+    """The steps of frames taken together, once they are made."""
+    for seen, made in zip(together, making.result(), strict=True):
+        yield processing.finish(seen, made, clock)
+
+
+def _follow(thermometer: Thermometer | None, arrival: Arrival, processing: Processing) -> None:
+    """Have the bench follow the lidar's temperature."""
+    if thermometer and (celsius := thermometer.at(arrival.frame)):
+        processing.bench.look_at(celsius)

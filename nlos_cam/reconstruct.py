@@ -1,7 +1,7 @@
 """Lidar maps in, hidden depth out: pure, no input or output."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,21 +59,52 @@ def reconstruct(
     clock: Clock = time.perf_counter,
     doubter: Doubter | None = None,
 ) -> Reconstruction:
-    """The hidden depth behind one frame's maps, and its doubt. Raises SceneError for a rig without an object box.
+    """The hidden depth behind one frame's maps, and its doubt. Raises SceneError for a rig without an object box."""
+    return reconstruct_all([maps], rig, network, clock, doubter)[0]
+
+
+def reconstruct_all(
+    several: Sequence[LidarMaps],
+    rig: Rig,
+    network: Network,
+    clock: Clock = time.perf_counter,
+    doubter: Doubter | None = None,
+) -> list[Reconstruction]:
+    """The hidden depth behind each of several frames' maps, and its doubt; an equal share of the networks' time each.
+
+    Raises SceneError for a rig without an object box.
+    """
+    box = object_box(rig)
+    begun_s = clock()
+    images = _images(several, network)
+    each_s = (clock() - begun_s) / len(several)
+    made = zip(several, images, strict=True)
+    return [_doubted(_found(image, box, each_s), maps, image, doubter, box, clock) for maps, image in made]
+
+
+def _images(several: Sequence[LidarMaps], network: Network) -> Float32:
+    """(n, 64, 64), in v.
 
     Maps without any return tell nothing, so nothing is made of them: the networks, which take a cell without a return
     for an average one, would show an average object.
     """
-    box = object_box(rig)
-    begun_s = clock()
-    if maps.valid.any():
-        image = network(maps.depth_m[np.newaxis], maps.intensity[np.newaxis])[0]
-    else:
-        image = np.zeros((OBJECT_PIXELS, OBJECT_PIXELS), np.float32)
-    made_s = clock()
-    found = Reconstruction(depth_from_image(image, box), pose_of(box), None, {"network": made_s - begun_s})
+    images = np.zeros((len(several), OBJECT_PIXELS, OBJECT_PIXELS), np.float32)
+    if telling := [index for index, maps in enumerate(several) if maps.valid.any()]:
+        depth_m = np.stack([several[index].depth_m for index in telling])
+        images[telling] = network(depth_m, np.stack([several[index].intensity for index in telling]))
+    return images
+
+
+def _found(image: Float32, box: ObjectBox, network_s: float) -> Reconstruction:
+    return Reconstruction(depth_from_image(image, box), pose_of(box), None, {"network": network_s})
+
+
+def _doubted(
+    found: Reconstruction, maps: LidarMaps, image: Float32, doubter: Doubter | None, box: ObjectBox, clock: Clock
+) -> Reconstruction:
     if doubter is None:
         return found
+    begun_s = clock()
     doubt = doubt_of(doubter, maps, image, box)
-    timings_s = {**found.timings_s, "doubt": clock() - made_s}
+    timings_s = {**found.timings_s, "doubt": clock() - begun_s}
     return replace(found, uncertainty_m=doubt.error_m, timings_s=timings_s, doubt=doubt)

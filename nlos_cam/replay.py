@@ -24,7 +24,7 @@ from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.live_report import OnWarning, Step, Warned, frames_by_verdict, say_nothing
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.physics_check import UNEXPLAINED
-from nlos_cam.processing import Processing, read_along, steps
+from nlos_cam.processing import Processing, read_along, steps_ahead
 from nlos_cam.reconstruct import Clock
 from nlos_cam.replay_looks import Looks
 from nlos_cam.samples import Samples
@@ -124,7 +124,7 @@ def replay(
         looking = files.enter_context((looks or Looks(bench)).into(part))
         frames, thermometer = read_along(camera, camera)
         with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader, processing.checks:
-            for step in steps(reader, processing, clock, thermometer=thermometer):
+            for step in steps_ahead(reader, processing, clock, thermometer):
                 results.add(step)
                 looking.add(step, thermometer.celsius)
                 on_frame()

@@ -1,5 +1,7 @@
+import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count as count_up
 from pathlib import Path
 from threading import Event
 
@@ -11,9 +13,11 @@ from nlos_calibration.errors import CalibrationError
 
 from nlos_cam.bench import Bench, Look
 from nlos_cam.frame_reader import FrameReader
+from nlos_cam.frames import maps_from_frame
 from nlos_cam.live_report import Step
 from nlos_cam.physics_check import Check
-from nlos_cam.processing import Processing, read_along, signs_of, steps
+from nlos_cam.physics_check_render import EveryFrames
+from nlos_cam.processing import FRAMES_TOGETHER, MOST_AHEAD, Processing, read_along, signs_of, steps, steps_ahead
 from nlos_cam.reconstruct import Clock
 from nlos_cam.verdict import Signs, Verdict
 
@@ -94,6 +98,63 @@ def test_a_camera_is_asked_from_time_to_time_also_where_only_the_view_tells_its_
         all_steps(Processing(Bench(RIG, known), network), camera)
         asked[known is not None] = camera.asked
     assert asked == {False: 3, True: 3}
+
+
+def ahead(processing: Processing, camera: WallCamera) -> list[Step]:
+    frames, thermometer = read_along(camera, camera)
+    with FrameReader(frames, keeps_all=True, stop=Event(), clock=lambda: 0.0) as reader, processing.checks:
+        return list(steps_ahead(reader, processing, lambda: 0.0, thermometer))
+
+
+CALLS = count_up()
+
+
+def looking(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+    """Shows what it eats; every other call takes longer, so that those that come side by side end out of order."""
+    time.sleep(0.02 * (next(CALLS) % 2 == 0))
+    return np.clip(np.nan_to_num(depth_m[:, :, :64]) + 0.5, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("count", [0, 1, FRAMES_TOGETHER, FRAMES_TOGETHER * (MOST_AHEAD + 3) + 3])
+def test_steps_that_are_worked_on_together_are_those_worked_on_in_turn(tmp_path: Path, count: int) -> None:
+    def processing() -> Processing:
+        bench, checks = Bench(RIG, measured_wall(tmp_path)), EveryFrames(RIG, every=5, accuracy="draft")
+        return Processing(bench, looking, average=3, doubter=FakeDoubter(), checks=checks)
+
+    in_turn = all_steps(processing(), WallCamera(count, moved=range(count // 2)))
+    together = ahead(processing(), WallCamera(count, moved=range(count // 2)))
+    assert [step.frame.frame_number for step in together] == list(range(count))
+    for one, other in zip(in_turn, together, strict=True):
+        assert (one.verdict, one.warnings, one.arrived_s) == (other.verdict, other.warnings, other.arrived_s)
+        assert one.check is not None
+        assert other.check is not None
+        assert (one.check.frame_number, one.check.score) == (other.check.frame_number, other.check.score)
+        np.testing.assert_array_equal(one.maps.depth_m, other.maps.depth_m)
+        np.testing.assert_array_equal(one.reconstruction.depth_m, other.reconstruction.depth_m)
+        assert one.difference is not None
+        assert other.difference is not None
+        np.testing.assert_array_equal(one.difference.depth_m, other.difference.depth_m)
+
+
+def test_frames_worked_on_together_share_the_networks_time() -> None:
+    ticks = iter(range(10_000))
+    with FrameReader(WallCamera(4), keeps_all=True, stop=Event(), clock=lambda: 0.0) as reader:
+        done = list(steps_ahead(reader, Processing(Bench(RIG), network), lambda: float(next(ticks))))
+    assert len(done) == FRAMES_TOGETHER == 4
+    (share_s,) = {step.stages_s["network"] for step in done}
+    assert share_s in {ticks / 4 for ticks in range(1, 100)}
+
+
+def test_what_one_of_many_frames_leads_to_is_raised() -> None:
+    odd_m = maps_from_frame(wall_frame(9)).depth_m
+
+    def failing(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+        if any(np.array_equal(one_m, odd_m, equal_nan=True) for one_m in depth_m):
+            raise ZeroDivisionError("an odd frame")
+        return network()
+
+    with pytest.raises(ZeroDivisionError, match="an odd frame"):
+        ahead(Processing(Bench(RIG), failing), WallCamera(40))
 
 
 def failing_at(number: int) -> Iterator[np.ndarray]:

@@ -18,7 +18,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.bench import Bench
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.processing import Processing
+from nlos_cam.processing import FRAMES_TOGETHER, MOST_AHEAD, Processing
 from nlos_cam.replay import DIFFERENCE, REPORT, RESULT, SHEET, replay
 
 RIG = load_rig("paper-rig")
@@ -114,7 +114,9 @@ def test_an_interrupted_replay_keeps_what_is_done_and_says_so(tmp_path: Path) ->
             stop.set()
 
     report = replay(Recorded(1000), Processing(Bench(RIG), network), tmp_path / "out", stop=stop, on_frame=on_frame)
-    assert report.frames == 7
+    assert report.frames == FRAMES_TOGETHER * (MOST_AHEAD + 2)
+    with np.load(tmp_path / "out" / RESULT) as result:
+        assert result["frame_number"].tolist() == list(range(100, 100 + report.frames))
     assert "Interrupted" in (tmp_path / "out" / REPORT).read_text()
 
 
