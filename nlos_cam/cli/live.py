@@ -1,18 +1,17 @@
 """`nlos-cam live` and `nlos-cam replay`: frames in, hidden depth out."""
 
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from nlos_models.doubt_inference import Doubter
 from nlos_models.inference import Reconstructor
 
 from nlos_cam.bench import Bench, open_bench
 from nlos_cam.budget import SHIPPED
-from nlos_cam.camera import Camera, Recording, open_camera
+from nlos_cam.camera import Camera, open_camera
 from nlos_cam.camera.clock import WallClock
 from nlos_cam.camera.table import Reader
 from nlos_cam.cli.common import (
@@ -28,11 +27,12 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.cli.live_budget import BudgetMs, Choice, Tradeoff, loader, options_here, timer, within_budget
+from nlos_cam.cli.live_kept import Log, RecordTo, kept_of
 from nlos_cam.cli.live_told import told, warn
 from nlos_cam.cli.live_view import NoView, Open, ViewHost, ViewPort, tell_of_view, viewer_of
-from nlos_cam.cli.view import SUFFIX, SaveReplayView, SaveView, Stills, Video, saving
-from nlos_cam.frame_log import SUFFIXES, FrameLog
+from nlos_cam.cli.view import SaveReplayView, SaveView, Stills, Video, saving
 from nlos_cam.live import run_live, warm_up
+from nlos_cam.live_report import LiveReport
 from nlos_cam.physics_check import Checks
 from nlos_cam.physics_check_runner import BackgroundChecks
 from nlos_cam.precedence import precedence
@@ -41,7 +41,6 @@ from nlos_cam.replay import REPORT, replay
 from nlos_cam.replay_looks import Looks
 from nlos_cam.set_up import load_doubt, load_networks, misfits, set_up
 from nlos_cam.undisturbed import undisturbed
-from nlos_cam.view.viewer import Moment
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:scene.toml, bag:run.bag.")]
 Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it (wall.toml).")]
@@ -51,11 +50,9 @@ Average = Annotated[
     int,
     typer.Option("--average", min=1, max=1000, help="Average the maps of so many frames; what moves meanwhile smears."),
 ]
-RecordTo = Annotated[Path | None, typer.Option("--record", help="Also record the camera's streams (F.bag).")]
 ReadBy = Annotated[Reader, typer.Option("--reader", help="Who reads the file: plain (we), or sdk (librealsense).")]
 BagFile = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording with depth, infrared and confidence.")]
 Out = Annotated[Path | None, typer.Option("--out", help="The folder to write.")]
-Log = Annotated[Path | None, typer.Option("--log", help="Write one line for each frame: F.csv, or F.jsonl.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -85,23 +82,20 @@ def live(
     """Show what is hidden around the corner, live, in a browser."""
     if budget_ms is not None and average > 1:
         raise typer.BadParameter("--budget-ms chooses how many frames are averaged: leave --average away")
-    path = _named(record, "--record", "a recording", (".bag",), overwrite=overwrite)
-    frame_log = _named(log, "--log", "a log", SUFFIXES, overwrite=overwrite)
-    recording = Recording(path, optional=True) if path else None
-    view_path = _named(save_view, "--save-view", "a saved view", (SUFFIX,), overwrite=overwrite)
+    kept = kept_of(record, log, save_view, overwrite=overwrite)
     with interrupted_by_signals():
         with tracked("rendering the scene ahead") as on_progress:
-            opened = open_camera(camera, on_progress=on_progress, recording=recording)
+            opened = open_camera(camera, on_progress=on_progress, recording=kept.recording)
         bench = open_bench(wall, opened)
         checks = BackgroundChecks(bench.rig, on_error=_warn_once)
         processing, choice = _chosen(opened, bench, weights, average, budget_ms, tradeoff, checks)
         warm_up(opened, processing)
-    viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, view_path)
+    viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, kept.view)
     with (
         stop_on_signals() as stop,
         precedence(),
         viewer,
-        _logging(frame_log) as on_moment,
+        kept.logging() as on_moment,
         undisturbed(),
         opened as source,
     ):
@@ -118,13 +112,8 @@ def live(
             on_warning=warn,
             on_moment=on_moment,
         )
-    if recording:
-        say(f"recorded {recording.sets} frames to {recording.path}")
-    if view_path:
-        say(f"saved the view: nlos-cam view {view_path}")
-    budget = {"budget": choice.outcome(report)} if choice else {}
-    text = [told(report), *([choice.outcome_told(report)] if choice else [])]
-    finish({**asdict(report), **budget}, as_json=json, text="\n".join(text))
+    kept.say()
+    _finish_live(report, choice, as_json=json)
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)
 
@@ -149,7 +138,8 @@ def replay_bag(
         bench = open_bench(wall, opened)
         from nlos_cam.physics_check_render import EveryFrames  # the renderer takes a second to import
 
-        processing = _processing(bench, weights, average, EveryFrames(bench.rig, on_error=_warn_once))
+        checks = EveryFrames(bench.rig, on_error=_warn_once)
+        processing = _processing(bench, load_networks(weights), load_doubt(weights), average, checks)
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
         report = replay(
@@ -167,24 +157,11 @@ def replay_bag(
         raise typer.Exit(INTERRUPTED)
 
 
-def _named(path: Path | None, option: str, what: str, suffixes: tuple[str, ...], *, overwrite: bool) -> Path | None:
-    """Where something is written, if it is. Raises typer.BadParameter for a name that is not of its kind."""
-    if path is None:
-        return None
-    if path.suffix not in suffixes:
-        raise typer.BadParameter(f"{option} {path}: {what}'s name ends in {' or '.join(suffixes)}")
-    return output_path(path, "live", path.suffix, overwrite=overwrite)
-
-
-@contextmanager
-def _logging(path: Path | None) -> Generator[Callable[[Moment], None]]:
-    """What is called with each frame's moment: a log's `add`, if there is a path to write it to."""
-    if path is None:
-        yield lambda _: None
-        return
-    with FrameLog(path) as frame_log:
-        yield frame_log.add
-    say(f"logged each frame to {path}")
+def _finish_live(report: LiveReport, choice: Choice | None, *, as_json: bool) -> None:
+    """What the run did, and what became of its budget."""
+    budget = {"budget": choice.outcome(report)} if choice else {}
+    text = [told(report), *([choice.outcome_told(report)] if choice else [])]
+    finish({**asdict(report), **budget}, as_json=as_json, text="\n".join(text))
 
 
 def _chosen(
@@ -198,13 +175,15 @@ def _chosen(
 ) -> tuple[Processing, Choice | None]:
     """What is made of frames: as is usual, or within a budget, which then was chosen so."""
     if budget_ms is None:
-        return _processing(bench, weights, average, checks), None
+        return _processing(bench, load_networks(weights), load_doubt(weights), average, checks), None
     options = options_here(tradeoff, weights)
-    making = partial(set_up, bench, doubter=load_doubt(weights))  # takes as long whatever it watches
+    doubter = load_doubt(weights)
+    making = partial(set_up, bench, doubter=doubter)  # takes as long whatever it watches
     network, choice = within_budget(budget_ms, options, making, loader(weights), timer(camera))
     say(choice.told())
-    chosen = weights if choice.option.weights == SHIPPED else Path(choice.option.weights)
-    return _processing(bench, chosen, choice.option.frames, checks, network), choice
+    if choice.option.weights != SHIPPED:
+        doubter = load_doubt(Path(choice.option.weights))
+    return _processing(bench, network, doubter, choice.option.frames, checks), choice
 
 
 def _warn_once(warning: str) -> None:
@@ -212,10 +191,9 @@ def _warn_once(warning: str) -> None:
 
 
 def _processing(
-    bench: Bench, weights: Path | None, average: int, checks: Checks, network: Reconstructor | None = None
+    bench: Bench, network: Reconstructor, doubter: Doubter | None, average: int, checks: Checks
 ) -> Processing:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
-    network, doubter = network or load_networks(weights), load_doubt(weights)
     processing = set_up(bench, network, average, doubter=doubter, checks=checks)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
     for note in misfits(bench, network.record, doubter):
