@@ -28,6 +28,7 @@ from nlos_cam.objects.depth_image import depth_from_image, object_box
 from nlos_cam.objects.test_set import test_set
 from nlos_cam.physics_check import UNEXPLAINED
 from nlos_cam.physics_check_render import check
+from nlos_cam.render.accuracy import Stop
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 
@@ -38,6 +39,8 @@ NOTHING = np.full((64, 64), np.nan, np.float32)
 MOST_FLAGGED = 0.01
 OTHERS = 7, 19
 """How far down the list the other objects stand whose reconstruction is held against an object's maps."""
+OUTSIDE_ACCURACY: Stop = "draft"
+"""At `standard` a glossy thing takes minutes, and these are far from what explains them in any case."""
 ORDINARY, TEST, WRONG, OUTSIDE = "new objects", "test objects", "another object's", "outside: "
 Scores = NDArray[np.float64]
 
@@ -56,9 +59,9 @@ class Study:
     def __init__(self, network: Reconstructor) -> None:
         self._network = network
 
-    def see(self, scene: Scene, sensor: Any = None) -> Seen:
+    def see(self, scene: Scene, sensor: Any = None, accuracy: Stop = "standard") -> Seen:
         """One frame of a scene, with its own noise."""
-        maps = sense([render(scene).multi], scene.rig, sensor)[0]
+        maps = sense([render(scene, accuracy).multi], scene.rig, sensor)[0]
         image = self._network(maps.depth_m[np.newaxis], maps.intensity[np.newaxis])[0]
         return Seen(maps, depth_from_image(image, BOX))
 
@@ -95,7 +98,7 @@ def populations(
     add("empty bench, nothing shown", scores((maps, NOTHING) for maps in empty))
     add("empty bench, an object shown", scores((maps, one.found_m) for maps, one in zip(empty, seen, strict=True)))
     for kind, sights in outside.items():
-        made = [study.see(sight.scene, sight.sensor) for sight in sights]
+        made = [study.see(sight.scene, sight.sensor, OUTSIDE_ACCURACY) for sight in sights]
         add(f"{OUTSIDE}{kind}", scores((one.maps, one.found_m) for one in made))
     return found
 
