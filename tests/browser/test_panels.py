@@ -18,7 +18,7 @@ from nlos_cam.view.saved_view import SavedView
 from nlos_cam.view.verdict_picture import LOOKS
 from nlos_cam.view.viewer import Moment
 
-pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 
 PAGE_RGB = (13, 16, 17)
 BANNER: Region = slice(2, 90), slice(2, 740)

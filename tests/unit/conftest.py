@@ -116,7 +116,7 @@ def noise_bag_uncompressed(noise_bag: Path, tmp_path_factory: pytest.TempPathFac
     return rewrite(noise_bag, target, lambda _, time_ns, raw: [(time_ns, raw)])
 
 
-def exact_wall(
+def fitted_wall(
     distance_m: float = 0.2, yaw_deg: float = 40.0, pitch_deg: float = 3.0, *, width: int = 64, **others: Any
 ) -> MeasuredWall:
     """A wall as it is measured without noise, by 60 frames of an even light; `others` are fields of its record."""
@@ -147,7 +147,7 @@ def exact_wall(
 
 @pytest.fixture(scope="session")
 def measured() -> Callable[..., MeasuredWall]:
-    return exact_wall
+    return fitted_wall
 
 
 @pytest.fixture(scope="session")

@@ -25,14 +25,15 @@ class FakeNetwork:
         self.eaten: list[np.ndarray] = []
 
     def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
-        assert depth_m.shape == intensity.shape == (1, 64, 80)
-        self.eaten.append(depth_m[0])
-        return np.zeros((1, 64, 64), np.float32)
+        assert depth_m.shape == intensity.shape == (len(depth_m), 64, 80)
+        self.eaten.extend(depth_m)
+        return np.zeros((len(depth_m), 64, 64), np.float32)
 
 
 @pytest.fixture
 def network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeNetwork:
     found = FakeNetwork()
+    monkeypatch.setattr("nlos_cam.processing.os.cpu_count", lambda: 1)  # so that it eats in order
     monkeypatch.setattr(commands, "load_networks", lambda *_: found)
     monkeypatch.setattr(commands, "load_doubt", lambda *_: None)
     monkeypatch.chdir(tmp_path)
