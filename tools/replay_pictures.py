@@ -16,17 +16,15 @@ from threading import Event
 from typing import Self
 
 from nlos_calibration.rig import load_rig
-from nlos_models.inference import load_reconstructor
 
 from nlos_cam.bench import Bench
-from nlos_cam.cache import cache_folder
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.camera.world import World, open_world
 from nlos_cam.cli.common import tracked
 from nlos_cam.frames import Frame
-from nlos_cam.processing import Processing
 from nlos_cam.replay import replay
 from nlos_cam.replay_looks import VIDEO, Looks
+from nlos_cam.set_up import load_doubt, load_networks, set_up
 
 IMAGES = Path("docs/images")
 SCENES = {"airplane": "", "cup": "examples/cup.toml", "empty": "examples/empty.toml"}
@@ -71,7 +69,7 @@ def draw(name: str, scene: str, frames: int, out: Path) -> None:
     with tracked(f"rendering {name}") as on_progress:
         world = open_world(scene, on_progress)
     bench = Bench(world.rig if world.rig.object_box else load_rig("paper-rig"))
-    processing = Processing(bench, load_reconstructor(None, cache_folder() / "onnx"))
+    processing = set_up(bench, load_networks(), doubter=load_doubt())
     looks, camera = Looks(bench, stills=2, video=name == FILMED), Unhurried(world, frames)
     with TemporaryDirectory() as folder, tracked(f"reconstructing {name}") as on_progress:
         made, done = Path(folder) / "replay", iter(range(1, frames + 1))
