@@ -115,7 +115,7 @@ def train_doubt(
     network = in_channels_last(network)
     whole, quick = as_doubt_batch(held_out), (running or Running()).quick(network)
 
-    def loss(batch: DoubtBatch) -> Tensor:
+    def loss(batch: DoubtBatch, _: float) -> Tensor:
         return doubt_loss(quick(*batch[:3]), batch)
 
     figures = fit(

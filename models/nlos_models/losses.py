@@ -25,6 +25,14 @@ def kl_divergence(mean: Tensor, log_variance: Tensor) -> Tensor:
     return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()
 
 
+def variational_share(done: float, warm_up: float) -> float:
+    """How much of its noise and divergence a VAE has when such a share of its run is done: all, without a warm-up.
+
+    With one it begins as a plain autoencoder, for that share of the run; both then rise evenly over as much again.
+    """
+    return min(1.0, max(0.0, done / warm_up - 1)) if warm_up else 1.0
+
+
 def latent_error(latent: Tensor, mean: Tensor, log_variance: Tensor) -> Tensor:
     """Squared error of latents (n, latent) in units of the encoder's own doubt, so that empty entries weigh little."""
     weight = torch.exp(-log_variance.float()).clamp(max=100.0)

@@ -8,13 +8,27 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from lightning_fabric import Fabric
-from torch import Tensor
+from torch import Tensor, nn
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
 from nlos_models.errors import RecipeError, TrainingError
 from nlos_models.recipe import Recipe
 
 Accelerator = Literal["auto", "cpu", "cuda"]
+Loss = Callable[[Any, float], Tensor]
+"""Of a batch, when such a share of the run's steps is done."""
+
+
+class LossStep(nn.Module):
+    """A loss as a module's forward: what several processes need, to average the gradients behind it."""
+
+    def __init__(self, module: nn.Module, loss: Loss) -> None:
+        super().__init__()
+        self.module, self._loss = module, loss
+
+    def forward(self, batch: Any, done: float) -> Tensor:
+        """The loss of one batch, when such a share of the run's steps is done."""
+        return self._loss(batch, done)
 
 
 def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: int = 1) -> Fabric:

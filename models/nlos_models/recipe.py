@@ -36,6 +36,8 @@ class Recipe(BaseModel):
     schedule: Literal["one-cycle", "plateau"] = "plateau"
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     kl_weight: float = 0.05
+    latent_warm_up: float = Field(default=0.0, ge=0, le=0.5)
+    """Of a VAE: for this share of the run it is a plain autoencoder; noise and divergence then rise over as much."""
     left_noise: float = 0.2
     dropout: float = Field(default=0.5, ge=0, lt=1)
     width: float = Field(default=1.0, gt=0, le=2)
@@ -76,24 +78,30 @@ class Recipe(BaseModel):
     def _agrees_with_itself(self) -> Self:
         if self.batch > self.objects:
             raise ValueError(f"a batch of {self.batch} is larger than objects ({self.objects})")
-        if self.augmentation == "turns" and self.task != "vae":
-            raise ValueError("augmentation 'turns' is for a VAE: maps of the rig have the mirror's symmetry alone")
-        if self.task == "transfer" and self.steps != "two":
-            raise ValueError(f"steps {self.steps!r} is for a compressor: a transfer keeps the decoder")
         if self.task != "vae" and not self.latent_weight + self.image_weight:
             raise ValueError("latent_weight and image_weight are both 0: there is nothing to learn by")
         if self.steps == "one" and self.latent_weight:
             raise ValueError("steps 'one' knows no latent to aim at: set latent_weight = 0")
-        if self.start == "weights" and (self.task == "transfer" or self.steps != "two"):
-            raise ValueError("start 'weights' is for a VAE or a two-step compressor: leave it out")
         if self.colour and (self.task == "transfer" or self.maps != "raw maps"):
             raise ValueError("colour is simulation only, and of raw maps: no bench to transfer to, no difference maps")
-        if self.width != 1 and (self.colour or self.task != "compressor"):
-            raise ValueError("width is of a compressor of depth: leave it out")
         if self.steps != "two" and not self.image_weight:
             raise ValueError(
                 f"steps {self.steps!r} trains a decoder, which learns by images alone: set an image_weight"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _asks_for_what_its_task_has(self) -> Self:
+        if self.augmentation == "turns" and self.task != "vae":
+            raise ValueError("augmentation 'turns' is for a VAE: maps of the rig have the mirror's symmetry alone")
+        if self.latent_warm_up and self.task != "vae":
+            raise ValueError("latent_warm_up is of a VAE's noise and divergence: leave it out")
+        if self.task == "transfer" and self.steps != "two":
+            raise ValueError(f"steps {self.steps!r} is for a compressor: a transfer keeps the decoder")
+        if self.start == "weights" and (self.task == "transfer" or self.steps != "two"):
+            raise ValueError("start 'weights' is for a VAE or a two-step compressor: leave it out")
+        if self.width != 1 and (self.colour or self.task != "compressor"):
+            raise ValueError("width is of a compressor of depth: leave it out")
         return self
 
     @model_validator(mode="after")

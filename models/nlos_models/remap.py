@@ -59,7 +59,7 @@ class Remapping:
         targets = self._targets(recipe, fabric)
         latent_of, decoded = running.quick(pipeline.latent), running.quick(pipeline.decoder)
 
-        def loss(batch: MapBatch) -> Tensor:
+        def loss(batch: MapBatch, _: float) -> Tensor:
             for part in still:
                 part.eval()
             latent = latent_of(batch.depth_m, batch.intensity)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nlos_models.data import Float32, Half, MapSet, as_images, image_batches
 from nlos_models.errors import TrainingError
-from nlos_models.losses import image_error, kl_divergence
+from nlos_models.losses import image_error, kl_divergence, variational_share
 from nlos_models.networks import new_pipeline, new_vae
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
@@ -37,13 +37,15 @@ def train_vae(
     vae = in_channels_last(start or new_vae(colour=recipe.colour))
     quick = (running or Running()).quick(vae)
 
-    def loss(image: Tensor) -> Tensor:
+    def loss(image: Tensor, done: float) -> Tensor:
         if recipe.augmentation == "turns":
             image = turn_some(image, torch.randint(4, (len(image),), device=image.device))
         image = image.contiguous(memory_format=torch.channels_last)
-        rebuilt, mean, log_variance = quick(image, torch.randn(len(image), vae.latent, device=image.device))
+        share = variational_share(done, recipe.latent_warm_up)
+        noise = share * torch.randn(len(image), vae.latent, device=image.device)
+        rebuilt, mean, log_variance = quick(image, noise)
         error = image_error(rebuilt, image, recipe.surface_weight, recipe.image_loss)
-        return error + recipe.kl_weight * kl_divergence(mean, log_variance)
+        return error + share * recipe.kl_weight * kl_divergence(mean, log_variance)
 
     figures = fit(
         vae,

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from nlos_models.compiled import Network, compiled, compiling
 from nlos_models.errors import RecipeError, TrainingError
-from nlos_models.processes import open_fabric, seed_of, share_of
+from nlos_models.processes import Loss, LossStep, open_fabric, seed_of, share_of
 from nlos_models.recipe import Recipe
 from nlos_models.run_files import Tell, read_best, read_last, write_best, write_last, write_log
 from nlos_models.schedule import has_ended, schedule_of
@@ -27,7 +27,6 @@ from nlos_models.tensorboard import Board
 
 Batches = Callable[[torch.Generator], Iterable[Any]]
 """One epoch of batches, shuffled by the generator."""
-Loss = Callable[[Any], Tensor]
 Score = Callable[[], dict[str, float]]
 OnStep = Callable[[int, int], None]
 """Called with the steps done and the steps in all."""
@@ -67,18 +66,6 @@ class Running:
     def quick(self, network: Network) -> Network:
         """The network, or part of one, as a step runs it."""
         return compiled(network) if self.compiled else network
-
-
-class _Step(nn.Module):
-    """A loss as a module's forward: what several processes need, to average the gradients behind it."""
-
-    def __init__(self, module: nn.Module, loss: Loss) -> None:
-        super().__init__()
-        self.module, self._loss = module, loss
-
-    def forward(self, batch: Any) -> Tensor:
-        """The loss of one batch."""
-        return self._loss(batch)
 
 
 def fit(
@@ -124,8 +111,9 @@ class _Run:
         self.module = module
         free = [p for p in module.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(free, recipe.learning_rate, recipe.betas)
-        self._forward, self._optimizer = self.fabric.setup(_Step(module, loss), self.optimizer)
-        self.schedule = schedule_of(recipe, self.optimizer, recipe.epochs * steps)
+        self._forward, self._optimizer = self.fabric.setup(LossStep(module, loss), self.optimizer)
+        self._steps_in_all = recipe.epochs * steps
+        self.schedule = schedule_of(recipe, self.optimizer, self._steps_in_all)
         self.epoch, self.step, self.rows = 0, 0, list[dict[str, float]]()
         self.total = torch.zeros((), device=self.fabric.device)
         if self.leads:
@@ -139,6 +127,10 @@ class _Run:
         return self.epoch < self.recipe.epochs and not has_ended(self.recipe, self._rate)
 
     @property
+    def _steps_done(self) -> int:
+        return self.epoch * self.steps + self.step
+
+    @property
     def _rate(self) -> float:
         return self.optimizer.param_groups[0]["lr"]
 
@@ -150,14 +142,15 @@ class _Run:
         for batch in islice(batches(generator), self.step, None):
             self._advance(batch)
             if self.leads:
-                on_step(self.epoch * self.steps + self.step, self.recipe.epochs * self.steps)
+                on_step(self._steps_done, self._steps_in_all)
             self._pause()
 
     def _advance(self, batch: Any) -> None:
         rank, world = self.fabric.global_rank, self.fabric.world_size
         torch.manual_seed(seed_of(self.recipe.seed, self.epoch, self.step, rank))
         with compiling():
-            value = self._forward(self.fabric.to_device(share_of(batch, rank, world)))
+            done = self._steps_done / self._steps_in_all
+            value = self._forward(self.fabric.to_device(share_of(batch, rank, world)), done)
             self._optimizer.zero_grad(set_to_none=True)
             self.fabric.backward(value)
         self._optimizer.step()
@@ -180,7 +173,7 @@ class _Run:
         asked = self.running.stop()
         if self.fabric.world_size == 1:
             return asked
-        if (self.epoch * self.steps + self.step) % STEPS_BETWEEN_WORDS:
+        if self._steps_done % STEPS_BETWEEN_WORDS:
             return False
         return bool(self._over_all(torch.tensor(float(asked), device=self.fabric.device), "sum"))
 

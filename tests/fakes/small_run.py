@@ -34,6 +34,8 @@ class SmallRun:
     def __init__(self, recipe: Recipe, folder: Path, *, plain: bool = False) -> None:
         torch.manual_seed(7)
         self.recipe, self.folder, self.steps, self.scored = recipe, folder, list[tuple[int, int]](), 0
+        self.done = list[float]()
+        """What the loss was told of the run's progress, step by step."""
         self.x = torch.rand(SAMPLES, 3)
         self.y = self.x.sum(1, keepdim=True)
         middle = [] if plain else [nn.BatchNorm1d(16), nn.Dropout(0.1)]
@@ -45,7 +47,8 @@ class SmallRun:
         for index in order.split(self.recipe.batch):
             yield self.x[index], self.y[index]
 
-    def _loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
+    def _loss(self, batch: tuple[Tensor, Tensor], done: float) -> Tensor:
+        self.done.append(done)
         x, y = batch
         return (self.net(x + self.noise * torch.randn(x.shape)) - y).square().mean()
 

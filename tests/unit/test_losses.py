@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from nlos_models.losses import image_error, kl_divergence, latent_error
+from nlos_models.losses import image_error, kl_divergence, latent_error, variational_share
 from nlos_models.recipe import ImageLoss
 
 
@@ -32,6 +32,14 @@ def test_absolute_error_answers_doubt_with_the_surface_or_with_nothing(
     truth[: round(4 * share)] = 0.6
     losses = {v: image_error(torch.full_like(truth, v), truth, weight, "absolute").item() for v in (0.0, 0.2, 0.4, 0.6)}
     assert min(losses, key=lambda v: losses[v]) == best
+
+
+@pytest.mark.parametrize(("done", "share"), [(0.0, 0.0), (0.2, 0.0), (0.25, 0.25), (0.3, 0.5), (0.4, 1.0), (1.0, 1.0)])
+def test_a_warm_up_keeps_noise_and_divergence_away_and_lets_them_rise_over_as_much_again(
+    done: float, share: float
+) -> None:
+    assert variational_share(done, warm_up=0.2) == pytest.approx(share)
+    assert variational_share(done, warm_up=0.0) == 1.0
 
 
 def test_kl_is_0_for_the_standard_normal_and_positive_elsewhere() -> None:

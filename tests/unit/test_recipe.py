@@ -78,6 +78,7 @@ def test_on_fewer_objects_the_batch_is_never_larger_than_all() -> None:
         ("transfer", 'start = "weights"', "start 'weights' is for a VAE or a two-step compressor"),
         ("compressor", 'start = "weights"\nsteps = "one"\nlatent_weight = 0\nimage_weight = 1', "start 'weights'"),
         ("compressor", 'start = "weights"\nsteps = "two-then-joint"\nimage_weight = 1', "start 'weights'"),
+        ("compressor", "latent_warm_up = 0.1", "a VAE's noise and divergence"),
         ("transfer", "colour = true", "no bench to transfer to"),
         ("compressor", 'colour = true\nmaps = "difference maps"', "no difference maps"),
     ],

@@ -94,6 +94,20 @@ def test_a_stopped_and_resumed_vae_equals_an_uninterrupted_one(trained: Trained,
     assert _log(tmp_path) == _log(trained[2])
 
 
+def test_a_vae_that_warms_up_knows_no_divergence_until_then_and_resumes_alike(tmp_path: Path) -> None:
+    data, losses = (small_images(COUNT, 0), small_images(4, 1)), list[list[str]]()
+    for weight in (0.0, 5.0):
+        folder = tmp_path / f"{weight}"
+        recipe = _recipe("vae", latent_warm_up=0.5, kl_weight=weight, epochs=4, schedule="one-cycle")
+        with pytest.raises(Stopped):
+            train_vae(recipe, *data, folder, _stop_at)
+        train_vae(recipe, *data, folder, _ignore)
+        losses.append([row["loss"] for row in _log(folder)])
+    without, with_it = losses
+    assert without[:2] == with_it[:2]
+    assert all(one != other for one, other in zip(without[2:], with_it[2:], strict=True))
+
+
 def test_a_stopped_and_resumed_compressor_equals_an_uninterrupted_one(trained: Trained, tmp_path: Path) -> None:
     recipe, start = _recipe("compressor", latent_weight=0.05, image_weight=1.0), Start(trained[0])
     whole, figures = _train(recipe, start, tmp_path / "whole")

@@ -97,6 +97,7 @@ def test_progress_counts_every_step_to_the_end_and_every_epoch(tmp_path: Path) -
     run, epochs = SmallRun(small_recipe(), tmp_path), list[dict[str, float]]()
     run.go(on_epoch=epochs.append)
     assert run.steps == [(k + 1, 4 * STEPS) for k in range(4 * STEPS)]
+    assert run.done == [k / (4 * STEPS) for k in range(4 * STEPS)]
     assert [row["epoch"] for row in epochs] == [0, 1, 2, 3]
 
 
