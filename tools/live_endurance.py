@@ -8,7 +8,6 @@ nothing, since it draws on the same processors.
 
 import argparse
 import json
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -22,6 +21,7 @@ from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
+from headless_chromium import CHROMIUM, SOFTWARE_GL
 from live_process import LiveProcess
 from long_capture import Look, memory, memory_mib
 
@@ -32,7 +32,6 @@ START_TIMEOUT_S, END_TIMEOUT_S = 300.0, 60.0
 MOST_DROPPED_SHARE, LEAST_FPS, MOST_P99_MS, MOST_MIB_PER_MINUTE, LEAST_TIMES_REAL = 0.001, 29.9, 20.0, 0.5, 3.0
 """What is promised."""
 REPLAYED_S = 60.0
-SOFTWARE_GL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 
 Watch = Callable[[str], Any]
 """Watches the view at an address while the block lasts; gives what it saw, which grows."""
@@ -69,10 +68,9 @@ def client(address: str) -> Generator[dict[str, Any]]:
 def chromium(address: str) -> Generator[dict[str, Any]]:
     """A headless browser that draws in software."""
     with tempfile.TemporaryDirectory() as profile:
-        program = shutil.which("chromium") or "/usr/bin/chromium"
         options = ["--headless", f"--user-data-dir={profile}", "--window-size=1280,800", *SOFTWARE_GL]
         devnull = subprocess.DEVNULL
-        with subprocess.Popen([program, *options, address], stdout=devnull, stderr=devnull) as browser:
+        with subprocess.Popen([CHROMIUM, *options, address], stdout=devnull, stderr=devnull) as browser:
             yield {}
             browser.terminate()
 

@@ -8,7 +8,6 @@ one. Needs Chromium and the dev extra.
 import argparse
 import io
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -17,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from headless_chromium import CHROMIUM, SOFTWARE_GL
 from PIL import Image
 from playwright.sync_api import Error, sync_playwright
 
 IMAGES = Path("docs/images")
-SOFTWARE_GL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 LOOK_MS, SETTLE_MS = 60_000, 25_000
 """Drawn in software, the page takes half a minute to load; then its plots fill."""
 LOAD_TIMEOUT_S = 300.0
@@ -63,10 +62,9 @@ def _address(program: subprocess.Popen[str]) -> str:
 
 def _take(address: str, out: Path, size: list[int]) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
-    chromium = shutil.which("chromium") or "/usr/bin/chromium"
     with (
         sync_playwright() as playwright,
-        playwright.chromium.launch(executable_path=chromium, args=SOFTWARE_GL) as browser,
+        playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_GL) as browser,
     ):
         page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         page.goto(address, wait_until="commit")

@@ -2,7 +2,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browser_page import CHROMIUM, SOFTWARE_GL, needs_browser
+from browser_page import needs_browser
+from headless_chromium import CHROMIUM, SOFTWARE_GL
 
 
 @pytest.fixture(scope="session")

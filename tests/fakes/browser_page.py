@@ -1,7 +1,6 @@
 """A page of the view in a headless Chromium that draws in software, looked at by its pixels."""
 
 import io
-import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -12,12 +11,11 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from headless_chromium import CHROMIUM
 from PIL import Image
 
 from nlos_cam.view.viewer import Moment, Viewer
 
-CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
-SOFTWARE_GL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 SIZE = {"width": 1280, "height": 800}
 DRAW_TIMEOUT_S = 180.0
 BUTTONS_PX, TAB_GAP_PX, LEAST_TAB_PX, HEADER_PX = 105, 10, 24, 14
