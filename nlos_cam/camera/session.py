@@ -82,6 +82,7 @@ class Session:
         self._listening = False
         self._previewed_s = -inf
         """When the newest sample was taken that came before the settings held."""
+        self._held_back = 0
 
     def start(self, prepare: Callable[[Any], None] | None = None, ready: Callable[[], None] | None = None) -> None:
         """Let frames come, once `prepare` has had the running sensor; from `ready` on, none is lost.
@@ -119,10 +120,16 @@ class Session:
         inbox.put(sample)
 
     def _is_heard(self, sample: Sample) -> bool:
-        """Whether it is delivered: not one of a set that had begun before, which would lack what came until then."""
+        """Whether it is delivered: not one of a set that had begun before, which would lack what came until then.
+
+        No more than that set is held back, so that a clock which stands still silences nothing.
+        """
         if not self._listening:
             self._previewed_s = max(self._previewed_s, sample.timestamp_s)
-        return self._listening and abs(sample.timestamp_s - self._previewed_s) > SAME_INSTANT_S
+            return False
+        began_before = abs(sample.timestamp_s - self._previewed_s) <= SAME_INSTANT_S
+        self._held_back += began_before
+        return not began_before or self._held_back >= len(self._clocks)
 
     def _unwrapped(self, sample: Sample, domain: str) -> Sample:
         """A sample on a clock that goes on: the device's own wraps every 71.6 minutes, for each stream by itself."""

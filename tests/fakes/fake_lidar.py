@@ -137,7 +137,7 @@ class FakeLidar:
         """After unplugging itself, it is plugged in when it was looked for so often; never, if 0."""
         self.saturated_share: Callable[[float], float] = lambda _: 0.0
         """Share of infrared pixels at 255, by laser power."""
-        self.zero_ms = 0.0
+        self.zero_ms, self.period_ms = 0.0, 1000 / 30
         self.colour: Callable[[int], int] | None = None
         """What its colour camera sees, one grey, by frame number; None where it has no such camera. Of two sensors one
         runs at a time."""
@@ -192,9 +192,8 @@ class FakeLidar:
         for number in numbers:
             for profile in self.opened:
                 if self._callback and profile.stream in streams:
-                    self._callback(
-                        FakeFrame(profile, number, self.zero_ms + number * 1000 / 30, self._pixels(profile, number))
-                    )
+                    taken_ms = self.zero_ms + number * self.period_ms
+                    self._callback(FakeFrame(profile, number, taken_ms, self._pixels(profile, number)))
 
     def _pixels(self, profile: FakeProfile, number: int) -> np.ndarray:
         if profile.stream == "color" and self.colour:

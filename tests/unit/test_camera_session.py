@@ -109,6 +109,17 @@ def test_a_set_that_had_begun_before_the_settings_held_is_no_incomplete_one(fake
     assert inbox.incomplete == inbox.dropped == 0
 
 
+def test_a_clock_that_stands_still_holds_no_more_than_one_set_back(fake_l515: Any) -> None:
+    lidar, inbox = fake_l515(usb="2.1"), Inbox(lossless=False)
+    lidar.period_ms = 0.0
+    session = Session(*find_streams(FakeDevice(lidar, 0)), inbox)
+    session.start(lambda _: None)
+    lidar.deliver(range(5, 8))
+    found = [inbox.take(0.0), inbox.take(0.0), inbox.take(0.0)]
+    session.stop()
+    assert [one and one.number for one in found] == [6, 7, None]
+
+
 def test_telemetry_of_a_session_that_stopped_is_empty(fake_l515: Any) -> None:
     session = Session(*find_streams(FakeDevice(fake_l515(usb="2.1"), 0)), Inbox(lossless=False))
     assert session.telemetry()
