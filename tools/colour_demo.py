@@ -2,7 +2,7 @@
 
 Runs `dataset build --colour`, `train vae` and `train compressor`, says each command, and judges the weights on the 54
 test objects, painted. A second call goes on where the first was stopped. Without options it is the recipes' own scale,
-which wants a GPU; `--small` is for two CPU cores: some minutes of rendering, ten for each training.
+which wants a GPU; `--small` is for two CPU cores: some minutes of rendering, half an hour for each training.
 """
 
 import argparse

@@ -98,7 +98,7 @@ class Session:
         if not self.settings:
             raise RuntimeError("it vanished while it was set up")
         if self._preview.arrived:
-            self.look(BOUNDARY_WAIT_S)  # else the first set would lack what came before this
+            self.look(BOUNDARY_WAIT_S)  # else the first set of a recording would lack what came before this
         if ready:
             ready()
         self._listening = True
