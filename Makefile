@@ -7,10 +7,10 @@ BIN := .venv/bin
 live: .venv/.live
 	$(BIN)/nlos-cam live --camera sim
 
-# Unit tests in two processes; what measures time, or draws in a browser, alone.
+# Laws and unit tests in two processes; what measures time, has processes of its own or draws in a browser, alone.
 test: .venv/.test
-	$(BIN)/python -m pytest tests/bench tests/browser tests/contract tests/hardware tests/laws
-	$(BIN)/python -m pytest -n 2 --dist loadfile tests/unit
+	$(BIN)/python -m pytest tests/bench tests/browser tests/contract tests/hardware
+	$(BIN)/python -m pytest -n 2 --dist loadfile tests/laws tests/unit
 
 check: .venv/.test
 	$(BIN)/python tools/check.py
