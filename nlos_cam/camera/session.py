@@ -11,6 +11,7 @@ from nlos_calibration.projection import Intrinsics
 from nlos_cam.camera.inbox import Inbox
 from nlos_cam.camera.si_units import frame_in_si
 from nlos_cam.camera.streams import (
+    FORMATS,
     FRAMES_PER_S,
     SAME_INSTANT_S,
     FrameSet,
@@ -129,7 +130,7 @@ class Session:
             return False
         began_before = abs(sample.timestamp_s - self._previewed_s) <= SAME_INSTANT_S
         self._held_back += began_before
-        return not began_before or self._held_back >= len(self._clocks)
+        return not began_before or self._held_back >= len(FORMATS)
 
     def _unwrapped(self, sample: Sample, domain: str) -> Sample:
         """A sample on a clock that goes on: the device's own wraps every 71.6 minutes, for each stream by itself."""

@@ -58,13 +58,25 @@ def test_what_is_not_measured_yet_is_no_setting(fake_l515: Any) -> None:
     assert "apd_temperature" not in settings
 
 
+def session_of(lidar: FakeLidar) -> Session:
+    return Session(*find_streams(FakeDevice(lidar, 0)), Inbox(lossless=False))
+
+
+def heard(session: Session) -> list[int]:
+    """The numbers of the sets that were delivered."""
+    numbers = list[int]()
+    while found := session.inbox.take(0.0):
+        numbers.append(found.number)
+    return numbers
+
+
 @pytest.fixture
 def preparing(fake_l515: Any) -> Callable[[Callable[[Session, FakeLidar], Any]], Any]:
     """What an act gives that is done while a session prepares its sensor."""
 
     def prepare(act: Callable[[Session, FakeLidar], Any]) -> Any:
         lidar, given = fake_l515(usb="2.1"), list[Any]()
-        session = Session(*find_streams(FakeDevice(lidar, 0)), Inbox(lossless=False))
+        session = session_of(lidar)
         session.start(lambda _: given.append(act(session, lidar)))
         session.stop()
         assert session.inbox.arrived.total() == 0  # what comes meanwhile is not delivered
@@ -98,30 +110,28 @@ def test_a_device_that_vanishes_while_it_is_prepared_is_an_error(preparing: Any)
 
 
 def test_a_set_that_had_begun_before_the_settings_held_is_no_incomplete_one(fake_l515: Any) -> None:
-    lidar, inbox = fake_l515(usb="2.1"), Inbox(lossless=False)
-    session = Session(*find_streams(FakeDevice(lidar, 0)), inbox)
+    lidar = fake_l515(usb="2.1")
+    session = session_of(lidar)
     session.start(lambda _: None, ready=lambda: lidar.deliver(range(5, 6), streams=("depth",)))
     lidar.deliver(range(5, 6), streams=("infrared", "confidence"))
     lidar.deliver(range(6, 8))
-    found = [inbox.take(0.0), inbox.take(0.0), inbox.take(0.0)]
+    assert heard(session) == [6, 7]
+    assert session.inbox.incomplete == session.inbox.dropped == 0
     session.stop()
-    assert [one and one.number for one in found] == [6, 7, None]
-    assert inbox.incomplete == inbox.dropped == 0
 
 
 def test_a_clock_that_stands_still_holds_no_more_than_one_set_back(fake_l515: Any) -> None:
-    lidar, inbox = fake_l515(usb="2.1"), Inbox(lossless=False)
+    lidar = fake_l515(usb="2.1")
     lidar.period_ms = 0.0
-    session = Session(*find_streams(FakeDevice(lidar, 0)), inbox)
+    session = session_of(lidar)
     session.start(lambda _: None)
     lidar.deliver(range(5, 8))
-    found = [inbox.take(0.0), inbox.take(0.0), inbox.take(0.0)]
+    assert heard(session) == [6, 7]
     session.stop()
-    assert [one and one.number for one in found] == [6, 7, None]
 
 
 def test_telemetry_of_a_session_that_stopped_is_empty(fake_l515: Any) -> None:
-    session = Session(*find_streams(FakeDevice(fake_l515(usb="2.1"), 0)), Inbox(lossless=False))
+    session = session_of(fake_l515(usb="2.1"))
     assert session.telemetry()
     session.stop()
     assert session.telemetry() == {}
