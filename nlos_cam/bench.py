@@ -13,7 +13,7 @@ from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig, load_rig
 from nlos_calibration.wall_record import WallRecord
 
-from nlos_cam.camera.base import Camera
+from nlos_cam.camera.protocol import Camera
 from nlos_cam.frames import Frame, LidarMaps
 
 MOST_APART_PIXELS = 0.25

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos_cam.live_report import Step
+from nlos_cam.processing import Step
 from nlos_cam.view.pictures import MOST_UNCERTAIN_M
 
 USUAL_PERCENT = 95

@@ -7,8 +7,16 @@ from zlib import crc32
 
 import numpy as np
 from nlos_calibration.rig import Rig
+from nlos_models.data import MapSet
+from nlos_models.doubt_training import DoubtSet
+from nlos_models.inference import Reconstructor
+from nlos_models.recipe import Recipe
+from nlos_models.remap import parts_of
 from numpy.typing import NDArray
 
+from nlos_cam import dataset
+from nlos_cam.cli.common import tracked
+from nlos_cam.errors import SceneError
 from nlos_cam.folders import file_when_whole
 from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps, maps_from_frame
 from nlos_cam.objects.depth_image import image_from_depth, object_box
@@ -174,3 +182,59 @@ def _read(path: Path) -> DoubtSamples | None:
 def _write(path: Path, samples: DoubtSamples) -> None:
     with file_when_whole(path) as part, part.open("wb") as file:
         np.savez(file, **vars(samples))
+
+
+LEAST_CELLS = 8
+"""An outlier that shows in fewer cells of the maps is not learnt from: it can hardly be told from nothing at all."""
+
+
+HELD_OUT_SHARE = 0.15
+"""Of outliers and empty benches, beside those that are learnt from."""
+
+
+def counts_of(recipe: Recipe) -> dict[str, int]:
+    """How many samples are rendered of each kind.
+
+    On benches that lie slightly off, as many ordinary objects as outliers: else what lies off would itself be a sign.
+    """
+    of_each = dict.fromkeys(TO_LEARN, recipe.outliers)
+    return {EMPTY: recipe.empties, ORDINARY: sum(of_each.values()) // 2, **of_each}
+
+
+def doubt_set(pipeline: Reconstructor, samples: DoubtSamples) -> DoubtSet:
+    """Samples beside what a pipeline makes of them."""
+    outside = (samples.kind != EMPTY) & (samples.kind != ORDINARY)
+    made = _images(pipeline, MapSet(samples.depth_m, samples.intensity, samples.image))
+    return DoubtSet(samples.depth_m, samples.intensity, made, samples.image, samples.kind == EMPTY, outside)
+
+
+def _whole_set(pipeline: Reconstructor, usual: MapSet, samples: DoubtSamples) -> DoubtSet:
+    """Ordinary maps of a dataset, and the samples that can be seen."""
+    made = doubt_set(pipeline, samples)
+    made = made.where((samples.cells >= LEAST_CELLS) | made.nothing)
+    of_dataset, no = _images(pipeline, usual), np.zeros(len(usual.image), np.bool_)
+    ordinary = DoubtSet(usual.depth_m, usual.intensity, of_dataset, usual.image.astype(np.float16), no, no)
+    pairs = {name: (values, vars(made)[name]) for name, values in vars(ordinary).items()}
+    return DoubtSet(**{name: np.concatenate(pair) for name, pair in pairs.items()})
+
+
+def _images(pipeline: Reconstructor, maps: MapSet) -> np.ndarray:
+    pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
+    return np.concatenate([pipeline(*pair) for pair in pairs]).astype(np.float16)
+
+
+def _made(folder: Path, counts: dict[str, int], seed: int, plan: dataset.DatasetPlan) -> DoubtSamples:
+    with tracked("rendering empty benches and outliers") as on_progress:
+        return samples_on_disk(
+            folder, counts, seed, plan.rig, plan.sensor, accuracy=plan.accuracy, on_progress=on_progress
+        )
+
+
+def _check(recipe: Recipe, pipeline: Reconstructor, training: dataset.Dataset, judging: dataset.Dataset) -> None:
+    if pipeline.record.input != "raw maps":
+        raise SceneError(f"these weights eat {pipeline.record.input}, and doubt is learnt of raw maps: name others")
+    if not training.plan.rig.checksum == judging.plan.rig.checksum == pipeline.record.rig_checksum:
+        raise SceneError("maps, held-out maps and weights are not all of one rig: name others, or build the maps again")
+    if len(training) < recipe.objects:
+        told = f"the dataset holds {len(training)} objects, the recipe asks for {recipe.objects}"
+        raise SceneError(f"{told}: build that many, or give --objects")

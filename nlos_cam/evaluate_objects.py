@@ -9,7 +9,7 @@ from nlos_calibration.rig import ObjectBox, Rig
 from nlos_models.data import MapSet
 from nlos_models.inference import Reconstructor
 
-from nlos_cam.camera.world import World
+from nlos_cam.camera.simulated_world import World
 from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
 from nlos_cam.map_mean import MapMean
 from nlos_cam.objects.depth_image import image_from_depth

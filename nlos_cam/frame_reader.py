@@ -3,13 +3,13 @@
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from threading import Condition, Event, Thread
 from types import TracebackType
 from typing import Self
 
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
+from nlos_cam.processing import Arrival
 from nlos_cam.reconstruct import Clock
 
 QUEUE_FRAMES = 3
@@ -20,14 +20,6 @@ POLL_S = 0.1
 """How often a wait looks up, so that a signal is answered."""
 SAME_CLOCK_S = 10.0
 """Timestamps this close to the host's time of day are host time; others have a zero of their own."""
-
-
-@dataclass(frozen=True)
-class Arrival:
-    """A frame, and when the reader had it."""
-
-    frame: Frame
-    arrived_s: float
 
 
 class FrameReader:

@@ -147,3 +147,16 @@ def maps_from_frame(frame: Frame) -> LidarMaps:
     edges = _edges(height, MAP_ROWS), _edges(width, MAP_COLUMNS)
     depth, intensity = _reduce_cells(frame.depth_m.view(np.int32), frame.ir, *edges, most)
     return LidarMaps(depth, intensity, ~np.isnan(depth))
+
+
+MOST_SATURATED = 0.001
+"""Share of infrared pixels; the L515 under-estimates depth where they are."""
+
+
+def saturated_share(ir: NDArray[np.uint8]) -> float:
+    """Of the pixels of an infrared image, the share that is saturated."""
+    return float(np.count_nonzero(ir == SATURATED)) / ir.size
+
+
+SATURATED = 255
+"""The full scale of the IR's 8 bits, in counts."""

@@ -10,12 +10,12 @@ from nlos_models.data import MapSet
 from numpy.typing import NDArray
 
 from nlos_cam.bench import Bench, open_bench
-from nlos_cam.camera.replay import ReplayCamera, open_lidar_bag
-from nlos_cam.camera.sidecar import Sidecar, load_sidecar, sidecar_path
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
 from nlos_cam.labelled_truth import fixed_objects, truth_depth_m
 from nlos_cam.objects.depth_image import image_from_depth, object_box
+from nlos_cam.recording.playback import ReplayCamera, open_lidar_bag
+from nlos_cam.recording.sidecar import Sidecar, load_sidecar, sidecar_path
 
 FRAMES_EACH = 8
 """Of a recording, whose frames differ by their noise alone: more of them add little."""

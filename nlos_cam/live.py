@@ -1,19 +1,23 @@
 """The streaming loop: each frame's way from a camera to a reconstruction and to a viewer, timed."""
 
+import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Event
 
 import numpy as np
 
-from nlos_cam.camera.base import Camera
+from nlos_cam.camera.protocol import Camera
 from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.live_report import LiveReport, OnWarning, Tally, say_nothing
 from nlos_cam.moments import Moments
-from nlos_cam.processing import Processing, read_along, steps
-from nlos_cam.reconstruct import Clock, reconstruct
+from nlos_cam.processing import Arrival, Processing, Seen, Step
+from nlos_cam.reconstruct import Clock, Reconstruction, reconstruct
 from nlos_cam.sightings import watched
+from nlos_cam.thermometer import Thermometer, thermometer_of
 from nlos_cam.view.viewer import Moment, Viewer
 
 USUAL_DEPTH_M = 0.3
@@ -93,3 +97,95 @@ def paced(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]
         if stop.wait(max(0.0, frame.timestamp_s + offset_s - clock())):
             return
         yield frame
+
+
+FRAMES_TOGETHER = 4
+"""Where nobody waits for them, the networks take so many frames at once: two thirds of the time for each."""
+
+
+MOST_AHEAD = 2
+"""So many times as many are worked on while others are judged: for about as long as a physics check takes."""
+
+
+OnFailure = Callable[[Frame, Exception, int], None]
+"""Called with a frame that came to no result, why, and how many have in a row; raises to end there."""
+
+
+def _refuse(frame: Frame, error: Exception, in_a_row: int) -> None:
+    del frame, in_a_row
+    raise error
+
+
+def read_along(frames: Iterable[Frame], camera: Camera) -> tuple[Iterable[Frame], Thermometer]:
+    """The same frames, and the camera's thermometer, read as they pass."""
+    thermometer = thermometer_of(camera)
+    return thermometer.watch(frames), thermometer
+
+
+def steps(
+    reader: FrameReader,
+    processing: Processing,
+    clock: Clock = time.time,
+    on_failure: OnFailure = _refuse,
+    thermometer: Thermometer | None = None,
+) -> Generator[Step]:
+    """Reconstruct every frame that the reader gives, in order."""
+    begun_s, in_a_row = clock(), 0
+    for arrival in reader:
+        try:
+            _follow(thermometer, arrival, processing)
+            step = processing.step(arrival, clock, begun_s)
+        except Exception as error:  # noqa: BLE001  whatever an odd frame leads to, who called decides
+            in_a_row += 1
+            on_failure(arrival.frame, error, in_a_row)
+        else:
+            in_a_row = 0
+            yield step
+        begun_s = clock()
+
+
+def steps_ahead(
+    reader: FrameReader, processing: Processing, clock: Clock = time.time, thermometer: Thermometer | None = None
+) -> Generator[Step]:
+    """The same steps in the same order, for frames that nobody waits for: the networks take several at once.
+
+    Which ones does not depend on how fast they come, so the same frames give the same bits. What one leads to ends it.
+    """
+    ahead = deque[tuple[Sequence[Seen], Future[list[Reconstruction]]]]()
+    with ThreadPoolExecutor(os.cpu_count(), "networks") as threads:
+        for together in _lots(reader, processing, clock, thermometer):
+            ahead.append((together, threads.submit(processing.reconstruct, together, clock)))
+            if len(ahead) > MOST_AHEAD:
+                yield from _finished(*ahead.popleft(), processing, clock)
+        for lot in ahead:
+            yield from _finished(*lot, processing, clock)
+
+
+def _lots(
+    reader: FrameReader, processing: Processing, clock: Clock, thermometer: Thermometer | None
+) -> Generator[Sequence[Seen]]:
+    """What the lidar saw, FRAMES_TOGETHER at a time; fewer at the end."""
+    together, begun_s = list[Seen](), clock()
+    for arrival in reader:
+        _follow(thermometer, arrival, processing)
+        together.append(processing.see(arrival, clock, begun_s))
+        if len(together) == FRAMES_TOGETHER:
+            yield together
+            together = []
+        begun_s = clock()
+    if together:
+        yield together
+
+
+def _finished(
+    together: Sequence[Seen], making: Future[list[Reconstruction]], processing: Processing, clock: Clock
+) -> Generator[Step]:
+    """The steps of frames taken together, once they are made."""
+    for seen, made in zip(together, making.result(), strict=True):
+        yield processing.finish(seen, made, clock)
+
+
+def _follow(thermometer: Thermometer | None, arrival: Arrival, processing: Processing) -> None:
+    """Have the bench follow the lidar's temperature."""
+    if thermometer and (celsius := thermometer.at(arrival.frame)):
+        processing.bench.look_at(celsius)

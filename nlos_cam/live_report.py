@@ -6,12 +6,11 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
-from nlos_cam.camera.base import Camera
+from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frame_reader import FrameReader
-from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.physics_check import Check
-from nlos_cam.reconstruct import Reconstruction
+from nlos_cam.frames import Frame
+from nlos_cam.processing import Step
 from nlos_cam.stage_times import Percentiles, StageTimes, percentiles_ms
 from nlos_cam.stall import StallWatch
 from nlos_cam.verdict import Verdict
@@ -25,26 +24,6 @@ LATENCY, DELIVERY = "latency", "delivery"
 FIGURES = re.compile(r"\d+(\.\d+)?")
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Step:
-    """One frame's way through the loop."""
-
-    frame: Frame
-    maps: LidarMaps
-    reconstruction: Reconstruction
-    published_s: float
-    stages_s: Mapping[str, float]
-    difference: LidarMaps | None = None
-    """The maps less the bare wall's; None without a reference."""
-    warnings: tuple[str, ...] = ()
-    verdict: Verdict | None = None
-    """None from networks that do not tell."""
-    check: Check | None = None
-    """The newest physics check, of this frame or an earlier one."""
-    arrived_s: float | None = None
-    """When the loop's reader had the frame."""
 
 
 OnWarning = Callable[[str, bool], None]

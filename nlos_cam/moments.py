@@ -5,7 +5,8 @@ from dataclasses import replace
 
 from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import Frame
-from nlos_cam.live_report import DELIVERY, Step
+from nlos_cam.live_report import DELIVERY
+from nlos_cam.processing import Step
 from nlos_cam.reconstruct import Clock
 from nlos_cam.thermometer import Thermometer
 from nlos_cam.verdict import Verdict

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32, LidarMaps
-from nlos_cam.render.sensor_model import SATURATED, SensorModel
+from nlos_cam.frames import SATURATED, Float32, LidarMaps
+from nlos_cam.render.sensor_model import SensorModel
 
 Array = NDArray[np.float64]
 

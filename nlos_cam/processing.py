@@ -1,39 +1,45 @@
 """What is made of each frame of a camera: maps, their difference from the bare wall, warnings, the hidden depth."""
 
-import os
-import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from nlos_calibration.errors import CalibrationError
 from nlos_models.doubt_inference import Doubter
 
 from nlos_cam.bench import Bench, Look
-from nlos_cam.camera.base import Camera
-from nlos_cam.frame_reader import Arrival, FrameReader
 from nlos_cam.frames import Frame, LidarMaps, maps_from_frame
-from nlos_cam.live_report import Step
 from nlos_cam.map_mean import MapMean
 from nlos_cam.physics_check import UNEXPLAINED, Check, Checks, NoChecks
 from nlos_cam.reconstruct import Clock, Network, Reconstruction, reconstruct_all
-from nlos_cam.sightings import amiss
-from nlos_cam.thermometer import Thermometer, thermometer_of
-from nlos_cam.verdict import Judge, Limits, Signs
-
-FRAMES_TOGETHER = 4
-"""Where nobody waits for them, the networks take so many frames at once: two thirds of the time for each."""
-MOST_AHEAD = 2
-"""So many times as many are worked on while others are judged: for about as long as a physics check takes."""
-
-OnFailure = Callable[[Frame, Exception, int], None]
-"""Called with a frame that came to no result, why, and how many have in a row; raises to end there."""
+from nlos_cam.verdict import Judge, Limits, Signs, Verdict, amiss
 
 
-def _refuse(frame: Frame, error: Exception, in_a_row: int) -> None:
-    del frame, in_a_row
-    raise error
+@dataclass(frozen=True)
+class Arrival:
+    """A frame, and when the reader had it."""
+
+    frame: Frame
+    arrived_s: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """One frame's way through the loop."""
+
+    frame: Frame
+    maps: LidarMaps
+    reconstruction: Reconstruction
+    published_s: float
+    stages_s: Mapping[str, float]
+    difference: LidarMaps | None = None
+    """The maps less the bare wall's; None without a reference."""
+    warnings: tuple[str, ...] = ()
+    verdict: Verdict | None = None
+    """None from networks that do not tell."""
+    check: Check | None = None
+    """The newest physics check, of this frame or an earlier one."""
+    arrived_s: float | None = None
+    """When the loop's reader had the frame."""
 
 
 @dataclass(frozen=True)
@@ -122,78 +128,3 @@ def signs_of(frame: Frame, look: Look, check: Check | None) -> Signs:
     names = amiss(frame)
     invalid = "blank" in names or "half_invalid" in names
     return Signs("saturated" in names, invalid, look.moved, check)
-
-
-def read_along(frames: Iterable[Frame], camera: Camera) -> tuple[Iterable[Frame], Thermometer]:
-    """The same frames, and the camera's thermometer, read as they pass."""
-    thermometer = thermometer_of(camera)
-    return thermometer.watch(frames), thermometer
-
-
-def steps(
-    reader: FrameReader,
-    processing: Processing,
-    clock: Clock = time.time,
-    on_failure: OnFailure = _refuse,
-    thermometer: Thermometer | None = None,
-) -> Generator[Step]:
-    """Reconstruct every frame that the reader gives, in order."""
-    begun_s, in_a_row = clock(), 0
-    for arrival in reader:
-        try:
-            _follow(thermometer, arrival, processing)
-            step = processing.step(arrival, clock, begun_s)
-        except Exception as error:  # noqa: BLE001  whatever an odd frame leads to, who called decides
-            in_a_row += 1
-            on_failure(arrival.frame, error, in_a_row)
-        else:
-            in_a_row = 0
-            yield step
-        begun_s = clock()
-
-
-def steps_ahead(
-    reader: FrameReader, processing: Processing, clock: Clock = time.time, thermometer: Thermometer | None = None
-) -> Generator[Step]:
-    """The same steps in the same order, for frames that nobody waits for: the networks take several at once.
-
-    Which ones does not depend on how fast they come, so the same frames give the same bits. What one leads to ends it.
-    """
-    ahead = deque[tuple[Sequence[Seen], Future[list[Reconstruction]]]]()
-    with ThreadPoolExecutor(os.cpu_count(), "networks") as threads:
-        for together in _lots(reader, processing, clock, thermometer):
-            ahead.append((together, threads.submit(processing.reconstruct, together, clock)))
-            if len(ahead) > MOST_AHEAD:
-                yield from _finished(*ahead.popleft(), processing, clock)
-        for lot in ahead:
-            yield from _finished(*lot, processing, clock)
-
-
-def _lots(
-    reader: FrameReader, processing: Processing, clock: Clock, thermometer: Thermometer | None
-) -> Generator[Sequence[Seen]]:
-    """What the lidar saw, FRAMES_TOGETHER at a time; fewer at the end."""
-    together, begun_s = list[Seen](), clock()
-    for arrival in reader:
-        _follow(thermometer, arrival, processing)
-        together.append(processing.see(arrival, clock, begun_s))
-        if len(together) == FRAMES_TOGETHER:
-            yield together
-            together = []
-        begun_s = clock()
-    if together:
-        yield together
-
-
-def _finished(
-    together: Sequence[Seen], making: Future[list[Reconstruction]], processing: Processing, clock: Clock
-) -> Generator[Step]:
-    """The steps of frames taken together, once they are made."""
-    for seen, made in zip(together, making.result(), strict=True):
-        yield processing.finish(seen, made, clock)
-
-
-def _follow(thermometer: Thermometer | None, arrival: Arrival, processing: Processing) -> None:
-    """Have the bench follow the lidar's temperature."""
-    if thermometer and (celsius := thermometer.at(arrival.frame)):
-        processing.bench.look_at(celsius)

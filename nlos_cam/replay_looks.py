@@ -7,7 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from nlos_cam.bench import Bench
-from nlos_cam.live_report import Step
+from nlos_cam.processing import Step
 from nlos_cam.samples import Samples
 from nlos_cam.view.viewer import Moment, Viewer
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nlos_cam.live_report import Step
+from nlos_cam.processing import Step
 
 
 class Samples:

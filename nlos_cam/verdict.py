@@ -4,6 +4,9 @@ from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+
+from nlos_cam.frames import MOST_SATURATED, Frame, saturated_share
 from nlos_cam.physics_check import Check
 from nlos_cam.reconstruct import Reconstruction
 
@@ -74,3 +77,16 @@ class Judge:
         unexplained = signs.check is not None and signs.check.score >= limits.unexplained
         outside = unlike or unexplained or signs.invalid or not found.shows
         return found, told or (Verdict.OUTSIDE if outside else Verdict.SEEN)
+
+
+def amiss(frame: Frame) -> list[str]:
+    """By name: blank (no depth at all), else half_invalid (for half the pixels or more); and saturated."""
+    pixels, with_depth = frame.depth_m.size, np.count_nonzero(frame.depth_m > 0)  # NaN is not
+    names: list[str] = []
+    if with_depth == 0:
+        names.append("blank")
+    elif 2 * with_depth <= pixels:
+        names.append("half_invalid")
+    if saturated_share(frame.ir) > MOST_SATURATED:
+        names.append("saturated")
+    return names

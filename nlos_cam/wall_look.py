@@ -10,7 +10,7 @@ from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.projection import Intrinsics
 from numpy.typing import NDArray
 
-from nlos_cam.camera.base import Camera
+from nlos_cam.camera.protocol import Camera
 from nlos_cam.frames import maps_from_frame
 
 CELSIUS_EVERY = 30

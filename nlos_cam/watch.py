@@ -7,8 +7,7 @@ from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.wall import WallFit, fit_wall
 
-from nlos_cam.camera.laser_power import saturated_share
-from nlos_cam.frames import Float32, Frame
+from nlos_cam.frames import Float32, Frame, saturated_share
 
 GLANCE_COLUMNS = 160
 """A frame is thinned to about so many: a plane is still sure to a tenth of a millimetre."""

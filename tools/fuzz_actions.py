@@ -9,11 +9,11 @@ from threading import Event
 
 from rosbags.rosbag1 import Reader
 
-from nlos_cam.camera.bag_file import BagFile
-from nlos_cam.camera.repair import repair
-from nlos_cam.camera.replay import ReplayCamera
 from nlos_cam.errors import RecordingError
-from nlos_cam.export import Wanted, export
+from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.export import Wanted, export
+from nlos_cam.recording.playback import ReplayCamera
+from nlos_cam.recording.repair import repair
 
 
 def repair_and_read(path: Path, folder: Path) -> None:

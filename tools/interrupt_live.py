@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from live_process import LiveProcess
 
-from nlos_cam.camera.bag_file import BagFile
-from nlos_cam.camera.repair import repair
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
+from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.repair import repair
 from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -21,11 +21,11 @@ from typing import Protocol
 import lz4.frame
 import numpy as np
 
-from nlos_cam.camera.bag_file import BagFile
-from nlos_cam.camera.repair import repair
-from nlos_cam.camera.replay_sdk import SdkReplayCamera
-from nlos_cam.camera.world import open_world
+from nlos_cam.camera.simulated_world import open_world
 from nlos_cam.errors import RecordingError
+from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.repair import repair
+from nlos_cam.recording.sdk_playback import SdkReplayCamera
 from nlos_cam.render.sensor import SensedImages
 from nlos_cam.render.tradeoff_report import machine
 

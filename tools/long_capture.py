@@ -21,7 +21,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from nlos_cam.camera import open_camera
-from nlos_cam.camera.table import Reader
+from nlos_cam.camera.registry import Reader
 from nlos_cam.cli.common import tracked
 from nlos_cam.render.tradeoff_report import machine
 

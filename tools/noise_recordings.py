@@ -8,7 +8,7 @@ import numpy as np
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.render.sensor import SensedImages
 
 WIDTH, HEIGHT = 160, 120

@@ -18,7 +18,7 @@ from nlos_models.inference import load_reconstructor
 from nlos_cam.bench import Bench, open_bench
 from nlos_cam.cache import cache_folder
 from nlos_cam.camera import open_camera
-from nlos_cam.camera.clock import WallClock
+from nlos_cam.camera.protocol import WallClock
 from nlos_cam.cli.common import say
 from nlos_cam.frames import Float32, LidarMaps
 from nlos_cam.live import run_live, warm_up

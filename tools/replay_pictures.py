@@ -18,8 +18,8 @@ from typing import Self
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.bench import Bench
+from nlos_cam.camera.simulated_world import World, open_world
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.camera.world import World, open_world
 from nlos_cam.cli.common import tracked
 from nlos_cam.frames import Frame
 from nlos_cam.replay import replay

@@ -13,18 +13,18 @@ from threading import Event
 
 import numpy as np
 
-from nlos_cam.camera.record import Recording
-from nlos_cam.camera.replay import verify
-from nlos_cam.camera.sidecar import load_sidecar, sidecar_path
+from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera.simulated_world import World
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.camera.takes import Job, Takes, settle
-from nlos_cam.camera.world import World
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
 from nlos_cam.objects.categories import CATEGORIES
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.test_set import FixedObject, test_set
+from nlos_cam.recording.capture import Job, Takes, settle
+from nlos_cam.recording.playback import verify
+from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import SceneFile, load_scene

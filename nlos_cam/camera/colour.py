@@ -18,12 +18,11 @@ from nlos_calibration.bare_wall import Moments
 from nlos_calibration.board_view import BoardView, CameraErrors
 from numpy.typing import NDArray
 
-from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.l515 import find_l515, shared_context
+from nlos_cam.camera.registry import NAMES
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import find_streams
 from nlos_cam.camera.streams import FRAMES_PER_S, intrinsics_of, sample_from_sdk, stream_name
-from nlos_cam.camera.table import NAMES
 from nlos_cam.errors import (
     CameraError,
     CameraLostError,
@@ -32,6 +31,7 @@ from nlos_cam.errors import (
     RecordingError,
     StreamMissingError,
 )
+from nlos_cam.recording.bag_reader import BagFile
 
 Array = NDArray[np.float64]
 

@@ -3,13 +3,8 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
+from nlos_cam.frames import MOST_SATURATED
 
-from nlos_cam.render.sensor_model import SATURATED
-
-MOST_SATURATED = 0.001
-"""Share of infrared pixels; the L515 under-estimates depth where they are."""
 STRIDES = 10
 """Strides from the strongest laser to the weakest."""
 
@@ -36,11 +31,6 @@ class Settled:
     power: float
     saturated: float | None
     """Share of infrared pixels at that power; None where no frame came to look at."""
-
-
-def saturated_share(ir: NDArray[np.uint8]) -> float:
-    """Of the pixels of an infrared image, the share that is saturated."""
-    return float(np.count_nonzero(ir == SATURATED)) / ir.size
 
 
 def weaker(power: float, limits: Limits) -> Iterator[float]:

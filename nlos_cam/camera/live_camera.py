@@ -11,13 +11,12 @@ from typing import Any, Self
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig
 
-from nlos_cam.camera.clock import Clock, WallClock
-from nlos_cam.camera.continuity import Continuity
-from nlos_cam.camera.inbox import Inbox
-from nlos_cam.camera.record import Recording
+from nlos_cam.camera.protocol import Clock, WallClock
+from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.recovery import NO_INTRINSICS, Hooks, Recovery
-from nlos_cam.camera.session import Session, Size, find_streams
+from nlos_cam.camera.session import Inbox, Session, Size, find_streams
 from nlos_cam.camera.streams import FORMATS, FrameSet
+from nlos_cam.camera.timestamps import Continuity
 from nlos_cam.errors import CameraError, CameraLostError
 from nlos_cam.frames import Float32, Frame
 

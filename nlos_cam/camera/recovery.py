@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from threading import Event
 from typing import Any
 
-from nlos_cam.camera.clock import Clock
+from nlos_cam.camera.protocol import Clock
 from nlos_cam.errors import CameraError, CameraLostError
 
 BACK_OFF_S = (0.5, 1.0, 2.0)

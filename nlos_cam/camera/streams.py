@@ -1,15 +1,52 @@
-"""The streams that a lidar delivers through librealsense, and how three single frames become one set."""
+"""The streams that a lidar delivers through librealsense, and how three single frames become one set.
+
+Numbers that mean the same instant on every stream, where librealsense counts the frames of each by itself.
+
+It does on kernels without the patch that passes an L515's metadata on. A stream that begins a frame late, or loses one,
+is then behind the others' numbers until it is started again, while its timestamps are right.
+
+A set of streams, as a Frame in SI units.
+"""
 
 from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from nlos_calibration.projection import Intrinsics
 from numpy.typing import NDArray
 
-from nlos_cam.camera.alignment import Alignment
+from nlos_cam.frames import Float32, Frame
+
+TELLING = 3
+"""Numbers in a row of which the streams' timestamps differ by the same number of frames."""
+
+
+class Alignment:
+    """Raises the numbers of a stream that is behind, once timestamps have told by how much."""
+
+    def __init__(self, frames_per_s: float) -> None:
+        self._frames_per_s = frames_per_s
+        self._behind: Counter[str] = Counter()
+        """In frames, by stream."""
+        self._lags: Mapping[str, int] = {}
+        self._told = 0
+
+    def add(self, sample: "Sample") -> "Sample":
+        """The sample with its number as the other streams count."""
+        behind = self._behind[sample.stream]
+        return replace(sample, number=sample.number + behind) if behind else sample
+
+    def note(self, times_s: Mapping[str, float]) -> None:
+        """Take note of when the frames of one number were taken, by stream."""
+        first_s = min(times_s.values())
+        lags = {stream: round((time_s - first_s) * self._frames_per_s) for stream, time_s in times_s.items()}
+        self._told = self._told + 1 if lags == self._lags else 1
+        self._lags = lags
+        if self._told == TELLING:
+            self._behind.update(lags)
+
 
 FORMATS = {"depth": "z16", "infrared": "y8", "confidence": "raw8"}
 """The streams that are needed, by the SDK's names, and the pixel format of each."""
@@ -199,3 +236,25 @@ class Pairing:
         if self._zero_s is not None and zero_s - self._zero_s > STALL_S:
             self._occurrences.counts["stalled"] += 1
         self._zero_s = zero_s
+
+
+def frame_in_si(
+    found: FrameSet,
+    unit_m: float,
+    intrinsics: Intrinsics,
+    settings: Mapping[str, float],
+    truth_depth_m: Float32 | None = None,
+) -> Frame:
+    """The frame of a set whose depth counts in units of `unit_m`."""
+    depth_m = found.depth_z16 * np.float32(unit_m)
+    depth_m[found.depth_z16 == 0] = np.nan
+    return Frame(
+        depth_m=depth_m,
+        ir=found.ir,
+        confidence=found.confidence_raw8 >> np.uint8(4),
+        timestamp_s=found.timestamp_s,
+        frame_number=found.number,
+        intrinsics=intrinsics,
+        settings=settings,
+        truth_depth_m=truth_depth_m,
+    )

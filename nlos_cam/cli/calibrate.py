@@ -16,8 +16,8 @@ from nlos_calibration.wall_record import OccluderRecord, WallRecord, wall_record
 from numpy.typing import NDArray
 
 from nlos_cam.camera import open_camera
-from nlos_cam.camera.base import Camera
 from nlos_cam.camera.colour import look_in_colour
+from nlos_cam.camera.protocol import Camera
 from nlos_cam.cli.calibrate_told import told
 from nlos_cam.cli.calibrate_watch import watch_until_enter
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, tracked

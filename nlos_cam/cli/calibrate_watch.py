@@ -9,9 +9,9 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from nlos_cam.camera.base import Camera
-from nlos_cam.camera.laser_power import MOST_SATURATED
+from nlos_cam.camera.protocol import Camera
 from nlos_cam.cli.common import say, stderr
+from nlos_cam.frames import MOST_SATURATED
 from nlos_cam.watch import Glance, glance
 
 EVERY = 3

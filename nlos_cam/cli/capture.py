@@ -12,11 +12,8 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from nlos_cam.camera import Camera, Recording, open_camera
-from nlos_cam.camera.disk import check_room, free_bytes, recording_s
-from nlos_cam.camera.replay import Verified, verify
-from nlos_cam.camera.sidecar import sidecar_path, wall_of
+from nlos_cam.camera.recorder import check_room, free_bytes, recording_s
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.camera.takes import Job, Take, Takes, settle
 from nlos_cam.cli.capture_told import ending, nothing, result, told
 from nlos_cam.cli.common import (
     INTERRUPTED,
@@ -30,6 +27,9 @@ from nlos_cam.cli.common import (
     stop_on_signals,
     tracked,
 )
+from nlos_cam.recording.capture import Job, Take, Takes, settle
+from nlos_cam.recording.playback import Verified, verify
+from nlos_cam.recording.sidecar import sidecar_path, wall_of
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:bare-wall or sim:SCENE.toml.")]
 ENDLESS_S = 1e9

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nlos_cam.camera.sidecar import State, Summary, sidecar_path
-from nlos_cam.camera.takes import Job, Take
 from nlos_cam.errors import NlosCamError
+from nlos_cam.recording.capture import Job, Take
+from nlos_cam.recording.sidecar import State, Summary, sidecar_path
 
 FIGURES = ("saturated_share", "invalid_share", "temporal_noise_mm")
 

@@ -9,10 +9,10 @@ from rich.table import Table
 
 from nlos_cam.camera import SIMULATED
 from nlos_cam.camera.l515 import DeviceInfo
-from nlos_cam.camera.usb import UsbDevice
 from nlos_cam.cli.common import Json, finish, show
 from nlos_cam.doctor import Facts, gather
 from nlos_cam.doctor.facts import Pair
+from nlos_cam.doctor.usb import UsbDevice
 
 SEEN = {True: "yes", False: "[red]no[/]", None: ""}
 """A camera seen, not seen, and not looked for."""

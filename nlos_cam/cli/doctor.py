@@ -9,9 +9,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from nlos_cam.camera.udev import install, rules
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, show
 from nlos_cam.doctor import Check, diagnose, gather
+from nlos_cam.doctor.udev import install, rules
 from nlos_cam.errors import NlosCamError
 
 COLOURS = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}

@@ -10,10 +10,10 @@ from nlos_models.doubt_inference import Doubter
 from nlos_models.inference import Reconstructor
 
 from nlos_cam.bench import Bench, open_bench
-from nlos_cam.budget import SHIPPED
+from nlos_cam.budget import SHIPPED, Choice, loader, options_here, timer, within_budget
 from nlos_cam.camera import Camera, open_camera
-from nlos_cam.camera.clock import WallClock
-from nlos_cam.camera.table import Reader
+from nlos_cam.camera.protocol import WallClock
+from nlos_cam.camera.registry import Reader
 from nlos_cam.cli.common import (
     INTERRUPTED,
     Json,
@@ -26,7 +26,7 @@ from nlos_cam.cli.common import (
     stop_on_signals,
     tracked,
 )
-from nlos_cam.cli.live_budget import BudgetMs, Choice, Tradeoff, loader, options_here, timer, within_budget
+from nlos_cam.cli.live_budget import BudgetMs, Tradeoff
 from nlos_cam.cli.live_kept import Log, RecordTo, kept_of
 from nlos_cam.cli.live_told import told, warn
 from nlos_cam.cli.live_view import NoView, Open, ViewHost, ViewPort, tell_of_view, viewer_of

@@ -5,8 +5,6 @@ from typing import Annotated
 
 import typer
 
-from nlos_cam.camera.bag_file import BagFile
-from nlos_cam.camera.repair import Repaired, repair
 from nlos_cam.cli.common import (
     INTERRUPTED,
     Json,
@@ -19,7 +17,9 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.errors import RecordingError
-from nlos_cam.export import Exported, Format, Wanted, export
+from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.export import Exported, Format, Wanted, export
+from nlos_cam.recording.repair import Repaired, repair
 
 DamagedBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording that was killed, cut short or damaged.")]
 NewBag = Annotated[Path | None, typer.Option("--out", help="The recording to write (.bag).")]

@@ -12,9 +12,9 @@ from nlos_models.run_files import digest_of
 
 from nlos_cam import dataset
 from nlos_cam.cli.common import PAPER_RIG, finish, say
-from nlos_cam.cli.train_data import HeldOut, Maps, read_maps
+from nlos_cam.cli.train_data import read_maps
 from nlos_cam.cli.train_doubt import doubt
-from nlos_cam.cli.train_options import Budget, RunOptions, refuse_ignored, with_run_options
+from nlos_cam.cli.train_options import Budget, HeldOut, Maps, RunOptions, refuse_ignored, with_run_options
 from nlos_cam.cli.train_runs import job_of, run_compressor, run_transfer, run_vae
 from nlos_cam.cli.train_start import compressor_start, transfer_start, vae_start
 from nlos_cam.objects.textures import TEXTURES

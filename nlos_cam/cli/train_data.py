@@ -4,11 +4,10 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-import typer
 from nlos_calibration.bare_wall import Moments
 from nlos_calibration.measured_wall import load_measured
 from nlos_models.data import Half, MapBatch, MapSet
@@ -25,8 +24,6 @@ from nlos_cam.render.sensor import Sensor
 BARE_WALL_FRAMES = 60
 """As many as `calibrate` takes."""
 
-Maps = Annotated[Path, typer.Option("--dataset", help="Training maps, from `dataset build` or of recordings.")]
-HeldOut = Annotated[Path, typer.Option("--held-out", help="Maps to judge by, of other objects.")]
 BareMaps = tuple[Float32, Float32]
 """Depth and intensity, each (64, 80)."""
 

@@ -71,3 +71,9 @@ def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
     spelt_out.__annotations__ = {each.name: each.annotation for each in every}
     spelt_out.__dict__["__signature__"] = inspect.Signature(every)
     return spelt_out
+
+
+Maps = Annotated[Path, typer.Option("--dataset", help="Training maps, from `dataset build` or of recordings.")]
+
+
+HeldOut = Annotated[Path, typer.Option("--held-out", help="Maps to judge by, of other objects.")]

@@ -2,9 +2,8 @@
 
 from collections.abc import Callable
 
-from nlos_cam.doctor import camera, linux, software
-from nlos_cam.doctor.check import Check, Finding, failed, ok, skipped, warning
-from nlos_cam.doctor.facts import Facts
+from nlos_cam.doctor import checks
+from nlos_cam.doctor.facts import Check, Facts, Finding, failed, ok, skipped, warning
 
 REPLUG = (
     "unplug the camera, wait 5 s, plug it straight into a USB 3 port and run this again; if it stays, run with "
@@ -15,15 +14,15 @@ REPLUG_WINDOWS = (
     "again: Windows' own camera driver has to take it, not one of Zadig or of a vendor"
 )
 CAUSES: dict[str, Callable[[Facts], Finding]] = {
-    "sdk-version": software.sdk_version,
-    "sdk-alone": software.sdk_alone,
-    "system": software.system,
-    "container": linux.container,
-    "permissions": linux.permissions,
-    "video-driver": linux.video_driver,
-    "hid-sensors": linux.hid_sensors,
-    "in-use": linux.in_use,
-    "firmware": camera.firmware,
+    "sdk-version": checks.sdk_version,
+    "sdk-alone": checks.sdk_alone,
+    "system": checks.system,
+    "container": checks.container,
+    "permissions": checks.permissions,
+    "video-driver": checks.video_driver,
+    "hid-sensors": checks.hid_sensors,
+    "in-use": checks.in_use,
+    "firmware": checks.firmware,
 }
 """What can hide from librealsense a camera that USB shows, the likeliest first."""
 
@@ -36,11 +35,11 @@ def sdk_camera(facts: Facts) -> Finding:
     if hidden:
         return _hidden(facts, ", ".join(hidden))
     if not facts.pairs:
-        return skipped(camera.ABSENT)
+        return skipped(checks.NO_CAMERA)
     told = ", ".join(f"l515:{pair.sdk.serial}" for pair in facts.pairs if pair.sdk)
     if facts.usb.error or all(pair.usb for pair in facts.pairs):
         return ok(f"librealsense sees {told}")
-    return warning(f"librealsense sees {told}, USB not all of it", linux.CONTAINER_FIX)
+    return warning(f"librealsense sees {told}, USB not all of it", checks.CONTAINER_FIX)
 
 
 def _hidden(facts: Facts, told: str) -> Finding:
@@ -55,24 +54,24 @@ def _hidden(facts: Facts, told: str) -> Finding:
 
 
 CHECKS: dict[str, Callable[[Facts], Finding]] = {
-    "python": software.python,
-    "system": software.system,
-    "sdk": software.sdk,
-    "sdk-version": software.sdk_version,
-    "sdk-alone": software.sdk_alone,
-    "libusb": software.libusb,
-    "usb-camera": camera.usb_camera,
-    "recovery": camera.recovery,
-    "link": camera.link,
-    "container": linux.container,
-    "udev-rules": linux.udev_rules,
-    "permissions": linux.permissions,
-    "video-driver": linux.video_driver,
-    "hid-sensors": linux.hid_sensors,
-    "in-use": linux.in_use,
+    "python": checks.python,
+    "system": checks.system,
+    "sdk": checks.sdk,
+    "sdk-version": checks.sdk_version,
+    "sdk-alone": checks.sdk_alone,
+    "libusb": checks.libusb,
+    "usb-camera": checks.usb_camera,
+    "recovery": checks.recovery,
+    "link": checks.link,
+    "container": checks.container,
+    "udev-rules": checks.udev_rules,
+    "permissions": checks.permissions,
+    "video-driver": checks.video_driver,
+    "hid-sensors": checks.hid_sensors,
+    "in-use": checks.in_use,
     "sdk-camera": sdk_camera,
-    "firmware": camera.firmware,
-    "metadata": linux.metadata,
+    "firmware": checks.firmware,
+    "metadata": checks.metadata,
 }
 """Every check by its name, in the order in which they are told."""
 

@@ -1,14 +1,17 @@
-"""What a diagnosis rests on: the host, what USB shows, what librealsense shows, and which of them are the same."""
+"""What a diagnosis rests on: the host, what USB shows, what librealsense shows, and which of them are the same.
+
+What a check finds: a status, what was seen, and what to do about it.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
-from typing import Any
+from typing import Any, Literal
 
-from nlos_cam.camera.host import Host, read_host
 from nlos_cam.camera.l515 import DeviceInfo, connected, shared_context
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.usb import UsbDevice, UsbScan, scan, sdk_serial
+from nlos_cam.doctor.host import Host, read_host
+from nlos_cam.doctor.usb import UsbDevice, UsbScan, scan, sdk_serial
 from nlos_cam.errors import CameraError
 
 LIDAR_NAMES = ("L515", "L500")
@@ -126,3 +129,45 @@ def pair(usb: Sequence[UsbDevice], sdk: Sequence[DeviceInfo]) -> list[Pair]:
     if len(unread) == len(strange):
         return matched + [Pair(device, info) for device, info in zip(unread, strange, strict=True)]
     return matched + [Pair(device, None) for device in unread] + [Pair(None, info) for info in strange]
+
+
+Status = Literal["ok", "warning", "failed", "skipped"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The outcome of one question; a warning or a failure always says what to do."""
+
+    status: Status
+    detail: str
+    fix: str = ""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A finding under the name of its question; names and fields are fixed: scripts depend on them."""
+
+    name: str
+    status: Status
+    detail: str
+    fix: str
+
+
+def ok(detail: str) -> Finding:
+    """All is well: what was seen."""
+    return Finding("ok", detail)
+
+
+def skipped(reason: str) -> Finding:
+    """The question does not arise here: why."""
+    return Finding("skipped", reason)
+
+
+def warning(detail: str, fix: str) -> Finding:
+    """It works, but not as well as it could."""
+    return Finding("warning", detail, fix)
+
+
+def failed(detail: str, fix: str) -> Finding:
+    """A camera will not work like this."""
+    return Finding("failed", detail, fix)

@@ -14,8 +14,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32
-from nlos_cam.render.sensor_model import DEPTH_UNIT_M, FARTHEST, MOST_CONFIDENT, SATURATED, SURE_COUNTS
+from nlos_cam.frames import SATURATED, Float32
+from nlos_cam.render.sensor_model import DEPTH_UNIT_M, FARTHEST, MOST_CONFIDENT, SURE_COUNTS
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

@@ -6,12 +6,12 @@ from typing import Annotated, Self
 from nlos_calibration.rig import Record
 from pydantic import Field, model_validator
 
+from nlos_cam.frames import SATURATED
+
 DEPTH_UNIT_M = 0.00025
 """The L515's Z16 unit."""
 FARTHEST = 65535
 """The most that Z16 holds, in its unit."""
-SATURATED = 255
-"""The full scale of the IR's 8 bits, in counts."""
 MOST_CONFIDENT = 15
 SURE_COUNTS = 6.0
 """IR counts at which the signal alone gives 63 % of the confidence it can give."""

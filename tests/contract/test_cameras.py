@@ -14,10 +14,10 @@ from fake_lidar import FakeLidar
 
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.l515 import list_devices
-from nlos_cam.camera.replay import verify
-from nlos_cam.camera.world import World, open_world
+from nlos_cam.camera.simulated_world import World, open_world
 from nlos_cam.errors import CameraError, NlosCamError
 from nlos_cam.frames import Frame
+from nlos_cam.recording.playback import verify
 
 FAKE_L515 = "l515:fake"
 RECORDED = 12

@@ -12,15 +12,15 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam import frame_reader
 from nlos_cam.bench import Bench
-from nlos_cam.camera import Recording, inbox
-from nlos_cam.camera.replay import ReplayCamera
-from nlos_cam.camera.replay_sdk import SdkReplayCamera
+from nlos_cam.camera import Recording, session
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
 from nlos_cam.live import run_live
 from nlos_cam.live_report import LiveReport
 from nlos_cam.processing import Processing
+from nlos_cam.recording.playback import ReplayCamera
+from nlos_cam.recording.sdk_playback import SdkReplayCamera
 from nlos_cam.render.fault_record import Fault
 from nlos_cam.render.sensor import SensedImages
 from nlos_cam.verdict import Verdict
@@ -42,7 +42,7 @@ def network(*_: np.ndarray) -> np.ndarray:
 @pytest.fixture
 def camera(noise_world: Any, hurried_clock: Any, monkeypatch: pytest.MonkeyPatch) -> Make:
     """A camera in a world without noise that saturates; nothing is dropped because the machine is slow."""
-    monkeypatch.setattr(inbox, "CAPACITY", PLENTY)
+    monkeypatch.setattr(session, "CAPACITY", PLENTY)
     monkeypatch.setattr(frame_reader, "QUEUE_FRAMES", PLENTY)
 
     class QuietWorld(noise_world):

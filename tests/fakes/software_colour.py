@@ -9,7 +9,7 @@ from nlos_calibration.projection import Intrinsics
 from numpy.typing import NDArray
 
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.render.sensor import SensedImages
 

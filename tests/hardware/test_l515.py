@@ -17,7 +17,7 @@ import pytest
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.colour import look_in_colour
 from nlos_cam.camera.l515 import NEAR_WALL, L515Camera, list_devices
-from nlos_cam.camera.replay import ReplayCamera, verify
+from nlos_cam.recording.playback import ReplayCamera, verify
 
 pytestmark = pytest.mark.hardware
 SECONDS = 5

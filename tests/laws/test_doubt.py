@@ -11,13 +11,11 @@ from nlos_models.inference import load_reconstructor
 from nlos_cam.bench import Bench
 from nlos_cam.cache import cache_folder
 from nlos_cam.evaluate_objects import echoes_of, sense
-from nlos_cam.frame_reader import Arrival
 from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.live_report import Step
 from nlos_cam.objects.depth_image import object_box
 from nlos_cam.objects.test_set import test_set
 from nlos_cam.outliers import TO_LEARN, outlier
-from nlos_cam.processing import Processing
+from nlos_cam.processing import Arrival, Processing, Step
 from nlos_cam.render.renderer import render
 from nlos_cam.render.sensor import Sensor
 from nlos_cam.render.sensor_model import SensorModel

@@ -19,7 +19,7 @@ from nlos_models.errors import CheckpointError
 
 import nlos_cam
 from nlos_cam import api
-from nlos_cam.camera.base import Camera
+from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import CameraNotFoundError, NlosCamError
 
 RECORD = SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from nlos_cam.camera.alignment import TELLING, Alignment
-from nlos_cam.camera.streams import FORMATS, FRAMES_PER_S, Pairing, Sample
+from nlos_cam.camera.streams import FORMATS, FRAMES_PER_S, TELLING, Alignment, Pairing, Sample
 
 STREAMS = tuple(FORMATS)
 PIXELS = np.zeros((1, 1), np.uint16)

@@ -5,11 +5,10 @@ import lz4.frame
 import numpy as np
 import pytest
 
-from nlos_cam.camera import bag_chunk, bag_content
-from nlos_cam.camera.bag_chunk import examine, find_chunk, is_headless, salvage_set_up, unpack
-from nlos_cam.camera.bag_content import Ending
-from nlos_cam.camera.bag_format import (
+from nlos_cam.recording import rosbag, salvage
+from nlos_cam.recording.rosbag import (
     BagFormatError,
+    Ending,
     Op,
     Read,
     Record,
@@ -18,6 +17,7 @@ from nlos_cam.camera.bag_format import (
     pack_record,
     read_record,
 )
+from nlos_cam.recording.salvage import examine, find_chunk, is_headless, salvage_set_up, unpack
 
 DESCRIPTION = {"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"string data"}
 SET_UP_S, FIRST_S = (0, 1), (0, 500)
@@ -115,7 +115,7 @@ def test_a_bomb_is_refused_before_it_goes_off(monkeypatch: pytest.MonkeyPatch) -
     content, read_bytes, ending, why = unpack(reader(bomb), 0, len(bomb), 1 << 16)
     assert (content, ending, why) == (b"", Ending.BROKEN, "it holds more than 64 MiB")
     assert read_bytes < len(bomb) / 3
-    for module in (bag_chunk, bag_content):
+    for module in (salvage, rosbag):
         monkeypatch.setattr(module, "CHUNK_LIMIT", len(CONTENT) - 1)
     assert examined(packed(CONTENT))[0].chunk is None
     found, _ = examined(CONTENT, "none")

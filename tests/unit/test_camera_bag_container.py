@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 from rosbags.rosbag1 import Reader
 
-from nlos_cam.camera import bag_container
-from nlos_cam.camera.bag_container import BagContainer
 from nlos_cam.errors import RecordingError
+from nlos_cam.recording import bag_container
+from nlos_cam.recording.bag_container import BagContainer
 
 
 def contents(path: Path) -> dict[str, list[tuple[int, bytes]]]:

@@ -2,8 +2,17 @@ import struct
 
 import pytest
 
-from nlos_cam.camera.bag_content import Content, Ending, read_content, reader, set_up_records
-from nlos_cam.camera.bag_format import CHUNK_LIMIT, Op, pack_index, pack_record
+from nlos_cam.recording.rosbag import (
+    CHUNK_LIMIT,
+    Content,
+    Ending,
+    Op,
+    pack_index,
+    pack_record,
+    read_content,
+    reader,
+    set_up_records,
+)
 
 DESCRIPTION = {"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"string data"}
 AFTER = pack_index(0, bytes(12))

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nlos_cam.camera.bag_container import MOST_BYTES
-from nlos_cam.camera.bag_file import BagFile
-from nlos_cam.camera.replay import verify
 from nlos_cam.errors import RecordingError
+from nlos_cam.recording.bag_container import MOST_BYTES
+from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.playback import verify
 
 ABSURD = b"\xff\xff\xff\xff"
 SIZES = (b"size=", b"count=", b"chunk_count=", b"conn_count=", b"index_pos=", b"chunk_pos=")

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlos_cam.camera.bag_container import BagContainer
-from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import read_settings
 from nlos_cam.camera.streams import intrinsics_of, sample_from_sdk
 from nlos_cam.errors import RecordingError
+from nlos_cam.recording.bag_container import BagContainer
+from nlos_cam.recording.bag_reader import BagFile
 
 BAGS = ("noise_bag", "noise_bag_uncompressed", "real_bag")
 

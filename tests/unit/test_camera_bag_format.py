@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlos_cam.camera.bag_format import (
+from nlos_cam.recording.rosbag import (
     FILE_HEADER_BYTES,
     HEADER_LIMIT,
     BagCutError,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from nlos_calibration.projection import Intrinsics
 
-from nlos_cam.camera.bag_messages import (
+from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.recording.bag_container import (
     ENCODINGS,
     depth_unit_m,
     lens_of,
@@ -17,7 +18,6 @@ from nlos_cam.camera.bag_messages import (
     sdk_name,
     timestamp_s,
 )
-from nlos_cam.camera.sdk import load_sdk
 
 IMAGE = "sensor_msgs/msg/Image"
 

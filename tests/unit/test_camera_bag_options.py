@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera.bag_container import BagContainer
-from nlos_cam.camera.bag_options import RecordedOptions
+from nlos_cam.recording.bag_container import BagContainer
+from nlos_cam.recording.bag_reader import RecordedOptions
 
 TOPIC = "/device_0/sensor_0/option/Frames_Queue_Size/value"
 CHANGES = {10_000_000: 3.0, 20_000_000: 5.0, 30_000_000: 4.0}

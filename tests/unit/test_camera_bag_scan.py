@@ -2,9 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from nlos_cam.camera import bag_scan
-from nlos_cam.camera.bag_format import Op, Read, pack_index, read_record
-from nlos_cam.camera.bag_scan import Scan, scan_bag
+from nlos_cam.recording import salvage
+from nlos_cam.recording.rosbag import Op, Read, pack_index, read_record
+from nlos_cam.recording.salvage import Scan, scan_bag
 
 FIRST_CHUNK_AT = 4117
 
@@ -163,7 +163,7 @@ def test_a_record_that_windows_part_is_found(bag: Path, tmp_path: Path, monkeypa
     whole = bag.read_bytes()
     at, _ = chunk_places(whole)[1]
     for window in range(40, 90):
-        monkeypatch.setattr(bag_scan, "WINDOW_BYTES", window)
+        monkeypatch.setattr(salvage, "WINDOW_BYTES", window)
         found = scanned(tmp_path, b"\1" * 200 + whole[at:])
         assert [chunk.index for chunk in found.chunks] == indexes(scan_bag(bag))[1:]
 

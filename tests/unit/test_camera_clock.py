@@ -1,7 +1,7 @@
 import time
 from threading import Event
 
-from nlos_cam.camera.clock import WallClock
+from nlos_cam.camera.protocol import WallClock
 
 
 def test_it_starts_at_the_time_of_day_and_never_goes_back() -> None:

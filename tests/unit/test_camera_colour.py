@@ -13,10 +13,9 @@ from nlos_calibration.board_view import BoardView, CameraErrors, undistorted
 from nlos_calibration.projection import Intrinsics
 from software_colour import SoftwareColour, record_with_colour
 
-from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.colour import GREY, SETTLES, look_in_colour
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.errors import (
     CameraError,
     CameraLostError,
@@ -25,6 +24,7 @@ from nlos_cam.errors import (
     RecordingError,
     StreamMissingError,
 )
+from nlos_cam.recording.bag_reader import BagFile
 from nlos_cam.render.sensor import SensedImages
 
 SMALL = Intrinsics(64, 48, 60.0, 61.0, 33.0, 22.0)

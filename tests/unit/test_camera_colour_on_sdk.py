@@ -10,7 +10,7 @@ from software_colour import SoftwareColour
 
 from nlos_cam.camera.colour import look_in_colour
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.simulated import SoftwareLidar
 
 SMALL = Intrinsics(64, 48, 60.0, 61.0, 33.0, 22.0)
 LIDAR_FROM_COLOUR = np.linalg.inv(np.vstack([COLOUR_FROM_DEPTH, [0.0, 0.0, 0.0, 1.0]]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from nlos_calibration.projection import Intrinsics
 
-from nlos_cam.camera.continuity import Continuity
+from nlos_cam.camera.timestamps import Continuity
 from nlos_cam.frames import Frame
 
 NOTHING = np.zeros((1, 1), np.uint8)

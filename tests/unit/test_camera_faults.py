@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlos_cam.camera.faults import Delivery, FaultyDevice
+from nlos_cam.camera.fault_injection import Delivery, FaultyDevice
 from nlos_cam.camera.streams import FORMATS
-from nlos_cam.camera.unwrap import PERIOD_S
+from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.render.fault_record import Fault
 from nlos_cam.render.sensor import SensedImages
 
@@ -127,9 +127,9 @@ def test_a_clock_that_wraps_jumps_back_by_its_period_and_nothing_else_changes() 
     came = handed(Fault(kind="clock_wrap", at_frame=5))
     assert numbers(came) == list(range(12))
     times_s = [delivery.timestamp_s for delivery in came]
-    assert all(0 <= time_s < PERIOD_S for time_s in times_s)
+    assert all(0 <= time_s < WRAP_PERIOD_S for time_s in times_s)
     steps_s = np.diff(times_s)
-    assert steps_s[4] == pytest.approx(1 / 30 - PERIOD_S, abs=1e-6)
+    assert steps_s[4] == pytest.approx(1 / 30 - WRAP_PERIOD_S, abs=1e-6)
     np.testing.assert_allclose(np.delete(steps_s, 4), 1 / 30, atol=1e-6)
 
 

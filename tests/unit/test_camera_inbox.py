@@ -4,7 +4,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from nlos_cam.camera.inbox import CAPACITY, Inbox
+from nlos_cam.camera.session import CAPACITY, Inbox
 from nlos_cam.camera.streams import FORMATS, Sample
 
 

@@ -9,10 +9,10 @@ from fake_lidar import NapClock
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.camera.l515 import NEAR_WALL, PRESET, L515Camera
-from nlos_cam.camera.record import Recording
-from nlos_cam.camera.replay import ReplayCamera, verify
+from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.simulated import SoftwareLidar
+from nlos_cam.recording.playback import ReplayCamera, verify
 from nlos_cam.render.sensor import SensedImages
 
 SATURATES_ABOVE = 60.0

@@ -5,7 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from nlos_cam.camera.laser_power import MOST_SATURATED, STRIDES, Limits, saturated_share, turn_down, weaker
+from nlos_cam.camera.laser_power import STRIDES, Limits, turn_down, weaker
+from nlos_cam.frames import MOST_SATURATED, saturated_share
 
 RANGES = [Limits(0, 100, 1), Limits(5, 95, 5), Limits(0, 100, 30), Limits(1, 3, 1), Limits(0, 1, 0.01)]
 

@@ -2,7 +2,7 @@ import pytest
 from fake_librealsense import FakeSdk, FakeSensor
 from fake_lidar import FakeLidar
 
-from nlos_cam.camera.options import NOT_OFFERED, Options
+from nlos_cam.camera.l515 import NOT_OFFERED, Options
 
 
 @pytest.fixture

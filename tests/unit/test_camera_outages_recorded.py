@@ -10,10 +10,10 @@ import pytest
 from fake_lidar import FakeLidar
 
 from nlos_cam.camera.live_camera import LiveCamera
-from nlos_cam.camera.record import Recording
-from nlos_cam.camera.replay import verify
+from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.errors import CameraLostError
+from nlos_cam.recording.playback import verify
 from nlos_cam.render.fault_record import Fault
 
 Make = Callable[..., Any]

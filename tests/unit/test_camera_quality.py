@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from nlos_calibration.projection import Intrinsics
 
-from nlos_cam.camera.quality import LEAST_PAIRS, Quality, QualityMeter
 from nlos_cam.frames import Frame
+from nlos_cam.recording.quality import LEAST_PAIRS, Quality, QualityMeter
 
 SHAPE = 48, 64
 PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)

@@ -5,13 +5,12 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera.disk import RESERVE_BYTES
-from nlos_cam.camera.inbox import CAPACITY
-from nlos_cam.camera.record import Recording
-from nlos_cam.camera.replay import ReplayCamera, verify
+from nlos_cam.camera.recorder import RESERVE_BYTES, Recording
+from nlos_cam.camera.session import CAPACITY
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Frame
+from nlos_cam.recording.playback import ReplayCamera, verify
 
 Make = Callable[[Recording], SimulatedCamera]
 
@@ -145,7 +144,7 @@ def test_a_frame_is_covered_by_the_take_that_it_is_in(camera: Make, tmp_path: Pa
 
 
 def test_a_next_take_begins_though_no_frame_comes(camera: Make, tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("nlos_cam.camera.record.BOUNDARY_WAIT_S", 0.01)
+    monkeypatch.setattr("nlos_cam.camera.recorder.BOUNDARY_WAIT_S", 0.01)
     recording = Recording(tmp_path / "a.bag", frames=1, last=False)
     with camera(recording) as source:
         next(iter(source))
@@ -180,7 +179,7 @@ def test_a_camera_goes_on_without_an_optional_one(
     camera: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, ending: str
 ) -> None:
     if ending == "no index":
-        monkeypatch.setattr("nlos_cam.camera.sdk_recorder.can_grow", lambda *_: False)
+        monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: False)
     left = 0 if ending == "little space" else 2 * RESERVE_BYTES
     recording = Recording(tmp_path / "a.bag", optional=True, free=lambda _: left)
     with camera(recording) as source:

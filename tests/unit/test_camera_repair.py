@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader
 
-from nlos_cam.camera import repair as module
-from nlos_cam.camera.repair import Repaired, repair
-from nlos_cam.camera.replay import verify
-from nlos_cam.camera.replay_sdk import SdkReplayCamera
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
+from nlos_cam.recording import repair as module
+from nlos_cam.recording.playback import verify
+from nlos_cam.recording.repair import Repaired, repair
+from nlos_cam.recording.sdk_playback import SdkReplayCamera
 
 KINDS = ("packed", "plain", "packed-unindexed", "plain-unindexed")
 

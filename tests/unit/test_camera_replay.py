@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlos_cam.camera import software_lidar
-from nlos_cam.camera.record import Recording
-from nlos_cam.camera.replay import ReplayCamera, verify
+from nlos_cam.camera import simulated
+from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import RecordingError, StreamMissingError
+from nlos_cam.recording.playback import ReplayCamera, verify
 
 
 def record_streams(path: Path, world: Any) -> Path:
     """A recording of the streams that a SoftwareLidar has just now."""
     sdk = load_sdk()
-    lidar = software_lidar.SoftwareLidar(world.rig.pinhole, sdk)
+    lidar = simulated.SoftwareLidar(world.rig.pinhole, sdk)
     recorder = sdk.recorder(str(path), lidar.device)
     sensor = lidar.device.query_sensors()[0]
     sensor.open(sensor.get_stream_profiles())
@@ -185,7 +185,7 @@ def test_an_iteration_ends_where_another_begins(noise_bag: Path) -> None:
 def test_a_missing_stream_is_named_with_what_to_do(
     noise_world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, streams: tuple[str, ...]
 ) -> None:
-    monkeypatch.setattr(software_lidar, "FORMATS", {stream: FORMATS[stream] for stream in streams})
+    monkeypatch.setattr(simulated, "FORMATS", {stream: FORMATS[stream] for stream in streams})
     path = record_streams(tmp_path / "partial.bag", noise_world())
     with pytest.raises(StreamMissingError) as raised:
         ReplayCamera(path)

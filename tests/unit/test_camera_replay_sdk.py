@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 
 from nlos_cam.camera import open_camera
-from nlos_cam.camera.inbox import Inbox
-from nlos_cam.camera.replay import ReplayCamera
-from nlos_cam.camera.replay_sdk import SdkReplayCamera
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.software_lidar import SoftwareLidar
-from nlos_cam.camera.unwrap import PERIOD_S
+from nlos_cam.camera.session import Inbox
+from nlos_cam.camera.simulated import SoftwareLidar
+from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.errors import RecordingError, StreamMissingError
+from nlos_cam.recording.playback import ReplayCamera
+from nlos_cam.recording.sdk_playback import SdkReplayCamera
 
 IMAGE, METADATA = "/image/data", "/image/metadata"
 Messages = Iterable[tuple[int, bytes]]
@@ -104,7 +104,7 @@ def test_both_readers_give_the_same_frames_of_a_file_that_the_sdk_did_not_compre
 @pytest.mark.parametrize("camera", [ReplayCamera, SdkReplayCamera])
 def test_a_clock_that_wraps_goes_on(rewritten: Any, camera: type[ReplayCamera | SdkReplayCamera]) -> None:
     frames, _ = seen(camera(rewritten(around_a_wrap)))
-    assert [frame[1] for frame in frames] == pytest.approx([PERIOD_S + (i - 10) * 0.033333 for i in range(20)])
+    assert [frame[1] for frame in frames] == pytest.approx([WRAP_PERIOD_S + (i - 10) * 0.033333 for i in range(20)])
 
 
 @pytest.mark.parametrize("reader", ["plain", "sdk"])
@@ -141,7 +141,7 @@ TOLD = r"is damaged \d+\.\d s into its .*nlos-cam repair"
 
 def test_damage_does_not_reach_the_sdk(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = SimpleNamespace(context=lambda: pytest.fail("the SDK was given the file"))
-    monkeypatch.setattr("nlos_cam.camera.replay_sdk.load_sdk", lambda: fake)
+    monkeypatch.setattr("nlos_cam.recording.sdk_playback.load_sdk", lambda: fake)
     with pytest.raises(RecordingError, match=TOLD):
         SdkReplayCamera(damaged)
 
@@ -155,7 +155,7 @@ def test_damage_that_only_the_sdk_would_meet_does_not_reach_it(
     path.write_bytes(content)
     assert len(seen(ReplayCamera(path))[0]) == 20
     fake = SimpleNamespace(context=lambda: pytest.fail("the SDK was given the file"))
-    monkeypatch.setattr("nlos_cam.camera.replay_sdk.load_sdk", lambda: fake)
+    monkeypatch.setattr("nlos_cam.recording.sdk_playback.load_sdk", lambda: fake)
     with pytest.raises(RecordingError, match=r"is damaged \(at byte \d+: a record's header .*nlos-cam repair"):
         SdkReplayCamera(path)
 
@@ -181,7 +181,7 @@ def test_a_file_without_a_whole_index_does_not_reach_the_sdk(
 ) -> None:
     path = tmp_path / "cut.bag"
     path.write_bytes(noise_bag.read_bytes()[: int(share * noise_bag.stat().st_size)])
-    monkeypatch.setattr("nlos_cam.camera.replay_sdk.load_sdk", lambda: pytest.fail("the SDK was asked"))
+    monkeypatch.setattr("nlos_cam.recording.sdk_playback.load_sdk", lambda: pytest.fail("the SDK was asked"))
     with pytest.raises(RecordingError):
         SdkReplayCamera(path)
 
@@ -196,19 +196,19 @@ def test_what_the_sdk_refuses_is_told(noise_bag: Path, monkeypatch: pytest.Monke
         raise RuntimeError("no such stream")
 
     fake = SimpleNamespace(context=lambda: SimpleNamespace(load_device=refuse))
-    monkeypatch.setattr("nlos_cam.camera.replay_sdk.load_sdk", lambda: fake)
+    monkeypatch.setattr("nlos_cam.recording.sdk_playback.load_sdk", lambda: fake)
     with pytest.raises(RecordingError, match=r"cut short or damaged \(no such stream\): `nlos-cam repair"):
         SdkReplayCamera(noise_bag)
 
 
 def test_a_stream_that_the_sdk_does_not_find_is_told(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.camera.replay_sdk.find_streams", lambda _: (None, {}))
+    monkeypatch.setattr("nlos_cam.recording.sdk_playback.find_streams", lambda _: (None, {}))
     with pytest.raises(RecordingError, match=r"is damaged \(librealsense finds no 'depth' in it\): `nlos-cam repair"):
         SdkReplayCamera(noise_bag)
 
 
 def test_a_playback_that_never_begins_is_told(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.camera.replay_sdk.START_TIMEOUT_S", 0.0)
+    monkeypatch.setattr("nlos_cam.recording.sdk_playback.START_TIMEOUT_S", 0.0)
     stopped = SimpleNamespace(current_status=lambda: load_sdk().playback_status.stopped)
     with SdkReplayCamera(noise_bag) as camera, pytest.raises(RecordingError, match="gave no frame"):
         camera._next(Inbox(lossless=True), stopped)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera.sdk_recorder import FLUSH_S, FLUSHES, STILL_S, SdkRecorder
+from nlos_cam.camera.recorder import FLUSH_S, FLUSHES, STILL_S, SdkRecorder
 from nlos_cam.errors import DiskFullError, RecordingError
 
 UNTIL_THE_LIMIT = """
@@ -120,7 +120,7 @@ def test_a_file_that_grows_now_and_then_is_no_failure(made: SdkRecorder, clock: 
 def test_no_room_for_the_index_is_found_before_the_sdk_finds_it(
     made: SdkRecorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nlos_cam.camera.sdk_recorder.can_grow", lambda *_: False)
+    monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: False)
     with pytest.raises(DiskFullError, match="no room for its index"):
         made.close()
 

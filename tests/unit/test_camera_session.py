@@ -8,8 +8,7 @@ import pytest
 from fake_librealsense import FakeDevice, FakeSensor
 from fake_lidar import FakeLidar
 
-from nlos_cam.camera.inbox import Inbox
-from nlos_cam.camera.session import Session, find_streams, read_settings
+from nlos_cam.camera.session import Inbox, Session, find_streams, read_settings
 from nlos_cam.camera.streams import FORMATS
 
 

@@ -1,8 +1,7 @@
 import numpy as np
 from nlos_calibration.projection import Intrinsics
 
-from nlos_cam.camera.si_units import frame_in_si
-from nlos_cam.camera.streams import FrameSet
+from nlos_cam.camera.streams import FrameSet, frame_in_si
 
 PINHOLE = Intrinsics(3, 1, 1.0, 1.0, 1.0, 0.5)
 

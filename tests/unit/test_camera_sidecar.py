@@ -13,9 +13,11 @@ from nlos_calibration.errors import RecordFileError
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig, dump_toml, load_rig
 
-from nlos_cam.camera.quality import Quality
-from nlos_cam.camera.replay import Verified
-from nlos_cam.camera.sidecar import (
+from nlos_cam.errors import DiskFullError, RecordingError
+from nlos_cam.frames import Frame
+from nlos_cam.recording.playback import Verified
+from nlos_cam.recording.quality import Quality
+from nlos_cam.recording.sidecar import (
     LOOK_S,
     MOST_LOOKS,
     SidecarFile,
@@ -25,8 +27,6 @@ from nlos_cam.camera.sidecar import (
     versions,
     wall_of,
 )
-from nlos_cam.errors import DiskFullError, RecordingError
-from nlos_cam.frames import Frame
 
 PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
 DARK = np.zeros((48, 64), np.uint8)
@@ -104,7 +104,7 @@ def test_a_camera_without_thermometers_has_no_series(path: Path) -> None:
 
 
 def test_a_long_series_is_thinned_and_still_spans_the_recording(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.camera.sidecar.MOST_LOOKS", 10)
+    monkeypatch.setattr("nlos_cam.recording.sidecar.MOST_LOOKS", 10)
     assert MOST_LOOKS > 10
     sidecar = SidecarFile(path, Warm())
     for number in range(100):
@@ -145,7 +145,7 @@ def test_the_file_is_whole_at_any_time(path: Path, monkeypatch: pytest.MonkeyPat
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("nlos_cam.camera.sidecar.os.fsync", full)
+    monkeypatch.setattr("nlos_cam.recording.sidecar.os.fsync", full)
     sidecar.on_frame(frame(0.0))  # goes on: the recording's own end tells
     with pytest.raises(DiskFullError, match=r"a\.json cannot be written \(No space left on device\)"):
         sidecar.finish("complete", summary_of(READ, SEEN, {}))

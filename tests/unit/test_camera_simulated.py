@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlos_cam.camera.record import Recording
-from nlos_cam.camera.replay import ReplayCamera
+from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MOST_LATE, SimulatedCamera
+from nlos_cam.recording.playback import ReplayCamera
 
 
 class BusyClock:

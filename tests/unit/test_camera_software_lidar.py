@@ -9,7 +9,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import read_settings
-from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.camera.streams import intrinsics_of, is_needed, stream_name
 
 PINHOLE = load_rig("paper-rig").pinhole

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera.record import Recording
-from nlos_cam.camera.replay import Verified, verify
-from nlos_cam.camera.sidecar import load_sidecar, sidecar_path
+from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.camera.takes import Job, Take, Takes, settle
 from nlos_cam.errors import CameraLostError, DiskFullError, RecordingError
+from nlos_cam.recording.capture import Job, Take, Takes, settle
+from nlos_cam.recording.playback import Verified, verify
+from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
 
 Run = Callable[..., list[Take]]
 
@@ -163,8 +163,8 @@ def test_a_disk_too_full_for_the_sidecar_too_hides_no_other_error(
     def full(*_: Any) -> None:
         raise DiskFullError("0.json cannot be written")
 
-    monkeypatch.setattr("nlos_cam.camera.sidecar.SidecarFile.finish", full)
-    monkeypatch.setattr("nlos_cam.camera.sdk_recorder.can_grow", lambda *_: indexed)
+    monkeypatch.setattr("nlos_cam.recording.sidecar.SidecarFile.finish", full)
+    monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: indexed)
     (take,) = run(frames=4)
     assert (take.found is not None) == indexed
     assert ("0.json cannot be written" if indexed else "nlos-cam repair") in str(take.error)
@@ -174,7 +174,7 @@ def test_a_disk_too_full_for_the_sidecar_too_hides_no_other_error(
 def test_a_file_that_cannot_be_closed_is_told_and_not_read_back(
     run: Run, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    monkeypatch.setattr("nlos_cam.camera.sdk_recorder.can_grow", lambda *_: False)
+    monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: False)
     (take,) = run(count=count, frames=4, read_back=lambda _: pytest.fail("it has no index"))
     assert (take.state, take.closed, take.found) == ("disk full", False, None)
     assert "nlos-cam repair" in str(take.error)

@@ -12,13 +12,13 @@ import pytest
 import typer
 
 from nlos_cam.camera import Recording
-from nlos_cam.camera.quality import Quality
-from nlos_cam.camera.replay import Verified, verify
-from nlos_cam.camera.sidecar import load_sidecar
 from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.camera.takes import Job, Take
 from nlos_cam.cli import capture
 from nlos_cam.errors import CameraNotFoundError, DiskFullError, NlosCamError, OutputExistsError
+from nlos_cam.recording.capture import Job, Take
+from nlos_cam.recording.playback import Verified, verify
+from nlos_cam.recording.quality import Quality
+from nlos_cam.recording.sidecar import load_sidecar
 
 Run = Callable[..., dict[str, Any]]
 PROGRAM = """

@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera.quality import Quality
-from nlos_cam.camera.replay import Verified
-from nlos_cam.camera.takes import Job, Take
 from nlos_cam.cli import capture
 from nlos_cam.cli.capture_told import ending, result, told
 from nlos_cam.cli.main import main
 from nlos_cam.errors import CameraLostError, DiskFullError
+from nlos_cam.recording.capture import Job, Take
+from nlos_cam.recording.playback import Verified
+from nlos_cam.recording.quality import Quality
 
 STREAMS = {"depth": 30, "infrared": 30, "confidence": 30}
 SEEN = Quality(30, 0.001, 0.25, 9.0, 1.234, 0.1)

@@ -12,10 +12,10 @@ import pytest
 import typer
 
 from nlos_cam import dataset
-from nlos_cam.camera.replay import ReplayCamera
-from nlos_cam.camera.sidecar import SidecarFile, sidecar_path
 from nlos_cam.cli.dataset_label import add_label
 from nlos_cam.errors import OutputExistsError, RecordingError
+from nlos_cam.recording.playback import ReplayCamera
+from nlos_cam.recording.sidecar import SidecarFile, sidecar_path
 
 Run = Callable[..., dict[str, Any]]
 

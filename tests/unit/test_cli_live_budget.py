@@ -9,9 +9,8 @@ from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.bench import Bench
-from nlos_cam.budget import HANDOVER_MS, SHIPPED, Option
+from nlos_cam.budget import CALLS, HANDOVER_MS, SHIPPED, Choice, Option, Timed, options_here, timer, within_budget
 from nlos_cam.cli import live_budget
-from nlos_cam.cli.live_budget import CALLS, Choice, Timed, options_here, timer, within_budget
 from nlos_cam.errors import BudgetError
 from nlos_cam.processing import Processing
 

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 import typer
 
-from nlos_cam.camera.replay import verify
 from nlos_cam.cli import recordings
 from nlos_cam.cli.main import main
 from nlos_cam.errors import OutputExistsError
+from nlos_cam.recording.playback import verify
 
 Run = Callable[..., tuple[int, dict[str, Any], str]]
 

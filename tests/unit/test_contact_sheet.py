@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from nlos_cam.contact_sheet import _even_limits, _limits, draw_sheet
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.live_report import Step
+from nlos_cam.processing import Step
 from nlos_cam.reconstruct import Reconstruction
 from nlos_cam.verdict import Verdict
 

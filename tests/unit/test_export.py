@@ -10,10 +10,10 @@ import pytest
 import trimesh
 
 from nlos_cam.camera import open_camera
-from nlos_cam.camera.bag_file import BagFile
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import RecordingError
-from nlos_cam.export import INFO, Exported, Wanted, export
+from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.export import INFO, Exported, Wanted, export
 
 FRAMES = 20
 

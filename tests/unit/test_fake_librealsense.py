@@ -12,7 +12,7 @@ from fake_lidar import FakeFrame, FakeLidar, FakeProfile, NapClock
 from nlos_cam.camera.l515 import L515Camera
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import find_streams
-from nlos_cam.camera.software_lidar import SoftwareLidar
+from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.camera.streams import FORMATS
 
 Make = Callable[..., Any]

@@ -9,7 +9,8 @@ from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.errors import NlosCamError, SceneError
 from nlos_cam.frames import Frame, maps_from_frame
-from nlos_cam.live_report import MOST_FAILED, Held, LiveReport, Step, Tally, Warned
+from nlos_cam.live_report import MOST_FAILED, Held, LiveReport, Tally, Warned
+from nlos_cam.processing import Step
 from nlos_cam.reconstruct import Reconstruction
 from nlos_cam.verdict import Verdict
 

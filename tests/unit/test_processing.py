@@ -14,10 +14,10 @@ from nlos_calibration.errors import CalibrationError
 from nlos_cam.bench import Bench, Look
 from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.live_report import Step
+from nlos_cam.live import FRAMES_TOGETHER, MOST_AHEAD, read_along, steps, steps_ahead
 from nlos_cam.physics_check import Check
 from nlos_cam.physics_check_render import EveryFrames
-from nlos_cam.processing import FRAMES_TOGETHER, MOST_AHEAD, Processing, read_along, signs_of, steps, steps_ahead
+from nlos_cam.processing import Processing, Step, signs_of
 from nlos_cam.reconstruct import Clock
 from nlos_cam.verdict import Signs, Verdict
 

@@ -18,7 +18,8 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.bench import Bench
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.processing import FRAMES_TOGETHER, MOST_AHEAD, Processing
+from nlos_cam.live import FRAMES_TOGETHER, MOST_AHEAD
+from nlos_cam.processing import Processing
 from nlos_cam.replay import DIFFERENCE, REPORT, RESULT, SHEET, replay
 
 RIG = load_rig("paper-rig")

@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from nlos_cam.render.sensor_model import SATURATED, STEADY_CELSIUS, SensorModel, WarmUp
+from nlos_cam.frames import SATURATED
+from nlos_cam.render.sensor_model import STEADY_CELSIUS, SensorModel, WarmUp
 
 MOST = {
     "pulse_ns": 100.0,

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from fake_wall import SMALL, wall_frame
 
-from nlos_cam.camera.sidecar import Sidecar, Temperatures, sidecar_path
 from nlos_cam.frames import Frame
+from nlos_cam.recording.sidecar import Sidecar, Temperatures, sidecar_path
 from nlos_cam.thermometer import Thermometer, thermometer_of
 
 FRAMES = [wall_frame(number) for number in range(1, 100, 10)]

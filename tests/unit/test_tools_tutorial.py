@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera import world
+from nlos_cam.camera import simulated_world
 from nlos_cam.cli.main import main
 from nlos_cam.render.hidden_record import Motion
 from nlos_cam.render.scene_file import SceneFile, paper_scene
@@ -43,7 +43,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]]
     """Run one command in an empty folder with the examples, in this process."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(world, "paper_scene", still_scene)
+    monkeypatch.setattr(simulated_world, "paper_scene", still_scene)
 
     def call(words: list[str]) -> int:
         if words[0] == "nlos-cam":

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlos_cam.camera import world as module
-from nlos_cam.camera.world import World, open_world
+from nlos_cam.camera import simulated_world as module
+from nlos_cam.camera.simulated_world import World, open_world
 from nlos_cam.errors import SceneError
 from nlos_cam.render.sensor import SensedImages
 

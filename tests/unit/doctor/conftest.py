@@ -12,10 +12,10 @@ import usb.core
 from fake_librealsense import FakeSdk
 from usb.backend import IBackend
 
-from nlos_cam.camera.host import Platform, read_host
-from nlos_cam.camera.usb import scan
 from nlos_cam.doctor import Check, Facts, diagnose
 from nlos_cam.doctor.facts import look_at_sdk
+from nlos_cam.doctor.host import Platform, read_host
+from nlos_cam.doctor.usb import scan
 from nlos_cam.errors import CameraError
 
 L515_CLASSES = (0x0E, 0x0E, 0xFF, 0x03)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nlos_cam.camera.host import MODULES, Host, Platform, open_node, read_host, this_platform
+from nlos_cam.doctor.host import MODULES, Host, Platform, open_node, read_host, this_platform
 
 LINUX = Platform("linux", "x86_64", (3, 11))
 READ = (".dockerenv", "proc/modules", "proc/1/cgroup", "proc/1/environ", "proc/version", "proc/sys/kernel/osrelease")

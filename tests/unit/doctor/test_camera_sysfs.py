@@ -3,7 +3,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from nlos_cam.camera.sysfs import Holder, entries, holders, is_there, kernel_cameras, text
+from nlos_cam.doctor.host import Holder, entries, holders, is_there, kernel_cameras, text
 
 HOLDS = "import sys; file = open(sys.argv[1]); print('open', flush=True); sys.stdin.read()"
 

@@ -2,8 +2,8 @@ import re
 
 import pytest
 
-from nlos_cam.camera.udev import FILE_NAME, RELOAD, WRITE_AND_INSTALL, install, rules
-from nlos_cam.camera.usb_ids import LIDARS, OTHERS
+from nlos_cam.doctor.host import LIDARS, OTHERS
+from nlos_cam.doctor.udev import FILE_NAME, RELOAD, WRITE_AND_INSTALL, install, rules
 
 CLAUSE = re.compile(r'[A-Z]+(\{\w+\})?(==|:=|\+=)"[^"]*"')
 

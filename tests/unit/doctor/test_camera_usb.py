@@ -13,7 +13,7 @@ import usb.core
 import usb.util
 from usb.backend.libusb1 import _LibUSB
 
-from nlos_cam.camera.usb import SPEEDS, SUPER_SPEED, UsbDevice, firmware_of, scan, sdk_serial
+from nlos_cam.doctor.usb import SPEEDS, SUPER_SPEED, UsbDevice, firmware_of, scan, sdk_serial
 
 Make = Callable[..., SimpleNamespace]
 

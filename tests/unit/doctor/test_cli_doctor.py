@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera.udev import rules
 from nlos_cam.cli import doctor
 from nlos_cam.cli.main import main
 from nlos_cam.doctor.diagnosis import CHECKS
+from nlos_cam.doctor.udev import rules
 
 Run = Callable[..., tuple[int, str, str]]
 

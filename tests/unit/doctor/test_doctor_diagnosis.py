@@ -5,14 +5,12 @@ from typing import Any, get_args
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlos_cam.camera.host import MODULES, Host, Node, Platform
 from nlos_cam.camera.l515 import DeviceInfo
-from nlos_cam.camera.sysfs import Holder, KernelCamera
-from nlos_cam.camera.usb import UsbDevice, UsbScan
 from nlos_cam.doctor import Facts, diagnose
-from nlos_cam.doctor.check import Status
 from nlos_cam.doctor.diagnosis import CAUSES, CHECKS, REPLUG
-from nlos_cam.doctor.facts import Sdk
+from nlos_cam.doctor.facts import Sdk, Status
+from nlos_cam.doctor.host import MODULES, Holder, Host, KernelCamera, Node, Platform
+from nlos_cam.doctor.usb import UsbDevice, UsbScan
 
 NAMES = (
     "python system sdk sdk-version sdk-alone libusb usb-camera recovery link container udev-rules permissions "

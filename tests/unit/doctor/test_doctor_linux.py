@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera.host import Platform
+from nlos_cam.doctor.host import Platform
 
 RULES = "etc/udev/rules.d/99-l515.rules"
 

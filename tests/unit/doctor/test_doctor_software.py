@@ -5,9 +5,9 @@ from unittest.mock import Mock
 import pytest
 import usb.core
 
-from nlos_cam.camera.host import Platform
 from nlos_cam.camera.sdk import WHEEL
-from nlos_cam.doctor.software import numbers
+from nlos_cam.doctor.checks import numbers
+from nlos_cam.doctor.host import Platform
 
 
 @pytest.mark.parametrize(

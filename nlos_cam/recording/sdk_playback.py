@@ -10,15 +10,14 @@ from typing import Any, Self
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig
 
-from nlos_cam.camera.bag_container import advice, told
-from nlos_cam.camera.bag_scan import scan_bag
-from nlos_cam.camera.inbox import Inbox
-from nlos_cam.camera.replay import identity_of, open_lidar_bag
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import Session, find_streams
+from nlos_cam.camera.session import Inbox, Session, find_streams
 from nlos_cam.camera.streams import FORMATS, FrameSet
 from nlos_cam.errors import CameraError, RecordingError
 from nlos_cam.frames import Frame
+from nlos_cam.recording.bag_container import advice, told
+from nlos_cam.recording.playback import identity_of, open_lidar_bag
+from nlos_cam.recording.salvage import scan_bag
 
 POLL_S = 0.05
 START_TIMEOUT_S = 30.0

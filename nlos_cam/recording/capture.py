@@ -9,14 +9,13 @@ from threading import Event
 
 from nlos_calibration.rig import Rig
 
-from nlos_cam.camera.base import Camera
-from nlos_cam.camera.disk import RESERVE_BYTES
-from nlos_cam.camera.quality import Quality, QualityMeter
-from nlos_cam.camera.record import Recording
-from nlos_cam.camera.replay import Verified
-from nlos_cam.camera.sidecar import SidecarFile, State, Summary, WallFile, sidecar_path, summary_of
+from nlos_cam.camera.protocol import Camera
+from nlos_cam.camera.recorder import RESERVE_BYTES, Recording
 from nlos_cam.errors import CameraError, DiskFullError, NlosCamError, RecordingError
 from nlos_cam.frames import Frame
+from nlos_cam.recording.playback import Verified
+from nlos_cam.recording.quality import Quality, QualityMeter
+from nlos_cam.recording.sidecar import SidecarFile, State, Summary, WallFile, sidecar_path, summary_of
 
 Wall = tuple[Rig, WallFile]
 OnSets = Callable[[int], None]

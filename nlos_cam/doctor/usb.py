@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nlos_cam.camera.sysfs import text
-from nlos_cam.camera.usb_ids import INTEL, LIDARS, OTHERS, Kind
+from nlos_cam.doctor.host import INTEL, LIDARS, OTHERS, Kind, text
 
 SPEEDS = {
     1: "1.5 Mbit/s (USB 1)",

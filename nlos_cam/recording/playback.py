@@ -9,12 +9,11 @@ from typing import Self
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig
 
-from nlos_cam.camera.bag_file import BagFile
-from nlos_cam.camera.si_units import frame_in_si
-from nlos_cam.camera.streams import FORMATS, Pairing
-from nlos_cam.camera.unwrap import ClockUnwrap
+from nlos_cam.camera.streams import FORMATS, Pairing, frame_in_si
+from nlos_cam.camera.timestamps import ClockUnwrap
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
+from nlos_cam.recording.bag_reader import BagFile
 
 IDENTITY = {
     "name": "name",

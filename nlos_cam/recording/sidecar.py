@@ -16,11 +16,11 @@ from nlos_calibration.rig import Finite, PinholeRecord, Record, Rig, first_probl
 from nlos_calibration.wall_record import load_wall
 from pydantic import AwareDatetime, Field, ValidationError
 
-from nlos_cam.camera.base import Camera
-from nlos_cam.camera.quality import Quality
-from nlos_cam.camera.replay import Verified
+from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.frames import Frame
+from nlos_cam.recording.playback import Verified
+from nlos_cam.recording.quality import Quality
 
 State = Literal["recording", "complete", "interrupted", "lost", "disk full", "damaged"]
 """While it records, or after it was killed: recording. Ended by Ctrl-C: interrupted. The camera vanished: lost.

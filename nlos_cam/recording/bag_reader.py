@@ -1,4 +1,7 @@
-"""A librealsense recording, read without librealsense: streams, frames in order or by index, options, metadata."""
+"""A librealsense recording, read without librealsense: streams, frames in order or by index, options, metadata.
+
+The options of a recorded sensor: which values were in force when.
+"""
 
 import re
 from bisect import bisect_left, bisect_right
@@ -14,12 +17,39 @@ import numpy as np
 from nlos_calibration.projection import Intrinsics
 from numpy.typing import NDArray
 
-from nlos_cam.camera import bag_messages
-from nlos_cam.camera.bag_container import BagContainer, Entry
-from nlos_cam.camera.bag_messages import ENCODINGS, FrameMetadata, sdk_name
-from nlos_cam.camera.bag_options import RecordedOptions
 from nlos_cam.camera.streams import Sample
 from nlos_cam.errors import RecordingError
+from nlos_cam.recording import bag_container
+from nlos_cam.recording.bag_container import ENCODINGS, BagContainer, Entry, FrameMetadata, sdk_name
+
+
+class RecordedOptions:
+    """The options of one sensor, from the messages that told of them."""
+
+    def __init__(self, container: BagContainer, topics: Mapping[str, str]) -> None:
+        """`topics`: of each option's value, with the option's name."""
+        self._container = container
+        self._names = {topic: sdk_name(name) for topic, name in topics.items()}
+        self._changes: list[tuple[Entry, str]] = sorted(
+            (entry, topic) for topic in topics for entry in container.entries[topic]
+        )
+        self._done = 0
+        """Changes that are in `_values`."""
+        self._values: dict[str, float] = {}
+
+    def at(self, time_ns: int) -> Mapping[str, float]:
+        """The values in force, by the SDK's names; the same object until one changes."""
+        done = bisect_right(self._changes, time_ns, key=lambda change: change[0].time_ns)
+        if done != self._done:
+            ahead = done > self._done
+            latest = {topic: entry for entry, topic in self._changes[self._done if ahead else 0 : done]}
+            read = {self._names[topic]: self._value(topic, entry) for topic, entry in latest.items()}
+            self._values, self._done = self._values | read if ahead else read, done
+        return self._values
+
+    def _value(self, topic: str, entry: Entry) -> float:
+        return float(self._container.read(topic, entry).data)
+
 
 DEVICE = "/device_0"
 STREAM = re.compile(DEVICE + r"/sensor_(\d+)/(\w+)_(\d+)(?=/image/data$)")
@@ -83,7 +113,9 @@ class BagFile:
         info, camera = self._first(f"{topic}/info"), self._first(f"{topic}/info/camera_info")
         name = sdk_name(kind if index == "0" else f"{kind}_{index}")
         frames = len(self._entries[f"{topic}/image/data"])
-        return StreamInfo(name, topic, int(sensor), info.encoding, info.fps, bag_messages.intrinsics_of(camera), frames)
+        return StreamInfo(
+            name, topic, int(sensor), info.encoding, info.fps, bag_container.intrinsics_of(camera), frames
+        )
 
     def _first(self, topic: str) -> Any:
         entries = self._entries.get(topic)
@@ -109,7 +141,7 @@ class BagFile:
 
     def _pixels(self, image: Any, info: StreamInfo, entry: Entry) -> NDArray[Any]:
         with self._container.told_at(entry):
-            return bag_messages.pixels(image, info.encoding, info.intrinsics)
+            return bag_container.pixels(image, info.encoding, info.intrinsics)
 
     def sensor_name(self, stream: str) -> str:
         """What the sensor of a stream is called; empty where that is not recorded."""
@@ -135,7 +167,7 @@ class BagFile:
                 f"{self.path}: its {stream} stream is encoded as {info.encoding}, which we cannot read"
             )
         image = self._container.read(f"{info.topic}/image/data", entry)
-        return Sample(stream, image.header.seq, bag_messages.timestamp_s(image), self._pixels(image, info, entry))
+        return Sample(stream, image.header.seq, bag_container.timestamp_s(image), self._pixels(image, info, entry))
 
     def metadata(self, stream: str, index: int) -> FrameMetadata:
         """What is told of that frame besides its image."""
@@ -144,7 +176,7 @@ class BagFile:
         first, end = (side(entries, time_ns, key=_time_ns) for side in (bisect_left, bisect_right))
         pairs = [self._container.read(topic, entry) for entry in entries[first:end]]
         with self._container.told_at(self._frames(stream)[index]):
-            return bag_messages.metadata(pairs)
+            return bag_container.metadata(pairs)
 
     def settings(self, time_ns: int = STATIC_NS, stream: str = "depth") -> Mapping[str, float]:
         """The options of the stream's sensor in force at a time, by the SDK's names: from the first to `end_ns`.
@@ -160,7 +192,7 @@ class BagFile:
 
     def lens(self, stream: str) -> tuple[str, NDArray[np.float64]]:
         """The distortion model of a stream, by the SDK's name, and its coefficients."""
-        return bag_messages.lens_of(self._first(f"{self.streams[stream].topic}/info/camera_info"))
+        return bag_container.lens_of(self._first(f"{self.streams[stream].topic}/info/camera_info"))
 
     def pose(self, stream: str, other: str) -> NDArray[np.float64]:
         """Where another stream's camera is in the frame of a stream's: stream_from_other (4, 4).
@@ -179,14 +211,14 @@ class BagFile:
         for topic, entries in self._entries.items():
             if topic.startswith(start) and entries:
                 with self._container.told_at(entries[0]):
-                    poses[topic.removeprefix(start)] = bag_messages.pose_of(self._container.read(topic, entries[0]))
+                    poses[topic.removeprefix(start)] = bag_container.pose_of(self._container.read(topic, entries[0]))
         return poses
 
     def depth_unit_m(self) -> float:
         """Metres per depth count. Raises RecordingError where the recording does not tell."""
         info, entry = self.streams["depth"], self._frames("depth")[0]
         with self._container.told_at(entry):
-            tail = bag_messages.depth_unit_m(self._container.raw(entry))
+            tail = bag_container.depth_unit_m(self._container.raw(entry))
         unit_m = self.settings().get("depth_units", tail)
         if unit_m is None or not 0 < unit_m < inf:
             raise RecordingError(f"{self.path}: {info.topic} does not tell its depth unit ({unit_m}): record it again")

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from nlos_cam.camera.base import Camera
+from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import CameraNotFoundError, NlosCamError
 
 if TYPE_CHECKING:
-    from nlos_cam.camera.record import Recording
+    from nlos_cam.camera.recorder import Recording
 
 OnProgress = Callable[[int, int], None]
 """Called with poses rendered and poses in all, while a simulated world is rendered ahead."""
@@ -49,17 +49,17 @@ def _replay(uri: str, path: Path, recording: "Recording | None", reader: Reader)
     if recording:
         raise NlosCamError(f"{uri} is a recording already: copy the file, or give a live camera (l515, sim)")
     if reader == "sdk":
-        from nlos_cam.camera.replay_sdk import SdkReplayCamera
+        from nlos_cam.recording.sdk_playback import SdkReplayCamera
 
         return SdkReplayCamera(path)
-    from nlos_cam.camera.replay import ReplayCamera
+    from nlos_cam.recording.playback import ReplayCamera
 
     return ReplayCamera(path)
 
 
 def _simulated(uri: str, name: str, on_progress: OnProgress | None, recording: "Recording | None") -> Camera:
     from nlos_cam.camera.simulated import SimulatedCamera
-    from nlos_cam.camera.world import open_world
+    from nlos_cam.camera.simulated_world import open_world
 
     world = open_world(name, on_progress)
     return SimulatedCamera(uri, world, recording=recording, faults=world.scene.faults)

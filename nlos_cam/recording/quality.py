@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.frames import Float32, Frame
-from nlos_cam.render.sensor_model import SATURATED
+from nlos_cam.frames import SATURATED, Float32, Frame
 
 LEAST_PAIRS = 8
 """Pairs of frames in which a pixel must be valid for its noise to count; with fewer in all, no noise is told."""

@@ -1,7 +1,12 @@
-"""The seam that every camera is seen through. Everything above it is ignorant of librealsense."""
+"""The seam that every camera is seen through. Everything above it is ignorant of librealsense.
 
+Time as an argument.
+"""
+
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from threading import Event
 from typing import Protocol, Self
 
 from nlos_calibration.projection import Intrinsics
@@ -42,3 +47,28 @@ class Camera(Protocol):
         Each costs a real device a command on its link: ask for what is needed by the `ending` of its name.
         """
         ...
+
+
+class Clock(Protocol):
+    """What time it is, and waiting."""
+
+    def now(self) -> float:
+        """Seconds since 1970; never goes back."""
+        ...
+
+    def wait(self, stop: Event, seconds: float) -> bool:
+        """Wait that long, or until `stop` is set; whether it is."""
+        ...
+
+
+class WallClock:
+    """The host's time of day when made, kept steady from then on."""
+
+    def __init__(self) -> None:
+        self._zero_s = time.time() - time.monotonic()
+
+    def now(self) -> float:
+        return self._zero_s + time.monotonic()
+
+    def wait(self, stop: Event, seconds: float) -> bool:
+        return stop.wait(max(seconds, 0.0))

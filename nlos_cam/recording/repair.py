@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
-from nlos_cam.camera.bag_chunk import Chunk
-from nlos_cam.camera.bag_format import (
+from nlos_cam.camera.streams import FORMATS
+from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
+from nlos_cam.recording.rosbag import (
     ENTRY_BYTES,
     FILE_HEADER_BYTES,
     MAGIC,
@@ -21,9 +22,7 @@ from nlos_cam.camera.bag_format import (
     pack_file_header,
     pack_index,
 )
-from nlos_cam.camera.bag_scan import Damage, OnProgress, Scan, scan_bag, unreported
-from nlos_cam.camera.streams import FORMATS
-from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
+from nlos_cam.recording.salvage import Chunk, Damage, OnProgress, Scan, scan_bag, unreported
 
 FRAMES_TOPIC = re.compile(r"/([A-Za-z]+)_\d+/image/data$")
 VERSION_TOPIC = "/file_version"

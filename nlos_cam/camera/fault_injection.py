@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nlos_cam.camera.streams import FORMATS, FRAMES_PER_S
-from nlos_cam.camera.unwrap import PERIOD_S
+from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.render.fault_record import Fault, FaultKind
 from nlos_cam.render.sensor import SensedImages
 
@@ -98,7 +98,7 @@ class FaultyDevice:
         return [*handed * (2 if self._befallen(instant, "duplicate") else 1), *late]
 
     def _timestamp_s(self, instant: int, due_s: float) -> float:
-        return (instant - self._clock_from) / FRAMES_PER_S % PERIOD_S if self.has_own_clock else due_s
+        return (instant - self._clock_from) / FRAMES_PER_S % WRAP_PERIOD_S if self.has_own_clock else due_s
 
     def _spoil(self, delivery: Delivery, instant: int) -> Delivery:
         images = delivery.images

@@ -2,7 +2,7 @@
 
 from shlex import quote
 
-from nlos_cam.camera.usb_ids import INTEL, L515, LIDARS
+from nlos_cam.doctor.host import INTEL, L515, LIDARS
 
 HEAD = """\
 # Access to the Intel RealSense L515 for every user, as librealsense 2.54 needs it.

@@ -1,0 +1,403 @@
+"""Checks of what Linux puts between a camera and librealsense: containers, rules, permissions, drivers, other users.
+
+Checks of what is installed: Python, the system, librealsense and libusb.
+
+Checks of the camera itself: is it on USB, in its normal mode, on a fast link, with a firmware that is known.
+"""
+
+import re
+
+from nlos_cam.camera.sdk import WHEEL
+from nlos_cam.doctor.facts import Facts, Finding, failed, ok, skipped, warning
+from nlos_cam.doctor.host import L515, LIDARS, Host, KernelCamera
+from nlos_cam.doctor.udev import RELOAD, WRITE_AND_INSTALL
+
+CONTAINER_FIX = (
+    'start the container with `-v /dev:/dev -v /sys:/sys --device-cgroup-rule "c 81:* rmw" --device-cgroup-rule '
+    '"c 189:* rmw"`, and install the udev rules and kernel modules on the host'
+)
+NOT_LINUX = "only Linux needs this"
+NO_CAMERA_IN_KERNEL = "the kernel sees no L515"
+HID_MODULES = ("hid_sensor_hub", "hid_sensor_accel_3d", "hid_sensor_gyro_3d")
+HID_OPTIONS = "CONFIG_HID_SENSOR_HUB, CONFIG_HID_SENSOR_ACCEL_3D and CONFIG_HID_SENSOR_GYRO_3D"
+LEAST_SENSORS = 2
+"""librealsense on Linux leaves out an L515 of which it does not see accelerometer and gyroscope."""
+JOIN = "`sudo usermod -aG plugdev,video $USER`, and log in again"
+PASSERS_BY = {"pipewire", "wireplumber"}
+"""Desktop services that keep a camera's node open without streaming."""
+
+
+def _not_here(facts: Facts) -> str:
+    """Why a question about a camera on Linux does not arise; empty if it does."""
+    if facts.host.platform.system != "linux":
+        return NOT_LINUX
+    return "" if facts.host.cameras else NO_CAMERA_IN_KERNEL
+
+
+def container(facts: Facts) -> Finding:
+    """Whether this is a container, and the camera is passed into it."""
+    host = facts.host
+    if host.platform.system != "linux":
+        return skipped(NOT_LINUX)
+    if not host.container:
+        return ok("not in a container")
+    if host.cameras and not facts.usb.of_kind("camera") + facts.usb.of_kind("recovery"):
+        return failed(
+            f"this is a container ({host.container}), and the host's L515 is not passed into it", CONTAINER_FIX
+        )
+    if facts.pairs and not any(node.error for node in host.nodes):
+        return ok(f"in a container ({host.container}) that shows the camera")
+    return warning(
+        f"this is a container ({host.container}): a camera of the host shows only if it is passed", CONTAINER_FIX
+    )
+
+
+def udev_rules(facts: Facts) -> Finding:
+    """Whether rules give this user access to an L515 once it is plugged in."""
+    host = facts.host
+    if host.platform.system != "linux":
+        return skipped(NOT_LINUX)
+    if host.rules:
+        return ok(f"rules in {', '.join(host.rules)}")
+    if host.container:
+        return skipped("in a container the host's rules count")
+    if host.platform.is_root:
+        return warning("no udev rules for the L515: only root can open it", WRITE_AND_INSTALL)
+    if host.nodes and not any(node.error for node in host.nodes):
+        return warning("no udev rules for the L515, though this user can open it now", WRITE_AND_INSTALL)
+    return failed("no udev rules for the L515: it opens for root only", WRITE_AND_INSTALL)
+
+
+def permissions(facts: Facts) -> Finding:
+    """Whether every node of the camera opens."""
+    host = facts.host
+    if host.platform.system != "linux":
+        return skipped(NOT_LINUX)
+    shut = [f"{node.path} ({node.error})" for node in host.nodes if node.error]
+    if not host.cameras:  # no /sys here, so libusb is the only witness
+        shut = [f"{device.label} ({device.error})" for device in facts.usb.devices if device.denied]
+    if shut:
+        return failed(f"cannot open {', '.join(shut)}", _permission_fix(host))
+    return ok(f"{len(host.nodes)} nodes open") if host.nodes else skipped(NO_CAMERA_IN_KERNEL)
+
+
+def _permission_fix(host: Host) -> str:
+    if host.container:
+        return CONTAINER_FIX
+    if not host.rules:
+        return WRITE_AND_INSTALL
+    fix = f"{RELOAD}; then unplug the camera and plug it in again"
+    return fix if host.platform.in_plugdev else f"{fix}; if that is not enough, {JOIN}"
+
+
+def video_driver(facts: Facts) -> Finding:
+    """Whether uvcvideo has made video nodes of the camera."""
+    if reason := _not_here(facts):
+        return skipped(reason)
+    cameras = [camera for camera in facts.host.cameras if LIDARS[camera.product_id][0] == "camera"]
+    if bare := [camera.port for camera in cameras if not camera.video_nodes]:
+        state = facts.host.modules.get("uvcvideo", "unknown")
+        fix = "install a kernel with CONFIG_USB_VIDEO_CLASS" if state == "missing" else "sudo modprobe uvcvideo"
+        return failed(f"the L515 at {', '.join(bare)} has no /dev/video* (uvcvideo: {state})", fix)
+    return ok(
+        ", ".join(node for camera in cameras for node in camera.video_nodes) or "in recovery mode: none is needed"
+    )
+
+
+def hid_sensors(facts: Facts) -> Finding:
+    """Whether the kernel shows the motion sensors, without which librealsense silently leaves the camera out."""
+    if facts.host.platform.system != "linux":
+        return skipped(NOT_LINUX)
+    cameras = [camera for camera in facts.host.cameras if camera.product_id == L515]
+    if not cameras:
+        return skipped(NO_CAMERA_IN_KERNEL)
+    for camera in cameras:
+        if len(camera.hid_sensors) < LEAST_SENSORS:
+            return _without_sensors(facts, camera)
+    return ok("; ".join(f"{camera.port}: {', '.join(camera.hid_sensors)}" for camera in cameras))
+
+
+def _without_sensors(facts: Facts, camera: KernelCamera) -> Finding:
+    seen = ", ".join(camera.hid_sensors) or "none"
+    drivers = ", ".join(camera.hid_devices) or "no HID device"
+    detail = (
+        f"the L515 at {camera.port} shows fewer than {LEAST_SENSORS} motion sensors ({seen}; {drivers}): librealsense "
+        "then leaves it out without a word"
+    )
+    return failed(detail, _sensor_fix(facts, camera))
+
+
+def _sensor_fix(facts: Facts, camera: KernelCamera) -> str:
+    host = facts.host
+    offers = next((device.interfaces for device in facts.usb.devices if device.port == camera.port), ())
+    if offers and "hid" not in offers:
+        return "it offers no HID interface: unplug it, wait 5 s, plug it in again; if it stays so, update its firmware"
+    if host.container and not host.has_iio:
+        return f"{CONTAINER_FIX}: this one hides /sys/bus/iio"
+    if missing := [name for name in HID_MODULES if host.modules.get(name) == "missing"]:
+        return (
+            f"this kernel has no {', '.join(missing)} (JetPack 6 is built so): install one with {HID_OPTIONS}, or "
+            "try librealsense 2.54.2 built with -DFORCE_RSUSB_BACKEND=ON, which reads USB without it"
+        )
+    return f"sudo modprobe -a {' '.join(HID_MODULES)}; then unplug the camera and plug it in again"
+
+
+def in_use(facts: Facts) -> Finding:
+    """Whether another process holds the camera: librealsense gives it to one at a time."""
+    if reason := _not_here(facts):
+        return skipped(reason)
+    held = {f"{one.name} (pid {one.pid})": one for one in facts.host.holders}
+    closed = facts.host.closed_processes
+    blind = f"; {closed} processes of others do not show: sudo sees them" if closed else ""
+    if not held:
+        return ok(f"no other process has it open{blind}")
+    pids = " ".join(str(pid) for pid in sorted({one.pid for one in held.values()}))
+    if {one.name for one in held.values()} <= PASSERS_BY:
+        return warning(
+            f"{', '.join(held)} has it open; it may only watch{blind}",
+            "if streaming fails: systemctl --user stop wireplumber pipewire",
+        )
+    return failed(f"{', '.join(held)} has it open{blind}", f"close that program, or `kill {pids}`")
+
+
+def metadata(facts: Facts) -> Finding:
+    """Where the frames' numbers and times come from; both ways work here."""
+    on = facts.host.platform.system
+    if on == "linux" and facts.host.patched_uvc:
+        return ok("uvcvideo is librealsense's: frames carry the camera's clock and number")
+    if on == "linux" and facts.host.modules.get("uvcvideo") in {"loaded", "built in"}:
+        return ok("uvcvideo is the kernel's own: frames carry this host's clock and the SDK's count, which does here")
+    if on == "windows":
+        return ok(
+            "frames carry the camera's clock only once librealsense's scripts/realsense_metadata_win10.ps1 has run as "
+            "administrator; without it this host's clock does"
+        )
+    return skipped("uvcvideo is not loaded" if on == "linux" else "only Linux and Windows have it")
+
+
+MACOS_WHEEL = "pyrealsense2-macosx==2.54.2"
+FROM_SOURCE = "build librealsense 2.54.2 from source with -DBUILD_PYTHON_BINDINGS=ON"
+NEWEST_PYTHON = {"linux x86_64": (3, 11), "windows amd64": (3, 11), "darwin": (3, 12)}
+"""The last Python that a wheel with the L515's driver exists for; macOS has a community's."""
+TESTED = (2, 54, 2)
+REMOVED = (2, 55)
+"""librealsense from here on does not know the L515, and says nothing of it."""
+SYSTEM_LIBRARIES = {"libusb-1.0": "libusb-1.0-0", "libudev": "libudev1", "libstdc++": "libstdc++6"}
+"""Shared libraries that the Linux wheel asks for, and the Debian packages that bring them."""
+VC_RUNTIME = "install Microsoft's Visual C++ runtime: https://aka.ms/vs/17/release/vc_redist.x64.exe"
+
+
+def _wheel(on: str) -> str:
+    return MACOS_WHEEL if on == "darwin" else WHEEL
+
+
+def numbers(version: str) -> tuple[int, ...]:
+    """A version as numbers: 01.05.08.01 is (1, 5, 8, 1)."""
+    return tuple(int(part) for part in re.findall(r"\d+", version))
+
+
+def python(facts: Facts) -> Finding:
+    """Whether librealsense has a wheel for this Python on this system."""
+    on = facts.host.platform
+    here = f"Python {on.python[0]}.{on.python[1]} on {on.system} {on.machine}"
+    if not facts.sdk.load_error:
+        return ok(f"{here}: librealsense runs here")
+    if on.is_musl:
+        return failed(
+            f"{here} with musl: librealsense's wheels are for glibc", "use a system with glibc (Debian, Ubuntu, Fedora)"
+        )
+    newest = NEWEST_PYTHON.get(f"{on.system} {on.machine}") or NEWEST_PYTHON.get(on.system)
+    if newest is None:
+        return failed(f"{here}: there is no wheel of librealsense 2.54.2 for it", FROM_SOURCE)
+    if on.python > newest:
+        last = f"{newest[0]}.{newest[1]}"
+        return failed(
+            f"{here}: the last librealsense that knows the L515 has wheels up to Python {last}",
+            f"use Python {last} (`python{last} -m venv .venv`), or {FROM_SOURCE}",
+        )
+    return ok(f"{here}: a wheel of librealsense exists")
+
+
+def system(facts: Facts) -> Finding:
+    """Whether a camera can be used on this operating system."""
+    if facts.host.platform.system == "darwin":
+        return _macos(facts)
+    if facts.host.is_wsl:
+        return _wsl(facts)
+    return ok(f"a camera can be used on {facts.host.platform.system}")
+
+
+def _macos(facts: Facts) -> Finding:
+    tell = warning if facts.sdk.lidars else failed
+    return tell(
+        "macOS: simulation and recordings only; since macOS 12 librealsense reaches a camera as root at most, and "
+        "often not even then",
+        "use the camera on Linux or Windows; to try it here all the same: "
+        f"`pip install {MACOS_WHEEL}`, and run with sudo",
+    )
+
+
+def _wsl(facts: Facts) -> Finding:
+    tell = warning if facts.pairs else failed
+    return tell(
+        "WSL: a virtual machine that sees only the USB devices handed to it, with a kernel that may lack uvcvideo and "
+        "the HID sensors",
+        "run nlos-cam on Windows itself; or, in PowerShell as administrator: `usbipd list`, "
+        "`usbipd bind --busid B`, `usbipd attach --wsl --busid B` with the camera's B from the list",
+    )
+
+
+def sdk(facts: Facts) -> Finding:
+    """Whether librealsense can be loaded and asked."""
+    if error := facts.sdk.load_error:
+        return failed(error, _load_fix(error, facts.host.platform.system))
+    if error := facts.sdk.query_error:
+        return failed(f"librealsense is there, but cannot list devices: {error}", _query_fix(error))
+    return ok(f"librealsense {facts.sdk.version or 'of unknown version'} is loaded")
+
+
+def _load_fix(error: str, on: str) -> str:
+    """What to install, by what the loader missed."""
+    if "DLL" in error:
+        return VC_RUNTIME
+    if "GLIBC" in error:
+        return (
+            "the system's C library is too old for the wheel: use a newer release of the system (glibc 2.17 or later)"
+        )
+    for library, package in SYSTEM_LIBRARIES.items():
+        if library in error:
+            return f"sudo apt install {package}" + (", or `pip install libusb-package`" if "usb" in library else "")
+    return f"pip install {_wheel(on)} libusb-package"
+
+
+def _query_fix(error: str) -> str:
+    if "attribute" in error:  # a folder or file called pyrealsense2 stands before the wheel
+        return f"remove any folder or file of your own called pyrealsense2; `pip install --force-reinstall {WHEEL}`"
+    return "unplug the camera, wait 5 s, plug it in again; close realsense-viewer and whatever else uses it"
+
+
+def sdk_version(facts: Facts) -> Finding:
+    """Whether this librealsense still has the L515's driver: it was removed in 2.55, without a word."""
+    if not facts.sdk.packages:
+        return skipped("no package of librealsense is installed that would tell its version")
+    newest = max(facts.sdk.packages, key=lambda package: numbers(package[1]))[1]
+    fix = f"pip install {_wheel(facts.host.platform.system)}"
+    if numbers(newest)[:2] >= REMOVED:
+        return failed(
+            f"librealsense {newest} has no driver for the L515 (the last that has is 2.54.2): it reports no device",
+            fix,
+        )
+    if numbers(newest)[:3] != TESTED:
+        return warning(f"librealsense {newest} knows the L515, but only 2.54.2 is tested", fix)
+    return ok(f"librealsense {newest} knows the L515")
+
+
+def sdk_alone(facts: Facts) -> Finding:
+    """Whether a second librealsense overwrites the first: their packages share one folder."""
+    told = ", ".join(f"{name} {version}" for name, version in facts.sdk.packages)
+    if len(facts.sdk.packages) > 1:
+        names = " ".join(name for name, _ in facts.sdk.packages)
+        return failed(
+            f"{told} are installed into one folder, and overwrite each other",
+            f"pip uninstall -y {names} && pip install {_wheel(facts.host.platform.system)}",
+        )
+    return ok(f"only {told}") if told else skipped("no package of librealsense is installed")
+
+
+def libusb(facts: Facts) -> Finding:
+    """Whether the devices on USB can be listed without librealsense."""
+    if facts.usb.error:
+        return failed(
+            f"USB cannot be looked at: {facts.usb.error}",
+            "pip install pyusb libusb-package"
+            + (", or `sudo apt install libusb-1.0-0`" if facts.host.platform.system == "linux" else ""),
+        )
+    return ok(f"{facts.usb.total} USB devices are listed")
+
+
+NO_CAMERA = "no L515 is seen, neither on USB nor by librealsense"
+LEAST_FIRMWARE = (1, 5, 1, 3)
+BEST_FIRMWARE = (1, 5, 8, 1)
+FLASH = (
+    "with librealsense 2.54.2's realsense-viewer (More > Update Firmware), or `rs-fw-update -f "
+    "Signed_Image_UVC_1_5_8_1.bin`, on a USB 3 port"
+)
+
+
+def usb_camera(facts: Facts) -> Finding:
+    """Whether an L515 is on the bus, in whatever mode."""
+    if facts.usb.error:
+        return skipped("USB cannot be looked at: see libusb")
+    here = facts.usb.of_kind("camera") + facts.usb.of_kind("recovery")
+    if here:
+        return ok(", ".join(f"{device.label} ({device.id}, {device.link})" for device in here))
+    if kernel := facts.host.cameras:
+        ports = ", ".join(camera.port for camera in kernel)
+        fix = (
+            CONTAINER_FIX
+            if facts.host.container
+            else "unplug the camera and plug it in again: udev then makes its node"
+        )
+        return failed(f"the kernel sees an L515 at {ports}, but /dev/bus/usb does not show it here", fix)
+    if facts.sdk.lidars:
+        return warning(
+            "librealsense sees an L515 that USB does not show",
+            CONTAINER_FIX if facts.host.container else "run as a user who may list USB devices",
+        )
+    return _absent(facts)
+
+
+def _absent(facts: Facts) -> Finding:
+    plug = (
+        "plug it straight into a USB 3 port with its own cable; `lsusb -d 8086:` should list it; without a camera, use "
+        "--camera sim"
+    )
+    if others := facts.usb.of_kind("other"):
+        told = ", ".join(f"{device.label} ({device.id})" for device in others)
+        return failed(f"no L515 on USB, but another RealSense: {told}", f"only an L515 will do: {plug}")
+    if not facts.usb.total:
+        return failed(
+            "nothing is plugged in: USB shows no device at all", f"{plug}; in a virtual machine, pass USB to it"
+        )
+    return failed(f"nothing is plugged in: none of the {facts.usb.total} devices on USB is an L515", plug)
+
+
+def recovery(facts: Facts) -> Finding:
+    """Whether a camera waits for firmware instead of giving frames."""
+    if stuck := facts.usb.of_kind("recovery"):
+        return failed(
+            ", ".join(f"{device.label} ({device.id})" for device in stuck)
+            + ": it waits for firmware, and gives no frames",
+            "unplug it, wait 5 s, plug it into a USB 3 port; if it comes back like this: `rs-fw-update -r -f "
+            "Signed_Image_UVC_1_5_8_1.bin` of librealsense 2.54.2, or its realsense-viewer",
+        )
+    return ok(f"{len(facts.pairs)} in normal mode") if facts.pairs else skipped(NO_CAMERA)
+
+
+def link(facts: Facts) -> Finding:
+    """Whether every camera is on USB 3."""
+    if not facts.pairs:
+        return skipped(NO_CAMERA)
+    if slow := [pair for pair in facts.pairs if pair.is_slow]:
+        return warning(
+            f"{', '.join(pair.label for pair in slow)} is on USB 2: depth, infrared and confidence come at 320 x 240 "
+            "and 30 frames/s only, without max-usable-range and IR reflectivity",
+            "turn the USB-C plug round and push it in whole; use a USB 3 cable and a USB 3 port, without a hub; a "
+            "camera that stays on USB 2 with every cable and port is defective",
+        )
+    return ok(", ".join(f"{pair.label}: {pair.link}" for pair in facts.pairs))
+
+
+def firmware(facts: Facts) -> Finding:
+    """Whether every camera's firmware is accepted by librealsense 2.54.2, and the one it asks for."""
+    told = {pair.label: pair.firmware for pair in facts.pairs}
+    known = {label: version for label, version in told.items() if version}
+    if not known:
+        return skipped("no camera tells its firmware" if told else NO_CAMERA)
+    detail = ", ".join(f"{label}: {version}" for label, version in known.items())
+    oldest = min(map(numbers, known.values()))
+    if oldest < LEAST_FIRMWARE[: len(oldest)]:
+        return failed(f"{detail}; librealsense takes 1.5.1.3 and later", f"update to 1.5.8.1 {FLASH}")
+    if oldest < BEST_FIRMWARE[: len(oldest)]:
+        return warning(f"{detail}; librealsense asks for 1.5.8.1", f"update to 1.5.8.1 {FLASH}")
+    return ok(detail)
