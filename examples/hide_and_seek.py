@@ -6,9 +6,8 @@ import numpy as np
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset_samples import sense_object
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import Pose, category_triangles, place
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.depth_map import object_box, orthographic_depth
+from nlos_cam.objects.placement import Pose, category_triangles, place
 from nlos_cam.reconstruct import reconstruct
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor import Sensor

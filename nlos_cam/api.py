@@ -33,7 +33,7 @@ from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import Float32, LidarMaps
 from nlos_cam.live import read_along, steps, warm_up
 from nlos_cam.live_report import Tally
-from nlos_cam.objects.depth_image import cell_centres_m, object_box
+from nlos_cam.objects.depth_map import cell_centres_m, object_box
 from nlos_cam.processing import Processing, Step
 from nlos_cam.reconstruct import Clock
 from nlos_cam.set_up import load_doubt, load_networks, misfits, set_up

@@ -27,7 +27,7 @@ from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.errors import BudgetError, RecordingError
 from nlos_cam.live import warm_up
 from nlos_cam.live_report import LiveReport
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.processing import Processing
 
 TRADEOFF = "tradeoff.json"

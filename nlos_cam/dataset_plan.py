@@ -12,8 +12,8 @@ from nlos_models.recipe import SIMULATION_ONLY
 from pydantic import TypeAdapter
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.render.patches import JUMP_M
 from nlos_cam.render.scene import Radiometry
 from nlos_cam.render.scene_file import RENDERING_VERSION, SceneFile

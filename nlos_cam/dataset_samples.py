@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from nlos_cam.dataset_plan import DatasetPlan, Objects, scene_row
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
-from nlos_cam.objects.depth_image import image_from_depth
-from nlos_cam.objects.files import MeshFile, read_mesh
-from nlos_cam.objects.hidden import object_depth, object_depths
-from nlos_cam.objects.mesh_folder import folder_objects, mesh_depth
+from nlos_cam.objects.depth_map import image_from_depth
+from nlos_cam.objects.meshes import MeshFile, folder_objects, mesh_depth, read_mesh
+from nlos_cam.objects.placement import object_depth, object_depths
 from nlos_cam.objects.textures import Coat, image_from_albedo, painted
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Radiometry, Scene

@@ -19,7 +19,7 @@ from nlos_cam.cli.common import tracked
 from nlos_cam.errors import SceneError
 from nlos_cam.folders import file_when_whole
 from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps, maps_from_frame
-from nlos_cam.objects.depth_image import image_from_depth, object_box
+from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.outliers import TO_JUDGE, TO_LEARN, outlier
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.sensor import Sensor

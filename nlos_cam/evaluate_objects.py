@@ -12,8 +12,8 @@ from nlos_models.inference import Reconstructor
 from nlos_cam.camera.simulated_world import World
 from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
 from nlos_cam.map_mean import MapMean
-from nlos_cam.objects.depth_image import image_from_depth
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.depth_map import image_from_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.renderer import MultiBounce, render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import SceneFile

@@ -11,10 +11,10 @@ from pydantic import ValidationError
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import OBJECT_PIXELS, Float32
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.files import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, read_depth_map
-from nlos_cam.objects.hidden import nothing_to_see
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.meshes import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, read_depth_map
+from nlos_cam.objects.placement import nothing_to_see
 from nlos_cam.render.hidden_record import HiddenObject
 from nlos_cam.render.scene_file import SceneFile
 

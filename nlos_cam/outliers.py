@@ -12,10 +12,8 @@ import trimesh
 from trimesh.transformations import euler_matrix
 
 from nlos_cam.frames import OBJECT_PIXELS
-from nlos_cam.objects.backgrounds import panel
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import Pose, place
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.depth_map import object_box, orthographic_depth
+from nlos_cam.objects.placement import Pose, panel, place
 from nlos_cam.outliers_to_learn import TO_LEARN
 from nlos_cam.render.surface import Surface, phong, retroreflective
 from nlos_cam.sights import Generator, Kind, Sight, ordinary, placed, smooth_pattern, width_m

@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 
 from nlos_cam.frames import OBJECT_PIXELS, Float32
-from nlos_cam.objects.backgrounds import post
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import random_pose
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.placement import post, random_pose
 from nlos_cam.render.surface import Surface
 from nlos_cam.sights import Generator, Kind, Sight, ordinary, placed, smooth_pattern, width_m
 from nlos_cam.varied_bench import moved

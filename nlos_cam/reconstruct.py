@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.doubt import Doubt, doubt_of
 from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps
-from nlos_cam.objects.depth_image import depth_from_image, object_box
+from nlos_cam.objects.depth_map import depth_from_image, object_box
 
 Clock = Callable[[], float]
 Network = Callable[[Float32, Float32], Float32]

@@ -23,7 +23,7 @@ from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.live import read_along, steps_ahead
 from nlos_cam.live_report import OnWarning, Warned, frames_by_verdict, say_nothing
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.physics_check import UNEXPLAINED
 from nlos_cam.processing import Processing, Step
 from nlos_cam.reconstruct import Clock

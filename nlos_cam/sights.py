@@ -8,11 +8,10 @@ import numpy as np
 from nlos_calibration.rig import ObjectBox, Rig
 
 from nlos_cam.frames import OBJECT_PIXELS, Float32
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import category_triangles, place, random_pose
-from nlos_cam.objects.raster import orthographic_depth
-from nlos_cam.objects.solids import Triangles
+from nlos_cam.objects.depth_map import object_box, orthographic_depth
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import category_triangles, place, random_pose
+from nlos_cam.objects.primitives import Triangles
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor_model import SensorModel
 from nlos_cam.render.surface import Surface

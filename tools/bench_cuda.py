@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render import cpu, cuda
 from nlos_cam.render.accuracy import accuracy_named
 from nlos_cam.render.job import Job

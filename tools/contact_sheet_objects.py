@@ -8,11 +8,10 @@ from matplotlib.figure import Figure
 from nlos_calibration.rig import ObjectBox, load_rig
 
 from nlos_cam.frames import Float32
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import image_from_depth, object_box
-from nlos_cam.objects.hidden import category_triangles, place, random_pose
-from nlos_cam.objects.raster import orthographic_depth
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import image_from_depth, object_box, orthographic_depth
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import category_triangles, place, random_pose
 
 VARIATIONS = 5
 SIDE_BY_SIDE = 2

@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.hidden import Pose, category_triangles, place
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.depth_map import orthographic_depth
+from nlos_cam.objects.placement import Pose, category_triangles, place
 from nlos_cam.render.accuracy import STOPS
 from nlos_cam.render.agreement import Echoes, agreement
 from nlos_cam.render.prepare import Prepared

@@ -11,7 +11,7 @@ from nlos_calibration.rig import Rig, load_rig
 from numpy.typing import NDArray
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, Float32
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams, cast
 from nlos_cam.render.echo import MultiBounce
 from nlos_cam.render.renderer import three_bounce

@@ -32,8 +32,8 @@ from nlos_cam.doubt_samples import EMPTY, ORDINARY, samples_on_disk
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate_objects import echoes_of, sense, truth_of
 from nlos_cam.frames import LidarMaps
-from nlos_cam.objects.depth_image import depth_from_image, object_box
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import depth_from_image, object_box
 from nlos_cam.outliers import IN_SHAPE, TO_JUDGE, TO_LEARN
 from nlos_cam.processing import limits_of
 from nlos_cam.reconstruct import Reconstruction, reconstruct

@@ -19,8 +19,8 @@ from nlos_cam.evaluate_objects import SeededObject, Subject, as_map_set, echoes_
 from nlos_cam.evaluate_report import in_words
 from nlos_cam.folders import file_when_whole
 from nlos_cam.frames import OBJECT_PIXELS, Float32
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.set_up import load_networks
 
 DOCS = Path(__file__).parents[1] / "docs"

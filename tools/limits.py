@@ -25,8 +25,8 @@ from nlos_cam.evaluate import BARS, Figures, judge
 from nlos_cam.evaluate_objects import QUIET, Subject, as_map_set, echoes_of, seeded_objects, sense, truth_of
 from nlos_cam.evaluate_report import in_words
 from nlos_cam.frames import Float32, LidarMaps
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import object_box
 
 DOCS = Path(__file__).parents[1] / "docs"
 FRAMES = 10, 100

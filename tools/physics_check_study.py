@@ -24,8 +24,8 @@ from nlos_cam.cli.common import say, tracked
 from nlos_cam.dataset import TEST_SEED
 from nlos_cam.evaluate_objects import seeded_objects, sense
 from nlos_cam.frames import Float32, LidarMaps
-from nlos_cam.objects.depth_image import depth_from_image, object_box
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import depth_from_image, object_box
 from nlos_cam.physics_check import UNEXPLAINED
 from nlos_cam.physics_check_render import check
 from nlos_cam.render.accuracy import Stop

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.beams import cast
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.scene import Radiometry, Scene

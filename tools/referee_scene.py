@@ -6,7 +6,7 @@ import numpy as np
 from nlos_calibration.rig import Extent, LidarPose, ObjectBox, Rig
 from numpy.typing import NDArray
 
-from nlos_cam.objects.depth_image import cell_centres_m
+from nlos_cam.objects.depth_map import cell_centres_m
 from nlos_cam.render.scene import Radiometry, Scene
 
 Array = NDArray[np.float64]

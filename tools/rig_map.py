@@ -26,8 +26,8 @@ from nlos_cam.dataset import TEST_SEED, DatasetPlan
 from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, judge, plain
 from nlos_cam.evaluate_objects import Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
 from nlos_cam.folders import file_when_whole
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.render.scene_file import RENDERING_VERSION
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -19,9 +19,9 @@ from nlos_cam.camera.simulated_world import World
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.test_set import FixedObject, test_set
+from nlos_cam.objects.benchmark import FixedObject, test_set
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.recording.capture import Job, Takes, settle
 from nlos_cam.recording.playback import verify
 from nlos_cam.recording.sidecar import load_sidecar, sidecar_path

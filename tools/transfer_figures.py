@@ -24,8 +24,8 @@ from nlos_cam.cli.common import tracked
 from nlos_cam.evaluate_objects import reconstruct_all
 from nlos_cam.frames import Float32, maps_from_frame
 from nlos_cam.labelled import read_labelled, recordings_in
-from nlos_cam.objects.depth_image import image_from_depth, object_box
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor import Sensor

@@ -19,7 +19,7 @@ from nlos_cam.cli.common import tracked
 from nlos_cam.cli.train_data import BareMaps, measured_bare_wall, render_bare_wall
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import Float32
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from pydantic import ValidationError
 from nlos_cam.cli.common import say
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import Float32
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.files import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, Up, read_depth_map, read_mesh
-from nlos_cam.objects.hidden import fit, nothing_to_see
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.meshes import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, Up, read_depth_map, read_mesh
+from nlos_cam.objects.placement import fit, nothing_to_see
 from nlos_cam.render.scene_file import HiddenObject, SceneFile
 
 _KINDS = f"a mesh ({', '.join(MESH_SUFFIXES)}), a {DEPTH_MAP_SUFFIX} depth map (n, n) in metres"

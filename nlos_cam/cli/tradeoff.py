@@ -20,8 +20,8 @@ from nlos_cam.dataset import TEST_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate_objects import seeded_objects
 from nlos_cam.folders import renamed_when_whole
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import paper_scene
 from nlos_cam.render.tradeoff import Row, facts, measure, settings

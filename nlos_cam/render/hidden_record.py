@@ -8,9 +8,9 @@ from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, mod
 from pydantic_core import PydanticCustomError
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.files import MeshFile, Up, read_mesh, upright
-from nlos_cam.objects.hidden import Triangles, category_triangles
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.meshes import MeshFile, Up, read_mesh, upright
+from nlos_cam.objects.placement import Triangles, category_triangles
 from nlos_cam.render.surface import Material
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 
-from nlos_cam.objects.depth_image import cell_centres_m
+from nlos_cam.objects.depth_map import cell_centres_m
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Float32
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.render.patches import JUMP_M, Patches, make_patches
 from nlos_cam.render.surface import Surface
 

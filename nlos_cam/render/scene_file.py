@@ -14,9 +14,8 @@ from nlos_calibration.wall_record import rig_named
 from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import Pose, nothing_to_see, place
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.depth_map import object_box, orthographic_depth
+from nlos_cam.objects.placement import Pose, nothing_to_see, place
 from nlos_cam.render.fault_record import Fault, one_wrap
 from nlos_cam.render.hidden_record import HiddenObject, Motion
 from nlos_cam.render.patches import JUMP_M

@@ -15,7 +15,7 @@ from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 
 from nlos_cam.frames import Float32
-from nlos_cam.objects.depth_image import cell_centres_m
+from nlos_cam.objects.depth_map import cell_centres_m
 from nlos_cam.render.patches import cell_pitch_m
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ import rerun as rr
 from nlos_calibration.rig import ObjectBox, Rig
 from numpy.typing import NDArray
 
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 
 WALL_RGBA, OCCLUDER_RGBA, LIGHT_RGBA = (120, 130, 140, 70), (90, 150, 255, 90), (255, 210, 80, 200)
 BOX_RGB, LIDAR_RGB = (150, 150, 150), (255, 110, 90)

@@ -10,7 +10,7 @@ from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
 from nlos_cam.frames import OBJECT_PIXELS
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.view.bench_drawing import bench_parts
 from nlos_cam.view.layout import FRAME_TIMELINE, TIMELINE, Shown, layout
 from nlos_cam.view.pictures import (

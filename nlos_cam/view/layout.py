@@ -6,7 +6,7 @@ import numpy as np
 import rerun.blueprint as rrb
 from nlos_calibration.rig import Rig
 
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.view.pictures import BACKGROUND_RGB, MOST_UNCERTAIN_M, RESIDUAL_SPAN_M
 from nlos_cam.view.verdict_picture import BANNER_HEIGHT, BANNER_WIDTH
 

@@ -9,7 +9,7 @@ from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 
 from nlos_cam.frames import Float32
-from nlos_cam.objects.depth_image import cell_centres_m, image_from_depth
+from nlos_cam.objects.depth_map import cell_centres_m, image_from_depth
 
 Rgb = NDArray[np.uint8]
 BACKGROUND_RGB = (13, 16, 17)

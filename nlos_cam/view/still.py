@@ -7,7 +7,7 @@ import numpy as np
 from nlos_calibration.rig import Rig
 from PIL import Image, ImageDraw
 
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.view.pictures import (
     BACKGROUND_RGB,
     MOST_UNCERTAIN_M,

@@ -9,7 +9,7 @@ import numpy as np
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.physics_check import Check
 from nlos_cam.reconstruct import Reconstruction, pose_of
 from nlos_cam.verdict import Verdict

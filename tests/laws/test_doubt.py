@@ -12,8 +12,8 @@ from nlos_cam.bench import Bench
 from nlos_cam.cache import cache_folder
 from nlos_cam.evaluate_objects import echoes_of, sense
 from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.outliers import TO_LEARN, outlier
 from nlos_cam.processing import Arrival, Processing, Step
 from nlos_cam.render.renderer import render

@@ -9,7 +9,7 @@ import torch
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.renderer import render, render_all, three_bounce

@@ -12,11 +12,10 @@ from nlos_calibration.rig import ObjectBox, load_rig
 from trimesh.exchange.ply import export_ply
 from trimesh.transformations import rotation_matrix
 
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import cell_centres_m
-from nlos_cam.objects.files import read_mesh, upright
-from nlos_cam.objects.hidden import Pose, category_triangles, object_depth, place
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.depth_map import cell_centres_m, orthographic_depth
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.meshes import read_mesh, upright
+from nlos_cam.objects.placement import Pose, category_triangles, object_depth, place
 
 PAPER = load_rig("paper-rig").object_box
 assert PAPER is not None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.renderer import render, three_bounce, transient
 from nlos_cam.render.scene import Scene
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from nlos_calibration.rig import Rig, load_rig
 
 from nlos_cam.frames import SATURATED
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.beams import cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Scene

@@ -23,10 +23,9 @@ from rosbags.rosbag1 import Reader, Writer
 from view_streams import ASSETS, Streams
 
 from nlos_cam.frames import Float32
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import Pose, place
-from nlos_cam.objects.raster import orthographic_depth
-from nlos_cam.objects.settings import Category
+from nlos_cam.objects.depth_map import object_box, orthographic_depth
+from nlos_cam.objects.generators import Category
+from nlos_cam.objects.placement import Pose, place
 from nlos_cam.view.server import ViewServer
 
 settings.register_profile("no clock", deadline=None)  # a machine that is busy fails no law

@@ -5,9 +5,8 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import Float32
-from nlos_cam.objects.backgrounds import panel, post, with_background
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.placement import object_depth, panel, post, with_background
 
 BOX = object_box(load_rig("paper-rig"))
 OBJECTS = [object_depth(seed, BOX)[1] for seed in range(20)]

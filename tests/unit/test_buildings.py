@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nlos_cam.objects.buildings import birdhouse, tower
+from nlos_cam.objects.generators import birdhouse, tower
 
 View = Callable[..., NDArray[np.float32]]
 

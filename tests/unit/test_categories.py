@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import category_triangles, place, random_pose
-from nlos_cam.objects.raster import orthographic_depth
+from nlos_cam.objects.depth_map import object_box, orthographic_depth
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import category_triangles, place, random_pose
 from nlos_cam.render.scene_file import paper_scene
 
 BOX = object_box(load_rig("paper-rig"))

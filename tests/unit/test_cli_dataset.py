@@ -14,7 +14,7 @@ from nlos_cam import dataset
 from nlos_cam.cli.dataset import Rate
 from nlos_cam.cli.main import main
 from nlos_cam.dataset_shards import head_of
-from nlos_cam.objects.categories import CATEGORIES
+from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.textures import TEXTURES
 
 RIG = load_rig("paper-rig")

@@ -15,7 +15,7 @@ from nlos_cam import dataset, evaluate_baselines
 from nlos_cam.cli import evaluate, evaluate_maps
 from nlos_cam.cli.main import main
 from nlos_cam.dataset import DatasetPlan
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
 
 RIG = load_rig("paper-rig")
 METRICS = {"silhouette_iou", "accuracy_mean_abs", "accuracy_within_2_percent", "foreground_rmse_mm"}

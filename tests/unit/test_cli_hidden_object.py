@@ -11,7 +11,7 @@ from nlos_calibration.rig import Rig, load_rig
 
 from nlos_cam.cli.hidden_object import hidden_depth
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.files import read_mesh
+from nlos_cam.objects.meshes import read_mesh
 from nlos_cam.render.scene_file import HiddenObject, SceneFile
 
 RIG = load_rig("paper-rig")

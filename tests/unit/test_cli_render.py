@@ -10,7 +10,7 @@ import trimesh
 from nlos_calibration.rig import dump_toml, load_rig
 
 from nlos_cam.cli.main import main
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene

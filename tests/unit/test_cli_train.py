@@ -20,7 +20,7 @@ from small_maps import SmallDataset, small_images, small_maps, use_small_network
 from nlos_cam import dataset
 from nlos_cam.cli import train_data, train_runs, train_start
 from nlos_cam.cli.main import main
-from nlos_cam.objects.categories import CATEGORIES
+from nlos_cam.objects.generators import CATEGORIES
 
 PLAN = dataset.DatasetPlan(load_rig("paper-rig"), 0)
 COUNTS = {"data": 8, "held-out": 4}

@@ -3,7 +3,7 @@ import pytest
 import torch
 from nlos_calibration.rig import Occluder, load_rig
 
-from nlos_cam.objects.depth_image import cell_centres_m, object_box
+from nlos_cam.objects.depth_map import cell_centres_m, object_box
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.cuda_legs import Optics, Surface, Wall, legs, scattered
 from nlos_cam.render.job import Job

@@ -7,7 +7,7 @@ import pytest
 import torch
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.cuda_visibility import lay_out, shade
 from nlos_cam.render.job import Job

@@ -24,9 +24,9 @@ from nlos_cam.dataset_samples import (
 )
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import image_from_depth
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.depth_map import image_from_depth
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor import Sensor
 from nlos_cam.render.sensor_model import SensorModel

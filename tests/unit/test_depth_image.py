@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.depth_image import cell_centres_m, depth_from_image, image_from_depth
+from nlos_cam.objects.depth_map import cell_centres_m, depth_from_image, image_from_depth
 
 BOX = load_rig("paper-rig").object_box
 

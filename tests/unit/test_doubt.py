@@ -5,7 +5,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.doubt import doubt_of
 from nlos_cam.frames import LidarMaps
-from nlos_cam.objects.depth_image import depth_from_image, object_box
+from nlos_cam.objects.depth_map import depth_from_image, object_box
 
 BOX = object_box(load_rig("paper-rig"))
 

@@ -18,7 +18,7 @@ from nlos_cam.evaluate import (
     per_object,
     plain,
 )
-from nlos_cam.objects.depth_image import depth_from_image, object_box
+from nlos_cam.objects.depth_map import depth_from_image, object_box
 
 BOX = object_box(load_rig("paper-rig"))
 PERFECT = {"silhouette_iou": 1, "accuracy_mean_abs": 1, "accuracy_within_2_percent": 1, "foreground_rmse_mm": 0}

@@ -12,7 +12,7 @@ from nlos_models.data import MapSet
 from nlos_cam import dataset, evaluate_baselines
 from nlos_cam.dataset import DatasetPlan, procedural_images
 from nlos_cam.evaluate_baselines import mean_image, training_maps, with_nearest, without_maps
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 
 RIG = load_rig("paper-rig")
 
@@ -116,8 +116,8 @@ def test_training_maps_are_kept_by_what_decides_them(tmp_path: Path, monkeypatch
 
 
 def test_every_category_is_among_those_that_tell_whether_objects_are_still_made_as_they_were() -> None:
-    from nlos_cam.objects.categories import CATEGORIES
-    from nlos_cam.objects.hidden import object_depth
+    from nlos_cam.objects.generators import CATEGORIES
+    from nlos_cam.objects.placement import object_depth
 
     seen = {object_depth(seed, object_box(RIG))[0] for seed in range(evaluate_baselines.TOLD_BY)}
     assert seen == set(CATEGORIES)

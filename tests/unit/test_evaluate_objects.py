@@ -8,9 +8,9 @@ from nlos_cam.camera.simulated_world import World
 from nlos_cam.dataset import TEST_SEED
 from nlos_cam.evaluate_objects import QUIET, as_map_set, echoes_of, reconstruct_all, seeded_objects, sense, truth_of
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.objects.depth_image import image_from_depth, object_box
-from nlos_cam.objects.hidden import object_depth
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import image_from_depth, object_box
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.renderer import MultiBounce
 from nlos_cam.render.scene_file import SceneFile
 

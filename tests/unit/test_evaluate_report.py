@@ -14,7 +14,7 @@ from nlos_cam import evaluate_report
 from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate import BARS
 from nlos_cam.evaluate_report import Judgement, as_figures, as_markdown, in_words, write
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 
 BOX = object_box(load_rig("paper-rig"))
 FACTS = {

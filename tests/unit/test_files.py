@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from trimesh.exchange.ply import export_ply
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects import files
-from nlos_cam.objects.files import MeshFile, read_mesh, upright
+from nlos_cam.objects import meshes
+from nlos_cam.objects.meshes import MeshFile, read_mesh, upright
 
 SOLID = trimesh.creation.torus(0.3, 0.1, major_sections=9, minor_sections=5)
 EXPORTS = {
@@ -206,7 +206,7 @@ def test_a_vertex_that_no_face_uses_may_be_anything(tmp_path: Path) -> None:
 def test_too_large_a_file_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, words: str
 ) -> None:
-    monkeypatch.setattr(files, limit, value)
+    monkeypatch.setattr(meshes, limit, value)
     assert re.search(words, _refused(tmp_path, "thing.stl", EXPORTS["binary.stl"]))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.files import read_depth_map
+from nlos_cam.objects.meshes import read_depth_map
 
 
 def _refused(path: Path) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import STOPS
 from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.effects import EFFECTS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nlos_cam.objects.furniture import computer, cupboard, oven, soundbox, table
+from nlos_cam.objects.generators import computer, cupboard, oven, soundbox, table
 
 View = Callable[..., NDArray[np.float32]]
 

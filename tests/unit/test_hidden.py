@@ -6,8 +6,8 @@ from nlos_calibration.rig import ObjectBox, load_rig
 
 from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.hidden import (
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import (
     POSE_UNITS,
     Pose,
     category_triangles,

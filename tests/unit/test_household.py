@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nlos_cam.objects.household import baskets, bell, bowl, cup, hat, lamp
-from nlos_cam.objects.settings import Category
+from nlos_cam.objects.generators import Category, baskets, bell, bowl, cup, hat, lamp
 
 View = Callable[..., NDArray[np.float32]]
 

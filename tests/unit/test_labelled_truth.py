@@ -9,8 +9,8 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.labelled_truth import fixed_objects, truth_depth_m
-from nlos_cam.objects.depth_image import cell_centres_m, object_box
-from nlos_cam.objects.test_set import test_set as fixed_set
+from nlos_cam.objects.benchmark import test_set as fixed_set
+from nlos_cam.objects.depth_map import cell_centres_m, object_box
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)

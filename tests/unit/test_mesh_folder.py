@@ -8,11 +8,10 @@ import trimesh
 from nlos_calibration.rig import ObjectBox, load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects import mesh_folder
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.files import MeshFile, read_mesh
-from nlos_cam.objects.hidden import Pose, random_pose
-from nlos_cam.objects.mesh_folder import POSES, folder_objects, mesh_depth
+from nlos_cam.objects import meshes as mesh_folder
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.meshes import POSES, MeshFile, folder_objects, mesh_depth, read_mesh
+from nlos_cam.objects.placement import Pose, random_pose
 
 BOX = object_box(load_rig("paper-rig"))
 TORUS = trimesh.creation.torus(30, 10, major_sections=16, minor_sections=8)

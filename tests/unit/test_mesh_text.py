@@ -2,7 +2,7 @@
 
 import pytest
 
-from nlos_cam.objects.mesh_text import plain
+from nlos_cam.objects.meshes import plain
 
 VERTICES = b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 

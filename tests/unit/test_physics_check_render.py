@@ -11,8 +11,8 @@ from nlos_cam import physics_check_render
 from nlos_cam.bench import Bench
 from nlos_cam.frames import Float32, LidarMaps
 from nlos_cam.live import run_live
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.physics_check_render import EveryFrames, check
 from nlos_cam.processing import Processing
 from nlos_cam.render.renderer import render

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from nlos_calibration.rig import load_rig
 from PIL import Image
 
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.view.pictures import (
     BACKGROUND_RGB,
     FADED,

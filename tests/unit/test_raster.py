@@ -7,8 +7,7 @@ import pytest
 import trimesh
 from nlos_calibration.rig import ObjectBox
 
-from nlos_cam.objects.depth_image import cell_centres_m
-from nlos_cam.objects.raster import orthographic_depth, share_outside
+from nlos_cam.objects.depth_map import cell_centres_m, orthographic_depth, share_outside
 
 BOX = ObjectBox(x_min_m=0.0, x_max_m=0.64, y_min_m=-0.32, y_max_m=0.32, z_near_m=0.1, z_far_m=0.6)
 X, Y = np.meshgrid(*cell_centres_m(BOX))

@@ -8,7 +8,7 @@ import trimesh
 from nlos_calibration.rig import dump_toml
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.files import read_mesh
+from nlos_cam.objects.meshes import read_mesh
 from nlos_cam.render.scene_file import SceneFile, load_scene
 
 WEDGE = """

@@ -9,7 +9,7 @@ from nlos_calibration.rig import Occluder, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import SATURATED
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Radiometry, Scene

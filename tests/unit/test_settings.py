@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.settings import Category, Setting, category
-from nlos_cam.objects.solids import Triangles, box
+from nlos_cam.objects.generators import CATEGORIES, Category, Setting, category
+from nlos_cam.objects.primitives import Triangles, box
 
 UNIT = st.floats(0, 1)
 ENDS = st.integers(-500, 500).map(lambda tenths: tenths / 10)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nlos_cam.objects.solids import (
+from nlos_cam.objects.primitives import (
     Triangles,
     arch,
     at,

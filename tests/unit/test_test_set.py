@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import Pose
-from nlos_cam.objects.test_set import FixedObject, test_set
+from nlos_cam.objects.benchmark import FixedObject, test_set
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import Pose
 
 BOX = object_box(load_rig("paper-rig"))
 OBJECTS = test_set(BOX)

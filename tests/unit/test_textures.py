@@ -6,8 +6,8 @@ from nlos_calibration.rig import load_rig
 from nlos_models.colour_metrics import BLACK_V
 from nlos_models.silhouette import KEPT_SHARE
 
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
 from nlos_cam.render.surface import Surface
 

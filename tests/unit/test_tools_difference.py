@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 

@@ -20,7 +20,7 @@ from nlos_cam.cli.evaluate_maps import Judged
 from nlos_cam.dataset import TEST_SEED, DatasetPlan
 from nlos_cam.evaluate import BARS
 from nlos_cam.evaluate_objects import seeded_objects
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 
 TOOLS = Path(__file__).parents[2] / "tools"
 RIG = load_rig("paper-rig")

@@ -7,9 +7,9 @@ from types import ModuleType
 import numpy as np
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.depth_image import image_from_depth, object_box
-from nlos_cam.objects.test_set import test_set
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import image_from_depth, object_box
+from nlos_cam.objects.generators import CATEGORIES
 
 BOX = object_box(load_rig("paper-rig"))
 MOST_BYTES = 300_000

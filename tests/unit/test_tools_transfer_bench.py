@@ -13,9 +13,9 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.labelled import read_labelled
-from nlos_cam.objects.depth_image import object_box
-from nlos_cam.objects.test_set import FixedObject
-from nlos_cam.objects.test_set import test_set as fixed_set
+from nlos_cam.objects.benchmark import FixedObject
+from nlos_cam.objects.benchmark import test_set as fixed_set
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.recording.playback import ReplayCamera
 from nlos_cam.recording.sidecar import load_sidecar
 from nlos_cam.render.renderer import MultiBounce

@@ -14,7 +14,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.dataset import TEST_SEED
 from nlos_cam.evaluate import Interval
 from nlos_cam.evaluate_objects import seeded_objects
-from nlos_cam.objects.depth_image import object_box
+from nlos_cam.objects.depth_map import object_box
 from nlos_cam.tradeoff_reconstruct import (
     LEAST_CALLS,
     Bench,

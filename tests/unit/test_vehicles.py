@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nlos_cam.objects.settings import Category
-from nlos_cam.objects.vehicles import airplane, boat, car, motorcycle, rocket
+from nlos_cam.objects.generators import Category, airplane, boat, car, motorcycle, rocket
 
 View = Callable[..., NDArray[np.float32]]
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.depth_image import cell_centres_m
-from nlos_cam.objects.hidden import object_depth
+from nlos_cam.objects.depth_map import cell_centres_m
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.visibility import FACES, HeightField, blocked, height_field, horizon_table, occluded, visible
 from nlos_cam.render.visibility import segment_blocked as between
 

@@ -1,22 +1,90 @@
-"""Hidden objects from files: triangle meshes (.obj, .stl, .ply) and depth maps (.npy)."""
+"""Hidden objects from files: triangle meshes (.obj, .stl, .ply) and depth maps (.npy).
+
+Mesh files made plain enough for a parser that has none of its optional packages.
+
+Hidden objects from a folder of meshes: which files it holds, and one of them at a random pose for each seed.
+"""
 
 import hashlib
 import logging
+import re
 import warnings
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import trimesh
+from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import Float32
-from nlos_cam.objects.hidden import Triangles
-from nlos_cam.objects.mesh_text import plain
+from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.objects.depth_map import orthographic_depth
+from nlos_cam.objects.placement import Triangles, place, random_pose
+
+_PLAIN = bytes(range(128)).replace(b"\t", b" ") + b"?" * 128
+"""Tabs as blanks; letters of other alphabets, which only names and comments hold, as "?"."""
+_COMMENT = re.compile(rb"#[^\n]*")
+_RELATIVE = re.compile(rb" -(\d+)")
+_RELATIVE_FACE = re.compile(rb"^f [^\n]*-", re.MULTILINE)
+_VERTEX_0 = re.compile(rb"^f[^\n]* 0+(?!\d)", re.MULTILINE)
+
+
+def plain(content: bytes, suffix: str) -> bytes:
+    """The content of a .obj, .stl or .ply file with the same triangles.
+
+    Raises ValueError where a parser would go astray: binary of the wrong length, a face of vertex 0.
+    """
+    if suffix == ".ply":
+        content = _without_edges(content)
+    if b"\0" in content:
+        return _checked_binary(content, suffix)
+    text = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").translate(_PLAIN)
+    return _plain_obj(text) if suffix == ".obj" else text
+
+
+def _checked_binary(content: bytes, suffix: str) -> bytes:
+    if suffix == ".obj":
+        raise ValueError("it is not text")
+    faces = int.from_bytes(content[80:84], "little")
+    if suffix == ".stl" and len(content) != 84 + 50 * faces:
+        raise ValueError(f"it has {len(content)} bytes, but its {faces} faces take {84 + 50 * faces}")
+    return content
+
+
+def _without_edges(content: bytes) -> bytes:
+    """A .ply file whose edges go by another name: as wireframe they would ask for scipy."""
+    header, end, body = content.partition(b"end_header")
+    return header.replace(b"element edge ", b"element wire ") + end + body
+
+
+def _plain_obj(text: bytes) -> bytes:
+    text = _COMMENT.sub(b"", text.replace(b"\\\n", b" "))
+    if _RELATIVE_FACE.search(text):
+        text = _absolute(text)
+    if _VERTEX_0.search(text):
+        raise ValueError("a face names vertex 0, but vertices count from 1")
+    return text
+
+
+def _absolute(text: bytes) -> bytes:
+    """A .obj text whose faces name no vertex by how far back it stands (-1 is the latest)."""
+    seen, lines = 0, text.split(b"\n")
+    for k, line in enumerate(lines):
+        if line.startswith(b"v "):
+            seen += 1
+        elif line.startswith(b"f "):
+            lines[k] = _RELATIVE.sub(partial(_number, seen), line)
+    return b"\n".join(lines)
+
+
+def _number(seen: int, back: re.Match[bytes]) -> bytes:
+    return b" %d" % max(seen + 1 - int(back[1]), 0)  # before the first: 0, which is refused
+
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply")
 DEPTH_MAP_SUFFIX = ".npy"
@@ -148,3 +216,52 @@ def _problem(triangles: Triangles) -> str:
     if not np.abs(normals).max() > 1e-12 * extent**2:
         return "has no face with an area: it is a point or a line; export a surface or a solid"
     return ""
+
+
+POSES = 20
+"""Poses that a mesh is tried at before it counts as one that shows nothing: a sheet may be seen edge on."""
+Mesh = TypeVar("Mesh")
+
+
+def folder_objects(folder: Path) -> list[Path]:
+    """The meshes (.obj, .stl, .ply) of a folder and its subfolders, sorted by their place in it.
+
+    What starts with a dot is passed over, as other programs hide their own files so. Raises SceneError where the folder
+    cannot be looked through, or holds none.
+    """
+    if not folder.is_dir():
+        raise SceneError(f"no folder {folder}: give one that holds meshes ({', '.join(MESH_SUFFIXES)})")
+    found = [path for path in folder.rglob("*") if path.suffix.lower() in MESH_SUFFIXES and path.is_file()]
+    meshes = {path.relative_to(folder).parts: path for path in found}
+    seen = [meshes[parts] for parts in sorted(meshes) if not any(part.startswith(".") for part in parts)]
+    if not seen:
+        endings = ", ".join(MESH_SUFFIXES)
+        raise SceneError(f"no meshes in {folder}: neither it nor its subfolders hold a file that ends in {endings}")
+    return seen
+
+
+def mesh_depth(
+    seed: int,
+    meshes: Sequence[Mesh],
+    box: ObjectBox,
+    up: Up = "y",
+    *,
+    read: Callable[[Mesh], MeshFile],
+) -> tuple[Mesh, Float32]:
+    """One of the meshes and its depth map (64, 64) in metres, NaN background; the seed picks it and its pose.
+
+    It is placed as procedural objects are, whatever the unit of its file; where a pose shows no surface, at the next.
+    Only the mesh that is picked is read. Raises SceneError, which names the file, for one that shows none at all.
+    """
+    generator = np.random.default_rng([seed, OBJECT_PIXELS])
+    picked = meshes[int(generator.integers(len(meshes)))]
+    mesh = read(picked)
+    triangles = upright(mesh.triangles, up)
+    for _ in range(POSES):
+        depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
+        if not np.isnan(depth_m).all():
+            return picked, depth_m
+    raise SceneError(
+        f"{mesh.path} shows no surface from any of {POSES} poses: it is thinner than a cell of the depth map; take it "
+        "out of the folder, or make it thicker"
+    )

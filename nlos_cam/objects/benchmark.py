@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.frames import Float32
-from nlos_cam.objects.categories import CATEGORIES
-from nlos_cam.objects.hidden import Pose, place, pose_from
-from nlos_cam.objects.raster import orthographic_depth
-from nlos_cam.objects.solids import Triangles
+from nlos_cam.objects.depth_map import orthographic_depth
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import Pose, place, pose_from
+from nlos_cam.objects.primitives import Triangles
 
 OF_EACH = 3
 POSE_STEPS = (19, 7, 43, 13, 31, 25, 37)
