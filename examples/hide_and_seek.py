@@ -10,8 +10,8 @@ from nlos_cam.objects.depth_map import object_box, orthographic_depth
 from nlos_cam.objects.placement import Pose, category_triangles, place
 from nlos_cam.reconstruct import reconstruct
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 from nlos_cam.set_up import load_networks
 
 

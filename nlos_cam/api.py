@@ -22,6 +22,7 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
 
 from nlos_cam.bench import open_bench
@@ -30,7 +31,7 @@ from nlos_cam.camera.protocol import Camera
 from nlos_cam.camera.registry import OnProgress
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frame_reader import FrameReader
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import LidarMaps
 from nlos_cam.live import read_along, steps, warm_up
 from nlos_cam.live_report import Tally
 from nlos_cam.objects.depth_map import cell_centres_m, object_box

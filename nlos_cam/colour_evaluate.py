@@ -5,20 +5,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float16, Float32
 from nlos_calibration.rig import Rig
 from nlos_models.colour_metrics import SMALLER_IS_BETTER, brightness, colour_metrics
-from nlos_models.data import Half, MapSet
+from nlos_models.data import MapSet
 from nlos_models.metrics import surface
 from nlos_models.recipe import SIMULATION_ONLY
 
 from nlos_cam.dataset_samples import sense_colour
 from nlos_cam.evaluate import advantage, over_objects, plain
-from nlos_cam.frames import Float32
 from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
+from nlos_cam.render.material import Surface
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
-from nlos_cam.render.surface import Surface
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 
 ROWS = ("truth", "reconstruction", "difference")
 
@@ -51,7 +51,7 @@ def better_than(guess: Float32, image: Float32, truth: Float32) -> dict[str, Fig
     return plain(advantage(colour_metrics(image, truth), colour_metrics(guess, truth), SMALLER_IS_BETTER))
 
 
-def colour_guesses(image: Float32, training: Half | Float32) -> dict[str, Float32]:
+def colour_guesses(image: Float32, training: Float16 | Float32) -> dict[str, Float32]:
     """Images (n, 3, 64, 64) to beat: nothing, the mean training object, and our silhouettes in the mean colour."""
     training = training.astype(np.float32)
     seen, shown = surface(brightness(training)), surface(brightness(image))
@@ -64,7 +64,7 @@ def colour_guesses(image: Float32, training: Half | Float32) -> dict[str, Float3
 
 
 def figures_of_colour(
-    image: Float32, truth: Float32, others: Mapping[str, Float32], training: Half | Float32
+    image: Float32, truth: Float32, others: Mapping[str, Float32], training: Float16 | Float32
 ) -> dict[str, Any]:
     """All figures of images (n, 3, 64, 64), ready for JSON, beside those of others and of trivial guesses."""
     guesses = colour_guesses(image, training)

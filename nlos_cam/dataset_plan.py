@@ -14,11 +14,11 @@ from pydantic import TypeAdapter
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.render.material import Material
 from nlos_cam.render.patches import JUMP_M
 from nlos_cam.render.scene import Radiometry
 from nlos_cam.render.scene_file import RENDERING_VERSION, SceneFile
-from nlos_cam.render.sensor_model import SensorModel
-from nlos_cam.render.surface import Material
+from nlos_cam.render.sensor.model import SensorModel
 
 OBJECTS_VERSION = 2
 """Raised with any change of what a seed makes of its categories."""

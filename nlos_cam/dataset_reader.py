@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Int64
 from nlos_models.data import MapBatch, MapSet, as_batch
 from nlos_models.recipe import SIMULATION_ONLY
 from numpy.typing import NDArray
@@ -18,8 +19,6 @@ from nlos_cam.errors import RecordingError, SceneError
 MAP_CHANNELS = ("depth_m", "intensity", "image")
 BUFFER = 40
 """Shards that are shuffled together and kept in memory (twice as many while one batch spans two such sets)."""
-
-Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Dataset:
             rows = order[start : start + batch][rank::world]
             yield as_batch(window.take(rows), rows, mirrored[start : start + batch][rank::world])
 
-    def _shuffled_blocks(self, generator: np.random.Generator) -> list[tuple[NDArray[np.int64], Rows]]:
+    def _shuffled_blocks(self, generator: np.random.Generator) -> list[tuple[NDArray[np.int64], Int64]]:
         """Shards in random order, BUFFER at a time, each with all their rows in random order."""
         rows_of = [np.arange(end - len(shard.seeds), end) for shard, end in zip(self.shards, self.ends, strict=True)]
         order = generator.permutation(len(self.shards))
@@ -85,7 +84,7 @@ class _Window:
         self._block = {int(shard): number for number, shards in enumerate(blocks) for shard in shards}
         self._held: dict[int, list[NDArray[Any]]] = {}
 
-    def take(self, rows: Rows) -> MapSet:
+    def take(self, rows: Int64) -> MapSet:
         """The maps and images of some rows, in their order."""
         shards = np.searchsorted(self._ends, rows, side="right")
         wanted = [int(shard) for shard in np.unique(shards)]

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox
 from nlos_models.doubt_inference import Doubter
 from nlos_models.metrics import LEAST_V
 
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import LidarMaps
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 from zlib import crc32
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig
 from nlos_models.data import MapSet
 from nlos_models.doubt_training import DoubtSet
@@ -18,12 +19,12 @@ from nlos_cam import dataset
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import SceneError
 from nlos_cam.folders import file_when_whole
-from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps, maps_from_frame
+from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.outliers import TO_JUDGE, TO_LEARN, outlier
 from nlos_cam.render.renderer import Rendering, render
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 from nlos_cam.sights import Sight, ordinary
 from nlos_cam.varied_bench import SLIGHT, varied, varied_empty
 

@@ -5,15 +5,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import ObjectBox
 from nlos_models import metrics
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32
-
-Values = NDArray[np.float64]
-"""One value for each object (n,); NaN where an object has none."""
-PerObject = dict[str, Values]
+PerObject = dict[str, Float64]
 """By the metric's name."""
 
 RESAMPLES = 2000
@@ -61,7 +58,7 @@ def plain(figures: Figures) -> dict[str, dict[str, float | None]]:
     return {name: asdict(figure) for name, figure in figures.items()}
 
 
-def over_objects(values: Mapping[str, Values]) -> Figures:
+def over_objects(values: Mapping[str, Float64]) -> Figures:
     """The mean of each metric over objects, with its interval."""
     return {name: interval(value) for name, value in values.items()}
 
@@ -71,7 +68,7 @@ def judge(image: Float32, truth: Float32, box: ObjectBox) -> Figures:
     return over_objects(per_object(image, truth, box))
 
 
-def per_category(values: Mapping[str, Values], categories: Sequence[str]) -> dict[str, Figures]:
+def per_category(values: Mapping[str, Float64], categories: Sequence[str]) -> dict[str, Figures]:
     """The figures of each category's objects alone, in the order of first appearance."""
     of = np.array(categories)
     return {
@@ -81,7 +78,7 @@ def per_category(values: Mapping[str, Values], categories: Sequence[str]) -> dic
 
 
 def advantage(
-    ours: Mapping[str, Values], theirs: Mapping[str, Values], smaller_is_better: Collection[str] = SMALLER_IS_BETTER
+    ours: Mapping[str, Float64], theirs: Mapping[str, Float64], smaller_is_better: Collection[str] = SMALLER_IS_BETTER
 ) -> Figures:
     """By how much ours is better, object by object: positive is better, also where less is better.
 
@@ -93,7 +90,7 @@ def advantage(
     }
 
 
-def interval(values: Values) -> Interval:
+def interval(values: Float64) -> Interval:
     """Mean over objects (n,) and its bootstrap 95 % interval; objects without a value are left out."""
     values = values[~np.isnan(values)]
     if not values.size:

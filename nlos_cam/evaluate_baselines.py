@@ -8,12 +8,12 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from nlos_models.data import Half, MapSet
+from nlos_calibration.arrays import Float16, Float32
+from nlos_models.data import MapSet
 from nlos_models.preprocess import SMALLEST_SPREAD, channel_statistics, split_and_stack
 from torch import Tensor
 
 from nlos_cam import dataset
-from nlos_cam.frames import Float32
 
 NEIGHBOURS = 2000
 """Training objects that the nearest one is searched among, unless a training set is given."""
@@ -39,7 +39,7 @@ def without_maps(count: int, mean: Float32) -> dict[str, Float32]:
     return {"all_background": np.zeros(shape, np.float32), "mean_object": np.broadcast_to(mean, shape)}
 
 
-def mean_image(images: Half) -> Float32:
+def mean_image(images: Float16) -> Float32:
     """The mean (64, 64) of images (n, 64, 64)."""
     return images.mean(0, dtype=np.float64).astype(np.float32)
 

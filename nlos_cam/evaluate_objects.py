@@ -5,19 +5,20 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_models.data import MapSet
 from nlos_models.inference import Reconstructor
 
 from nlos_cam.camera.simulated_world import World
-from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
+from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.map_mean import MapMean
 from nlos_cam.objects.depth_map import image_from_depth
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.renderer import MultiBounce, render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import SceneFile
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
 
 OnProgress = Callable[[int, int], None]
 

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64
 from numpy.typing import NDArray
 
-from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, Figures, Interval, Values
+from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, Figures, Interval
 from nlos_cam.evaluate_surface import Bin
-from nlos_cam.frames import Float32
 
 SHEET_COLUMNS = 18
 MOST_ON_A_SHEET = 54
@@ -43,7 +43,7 @@ def draw_sheet(path: Path, image: Float32, truth: Float32, titles: Sequence[str]
     figure.savefig(path, dpi=100)
 
 
-def draw_gallery(path: Path, image: Float32, truth: Float32, titles: Sequence[str], iou: Values) -> None:
+def draw_gallery(path: Path, image: Float32, truth: Float32, titles: Sequence[str], iou: Float64) -> None:
     """The objects with the lowest silhouette IoU above those with the highest, with their figures."""
     order = np.argsort(iou, kind="stable")
     count = min(GALLERY, len(order))
@@ -132,7 +132,10 @@ def _points(axis: Any, figures: Sequence[Interval]) -> None:
 
 
 def draw_against_surface(
-    path: Path, like: Mapping[str, Values], errors: Mapping[str, Values], curves: Mapping[str, Mapping[str, list[Bin]]]
+    path: Path,
+    like: Mapping[str, Float64],
+    errors: Mapping[str, Float64],
+    curves: Mapping[str, Mapping[str, list[Bin]]],
 ) -> None:
     """Every object's error against each measure of its surface, and the mean over bins of equally many objects."""
     figure = _figure((11, 7.5))

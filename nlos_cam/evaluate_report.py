@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import ObjectBox
 
 from nlos_cam import evaluate_pictures as pictures
@@ -17,7 +18,6 @@ from nlos_cam.evaluate import (
     SMALLER_IS_BETTER,
     Interval,
     PerObject,
-    Values,
     advantage,
     bars_met,
     over_objects,
@@ -26,7 +26,6 @@ from nlos_cam.evaluate import (
     plain,
 )
 from nlos_cam.folders import renamed_when_whole
-from nlos_cam.frames import Float32
 
 SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
 SILHOUETTE_ERROR, DEPTH_ERROR = "1 - silhouette IoU", "foreground RMSE, mm"
@@ -59,7 +58,7 @@ class Judgement:
         return per_object(self.image, self.truth, self.box)
 
     @property
-    def like(self) -> dict[str, Values]:
+    def like(self) -> dict[str, Float64]:
         """What the true surfaces are like."""
         return {
             SIZE: surfaces.surface_cm2(self.truth, self.box),
@@ -67,7 +66,7 @@ class Judgement:
         }
 
     @property
-    def errors(self) -> dict[str, Values]:
+    def errors(self) -> dict[str, Float64]:
         """The two errors that are held against the surface."""
         ours = self.ours
         return {SILHOUETTE_ERROR: 1 - ours["silhouette_iou"], DEPTH_ERROR: ours["foreground_rmse_mm"]}

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import ObjectBox
 from nlos_models.metrics import surface
 from numpy.typing import NDArray
 
-from nlos_cam.evaluate import Interval, Values, interval, mm_per_v, resampled
-from nlos_cam.frames import Float32
+from nlos_cam.evaluate import Interval, interval, mm_per_v, resampled
 
 STEP_MM = 10.0
 """Neighbouring surface pixels that differ by more in depth have an edge between them."""
@@ -18,13 +18,13 @@ BINS = 4
 ZONES = ("core", "rim inside", "rim outside", "far background")
 
 
-def surface_cm2(truth: Float32, box: ObjectBox) -> Values:
+def surface_cm2(truth: Float32, box: ObjectBox) -> Float64:
     """How large the surface of images (n, 64, 64) is, seen from the wall, (n,)."""
     width_cm, height_cm = _pitch_cm(truth, box)
     return width_cm * height_cm * surface(truth).sum((-2, -1))
 
 
-def detail_per_cm(truth: Float32, box: ObjectBox) -> Values:
+def detail_per_cm(truth: Float32, box: ObjectBox) -> Float64:
     """Length of the edges (outline, holes, steps in depth) for each area of surface, (n,); a large plate has least.
 
     A square plate of side a has 4 / a. NaN where there is no surface.
@@ -61,14 +61,14 @@ class Bin:
     error: Interval
 
 
-def curve(like: Values, error: Values, bins: int = BINS) -> list[Bin]:
+def curve(like: Float64, error: Float64, bins: int = BINS) -> list[Bin]:
     """Error over bins of equally many objects, from those with least of what `like` measures to those with most."""
     order = np.argsort(like, kind="stable")
     parts = [part for part in np.array_split(order, bins) if part.size]
     return [Bin(float(like[p].min()), float(like[p].max()), len(p), interval(error[p])) for p in parts]
 
 
-def rank_correlation(like: Values, error: Values) -> Interval:
+def rank_correlation(like: Float64, error: Float64) -> Interval:
     """Spearman's: 1 where the error grows with what `like` measures, -1 where it falls; objects without one left out.
 
     None where fewer than three objects have both, or one of the two never varies. Resamples keep the ranks of all.
@@ -81,7 +81,7 @@ def rank_correlation(like: Values, error: Values) -> Interval:
     return Interval(float(_correlation(ranks[:, None])[0]), float(low), float(high))
 
 
-def _ranks(values: Values) -> Values:
+def _ranks(values: Float64) -> Float64:
     """From 0; equal values share the mean of theirs."""
     _, which, count = np.unique(values, return_inverse=True, return_counts=True)
     return (np.cumsum(count) - (count + 1) / 2)[which]

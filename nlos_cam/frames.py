@@ -6,6 +6,7 @@ from math import ceil
 
 import numba
 import numpy as np
+from nlos_calibration.arrays import Float32, Int32
 from nlos_calibration.projection import Intrinsics
 from numpy.typing import NDArray
 
@@ -14,8 +15,6 @@ OBJECT_PIXELS = 64
 WINNER_SPREAD_M = 0.01
 """Samples of a cell this close to its median depth count towards its intensity: a plain mean would mix winners."""
 
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 Real = float | np.float32
 
 

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig, load_rig
 from nlos_models.data import MapSet
 from numpy.typing import NDArray
 
 from nlos_cam.bench import Bench, open_bench
 from nlos_cam.errors import RecordingError
-from nlos_cam.frames import Float32, LidarMaps, maps_from_frame
+from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.labelled_truth import fixed_objects, truth_depth_m
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.recording.playback import ReplayCamera, open_lidar_bag

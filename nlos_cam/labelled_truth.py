@@ -6,17 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig, first_problem
 from pydantic import ValidationError
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.meshes import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, read_depth_map
 from nlos_cam.objects.placement import nothing_to_see
-from nlos_cam.render.hidden_record import HiddenObject
-from nlos_cam.render.scene_file import SceneFile
+from nlos_cam.render.scene_file import HiddenObject, SceneFile
 
 TRUTH_SUFFIX = ".truth.toml"
 """Of a file with the fields of a scene file's [object]: what it is, and how it stands in the rig's object box."""

@@ -15,7 +15,7 @@ from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import object_box, orthographic_depth
 from nlos_cam.objects.placement import Pose, panel, place
 from nlos_cam.outliers_to_learn import TO_LEARN
-from nlos_cam.render.surface import Surface, phong, retroreflective
+from nlos_cam.render.material import Surface, phong, retroreflective
 from nlos_cam.sights import Generator, Kind, Sight, ordinary, placed, smooth_pattern, width_m
 
 __all__ = ["IN_SHAPE", "TO_JUDGE", "TO_LEARN", "outlier"]

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from nlos_calibration.arrays import Float32
 
-from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import post, random_pose
-from nlos_cam.render.surface import Surface
+from nlos_cam.render.material import Surface
 from nlos_cam.sights import Generator, Kind, Sight, ordinary, placed, smooth_pattern, width_m
 from nlos_cam.varied_bench import moved
 

@@ -4,7 +4,9 @@ import logging
 from dataclasses import dataclass
 from typing import Protocol, Self
 
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_calibration.arrays import Float32
+
+from nlos_cam.frames import LidarMaps
 
 UNEXPLAINED = 0.91
 """The score from which on what is shown does not explain the maps: 1 % of the 300 new objects that it was chosen on

@@ -6,14 +6,15 @@ from functools import lru_cache
 from typing import Self
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig
 
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Float32, LidarMaps
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.physics_check import Check, failure, log_warning
 from nlos_cam.physics_check_score import Expected, explanation
 from nlos_cam.reconstruct import Clock
 from nlos_cam.render.accuracy import Stop
-from nlos_cam.render.beams import cast
+from nlos_cam.render.geometry import cast
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.scene import Scene
 

@@ -10,9 +10,10 @@ from contextlib import suppress
 from threading import Condition, Thread
 from typing import IO, Self
 
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig
 
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import LidarMaps
 from nlos_cam.physics_check import Check, failure, log_warning
 from nlos_cam.reconstruct import Clock
 from nlos_cam.render.accuracy import Stop

@@ -17,12 +17,10 @@ any object that is not there as a dark one.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float32, Float64
 
-from nlos_cam.frames import SATURATED, Float32, LidarMaps
-from nlos_cam.render.sensor_model import SensorModel
-
-Array = NDArray[np.float64]
+from nlos_cam.frames import SATURATED, LidarMaps
+from nlos_cam.render.sensor.model import SensorModel
 
 WALL_TOLERANCE_M = 0.003
 """Of the bare wall's depth: what a bench's record leaves."""
@@ -44,12 +42,12 @@ NOISE = SensorModel()
 class Expected:
     """What would come back from each cell (64, 80): depths along the optical axis, intensities in units of I0."""
 
-    direct_m: Array
+    direct_m: Float64
     """NaN where nothing returns."""
-    direct: Array
-    echo_m: Array
+    direct: Float64
+    echo_m: Float64
     """Of three bounces; NaN where there is none."""
-    echo: Array
+    echo: Float64
 
     @property
     def bare(self) -> "Expected":
@@ -107,7 +105,9 @@ def mean_cost(seen: LidarMaps, expected: Expected, gain: float, albedo: float) -
     return float(cost[counts].mean()) if counts.any() else 0.0
 
 
-def _distance(off: Array, light: Array, expected: Array, counts_of_i0: float, lead: Array, most: float) -> Array:
+def _distance(
+    off: Float64, light: Float64, expected: Float64, counts_of_i0: float, lead: Float64, most: float
+) -> Float64:
     """What `h` is of one of the two echoes; infinite where it is none, or nothing was seen.
 
     `off` is the depth's part of it, `lead` the log of how much the other is stronger; from a log light of `most` on the
@@ -122,11 +122,11 @@ def _distance(off: Array, light: Array, expected: Array, counts_of_i0: float, le
     return np.where((expected > 0) & np.isfinite(h), h, np.inf)
 
 
-def _light(seen: LidarMaps, gain: float) -> Array:
+def _light(seen: LidarMaps, gain: float) -> Float64:
     """The logarithm of what was seen, in units of I0."""
     return _log(seen.intensity.astype(np.float64) / gain)
 
 
-def _log(intensity: Array) -> Array:
+def _log(intensity: Float64) -> Float64:
     """The logarithm; of nothing, that of next to nothing."""
     return np.log(np.maximum(intensity, 1e-12))

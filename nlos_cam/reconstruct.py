@@ -5,12 +5,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_models.doubt_inference import Doubter
 from numpy.typing import NDArray
 
 from nlos_cam.doubt import Doubt, doubt_of
-from nlos_cam.frames import OBJECT_PIXELS, Float32, LidarMaps
+from nlos_cam.frames import OBJECT_PIXELS, LidarMaps
 from nlos_cam.objects.depth_map import depth_from_image, object_box
 
 Clock = Callable[[], float]

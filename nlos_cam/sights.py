@@ -5,16 +5,16 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import ObjectBox, Rig
 
-from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import object_box, orthographic_depth
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import category_triangles, place, random_pose
-from nlos_cam.objects.primitives import Triangles
+from nlos_cam.render.material import Surface
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor_model import SensorModel
-from nlos_cam.render.surface import Surface
+from nlos_cam.render.sensor.model import SensorModel
 
 Generator = np.random.Generator
 
@@ -39,7 +39,7 @@ Kind = Callable[[Generator, Sight], Sight]
 """Makes an outlier of a sight that is ordinary, but for its object, which is still to come."""
 
 
-def _triangles(generator: Generator) -> Triangles:
+def _triangles(generator: Generator) -> Float64:
     return category_triangles(str(generator.choice(list(CATEGORIES))), int(generator.integers(2**31)))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_models.checkpoint import load_pipeline
 from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, exported
@@ -17,7 +18,7 @@ from nlos_cam import dataset
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, Figures, judge
 from nlos_cam.evaluate_objects import Subject, as_map_set, echoes_of, seeded_objects, sense, truth_of
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import LidarMaps
 from nlos_cam.render.renderer import MultiBounce
 
 FRAMES = 1, 4, 16

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from nlos_calibration.rig import Rig
 
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
 
 Generator = np.random.Generator
 

@@ -6,16 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_calibration.wall_record import WallRecord
-from numpy.typing import NDArray
 
 from nlos_cam.wall_pictures import Picture, figure_of, png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
 Limits = tuple[float, float]
 Style = dict[str, Any]
 
@@ -85,7 +84,7 @@ def drawn_limits(rig: Rig) -> tuple[Limits, Limits, Limits]:
     return (min(x) - MARGIN_M, max(x) + MARGIN_M), (min(y) - 0.05, max(y) + 0.05), (-0.04, max(z) + 0.04)
 
 
-def _reached(rig: Rig) -> Array:
+def _reached(rig: Rig) -> Float64:
     """Where the optical axis meets the wall, or how far along it there is room."""
     along, distance_m = rig.wall_from_lidar[:3, 2], rig.lidar.distance_m
     aside = hypot(along[X], along[Y])
@@ -134,7 +133,7 @@ def _view(axis: "Axes", side: _Side, rig: Rig) -> None:
     axis.plot(*path[:, drawn].T, color=LIDAR, linewidth=1.3, linestyle="-.")
 
 
-def _corner_rays(rig: Rig) -> Array:
+def _corner_rays(rig: Rig) -> Float64:
     edges = rig.pinhole.scaled(1, 1)
     x, y = (np.array([-0.5, 0.5]) - edges.ppx) / edges.fx, (np.array([-0.5, 0.5]) - edges.ppy) / edges.fy
     return np.array([[x[i], y[j], 1.0] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])

@@ -6,6 +6,7 @@ from math import floor, log10
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.bare_wall import FULL_SCALE, BareWall
 from nlos_calibration.range_noise import depth_noise_m
 from nlos_calibration.wall_record import WallRecord
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 DPI = 100
 STRAY, STRIPE, NO_RETURN = (0.72, 0.72, 0.72, 1.0), (0.35, 0.35, 0.35, 1.0), (0.9, 0.9, 0.9, 1.0)
@@ -167,7 +167,7 @@ def _infrared(reference: BareWall) -> Picture:
 
 
 def _map(
-    axis: "Axes", values: Array, label: str, *, extend: Any = "neither", levels: int = LEVELS, **style: Any
+    axis: "Axes", values: Float64, label: str, *, extend: Any = "neither", levels: int = LEVELS, **style: Any
 ) -> "Colorbar":
     """Draw an image of the sensor in blocks, and return its colour bar."""
     from matplotlib import colormaps
@@ -206,7 +206,7 @@ def _percent(mask: NDArray[np.bool_]) -> str:
     return "none" if share == 0.0 else "less than 0.1 %" if share < 0.1 else f"{share:.1f} %"
 
 
-def _limit(values: Array) -> float:
+def _limit(values: Float64) -> float:
     """Where a scale ends that holds 99 % of the values: the next round number; 0.1 where there are none above 0."""
     known = values[np.isfinite(values)]
     most = float(np.percentile(known, 99.0)) if len(known) else 0.0

@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.wall import WallFit, fit_wall
 
-from nlos_cam.frames import Float32, Frame, saturated_share
+from nlos_cam.frames import Frame, saturated_share
 
 GLANCE_COLUMNS = 160
 """A frame is thinned to about so many: a plane is still sure to a tenth of a millimetre."""

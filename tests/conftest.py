@@ -11,7 +11,7 @@ from nlos_calibration.rig import Rig, load_rig
 from nlos_cam.camera import Recording
 from nlos_cam.camera.l515 import L515Camera
 from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.render.sensor import SensedImages
+from nlos_cam.render.sensor.sensor import SensedImages
 
 
 @pytest.fixture(autouse=True)

@@ -15,10 +15,10 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.render import cpu, cuda
+from nlos_cam.render import backend_numba, backend_torch
 from nlos_cam.render.accuracy import accuracy_named
 from nlos_cam.render.job import Job
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.renderer import render_all
 from nlos_cam.render.scene import Scene
 
@@ -44,7 +44,7 @@ def prepared(scenes: list[Scene], accuracy: str) -> Iterator[Job]:
 def difference(jobs: list[Job], device: torch.device) -> float:
     """Relative L1 of some histograms from those of the numba renderer."""
     some = [job.some(np.arange(0, len(job.foot_m), 50)) for job in jobs]
-    pairs = zip(cuda.histograms_of_all(some, device), map(cpu.histograms, some), strict=True)
+    pairs = zip(backend_torch.histograms_of_all(some, device), map(backend_numba.histograms, some), strict=True)
     return max(float(np.abs(found - other).sum() / other.sum()) for found, other in pairs)
 
 
@@ -57,13 +57,13 @@ def main() -> None:
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 4, 16, 64])
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
-    device, rig = cuda.device_named(options.backend), load_rig("paper-rig")
+    device, rig = backend_torch.device_named(options.backend), load_rig("paper-rig")
     scenes = [Scene(rig, object_depth(seed, object_box(rig))[1]) for seed in range(options.objects)]
     jobs = list(prepared(scenes, options.accuracy))
 
     def in_batches(size: int) -> None:
         for start in range(0, len(jobs), size):
-            cuda.histograms_of_all(jobs[start : start + size], device)
+            backend_torch.histograms_of_all(jobs[start : start + size], device)
 
     rates = {size: len(jobs) / seconds(lambda size=size: in_batches(size), options.repeats) for size in options.batch}
     for size, rate in rates.items():

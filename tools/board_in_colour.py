@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from board_trials import FLAT, Bench, random_bench, summary, trials
 from board_view import Light, clean_view, corners_px, frames_of
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS
 from nlos_calibration.board_corners import Corners
 from nlos_calibration.board_plane import BoardFit, PrintErrors
@@ -20,8 +21,6 @@ from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
 from wall_scenes import View
-
-Array = NDArray[np.float64]
 
 OUT = Path(__file__).parents[1] / "docs" / "board_in_colour.json"
 COLOUR = Intrinsics(1280, 720, 907.114, 907.605, 662.66, 367.428)
@@ -56,7 +55,7 @@ class Taken:
     """The camera that takes the picture."""
 
     pinhole: Intrinsics
-    lidar_from_colour: Array
+    lidar_from_colour: Float64
 
     def seen(self, bench: Bench) -> View:
         """A bench by this camera, as if its lens were straight."""
@@ -79,14 +78,14 @@ def as_errors_allow(generator: np.random.Generator, errors: CameraErrors) -> Tak
     return Taken(replace(COLOUR, fx=COLOUR.fx * longer, fy=COLOUR.fy * longer), moved)
 
 
-def through_lens(pixels: Array, pinhole: Intrinsics = COLOUR) -> Array:
+def through_lens(pixels: Float64, pinhole: Intrinsics = COLOUR) -> Float64:
     """Where pixels (n, 2) of a straight lens are in the image of this one."""
     rays = np.column_stack([(pixels - [pinhole.ppx, pinhole.ppy]) / [pinhole.fx, pinhole.fy], np.ones(len(pixels))])
     bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), pinhole.matrix, LENS)
     return bent.reshape(-1, 2).astype(np.float64)
 
 
-def image_through_lens(straight: Array, pinhole: Intrinsics = COLOUR) -> Array:
+def image_through_lens(straight: Float64, pinhole: Intrinsics = COLOUR) -> Float64:
     """The image (height, width) that the lens makes of that of a straight one."""
     every = np.stack(np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height)), axis=-1).astype(np.float32)
     came_from = cv2.undistortImagePoints(every.reshape(-1, 1, 2), pinhole.matrix, LENS).reshape(every.shape)

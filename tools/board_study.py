@@ -14,15 +14,13 @@ import numpy as np
 from board_trials import FLAT, Bench, Trial, by_corners, by_image, random_bench, summary, trials
 from board_view import Light, at_near_edge, in_the_middle
 from matplotlib.figure import Figure
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS, Board
 from nlos_calibration.board_corners import find_corners
 from nlos_calibration.board_plane import BoardFit, PrintErrors, fit_board
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.rig import load_rig
-from numpy.typing import NDArray
 from wall_scenes import view
-
-Array = NDArray[np.float64]
 
 DOCS = Path(__file__).parents[1] / "docs"
 PINHOLE = load_rig("bare-wall").pinhole
@@ -65,7 +63,7 @@ def over_grid(bench: Callable[[float, float], Bench], frames: int, repeats: int 
     for distance_m in DISTANCES_M:
         for angle_deg in ANGLES_DEG:
             corners: list[int] = []
-            off: list[Array] = []
+            off: list[Float64] = []
             one = bench(distance_m, angle_deg)
             for _ in range(repeats):
                 try:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from board_view import Light, Placed, at_near_edge, clean_view, corners_px, frames_of
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import Board
 from nlos_calibration.board_corners import Corners, find_corners
 from nlos_calibration.board_plane import BoardFit, PrintErrors, fit_board
@@ -17,8 +18,7 @@ from nlos_calibration.uncertainty import INTERVAL_STDS, measures_of
 from numpy.typing import NDArray
 from wall_scenes import View, view
 
-Array = NDArray[np.float64]
-Trial = tuple[Array, Array]
+Trial = tuple[Float64, Float64]
 """(3,) distance in mm, yaw and pitch in degrees: how far off, and in stated standard uncertainties."""
 
 NAMES = ("distance_mm", "yaw_deg", "pitch_deg")
@@ -47,7 +47,7 @@ class Bench:
         return off * [1e3, 1.0, 1.0], off / std
 
 
-def _truth(seen: View) -> tuple[Array, Array]:
+def _truth(seen: View) -> tuple[Float64, Float64]:
     return -seen.pose[2, :3] / seen.pose[2, 3], np.zeros((3, 3))
 
 

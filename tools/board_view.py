@@ -10,11 +10,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import Board
 from numpy.typing import NDArray
 from wall_scenes import View
-
-Array = NDArray[np.float64]
 
 TEXTURE_PER_SQUARE = 240
 SUPERSAMPLED = 4
@@ -47,7 +46,7 @@ class Placed:
     stretch: float = 1.0
     """Of width over height."""
 
-    def wall_from_board(self, board: Board) -> Array:
+    def wall_from_board(self, board: Board) -> Float64:
         """Points (x, y, 1) of the drawing to points (x, y, z, 1) of the wall, as a matrix (4, 3)."""
         cos, sin = np.cos(self.turn_rad), np.sin(self.turn_rad)
         turn = np.array([[cos, sin], [sin, -cos]]) * self.scale * np.sqrt([self.stretch, 1.0 / self.stretch])
@@ -69,7 +68,7 @@ def in_the_middle(seen: View) -> Placed:
     return Placed(*(-axis[:2] / axis[2] * seen.pose[2, 3]))
 
 
-def corners_px(board: Board, seen: View, placed: Placed, bow_m: tuple[float, float] = (0.0, 0.0)) -> Array:
+def corners_px(board: Board, seen: View, placed: Placed, bow_m: tuple[float, float] = (0.0, 0.0)) -> Float64:
     """Where the chessboard corners (n, 2) truly are in the image, whether in it or not.
 
     `bow_m` is how far the middle of the sheet stands off the wall, seen along its x and its y axis.
@@ -82,7 +81,7 @@ def corners_px(board: Board, seen: View, placed: Placed, bow_m: tuple[float, flo
     return np.column_stack([lidar.fx * x_m / z_m + lidar.ppx, lidar.fy * y_m / z_m + lidar.ppy])
 
 
-def clean_view(board: Board, seen: View, placed: Placed, light: Light | None = None) -> Array:
+def clean_view(board: Board, seen: View, placed: Placed, light: Light | None = None) -> Float64:
     """The mean counts (height, width) before saturation, noise and rounding; the wall about the sheet is white."""
     light = light or Light()
     rays, distance_m = seen.pinhole.rays(), float(seen.pose[2, 3])
@@ -97,7 +96,7 @@ def clean_view(board: Board, seen: View, placed: Placed, light: Light | None = N
 
 
 def frames_of(
-    clean: Array, generator: np.random.Generator, count: int, light: Light | None = None
+    clean: Float64, generator: np.random.Generator, count: int, light: Light | None = None
 ) -> NDArray[np.uint8]:
     """Frames (count, height, width) of what the lidar delivers of a view."""
     light = light or Light()
@@ -113,7 +112,7 @@ def _texture(board: Board) -> NDArray[np.float32]:
     return np.pad(TONER + (1.0 - TONER) * pattern, TEXTURE_PER_SQUARE, constant_values=1.0).astype(np.float32)
 
 
-def _albedo(board: Board, seen: View, placed: Placed) -> Array:
+def _albedo(board: Board, seen: View, placed: Placed) -> Float64:
     """The albedo (height, width), averaged over each pixel's area."""
     fine = seen.pinhole.scaled(SUPERSAMPLED * seen.pinhole.width, SUPERSAMPLED * seen.pinhole.height)
     camera = np.array([[fine.fx, 0.0, fine.ppx], [0.0, fine.fy, fine.ppy], [0.0, 0.0, 1.0]])

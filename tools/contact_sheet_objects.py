@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, load_rig
 
-from nlos_cam.frames import Float32
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import image_from_depth, object_box, orthographic_depth
 from nlos_cam.objects.generators import CATEGORIES

@@ -17,8 +17,8 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.objects.depth_map import orthographic_depth
 from nlos_cam.objects.placement import Pose, category_triangles, place
 from nlos_cam.render.accuracy import STOPS
-from nlos_cam.render.agreement import Echoes, agreement
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.accuracy_search import Echoes, agreement
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.tradeoff_report import machine

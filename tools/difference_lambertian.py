@@ -9,8 +9,7 @@ from difference_scenes import Bench, Signal
 from difference_sight import Mask, Sight, Track
 from difference_snr import Cells, frames_for_cells, frames_for_filter, hours, ratio
 from difference_waveform import Array, chips_peak, gaussian_peak
-
-from nlos_cam.frames import Float32
+from nlos_calibration.arrays import Float32
 
 WARMER_CELSIUS = None, 0.0, 0.1, 1.0, 5.0
 """None has an endless reference."""

@@ -10,12 +10,12 @@ from nlos_calibration.wall import fit_wall, wall_depth
 from numpy.typing import NDArray
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
-from nlos_cam.render.beams import cast
+from nlos_cam.render.geometry import cast
 from nlos_cam.render.renderer import MultiBounce
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_bias import DepthBias
-from nlos_cam.render.sensor_effects import sensor_effects
-from nlos_cam.render.sensor_model import SensorModel, WarmUp
+from nlos_cam.render.sensor.bias import DepthBias
+from nlos_cam.render.sensor.effects import sensor_effects
+from nlos_cam.render.sensor.model import SensorModel, WarmUp
+from nlos_cam.render.sensor.sensor import Sensor
 
 USUAL_NOISE_FRAMES = 300
 COLD_CELSIUS, WARM_CELSIUS = 25.0, 45.0

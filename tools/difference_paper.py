@@ -9,9 +9,9 @@ from difference_noise import REFERENCE_CELSIUS, Pattern, biased, cell_means, map
 from difference_scenes import SHAPE, Bench, Signal, paper_rig
 from difference_sight import MAPS, Mask, Sight, Track, Which, merged, switched
 from difference_waveform import Array
+from nlos_calibration.arrays import Float32
 
-from nlos_cam.frames import Float32
-from nlos_cam.render.sensor import Sensor
+from nlos_cam.render.sensor.sensor import Sensor
 
 RECEIVER_CELLS_M2 = 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 2e-2
 CHOSEN_M2 = {0.0: 5e-4, 1.0: 5e-3}

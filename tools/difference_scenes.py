@@ -7,16 +7,17 @@ from typing import TypeVar
 
 import numpy as np
 from difference_waveform import Array, Peak, first_order, pulse_sigma_m, received
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig, load_rig
 from numpy.typing import NDArray
 
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, Float32
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams, cast
-from nlos_cam.render.echo import MultiBounce
+from nlos_cam.render.echoes import MultiBounce
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, Beams, cast
 from nlos_cam.render.renderer import three_bounce
 from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
 
 SHAPE = MAP_ROWS, MAP_COLUMNS
 Value = TypeVar("Value", np.float64, np.bool_)

@@ -9,9 +9,8 @@ from difference_noise import REFERENCE_CELSIUS, MapNoise, Pattern
 from difference_scenes import Signal
 from difference_snr import Cells, Ratio, effective, ratio
 from difference_waveform import Array
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Mask
 
-Mask = NDArray[np.bool_]
 Which = Callable[[Signal], Mask]
 """The cells (64, 80) of an object's maps that are looked at."""
 Track = Callable[[Iterable[Any], str], Iterable[Any]]

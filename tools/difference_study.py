@@ -32,14 +32,14 @@ from difference_paper import CHOSEN_M2, USUAL, USUAL_FRAMES, USUAL_WARMER, paper
 from difference_scenes import SHAPE, Bench, later_light, paper_rig
 from difference_sight import REFERENCE_FRAMES, Sight, Track
 from difference_tables import as_markdown
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig
 
 from nlos_cam.cli.common import INTERRUPTED, progress
-from nlos_cam.frames import Float32
-from nlos_cam.render.echo import nothing
+from nlos_cam.render.echoes import nothing
 from nlos_cam.render.scene import Radiometry
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"

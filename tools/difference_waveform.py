@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from math import erf, exp, pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float64
 
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S
-from nlos_cam.render.echo import SIGMAS_PER_FWHM
-
-Array = NDArray[np.float64]
+from nlos_cam.render.echoes import SIGMAS_PER_FWHM
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
 
 REACH_SIGMAS = 6.0
 """Beyond this the pulse is 1.5e-8 of its height."""
@@ -28,12 +26,12 @@ def pulse_sigma_m(pulse_ns: float) -> float:
     return pulse_ns * 1e-9 * SPEED_OF_LIGHT_M_PER_S * float(SIGMAS_PER_FWHM)
 
 
-def pulse(off_m: Array, sigma_m: float) -> Array:
+def pulse(off_m: Float64, sigma_m: float) -> Float64:
     """g: the pulse at `off_m` of path length from its middle, 1 in its middle."""
     return np.exp(-0.5 * np.square(off_m / sigma_m))
 
 
-def centres_m(bins: int, bin_m: float) -> Array:
+def centres_m(bins: int, bin_m: float) -> Float64:
     """The path lengths (bins,) in the middle of bins that begin at 0."""
     return (np.arange(bins, dtype=np.float64) + 0.5) * bin_m
 
@@ -42,7 +40,7 @@ def centres_m(bins: int, bin_m: float) -> Array:
 class Peak:
     """What weak later light meets: g of a lone echo, of height 1."""
 
-    slope: Callable[[Array], Array]
+    slope: Callable[[Float64], Float64]
     """g' at paths before the peak, as a function of how far before it; positive there."""
     bend: float
     """-g'' at the peak."""
@@ -70,7 +68,7 @@ def chips_peak() -> Peak:
     return Peak(lambda off_m: np.interp(-off_m, places_m, slope) / chip_m, bend / chip_m)
 
 
-def first_order(direct: Array, path_m: Array, later: Array, bin_m: float, peak: Peak) -> Array:
+def first_order(direct: Float64, path_m: Float64, later: Float64, bin_m: float, peak: Peak) -> Float64:
     """By how much weak later light (n, bins) shifts the peak (n,) of a direct return (n,), in metres of path.
 
     D g'(t) + sum h_k g'(t - dL_k) = 0 has, to first order in h / D, the root t = sum h_k g'(-dL_k) / (-D g''(0)); of a
@@ -80,7 +78,7 @@ def first_order(direct: Array, path_m: Array, later: Array, bin_m: float, peak: 
     return (later * peak.slope(off_m)).sum(1) / (direct * peak.bend)
 
 
-def received(direct: Array, path_m: Array, later: Array, bin_m: float, sigma_m: float) -> tuple[Array, Array]:
+def received(direct: Float64, path_m: Float64, later: Float64, bin_m: float, sigma_m: float) -> tuple[Float64, Float64]:
     """Path length (n,) and height (n,) of the highest peak, whatever the strength of the later light (n, bins).
 
     Sampled at the bins' centres; between them by a parabola through the logarithm, which is exact for a lone echo.

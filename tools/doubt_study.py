@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from doubt_pictures import draw_reliability
 from named_weights import errors_told
+from nlos_calibration.arrays import Float64
 from nlos_calibration.rig import Rig
 from nlos_models.checkpoint import shipped_folder
 from nlos_models.doubt_inference import Doubter, load_doubter
@@ -37,7 +38,7 @@ from nlos_cam.objects.depth_map import depth_from_image, object_box
 from nlos_cam.outliers import IN_SHAPE, TO_JUDGE, TO_LEARN
 from nlos_cam.processing import limits_of
 from nlos_cam.reconstruct import Reconstruction, reconstruct
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
 from nlos_cam.verdict import Judge, Signs, Verdict
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -47,8 +48,6 @@ FEWER = {"glossy": 0.25}
 """A lobe takes a hundred times as long to render: of these so large a share, and at draft."""
 VISIBLE_CELLS = 8
 """What shows in fewer cells of the maps cannot be told from nothing."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -90,9 +89,9 @@ def verdicts_of(told: Sequence[Told]) -> dict[str, int]:
     return {verdict.value: counted[verdict] for verdict in Verdict if counted[verdict]}
 
 
-def errors_of(told: Sequence[Told], truth_m: NDArray[np.float32]) -> tuple[Array, Array]:
+def errors_of(told: Sequence[Told], truth_m: NDArray[np.float32]) -> tuple[Float64, Float64]:
     """Expected and observed absolute error in metres (pixels,), where both image and truth (n, 64, 64) have surface."""
-    expected, observed = list[Array](), list[Array]()
+    expected, observed = list[Float64](), list[Float64]()
     for one, true_m in zip(told, truth_m, strict=True):
         off_m = np.abs(one.found.depth_m - true_m)
         there = ~np.isnan(off_m)
@@ -101,7 +100,7 @@ def errors_of(told: Sequence[Told], truth_m: NDArray[np.float32]) -> tuple[Array
     return np.concatenate(expected), np.concatenate(observed)
 
 
-def reliability(expected: Array, observed: Array, bins: int = BINS) -> list[dict[str, float]]:
+def reliability(expected: Float64, observed: Float64, bins: int = BINS) -> list[dict[str, float]]:
     """Pixels in bins of as many each, by what was expected: the means of both."""
     order = np.array_split(np.argsort(expected), bins)
     return [
@@ -110,12 +109,12 @@ def reliability(expected: Array, observed: Array, bins: int = BINS) -> list[dict
     ]
 
 
-def coverage(expected: Array, observed: Array) -> list[dict[str, float]]:
+def coverage(expected: Float64, observed: Float64) -> list[dict[str, float]]:
     """Of stated intervals about a depth, which holds the truth: Laplace's, whose half width is -ln(1 - level) times."""
     return [{"level": level, "observed": float((observed <= -np.log(1 - level) * expected).mean())} for level in LEVELS]
 
 
-def rank_correlation(one: Array, other: Array) -> float:
+def rank_correlation(one: Float64, other: Float64) -> float:
     """Spearman's."""
     ranks = [np.argsort(np.argsort(values)) for values in (one, other)]
     return float(np.corrcoef(*ranks)[0, 1])

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.drift import DriftCheck
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
@@ -12,10 +13,8 @@ from nlos_calibration.range_noise import depth_noise_m
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_track import watched_pixels
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Hide = Callable[[Array, int], Array]
+Hide = Callable[[Float64, int], Float64]
 """From the depths of the watched pixels (N,) and a frame's number to what is seen of them."""
 Pose = tuple[float, float, float]
 """Distance in metres, yaw and pitch in degrees."""
@@ -28,12 +27,12 @@ DEAD = 0.01
 """Share of the samples that give no depth."""
 
 
-def wall_from_lidar(pose: Pose) -> Array:
+def wall_from_lidar(pose: Pose) -> Float64:
     distance_m, yaw_deg, pitch_deg = pose
     return wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m)
 
 
-def sensed(depth_m: Array, generator: np.random.Generator) -> Array:
+def sensed(depth_m: Float64, generator: np.random.Generator) -> Float64:
     """One frame of `depth_m`: noise of 0.5 mm and 2 mm for each metre, steps of 0.25 mm, dead samples."""
     noisy_m = depth_m + generator.standard_normal(depth_m.shape) * (0.0005 + 0.002 * depth_m)
     return np.where(generator.random(depth_m.shape) < DEAD, np.nan, np.round(noisy_m / 0.00025) * 0.00025)
@@ -80,19 +79,19 @@ class WallStream:
             told = number if told is None and self.check.warnings else told
         return told
 
-    def depth_from(self, pose: Pose) -> Array:
+    def depth_from(self, pose: Pose) -> Float64:
         """Of the watched pixels (N,), without noise; NaN where a beam never meets the wall."""
         depth_m = wall_depth(wall_from_lidar(pose), self.intrinsics).ravel()[self.pixels]
         return np.where(np.isfinite(depth_m), depth_m, np.nan)
 
-    def look(self, depth_m: Array) -> None:
+    def look(self, depth_m: Float64) -> None:
         """Take in a frame of these depths of the watched pixels (N,), which gets its noise here."""
         self._frame.ravel()[self.pixels] = sensed(depth_m, self._generator)
         self.check.look(self._frame, {})
         self.frames += 1
 
 
-def detours(places: Array, share: float, seed: int, *, beyond: bool = False) -> Hide:
+def detours(places: Float64, share: float, seed: int, *, beyond: bool = False) -> Hide:
     """Light that went by way of an object that moves: a share of the pixels is 3 to 40 cm farther, smoothly.
 
     They are here and there, or `beyond` a line that only sways.
@@ -101,7 +100,7 @@ def detours(places: Array, share: float, seed: int, *, beyond: bool = False) -> 
     waves = generator.uniform(1, 6, (4, 2)) * generator.choice([-1, 1], (4, 2))
     phases, speeds = generator.uniform(0, 2 * np.pi, 4), generator.uniform(0.02, 0.2, 4)
 
-    def hide(depth_m: Array, number: int) -> Array:
+    def hide(depth_m: Float64, number: int) -> Float64:
         where, length, *_ = np.sin(places @ waves.T + phases + speeds * number).T.reshape(2, 2, -1).sum(axis=1)
         if beyond:
             where = places[:, 0] + 0.05 * np.sin(3.0 * places[:, 1] + speeds[0] * number)
@@ -116,10 +115,10 @@ def both(first: Hide, second: Hide) -> Hide:
     return lambda depth_m, number: second(first(depth_m, number), number)
 
 
-def sheet(places: Array, nearest: float) -> Hide:
+def sheet(places: Float64, nearest: float) -> Hide:
     """An occluder: from that place in the view on (0 to 1) the depth is shorter, by 5 to 50 cm, but never by half."""
 
-    def hide(depth_m: Array, _: int) -> Array:
+    def hide(depth_m: Float64, _: int) -> Float64:
         into = np.clip((places[:, 0] - nearest) / (1.0 - nearest), 0.0, 1.0)
         shorter = np.maximum(depth_m - 0.05 - 0.45 * into, 0.5 * depth_m)
         return np.where(places[:, 0] >= nearest, shorter, depth_m)

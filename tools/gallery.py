@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import load_rig
 from nlos_models.metrics import silhouette_iou
 
-from nlos_cam.evaluate import BARS, Values
+from nlos_cam.evaluate import BARS
 from nlos_cam.evaluate_objects import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
 from nlos_cam.evaluate_report import in_words
 from nlos_cam.folders import file_when_whole
-from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.set_up import load_networks
@@ -71,7 +72,7 @@ def unlike_training() -> list[SeededObject]:
     return [SeededObject(name, name, depth_m.astype(np.float32)) for name, depth_m in shapes.items()]
 
 
-def seen(subjects: Sequence[Subject]) -> tuple[Float32, Float32, Values]:
+def seen(subjects: Sequence[Subject]) -> tuple[Float32, Float32, Float64]:
     """What the shipped networks make of objects (n, 64, 64), the truth, and the silhouettes' IoU."""
     rig = load_rig("paper-rig")
     truth = truth_of(subjects, object_box(rig))
@@ -80,7 +81,7 @@ def seen(subjects: Sequence[Subject]) -> tuple[Float32, Float32, Values]:
     return image, truth, silhouette_iou(image, truth)
 
 
-def draw(path: Path, rows: Sequence[tuple[str, Sequence[Subject], Float32, Float32, Values]]) -> None:
+def draw(path: Path, rows: Sequence[tuple[str, Sequence[Subject], Float32, Float32, Float64]]) -> None:
     """Truth above reconstruction, a block of two rows for each of `rows`."""
     from matplotlib.figure import Figure
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import torch
 from named_weights import errors_told
+from nlos_calibration.arrays import Float32
 from nlos_models.checkpoint import load_encoder, load_pipeline, load_record, shipped_folder
 from nlos_models.data import MapSet
 from nlos_models.losses import latent_error
@@ -24,7 +25,7 @@ from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan
 from nlos_cam.evaluate import BARS, Figures, judge
 from nlos_cam.evaluate_objects import QUIET, Subject, as_map_set, echoes_of, seeded_objects, sense, truth_of
 from nlos_cam.evaluate_report import in_words
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box
 

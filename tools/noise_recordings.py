@@ -9,7 +9,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
-from nlos_cam.render.sensor import SensedImages
+from nlos_cam.render.sensor.sensor import SensedImages
 
 WIDTH, HEIGHT = 160, 120
 FRAMES = 40

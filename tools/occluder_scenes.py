@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float64
 from wall_scenes import View
-
-Array = NDArray[np.float64]
 
 WALL_EXTENT_M = 2.0
 
@@ -30,7 +28,7 @@ class Sheet:
     """The y that it ends at."""
 
 
-def bench(seen: View, sheet: Sheet | None, *, beams: int = 1) -> Array:
+def bench(seen: View, sheet: Sheet | None, *, beams: int = 1) -> Float64:
     """Depth (height, width) of wall and sheet, inf where a ray meets neither.
 
     With more than one beam across a pixel it reads their mean: one on the edge flies between sheet and wall.
@@ -45,7 +43,7 @@ def bench(seen: View, sheet: Sheet | None, *, beams: int = 1) -> Array:
     return depth_m.reshape(pinhole.height, seen.pinhole.width, beams).mean(axis=-1)
 
 
-def _sheet_depth(sheet: Sheet, lidar: Array, rays: Array) -> Array:
+def _sheet_depth(sheet: Sheet, lidar: Float64, rays: Float64) -> Float64:
     """Along each ray, as far as it meets the sheet: normal . (p - edge) = 0."""
     lean, twist = np.tan(np.radians([sheet.lean_deg, sheet.twist_deg]))
     normal, edge = np.array([1.0, -twist, -lean]), np.array([sheet.x_m, 0.0, sheet.gap_m])
@@ -56,7 +54,7 @@ def _sheet_depth(sheet: Sheet, lidar: Array, rays: Array) -> Array:
     return np.where((depth_m > 0.0) & on, depth_m, np.inf)
 
 
-def ball(seen: View, centre_m: tuple[float, float, float], radius_m: float) -> Array:
+def ball(seen: View, centre_m: tuple[float, float, float], radius_m: float) -> Float64:
     """Depth (height, width) of a ball in the wall frame, inf beside it."""
     rays = seen.pinhole.rays() @ seen.pose[:3, :3].T
     towards = np.asarray(centre_m) - seen.pose[:3, 3]

@@ -8,15 +8,13 @@ from nlos_calibration.errors import OccluderRefusedError
 from nlos_calibration.occluder import MIN_COLUMNS, OccluderFit, find_occluder
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import LidarPose, Occluder, PinholeRecord, load_rig
-from numpy.typing import NDArray
 from occluder_scenes import Sheet, bench
 from wall_scenes import View, looked_at, view, with_outliers
 from wall_trials import NO_ECHO
 
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 
-Array = NDArray[np.float64]
 Generator = np.random.Generator
 
 SIZE = 160, 120

@@ -13,6 +13,7 @@ from pathlib import Path
 from threading import Condition, Event, Thread
 from typing import Any, Self
 
+from nlos_calibration.arrays import Float32
 from nlos_models.inference import load_reconstructor
 
 from nlos_cam.bench import Bench, open_bench
@@ -20,7 +21,7 @@ from nlos_cam.cache import cache_folder
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.protocol import WallClock
 from nlos_cam.cli.common import say
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import LidarMaps
 from nlos_cam.live import run_live, warm_up
 from nlos_cam.physics_check import Check, Checks, NoChecks
 from nlos_cam.physics_check_render import check

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import load_rig
 from nlos_models.inference import Reconstructor, load_reconstructor
-from numpy.typing import NDArray
 
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import say, tracked
 from nlos_cam.dataset import TEST_SEED
 from nlos_cam.evaluate_objects import seeded_objects, sense
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import depth_from_image, object_box
 from nlos_cam.physics_check import UNEXPLAINED
@@ -42,7 +42,6 @@ OTHERS = 7, 19
 OUTSIDE_ACCURACY: Stop = "draft"
 """At `standard` a glossy thing takes minutes, and these are far from what explains them in any case."""
 ORDINARY, TEST, WRONG, OUTSIDE = "new objects", "test objects", "another object's", "outside: "
-Scores = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -70,18 +69,18 @@ class Study:
         return [self.see(Scene(RIG, depth_m)) for depth_m in depths_m]
 
 
-def scores(pairs: Iterable[tuple[LidarMaps, Float32]], accuracy: Any = "standard") -> Scores:
+def scores(pairs: Iterable[tuple[LidarMaps, Float32]], accuracy: Any = "standard") -> Float64:
     """The score of each hidden depth, held against maps."""
     return np.array([check(maps, depth_m, RIG, accuracy=accuracy).score for maps, depth_m in pairs])
 
 
 def populations(
     study: Study, new: int, outside: Mapping[str, Sequence[Any]], told: Callable[[int, int], None]
-) -> dict[str, Scores]:
+) -> dict[str, Float64]:
     """Scores by what was held against the maps; `outside` are sights by kind."""
-    found, steps = dict[str, Scores](), 7 + len(outside)
+    found, steps = dict[str, Float64](), 7 + len(outside)
 
-    def add(name: str, values: Scores) -> None:
+    def add(name: str, values: Float64) -> None:
         found[name] = values
         told(len(found), steps)
 
@@ -106,7 +105,7 @@ def populations(
 def outliers(each: int) -> dict[str, list[Any]]:
     """Sights of every kind of outlier, always the same ones."""
     from nlos_cam.outliers import TO_JUDGE, TO_LEARN, Sight, outlier
-    from nlos_cam.render.sensor_model import SensorModel
+    from nlos_cam.render.sensor.model import SensorModel
 
     plain = Sight(RIG, SensorModel())
     kinds = {**TO_LEARN, **TO_JUDGE}
@@ -116,23 +115,23 @@ def outliers(each: int) -> dict[str, list[Any]]:
     }
 
 
-def least_threshold(ordinary: Scores) -> float:
+def least_threshold(ordinary: Float64) -> float:
     """The least, in hundredths, that at most MOST_FLAGGED of ordinary scores reach."""
     steps = np.arange(0, np.ceil(100 * ordinary.max()) + 2) / 100
     return float(steps[[(ordinary >= step).mean() <= MOST_FLAGGED for step in steps]][0])
 
 
-def flagged(values: Scores, threshold: float) -> float:
+def flagged(values: Float64, threshold: float) -> float:
     """The share that reaches a threshold."""
     return float((values >= threshold).mean())
 
 
-def told_apart(ordinary: Scores, other: Scores) -> float:
+def told_apart(ordinary: Float64, other: Float64) -> float:
     """The probability that the other's score is the higher (the area under the ROC curve)."""
     return float(((other[:, None] > ordinary).mean() + (other[:, None] >= ordinary).mean()) / 2)
 
 
-def figures(found: Mapping[str, Scores], threshold: float) -> dict[str, Any]:
+def figures(found: Mapping[str, Float64], threshold: float) -> dict[str, Any]:
     """What goes to the JSON file."""
     rows = {
         name: {
@@ -150,7 +149,7 @@ def figures(found: Mapping[str, Scores], threshold: float) -> dict[str, Any]:
     return {"threshold": threshold, "exported": UNEXPLAINED, "scores": rows, "outside": outside}
 
 
-def draw(path: Path, found: Mapping[str, Scores], threshold: float) -> None:
+def draw(path: Path, found: Mapping[str, Float64], threshold: float) -> None:
     """How scores spread, and what is flagged against how many ordinary frames are."""
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -163,7 +162,7 @@ def draw(path: Path, found: Mapping[str, Scores], threshold: float) -> None:
     figure.savefig(path, dpi=100)
 
 
-def _spread(axis: Axes, shown: Mapping[str, Scores], threshold: float) -> None:
+def _spread(axis: Axes, shown: Mapping[str, Float64], threshold: float) -> None:
     for name, values in shown.items():
         axis.step(np.sort(values), (np.arange(len(values)) + 1) / len(values), where="post", label=name)
     axis.axvline(threshold, color="0.5", linestyle=":")
@@ -171,7 +170,7 @@ def _spread(axis: Axes, shown: Mapping[str, Scores], threshold: float) -> None:
     axis.legend(fontsize=7)
 
 
-def _traded(axis: Axes, shown: Mapping[str, Scores]) -> None:
+def _traded(axis: Axes, shown: Mapping[str, Float64]) -> None:
     ordinary = shown[ORDINARY]
     steps = np.sort(np.concatenate([[-np.inf, np.inf], *shown.values()]))[::-1]
     for name in (WRONG, "empty bench, an object shown", "outside the trained range"):

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.beams import cast
+from nlos_cam.render.geometry import cast
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
 
 DOCS = Path(__file__).parents[1] / "docs"
 RIG = load_rig("paper-rig")

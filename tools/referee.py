@@ -23,13 +23,13 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from nlos_calibration.arrays import Float64
 from referee_agreement import (
     BEAMS,
     BINS,
     CASES,
     EFFECTS,
     SEEDS,
-    Array,
     Mask,
     Trial,
     bright,
@@ -41,7 +41,7 @@ from referee_mitransient import load, sample
 from referee_scene import PLATE, RIG, hidden
 
 from nlos_cam.frames import OBJECT_PIXELS
-from nlos_cam.render.beams import cast
+from nlos_cam.render.geometry import cast
 from nlos_cam.render.renderer import three_bounce
 from nlos_cam.render.scene import Scene
 
@@ -74,7 +74,7 @@ def race(plate: Trial) -> dict[str, Any]:
     }
 
 
-def _against(stop: str, truth: Array, which: Mask, cost: float, lit: int) -> dict[str, Any]:
+def _against(stop: str, truth: Float64, which: Mask, cost: float, lit: int) -> dict[str, Any]:
     """One stop, and the core-seconds that mitransient takes to its error: cost / error^2 for each beam."""
     scene, seconds = hidden(PLATE, OBJECT_PIXELS), list[float]()
     found = three_bounce(scene, stop, EFFECTS)

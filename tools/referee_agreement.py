@@ -8,17 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float64, Mask
 from referee_mitransient import Estimate, Job, sample
 from referee_scene import PLATE, RIG, STEP, Face, hidden
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.beams import cast
+from nlos_cam.render.geometry import cast
 from nlos_cam.render.renderer import three_bounce
 from nlos_cam.render.scene import Scene
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 BEAMS = np.add.outer(80 * np.array([20, 31, 42]), [20, 38, 56]).ravel()
 """Flat indices into the map of 64 x 80: rows and columns that spread over the wall."""
@@ -67,46 +64,46 @@ class Trial:
 
     case: Case
     job: Job
-    ours: Array
+    ours: Float64
     """(beams, bins)."""
     theirs: Estimate
     figures: dict[str, Any]
 
 
-def feet_m() -> Array:
+def feet_m() -> Float64:
     """Where the beams land (beams, 3)."""
     return cast(RIG, Scene(RIG).cell_intrinsics).foot_m[BEAMS]
 
 
-def limit(case: Case, effects: tuple[str, ...] = EFFECTS, **change: Any) -> Array:
+def limit(case: Case, effects: tuple[str, ...] = EFFECTS, **change: Any) -> Float64:
     """Our transients (beams, bins) of a case, or of one with its scene changed, in the limit of small cells."""
     fine = _histograms(case, case.cells, effects, **change)
     return 2 * fine - _histograms(case, case.cells // 2, effects, **change) if case.extrapolated else fine
 
 
-def _histograms(case: Case, cells: int, effects: tuple[str, ...] = EFFECTS, **change: Any) -> Array:
+def _histograms(case: Case, cells: int, effects: tuple[str, ...] = EFFECTS, **change: Any) -> Float64:
     found = three_bounce(hidden(case.faces, cells, **change), case.accuracy, effects, chosen=BEAMS)
     return found[:, :BINS].astype(np.float64)
 
 
-def bright(ours: Array) -> Mask:
+def bright(ours: Float64) -> Mask:
     """The bins (beams, bins) that are compared."""
     return ours > FAINT * ours.max(1, keepdims=True)
 
 
-def reduced_chi_square(ours: Array, estimate: Array, error: Array, which: Mask) -> float:
+def reduced_chi_square(ours: Float64, estimate: Float64, error: Float64, which: Mask) -> float:
     """Mean square of the difference in standard errors: 1 where the noise alone parts the two, with nothing fitted."""
     return float((((estimate - ours)[which] / error[which]) ** 2).mean())
 
 
-def best_scale(ours: Array, estimate: Array, error: Array, which: Mask) -> tuple[float, float]:
+def best_scale(ours: Float64, estimate: Float64, error: Float64, which: Mask) -> tuple[float, float]:
     """The factor on ours that fits best, by least squares, and its standard error."""
     a, b, weight = ours[which], estimate[which], error[which] ** -2.0
     information = float((weight * a * a).sum())
     return float((weight * a * b).sum()) / information, information**-0.5
 
 
-def relative_error(difference: Array, truth: Array, which: Mask) -> float:
+def relative_error(difference: Float64, truth: Float64, which: Mask) -> float:
     """Root mean square of a difference as a share of the truth, bin by bin."""
     return float(np.sqrt(((difference[which] / truth[which]) ** 2).mean()))
 
@@ -143,14 +140,14 @@ def trial(case: Case) -> Trial:
     return Trial(case, job, ours, theirs, figures)
 
 
-def _wrong(case: Case, ours: Array, theirs: Estimate, which: Mask) -> dict[str, float]:
+def _wrong(case: Case, ours: Float64, theirs: Estimate, which: Mask) -> dict[str, float]:
     """The same figure of renderers that are wrong, a scale fitted to help some: what stays near 1 goes unnoticed."""
     found = {
         "one bin late": reduced_chi_square(np.roll(ours, 1, axis=1), theirs.mean, theirs.error, which),
         "1 % brighter": reduced_chi_square(1.01 * ours, theirs.mean, theirs.error, which),
     }
     if case.extrapolated:
-        variants: dict[str, Callable[[], Array]] = {
+        variants: dict[str, Callable[[], Float64]] = {
             "without self-occlusion": lambda: limit(case, ("three-bounce", "tilt"))
         }
     else:

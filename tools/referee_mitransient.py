@@ -16,10 +16,9 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 from referee_scene import RIG, Face
-
-Array = NDArray[np.float64]
 
 UNITS_PER_M = 1000.0
 CENTRE_M = np.array([(RIG.relay.x_min_m + RIG.relay.x_max_m) / 2, (RIG.relay.y_min_m + RIG.relay.y_max_m) / 2, 0.0])
@@ -52,16 +51,16 @@ class Job:
 class Estimate:
     """Monte-Carlo histograms of some beams, from independent runs."""
 
-    mean: Array
+    mean: Float64
     """(beams, bins)."""
-    error: Array
+    error: Float64
     """(beams, bins); standard error of the mean, from the scatter of the runs."""
     runs: int
     core_seconds: float
     """Of the quickest run of one beam."""
 
     @property
-    def noise(self) -> Array:
+    def noise(self) -> Float64:
         """(beams, bins); standard deviation of one run."""
         return self.error * np.sqrt(self.runs)
 
@@ -80,7 +79,7 @@ def load() -> ModuleType:
     return mitsuba
 
 
-def sample(job: Job, feet_m: Array, seeds: NDArray[np.uint32]) -> Estimate:
+def sample(job: Job, feet_m: Float64, seeds: NDArray[np.uint32]) -> Estimate:
     """Histograms of the beams that land on `feet_m` (beams, 3), one run for each of their seeds (beams, runs)."""
     mitsuba = load()
     scene, mean, error, seconds = mitsuba.load_dict(_scene(mitsuba, job)), [], [], []
@@ -97,11 +96,11 @@ def sample(job: Job, feet_m: Array, seeds: NDArray[np.uint32]) -> Estimate:
     return Estimate(np.array(mean), np.array(error), seeds.shape[1], min(seconds))
 
 
-def _units(point_m: Array) -> list[float]:
+def _units(point_m: Float64) -> list[float]:
     return ((point_m - CENTRE_M) * UNITS_PER_M).tolist()
 
 
-def _mesh(mitsuba: ModuleType, quads_m: Array, albedo: float) -> Any:
+def _mesh(mitsuba: ModuleType, quads_m: Float64, albedo: float) -> Any:
     """A mesh of quadrilaterals (n, 4, 3)."""
     first = 4 * np.arange(len(quads_m))[:, None, None]
     triangles = first + np.array([[0, 1, 2], [0, 2, 3]])
@@ -136,14 +135,14 @@ def _scene(mitsuba: ModuleType, job: Job) -> dict[str, Any]:
     return scene
 
 
-def _point_laser(mitsuba: ModuleType, scene: Any, foot_m: Array) -> None:
+def _point_laser(mitsuba: ModuleType, scene: Any, foot_m: Float64) -> None:
     from mitransient.nlos import focus_emitter_at_relay_wall_3dpoint
 
     wall = next(shape for shape in scene.shapes() if shape.sensor() is not None)
     focus_emitter_at_relay_wall_3dpoint(mitsuba.Point3f(_units(foot_m)), wall, scene.emitters()[0])
 
 
-def _run(scene: Any, job: Job, foot_m: Array, seed: int) -> Array:
+def _run(scene: Any, job: Job, foot_m: Float64, seed: int) -> Float64:
     """One run's histogram (bins,): the pixels' sum, each with its cell's area and the receiver's solid angle."""
     _, transient = scene.integrator().render(scene, scene.sensors()[0], seed=seed, spp=job.samples)
     radiance = np.array(transient, dtype=np.float64)[..., 0]  # (rows, columns, bins)

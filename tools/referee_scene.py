@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.rig import Extent, LidarPose, ObjectBox, Rig
 from numpy.typing import NDArray
 
 from nlos_cam.objects.depth_map import cell_centres_m
 from nlos_cam.render.scene import Radiometry, Scene
-
-Array = NDArray[np.float64]
 
 SLOPE_X, SLOPE_Y = 0.3, 0.2
 """dz/dx and dz/dy of every face."""
@@ -30,24 +29,24 @@ class Face:
     z_m: float
     """Of the plane, at the middle of the object box."""
 
-    def depth_m(self, x_m: Array, y_m: Array) -> Array:
+    def depth_m(self, x_m: Float64, y_m: Float64) -> Float64:
         """The plane's depth at points of the wall."""
         middle = (BOX.x_min_m + BOX.x_max_m) / 2, (BOX.y_min_m + BOX.y_max_m) / 2
         return self.z_m + SLOPE_X * (x_m - middle[0]) + SLOPE_Y * (y_m - middle[1])
 
-    def covers(self, x_m: Array, y_m: Array) -> NDArray[np.bool_]:
+    def covers(self, x_m: Float64, y_m: Float64) -> NDArray[np.bool_]:
         """Which points of the wall lie before the face."""
         return (x_m > self.x_min_m) & (x_m < self.x_max_m) & (y_m > self.y_min_m) & (y_m < self.y_max_m)
 
     @property
-    def corners_m(self) -> Array:
+    def corners_m(self) -> Float64:
         """(4, 3); in the order that makes the face look at the wall."""
         x = np.array([self.x_min_m, self.x_min_m, self.x_max_m, self.x_max_m])
         y = np.array([self.y_min_m, self.y_max_m, self.y_max_m, self.y_min_m])
         return np.stack([x, y, self.depth_m(x, y)], axis=-1)
 
     @property
-    def sides_m(self) -> Array:
+    def sides_m(self) -> Float64:
         """(4, 4, 3); the walls of the column that a depth map makes of the face, down to the box's far end."""
         rim = self.corners_m
         foot = np.concatenate([rim[:, :2], np.full((4, 1), BOX.z_far_m)], axis=1)

@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.choose import Work, least_seconds, some_of
+from nlos_cam.render.accuracy_search import Work, least_seconds, some_of
 from nlos_cam.render.effects import Effects, included
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.renderer import render, three_bounce
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import paper_scene

@@ -28,7 +28,7 @@ from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import SceneFile, load_scene
-from nlos_cam.render.sensor import SensedImages
+from nlos_cam.render.sensor.sensor import SensedImages
 
 SCENE = Path(__file__).parents[1] / "examples" / "bench.toml"
 ADAPTATION, VALIDATION, HELD_OUT = "adaptation", "validation", "held-out"

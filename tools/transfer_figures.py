@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, load_rig
 from nlos_models import metrics
 from nlos_models.data import MapSet
@@ -22,14 +23,14 @@ from nlos_cam import evaluate
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
 from nlos_cam.evaluate_objects import reconstruct_all
-from nlos_cam.frames import Float32, maps_from_frame
+from nlos_cam.frames import maps_from_frame
 from nlos_cam.labelled import read_labelled, recordings_in
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 
 DOCS = Path(__file__).parents[1] / "docs"
 PARTS = ADAPTATION, VALIDATION, HELD_OUT

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from math import hypot
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.projection import Intrinsics
@@ -12,14 +13,12 @@ from nlos_calibration.rig import LidarPose, PinholeRecord, load_rig
 from nlos_calibration.uncertainty import INTERVAL_STDS
 from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall import WallFit, fit_wall
-from numpy.typing import NDArray
 from wall_scenes import View, bent, curved, looked_at, patch, patchy, rippled, stepped, view, window, with_outliers
 
-from nlos_cam.render.echo import MultiBounce
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.echoes import MultiBounce
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 
-Array = NDArray[np.float64]
 Generator = np.random.Generator
 
 DISTANCES_M, FACING_DEG, PITCHES_DEG = (0.15, 0.20, 0.25, 0.30), (15.0, 30.0, 45.0, 60.0, 75.0), (-12.0, 0.0, 8.0)
@@ -71,12 +70,12 @@ class Outcome:
         return self.verdict == "good" and self.wrong
 
 
-def _bare(seen: View, generator: Generator) -> tuple[Array, View]:
+def _bare(seen: View, generator: Generator) -> tuple[Float64, View]:
     del generator
     return seen.depth_m, seen
 
 
-def _no_return(seen: View, generator: Generator) -> tuple[Array, View]:
+def _no_return(seen: View, generator: Generator) -> tuple[Float64, View]:
     """Part of the view, from one side, gives nothing."""
     rows, columns = _image(seen)
     way, share = generator.uniform(0.0, 2.0 * np.pi), generator.uniform(0.2, 0.7)
@@ -84,13 +83,13 @@ def _no_return(seen: View, generator: Generator) -> tuple[Array, View]:
     return np.where(along > np.quantile(along, 1.0 - share), np.nan, seen.depth_m), seen
 
 
-def _image(seen: View) -> tuple[Array, Array]:
+def _image(seen: View) -> tuple[Float64, Float64]:
     """Row and column (height, width), each over the image's width."""
     rows, columns = np.indices(seen.depth_m.shape) / seen.depth_m.shape[1]
     return rows, columns
 
 
-def _other_surface(seen: View, generator: Generator) -> tuple[Array, View]:
+def _other_surface(seen: View, generator: Generator) -> tuple[Float64, View]:
     """Something stands before the wall, square to the lidar."""
     rows, columns = _image(seen)
     way, share = generator.uniform(0.0, 2.0 * np.pi), generator.uniform(0.02, 0.5)
@@ -99,16 +98,16 @@ def _other_surface(seen: View, generator: Generator) -> tuple[Array, View]:
     return np.where(along > np.quantile(along, 1.0 - share), near_m, seen.depth_m), seen
 
 
-def _bent(seen: View, generator: Generator) -> tuple[Array, View]:
+def _bent(seen: View, generator: Generator) -> tuple[Float64, View]:
     """From a fifth of a degree to eight."""
     return _fold(seen, generator, 10.0 ** generator.uniform(-0.7, 0.9))
 
 
-def _corner(seen: View, generator: Generator) -> tuple[Array, View]:
+def _corner(seen: View, generator: Generator) -> tuple[Float64, View]:
     return _fold(seen, generator, generator.uniform(8.0, 110.0))
 
 
-def _fold(seen: View, generator: Generator, bend_deg: float) -> tuple[Array, View]:
+def _fold(seen: View, generator: Generator, bend_deg: float) -> tuple[Float64, View]:
     """Either way; drawn anew where the second wall would pass behind the lidar."""
     share, way, sign = generator.uniform(0.05, 0.95), generator.uniform(0.0, 2.0 * np.pi), generator.choice([-1, 1])
     try:
@@ -117,46 +116,46 @@ def _fold(seen: View, generator: Generator, bend_deg: float) -> tuple[Array, Vie
         return _fold(seen, generator, bend_deg)
 
 
-def _curved(seen: View, generator: Generator) -> tuple[Array, View]:
+def _curved(seen: View, generator: Generator) -> tuple[Float64, View]:
     radius_m = 10.0 ** generator.uniform(0.0, 2.2) * generator.choice([-1, 1])
     return curved(seen, radius_m, generator.uniform(0.0, np.pi)), seen
 
 
-def _stepped(seen: View, generator: Generator) -> tuple[Array, View]:
+def _stepped(seen: View, generator: Generator) -> tuple[Float64, View]:
     height_m = 10.0 ** generator.uniform(-3.3, -1.3) * generator.choice([-1, 1])
     return stepped(seen, height_m, generator.uniform(0.05, 0.5), generator.uniform(0.0, 2.0 * np.pi)), seen
 
 
-def _window(seen: View, generator: Generator) -> tuple[Array, View]:
+def _window(seen: View, generator: Generator) -> tuple[Float64, View]:
     return window(seen, 10.0 ** generator.uniform(-3.3, -1.0), int(generator.choice([4, 12, 30]))), seen
 
 
-def _mirror(seen: View, generator: Generator) -> tuple[Array, View]:
+def _mirror(seen: View, generator: Generator) -> tuple[Float64, View]:
     mirrored = patch(seen, generator.uniform(0.02, 0.45))
     return np.where(mirrored, seen.depth_m * generator.uniform(1.5, 5.0), seen.depth_m), seen
 
 
-def _saturated(seen: View, generator: Generator) -> tuple[Array, View]:
+def _saturated(seen: View, generator: Generator) -> tuple[Float64, View]:
     """In the middle the depth is too short."""
     spot = patch(seen, generator.uniform(0.02, 0.45))
     return np.where(spot, seen.depth_m - 10.0 ** generator.uniform(-3.3, -1.0), seen.depth_m), seen
 
 
-def _rippled(seen: View, generator: Generator) -> tuple[Array, View]:
+def _rippled(seen: View, generator: Generator) -> tuple[Float64, View]:
     """Up to 2 mm high."""
     return rippled(seen, generator.uniform(0.0002, 0.002), generator.uniform(2.5, 12.0), generator), seen
 
 
-def _patchy(seen: View, generator: Generator) -> tuple[Array, View]:
+def _patchy(seen: View, generator: Generator) -> tuple[Float64, View]:
     """Up to 1 mm."""
     return patchy(seen, generator.uniform(0.0002, 0.001), generator), seen
 
 
-def _stuck(seen: View, generator: Generator) -> tuple[Array, View]:
+def _stuck(seen: View, generator: Generator) -> tuple[Float64, View]:
     return np.full(seen.depth_m.shape, generator.uniform(0.1, 1.0)), seen
 
 
-HARD: dict[str, Callable[[View, Generator], tuple[Array, View]]] = {
+HARD: dict[str, Callable[[View, Generator], tuple[Float64, View]]] = {
     "another surface": _other_surface,
     "bent": _bent,
     "corner": _corner,

@@ -11,13 +11,11 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.footprint import MAP_SHAPE
 from nlos_calibration.projection import Intrinsics
-
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 FULL_SCALE = 255
 """IR counts that say no more than that there was too much light."""
@@ -38,11 +36,11 @@ class Moments:
         self._mean += off / np.maximum(self.count, 1)
         self._squares += off * np.where(known, values - self._mean, 0.0)
 
-    def mean(self) -> Array:
+    def mean(self) -> Float64:
         """NaN where there was no sample."""
         return np.where(self.count > 0, self._mean, np.nan)
 
-    def spread(self) -> Array:
+    def spread(self) -> Float64:
         """The standard deviation of a sample; NaN where there are fewer than two."""
         return np.sqrt(self._squares / np.where(self.count > 1, self.count - 1.0, np.nan))
 
@@ -108,7 +106,7 @@ class BareWallStatistics:
         if celsius:
             self._celsius.append(dict(celsius))
 
-    def ir_mean(self) -> Array:
+    def ir_mean(self) -> Float64:
         """(height, width), in counts; NaN before the first frame."""
         return self._ir.mean()
 

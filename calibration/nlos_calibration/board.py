@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.rig import Positive, Record
 
-Array = NDArray[np.float64]
 Dictionary = Literal["DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250"]
 Paper = Literal["a4", "a3", "letter"]
 
@@ -55,7 +55,7 @@ class Board(Record):
         return self.squares_x * self.square_mm, self.squares_y * self.square_mm
 
     @property
-    def corners_m(self) -> Array:
+    def corners_m(self) -> Float64:
         """The chessboard corners (n, 3) in the board frame, by their ids."""
         return np.asarray(self.opencv_board.getChessboardCorners(), np.float64)
 

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import Board
 from nlos_calibration.errors import BoardRefusedError
 
-Array = NDArray[np.float64]
 Light = Literal["infrared", "colour"]
 
 MIN_CORNERS = 8
@@ -36,7 +36,7 @@ class Corners:
 
     ids: NDArray[np.int64]
     """(n,)."""
-    pixels: Array
+    pixels: Float64
     """(n, 2); x, y in pixel centres."""
 
 

@@ -13,13 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import Board
 from nlos_calibration.board_corners import MIN_CORNERS, Corners
 from nlos_calibration.board_pose import UNKNOWNS, BoardPose, SeenCorners, refine_pose, solve_pose
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.projection import Intrinsics
-
-Array = NDArray[np.float64]
 
 OUTLIER_SIGMAS, SIGMA_FLOOR_PX = 5.0, 0.02
 LEAST_SQUARES, MAGSAC_PX = 0, 1.0
@@ -56,9 +55,9 @@ class PrintErrors:
 class BoardFit:
     """The plane of a board in the frame of what saw it: the lidar's, or a camera's until it is moved there."""
 
-    slopes: Array
+    slopes: Float64
     """(3,); -normal / distance_m, the normal towards it."""
-    covariance: Array
+    covariance: Float64
     """(3, 3) of the slopes."""
     corners: int
     """How many the plane rests on."""
@@ -117,7 +116,7 @@ def _seen(corners: Corners, board: Board, intrinsics: Intrinsics, printed: Print
     )
 
 
-def _good(points_m: Array, pixels: Array) -> NDArray[np.bool_]:
+def _good(points_m: Float64, pixels: Float64) -> NDArray[np.bool_]:
     """Which corners lie as on a plane with most others: the detector now and then takes an edge for a corner."""
     errors_px = np.linalg.norm(_off_a_plane_px(points_m, pixels, cv2.USAC_MAGSAC), axis=1)
     sigma_px = max(float(np.median(errors_px)) / sqrt(2.0) / MEDIAN_PER_SIGMA, SIGMA_FLOOR_PX)
@@ -130,7 +129,7 @@ def _good(points_m: Array, pixels: Array) -> NDArray[np.bool_]:
     return good
 
 
-def _off_a_plane_px(points_m: Array, pixels: Array, method: int) -> Array:
+def _off_a_plane_px(points_m: Float64, pixels: Float64, method: int) -> Float64:
     """Residuals (n, 2) of any plane seen by any pinhole."""
     found: tuple[Any, ...] = cv2.findHomography(points_m[:, :2], pixels, method, MAGSAC_PX)
     if found[0] is None:  # OpenCV's types do not say so
@@ -138,7 +137,7 @@ def _off_a_plane_px(points_m: Array, pixels: Array, method: int) -> Array:
     return pixels - np.asarray(cv2.perspectiveTransform(points_m[np.newaxis, :, :2], found[0])[0], np.float64)
 
 
-def _plane_variance_px2(points_m: Array, pixels: Array) -> float:
+def _plane_variance_px2(points_m: Float64, pixels: Float64) -> float:
     """Of the residuals of any plane seen by any pinhole. Raises BoardRefusedError where it is no noise."""
     variance_px2 = _variance_px2(_off_a_plane_px(points_m, pixels, LEAST_SQUARES), spent=8)
     if variance_px2 > MAX_RESIDUAL_PX**2:
@@ -149,7 +148,7 @@ def _plane_variance_px2(points_m: Array, pixels: Array) -> float:
     return variance_px2
 
 
-def _variance_px2(errors_px: Array, spent: int) -> float:
+def _variance_px2(errors_px: Float64, spent: int) -> float:
     """Of a coordinate, from what a model with `spent` parameters leaves.
 
     Divided by two less than that leaves: normal intervals are then as wide as Student's, which they should be where
@@ -158,7 +157,7 @@ def _variance_px2(errors_px: Array, spent: int) -> float:
     return max(float((errors_px**2).sum()) / (errors_px.size - spent - 2), SIGMA_FLOOR_PX**2)
 
 
-def _by_focal(seen: SeenCorners, pose: BoardPose, focal_std: float) -> Array:
+def _by_focal(seen: SeenCorners, pose: BoardPose, focal_std: float) -> Float64:
     """How the slopes (3,) change where the focal length is longer by its uncertainty."""
     if focal_std == 0.0:
         return np.zeros(3)
@@ -189,7 +188,7 @@ def _check_print(pose: BoardPose) -> None:
         )
 
 
-def _check_certain(slopes: Array, covariance: Array) -> None:
+def _check_certain(slopes: Float64, covariance: Float64) -> None:
     distance_m = 1.0 / float(np.linalg.norm(slopes))
     angle_std_deg = degrees(distance_m * sqrt(float(np.linalg.eigvalsh(covariance)[-1])))
     if angle_std_deg > MAX_ANGLE_STD_DEG:

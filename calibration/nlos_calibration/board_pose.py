@@ -10,11 +10,9 @@ from math import degrees, sqrt
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import BoardRefusedError
-
-Array = NDArray[np.float64]
 
 UNKNOWNS = 9
 AMBIGUOUS_CHI2 = 25.0
@@ -27,15 +25,15 @@ MAX_STEPS, SETTLED = 50, 1e-10
 class SeenCorners:
     """Corners on the drawing, where they are seen, and how well."""
 
-    points_m: Array
+    points_m: Float64
     """(n, 3)."""
-    pixels: Array
+    pixels: Float64
     """(n, 2)."""
-    camera: Array
+    camera: Float64
     """(3, 3)."""
-    size_m: Array
+    size_m: Float64
     """(2,); the drawing's width and height."""
-    print_std: Array
+    print_std: Float64
     """(3,); what to expect of the print's stretch (width over height) and of its bows along x and y (m)."""
     variance_px2: float
     """Of a coordinate."""
@@ -45,21 +43,21 @@ class SeenCorners:
 class BoardPose:
     """lidar_from_board, and what the print is like."""
 
-    parameters: Array
+    parameters: Float64
     """(9,): rotation vector, translation, logarithm of the stretch, bows along x and y."""
-    errors_px: Array
+    errors_px: Float64
     """(n, 2)."""
     chi2: float
     """Of the corners and of what is expected of the print."""
-    covariance: Array
+    covariance: Float64
     """(9, 9)."""
 
     @property
-    def normal(self) -> Array:
+    def normal(self) -> Float64:
         """(3,), away from the lidar."""
         return cv2.Rodrigues(self.parameters[:3])[0][:, 2].astype(np.float64)
 
-    def slopes(self) -> tuple[Array, Array]:
+    def slopes(self) -> tuple[Float64, Float64]:
         """The slopes n / (n . t) of the plane with normal n through t, and their covariance."""
         by_turn = cv2.Rodrigues(self.parameters[:3])[1]
         normal, shift = self.normal, self.parameters[3:6]
@@ -87,7 +85,7 @@ def solve_pose(seen: SeenCorners) -> BoardPose:
     return best
 
 
-def refine_pose(seen: SeenCorners, parameters: Array) -> BoardPose:
+def refine_pose(seen: SeenCorners, parameters: Float64) -> BoardPose:
     """Least squares by Gauss and Newton's steps from `parameters` (9,), damped where they would not improve."""
     rows, errors = _linear(seen, parameters)
     damping = 0.0
@@ -106,7 +104,7 @@ def refine_pose(seen: SeenCorners, parameters: Array) -> BoardPose:
     return BoardPose(parameters, errors_px, float(errors @ errors), np.linalg.inv(rows.T @ rows).astype(np.float64))
 
 
-def _linear(seen: SeenCorners, parameters: Array) -> tuple[Array, Array]:
+def _linear(seen: SeenCorners, parameters: Float64) -> tuple[Float64, Float64]:
     """What is seen, by the parameters (2 n + 3, 9), and what they leave of it, in standard deviations."""
     points_m, by_print = _printed(seen, parameters[6:])
     pixels, by_pose = cv2.projectPoints(points_m, parameters[:3], parameters[3:6], seen.camera, None)[:2]
@@ -119,7 +117,7 @@ def _linear(seen: SeenCorners, parameters: Array) -> tuple[Array, Array]:
     return rows.astype(np.float64), errors
 
 
-def _printed(seen: SeenCorners, how: Array) -> tuple[Array, Array]:
+def _printed(seen: SeenCorners, how: Float64) -> tuple[Float64, Float64]:
     """Where the corners (n, 3) of a stretched and bowed print are, and that by stretch and bows (n, 3, 3)."""
     across, down = (2.0 * seen.points_m[:, :2] / seen.size_m - 1.0).T
     heights = np.stack([1.0 - across**2, 1.0 - down**2])

@@ -9,15 +9,13 @@ from math import radians
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import Board
 from nlos_calibration.board_corners import Corners, Light, find_corners
 from nlos_calibration.board_plane import BoardFit, PrintErrors, fit_board
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.projection import Intrinsics
-
-Array = NDArray[np.float64]
 
 UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 
@@ -45,12 +43,12 @@ EXACT = CameraErrors(0.0, 0.0, 0.0)
 class BoardView:
     """An image in which a board is looked for, and what took it; the lidar in infrared, unless told otherwise."""
 
-    image: Array
+    image: Float64
     """(height, width), the mean over frames; of any gain."""
     intrinsics: Intrinsics
-    distortion: Array = field(default_factory=lambda: np.zeros(5))
+    distortion: Float64 = field(default_factory=lambda: np.zeros(5))
     """(5,): k1, k2, p1, p2, k3 of Brown and Conrady, as OpenCV and librealsense have them."""
-    lidar_from_camera: Array = field(default_factory=lambda: np.eye(4))
+    lidar_from_camera: Float64 = field(default_factory=lambda: np.eye(4))
     """(4, 4)."""
     light: Light = "infrared"
     errors: CameraErrors = EXACT
@@ -84,8 +82,8 @@ def undistorted(corners: Corners, view: BoardView) -> Corners:
 
 
 def plane_in_lidar(
-    slopes: Array, covariance: Array, lidar_from_camera: Array, errors: CameraErrors
-) -> tuple[Array, Array]:
+    slopes: Float64, covariance: Float64, lidar_from_camera: Float64, errors: CameraErrors
+) -> tuple[Float64, Float64]:
     """A plane slopes . p = 1 of the camera's frame as one of the lidar's: slopes (3,) and covariance (3, 3).
 
     With u the slopes turned, and t the camera's place, u . (p - t) = 1: the lidar's slopes are u / (1 + u . t).
@@ -109,7 +107,7 @@ def plane_in_lidar(
     )
 
 
-def _turned_by(vector: Array) -> Array:
+def _turned_by(vector: Float64) -> Float64:
     """How a vector (3,) changes with a small turn, w x vector, by w: (3, 3)."""
     x, y, z = vector
     return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])

@@ -3,10 +3,9 @@
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import Board
 from nlos_calibration.board_corners import Light
 from nlos_calibration.board_plane import BoardFit
@@ -19,8 +18,6 @@ from nlos_calibration.uncertainty import WallMeasures, measures_of
 from nlos_calibration.verdict import Verdict, out_of_range
 from nlos_calibration.wall import WallFit
 
-Array = NDArray[np.float64]
-
 COLOUR_IS_OFF = (
     "the colour camera's pose against the lidar, which is the factory's and may have moved: look in infrared to see"
 )
@@ -31,7 +28,7 @@ COLOUR_IS_OFF = (
 class WallByBoard(WallMeasures):
     """Where the wall is by a board alone, since its depth was refused."""
 
-    wall_from_lidar: Array
+    wall_from_lidar: Float64
     """(4, 4)."""
     verdict: Verdict
     advice: str

@@ -9,9 +9,9 @@ from math import degrees, sqrt
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from nlos_calibration.arrays import Float64
+
 Used = Literal["both", "depth", "board"]
 
 AGREE_SIGMAS = 4.0
@@ -24,9 +24,9 @@ MAX_OFFSET_M, MAX_SCALE = 0.03, 0.2
 class Plane:
     """A plane in the lidar frame with its uncertainty."""
 
-    slopes: Array
+    slopes: Float64
     """(3,); -normal / distance_m, the normal towards the lidar."""
-    covariance: Array
+    covariance: Float64
     """(3, 3) of the slopes."""
 
     @property
@@ -35,7 +35,7 @@ class Plane:
         return 1.0 / float(np.linalg.norm(self.slopes))
 
     @property
-    def normal(self) -> Array:
+    def normal(self) -> Float64:
         """(3,), unit, towards the lidar."""
         return -self.slopes * self.distance_m
 
@@ -89,7 +89,7 @@ def disagreement(depth: Plane, board: Plane) -> Disagreement:
     )
 
 
-def _sigmas(axes: Array, difference: Array, covariance: Array) -> float:
+def _sigmas(axes: Float64, difference: Float64, covariance: Float64) -> float:
     """The length of the difference along `axes` (k, 3), in standard deviations."""
     off = axes @ difference
     return sqrt(max(float(off @ np.linalg.solve(axes @ covariance @ axes.T, off)), 0.0))

@@ -3,9 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.range_noise import MeanNoise, depth_noise_m, measured_noise
-
-Array = NDArray[np.float64]
 
 FIRST_FRAMES = 5
 """Their median is what later samples are held against."""
@@ -22,8 +21,8 @@ class DepthMean:
 
     def __init__(self, height: int, width: int) -> None:
         self.frames = 0
-        self._first: list[Array] = []
-        self._median_m: Array | None = None
+        self._first: list[Float64] = []
+        self._median_m: Float64 | None = None
         self._count = np.zeros((height, width), np.int64)
         self._sum_m, self._squares_m2 = np.zeros((height, width)), np.zeros((height, width))
 
@@ -38,12 +37,12 @@ class DepthMean:
         if len(self._first) == FIRST_FRAMES:
             self._settled_m()
 
-    def mean_m(self) -> Array:
+    def mean_m(self) -> Float64:
         """(height, width); NaN where fewer than half of the frames had a return."""
         mean_m = self._settled_m() + self._sum_m / np.maximum(self._count, 1)
         return np.where(2 * self._count >= max(self.frames, 1), mean_m, np.nan)
 
-    def spread_m(self) -> Array:
+    def spread_m(self) -> Float64:
         """(height, width); the standard deviation of a sample, NaN where there are fewer than two."""
         self._settled_m()
         freedom = np.where(self._count > 1, self._count - 1.0, np.nan)
@@ -59,7 +58,7 @@ class DepthMean:
         """What the flattened mean is uncertain by."""
         return measured_noise(self.mean_m().ravel(), self.spread_m().ravel(), self.count().ravel())
 
-    def _settled_m(self) -> Array:
+    def _settled_m(self) -> Float64:
         """The median of the first frames, once they are there or a result is wanted: their sums are about it."""
         if self._median_m is None:
             self._median_m = _median(np.stack(self._first)) if self._first else np.full(self._count.shape, np.nan)
@@ -68,7 +67,7 @@ class DepthMean:
             self._first.clear()
         return self._median_m
 
-    def _take(self, depth_m: Array, median_m: Array) -> None:
+    def _take(self, depth_m: Float64, median_m: Float64) -> None:
         off_m = depth_m - median_m
         counted = np.abs(off_m) <= STRAY_SIGMAS * depth_noise_m(median_m)  # False for NaN
         off_m[~counted] = 0.0
@@ -77,7 +76,7 @@ class DepthMean:
         self._squares_m2 += off_m**2
 
 
-def _median(frames_m: Array) -> Array:
+def _median(frames_m: Float64) -> Float64:
     """The median of each pixel over frames (n, height, width) without the NaNs, of an even number the upper."""
     ordered = np.sort(frames_m, axis=0)  # NaN last
     middle = np.isfinite(frames_m).sum(axis=0) // 2

@@ -3,17 +3,12 @@
 from collections.abc import Mapping
 from math import isclose
 
-import numpy as np
-from numpy.typing import NDArray
-
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.drift_window import Drift, DriftWindow
 from nlos_calibration.errors import CalibrationError
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.wall_track import WallTrack
-
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 SURE_SIGMAS = 4.0
 """A drift is told that is beyond a tolerance by so many standard uncertainties."""
@@ -62,7 +57,7 @@ def _check_size(shape: tuple[int, ...], then: Intrinsics) -> None:
 class DriftCheck:
     """Holds the frames of a stream against the bare wall's reference. Time is counted in frames, 30 in a second."""
 
-    def __init__(self, reference: BareWall, wall_from_lidar: Array) -> None:
+    def __init__(self, reference: BareWall, wall_from_lidar: Float64) -> None:
         self.drift: Drift | None = None
         """Over the last second; None while too few frames show the wall."""
         self._reference = reference

@@ -4,12 +4,9 @@ from dataclasses import dataclass
 from math import hypot
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall_track import Sight
-
-Array = NDArray[np.float64]
 
 WINDOW_FRAMES, LEAST_FRAMES = 30, 15
 """What is told is the median over the first, of at least so many that showed the wall."""

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.plane import PlaneFit
-
-Array = NDArray[np.float64]
 
 SURE_SIGMAS = 3.0
 HALVES_POINTS = 60_000
@@ -40,19 +39,19 @@ class Flatness:
 class _Sums:
     """The normal equations of a part of the view: of slopes (3) and of a constant added to the depth (1)."""
 
-    matrix: Array
+    matrix: Float64
     """(4, 4)."""
-    right: Array
+    right: Float64
     """(4,)."""
 
-    def step(self, offset_m: float = 0.0) -> Array:
+    def step(self, offset_m: float = 0.0) -> Float64:
         """By how much the slopes (3,) of this part alone differ, once `offset_m` is added to every depth."""
         # an offset to be added is an error to be subtracted: the fourth unknown is its negative
         step = np.linalg.lstsq(self.matrix[:3, :3], self.right[:3] + offset_m * self.matrix[:3, 3])[0]
         return step.astype(np.float64)
 
 
-def flatness(plane: PlaneFit, rays: Array) -> Flatness:
+def flatness(plane: PlaneFit, rays: Float64) -> Flatness:
     """Judge the residuals of `plane`, fitted to depth along `rays` (height, width, 3)."""
     halves, whole, chi2 = _halves(plane, rays.reshape(-1, 3))
     offset_m = _offset_m(whole, chi2)
@@ -70,7 +69,7 @@ def flatness(plane: PlaneFit, rays: Array) -> Flatness:
     )
 
 
-def _halves(plane: PlaneFit, rays: Array) -> tuple[list[_Sums], _Sums, float]:
+def _halves(plane: PlaneFit, rays: Float64) -> tuple[list[_Sums], _Sums, float]:
     """Eight halves of some inliers, of four ways to cut; all of these; their mean square in standard deviations.
 
     A step along a cut leaves both of its halves flat; a step across it leaves both as tilted as the whole.
@@ -94,12 +93,12 @@ def _total(parts: list[_Sums]) -> _Sums:
     )
 
 
-def _sums(rows: Array, sigmas: Array, part: NDArray[np.bool_]) -> _Sums:
+def _sums(rows: Float64, sigmas: Float64, part: NDArray[np.bool_]) -> _Sums:
     rows = rows[part]
     return _Sums(rows.T @ rows, rows.T @ sigmas[part])
 
 
-def _bend(plane: PlaneFit, steps: list[Array], whole: Array | None = None) -> tuple[float, float]:
+def _bend(plane: PlaneFit, steps: list[Float64], whole: Float64 | None = None) -> tuple[float, float]:
     """The most by which distance (m) and normal (degrees) change by any of the steps (3,), beyond the whole's."""
     distance_m, normal = _plane(plane.slopes + (np.zeros(3) if whole is None else whole))
     parts = [_plane(plane.slopes + step) for step in steps]
@@ -107,12 +106,12 @@ def _bend(plane: PlaneFit, steps: list[Array], whole: Array | None = None) -> tu
     return max(abs(far_m - distance_m) for far_m, _ in parts), float(np.degrees(max(turns)))
 
 
-def _plane(slopes: Array) -> tuple[float, Array]:
+def _plane(slopes: Float64) -> tuple[float, Float64]:
     distance_m = 1.0 / float(np.linalg.norm(slopes))
     return distance_m, -slopes * distance_m
 
 
-def _std(plane: PlaneFit, covariance: Array) -> tuple[float, float]:
+def _std(plane: PlaneFit, covariance: Float64) -> tuple[float, float]:
     """Of distance (m) and of the normal's turn, whichever way (degrees)."""
     along = plane.distance_m**2 * plane.normal
     across = plane.distance_m * (np.eye(3) - np.outer(plane.normal, plane.normal))

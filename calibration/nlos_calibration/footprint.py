@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Extent
-
-Array = NDArray[np.float64]
 
 MAP_SHAPE = 64, 80
 """Rows and columns of the map that a frame is reduced to."""
@@ -18,9 +17,9 @@ MAP_SHAPE = 64, 80
 class Footprint:
     """Points of the wall plane in the wall frame's x and y; NaN where a beam never meets it."""
 
-    corners_m: Array
+    corners_m: Float64
     """(4, 2); of the view: upper left, upper right, lower right, lower left."""
-    cells_m: Array
+    cells_m: Float64
     """(rows, columns, 2); where the beam through each cell's centre meets the plane. cells_m[i] is row i's line."""
     on_wall: NDArray[np.bool_]
     """(rows, columns); the cells that meet the plane within the wall's extent."""
@@ -32,7 +31,7 @@ class Footprint:
 
 
 def footprint(
-    wall_from_lidar: Array, intrinsics: Intrinsics, wall: Extent, shape: tuple[int, int] = MAP_SHAPE
+    wall_from_lidar: Float64, intrinsics: Intrinsics, wall: Extent, shape: tuple[int, int] = MAP_SHAPE
 ) -> Footprint:
     """The footprint of a map of `shape` cells seen from the pose (4, 4)."""
     cells_m = on_plane(wall_from_lidar, intrinsics.scaled(shape[1], shape[0]).rays())
@@ -44,7 +43,7 @@ def footprint(
     return Footprint(on_plane(wall_from_lidar, corners), cells_m, on_wall)
 
 
-def on_plane(wall_from_lidar: Array, rays: Array) -> Array:
+def on_plane(wall_from_lidar: Float64, rays: Float64) -> Float64:
     """Wall x and y (..., 2) of where rays (..., 3) in the lidar frame meet the wall plane; NaN where they never do."""
     directions = rays @ wall_from_lidar[:3, :3].T
     origin = wall_from_lidar[:3, 3]

@@ -6,25 +6,24 @@ lidar (unit normal towards the lidar, distance) is therefore a whole pose.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from nlos_calibration.arrays import Float64
 
 
-def normal_from_angles(yaw_rad: float, pitch_rad: float) -> Array:
+def normal_from_angles(yaw_rad: float, pitch_rad: float) -> Float64:
     """The wall's normal (3,) in the lidar frame; positive yaw turns the axis towards wall +x, positive pitch up."""
     return np.array(
         [np.sin(yaw_rad) * np.cos(pitch_rad), -np.sin(pitch_rad), -np.cos(yaw_rad) * np.cos(pitch_rad)],
     )
 
 
-def angles_from_normal(normal_lidar: Array) -> tuple[float, float]:
+def angles_from_normal(normal_lidar: Float64) -> tuple[float, float]:
     """(yaw_rad, pitch_rad) of a wall whose unit normal in the lidar frame is `normal_lidar` (3,)."""
     x, y, z = normal_lidar
     return float(np.arctan2(x, -z)), float(np.arcsin(np.clip(-y, -1.0, 1.0)))
 
 
-def wall_from_plane(normal_lidar: Array, distance_m: float) -> Array:
+def wall_from_plane(normal_lidar: Float64, distance_m: float) -> Float64:
     """The pose wall_from_lidar (4, 4) for a plane normal . p + distance_m = 0, the normal (3,) towards the lidar.
 
     The rows of the rotation are the wall's axes seen from the lidar: z = normal, x = the lidar's x made orthogonal to
@@ -42,6 +41,6 @@ def wall_from_plane(normal_lidar: Array, distance_m: float) -> Array:
     return pose
 
 
-def facing_angle_rad(wall_from_lidar: Array) -> float:
+def facing_angle_rad(wall_from_lidar: Float64) -> float:
     """The angle between the optical axis and the wall's normal, from the pose (4, 4)."""
     return float(np.arccos(np.clip(-wall_from_lidar[2, 2], -1.0, 1.0)))

@@ -4,13 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.bare_wall import BareWall, load_reference
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.wall_record import WallRecord, load_wall
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -32,12 +30,12 @@ def load_measured(path: Path) -> MeasuredWall:
     return MeasuredWall(record, load_reference(path.parent / named, record.reference_sha256) if named else None)
 
 
-def wall_points_m(record: WallRecord, reference: BareWall) -> Array:
+def wall_points_m(record: WallRecord, reference: BareWall) -> Float64:
     """The reference's pixels (height, width, 3) in the wall frame, NaN where no return: z is how far off the plane."""
     return points_m(record, reference.depth_m.astype(np.float64), reference.intrinsics)
 
 
-def points_m(record: WallRecord, depth_m: Array, intrinsics: Intrinsics) -> Array:
+def points_m(record: WallRecord, depth_m: Float64, intrinsics: Intrinsics) -> Float64:
     """Depths (height, width) of the lidar as points (height, width, 3) in the wall frame.
 
     The lidar's range offset is allowed for as it is in the record's pose.
@@ -51,7 +49,7 @@ def depth_lacks_m(record: WallRecord) -> float:
     return record.range_offset_m if record.range_offset_cause == "depth" else 0.0
 
 
-def wall_from_zero(record: WallRecord) -> Array:
+def wall_from_zero(record: WallRecord) -> Float64:
     """The pose (4, 4) of where the beams meet: the lidar's, but that an offset of the origin is before the glass."""
     pose = np.array(record.wall_from_lidar)
     pose[:3, 3] += (record.range_offset_m - depth_lacks_m(record)) * pose[:3, 2]

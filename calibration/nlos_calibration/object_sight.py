@@ -1,12 +1,10 @@
 """Who sees the hidden object's box past the occluder: the lidar, which must not, and the wall, which must."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.footprint import Footprint
 from nlos_calibration.rig import ObjectBox, Occluder, Rig
-
-Array = NDArray[np.float64]
 
 SLICES = 24
 """Of the box along y, in which the share of it that the lidar sees is added up."""
@@ -39,7 +37,7 @@ def wall_sees(rig: Rig, box: ObjectBox, seen: Footprint) -> float:
     return _share(box, [_past_edge(occluder, (farthest_m, 0.0))])
 
 
-def _past_edge(occluder: Occluder, eye: tuple[float, float]) -> Array:
+def _past_edge(occluder: Occluder, eye: tuple[float, float]) -> Float64:
     """Half plane (a, b, c), a x + b z + c >= 0, of what is seen below the edge from an eye (x, z) before the sheet.
 
     The sight to (x, z) meets the sheet at eye_z + (z - eye_z) (x_m - eye_x) / (x - eye_x), to be below the edge.
@@ -48,7 +46,7 @@ def _past_edge(occluder: Occluder, eye: tuple[float, float]) -> Array:
     return np.array([rise_m, -run_m, run_m * eye[1] - rise_m * eye[0]])
 
 
-def _field(rig: Rig, y_m: float) -> list[Array]:
+def _field(rig: Rig, y_m: float) -> list[Float64]:
     """The half planes (a, b, c) that the four sides of the lidar's field of view leave of a slice at y."""
     pinhole, pose = rig.pinhole.scaled(1, 1), rig.wall_from_lidar
     left, right = (np.array([-0.5, 0.5]) - pinhole.ppx) / pinhole.fx
@@ -58,7 +56,7 @@ def _field(rig: Rig, y_m: float) -> list[Array]:
     return [np.array([x, z, y * y_m - side @ pose[:3, 3]]) for side in sides for x, y, z in [side]]
 
 
-def _share(box: ObjectBox, half_planes: list[Array]) -> float:
+def _share(box: ObjectBox, half_planes: list[Float64]) -> float:
     """Of the box's cross-section in x and z, what all half planes leave."""
     x, z = (box.x_min_m, box.x_max_m), (box.z_near_m, box.z_far_m)
     corners = np.array([[x[0], z[0]], [x[1], z[0]], [x[1], z[1]], [x[0], z[1]]])
@@ -68,10 +66,10 @@ def _share(box: ObjectBox, half_planes: list[Array]) -> float:
     return _area(left) / _area(corners)
 
 
-def _cut(corners: Array, half_plane: Array) -> Array:
+def _cut(corners: Float64, half_plane: Float64) -> Float64:
     """A convex polygon (n, 2) cut by a half plane (Sutherland and Hodgman); (0, 2) where nothing is left."""
     inside = corners @ half_plane[:2] + half_plane[2]
-    kept: list[Array] = []
+    kept: list[Float64] = []
     for here, there, at, to in zip(corners, np.roll(corners, -1, 0), inside, np.roll(inside, -1), strict=True):
         if at >= 0.0:
             kept.append(here)
@@ -80,7 +78,7 @@ def _cut(corners: Array, half_plane: Array) -> Array:
     return np.array(kept).reshape(-1, 2)
 
 
-def _area(corners: Array) -> float:
+def _area(corners: Float64) -> float:
     """By the shoelace formula."""
     x, z = corners.T
     return float(abs(x @ np.roll(z, -1) - z @ np.roll(x, -1)) / 2.0)

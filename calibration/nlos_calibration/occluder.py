@@ -4,17 +4,14 @@ from dataclasses import dataclass, field
 from math import degrees, hypot, radians
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.errors import OccluderRefusedError, WallRefusedError
 from nlos_calibration.occluder_edge import Edge, find_edge, rows_of
 from nlos_calibration.occluder_sheet import Scene, SheetFit, fit_sheet, look
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.range_noise import MeanNoise
 from nlos_calibration.rig import Occluder, Rig
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MIN_SHARE, MIN_PIXELS, MIN_COLUMNS = 0.002, 100, 4
 """Less in front of the wall is no occluder; of fewer columns nobody can tell how it stands."""
@@ -60,10 +57,10 @@ class OccluderFit:
 
 
 def find_occluder(
-    depth_m: Array,
+    depth_m: Float64,
     noise: MeanNoise,
     intrinsics: Intrinsics,
-    wall_from_lidar: Array,
+    wall_from_lidar: Float64,
     generator: np.random.Generator,
     *,
     distance_std_m: float = 0.0,
@@ -169,7 +166,7 @@ def _check_stand(sheet: SheetFit, middle_m: float) -> None:
         )
 
 
-def _edge(met_m: Array, pixels: Mask, passed: Mask) -> Edge:
+def _edge(met_m: Float64, pixels: Mask, passed: Mask) -> Edge:
     """The sheet's edge; refuses one that is out of view, touches the wall, or ends in the middle of the view."""
     lowest_m, middle_m = np.percentile(met_m[pixels][:, 2], (5.0, 50.0))
     would = met_m[..., 2].max(axis=1) > middle_m

@@ -6,8 +6,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from nlos_calibration.arrays import Float64, Mask
 
 MIN_ROW_PIXELS = 2
 """Of the sheet, in a row: fewer may be strays."""
@@ -29,7 +28,7 @@ class Edge:
     """In how many rows of the image it is seen."""
 
 
-def find_edge(met_m: Array, sheet: Mask, passed: Mask) -> Edge | None:
+def find_edge(met_m: Float64, sheet: Mask, passed: Mask) -> Edge | None:
     """The edge from where each pixel's ray meets the sheet's plane (height, width, 3); None where it is not seen.
 
     `sheet` are pixels that return from the sheet, `passed` those whose beams went by it. A pixel that mixes both, reads
@@ -63,7 +62,7 @@ def _follow(marked: Mask, start: NDArray[np.int64]) -> NDArray[np.int64]:
     return (marked & (columns >= start[:, np.newaxis])).sum(axis=1)
 
 
-def _line(y_m: Array, z_m: Array, width_m: Array) -> Edge:
+def _line(y_m: Float64, z_m: Float64, width_m: Float64) -> Edge:
     """A line through the middles of brackets that are `width_m` wide; rows far off it are left out."""
     line, inside = np.array([np.median(z_m), 0.0]), np.ones(len(z_m), np.bool_)
     terms, resolution_m = np.column_stack([np.ones_like(y_m), y_m]), float(np.median(width_m)) / sqrt(12.0)

@@ -5,15 +5,12 @@ from math import degrees, hypot
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.plane import GATE_SIGMAS, PlaneFit, fit_depth, plane_depth_m
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.range_noise import MeanNoise, depth_noise_m
 from nlos_calibration.ripples import ripples
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 WALL_BAND_M = 0.004
 """What the wall's own pose and the lidar's ripples may put a point of it off the plane, beside noise."""
@@ -25,13 +22,13 @@ NEIGHBOURS = 4.5 / 9.0
 class Scene:
     """What the lidar saw, by the wall's plane."""
 
-    depth_m: Array
+    depth_m: Float64
     """(height, width); NaN is no return."""
-    sigma_m: Array
+    sigma_m: Float64
     """(height, width); the noise of one sample there, since ripples do not fall with the number of samples."""
-    rays: Array
+    rays: Float64
     """(height, width, 3); of unit depth, in the lidar frame."""
-    pose: Array
+    pose: Float64
     """wall_from_lidar (4, 4)."""
     near: Mask
     """Pixels in front of the wall, together with their neighbours."""
@@ -41,7 +38,7 @@ class Scene:
     """Of the depths, those behind the wall."""
 
     @property
-    def direction(self) -> Array:
+    def direction(self) -> Float64:
         """The rays in the wall frame."""
         return self.rays @ self.pose[:3, :3].T
 
@@ -53,11 +50,11 @@ class SheetFit:
     plane: PlaneFit
     uneven_m: float
     """RMS of the deviation of parts of it from the plane, beyond noise."""
-    normal: Array
+    normal: Float64
     """(3,)."""
-    covariance: Array
+    covariance: Float64
     """(3, 3) of `normal`."""
-    lidar_m: Array
+    lidar_m: Float64
     """(3,)."""
 
     @property
@@ -94,10 +91,10 @@ class SheetFit:
         """How surely."""
         return self._std((self.lidar_m - np.array([self.x_m(z_m), 0.0, z_m])) / self.normal[0])
 
-    def _std(self, gradient: Array) -> float:
+    def _std(self, gradient: Float64) -> float:
         return float(np.sqrt(max(gradient @ self.covariance @ gradient, 0.0)))
 
-    def met_m(self, scene: Scene) -> Array:
+    def met_m(self, scene: Scene) -> Float64:
         """Where each ray meets the plane (height, width, 3), far away where it never does."""
         return scene.pose[:3, 3] + scene.direction * self._depth_m(scene)[..., np.newaxis]
 
@@ -105,11 +102,11 @@ class SheetFit:
         """The pixels that may be points of the plane, by their depth (height, width)."""
         return np.abs(scene.depth_m - self._depth_m(scene)) <= GATE_SIGMAS * scene.sigma_m
 
-    def _depth_m(self, scene: Scene) -> Array:
+    def _depth_m(self, scene: Scene) -> Float64:
         return plane_depth_m(scene.rays, self.plane.slopes)
 
 
-def look(depth_m: Array, noise: MeanNoise, intrinsics: Intrinsics, pose: Array) -> Scene:
+def look(depth_m: Float64, noise: MeanNoise, intrinsics: Intrinsics, pose: Float64) -> Scene:
     """Each pixel before the wall, on it or behind it, by more than noise and the wall's own error explain."""
     depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan)
     rays = intrinsics.rays()

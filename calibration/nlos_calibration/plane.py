@@ -9,13 +9,10 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.range_noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 GATE_SIGMAS = 5.0
 MIN_SCALE, MAX_SCALE = 0.25, 8.0
@@ -42,7 +39,7 @@ MEDIAN_PER_SIGMA = 0.67449
 class PlaneFit:
     """A plane normal . p + distance_m = 0 in the lidar frame, the unit normal towards the lidar."""
 
-    normal: Array
+    normal: Float64
     """(3,)."""
     distance_m: float
     residual_m: float
@@ -51,15 +48,15 @@ class PlaneFit:
     """Share of the valid points that lie on the plane."""
     inliers: Mask
     """(N,); False for points that are not valid."""
-    slopes: Array
+    slopes: Float64
     """(3,); -normal / distance_m."""
-    covariance: Array
+    covariance: Float64
     """(3, 3) of the slopes, scaled by the residuals, as if these were independent of one another."""
     noise_scale: float
     """RMS of the residuals over the noise to expect."""
-    errors_m: Array
+    errors_m: Float64
     """(N,); how far each point's depth is beyond the plane's; NaN but for inliers."""
-    sigmas_m: Array
+    sigmas_m: Float64
     """(N,); the noise to expect there; NaN but for inliers."""
 
 
@@ -67,8 +64,8 @@ class PlaneFit:
 class _Points:
     """The points that are valid."""
 
-    rays: Array
-    depth_m: Array
+    rays: Float64
+    depth_m: Float64
     noise: MeanNoise
 
     def at(self, points: Mask | slice) -> "_Points":
@@ -78,7 +75,7 @@ class _Points:
         return self.at(slice(None, None, max(len(self.rays) // STATISTICS_POINTS, 1)))
 
 
-def fit_plane(points_m: Array, generator: np.random.Generator, noise: MeanNoise | None = None) -> PlaneFit:
+def fit_plane(points_m: Float64, generator: np.random.Generator, noise: MeanNoise | None = None) -> PlaneFit:
     """Fit the plane that most of the points (N, 3) in the lidar frame lie on: `fit_depth` of points."""
     depth_m = np.where(np.isfinite(points_m).all(axis=1), points_m[:, 2], np.nan)
     seen = depth_m >= MIN_DEPTH_M
@@ -87,8 +84,8 @@ def fit_plane(points_m: Array, generator: np.random.Generator, noise: MeanNoise 
 
 
 def fit_depth(
-    rays: Array,
-    depth_m: Array,
+    rays: Float64,
+    depth_m: Float64,
     generator: np.random.Generator,
     noise: MeanNoise | None = None,
     min_extent: float = MIN_RAY_EXTENT,
@@ -114,7 +111,7 @@ def fit_depth(
     return _plane(slopes, agreed, float(inside.mean()), inliers)
 
 
-def _plane(slopes: Array, agreed: _Points, inlier_fraction: float, inliers: Mask) -> PlaneFit:
+def _plane(slopes: Float64, agreed: _Points, inlier_fraction: float, inliers: Mask) -> PlaneFit:
     """The plane of `slopes`, fitted to the points that agreed.
 
     Its covariance is scaled by the residuals' mean square, not their median: outliers inside the gate move the slopes
@@ -138,24 +135,24 @@ def _plane(slopes: Array, agreed: _Points, inlier_fraction: float, inliers: Mask
     )
 
 
-def _spread_over(inliers: Mask, values: Array) -> Array:
+def _spread_over(inliers: Mask, values: Float64) -> Float64:
     everywhere = np.full(len(inliers), np.nan)
     everywhere[inliers] = values
     return everywhere
 
 
-def plane_depth_m(rays: Array, slopes: Array) -> Array:
+def plane_depth_m(rays: Float64, slopes: Float64) -> Float64:
     """The depth (...) of planes along rays (..., 3), far away where a ray never meets them; slopes (3,) or (3, n)."""
     return 1.0 / np.maximum(rays @ slopes, 1.0 / FARTHEST_M)
 
 
-def _errors(points: _Points, slopes: Array) -> tuple[Array, Array, Array]:
+def _errors(points: _Points, slopes: Float64) -> tuple[Float64, Float64, Float64]:
     """How far depths are beyond the plane's, the noise to expect there, and the plane's depth (far if it has none)."""
     predicted_m = plane_depth_m(points.rays, slopes)
     return points.depth_m - predicted_m, points.noise.of(predicted_m), predicted_m
 
 
-def _consensus(points: _Points, generator: np.random.Generator) -> Array:
+def _consensus(points: _Points, generator: np.random.Generator) -> Float64:
     """The slopes (3,), out of those through random triples of points, that the most points agree on."""
     triples = generator.integers(len(points.rays), size=(TRIPLES, 3))
     # the determinant of three rays is twice the area of their triangle in the image: none for points seen in a line
@@ -169,12 +166,12 @@ def _consensus(points: _Points, generator: np.random.Generator) -> Array:
     return candidates[np.argmin(np.minimum(errors**2, 1.0).sum(axis=0))]
 
 
-def _widest_m(predicted_m: Array, noise: MeanNoise) -> Array:
+def _widest_m(predicted_m: Float64, noise: MeanNoise) -> Float64:
     """The gate to begin with: that of a single sample, since ripples do not fall with the number of samples."""
     return GATE_SIGMAS * max(noise.scale, 1.0) * depth_noise_m(predicted_m)
 
 
-def _refit(points: _Points, slopes: Array, scale: float) -> tuple[Array, float, Mask]:
+def _refit(points: _Points, slopes: Float64, scale: float) -> tuple[Float64, float, Mask]:
     """Weighted least squares over the points inside the gate, repeated until it moves no more.
 
     Returns slopes, the residuals' scale (inf while it is not known) and which points are inside.
@@ -194,14 +191,16 @@ def _refit(points: _Points, slopes: Array, scale: float) -> tuple[Array, float, 
     return slopes, scale, inside
 
 
-def _rows(rays: Array, errors_m: Array, sigmas_m: Array, predicted_m: Array, inside: Mask) -> tuple[Array, Array]:
+def _rows(
+    rays: Float64, errors_m: Float64, sigmas_m: Float64, predicted_m: Float64, inside: Mask
+) -> tuple[Float64, Float64]:
     """The linear least-squares problem of a step of the slopes, in standard deviations: d p_z = -p_z^2 r . step."""
     # weights from the plane predicted last, not from the noisy sample: those would favour samples that err far
     weight = np.where(inside, 1.0 / sigmas_m, 0.0)
     return rays * (predicted_m**2 * weight)[:, np.newaxis], -errors_m * weight
 
 
-def _gate_m(noise: MeanNoise, scale: float, sigmas_m: Array, predicted_m: Array) -> Array:
+def _gate_m(noise: MeanNoise, scale: float, sigmas_m: Float64, predicted_m: Float64) -> Float64:
     """How far inliers may be off: the noise as the residuals show it, once they do."""
     widest_m = _widest_m(predicted_m, noise)
     if not np.isfinite(scale):
@@ -209,7 +208,7 @@ def _gate_m(noise: MeanNoise, scale: float, sigmas_m: Array, predicted_m: Array)
     return np.minimum(GATE_SIGMAS * max(scale, MIN_SCALE) * sigmas_m, MAX_SCALE * widest_m)
 
 
-def _residual_scale(points: _Points, slopes: Array, scale: float) -> float:
+def _residual_scale(points: _Points, slopes: Float64, scale: float) -> float:
     """The residuals over the noise to expect, by the median of those inside the gate, which few outliers move."""
     errors_m, sigmas_m, predicted_m = _errors(points, slopes)
     inside = np.abs(errors_m) <= _gate_m(points.noise, scale, sigmas_m, predicted_m)
@@ -218,7 +217,7 @@ def _residual_scale(points: _Points, slopes: Array, scale: float) -> float:
     return float(np.median(np.abs(errors_m[inside] / sigmas_m[inside]))) / MEDIAN_PER_SIGMA
 
 
-def _check_majority(inside: Mask, points: _Points, slopes: Array) -> None:
+def _check_majority(inside: Mask, points: _Points, slopes: Float64) -> None:
     if inside.mean() >= MIN_INLIER_FRACTION:
         return
     farther = _errors(points, slopes)[0] > 0.0
@@ -229,7 +228,7 @@ def _check_majority(inside: Mask, points: _Points, slopes: Array) -> None:
     )
 
 
-def _check_extent(rays: Array, min_extent: float) -> None:
+def _check_extent(rays: Float64, min_extent: float) -> None:
     """Refuse inliers seen in a line; percentiles, since a few chance inliers beside a line do not make a plane."""
     centred = rays[:, :2] - rays[:, :2].mean(axis=0)
     narrow = np.linalg.eigh(centred.T @ centred)[1][:, 0]

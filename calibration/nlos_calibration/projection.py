@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from nlos_calibration.arrays import Float64
 
 
 @dataclass(frozen=True)
@@ -26,11 +25,11 @@ class Intrinsics:
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, ppx, ppy)
 
     @property
-    def matrix(self) -> Array:
+    def matrix(self) -> Float64:
         """The same for OpenCV: (3, 3)."""
         return np.array([[self.fx, 0.0, self.ppx], [0.0, self.fy, self.ppy], [0.0, 0.0, 1.0]])
 
-    def rays(self) -> Array:
+    def rays(self) -> Float64:
         """Rays (height, width, 3) in the lidar frame with unit z: a point is depth_m * ray."""
         x = (np.arange(self.width) - self.ppx) / self.fx
         y = (np.arange(self.height) - self.ppy) / self.fy

@@ -7,8 +7,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Depth = TypeVar("Depth", float, Array)
+from nlos_calibration.arrays import Float64
+
+Depth = TypeVar("Depth", float, Float64)
 
 NOISE_FLOOR_M, NOISE_PER_METRE = 0.0005, 0.002
 """Standard deviation of one depth sample: the floor, and what each metre of depth adds."""
@@ -35,14 +36,14 @@ class MeanNoise:
     Ripples of the lidar are no noise: they show in the residuals, which scale the covariance (`flatness`).
     """
 
-    samples: Array = field(default_factory=lambda: np.ones(1))
+    samples: Float64 = field(default_factory=lambda: np.ones(1))
     """(N,); how many were averaged at each point; or (1,), at each as many."""
     scale: float = 1.0
     """A sample's noise over the nominal."""
     measured: bool = False
     """Whether `scale` was, from the spread of samples; else it is a guess."""
 
-    def of(self, depth_m: Array) -> Array:
+    def of(self, depth_m: Float64) -> Float64:
         """The standard deviation (N,) of means at `depth_m` (N,)."""
         rounding_m = QUANTUM_M / sqrt(12) * exp(-2 * (pi * self.scale * NOISE_FLOOR_M / QUANTUM_M) ** 2)
         return np.sqrt(self.scale**2 * depth_noise_m(depth_m) ** 2 / self.samples + rounding_m**2)
@@ -52,7 +53,7 @@ class MeanNoise:
         return self if len(self.samples) == 1 else replace(self, samples=self.samples[points])
 
 
-def measured_noise(depth_m: Array, spread_m: Array, samples: NDArray[np.int64]) -> MeanNoise:
+def measured_noise(depth_m: Float64, spread_m: Float64, samples: NDArray[np.int64]) -> MeanNoise:
     """The noise of means at `depth_m` (N,) of `samples` (N,), from their spread (N,); NaN where there is none.
 
     The scale is a median over the points, since a few flicker; that of a variance from n samples is

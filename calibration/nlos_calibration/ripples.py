@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.plane import PlaneFit
-
-Array = NDArray[np.float64]
 
 BLOCKS_ACROSS = 40
 """The finest blocks: fine enough for ripples of half a degree, coarse enough to average noise."""
@@ -24,11 +23,11 @@ class Ripples:
     """Normal to the wall, of what blocks of pixels deviate by beyond their noise."""
     correlation: float
     """By how much the mean square of block means exceeds that of independent residuals; 1 where it surely does not."""
-    covariance: Array
+    covariance: Float64
     """(3, 3) of the plane's slopes, with that in it."""
 
 
-def ripples(plane: PlaneFit, rays: Array) -> Ripples:
+def ripples(plane: PlaneFit, rays: Float64) -> Ripples:
     """Judge the residuals of `plane`, fitted to depth along `rays` (height, width, 3)."""
     shape = rays.shape[:2]
     size = max(2, shape[1] // BLOCKS_ACROSS)
@@ -45,7 +44,7 @@ def ripples(plane: PlaneFit, rays: Array) -> Ripples:
     return Ripples(rms_m, correlation, _greater(correlation * plane.covariance, _clustered(plane, pulls)))
 
 
-def _beyond_noise_m(count: Array, within: Array, normal_m: Array, variance_m2: Array, size: int) -> float:
+def _beyond_noise_m(count: Float64, within: Float64, normal_m: Float64, variance_m2: Float64, size: int) -> float:
     """RMS of block means beyond their noise, which is judged by the scatter within blocks."""
     full = count >= size**2 / 2
     if not full.any():
@@ -55,7 +54,7 @@ def _beyond_noise_m(count: Array, within: Array, normal_m: Array, variance_m2: A
     return float(np.sqrt(max(beyond_m2.mean(), 0.0)))
 
 
-def _correlation(count: Array, total: Array, chi2: float) -> tuple[float, int]:
+def _correlation(count: Float64, total: Float64, chi2: float) -> tuple[float, int]:
     """The mean square of block means over what it would be if residuals were independent, and the size of the blocks.
 
     Of blocks of several sizes the largest: the mean over a patch as wide as a ripple varies most. 1 if it is not sure.
@@ -70,7 +69,7 @@ def _correlation(count: Array, total: Array, chi2: float) -> tuple[float, int]:
     return found
 
 
-def _pulls(plane: PlaneFit, rays: Array, weighted: Array, size: int) -> Array:
+def _pulls(plane: PlaneFit, rays: Float64, weighted: Float64, size: int) -> Float64:
     """How each block (n, 3) pulls at the slopes: the sums of the least squares' gradient over it."""
     slopewise = rays.reshape(-1, 3) @ plane.slopes
     predicted_m = np.divide(1.0, slopewise, out=np.zeros_like(slopewise), where=plane.inliers)
@@ -78,14 +77,14 @@ def _pulls(plane: PlaneFit, rays: Array, weighted: Array, size: int) -> Array:
     return np.stack([block_sums(strength * rays[..., axis], size).ravel() for axis in range(3)], axis=-1)
 
 
-def _clustered(plane: PlaneFit, pulls: Array) -> Array:
+def _clustered(plane: PlaneFit, pulls: Float64) -> Float64:
     """The covariance if blocks, not pixels, are independent (Liang and Zeger): each block tells its own spread."""
     bread = plane.covariance / plane.noise_scale**2
     blocks = int(pulls.any(axis=1).sum())
     return bread @ (pulls.T @ pulls) @ bread * blocks / max(blocks - 3, 1)
 
 
-def _greater(one: Array, other: Array) -> Array:
+def _greater(one: Float64, other: Float64) -> Float64:
     """The covariance that is the greater of two in every direction: where both are diagonal, entry by entry."""
     root = np.linalg.cholesky(one)
     inner = np.linalg.solve(root, np.linalg.solve(root, other).T)
@@ -94,7 +93,7 @@ def _greater(one: Array, other: Array) -> Array:
     return ((joint * np.maximum(values, 1.0)) @ joint.T).astype(np.float64)
 
 
-def block_sums(values: NDArray[np.generic], size: int) -> Array:
+def block_sums(values: NDArray[np.generic], size: int) -> Float64:
     """The sums over blocks of `size` x `size`."""
     rows, columns = (np.arange(0, length, size) for length in values.shape)
     return np.add.reduceat(np.add.reduceat(values.astype(np.float64), rows, axis=0), columns, axis=1)

@@ -4,11 +4,9 @@ from dataclasses import dataclass
 from math import degrees, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.geometry import angles_from_normal
-
-Array = NDArray[np.float64]
 
 INTERVAL_STDS = 1.96
 """Half the width of a 95 % interval, in standard uncertainties."""
@@ -28,7 +26,7 @@ class WallMeasures:
     facing_std_deg: float
 
 
-def measures_of(slopes: Array, covariance: Array) -> WallMeasures:
+def measures_of(slopes: Float64, covariance: Float64) -> WallMeasures:
     """Distance and angles of `slopes` (3,) = -normal / distance_m, uncertain by `covariance` (3, 3)."""
     distance_m = 1.0 / float(np.linalg.norm(slopes))
     normal = -slopes * distance_m
@@ -50,12 +48,12 @@ def measures_of(slopes: Array, covariance: Array) -> WallMeasures:
     )
 
 
-def _facing_rad(normal: Array) -> float:
+def _facing_rad(normal: Float64) -> float:
     """By the tangent: the cosine says nothing about small angles."""
     return float(np.arctan2(np.hypot(normal[0], normal[1]), -normal[2]))
 
 
-def _facing_std_rad(normal: Array, turn: Array) -> float:
+def _facing_std_rad(normal: Float64, turn: Float64) -> float:
     """How surely the facing angle f is known.
 
     Turns towards the axis change it one for one. Turns aside by s change it to sqrt(f^2 + s^2): nothing while s is
@@ -72,5 +70,5 @@ def _facing_std_rad(normal: Array, turn: Array) -> float:
     return sqrt(float(towards @ turn @ towards) + second_order)
 
 
-def _std(gradient: Array, covariance: Array) -> float:
+def _std(gradient: Float64, covariance: Float64) -> float:
     return sqrt(max(float(gradient @ covariance @ gradient), 0.0))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.flatness import flatness
 from nlos_calibration.geometry import wall_from_plane
@@ -14,8 +15,6 @@ from nlos_calibration.range_noise import STATISTICS_POINTS, MeanNoise, depth_noi
 from nlos_calibration.ripples import block_sums, ripples
 from nlos_calibration.uncertainty import WallMeasures, measures_of
 from nlos_calibration.verdict import Verdict, check_flat, judge, warnings
-
-Array = NDArray[np.float64]
 
 MIN_VALID_SHARE = 0.05
 STUCK_SHARE = 0.5
@@ -34,9 +33,9 @@ class WallFit(WallMeasures):
     what every depth has in common: that is `range_offset`'s.
     """
 
-    wall_from_lidar: Array
+    wall_from_lidar: Float64
     """(4, 4)."""
-    covariance: Array = field(repr=False)
+    covariance: Float64 = field(repr=False)
     """(3, 3) of -normal / distance, as seen from the zero of depth."""
     residual_m: float
     """RMS distance of the inliers from the plane."""
@@ -56,7 +55,7 @@ class WallFit(WallMeasures):
     warnings: tuple[str, ...]
 
 
-def wall_depth(wall_from_lidar: Array, intrinsics: Intrinsics) -> Array:
+def wall_depth(wall_from_lidar: Float64, intrinsics: Intrinsics) -> Float64:
     """The depth (height, width) that a bare, endless wall gives; inf where a beam never meets it."""
     away = -(intrinsics.rays() @ wall_from_lidar[2, :3])
     depth_m = np.full(away.shape, np.inf)
@@ -106,7 +105,7 @@ def fit_wall(
     )
 
 
-def _check_depth(depth_m: Array) -> None:
+def _check_depth(depth_m: Float64) -> None:
     """Refuse a map that is nearly empty, or that says the same everywhere."""
     valid_m = depth_m[np.isfinite(depth_m)]
     share = len(valid_m) / depth_m.size
@@ -123,7 +122,7 @@ def _check_depth(depth_m: Array) -> None:
         )
 
 
-def _check_one_surface(depth_m: Array, expected_m: Array) -> None:
+def _check_one_surface(depth_m: Float64, expected_m: Float64) -> None:
     """Refuse a map in which blocks of pixels stray from the wall together (NaN in `depth_m` is neither)."""
     gate_m = GATE_SIGMAS * depth_noise_m(depth_m)
     valid = np.isfinite(depth_m)

@@ -7,11 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.range_noise import depth_noise_m, measured_noise
-
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 GRID = 18, 24
 """One pixel of each cell of such a grid of the view is watched."""
@@ -82,7 +80,7 @@ class WallTrack:
     hardly any is near, the gate is widened and narrows from frame to frame.
     """
 
-    def __init__(self, reference: BareWall, wall_from_lidar: Array) -> None:
+    def __init__(self, reference: BareWall, wall_from_lidar: Float64) -> None:
         self.pixels = watched_pixels(reference)
         height, width = reference.depth_m.shape
         depth_m = reference.depth_m.ravel()[self.pixels].astype(np.float64)
@@ -123,7 +121,7 @@ class WallTrack:
             return None
         return self._sight(np.where(returned, seen_m, self._depth_m), weight)
 
-    def _begin(self, off: Array) -> tuple[Array, NDArray[np.bool_] | float]:
+    def _begin(self, off: Float64) -> tuple[Float64, NDArray[np.bool_] | float]:
         """The errors from the plane to begin with: the last frame's, the reference's or a search's.
 
         And which pixels may count, 1 for all.
@@ -147,7 +145,7 @@ class WallTrack:
         self._grid.flat[self._cells] = inside - PATCH_SHARE * returned
         return cv2.blur(self._grid, (3, 3), borderType=cv2.BORDER_CONSTANT).flat[self._cells] >= 0.0
 
-    def _sight(self, seen_m: Array, weight: Array) -> Sight | None:
+    def _sight(self, seen_m: Float64, weight: Float64) -> Sight | None:
         distance_m, yaw_deg, pitch_deg = _pose(self._slopes + self._change)
         distance_m, yaw_deg, pitch_deg = distance_m - self._pose[0], yaw_deg - self._pose[1], pitch_deg - self._pose[2]
         turn_deg = hypot(yaw_deg, pitch_deg)
@@ -167,7 +165,7 @@ def _share(chosen: NDArray[np.bool_]) -> float:
     return np.count_nonzero(chosen) / len(chosen)
 
 
-def _pose(slopes: Array) -> tuple[float, float, float]:
+def _pose(slopes: Float64) -> tuple[float, float, float]:
     """Distance, yaw and pitch of a wall (`geometry.angles_from_normal` with normal = -slopes x distance)."""
     x, y, z = slopes.tolist()
     distance_m = 1.0 / sqrt(x * x + y * y + z * z)

@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-Half = NDArray[np.float16]
-Float32 = NDArray[np.float32]
+from nlos_models.arrays import Float16, Float32
 
 
 @dataclass(frozen=True)
@@ -21,7 +20,7 @@ class MapSet:
     """(n, 64, 80); NaN where there is no return."""
     intensity: Float32
     """(n, 64, 80), or in colour (n, 3, 64, 80)."""
-    image: Half | Float32
+    image: Float16 | Float32
     """(n, 64, 64) in [0, 1], or in colour (n, 3, 64, 64)."""
 
 
@@ -41,13 +40,13 @@ def flip_some(tensors: list[Tensor], flips: Tensor) -> list[Tensor]:
     return [torch.where(chosen.view(-1, *[1] * (t.ndim - 1)), t.flip(-2), t) for t in tensors]
 
 
-def as_images(images: Half | Float32) -> Tensor:
+def as_images(images: Float16 | Float32) -> Tensor:
     """Images (n, 64, 64) as the (n, 1, 64, 64) of float32 that networks take; those in colour have their channels."""
     tensor = torch.from_numpy(images.astype(np.float32))
     return tensor[:, None] if tensor.ndim == 3 else tensor
 
 
-def image_batches(images: Half, batch: int, generator: torch.Generator) -> Iterator[Tensor]:
+def image_batches(images: Float16, batch: int, generator: torch.Generator) -> Iterator[Tensor]:
     """One epoch of images (b, 1 or 3, 64, 64), shuffled and mirrored at random."""
     for index in shuffled(len(images), batch, generator):
         chosen = as_images(images[index.numpy()])

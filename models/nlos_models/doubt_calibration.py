@@ -7,10 +7,9 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
+from nlos_models.arrays import Float64, Mask
 from nlos_models.doubt_network import LEAST_ERROR_V, MOST_ERROR_V, DoubtNetwork
-from nlos_models.doubt_training import Bools, DoubtSet, said_of
-
-Array = NDArray[np.float64]
+from nlos_models.doubt_training import DoubtSet, said_of
 
 TEMPERATURES = np.geomspace(1.0, 5.0, 65)
 """Never below 1: where all are told apart, the likeliest is 0, which says no more than that."""
@@ -31,19 +30,19 @@ class Calibration:
     outside_above: float
 
 
-def error_scale(expected: Array, error: Array) -> float:
+def error_scale(expected: Float64, error: Float64) -> float:
     """What expected errors (n,) are to be multiplied by, so that errors (n,) are likeliest: Laplace's one answer."""
     return float(np.mean(error / expected))
 
 
-def temperature(logits: Array, truth: Bools) -> float:
+def temperature(logits: Float64, truth: Mask) -> float:
     """What logits (n,) are to be divided by, so that the truth (n,) is likeliest."""
     x, y = torch.from_numpy(logits), torch.from_numpy(truth.astype(np.float64))
     losses = [float(functional.binary_cross_entropy_with_logits(x / t, y)) for t in TEMPERATURES]
     return float(TEMPERATURES[int(np.argmin(losses))])
 
 
-def shared_errors(made: NDArray[np.floating], truth: NDArray[np.floating]) -> tuple[Bools, Array]:
+def shared_errors(made: NDArray[np.floating], truth: NDArray[np.floating]) -> tuple[Mask, Float64]:
     """Where images (n, 64, 64) and truths both have a surface, and by how much v is off there (pixels,)."""
     shared = (made > 0) & (truth > 0)
     return shared, np.abs(made.astype(np.float64) - truth)[shared]
@@ -54,7 +53,7 @@ def calibrated(network: DoubtNetwork, held_out: DoubtSet) -> Calibration:
 
     The set needs objects of each sort: ordinary, outside, and none.
     """
-    said, logits = said_of(network, held_out), dict[str, Array]()
+    said, logits = said_of(network, held_out), dict[str, Float64]()
     for name in ("nothing", "outside"):
         logits[name] = getattr(said, name).double().numpy()
     hot = temperature(logits["nothing"], held_out.nothing), temperature(logits["outside"], held_out.outside)
@@ -70,5 +69,5 @@ def calibrated(network: DoubtNetwork, held_out: DoubtSet) -> Calibration:
     )
 
 
-def _sigmoid(logits: Array) -> Array:
+def _sigmoid(logits: Float64) -> Float64:
     return 1 / (1 + np.exp(-logits))

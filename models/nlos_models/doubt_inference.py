@@ -4,14 +4,12 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos_models.arrays import Float32
 from nlos_models.checkpoint import shipped_folder
 from nlos_models.doubt_network import MAP_SHAPE
 from nlos_models.doubt_weights import DoubtRecord, load_doubt
 from nlos_models.inference import checksum_of, open_session, write_onnx
-
-Float32 = NDArray[np.float32]
 
 INPUTS = {"depth_m": MAP_SHAPE, "intensity": MAP_SHAPE, "image": (64, 64)}
 

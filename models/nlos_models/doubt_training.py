@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from nlos_models.data import Float32, Half, flip_some, shuffled
+from nlos_models.arrays import Float16, Float32, Mask
+from nlos_models.data import flip_some, shuffled
 from nlos_models.doubt_network import LEAST_ERROR_V, DoubtNetwork, DoubtOutput
 from nlos_models.recipe import Recipe
 from nlos_models.remap import in_channels_last, parts_of
 from nlos_models.train import OnStep, Running, fit
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -28,13 +27,13 @@ class DoubtSet:
     """(n, 64, 80); NaN where there is no return."""
     intensity: Float32
     """(n, 64, 80)."""
-    made: Half
+    made: Float16
     """(n, 64, 64); the pipeline's images."""
-    truth: Half
+    truth: Float16
     """(n, 64, 64); 0 for background."""
-    nothing: Bools
+    nothing: Mask
     """(n,); nothing is hidden."""
-    outside: Bools
+    outside: Mask
     """(n,); what is hidden, or how it is seen, is unlike what the pipeline was trained on."""
 
     def __len__(self) -> int:

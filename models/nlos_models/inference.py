@@ -10,15 +10,13 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
+from nlos_models.arrays import Float32
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
 from nlos_models.errors import CheckpointError, ModelError
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import SIMULATION_ONLY
-
-Float32 = NDArray[np.float32]
 
 MAP_SHAPE = (64, 80)
 OPSET = 18

@@ -6,12 +6,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from nlos_models.arrays import Float32
 from nlos_models.errors import ModelError
 
-Float32 = NDArray[np.float32]
 Sample = tuple[Float32, Float32]
 """Depth and intensity maps, each (n, 64, 80)."""
 

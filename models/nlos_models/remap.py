@@ -11,8 +11,9 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from nlos_models.arrays import Float16, Float32
 from nlos_models.colour_metrics import colour_error, colour_silhouette_iou
-from nlos_models.data import Float32, Half, MapBatch, MapSet, as_images
+from nlos_models.data import MapBatch, MapSet, as_images
 from nlos_models.errors import TrainingError
 from nlos_models.losses import image_error, latent_error
 from nlos_models.metrics import silhouette_iou
@@ -127,7 +128,7 @@ def run(pipeline: Pipeline, maps: MapSet) -> Float32:
 
 
 @torch.no_grad()
-def latents_of(encoder: Encoder, images: Half | Float32) -> Tensor:
+def latents_of(encoder: Encoder, images: Float16 | Float32) -> Tensor:
     """Mean and log-variance (n, 2, latent) of images (n, 64, 64) or in colour, where the encoder is."""
     device = next(encoder.parameters()).device
     parts = (as_images(part).to(device) for part in parts_of(images))
@@ -139,7 +140,7 @@ def parts_of(arrays: NDArray[Any]) -> list[NDArray[Any]]:
     return [arrays[k : k + SCORING_BATCH] for k in range(0, len(arrays), SCORING_BATCH)]
 
 
-def figures_of(image: Float32, truth: Half | Float32) -> dict[str, float]:
+def figures_of(image: Float32, truth: Float16 | Float32) -> dict[str, float]:
     """What a run is judged by: squared error, summed over pixels, and silhouette IoU, averaged over (n, 64, 64).
 
     Of images in colour (n, 3, 64, 64) also the error of colour: 1 where none shares a pixel with its truth.

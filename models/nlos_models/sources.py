@@ -7,7 +7,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from nlos_models.data import Float32, Half, MapBatch, MapSet, map_batches
+from nlos_models.arrays import Float16, Float32
+from nlos_models.data import MapBatch, MapSet, map_batches
 
 STATISTICS_OBJECTS = 10_000
 """So many objects tell the channels' mean and spread to far better than the noise that training adds."""
@@ -17,7 +18,7 @@ class MapSource(Protocol):
     """Training maps that need not fit into memory; it must be picklable to be shared by several processes."""
 
     @property
-    def image(self) -> Half | Float32:
+    def image(self) -> Float16 | Float32:
         """All images (n, 64, 64) in [0, 1], in the order of the rows: 8 kB an object."""
         ...
 
@@ -37,7 +38,7 @@ class InMemory:
     maps: MapSet
 
     @property
-    def image(self) -> Half | Float32:
+    def image(self) -> Float16 | Float32:
         """All images (n, 64, 64)."""
         return self.maps.image
 

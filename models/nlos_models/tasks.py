@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlos_models.data import Float32, Half, MapSet, as_images, image_batches
+from nlos_models.arrays import Float16, Float32
+from nlos_models.data import MapSet, as_images, image_batches
 from nlos_models.errors import TrainingError
 from nlos_models.losses import image_error, kl_divergence, variational_share
 from nlos_models.networks import new_pipeline, new_vae
@@ -22,8 +23,8 @@ from nlos_models.train import OnStep, Running, fit
 
 def train_vae(
     recipe: Recipe,
-    images: Half,
-    held_out: Half,
+    images: Float16,
+    held_out: Float16,
     folder: Path,
     on_step: OnStep,
     running: Running | None = None,
@@ -120,7 +121,7 @@ def turn_some(images: Tensor, quarters: Tensor) -> Tensor:
 
 
 @torch.inference_mode()
-def rebuilt(vae: ResVae, images: Half | Float32) -> Float32:
+def rebuilt(vae: ResVae, images: Float16 | Float32) -> Float32:
     """What a VAE alone makes of images (n, 64, 64) or (n, 3, 64, 64), cut as the pipeline cuts."""
     device = next(vae.parameters()).device
     means = (vae.encoder(as_images(part).to(device))[0] for part in parts_of(images))

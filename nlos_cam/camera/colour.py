@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.bare_wall import Moments
 from nlos_calibration.board_view import BoardView, CameraErrors
 from numpy.typing import NDArray
@@ -32,8 +33,6 @@ from nlos_cam.errors import (
     StreamMissingError,
 )
 from nlos_cam.recording.bag_reader import BagFile
-
-Array = NDArray[np.float64]
 
 COLOUR, FORMAT = "color", "rgb8"
 """The SDK's names of the stream, and of the format that a live camera is asked for."""
@@ -137,7 +136,7 @@ def _colour_of(device: Any) -> tuple[Any, Any]:
     return best[1:]
 
 
-def _lens(where: str, model: str, coefficients: Array) -> Array:
+def _lens(where: str, model: str, coefficients: Float64) -> Float64:
     """The coefficients as OpenCV has them, of a lens that we can undo. Raises NlosCamError for another."""
     if not coefficients.any():
         return np.zeros(5)
@@ -149,7 +148,7 @@ def _lens(where: str, model: str, coefficients: Array) -> Array:
     return coefficients.astype(np.float64)
 
 
-def _pose(extrinsics: Any) -> Array:
+def _pose(extrinsics: Any) -> Float64:
     """(4, 4) from the SDK's, whose rotation is in columns."""
     pose = np.eye(4)
     pose[:3, :3] = np.reshape(extrinsics.rotation, (3, 3)).T
@@ -157,7 +156,7 @@ def _pose(extrinsics: Any) -> Array:
     return pose
 
 
-def _mean_of(uri: str, sensor: Any, profile: Any, look: _Look) -> Array:
+def _mean_of(uri: str, sensor: Any, profile: Any, look: _Look) -> Float64:
     """The mean grey image of a sensor, which runs only meanwhile."""
     size = intrinsics_of(profile)
     mean, waiting = Moments((size.height, size.width)), Queue[NDArray[Any]](maxsize=WAITING)

@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from typing import Any
 
+from nlos_calibration.arrays import Float32
+
 from nlos_cam.camera.laser_power import Limits, turn_down
 from nlos_cam.camera.live_camera import LiveCamera
 from nlos_cam.camera.protocol import Clock
@@ -16,7 +18,7 @@ from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import Inbox, Size
 from nlos_cam.errors import CameraError, CameraNotFoundError
-from nlos_cam.frames import MOST_SATURATED, Float32, saturated_share
+from nlos_cam.frames import MOST_SATURATED, saturated_share
 
 TOLERANCE = 1e-3
 NOT_OFFERED = "not offered by this firmware"

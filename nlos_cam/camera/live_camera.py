@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from threading import Event, RLock
 from typing import Any, Self
 
+from nlos_calibration.arrays import Float32
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig
 
@@ -18,7 +19,7 @@ from nlos_cam.camera.session import Inbox, Session, Size, find_streams
 from nlos_cam.camera.streams import FORMATS, FrameSet
 from nlos_cam.camera.timestamps import Continuity
 from nlos_cam.errors import CameraError, CameraLostError
-from nlos_cam.frames import Float32, Frame
+from nlos_cam.frames import Frame
 
 log = logging.getLogger(__name__)
 

@@ -11,6 +11,7 @@ from math import inf
 from threading import Condition
 from typing import Any
 
+from nlos_calibration.arrays import Float32
 from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.camera.streams import (
@@ -27,7 +28,7 @@ from nlos_cam.camera.streams import (
     stream_name,
 )
 from nlos_cam.camera.timestamps import ClockUnwrap
-from nlos_cam.frames import Float32, Frame
+from nlos_cam.frames import Frame
 
 CAPACITY = 8
 """Sets: a quarter of a second, and 10 MB at 640 x 480."""

@@ -8,6 +8,7 @@ from threading import Event, Thread
 from typing import Any, Self
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
@@ -21,9 +22,8 @@ from nlos_cam.camera.session import Inbox
 from nlos_cam.camera.simulated_world import World
 from nlos_cam.camera.streams import BYTES_PER_PIXEL, FORMATS, FRAMES_PER_S
 from nlos_cam.errors import CameraLostError
-from nlos_cam.frames import Float32
-from nlos_cam.render.fault_record import Fault
-from nlos_cam.render.sensor import DEPTH_UNIT_M, SensedImages
+from nlos_cam.render.scene_file import Fault
+from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
 
 NAME, SERIAL = "Simulated L515", "simulated"
 SENSOR_NAME = "L500 Depth Sensor"

@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.projection import Intrinsics
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32, Frame
+from nlos_cam.frames import Frame
 
 TELLING = 3
 """Numbers in a row of which the streams' timestamps differ by the same number of frames."""

@@ -4,6 +4,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.rig import Rig
 from nlos_calibration.wall_record import rig_named
@@ -18,7 +19,6 @@ from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
 from nlos_cam.cli.train_data import BareMaps, measured_bare_wall, render_bare_wall
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import Float32
 from nlos_cam.objects.benchmark import test_set
 
 

@@ -5,12 +5,12 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig, first_problem
 from pydantic import ValidationError
 
 from nlos_cam.cli.common import say
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import Float32
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.meshes import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, Up, read_depth_map, read_mesh

@@ -8,10 +8,10 @@ from nlos_calibration.rig import first_problem
 from pydantic import ValidationError
 
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
-from nlos_cam.render.choose import choose
+from nlos_cam.render.accuracy_search import choose
 from nlos_cam.render.effects import EFFECTS, Effects
+from nlos_cam.render.material import Material
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.surface import Material
 
 Stop = Annotated[str | None, typer.Option("--accuracy", help="draft, standard (the default), fine or reference.")]
 MaxError = Annotated[

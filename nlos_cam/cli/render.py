@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from nlos_calibration.arrays import Float32
 from nlos_calibration.wall_record import rig_named
 from rich.table import Table
 
@@ -25,13 +26,12 @@ from nlos_cam.cli.hidden_object import (
     UpAxis,
     hidden_depth,
 )
-from nlos_cam.frames import Float32
-from nlos_cam.render.explain import costs
+from nlos_cam.render.accuracy_search import costs
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import load_scene
-from nlos_cam.render.sensor_effects import sensor_effects
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.effects import sensor_effects
+from nlos_cam.render.sensor.model import SensorModel
 
 
 def register(app: typer.Typer) -> None:

@@ -8,18 +8,19 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from nlos_calibration.arrays import Float16, Float32
 from nlos_calibration.bare_wall import Moments
 from nlos_calibration.measured_wall import load_measured
-from nlos_models.data import Half, MapBatch, MapSet
+from nlos_models.data import MapBatch, MapSet
 from nlos_models.recipe import Recipe
 from nlos_models.sources import InMemory, MapSource, first_of, less_bare_wall
 
 from nlos_cam import dataset
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Float32, maps_from_frame
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import Sensor
+from nlos_cam.render.sensor.sensor import Sensor
 
 BARE_WALL_FRAMES = 60
 """As many as `calibrate` takes."""
@@ -50,7 +51,7 @@ class Streamed:
     """A dataset on the disk as a source; `bare` is subtracted from its maps if there is one."""
 
     dataset: dataset.Dataset
-    image: Half
+    image: Float16
     """All images (n, 64, 64)."""
     bare: BareMaps | None = None
 

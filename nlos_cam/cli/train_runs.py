@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lightning_fabric import Fabric
+from nlos_calibration.arrays import Float16
 from nlos_calibration.rig import Rig
 from nlos_models.checkpoint import RECORD, load_record, save_pipeline, save_vae
-from nlos_models.data import Half, MapSet
+from nlos_models.data import MapSet
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
 from nlos_models.record import CheckpointRecord
@@ -56,7 +57,7 @@ def job_of(run: RunOptions, recipe: Recipe, rig: Rig, before: list[Recipe], orig
     return Job(recipe, run.out, record, run.tensorboard, run.compiled, origin)
 
 
-def run_vae(fabric: Fabric, job: Job, start: ResVae | None, images: Half, held_out: Half) -> Figures:
+def run_vae(fabric: Fabric, job: Job, start: ResVae | None, images: Float16, held_out: Float16) -> Figures:
     """Train a VAE and save it; its held-out figures."""
     with watched_run(fabric, job, "VAE") as (on_step, running):
         vae, figures = train_vae(job.recipe, images, held_out, job.out, on_step, running, start)

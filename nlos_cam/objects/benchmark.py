@@ -7,13 +7,12 @@ there (`nlos_cam.objects.settings`); other settings and the poses are spread eve
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import ObjectBox
 
-from nlos_cam.frames import Float32
 from nlos_cam.objects.depth_map import orthographic_depth
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import Pose, place, pose_from
-from nlos_cam.objects.primitives import Triangles
 
 OF_EACH = 3
 POSE_STEPS = (19, 7, 43, 13, 31, 25, 37)
@@ -33,7 +32,7 @@ class FixedObject:
     settings: Mapping[str, float]
     """Of the category's generator."""
     pose: Pose
-    triangles: Triangles = field(repr=False, compare=False)
+    triangles: Float64 = field(repr=False, compare=False)
     """(n, 3, 3) in the wall frame, in metres."""
     depth_m: Float32 = field(repr=False, compare=False)
     """(64, 64), NaN for background."""

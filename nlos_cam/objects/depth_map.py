@@ -5,12 +5,13 @@ Hidden depth in its two forms: metres over the object box, and the image v in [0
 
 import numba
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_models.metrics import BACKGROUND_BELOW_V, LEAST_V
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.frames import OBJECT_PIXELS
 
 
 def object_box(rig: Rig) -> ObjectBox:

@@ -21,9 +21,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 
 from nlos_cam.objects.primitives import (
-    Triangles,
     arch,
     at,
     bar,
@@ -80,7 +80,7 @@ class Setting:
 class Category:
     """A kind of thing: how it is made of its settings, in the order in which a seed decides them."""
 
-    make: Callable[..., Triangles]
+    make: Callable[..., Float64]
     settings: Mapping[str, Setting]
 
     @property
@@ -97,7 +97,7 @@ class Category:
         return {name: s.kept(unit) for (name, s), unit in zip(self.settings.items(), units, strict=True)}
 
 
-def category(**settings: Setting) -> Callable[[Callable[..., Triangles]], Category]:
+def category(**settings: Setting) -> Callable[[Callable[..., Float64]], Category]:
     """A decorator that makes a category of a function of its settings; the category has the function's name."""
     return lambda make: Category(make, settings)
 
@@ -112,7 +112,7 @@ SIDES = (-1, 1)
     reach=Setting(0.34, 0.46),
     tip=Setting(14, 30),
 )
-def computer(width: float, height: float, neck: float, reach: float, tip: float) -> Triangles:
+def computer(width: float, height: float, neck: float, reach: float, tip: float) -> Float64:
     """A screen set into its frame, on neck and foot, with the keyboard before it."""
     foot = -height / 2 - neck
     screen = joined(frame(width, height, 0.07, 0.18), at(box(width - 0.1, height - 0.1, 0.04), z=0.06))
@@ -129,7 +129,7 @@ def computer(width: float, height: float, neck: float, reach: float, tip: float)
     ajar=Setting(60, 115, held_out=(80, 95)),
     tip=Setting(-5, 15),
 )
-def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float) -> Triangles:
+def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float) -> Float64:
     """Two doors on short legs: one is shut, with its knob; the other stands open and shows the shelves."""
     leaf, rows = width / 2 - 0.02, int(shelves)
     case = joined(frame(width, 0.9, 0.05, depth), at(box(width, 0.9, 0.03), z=depth / 2))
@@ -150,7 +150,7 @@ def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float
     knobs=Setting(3, 6),
     tip=Setting(18, 36),
 )
-def oven(width: float, depth: float, window: float, knobs: float, tip: float) -> Triangles:
+def oven(width: float, depth: float, window: float, knobs: float, tip: float) -> Float64:
     """A cooker seen a little from above: hob with rings, knobs, a handle, and the door's window set in."""
     front, count = -depth / 2, int(knobs)
     door = at(frame(width, 0.6, (0.6 - window) / 2, 0.14), y=-0.2, z=front + 0.07)
@@ -171,14 +171,14 @@ def oven(width: float, depth: float, window: float, knobs: float, tip: float) ->
     woofer=Setting(0.35, 0.45, held_out=(0.39, 0.415)),
     tweeter=Setting(0.2, 0.28),
 )
-def soundbox(width: float, depth: float, woofer: float, tweeter: float) -> Triangles:
+def soundbox(width: float, depth: float, woofer: float, tweeter: float) -> Float64:
     """A loudspeaker: a tall box, a large cone below and a small one above, each with its rim and its cap."""
     low, high = _speaker(width, 0.6, woofer * width), _speaker(width, 0.4, tweeter * width)
     fronts = joined(at(low, y=-0.2), at(high, y=0.3))
     return joined(at(fronts, z=-depth / 2), at(box(width, 1.0, depth - 0.28), z=0.14))
 
 
-def _speaker(width: float, height: float, radius: float) -> Triangles:
+def _speaker(width: float, height: float, radius: float) -> Float64:
     """A front plate facing the wall at z = 0, with a cone of some radius sunk into it."""
     cone = turned(lathe([(radius, 0.0), (radius * 0.4, -0.25), (0, -0.25)]), (1, 0, 0), -90)
     cap = at(knob(radius * 0.4, 0.1), z=0.25)
@@ -192,7 +192,7 @@ def _speaker(width: float, height: float, radius: float) -> Triangles:
     height=Setting(0.45, 0.7, held_out=(0.54, 0.61)),
     tip=Setting(15, 40),
 )
-def table(width: float, depth: float, leg: float, height: float, tip: float) -> Triangles:
+def table(width: float, depth: float, leg: float, height: float, tip: float) -> Float64:
     """A table seen a little from above: top and four legs."""
     legs = [
         at(box(leg, height, leg), s * (width - leg) / 2, -height / 2, z * (depth - leg) / 2)
@@ -209,7 +209,7 @@ def table(width: float, depth: float, leg: float, height: float, tip: float) -> 
     gable=Setting(0.25, 0.4, held_out=(0.305, 0.345)),
     hole=Setting(0.09, 0.14),
 )
-def birdhouse(width: float, height: float, depth: float, gable: float, hole: float) -> Triangles:
+def birdhouse(width: float, height: float, depth: float, gable: float, hole: float) -> Float64:
     """A box with a gable roof, a round hole with its rim, and a perch under it."""
     eaves, front, sunk = height / 2 - 0.1, -depth / 2, 0.2
     house = at(box(width, height, depth - sunk), 0, -0.1, sunk / 2)
@@ -225,7 +225,7 @@ def birdhouse(width: float, height: float, depth: float, gable: float, hole: flo
     flare=Setting(1.15, 1.4, held_out=(1.24, 1.32)),
     turn=Setting(0.0, 1.0),
 )
-def tower(radius: float, flare: float, turn: float) -> Triangles:
+def tower(radius: float, flare: float, turn: float) -> Float64:
     """A round tower with battlements."""
     head = radius * flare
     merlon = 0.45 * head
@@ -242,7 +242,7 @@ def tower(radius: float, flare: float, turn: float) -> Triangles:
     ribs=Setting(3, 6),
     tip=Setting(10, 30),
 )
-def baskets(bottom: float, height: float, handle: float, ribs: float, tip: float) -> Triangles:
+def baskets(bottom: float, height: float, handle: float, ribs: float, tip: float) -> Float64:
     """A round basket with woven rows, tipped so that its hollow shows, and a tall handle over it."""
     rows = 2 * int(ribs) + 1
     top, low = 0.44, -height
@@ -259,7 +259,7 @@ def baskets(bottom: float, height: float, handle: float, ribs: float, tip: float
     rim=Setting(0.4, 0.52, held_out=(0.44, 0.475)),
     waist=Setting(0.2, 0.28, held_out=(0.23, 0.255)),
 )
-def bell(rim: float, waist: float) -> Triangles:
+def bell(rim: float, waist: float) -> Float64:
     """A bell with a flared rim, a crown and a clapper."""
     crown = [(0, 0.34), (waist * 0.7, 0.32), (waist, 0.2)]
     shell = lathe([*crown, (waist * 1.1, -0.1), (rim * 0.8, -0.28), (rim, -0.4), (0, -0.4)])
@@ -271,7 +271,7 @@ def bell(rim: float, waist: float) -> Triangles:
     foot=Setting(0.16, 0.24, held_out=(0.19, 0.215)),
     tip=Setting(20, 42),
 )
-def bowl(depth: float, foot: float, tip: float) -> Triangles:
+def bowl(depth: float, foot: float, tip: float) -> Float64:
     """Tipped towards the wall, so that its hollow shows above its side and foot."""
     base = [(0, -depth - 0.06), (foot, -depth - 0.06), (foot, -depth)]
     outer = [*base, (0.38, -depth * 0.5), (0.47, -depth * 0.15), (0.5, 0)]
@@ -286,7 +286,7 @@ def bowl(depth: float, foot: float, tip: float) -> Triangles:
     handle=Setting(0.24, 0.3),
     tip=Setting(5, 28),
 )
-def cup(radius: float, taper: float, height: float, handle: float, tip: float) -> Triangles:
+def cup(radius: float, taper: float, height: float, handle: float, tip: float) -> Float64:
     """A mug with its handle to one side."""
     wall = [(0, -height / 2), (radius * taper, -height / 2), (radius, height / 2), (radius - 0.06, height / 2)]
     body = lathe([*wall, (radius * taper - 0.06, 0.08 - height / 2), (0, 0.08 - height / 2)])
@@ -298,7 +298,7 @@ def cup(radius: float, taper: float, height: float, handle: float, tip: float) -
     height=Setting(0.36, 0.54, held_out=(0.43, 0.48)),
     tip=Setting(8, 38),
 )
-def hat(crown: float, height: float, tip: float) -> Triangles:
+def hat(crown: float, height: float, tip: float) -> Float64:
     """A brimmed hat with its band, a little tipped."""
     top = [(0, height - 0.03), (crown * 0.6, height), (crown * 0.85, height), (crown, height * 0.85)]
     band = [(crown * 1.06, 0.2), (crown * 1.2, 0.2), (crown * 1.24, 0.06)]
@@ -311,7 +311,7 @@ def hat(crown: float, height: float, tip: float) -> Triangles:
     shade=Setting(0.3, 0.42, held_out=(0.345, 0.38)),
     foot=Setting(0.2, 0.3),
 )
-def lamp(top: float, bottom: float, shade: float, foot: float) -> Triangles:
+def lamp(top: float, bottom: float, shade: float, foot: float) -> Float64:
     """A table lamp: foot, stem, shade."""
     hood = lathe([(0, 0.5), (top, 0.5), (bottom, 0.5 - shade), (0, 0.5 - shade)])
     stem = at(box(0.08, 0.6, 0.08), 0, -0.15)
@@ -325,7 +325,7 @@ def lamp(top: float, bottom: float, shade: float, foot: float) -> Triangles:
     sweep=Setting(0.05, 0.22, held_out=(0.0, 0.04)),
     tail=Setting(0.16, 0.24),
 )
-def airplane(body: float, span: float, chord: float, sweep: float, tail: float) -> Triangles:
+def airplane(body: float, span: float, chord: float, sweep: float, tail: float) -> Float64:
     """Seen from above: fuselage, swept wings, tailplane, fin. Frozen: the default scene's picture is one of them."""
     fuselage = ellipsoid(body, 0.5, body)
     wings = [
@@ -342,7 +342,7 @@ def airplane(body: float, span: float, chord: float, sweep: float, tail: float) 
     lead=Setting(0.25, 0.4, held_out=(0.305, 0.345)),
     lag=Setting(0.12, 0.3),
 )
-def boat(beam: float, sail: float, lead: float, lag: float) -> Triangles:
+def boat(beam: float, sail: float, lead: float, lag: float) -> Float64:
     """From the side: hull, mast and two triangular sails."""
     hull = slab([(-0.48, -0.2), (0.5, -0.2), (0.3, -0.45), (-0.32, -0.45)], 2 * beam)
     mast = at(box(0.06, sail + 0.1, 0.06), 0, sail / 2 - 0.22)
@@ -358,7 +358,7 @@ def boat(beam: float, sail: float, lead: float, lag: float) -> Triangles:
     back=Setting(0.25, 0.44, held_out=(0.32, 0.37)),
     cabin=Setting(0.2, 0.26),
 )
-def car(height: float, wheel: float, width: float, front: float, back: float, cabin: float) -> Triangles:
+def car(height: float, wheel: float, width: float, front: float, back: float, cabin: float) -> Float64:
     """From the side: body, a cabin with windows set in, two wheels."""
     body = slab([(-0.5, -0.08), (-0.5, 0.04), (0.44, 0.04), (0.5, -0.02), (0.5, -0.08)], 2 * width)
     sill = at(box(1.0, height - 0.06, 2 * width), 0, -0.08 - (height - 0.06) / 2)
@@ -384,7 +384,7 @@ def car(height: float, wheel: float, width: float, front: float, back: float, ca
     bars=Setting(0.16, 0.26),
     tank=Setting(0.12, 0.17),
 )
-def motorcycle(wheel: float, tyre: float, base: float, rake: float, bars: float, tank: float) -> Triangles:
+def motorcycle(wheel: float, tyre: float, base: float, rake: float, bars: float, tank: float) -> Float64:
     """From the side: two open wheels, a slanted fork up to the handlebar, tank, seat, engine and exhaust."""
     axle, head = -0.22, base - rake
     wheels = [at(joined(ring(wheel, tyre), disc(0.05, 0.14)), s * base, axle) for s in SIDES]
@@ -405,7 +405,7 @@ def motorcycle(wheel: float, tyre: float, base: float, rake: float, bars: float,
     nose=Setting(0.2, 0.35, held_out=(0.255, 0.295)),
     fin=Setting(0.14, 0.22),
 )
-def rocket(radius: float, nose: float, fin: float) -> Triangles:
+def rocket(radius: float, nose: float, fin: float) -> Float64:
     """Nose cone, body with a porthole, and fins."""
     tip = [(0, 0.5), (radius * 0.6, 0.5 - nose * 0.5), (radius, 0.5 - nose)]
     body = lathe([*tip, (radius, -0.4), (radius * 0.6, -0.5), (0, -0.5)])

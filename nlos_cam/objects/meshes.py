@@ -19,12 +19,13 @@ from typing import Literal, TypeVar
 
 import numpy as np
 import trimesh
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import orthographic_depth
-from nlos_cam.objects.placement import Triangles, place, random_pose
+from nlos_cam.objects.placement import place, random_pose
 
 _PLAIN = bytes(range(128)).replace(b"\t", b" ") + b"?" * 128
 """Tabs as blanks; letters of other alphabets, which only names and comments hold, as "?"."""
@@ -109,7 +110,7 @@ class MeshFile:
     path: Path
     sha256: str
     """Of the content."""
-    triangles: Triangles = field(repr=False, compare=False)
+    triangles: Float64 = field(repr=False, compare=False)
     """(n, 3, 3), in the file's unit and axes; parts joined."""
 
 
@@ -129,7 +130,7 @@ def read_mesh(path: Path) -> MeshFile:
     return MeshFile(path, hashlib.sha256(content).hexdigest(), triangles)
 
 
-def upright(triangles: Triangles, up: Up) -> Triangles:
+def upright(triangles: Float64, up: Up) -> Float64:
     """Triangles (n, 3, 3) turned so that the axis `up` of their file is y, and the side that faces the wall is -z.
 
     With z up, as CAD and Blender have it, that side is the file's +y: what an export with y up turns into -z too.
@@ -196,14 +197,14 @@ def _parts(content: bytes, suffix: str) -> list[trimesh.Trimesh]:
     return [part for part in scene.geometry.values() if isinstance(part, trimesh.Trimesh)]
 
 
-def _triangles(part: trimesh.Trimesh) -> Triangles:
+def _triangles(part: trimesh.Trimesh) -> Float64:
     faces = np.asarray(part.faces, np.int64).reshape(-1, 3)
     if faces.size and faces.min() < 0:
         raise ValueError(f"a face names vertex {faces.min()}")
     return np.asarray(part.vertices, np.float64)[faces]
 
 
-def _problem(triangles: Triangles) -> str:
+def _problem(triangles: Float64) -> str:
     """Why nobody could place triangles (n, 3, 3); empty where one can."""
     if not len(triangles):
         return "has no faces: it is empty, cut short or a point cloud; export a mesh of triangles"

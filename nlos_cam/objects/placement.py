@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from math import radians
 
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import ObjectBox
 from trimesh.transformations import euler_matrix
 
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import OBJECT_PIXELS, Float32
+from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import orthographic_depth, share_outside
 from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.primitives import Triangles
 
 
 def post(depth_m: Float32, generator: np.random.Generator) -> Float32:
@@ -63,7 +63,7 @@ class Pose:
     """From z_near to the object's nearest point."""
 
 
-def category_triangles(category: str, seed: int) -> Triangles:
+def category_triangles(category: str, seed: int) -> Float64:
     """The triangles (n, 3, 3) of one variation of a category, in its own units. Raises SceneError if unknown."""
     kind = CATEGORIES[_known([category])[0]]
     return kind.make(**kind.drawn(np.random.default_rng(seed).random(len(kind.settings))))
@@ -81,13 +81,13 @@ class Fit:
     """Share of its silhouette that lies beside the box, and is cut off."""
 
 
-def fit(triangles: Triangles, pose: Pose, box: ObjectBox) -> Fit:
+def fit(triangles: Float64, pose: Pose, box: ObjectBox) -> Fit:
     """How `place` and the rasteriser make an object fit the box."""
     depth_m = float(np.ptp(_at_size(triangles, pose)[:, 2]))
     return Fit(depth_m, _room_m(pose, box), share_outside(place(triangles, pose, box), box))
 
 
-def place(triangles: Triangles, pose: Pose, box: ObjectBox) -> Triangles:
+def place(triangles: Float64, pose: Pose, box: ObjectBox) -> Float64:
     """The triangles (n, 3, 3) turned, scaled and moved into the box, in the wall frame.
 
     A thing deeper than the box is flattened to fit: its silhouette stays. Raises SceneError where front_m leaves none.
@@ -108,7 +108,7 @@ def nothing_to_see(label: str, box: ObjectBox) -> SceneError:
     )
 
 
-def _at_size(triangles: Triangles, pose: Pose) -> Triangles:
+def _at_size(triangles: Float64, pose: Pose) -> Float64:
     """The corners (3 n, 3), turned and scaled about their middle."""
     turn = euler_matrix(pose.tilt_x_rad, pose.tilt_y_rad, pose.turn_z_rad)[:3, :3]
     points = triangles.reshape(-1, 3) @ turn.T

@@ -5,71 +5,70 @@ from functools import cache
 
 import numpy as np
 import trimesh
+from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 from trimesh import transformations
 
 SECTIONS = 28
 
-Triangles = NDArray[np.float64]
-"""(n, 3, 3): triangles, corners, (x, y, z)."""
 Point = tuple[float, float]
 
 
-def at(triangles: Triangles, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Triangles:
+def at(triangles: Float64, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float64:
     """The solid moved by (x, y, z)."""
     return triangles + np.array([x, y, z])
 
 
-def turned(triangles: Triangles, axis: Sequence[float], angle_deg: float) -> Triangles:
+def turned(triangles: Float64, axis: Sequence[float], angle_deg: float) -> Float64:
     """The solid turned about an axis through the origin."""
     turn = np.asarray(transformations.rotation_matrix(np.radians(angle_deg), axis))
     return triangles @ turn[:3, :3].T
 
 
-def tipped(triangles: Triangles, angle_deg: float) -> Triangles:
+def tipped(triangles: Float64, angle_deg: float) -> Float64:
     """The solid with its top tipped towards the wall, as if seen from above by so much."""
     return turned(triangles, (1, 0, 0), -angle_deg)
 
 
-def joined(*parts: Triangles) -> Triangles:
+def joined(*parts: Float64) -> Float64:
     """One solid of several; inner faces stay, since only the front is ever seen."""
     return np.concatenate(parts)
 
 
-def box(width: float, height: float, depth: float) -> Triangles:
+def box(width: float, height: float, depth: float) -> Float64:
     """A box centred on the origin."""
     return _unit_box() * (width, height, depth)
 
 
-def ellipsoid(rx: float, ry: float, rz: float) -> Triangles:
+def ellipsoid(rx: float, ry: float, rz: float) -> Float64:
     """An ellipsoid centred on the origin."""
     return _unit_sphere(3) * (rx, ry, rz)
 
 
-def knob(radius: float, reach: float) -> Triangles:
+def knob(radius: float, reach: float) -> Float64:
     """A small round thing centred on the origin that reaches so far towards the wall: a quarter as fine as others."""
     return _unit_sphere(2) * (radius, radius, reach)
 
 
-def lathe(profile: Sequence[Point]) -> Triangles:
+def lathe(profile: Sequence[Point]) -> Float64:
     """The solid that a profile of (radius, height) sweeps about the y axis."""
     angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)[:, None]
     radius, height = np.asarray(profile, float).T
     return _quilt(np.stack(np.broadcast_arrays(radius * np.cos(angle), height, radius * np.sin(angle)), axis=-1))
 
 
-def disc(radius: float, thickness: float) -> Triangles:
+def disc(radius: float, thickness: float) -> Float64:
     """A disc centred on the origin that faces the wall."""
     half = thickness / 2
     return turned(lathe([(0, -half), (radius, -half), (radius, half), (0, half)]), (1, 0, 0), -90)
 
 
-def ring(radius: float, tube: float) -> Triangles:
+def ring(radius: float, tube: float) -> Float64:
     """A torus in the x-y plane."""
     return arch(radius, tube, 360)
 
 
-def arch(radius: float, tube: float, angle_deg: float = 180.0) -> Triangles:
+def arch(radius: float, tube: float, angle_deg: float = 180.0) -> Float64:
     """The part of a torus in the x-y plane from the +x axis on, counter-clockwise seen with y up."""
     along = np.linspace(0, np.radians(angle_deg), SECTIONS + 1)[:, None]
     around = np.linspace(0, 2 * np.pi, 13)
@@ -78,7 +77,7 @@ def arch(radius: float, tube: float, angle_deg: float = 180.0) -> Triangles:
     return _quilt(np.stack(np.broadcast_arrays(*points), axis=-1))
 
 
-def slab(corners: Sequence[Point], thickness: float) -> Triangles:
+def slab(corners: Sequence[Point], thickness: float) -> Float64:
     """A convex polygon of (x, y) corners in the x-y plane, given a thickness along z."""
     outline: NDArray[np.float64] = np.asarray(corners, float)
     n = len(outline)
@@ -90,7 +89,7 @@ def slab(corners: Sequence[Point], thickness: float) -> Triangles:
     return np.vstack([front, back])[np.asarray(faces)]
 
 
-def bar(start: Point, end: Point, width: float, thickness: float) -> Triangles:
+def bar(start: Point, end: Point, width: float, thickness: float) -> Float64:
     """A straight bar in the x-y plane from one point to another."""
     (x0, y0), (x1, y1) = start, end
     share = width / 2 / np.hypot(x1 - x0, y1 - y0)
@@ -98,7 +97,7 @@ def bar(start: Point, end: Point, width: float, thickness: float) -> Triangles:
     return slab([(x0 - u, y0 - v), (x0 + u, y0 + v), (x1 + u, y1 + v), (x1 - u, y1 - v)], thickness)
 
 
-def pierced(width: float, height: float, hole: float, thickness: float) -> Triangles:
+def pierced(width: float, height: float, hole: float, thickness: float) -> Float64:
     """A plate centred on the origin that faces the wall, with a round hole of radius `hole` in its middle."""
     angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -111,7 +110,7 @@ def pierced(width: float, height: float, hole: float, thickness: float) -> Trian
     return _quilt(np.stack(rings, axis=1))
 
 
-def frame(width: float, height: float, border: float, thickness: float) -> Triangles:
+def frame(width: float, height: float, border: float, thickness: float) -> Float64:
     """A rectangular frame centred on the origin that faces the wall: its border lies within the width and height."""
     rail, post = box(width, border, thickness), box(border, height, thickness)
     up, aside = (height - border) / 2, (width - border) / 2
@@ -119,16 +118,16 @@ def frame(width: float, height: float, border: float, thickness: float) -> Trian
 
 
 @cache
-def _unit_box() -> Triangles:
+def _unit_box() -> Float64:
     return np.asarray(trimesh.creation.box().triangles, np.float64)
 
 
 @cache
-def _unit_sphere(subdivisions: int) -> Triangles:
+def _unit_sphere(subdivisions: int) -> Float64:
     return np.asarray(trimesh.creation.icosphere(subdivisions).triangles, np.float64)
 
 
-def _quilt(points: NDArray[np.float64]) -> Triangles:
+def _quilt(points: NDArray[np.float64]) -> Float64:
     """The surface through a grid of points (rows, columns, 3): two triangles for every four neighbours."""
     a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
     return np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(-1, 3, 3)

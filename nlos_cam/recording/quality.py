@@ -5,10 +5,11 @@ from math import sqrt
 
 import numba
 import numpy as np
+from nlos_calibration.arrays import Float32
 from numpy.typing import NDArray
 
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.frames import SATURATED, Float32, Frame
+from nlos_cam.frames import SATURATED, Frame
 
 LEAST_PAIRS = 8
 """Pairs of frames in which a pixel must be valid for its noise to count; with fewer in all, no noise is told."""

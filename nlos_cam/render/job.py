@@ -4,31 +4,29 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.near import NEAR_DIAGONALS, contact_m2, softened, solid_angle
+from nlos_cam.render.geometry import NEAR_DIAGONALS, Relay, contact_m2, softened, solid_angle
+from nlos_cam.render.material import Brdf
 from nlos_cam.render.patches import Patches
-from nlos_cam.render.relay import Relay
-from nlos_cam.render.surface import Brdf
 from nlos_cam.render.visibility import HeightField
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Job:
     """Some beams, the patches, the relay wall and all that decides their three-bounce histograms."""
 
-    foot_m: Array
+    foot_m: Float64
     """(n, 3); where the beams land on the wall."""
-    length_m: Array
+    length_m: Float64
     """(n,); d1."""
-    cos_incidence: Array
+    cos_incidence: Float64
     """(n,); cos t1."""
     patches: Patches
     relay: Relay
-    lidar_m: Array
+    lidar_m: Float64
     """(3,)."""
     edge_m: tuple[float, float]
     """(x, z) of the occluder's edge."""
@@ -38,7 +36,7 @@ class Job:
     bin_m: float
     bins: int
     accuracy: Accuracy
-    map_foot_m: Array
+    map_foot_m: Float64
     """(k, 3); of every beam of the map: a BRDF is tabulated among these, whichever of them are rendered."""
     wall_m: tuple[float, float, float, float]
     """(x_min, x_max, y_min, y_max) of the physical wall, which inter-reflection goes over."""
@@ -63,7 +61,7 @@ class Job:
         return NEAR_DIAGONALS * max(self.patches.diagonal_m, self.relay.diagonal_m)
 
     @cached_property
-    def soft_patch_m2(self) -> Array:
+    def soft_patch_m2(self) -> Float64:
         """(n,); what near contact adds to d2^2 at a patch."""
         return contact_m2(self.patches.area_m2, self.solid_angle)
 
@@ -73,12 +71,12 @@ class Job:
         return contact_m2(self.relay.cell_m2, self.solid_angle)
 
     @cached_property
-    def beam_weight(self) -> Array:
+    def beam_weight(self) -> Float64:
         """(n,); what of S2 depends on the beam alone."""
         return (np.ones_like(self.cos_incidence) if self.lambertian else self.cos_incidence) / self.solid_angle
 
     @cached_property
-    def relay_weight(self) -> Array:
+    def relay_weight(self) -> Float64:
         """(m,); what of S2 depends on the relay cell alone: its area, and the way from it to the lidar."""
         relay = self.relay
         squared = softened(relay.length_m**2, self.soft_wall_m2, self.near_m)
@@ -86,7 +84,7 @@ class Job:
         return weight * self.receiver_cell_m2 * relay.cos_lidar if self.lambertian else weight
 
     @cached_property
-    def strength(self) -> Array:
+    def strength(self) -> Float64:
         """(n,); what of S2 depends on the patch alone: albedo times true area."""
         return self.patches.albedo * self.patches.area_m2
 

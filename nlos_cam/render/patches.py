@@ -3,12 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 
 from nlos_cam.objects.depth_map import cell_centres_m
-
-Array = NDArray[np.float64]
 
 JUMP_M = 0.02
 """Neighbours further apart in depth than this are not one surface: beta (S3) must not join them by a curtain."""
@@ -18,13 +17,13 @@ JUMP_M = 0.02
 class Patches:
     """The active cells of a hidden surface, one row each: centre, normal towards the wall, beta (S3)."""
 
-    point_m: Array
+    point_m: Float64
     """(n, 3)."""
-    normal: Array
+    normal: Float64
     """(n, 3), unit."""
-    beta: Array
+    beta: Float64
     """(n,); true area over projected area."""
-    albedo: Array
+    albedo: Float64
     """(n,); what part of the light a patch gives back, times the share of its cell that it fills."""
     row: NDArray[np.int64]
     column: NDArray[np.int64]
@@ -34,12 +33,12 @@ class Patches:
     """Of a cell."""
 
     @property
-    def area_m2(self) -> Array:
+    def area_m2(self) -> Float64:
         """(n,); true area."""
         return self.beta * self.cell_m2
 
     @property
-    def slope(self) -> Array:
+    def slope(self) -> Float64:
         """(n, 2); dz/dx and dz/dy."""
         return -self.normal[:, :2] / self.normal[:, 2:]
 
@@ -50,7 +49,7 @@ class Patches:
         return replace(self, normal=normal, beta=np.ones_like(self.beta))
 
 
-def slope_along(depth: Array, axis: int, pitch_m: float, jump_m: float = JUMP_M) -> Array:
+def slope_along(depth: Float64, axis: int, pitch_m: float, jump_m: float = JUMP_M) -> Float64:
     """Forward difference along an axis; backward at an edge or a jump; 0 where no neighbour is the same surface."""
     padding = [(1, 1) if a == axis else (0, 0) for a in range(2)]
     step = np.diff(np.pad(depth, padding, constant_values=np.nan), axis=axis)
@@ -60,7 +59,7 @@ def slope_along(depth: Array, axis: int, pitch_m: float, jump_m: float = JUMP_M)
     return np.nan_to_num(np.where(np.isnan(forward), backward, forward), nan=0.0) / pitch_m
 
 
-def make_patches(depth: Array, box: ObjectBox, albedo: Array, jump_m: float = JUMP_M) -> Patches:
+def make_patches(depth: Float64, box: ObjectBox, albedo: Float64, jump_m: float = JUMP_M) -> Patches:
     """The patches of a depth map (rows, columns), NaN for background, with the albedo (rows, columns) of its cells."""
     x_m, y_m = cell_centres_m(box, len(depth))
     pitch_x, pitch_y = cell_pitch_m(box, depth.shape)
@@ -89,7 +88,7 @@ def clustered(patches: Patches, stride: int, size: int) -> Patches:
     found = np.unique(block, return_inverse=True, return_counts=True)
     blocks, which, count = (column.astype(np.int64) for column in found)
 
-    def summed(columns: Array) -> Array:
+    def summed(columns: Float64) -> Float64:
         return np.stack([np.bincount(which, column, len(blocks)).astype(np.float64) for column in columns.T], -1)
 
     area = summed((patches.albedo * patches.beta)[:, None] * patches.normal)
@@ -109,7 +108,7 @@ def clustered(patches: Patches, stride: int, size: int) -> Patches:
     )
 
 
-def coarser(depth: Array, stride: int) -> Array:
+def coarser(depth: Float64, stride: int) -> Float64:
     """The mean depth of blocks of stride x stride cells, NaN where none of them is a surface."""
     size = len(depth) // stride
     blocks = depth.reshape(size, stride, size, stride)

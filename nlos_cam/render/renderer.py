@@ -7,20 +7,20 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import MAP_COLUMNS, WINNER_SPREAD_M, Float32
-from nlos_cam.render import cpu, reference
+from nlos_cam.frames import MAP_COLUMNS, WINNER_SPREAD_M
+from nlos_cam.render import backend_numba, backend_reference
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
-from nlos_cam.render.beams import gate_bins
-from nlos_cam.render.echo import MultiBounce, add_direct, compete, nothing, spread, strongest
+from nlos_cam.render.echoes import MultiBounce, add_direct, compete, nothing, spread, strongest
 from nlos_cam.render.effects import Effects, Plan, included
+from nlos_cam.render.geometry import gate_bins
 from nlos_cam.render.job import Job, near_legs
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
 
-Array = NDArray[np.float64]
 Implementation = Callable[[Job], NDArray[np.floating[Any]]]
 BACKENDS = "cpu", "torch", "cuda"
 """numba; torch on the CPU; torch on a GPU."""
@@ -139,21 +139,21 @@ def implementation(accuracy: Accuracy, backend: str) -> Implementation:
     if backend not in BACKENDS:
         raise SceneError(f"no backend {backend!r}: choose one of {', '.join(BACKENDS)}")
     if accuracy.sub_bins == 0:
-        return reference.histograms
+        return backend_reference.histograms
     if backend == "cpu":
-        return cpu.histograms
-    from nlos_cam.render import cuda  # torch takes a second to import
+        return backend_numba.histograms
+    from nlos_cam.render import backend_torch  # torch takes a second to import
 
-    return partial(cuda.histograms, device=cuda.device_named(backend))
+    return partial(backend_torch.histograms, device=backend_torch.device_named(backend))
 
 
 def _histograms_of_all(jobs: Sequence[Job], accuracy: Accuracy, backend: str) -> list[NDArray[np.floating[Any]]]:
     one_by_one = implementation(accuracy, backend)
     if backend == "cpu" or accuracy.sub_bins == 0:
         return [one_by_one(job) for job in jobs]
-    from nlos_cam.render import cuda
+    from nlos_cam.render import backend_torch
 
-    return [*cuda.histograms_of_all(jobs, cuda.device_named(backend))]
+    return [*backend_torch.histograms_of_all(jobs, backend_torch.device_named(backend))]
 
 
 def _echoes(ready: Prepared, found: NDArray[np.floating[Any]] | None) -> MultiBounce:

@@ -4,17 +4,15 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
+from nlos_calibration.arrays import Float32
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import ObjectBox, Rig
-from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Float32
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS
 from nlos_cam.objects.depth_map import object_box
+from nlos_cam.render.material import Surface
 from nlos_cam.render.patches import JUMP_M, Patches, make_patches
-from nlos_cam.render.surface import Surface
-
-Array = NDArray[np.float64]
 
 Radiometry = Literal["paper", "lambertian"]
 """S1 to S5 to the letter, or every cosine and 1 / pi of the rendering equation for the same paths."""

@@ -1,27 +1,190 @@
-"""`scene.toml`: a rig, a hidden object, its motion and the sensor model, as one validated record."""
+"""`scene.toml`: a rig, a hidden object, its motion and the sensor model, as one validated record.
+
+The records of a hidden object in scene files: what it is, what it is made of, how it stands and how it moves.
+
+The record of a fault in scene files: what befalls a simulated camera, when, and for how long.
+"""
 
 import hashlib
 import tomllib
 from dataclasses import replace
 from math import pi, radians, sin
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.rig import Record, Rig, first_problem, load_rig
 from nlos_calibration.wall_record import rig_named
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.depth_map import object_box, orthographic_depth
-from nlos_cam.objects.placement import Pose, nothing_to_see, place
-from nlos_cam.render.fault_record import Fault, one_wrap
-from nlos_cam.render.hidden_record import HiddenObject, Motion
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.meshes import MeshFile, Up, read_mesh, upright
+from nlos_cam.objects.placement import Pose, category_triangles, nothing_to_see, place
+from nlos_cam.render.material import Material
 from nlos_cam.render.patches import JUMP_M
 from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.sensor_model import SensorModel
-from nlos_cam.render.surface import Material
+from nlos_cam.render.sensor.model import SensorModel
+
+
+def _known(category: str) -> str:
+    if category not in CATEGORIES:
+        raise ValueError(f"no such category: choose one of {', '.join(CATEGORIES)}")
+    return category
+
+
+def _mesh(value: object) -> MeshFile:
+    if isinstance(value, MeshFile):
+        return value
+    if not isinstance(value, str | Path):
+        raise PydanticCustomError("mesh_file", "must be the path of a mesh")
+    try:
+        return read_mesh(Path(value))
+    except SceneError as error:
+        raise PydanticCustomError("mesh_file", "{problem}", {"problem": str(error)}) from error
+
+
+def _within(low: float, high: float) -> AfterValidator:
+    """A range that NaN is outside of, told as a whole."""
+
+    def check(value: float) -> float:
+        if not low <= value <= high:
+            raise PydanticCustomError("range", "must be from {low} to {high}", {"low": f"{low:g}", "high": f"{high:g}"})
+        return value
+
+    return AfterValidator(check)
+
+
+Mesh = Annotated[MeshFile, PlainValidator(_mesh), PlainSerializer(lambda mesh: str(mesh.path), str)]
+Size = Annotated[float, _within(0.001, 10)]
+Length = Annotated[float, _within(-10, 10)]
+Reach = Annotated[float, _within(0, 10)]
+Angle = Annotated[float, _within(-360, 360)]
+
+
+class HiddenObject(Record):
+    """One variation of a procedural category, or a mesh from a file, and how it stands at rest."""
+
+    category: Annotated[str, AfterValidator(_known)] | None = None
+    seed: int = Field(default=0, ge=0)
+    """Which variation of the category."""
+    size_m: Size = 0.18
+    """The larger of its extents along x and y, once turned: the unit of a mesh's file does not matter."""
+    tilt_x_deg: Angle = 0.0
+    tilt_y_deg: Angle = 0.0
+    turn_deg: Angle = 0.0
+    x_m: Length = 0.0
+    y_m: Length = 0.0
+    front_m: Reach = 0.03
+    """From the box's near side to the object's nearest point."""
+    file: Mesh | None = None
+    """A .obj, .stl or .ply; a path in a scene file starts from its folder."""
+    up: Up = "y"
+    """Which axis of the mesh's file points up."""
+    material: Material = Material()
+
+    @model_validator(mode="after")
+    def _one_thing(self) -> Self:
+        if (self.category is None) == (self.file is None):
+            raise PydanticCustomError("one_thing", "give one of category and file")
+        if self.file and self.seed:
+            raise PydanticCustomError("seed", "seed is for a category: a file has no variations")
+        if self.category and self.up != "y":
+            raise PydanticCustomError("up", "up is for a file: a category stands with y up")
+        return self
+
+    @property
+    def label(self) -> str:
+        """What a message calls it: the category, or the file's path."""
+        return str(self.file.path) if self.file else str(self.category)
+
+    @property
+    def triangles(self) -> Float64:
+        """(n, 3, 3), before it is placed: y up, -z towards the wall."""
+        return upright(self.file.triangles, self.up) if self.file else category_triangles(self.label, self.seed)
+
+
+class Motion(Record):
+    """A loop of poses: each quantity swings to and fro by its amplitude, at its own whole number of swings a loop."""
+
+    poses: int = Field(default=90, gt=0)
+    """At 30 poses a second."""
+    sway_x_m: Length = 0.0
+    sway_y_m: Length = 0.0
+    approach_m: Reach = 0.0
+    turn_deg: Angle = 0.0
+    tilt_deg: Angle = 0.0
+
+
+FaultKind = Literal[
+    "stall",
+    "drops",
+    "duplicate",
+    "out_of_order",
+    "all_zero",
+    "saturated",
+    "half_invalid",
+    "wrong_size",
+    "unplug",
+    "clock_wrap",
+]
+
+
+class Fault(Record):
+    """One `[[faults]]` table: `kind` says what the device does instead of delivering its frames as they are.
+
+    stall: it delivers nothing and does not count on. drops: it counts on, and delivers nothing. duplicate: each frame
+    comes twice. out_of_order: each comes after the one that follows it. all_zero: black in depth, infrared and
+    confidence. saturated: infrared is 255 throughout. half_invalid: no depth in the lower half. wrong_size: half the
+    rows and columns. unplug: the device is gone, and counts from 0 when it is back. clock_wrap: timestamps are of a
+    hardware clock of 32 bits of microseconds, which starts again at 0.
+    """
+
+    kind: FaultKind
+    at_frame: int = Field(ge=0)
+    """The first frame that it befalls; the world has 30 a second, counted from 0 when the camera is entered."""
+    frames: int = Field(default=1, gt=0)
+    """How many it befalls: for stall and unplug, that is how long they last; of out_of_order, those that are late."""
+    stream: Literal["depth", "infrared", "confidence"] | None = None
+    """Of drops: the only stream that loses frames."""
+
+    @model_validator(mode="after")
+    def _sensible(self) -> Self:
+        if self.stream and self.kind != "drops":
+            raise PydanticCustomError("stream", "stream is for drops: a {kind} befalls all", {"kind": self.kind})
+        if self.kind == "clock_wrap" and "frames" in self.model_fields_set:
+            raise PydanticCustomError("frames", "a clock_wrap is at one frame: leave `frames` away")
+        return self
+
+    @property
+    def until_frame(self) -> int:
+        """The first frame that it does not befall any more."""
+        return self.at_frame + self.frames * (2 if self.kind == "out_of_order" else 1)
+
+    def befalls(self, frame: int) -> bool:
+        """Whether it lasts at this frame."""
+        return self.at_frame <= frame < self.until_frame
+
+
+def one_wrap(faults: tuple[Fault, ...]) -> tuple[Fault, ...]:
+    """The same. Raises PydanticCustomError for a clock that wraps more often than every 71 minutes."""
+    if sum(fault.kind == "clock_wrap" for fault in faults) > 1:
+        raise PydanticCustomError("clock_wrap", "a clock wraps every 71.6 minutes: give one clock_wrap")
+    return faults
+
 
 RENDERING_VERSION = 3
 """Raised with any change of what a scene renders to, so that cached worlds are rendered anew."""

@@ -8,14 +8,12 @@ import numpy as np
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.agreement import Agreement, Echoes, agreement
-from nlos_cam.render.choose import Stopwatch, least_seconds
+from nlos_cam.render.accuracy_search import Agreement, Echoes, Stopwatch, agreement, least_seconds
 from nlos_cam.render.effects import Effects
-from nlos_cam.render.findings import plan
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.planning import Prepared, plan
 from nlos_cam.render.renderer import Rendering, render, three_bounce
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.stage import Stage
+from nlos_cam.render.scene_facts import Stage
 
 Part = Literal["stop", "sub_bins", "relay grid", "object_stride", "beams_per_cell", "effect left out"]
 

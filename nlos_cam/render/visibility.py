@@ -11,15 +11,12 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64, Int64
 from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32
 from nlos_cam.objects.depth_map import cell_centres_m
 from nlos_cam.render.patches import cell_pitch_m
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 FACES = 4
 """Directions along +columns, -columns, +rows, -rows, each with its own sectors."""
@@ -32,7 +29,7 @@ ROUNDING = 1e-5
 class HeightField(NamedTuple):
     """A depth map laid out for walking: NaN is background, which neither shades nor receives."""
 
-    depth_m: Array
+    depth_m: Float64
     """(n, n)."""
     x_0_m: float
     """Wall x of column 0; y of row 0."""
@@ -124,7 +121,7 @@ def blocked(field: HeightField, row: int, column: int, depth_m: float, u: float,
 
 
 @numba.njit(cache=True)
-def visible(field: HeightField, row: int, column: int, point: Array, x: float, y: float) -> bool:
+def visible(field: HeightField, row: int, column: int, point: Float64, x: float, y: float) -> bool:
     """Whether the wall point (x, y) and a patch's centre (3,) see each other past the rest of the object."""
     if not field.shades:
         return True
@@ -189,7 +186,7 @@ def _horizons(
 
 @numba.njit(cache=True, parallel=True)
 def horizon_table(
-    field: HeightField, rows: Index, columns: Index, depth_m: Array, reach: Array, sectors: int
+    field: HeightField, rows: Int64, columns: Int64, depth_m: Float64, reach: Float64, sectors: int
 ) -> tuple[Float32, Float32]:
     """Lower and upper bounds (n, FACES * sectors) of the horizons of patches, for every sector of directions.
 

@@ -5,13 +5,12 @@ from math import floor, log10
 
 import cv2
 import numpy as np
+from nlos_calibration.arrays import Float32, UInt8
 from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32
 from nlos_cam.objects.depth_map import cell_centres_m, image_from_depth
 
-Rgb = NDArray[np.uint8]
 BACKGROUND_RGB = (13, 16, 17)
 """The page's own dark: what has no surface has no colour."""
 PICTURE_WIDTH = 320
@@ -35,7 +34,7 @@ FADED = 0.35
 """The share of its colour that is left to what may not be believed."""
 
 
-def hidden_rgb(depth_m: Float32, box: ObjectBox) -> Rgb:
+def hidden_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
     """Hidden depth (64, 64) as a picture (64, 64, 3): bright is near the wall, the background dark."""
     v = image_from_depth(depth_m, box)
     rgb = _coloured(DARKEST + v * (255 - DARKEST), cv2.COLORMAP_INFERNO)
@@ -43,7 +42,7 @@ def hidden_rgb(depth_m: Float32, box: ObjectBox) -> Rgb:
     return rgb
 
 
-def lidar_rgb(depth_m: Float32, near_m: float, far_m: float) -> Rgb:
+def lidar_rgb(depth_m: Float32, near_m: float, far_m: float) -> UInt8:
     """Lidar depth (height, width) as a picture, red (near) to blue (far); no return is dark."""
     share = (depth_m - near_m) / max(far_m - near_m, 1e-6)
     rgb = _coloured(np.nan_to_num(1.0 - np.clip(share, 0.0, 1.0)) * 255, cv2.COLORMAP_TURBO)
@@ -56,12 +55,12 @@ def infrared_grey(ir: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.sqrt(ir * np.float32(255.0)).astype(np.uint8)
 
 
-def confidence_rgb(confidence: NDArray[np.uint8]) -> Rgb:
+def confidence_rgb(confidence: NDArray[np.uint8]) -> UInt8:
     """Confidence 0 to 15 (height, width) as a picture, dark to bright."""
     return _coloured(np.minimum(confidence, MOST_CONFIDENT) * (255.0 / MOST_CONFIDENT), cv2.COLORMAP_BONE)
 
 
-def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> Rgb:
+def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> UInt8:
     """How uncertain the hidden depth is (64, 64) as a picture, bright where it is; dark where there is no surface."""
     share = np.clip(np.nan_to_num(uncertainty_m, nan=np.inf) / MOST_UNCERTAIN_M, 0.0, 1.0)
     rgb = _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_VIRIDIS)
@@ -69,7 +68,7 @@ def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> Rgb:
     return rgb
 
 
-def relief_rgb(depth_m: Float32, box: ObjectBox) -> Rgb:
+def relief_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
     """Hidden depth (64, 64) as if lit from the top left, where the surface faces."""
     pitch_m = (box.x_max_m - box.x_min_m) / depth_m.shape[1]
     down, right = np.gradient(np.nan_to_num(depth_m, nan=box.z_far_m), pitch_m)
@@ -80,7 +79,7 @@ def relief_rgb(depth_m: Float32, box: ObjectBox) -> Rgb:
     return rgb
 
 
-def faded(rgb: Rgb) -> Rgb:
+def faded(rgb: UInt8) -> UInt8:
     """The same picture (..., 3) with little colour left, for what may not be believed."""
     grey = rgb.mean(axis=-1, keepdims=True)
     return np.rint(grey + FADED * (rgb - grey)).astype(np.uint8)
@@ -101,7 +100,7 @@ def depth_span_m(depth_m: Float32) -> tuple[float, float]:
     return float(near_m), float(far_m)
 
 
-def difference_rgb(further: NDArray[np.floating], span: float) -> Rgb:
+def difference_rgb(further: NDArray[np.floating], span: float) -> UInt8:
     """What is farther than expected as a picture: blue, and nearer red, grey as expected; NaN is dark."""
     share = np.clip(np.nan_to_num(further) / span, -1.0, 1.0)
     rgb = np.stack([np.interp(share, (-1.0, 0.0, 1.0), stops) for stops in DIVERGING_RGB], axis=-1).astype(np.uint8)
@@ -109,14 +108,14 @@ def difference_rgb(further: NDArray[np.floating], span: float) -> Rgb:
     return rgb
 
 
-def noise_rgb(noise: NDArray[np.floating], span: float) -> Rgb:
+def noise_rgb(noise: NDArray[np.floating], span: float) -> UInt8:
     """A spread as a picture, bright where it is large; NaN is dark."""
     rgb = _coloured(DARKEST + np.clip(np.nan_to_num(noise) / span, 0.0, 1.0) * (255 - DARKEST), cv2.COLORMAP_INFERNO)
     rgb[np.isnan(noise)] = BACKGROUND_RGB
     return rgb
 
 
-def saturated_rgb(ir: NDArray[np.floating], saturated: NDArray[np.floating]) -> Rgb:
+def saturated_rgb(ir: NDArray[np.floating], saturated: NDArray[np.floating]) -> UInt8:
     """Mean IR counts in grey, and in its own colour what was ever saturated."""
     rgb = np.repeat(infrared_grey(np.nan_to_num(ir).astype(np.uint8))[..., np.newaxis], 3, axis=-1)
     rgb[saturated > 0.0] = SATURATED_RGB
@@ -148,7 +147,7 @@ class Surface:
     """(n, 3)."""
     triangles: NDArray[np.uint32]
     """(m, 3)."""
-    rgb: Rgb
+    rgb: UInt8
     """(n, 3)."""
     normals: NDArray[np.float32]
     """(n, 3); away from the wall, of length 1."""
@@ -179,6 +178,6 @@ def _normals(points_m: NDArray[np.float32], triangles: NDArray[np.uint32]) -> ND
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
-def _coloured(values: NDArray[np.floating], colour_map: int) -> Rgb:
+def _coloured(values: NDArray[np.floating], colour_map: int) -> UInt8:
     bgr = cv2.applyColorMap(values.astype(np.uint8), colour_map)
     return np.ascontiguousarray(bgr[..., ::-1], dtype=np.uint8)

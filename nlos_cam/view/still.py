@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from nlos_calibration.arrays import UInt8
 from nlos_calibration.rig import Rig
 from PIL import Image, ImageDraw
 
@@ -11,7 +12,6 @@ from nlos_cam.objects.depth_map import object_box
 from nlos_cam.view.pictures import (
     BACKGROUND_RGB,
     MOST_UNCERTAIN_M,
-    Rgb,
     depth_span_m,
     hidden_rgb,
     infrared_grey,
@@ -42,7 +42,7 @@ class Still:
         self._span_m = depth_span_m(first.frame.depth_m)
         self._seen = first
 
-    def rgb(self, moment: Moment, *, with_lidar: bool = True) -> Rgb:
+    def rgb(self, moment: Moment, *, with_lidar: bool = True) -> UInt8:
         """(720, 1280, 3); without new pictures of the lidar's, whose noise is hard to compress, those before stay."""
         self._seen = moment if with_lidar else self._seen
         page = _Page()
@@ -102,7 +102,7 @@ class _Page:
         self._pen.text((x, y + 34), "nlos-cam", fill=PALE_RGB, font=font(40), anchor="rm")
         self._pen.text((x, y + 74), "seeing around a corner", fill=QUIET_RGB, font=font(21), anchor="rm")
 
-    def picture(self, at: tuple[int, int], title: str, rgb: Rgb, size: tuple[int, int]) -> None:
+    def picture(self, at: tuple[int, int], title: str, rgb: UInt8, size: tuple[int, int]) -> None:
         """Below its title, as large as fits, in the middle of its panel."""
         (x, y), (width, height) = at, size
         self._pen.rectangle((x, y, x + width - 1, y + height - 1), fill=PANEL_RGB)
@@ -111,7 +111,7 @@ class _Page:
         down, right = (height - fitted.shape[0]) // 2, (width - fitted.shape[1]) // 2
         self.image.paste(Image.fromarray(fitted), (x + right, y + down))
 
-    def bar(self, at: tuple[int, int], size: int, rgb: Rgb, top: str, bottom: str) -> None:
+    def bar(self, at: tuple[int, int], size: int, rgb: UInt8, top: str, bottom: str) -> None:
         """The scale of colours to the right of a square picture."""
         x, y = at[0] + size + 10, at[1]
         self.image.paste(Image.fromarray(rgb).resize((BAR, size), Image.Resampling.BILINEAR), (x, y))
@@ -122,7 +122,7 @@ class _Page:
         self._pen.text((MARGIN, HEIGHT - MARGIN), text, fill=QUIET_RGB, font=font(18), anchor="lm")
 
 
-def _fitted(rgb: Rgb, width: int, height: int) -> Rgb:
+def _fitted(rgb: UInt8, width: int, height: int) -> UInt8:
     """As large as fits; cells stay cells, and photographs are thinned smoothly."""
     scale = min(width / rgb.shape[1], height / rgb.shape[0])
     size = max(round(rgb.shape[1] * scale), 1), max(round(rgb.shape[0] * scale), 1)

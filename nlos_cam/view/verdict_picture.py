@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from nlos_calibration.arrays import UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from nlos_cam.verdict import Verdict
-from nlos_cam.view.pictures import BACKGROUND_RGB, Rgb, faded
+from nlos_cam.view.pictures import BACKGROUND_RGB, faded
 
 BANNER_WIDTH, BANNER_HEIGHT = 880, 96
 NOTED_PIXELS = 512
@@ -49,7 +50,7 @@ def may_be_believed(verdict: Verdict | None) -> bool:
 
 
 @cache
-def banner_rgb(verdict: Verdict | None) -> Rgb:
+def banner_rgb(verdict: Verdict | None) -> UInt8:
     """The verdict's panel: its name large, what to do or think below, on a ground of its colour."""
     look = look_of(verdict)
     ground = tuple(int(b + DIM * (c - b)) for b, c in zip(BACKGROUND_RGB, look.rgb, strict=True))
@@ -61,7 +62,7 @@ def banner_rgb(verdict: Verdict | None) -> Rgb:
     return np.asarray(image)
 
 
-def as_believed(rgb: Rgb, verdict: Verdict | None) -> Rgb:
+def as_believed(rgb: UInt8, verdict: Verdict | None) -> UInt8:
     """A reconstruction's picture (64, 64, 3) as it is; if it may not be believed (512, 512, 3): faded, framed, named.
 
     What is doubted is hatched too; what is nothing is not.

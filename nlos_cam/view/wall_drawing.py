@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import rerun as rr
+from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.footprint import footprint, on_plane
 from nlos_calibration.measured_wall import MeasuredWall, wall_points_m
@@ -20,9 +21,6 @@ from numpy.typing import NDArray
 
 from nlos_cam.view.layout import WallNames
 from nlos_cam.view.pictures import PICTURE_WIDTH, SATURATED_RGB, difference_rgb, noise_rgb, round_span, saturated_rgb
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 RESIDUAL_SPAN_M, USUAL_NOISE_M = 0.002, 0.001
 MOST_POINTS, MOST_SATURATED = 6000, 1500
@@ -48,7 +46,7 @@ def every_nth(shape: tuple[int, ...], most: int) -> tuple[slice, slice]:
     return slice(None, None, step), slice(None, None, step)
 
 
-def outline_m(measured: MeasuredWall) -> Array:
+def outline_m(measured: MeasuredWall) -> Float64:
     """The footprint (n, 2) of the map on the wall as a polygon, closed; empty where no beam meets the wall.
 
     What is seen of a flat wall is convex, and so is the wall: the hull of the cells that are on it loses nothing.
@@ -63,7 +61,7 @@ def outline_m(measured: MeasuredWall) -> Array:
     return np.concatenate([hull_m, hull_m[:1]])
 
 
-def _within(points_m: Array, wall: Extent) -> Mask:
+def _within(points_m: Float64, wall: Extent) -> Mask:
     x_m, y_m = points_m[..., 0], points_m[..., 1]
     return (x_m >= wall.x_min_m) & (x_m <= wall.x_max_m) & (y_m >= wall.y_min_m) & (y_m <= wall.y_max_m)
 

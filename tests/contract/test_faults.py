@@ -21,8 +21,8 @@ from nlos_cam.live_report import LiveReport
 from nlos_cam.processing import Processing
 from nlos_cam.recording.playback import ReplayCamera
 from nlos_cam.recording.sdk_playback import SdkReplayCamera
-from nlos_cam.render.fault_record import Fault
-from nlos_cam.render.sensor import SensedImages
+from nlos_cam.render.scene_file import Fault
+from nlos_cam.render.sensor.sensor import SensedImages
 from nlos_cam.verdict import Verdict
 from nlos_cam.view.viewer import Moment, NullViewer
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from nlos_cam.camera.l515 import NEAR_WALL
 from nlos_cam.camera.streams import FORMATS
-from nlos_cam.render.sensor import DEPTH_UNIT_M
+from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M
 
 COLOUR_FROM_DEPTH = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.6, 0.8, 0.014], [0.0, -0.8, 0.6, -0.007]])
 """Where the colour camera is: far from the L515's, so that nothing passes by chance."""

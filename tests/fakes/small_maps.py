@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nlos_calibration.arrays import Float16
 from nlos_models import checkpoint, networks
-from nlos_models.data import Half, MapBatch, MapSet, map_batches
+from nlos_models.data import MapBatch, MapSet, map_batches
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
 from torch import Tensor, nn
@@ -17,7 +18,7 @@ from torch.nn import functional
 LATENT = 256
 
 
-def small_images(count: int, seed: int) -> Half:
+def small_images(count: int, seed: int) -> Float16:
     """Images (n, 64, 64): one bright square each."""
     generator, images = np.random.default_rng(seed), np.zeros((count, 64, 64), np.float16)
     for image in images:

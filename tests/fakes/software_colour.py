@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.render.sensor import SensedImages
+from nlos_cam.render.sensor.sensor import SensedImages
 
 BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "yuyv": 2, "uyvy": 2}
 

@@ -18,7 +18,7 @@ from nlos_cam.camera import open_camera
 from nlos_cam.camera.colour import look_in_colour
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
-from nlos_cam.render.sensor import DEPTH_UNIT_M, SensedImages
+from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.render.material import Brdf, Surface, phong, retroreflective
 from nlos_cam.render.renderer import three_bounce
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.surface import Brdf, Surface, phong, retroreflective
 
 RIG = load_rig("paper-rig")
 KINDS = (phong, retroreflective)

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration.rig import LidarPose, load_rig
 
-from nlos_cam.render.beams import cast
-from nlos_cam.render.near import NEAR_DIAGONALS, contact_m2, softened
+from nlos_cam.render.geometry import NEAR_DIAGONALS, cast, contact_m2, softened
 from nlos_cam.render.scene import Scene
 
 RIG = load_rig("paper-rig")

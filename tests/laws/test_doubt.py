@@ -17,8 +17,8 @@ from nlos_cam.objects.depth_map import object_box
 from nlos_cam.outliers import TO_LEARN, outlier
 from nlos_cam.processing import Arrival, Processing, Step
 from nlos_cam.render.renderer import render
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 from nlos_cam.sights import Sight, ordinary
 from nlos_cam.varied_bench import varied_empty
 from nlos_cam.verdict import Verdict

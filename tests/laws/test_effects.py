@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from nlos_calibration.rig import Occluder, load_rig
 
 from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.effects import EFFECTS, included
-from nlos_cam.render.findings import plan
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
+from nlos_cam.render.material import Surface, phong
+from nlos_cam.render.planning import plan
 from nlos_cam.render.renderer import transient
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.stage import Stage
-from nlos_cam.render.surface import Surface, phong
+from nlos_cam.render.scene_facts import Stage
 
 RIG = load_rig("paper-rig")
 OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})

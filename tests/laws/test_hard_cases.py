@@ -11,11 +11,11 @@ from nlos_calibration.rig import LidarPose, Rig, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.effects import EFFECTS
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
+from nlos_cam.render.material import Surface
 from nlos_cam.render.renderer import Rendering
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.surface import Surface
 
 RIG = load_rig("paper-rig")
 OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
@@ -119,7 +119,7 @@ def test_a_path_exactly_on_a_bins_edge_is_kept(implementation: Any) -> None:
     """The longest path of all beams, in a grid of bins that ends right there."""
     depth, one = _grid(), replace(FEW, relay_columns=1, relay_rows=1)
     depth[3, 3] = 0.25
-    from nlos_cam.render.prepare import Prepared
+    from nlos_cam.render.planning import Prepared
 
     job = Prepared.of(Scene(OPEN, depth), one, ["three-bounce"]).job()
     assert job is not None
@@ -135,7 +135,7 @@ def test_a_path_exactly_on_a_bins_edge_is_kept(implementation: Any) -> None:
 
 
 def test_two_equal_maxima_go_to_the_shorter_path(implementation: Any) -> None:
-    from nlos_cam.render.echo import strongest
+    from nlos_cam.render.echoes import strongest
 
     histogram = np.zeros((3, 50), np.float32)
     histogram[:, [7, 31]] = 0.5

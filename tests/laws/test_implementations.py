@@ -12,9 +12,9 @@ from nlos_cam.errors import SceneError
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.effects import EFFECTS
+from nlos_cam.render.material import Material, Surface
 from nlos_cam.render.renderer import render, render_all, three_bounce
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.surface import Material, Surface
 
 RIG = load_rig("paper-rig")
 QUICK = Accuracy("quick", relay_columns=40, relay_rows=32, sub_bins=64)

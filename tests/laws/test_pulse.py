@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.render.echo import pulse_bins, spread
+from nlos_cam.render.echoes import pulse_bins, spread
 from nlos_cam.render.scene import Scene
 
 RIG = load_rig("paper-rig")

@@ -12,9 +12,9 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.render.accuracy import STOPS, Accuracy
 from nlos_cam.render.effects import EFFECTS
+from nlos_cam.render.material import Surface, phong
 from nlos_cam.render.renderer import render, render_all
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.surface import Surface, phong
 
 RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=7, relay_rows=5, scatter_error=0.1)

@@ -10,13 +10,12 @@ from nlos_calibration.rig import Rig, load_rig
 
 from nlos_cam.frames import SATURATED
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.beams import cast
+from nlos_cam.render.geometry import cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import SensedImages, Sensor
-from nlos_cam.render.sensor_bias import PATCHES_SEED, RIPPLES_SEED, WAVES, patches, ripples
-from nlos_cam.render.sensor_model import DEPTH_UNIT_M, MOST_CONFIDENT, SensorModel, WarmUp
-from nlos_cam.render.sensor_texture import texture
+from nlos_cam.render.sensor.bias import PATCHES_SEED, RIPPLES_SEED, WAVES, patches, ripples, texture
+from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MOST_CONFIDENT, SensorModel, WarmUp
+from nlos_cam.render.sensor.sensor import SensedImages, Sensor
 
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 RICH = SensorModel(ambient_counts=40, read_noise_counts=1.5, dead_share=0)

@@ -11,11 +11,11 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.effects import EFFECTS
+from nlos_cam.render.geometry import Relay
 from nlos_cam.render.job import Job
-from nlos_cam.render.prepare import Prepared
-from nlos_cam.render.relay import Relay
+from nlos_cam.render.material import Surface, phong
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.surface import Surface, phong
 
 RIG = load_rig("paper-rig")
 OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})

@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nlos_calibration.arrays import Float64
 from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import angles_from_normal, normal_from_angles, wall_from_plane
 from nlos_calibration.plane import fit_plane
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 LONGEST_DEPTH_M = 4.0
@@ -24,25 +22,25 @@ pitches_deg = st.floats(-15.0, 15.0)
 few = settings(derandomize=True, deadline=None, max_examples=15)
 
 
-def pose_of(distance_m: float, yaw_deg: float, pitch_deg: float) -> Array:
+def pose_of(distance_m: float, yaw_deg: float, pitch_deg: float) -> Float64:
     return wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m)
 
 
-def through_sensor(depth_m: Array, generator: np.random.Generator, dead: float) -> Array:
+def through_sensor(depth_m: Float64, generator: np.random.Generator, dead: float) -> Float64:
     """One frame of `depth_m` as an L515 would give it: noise, steps of 0.25 mm, a limited range, dead pixels."""
     seen = np.where(depth_m < LONGEST_DEPTH_M, depth_m, np.nan)
     noisy = seen + generator.standard_normal(seen.shape) * (0.0005 + 0.002 * seen)
     return np.where(generator.random(seen.shape) < dead, np.nan, np.round(noisy / 0.00025) * 0.00025)
 
 
-def measured(depth_m: Array, seed: int = 0, frames: int = FRAMES, dead: float = 0.03) -> WallFit:
+def measured(depth_m: Float64, seed: int = 0, frames: int = FRAMES, dead: float = 0.03) -> WallFit:
     mean, generator = DepthMean(*depth_m.shape), np.random.default_rng(seed)
     for _ in range(frames):
         mean.add(through_sensor(depth_m, generator, dead).astype(np.float32))
     return fit_wall(mean.mean_m(), PINHOLE, generator, mean.noise())
 
 
-def assert_close(fit: WallFit, distance_m: float, pose: Array) -> None:
+def assert_close(fit: WallFit, distance_m: float, pose: Float64) -> None:
     assert abs(fit.distance_m - distance_m) < 1e-3
     tilt = np.arccos(np.clip(fit.wall_from_lidar[2, :3] @ pose[2, :3], -1.0, 1.0))
     assert np.degrees(tilt) < 0.2
@@ -124,7 +122,7 @@ def test_two_walls_in_a_corner_are_refused(distance_m: float, yaw_deg: float, be
         measured(corner)
 
 
-def three_bounce_depth(rig_name: str = "paper-rig") -> tuple[Array, Array, Array]:
+def three_bounce_depth(rig_name: str = "paper-rig") -> tuple[Float64, Float64, Float64]:
     """(wall, occluder, three-bounce) depth maps of the paper's rig with a point in the middle of the object box."""
     rig = load_rig(rig_name)
     pose, rays = rig.wall_from_lidar, PINHOLE.rays()

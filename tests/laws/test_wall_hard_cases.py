@@ -6,12 +6,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -29,13 +27,13 @@ def seen(scenes: ModuleType, request: pytest.FixtureRequest) -> object:
     return scenes.view(*request.param, PINHOLE)
 
 
-def measured(scenes: ModuleType, depth_m: Array, *, frames: int = 8, noise: float = 1.0, seed: int = 0) -> WallFit:
+def measured(scenes: ModuleType, depth_m: Float64, *, frames: int = 8, noise: float = 1.0, seed: int = 0) -> WallFit:
     generator = np.random.default_rng(seed)
     mean = scenes.looked_at(depth_m, generator, frames=frames, noise=noise)
     return fit_wall(mean.mean_m(), PINHOLE, generator, mean.noise())
 
 
-def only(depth_m: Array, rows: slice | list[int], columns: slice | list[int]) -> Array:
+def only(depth_m: Float64, rows: slice | list[int], columns: slice | list[int]) -> Float64:
     """Depth at some pixels alone."""
     some = np.full(depth_m.shape, np.nan)
     some[rows, columns] = depth_m[rows, columns]

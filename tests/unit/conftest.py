@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import settings
+from nlos_calibration.arrays import Float32
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.measured_wall import MeasuredWall
@@ -22,7 +23,6 @@ from rerun.chunk import RrdReader
 from rosbags.rosbag1 import Reader, Writer
 from view_streams import ASSETS, Streams
 
-from nlos_cam.frames import Float32
 from nlos_cam.objects.depth_map import object_box, orthographic_depth
 from nlos_cam.objects.generators import Category
 from nlos_cam.objects.placement import Pose, place

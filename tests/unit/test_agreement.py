@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.render.agreement import Echoes, agreement, relative_error
+from nlos_cam.render.accuracy_search import Echoes, agreement, relative_error
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 

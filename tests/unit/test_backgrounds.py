@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.frames import Float32
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth, panel, post, with_background
 

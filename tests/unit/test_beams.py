@@ -5,7 +5,7 @@ import pytest
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import Extent, LidarPose, Occluder, Rig, load_rig
 
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, cast, gate_bins
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, cast, gate_bins
 
 BARE, PAPER = load_rig("bare-wall"), load_rig("paper-rig")
 

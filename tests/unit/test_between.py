@@ -5,9 +5,16 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.between import WALL_CELLS, form_factor, patch_to_patch, wall_cell_m2, wall_cells, wall_factors
+from nlos_cam.render.interreflection import (
+    WALL_CELLS,
+    form_factor,
+    patch_to_patch,
+    wall_cell_m2,
+    wall_cells,
+    wall_factors,
+)
 from nlos_cam.render.job import Job
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
 
 RIG = load_rig("paper-rig")

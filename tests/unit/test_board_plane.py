@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS
 from nlos_calibration.board_corners import Corners
 from nlos_calibration.board_plane import PrintErrors, fit_board
@@ -9,16 +10,13 @@ from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.geometry import normal_from_angles
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.uncertainty import measures_of
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 A4 = BOARDS["a4"]
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)
 NORMAL, DISTANCE_M = normal_from_angles(np.radians(45.0), np.radians(5.0)), 0.2
 
 
-def seen(points_m: Array, distance_m: float = DISTANCE_M, normal: Array = NORMAL) -> Array:
+def seen(points_m: Float64, distance_m: float = DISTANCE_M, normal: Float64 = NORMAL) -> Float64:
     """Pixels of points (n, 3) of a board on the wall, z into the wall, its middle a little short of the axis."""
     right = np.cross([0.0, 1.0, 0.0], -normal)
     right /= np.linalg.norm(right)
@@ -32,7 +30,7 @@ def seen(points_m: Array, distance_m: float = DISTANCE_M, normal: Array = NORMAL
     )
 
 
-def corners(points_m: Array | None = None, sigma_px: float = 0.05, seed: int = 0, **where: float) -> Corners:
+def corners(points_m: Float64 | None = None, sigma_px: float = 0.05, seed: int = 0, **where: float) -> Corners:
     pixels = seen(A4.corners_m if points_m is None else points_m, **where)
     return Corners(
         np.arange(len(pixels)), pixels + sigma_px * np.random.default_rng(seed).standard_normal(pixels.shape)
@@ -103,7 +101,7 @@ def test_a_stretched_print_does_not_turn_the_wall(stretch: float) -> None:
     assert measures.yaw_deg == pytest.approx(45.0, abs=0.1)
 
 
-def bowed(height_m: float) -> Array:
+def bowed(height_m: float) -> Float64:
     across = 2.0 * A4.corners_m[:, 0] / 0.18 - 1.0
     return A4.corners_m - np.outer(height_m * (1.0 - across**2), [0.0, 0.0, 1.0])
 
@@ -125,7 +123,7 @@ def test_a_sheet_that_bows_a_little_is_seen_through() -> None:
     ],
     ids=["stretched", "skewed", "bowed", "rolled"],
 )
-def test_a_print_that_is_not_flat_or_not_to_proportion_is_refused(points_m: Array, problem: str) -> None:
+def test_a_print_that_is_not_flat_or_not_to_proportion_is_refused(points_m: Float64, problem: str) -> None:
     with pytest.raises(BoardRefusedError, match=problem):
         fit_board(corners(points_m, sigma_px=0.03), A4, PINHOLE)
 

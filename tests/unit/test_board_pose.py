@@ -3,12 +3,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS
 from nlos_calibration.board_pose import SeenCorners, _linear, refine_pose, solve_pose
 from nlos_calibration.errors import BoardRefusedError
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 A4 = BOARDS["a4"]
 CAMERA = np.array([[457.0, 0.0, 319.5], [0.0, 461.0, 239.5], [0.0, 0.0, 1.0]])
@@ -17,7 +15,7 @@ TRUE = np.array([0.1, 0.7, 0.05, -0.11, -0.13, 0.30, 0.004, 0.0005, -0.0003])
 """An oblique pose of a stretched and bowed print."""
 
 
-def seen_of(parameters: Array, sigma_px: float, generator: np.random.Generator) -> SeenCorners:
+def seen_of(parameters: Float64, sigma_px: float, generator: np.random.Generator) -> SeenCorners:
     drawn = SeenCorners(
         A4.corners_m,
         np.zeros((len(A4.corners_m), 2)),

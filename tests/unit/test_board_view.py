@@ -6,6 +6,7 @@ from types import ModuleType
 import cv2
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS
 from nlos_calibration.board_corners import Corners, find_corners
 from nlos_calibration.board_plane import PrintErrors, fit_board
@@ -20,9 +21,6 @@ from nlos_calibration.board_view import (
 )
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.uncertainty import measures_of
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 TOOLS = Path(__file__).parents[2] / "tools"
 A4 = BOARDS["a4"]
@@ -49,11 +47,11 @@ def corners(colour: ModuleType) -> Corners:
     return Corners(inside, colour.through_lens(straight[inside]))
 
 
-def moved(slopes: Array, pose: Array = POSE, errors: CameraErrors = EXACT) -> Array:
+def moved(slopes: Float64, pose: Float64 = POSE, errors: CameraErrors = EXACT) -> Float64:
     return plane_in_lidar(slopes, np.zeros((3, 3)), pose, errors)[0]
 
 
-def numerically(change: Array, of: object) -> Array:
+def numerically(change: Float64, of: object) -> Float64:
     """The derivative of what `of` makes of three small numbers, by central differences."""
     steps = np.eye(3) * 1e-6
     return np.stack([(of(change + step) - of(change - step)) / 2e-6 for step in steps], axis=1)  # type: ignore[operator]
@@ -87,12 +85,12 @@ def test_the_covariance_is_moved_as_the_plane_is() -> None:
 
 
 def test_what_the_cameras_pose_does_is_in_the_covariance() -> None:
-    def turned(angle: Array) -> Array:
+    def turned(angle: Float64) -> Float64:
         pose = POSE.copy()
         pose[:3, :3] = cv2.Rodrigues(angle)[0] @ POSE[:3, :3]
         return moved(SLOPES, pose)
 
-    def shifted(by_m: Array) -> Array:
+    def shifted(by_m: Float64) -> Float64:
         pose = POSE.copy()
         pose[:3, 3] += by_m
         return moved(SLOPES, pose)
@@ -130,7 +128,7 @@ def test_exact_corners_in_colour_give_the_exact_plane_of_the_lidar(colour: Modul
 @pytest.mark.parametrize(
     "change", [{"distortion": np.zeros(5)}, {"lidar_from_camera": np.eye(4)}], ids=["lens", "pose"]
 )
-def test_lens_and_pose_are_needed(colour: ModuleType, corners: Corners, change: dict[str, Array]) -> None:
+def test_lens_and_pose_are_needed(colour: ModuleType, corners: Corners, change: dict[str, Float64]) -> None:
     fit = fit_in_lidar(corners, A4, replace(colour.TOLD, **change), NO_PRINT)
     found = measures_of(fit.slopes, fit.covariance)
     assert abs(found.distance_m - 0.25) > 3.0 * found.distance_std_m

@@ -25,7 +25,7 @@ from nlos_cam.errors import (
     StreamMissingError,
 )
 from nlos_cam.recording.bag_reader import BagFile
-from nlos_cam.render.sensor import SensedImages
+from nlos_cam.render.sensor.sensor import SensedImages
 
 SMALL = Intrinsics(64, 48, 60.0, 61.0, 33.0, 22.0)
 FLAT = SensedImages(np.full((48, 64), 800, np.uint16), np.full((48, 64), 48, np.uint8), np.full((48, 64), 15, np.uint8))

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from nlos_cam.camera.fault_injection import Delivery, FaultyDevice
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.camera.timestamps import WRAP_PERIOD_S
-from nlos_cam.render.fault_record import Fault
-from nlos_cam.render.sensor import SensedImages
+from nlos_cam.render.scene_file import Fault
+from nlos_cam.render.sensor.sensor import SensedImages
 
 START_S = 1e9
 

@@ -14,7 +14,7 @@ from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.errors import CameraLostError
 from nlos_cam.recording.playback import verify
-from nlos_cam.render.fault_record import Fault
+from nlos_cam.render.scene_file import Fault
 
 Make = Callable[..., Any]
 UNPLUGGED = Fault(kind="unplug", at_frame=15, frames=2000)

@@ -9,11 +9,11 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.choose import Choice, Work, _seconds, choose, least_seconds, pick, predict, some_of
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.accuracy_search import Choice, Work, _seconds, choose, least_seconds, pick, predict, some_of
+from nlos_cam.render.material import Surface
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.renderer import three_bounce
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.surface import Surface
 
 RIG = load_rig("paper-rig")
 SMALL = tuple(
@@ -121,7 +121,7 @@ def _renderings(scene: Scene) -> int:
     """How many times a timed piece of work sums histograms."""
     from unittest.mock import patch
 
-    from nlos_cam.render import choose as module
+    from nlos_cam.render import accuracy_search as module
 
     work: list[Work] = []
 

@@ -16,7 +16,7 @@ from nlos_calibration.wall_record import load_wall
 from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.cli.main import main
-from nlos_cam.render.sensor import DEPTH_UNIT_M, SensedImages
+from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
 
 TOOLS = Path(__file__).parents[2] / "tools"
 A4, FRAMES = BOARDS["a4"], 8

@@ -15,8 +15,8 @@ from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import HiddenObject, SceneFile
-from nlos_cam.render.sensor_effects import sensor_effects
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.effects import sensor_effects
+from nlos_cam.render.sensor.model import SensorModel
 
 RIG = load_rig("paper-rig")
 NAMES = [*EFFECTS, *(effect.name for effect in sensor_effects(SensorModel()))]

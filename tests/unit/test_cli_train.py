@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 import torch
+from nlos_calibration.arrays import Float16
 from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint, tasks
 from nlos_models.checkpoint import load_pipeline, load_record
-from nlos_models.data import Half
 from safetensors.torch import load_file, save_file
 from small_maps import SmallDataset, small_images, small_maps, use_small_networks
 
@@ -103,7 +103,9 @@ def test_a_vae_is_shown_the_kinds_that_its_recipe_does_not_leave_out(
 ) -> None:
     shown: list[set[str]] = []
 
-    def images(seed: int, count: int, _: object, kinds: tuple[str, ...], *, backgrounds: float, **__: object) -> Half:
+    def images(
+        seed: int, count: int, _: object, kinds: tuple[str, ...], *, backgrounds: float, **__: object
+    ) -> Float16:
         shown.append({*kinds, f"{backgrounds}"})
         return small_images(count, seed)
 

@@ -21,7 +21,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import Sensor
+from nlos_cam.render.sensor.sensor import Sensor
 
 PLAN = dataset.DatasetPlan(load_rig("paper-rig"), 0)
 RECIPE = Recipe(task="compressor", objects=4, held_out=2, epochs=1, batch=2, learning_rate=1e-3)

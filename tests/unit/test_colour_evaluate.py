@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.image import imread
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import load_rig
 from nlos_models.recipe import SIMULATION_ONLY
 
@@ -17,7 +18,6 @@ from nlos_cam.colour_evaluate import (
 )
 from nlos_cam.dataset_plan import DatasetPlan
 from nlos_cam.dataset_samples import make_samples
-from nlos_cam.frames import Float32
 from nlos_cam.objects.textures import TEXTURES
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float32
 from nlos_models.colour_metrics import (
     brightness,
     colour_accuracy_mean_abs,
@@ -10,10 +11,9 @@ from nlos_models.colour_metrics import (
     colour_silhouette_iou,
     root_mean_square_error,
 )
-from nlos_models.metrics import Images
 
 
-def _square(colour: tuple[float, float, float], rows: slice = slice(16, 48)) -> Images:
+def _square(colour: tuple[float, float, float], rows: slice = slice(16, 48)) -> Float32:
     image = np.zeros((1, 3, 64, 64), np.float32)
     image[:, :, rows, 16:48] = 0.1 + 0.9 * np.array(colour, np.float32)[:, None, None]
     return image

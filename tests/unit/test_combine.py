@@ -2,9 +2,6 @@ import numpy as np
 import pytest
 from nlos_calibration.combine import AGREE_SIGMAS, Plane, combine, disagreement
 from nlos_calibration.geometry import normal_from_angles
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 
 def plane(distance_m: float, yaw_deg: float = 45.0, *, std_m: float = 1e-4, std_deg: float = 0.02) -> Plane:

@@ -5,14 +5,14 @@ from nlos_calibration.rig import Occluder, load_rig
 
 from nlos_cam.objects.depth_map import cell_centres_m, object_box
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.cuda_legs import Optics, Surface, Wall, legs, scattered
+from nlos_cam.render.backend_reference import legs as exact_legs
+from nlos_cam.render.backend_torch import Optics, Surface, Wall, legs, scattered
+from nlos_cam.render.brdf_table import scattered as scattered_on_arrays
+from nlos_cam.render.geometry import softened
 from nlos_cam.render.job import Job
-from nlos_cam.render.near import softened
-from nlos_cam.render.prepare import Prepared
-from nlos_cam.render.reference import legs as exact_legs
-from nlos_cam.render.scatter import scattered as scattered_on_arrays
+from nlos_cam.render.material import phong
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.surface import phong
 
 CPU = torch.device("cpu")
 RIG = load_rig("paper-rig")

@@ -9,9 +9,9 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.cuda_visibility import lay_out, shade
+from nlos_cam.render.backend_torch import lay_out, shade
 from nlos_cam.render.job import Job
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.visibility import visible
 

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 from nlos_cam.dataset_plan import FIRST_OBJECTS, SCENE_COLUMNS, DatasetPlan, Objects, RigSpread, scene_row
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.render.material import Material
 from nlos_cam.render.scene_file import SceneFile
-from nlos_cam.render.sensor_model import SensorModel
-from nlos_cam.render.surface import Material
+from nlos_cam.render.sensor.model import SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
 PLAN = DatasetPlan(RIG, 7)

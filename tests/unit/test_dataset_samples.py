@@ -28,8 +28,8 @@ from nlos_cam.objects.depth_map import image_from_depth
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")
 BOX = PLAN.box

@@ -1,13 +1,11 @@
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.depth_mean import FIRST_FRAMES, DepthMean
 from nlos_calibration.range_noise import depth_noise_m
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 
-def mean_of(frames: Array) -> DepthMean:
+def mean_of(frames: Float64) -> DepthMean:
     mean = DepthMean(*frames.shape[1:])
     for frame in frames:
         mean.add(frame)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.render.beams import Beams, cast
-from nlos_cam.render.echo import MultiBounce, add_direct, compete, nothing, strongest
+from nlos_cam.render.echoes import MultiBounce, add_direct, compete, nothing, strongest
+from nlos_cam.render.geometry import Beams, cast
 
 RIG = load_rig("paper-rig")
 BIN_M = 0.01

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.render import explain as module
-from nlos_cam.render.explain import costs
+from nlos_cam.render import accuracy_search as module
+from nlos_cam.render.accuracy_search import costs
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 

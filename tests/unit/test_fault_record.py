@@ -3,8 +3,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from nlos_cam.render.fault_record import Fault, one_wrap
-from nlos_cam.render.scene_file import SceneFile, bare_wall_scene
+from nlos_cam.render.scene_file import Fault, SceneFile, bare_wall_scene, one_wrap
 
 
 @pytest.mark.parametrize(

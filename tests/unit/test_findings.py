@@ -6,12 +6,12 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import STOPS
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.effects import EFFECTS
-from nlos_cam.render.findings import plan
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
+from nlos_cam.render.material import Surface, phong
+from nlos_cam.render.planning import plan
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.stage import Stage
-from nlos_cam.render.surface import Surface, phong
+from nlos_cam.render.scene_facts import Stage
 
 RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
 

@@ -1,14 +1,12 @@
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.flatness import Flatness, flatness
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.plane import fit_depth
 from nlos_calibration.range_noise import MeanNoise, depth_noise_m
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import wall_depth
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 RAYS = PINHOLE.rays()
@@ -16,11 +14,11 @@ COLUMN = np.broadcast_to(np.arange(160), (120, 160))
 ROW = np.broadcast_to(np.arange(120)[:, np.newaxis], (120, 160))
 
 
-def wall(yaw_deg: float = 20.0) -> Array:
+def wall(yaw_deg: float = 20.0) -> Float64:
     return wall_depth(wall_from_plane(normal_from_angles(np.radians(yaw_deg), 0.1), 0.2), PINHOLE)
 
 
-def judged(depth_m: Array, *, noise: float = 1.0, samples: float = 25.0, seed: int = 0) -> Flatness:
+def judged(depth_m: Float64, *, noise: float = 1.0, samples: float = 25.0, seed: int = 0) -> Flatness:
     noisy_m = depth_m + noise * depth_noise_m(depth_m) * np.random.default_rng(seed).standard_normal(depth_m.shape) / 5
     told = MeanNoise(np.full(depth_m.size, samples), 1.0)
     return flatness(fit_depth(RAYS.reshape(-1, 3), noisy_m.ravel(), np.random.default_rng(0), told), RAYS)
@@ -44,7 +42,7 @@ def test_a_bend_is_told_by_how_much_each_side_turns() -> None:
 
 
 @pytest.mark.parametrize("across", [COLUMN, ROW, COLUMN + ROW, COLUMN - ROW])
-def test_a_step_is_found_whichever_way_it_runs(across: Array) -> None:
+def test_a_step_is_found_whichever_way_it_runs(across: Float64) -> None:
     flat = judged(wall() - 0.002 * (across > np.median(across)))
     assert flat.bend_deg > 0.4
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Frame, LidarMaps, _edges, maps_from_frame
-from nlos_cam.render.sensor import cell_of_pixels
+from nlos_cam.render.sensor.sensor import cell_of_pixels
 
 SIZES = [(480, 640), (240, 320), (768, 1024), (64, 80), (100, 90), (32, 40)]
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.render import cpu, reference
+from nlos_cam.render import backend_numba, backend_reference
 from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.render.backend_numba import LANES, tables
 from nlos_cam.render.job import Job
-from nlos_cam.render.kernels import LANES, tables
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
 
 RIG = load_rig("paper-rig")
@@ -37,7 +37,7 @@ def test_a_table_is_the_histogram_later_by_each_number_of_sub_bins(per_bin: int)
 @pytest.mark.parametrize("sub_bins", [1, 8, 64])
 def test_the_light_of_each_beam_is_that_of_the_brute_force_whatever_the_sub_bins(sub_bins: int) -> None:
     job = _job(sub_bins)
-    fast, slow = cpu.histograms(job), reference.histograms(job)
+    fast, slow = backend_numba.histograms(job), backend_reference.histograms(job)
     assert fast.shape == slow.shape
     assert fast.dtype == np.float32
     np.testing.assert_allclose(fast.sum(1), slow.sum(1), rtol=1e-5)
@@ -46,13 +46,13 @@ def test_the_light_of_each_beam_is_that_of_the_brute_force_whatever_the_sub_bins
 def test_paths_are_off_by_no_more_than_a_sub_bin() -> None:
     """Cumulated light crosses each edge at most one sub-bin early or late."""
     job = _job(8)
-    fast, slow = cpu.histograms(job), reference.histograms(job)
+    fast, slow = backend_numba.histograms(job), backend_reference.histograms(job)
     moved = np.abs(np.cumsum(fast, 1, dtype=np.float64) - np.cumsum(slow, 1)).sum(1) / slow.sum(1)
     assert moved.max() < 2 / 8
 
 
 def test_horizon_tables_are_empty_where_nothing_shades() -> None:
     job = _job(8, sectors=3)
-    low, high = cpu.horizons(job)
+    low, high = backend_numba.horizons(job)
     assert low.shape == high.shape == (36, 12)
     assert (low <= high * (1 + 1e-6)).all()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nlos_cam.render.near import MANY, contact_m2, softened
+from nlos_cam.render.geometry import MANY, contact_m2, softened
 
 
 def test_at_contact_all_of_it_is_added_and_from_the_end_on_nothing() -> None:

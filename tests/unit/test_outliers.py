@@ -8,7 +8,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.outliers import IN_SHAPE, LEAST_PIXELS, TO_JUDGE, TO_LEARN, outlier
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
 from nlos_cam.sights import Sight, ordinary
 
 RIG = load_rig("paper-rig")

@@ -5,11 +5,12 @@ from threading import Event
 import numpy as np
 import pytest
 from fake_wall import WallCamera
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import load_rig
 
 from nlos_cam import physics_check_render
 from nlos_cam.bench import Bench
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import LidarMaps
 from nlos_cam.live import run_live
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth

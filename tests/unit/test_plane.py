@@ -1,12 +1,10 @@
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import normal_from_angles
 from nlos_calibration.plane import MIN_POINTS, fit_depth, fit_plane
 from nlos_calibration.range_noise import MeanNoise, depth_noise_m
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 
 @pytest.fixture
@@ -14,7 +12,7 @@ def generator() -> np.random.Generator:
     return np.random.default_rng(7)
 
 
-def wall_points(generator: np.random.Generator, count: int = 2000, *, noise: float = 1.0) -> tuple[Array, Array]:
+def wall_points(generator: np.random.Generator, count: int = 2000, *, noise: float = 1.0) -> tuple[Float64, Float64]:
     """Points (count, 3) on a wall 0.2 m away under random rays of the lidar's field, and the wall's normal."""
     normal = normal_from_angles(np.radians(40.0), np.radians(5.0))
     rays = np.column_stack([generator.uniform([-0.7, -0.52], [0.6, 0.52], (count, 2)), np.ones(count)])
@@ -23,7 +21,7 @@ def wall_points(generator: np.random.Generator, count: int = 2000, *, noise: flo
     return rays * depth_m[:, np.newaxis], normal
 
 
-def angle_deg(a: Array, b: Array) -> float:
+def angle_deg(a: Float64, b: Float64) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))
 
 

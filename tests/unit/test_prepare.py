@@ -7,12 +7,11 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.effects import EFFECTS
+from nlos_cam.render.geometry import NEAR_DIAGONALS, NO_OCCLUDER
 from nlos_cam.render.job import Job, near_legs
-from nlos_cam.render.near import NEAR_DIAGONALS
-from nlos_cam.render.prepare import Prepared
-from nlos_cam.render.relay import NO_OCCLUDER
+from nlos_cam.render.material import Surface, phong
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.surface import Surface, phong
 
 RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)

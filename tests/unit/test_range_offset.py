@@ -1,23 +1,21 @@
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.range_noise import depth_noise_m
 from nlos_calibration.range_offset import TAPE_STD_M, FitWith, tape_the_wall
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 
 
-def pose(distance_m: float, yaw_deg: float) -> Array:
+def pose(distance_m: float, yaw_deg: float) -> Float64:
     return wall_from_plane(normal_from_angles(np.radians(yaw_deg), 0.05), distance_m)
 
 
-def seen(depth_m: Array) -> FitWith:
+def seen(depth_m: Float64) -> FitWith:
     """How a lidar that reads `depth_m`, with a fifth of a sample's noise, measures the wall."""
     noisy_m = depth_m + 0.2 * depth_noise_m(depth_m) * np.random.default_rng(0).standard_normal(depth_m.shape)
 
@@ -27,7 +25,7 @@ def seen(depth_m: Array) -> FitWith:
     return fit_with
 
 
-def bare(distance_m: float, yaw_deg: float) -> Array:
+def bare(distance_m: float, yaw_deg: float) -> Float64:
     depth_m = wall_depth(pose(distance_m, yaw_deg), PINHOLE)
     return np.where(depth_m < 4.0, depth_m, np.nan)
 

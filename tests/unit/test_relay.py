@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import Occluder, load_rig
 
-from nlos_cam.render.relay import NO_OCCLUDER, behind, occluder_edge, relay_cells
+from nlos_cam.render.geometry import NO_OCCLUDER, behind, occluder_edge, relay_cells
 
 BARE, PAPER = load_rig("bare-wall"), load_rig("paper-rig")
 LIDAR_M = np.array([0.0, 0.0, 0.2])

@@ -8,9 +8,9 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.render.material import Surface
 from nlos_cam.render.renderer import render, three_bounce, transient
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.surface import Surface
 
 RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=4, relay_rows=3)

@@ -1,14 +1,12 @@
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.plane import PlaneFit, fit_depth
 from nlos_calibration.range_noise import MeanNoise, depth_noise_m
 from nlos_calibration.rig import load_rig
 from nlos_calibration.ripples import Ripples, block_sums, ripples
 from nlos_calibration.wall import wall_depth
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 RAYS = PINHOLE.rays()
@@ -17,7 +15,7 @@ ROW = np.broadcast_to(np.arange(120)[:, np.newaxis], (120, 160))
 WALL_M = wall_depth(wall_from_plane(normal_from_angles(np.radians(20.0), 0.1), 0.2), PINHOLE)
 
 
-def fitted(extra_m: Array | float, *, noise: float = 1.0, seed: int = 0) -> PlaneFit:
+def fitted(extra_m: Float64 | float, *, noise: float = 1.0, seed: int = 0) -> PlaneFit:
     """The plane of a mean over 25 frames, with some depth of the lidar's own."""
     deviates = np.random.default_rng(seed).standard_normal(WALL_M.shape)
     noisy_m = WALL_M + extra_m + noise * depth_noise_m(WALL_M) * deviates / 5
@@ -25,7 +23,7 @@ def fitted(extra_m: Array | float, *, noise: float = 1.0, seed: int = 0) -> Plan
     return fit_depth(RAYS.reshape(-1, 3), noisy_m.ravel(), np.random.default_rng(0), told)
 
 
-def judged(extra_m: Array | float, *, noise: float = 1.0, seed: int = 0) -> Ripples:
+def judged(extra_m: Float64 | float, *, noise: float = 1.0, seed: int = 0) -> Ripples:
     return ripples(fitted(extra_m, noise=noise, seed=seed), RAYS)
 
 

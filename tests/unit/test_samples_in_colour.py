@@ -5,19 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import load_rig
 from nlos_models.recipe import SIMULATION_ONLY
 
 from nlos_cam.dataset_plan import DatasetPlan, RigSpread
 from nlos_cam.dataset_samples import hidden_object, make_samples, procedural_images, sense_colour, sense_object
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import Float32, LidarMaps
+from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
+from nlos_cam.render.material import Material, Surface
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor import Sensor
-from nlos_cam.render.sensor_model import SensorModel
-from nlos_cam.render.surface import Material, Surface
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
 
 RIG = load_rig("paper-rig")
 QUIET = SensorModel(range_noise_m=0.0, range_noise_per_m=0.0, read_noise_counts=0.0, shot_noise=0.0, dead_share=0.0)

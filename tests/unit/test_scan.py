@@ -7,7 +7,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.render.accuracy import STOPS
 from nlos_cam.render.effects import Effect
 from nlos_cam.render.renderer import render
-from nlos_cam.render.scan import render_scan, scan_effect, slices
+from nlos_cam.render.scanning import render_scan, scan_effect, slices
 from nlos_cam.render.scene import Scene
 
 RIG = load_rig("paper-rig")

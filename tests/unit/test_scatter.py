@@ -7,11 +7,11 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.render.brdf_table import MOST_NODES, node_count, nodes, scattered, scattering
 from nlos_cam.render.job import Job
-from nlos_cam.render.prepare import Prepared
-from nlos_cam.render.scatter import MOST_NODES, node_count, nodes, scattered, scattering
+from nlos_cam.render.material import Brdf, Surface, phong
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.surface import Brdf, Surface, phong
 
 BRDF = phong(0.4, 0.6, 10)
 COARSE = Accuracy("coarse", relay_columns=4, relay_rows=3)

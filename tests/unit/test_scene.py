@@ -5,8 +5,8 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
+from nlos_cam.render.material import Surface
 from nlos_cam.render.scene import FINEST_GRID, Scene
-from nlos_cam.render.surface import Surface
 
 RIG = load_rig("paper-rig")
 

@@ -11,9 +11,8 @@ from nlos_calibration.rig import dump_toml, load_rig
 from pydantic import ValidationError
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.fault_record import Fault
-from nlos_cam.render.scene_file import HiddenObject, Motion, SceneFile, bare_wall_scene, load_scene, paper_scene
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.scene_file import Fault, HiddenObject, Motion, SceneFile, bare_wall_scene, load_scene, paper_scene
+from nlos_cam.render.sensor.model import SensorModel
 
 CUP = """
 name = "cup"

@@ -10,11 +10,11 @@ from nlos_calibration.rig import Occluder, load_rig
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import SATURATED
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, cast
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.sensor import SensedImages, Sensor, cell_of_pixels
-from nlos_cam.render.sensor_model import DEPTH_UNIT_M, MOST_CONFIDENT, SensorModel
+from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MOST_CONFIDENT, SensorModel
+from nlos_cam.render.sensor.sensor import SensedImages, Sensor, cell_of_pixels
 
 RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from nlos_cam.render.sensor_bias import BIASES, DepthBias, patches, ripples
-from nlos_cam.render.sensor_effects import sensor_effects
-from nlos_cam.render.sensor_model import STEADY_CELSIUS, SensorModel, WarmUp
+from nlos_cam.render.sensor.bias import BIASES, DepthBias, patches, ripples
+from nlos_cam.render.sensor.effects import sensor_effects
+from nlos_cam.render.sensor.model import STEADY_CELSIUS, SensorModel, WarmUp
 
 SHAPE = 120, 160
 WARM_UP = WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600)

@@ -5,8 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlos_cam.render.sensor_chain import Chain, Echoes, Optics, compete, noise_counts, quantise, saturate, signal_surety
-from nlos_cam.render.sensor_texture import EVEN
+from nlos_cam.render.sensor.bias import EVEN
+from nlos_cam.render.sensor.sensor import (
+    Chain,
+    Echoes,
+    Optics,
+    compete,
+    noise_counts,
+    quantise,
+    saturate,
+    signal_surety,
+)
 
 NO_STAGE = Chain(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 NOISY = NO_STAGE._replace(read_variance=0.49, shot_variance=0.09)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from nlos_cam.frames import SATURATED
-from nlos_cam.render.sensor_model import STEADY_CELSIUS, SensorModel, WarmUp
+from nlos_cam.render.sensor.model import STEADY_CELSIUS, SensorModel, WarmUp
 
 MOST = {
     "pulse_ns": 100.0,

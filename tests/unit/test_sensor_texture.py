@@ -6,9 +6,9 @@ import pytest
 from nlos_calibration.rig import Rig, load_rig
 
 from nlos_cam.render.renderer import MultiBounce
-from nlos_cam.render.sensor import SensedImages, Sensor
-from nlos_cam.render.sensor_model import SensorModel
-from nlos_cam.render.sensor_texture import texture
+from nlos_cam.render.sensor.bias import texture
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import SensedImages, Sensor
 
 SHAPE = 240, 320
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)

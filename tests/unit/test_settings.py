@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nlos_calibration.arrays import Float64
 
 from nlos_cam.objects.generators import CATEGORIES, Category, Setting, category
-from nlos_cam.objects.primitives import Triangles, box
+from nlos_cam.objects.primitives import box
 
 UNIT = st.floats(0, 1)
 ENDS = st.integers(-500, 500).map(lambda tenths: tenths / 10)
@@ -92,7 +93,7 @@ def test_the_test_set_takes_the_held_out_interval_or_the_range(unit: float) -> N
 
 def test_a_category_has_the_functions_name_and_its_settings_in_order() -> None:
     @category(width=Setting(1, 2), height=Setting(3, 5, held_out=(3.5, 4)))
-    def crate(width: float, height: float) -> Triangles:
+    def crate(width: float, height: float) -> Float64:
         return box(width, height, 1)
 
     assert crate.name == "crate"

@@ -6,11 +6,11 @@ from nlos_calibration.rig import ObjectBox, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.prepare import Prepared
+from nlos_cam.render.line_of_sight import first_hits
+from nlos_cam.render.material import Surface
+from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sight import first_hits
-from nlos_cam.render.stage import Stage
-from nlos_cam.render.surface import Surface
+from nlos_cam.render.scene_facts import Stage
 from nlos_cam.render.visibility import height_field
 
 PAPER = load_rig("paper-rig")

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 
 from nlos_cam.objects.primitives import (
-    Triangles,
     arch,
     at,
     bar,
@@ -23,16 +23,16 @@ from nlos_cam.objects.primitives import (
 )
 
 
-def _extents(solid: Triangles) -> list[float]:
+def _extents(solid: Float64) -> list[float]:
     return pytest.approx(np.ptp(solid.reshape(-1, 3), axis=0).tolist(), rel=0.02)
 
 
-def _middle(solid: Triangles) -> np.ndarray:
+def _middle(solid: Float64) -> np.ndarray:
     points = solid.reshape(-1, 3)
     return (points.min(0) + points.max(0)) / 2
 
 
-def _area(solid: Triangles) -> float:
+def _area(solid: Float64) -> float:
     return float(np.linalg.norm(np.cross(solid[:, 1] - solid[:, 0], solid[:, 2] - solid[:, 0]), axis=1).sum() / 2)
 
 
@@ -93,7 +93,7 @@ def test_an_arch_is_its_share_of_a_ring_from_the_x_axis_on(angle: float) -> None
         bar((0, 0), (1, 1), 0.1, 0.2),
     ],
 )
-def test_a_solid_is_closed(solid: Triangles) -> None:
+def test_a_solid_is_closed(solid: Float64) -> None:
     """Every edge belongs to two triangles, but for those that a lathe's axis makes points."""
     corners, index = np.unique(np.round(solid.reshape(-1, 3), 9), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)

@@ -7,11 +7,10 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, gate_bins
-from nlos_cam.render.relay import occluder_edge
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, gate_bins, occluder_edge
+from nlos_cam.render.material import Surface
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.stage import Stage, bins_of
-from nlos_cam.render.surface import Surface
+from nlos_cam.render.scene_facts import Stage, bins_of
 
 RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)

@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.surface import Material, Surface, brdf_range, phong, retroreflective
+from nlos_cam.render.material import Material, Surface, brdf_range, phong, retroreflective
 
 
 @pytest.mark.parametrize("albedo", [-0.1, 1.1, np.nan, np.inf, np.array([0.5, 2.0, 0.5])])

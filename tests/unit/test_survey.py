@@ -5,10 +5,10 @@ import pytest
 from nlos_calibration.rig import Occluder, Rig, load_rig
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.relay import NO_OCCLUDER, occluder_edge
+from nlos_cam.render.energy_survey import CAUTION, Survey, occluder_meets, shaded
+from nlos_cam.render.geometry import NO_OCCLUDER, occluder_edge
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.stage import Stage
-from nlos_cam.render.survey import CAUTION, Survey, occluder_meets, shaded
+from nlos_cam.render.scene_facts import Stage
 
 RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from nlos_calibration.arrays import Float16
 from nlos_models.checkpoint import CheckpointRecord, load_encoder, load_pipeline, load_vae, save_pipeline, save_vae
-from nlos_models.data import Half, MapSet
+from nlos_models.data import MapSet
 from nlos_models.errors import CheckpointError
 from nlos_models.inference import load_reconstructor
 from nlos_models.pipeline import Pipeline
@@ -31,7 +32,7 @@ def _recipe(task: str, **changes: object) -> Recipe:
     return Recipe.model_validate(facts | {"colour": True, "kl_weight": 0.03, "schedule": "one-cycle"} | changes)
 
 
-def _images(count: int, seed: int) -> Half:
+def _images(count: int, seed: int) -> Float16:
     generator, images = np.random.default_rng(seed), np.zeros((count, 3, 64, 64), np.float16)
     for image in images:
         row, column = generator.integers(8, 30, 2)

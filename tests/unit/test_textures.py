@@ -9,7 +9,7 @@ from nlos_models.silhouette import KEPT_SHARE
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
-from nlos_cam.render.surface import Surface
+from nlos_cam.render.material import Surface
 
 BOX = object_box(load_rig("paper-rig"))
 

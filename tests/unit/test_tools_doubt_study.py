@@ -7,10 +7,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
+from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.doubt_samples import EMPTY, DoubtSamples
-from nlos_cam.frames import Float32
 from nlos_cam.objects.depth_map import depth_from_image, object_box
 from nlos_cam.outliers import TO_JUDGE, TO_LEARN
 from nlos_cam.verdict import Verdict

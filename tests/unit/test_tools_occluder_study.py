@@ -12,7 +12,7 @@ import pytest
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import LidarPose, Occluder, load_rig
 
-from nlos_cam.render.beams import cast
+from nlos_cam.render.geometry import cast
 
 TOOLS = Path(__file__).parents[2] / "tools"
 PAPER = load_rig("paper-rig")

@@ -15,7 +15,7 @@ from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.evaluate_objects import SeededObject, seeded_objects
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor_model import SensorModel
+from nlos_cam.render.sensor.model import SensorModel
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

@@ -15,8 +15,7 @@ import pytest
 
 from nlos_cam.camera import simulated_world
 from nlos_cam.cli.main import main
-from nlos_cam.render.hidden_record import Motion
-from nlos_cam.render.scene_file import SceneFile, paper_scene
+from nlos_cam.render.scene_file import Motion, SceneFile, paper_scene
 
 ROOT = Path(__file__).parents[2]
 SHORTER = {"--seconds": "0.5", "--count": "2", "--every": "5"}

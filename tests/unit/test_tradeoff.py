@@ -10,8 +10,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import STOPS
-from nlos_cam.render.agreement import Agreement
-from nlos_cam.render.choose import Work
+from nlos_cam.render.accuracy_search import Agreement, Work
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.tradeoff import REPEATS, Part, Row, facts, measure, pareto_front, settings
 

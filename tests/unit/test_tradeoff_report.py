@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nlos_cam.render.agreement import Agreement
+from nlos_cam.render.accuracy_search import Agreement
 from nlos_cam.render.tradeoff import Facts, Row
 from nlos_cam.render.tradeoff_report import as_markdown, as_table, draw, machine
 

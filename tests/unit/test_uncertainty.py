@@ -1,20 +1,18 @@
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.geometry import normal_from_angles
 from nlos_calibration.uncertainty import WallMeasures, measures_of
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 SPREAD = np.array([[4.0, 1.0, -0.5], [1.0, 2.0, 0.3], [-0.5, 0.3, 1.0]])
 """The shape of a covariance; as large as the plane's slopes are uncertain."""
 
 
-def slopes_of(distance_m: float, yaw_deg: float, pitch_deg: float) -> Array:
+def slopes_of(distance_m: float, yaw_deg: float, pitch_deg: float) -> Float64:
     return -normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)) / distance_m
 
 
-def drawn(slopes: Array, covariance: Array, count: int = 4000) -> list[WallMeasures]:
+def drawn(slopes: Float64, covariance: Float64, count: int = 4000) -> list[WallMeasures]:
     some = np.random.default_rng(0).multivariate_normal(slopes, covariance, count)
     return [measures_of(one, covariance) for one in some]
 
@@ -44,7 +42,7 @@ def test_standard_uncertainties_are_the_spread_of_what_could_have_been_measured(
 
 @pytest.mark.parametrize("facing_deg", [0.0, 0.02, 0.1, 0.3, 1.0, 5.0])
 @pytest.mark.parametrize("shape", [np.eye(3), SPREAD])
-def test_a_wall_faced_squarely_has_a_facing_angle_that_is_allowed_for(facing_deg: float, shape: Array) -> None:
+def test_a_wall_faced_squarely_has_a_facing_angle_that_is_allowed_for(facing_deg: float, shape: Float64) -> None:
     """Near 0 the angle cannot be negative: what is measured is too large, and its interval must reach back to 0."""
     slopes, covariance = slopes_of(0.2, facing_deg, 0.0), 1e-4 * shape  # tenths of a degree
     inside = [abs(one.facing_deg - facing_deg) <= 1.96 * one.facing_std_deg for one in drawn(slopes, covariance)]

@@ -2,28 +2,26 @@ import re
 
 import numpy as np
 import pytest
+from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 
 
-def pose(distance_m: float = 0.2, yaw_deg: float = 45.0, pitch_deg: float = 0.0) -> Array:
+def pose(distance_m: float = 0.2, yaw_deg: float = 45.0, pitch_deg: float = 0.0) -> Float64:
     return wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m)
 
 
-def bare(distance_m: float = 0.2, yaw_deg: float = 45.0, pitch_deg: float = 0.0) -> Array:
+def bare(distance_m: float = 0.2, yaw_deg: float = 45.0, pitch_deg: float = 0.0) -> Float64:
     depth_m = wall_depth(pose(distance_m, yaw_deg, pitch_deg), PINHOLE)
     return np.where(depth_m < 9.0, depth_m, np.nan)
 
 
-def fitted(depth_m: Array, pinhole: Intrinsics = PINHOLE) -> WallFit:
+def fitted(depth_m: Float64, pinhole: Intrinsics = PINHOLE) -> WallFit:
     return fit_wall(depth_m, pinhole, np.random.default_rng(0))
 
 

@@ -12,7 +12,7 @@ from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import wall_record
 
-from nlos_cam.render.beams import cast
+from nlos_cam.render.geometry import cast
 from nlos_cam.wall_look import Seen
 from nlos_cam.wall_measure import by_board, by_depth, by_occluder
 

@@ -8,7 +8,7 @@ import pytest
 from nlos_cam.camera import simulated_world as module
 from nlos_cam.camera.simulated_world import World, open_world
 from nlos_cam.errors import SceneError
-from nlos_cam.render.sensor import SensedImages
+from nlos_cam.render.sensor.sensor import SensedImages
 
 SCENE = """
 name = "two poses"

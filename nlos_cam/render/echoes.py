@@ -4,12 +4,10 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams
-
-Array = NDArray[np.float64]
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, Beams
 
 SIGMAS_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 
@@ -114,7 +112,7 @@ def peak_share(pulse_ns: float, bin_m: float) -> float:
     return float(_pulse(pulse_ns, bin_m).max()) if pulse_ns else 1.0
 
 
-def _pulse(pulse_ns: float, bin_m: float) -> Array:
+def _pulse(pulse_ns: float, bin_m: float) -> Float64:
     """The pulse over the bins around its middle, in all 1."""
     sigma = pulse_bins(pulse_ns, bin_m)
     half = int(np.ceil(4 * sigma)) + 1

@@ -6,15 +6,12 @@ returns, those of every patch that it lights, that much later and by the form fa
 
 import numba
 import numpy as np
+from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
-from nlos_cam.frames import Float32
+from nlos_cam.render.geometry import contact_m2, softened
 from nlos_cam.render.job import Job
-from nlos_cam.render.near import contact_m2, softened
 from nlos_cam.render.visibility import HeightField, occluded, segment_blocked, visible
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 WALL_CELLS = 24
 """Along each side of the wall that the light may go over."""
@@ -25,7 +22,14 @@ AROUND_M = 0.4
 
 @numba.njit(cache=True)
 def form_factor(
-    a: Array, normal_a: Array, b: Array, normal_b: Array, strength: float, soft: float, near_m: float, lambertian: bool
+    a: Float64,
+    normal_a: Float64,
+    b: Float64,
+    normal_b: Float64,
+    strength: float,
+    soft: float,
+    near_m: float,
+    lambertian: bool,
 ) -> float:
     """What part of the light that leaves at a is given on at b, but for what stands between."""
     leg = b - a
@@ -42,12 +46,12 @@ def form_factor(
 def _between_patches(
     a: int,
     b: int,
-    points: Array,
-    normals: Array,
-    strength: Array,
-    soft: Array,
-    rows: Index,
-    columns: Index,
+    points: Float64,
+    normals: Float64,
+    strength: Float64,
+    soft: Float64,
+    rows: Int64,
+    columns: Int64,
     field: HeightField,
     near_m: float,
     lambertian: bool,
@@ -61,16 +65,16 @@ def _between_patches(
 
 @numba.njit(cache=True, parallel=True)
 def patch_to_patch(
-    points: Array,
-    normals: Array,
-    strength: Array,
-    soft: Array,
-    rows: Index,
-    columns: Index,
+    points: Float64,
+    normals: Float64,
+    strength: Float64,
+    soft: Float64,
+    rows: Int64,
+    columns: Int64,
     field: HeightField,
     near_m: float,
     lambertian: bool,
-) -> Array:
+) -> Float64:
     """Form factors (n, n) from patch to patch, 0 where the object stands between."""
     n = len(points)
     table = np.zeros((n, n))
@@ -84,14 +88,14 @@ def patch_to_patch(
 
 @numba.njit(cache=True, parallel=True)
 def patch_to_wall(
-    points: Array,
-    normals: Array,
-    strength: Array,
-    soft: Array,
-    rows: Index,
-    columns: Index,
-    x: Array,
-    y: Array,
+    points: Float64,
+    normals: Float64,
+    strength: Float64,
+    soft: Float64,
+    rows: Int64,
+    columns: Int64,
+    x: Float64,
+    y: Float64,
     cell_m2: float,
     soft_wall: float,
     edge_x: float,
@@ -99,7 +103,7 @@ def patch_to_wall(
     field: HeightField,
     near_m: float,
     lambertian: bool,
-) -> tuple[Array, Array]:
+) -> tuple[Float64, Float64]:
     """Form factors (n, m) from patches to cells of the wall, and from the cells to the patches."""
     there, back = np.zeros((len(points), len(x))), np.zeros((len(points), len(x)))
     up = np.array([0.0, 0.0, 1.0])
@@ -125,17 +129,17 @@ def _add(target: Float32, at: int, weight: float, source: Float32) -> None:
 
 @numba.njit(cache=True, parallel=True)
 def _over_the_object(
-    points: Array,
-    normals: Array,
-    strength: Array,
-    soft: Array,
-    rows: Index,
-    columns: Index,
+    points: Float64,
+    normals: Float64,
+    strength: Float64,
+    soft: Float64,
+    rows: Int64,
+    columns: Int64,
     field: HeightField,
     near_m: float,
     lambertian: bool,
     per_m: float,
-    start: Index,
+    start: Int64,
     histogram: Float32,
     width: int,
 ) -> Float32:
@@ -151,7 +155,7 @@ def _over_the_object(
 
 
 @numba.njit(cache=True, parallel=True)
-def _carry(factor: Array, steps: Index, histogram: Float32, width: int) -> Float32:
+def _carry(factor: Float64, steps: Int64, histogram: Float32, width: int) -> Float32:
     """Histograms (n, width): of every other (m,) the histogram (m, k), shifted by steps (n, m) and weighted."""
     out = np.zeros((len(factor), width), np.float32)
     for a in numba.prange(len(factor)):
@@ -180,18 +184,18 @@ def with_inter_reflection(job: Job, first: NDArray[np.int32], histogram: Float32
     return np.pad(histogram, [(0, 0), (0, width - histogram.shape[1])]) + by_wall + straight
 
 
-def _patches(job: Job) -> tuple[Array, Array, Array, Array, Index, Index, HeightField, float, bool]:
+def _patches(job: Job) -> tuple[Float64, Float64, Float64, Float64, Int64, Int64, HeightField, float, bool]:
     p = job.patches
     where = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
     return *where, job.field, job.near_m, job.lambertian
 
 
-def object_factors(job: Job) -> Array:
+def object_factors(job: Job) -> Float64:
     """Form factors (n, n) from patch to patch of a job."""
     return patch_to_patch(*_patches(job))
 
 
-def wall_factors(job: Job, cells: Array) -> tuple[Array, Array]:
+def wall_factors(job: Job, cells: Float64) -> tuple[Float64, Float64]:
     """Form factors (n, m) from the patches of a job to cells of the wall (m, 3), and back."""
     p, cell_m2 = job.patches, wall_cell_m2(job)
     where = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
@@ -199,7 +203,7 @@ def wall_factors(job: Job, cells: Array) -> tuple[Array, Array]:
     return patch_to_wall(*where, *wall, *job.edge_m, job.field, job.near_m, job.lambertian)
 
 
-def _wall_extent(job: Job) -> Array:
+def _wall_extent(job: Job) -> Float64:
     """(2, 2); least and most x and y of the wall that inter-reflection goes over."""
     wall = np.array(job.wall_m)
     low, high = job.patches.point_m[:, :2].min(0) - AROUND_M, job.patches.point_m[:, :2].max(0) + AROUND_M
@@ -211,7 +215,7 @@ def wall_cell_m2(job: Job) -> float:
     return float(np.prod(np.maximum(np.diff(_wall_extent(job), axis=0), 0.0)) / WALL_CELLS**2)
 
 
-def wall_cells(job: Job) -> Array:
+def wall_cells(job: Job) -> Float64:
     """The middles (m, 3) of its cells."""
     low, high = _wall_extent(job)
     steps = (np.arange(WALL_CELLS) + 0.5) / WALL_CELLS
@@ -219,7 +223,7 @@ def wall_cells(job: Job) -> Array:
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
 
 
-def share_of_more_bounces(job: Job, taken: Array, given: Array) -> float:
+def share_of_more_bounces(job: Job, taken: Float64, given: Float64) -> float:
     """How much energy one bounce more carries, against three bounces, told from some of the patches.
 
     `taken` and `given` (n,) are the light that each patch gives on, and what the lidar gets of it.

@@ -1,17 +1,52 @@
-"""The first leg: where each beam of the lidar lands, and what returns straight from there (S1)."""
+"""The first leg: where each beam of the lidar lands, and what returns straight from there (S1).
+
+Near contact: 1 / d^2 from the middle of a cell is its average only from afar.
+
+The third bounce: the relay wall as a grid of cells, and the leg from each back to the lidar.
+"""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any, TypeVar
 
+import numba
 import numpy as np
+from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import DeviceConstants, Rig
 from numpy.typing import NDArray
 
-from nlos_cam.render.near import NEAR_DIAGONALS, softened, solid_angle
+NEAR_DIAGONALS = 4
+"""Near contact begins at this many diagonals of the larger cell."""
+MANY = 1.2
+"""Neighbours take their share too: without this a plane of square cells takes 7 % more than was sent. It suffices for
+cells up to twice as long as wide."""
+Area = TypeVar("Area", Float64, float)
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+
+def solid_angle(*, lambertian: bool) -> float:
+    """What each bounce spreads its light over: pi with the cosine of the rendering equation, 2 pi without (S1, S2)."""
+    return np.pi if lambertian else 2 * np.pi
+
+
+def contact_m2(area_m2: Area, solid_angle: float) -> Area:
+    """What near contact adds to d^2 at one cell of many: with it, a plane of cells takes no more than was sent."""
+    return MANY * area_m2 / solid_angle
+
+
+@numba.vectorize([numba.float64(numba.float64, numba.float64, numba.float64)], cache=True)
+def softened(squared_m2: Any, soft_m2: Any, near_m: Any) -> Any:
+    """d^2 that stays finite at contact: plus the receiving area over the solid angle, fading out towards `near_m`.
+
+    On the axis of a disc of area a the average of 1 / d^2 is 1 / (d^2 + a / pi), by which it never takes more than
+    was sent. Beyond a few diagonals the two agree, and S1 and S2 hold to the letter. For arrays, and in compiled loops.
+    """
+    if squared_m2 >= near_m * near_m:
+        return squared_m2
+    ramp = 1 - squared_m2 / (near_m * near_m)
+    return squared_m2 + soft_m2 * ramp * ramp
+
+
 SPEED_OF_LIGHT_M_PER_S = 299_792_458.0
 
 
@@ -20,25 +55,31 @@ class Beams:
     """Beams in the order of the image, flattened; lengths are NaN where a beam meets nothing."""
 
     shape: tuple[int, int]
-    foot_m: Array
+    foot_m: Float64
     """(n, 3); where the beam lands, in the wall frame."""
-    direction: Array
+    direction: Float64
     """(n, 3); unit, in the wall frame."""
-    length_m: Array
+    length_m: Float64
     """(n,); d1."""
-    cos_incidence: Array
+    cos_incidence: Float64
     """(n,); to the normal of what it meets."""
-    cos_axis: Array
+    cos_axis: Float64
     """(n,); beam to optical axis: S5 turns range into depth by it."""
     on_wall: Mask
     """(n,); the beam lights the wall, and so may reach the hidden object."""
-    direct: Array
+    direct: Float64
     """(n,); I_direct, 0 where nothing returns inside the gate."""
-    lidar_m: Array
+    lidar_m: Float64
     """(3,)."""
 
     def met(
-        self, rig: Rig, which: NDArray[np.int64], length_m: Array, cosine: Array, albedo: Array, solid_angle: float
+        self,
+        rig: Rig,
+        which: NDArray[np.int64],
+        length_m: Float64,
+        cosine: Float64,
+        albedo: Float64,
+        solid_angle: float,
     ) -> "Beams":
         """The same where some beams meet something on their way, at a length and a cosine (k,), and return from it."""
         foot, length, incidence = self.foot_m.copy(), self.length_m.copy(), self.cos_incidence.copy()
@@ -92,7 +133,7 @@ def _cast(rig: Rig, intrinsics: Intrinsics, lambertian: bool, occluder: bool) ->
     return beams
 
 
-def returned(rig: Rig, length_m: Array, cosine: Array, solid_angle: float) -> Array:
+def returned(rig: Rig, length_m: Float64, cosine: Float64, solid_angle: float) -> Float64:
     """I_direct (n,) of S1, with S_unit_wall the device's receiver cell; 0 outside the gate or where nothing is met."""
     cell_m2 = rig.device.receiver_cell_m2
     near_m = NEAR_DIAGONALS * np.sqrt(2 * cell_m2)
@@ -106,15 +147,71 @@ def gate_bins(device: DeviceConstants) -> int:
     return max(int(np.ceil(SPEED_OF_LIGHT_M_PER_S * device.gate_s / device.bin_m)), 1)
 
 
-def _inside(rig: Rig, point: Array) -> Mask:
+def _inside(rig: Rig, point: Float64) -> Mask:
     x, y, wall = point[:, 0], point[:, 1], rig.wall
     return (x >= wall.x_min_m) & (x <= wall.x_max_m) & (y >= wall.y_min_m) & (y <= wall.y_max_m)
 
 
-def _occluder_length(rig: Rig, lidar: Array, direction: Array) -> Array:
+def _occluder_length(rig: Rig, lidar: Float64, direction: Float64) -> Float64:
     """How far along each beam the occluder's half plane stands; inf where the beam misses it."""
     if rig.occluder is None:
         return np.full(len(direction), np.inf)
     length = (rig.occluder.x_m - lidar[0]) / direction[:, 0]
     height = lidar[2] + length * direction[:, 2]
     return np.where((length > 0) & (height >= rig.occluder.z_min_m), length, np.inf)
+
+
+NO_OCCLUDER = (np.inf, np.inf)
+"""An edge that blocks nothing: no x lies on both sides of it."""
+
+
+@dataclass(frozen=True)
+class Relay:
+    """Cells of the relay wall."""
+
+    x_m: Float64
+    """(n,)."""
+    y_m: Float64
+    """(n,)."""
+    length_m: Float64
+    """(n,); d4."""
+    cos_lidar: Float64
+    """(n,); the way to the lidar against the wall's normal."""
+    cell_m2: float
+    diagonal_m: float
+    """Of a cell."""
+
+    def kept(self, which: Mask) -> "Relay":
+        """Only some of the cells."""
+        columns = self.x_m[which], self.y_m[which], self.length_m[which], self.cos_lidar[which]
+        return Relay(*columns, self.cell_m2, self.diagonal_m)
+
+    def behind(self, edge_m: tuple[float, float], lidar_m: Float64) -> Mask:
+        """Which cells (n,) an occluder of that edge hides from the lidar."""
+        return behind(edge_m, self.x_m, np.zeros_like(self.x_m), lidar_m)
+
+
+def occluder_edge(rig: Rig) -> tuple[float, float]:
+    """(x_m, z_min_m) of the occluder, or an edge that blocks nothing."""
+    return (rig.occluder.x_m, rig.occluder.z_min_m) if rig.occluder else NO_OCCLUDER
+
+
+def relay_cells(rig: Rig, lidar_m: Float64, columns: int, rows: int) -> Relay:
+    """Cut the relay wall into columns x rows cells, as if nothing stood in front of it."""
+    extent = rig.relay
+    pitch_x, pitch_y = (extent.x_max_m - extent.x_min_m) / columns, (extent.y_max_m - extent.y_min_m) / rows
+    x, y = np.meshgrid(
+        extent.x_min_m + (np.arange(columns) + 0.5) * pitch_x,
+        extent.y_min_m + (np.arange(rows) + 0.5) * pitch_y,
+    )
+    x, y = x.ravel().astype(np.float64), y.ravel().astype(np.float64)
+    length = np.sqrt((x - lidar_m[0]) ** 2 + (y - lidar_m[1]) ** 2 + lidar_m[2] ** 2)
+    return Relay(x, y, length, lidar_m[2] / length, pitch_x * pitch_y, float(np.hypot(pitch_x, pitch_y)))
+
+
+def behind(edge_m: tuple[float, float], x_m: Float64, z_m: Float64, lidar_m: Float64) -> Mask:
+    """Which points (n,) the half plane x = edge_m[0], z >= edge_m[1] hides from the lidar."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = (edge_m[0] - lidar_m[0]) / (x_m - lidar_m[0])
+        height = lidar_m[2] + share * (z_m - lidar_m[2])
+        return (share > 0) & (share < 1) & (height >= edge_m[1])

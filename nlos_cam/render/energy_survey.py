@@ -7,17 +7,14 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
-from nlos_cam.render.beams import Beams
-from nlos_cam.render.between import AROUND_M
+from nlos_cam.render.geometry import NO_OCCLUDER, Beams, Relay, softened
+from nlos_cam.render.interreflection import AROUND_M
 from nlos_cam.render.job import Job
-from nlos_cam.render.near import softened
 from nlos_cam.render.patches import Patches
-from nlos_cam.render.relay import NO_OCCLUDER, Relay
 from nlos_cam.render.visibility import BIAS_CELLS, HeightField, occluded
-
-Array = NDArray[np.float64]
 
 SOME_BEAMS, SOME_CELLS = 160, 96
 CAUTION = 1.5
@@ -28,23 +25,23 @@ CAUTION = 1.5
 class Survey:
     """For each patch (n,): the light that reaches it from the beams, and that which the lidar gets of what it gives."""
 
-    taken: Array
-    given: Array
-    taken_tilt: Array
+    taken: Float64
+    given: Float64
+    taken_tilt: Float64
     """How much of it changes, beam by beam, where the patch is taken to face the wall squarely."""
-    given_tilt: Array
-    taken_cut: Array
+    given_tilt: Float64
+    taken_cut: Float64
     """How much more it would be without the occluder."""
-    given_cut: Array
+    given_cut: Float64
     uneven: float
     """How many times as much a BRDF may make one patch give as another."""
 
     @property
-    def energy(self) -> Array:
+    def energy(self) -> Float64:
         """(n,); of three bounces over each patch."""
         return self.taken * self.given
 
-    def share(self, change: Array) -> float:
+    def share(self, change: Float64) -> float:
         """A change of each patch's energy (n,) as a bound on the relative change of the whole, 1 being all or more."""
         whole, part = float(self.energy.sum()), CAUTION * self.uneven * float(change.sum())
         return min(part / whole, 1.0) if whole > 0 else float(part > 0)
@@ -81,20 +78,20 @@ def survey(job: Job, uneven: float) -> Survey:
 
 @numba.njit(cache=True, parallel=True)
 def _sums(
-    points: Array,
-    normals: Array,
-    beta: Array,
-    x: Array,
-    y: Array,
-    weight: Array,
+    points: Float64,
+    normals: Float64,
+    beta: Float64,
+    x: Float64,
+    y: Float64,
+    weight: Float64,
     hidden: NDArray[np.bool_],
-    soft: Array,
+    soft: Float64,
     near_m: float,
     edge_x: float,
     edge_z: float,
     lambertian: bool,
     outgoing: bool,
-) -> Array:
+) -> Float64:
     """Sums (3, n) over points of the wall: the light, what tilt changes of it, what the occluder cuts off."""
     sums = np.zeros((3, len(points)))
     for s in numba.prange(len(points)):

@@ -8,16 +8,13 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from nlos_calibration.arrays import Float64, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.beams import Beams
+from nlos_cam.render.geometry import Beams, Relay
 from nlos_cam.render.patches import slope_along
-from nlos_cam.render.relay import Relay
 from nlos_cam.render.visibility import HeightField
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @numba.njit(cache=True)
@@ -31,7 +28,7 @@ def _entry(start: float, direction: float, low: float, high: float) -> tuple[flo
 
 @numba.njit(cache=True)
 def _first_hit(
-    field: HeightField, slope: Array, start: Array, direction: Array, length: float
+    field: HeightField, slope: Float64, start: Float64, direction: Float64, length: float
 ) -> tuple[float, float, int, int]:
     """Length to the first column within `length`, cosine there, row and column of its cell; inf where there is none."""
     rows, columns = field.depth_m.shape
@@ -69,8 +66,8 @@ def _first_hit(
 
 @numba.njit(cache=True, parallel=True)
 def first_hits(
-    field: HeightField, slope: Array, start: Array, directions: Array, lengths: Array
-) -> tuple[Array, Array, Index, Index]:
+    field: HeightField, slope: Float64, start: Float64, directions: Float64, lengths: Float64
+) -> tuple[Float64, Float64, Int64, Int64]:
     """Where rays from a point (3,), unit directions (n, 3), meet the object before their lengths (n,).
 
     Gives length (n,), inf where nothing is met; cosine to what is met (n,); and its row and column (n,). `slope` is of
@@ -89,9 +86,9 @@ class Sight:
 
     beam: NDArray[np.int64]
     """(k,); the beams that it stops."""
-    length_m: Array
+    length_m: Float64
     """(k,)."""
-    cosine: Array
+    cosine: Float64
     """(k,); to the normal of what is met."""
     row: NDArray[np.int64]
     """(k,); the cell of the depth map that is met."""
@@ -100,7 +97,7 @@ class Sight:
     """(m,); the relay cells from which no light gets to the lidar."""
 
 
-def look(beams: Beams, relay: Relay, field: HeightField, depth_m: Array, jump_m: float) -> Sight | None:
+def look(beams: Beams, relay: Relay, field: HeightField, depth_m: Float64, jump_m: float) -> Sight | None:
     """Follow every beam, and every way from a relay cell to the lidar; None where the object is in none's way."""
     to_cells = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1) - beams.lidar_m
     directions = np.concatenate([beams.direction, to_cells / relay.length_m[:, None]])

@@ -3,29 +3,103 @@
 Both are found out on the spot. The error: brute force on a few beams, and each stop on the same. The time: of a small
 share of the beams, in two sizes, since planning and tables are paid once and beams one by one. The look costs about as
 much as three beams in a hundred by brute force; the budget is for the rendering after it.
+
+How far one rendering of a scene is from another, echo by echo.
+
+What each effect of a plan costs: the time that a rendering takes with it, less the time without it.
 """
 
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, Self
 
 import numba
 import numpy as np
+from nlos_calibration.arrays import Int64, Mask
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.agreement import relative_error
-from nlos_cam.render.echo import spread, strongest
-from nlos_cam.render.effects import Effects, included
-from nlos_cam.render.kernels import BEAM_TILE
-from nlos_cam.render.prepare import Prepared
-from nlos_cam.render.renderer import histograms
+from nlos_cam.render.backend_numba import BEAM_TILE
+from nlos_cam.render.echoes import spread, strongest
+from nlos_cam.render.effects import Effects, Plan, included
+from nlos_cam.render.geometry import cast
+from nlos_cam.render.planning import Prepared
+from nlos_cam.render.renderer import Rendering, histograms, render
 from nlos_cam.render.scene import Scene
 
-Index = NDArray[np.int64]
+Array = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Echoes:
+    """What is compared, one entry (n,) for each beam or each cell."""
+
+    intensity: Array
+    path_m: Array
+    """NaN where nothing comes back."""
+    depth_m: Array
+    """What the lidar reports; NaN where nothing comes back."""
+
+    @classmethod
+    def of_beams(cls, rendering: Rendering) -> Self:
+        """The strongest three-bounce bin of each beam, one per cell: stricter than maps, which a direct one may win."""
+        multi = rendering.multi
+        return cls(multi.peak.ravel(), multi.path_m.ravel(), rendering.depth_m.ravel())
+
+    @classmethod
+    def of_cells(cls, rendering: Rendering, scene: Scene) -> Self:
+        """The maps (64, 80), for renderings with different numbers of beams per cell."""
+        depth = rendering.depth_m.ravel()
+        cos_axis = cast(scene.rig, scene.cell_intrinsics).cos_axis
+        return cls(rendering.intensity.ravel(), 2 * depth / cos_axis, depth)
+
+    def some(self, which: Mask) -> "Echoes":
+        """Only some of them."""
+        return Echoes(self.intensity[which], self.path_m[which], self.depth_m[which])
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """One rendering against another that is taken to be the truth."""
+
+    intensity_error_median: float
+    """Relative."""
+    intensity_error_p99: float
+    intensity_error_max: float
+    bin_exact: float
+    """Share of echoes in the same bin of path length."""
+    bin_within_1: float
+    depth_error_mm: float
+    """Median, where both report a depth."""
+    depth_error_mean_mm: float
+
+
+def relative_error(found: Array, truth: Array) -> Array:
+    """|found - truth| / truth (n,); where nothing should come back, 0 if nothing does and else 1."""
+    off = np.abs(found - truth)
+    return np.divide(off, truth, out=(off > 0).astype(off.dtype), where=truth > 0)
+
+
+def agreement(found: Echoes, truth: Echoes, bin_m: float) -> Agreement:
+    """Hold echoes (at least one) against the true ones."""
+    error = relative_error(found.intensity, truth.intensity)
+    bins = np.abs(found.path_m - truth.path_m) / bin_m
+    bins[np.isnan(found.path_m) & np.isnan(truth.path_m)] = 0  # NaN of one alone is in no bin of the other
+    depth = 1000 * np.abs(found.depth_m - truth.depth_m)
+    depth = depth[~np.isnan(depth)]
+    return Agreement(
+        intensity_error_median=float(np.median(error)),
+        intensity_error_p99=float(np.quantile(error, 0.99)),
+        intensity_error_max=float(error.max()),
+        bin_exact=float((bins < 0.5).mean()),
+        bin_within_1=float((bins < 1.5).mean()),
+        depth_error_mm=float(np.median(depth)) if depth.size else 0.0,
+        depth_error_mean_mm=float(depth.mean()) if depth.size else 0.0,
+    )
+
 
 SAMPLE_BEAMS = 32
 """At least so many are summed by brute force."""
@@ -139,7 +213,7 @@ def _three_bounces_of(ready: Prepared) -> Effects:
     return [effect.name for effect in ready.plan if effect.included and effect.name != "inter-reflection"]
 
 
-def some_of(lit: Index, count: int) -> Index:
+def some_of(lit: Int64, count: int) -> Int64:
     """About `count` of the beams, spread over the map: one at random, but always the same, from each strip."""
     if len(lit) <= count:
         return lit
@@ -154,7 +228,7 @@ def _whole_rounds(beams: float, tile: int) -> int:
     return int(-(-beams // one_round)) * one_round
 
 
-def _seconds(scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: Index, stopwatch: Stopwatch) -> float:
+def _seconds(scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: Int64, stopwatch: Stopwatch) -> float:
     """Seconds of a whole rendering, told from those of some beams and of some of those."""
     if stop.sub_bins == 0:
         tile, repeats, beams = 1, 1, SAMPLE_BEAMS
@@ -163,7 +237,7 @@ def _seconds(scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: 
     few = some_of(lit, _whole_rounds(beams / SHARE, tile))
     many = some_of(lit, max(_whole_rounds(beams, tile), 2 * len(few)))
 
-    def rendered(chosen: Index) -> Work:
+    def rendered(chosen: Int64) -> Work:
         return lambda: _render_some(scene, stop, effects, backend, chosen)
 
     rendered(few)()  # compiles
@@ -175,7 +249,7 @@ def _seconds(scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: 
 
 
 def _render_some(
-    scene: Scene, stop: Accuracy, effects: Effects, backend: str, chosen: Index
+    scene: Scene, stop: Accuracy, effects: Effects, backend: str, chosen: Int64
 ) -> NDArray[np.floating[Any]]:
     """The work of a rendering, for some of the beams."""
     ready = Prepared.of(scene, stop, effects)
@@ -186,3 +260,30 @@ def _render_some(
             found = spread(found.astype(np.float32), scene.pulse_ns, scene.rig.device.bin_m)
         strongest(found, scene.rig.device.bin_m)
     return found
+
+
+"""The least of so many: what disturbs a machine only ever adds."""
+
+
+def costs(
+    scene: Scene,
+    accuracy: str | Accuracy,
+    plan: Plan,
+    backend: str = "cpu",
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, float]:
+    """Seconds that each included effect adds to a rendering, by name; 0 for what is left out."""
+    names = [effect.name for effect in plan if effect.included]
+
+    def least(effects: list[str]) -> float:
+        times: list[float] = []
+        for _ in range(REPEATS):
+            started = clock()
+            render(scene, accuracy, effects, backend)
+            times.append(clock() - started)
+        return min(times)
+
+    least(names)  # compiles
+    whole = least(names)
+    added = {name: max(whole - least([other for other in names if other != name]), 0.0) for name in names}
+    return {effect.name: added.get(effect.name, 0.0) for effect in plan}

@@ -4,7 +4,7 @@ from math import sqrt
 
 from nlos_cam.frames import SATURATED
 from nlos_cam.render.effects import Effect
-from nlos_cam.render.sensor_model import DEPTH_UNIT_M, FARTHEST, SensorModel
+from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, SensorModel
 
 IR, DEPTH = "relative L1 of the IR", "relative L1 of the depth"
 

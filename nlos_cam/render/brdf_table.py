@@ -6,17 +6,16 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float64
 
 from nlos_cam.render.job import Job
-from nlos_cam.render.surface import Brdf
+from nlos_cam.render.material import Brdf
 
-Array = NDArray[np.float64]
 PROBES = 4096
 """Legs on which an interpolation is tried."""
 MOST_NODES = 64
 """Along each axis."""
-Scattering = Callable[[Array, Array, Array, Array, Array], Array]
+Scattering = Callable[[Float64, Float64, Float64, Float64, Float64], Float64]
 
 
 @lru_cache(maxsize=8)
@@ -28,7 +27,7 @@ def scattering(brdf: Brdf) -> Scattering:
     compiled: Any = numba.njit(brdf)
 
     @numba.njit(parallel=True)
-    def factor(foot: Array, points: Array, normals: Array, x: Array, y: Array) -> Array:
+    def factor(foot: Float64, points: Float64, normals: Float64, x: Float64, y: Float64) -> Float64:
         table = np.empty((len(points), len(x)))
         for s in numba.prange(len(points)):
             point, normal = points[s], normals[s]
@@ -46,7 +45,7 @@ def scattering(brdf: Brdf) -> Scattering:
     return factor
 
 
-def scattered(brdf: Brdf, foot: Array, point: Array, normal: Array, out: Array) -> Array:
+def scattered(brdf: Brdf, foot: Float64, point: Float64, normal: Float64, out: Float64) -> Float64:
     """The same factor (n,) leg by leg: feet, points, normals and wall points (n, 3), for a look without compiling."""
     to_foot, to_wall = foot - point, out - point
     to_foot /= np.maximum(np.linalg.norm(to_foot, axis=1, keepdims=True), 1e-12)
@@ -55,7 +54,7 @@ def scattered(brdf: Brdf, foot: Array, point: Array, normal: Array, out: Array) 
     return brdf(np.maximum(cos_in, 0.0), np.maximum(cos_out, 0.0), (to_foot * to_wall).sum(1)) + np.zeros(len(foot))
 
 
-def nodes(job: Job, brdf: Brdf) -> Iterator[tuple[Array, Array]]:
+def nodes(job: Job, brdf: Brdf) -> Iterator[tuple[Float64, Float64]]:
     """Feet (3,) that stand for those around them, and to what share (n,) each beam is one's: linear in between.
 
     Their columns and rows are quantiles of the feet's own, so that they are dense where the beams are.
@@ -69,7 +68,7 @@ def nodes(job: Job, brdf: Brdf) -> Iterator[tuple[Array, Array]]:
                 yield np.array([x, y, 0.0]), share
 
 
-def _lines(foot_m: Array, count: int) -> list[Array]:
+def _lines(foot_m: Float64, count: int) -> list[Float64]:
     return [np.unique(np.quantile(foot_m[:, axis], np.linspace(0, 1, count))) for axis in (0, 1)]
 
 
@@ -96,13 +95,13 @@ def node_count(job: Job, brdf: Brdf) -> int:
     return count
 
 
-def _bracket(at: Array, line: Array) -> tuple[Array, Array, Array]:
+def _bracket(at: Float64, line: Float64) -> tuple[Float64, Float64, Float64]:
     """The points of a line before and after, and how far in between (0 to 1)."""
     before = np.clip(np.searchsorted(line, at, "right") - 1, 0, max(len(line) - 2, 0))
     low, high = line[before], line[np.minimum(before + 1, len(line) - 1)]
     return low, high, np.divide(at - low, high - low, out=np.zeros_like(at), where=high > low)
 
 
-def _hats(at: Array, line: Array) -> Array:
+def _hats(at: Float64, line: Float64) -> Float64:
     """Linear interpolation between the points of a line as weights (len(line), len(at))."""
     return np.stack([np.interp(at, line, one) for one in np.eye(len(line))])

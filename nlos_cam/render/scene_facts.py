@@ -4,22 +4,19 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 from nlos_calibration.rig import DeviceConstants, Rig
-from numpy.typing import NDArray
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.beams import SPEED_OF_LIGHT_M_PER_S, Beams, cast, gate_bins
-from nlos_cam.render.between import share_of_more_bounces
+from nlos_cam.render.energy_survey import Survey, survey
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, Beams, Relay, cast, gate_bins, occluder_edge, relay_cells
+from nlos_cam.render.interreflection import share_of_more_bounces
 from nlos_cam.render.job import Job
+from nlos_cam.render.line_of_sight import Sight, look
+from nlos_cam.render.material import brdf_range
 from nlos_cam.render.patches import Patches, clustered, coarser
-from nlos_cam.render.relay import Relay, occluder_edge, relay_cells
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sight import Sight, look
-from nlos_cam.render.surface import brdf_range
-from nlos_cam.render.survey import Survey, survey
 from nlos_cam.render.visibility import HeightField, height_field
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -30,7 +27,7 @@ class Stage:
     accuracy: Accuracy
 
     @property
-    def albedo(self) -> Array:
+    def albedo(self) -> Float64:
         """The albedo of every cell of the accuracy's grid, the mean of channels and block."""
         size, stride = len(self.depth_m), self.stride
         every = self.scene.surface.over((size * stride, size * stride)).mean(-1)
@@ -58,7 +55,7 @@ class Stage:
         return 1 if depth is None or len(depth) % self.accuracy.object_stride else self.accuracy.object_stride
 
     @cached_property
-    def depth_m(self) -> Array:
+    def depth_m(self) -> Float64:
         """The depth map on the accuracy's grid; (0, 0) where there is none."""
         depth = self.scene.object_depth_m
         if depth is None:

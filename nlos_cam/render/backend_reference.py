@@ -1,21 +1,81 @@
 """The renderer that defines the others: every three-bounce path by itself, in float64 (S2 to S4).
 
 Slow on purpose (it is compiled, and still takes a minute or two for a whole map): each line is an equation.
+
+Inter-reflection path by path, in float64: what `between` is held against. For small scenes; others are refused.
 """
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float64, Int64, Mask
 
+from nlos_cam.errors import SceneError
+from nlos_cam.render.brdf_table import scattering
+from nlos_cam.render.geometry import softened
+from nlos_cam.render.interreflection import object_factors, wall_cells, wall_factors
 from nlos_cam.render.job import Job
-from nlos_cam.render.near import softened
-from nlos_cam.render.reference_between import more_paths
-from nlos_cam.render.scatter import scattering
 from nlos_cam.render.visibility import HeightField, occluded, visible
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+MOST_PATHS = 3e10
+"""Some minutes' worth."""
+
+
+def more_paths(job: Job, taken: Float64, given: Float64) -> Float64:
+    """Histograms (n, bins) of the paths that meet the object twice.
+
+    `taken` (n, patches) is the light that each patch gives on of each beam, `given` (patches, m) what the lidar gets of
+    it by each relay cell. Raises SceneError where there are more than MOST_PATHS.
+    """
+    point, cells = job.patches.point_m, wall_cells(job)
+    count = taken.size * given.size * len(cells)
+    if count > MOST_PATHS:
+        raise SceneError(
+            f"inter-reflection path by path would sum {count:.1g} paths, at most {MOST_PATHS:.0e}: choose fine, "
+            "or leave inter-reflection out of the effects"
+        )
+    relay = np.stack([job.relay.x_m, job.relay.y_m, np.zeros_like(job.relay.x_m)], 1)
+    there, back = wall_factors(job, cells)
+    d2 = np.linalg.norm(job.foot_m[:, None] - point, axis=-1) + job.length_m[:, None]
+    d3 = np.linalg.norm(point[:, None] - relay, axis=-1) + job.relay.length_m
+    to_wall = np.linalg.norm(point[:, None] - cells, axis=-1)
+    factors = object_factors(job)
+    return _sum(taken, d2, given, d3, factors, point, there, back, to_wall, job.bin_m, job.bins)
+
+
+@numba.njit(cache=True, parallel=True)
+def _sum(
+    taken: Float64,
+    d2: Float64,
+    given: Float64,
+    d3: Float64,
+    factors: Float64,
+    points: Float64,
+    there: Float64,
+    back: Float64,
+    to_wall: Float64,
+    bin_m: float,
+    bins: int,
+) -> Float64:
+    histogram = np.zeros((len(taken), bins))
+    for p in numba.prange(len(taken)):
+        for a in range(len(points)):
+            if taken[p, a] == 0:
+                continue
+            for b in range(len(points)):
+                away = np.sqrt(((points[a] - points[b]) ** 2).sum())
+                for q in range(given.shape[1]):
+                    ends, light = d2[p, a] + d3[b, q], taken[p, a] * given[b, q]
+                    if light == 0:
+                        continue
+                    k = int(np.floor((ends + away) / bin_m))
+                    if k < bins:
+                        histogram[p, k] += light * factors[a, b]
+                    for w in range(there.shape[1]):
+                        k = int(np.floor((ends + to_wall[a, w] + to_wall[b, w]) / bin_m))
+                        if k < bins:
+                            histogram[p, k] += light * there[a, w] * back[b, w]
+    return histogram
+
 
 BEAM_GROUP = 256
 """Beams summed in one compiled call."""
@@ -23,12 +83,12 @@ BEAM_GROUP = 256
 
 @numba.njit(cache=True, parallel=True)
 def legs(
-    points: Array,
-    normals: Array,
-    rows: Index,
-    columns: Index,
-    x: Array,
-    y: Array,
+    points: Float64,
+    normals: Float64,
+    rows: Int64,
+    columns: Int64,
+    x: Float64,
+    y: Float64,
     edge_x: float,
     edge_z: float,
     field: HeightField,
@@ -46,7 +106,7 @@ def legs(
 
 @numba.njit(cache=True, error_model="numpy")
 def _taken(
-    foot: Array, normal: Array, point: Array, strength: float, soft: float, near_m: float, lambertian: bool
+    foot: Float64, normal: Float64, point: Float64, strength: float, soft: float, near_m: float, lambertian: bool
 ) -> float:
     """What of S2 the way from a beam's foot to a patch makes: the light that the patch gives on."""
     to_foot = foot - point
@@ -72,26 +132,26 @@ def _given(
 
 @numba.njit(cache=True, parallel=True)
 def _paths(
-    foot: Array,
-    d1: Array,
-    beam_weight: Array,
+    foot: Float64,
+    d1: Float64,
+    beam_weight: Float64,
     lit: Mask,
-    points: Array,
-    normals: Array,
-    strength: Array,
-    soft_patch: Array,
-    x: Array,
-    y: Array,
-    d4: Array,
-    relay_weight: Array,
+    points: Float64,
+    normals: Float64,
+    strength: Float64,
+    soft_patch: Float64,
+    x: Float64,
+    y: Float64,
+    d4: Float64,
+    relay_weight: Float64,
     soft_wall: float,
     seen: Mask,
-    factor: Array,
+    factor: Float64,
     near_m: float,
     lambertian: bool,
     bin_m: float,
     bins: int,
-) -> Array:
+) -> Float64:
     histogram = np.zeros((len(foot), bins))
     for p in numba.prange(len(foot)):
         for s in range(len(points)):
@@ -117,21 +177,21 @@ def _paths(
 
 @numba.njit(cache=True)
 def _ends(
-    foot: Array,
-    beam_weight: Array,
+    foot: Float64,
+    beam_weight: Float64,
     lit: Mask,
-    points: Array,
-    normals: Array,
-    strength: Array,
-    soft_patch: Array,
-    x: Array,
-    y: Array,
-    relay_weight: Array,
+    points: Float64,
+    normals: Float64,
+    strength: Float64,
+    soft_patch: Float64,
+    x: Float64,
+    y: Float64,
+    relay_weight: Float64,
     soft_wall: float,
     seen: Mask,
     near_m: float,
     lambertian: bool,
-) -> tuple[Array, Array]:
+) -> tuple[Float64, Float64]:
     """Both ends of every path: taken (beams, patches) and given (patches, cells)."""
     taken, given = np.zeros((len(foot), len(points))), np.zeros((len(points), len(x)))
     for s in range(len(points)):
@@ -148,13 +208,13 @@ def _ends(
     return taken, given
 
 
-def histograms(job: Job) -> Array:
+def histograms(job: Job) -> Float64:
     """Histograms (n, bins) of I_multi over path length, for the job's beams."""
     more = _more_bounces(job) if job.more_bounces else 0.0  # first: it refuses what would take too long
     return _three_bounces(job) + more
 
 
-def _three_bounces(job: Job) -> Array:
+def _three_bounces(job: Job) -> Float64:
     """In groups of beams, between which Ctrl-C is heard: one beam at a time where a BRDF couples the legs."""
     patches, relay, count = job.patches, job.relay, len(job.foot_m)
     seen = _visible(job, relay.x_m, relay.y_m)
@@ -168,7 +228,7 @@ def _three_bounces(job: Job) -> Array:
     return histogram
 
 
-def _more_bounces(job: Job) -> Array:
+def _more_bounces(job: Job) -> Float64:
     p, relay = job.patches, job.relay
     surface = p.point_m, p.normal, job.strength, job.soft_patch_m2
     lit = _visible(job, job.foot_m[:, 0].copy(), job.foot_m[:, 1].copy())
@@ -177,13 +237,13 @@ def _more_bounces(job: Job) -> Array:
     return more_paths(job, taken, given)
 
 
-def _visible(job: Job, x_m: Array, y_m: Array) -> Mask:
+def _visible(job: Job, x_m: Float64, y_m: Float64) -> Mask:
     """V (n, m) of the legs between the job's patches and points of the wall."""
     p = job.patches
     return legs(p.point_m, p.normal, p.row, p.column, x_m, y_m, *job.edge_m, job.field)
 
 
-def _some(job: Job, which: slice, seen: Mask, factor: Array) -> Array:
+def _some(job: Job, which: slice, seen: Mask, factor: Float64) -> Float64:
     patches, relay, foot = job.patches, job.relay, np.ascontiguousarray(job.foot_m[which])
     return _paths(
         foot,

@@ -9,9 +9,9 @@ import numpy as np
 from nlos_cam.frames import MAP_ROWS
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
 from nlos_cam.render.effects import Effect, Effects
+from nlos_cam.render.energy_survey import CAUTION
 from nlos_cam.render.renderer import Rendering, render, three_bounce
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.survey import CAUTION
 
 SceneAt = Callable[[float], Scene]
 """The scene at a time of the scan, 0 (its top row) to 1 (its bottom row)."""

@@ -2,19 +2,22 @@
 
 Ripples and patches are fixed patterns of the device. Drift is told against the warm device: there the common drift is
 none and the patches are whole; where a warm-up begins it is the other way round.
+
+What the relay wall's own pattern (grain, paint, dirt) does to the light of each pixel: a factor that stays.
+
+The wall reflects a beam's direct return, and the first bounce of all its three-bounce paths, at one and the same point:
+its reflectance there is a factor of the whole echo, and changes no winner (S1, S2, S5). Third bounces come from the
+whole relay wall, whose texture they average: that is left out, as is any gloss.
 """
 
 from math import inf
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float32, Float64
 
-from nlos_cam.frames import Float32
 from nlos_cam.render.effects import Plan, included
-from nlos_cam.render.sensor_model import SensorModel
-
-Array = NDArray[np.float64]
+from nlos_cam.render.sensor.model import SensorModel
 
 BIASES = {
     "range offset": "range_offset_m",
@@ -30,14 +33,14 @@ RIPPLES_SEED, PATCHES_SEED = 1, 2
 NO_BIAS = np.zeros(0, np.float32)
 
 
-def ripples(shape: tuple[int, int], waves: float, generator: np.random.Generator) -> Array:
+def ripples(shape: tuple[int, int], waves: float, generator: np.random.Generator) -> Float64:
     """A wave (height, width) of amplitude 1 that runs any way, `waves` of it across the width."""
     rows, columns = np.indices(shape) / shape[1]
     way, phase = generator.uniform(0.0, 2.0 * np.pi, 2)
     return np.sin(2.0 * np.pi * waves * (columns * np.cos(way) + rows * np.sin(way)) + phase)
 
 
-def patches(shape: tuple[int, int], generator: np.random.Generator, across: int = 12) -> Array:
+def patches(shape: tuple[int, int], generator: np.random.Generator, across: int = 12) -> Float64:
     """A smooth pattern (height, width) of standard deviation 1, in about `across` patches across the width."""
     height, width = shape
     coarse = generator.standard_normal((across * height // width + 3, across + 3)).astype(np.float32)
@@ -77,3 +80,24 @@ class DepthBias:
         """0 where the warm-up begins, 1 where it ends."""
         warm = self._warm_up
         return (celsius - warm.from_celsius) / (warm.to_celsius - warm.from_celsius) if warm else 1.0
+
+
+TEXTURE_SEED = 3
+"""Every wall of ours has the same pattern."""
+STAINS, GRAINS = 5, 90
+"""Patches across the view: of paint and dirt, and of what is about as small as a cell of the maps."""
+EVEN = np.zeros(0, np.float32)
+
+
+def texture(shape: tuple[int, int], strength: float) -> Float32:
+    """What each pixel (n,) of an image (height, width) receives of an even wall's light, 1 on average.
+
+    `strength` is the standard deviation of its logarithm, whose variance is half of stains, half of grain. Empty for
+    an even wall.
+    """
+    if not strength:
+        return EVEN
+    generator = np.random.default_rng(TEXTURE_SEED)
+    pattern = patches(shape, generator, STAINS) + patches(shape, generator, GRAINS)
+    factor = np.exp(strength * (pattern - pattern.mean()) / pattern.std())
+    return (factor / factor.mean()).astype(np.float32).ravel()

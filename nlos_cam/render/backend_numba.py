@@ -1,0 +1,413 @@
+"""The fast renderer: S2 factorised at the object's patches, for the CPU (numba, float32).
+
+weight(p, s, q) = A(p, s) B(s, q) and length = (d1 + d2)(p, s) + (d3 + d4)(s, q). So each patch s gets one table of B
+over d3 + d4, counted in sub-bins, and each beam p adds it, shifted by d1 + d2 to the nearest sub-bin. The sums of
+sub-bins to bins are made beforehand for each of the shifts within a bin, so that a beam adds one row: one product for a
+patch and a bin. Neither rounding leans: a path lies anywhere within its sub-bin, and the nearest shift leaves the bin's
+edge in the middle of that.
+
+Legs between patches and points of the wall, many at a time (numba, float32): weight, length, visibility.
+
+These are compiled into `kernels`, whose cache looks at its own file alone: after a change here, delete __pycache__.
+
+The two sums of the fast renderer, compiled: relay cells into patches' tables, tables into beams' histograms.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from nlos_calibration.arrays import Float32, Float64, Int32
+from numpy.typing import NDArray
+
+from nlos_cam.render.brdf_table import nodes, scattering
+from nlos_cam.render.interreflection import with_inter_reflection
+from nlos_cam.render.job import Job
+from nlos_cam.render.visibility import HeightField, blocked, horizon_table
+
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+
+
+class Surface32(NamedTuple):
+    """Patches as columns of float32."""
+
+    x_m: Float32
+    y_m: Float32
+    z_m: Float32
+    normal_x: Float32
+    normal_y: Float32
+    normal_z: Float32
+    soft_m2: Float32
+    """What near contact adds to d^2: the area over the solid angle that the radiometry scatters into."""
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+
+
+class Points32(NamedTuple):
+    """Points of the wall: the feet of beams, or relay cells; with the rest of their way to the lidar."""
+
+    x_m: Float32
+    y_m: Float32
+    length_m: Float32
+    weight: Float32
+    soft_m2: np.float32
+
+
+class Optics(NamedTuple):
+    """What all legs share."""
+
+    edge_x_m: np.float32
+    edge_z_m: np.float32
+    near_m2: np.float32
+    """Square of the distance at which near contact begins."""
+    lambertian: bool
+    inverse_bin: np.float32
+    """Sub-bins per metre."""
+    sectors: int
+    """Of each face of the horizon tables; 0 where nothing shades."""
+
+
+class Legs(NamedTuple):
+    """Scratch for the legs from one patch to many points of the wall."""
+
+    weight: Float32
+    length_m: Float32
+    sector: Int32
+    major: Float32
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
+def geometry(
+    legs: Legs,
+    s: int,
+    surface: Surface32,
+    points: Points32,
+    start: int,
+    count: int,
+    optics: Optics,
+    field: HeightField,
+    outgoing: bool,
+) -> None:
+    """Legs from patch s to points: weight without visibility and length, vector by vector.
+
+    Towards the lidar (`outgoing`) the weight has the wall's cosine, and in Lambertian radiometry the patch's; from it
+    the patch's, and in Lambertian radiometry the wall's.
+    """
+    x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
+    nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
+    soft = points.soft_m2 if outgoing else surface.soft_m2[s]
+    to_edge, nothing, one, two = optics.edge_x_m - x, np.float32(0), np.float32(1), np.float32(2)
+    inverse_x, inverse_y = np.float32(1 / field.pitch_x_m), np.float32(-1 / field.pitch_y_m)
+    half, last, faces = np.float32(optics.sectors / 2), np.float32(optics.sectors - 1), np.float32(optics.sectors)
+    at_x, at_y, light = (
+        points.x_m[start : start + count],
+        points.y_m[start : start + count],
+        points.weight[start : start + count],
+    )
+    for i in range(count):
+        dx, dy = at_x[i] - x, at_y[i] - y
+        squared = dx * dx + dy * dy + z * z
+        length = np.sqrt(squared)
+        facing = nx * dx + ny * dy - nz * z
+        cut = (to_edge * (optics.edge_x_m - at_x[i]) < nothing) & (z * (one - to_edge / dx) >= optics.edge_z_m)
+        ramp = max(one - squared / optics.near_m2, nothing)
+        cosine = z if outgoing else facing
+        if optics.lambertian:
+            cosine = z * facing / length
+        weight = light[i] * cosine / (length * (squared + soft * ramp * ramp))
+        legs.weight[i] = weight if (facing > nothing) & (not cut) else nothing
+        legs.length_m[i] = length
+        u, v = dx * inverse_x, dy * inverse_y
+        along_columns = abs(u) >= abs(v)
+        major, minor = (u if along_columns else v), (v if along_columns else u)
+        legs.major[i] = abs(major)
+        inside = min((minor / max(abs(major), np.float32(1e-20)) + one) * half, last)
+        face = (nothing if along_columns else two) + (nothing if major >= nothing else one)
+        legs.sector[i] = np.int32(face * faces + np.floor(inside))
+
+
+@numba.njit(cache=True)
+def shade(
+    legs: Legs,
+    s: int,
+    surface: Surface32,
+    points: Points32,
+    start: int,
+    count: int,
+    field: HeightField,
+    low: Float32,
+    high: Float32,
+) -> None:
+    """Set the weight of legs that the object blocks to 0."""
+    z = surface.z_m[s]
+    for i in range(count):
+        if z >= legs.major[i] * high[s, legs.sector[i]]:
+            continue
+        if z >= legs.major[i] * low[s, legs.sector[i]]:
+            u = (points.x_m[start + i] - surface.x_m[s]) / field.pitch_x_m
+            v = (surface.y_m[s] - points.y_m[start + i]) / field.pitch_y_m
+            if legs.weight[i] == 0 or not blocked(field, surface.row[s], surface.column[s], z, u, v):
+                continue
+        legs.weight[i] = 0
+
+
+@numba.njit(cache=True, inline="always")
+def scratch(count: int) -> Legs:
+    return Legs(
+        np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int32), np.empty(count, np.float32)
+    )
+
+
+LANES = 16
+"""Rows of tables are a whole number of the widest vectors."""
+BEAM_TILE = 64
+"""Beams whose histograms stay in the cache while the patches go by."""
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def _count(
+    s: int,
+    surface: Surface32,
+    relay: Points32,
+    optics: Optics,
+    field: HeightField,
+    low: Float32,
+    high: Float32,
+    factor: Float32,
+    per_bin: int,
+    histogram: Float32,
+) -> int:
+    """Count B over d3 + d4 of one patch in sub-bins; gives the bin at which they start."""
+    cells = len(relay.x_m)
+    legs = scratch(cells)
+    geometry(legs, s, surface, relay, 0, cells, optics, field, True)
+    if optics.sectors:
+        shade(legs, s, surface, relay, 0, cells, field, low, high)
+    if len(factor):
+        for q in range(cells):
+            legs.weight[q] *= factor[s, q]
+    shortest = np.float32(np.inf)
+    for q in range(cells):
+        legs.length_m[q] = (legs.length_m[q] + relay.length_m[q]) * optics.inverse_bin
+        shortest = min(shortest, legs.length_m[q])
+    first = int(shortest) // per_bin
+    start = np.float32(first * per_bin)
+    for q in range(cells):
+        legs.sector[q] = np.int32(legs.length_m[q] - start)  # not negative: first is this patch's own floor
+    for q in range(cells):
+        histogram[legs.sector[q]] += legs.weight[q]
+    return first
+
+
+@numba.njit(cache=True, parallel=True)
+def sub_bins(
+    surface: Surface32,
+    relay: Points32,
+    optics: Optics,
+    field: HeightField,
+    low: Float32,
+    high: Float32,
+    factor: Float32,
+    per_bin: int,
+    width: int,
+) -> tuple[Int32, Float32]:
+    """Histograms (n, width * per_bin) of B over d3 + d4 in sub-bins, and the bin (n,) at which each starts."""
+    patches = len(surface.x_m)
+    first, histogram = np.zeros(patches, np.int32), np.zeros((patches, width * per_bin), np.float32)
+    for s in numba.prange(patches):
+        first[s] = _count(s, surface, relay, optics, field, low, high, factor, per_bin, histogram[s])
+    return first, histogram
+
+
+@numba.njit(cache=True, parallel=True)
+def tables(histogram: Float32, per_bin: int) -> Float32:
+    """Histograms (n, width * per_bin) in sub-bins as sums to bins (n, per_bin, width), for each shift by sub-bins."""
+    patches, width = len(histogram), histogram.shape[1] // per_bin
+    table = np.zeros((patches, per_bin, width), np.float32)
+    for s in numba.prange(patches):
+        below = np.zeros(width * per_bin + 1)  # the sum of all that comes before
+        for k in range(width * per_bin):
+            below[k + 1] = below[k] + histogram[s, k]
+        for shift in range(per_bin):
+            for i in range(width):
+                table[s, shift, i] = below[(i + 1) * per_bin - shift] - below[max(i * per_bin - shift, 0)]
+    return table
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def _add_tile(
+    start: int,
+    count: int,
+    feet: Points32,
+    surface: Surface32,
+    optics: Optics,
+    field: HeightField,
+    low: Float32,
+    high: Float32,
+    strength: Float32,
+    first: Int32,
+    table: Float32,
+    bins: int,
+    histogram: Float32,
+) -> None:
+    """Add every patch to the histograms (count, bins) of a few beams."""
+    _, per_bin, width = table.shape
+    log = int(np.log2(per_bin) + 0.5)
+    legs = scratch(count)
+    for s in range(len(table)):
+        geometry(legs, s, surface, feet, start, count, optics, field, False)
+        if optics.sectors:
+            shade(legs, s, surface, feet, start, count, field, low, high)
+        for i in range(count):
+            legs.sector[i] = np.int32(
+                (legs.length_m[i] + feet.length_m[start + i]) * optics.inverse_bin + np.float32(0.5)
+            )
+        for i in range(count):
+            at = (legs.sector[i] >> log) + first[s]
+            if legs.weight[i] == 0 or at >= bins:
+                continue
+            weight = legs.weight[i] * strength[s]
+            row, out = table[s, legs.sector[i] & (per_bin - 1)], histogram[i, at : at + width]
+            for k in range(width):
+                out[k] += weight * row[k]
+
+
+@numba.njit(cache=True, parallel=True)
+def shift_and_add(
+    feet: Points32,
+    surface: Surface32,
+    optics: Optics,
+    field: HeightField,
+    low: Float32,
+    high: Float32,
+    strength: Float32,
+    first: Int32,
+    table: Float32,
+    bins: int,
+) -> Float32:
+    """Histograms (n, bins) of beams: every patch's table, times A, shifted by d1 + d2."""
+    beams = len(feet.x_m)
+    histogram = np.zeros((beams, (bins + table.shape[2] + LANES) // LANES * LANES), np.float32)
+    for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
+        start = tile * BEAM_TILE
+        end = min(start + BEAM_TILE, beams)
+        _add_tile(
+            start,
+            end - start,
+            feet,
+            surface,
+            optics,
+            field,
+            low,
+            high,
+            strength,
+            first,
+            table,
+            bins,
+            histogram[start:end],
+        )
+    return histogram
+
+
+def histograms(job: Job) -> Float32:
+    """Histograms (n, bins) of I_multi over path length, for the job's beams.
+
+    Does not depend on the number of threads: each histogram is summed by one thread, patches in order.
+    """
+    stage = _Stage(job)
+    if job.brdf is None:
+        return stage.histograms(np.empty((0, 0), np.float32), np.ones(len(job.foot_m)))
+    total = np.zeros((len(job.foot_m), job.bins), np.float32)
+    for foot, share in nodes(job, job.brdf):
+        factor = scattering(job.brdf)(foot, job.patches.point_m, job.patches.normal, job.relay.x_m, job.relay.y_m)
+        total += stage.histograms(factor.astype(np.float32), share)
+    return total
+
+
+class _Stage:
+    """A job in float32, with what does not depend on the BRDF made once."""
+
+    def __init__(self, job: Job) -> None:
+        patches, relay = job.patches, job.relay
+        self.job, accuracy = job, job.accuracy
+        self.surface = Surface32(
+            *_columns(patches.point_m),
+            *_columns(patches.normal),
+            _single(job.soft_patch_m2),
+            patches.row,
+            patches.column,
+        )
+        columns = relay.x_m, relay.y_m, relay.length_m, job.relay_weight
+        self.relay = _points(columns, job.soft_wall_m2)
+        self.low, self.high = horizons(job)
+        edge_x, edge_z = job.edge_m
+        self.optics = Optics(
+            np.float32(edge_x),
+            np.float32(edge_z),
+            np.float32(job.near_m**2),
+            job.lambertian,
+            np.float32(accuracy.sub_bins / job.bin_m),
+            accuracy.sectors if job.field.shades else 0,
+        )
+        self.width = table_width(job)
+
+    def histograms(self, factor: Float32, share: Float64) -> Float32:
+        """Histograms (n, bins) of the beams, each taken to some share (n,)."""
+        job, shadow = self.job, (self.optics, self.job.field, self.low, self.high)
+        some = np.flatnonzero(share)
+        x, y, _ = job.foot_m[some].T
+        feet = _points((x, y, job.length_m[some], job.beam_weight[some] * share[some]), 0.0)
+        first, fine = sub_bins(self.surface, self.relay, *shadow, factor, job.accuracy.sub_bins, self.width)
+        if job.more_bounces:
+            fine = with_inter_reflection(job, first, fine)
+        table = tables(fine, job.accuracy.sub_bins)
+        found = shift_and_add(feet, self.surface, *shadow, _single(job.strength), first, table, job.bins)
+        if len(some) == len(share):
+            return found[:, : job.bins]
+        histogram = np.zeros((len(share), job.bins), np.float32)
+        histogram[some] = found[:, : job.bins]
+        return histogram
+
+
+def _single(column: Float64) -> Float32:
+    return np.ascontiguousarray(column, np.float32)
+
+
+def _points(columns: tuple[Float64, Float64, Float64, Float64], soft_m2: float) -> Points32:
+    x, y, length, weight = (_single(column) for column in columns)
+    return Points32(x, y, length, weight, np.float32(soft_m2))
+
+
+def _columns(points: Float64) -> tuple[Float32, Float32, Float32]:
+    return _single(points[:, 0]), _single(points[:, 1]), _single(points[:, 2])
+
+
+def horizons(job: Job) -> tuple[Float32, Float32]:
+    """The horizon tables (n, directions) that the job's accuracy asks for; empty where nothing shades."""
+    patches, field, accuracy = job.patches, job.field, job.accuracy
+    if not field.shades:
+        return np.empty((0, 0), np.float32), np.empty((0, 0), np.float32)
+    x = np.concatenate([job.foot_m[:, 0], job.relay.x_m])
+    y = np.concatenate([job.foot_m[:, 1], job.relay.y_m])
+    across = np.maximum(x.max() - patches.point_m[:, 0], patches.point_m[:, 0] - x.min()) / field.pitch_x_m
+    along = np.maximum(y.max() - patches.point_m[:, 1], patches.point_m[:, 1] - y.min()) / field.pitch_y_m
+    where = patches.row, patches.column, patches.point_m[:, 2].copy(), np.maximum(across, along)
+    return horizon_table(field, *where, accuracy.sectors)
+
+
+def table_width(job: Job) -> int:
+    """Bins from the shortest to the longest d3 + d4 of any patch, in whole vectors.
+
+    The sum is convex over the wall: longest at a corner of the relay, and never shorter than the straight way to the
+    mirrored lidar.
+    """
+    x, y, z = job.patches.point_m.T
+    relay, lidar = job.relay, job.lidar_m
+    longest = np.zeros_like(x)
+    for corner_x in (relay.x_m.min(), relay.x_m.max()):
+        for corner_y in (relay.y_m.min(), relay.y_m.max()):
+            d3 = np.sqrt((x - corner_x) ** 2 + (y - corner_y) ** 2 + z**2)
+            longest = np.maximum(longest, d3 + np.linalg.norm([corner_x - lidar[0], corner_y - lidar[1], lidar[2]]))
+    shortest = np.sqrt((x - lidar[0]) ** 2 + (y - lidar[1]) ** 2 + (z + lidar[2]) ** 2)
+    bins = int((longest - shortest).max() / job.bin_m) + 3
+    return (bins + LANES - 1) // LANES * LANES

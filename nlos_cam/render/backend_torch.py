@@ -1,0 +1,417 @@
+"""The fast renderer on tensors (torch): the factorisation of `cpu`, for a batch of objects, on a GPU or the CPU.
+
+Patches of all objects stand one after another. Their legs are worked out in a few large kernels, the tables of patches
+are counted in integers, and each beam of an object sums windows of that object's tables, where they lie. No sum depends
+on the order in which threads arrive.
+
+Self-occlusion V on tensors: the lookup of `visibility`'s bounds and its exact walk, for many legs at a time.
+
+Legs between the patches of a batch and points of the wall, on tensors of float32: weight, length, scattering.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from nlos_calibration.arrays import Float32, Float64
+from torch import Tensor
+from torch.nn.functional import avg_pool1d, embedding_bag, pad
+
+from nlos_cam.errors import SceneError
+from nlos_cam.render.backend_numba import horizons, table_width
+from nlos_cam.render.brdf_table import nodes
+from nlos_cam.render.interreflection import with_inter_reflection
+from nlos_cam.render.job import Job
+from nlos_cam.render.material import Brdf
+from nlos_cam.render.visibility import FACES, bias_m
+
+
+class Fields(NamedTuple):
+    """The height fields of a batch, each turned so that a walk along any face goes up its rows; NaN all around."""
+
+    depth_m: Tensor
+    """Flat, rows of `across` cells."""
+    across: int
+    along: int
+    """Rows of one face of one object: the grid, and the longest walk beyond it."""
+    steps: int
+    """Of the longest walk."""
+    columns_per_m: float
+    rows_per_m: float
+    """Negative: rows run along -y."""
+    bias_m: float
+    sectors: int
+
+
+class Sites(NamedTuple):
+    """What visibility needs of patches (n)."""
+
+    depth_m: Tensor
+    """(n, 1)."""
+    low: Tensor
+    """(n, FACES * sectors); a leg below these is blocked."""
+    high: Tensor
+    """(n, FACES * sectors); a leg above these is free."""
+    start: Tensor
+    """(n, FACES); row of the fields that the patch stands in."""
+    across: Tensor
+    """(n, FACES); its place across."""
+
+    def part(self, start: int, end: int) -> "Sites":
+        """Only some patches, one after another."""
+        return Sites(*(column[start:end] for column in self))
+
+
+def lay_out(jobs: Sequence[Job], device: torch.device) -> tuple[Fields, Sites]:
+    """The fields and sites of jobs that share a grid; an object that shades nothing has bounds of 0."""
+    fields = [job.field for job in jobs]
+    size = len(fields[0].depth_m)
+    steps = max(max(f.last_row - f.first_row, f.last_column - f.first_column) for f in fields)
+    rows = torch.as_tensor(np.stack([f.depth_m for f in fields]))
+    columns = rows.transpose(1, 2)
+    faces = torch.stack([columns, columns.flip(1), rows, rows.flip(1)], 1)
+    padded = pad(faces, (1, 1, 0, steps), value=torch.nan).flatten().to(device, torch.float32)
+    scale = 1 / fields[0].pitch_x_m, -1 / fields[0].pitch_y_m
+    sectors = jobs[0].accuracy.sectors
+    shared = Fields(padded, size + 2, size + steps, steps, *scale, bias_m(fields[0]), sectors)
+    sites = [_sites(job, index, shared, size) for index, job in enumerate(jobs)]
+    together = (torch.as_tensor(np.concatenate(column), device=device) for column in zip(*sites, strict=True))
+    return shared, Sites(*together)
+
+
+def _sites(job: Job, index: int, fields: Fields, size: int) -> tuple[np.ndarray, ...]:
+    """The columns of one object's sites: depth, low, high, start and across."""
+    row, column = job.patches.row, job.patches.column
+    free = np.zeros((len(row), FACES * fields.sectors), np.float32)
+    low, high = horizons(job) if job.field.shades else (free, free)
+    along = np.stack([column, size - 1 - column, row, size - 1 - row], 1)
+    across = np.stack([row, row, column, column], 1).astype(np.float32)
+    start = (index * FACES + np.arange(FACES)) * fields.along + along
+    return job.patches.point_m[:, 2:].astype(np.float32), low, high, start, across
+
+
+def shade(weight: Tensor, dx_m: Tensor, dy_m: Tensor, sites: Sites, fields: Fields, chunk: int) -> None:
+    """Set the weight (n, m) of legs that the object blocks to 0: looked up where the bounds decide, else walked."""
+    u, v = dx_m * fields.columns_per_m, dy_m * fields.rows_per_m
+    along_columns = u.abs() >= v.abs()
+    far = torch.maximum(u.abs(), v.abs())
+    tilt = torch.where(along_columns, v, u).div_(far.clamp(min=1e-20))
+    sector = _sector(tilt, along_columns, torch.where(along_columns, u, v) < 0, fields.sectors)
+    meets = (sites.depth_m < sites.high.gather(1, sector).mul_(far)) & (weight != 0)
+    for some in meets.flatten().nonzero()[:, 0].split(max(chunk // max(fields.steps, 1), 1)):
+        which = some // weight.shape[1]
+        legs = which, sector.flatten()[some], tilt.flatten()[some], far.flatten()[some]
+        hidden = sites.depth_m[which, 0] < sites.low[legs[:2]] * legs[3]
+        undecided = (~hidden).nonzero()[:, 0]
+        hidden[undecided] = blocked(fields, sites, *(column[undecided] for column in legs))
+        weight.view(-1)[some[hidden]] = 0
+
+
+def _sector(tilt: Tensor, along_columns: Tensor, backward: Tensor, sectors: int) -> Tensor:
+    """Which of the FACES * sectors holds a direction."""
+    inside = torch.add(sectors / 2, tilt, alpha=sectors / 2).clamp_(max=sectors - 1)  # floored when made whole
+    return (inside + torch.where(along_columns, 0.0, 2.0 * sectors) + backward * float(sectors)).long()
+
+
+def blocked(fields: Fields, sites: Sites, which: Tensor, sector: Tensor, tilt: Tensor, far: Tensor) -> Tensor:
+    """Whether (k,) the object blocks legs from patches through sectors, `far` cells long, by `tilt` across for each.
+
+    `visibility.blocked` with all steps side by side; beyond its last step there is only background.
+    """
+    face, step = sector // fields.sectors, torch.arange(1, fields.steps + 1, device=tilt.device)
+    across = sites.across[which, face][:, None] + tilt[:, None] * step
+    below = across.floor()
+    share = across - below
+    cell = below.long() + 1  # of the margin
+    row = (sites.start[which, face][:, None] + step) * fields.across
+    near = fields.depth_m[row + cell.clamp(0, fields.across - 1)]
+    beyond = fields.depth_m[row + (cell + 1).clamp(0, fields.across - 1)]
+    between = near + share * (beyond - near)
+    between = torch.where(between.isnan(), torch.where(share < 0.5, near, beyond), between)
+    depth = sites.depth_m[which]
+    return (depth - between - fields.bias_m > step * (depth / far[:, None])).any(1)
+
+
+class Surface(NamedTuple):
+    """Patches as columns (n, 1)."""
+
+    x_m: Tensor
+    y_m: Tensor
+    z_m: Tensor
+    normal_x: Tensor
+    normal_y: Tensor
+    normal_z: Tensor
+    soft_m2: Tensor
+    strength: Tensor
+
+    @classmethod
+    def of(cls, jobs: Sequence[Job], device: torch.device) -> "Surface":
+        """The patches of all jobs, one after another."""
+        columns = [
+            np.column_stack([j.patches.point_m, j.patches.normal, j.soft_patch_m2, j.strength]).T[..., None]
+            for j in jobs
+        ]
+        return cls(*torch.as_tensor(np.concatenate(columns, 1).astype(np.float32), device=device))
+
+    def part(self, start: int, end: int) -> "Surface":
+        """Only some, one after another."""
+        return Surface(*(column[start:end] for column in self))
+
+
+class Wall(NamedTuple):
+    """Points of the wall (m,): the feet of beams, or relay cells; with the rest of their way to the lidar."""
+
+    x_m: Tensor
+    y_m: Tensor
+    length_m: Tensor
+    weight: Tensor
+
+    @classmethod
+    def of(cls, *columns: Float64, device: torch.device) -> "Wall":
+        """The same on a device."""
+        return cls(*torch.as_tensor(np.stack(columns).astype(np.float32), device=device))
+
+    def part(self, start: int, end: int) -> "Wall":
+        """Only some, one after another."""
+        return Wall(*(column[start:end] for column in self))
+
+
+class Optics(NamedTuple):
+    """What all legs of a batch share."""
+
+    edge_m: tuple[float, float]
+    near: bool
+    """Whether any patch is within near contact of the wall."""
+    near_m2: float
+    soft_wall_m2: float
+    lambertian: bool
+    fields: Fields | None
+    """None where nothing shades."""
+    chunk: int
+    """Elements that a tensor may have."""
+
+
+def legs(surface: Surface, sites: Sites | None, wall: Wall, optics: Optics, *, outgoing: bool) -> tuple[Tensor, Tensor]:
+    """Weights (n, m), 0 where nothing passes, and lengths (n, m) of the legs from patches to points of the wall.
+
+    Towards the lidar (`outgoing`) the weight has the wall's cosine, from it the patch's; in Lambertian radiometry both.
+    """
+    z = surface.z_m
+    dx, dy = wall.x_m - surface.x_m, wall.y_m - surface.y_m
+    squared = torch.addcmul(z * z, dx, dx).addcmul_(dy, dy)
+    length = squared.sqrt()
+    facing = torch.addcmul(-surface.normal_z * z, surface.normal_x, dx).addcmul_(surface.normal_y, dy)
+    passes = facing > 0
+    if np.isfinite(optics.edge_m[0]):
+        passes &= ~_cut(surface, wall, optics.edge_m)
+    cosine = z * facing / length if optics.lambertian else z if outgoing else facing
+    if optics.near:
+        soft = optics.soft_wall_m2 if outgoing else surface.soft_m2
+        squared += soft * (1 - squared / optics.near_m2).clamp_(min=0).square_()
+    weight = torch.where(passes, wall.weight * cosine / squared.mul_(length), 0)
+    if optics.fields is not None and sites is not None:
+        shade(weight, dx, dy, sites, optics.fields, optics.chunk)
+    return weight, length
+
+
+def _cut(surface: Surface, wall: Wall, edge_m: tuple[float, float]) -> Tensor:
+    """Whether (n, m) the occluder stands in the way: for each patch, the wall from some place on beyond the edge.
+
+    A leg passes the edge at height z t / (t + d), from a patch at d this side of the edge to a wall point t beyond.
+    """
+    (edge_x, edge_z), z, d = edge_m, surface.z_m, surface.x_m - edge_m[0]
+    begins = torch.where((z > edge_z) & (d != 0), edge_z * d.abs() / (z - edge_z), torch.inf)
+    return (edge_x - wall.x_m) * d.sign() >= begins
+
+
+def scattered(brdf: Brdf, foot_m: Float64, surface: Surface, wall: Wall) -> Tensor:
+    """The factor (n, m) of a BRDF on the ways from one foot (3,) over patches to points of the wall."""
+    x, y, z = (float(place) - column for place, column in zip(foot_m, surface[:3], strict=True))
+    d2 = (x * x + y * y + z * z).sqrt().clamp(min=1e-12)  # where the object touches the wall
+    x, y, z = x / d2, y / d2, z / d2
+    dx, dy, dz = wall.x_m - surface.x_m, wall.y_m - surface.y_m, -surface.z_m
+    d3 = (dx * dx + dy * dy + dz * dz).sqrt().clamp(min=1e-12)
+    cos_in = surface.normal_x * x + surface.normal_y * y + surface.normal_z * z
+    cos_out = (surface.normal_x * dx + surface.normal_y * dy + surface.normal_z * dz) / d3
+    cos_between = (x * dx + y * dy + z * dz) / d3
+    value = brdf(cos_in.clamp(min=0), cos_out.clamp(min=0), cos_between)  # legs cut the dark side off themselves
+    return torch.as_tensor(value, dtype=torch.float32, device=d3.device).expand(d3.shape)
+
+
+CPU_CHUNK = 1 << 18
+"""Elements of a tensor that stay in a CPU's cache."""
+CUDA_CHUNK = 1 << 27
+"""Elements that keep a GPU busy; fewer where they would take more than half of its memory."""
+BYTES_PER_ELEMENT = 160
+"""Of all tensors of legs together."""
+WHOLE_STEPS = 2.0**44
+"""That the largest weight of a table counts: 2^18 of them still fit an integer of 64 bits."""
+
+
+def device_named(backend: str) -> torch.device:
+    """The device of a backend: "torch" is the CPU, "cuda" the GPU. Raises SceneError where there is none."""
+    if backend == "cuda" and not torch.cuda.is_available():
+        raise SceneError(
+            "backend is 'cuda', and no CUDA device is here: choose cpu, or torch for the same code on the CPU"
+        )
+    return torch.device("cuda" if backend == "cuda" else "cpu")
+
+
+def chunk_for(device: torch.device) -> int:
+    """How many legs to work out at a time."""
+    if device.type == "cpu":
+        return CPU_CHUNK
+    half = torch.cuda.get_device_properties(device).total_memory // 2
+    return min(half // BYTES_PER_ELEMENT, CUDA_CHUNK)
+
+
+def histograms(job: Job, device: torch.device) -> Float32:
+    """Histograms (n, bins) of I_multi over path length, for the job's beams."""
+    return histograms_of_all([job], device)[0]
+
+
+def histograms_of_all(jobs: Sequence[Job], device: torch.device) -> list[Float32]:
+    """The same of many jobs; those that differ in the object alone are worked out together."""
+    alike: dict[object, list[int]] = {}
+    for index, job in enumerate(jobs):
+        alike.setdefault(_shared(job) or index, []).append(index)
+    found: dict[int, Float32] = {}
+    for which in alike.values():
+        batch = _Batch([jobs[index] for index in which], device)
+        found.update(zip(which, batch.histograms(), strict=True))
+    return [found[index] for index in range(len(jobs))]
+
+
+def _shared(job: Job) -> tuple[object, ...] | None:
+    """What jobs of one batch have in common; None for a job that is worked out alone."""
+    if job.brdf is not None or job.more_bounces:
+        return None
+    relay, field = job.relay, job.field
+    feet = job.foot_m, job.length_m, job.beam_weight
+    columns = [column.tobytes() for column in (*feet, relay.x_m, relay.y_m, relay.length_m, job.relay_weight)]
+    numbers = job.edge_m, job.near_m, job.soft_wall_m2, job.lambertian, job.bin_m, job.accuracy
+    return *columns, *numbers, field.depth_m.shape, field.pitch_x_m, field.pitch_y_m
+
+
+class _Batch:
+    """Jobs that differ in the object alone, on a device."""
+
+    def __init__(self, jobs: Sequence[Job], device: torch.device) -> None:
+        job = self.job = jobs[0]
+        self.jobs, self.device, self.chunk = jobs, device, chunk_for(device)
+        fields, self.sites = lay_out(jobs, device) if any(j.field.shades for j in jobs) else (None, None)
+        self.surface = Surface.of(jobs, device)
+        relay = job.relay
+        self.relay = Wall.of(relay.x_m, relay.y_m, relay.length_m, job.relay_weight, device=device)
+        near = min(one.patches.point_m[:, 2].min() for one in jobs) < job.near_m
+        self.optics = Optics(
+            job.edge_m, bool(near), job.near_m**2, job.soft_wall_m2, job.lambertian, fields, self.chunk
+        )
+        self.per_bin, self.width = job.accuracy.sub_bins, max(map(table_width, jobs))
+        self.per_m = self.per_bin / job.bin_m
+
+    def histograms(self) -> list[Float32]:
+        """Of each job, (n, bins)."""
+        job = self.job
+        if job.brdf is None:
+            found = self._sums(*self._tables(None), self._feet(np.ones(len(job.foot_m))))
+            return [histogram.cpu().numpy() for histogram in found]
+        total = torch.zeros((len(job.foot_m), job.bins), device=self.device)
+        for foot, share in nodes(job, job.brdf):
+            lit = torch.as_tensor(np.flatnonzero(share), device=self.device)
+            total[lit] += self._sums(*self._tables(foot), self._feet(share))[0]
+        return [total.cpu().numpy()]
+
+    def _feet(self, share: Float64) -> Wall:
+        """The feet of beams that are taken to some share (n,)."""
+        job, lit = self.job, np.flatnonzero(share)
+        weight = job.beam_weight[lit] * share[lit]
+        return Wall.of(job.foot_m[lit, 0], job.foot_m[lit, 1], job.length_m[lit], weight, device=self.device)
+
+    def _parts(self, points: int) -> Iterator[tuple[Surface, Sites | None]]:
+        """Patches, as many at a time as their legs to so many points may be."""
+        count = max(self.chunk // points, 1)
+        for start in range(0, len(self.surface.x_m), count):
+            ends = start, start + count
+            yield self.surface.part(*ends), self.sites.part(*ends) if self.sites else None
+
+    def _tables(self, foot: Float64 | None) -> tuple[Tensor, Tensor]:
+        """The bins (n, 1) at which tables start, and the tables (n, per_bin, width): for light from a foot, or any."""
+        counts = [self._counts(*part, foot) for part in self._parts(len(self.relay.x_m))]
+        first, fine = (torch.cat(parts) for parts in zip(*counts, strict=True))
+        if self.job.more_bounces:
+            more = with_inter_reflection(self.job, first[:, 0].cpu().numpy(), fine.cpu().numpy())
+            fine = torch.as_tensor(more, device=self.device)
+        return first, tables(fine, self.per_bin)
+
+    def _counts(self, surface: Surface, sites: Sites | None, foot: Float64 | None) -> tuple[Tensor, Tensor]:
+        """The first bin (n, 1) of some patches, and B over d3 + d4 in sub-bins from there on."""
+        weight, length = legs(surface, sites, self.relay, self.optics, outgoing=True)
+        if foot is not None and self.job.brdf is not None:
+            weight *= scattered(self.job.brdf, foot, surface, self.relay)
+        at = (length + self.relay.length_m) * self.per_m
+        first = at.amin(1, keepdim=True).int() // self.per_bin
+        return first, counted((at - first * self.per_bin).long(), weight, self.width * self.per_bin)
+
+    def _sums(self, first: Tensor, table: Tensor, feet: Wall) -> list[Tensor]:
+        """Histograms (n, bins) of each job: its patches' tables, times A, shifted by d1 + d2."""
+        found = [torch.zeros((len(feet.x_m), job.bins), device=self.device) for job in self.jobs]
+        sizes = [len(job.patches.beta) for job in self.jobs]
+        count = max(self.chunk // len(first), 1)
+        for start in range(0, len(feet.x_m), count):
+            some = feet.part(start, start + count)
+            weight, length = legs(self.surface, self.sites, some, self.optics, outgoing=False)
+            sub_bin = torch.add(some.length_m * self.per_m + 0.5, length, alpha=self.per_m).int()
+            columns = table, sub_bin % self.per_bin, sub_bin // self.per_bin + first, weight * self.surface.strength
+            by_job = zip(*(column.split(sizes) for column in columns), strict=True)
+            for histogram, (rows, shift, at, a) in zip(found, by_job, strict=True):
+                histogram[start : start + count] = shifted_sum(rows, shift, at, a, histogram.shape[1])
+        return found
+
+
+def counted(at: Tensor, weight: Tensor, size: int) -> Tensor:
+    """Histograms (n, size) of weights (n, m) that fall into cells `at` (n, m).
+
+    In whole steps: integers add up to the same in whatever order a GPU's threads come.
+    """
+    step = weight.amax(1, keepdim=True).double().clamp_(min=1e-300) / WHOLE_STEPS
+    total = torch.zeros((len(at), size), dtype=torch.int64, device=at.device)
+    return (total.scatter_add_(1, at, (weight / step).long()) * step).float()
+
+
+def tables(fine: Tensor, per_bin: int) -> Tensor:
+    """Histograms (n, width * per_bin) in sub-bins as sums to bins (n, per_bin, width), one for each shift."""
+    sums = avg_pool1d(pad(fine, (per_bin - 1, 0))[:, None], per_bin, 1)[:, 0] * per_bin
+    return sums.unflatten(1, (-1, per_bin)).flip(2).transpose(1, 2)
+
+
+def shifted_sum(table: Tensor, shift: Tensor, at: Tensor, weight: Tensor, bins: int) -> Tensor:
+    """Histograms (m, bins): of each patch a row of its table (n, per_bin, width), at a bin and to a weight (n, m).
+
+    Each row stands behind as many zeros as a patch may be late. So what it adds to a beam's histogram, from the bin of
+    the earliest patch on, is a window of the rows as they lie.
+    """
+    earliest = at.amin(0)
+    late = at - earliest
+    most = int(late.max())
+    rows = pad(table, (most, 0))
+    span = rows.shape[2]
+    row = torch.arange(len(at), device=at.device)[:, None] * (rows.shape[1] * span) + most
+    windows = pad(rows.flatten(), (0, most)).unfold(0, span, 1)
+    found = window_sums(windows, (row + (shift * span - late)).T.contiguous(), weight.T.contiguous())
+    placed = torch.zeros((len(found), bins + span), device=at.device)
+    placed.scatter_(1, earliest.clamp(max=bins)[:, None].long() + torch.arange(span, device=at.device), found)
+    return placed[:, :bins]
+
+
+def window_sums(windows: Tensor, start: Tensor, weight: Tensor) -> Tensor:
+    """Weighted sums (m, span) of windows (k, span): for each of m its own n, `start` (m, n) and `weight` (m, n).
+
+    A GPU reads windows where they lie, each sum by one thread; that kernel's sibling on the CPU would copy all of them.
+    """
+    if windows.is_cuda:
+        return embedding_bag(start, windows, per_sample_weights=weight, mode="sum")
+    few = max(16 * CPU_CHUNK // max(start.shape[1] * windows.shape[1], 1), 1)
+    parts = zip(start.split(few), weight.split(few), strict=True)
+    return torch.cat([torch.bmm(some[:, None], windows[where])[:, 0] for where, some in parts])
