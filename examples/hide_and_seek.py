@@ -8,11 +8,11 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.dataset_samples import sense_object
 from nlos_cam.objects.depth_map import object_box, orthographic_depth
 from nlos_cam.objects.placement import Pose, category_triangles, place
-from nlos_cam.reconstruct import reconstruct
+from nlos_cam.reconstruct.network import reconstruct
+from nlos_cam.reconstruct.pipeline import load_networks
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor.model import SensorModel
 from nlos_cam.render.sensor.sensor import Sensor
-from nlos_cam.set_up import load_networks
 
 
 def main(category: str = "cup", seed: int = 0) -> None:

@@ -9,7 +9,7 @@ from nlos_models.metrics import silhouette_iou
 
 from nlos_cam.evaluate_objects import as_map_set, echoes_of, seeded_objects, sense, truth_of
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.set_up import load_networks
+from nlos_cam.reconstruct.pipeline import load_networks
 
 FIRST_SEED = 20_000_000
 """Training draws none from here on."""

@@ -25,20 +25,19 @@ import numpy as np
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
 
-from nlos_cam.bench import open_bench
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.camera.registry import OnProgress
 from nlos_cam.errors import NlosCamError
-from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import LidarMaps
-from nlos_cam.live import read_along, steps, warm_up
-from nlos_cam.live_report import Tally
+from nlos_cam.live.frame_queue import FrameReader
+from nlos_cam.live.loop import read_along, steps, warm_up
+from nlos_cam.live.statistics import Tally
 from nlos_cam.objects.depth_map import cell_centres_m, object_box
-from nlos_cam.processing import Processing, Step
-from nlos_cam.reconstruct import Clock
-from nlos_cam.set_up import load_doubt, load_networks, misfits, set_up
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.bench import open_bench
+from nlos_cam.reconstruct.network import Clock
+from nlos_cam.reconstruct.pipeline import Processing, Step, load_doubt, load_networks, misfits, set_up
+from nlos_cam.reconstruct.verdict import Verdict
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from nlos_calibration.rig import ObjectBox, Rig, load_rig
 from nlos_models.data import MapSet
 from numpy.typing import NDArray
 
-from nlos_cam.bench import Bench, open_bench
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.labelled_truth import fixed_objects, truth_depth_m
 from nlos_cam.objects.depth_map import image_from_depth, object_box
+from nlos_cam.reconstruct.bench import Bench, open_bench
 from nlos_cam.recording.playback import ReplayCamera, open_lidar_bag
 from nlos_cam.recording.sidecar import Sidecar, load_sidecar, sidecar_path
 

@@ -17,7 +17,7 @@ from nlos_calibration.wall import WallFit, fit_wall
 from nlos_calibration.wall_record import WallRecord, with_occluder
 from numpy.typing import NDArray
 
-from nlos_cam.bench import check_intrinsics
+from nlos_cam.reconstruct.bench import check_intrinsics
 from nlos_cam.wall_look import Seen
 
 NEAR_WALL_M = 0.02

@@ -36,10 +36,10 @@ from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import depth_from_image, object_box
 from nlos_cam.outliers import IN_SHAPE, TO_JUDGE, TO_LEARN
-from nlos_cam.processing import limits_of
-from nlos_cam.reconstruct import Reconstruction, reconstruct
+from nlos_cam.reconstruct.network import Reconstruction, reconstruct
+from nlos_cam.reconstruct.pipeline import limits_of
+from nlos_cam.reconstruct.verdict import Judge, Signs, Verdict
 from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.verdict import Judge, Signs, Verdict
 
 DOCS = Path(__file__).parents[1] / "docs"
 BINS = 10

@@ -22,7 +22,7 @@ from nlos_cam.folders import file_when_whole
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.set_up import load_networks
+from nlos_cam.reconstruct.pipeline import load_networks
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE, PICTURE = DOCS / "gallery.md", DOCS / "images" / "failures.png"

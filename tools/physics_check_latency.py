@@ -16,17 +16,16 @@ from typing import Any, Self
 from nlos_calibration.arrays import Float32
 from nlos_models.inference import load_reconstructor
 
-from nlos_cam.bench import Bench, open_bench
 from nlos_cam.cache import cache_folder
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.protocol import WallClock
 from nlos_cam.cli.common import say
 from nlos_cam.frames import LidarMaps
-from nlos_cam.live import run_live, warm_up
-from nlos_cam.physics_check import Check, Checks, NoChecks
-from nlos_cam.physics_check_render import check
-from nlos_cam.physics_check_runner import BackgroundChecks
-from nlos_cam.processing import Processing
+from nlos_cam.live.loop import run_live, warm_up
+from nlos_cam.live.physics_check_process import BackgroundChecks
+from nlos_cam.reconstruct.bench import Bench, open_bench
+from nlos_cam.reconstruct.physics_check import Check, Checks, NoChecks, check
+from nlos_cam.reconstruct.pipeline import Processing
 from nlos_cam.render.tradeoff_report import machine
 from nlos_cam.view.viewer import NullViewer
 

@@ -26,8 +26,7 @@ from nlos_cam.evaluate_objects import seeded_objects, sense
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import depth_from_image, object_box
-from nlos_cam.physics_check import UNEXPLAINED
-from nlos_cam.physics_check_render import check
+from nlos_cam.reconstruct.physics_check import UNEXPLAINED, check
 from nlos_cam.render.accuracy import Stop
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene

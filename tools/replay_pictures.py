@@ -17,14 +17,14 @@ from typing import Self
 
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.bench import Bench
 from nlos_cam.camera.simulated_world import World, open_world
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.cli.common import tracked
 from nlos_cam.frames import Frame
-from nlos_cam.replay import replay
-from nlos_cam.replay_looks import VIDEO, Looks
-from nlos_cam.set_up import load_doubt, load_networks, set_up
+from nlos_cam.live.replay import replay
+from nlos_cam.live.replay_media import VIDEO, Looks
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import load_doubt, load_networks, set_up
 
 IMAGES = Path("docs/images")
 SCENES = {"airplane": "", "cup": "examples/cup.toml", "empty": "examples/empty.toml"}

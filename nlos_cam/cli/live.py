@@ -9,8 +9,6 @@ import typer
 from nlos_models.doubt_inference import Doubter
 from nlos_models.inference import Reconstructor
 
-from nlos_cam.bench import Bench, open_bench
-from nlos_cam.budget import SHIPPED, Choice, loader, options_here, timer, within_budget
 from nlos_cam.camera import Camera, open_camera
 from nlos_cam.camera.protocol import WallClock
 from nlos_cam.camera.registry import Reader
@@ -31,16 +29,16 @@ from nlos_cam.cli.live_kept import Log, RecordTo, kept_of
 from nlos_cam.cli.live_told import told, warn
 from nlos_cam.cli.live_view import NoView, Open, ViewHost, ViewPort, tell_of_view, viewer_of
 from nlos_cam.cli.view import SaveReplayView, SaveView, Stills, Video, saving
-from nlos_cam.live import run_live, warm_up
-from nlos_cam.live_report import LiveReport
-from nlos_cam.physics_check import Checks
-from nlos_cam.physics_check_runner import BackgroundChecks
-from nlos_cam.precedence import precedence
-from nlos_cam.processing import Processing
-from nlos_cam.replay import REPORT, replay
-from nlos_cam.replay_looks import Looks
-from nlos_cam.set_up import load_doubt, load_networks, misfits, set_up
-from nlos_cam.undisturbed import undisturbed
+from nlos_cam.live.budget import SHIPPED, Choice, loader, options_here, timer, within_budget
+from nlos_cam.live.loop import run_live, warm_up
+from nlos_cam.live.physics_check_process import BackgroundChecks
+from nlos_cam.live.realtime import precedence, undisturbed
+from nlos_cam.live.replay import REPORT, replay
+from nlos_cam.live.replay_media import Looks
+from nlos_cam.live.statistics import LiveReport
+from nlos_cam.reconstruct.bench import Bench, open_bench
+from nlos_cam.reconstruct.physics_check import Checks
+from nlos_cam.reconstruct.pipeline import Processing, load_doubt, load_networks, misfits, set_up
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:scene.toml, bag:run.bag.")]
 Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it (wall.toml).")]
@@ -136,7 +134,7 @@ def replay_bag(
     with interrupted_by_signals():
         opened = open_camera(f"bag:{bag}", reader=reader)
         bench = open_bench(wall, opened)
-        from nlos_cam.physics_check_render import EveryFrames  # the renderer takes a second to import
+        from nlos_cam.reconstruct.physics_check import EveryFrames  # the renderer takes a second to import
 
         checks = EveryFrames(bench.rig, on_error=_warn_once)
         processing = _processing(bench, load_networks(weights), load_doubt(weights), average, checks)

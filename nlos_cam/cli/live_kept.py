@@ -11,7 +11,7 @@ import typer
 from nlos_cam.camera import Recording
 from nlos_cam.cli.common import output_path, say
 from nlos_cam.cli.view import SUFFIX
-from nlos_cam.frame_log import SUFFIXES, FrameLog
+from nlos_cam.live.frame_log import SUFFIXES, FrameLog
 from nlos_cam.view.viewer import Moment
 
 RecordTo = Annotated[Path | None, typer.Option("--record", help="Also record the camera's streams (F.bag).")]

@@ -3,8 +3,8 @@
 from rich.markup import escape
 
 from nlos_cam.cli.common import say
-from nlos_cam.live_report import OUTSIDE_LATENCY, LiveReport
-from nlos_cam.sightings import in_words
+from nlos_cam.live.loop import in_words
+from nlos_cam.live.statistics import OUTSIDE_LATENCY, LiveReport
 
 
 def warn(warning: str, begins: bool) -> None:

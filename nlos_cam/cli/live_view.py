@@ -8,8 +8,8 @@ from urllib.parse import urlsplit
 
 import typer
 
-from nlos_cam.bench import Bench
 from nlos_cam.cli.common import say
+from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.view.assets import LOOPBACK
 from nlos_cam.view.hosts import exposed
 from nlos_cam.view.viewer import NullViewer, Viewer

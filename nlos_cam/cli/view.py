@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from nlos_cam.bench import Bench
 from nlos_cam.cli.common import INTERRUPTED, Json, finish, interrupted_by_signals, stop_on_signals
 from nlos_cam.cli.live_view import Open, ViewHost, ViewPort, tell_of_view
+from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.view.assets import LOOPBACK
 from nlos_cam.view.viewer import Viewer, Viewers
 

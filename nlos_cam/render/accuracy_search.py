@@ -30,17 +30,17 @@ from nlos_cam.render.planning import Prepared
 from nlos_cam.render.renderer import Rendering, histograms, render
 from nlos_cam.render.scene import Scene
 
-Array = NDArray[np.floating[Any]]
+Floating = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
 class Echoes:
     """What is compared, one entry (n,) for each beam or each cell."""
 
-    intensity: Array
-    path_m: Array
+    intensity: Floating
+    path_m: Floating
     """NaN where nothing comes back."""
-    depth_m: Array
+    depth_m: Floating
     """What the lidar reports; NaN where nothing comes back."""
 
     @classmethod
@@ -77,7 +77,7 @@ class Agreement:
     depth_error_mean_mm: float
 
 
-def relative_error(found: Array, truth: Array) -> Array:
+def relative_error(found: Floating, truth: Floating) -> Floating:
     """|found - truth| / truth (n,); where nothing should come back, 0 if nothing does and else 1."""
     off = np.abs(found - truth)
     return np.divide(off, truth, out=(off > 0).astype(off.dtype), where=truth > 0)

@@ -8,7 +8,7 @@ from typing import Self
 from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Rig
 
-from nlos_cam.precedence import after_the_loop
+from nlos_cam.live.realtime import after_the_loop
 from nlos_cam.view.assets import LOOPBACK, page_assets
 from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.latest import Latest

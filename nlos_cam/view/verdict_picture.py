@@ -8,7 +8,7 @@ from nlos_calibration.arrays import UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.pictures import BACKGROUND_RGB, faded
 
 BANNER_WIDTH, BANNER_HEIGHT = 880, 96

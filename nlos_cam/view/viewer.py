@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import Protocol, Self
 
 from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.physics_check import Check
-from nlos_cam.reconstruct import Reconstruction
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.network import Reconstruction
+from nlos_cam.reconstruct.physics_check import Check
+from nlos_cam.reconstruct.verdict import Verdict
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from browser_page import Feed, Page, Pixels, Region, share_changed, share_like, 
 from made_up_moments import NOTHING, RIG, bump, full_moment
 from measured_walls import exact_wall
 
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.recorded import RecordedView
 from nlos_cam.view.rerun_viewer import RerunViewer
 from nlos_cam.view.saved_view import SavedView

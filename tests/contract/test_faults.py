@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam import frame_reader
-from nlos_cam.bench import Bench
 from nlos_cam.camera import Recording, session
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
-from nlos_cam.live import run_live
-from nlos_cam.live_report import LiveReport
-from nlos_cam.processing import Processing
+from nlos_cam.live import frame_queue
+from nlos_cam.live.loop import run_live
+from nlos_cam.live.statistics import LiveReport
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import Processing
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.recording.playback import ReplayCamera
 from nlos_cam.recording.sdk_playback import SdkReplayCamera
 from nlos_cam.render.scene_file import Fault
 from nlos_cam.render.sensor.sensor import SensedImages
-from nlos_cam.verdict import Verdict
 from nlos_cam.view.viewer import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
@@ -43,7 +43,7 @@ def network(*_: np.ndarray) -> np.ndarray:
 def camera(noise_world: Any, hurried_clock: Any, monkeypatch: pytest.MonkeyPatch) -> Make:
     """A camera in a world without noise that saturates; nothing is dropped because the machine is slow."""
     monkeypatch.setattr(session, "CAPACITY", PLENTY)
-    monkeypatch.setattr(frame_reader, "QUEUE_FRAMES", PLENTY)
+    monkeypatch.setattr(frame_queue, "QUEUE_FRAMES", PLENTY)
 
     class QuietWorld(noise_world):
         def images(self, number: int) -> SensedImages:
@@ -201,7 +201,7 @@ def test_a_device_that_never_comes_back_ends_the_run_with_one_line_and_what_was_
 
 
 def test_stopping_ends_a_wait_for_a_device_that_is_gone(camera: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_reader, "LET_GO_AFTER_S", 0.01)
+    monkeypatch.setattr(frame_queue, "LET_GO_AFTER_S", 0.01)
     gone = camera(fault("unplug", FOREVER))
     gone.silence_s, gone.replug_s = 0.05, float("inf")
     stop = Event()

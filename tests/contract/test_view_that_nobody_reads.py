@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.bench import Bench
 from nlos_cam.frames import Frame
-from nlos_cam.live import run_live
-from nlos_cam.processing import Processing
+from nlos_cam.live.loop import run_live
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import Processing
 from nlos_cam.view import rerun_viewer
 from nlos_cam.view.rerun_viewer import RerunViewer
 from nlos_cam.view.server import Send

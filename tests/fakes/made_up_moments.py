@@ -10,9 +10,9 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.physics_check import Check
-from nlos_cam.reconstruct import Reconstruction, pose_of
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.network import Reconstruction, pose_of
+from nlos_cam.reconstruct.physics_check import Check
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.viewer import Moment
 
 RIG = load_rig("paper-rig")

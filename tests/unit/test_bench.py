@@ -10,8 +10,8 @@ from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.bench import Bench, Look, difference_of, open_bench
 from nlos_cam.frames import LidarMaps, maps_from_frame
+from nlos_cam.reconstruct.bench import Bench, Look, difference_of, open_bench
 
 
 def camera(intrinsics: Intrinsics = SMALL, **others: Any) -> Any:

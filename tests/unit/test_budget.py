@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nlos_models.checkpoint import shipped_folder
 
-from nlos_cam.budget import BUSY_SHARE, HANDOVER_MS, PERIOD_MS, Machine, Option, choose, in_pace, load_tradeoff
 from nlos_cam.errors import BudgetError, RecordingError
+from nlos_cam.live.budget import BUSY_SHARE, HANDOVER_MS, PERIOD_MS, Machine, Option, choose, in_pace, load_tradeoff
 
 AS_MEASURED = Machine(slower=1.0, rest_ms=1.0)
 

@@ -17,7 +17,7 @@ from fake_wall import RIG, SERIAL, SMALL, write_wall
 from nlos_cam.cli import live as commands
 from nlos_cam.cli.main import main
 from nlos_cam.frames import Frame
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view import rerun_viewer
 
 

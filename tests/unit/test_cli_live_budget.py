@@ -8,11 +8,11 @@ import pytest
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.bench import Bench
-from nlos_cam.budget import CALLS, HANDOVER_MS, SHIPPED, Choice, Option, Timed, options_here, timer, within_budget
 from nlos_cam.cli import live_budget
 from nlos_cam.errors import BudgetError
-from nlos_cam.processing import Processing
+from nlos_cam.live.budget import CALLS, HANDOVER_MS, SHIPPED, Choice, Option, Timed, options_here, timer, within_budget
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import Processing
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 

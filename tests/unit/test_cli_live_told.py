@@ -1,5 +1,5 @@
 from nlos_cam.cli.live_told import told
-from nlos_cam.live_report import LiveReport
+from nlos_cam.live.statistics import LiveReport
 
 TIMES = {"p50": 1.04, "p95": 2.0, "p99": 3.06}
 

@@ -8,10 +8,10 @@ import pytest
 import typer
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.bench import Bench
 from nlos_cam.cli import live_view
 from nlos_cam.cli.live_view import opened_in_browser, tell_of_view, viewer_of
 from nlos_cam.errors import NlosCamError
+from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.view import rerun_viewer
 from nlos_cam.view.viewer import NullViewer
 

@@ -33,7 +33,7 @@ class FakeNetwork:
 @pytest.fixture
 def network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeNetwork:
     found = FakeNetwork()
-    monkeypatch.setattr("nlos_cam.processing.os.cpu_count", lambda: 1)  # so that it eats in order
+    monkeypatch.setattr("nlos_cam.reconstruct.pipeline.os.cpu_count", lambda: 1)  # so that it eats in order
     monkeypatch.setattr(commands, "load_networks", lambda *_: found)
     monkeypatch.setattr(commands, "load_doubt", lambda *_: None)
     monkeypatch.chdir(tmp_path)
@@ -57,7 +57,7 @@ def told(capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
 def test_a_warning_is_told_once_when_it_begins_and_once_when_it_ends(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
 ) -> None:
-    monkeypatch.setattr("nlos_cam.frame_reader.QUEUE_FRAMES", 1000)
+    monkeypatch.setattr("nlos_cam.live.frame_queue.QUEUE_FRAMES", 1000)
     assert main([*command, "--wall", "wall.toml", "--json"]) == 0
     report, said = told(capsys)
     [(warning, frames)] = report["warnings"].items()

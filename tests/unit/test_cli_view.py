@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from made_up_moments import RIG, Recorded, full_moment
 
-from nlos_cam.bench import Bench
 from nlos_cam.cli import live, live_view
 from nlos_cam.cli.main import main
 from nlos_cam.cli.view import saving
+from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.view import recorded
 from nlos_cam.view.saved_view import SavedView
 from nlos_cam.view.viewer import NullViewer

@@ -7,11 +7,11 @@ import pytest
 from fake_wall import wall_frame
 from matplotlib.figure import Figure
 
-from nlos_cam.contact_sheet import _even_limits, _limits, draw_sheet
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.processing import Step
-from nlos_cam.reconstruct import Reconstruction
-from nlos_cam.verdict import Verdict
+from nlos_cam.live.replay_media import _even_limits, _limits, draw_sheet
+from nlos_cam.reconstruct.network import Reconstruction
+from nlos_cam.reconstruct.pipeline import Step
+from nlos_cam.reconstruct.verdict import Verdict
 
 
 def step(number: int, difference: LidarMaps | None = None) -> Step:

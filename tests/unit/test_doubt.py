@@ -3,9 +3,9 @@ import pytest
 from fake_doubter import FakeDoubter
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.doubt import doubt_of
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_map import depth_from_image, object_box
+from nlos_cam.reconstruct.network import doubt_of
 
 BOX = object_box(load_rig("paper-rig"))
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlos_cam.frame_log import FrameLog
 from nlos_cam.frames import Frame
-from nlos_cam.reconstruct import Reconstruction
-from nlos_cam.verdict import Verdict
+from nlos_cam.live.frame_log import FrameLog
+from nlos_cam.reconstruct.network import Reconstruction
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.viewer import Moment
 
 NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})

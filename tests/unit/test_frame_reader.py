@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from nlos_calibration.projection import Intrinsics
 
-from nlos_cam import frame_reader
 from nlos_cam.errors import CameraLostError
-from nlos_cam.frame_reader import QUEUE_FRAMES, FrameReader
 from nlos_cam.frames import Frame
+from nlos_cam.live import frame_queue
+from nlos_cam.live.frame_queue import QUEUE_FRAMES, FrameReader
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 
@@ -81,7 +81,7 @@ def test_leaving_early_ends_the_thread() -> None:
 
 
 def test_a_camera_that_hangs_is_told_after_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_reader, "JOIN_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(frame_queue, "JOIN_TIMEOUT_S", 0.05)
     release = Event()
     reader = FrameReader(frames(None, lambda _: release.wait(10.0)), keeps_all=True, stop=Event())
     with pytest.raises(CameraLostError, match="did not stop"), reader:
@@ -91,7 +91,7 @@ def test_a_camera_that_hangs_is_told_after_the_deadline(monkeypatch: pytest.Monk
 
 
 def test_what_keeps_the_reader_waiting_is_told_to_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_reader, "LET_GO_AFTER_S", 0.01)
+    monkeypatch.setattr(frame_queue, "LET_GO_AFTER_S", 0.01)
     release = Event()
     source = frames(None, lambda _: release.wait(10.0))
     reader = FrameReader(source, keeps_all=True, stop=Event(), let_go=release.set)

@@ -3,10 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nlos_cam.doubt import Doubt
-from nlos_cam.physics_check import Check
-from nlos_cam.reconstruct import Reconstruction
-from nlos_cam.verdict import STEADY_FRAMES, Judge, Limits, Signs, Verdict
+from nlos_cam.reconstruct.network import Doubt, Reconstruction
+from nlos_cam.reconstruct.physics_check import Check
+from nlos_cam.reconstruct.verdict import STEADY_FRAMES, Judge, Limits, Signs, Verdict
 
 LIMITS = Limits(nothing=0.5, outside=0.3, unexplained=0.8)
 SURFACE_M = np.full((64, 64), 0.2, np.float32)

@@ -11,13 +11,13 @@ from fake_wall import WallCamera, measured_wall
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
-from nlos_cam import frame_reader
-from nlos_cam.bench import Bench
 from nlos_cam.errors import CameraLostError, SceneError
 from nlos_cam.frames import Frame
-from nlos_cam.live import paced, run_live, warm_up
-from nlos_cam.live_report import OUTSIDE_LATENCY, LiveReport
-from nlos_cam.processing import Processing
+from nlos_cam.live import frame_queue
+from nlos_cam.live.loop import paced, run_live, warm_up
+from nlos_cam.live.statistics import OUTSIDE_LATENCY, LiveReport
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import Processing
 from nlos_cam.view.viewer import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
@@ -229,7 +229,7 @@ def test_what_the_camera_raises_is_raised_once_the_report_is_told() -> None:
 
 
 def test_a_run_ends_after_its_seconds_also_where_no_frame_comes_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_reader, "LET_GO_AFTER_S", 0.01)
+    monkeypatch.setattr(frame_queue, "LET_GO_AFTER_S", 0.01)
     shown, left, now_s, viewer = Event(), Event(), [0.0], ListViewer()
     viewer.show = lambda _: shown.set()  # type: ignore[method-assign]
 

@@ -9,10 +9,10 @@ from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.errors import NlosCamError, SceneError
 from nlos_cam.frames import Frame, maps_from_frame
-from nlos_cam.live_report import MOST_FAILED, Held, LiveReport, Tally, Warned
-from nlos_cam.processing import Step
-from nlos_cam.reconstruct import Reconstruction
-from nlos_cam.verdict import Verdict
+from nlos_cam.live.statistics import MOST_FAILED, Held, LiveReport, Tally, Warned
+from nlos_cam.reconstruct.network import Reconstruction
+from nlos_cam.reconstruct.pipeline import Step
+from nlos_cam.reconstruct.verdict import Verdict
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})

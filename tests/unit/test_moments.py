@@ -8,12 +8,12 @@ import numpy as np
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.bench import Bench
 from nlos_cam.frames import Frame
-from nlos_cam.live import run_live
-from nlos_cam.processing import Processing
-from nlos_cam.stall import STALLED
-from nlos_cam.verdict import Verdict
+from nlos_cam.live.loop import run_live
+from nlos_cam.live.statistics import STALLED
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import Processing
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.viewer import Moment, NullViewer
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nlos_cam.frames import LidarMaps
-from nlos_cam.physics_check import NoChecks, failure, log_warning
+from nlos_cam.reconstruct.physics_check import NoChecks, failure, log_warning
 
 
 def test_where_nothing_is_checked_there_is_never_a_check() -> None:

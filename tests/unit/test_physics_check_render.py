@@ -8,17 +8,17 @@ from fake_wall import WallCamera
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import load_rig
 
-from nlos_cam import physics_check_render
-from nlos_cam.bench import Bench
 from nlos_cam.frames import LidarMaps
-from nlos_cam.live import run_live
+from nlos_cam.live.loop import run_live
+from nlos_cam.live.replay import REPORT, RESULT, replay
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.physics_check_render import EveryFrames, check
-from nlos_cam.processing import Processing
+from nlos_cam.reconstruct import physics_check
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.physics_check import EveryFrames, check
+from nlos_cam.reconstruct.pipeline import Processing
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
-from nlos_cam.replay import REPORT, RESULT, replay
 from nlos_cam.view.viewer import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
@@ -143,7 +143,7 @@ def test_a_replay_without_checks_tells_of_none(tmp_path: Path) -> None:
 
 def test_what_comes_back_from_the_bare_bench_is_rendered_once(monkeypatch: pytest.MonkeyPatch) -> None:
     check(seen(None), EMPTY, RIG)
-    monkeypatch.setattr(physics_check_render, "render", lambda *_: pytest.fail("rendered again"))
+    monkeypatch.setattr(physics_check, "render", lambda *_: pytest.fail("rendered again"))
     check(seen(None), EMPTY, RIG)
 
 

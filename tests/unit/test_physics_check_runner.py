@@ -9,8 +9,8 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import LidarMaps
-from nlos_cam.physics_check_render import check
-from nlos_cam.physics_check_runner import BackgroundChecks
+from nlos_cam.live.physics_check_process import BackgroundChecks
+from nlos_cam.reconstruct.physics_check import check
 
 RIG = load_rig("bare-wall")
 NOTHING = np.full((64, 64), np.nan, np.float32)
@@ -94,7 +94,7 @@ def test_a_process_that_never_answers_holds_nobody_up_and_is_gone_at_the_end() -
 
 
 def test_a_process_that_will_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.physics_check_runner.END_WITHIN_S", 0.2)
+    monkeypatch.setattr("nlos_cam.live.physics_check_process.END_WITHIN_S", 0.2)
     with BackgroundChecks(RIG, command=python(DEAF)) as checks:
         checks.offer(0, DARK, NOTHING)
         until(lambda: checks.over)  # what it printed is no answer

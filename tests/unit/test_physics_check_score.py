@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nlos_cam.frames import LidarMaps
-from nlos_cam.physics_check_score import Expected, explanation, fitted_gain, mean_cost
+from nlos_cam.reconstruct.physics_check import Expected, explanation, fitted_gain, mean_cost
 
 SHAPE = 64, 80
 GAIN = 1e5

@@ -9,8 +9,8 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import LidarMaps
-from nlos_cam.physics_check_render import check
-from nlos_cam.physics_check_worker import main, serve
+from nlos_cam.live.physics_check_process import main, serve
+from nlos_cam.reconstruct.physics_check import check
 
 RIG = load_rig("bare-wall")
 NOTHING = np.full((64, 64), np.nan, np.float32)
@@ -61,7 +61,7 @@ def test_it_works_with_the_least_urgency_and_what_is_printed_is_no_answer(monkey
     for name, pipe in (("stdin", Pipe("asked")), ("stdout", Pipe("told")), ("stderr", stderr)):
         monkeypatch.setattr(sys, name, pipe)
     monkeypatch.setattr(
-        "nlos_cam.physics_check_worker.serve",
+        "nlos_cam.live.physics_check_process.serve",
         lambda asked, told, leave: served.append((asked, told, sys.stdout is stderr, callable(leave))),
     )
     main()

@@ -6,8 +6,8 @@ from threading import Event, Thread
 
 import pytest
 
-from nlos_cam import precedence as module
-from nlos_cam.precedence import DRAWING, LOOP, ORDINARY, after_the_loop, as_any_other, precedence
+from nlos_cam.live import realtime as module
+from nlos_cam.live.realtime import DRAWING, LOOP, ORDINARY, after_the_loop, as_any_other, precedence
 
 OTHER, ROUND_ROBIN = 0, 2
 

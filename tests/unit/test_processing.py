@@ -11,15 +11,14 @@ from fake_doubter import FakeDoubter
 from fake_wall import RIG, WallCamera, measured_wall, wall_frame
 from nlos_calibration.errors import CalibrationError
 
-from nlos_cam.bench import Bench, Look
-from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.live import FRAMES_TOGETHER, MOST_AHEAD, read_along, steps, steps_ahead
-from nlos_cam.physics_check import Check
-from nlos_cam.physics_check_render import EveryFrames
-from nlos_cam.processing import Processing, Step, signs_of
-from nlos_cam.reconstruct import Clock
-from nlos_cam.verdict import Signs, Verdict
+from nlos_cam.live.frame_queue import FrameReader
+from nlos_cam.live.loop import FRAMES_TOGETHER, MOST_AHEAD, read_along, steps, steps_ahead
+from nlos_cam.reconstruct.bench import Bench, Look
+from nlos_cam.reconstruct.network import Clock
+from nlos_cam.reconstruct.physics_check import Check, EveryFrames
+from nlos_cam.reconstruct.pipeline import Processing, Step, signs_of
+from nlos_cam.reconstruct.verdict import Signs, Verdict
 
 
 def network(*_: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_map import image_from_depth, object_box
-from nlos_cam.reconstruct import pose_of, reconstruct
+from nlos_cam.reconstruct.network import pose_of, reconstruct
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)

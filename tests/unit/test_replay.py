@@ -15,12 +15,12 @@ from fake_wall import WallCamera, measured_wall, wall_frame
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.bench import Bench
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.live import FRAMES_TOGETHER, MOST_AHEAD
-from nlos_cam.processing import Processing
-from nlos_cam.replay import DIFFERENCE, REPORT, RESULT, SHEET, replay
+from nlos_cam.live.loop import FRAMES_TOGETHER, MOST_AHEAD
+from nlos_cam.live.replay import DIFFERENCE, REPORT, RESULT, SHEET, replay
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import Processing
 
 RIG = load_rig("paper-rig")
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)

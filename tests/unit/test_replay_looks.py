@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from made_up_moments import RIG, Recorded, bump, full_moment
 
-from nlos_cam.bench import Bench
 from nlos_cam.frames import maps_from_frame
+from nlos_cam.live.replay import REPORT, RESULT, SHEET, replay
+from nlos_cam.live.replay_media import VIDEO, VIEW, Looks, moment_of
 from nlos_cam.objects.depth_map import image_from_depth, object_box
-from nlos_cam.processing import Processing, Step
-from nlos_cam.replay import REPORT, RESULT, SHEET, replay
-from nlos_cam.replay_looks import VIDEO, VIEW, Looks, moment_of
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import Processing, Step
 
 BENCH = Bench(RIG)
 NAMES = {REPORT, RESULT, SHEET}

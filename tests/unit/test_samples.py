@@ -1,6 +1,6 @@
 import pytest
 
-from nlos_cam.samples import Samples
+from nlos_cam.live.replay_media import Samples
 
 
 @pytest.mark.parametrize("count", [1, 5, 6, 7, 100, 1001])

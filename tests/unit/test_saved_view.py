@@ -8,7 +8,7 @@ import pytest
 from made_up_moments import RIG, full_moment, moment
 from measured_walls import exact_wall
 
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view import saved_view
 from nlos_cam.view.drawing import Drawing
 from nlos_cam.view.saved_view import QUEUE_MOMENTS, SavedView

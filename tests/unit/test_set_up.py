@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from fake_wall import RIG, measured_wall
 
-from nlos_cam import set_up as module
-from nlos_cam.bench import Bench
-from nlos_cam.set_up import load_networks, misfits, set_up
+from nlos_cam.reconstruct import pipeline as module
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import load_networks, misfits, set_up
 
 DOUBTER: Any = object()
 

@@ -5,8 +5,8 @@ import pytest
 from nlos_calibration.projection import Intrinsics
 
 from nlos_cam.frames import Frame
-from nlos_cam.sightings import in_words, watched
-from nlos_cam.verdict import amiss
+from nlos_cam.live.loop import in_words, watched
+from nlos_cam.reconstruct.verdict import amiss
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 PIXELS = 80 * 64

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlos_cam.stage_times import StageTimes, percentiles_ms
+from nlos_cam.live.statistics import StageTimes, percentiles_ms
 
 
 @given(st.lists(st.floats(0.0, 10.0), max_size=50))

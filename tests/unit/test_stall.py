@@ -1,6 +1,6 @@
 import pytest
 
-from nlos_cam.stall import STALLED, STALLED_AFTER_S, StallWatch
+from nlos_cam.live.statistics import STALLED, STALLED_AFTER_S, StallWatch
 
 JUST_BEFORE_S = 0.999 * STALLED_AFTER_S
 

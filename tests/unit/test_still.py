@@ -6,7 +6,7 @@ import pytest
 from made_up_moments import NOTHING, RIG, full_moment, moment
 from PIL import Image
 
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.pictures import BACKGROUND_RGB
 from nlos_cam.view.still import (
     HEIGHT,

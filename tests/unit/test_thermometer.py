@@ -8,8 +8,8 @@ import pytest
 from fake_wall import SMALL, wall_frame
 
 from nlos_cam.frames import Frame
+from nlos_cam.live.telemetry import Thermometer, thermometer_of
 from nlos_cam.recording.sidecar import Sidecar, Temperatures, sidecar_path
-from nlos_cam.thermometer import Thermometer, thermometer_of
 
 FRAMES = [wall_frame(number) for number in range(1, 100, 10)]
 """A third of a second apart."""

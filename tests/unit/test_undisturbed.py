@@ -4,7 +4,7 @@ import weakref
 
 import pytest
 
-from nlos_cam.undisturbed import SWITCH_S, undisturbed
+from nlos_cam.live.realtime import SWITCH_S, undisturbed
 
 
 class Loop:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.pictures import BACKGROUND_RGB
 from nlos_cam.view.verdict_picture import (
     BANNER_HEIGHT,

@@ -1,4 +1,9 @@
-"""What a live run did: how fast, how late, and what it saw."""
+"""What a live run did: how fast, how late, and what it saw.
+
+How long each stage of the last frames took, in memory of a fixed size.
+
+Notices that a camera gives no frames any more, and that it gives some again.
+"""
 
 import logging
 import re
@@ -6,14 +11,104 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import NlosCamError
-from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import Frame
-from nlos_cam.processing import Step
-from nlos_cam.stage_times import Percentiles, StageTimes, percentiles_ms
-from nlos_cam.stall import StallWatch
-from nlos_cam.verdict import Verdict
+from nlos_cam.live.frame_queue import FrameReader
+from nlos_cam.reconstruct.pipeline import Step
+from nlos_cam.reconstruct.verdict import Verdict
+
+REMEMBERED = 100_000
+"""Frames: 55 minutes at 30 frames/s, and 0.8 MB for each stage, which are taken at the first frame."""
+SHARES = 50, 95, 99
+
+Percentiles = dict[str, float]
+"""p50, p95 and p99, rising."""
+
+
+class StageTimes:
+    """Seconds by stage of the last frames; a stage may be missing from some."""
+
+    def __init__(self, remembered: int = REMEMBERED) -> None:
+        self._remembered, self._next = remembered, 0
+        self._columns: dict[str, NDArray[np.float64]] = {}
+
+    def add(self, seconds: Mapping[str, float]) -> None:
+        """Take one frame's in, in the place of the oldest where there is no other."""
+        for name in seconds:
+            if name not in self._columns:
+                self._columns[name] = np.full(self._remembered, np.nan)
+        for name, column in self._columns.items():
+            column[self._next] = seconds.get(name, np.nan)
+        self._next = (self._next + 1) % self._remembered
+
+    @property
+    def stages(self) -> list[str]:
+        """In the order in which they were first told."""
+        return list(self._columns)
+
+    def of(self, stage: str) -> NDArray[np.float64]:
+        """What is remembered of a stage, in no order."""
+        column = self._columns.get(stage, np.empty(0))
+        return column[~np.isnan(column)]
+
+
+def percentiles_ms(seconds: NDArray[np.float64]) -> Percentiles:
+    """Of any number of times; 0 of none."""
+    values = np.percentile(seconds, SHARES) if seconds.size else np.zeros(len(SHARES))
+    return {f"p{share}": 1e3 * float(value) for share, value in zip(SHARES, values, strict=True)}
+
+
+STALLED_AFTER_S = 0.5
+"""Fifteen frames: no pause of a camera that is well is as long."""
+STALLED = f"the camera stalled: no frame for {STALLED_AFTER_S:g} s, what is shown is old"
+
+OnStall = Callable[[str, bool], None]
+"""Called with what to tell, and whether it begins (or ends)."""
+
+
+class StallWatch:
+    """Tells of each stall once, however often it looks."""
+
+    def __init__(self, on_stall: OnStall) -> None:
+        self.stalls = 0
+        self.stalled_s = 0.0
+        """In all, from the last frame before each stall to the first after it."""
+        self._on_stall = on_stall
+        self._since_s: float | None = None
+        """The last frame's arrival, while stalled."""
+        self._told_s = 0.0
+
+    def look(self, now_s: float, newest_s: float | None) -> bool:
+        """Whether it is time to show the stall, again; `newest_s` is when the newest frame came, None before any."""
+        if newest_s is None:
+            return False
+        self.came(newest_s)
+        if now_s - newest_s < STALLED_AFTER_S:
+            return False
+        if self._since_s is None:
+            self._since_s, self.stalls, self._told_s = newest_s, self.stalls + 1, now_s
+            self._on_stall(STALLED, True)
+            return True
+        if due := now_s - self._told_s >= STALLED_AFTER_S:
+            self._told_s = now_s
+        return due
+
+    def came(self, newest_s: float) -> None:
+        """A stall ends with a frame that came after it began."""
+        if self._since_s is not None and newest_s > self._since_s:
+            self.close(newest_s)
+            self._on_stall(STALLED, False)
+
+    def close(self, now_s: float) -> None:
+        """The run ends: a stall under way ends with it, and nothing is told."""
+        if self._since_s is not None:
+            self.stalled_s += now_s - self._since_s
+            self._since_s = None
+
 
 MOST_FAILED = 30
 """Frames in a row that come to no result: so many are not the frames' fault."""

@@ -1,4 +1,10 @@
-"""Physics checks beside a streaming loop, in a process of little urgency that never holds the loop up."""
+"""Physics checks beside a streaming loop, in a process of little urgency that never holds the loop up.
+
+The process of physics checks, `python -m nlos_cam.physics_check_worker`: asked by stdin, told by stdout.
+
+It takes rig and accuracy first, then one frame after another, each as a pickle, and answers each with a Check, or with
+a text where that failed. It ends with its stdin, in the midst of a check too: however its parent ends, it does.
+"""
 
 import os
 import pickle
@@ -7,19 +13,21 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from queue import SimpleQueue
 from threading import Condition, Thread
-from typing import IO, Self
+from typing import IO, Any, Self
 
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig
 
 from nlos_cam.frames import LidarMaps
-from nlos_cam.physics_check import Check, failure, log_warning
-from nlos_cam.reconstruct import Clock
+from nlos_cam.live.realtime import as_any_other
+from nlos_cam.reconstruct.network import Clock
+from nlos_cam.reconstruct.physics_check import Check, failure, log_warning
 from nlos_cam.render.accuracy import Stop
 
 PERIOD_S = 1.0
-WORKER = sys.executable, "-m", "nlos_cam.physics_check_worker"
+WORKER = sys.executable, "-m", "nlos_cam.live.physics_check_process"
 END_WITHIN_S = 2.0
 """What has not ended by then is killed."""
 
@@ -159,3 +167,47 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+
+
+LEAST_URGENT = 19
+"""`nice` of the process: it gets what the loop leaves."""
+
+
+def serve(asked: IO[bytes], told: IO[bytes], leave: Callable[[], None]) -> None:
+    """Answer every question until there are no more; then `leave` is called, while one may be worked on."""
+    questions: SimpleQueue[Any] = SimpleQueue()
+    Thread(target=_listen, args=(asked, questions, leave), daemon=True).start()
+    rig, accuracy = questions.get()
+    from nlos_cam.reconstruct.physics_check import check  # takes a second to import: stdin is listened to meanwhile
+
+    while (question := questions.get()) is not None:
+        frame_number, maps, depth_m = question
+        try:
+            answer: object = check(maps, depth_m, rig, frame_number=frame_number, accuracy=accuracy)
+        except Exception as error:  # noqa: BLE001  whatever it was, it is told, and the next frame is looked at
+            answer = f"{type(error).__name__}: {error}"
+        with suppress(BrokenPipeError):
+            pickle.dump(answer, told)
+            told.flush()
+
+
+def _listen(asked: IO[bytes], questions: SimpleQueue[Any], leave: Callable[[], None]) -> None:
+    try:
+        while True:
+            questions.put(pickle.load(asked))  # noqa: S301  of our own parent, through a pipe that nobody else has
+    except (EOFError, OSError, pickle.UnpicklingError):
+        questions.put(None)
+        leave()
+
+
+def main() -> None:
+    """Work for the parent, as little urgent as can be."""
+    as_any_other()
+    if hasattr(os, "nice"):
+        os.nice(LEAST_URGENT)
+    told, sys.stdout = sys.stdout.buffer, sys.stderr  # what anybody prints is no answer
+    serve(sys.stdin.buffer, told, leave=lambda: os._exit(0))
+
+
+if __name__ == "__main__":
+    main()

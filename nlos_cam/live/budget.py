@@ -25,10 +25,10 @@ from nlos_cam.cache import cache_folder
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.errors import BudgetError, RecordingError
-from nlos_cam.live import warm_up
-from nlos_cam.live_report import LiveReport
+from nlos_cam.live.loop import warm_up
+from nlos_cam.live.statistics import LiveReport
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.processing import Processing
+from nlos_cam.reconstruct.pipeline import Processing
 
 TRADEOFF = "tradeoff.json"
 """What `tradeoff reconstruct` writes; one lies beside the shipped weights."""

@@ -14,23 +14,20 @@ import numpy as np
 from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
-from nlos_cam.bench import Bench
 from nlos_cam.camera.protocol import Camera
-from nlos_cam.contact_sheet import draw_sheet
 from nlos_cam.errors import RecordingError
 from nlos_cam.folders import renamed_when_whole
-from nlos_cam.frame_reader import FrameReader
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.live import read_along, steps_ahead
-from nlos_cam.live_report import OnWarning, Warned, frames_by_verdict, say_nothing
+from nlos_cam.live.frame_queue import FrameReader
+from nlos_cam.live.loop import in_words, read_along, steps_ahead
+from nlos_cam.live.replay_media import Looks, Samples, draw_sheet
+from nlos_cam.live.statistics import OnWarning, Warned, frames_by_verdict, say_nothing
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.physics_check import UNEXPLAINED
-from nlos_cam.processing import Processing, Step
-from nlos_cam.reconstruct import Clock
-from nlos_cam.replay_looks import Looks
-from nlos_cam.samples import Samples
-from nlos_cam.sightings import in_words
-from nlos_cam.verdict import Verdict
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.network import Clock
+from nlos_cam.reconstruct.physics_check import UNEXPLAINED
+from nlos_cam.reconstruct.pipeline import Processing, Step
+from nlos_cam.reconstruct.verdict import Verdict
 
 RESULT, DIFFERENCE, SHEET, REPORT = "reconstruction.npz", "difference.npz", "frames.png", "report.md"
 SHEET_FRAMES = 6

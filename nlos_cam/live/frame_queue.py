@@ -9,8 +9,8 @@ from typing import Self
 
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
-from nlos_cam.processing import Arrival
-from nlos_cam.reconstruct import Clock
+from nlos_cam.reconstruct.network import Clock
+from nlos_cam.reconstruct.pipeline import Arrival
 
 QUEUE_FRAMES = 3
 LET_GO_AFTER_S = 1.0

@@ -7,8 +7,8 @@ from enum import StrEnum
 import numpy as np
 
 from nlos_cam.frames import MOST_SATURATED, Frame, saturated_share
-from nlos_cam.physics_check import Check
-from nlos_cam.reconstruct import Reconstruction
+from nlos_cam.reconstruct.network import Reconstruction
+from nlos_cam.reconstruct.physics_check import Check
 
 STEADY_FRAMES = 5
 """Doubt about the range is averaged over so many frames (0.17 s), so that the verdict does not flicker."""

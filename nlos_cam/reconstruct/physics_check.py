@@ -1,4 +1,6 @@
-"""How far the echoes that a renderer expects explain the maps that a lidar gave: arrays in, a score out.
+"""A reconstruction rendered again, and held against what the lidar saw: what is found, and who looks.
+
+How far the echoes that a renderer expects explain the maps that a lidar gave: arrays in, a score out.
 
 Each cell tells one echo of two, the strongest (S5): the bare wall's own, or that of three bounces. Where both are about
 as strong, a small error of the object swaps them and moves the depth by decimetres. So both are held against what was
@@ -12,15 +14,93 @@ seen, and the one that explains it better counts. With r = seen less expected an
 Two things are not known beforehand and fitted: the device's gain, from the cells that show the bare wall, and the
 object's albedo, to within a factor of MOST_ALBEDO, as the one of the least cost. A wider range of albedos would explain
 any object that is not there as a dark one.
+
+The physics check itself: a reconstruction rendered again, through the expected sensor, against the lidar's maps.
 """
 
+import logging
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol, Self
 
 import numpy as np
 from nlos_calibration.arrays import Float32, Float64
+from nlos_calibration.rig import Rig
 
-from nlos_cam.frames import SATURATED, LidarMaps
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
+from nlos_cam.reconstruct.network import Clock
+from nlos_cam.render.accuracy import Stop
+from nlos_cam.render.geometry import cast
+from nlos_cam.render.renderer import Rendering, render
+from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor.model import SensorModel
+
+UNEXPLAINED = 0.91
+"""The score from which on what is shown does not explain the maps: 1 % of the 300 new objects that it was chosen on
+reach it (docs/physics-check.md)."""
+
+log = logging.getLogger(__name__)
+
+
+def log_warning(text: str) -> None:
+    """Tell of a check that failed where nobody else is told."""
+    log.warning("%s", text)
+
+
+def failure(frame_number: int, what: str) -> str:
+    """A check that failed, in a line."""
+    return f"the physics check of frame {frame_number} failed ({what}): frames go on without"
+
+
+@dataclass(frozen=True)
+class Check:
+    """What one frame's check found."""
+
+    frame_number: int
+    residual_depth_m: Float32
+    """(64, 80): seen less rendered; NaN where either has no return."""
+    residual_intensity: Float32
+    """(64, 80): seen less rendered, in IR counts."""
+    score: float
+    """0 where the maps are explained to within the sensor's noise; 1 where they are explained no better than by nothing
+    at all hidden; more where worse."""
+    seconds: float
+    """How long it took."""
+    albedo: float = 1.0
+    """Of the object, against what the networks were trained on: the one that explains the maps best."""
+
+
+class Checks(Protocol):
+    """Checks some of the frames that it is shown, beside the loop or in its midst, while it is entered."""
+
+    newest: Check | None
+    """None until there is one."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
+        """Show it a frame's maps and the hidden depth (64, 64) made of them."""
+        ...
+
+
+class NoChecks:
+    """For loops that nothing is checked of."""
+
+    newest: Check | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
+        pass
+
 
 WALL_TOLERANCE_M = 0.003
 """Of the bare wall's depth: what a bench's record leaves."""
@@ -130,3 +210,87 @@ def _light(seen: LidarMaps, gain: float) -> Float64:
 def _log(intensity: Float64) -> Float64:
     """The logarithm; of nothing, that of next to nothing."""
     return np.log(np.maximum(intensity, 1e-12))
+
+
+CHECKED_FRAMES = 30
+"""Of a replay, every so many frames are checked: about once a second."""
+
+
+def check(
+    maps: LidarMaps,
+    depth_m: Float32 | None,
+    rig: Rig,
+    *,
+    frame_number: int = 0,
+    accuracy: Stop = "standard",
+    clock: Clock = time.perf_counter,
+) -> Check:
+    """Render a hidden depth (64, 64) again, and hold what a lidar would see of it against the maps that it gave.
+
+    Without any surface, and on a rig without an object box, the bare bench is held against them. The depth of the maps
+    is that of the rig: what the lidar is known to lack was added (`Bench.corrected`).
+    """
+    begun_s = clock()
+    bare = _bare(rig)  # pyright: ignore[reportArgumentType]  frozen, so hashable
+    hides = depth_m is not None and rig.object_box is not None and bool(np.isfinite(depth_m).any())
+    expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare) if hides else bare
+    best = explanation(maps, expected, bare)
+    rendered_m, rendered = expected.seen(best.albedo, best.gain)
+    seen_m = np.where(maps.valid, maps.depth_m, np.float32(np.nan))
+    residuals = seen_m - rendered_m, maps.intensity - rendered
+    return Check(frame_number, *residuals, best.score, clock() - begun_s, best.albedo)
+
+
+@lru_cache(maxsize=4)
+def _bare(rig: Rig) -> Expected:
+    """What comes back with nothing hidden."""
+    return _expected(render(Scene(rig)), rig, None)
+
+
+def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected:
+    """Both echoes of each cell; where three bounces won, the direct one is the bare bench's."""
+    cos_axis = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).cos_axis.reshape(MAP_ROWS, MAP_COLUMNS)
+    echo, echo_m = rendering.multi.peak.astype(np.float64), rendering.multi.path_m / 2 * cos_axis
+    direct, direct_m = rendering.intensity.astype(np.float64), rendering.depth_m.astype(np.float64)
+    if bare is None:
+        return Expected(direct_m, direct, echo_m, echo)
+    bounced = (rendering.intensity <= rendering.multi.peak) & (echo > 0)
+    return Expected(np.where(bounced, bare.direct_m, direct_m), np.where(bounced, bare.direct, direct), echo_m, echo)
+
+
+class EveryFrames:
+    """Checks every so many frames on the spot: of the same frames always the same ones, to the bit.
+
+    `on_error` hears of the first check that fails.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        *,
+        every: int = CHECKED_FRAMES,
+        accuracy: Stop = "standard",
+        on_error: Callable[[str], None] = log_warning,
+    ) -> None:
+        self.newest: Check | None = None
+        self._rig, self._every, self._offered = rig, every, 0
+        self._accuracy: Stop = accuracy
+        self._on_error, self._said = on_error, False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
+        """Check this frame if it is one of those."""
+        self._offered += 1
+        if (self._offered - 1) % self._every:
+            return
+        try:
+            self.newest = check(maps, depth_m, self._rig, frame_number=frame_number, accuracy=self._accuracy)
+        except Exception as error:  # noqa: BLE001  whatever it was, frames go on without
+            if not self._said:
+                self._on_error(failure(frame_number, f"{type(error).__name__}: {error}"))
+            self._said = True
