@@ -11,7 +11,7 @@ import typer
 from nlos_cam.cli.common import say
 from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.view.assets import LOOPBACK
-from nlos_cam.view.hosts import exposed
+from nlos_cam.view.server import exposed
 from nlos_cam.view.viewer import NullViewer, Viewer
 
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
@@ -32,7 +32,7 @@ def viewer_of(bench: Bench, *, no_view: bool, host: str | None = None, port: int
         if host is not None or port is not None:
             raise typer.BadParameter("--view-host and --view-port say where the view is: leave --no-view away")
         return NullViewer()
-    from nlos_cam.view.rerun_viewer import RerunViewer
+    from nlos_cam.view.web import RerunViewer
 
     return RerunViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port)
 
@@ -51,7 +51,7 @@ def tell_of_view(
     if not viewer.address:
         say("running without a view (Ctrl-C ends it)")
         return
-    from nlos_cam.view.rerun_viewer import PREFERRED_PORT
+    from nlos_cam.view.web import PREFERRED_PORT
 
     taken = port is None and urlsplit(viewer.address).port != PREFERRED_PORT
     say(f"{what}: {viewer.address}  (Ctrl-C ends it{f'; port {PREFERRED_PORT} is taken' if taken else ''})")

@@ -34,7 +34,7 @@ def view(
     json: Json = False,
 ) -> None:
     """Look at a saved view in a browser, with play, pause and scrubbing."""
-    from nlos_cam.view.recorded import RecordedView
+    from nlos_cam.view.web import RecordedView
 
     with interrupted_by_signals():
         recorded = RecordedView(file, host=view_host or LOOPBACK, port=view_port)
@@ -51,6 +51,6 @@ def saving(viewer: Viewer, bench: Bench, path: Path | None) -> Viewer:
     """The viewer, and beside it one that saves what it shows, if there is a path to save it to."""
     if path is None:
         return viewer
-    from nlos_cam.view.saved_view import SavedView
+    from nlos_cam.view.rrd_file import SavedView
 
     return Viewers([viewer, SavedView(path, bench.rig, bench.measured)])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.reconstruct.pipeline import Step
-from nlos_cam.view.pictures import MOST_UNCERTAIN_M
+from nlos_cam.view.images import MOST_UNCERTAIN_M
 from nlos_cam.view.viewer import Moment, Viewer
 
 
@@ -58,12 +58,12 @@ class Looks:
         with ExitStack() as entered:
             viewers: list[Viewer] = []
             if self.view:
-                from nlos_cam.view.saved_view import SavedView
+                from nlos_cam.view.rrd_file import SavedView
 
                 saved = SavedView(folder / VIEW, self.bench.rig, self.bench.measured, keeps_all=True)
                 viewers.append(entered.enter_context(saved))
             if self.video:
-                from nlos_cam.view.film import Film
+                from nlos_cam.view.video import Film
 
                 viewers.append(entered.enter_context(Film(folder / VIDEO, self.bench.rig)))
             looking = Looking(viewers, Samples(self.stills) if self.stills else None)
@@ -73,7 +73,7 @@ class Looks:
         looking.made = {path.name for path in _looks_in(folder)}
 
     def _draw_stills(self, folder: Path, moments: list[Moment]) -> None:
-        from nlos_cam.view.still import Still
+        from nlos_cam.view.video import Still
 
         for moment in moments:
             Still(self.bench.rig, moments[0]).save(folder / STILL.format(moment.frame.frame_number), moment)

@@ -1,21 +1,29 @@
-"""What the viewer draws: the bench in 3D, the calibration if there is one, and each moment, as Rerun data."""
+"""What the viewer draws: the bench in 3D, the calibration if there is one, and each moment, as Rerun data.
+
+The bench as Rerun data, in the wall frame: wall, occluder, object box, lidar and the way of the light.
+
+What is plotted over time: latency by stage, frames lost, temperatures, the physics check's score.
+"""
 
 import uuid
+from collections.abc import Callable, Iterator, Mapping
+from math import nan
 from typing import Any
 
 import numpy as np
 import rerun as rr
 from nlos_calibration.measured_wall import MeasuredWall
-from nlos_calibration.rig import Rig
+from nlos_calibration.rig import ObjectBox, Rig
 from numpy.typing import NDArray
 
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.view.bench_drawing import bench_parts
-from nlos_cam.view.layout import FRAME_TIMELINE, TIMELINE, Shown, layout
-from nlos_cam.view.pictures import (
+from nlos_cam.view.images import (
+    NOTED_PIXELS,
     PICTURE_WIDTH,
     RESIDUAL_SPAN_M,
+    as_believed,
+    banner_rgb,
     change_span_m,
     confidence_rgb,
     depth_span_m,
@@ -25,14 +33,126 @@ from nlos_cam.view.pictures import (
     hidden_rgb,
     infrared_grey,
     lidar_rgb,
+    may_be_believed,
     surface,
     uncertainty_rgb,
 )
-from nlos_cam.view.plots import Plots
-from nlos_cam.view.verdict_picture import NOTED_PIXELS, as_believed, banner_rgb, may_be_believed
+from nlos_cam.view.layout import FRAME_TIMELINE, TIMELINE, Shown, layout
 from nlos_cam.view.viewer import Moment
-from nlos_cam.view.wall_drawing import bench_drawings, wall_names, wall_pictures
-from nlos_cam.view.wall_text import calibration_text
+from nlos_cam.view.wall_drawing import bench_drawings, calibration_text, wall_names, wall_pictures
+
+WALL_RGBA, OCCLUDER_RGBA, LIGHT_RGBA = (120, 130, 140, 70), (90, 150, 255, 90), (255, 210, 80, 200)
+BOX_RGB, LIDAR_RGB = (150, 150, 150), (255, 110, 90)
+OCCLUDER_HEIGHT_M = 0.3
+"""How much is drawn of what has no end."""
+MARGIN_M = 0.1
+FRUSTUM_M = 0.12
+
+Corners = list[tuple[float, float, float]]
+
+
+def bench_parts(rig: Rig) -> Iterator[tuple[str, Any]]:
+    """What there is, by path; none of it moves. Raises SceneError for a rig without an object box."""
+    low, high = _seen_of_wall(rig)
+    on_wall = [(x_m, y_m, 0.0) for x_m, y_m in _around((low[0], high[0]), (low[1], high[1]))]
+    yield "bench/wall", _rectangle(on_wall, WALL_RGBA)
+    if rig.occluder is not None:
+        ends_m = rig.occluder.z_min_m, rig.occluder.z_min_m + OCCLUDER_HEIGHT_M
+        corners = [(rig.occluder.x_m, y_m, z_m) for y_m, z_m in _around((low[1], high[1]), ends_m)]
+        yield "bench/occluder", _rectangle(corners, OCCLUDER_RGBA)
+    box = object_box(rig)
+    yield "bench/box", _edges(box)
+    yield "bench/light", rr.LineStrips3D([_light_path(rig, box)], colors=[LIGHT_RGBA], radii=0.002)
+    yield from _lidar(rig)
+
+
+def _lidar(rig: Rig) -> Iterator[tuple[str, Any]]:
+    pose, pinhole = rig.wall_from_lidar, rig.pinhole
+    yield "bench/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
+    camera = rr.Pinhole(
+        focal_length=(pinhole.fx, pinhole.fy),
+        principal_point=(pinhole.ppx, pinhole.ppy),
+        resolution=(pinhole.width, pinhole.height),
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=FRUSTUM_M,
+    )
+    yield "bench/lidar/view", camera
+    yield "bench/lidar/body", rr.Points3D([[0, 0, 0]], radii=0.012, labels=["lidar"], colors=[LIDAR_RGB])
+
+
+def _edges(box: ObjectBox) -> rr.Boxes3D:
+    low = np.array([box.x_min_m, box.y_min_m, box.z_near_m])
+    high = np.array([box.x_max_m, box.y_max_m, box.z_far_m])
+    return rr.Boxes3D(mins=[low], sizes=[high - low], colors=[BOX_RGB], radii=0.001, fill_mode="MajorWireframe")
+
+
+def _seen_of_wall(rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (x, y) of the part of the wall that is drawn: what matters to light, not the endless plane."""
+    relay = rig.relay
+    low = np.array([relay.x_min_m - MARGIN_M, relay.y_min_m])
+    return low, np.array([relay.x_max_m + MARGIN_M, relay.y_max_m])
+
+
+def _light_path(rig: Rig, box: ObjectBox) -> NDArray[np.float64]:
+    """The way of one three-bounce echo (5, 3): lidar, wall, hidden object, wall, lidar."""
+    eye = rig.wall_from_lidar[:3, 3]
+    middle = np.array([(box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2, box.z_near_m])
+    there, back = (np.array([middle[0] * 0.6, y_m, 0.0]) for y_m in (-0.04, 0.04))
+    return np.stack([eye, there, middle, back, eye])
+
+
+def _around(first: tuple[float, float], second: tuple[float, float]) -> list[tuple[float, float]]:
+    (a, b), (c, d) = first, second
+    return [(a, c), (b, c), (b, d), (a, d)]
+
+
+def _rectangle(corners: Corners, rgba: tuple[int, int, int, int]) -> rr.Mesh3D:
+    return rr.Mesh3D(vertex_positions=corners, triangle_indices=[(0, 1, 2), (0, 2, 3)], albedo_factor=rgba)
+
+
+Log = Callable[..., None]
+"""`(path, thing, static=False)`."""
+STAGE_RGB = ((235, 240, 245), (90, 170, 255), (255, 190, 90), (80, 220, 120), (230, 120, 220), (120, 220, 220))
+SENSOR_RGB = ((255, 120, 90), (255, 190, 90), (120, 200, 255), (160, 230, 140))
+DROPS_RGB, SCORE_RGB = (255, 110, 90), (90, 170, 255)
+WAITED_FOR = "wait"
+"""Of all stages, the one that is no work: the loop waits for the camera."""
+
+
+class Plots:
+    """Logs each moment's figures; what is plotted is named where it first appears."""
+
+    def __init__(self, log: Log, first: Moment) -> None:
+        self._log = log
+        self._stages = [name for name in first.stages_s if name != WAITED_FOR]
+        self._sensors: list[str] = []
+        self._checked = -1
+        self._name("latency", [f"{name}, ms" for name in ("total", *self._stages)], STAGE_RGB)
+        self._name("drops", ["frames lost"], [DROPS_RGB])
+        self._name("physics/score", ["score"], [SCORE_RGB])
+
+    def draw(self, moment: Moment) -> None:
+        """Log the figures of a moment; the check's when it is a new one."""
+        stages_s = [moment.stages_s.get(name, nan) for name in self._stages]
+        self._log("latency", rr.Scalars([1e3 * value for value in (moment.latency_s, *stages_s)]))
+        self._log("drops", rr.Scalars([moment.dropped]))
+        self._draw_celsius(moment.celsius)
+        if moment.check and moment.check.frame_number != self._checked:
+            self._checked = moment.check.frame_number
+            self._log("physics/score", rr.Scalars([moment.check.score]))
+
+    def _draw_celsius(self, celsius: Mapping[str, float]) -> None:
+        if not celsius:
+            return
+        if not self._sensors:
+            self._sensors = sorted(celsius)
+            self._name("temperature", [name.replace("_", " ") for name in self._sensors], SENSOR_RGB)
+        self._log("temperature", rr.Scalars([celsius.get(name, nan) for name in self._sensors]))
+
+    def _name(self, path: str, names: list[str], colours: Any) -> None:
+        rgb = [colours[i % len(colours)] for i in range(len(names))]
+        self._log(path, rr.SeriesLines(colors=rgb, names=names, widths=[1.5] * len(names)), static=True)
+
 
 APPLICATION = "nlos-cam"
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg"}

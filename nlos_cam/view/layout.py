@@ -7,8 +7,7 @@ import rerun.blueprint as rrb
 from nlos_calibration.rig import Rig
 
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.view.pictures import BACKGROUND_RGB, MOST_UNCERTAIN_M, RESIDUAL_SPAN_M
-from nlos_cam.view.verdict_picture import BANNER_HEIGHT, BANNER_WIDTH
+from nlos_cam.view.images import BACKGROUND_RGB, BANNER_HEIGHT, BANNER_WIDTH, MOST_UNCERTAIN_M, RESIDUAL_SPAN_M
 
 TIMELINE, FRAME_TIMELINE = "time", "frame"
 PLOT_WINDOW_S = 20.0

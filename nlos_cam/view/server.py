@@ -3,21 +3,200 @@
 Whoever may connect may look, so: a name that is not this machine's is refused (a page elsewhere that had its own name
 point here could read the view through a visitor's browser), nothing can be written, and streams and connections are
 limited. A browser that takes no data is let go.
+
+What the view's server answers to a request: a file, the stream, or why not.
+
+Hosts: which address a name stands for, which names are this machine's, what an address is called in a browser.
 """
 
+import ipaddress
 import os
 import socket
 from collections.abc import Callable
 from contextlib import suppress
-from http.server import ThreadingHTTPServer
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from socketserver import TCPServer
 from threading import BoundedSemaphore, Condition, Thread
 from typing import Any
 
 from nlos_cam.errors import NlosCamError
 from nlos_cam.view.assets import LOOPBACK, Assets
-from nlos_cam.view.hosts import address_of, names_of, resolved
-from nlos_cam.view.requests import MOST_STREAMS, Send, handler_of
+
+Send = Callable[[bytes], None]
+STREAM_PATH = "/live.rrd"
+WRITE_TIMEOUT_S = 5.0
+"""A browser that takes no data, or gives no request, for this long is let go."""
+PIECE_BYTES = 1 << 18
+"""A file goes out in pieces, each within that time: the viewer has 30 MB, and a link may be slow."""
+MOST_STREAMS = 8
+"""Browsers that watch at once; each costs a drawing, 12 times a second."""
+POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; worker-src 'self' blob:; frame-ancestors 'self'"
+)
+"""The browser itself refuses to fetch anything from elsewhere, or to show the view inside another's page."""
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+}
+
+
+@dataclass(frozen=True)
+class Served:
+    """What a server gives to whoever asks by a `known` name."""
+
+    assets: Assets
+    stream: Callable[[Send], None]
+    known: Callable[[str], bool]
+    most_streams: int
+    streams: BoundedSemaphore
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Answers GET and HEAD; whatever else is asked is not implemented."""
+
+    served: Served
+    timeout = WRITE_TIMEOUT_S
+    server_version, sys_version = "nlos-cam", ""
+
+    def do_GET(self) -> None:
+        try:
+            self._answer(self.path.partition("?")[0])
+        except OSError:
+            self.close_connection = True  # the browser left, which is its right
+
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
+    def _answer(self, path: str) -> None:
+        if not self.served.known(self.headers.get("Host", "")):
+            self._tell(HTTPStatus.FORBIDDEN, "this is not the name of the machine: open the address as it was told")
+        elif path == STREAM_PATH:
+            self._answer_stream()
+        elif path in self.served.assets:
+            kind, content = self.served.assets[path]
+            self._begin(HTTPStatus.OK, kind, len(content))
+            self._send(content)
+        else:
+            self._tell(HTTPStatus.NOT_FOUND, "there is nothing here: the view is at /")
+
+    def _answer_stream(self) -> None:
+        if not self.served.streams.acquire(blocking=False):
+            told = f"{self.served.most_streams} browsers watch already, and no more may: close one, and reload"
+            self._tell(HTTPStatus.SERVICE_UNAVAILABLE, told)
+            return
+        try:
+            self._begin(HTTPStatus.OK, "application/octet-stream")
+            if self.command != "HEAD":
+                self.served.stream(self._send)
+        finally:
+            self.served.streams.release()
+
+    def _tell(self, status: HTTPStatus, text: str) -> None:
+        content = f"{text}\n".encode()
+        self._begin(status, "text/plain; charset=utf-8", len(content))
+        self._send(content)
+
+    def _begin(self, status: HTTPStatus, kind: str, length: int | None = None) -> None:
+        self.send_response(status)
+        told = {"Content-Type": kind, **HEADERS}
+        if length is not None:
+            told["Content-Length"] = str(length)
+        for name, value in told.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+    def _send(self, content: bytes) -> None:
+        if self.command == "HEAD":
+            return
+        for start in range(0, len(content), PIECE_BYTES):
+            self.wfile.write(content[start : start + PIECE_BYTES])
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the name http.server uses
+        pass
+
+
+def handler_of(
+    assets: Assets, stream: Callable[[Send], None], known: Callable[[str], bool], most_streams: int
+) -> type[Handler]:
+    """A handler for requests whose Host header is `known`; at most so many streams are given at once."""
+    served = Served(assets, stream, known, most_streams, BoundedSemaphore(most_streams))
+    return type("ViewHandler", (Handler,), {"served": served})
+
+
+LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
+EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  looked up, not bound
+"""What listens on every interface, and where a browser on this machine finds it."""
+
+
+def resolved(host: str) -> tuple[socket.AddressFamily, str]:
+    """The family and the address of a host to listen at. Raises NlosCamError for a name that stands for none."""
+    try:
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except (OSError, UnicodeError) as error:
+        raise NlosCamError(f"--view-host {host}: no such address ({error}): give one of this machine's") from error
+    family, *_, address = found[0]
+    return family, str(address[0])
+
+
+def is_loopback(address: str) -> bool:
+    """Whether only this machine reaches an address."""
+    return ipaddress.ip_address(address.partition("%")[0]).is_loopback
+
+
+def exposed(host: str, port: int) -> str:
+    """What others than this machine's users see of what is served there, in one line; empty on the loopback.
+
+    Raises NlosCamError for a name that stands for no address.
+    """
+    _, address = resolved(host)
+    if is_loopback(address):
+        return ""
+    where = "any address of this machine" if address in EVERYWHERE else address
+    return (
+        f"anyone who can reach {where} at port {port} sees the bench's pictures and depth, unencrypted and without a "
+        "password"
+    )
+
+
+def names_of(host: str, address: str) -> Callable[[str], bool]:
+    """Whether a browser's Host header names this machine, or an address, which no other's name server can forge."""
+    names = LOCAL_NAMES | {host.lower(), socket.gethostname().lower()}
+    local_only = is_loopback(address)
+
+    def known(header: str) -> bool:
+        name = name_in(header)
+        return name in LOCAL_NAMES if local_only else name in names or _is_address(name)
+
+    return known
+
+
+def name_in(header: str) -> str:
+    """The host of a Host header, without its port: where a port is forwarded it is another."""
+    name = header.strip().lower()
+    if name.startswith("["):
+        return name[1:].partition("]")[0]
+    return name.rpartition(":")[0] if ":" in name else name
+
+
+def address_of(host: str, port: int) -> str:
+    """The URL by which a browser on this machine finds it."""
+    host = EVERYWHERE.get(host, host)
+    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
 
 __all__ = ["Send", "ViewServer"]
 

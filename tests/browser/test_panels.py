@@ -12,11 +12,10 @@ from made_up_moments import NOTHING, RIG, bump, full_moment
 from measured_walls import exact_wall
 
 from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.view.recorded import RecordedView
-from nlos_cam.view.rerun_viewer import RerunViewer
-from nlos_cam.view.saved_view import SavedView
-from nlos_cam.view.verdict_picture import LOOKS
+from nlos_cam.view.images import LOOKS
+from nlos_cam.view.rrd_file import SavedView
 from nlos_cam.view.viewer import Moment
+from nlos_cam.view.web import RecordedView, RerunViewer
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 

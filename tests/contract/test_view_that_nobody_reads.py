@@ -14,9 +14,9 @@ from nlos_cam.frames import Frame
 from nlos_cam.live.loop import run_live
 from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.reconstruct.pipeline import Processing
-from nlos_cam.view import rerun_viewer
-from nlos_cam.view.rerun_viewer import RerunViewer
+from nlos_cam.view import web
 from nlos_cam.view.server import Send
+from nlos_cam.view.web import RerunViewer
 
 RIG = load_rig("paper-rig")
 MEANWHILE = 100
@@ -68,8 +68,8 @@ class Camera:
 
 
 def test_the_loop_never_waits_for_a_browser_that_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
-    monkeypatch.setattr(rerun_viewer, "DRAW_PERIOD_S", 0.0)
+    monkeypatch.setattr(web, "page_assets", dict)
+    monkeypatch.setattr(web, "DRAW_PERIOD_S", 0.0)
     with Noted(RIG) as viewer, socket.socket() as deaf:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         place = urlsplit(viewer.address or "")

@@ -3,7 +3,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.view.bench_drawing import _light_path, bench_parts
+from nlos_cam.view.drawing import _light_path, bench_parts
 
 RIG = load_rig("paper-rig")
 BOX = RIG.object_box

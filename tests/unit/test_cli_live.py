@@ -18,7 +18,7 @@ from nlos_cam.cli import live as commands
 from nlos_cam.cli.main import main
 from nlos_cam.frames import Frame
 from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.view import rerun_viewer
+from nlos_cam.view import web
 
 
 def record_of(eats: str) -> SimpleNamespace:
@@ -138,7 +138,7 @@ def test_seconds_end_a_run(opened: Opened, capsys: pytest.CaptureFixture[str]) -
 
 @pytest.mark.usefixtures("opened")
 def test_the_address_of_the_view_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
+    monkeypatch.setattr(web, "page_assets", dict)
     assert main(["live", "--camera", "bag:fake", "--json"]) == 0
     assert "http://127.0.0.1:" in told(capsys)[1]
 

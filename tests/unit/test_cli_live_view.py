@@ -12,7 +12,7 @@ from nlos_cam.cli import live_view
 from nlos_cam.cli.live_view import opened_in_browser, tell_of_view, viewer_of
 from nlos_cam.errors import NlosCamError
 from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.view import rerun_viewer
+from nlos_cam.view import web
 from nlos_cam.view.viewer import NullViewer
 
 BENCH = Bench(load_rig("paper-rig"))
@@ -21,7 +21,7 @@ EVERYWHERE = "0.0.0.0"  # noqa: S104  on purpose: what it exposes is told
 
 @pytest.fixture(autouse=True)
 def no_assets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
+    monkeypatch.setattr(web, "page_assets", dict)
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_unless_asked_nobody_else_can_see_it(told: list[str]) -> None:
 def test_a_taken_port_is_told_and_the_view_is_elsewhere(told: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        monkeypatch.setattr(rerun_viewer, "PREFERRED_PORT", port)
+        monkeypatch.setattr(web, "PREFERRED_PORT", port)
         [line] = shown(told)
         assert f"port {port} is taken" in line
         assert f"127.0.0.1:{port}/" not in line

@@ -16,14 +16,14 @@ from nlos_cam.cli import live, live_view
 from nlos_cam.cli.main import main
 from nlos_cam.cli.view import saving
 from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.view import recorded
-from nlos_cam.view.saved_view import SavedView
+from nlos_cam.view import web
+from nlos_cam.view.rrd_file import SavedView
 from nlos_cam.view.viewer import NullViewer
 
 
 @pytest.fixture
 def saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(recorded, "page_assets", lambda **_: {"/": ("text/html", b"page")})
+    monkeypatch.setattr(web, "page_assets", lambda **_: {"/": ("text/html", b"page")})
     with SavedView(tmp_path / "view.rrd", RIG) as view:
         view.show(full_moment(0))
     return tmp_path / "view.rrd"

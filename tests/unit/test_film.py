@@ -6,8 +6,7 @@ import pytest
 from made_up_moments import RIG, full_moment
 
 from nlos_cam.errors import NlosCamError
-from nlos_cam.view.film import FRAMES_PER_S, Film
-from nlos_cam.view.still import HEIGHT, WIDTH, Still
+from nlos_cam.view.video import FRAMES_PER_S, HEIGHT, WIDTH, Film, Still
 
 
 def read(path: Path) -> list[np.ndarray]:
@@ -41,7 +40,7 @@ def test_a_film_is_what_browsers_play(tmp_path: Path) -> None:
 
 
 def test_a_missing_codec_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.view.film.CODEC", "none")
+    monkeypatch.setattr("nlos_cam.view.video.CODEC", "none")
     with pytest.raises(NlosCamError, match="no none codec"), Film(tmp_path / "film.webm", RIG):
         pass
 

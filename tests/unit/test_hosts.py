@@ -3,7 +3,7 @@ import socket
 import pytest
 
 from nlos_cam.errors import NlosCamError
-from nlos_cam.view.hosts import address_of, exposed, is_loopback, name_in, names_of, resolved
+from nlos_cam.view.server import address_of, exposed, is_loopback, name_in, names_of, resolved
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104  looked up, not bound
 

@@ -1,6 +1,6 @@
 from threading import Event, Thread
 
-from nlos_cam.view.latest import Latest
+from nlos_cam.view.viewer import Latest
 
 
 def test_a_late_reader_gets_the_newest_value_only() -> None:

@@ -8,7 +8,7 @@ from nlos_calibration.rig import load_rig
 from PIL import Image
 
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.view.pictures import (
+from nlos_cam.view.images import (
     BACKGROUND_RGB,
     FADED,
     JUMP_M,

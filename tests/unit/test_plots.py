@@ -5,7 +5,7 @@ import pytest
 import rerun as rr
 from made_up_moments import full_moment, moment
 
-from nlos_cam.view.plots import Plots
+from nlos_cam.view.drawing import Plots
 
 
 class Log:

@@ -9,9 +9,9 @@ import pytest
 from made_up_moments import RIG, full_moment
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.view import recorded
-from nlos_cam.view.recorded import RecordedView, whole_bytes
-from nlos_cam.view.saved_view import SavedView
+from nlos_cam.view import web
+from nlos_cam.view.rrd_file import SavedView
+from nlos_cam.view.web import RecordedView, whole_bytes
 
 
 @pytest.fixture
@@ -26,10 +26,10 @@ def test_each_browser_gets_the_whole_file_and_its_end(saved: Path, monkeypatch: 
     asked = []
 
     def assets(*, recorded: bool) -> dict[str, tuple[str, bytes]]:
-        asked.append(recorded)
+        asked.append(web)
         return {"/": ("text/html", b"page")}
 
-    monkeypatch.setattr(recorded, "page_assets", assets)
+    monkeypatch.setattr(web, "page_assets", assets)
     with RecordedView(saved) as view:
         for _ in range(2):
             with closing(HTTPConnection(urlsplit(view.address or "").netloc, timeout=10.0)) as browser:

@@ -9,15 +9,15 @@ import pytest
 from made_up_moments import RIG, full_moment, moment
 from measured_walls import exact_wall
 
-from nlos_cam.view import rerun_viewer
+from nlos_cam.view import web
 from nlos_cam.view.drawing import Drawing
-from nlos_cam.view.rerun_viewer import RerunViewer
 from nlos_cam.view.viewer import Moment
+from nlos_cam.view.web import RerunViewer
 
 
 @pytest.fixture
 def viewer(monkeypatch: pytest.MonkeyPatch) -> Iterator[RerunViewer]:
-    monkeypatch.setattr(rerun_viewer, "page_assets", lambda: {"/": ("text/html", b"page")})
+    monkeypatch.setattr(web, "page_assets", lambda: {"/": ("text/html", b"page")})
     with RerunViewer(RIG) as viewer:
         yield viewer
     with pytest.raises(ConnectionRefusedError):
@@ -49,7 +49,7 @@ def test_two_browsers_watch_independently(viewer: RerunViewer) -> None:
 
 
 def test_leaving_ends_the_streams_of_browsers_that_still_watch(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
+    monkeypatch.setattr(web, "page_assets", dict)
     with RerunViewer(RIG) as viewer:
         browser = connected(viewer)
         browser.request("GET", "/live.rrd")
@@ -68,7 +68,7 @@ def test_showing_costs_nothing_when_nobody_watches(viewer: RerunViewer) -> None:
 
 
 def test_a_measured_wall_reaches_each_browser(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
+    monkeypatch.setattr(web, "page_assets", dict)
     with RerunViewer(RIG, exact_wall()) as viewer:
         viewer.show(moment(0))
         for _ in range(2):
@@ -96,7 +96,7 @@ class Starved:
 
 
 def test_nothing_is_drawn_or_kept_for_a_browser_that_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rerun_viewer, "page_assets", dict)
+    monkeypatch.setattr(web, "page_assets", dict)
     drawn = []
     draw = Drawing.draw
 

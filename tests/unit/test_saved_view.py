@@ -9,9 +9,9 @@ from made_up_moments import RIG, full_moment, moment
 from measured_walls import exact_wall
 
 from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.view import saved_view
+from nlos_cam.view import rrd_file
 from nlos_cam.view.drawing import Drawing
-from nlos_cam.view.saved_view import QUEUE_MOMENTS, SavedView
+from nlos_cam.view.rrd_file import QUEUE_MOMENTS, SavedView
 
 Chunks = Callable[[Path], list[Any]]
 
@@ -82,8 +82,8 @@ def test_a_live_run_never_waits_for_the_file(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_file_ends_where_it_is_too_large_to_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(saved_view, "MOST_BYTES", 50_000)
-    monkeypatch.setattr(saved_view, "BATCH_S", 0.001)
+    monkeypatch.setattr(rrd_file, "MOST_BYTES", 50_000)
+    monkeypatch.setattr(rrd_file, "BATCH_S", 0.001)
     with SavedView(tmp_path / "view.rrd", RIG, keeps_all=True) as view:
         for number in range(0, 600, 3):
             view.show(full_moment(number))

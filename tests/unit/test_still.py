@@ -7,8 +7,8 @@ from made_up_moments import NOTHING, RIG, full_moment, moment
 from PIL import Image
 
 from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.view.pictures import BACKGROUND_RGB
-from nlos_cam.view.still import (
+from nlos_cam.view.images import BACKGROUND_RGB
+from nlos_cam.view.video import (
     HEIGHT,
     LARGE,
     LARGE_AT,

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.view.pictures import BACKGROUND_RGB
-from nlos_cam.view.verdict_picture import (
+from nlos_cam.view.images import (
+    BACKGROUND_RGB,
     BANNER_HEIGHT,
     BANNER_WIDTH,
     LOOKS,

@@ -10,7 +10,7 @@ from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.measured_wall import MeasuredWall
 
-from nlos_cam.view.pictures import BACKGROUND_RGB, SATURATED_RGB
+from nlos_cam.view.images import BACKGROUND_RGB, SATURATED_RGB
 from nlos_cam.view.wall_drawing import (
     MOST_POINTS,
     OFF_WALL_M,

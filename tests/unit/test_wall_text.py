@@ -8,7 +8,7 @@ from nlos_calibration.board_wall import BoardRecord
 from nlos_calibration.rig import OccluderRecord
 from nlos_calibration.wall_record import load_wall
 
-from nlos_cam.view.wall_text import ALL_IS_WELL, NOT_WATCHED, calibration_text
+from nlos_cam.view.wall_drawing import ALL_IS_WELL, NOT_WATCHED, calibration_text
 
 RECORD = exact_wall().record.model_copy(update={"reference": "wall.npz", "reference_sha256": "0" * 64})
 BOARD = BoardRecord(
