@@ -6,10 +6,9 @@ from pathlib import Path
 
 from nlos_calibration.wall_record import wall_record
 
+from nlos_cam.calibrate.files import WallFiles, written
+from nlos_cam.calibrate.measure import by_depth, look
 from nlos_cam.camera import open_camera
-from nlos_cam.wall_files import WallFiles, written
-from nlos_cam.wall_look import look
-from nlos_cam.wall_measure import by_depth
 
 
 def main(bag: Path, out: Path) -> None:

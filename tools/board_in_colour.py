@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from board_trials import FLAT, Bench, random_bench, summary, trials
-from board_view import Light, clean_view, corners_px, frames_of
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS
 from nlos_calibration.board_corners import Corners
@@ -20,7 +19,8 @@ from nlos_calibration.board_view import BoardView, CameraErrors, find_in_view, f
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
-from wall_scenes import View
+
+from nlos_cam.calibrate.synthetic import Light, View, clean_view, corners_px, frames_of
 
 OUT = Path(__file__).parents[1] / "docs" / "board_in_colour.json"
 COLOUR = Intrinsics(1280, 720, 907.114, 907.605, 662.66, 367.428)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from board_trials import FLAT, Bench, Trial, by_corners, by_image, random_bench, summary, trials
-from board_view import Light, at_near_edge, in_the_middle
 from matplotlib.figure import Figure
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS, Board
@@ -20,7 +19,8 @@ from nlos_calibration.board_corners import find_corners
 from nlos_calibration.board_plane import BoardFit, PrintErrors, fit_board
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.rig import load_rig
-from wall_scenes import view
+
+from nlos_cam.calibrate.synthetic import Light, at_near_edge, in_the_middle, view
 
 DOCS = Path(__file__).parents[1] / "docs"
 PINHOLE = load_rig("bare-wall").pinhole

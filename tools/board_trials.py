@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from board_view import Light, Placed, at_near_edge, clean_view, corners_px, frames_of
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board import Board
 from nlos_calibration.board_corners import Corners, find_corners
@@ -16,7 +15,8 @@ from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.uncertainty import INTERVAL_STDS, measures_of
 from numpy.typing import NDArray
-from wall_scenes import View, view
+
+from nlos_cam.calibrate.synthetic import Light, Placed, View, at_near_edge, clean_view, corners_px, frames_of, view
 
 Trial = tuple[Float64, Float64]
 """(3,) distance in mm, yaw and pitch in degrees: how far off, and in stated standard uncertainties."""

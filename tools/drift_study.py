@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from drift_streams import PINHOLE, Pose, WallStream, sensed, wall_from_lidar
 from drift_trials import AT_REST, AT_REST_FRAMES, HALF_HIDDEN, KNOCKED, SHIFTS, Knock, Rest, at_rest, knock, poses
 from nlos_calibration.wall import wall_depth
 
+from nlos_cam.calibrate.synthetic import PINHOLE, Pose, WallStream, sensed, wall_from_lidar
 from nlos_cam.cli.common import progress
 
 DOCS = Path(__file__).parents[1] / "docs"

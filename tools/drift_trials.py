@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from drift_streams import Array, Hide, Pose, WallStream, both, detours, sheet
 from nlos_calibration.drift_window import WINDOW_FRAMES, Drift
+
+from nlos_cam.calibrate.synthetic import Array, Hide, Pose, WallStream, both, detours, sheet
 
 DISTANCES_M, FACING_DEG, PITCHED_DEG = (0.15, 0.20, 0.25, 0.30), (15.0, 30.0, 45.0, 60.0, 75.0), 8.0
 SEED = 20_260

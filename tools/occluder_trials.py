@@ -8,10 +8,9 @@ from nlos_calibration.errors import OccluderRefusedError
 from nlos_calibration.occluder import MIN_COLUMNS, OccluderFit, find_occluder
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import LidarPose, Occluder, PinholeRecord, load_rig
-from occluder_scenes import Sheet, bench
-from wall_scenes import View, looked_at, view, with_outliers
 from wall_trials import NO_ECHO
 
+from nlos_cam.calibrate.synthetic import Sheet, View, bench, looked_at, view, with_outliers
 from nlos_cam.render.sensor.model import SensorModel
 from nlos_cam.render.sensor.sensor import Sensor
 

@@ -18,9 +18,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from nlos_calibration.wall import fit_wall
-from wall_scenes import looked_at, view
 from wall_trials import BARE, DISTANCES_M, FACING_DEG, HARD, Outcome, Setting, trial
 
+from nlos_cam.calibrate.synthetic import looked_at, view
 from nlos_cam.cli.common import progress
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -13,8 +13,20 @@ from nlos_calibration.rig import LidarPose, PinholeRecord, load_rig
 from nlos_calibration.uncertainty import INTERVAL_STDS
 from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall import WallFit, fit_wall
-from wall_scenes import View, bent, curved, looked_at, patch, patchy, rippled, stepped, view, window, with_outliers
 
+from nlos_cam.calibrate.synthetic import (
+    View,
+    bent,
+    curved,
+    looked_at,
+    patch,
+    patchy,
+    rippled,
+    stepped,
+    view,
+    window,
+    with_outliers,
+)
 from nlos_cam.render.echoes import MultiBounce
 from nlos_cam.render.sensor.model import SensorModel
 from nlos_cam.render.sensor.sensor import Sensor

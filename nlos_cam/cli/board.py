@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from nlos_calibration.board import BOARDS, PAPER_MM, Paper
 
-from nlos_cam.board_sheet import write_sheet
+from nlos_cam.calibrate.board_pdf import write_sheet
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path
 
 Out = Annotated[Path | None, typer.Option("--out", help="The PDF to write.")]

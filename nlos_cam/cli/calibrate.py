@@ -15,15 +15,14 @@ from nlos_calibration.wall import WallFit
 from nlos_calibration.wall_record import OccluderRecord, WallRecord, wall_record
 from numpy.typing import NDArray
 
+from nlos_cam.calibrate.color_view import look_in_colour
+from nlos_cam.calibrate.files import WallFiles, written
+from nlos_cam.calibrate.measure import Seen, by_board, by_depth, by_occluder, look
 from nlos_cam.camera import open_camera
-from nlos_cam.camera.colour import look_in_colour
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.cli.calibrate_told import told
 from nlos_cam.cli.calibrate_watch import watch_until_enter
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, tracked
-from nlos_cam.wall_files import WallFiles, written
-from nlos_cam.wall_look import Seen, look
-from nlos_cam.wall_measure import by_board, by_depth, by_occluder
 
 Wall = Annotated[bool, typer.Option("--wall", help="Measure the bare wall: no object, no occluder.")]
 CameraUri = Annotated[str | None, typer.Option("--camera", help="l515, l515:SERIAL, sim:bare-wall, ...")]

@@ -5,7 +5,7 @@ from nlos_calibration.uncertainty import INTERVAL_STDS
 from nlos_calibration.wall_record import OccluderRecord, WallRecord
 from rich.markup import escape
 
-from nlos_cam.wall_files import WallFiles
+from nlos_cam.calibrate.files import WallFiles
 
 
 def told(record: WallRecord, files: WallFiles) -> str:

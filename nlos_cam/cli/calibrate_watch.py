@@ -9,10 +9,10 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from nlos_cam.calibrate.measure import Glance, glance
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.cli.common import say, stderr
 from nlos_cam.frames import MOST_SATURATED
-from nlos_cam.watch import Glance, glance
 
 EVERY = 3
 """Of 30 frames a second."""

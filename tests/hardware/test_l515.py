@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nlos_cam.calibrate.color_view import look_in_colour
 from nlos_cam.camera import Camera, Recording, open_camera
-from nlos_cam.camera.colour import look_in_colour
 from nlos_cam.camera.l515 import NEAR_WALL, L515Camera, list_devices
 from nlos_cam.recording.playback import ReplayCamera, verify
 

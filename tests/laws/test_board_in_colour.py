@@ -14,8 +14,8 @@ from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall
 from software_colour import SoftwareColour, record_with_colour
 
+from nlos_cam.calibrate.color_view import look_in_colour
 from nlos_cam.camera import open_camera
-from nlos_cam.camera.colour import look_in_colour
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from drift_streams import PINHOLE, SMALL, Pose, WallStream, both, detours, sensed, sheet, wall_from_lidar
 from nlos_calibration.drift import BLIND_FRAMES, DriftCheck
 from nlos_calibration.drift_window import WINDOW_FRAMES
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall import wall_depth
+
+from nlos_cam.calibrate.synthetic import PINHOLE, SMALL, Pose, WallStream, both, detours, sensed, sheet, wall_from_lidar
 
 POSES = [(0.2, 45.0, 0.0), (0.15, 15.0, 0.0), (0.3, 70.0, -8.0), (0.3, 15.0, 5.0), (0.2, -60.0, 10.0), (0.2, 0.0, 0.0)]
 SHIFTS = [(0.002, 0.0, 0.0), (-0.002, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5)]

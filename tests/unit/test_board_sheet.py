@@ -7,7 +7,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from nlos_calibration.board import BOARDS, PAPER_MM, Board, Paper
 
-from nlos_cam.board_sheet import BAR_MM, bar_mm, black_cells, pattern_origin_mm, sheet_figure, write_sheet
+from nlos_cam.calibrate.board_pdf import BAR_MM, bar_mm, black_cells, pattern_origin_mm, sheet_figure, write_sheet
 
 PAPERS = list(BOARDS)
 DPI = 254

@@ -13,7 +13,7 @@ from nlos_calibration.board_view import BoardView, CameraErrors, undistorted
 from nlos_calibration.projection import Intrinsics
 from software_colour import SoftwareColour, record_with_colour
 
-from nlos_cam.camera.colour import GREY, SETTLES, look_in_colour
+from nlos_cam.calibrate.color_view import GREY, SETTLES, look_in_colour
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.errors import (

@@ -8,7 +8,7 @@ from fake_lidar import COLOUR_FROM_DEPTH, LENS
 from nlos_calibration.projection import Intrinsics
 from software_colour import SoftwareColour
 
-from nlos_cam.camera.colour import look_in_colour
+from nlos_cam.calibrate.color_view import look_in_colour
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
 

@@ -8,9 +8,9 @@ from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import wall_depth
 from rich.console import Console
 
+from nlos_cam.calibrate.measure import Glance, glance
 from nlos_cam.cli.calibrate_watch import EVERY, gauge, panel, until_enter, watch
 from nlos_cam.frames import Frame
-from nlos_cam.watch import Glance, glance
 
 INTRINSICS = load_rig("bare-wall").pinhole.scaled(160, 120)
 DEPTH_M = wall_depth(load_rig("bare-wall").wall_from_lidar, INTRINSICS)

@@ -2,10 +2,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drift_streams import SMALL, Pose, measured, wall_from_lidar
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.drift import MIN_PIXELS, TOLERANCE_C, DriftCheck, settings_changed
 from nlos_calibration.errors import CalibrationError
+
+from nlos_cam.calibrate.synthetic import SMALL, Pose, measured, wall_from_lidar
 
 TINY = SMALL.scaled(32, 24)
 POSE: Pose = (0.2, 45.0, 0.0)

@@ -2,9 +2,20 @@
 
 import numpy as np
 import pytest
-from drift_streams import REFERENCE_FRAMES, SMALL, Pose, WallStream, detours, measured, sensed, sheet, wall_from_lidar
 from nlos_calibration.bare_wall import BareWallStatistics
 from nlos_calibration.wall import wall_depth
+
+from nlos_cam.calibrate.synthetic import (
+    REFERENCE_FRAMES,
+    SMALL,
+    Pose,
+    WallStream,
+    detours,
+    measured,
+    sensed,
+    sheet,
+    wall_from_lidar,
+)
 
 TINY = SMALL.scaled(80, 60)
 POSE: Pose = (0.2, 30.0, 0.0)

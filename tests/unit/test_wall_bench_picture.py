@@ -7,7 +7,7 @@ from nlos_calibration.footprint import footprint, on_plane
 from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.wall_record import OccluderRecord, WallRecord
 
-from nlos_cam.wall_bench_picture import X, Y, Z, _corner_rays, _facing, _reached, bench_picture, drawn_limits
+from nlos_cam.calibrate.report_drawings import X, Y, Z, _corner_rays, _facing, _reached, bench_picture, drawn_limits
 
 Measured = Callable[..., MeasuredWall]
 ENTERED = OccluderRecord(source="entered", x_m=0.2, gap_m=0.1)

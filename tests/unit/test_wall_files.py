@@ -8,9 +8,9 @@ from nlos_calibration.measured_wall import load_measured
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.wall_record import load_wall
 
+from nlos_cam.calibrate.files import WallFiles, written
+from nlos_cam.calibrate.report import report
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.wall_files import WallFiles, written
-from nlos_cam.wall_report import report
 
 RECORD = Path(__file__).parent / "wall_v2.toml"
 
@@ -45,7 +45,7 @@ def test_what_ends_the_writing_leaves_the_earlier_files(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nlos_cam.wall_files.report", interrupted)
+    monkeypatch.setattr("nlos_cam.calibrate.files.report", interrupted)
     with pytest.raises(KeyboardInterrupt):
         written(files, load_wall(RECORD), replace(wall, depth_m=wall.depth_m + np.float32(0.1)))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -6,7 +6,7 @@ from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Extent, Rig
 from nlos_calibration.wall_record import WallRecord
 
-from nlos_cam.wall_footprint_picture import _holds, footprint_picture
+from nlos_cam.calibrate.report_drawings import _holds, footprint_picture
 
 Measured = Callable[..., MeasuredWall]
 

@@ -6,8 +6,8 @@ import pytest
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.projection import Intrinsics
 
+from nlos_cam.calibrate.measure import CELSIUS_EVERY, look
 from nlos_cam.frames import Frame, maps_from_frame
-from nlos_cam.wall_look import CELSIUS_EVERY, look
 
 INTRINSICS = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 SHAPE = (64, 80)

@@ -12,9 +12,8 @@ from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import wall_record
 
+from nlos_cam.calibrate.measure import Seen, by_board, by_depth, by_occluder
 from nlos_cam.render.geometry import cast
-from nlos_cam.wall_look import Seen
-from nlos_cam.wall_measure import by_board, by_depth, by_occluder
 
 RIG = load_rig("bare-wall")
 INTRINSICS = RIG.pinhole.scaled(160, 120)

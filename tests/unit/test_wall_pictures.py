@@ -7,7 +7,7 @@ import pytest
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.measured_wall import MeasuredWall
 
-from nlos_cam.wall_pictures import Picture, figure_of, png, wall_maps
+from nlos_cam.calibrate.report_maps import Picture, figure_of, png, wall_maps
 
 Measured = Callable[..., MeasuredWall]
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from nlos_calibration.measured_wall import MeasuredWall
 
-from nlos_cam.wall_report import report
+from nlos_cam.calibrate.report import report
 
 Measured = Callable[..., MeasuredWall]
 VOID = {"meta", "img", "rect", "path"}

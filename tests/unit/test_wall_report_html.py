@@ -3,8 +3,8 @@ from html import unescape
 
 import pytest
 
-from nlos_cam.wall_pictures import Picture
-from nlos_cam.wall_report_html import bullets, page, pairs, pictured, range_bar, table
+from nlos_cam.calibrate.report import bullets, page, pairs, pictured, range_bar, table
+from nlos_cam.calibrate.report_maps import Picture
 
 HOSTILE = "<script>alert(\"1\")</script> & 'x'"
 

@@ -8,7 +8,7 @@ from nlos_calibration.board_wall import BoardRecord
 from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.wall_record import OccluderRecord
 
-from nlos_cam import wall_report_text as text
+from nlos_cam.calibrate import report as text
 
 Measured = Callable[..., MeasuredWall]
 BOARD = BoardRecord(

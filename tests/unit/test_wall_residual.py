@@ -7,7 +7,7 @@ from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.range_noise import depth_noise_m
 from nlos_calibration.wall import wall_depth
 
-from nlos_cam.wall_residual import block_side, expected_std_m, in_blocks, most_of_block, residual_m
+from nlos_cam.calibrate.report_maps import block_side, expected_std_m, in_blocks, most_of_block, residual_m
 
 Measured = Callable[..., MeasuredWall]
 FLOAT32_M = 1e-6

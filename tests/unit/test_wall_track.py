@@ -2,11 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drift_streams import SMALL, Pose, measured, wall_from_lidar
 from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.uncertainty import measures_of
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_track import GRID, WallTrack, noise_scale, watched_pixels
+
+from nlos_cam.calibrate.synthetic import SMALL, Pose, measured, wall_from_lidar
 
 POSE: Pose = (0.2, 45.0, -5.0)
 

@@ -3,8 +3,8 @@ import pytest
 from nlos_calibration.rig import LidarPose, Rig, load_rig
 from nlos_calibration.wall import wall_depth
 
+from nlos_cam.calibrate.measure import glance, thinned
 from nlos_cam.frames import Frame
-from nlos_cam.watch import glance, thinned
 
 
 def frame_of(rig: Rig, width: int = 640, height: int = 480) -> Frame:

@@ -1,4 +1,7 @@
-"""The report's drawing of the bench, to scale, from above and from the side."""
+"""The report's drawing of the bench, to scale, from above and from the side.
+
+The report's drawing of the wall from the front: the cells that the lidar sees, the relay, what is hidden.
+"""
 
 from dataclasses import dataclass
 from math import atan2, cos, degrees, hypot, radians, sin
@@ -7,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 from nlos_calibration.arrays import Float64
-from nlos_calibration.rig import ObjectBox, Rig
+from nlos_calibration.footprint import MAP_SHAPE, footprint, on_plane
+from nlos_calibration.rig import Extent, ObjectBox, Rig
 from nlos_calibration.wall_record import WallRecord
 
-from nlos_cam.wall_pictures import Picture, figure_of, png
+from nlos_cam.calibrate.report_maps import Picture, figure_of, png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +26,7 @@ WALL, LIDAR, EDGE, VIEW, OCCLUDER, OBJECT = "0.35", "#08306b", "#4292c6", "#9eca
 FAR_M, MARGIN_M = 2.5, 0.12
 FARTHEST_DRAWN_M, HIGHEST_DRAWN_M = 0.9, 0.35
 """From the foot: an optical axis that meets the wall beyond leaves the picture."""
-WIDTH_IN = 11.0
+BENCH_WIDTH_IN = 11.0
 X, Y, Z = 0, 1, 2
 NAMES = {X: "x along the wall (m)", Y: "y up (m)", Z: "z from the wall (m)"}
 
@@ -44,7 +48,7 @@ def bench_picture(record: WallRecord) -> Picture:
     """The bench from above and from the side, both to one scale."""
     limits = drawn_limits(record.rig)
     wide, tall, deep = (high - low for low, high in limits)
-    figure = figure_of(WIDTH_IN, 0.86 * WIDTH_IN * max(tall, deep) / (wide + deep) + 0.9)
+    figure = figure_of(BENCH_WIDTH_IN, 0.86 * BENCH_WIDTH_IN * max(tall, deep) / (wide + deep) + 0.9)
     above, beside = figure.subplots(1, 2, width_ratios=(wide, deep))
     for axis, side in ((above, ABOVE), (beside, BESIDE)):
         _draw(axis, side, record, limits)
@@ -213,3 +217,79 @@ def _facing(record: WallRecord) -> str:
     """The facing angle; and the yaw, which is what is seen from above, where it is another."""
     same = abs(record.facing_deg - abs(record.yaw_deg)) <= 0.3
     return f"{record.facing_deg:.1f}°" + ("" if same else f"\n(yaw {record.yaw_deg:+z.1f}°)")
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+RELAY, SEEN, SEEN_EDGE = "#1b9e77", "#c6dbef", "#6baed6"
+CELLS_PER_LINE = 8
+FOOTPRINT_WIDTH_IN = 8.6
+FARTHEST_M = 100.0
+
+
+def footprint_picture(record: WallRecord) -> Picture:
+    """The wall from the front: what the lidar sees of it, what the object is seen by, what is hidden."""
+    rig = record.rig
+    x, y, _ = drawn_limits(rig)
+    figure = figure_of(FOOTPRINT_WIDTH_IN, min(FOOTPRINT_WIDTH_IN * (y[1] - y[0]) / (x[1] - x[0]) + 1.0, 9.0))
+    axis = figure.add_subplot()
+    axis.set(xlim=x, ylim=y, aspect="equal", xlabel=NAMES[X], ylabel=NAMES[Y], facecolor="0.93")
+    _cells(axis, rig)
+    shown = Extent(x_min_m=x[0], x_max_m=x[1], y_min_m=y[0], y_max_m=y[1])
+    if not _holds(rig.wall, shown):
+        _rectangle(axis, rig.wall, WALL, "-", "edge of the wall")
+    _rectangle(axis, rig.relay, RELAY, "-", "relay: the part of the wall that the object is seen by")
+    if rig.object_box is not None:
+        _rectangle(axis, rig.object_box, OBJECT, "--", "hidden object's box, behind the occluder")
+    if rig.occluder is not None:
+        style = "-" if record.occluder is not None else "--"
+        axis.axvline(rig.occluder.x_m, color=OCCLUDER, linewidth=1.5, linestyle=style, label="occluder's edge")
+    marked: dict[str, Any] = {"color": LIDAR, "linestyle": "none"}
+    axis.plot(0.0, 0.0, marker="+", markersize=14, label="foot of the perpendicular from the lidar", **marked)
+    meets = on_plane(rig.wall_from_lidar, np.array([0.0, 0.0, 1.0]))
+    axis.plot(*meets, marker="x", markersize=10, label="where the optical axis meets the wall", **marked)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    share = footprint(rig.wall_from_lidar, rig.pinhole, rig.wall).share
+    caption = (
+        f"The wall from the front. Blue is what the lidar sees, with a line for every {CELLS_PER_LINE}th of the map's "
+        f"64 x 80 cells; {100.0 * share:.0f} % of the cells meet the wall. Light comes back only from where blue and "
+        "relay (green) overlap: the more, the better."
+    )
+    return Picture("What the lidar sees of the wall", caption, png(figure))
+
+
+def _holds(outer: Extent, inner: Extent) -> bool:
+    across = outer.x_min_m <= inner.x_min_m and inner.x_max_m <= outer.x_max_m
+    return across and outer.y_min_m <= inner.y_min_m and inner.y_max_m <= outer.y_max_m
+
+
+def _cells(axis: "Axes", rig: Rig) -> None:
+    """The edges of every eighth cell, where they meet the wall's plane."""
+    from matplotlib.collections import PolyCollection
+
+    rows, columns = MAP_SHAPE
+    cells = rig.pinhole.scaled(columns, rows)
+    x = (np.arange(0, columns + 1, CELLS_PER_LINE) - 0.5 - cells.ppx) / cells.fx
+    y = (np.arange(0, rows + 1, CELLS_PER_LINE) - 0.5 - cells.ppy) / cells.fy
+    rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], axis=-1, dtype=np.float64)
+    at_m = on_plane(rig.wall_from_lidar, rays)
+    quads = np.stack([at_m[:-1, :-1], at_m[:-1, 1:], at_m[1:, 1:], at_m[1:, :-1]], axis=2).reshape(-1, 4, 2)
+    seen = quads[np.abs(quads).max(axis=(1, 2)) < FARTHEST_M]  # False for NaN
+    axis.add_collection(PolyCollection(list(seen), facecolor=SEEN, edgecolor=SEEN_EDGE, linewidth=0.6, alpha=0.8))
+
+
+def _rectangle(axis: "Axes", extent: Extent, colour: str, line: str, label: str) -> None:
+    from matplotlib.colors import to_rgba
+    from matplotlib.patches import Rectangle
+
+    size = extent.x_max_m - extent.x_min_m, extent.y_max_m - extent.y_min_m
+    fill = to_rgba(colour, 0.15 if line == "--" else 0.0)
+    style: dict[str, Any] = {
+        "edgecolor": colour,
+        "facecolor": fill,
+        "linestyle": line,
+        "linewidth": 1.8,
+        "label": label,
+    }
+    axis.add_patch(Rectangle((extent.x_min_m, extent.y_min_m), *size, **style))

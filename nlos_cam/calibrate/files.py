@@ -9,9 +9,9 @@ from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import dump_toml
 from nlos_calibration.wall_record import WallRecord
 
+from nlos_cam.calibrate.report import report
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.folders import file_when_whole
-from nlos_cam.wall_report import report
 
 
 @dataclass(frozen=True)

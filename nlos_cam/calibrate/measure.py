@@ -1,9 +1,18 @@
-"""From what was seen of a bare wall to its fit, by depth, tape and printed board, and what the record says of it."""
+"""What a camera saw of a bench that stood still: the statistics of its frames, and what it was seen with.
 
-from dataclasses import replace
+From what was seen of a bare wall to its fit, by depth, tape and printed board, and what the record says of it.
+
+A glance at the wall in a single frame, for somebody who is positioning the lidar: where it is, what to move.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from itertools import islice
 from math import hypot
 
 import numpy as np
+from nlos_calibration.arrays import Float32
+from nlos_calibration.bare_wall import BareWall, BareWallStatistics
 from nlos_calibration.board import Board
 from nlos_calibration.board_view import BoardView
 from nlos_calibration.board_wall import WallByBoard, wall_with_board
@@ -11,14 +20,58 @@ from nlos_calibration.drift import settings_changed
 from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.measured_wall import MeasuredWall, depth_lacks_m, points_m, wall_from_zero
 from nlos_calibration.occluder import OccluderFit, find_occluder
+from nlos_calibration.projection import Intrinsics
 from nlos_calibration.range_offset import tape_the_wall
 from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall import WallFit, fit_wall
 from nlos_calibration.wall_record import WallRecord, with_occluder
 from numpy.typing import NDArray
 
+from nlos_cam.camera.protocol import Camera
+from nlos_cam.frames import Frame, maps_from_frame, saturated_share
 from nlos_cam.reconstruct.bench import check_intrinsics
-from nlos_cam.wall_look import Seen
+
+CELSIUS_EVERY = 30
+"""Frames between two looks at the thermometers: each costs a device a command."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was looked at, and by what."""
+
+    camera: str
+    """The URI."""
+    statistics: BareWallStatistics
+    intrinsics: Intrinsics
+    serial: str
+    firmware: str
+    settings: Mapping[str, float]
+
+    def reference(self, inliers: NDArray[np.bool_]) -> BareWall:
+        """The bench as difference maps are formed from it; `inliers` (height, width) are the pixels of the plane."""
+        return self.statistics.reference(inliers, serial=self.serial, settings=self.settings)
+
+    def facts(self) -> dict[str, object]:
+        """What a record says of the device."""
+        told = {"serial": self.serial, "firmware": self.firmware}
+        return {**told, "settings": dict(self.settings), "temperatures_c": self.statistics.celsius()}
+
+
+def look(camera: Camera, frames: int, on_frame: Callable[[], None] = lambda: None) -> Seen:
+    """The statistics over at most `frames` frames of an entered camera. Raises WallRefusedError where none comes."""
+    statistics, settings = BareWallStatistics(camera.intrinsics), dict[str, float]()
+    for number, frame in enumerate(islice(camera, frames)):
+        maps = maps_from_frame(frame)
+        statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
+        settings = dict(frame.settings)
+        if number % CELSIUS_EVERY == 0:
+            statistics.look_at(camera.telemetry("_temperature"))
+        on_frame()
+    if statistics.depth.frames == 0:
+        raise WallRefusedError(f"{camera.uri} gave no frames: record the wall again, or look at it live")
+    serial, firmware = (camera.identity.get(name, "") for name in ("serial", "firmware"))
+    return Seen(camera.uri, statistics, camera.intrinsics, serial, firmware, settings)
+
 
 NEAR_WALL_M = 0.02
 """Off the plane; what is farther away when the occluder stands is the occluder, or between both."""
@@ -111,3 +164,38 @@ def _check_stands(record: WallRecord, wall: WallFit) -> None:
             f"{'farther' if apart_m > 0 else 'nearer'}, the lidar turned by {yaw_deg:+z.2f} degrees in yaw and "
             f"{pitch_deg:+z.2f} in pitch: calibrate the bare wall again, then put the occluder back"
         )
+
+
+GLANCE_COLUMNS = 160
+"""A frame is thinned to about so many: a plane is still sure to a tenth of a millimetre."""
+
+
+@dataclass(frozen=True)
+class Glance:
+    """What one frame says of the wall."""
+
+    fit: WallFit | None
+    refused: str
+    """Why there is no fit; empty where there is one."""
+    saturated: float
+    """Share of the pixels whose IR is at its full scale."""
+
+
+def glance(frame: Frame) -> Glance:
+    """Fit the wall in one frame, thinned. The same frame gives the same glance."""
+    depth_m, intrinsics = thinned(frame.depth_m, frame.intrinsics)
+    saturated = saturated_share(frame.ir)
+    try:
+        fit = fit_wall(depth_m, intrinsics, np.random.default_rng(0))
+    except WallRefusedError as error:
+        return Glance(None, str(error), saturated)
+    return Glance(fit, "", saturated)
+
+
+def thinned(depth_m: Float32, intrinsics: Intrinsics) -> tuple[Float32, Intrinsics]:
+    """Every n-th pixel of every n-th row, and the intrinsics that these have."""
+    step = max(1, round(intrinsics.width / GLANCE_COLUMNS))
+    first = step // 2
+    few = depth_m[first::step, first::step]
+    centre = (intrinsics.ppx - first) / step, (intrinsics.ppy - first) / step
+    return few, Intrinsics(few.shape[1], few.shape[0], intrinsics.fx / step, intrinsics.fy / step, *centre)
