@@ -5,7 +5,7 @@ import sys
 import numpy as np
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset_samples import sense_object
+from nlos_cam.dataset.samples import sense_object
 from nlos_cam.objects.depth_map import object_box, orthographic_depth
 from nlos_cam.objects.placement import Pose, category_triangles, place
 from nlos_cam.reconstruct.network import reconstruct

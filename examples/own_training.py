@@ -7,7 +7,7 @@ import torch
 from nlos_models.preprocess import Preprocess, split_and_stack
 from torch import nn
 
-from nlos_cam.dataset import open_dataset
+from nlos_cam.dataset.build import open_dataset
 
 BATCH = 8
 

@@ -13,7 +13,7 @@ from nlos_models.data import MapSet
 from nlos_models.preprocess import SMALLEST_SPREAD, channel_statistics, split_and_stack
 from torch import Tensor
 
-from nlos_cam import dataset
+from nlos_cam.dataset import build
 
 NEIGHBOURS = 2000
 """Training objects that the nearest one is searched among, unless a training set is given."""
@@ -94,19 +94,19 @@ def _statistics(training: TrainingMaps) -> tuple[Tensor, Tensor]:
     return channel_statistics(torch.cat(parts))
 
 
-def training_maps(plan: dataset.DatasetPlan, cache: Path, workers: int, on_progress: OnProgress) -> dataset.Dataset:
+def training_maps(plan: build.DatasetPlan, cache: Path, workers: int, on_progress: OnProgress) -> build.Dataset:
     """The first NEIGHBOURS training objects as this plan's rig and sensor see them, built once into a cache folder.
 
     A build that was cut short goes on where it was. The folder is named by a checksum of rig, sensor and objects.
     """
-    plan = replace(plan, first_seed=dataset.TRAINING_SEED, objects=dataset.Objects())
+    plan = replace(plan, first_seed=build.TRAINING_SEED, objects=build.Objects())
     folder = cache / "neighbours" / f"{_checksum(plan)}-{NEIGHBOURS}"
-    dataset.build(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
-    return dataset.open_dataset(folder)
+    build.build(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
+    return build.open_dataset(folder)
 
 
-def _checksum(plan: dataset.DatasetPlan) -> str:
+def _checksum(plan: build.DatasetPlan) -> str:
     """Of the plan, and of what its objects look like: another shape of cup is another training set."""
     digest = hashlib.sha256(plan.provenance.encode())
-    digest.update(dataset.procedural_images(plan.first_seed, TOLD_BY, plan.box).tobytes())
+    digest.update(build.procedural_images(plan.first_seed, TOLD_BY, plan.box).tobytes())
     return digest.hexdigest()[:16]

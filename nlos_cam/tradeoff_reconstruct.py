@@ -14,8 +14,8 @@ from nlos_models.checkpoint import load_pipeline
 from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, exported
 from nlos_models.quantise import Sample, quantise
 
-from nlos_cam import dataset
 from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.dataset import build
 from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, Figures, judge
 from nlos_cam.evaluate_objects import Subject, as_map_set, echoes_of, seeded_objects, sense, truth_of
 from nlos_cam.frames import LidarMaps
@@ -120,7 +120,7 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
 
 def calibration(rig: Rig, box: ObjectBox) -> Iterator[Sample]:
     """Maps of training objects, one at a time."""
-    subjects = seeded_objects(dataset.TRAINING_SEED, CALIBRATING, box)
+    subjects = seeded_objects(build.TRAINING_SEED, CALIBRATING, box)
     for maps in sense(echoes_of(subjects, rig, _untold), rig):
         yield maps.depth_m[None], maps.intensity[None]
 

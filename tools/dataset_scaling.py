@@ -15,7 +15,8 @@ from pathlib import Path
 
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset import PIECE, DatasetPlan, build
+from nlos_cam.dataset import build
+from nlos_cam.dataset.build import PIECE, DatasetPlan
 from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -25,17 +25,17 @@ from nlos_models.doubt_inference import Doubter, load_doubter
 from nlos_models.inference import Reconstructor, load_reconstructor
 from numpy.typing import NDArray
 
-from nlos_cam import dataset
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
 from nlos_cam.cli.evaluate_maps import rig_of
-from nlos_cam.doubt_samples import EMPTY, ORDINARY, samples_on_disk
+from nlos_cam.dataset import build
+from nlos_cam.dataset.doubt_samples import EMPTY, ORDINARY, samples_on_disk
+from nlos_cam.dataset.outliers import IN_SHAPE, TO_JUDGE, TO_LEARN
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate_objects import echoes_of, sense, truth_of
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import depth_from_image, object_box
-from nlos_cam.outliers import IN_SHAPE, TO_JUDGE, TO_LEARN
 from nlos_cam.reconstruct.network import Reconstruction, reconstruct
 from nlos_cam.reconstruct.pipeline import limits_of
 from nlos_cam.reconstruct.verdict import Judge, Signs, Verdict
@@ -168,7 +168,7 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
         maps = sense(echoes_of(subjects, rig, on_progress), rig)
     told = [pipeline.tell(one.depth_m, one.intensity) for one in maps]
     result: dict[str, Any] = {"test_objects": of_objects(told, truth_of(subjects, object_box(rig)), rig)}
-    usual = dataset.open_dataset(held_out).arrays()
+    usual = build.open_dataset(held_out).arrays()
     told = [pipeline.tell(*pair) for pair in zip(usual.depth_m[start:], usual.intensity[start:], strict=True)]
     result["held_out_objects"] = of_objects(told, usual.image[start:], rig)
     for kind in (EMPTY, ORDINARY, *TO_LEARN, *TO_JUDGE):
@@ -177,7 +177,7 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
             made = samples_on_disk(
                 samples,
                 wanted,
-                dataset.TEST_SEED,
+                build.TEST_SEED,
                 rig,
                 sensor,
                 accuracy="draft" if kind in FEWER else "standard",

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nlos_cam.dataset_reader import open_dataset
-from nlos_cam.dataset_shards import FIRST_ARRAYS, PARTS, SHARDS
+from nlos_cam.dataset.reader import open_dataset
+from nlos_cam.dataset.shards import FIRST_ARRAYS, PARTS, SHARDS
 from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"

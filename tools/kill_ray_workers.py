@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from nlos_calibration.rig import load_rig
 
-from nlos_cam import dataset
-from nlos_cam.dataset import DatasetPlan, build, open_dataset
-from nlos_cam.dataset_ray import RayFarm
-from nlos_cam.dataset_samples import Samples, make_samples
+from nlos_cam.dataset import build
+from nlos_cam.dataset import build as dataset
+from nlos_cam.dataset.build import DatasetPlan, open_dataset
+from nlos_cam.dataset.ray_backend import RayFarm
+from nlos_cam.dataset.samples import Samples, make_samples
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")
 LONGEST_S = 20.0

@@ -21,7 +21,7 @@ from nlos_models.silhouette import cut_silhouette, lift_edges
 
 from nlos_cam.cli.common import say, tracked
 from nlos_cam.cli.evaluate_maps import as_eaten, bare_wall_for, rig_of
-from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan
+from nlos_cam.dataset.build import TEST_SEED, TRAINING_SEED, DatasetPlan
 from nlos_cam.evaluate import BARS, Figures, judge
 from nlos_cam.evaluate_objects import QUIET, Subject, as_map_set, echoes_of, seeded_objects, sense, truth_of
 from nlos_cam.evaluate_report import in_words

@@ -21,7 +21,7 @@ from nlos_models.inference import Reconstructor, load_reconstructor
 
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import say, tracked
-from nlos_cam.dataset import TEST_SEED
+from nlos_cam.dataset.build import TEST_SEED
 from nlos_cam.evaluate_objects import seeded_objects, sense
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
@@ -103,7 +103,7 @@ def populations(
 
 def outliers(each: int) -> dict[str, list[Any]]:
     """Sights of every kind of outlier, always the same ones."""
-    from nlos_cam.outliers import TO_JUDGE, TO_LEARN, Sight, outlier
+    from nlos_cam.dataset.outliers import TO_JUDGE, TO_LEARN, Sight, outlier
     from nlos_cam.render.sensor.model import SensorModel
 
     plain = Sight(RIG, SensorModel())

@@ -23,9 +23,8 @@ from transfer_figures import DOCS, judge, paper_box
 
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.main import main as nlos_cam
+from nlos_cam.dataset.labelled import read_labelled, recordings_in, write_shards
 from nlos_cam.errors import NlosCamError
-from nlos_cam.labelled import read_labelled, recordings_in
-from nlos_cam.labelled_shards import write_shards
 
 COUNTS = 2, 5, 10, 20, 30
 FINISHED = "figures.json"

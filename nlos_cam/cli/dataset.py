@@ -10,10 +10,10 @@ from nlos_models.recipe import SIMULATION_ONLY
 from rich.progress import ProgressColumn, Task
 from rich.text import Text
 
-from nlos_cam import dataset
 from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say, tracked
 from nlos_cam.cli.dataset_command import command_of
 from nlos_cam.cli.dataset_label import add_label
+from nlos_cam.dataset import build as dataset
 from nlos_cam.objects.textures import TEXTURES
 from nlos_cam.render.accuracy import accuracy_named
 from nlos_cam.render.scene_file import load_scene
@@ -131,7 +131,7 @@ def _watched(
 ) -> dataset.Built:
     farm = None
     if ray:
-        from nlos_cam.dataset_ray import cluster
+        from nlos_cam.dataset.ray_backend import cluster
 
         farm = cluster(ray)
     with progress(Rate()) as bar:

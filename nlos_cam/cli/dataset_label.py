@@ -7,8 +7,7 @@ import typer
 
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, tracked
 from nlos_cam.cli.dataset_command import command_of
-from nlos_cam.labelled import FRAMES_EACH, read_labelled, recordings_in
-from nlos_cam.labelled_shards import write_shards
+from nlos_cam.dataset.labelled import FRAMES_EACH, read_labelled, recordings_in, write_shards
 
 Recordings = Annotated[Path, typer.Argument(metavar="DIR", help="A folder of recordings, each with its label.")]
 Wall = Annotated[

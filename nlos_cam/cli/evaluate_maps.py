@@ -12,12 +12,12 @@ from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.data import MapSet
 from nlos_models.sources import less_bare_wall
 
-from nlos_cam import dataset
 from nlos_cam import evaluate_baselines as trivial
 from nlos_cam import evaluate_objects as objects
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
-from nlos_cam.cli.train_data import BareMaps, measured_bare_wall, render_bare_wall
+from nlos_cam.dataset import build
+from nlos_cam.dataset.training_maps import BareMaps, measured_bare_wall, render_bare_wall
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.benchmark import test_set
 
@@ -32,7 +32,7 @@ class Judged:
     categories: list[str]
     maps: MapSet
     """Raw ones, whatever the weights eat: the baselines look at these."""
-    plan: dataset.DatasetPlan
+    plan: build.DatasetPlan
 
 
 def rig_of(record: CheckpointRecord) -> Rig:
@@ -47,7 +47,7 @@ def rig_of(record: CheckpointRecord) -> Rig:
 
 def fresh_objects(rig: Rig, count: int | None = None) -> Judged:
     """The 54, or so many random objects, through the noise of the simulated camera on a rig."""
-    plan = dataset.DatasetPlan(rig, dataset.TEST_SEED)
+    plan = build.DatasetPlan(rig, build.TEST_SEED)
     subjects = objects.seeded_objects(plan.first_seed, count, plan.box) if count else test_set(plan.box)
     with tracked("rendering test objects") as on_progress:
         echoes = objects.echoes_of(subjects, rig, on_progress)
@@ -59,13 +59,13 @@ def fresh_objects(rig: Rig, count: int | None = None) -> Judged:
 
 def stored_objects(folder: Path) -> Judged:
     """Those of a dataset."""
-    opened = dataset.open_dataset(folder)
+    opened = build.open_dataset(folder)
     categories = [str(category) for category in opened.column("category")]
     names = [f"{category} {seed}" for category, seed in zip(categories, opened.column("seed"), strict=True)]
     return Judged(f"Maps of {folder}", names, categories, opened.arrays(), opened.plan)
 
 
-def bare_wall_for(record: CheckpointRecord, plan: dataset.DatasetPlan, wall: Path | None = None) -> BareMaps | None:
+def bare_wall_for(record: CheckpointRecord, plan: build.DatasetPlan, wall: Path | None = None) -> BareMaps | None:
     """The bare wall that weights want their maps less of, as `train` took it; None where they eat raw maps.
 
     Raises SceneError for a measured wall that would be of no use.
@@ -82,15 +82,13 @@ def as_eaten(maps: MapSet, bare: BareMaps | None) -> MapSet:
     return less_bare_wall(maps, *bare) if bare else maps
 
 
-def guesses(
-    judged: Judged, training: Path | None, *, nearest: bool
-) -> tuple[dict[str, Float32], dataset.Dataset | None]:
+def guesses(judged: Judged, training: Path | None, *, nearest: bool) -> tuple[dict[str, Float32], build.Dataset | None]:
     """The baselines' images, and the training objects that the nearest was looked for among, if it is wanted."""
     if not nearest:
-        images = dataset.procedural_images(dataset.TRAINING_SEED, trivial.NEIGHBOURS, judged.plan.box)
+        images = build.procedural_images(build.TRAINING_SEED, trivial.NEIGHBOURS, judged.plan.box)
         return trivial.without_maps(len(judged.names), trivial.mean_image(images)), None
     if training:
-        opened = dataset.open_dataset(training)
+        opened = build.open_dataset(training)
     else:
         with tracked("rendering training objects for the nearest neighbour, once") as on_progress:
             opened = trivial.training_maps(judged.plan, cache_folder(), os.cpu_count() or 1, on_progress)
@@ -98,7 +96,7 @@ def guesses(
         return trivial.with_nearest(judged.maps, opened, on_progress), opened
 
 
-def notes_on(record: CheckpointRecord, judged: Judged, training: dataset.Dataset | None) -> list[str]:
+def notes_on(record: CheckpointRecord, judged: Judged, training: build.Dataset | None) -> list[str]:
     """What a reader has to know to read the figures."""
     rig, told = judged.plan.rig, list[str]()
     if record.rig_checksum != rig.checksum:

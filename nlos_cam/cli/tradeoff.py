@@ -16,7 +16,7 @@ from nlos_cam import tradeoff_reconstruct_report as reconstruction_report
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import INTERRUPTED, Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
 from nlos_cam.cli.hidden_object import hidden_depth
-from nlos_cam.dataset import TEST_SEED
+from nlos_cam.dataset.build import TEST_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate_objects import seeded_objects
 from nlos_cam.folders import renamed_when_whole

@@ -10,13 +10,13 @@ from nlos_models.processes import launched
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
 from nlos_models.run_files import digest_of
 
-from nlos_cam import dataset
 from nlos_cam.cli.common import PAPER_RIG, finish, say
-from nlos_cam.cli.train_data import read_maps
 from nlos_cam.cli.train_doubt import doubt
 from nlos_cam.cli.train_options import Budget, HeldOut, Maps, RunOptions, refuse_ignored, with_run_options
 from nlos_cam.cli.train_runs import job_of, run_compressor, run_transfer, run_vae
 from nlos_cam.cli.train_start import compressor_start, transfer_start, vae_start
+from nlos_cam.dataset import build
+from nlos_cam.dataset.training_maps import read_maps
 from nlos_cam.objects.textures import TEXTURES
 
 Wall = Annotated[
@@ -50,13 +50,13 @@ def vae(
     fabric = run.fabric(recipe)
     start, runs = vae_start(recipe, weights) if recipe.start == "weights" else (None, [])
     job = job_of(run, recipe, rig, runs, digest_of(start, rig.checksum), weights)
-    box = dataset.DatasetPlan(rig, 0).box
+    box = build.DatasetPlan(rig, 0).box
     say(f"making {recipe.objects + recipe.held_out} objects")
-    kinds, besides = dataset.Objects.without(recipe.left_out).categories, recipe.backgrounds
+    kinds, besides = build.Objects.without(recipe.left_out).categories, recipe.backgrounds
     textures = tuple(TEXTURES) if recipe.colour else ()
     images, held_out = (
-        dataset.procedural_images(seed, count, box, kinds, backgrounds=besides, textures=textures)
-        for seed, count in ((dataset.TRAINING_SEED, recipe.objects), (dataset.HELD_OUT_SEED, recipe.held_out))
+        build.procedural_images(seed, count, box, kinds, backgrounds=besides, textures=textures)
+        for seed, count in ((build.TRAINING_SEED, recipe.objects), (build.HELD_OUT_SEED, recipe.held_out))
     )
     _tell(run, recipe, launched(fabric, run_vae, job, start, images, held_out))
 

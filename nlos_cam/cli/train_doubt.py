@@ -14,20 +14,14 @@ from nlos_models.inference import load_reconstructor
 from nlos_models.processes import launched
 from nlos_models.sources import first_of
 
-from nlos_cam import dataset
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import finish
 from nlos_cam.cli.train_options import HeldOut, Maps, RunOptions
 from nlos_cam.cli.train_runs import Figures, Job, watched_run
-from nlos_cam.doubt_samples import (
-    HELD_OUT_SHARE,
-    _check,
-    _made,
-    _whole_set,
-    counts_of,
-)
+from nlos_cam.dataset import build
+from nlos_cam.dataset.doubt_samples import HELD_OUT_SHARE, _check, _made, _whole_set, counts_of
+from nlos_cam.dataset.outliers import TO_LEARN
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.outliers import TO_LEARN
 
 SAMPLES = "samples"
 
@@ -44,7 +38,7 @@ def doubt(
     recipe, watched = run.recipe("doubt"), weights or shipped_folder()
     fabric = run.fabric(recipe)
     pipeline = load_reconstructor(weights, cache_folder() / "onnx")
-    training, judging = (dataset.open_dataset(folder) for folder in (data, held_out_data))
+    training, judging = (build.open_dataset(folder) for folder in (data, held_out_data))
     _check(recipe, pipeline, training, judging)
     about = DoubtRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=list(TO_LEARN))
     if run.out.resolve() == watched.resolve() or (run.out / DOUBT_RECORD).exists():
@@ -54,8 +48,8 @@ def doubt(
     sets = [
         _whole_set(pipeline, first_of(maps.arrays(), most), _made(run.out / SAMPLES, some, seed, maps.plan))
         for maps, most, some, seed in (
-            (training, recipe.objects, counts, dataset.TRAINING_SEED),
-            (judging, recipe.held_out, fewer, dataset.HELD_OUT_SEED),
+            (training, recipe.objects, counts, build.TRAINING_SEED),
+            (judging, recipe.held_out, fewer, build.HELD_OUT_SEED),
         )
     ]
     job = Job(recipe, run.out, pipeline.record, run.tensorboard, run.compiled, about.watches)

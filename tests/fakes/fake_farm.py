@@ -4,8 +4,8 @@ from collections.abc import Generator, Sequence
 
 import numpy as np
 
-from nlos_cam.dataset_plan import DatasetPlan
-from nlos_cam.dataset_samples import Samples
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.samples import Samples
 
 SHAPES = {"depth_m": (4, 5), "intensity": (4, 5), "image": (4, 4), "object_depth_m": (4, 4), "scene": (6,)}
 

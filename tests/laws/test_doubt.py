@@ -9,19 +9,17 @@ from nlos_models.doubt_inference import load_doubter
 from nlos_models.inference import load_reconstructor
 
 from nlos_cam.cache import cache_folder
+from nlos_cam.dataset.outliers import TO_LEARN, Sight, ordinary, outlier, varied_empty
 from nlos_cam.evaluate_objects import echoes_of, sense
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.outliers import TO_LEARN, outlier
 from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.reconstruct.pipeline import Arrival, Processing, Step
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.render.renderer import render
 from nlos_cam.render.sensor.model import SensorModel
 from nlos_cam.render.sensor.sensor import Sensor
-from nlos_cam.sights import Sight, ordinary
-from nlos_cam.varied_bench import varied_empty
 
 RIG = load_rig("paper-rig")
 

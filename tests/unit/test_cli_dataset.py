@@ -10,10 +10,10 @@ from nlos_calibration.rig import load_rig
 from nlos_models.recipe import SIMULATION_ONLY
 from rich.progress import Progress
 
-from nlos_cam import dataset
 from nlos_cam.cli.dataset import Rate
 from nlos_cam.cli.main import main
-from nlos_cam.dataset_shards import head_of
+from nlos_cam.dataset import build
+from nlos_cam.dataset.shards import head_of
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.textures import TEXTURES
 
@@ -30,7 +30,7 @@ def farms(monkeypatch: pytest.MonkeyPatch) -> list[FakeFarm]:
         made.append(FakeFarm())
         return made[-1]
 
-    monkeypatch.setattr(dataset, "processes", processes)
+    monkeypatch.setattr(build, "processes", processes)
     return made
 
 
@@ -42,8 +42,8 @@ def _last(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
-def _plan(folder: Path) -> dataset.DatasetPlan:
-    return dataset.open_dataset(folder).plan
+def _plan(folder: Path) -> build.DatasetPlan:
+    return build.open_dataset(folder).plan
 
 
 def test_it_says_what_it_built_and_goes_on_where_it_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -57,7 +57,7 @@ def test_it_says_what_it_built_and_goes_on_where_it_was(tmp_path: Path, capsys: 
     assert _build(tmp_path, "--count", "6") == 0
     told = _last(capsys)
     assert (told["made"], told["objects_per_s"]) == (0, None)
-    assert _plan(tmp_path) == dataset.DatasetPlan(RIG, 0)
+    assert _plan(tmp_path) == build.DatasetPlan(RIG, 0)
 
 
 def test_its_options_are_the_plans(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_its_options_are_the_plans(tmp_path: Path) -> None:
     others = ["--without", "hat, boat", "--backgrounds", "0.25", "--accuracy", "draft", "--seed", "7"]
     assert _build(tmp_path, *spread, *others) == 0
     plan = _plan(tmp_path)
-    assert plan.spread == dataset.RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
+    assert plan.spread == build.RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
     assert set(CATEGORIES) - set(plan.objects.categories) == {"hat", "boat"}
     assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed) == (0.25, "draft", 7)
 
@@ -73,7 +73,7 @@ def test_its_options_are_the_plans(tmp_path: Path) -> None:
 def test_in_colour_it_says_that_it_is_a_simulation_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert _build(tmp_path, "--colour") == 0
     assert _last(capsys)["note"] == SIMULATION_ONLY
-    found = dataset.open_dataset(tmp_path, colour=True)
+    found = build.open_dataset(tmp_path, colour=True)
     assert found.plan.textures == tuple(TEXTURES)
     assert _build(tmp_path) == 4
     assert "another textures" in _last(capsys)["error"]["message"]
@@ -83,7 +83,7 @@ def test_a_shard_has_the_command_that_makes_it(tmp_path: Path) -> None:
     import h5py
 
     assert _build(tmp_path / "a b", "--without", "hat", "--workers", "1") == 0
-    shard = dataset.open_dataset(tmp_path / "a b").shards[0]
+    shard = build.open_dataset(tmp_path / "a b").shards[0]
     with h5py.File(shard.path) as file:
         command = str(file.attrs["command"])
     assert command.startswith(f"nlos-cam dataset build --out '{tmp_path}/a b' --count 4 --seed 0 ")
@@ -125,11 +125,11 @@ def test_damage_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_ctrl_c_keeps_finished_shards_and_is_130(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dataset, "SHARD", 2)
-    monkeypatch.setattr(dataset, "processes", lambda _: FakeFarm(fails_after=1))
+    monkeypatch.setattr(build, "SHARD", 2)
+    monkeypatch.setattr(build, "processes", lambda _: FakeFarm(fails_after=1))
     assert _build(tmp_path) == 130
     assert "finished shards are kept" in capsys.readouterr().err
-    assert dataset.read(tmp_path)[0].image.tolist() == samples_of(range(2))["image"].tolist()
+    assert build.read(tmp_path)[0].image.tolist() == samples_of(range(2))["image"].tolist()
 
 
 def test_a_folder_of_meshes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

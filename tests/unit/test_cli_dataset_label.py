@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import typer
 
-from nlos_cam import dataset
 from nlos_cam.cli.dataset_label import add_label
+from nlos_cam.dataset import build
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.recording.playback import ReplayCamera
 from nlos_cam.recording.sidecar import SidecarFile, sidecar_path
@@ -49,7 +49,7 @@ def recordings(noise_bag: Path, tmp_path: Path) -> Path:
 
 def test_it_makes_a_dataset_of_single_frames_and_says_so(run: Run, recordings: Path, tmp_path: Path) -> None:
     told = run(recordings, "--out", out := tmp_path / "data", "--frames", 3)
-    maps, plan = dataset.read(out)
+    maps, plan = build.read(out)
     assert len(maps.image) == told["samples"] == 6
     assert (told["recordings"], told["labels"], told["out"]) == (2, ["jug", "mug"], str(out))
     assert (told["rig_name"], told["rig_checksum"]) == (plan.rig.name, plan.rig.checksum)
@@ -59,7 +59,7 @@ def test_it_makes_a_dataset_of_single_frames_and_says_so(run: Run, recordings: P
 
 def test_its_shards_have_the_command_that_makes_them(run: Run, recordings: Path, tmp_path: Path) -> None:
     run(recordings, "--out", out := tmp_path / "my data", "--frames", 1)
-    with h5py.File(dataset.open_dataset(out).shards[0].path) as file:
+    with h5py.File(build.open_dataset(out).shards[0].path) as file:
         command = str(file.attrs["command"])
     assert command == f"nlos-cam dataset label {recordings} --out '{out}' --frames 1"
 
@@ -69,9 +69,9 @@ def test_it_replaces_nothing_unless_asked(run: Run, recordings: Path, tmp_path: 
     run(recordings, "--out", out, "--frames", 2)
     with pytest.raises(OutputExistsError, match="--overwrite"):
         run(recordings, "--out", out, "--frames", 1)
-    assert len(dataset.read(out)[0].image) == 4
+    assert len(build.read(out)[0].image) == 4
     run(recordings, "--out", out, "--frames", 1, "--overwrite")
-    assert len(dataset.read(out)[0].image) == 2
+    assert len(build.read(out)[0].image) == 2
 
 
 def test_what_is_wrong_with_a_recording_leaves_what_is_there(run: Run, recordings: Path, tmp_path: Path) -> None:
@@ -80,4 +80,4 @@ def test_what_is_wrong_with_a_recording_leaves_what_is_there(run: Run, recording
     (recordings / "b.npy").unlink()
     with pytest.raises(RecordingError, match="'jug'"):
         run(recordings, "--out", out, "--overwrite")
-    assert len(dataset.read(out)[0].image) == 2
+    assert len(build.read(out)[0].image) == 2

@@ -11,10 +11,11 @@ from nlos_calibration.rig import load_rig
 from nlos_models.data import MapSet
 from small_maps import SmallDataset
 
-from nlos_cam import dataset, evaluate_baselines
+from nlos_cam import evaluate_baselines
 from nlos_cam.cli import evaluate, evaluate_maps
 from nlos_cam.cli.main import main
-from nlos_cam.dataset import DatasetPlan
+from nlos_cam.dataset import build
+from nlos_cam.dataset.build import DatasetPlan
 from nlos_cam.objects.benchmark import test_set
 
 RIG = load_rig("paper-rig")
@@ -42,7 +43,7 @@ class Guesser:
 
 
 def _maps(plan: DatasetPlan, count: int) -> MapSet:
-    images = dataset.procedural_images(plan.first_seed, count, plan.box)
+    images = build.procedural_images(plan.first_seed, count, plan.box)
     wide = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8)))
     return MapSet(wide + 0.3, 40 * wide, images)
 
@@ -65,7 +66,7 @@ def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
 
     def training_maps(plan: DatasetPlan, *_: object) -> Stored:
         asked.append(plan)
-        return Stored(DatasetPlan(plan.rig, dataset.TRAINING_SEED), 4)
+        return Stored(DatasetPlan(plan.rig, build.TRAINING_SEED), 4)
 
     monkeypatch.setattr(evaluate_baselines, "training_maps", training_maps)
     monkeypatch.setattr(evaluate_baselines, "NEIGHBOURS", 4)
@@ -76,7 +77,7 @@ def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
 @pytest.fixture
 def stored(monkeypatch: pytest.MonkeyPatch) -> str:
     """The name of a dataset."""
-    monkeypatch.setattr(dataset, "open_dataset", lambda _: Stored(DatasetPlan(RIG, dataset.HELD_OUT_SEED), 3))
+    monkeypatch.setattr(build, "open_dataset", lambda _: Stored(DatasetPlan(RIG, build.HELD_OUT_SEED), 3))
     return "held-out"
 
 
@@ -154,7 +155,7 @@ def test_weights_that_eat_difference_maps_are_given_them_and_the_baselines_the_r
     monkeypatch.setattr(evaluate_maps, "render_bare_wall", lambda _: bare)
     arguments = ["evaluate", "--dataset", stored, "--training", stored, "--out", str(tmp_path / "figures"), "--json"]
     assert main(arguments) == 0
-    result, raw = _last(capsys), _maps(DatasetPlan(RIG, dataset.HELD_OUT_SEED), 3)
+    result, raw = _last(capsys), _maps(DatasetPlan(RIG, build.HELD_OUT_SEED), 3)
     np.testing.assert_allclose(np.concatenate(network.seen), raw.depth_m - 0.25, atol=1e-6)
     assert result["input"] == "difference maps"
     assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1

@@ -10,7 +10,7 @@ from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.recipe import Recipe
 from small_maps import SmallDataset, small_maps
 
-from nlos_cam import dataset, evaluate_baselines
+from nlos_cam import evaluate_baselines
 from nlos_cam.cli import evaluate_maps
 from nlos_cam.cli.evaluate_maps import (
     Judged,
@@ -22,11 +22,12 @@ from nlos_cam.cli.evaluate_maps import (
     rig_of,
     stored_objects,
 )
+from nlos_cam.dataset import build
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate_objects import seeded_objects, truth_of
 
 RIG = load_rig("paper-rig")
-PLAN = dataset.DatasetPlan(RIG, dataset.TEST_SEED)
+PLAN = build.DatasetPlan(RIG, build.TEST_SEED)
 RECORD = CheckpointRecord(rig_name=RIG.name, rig_checksum=RIG.checksum)
 DIFFERENCE = RECORD.model_copy(update={"input": "difference maps"})
 ELSEWHERE = replace(PLAN, rig=RIG.model_copy(update={"name": "elsewhere"}))
@@ -35,7 +36,7 @@ JUDGED = Judged("some", ["cup 1", "hat 2"], ["cup", "hat"], small_maps(2, 0), PL
 
 def test_fresh_objects_are_those_of_the_test_seeds() -> None:
     judged = fresh_objects(RIG, 1)
-    truth = truth_of(seeded_objects(dataset.TEST_SEED, 1, PLAN.box), PLAN.box)
+    truth = truth_of(seeded_objects(build.TEST_SEED, 1, PLAN.box), PLAN.box)
     np.testing.assert_array_equal(judged.maps.image, truth)
     assert judged.maps.depth_m.shape == (1, 64, 80)
     assert (len(judged.names), judged.plan) == (1, PLAN)
@@ -47,7 +48,7 @@ def test_stored_objects_are_those_of_the_dataset(monkeypatch: pytest.MonkeyPatch
         def column(self, name: str) -> np.ndarray:
             return {"category": np.array(["cup", "hat"], object), "seed": np.array([7, 8])}[name]
 
-    monkeypatch.setattr(dataset, "open_dataset", lambda _: Kept(JUDGED.maps, ELSEWHERE))
+    monkeypatch.setattr(build, "open_dataset", lambda _: Kept(JUDGED.maps, ELSEWHERE))
     judged = stored_objects(Path("held-out"))
     assert (judged.names, judged.categories, judged.plan) == (["cup 7", "hat 8"], ["cup", "hat"], ELSEWHERE)
     assert judged.maps is JUDGED.maps
@@ -81,7 +82,7 @@ def test_difference_maps_are_less_the_measured_wall_if_one_is_named_else_the_ren
 
 def test_the_nearest_is_looked_for_in_the_training_set_that_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     training = SmallDataset(JUDGED.maps, PLAN)
-    monkeypatch.setattr(dataset, "open_dataset", lambda _: training)
+    monkeypatch.setattr(build, "open_dataset", lambda _: training)
     images, among = guesses(JUDGED, Path("train"), nearest=True)
     assert among is training
     np.testing.assert_array_equal(images["nearest_neighbour"], JUDGED.maps.image)
@@ -92,7 +93,7 @@ def test_without_the_nearest_nothing_is_rendered(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(evaluate_baselines, "training_maps", lambda *_: pytest.fail("rendered"))
     images, among = guesses(JUDGED, None, nearest=False)
     assert (set(images), among) == ({"all_background", "mean_object"}, None)
-    mean = dataset.procedural_images(dataset.TRAINING_SEED, 3, PLAN.box).astype(np.float32).mean(0)
+    mean = build.procedural_images(build.TRAINING_SEED, 3, PLAN.box).astype(np.float32).mean(0)
     np.testing.assert_allclose(images["mean_object"][1], mean, atol=1e-3)
 
 

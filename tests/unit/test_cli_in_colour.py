@@ -11,11 +11,11 @@ from nlos_calibration.rig import load_rig
 from nlos_models.checkpoint import load_pipeline, load_record
 from nlos_models.recipe import SIMULATION_ONLY, load_recipe
 
-from nlos_cam import dataset
 from nlos_cam.cli.main import main
-from nlos_cam.cli.train_data import read_maps
-from nlos_cam.dataset_samples import make_samples
-from nlos_cam.dataset_shards import shard_path, store
+from nlos_cam.dataset import build
+from nlos_cam.dataset.samples import make_samples
+from nlos_cam.dataset.shards import shard_path, store
+from nlos_cam.dataset.training_maps import read_maps
 from nlos_cam.errors import RecordingError
 from nlos_cam.objects.textures import TEXTURES
 
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, threads = tmp_path_factory.mktemp("colour"), torch.get_num_threads()
     for name, textures in (("data", tuple(TEXTURES)), ("depth", ())):
         for seed, of in ((40, name), (50, f"{name}-held-out")):
-            plan = dataset.DatasetPlan(load_rig("paper-rig"), seed, accuracy="draft", textures=textures)
+            plan = build.DatasetPlan(load_rig("paper-rig"), seed, accuracy="draft", textures=textures)
             (folder / of).mkdir()
             store(shard_path(folder / of, seed), make_samples(plan, range(seed, seed + 2)), plan.provenance, "")
     for name, text in RECIPES.items():
@@ -111,7 +111,7 @@ def test_what_does_not_belong_together_is_one_line(
 
 def test_what_reads_datasets_of_depth_refuses_one_in_colour(folder: Path) -> None:
     recipe = load_recipe(folder / "compressor-of-depth.toml")
-    reads = (lambda: dataset.read(folder / "data"), lambda: read_maps(recipe, folder / "data", folder / "depth", None))
+    reads = (lambda: build.read(folder / "data"), lambda: read_maps(recipe, folder / "data", folder / "depth", None))
     for read in reads:
         with pytest.raises(RecordingError, match=r"data holds a dataset in colour \(simulation only"):
             read()

@@ -12,8 +12,8 @@ import torch
 from nlos_calibration.rig import load_rig
 from nlos_models.checkpoint import load_pipeline, load_vae
 
-from nlos_cam import dataset
 from nlos_cam.cli.main import main
+from nlos_cam.dataset import build
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -59,7 +59,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recipes, a trained VAE, and two datasets."""
     folder = tmp_path_factory.mktemp("learn")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "ProcessPoolExecutor", InThisProcess)
+        patch.setattr(build, "ProcessPoolExecutor", InThisProcess)
         for name, count, seed in (("data", "4", "0"), ("held-out", "2", "10000000")):
             assert main(["dataset", "build", "--out", str(folder / name), "--count", count, "--seed", seed]) == 0
     _recipe(folder, "compressor")
@@ -109,13 +109,13 @@ def test_a_trained_compressor_is_a_pipeline_with_the_vaes_decoder(
 def test_the_weights_are_tied_to_the_rig_that_the_maps_were_rendered_for(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other, original = RIG.model_copy(update={"name": "other"}), dataset.open_dataset
+    other, original = RIG.model_copy(update={"name": "other"}), build.open_dataset
 
-    def opened(folder: Path, *, colour: bool) -> dataset.Dataset:
+    def opened(folder: Path, *, colour: bool) -> build.Dataset:
         found = original(folder, colour=colour)
         return replace(found, plan=replace(found.plan, rig=other))
 
-    monkeypatch.setattr(dataset, "open_dataset", opened)
+    monkeypatch.setattr(build, "open_dataset", opened)
     assert _train_compressor(made, tmp_path / "run") == 0
     _, record = load_pipeline(tmp_path / "run")
     assert (record.rig_name, record.rig_checksum) == (other.name, other.checksum)
@@ -143,12 +143,12 @@ def test_what_does_not_fit_together_is_refused(
 def test_datasets_of_two_rigs_are_refused(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = dataset.open_dataset
+    original = build.open_dataset
 
-    def opened(folder: Path, *, colour: bool) -> dataset.Dataset:
+    def opened(folder: Path, *, colour: bool) -> build.Dataset:
         found = original(folder, colour=colour)
         return replace(found, plan=replace(found.plan, rig=RIG.model_copy(update={"name": folder.name})))
 
-    monkeypatch.setattr(dataset, "open_dataset", opened)
+    monkeypatch.setattr(build, "open_dataset", opened)
     assert _train_compressor(made, tmp_path / "run") == 1
     assert "different rigs" in _last(capsys)["error"]["message"]

@@ -17,12 +17,12 @@ from nlos_models.checkpoint import load_pipeline, load_record
 from safetensors.torch import load_file, save_file
 from small_maps import SmallDataset, small_images, small_maps, use_small_networks
 
-from nlos_cam import dataset
-from nlos_cam.cli import train_data, train_runs, train_start
+from nlos_cam.cli import train_runs, train_start
 from nlos_cam.cli.main import main
+from nlos_cam.dataset import build, training_maps
 from nlos_cam.objects.generators import CATEGORIES
 
-PLAN = dataset.DatasetPlan(load_rig("paper-rig"), 0)
+PLAN = build.DatasetPlan(load_rig("paper-rig"), 0)
 COUNTS = {"data": 8, "held-out": 4}
 BASE = "objects = 8\nheld_out = 4\nepochs = 2\nbatch = 4\nlearning_rate = 1e-3\n"
 LOSS = "latent_weight = 0.05\nimage_weight = 1.0\n"
@@ -45,8 +45,8 @@ def _small_networks_and_data() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         use_small_networks(patch, tasks, checkpoint, train_start)
         sets = {name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in COUNTS.items()}
-        patch.setattr(dataset, "open_dataset", lambda of, **_: sets[of.name])
-        patch.setattr(dataset, "procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
+        patch.setattr(build, "open_dataset", lambda of, **_: sets[of.name])
+        patch.setattr(build, "procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
         yield
     torch.set_num_threads(before)
 
@@ -109,7 +109,7 @@ def test_a_vae_is_shown_the_kinds_that_its_recipe_does_not_leave_out(
         shown.append({*kinds, f"{backgrounds}"})
         return small_images(count, seed)
 
-    monkeypatch.setattr(dataset, "procedural_images", images)
+    monkeypatch.setattr(build, "procedural_images", images)
     (folder / "vae.toml").write_text(RECIPES["vae"] + 'left_out = ["car", "boat"]\nbackgrounds = 0.25\n')
     assert go("vae")[0] == 0
     (folder / "vae.toml").write_text(RECIPES["vae"])
@@ -176,7 +176,7 @@ def test_difference_maps_are_what_the_weights_eat_then(
     go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bare = small_maps(1, 9)
-    monkeypatch.setattr(train_data, "render_bare_wall", lambda _: (0 * bare.intensity[0], 0 * bare.intensity[0] + 3))
+    monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (0 * bare.intensity[0], 0 * bare.intensity[0] + 3))
     assert go("difference", "--vae", str(folder / "vae"))[0] == 0
     assert load_record(tmp_path / "out").input == "difference maps"
     raw, difference = (load_file(where / "preprocess.safetensors") for where in (folder / "two", tmp_path / "out"))

@@ -14,21 +14,20 @@ from nlos_models.recipe import Recipe
 from nlos_models.sources import less_bare_wall
 from small_maps import SmallDataset, small_maps
 
-from nlos_cam import dataset
-from nlos_cam.cli import train_data
-from nlos_cam.cli.train_data import Streamed, measured_bare_wall, read_maps, render_bare_wall
+from nlos_cam.dataset import build, training_maps
+from nlos_cam.dataset.training_maps import Streamed, measured_bare_wall, read_maps, render_bare_wall
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor.sensor import Sensor
 
-PLAN = dataset.DatasetPlan(load_rig("paper-rig"), 0)
+PLAN = build.DatasetPlan(load_rig("paper-rig"), 0)
 RECIPE = Recipe(task="compressor", objects=4, held_out=2, epochs=1, batch=2, learning_rate=1e-3)
 
 
 def test_a_recipe_takes_the_first_objects_of_larger_sets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
+    monkeypatch.setattr(build, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
     maps = read_maps(RECIPE, Path("data"), Path("other"), None)
     np.testing.assert_array_equal(maps.training.image, small_maps(6, 4).image[:4])
     np.testing.assert_array_equal(maps.held_out.image, small_maps(6, 5).image[:2])
@@ -37,7 +36,7 @@ def test_a_recipe_takes_the_first_objects_of_larger_sets(monkeypatch: pytest.Mon
 def test_maps_of_other_objects_or_of_another_rig_have_another_digest(monkeypatch: pytest.MonkeyPatch) -> None:
     def digest(seed: int, name: str) -> str:
         plan = replace(PLAN, rig=PLAN.rig.model_copy(update={"name": name}))
-        monkeypatch.setattr(dataset, "open_dataset", lambda *_, **__: SmallDataset(small_maps(6, seed), plan))
+        monkeypatch.setattr(build, "open_dataset", lambda *_, **__: SmallDataset(small_maps(6, seed), plan))
         return read_maps(RECIPE, Path("data"), Path("other"), None).digest
 
     assert digest(1, "a") == digest(1, "a")
@@ -45,20 +44,20 @@ def test_maps_of_other_objects_or_of_another_rig_have_another_digest(monkeypatch
 
 
 def test_a_record_tells_how_many_objects_there_were_to_judge_by(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
+    monkeypatch.setattr(build, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
     recipe = RECIPE.model_copy(update={"held_out": 400})
     assert read_maps(recipe, Path("data"), Path("other"), None).told(recipe).held_out == 6
     assert read_maps(RECIPE, Path("data"), Path("other"), None).told(RECIPE) == RECIPE
 
 
 def test_a_dataset_to_be_judged_by_what_it_teaches_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
+    monkeypatch.setattr(build, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
     with pytest.raises(SceneError, match="give --held-out a dataset of other objects"):
         read_maps(RECIPE, Path("data"), Path("other/../data"), None)
 
 
 def test_a_wall_for_raw_maps_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
+    monkeypatch.setattr(build, "open_dataset", lambda of, **_: SmallDataset(small_maps(6, len(of.name)), PLAN))
     with pytest.raises(SceneError, match=r"wall\.toml would do nothing: leave --wall out"):
         read_maps(RECIPE, Path("data"), Path("other"), Path("wall.toml"))
 
@@ -68,7 +67,7 @@ def test_maps_of_two_rigs_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not colour
         return SmallDataset(small_maps(6, 0), replace(PLAN, rig=PLAN.rig.model_copy(update={"name": folder.name})))
 
-    monkeypatch.setattr(dataset, "open_dataset", opened)
+    monkeypatch.setattr(build, "open_dataset", opened)
     with pytest.raises(SceneError, match="data and other were rendered for different rigs"):
         read_maps(RECIPE, Path("data"), Path("other"), None)
 
@@ -87,11 +86,11 @@ def test_less_the_rendered_bare_wall_a_bare_walls_own_frame_is_noise_about_nothi
 
 def test_the_measured_bare_wall_is_the_references(monkeypatch: pytest.MonkeyPatch) -> None:
     reference = SimpleNamespace(map_depth_m=np.ones((64, 80)), map_intensity=np.zeros((64, 80)))
-    monkeypatch.setattr(train_data, "load_measured", lambda _: SimpleNamespace(reference=reference))
+    monkeypatch.setattr(training_maps, "load_measured", lambda _: SimpleNamespace(reference=reference))
     depth_m, intensity = measured_bare_wall(Path("wall.toml"))
     assert depth_m is reference.map_depth_m
     assert intensity is reference.map_intensity
-    monkeypatch.setattr(train_data, "load_measured", lambda _: SimpleNamespace(reference=None))
+    monkeypatch.setattr(training_maps, "load_measured", lambda _: SimpleNamespace(reference=None))
     with pytest.raises(SceneError, match=r"wall\.toml has no reference"):
         measured_bare_wall(Path("wall.toml"))
 
@@ -103,9 +102,9 @@ def test_difference_maps_are_less_the_measured_wall_if_one_is_named_else_the_ren
     def bare(intensity: float) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
         return lambda _: (np.zeros((64, 80), np.float32), np.full((64, 80), intensity, np.float32))
 
-    monkeypatch.setattr(dataset, "open_dataset", lambda _, **__: SmallDataset(small_maps(4, 0), PLAN))
-    monkeypatch.setattr(train_data, "render_bare_wall", bare(1.0))
-    monkeypatch.setattr(train_data, "measured_bare_wall", bare(2.0))
+    monkeypatch.setattr(build, "open_dataset", lambda _, **__: SmallDataset(small_maps(4, 0), PLAN))
+    monkeypatch.setattr(training_maps, "render_bare_wall", bare(1.0))
+    monkeypatch.setattr(training_maps, "measured_bare_wall", bare(2.0))
     recipe = RECIPE.model_copy(update={"maps": "difference maps"})
     made, raw = read_maps(recipe, Path("data"), Path("other"), wall), small_maps(4, 0)
     seen = ~np.isnan(raw.depth_m)
@@ -145,7 +144,7 @@ def test_a_stream_gives_the_maps_that_memory_does_differences_too_and_the_same_f
 
 
 def test_a_stream_is_of_all_of_a_dataset(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "open_dataset", lambda _, **__: SmallDataset(small_maps(6, 0), PLAN))
+    monkeypatch.setattr(build, "open_dataset", lambda _, **__: SmallDataset(small_maps(6, 0), PLAN))
     with pytest.raises(SceneError, match="a stream is of all: give --objects 6"):
         read_maps(RECIPE, Path("data"), Path("other"), None, stream=True)
     maps = read_maps(RECIPE.of_objects(6), Path("data"), Path("other"), None, stream=True)
@@ -153,6 +152,6 @@ def test_a_stream_is_of_all_of_a_dataset(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_no_bare_wall_is_rendered_for_rigs_that_differ() -> None:
-    plan = replace(PLAN, spread=dataset.RigSpread(place_m=0.01))
+    plan = replace(PLAN, spread=build.RigSpread(place_m=0.01))
     with pytest.raises(SceneError, match="differs from object to object"):
         render_bare_wall(plan)

@@ -13,14 +13,14 @@ from nlos_models import checkpoint
 from nlos_models.doubt_weights import load_doubt
 from small_maps import SmallDataset, small_maps, untrained_weights, use_small_networks
 
-from nlos_cam import dataset
 from nlos_cam.cli import train_doubt
 from nlos_cam.cli.main import main
-from nlos_cam.doubt_samples import EMPTY, ORDINARY, DoubtSamples
-from nlos_cam.outliers import TO_LEARN
+from nlos_cam.dataset import build
+from nlos_cam.dataset.doubt_samples import EMPTY, ORDINARY, DoubtSamples
+from nlos_cam.dataset.outliers import TO_LEARN
 
 RIG = load_rig("paper-rig")
-PLAN = dataset.DatasetPlan(RIG, 0)
+PLAN = build.DatasetPlan(RIG, 0)
 RECIPE = (
     'task = "doubt"\nobjects = 8\noutliers = 7\nempties = 14\nheld_out = 4\nepochs = 1\nbatch = 8\n'
     "learning_rate = 1e-3\n"
@@ -44,7 +44,7 @@ def _small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(train_doubt, "samples_on_disk", small_samples)
     sets = {name: SmallDataset(small_maps(count, count), PLAN) for name, count in (("data", 8), ("held-out", 6))}
-    monkeypatch.setattr(dataset, "open_dataset", lambda of, **_: sets[of.name])
+    monkeypatch.setattr(build, "open_dataset", lambda of, **_: sets[of.name])
     yield
     torch.set_num_threads(before)
 

@@ -16,8 +16,8 @@ from nlos_cam.colour_evaluate import (
     judge_colour,
     painted_maps,
 )
-from nlos_cam.dataset_plan import DatasetPlan
-from nlos_cam.dataset_samples import make_samples
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.samples import make_samples
 from nlos_cam.objects.textures import TEXTURES
 
 

@@ -10,10 +10,10 @@ import pytest
 from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
 
-from nlos_cam import dataset
-from nlos_cam.dataset import Built, DatasetPlan, build, open_dataset
-from nlos_cam.dataset_lock import LOCK, only_builder
-from nlos_cam.dataset_shards import SHARDS, store
+from nlos_cam.dataset import build
+from nlos_cam.dataset import build as dataset
+from nlos_cam.dataset.build import Built, DatasetPlan, open_dataset
+from nlos_cam.dataset.shards import LOCK, SHARDS, only_builder, store
 from nlos_cam.errors import (
     DiskFullError,
     FolderBusyError,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from nlos_cam.dataset_lock import LOCK, NOTE, only_builder
+from nlos_cam.dataset.shards import LOCK, NOTE, only_builder
 from nlos_cam.errors import FolderBusyError, OutputExistsError
 
 HOLD = """

@@ -9,7 +9,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 from pydantic import ValidationError
 
-from nlos_cam.dataset_plan import FIRST_OBJECTS, SCENE_COLUMNS, DatasetPlan, Objects, RigSpread, scene_row
+from nlos_cam.dataset.plan import FIRST_OBJECTS, SCENE_COLUMNS, DatasetPlan, Objects, RigSpread, scene_row
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.render.material import Material

@@ -12,9 +12,10 @@ import pytest
 from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
 
-from nlos_cam import dataset
-from nlos_cam.dataset import DatasetPlan, Farm, build, open_dataset, processes
-from nlos_cam.dataset_samples import make_samples
+from nlos_cam.dataset import build
+from nlos_cam.dataset import build as dataset
+from nlos_cam.dataset.build import DatasetPlan, Farm, open_dataset, processes
+from nlos_cam.dataset.samples import make_samples
 from nlos_cam.errors import WorkersLostError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft")

@@ -14,9 +14,9 @@ from fake_farm import samples_of
 from nlos_calibration.rig import load_rig
 
 import nlos_cam
-from nlos_cam import dataset_ray
-from nlos_cam.dataset_plan import DatasetPlan
-from nlos_cam.dataset_ray import AHEAD, RayFarm, cluster, make_piece
+from nlos_cam.dataset import ray_backend
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.ray_backend import AHEAD, RayFarm, cluster, make_piece
 from nlos_cam.errors import SceneError, WorkersLostError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0)
@@ -47,7 +47,7 @@ class FakeRay:
         return {"CPU": 2.0}
 
     def remote(self, **options: object) -> Callable[..., Any]:
-        assert options == {"num_cpus": 1, "max_retries": dataset_ray.TRIES}
+        assert options == {"num_cpus": 1, "max_retries": ray_backend.TRIES}
         return lambda work: SimpleNamespace(remote=lambda *arguments: (work, arguments))
 
     def wait(self, waiting: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
@@ -63,8 +63,8 @@ class FakeRay:
 
 @pytest.fixture(autouse=True)
 def _nothing_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset_ray, "make_samples", lambda _, piece: samples_of(piece))
-    monkeypatch.setattr(dataset_ray, "one_thread", lambda: None)
+    monkeypatch.setattr(ray_backend, "make_samples", lambda _, piece: samples_of(piece))
+    monkeypatch.setattr(ray_backend, "one_thread", lambda: None)
 
 
 def test_every_piece_is_made_once_and_few_are_asked_for_ahead() -> None:

@@ -9,10 +9,10 @@ from fake_farm import samples_of
 from nlos_calibration.rig import load_rig
 from nlos_models.data import MapBatch
 
-from nlos_cam import dataset_reader
-from nlos_cam.dataset_plan import DatasetPlan
-from nlos_cam.dataset_reader import MAP_CHANNELS, Dataset, open_dataset, read
-from nlos_cam.dataset_shards import shard_path, store
+from nlos_cam.dataset import reader
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset, read
+from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.errors import RecordingError, SceneError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40)
@@ -21,7 +21,7 @@ COUNT, SHARD = 43, 5
 
 @pytest.fixture(autouse=True)
 def _small_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset_reader, "BUFFER", 3)
+    monkeypatch.setattr(reader, "BUFFER", 3)
 
 
 @pytest.fixture(scope="module")
@@ -124,23 +124,23 @@ def test_no_more_is_in_memory_than_two_buffers_and_each_shard_is_read_once(
     data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reads: list[Path] = []
-    original = dataset_reader._maps
+    original = reader._maps
 
-    def counted(shard: dataset_reader.Shard) -> list[np.ndarray]:
+    def counted(shard: reader.Shard) -> list[np.ndarray]:
         reads.append(shard.path)
         return original(shard)
 
-    windows: list[dataset_reader._Window] = []
-    original_take = dataset_reader._Window.take
+    windows: list[reader._Window] = []
+    original_take = reader._Window.take
 
-    def take(window: dataset_reader._Window, rows: np.ndarray) -> dataset_reader.MapSet:
+    def take(window: reader._Window, rows: np.ndarray) -> reader.MapSet:
         windows.append(window)
         found = original_take(window, rows)
-        assert len(window._held) <= 2 * dataset_reader.BUFFER
+        assert len(window._held) <= 2 * reader.BUFFER
         return found
 
-    monkeypatch.setattr(dataset_reader, "_maps", counted)
-    monkeypatch.setattr(dataset_reader._Window, "take", take)
+    monkeypatch.setattr(reader, "_maps", counted)
+    monkeypatch.setattr(reader._Window, "take", take)
     assert len(_rows(data, batch=1)) == COUNT == len(windows)
     assert len(reads) == len(set(reads)) == len(data.shards)
 

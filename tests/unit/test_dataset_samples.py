@@ -11,9 +11,9 @@ import pytest
 import trimesh
 from nlos_calibration.rig import load_rig
 
-from nlos_cam import dataset_samples
-from nlos_cam.dataset_plan import DatasetPlan, Objects, RigSpread
-from nlos_cam.dataset_samples import (
+from nlos_cam.dataset import samples as dataset_samples
+from nlos_cam.dataset.plan import DatasetPlan, Objects, RigSpread
+from nlos_cam.dataset.samples import (
     Samples,
     hidden_object,
     joined,

@@ -12,8 +12,8 @@ from fake_farm import samples_of
 from nlos_calibration.rig import load_rig
 
 import nlos_cam
-from nlos_cam.dataset_plan import DatasetPlan
-from nlos_cam.dataset_shards import check_all, head_of, read_arrays, shard_path, shards_of, store
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.shards import check_all, head_of, read_arrays, shard_path, shards_of, store
 from nlos_cam.errors import DiskFullError, RecordingError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40)

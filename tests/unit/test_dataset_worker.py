@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numba
 import pytest
 
-from nlos_cam import dataset_worker
+from nlos_cam.dataset import build
 
 BLAS = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 PARENT = """
@@ -41,18 +41,18 @@ def test_a_worker_ends_with_a_parent_that_is_killed() -> None:
 
 
 def test_a_worker_without_a_parent_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset_worker, "parent_process", lambda: None)
-    monkeypatch.setattr(dataset_worker, "os", SimpleNamespace(_exit=lambda _: pytest.fail("ended")))
-    dataset_worker.end_with_parent()
+    monkeypatch.setattr(build, "parent_process", lambda: None)
+    monkeypatch.setattr(build, "os", SimpleNamespace(_exit=lambda _: pytest.fail("ended")))
+    build.end_with_parent()
 
 
 def test_a_worker_has_one_thread_and_is_deaf_to_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset_worker, "parent_process", lambda: None)
+    monkeypatch.setattr(build, "parent_process", lambda: None)
     for name in BLAS:
         monkeypatch.setenv(name, "2")
     threads, handler = numba.get_num_threads(), signal.getsignal(signal.SIGINT)
     try:
-        dataset_worker.begin_worker()
+        build.begin_worker()
         assert numba.get_num_threads() == 1
         assert {os.environ[name] for name in BLAS} == {"1"}
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN

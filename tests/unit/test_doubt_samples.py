@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import Rig, load_rig
 
-from nlos_cam import doubt_samples
-from nlos_cam.doubt_samples import BENCH, EMPTY, ORDINARY, DoubtSamples, make_samples, samples_on_disk
-from nlos_cam.outliers import TO_JUDGE, TO_LEARN
+from nlos_cam.dataset import doubt_samples
+from nlos_cam.dataset.doubt_samples import BENCH, EMPTY, ORDINARY, DoubtSamples, make_samples, samples_on_disk
+from nlos_cam.dataset.outliers import TO_JUDGE, TO_LEARN
 from nlos_cam.render.sensor.model import SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset import procedural_images
+from nlos_cam.dataset.build import procedural_images
 from nlos_cam.evaluate import (
     BARS,
     advantage,

@@ -9,8 +9,9 @@ import pytest
 from nlos_calibration.rig import LidarPose, load_rig
 from nlos_models.data import MapSet
 
-from nlos_cam import dataset, evaluate_baselines
-from nlos_cam.dataset import DatasetPlan, procedural_images
+from nlos_cam import evaluate_baselines
+from nlos_cam.dataset import build
+from nlos_cam.dataset.build import DatasetPlan, procedural_images
 from nlos_cam.evaluate_baselines import mean_image, training_maps, with_nearest, without_maps
 from nlos_cam.objects.depth_map import object_box
 
@@ -97,11 +98,11 @@ def test_without_maps_there_is_no_nearest_neighbour(images: np.ndarray) -> None:
 def test_training_maps_are_kept_by_what_decides_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[tuple[DatasetPlan, int, Path]] = []
     shapes = {"images": np.zeros((2, 64, 64), np.float16)}
-    monkeypatch.setattr(dataset, "build", lambda plan, count, folder, **_: built.append((plan, count, folder)))
-    monkeypatch.setattr(dataset, "open_dataset", lambda folder: folder)
-    monkeypatch.setattr(dataset, "procedural_images", lambda *_: shapes["images"])
+    monkeypatch.setattr(build, "build", lambda plan, count, folder, **_: built.append((plan, count, folder)))
+    monkeypatch.setattr(build, "open_dataset", lambda folder: folder)
+    monkeypatch.setattr(build, "procedural_images", lambda *_: shapes["images"])
     monkeypatch.setattr(evaluate_baselines, "NEIGHBOURS", 7)
-    plan = DatasetPlan(RIG, dataset.TEST_SEED, objects=dataset.Objects(("cup",)))
+    plan = DatasetPlan(RIG, build.TEST_SEED, objects=build.Objects(("cup",)))
     elsewhere = RIG.model_copy(update={"lidar": LidarPose(distance_m=0.3, yaw_deg=45)})
     for one in (plan, plan, replace(plan, rig=elsewhere), replace(plan, first_seed=5)):
         training_maps(one, tmp_path, 1, _quiet)
@@ -112,7 +113,7 @@ def test_training_maps_are_kept_by_what_decides_them(tmp_path: Path, monkeypatch
     assert len({first, moved, other_shapes}) == 3
     assert first.parent.parent == tmp_path
     assert built[0][1] == 7
-    assert (built[0][0].first_seed, built[0][0].objects) == (dataset.TRAINING_SEED, dataset.Objects())
+    assert (built[0][0].first_seed, built[0][0].objects) == (build.TRAINING_SEED, build.Objects())
 
 
 def test_every_category_is_among_those_that_tell_whether_objects_are_still_made_as_they_were() -> None:

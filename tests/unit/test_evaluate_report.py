@@ -11,7 +11,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam import evaluate_report
-from nlos_cam.dataset import procedural_images
+from nlos_cam.dataset.build import procedural_images
 from nlos_cam.evaluate import BARS
 from nlos_cam.evaluate_report import Judgement, as_figures, as_markdown, in_words, write
 from nlos_cam.objects.depth_map import object_box

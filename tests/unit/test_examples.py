@@ -15,8 +15,9 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.camera.simulated_world import open_world
-from nlos_cam.dataset import DatasetPlan, Samples, build
-from nlos_cam.dataset_samples import make_samples
+from nlos_cam.dataset import build
+from nlos_cam.dataset.build import DatasetPlan, Samples
+from nlos_cam.dataset.samples import make_samples
 from nlos_cam.render.scene_file import load_scene
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

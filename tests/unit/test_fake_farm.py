@@ -5,8 +5,8 @@ import pytest
 from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset import DatasetPlan
-from nlos_cam.dataset_samples import make_samples
+from nlos_cam.dataset.build import DatasetPlan
+from nlos_cam.dataset.samples import make_samples
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")
 PIECES = [range(2), range(2, 4), range(4, 5)]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import ObjectBox, load_rig
 
-from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
+from nlos_cam.dataset.build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import (

@@ -15,9 +15,9 @@ from nlos_calibration.rig import ObjectBox, dump_toml, load_rig
 
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.dataset.labelled import read_labelled, recordings_in, spread
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.labelled import read_labelled, recordings_in, spread
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.recording.playback import ReplayCamera
 from nlos_cam.recording.sidecar import SidecarFile, WallFile, sidecar_path

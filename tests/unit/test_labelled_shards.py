@@ -8,11 +8,11 @@ import pytest
 from nlos_calibration.rig import load_rig
 from nlos_models.data import MapSet
 
-from nlos_cam import dataset, labelled_shards
-from nlos_cam.dataset_shards import store
+from nlos_cam.dataset import build
+from nlos_cam.dataset import labelled as labelled_shards
+from nlos_cam.dataset.labelled import RECORDED, Labelled, write_shards
+from nlos_cam.dataset.shards import store
 from nlos_cam.errors import DiskFullError, RecordingError
-from nlos_cam.labelled import Labelled
-from nlos_cam.labelled_shards import RECORDED, write_shards
 
 RIG = load_rig("paper-rig").model_copy(update={"name": "bench"})
 
@@ -26,14 +26,14 @@ def _labelled(count: int) -> Labelled:
     return Labelled(MapSet(depth_m, intensity, truth_m.astype(np.float16)), truth_m, names, names, RIG)
 
 
-@pytest.mark.parametrize("count", [3, dataset.SHARD + 7])
+@pytest.mark.parametrize("count", [3, build.SHARD + 7])
 def test_what_is_read_is_what_was_written(tmp_path: Path, count: int) -> None:
     labelled = _labelled(count)
     write_shards(labelled, tmp_path)
-    maps, plan = dataset.read(tmp_path)
+    maps, plan = build.read(tmp_path)
     for name in ("depth_m", "intensity", "image"):
         np.testing.assert_array_equal(getattr(maps, name), getattr(labelled.maps, name))
-    kept = dataset.open_dataset(tmp_path)
+    kept = build.open_dataset(tmp_path)
     assert tuple(kept.column("category")) == labelled.label
     np.testing.assert_array_equal(kept.column("object_depth_m"), labelled.object_depth_m)
     assert np.isnan(kept.column("scene")).any(axis=0).sum() == 1  # the gain is not known
@@ -42,14 +42,14 @@ def test_what_is_read_is_what_was_written(tmp_path: Path, count: int) -> None:
 
 
 def test_a_smaller_dataset_leaves_nothing_of_a_larger_one(tmp_path: Path) -> None:
-    for count in (dataset.SHARD + 7, 4):
+    for count in (build.SHARD + 7, 4):
         write_shards(_labelled(count), tmp_path)
-    assert len(dataset.read(tmp_path)[0].image) == 4
+    assert len(build.read(tmp_path)[0].image) == 4
 
 
 def test_a_full_disk_keeps_the_dataset_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, stored = tmp_path / "data", list[Path]()
-    write_shards(_labelled(dataset.SHARD + 7), out)
+    write_shards(_labelled(build.SHARD + 7), out)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
 
     def full(path: Path, *others: Any) -> None:
@@ -60,7 +60,7 @@ def test_a_full_disk_keeps_the_dataset_that_was_there(tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(labelled_shards, "store", full)
     with pytest.raises(DiskFullError, match=f"no room for the dataset {out}: what was there is kept"):
-        write_shards(_labelled(dataset.SHARD + 9), out)
+        write_shards(_labelled(build.SHARD + 9), out)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     assert list(tmp_path.iterdir()) == [out]
 
@@ -68,4 +68,4 @@ def test_a_full_disk_keeps_the_dataset_that_was_there(tmp_path: Path, monkeypatc
 def test_nothing_rendered_is_mixed_into_what_was_recorded(tmp_path: Path) -> None:
     write_shards(_labelled(4), tmp_path)
     with pytest.raises(RecordingError, match="choose another --out"):
-        dataset.build(dataset.DatasetPlan(RIG, 0), 4, tmp_path, workers=1, on_progress=lambda *_: None)
+        build.build(build.DatasetPlan(RIG, 0), 4, tmp_path, workers=1, on_progress=lambda *_: None)

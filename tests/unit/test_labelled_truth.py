@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.dataset.labelled import fixed_objects, truth_depth_m
 from nlos_cam.errors import RecordingError, SceneError
-from nlos_cam.labelled_truth import fixed_objects, truth_depth_m
 from nlos_cam.objects.benchmark import test_set as fixed_set
 from nlos_cam.objects.depth_map import cell_centres_m, object_box
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.dataset.outliers import IN_SHAPE, LEAST_PIXELS, TO_JUDGE, TO_LEARN, Sight, ordinary, outlier
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.outliers import IN_SHAPE, LEAST_PIXELS, TO_JUDGE, TO_LEARN, outlier
 from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.sights import Sight, ordinary
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)

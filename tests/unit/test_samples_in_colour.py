@@ -9,8 +9,8 @@ from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import load_rig
 from nlos_models.recipe import SIMULATION_ONLY
 
-from nlos_cam.dataset_plan import DatasetPlan, RigSpread
-from nlos_cam.dataset_samples import hidden_object, make_samples, procedural_images, sense_colour, sense_object
+from nlos_cam.dataset.plan import DatasetPlan, RigSpread
+from nlos_cam.dataset.samples import hidden_object, make_samples, procedural_images, sense_colour, sense_object
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted

@@ -17,7 +17,7 @@ from small_maps import small_maps, untrained_weights, use_small_networks
 
 from nlos_cam.cli import evaluate_maps
 from nlos_cam.cli.evaluate_maps import Judged
-from nlos_cam.dataset import TEST_SEED, DatasetPlan
+from nlos_cam.dataset.build import TEST_SEED, DatasetPlan
 from nlos_cam.evaluate import BARS, PerObject
 
 TOOLS = Path(__file__).parents[2] / "tools"

@@ -12,8 +12,8 @@ import pytest
 from fake_farm import samples_of
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset import DatasetPlan
-from nlos_cam.dataset_shards import shard_path, store
+from nlos_cam.dataset.build import DatasetPlan
+from nlos_cam.dataset.shards import shard_path, store
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0)
 BUILDS = "import sys, time; open(sys.argv[1] + '/shard-000000000.part', 'wb').write(b'x'); time.sleep(60)"

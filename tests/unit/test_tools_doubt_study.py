@@ -10,9 +10,9 @@ from fake_doubter import FakeDoubter
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.doubt_samples import EMPTY, DoubtSamples
+from nlos_cam.dataset.doubt_samples import EMPTY, DoubtSamples
+from nlos_cam.dataset.outliers import TO_JUDGE, TO_LEARN
 from nlos_cam.objects.depth_map import depth_from_image, object_box
-from nlos_cam.outliers import TO_JUDGE, TO_LEARN
 from nlos_cam.reconstruct.verdict import Verdict
 
 RIG = load_rig("paper-rig")

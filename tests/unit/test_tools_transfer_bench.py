@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.labelled import read_labelled
+from nlos_cam.dataset.labelled import read_labelled
 from nlos_cam.objects.benchmark import FixedObject
 from nlos_cam.objects.benchmark import test_set as fixed_set
 from nlos_cam.objects.depth_map import object_box

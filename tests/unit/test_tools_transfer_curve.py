@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from nlos_calibration.rig import load_rig
 from nlos_models.data import MapSet
 
-from nlos_cam import dataset
+from nlos_cam.dataset import build
+from nlos_cam.dataset.labelled import Labelled
 from nlos_cam.errors import NlosCamError
-from nlos_cam.labelled import Labelled
 
 RIG = load_rig("paper-rig")
 PARTS = {"adaptation": 5, "validation": 2, "held-out": 3}
@@ -63,8 +63,8 @@ def seen(tools: ModuleType, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def _trainer(lessons: list[Any]) -> Callable[[Any], Path]:
     def train(lesson: Any) -> Path:
-        maps, _ = dataset.read(lesson.dataset)
-        validation, _ = dataset.read(lesson.validation)
+        maps, _ = build.read(lesson.dataset)
+        validation, _ = build.read(lesson.validation)
         lessons.append((lesson.samples, {float(v) for v in maps.depth_m[:, 0, 0]}, len(validation.image)))
         lesson.out.mkdir(parents=True)
         return lesson.out

@@ -11,7 +11,7 @@ import pytest
 import torch
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset import TEST_SEED
+from nlos_cam.dataset.build import TEST_SEED
 from nlos_cam.evaluate import Interval
 from nlos_cam.evaluate_objects import seeded_objects
 from nlos_cam.objects.depth_map import object_box
@@ -109,7 +109,8 @@ def test_a_setting_is_timed_by_its_median_on_its_threads_which_are_given_back() 
 
 
 def test_ranges_are_learnt_from_training_objects_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    from nlos_cam import dataset, tradeoff_reconstruct
+    from nlos_cam import tradeoff_reconstruct
+    from nlos_cam.dataset import build
 
     asked: list[tuple[int, int]] = []
 
@@ -121,7 +122,7 @@ def test_ranges_are_learnt_from_training_objects_alone(monkeypatch: pytest.Monke
     shapes = [(depth.shape, intensity.shape) for depth, intensity in calibration(RIG, BOX)]
     assert shapes == [((1, 64, 80), (1, 64, 80))] * 2
     first_seed, count = asked[0]
-    assert dataset.TRAINING_SEED <= first_seed < first_seed + count < dataset.HELD_OUT_SEED
+    assert build.TRAINING_SEED <= first_seed < first_seed + count < build.HELD_OUT_SEED
 
 
 @pytest.mark.parametrize("measured", [len(ROWS), 1])

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.dataset.outliers import SLIGHT, WIDE, Spread, moved, varied, varied_empty
 from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.varied_bench import SLIGHT, WIDE, Spread, moved, varied, varied_empty
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
 NONE = Spread(*(0.0,) * len(SLIGHT))

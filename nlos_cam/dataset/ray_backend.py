@@ -8,9 +8,9 @@ from itertools import islice
 from typing import Any
 
 import nlos_cam
-from nlos_cam.dataset_plan import DatasetPlan
-from nlos_cam.dataset_samples import Samples, make_samples
-from nlos_cam.dataset_worker import one_thread
+from nlos_cam.dataset.build import one_thread
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.samples import Samples, make_samples
 from nlos_cam.errors import NlosCamError, SceneError, WorkersLostError
 
 TRIES = 5

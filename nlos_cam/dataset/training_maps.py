@@ -15,7 +15,7 @@ from nlos_models.data import MapBatch, MapSet
 from nlos_models.recipe import Recipe
 from nlos_models.sources import InMemory, MapSource, first_of, less_bare_wall
 
-from nlos_cam import dataset
+from nlos_cam.dataset import build
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
 from nlos_cam.render.renderer import render
@@ -34,7 +34,7 @@ class TrainingMaps(NamedTuple):
 
     training: MapSource
     held_out: MapSet
-    plan: dataset.DatasetPlan
+    plan: build.DatasetPlan
 
     @property
     def digest(self) -> str:
@@ -50,7 +50,7 @@ class TrainingMaps(NamedTuple):
 class Streamed:
     """A dataset on the disk as a source; `bare` is subtracted from its maps if there is one."""
 
-    dataset: dataset.Dataset
+    build: build.Dataset
     image: Float16
     """All images (n, 64, 64)."""
     bare: BareMaps | None = None
@@ -62,7 +62,7 @@ class Streamed:
             parts.append(chunk)
             if (held := held + len(chunk.image)) >= count:
                 break
-        arrays = (np.concatenate([getattr(part, name) for part in parts])[:count] for name in dataset.MAP_CHANNELS)
+        arrays = (np.concatenate([getattr(part, name) for part in parts])[:count] for name in build.MAP_CHANNELS)
         maps = MapSet(*arrays)
         return less_bare_wall(maps, *self.bare) if self.bare else maps
 
@@ -94,7 +94,7 @@ def read_maps(
         raise SceneError(f"raw maps have nothing taken off, so that {wall} would do nothing: leave --wall out")
     if data.resolve() == held_out_data.resolve():
         raise SceneError(f"{data} is to learn from and to be judged by: give --held-out a dataset of other objects")
-    training, judging = (dataset.open_dataset(of, colour=recipe.colour) for of in (data, held_out_data))
+    training, judging = (build.open_dataset(of, colour=recipe.colour) for of in (data, held_out_data))
     plan, count = training.plan, len(training)
     if count < recipe.objects:
         raise SceneError(
@@ -111,14 +111,14 @@ def read_maps(
     return TrainingMaps(_source(training, recipe.objects, bare, stream=stream), held_out, plan)
 
 
-def _source(training: dataset.Dataset, count: int, bare: BareMaps | None, *, stream: bool) -> MapSource:
+def _source(training: build.Dataset, count: int, bare: BareMaps | None, *, stream: bool) -> MapSource:
     if stream:
         return Streamed(training, training.column("image"), bare)
     maps = first_of(training.arrays(), count)
     return InMemory(less_bare_wall(maps, *bare) if bare else maps)
 
 
-def _bare_wall(plan: dataset.DatasetPlan, wall: Path | None) -> BareMaps:
+def _bare_wall(plan: build.DatasetPlan, wall: Path | None) -> BareMaps:
     return measured_bare_wall(wall) if wall else render_bare_wall(plan)
 
 
@@ -130,12 +130,12 @@ def measured_bare_wall(path: Path) -> BareMaps:
     return wall.map_depth_m, wall.map_intensity
 
 
-def render_bare_wall(plan: dataset.DatasetPlan, frames: int = BARE_WALL_FRAMES) -> BareMaps:
+def render_bare_wall(plan: build.DatasetPlan, frames: int = BARE_WALL_FRAMES) -> BareMaps:
     """Depth and intensity, each (64, 80), of a rig with nothing hidden: the mean of so many noisy frames.
 
     Raises SceneError where the rig differs from object to object: then no one wall is that of all.
     """
-    if plan.spread != dataset.RigSpread():
+    if plan.spread != build.RigSpread():
         raise SceneError("this dataset's rig differs from object to object: difference maps need one rig, or --wall")
     sensor = Sensor(plan.rig, plan.sensor, plan.radiometry)
     echoes = render(Scene(plan.rig, radiometry=plan.radiometry), plan.accuracy).multi

@@ -2,26 +2,52 @@
 
 Workers make samples, one process writes them: a shard is written beside its place and renamed when whole, and building
 again makes only what is missing or damaged. A sample depends on its seed alone, so any workers make the same shards.
+
+How a worker process begins: with one thread, deaf to Ctrl-C, and set to end with its parent.
 """
 
+import os
+import signal
 import time
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
+from threading import Thread
 
 from nlos_models.data import MapSet
 
-from nlos_cam.dataset_lock import only_builder
-from nlos_cam.dataset_plan import DatasetPlan, Objects, RigSpread
-from nlos_cam.dataset_reader import MAP_CHANNELS, Dataset, open_dataset, read
-from nlos_cam.dataset_samples import Samples, joined, make_samples, objects_of, procedural_images, sense_object, silent
-from nlos_cam.dataset_shards import PARTS, SHARDS, Shard, check_all, head_of, shard_path, store
-from nlos_cam.dataset_worker import begin_worker
+from nlos_cam.dataset.plan import DatasetPlan, Objects, RigSpread
+from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset, read
+from nlos_cam.dataset.samples import Samples, joined, make_samples, objects_of, procedural_images, sense_object, silent
+from nlos_cam.dataset.shards import PARTS, SHARDS, Shard, check_all, head_of, only_builder, shard_path, store
 from nlos_cam.errors import OutputExistsError, RecordingError, WorkersLostError
+
+
+def begin_worker() -> None:
+    """Make this process a worker; what it prepares lasts as long as it does."""
+    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"  # numpy is still to be imported
+    one_thread()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the parent ends its workers
+    Thread(target=end_with_parent, daemon=True).start()
+
+
+def one_thread() -> None:
+    """One object per process is faster than several threads per object."""
+    import numba
+
+    numba.set_num_threads(1)
+
+
+def end_with_parent() -> None:
+    """Wait for the parent's end, and end: one that is killed tells nobody, and its workers would wait for ever."""
+    if parent := parent_process():
+        parent.join()
+        os._exit(1)
+
 
 __all__ = [
     "MAP_CHANNELS",

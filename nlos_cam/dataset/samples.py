@@ -14,7 +14,7 @@ from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
 from numpy.typing import NDArray
 
-from nlos_cam.dataset_plan import DatasetPlan, Objects, scene_row
+from nlos_cam.dataset.plan import DatasetPlan, Objects, scene_row
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.objects.depth_map import image_from_depth

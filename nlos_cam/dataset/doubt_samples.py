@@ -15,18 +15,16 @@ from nlos_models.recipe import Recipe
 from nlos_models.remap import parts_of
 from numpy.typing import NDArray
 
-from nlos_cam import dataset
 from nlos_cam.cli.common import tracked
+from nlos_cam.dataset import build
+from nlos_cam.dataset.outliers import SLIGHT, TO_JUDGE, TO_LEARN, Sight, ordinary, outlier, varied, varied_empty
 from nlos_cam.errors import SceneError
 from nlos_cam.folders import file_when_whole
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects.depth_map import image_from_depth, object_box
-from nlos_cam.outliers import TO_JUDGE, TO_LEARN, outlier
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.sensor.model import SensorModel
 from nlos_cam.render.sensor.sensor import Sensor
-from nlos_cam.sights import Sight, ordinary
-from nlos_cam.varied_bench import SLIGHT, varied, varied_empty
 
 EMPTY, ORDINARY = "empty", "ordinary"
 PIECE = 100
@@ -224,14 +222,14 @@ def _images(pipeline: Reconstructor, maps: MapSet) -> np.ndarray:
     return np.concatenate([pipeline(*pair) for pair in pairs]).astype(np.float16)
 
 
-def _made(folder: Path, counts: dict[str, int], seed: int, plan: dataset.DatasetPlan) -> DoubtSamples:
+def _made(folder: Path, counts: dict[str, int], seed: int, plan: build.DatasetPlan) -> DoubtSamples:
     with tracked("rendering empty benches and outliers") as on_progress:
         return samples_on_disk(
             folder, counts, seed, plan.rig, plan.sensor, accuracy=plan.accuracy, on_progress=on_progress
         )
 
 
-def _check(recipe: Recipe, pipeline: Reconstructor, training: dataset.Dataset, judging: dataset.Dataset) -> None:
+def _check(recipe: Recipe, pipeline: Reconstructor, training: build.Dataset, judging: build.Dataset) -> None:
     if pipeline.record.input != "raw maps":
         raise SceneError(f"these weights eat {pipeline.record.input}, and doubt is learnt of raw maps: name others")
     if not training.plan.rig.checksum == judging.plan.rig.checksum == pipeline.record.rig_checksum:

@@ -1,10 +1,14 @@
-"""A shard: some samples, their plan and the checksum of every array in one HDF5 file that is whole or not there."""
+"""A shard: some samples, their plan and the checksum of every array in one HDF5 file that is whole or not there.
+
+One builder to a folder: a lock that the system lets go of when its holder dies, and a note of who holds it.
+"""
 
 import errno
 import hashlib
 import os
+import platform
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import BytesIO
 from itertools import pairwise
@@ -13,12 +17,13 @@ from typing import Any
 
 import h5py
 import numpy as np
+from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 import nlos_cam
-from nlos_cam.dataset_plan import SCENE_COLUMNS, DatasetPlan
-from nlos_cam.dataset_samples import Samples
-from nlos_cam.errors import DiskFullError, RecordingError
+from nlos_cam.dataset.plan import SCENE_COLUMNS, DatasetPlan
+from nlos_cam.dataset.samples import Samples
+from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
 
 SHARDS, PARTS = "shard-*.h5", "shard-*.part"
 FIRST_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category")
@@ -166,3 +171,39 @@ def _checked(path: Path, name: str, stored: Any) -> NDArray[Any]:
 
 def _damaged(path: Path, why: str) -> RecordingError:
     return RecordingError(f"{path} is damaged ({why}): build again to make it anew, or delete it")
+
+
+LOCK, NOTE = ".build.lock", ".builder"
+
+
+@contextmanager
+def only_builder(folder: Path) -> Generator[None]:
+    """Hold a folder's lock. Raises FolderBusyError, with the holder's process id, where another process has it.
+
+    Raises OutputExistsError where nothing may be written there.
+    """
+    lock, note = FileLock(folder / LOCK), folder / NOTE
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise FolderBusyError(
+            f"{folder} is being built by {_holder(note)}: wait for it, or choose another --out"
+        ) from error
+    except PermissionError as error:
+        raise OutputExistsError(
+            f"{folder} cannot be written to: choose another --out, or change its permissions"
+        ) from error
+    try:
+        with suppress(OSError):  # a full disk is told where it matters
+            note.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
+        yield
+    finally:
+        note.unlink(missing_ok=True)
+        lock.release()
+
+
+def _holder(note: Path) -> str:
+    try:
+        return note.read_text(encoding="utf-8") or "another process"
+    except OSError:  # it is just beginning, or ending
+        return "another process"

@@ -12,8 +12,8 @@ from nlos_models.data import MapBatch, MapSet, as_batch
 from nlos_models.recipe import SIMULATION_ONLY
 from numpy.typing import NDArray
 
-from nlos_cam.dataset_plan import DatasetPlan
-from nlos_cam.dataset_shards import Shard, read_arrays, shards_of
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.shards import Shard, read_arrays, shards_of
 from nlos_cam.errors import RecordingError, SceneError
 
 MAP_CHANNELS = ("depth_m", "intensity", "image")
