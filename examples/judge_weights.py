@@ -7,7 +7,7 @@ import numpy as np
 from nlos_calibration.rig import load_rig
 from nlos_models.metrics import silhouette_iou
 
-from nlos_cam.evaluate_objects import as_map_set, echoes_of, seeded_objects, sense, truth_of
+from nlos_cam.evaluate.subjects import as_map_set, echoes_of, seeded_objects, sense, truth_of
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.reconstruct.pipeline import load_networks
 

@@ -19,10 +19,10 @@ from nlos_models.inference import refuse_colour
 from nlos_models.pipeline import Pipeline
 from nlos_models.remap import run
 
-from nlos_cam.cli.evaluate_maps import Judged, as_eaten, bare_wall_for, fresh_objects, rig_of
-from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, PerObject, advantage, over_objects, per_object, plain
-from nlos_cam.evaluate_pictures import LABELS
-from nlos_cam.evaluate_report import in_words
+from nlos_cam.evaluate.figures import LABELS
+from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, PerObject, advantage, over_objects, per_object, plain
+from nlos_cam.evaluate.report import in_words
+from nlos_cam.evaluate.subjects import Judged, as_eaten, bare_wall_for, fresh_objects, rig_of
 
 DOCS = Path(__file__).parents[1] / "docs"
 NOTES = """Means over objects and their bootstrap 95 % intervals. Differences are taken object by object, and

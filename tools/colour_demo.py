@@ -24,8 +24,8 @@ from nlos_models.tasks import rebuilt
 
 from nlos_cam.cli.common import PAPER_RIG, tracked
 from nlos_cam.cli.main import main as nlos_cam
-from nlos_cam.colour_evaluate import draw_colour_sheet, figures_of_colour, painted_maps
 from nlos_cam.dataset.build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, open_dataset
+from nlos_cam.evaluate.color import draw_colour_sheet, figures_of_colour, painted_maps
 from nlos_cam.objects.benchmark import OF_EACH, test_set
 from nlos_cam.objects.depth_map import object_box
 

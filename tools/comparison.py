@@ -13,8 +13,8 @@ from typing import Any
 from kept_page import keep
 
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.evaluate import BARS
-from nlos_cam.evaluate_report import in_words
+from nlos_cam.evaluate.metrics import BARS
+from nlos_cam.evaluate.report import in_words
 
 DOCS = Path(__file__).parents[1] / "docs"
 MEASURED = re.compile(r"(?<=<!-- measured -->\n).*(?=<!-- end of measured -->)", re.DOTALL)

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.evaluate.render_tradeoff import machine
 from nlos_cam.objects.depth_map import orthographic_depth
 from nlos_cam.objects.placement import Pose, category_triangles, place
 from nlos_cam.render.accuracy import STOPS
@@ -21,7 +22,6 @@ from nlos_cam.render.accuracy_search import Echoes, agreement
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
 FINE = STOPS["fine"]

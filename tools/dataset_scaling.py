@@ -17,7 +17,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset import build
 from nlos_cam.dataset.build import PIECE, DatasetPlan
-from nlos_cam.render.tradeoff_report import machine
+from nlos_cam.evaluate.render_tradeoff import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -36,11 +36,11 @@ from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig
 
 from nlos_cam.cli.common import INTERRUPTED, progress
+from nlos_cam.evaluate.render_tradeoff import machine
 from nlos_cam.render.echoes import nothing
 from nlos_cam.render.scene import Radiometry
 from nlos_cam.render.sensor.model import SensorModel
 from nlos_cam.render.sensor.sensor import Sensor
-from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
 OBJECTS, CHAINED = 24, 6

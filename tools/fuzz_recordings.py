@@ -15,7 +15,7 @@ from corruption import corrupt
 from fuzz_harness import GOOD, MEMORY_BYTES, TIMEOUT_S, Watched
 from noise_recordings import make_all
 
-from nlos_cam.render.tradeoff_report import machine
+from nlos_cam.evaluate.render_tradeoff import machine
 
 TOOLS = Path(__file__).parent
 DOCS = TOOLS.parent / "docs"

@@ -15,9 +15,9 @@ from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import load_rig
 from nlos_models.metrics import silhouette_iou
 
-from nlos_cam.evaluate import BARS
-from nlos_cam.evaluate_objects import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
-from nlos_cam.evaluate_report import in_words
+from nlos_cam.evaluate.metrics import BARS
+from nlos_cam.evaluate.report import in_words
+from nlos_cam.evaluate.subjects import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
 from nlos_cam.folders import file_when_whole
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.benchmark import test_set

@@ -23,9 +23,9 @@ from live_process import LiveProcess
 
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
+from nlos_cam.evaluate.render_tradeoff import machine
 from nlos_cam.recording.bag_reader import BagFile
 from nlos_cam.recording.repair import repair
-from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
 KINDS = "ctrl-c", "terminate", "viewer killed", "unplugged a while", "unplugged, then ctrl-c", "unplugged for good"

@@ -18,7 +18,7 @@ import numpy as np
 
 from nlos_cam.dataset.reader import open_dataset
 from nlos_cam.dataset.shards import FIRST_ARRAYS, PARTS, SHARDS
-from nlos_cam.render.tradeoff_report import machine
+from nlos_cam.evaluate.render_tradeoff import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
 DEFAULTS = (300, 10, 0, 10)

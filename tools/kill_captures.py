@@ -23,11 +23,11 @@ import numpy as np
 
 from nlos_cam.camera.simulated_world import open_world
 from nlos_cam.errors import RecordingError
+from nlos_cam.evaluate.render_tradeoff import machine
 from nlos_cam.recording.bag_reader import BagFile
 from nlos_cam.recording.repair import repair
 from nlos_cam.recording.sdk_playback import SdkReplayCamera
 from nlos_cam.render.sensor.sensor import SensedImages
-from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
 CAMERA, LONGEST_S = "sim:bare-wall", 6.0

@@ -20,11 +20,21 @@ from nlos_models.remap import run
 from nlos_models.silhouette import cut_silhouette, lift_edges
 
 from nlos_cam.cli.common import say, tracked
-from nlos_cam.cli.evaluate_maps import as_eaten, bare_wall_for, rig_of
 from nlos_cam.dataset.build import TEST_SEED, TRAINING_SEED, DatasetPlan
-from nlos_cam.evaluate import BARS, Figures, judge
-from nlos_cam.evaluate_objects import QUIET, Subject, as_map_set, echoes_of, seeded_objects, sense, truth_of
-from nlos_cam.evaluate_report import in_words
+from nlos_cam.evaluate.metrics import BARS, Figures, judge
+from nlos_cam.evaluate.report import in_words
+from nlos_cam.evaluate.subjects import (
+    QUIET,
+    Subject,
+    as_eaten,
+    as_map_set,
+    bare_wall_for,
+    echoes_of,
+    rig_of,
+    seeded_objects,
+    sense,
+    truth_of,
+)
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box

@@ -25,7 +25,7 @@ from headless_chromium import CHROMIUM, SOFTWARE_GL
 from live_process import LiveProcess
 from long_capture import Look, memory, memory_mib
 
-from nlos_cam.render.tradeoff_report import machine
+from nlos_cam.evaluate.render_tradeoff import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
 START_TIMEOUT_S, END_TIMEOUT_S = 300.0, 60.0

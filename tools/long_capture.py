@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.registry import Reader
 from nlos_cam.cli.common import tracked
-from nlos_cam.render.tradeoff_report import machine
+from nlos_cam.evaluate.render_tradeoff import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
 COMMAND = "from nlos_cam.cli.main import run; run()"

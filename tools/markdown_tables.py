@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from nlos_cam.evaluate_report import in_words
+from nlos_cam.evaluate.report import in_words
 
 
 def as_lines(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

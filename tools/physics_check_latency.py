@@ -20,13 +20,13 @@ from nlos_cam.cache import cache_folder
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.protocol import WallClock
 from nlos_cam.cli.common import say
+from nlos_cam.evaluate.render_tradeoff import machine
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live.loop import run_live, warm_up
 from nlos_cam.live.physics_check_process import BackgroundChecks
 from nlos_cam.reconstruct.bench import Bench, open_bench
 from nlos_cam.reconstruct.physics_check import Check, Checks, NoChecks, check
 from nlos_cam.reconstruct.pipeline import Processing
-from nlos_cam.render.tradeoff_report import machine
 from nlos_cam.view.viewer import NullViewer
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -22,7 +22,7 @@ from nlos_models.inference import Reconstructor, load_reconstructor
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import say, tracked
 from nlos_cam.dataset.build import TEST_SEED
-from nlos_cam.evaluate_objects import seeded_objects, sense
+from nlos_cam.evaluate.subjects import seeded_objects, sense
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import depth_from_image, object_box

@@ -21,10 +21,18 @@ from nlos_models.inference import Reconstructor, load_reconstructor
 
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
-from nlos_cam.cli.evaluate_maps import as_eaten, bare_wall_for
 from nlos_cam.dataset.build import TEST_SEED, DatasetPlan
-from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, judge, plain
-from nlos_cam.evaluate_objects import Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
+from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, judge, plain
+from nlos_cam.evaluate.subjects import (
+    Subject,
+    as_eaten,
+    as_map_set,
+    bare_wall_for,
+    echoes_of,
+    reconstruct_all,
+    sense,
+    truth_of,
+)
 from nlos_cam.folders import file_when_whole
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.evaluate.render_tradeoff import machine
 from nlos_cam.render.accuracy import STOPS, Accuracy
 from nlos_cam.render.accuracy_search import Work, least_seconds, some_of
 from nlos_cam.render.effects import Effects, included
@@ -24,7 +25,6 @@ from nlos_cam.render.planning import Prepared
 from nlos_cam.render.renderer import render, three_bounce
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import paper_scene
-from nlos_cam.render.tradeoff_report import machine
 
 DOCS = Path(__file__).parents[1] / "docs"
 STANDARD = STOPS["standard"]

@@ -6,9 +6,8 @@ Prints the table of docs/accuracy.md. Most of the time goes to brute force, whic
 import json
 from pathlib import Path
 
+from nlos_cam.evaluate.render_tradeoff import as_markdown, as_table, draw, facts, measure, settings
 from nlos_cam.render.scene_file import paper_scene
-from nlos_cam.render.tradeoff import facts, measure, settings
-from nlos_cam.render.tradeoff_report import as_markdown, as_table, draw
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -18,9 +18,9 @@ from nlos_models.checkpoint import load_pipeline
 from nlos_models.inference import refuse_colour
 from numpy.typing import NDArray
 
-from nlos_cam.cli.evaluate_maps import Judged, stored_objects
-from nlos_cam.evaluate import BARS, PerObject, advantage, over_objects, plain
-from nlos_cam.evaluate_report import in_words
+from nlos_cam.evaluate.metrics import BARS, PerObject, advantage, over_objects, plain
+from nlos_cam.evaluate.report import in_words
+from nlos_cam.evaluate.subjects import Judged, stored_objects
 
 DOCS = Path(__file__).parents[1] / "docs"
 LEFT_OUT = "airplane,table"

@@ -243,7 +243,7 @@ def loader(weights: Path | None) -> Callable[[Option], Reconstructor]:
     """Makes the networks of options; `weights` are those that a table beside them calls shipped."""
 
     def load(option: Option) -> Reconstructor:
-        from nlos_cam.tradeoff_reconstruct import runtimes
+        from nlos_cam.evaluate.runtime_tradeoff import runtimes
 
         folder = weights if option.weights == SHIPPED else Path(option.weights)
         rig = rig_named(load_record(folder or shipped_folder()).rig_name)

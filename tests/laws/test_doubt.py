@@ -10,7 +10,7 @@ from nlos_models.inference import load_reconstructor
 
 from nlos_cam.cache import cache_folder
 from nlos_cam.dataset.outliers import TO_LEARN, Sight, ordinary, outlier, varied_empty
-from nlos_cam.evaluate_objects import echoes_of, sense
+from nlos_cam.evaluate.subjects import echoes_of, sense
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box

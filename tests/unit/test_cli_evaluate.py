@@ -11,11 +11,11 @@ from nlos_calibration.rig import load_rig
 from nlos_models.data import MapSet
 from small_maps import SmallDataset
 
-from nlos_cam import evaluate_baselines
-from nlos_cam.cli import evaluate, evaluate_maps
+from nlos_cam.cli import evaluate
 from nlos_cam.cli.main import main
 from nlos_cam.dataset import build
 from nlos_cam.dataset.build import DatasetPlan
+from nlos_cam.evaluate import baselines, subjects
 from nlos_cam.objects.benchmark import test_set
 
 RIG = load_rig("paper-rig")
@@ -68,8 +68,8 @@ def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
         asked.append(plan)
         return Stored(DatasetPlan(plan.rig, build.TRAINING_SEED), 4)
 
-    monkeypatch.setattr(evaluate_baselines, "training_maps", training_maps)
-    monkeypatch.setattr(evaluate_baselines, "NEIGHBOURS", 4)
+    monkeypatch.setattr(baselines, "training_maps", training_maps)
+    monkeypatch.setattr(baselines, "NEIGHBOURS", 4)
     monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: Guesser())
     return asked
 
@@ -111,7 +111,7 @@ def test_a_dataset_is_judged_beside_the_baselines_and_kept(
 def test_without_a_dataset_the_test_set_is_judged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, guessing: list[DatasetPlan]
 ) -> None:
-    monkeypatch.setattr(evaluate_maps, "test_set", lambda box: test_set(box)[:2])
+    monkeypatch.setattr(subjects, "test_set", lambda box: test_set(box)[:2])
     assert main(["evaluate", "--out", str(tmp_path / "figures"), "--json"]) == 0
     result = _last(capsys)
     assert result["objects"] == 2
@@ -152,7 +152,7 @@ def test_weights_that_eat_difference_maps_are_given_them_and_the_baselines_the_r
     network = Guesser("difference maps")
     monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: network)
     bare = np.full((64, 80), 0.25, np.float32), np.zeros((64, 80), np.float32)
-    monkeypatch.setattr(evaluate_maps, "render_bare_wall", lambda _: bare)
+    monkeypatch.setattr(subjects, "render_bare_wall", lambda _: bare)
     arguments = ["evaluate", "--dataset", stored, "--training", stored, "--out", str(tmp_path / "figures"), "--json"]
     assert main(arguments) == 0
     result, raw = _last(capsys), _maps(DatasetPlan(RIG, build.HELD_OUT_SEED), 3)

@@ -10,9 +10,10 @@ from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.recipe import Recipe
 from small_maps import SmallDataset, small_maps
 
-from nlos_cam import evaluate_baselines
-from nlos_cam.cli import evaluate_maps
-from nlos_cam.cli.evaluate_maps import (
+from nlos_cam.dataset import build
+from nlos_cam.errors import SceneError
+from nlos_cam.evaluate import baselines, subjects
+from nlos_cam.evaluate.subjects import (
     Judged,
     as_eaten,
     bare_wall_for,
@@ -20,11 +21,10 @@ from nlos_cam.cli.evaluate_maps import (
     guesses,
     notes_on,
     rig_of,
+    seeded_objects,
     stored_objects,
+    truth_of,
 )
-from nlos_cam.dataset import build
-from nlos_cam.errors import SceneError
-from nlos_cam.evaluate_objects import seeded_objects, truth_of
 
 RIG = load_rig("paper-rig")
 PLAN = build.DatasetPlan(RIG, build.TEST_SEED)
@@ -71,8 +71,8 @@ def test_difference_maps_are_less_the_measured_wall_if_one_is_named_else_the_ren
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walls = [(np.full((64, 80), depth, np.float32), np.ones((64, 80), np.float32)) for depth in (0.1, 0.2)]
-    monkeypatch.setattr(evaluate_maps, "render_bare_wall", lambda _: walls[0])
-    monkeypatch.setattr(evaluate_maps, "measured_bare_wall", lambda _: walls[1])
+    monkeypatch.setattr(subjects, "render_bare_wall", lambda _: walls[0])
+    monkeypatch.setattr(subjects, "measured_bare_wall", lambda _: walls[1])
     for wall, depth_m in ((None, 0.1), (Path("wall.toml"), 0.2)):
         eaten = as_eaten(JUDGED.maps, bare_wall_for(DIFFERENCE, PLAN, wall))
         seen = ~np.isnan(JUDGED.maps.depth_m)
@@ -89,8 +89,8 @@ def test_the_nearest_is_looked_for_in_the_training_set_that_is_named(monkeypatch
 
 
 def test_without_the_nearest_nothing_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evaluate_baselines, "NEIGHBOURS", 3)
-    monkeypatch.setattr(evaluate_baselines, "training_maps", lambda *_: pytest.fail("rendered"))
+    monkeypatch.setattr(baselines, "NEIGHBOURS", 3)
+    monkeypatch.setattr(baselines, "training_maps", lambda *_: pytest.fail("rendered"))
     images, among = guesses(JUDGED, None, nearest=False)
     assert (set(images), among) == ({"all_background", "mean_object"}, None)
     mean = build.procedural_images(build.TRAINING_SEED, 3, PLAN.box).astype(np.float32).mean(0)

@@ -15,11 +15,11 @@ from nlos_models.record import CheckpointRecord
 
 from nlos_cam.cli import tradeoff as command
 from nlos_cam.cli.main import main
+from nlos_cam.evaluate.render_tradeoff import Row, measure, settings
 from nlos_cam.render.accuracy import STOPS
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import paper_scene
-from nlos_cam.render.tradeoff import Row, measure, settings
 
 SMALL = {name: replace(stop, relay_columns=8, relay_rows=4) for name, stop in STOPS.items()}
 FIRST = 6

@@ -8,7 +8,9 @@ from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import load_rig
 from nlos_models.recipe import SIMULATION_ONLY
 
-from nlos_cam.colour_evaluate import (
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.samples import make_samples
+from nlos_cam.evaluate.color import (
     better_than,
     colour_guesses,
     draw_colour_sheet,
@@ -16,8 +18,6 @@ from nlos_cam.colour_evaluate import (
     judge_colour,
     painted_maps,
 )
-from nlos_cam.dataset.plan import DatasetPlan
-from nlos_cam.dataset.samples import make_samples
 from nlos_cam.objects.textures import TEXTURES
 
 

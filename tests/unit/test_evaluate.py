@@ -5,7 +5,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset.build import procedural_images
-from nlos_cam.evaluate import (
+from nlos_cam.evaluate.metrics import (
     BARS,
     advantage,
     bars_met,

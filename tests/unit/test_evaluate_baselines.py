@@ -9,10 +9,10 @@ import pytest
 from nlos_calibration.rig import LidarPose, load_rig
 from nlos_models.data import MapSet
 
-from nlos_cam import evaluate_baselines
 from nlos_cam.dataset import build
 from nlos_cam.dataset.build import DatasetPlan, procedural_images
-from nlos_cam.evaluate_baselines import mean_image, training_maps, with_nearest, without_maps
+from nlos_cam.evaluate import baselines
+from nlos_cam.evaluate.baselines import mean_image, training_maps, with_nearest, without_maps
 from nlos_cam.objects.depth_map import object_box
 
 RIG = load_rig("paper-rig")
@@ -101,7 +101,7 @@ def test_training_maps_are_kept_by_what_decides_them(tmp_path: Path, monkeypatch
     monkeypatch.setattr(build, "build", lambda plan, count, folder, **_: built.append((plan, count, folder)))
     monkeypatch.setattr(build, "open_dataset", lambda folder: folder)
     monkeypatch.setattr(build, "procedural_images", lambda *_: shapes["images"])
-    monkeypatch.setattr(evaluate_baselines, "NEIGHBOURS", 7)
+    monkeypatch.setattr(baselines, "NEIGHBOURS", 7)
     plan = DatasetPlan(RIG, build.TEST_SEED, objects=build.Objects(("cup",)))
     elsewhere = RIG.model_copy(update={"lidar": LidarPose(distance_m=0.3, yaw_deg=45)})
     for one in (plan, plan, replace(plan, rig=elsewhere), replace(plan, first_seed=5)):
@@ -120,5 +120,5 @@ def test_every_category_is_among_those_that_tell_whether_objects_are_still_made_
     from nlos_cam.objects.generators import CATEGORIES
     from nlos_cam.objects.placement import object_depth
 
-    seen = {object_depth(seed, object_box(RIG))[0] for seed in range(evaluate_baselines.TOLD_BY)}
+    seen = {object_depth(seed, object_box(RIG))[0] for seed in range(baselines.TOLD_BY)}
     assert seen == set(CATEGORIES)

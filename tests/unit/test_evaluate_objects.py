@@ -6,7 +6,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.camera.simulated_world import World
 from nlos_cam.dataset.build import TEST_SEED
-from nlos_cam.evaluate_objects import QUIET, as_map_set, echoes_of, reconstruct_all, seeded_objects, sense, truth_of
+from nlos_cam.evaluate.subjects import QUIET, as_map_set, echoes_of, reconstruct_all, seeded_objects, sense, truth_of
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import image_from_depth, object_box

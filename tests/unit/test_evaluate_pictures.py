@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from nlos_cam import evaluate_pictures
-from nlos_cam.evaluate import BARS, over_objects
-from nlos_cam.evaluate_pictures import (
+from nlos_cam.evaluate import figures as evaluate_pictures
+from nlos_cam.evaluate.figures import (
     BLOCK,
     DIFFERENCE,
     HEAD,
@@ -21,6 +20,7 @@ from nlos_cam.evaluate_pictures import (
     draw_sheet,
     mosaic,
 )
+from nlos_cam.evaluate.metrics import BARS, over_objects
 
 
 @pytest.fixture

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam import evaluate_report
 from nlos_cam.dataset.build import procedural_images
-from nlos_cam.evaluate import BARS
-from nlos_cam.evaluate_report import Judgement, as_figures, as_markdown, in_words, write
+from nlos_cam.evaluate import report
+from nlos_cam.evaluate.metrics import BARS
+from nlos_cam.evaluate.report import Judgement, as_figures, as_markdown, in_words, write
 from nlos_cam.objects.depth_map import object_box
 
 BOX = object_box(load_rig("paper-rig"))
@@ -113,7 +113,7 @@ def test_what_ends_the_writing_leaves_the_earlier_folder(tmp_path: Path, monkeyp
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(evaluate_report.pictures, "draw_gallery", interrupted)
+    monkeypatch.setattr(report.pictures, "draw_gallery", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write(tmp_path / "out", judgement, as_figures(_judgement(3)))
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import ObjectBox, load_rig
 
-from nlos_cam.evaluate_surface import curve, detail_per_cm, rank_correlation, surface_cm2, where_the_error_is
+from nlos_cam.evaluate.metrics import curve, detail_per_cm, rank_correlation, surface_cm2, where_the_error_is
 from nlos_cam.objects.depth_map import object_box
 
 BOX: ObjectBox = object_box(load_rig("paper-rig"))

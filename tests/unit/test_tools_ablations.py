@@ -15,10 +15,10 @@ from nlos_models import checkpoint
 from nlos_models.checkpoint import load_record
 from small_maps import small_maps, untrained_weights, use_small_networks
 
-from nlos_cam.cli import evaluate_maps
-from nlos_cam.cli.evaluate_maps import Judged
 from nlos_cam.dataset.build import TEST_SEED, DatasetPlan
-from nlos_cam.evaluate import BARS, PerObject
+from nlos_cam.evaluate import subjects
+from nlos_cam.evaluate.metrics import BARS, PerObject
+from nlos_cam.evaluate.subjects import Judged
 
 TOOLS = Path(__file__).parents[2] / "tools"
 RIG = load_rig("paper-rig")
@@ -41,7 +41,7 @@ def ablations(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
     monkeypatch.setattr(tool, "fresh_objects", fresh)
     bare = np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32)
-    monkeypatch.setattr(evaluate_maps, "render_bare_wall", lambda _: bare)
+    monkeypatch.setattr(subjects, "render_bare_wall", lambda _: bare)
     return tool
 
 

@@ -15,11 +15,10 @@ from nlos_models import checkpoint
 from nlos_models.checkpoint import shipped_folder
 from small_maps import small_maps, untrained_weights, use_small_networks
 
-from nlos_cam.cli import evaluate_maps
-from nlos_cam.cli.evaluate_maps import Judged
 from nlos_cam.dataset.build import TEST_SEED, DatasetPlan
-from nlos_cam.evaluate import BARS
-from nlos_cam.evaluate_objects import seeded_objects
+from nlos_cam.evaluate import subjects
+from nlos_cam.evaluate.metrics import BARS
+from nlos_cam.evaluate.subjects import Judged, seeded_objects
 from nlos_cam.objects.depth_map import object_box
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -104,7 +103,7 @@ def test_a_map_of_a_network_that_finds_nothing_says_so(tool: Tool, tmp_path: Pat
 def test_on_every_rig_difference_maps_are_less_its_own_bare_wall(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
     rig_map, asked = tool("rig_map"), list[Any]()
     bare = np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32)
-    monkeypatch.setattr(evaluate_maps, "render_bare_wall", lambda plan: (asked.append(plan.rig), bare)[1])
+    monkeypatch.setattr(subjects, "render_bare_wall", lambda plan: (asked.append(plan.rig), bare)[1])
     networks = {"raw": Plate(), "difference": Plate("difference maps")}
     there = rig_map.rig_at(RIG, 0.3, 15.0)
     assert set(rig_map.cell_at(there, seeded_objects(0, 1, BOX), networks)["weights"]) == set(networks)

@@ -13,7 +13,7 @@ import pytest
 from fake_wall import WallCamera
 from nlos_calibration.rig import ObjectBox
 
-from nlos_cam.evaluate_objects import SeededObject, seeded_objects
+from nlos_cam.evaluate.subjects import SeededObject, seeded_objects
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor.model import SensorModel
 

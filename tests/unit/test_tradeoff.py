@@ -9,10 +9,10 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
+from nlos_cam.evaluate.render_tradeoff import REPEATS, Part, Row, facts, measure, pareto_front, settings
 from nlos_cam.render.accuracy import STOPS
 from nlos_cam.render.accuracy_search import Agreement, Work
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.tradeoff import REPEATS, Part, Row, facts, measure, pareto_front, settings
 
 RIG = load_rig("paper-rig")
 SMALL = {name: replace(stop, relay_columns=12, relay_rows=8) for name, stop in STOPS.items()}

@@ -12,22 +12,24 @@ import torch
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset.build import TEST_SEED
-from nlos_cam.evaluate import Interval
-from nlos_cam.evaluate_objects import seeded_objects
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.tradeoff_reconstruct import (
+from nlos_cam.evaluate.metrics import Interval
+from nlos_cam.evaluate.runtime_tradeoff import (
     LEAST_CALLS,
     Bench,
     Row,
     Setting,
+    as_markdown,
     calibration,
+    draw,
+    facts,
     losses,
     measure,
     pareto_front,
     recommended,
     settings,
 )
-from nlos_cam.tradeoff_reconstruct_report import as_markdown, draw, facts
+from nlos_cam.evaluate.subjects import seeded_objects
+from nlos_cam.objects.depth_map import object_box
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -109,8 +111,8 @@ def test_a_setting_is_timed_by_its_median_on_its_threads_which_are_given_back() 
 
 
 def test_ranges_are_learnt_from_training_objects_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    from nlos_cam import tradeoff_reconstruct
     from nlos_cam.dataset import build
+    from nlos_cam.evaluate import runtime_tradeoff
 
     asked: list[tuple[int, int]] = []
 
@@ -118,7 +120,7 @@ def test_ranges_are_learnt_from_training_objects_alone(monkeypatch: pytest.Monke
         asked.append((first_seed, count))
         return seeded_objects(first_seed, 2, box)
 
-    monkeypatch.setattr(tradeoff_reconstruct, "seeded_objects", kept)
+    monkeypatch.setattr(runtime_tradeoff, "seeded_objects", kept)
     shapes = [(depth.shape, intensity.shape) for depth, intensity in calibration(RIG, BOX)]
     assert shapes == [((1, 64, 80), (1, 64, 80))] * 2
     first_seed, count = asked[0]

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from nlos_cam.evaluate.render_tradeoff import Facts, Row, as_markdown, as_table, draw, machine
 from nlos_cam.render.accuracy_search import Agreement
-from nlos_cam.render.tradeoff import Facts, Row
-from nlos_cam.render.tradeoff_report import as_markdown, as_table, draw, machine
 
 KEYS = [
     "name",

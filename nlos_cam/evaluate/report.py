@@ -11,9 +11,9 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import ObjectBox
 
-from nlos_cam import evaluate_pictures as pictures
-from nlos_cam import evaluate_surface as surfaces
-from nlos_cam.evaluate import (
+from nlos_cam.evaluate import figures as pictures
+from nlos_cam.evaluate import metrics as surfaces
+from nlos_cam.evaluate.metrics import (
     BARS,
     SMALLER_IS_BETTER,
     Interval,

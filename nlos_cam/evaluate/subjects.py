@@ -1,25 +1,120 @@
-"""What weights are judged on: the test objects or a dataset, as maps that the weights eat, on the rig of either."""
+"""The objects that weights are judged on, and the maps that a lidar with noise makes of them on any rig.
+
+What weights are judged on: the test objects or a dataset, as maps that the weights eat, on the rig of either.
+"""
 
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
+import numpy as np
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.rig import Rig
+from nlos_calibration.rig import ObjectBox, Rig
 from nlos_calibration.wall_record import rig_named
 from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.data import MapSet
+from nlos_models.inference import Reconstructor
 from nlos_models.sources import less_bare_wall
 
-from nlos_cam import evaluate_baselines as trivial
-from nlos_cam import evaluate_objects as objects
 from nlos_cam.cache import cache_folder
+from nlos_cam.camera.simulated_world import World
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import build
 from nlos_cam.dataset.training_maps import BareMaps, measured_bare_wall, render_bare_wall
 from nlos_cam.errors import SceneError
+from nlos_cam.evaluate import baselines as trivial
+from nlos_cam.frames import LidarMaps, maps_from_frame
+from nlos_cam.map_mean import MapMean
 from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import image_from_depth
+from nlos_cam.objects.placement import object_depth
+from nlos_cam.render.renderer import MultiBounce, render
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.scene_file import SceneFile
+from nlos_cam.render.sensor.model import SensorModel
+
+OnProgress = Callable[[int, int], None]
+
+QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
+"""A sensor without noise or dead pixels; saturation and quantisation stay."""
+
+
+class Subject(Protocol):
+    """An object to judge on; those of the test set are such."""
+
+    @property
+    def name(self) -> str:
+        """What tables and pictures call it."""
+        ...
+
+    @property
+    def category(self) -> str:
+        """Its kind."""
+        ...
+
+    @property
+    def depth_m(self) -> Float32:
+        """(64, 64); NaN for background."""
+        ...
+
+
+@dataclass(frozen=True)
+class SeededObject:
+    """A random object."""
+
+    name: str
+    category: str
+    depth_m: Float32
+
+
+def seeded_objects(first_seed: int, count: int, box: ObjectBox) -> list[SeededObject]:
+    """Random objects by their seeds."""
+    made = [object_depth(seed, box) for seed in range(first_seed, first_seed + count)]
+    return [SeededObject(f"{category} {first_seed + k}", category, depth) for k, (category, depth) in enumerate(made)]
+
+
+def truth_of(subjects: Sequence[Subject], box: ObjectBox) -> Float32:
+    """The images (n, 64, 64) that a perfect reconstruction would be."""
+    return np.stack([image_from_depth(subject.depth_m, box) for subject in subjects])
+
+
+def echoes_of(subjects: Sequence[Subject], rig: Rig, on_progress: OnProgress) -> list[MultiBounce]:
+    """What comes back from each object on a rig, before any sensor."""
+    echoes: list[MultiBounce] = []
+    for subject in subjects:
+        echoes.append(render(Scene(rig, subject.depth_m)).multi)
+        on_progress(len(echoes), len(subjects))
+    return echoes
+
+
+def sense(echoes: list[MultiBounce], rig: Rig, sensor: SensorModel | None = None, frames: int = 1) -> list[LidarMaps]:
+    """The maps of each echo as `live` makes them: the sensor's chain, cells, and the mean of so many frames.
+
+    The frames are the simulated camera's, bit for bit, without the pace of a device: the same call gives the same maps.
+    """
+    scene = SceneFile(name="test objects", rig=rig, sensor=sensor or SensorModel())
+    world = World(scene, echoes, [None])
+    return [_averaged(world, range(k, k + frames * len(echoes), len(echoes))) for k in range(len(echoes))]
+
+
+def _averaged(world: World, numbers: Sequence[int]) -> LidarMaps:
+    mean = MapMean(len(numbers))
+    frames = (world.images(number).frame(world.rig.pinhole) for number in numbers)
+    return [mean.add(maps_from_frame(frame)) for frame in frames][-1]
+
+
+def as_map_set(maps: Sequence[LidarMaps], truth: Float32) -> MapSet:
+    """Maps beside their truths (n, 64, 64)."""
+    return MapSet(np.stack([m.depth_m for m in maps]), np.stack([m.intensity for m in maps]), truth)
+
+
+def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:
+    """Images (n, 64, 64), one object at a time, as live does it."""
+    pairs = zip(maps.depth_m, maps.intensity, strict=True)
+    return np.concatenate([reconstructor(depth[None], intensity[None]) for depth, intensity in pairs])
 
 
 @dataclass(frozen=True)
@@ -48,10 +143,10 @@ def rig_of(record: CheckpointRecord) -> Rig:
 def fresh_objects(rig: Rig, count: int | None = None) -> Judged:
     """The 54, or so many random objects, through the noise of the simulated camera on a rig."""
     plan = build.DatasetPlan(rig, build.TEST_SEED)
-    subjects = objects.seeded_objects(plan.first_seed, count, plan.box) if count else test_set(plan.box)
+    subjects = seeded_objects(plan.first_seed, count, plan.box) if count else test_set(plan.box)
     with tracked("rendering test objects") as on_progress:
-        echoes = objects.echoes_of(subjects, rig, on_progress)
-    maps = objects.as_map_set(objects.sense(echoes, rig), objects.truth_of(subjects, plan.box))
+        echoes = echoes_of(subjects, rig, on_progress)
+    maps = as_map_set(sense(echoes, rig), truth_of(subjects, plan.box))
     kind = "random objects" if count else "fixed test objects"
     what = f"{len(subjects)} {kind} that training never draws, through the sensor's noise"
     return Judged(what, [one.name for one in subjects], [one.category for one in subjects], maps, plan)

@@ -13,7 +13,7 @@ from nlos_models.metrics import surface
 from nlos_models.recipe import SIMULATION_ONLY
 
 from nlos_cam.dataset.samples import sense_colour
-from nlos_cam.evaluate import advantage, over_objects, plain
+from nlos_cam.evaluate.metrics import advantage, over_objects, plain
 from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
 from nlos_cam.render.material import Surface
 from nlos_cam.render.scene import Scene

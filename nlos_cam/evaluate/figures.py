@@ -8,8 +8,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64
 from numpy.typing import NDArray
 
-from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, Figures, Interval
-from nlos_cam.evaluate_surface import Bin
+from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, Bin, Figures, Interval
 
 SHEET_COLUMNS = 18
 MOST_ON_A_SHEET = 54

@@ -1,0 +1,231 @@
+"""What accuracy costs in time on one scene: the stops of the dial and their ingredients against brute force.
+
+A measured trade-off as a table for machines (JSON), a table for people (Markdown) and a Pareto plot.
+"""
+
+import platform
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numba
+import numpy as np
+
+from nlos_cam.errors import SceneError
+from nlos_cam.render.accuracy import STOPS, Accuracy
+from nlos_cam.render.accuracy_search import Agreement, Echoes, Stopwatch, agreement, least_seconds
+from nlos_cam.render.effects import Effects
+from nlos_cam.render.planning import Prepared, plan
+from nlos_cam.render.renderer import Rendering, render, three_bounce
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.scene_facts import Stage
+
+Part = Literal["stop", "sub_bins", "relay grid", "object_stride", "beams_per_cell", "effect left out"]
+
+REPEATS = 7
+"""Of each setting but brute force; the least counts."""
+FINEST_BEAMS = 4
+"""Beams per cell, along each axis, that fewer are held against: brute force has one, and that is their error."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One thing to measure: a stop, or `standard` with one ingredient changed."""
+
+    name: str
+    part: Part
+    accuracy: Accuracy
+    effects: Effects = "auto"
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured of a setting."""
+
+    name: str
+    part: Part
+    seconds: float
+    speedup: float
+    """Over brute force, compiled as well."""
+    errors: Agreement
+    """Against brute force; of `beams_per_cell`, against FINEST_BEAMS at `standard`."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """How large the scene is."""
+
+    patches: int
+    beams_on_wall: int
+
+
+def settings(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> list[Setting]:
+    """All that is measured of a scene, brute force first."""
+    standard = stops["standard"]
+    ordered = sorted(stops.values(), key=lambda stop: stop.sub_bins > 0)
+    columns, rows = standard.relay_columns, standard.relay_rows
+    grids = [(max(int(columns * share), 1), max(int(rows * share), 1)) for share in (0.25, 0.5, 1, 2)]
+    called_for = [effect.name for effect in plan(Stage(scene, standard)) if effect.included]
+    return [
+        *(Setting(stop.name, "stop", stop) for stop in ordered),
+        *(Setting(f"sub_bins {n}", "sub_bins", replace(standard, sub_bins=n)) for n in (1, 2, 4, 8, 16, 32, 64)),
+        *(
+            Setting(f"relay grid {x} x {y}", "relay grid", replace(standard, relay_columns=x, relay_rows=y))
+            for x, y in grids
+        ),
+        *(Setting(f"object_stride {n}", "object_stride", replace(standard, object_stride=n)) for n in (1, 2, 4)),
+        *(Setting(f"beams_per_cell {n}", "beams_per_cell", replace(standard, beams_per_cell=n)) for n in (1, 2)),
+        *(
+            Setting(f"without {name}", "effect left out", standard, tuple(e for e in called_for if e != name))
+            for name in called_for
+        ),
+    ]
+
+
+def facts(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> Facts:
+    """The scene's size. Raises SceneError where no three-bounce path is possible: there is nothing to trade."""
+    ready = Prepared.of(scene, stops["reference"], "auto")
+    job = ready.job()
+    if job is None:
+        raise SceneError("nothing is hidden, or no light reaches it and returns: give an object within the gate")
+    return Facts(len(job.patches.beta), len(job.foot_m))
+
+
+def measure(scene: Scene, stops: Mapping[str, Accuracy] = STOPS, stopwatch: Stopwatch = least_seconds) -> Iterator[Row]:
+    """One row for each of `settings`, as they are measured."""
+    brute, *others = settings(scene, stops)
+    lit = Prepared.of(scene, brute.accuracy, "auto").beams.on_wall
+    bin_m = scene.rig.device.bin_m
+    three_bounce(scene, brute.accuracy, chosen=np.flatnonzero(lit)[:1])  # compiles
+    slow_s, slow = _timed(scene, brute, stopwatch, 1)
+    truth = Echoes.of_beams(slow).some(lit)
+    yield Row(brute.name, brute.part, slow_s, 1.0, agreement(truth, truth, bin_m))
+    finest = render(scene, replace(stops["standard"], beams_per_cell=FINEST_BEAMS))
+    true_cells = Echoes.of_cells(finest, scene).some(lit)
+    for setting in others:
+        render(scene, setting.accuracy, setting.effects)  # compiles
+        seconds, found = _timed(scene, setting, stopwatch, REPEATS)
+        if setting.part == "beams_per_cell":
+            errors = agreement(Echoes.of_cells(found, scene).some(lit), true_cells, bin_m)
+        else:
+            errors = agreement(Echoes.of_beams(found).some(lit), truth, bin_m)
+        yield Row(setting.name, setting.part, seconds, slow_s / seconds, errors)
+
+
+def _timed(scene: Scene, setting: Setting, stopwatch: Stopwatch, repeats: int) -> tuple[float, Rendering]:
+    kept: list[Rendering] = []
+    seconds = stopwatch(lambda: kept.append(render(scene, setting.accuracy, setting.effects)), repeats)
+    return seconds, kept[-1]
+
+
+def pareto_front(rows: list[Row]) -> list[Row]:
+    """The rows held against brute force of which no other is both quicker and nearer, from quick to slow."""
+    front: list[Row] = []
+    for row in sorted(_alike(rows), key=lambda row: (row.seconds, row.errors.intensity_error_p99)):
+        if not front or row.errors.intensity_error_p99 < front[-1].errors.intensity_error_p99:
+            front.append(row)
+    return front
+
+
+def _alike(rows: list[Row]) -> list[Row]:
+    """Those whose intensity error tells what they miss: an effect left out may change the map alone."""
+    return [row for row in rows if row.part not in {"beams_per_cell", "effect left out"}]
+
+
+HEAD = (
+    "| setting | seconds | times faster | peak error: median | p99 | max | same bin | within one "
+    "| depth: median | mean |\n"
+    "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+)
+BEAMS = f"{FINEST_BEAMS} x {FINEST_BEAMS}"
+NOTES = f"""Seconds are the least of several renderings, all in one run; brute force is compiled too, and ran once. Peak
+error is that of the strongest three-bounce bin, relative, over the beams that light the wall; depth is what the lidar
+reports.
+Ingredients are `standard` with one thing changed. `beams_per_cell` is held against {BEAMS} beams per cell at
+`standard`, cell by cell: brute force has one beam per cell, and that is its own error. Brute force stands on the same
+relay grid as `standard`: where a finer relay grid differs from it, the finer one is the nearer to the truth."""
+
+
+def machine() -> str:
+    """The machine in words."""
+    cpu = Path("/proc/cpuinfo")
+    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    model = names[0] if names else platform.processor() or platform.machine()
+    return f"{numba.get_num_threads()} threads, {model}, {platform.system()}, Python {platform.python_version()}"
+
+
+def as_table(facts: Facts, rows: list[Row], planned: int) -> dict[str, Any]:
+    """Everything, in the order of `measure`, ready for JSON; `complete` tells whether all that was planned is in it."""
+    flat = [
+        {"name": row.name, "part": row.part, "seconds": row.seconds, "speedup": row.speedup, **asdict(row.errors)}
+        for row in rows
+    ]
+    return {
+        "machine": machine(),
+        **asdict(facts),
+        "reference_seconds": rows[0].seconds if rows else None,
+        "complete": len(rows) == planned,
+        "stops": [{k: v for k, v in row.items() if k != "part"} for row in flat if row["part"] == "stop"],
+        "ingredients": [row for row in flat if row["part"] != "stop"],
+        "pareto_front": [row.name for row in pareto_front(rows)],
+    }
+
+
+def as_markdown(table: dict[str, Any]) -> str:
+    """The table for people."""
+    size = f"{table['patches']} patches, {table['beams_on_wall']} beams on the wall"
+    parts = [
+        f"{table['machine']}; {size}; brute force {table['reference_seconds']:.3g} s."
+        + ("" if table["complete"] else " Interrupted: not all was measured."),
+        "\n".join([HEAD, *map(_line, table["stops"])]),
+        "\n".join([HEAD, *map(_line, table["ingredients"])]),
+        NOTES,
+        f"Nothing measured is both quicker and nearer than: {', '.join(table['pareto_front'])}.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _line(row: dict[str, Any]) -> str:
+    errors = (f"{100 * row[f'intensity_error_{of}']:.3g} %" for of in ("median", "p99", "max"))
+    bins = (f"{100 * row[of]:.2f} %" for of in ("bin_exact", "bin_within_1"))
+    depths = (f"{row[of]:.2g} mm" for of in ("depth_error_mm", "depth_error_mean_mm"))
+    first = row["name"], f"{row['seconds']:.4f}", f"{row['speedup']:.0f}"
+    return f"| {' | '.join([*first, *errors, *bins, *depths])} |"
+
+
+def draw(path: Path, rows: list[Row], title: str) -> None:
+    """Error against time, both logarithmic; what has no error stands on the lower edge."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    axis = figure.add_subplot()
+    shown = [row for row in rows if row.part != "beams_per_cell"]
+    floor = 0.5 * min((error for row in shown if (error := row.errors.intensity_error_p99) > 0), default=1e-6)
+
+    def places(of: list[Row]) -> tuple[list[float], list[float]]:
+        return [1000 * row.seconds for row in of], [100 * max(row.errors.intensity_error_p99, floor) for row in of]
+
+    axis.plot(*places(pareto_front(rows)), color="0.8", linewidth=6, solid_capstyle="round", label="Pareto front")
+    for part in dict.fromkeys(row.part for row in shown if row.part != "stop"):
+        series = [row for row in shown if row.part == part]
+        line = "none" if part == "effect left out" else "-"
+        (drawn,) = axis.plot(*places(series), marker="o", markersize=4, linestyle=line, label=part)
+        _label(axis, series, places(series), drawn.get_color(), 7)
+    stops = [row for row in shown if row.part == "stop"]
+    axis.plot(*places(stops), linestyle="none", marker="*", markersize=15, color="black", clip_on=False, label="stops")
+    _label(axis, stops, places(stops), "black", 11)
+    axis.set(xscale="log", yscale="log", xlabel="milliseconds", title=title)
+    axis.set_ylim(bottom=100 * floor)
+    axis.set_ylabel("99th percentile of the relative peak error, % (no error: lower edge)")
+    axis.grid(visible=True, which="both", alpha=0.2)
+    axis.legend()
+    figure.savefig(path, dpi=110)
+
+
+def _label(axis: Any, rows: list[Row], places: tuple[list[float], list[float]], colour: Any, size: int) -> None:
+    for row, x, y in zip(rows, *places, strict=True):
+        name = row.name.removeprefix(row.part).strip()
+        style = {"fontsize": size, "color": colour, "ha": "center"}
+        axis.annotate(name, (x, y), xytext=(0, size), textcoords="offset points", **style)
