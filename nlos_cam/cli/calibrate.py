@@ -1,28 +1,161 @@
-"""`nlos-cam calibrate`: measure the bench before using it."""
+"""`nlos-cam calibrate`: measure the bench before using it.
 
+What a person is told of a calibration.
+
+`calibrate --watch`: distance and angle on the terminal, ten times a second, while somebody positions the rig.
+
+`nlos-cam board`: print a board that tells the wall where the lidar's depth does not.
+"""
+
+import sys
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
+from threading import Event, Thread
 from typing import Annotated
 
 import numpy as np
 import typer
-from nlos_calibration.board import BOARDS, Paper
+from nlos_calibration.board import BOARDS, PAPER_MM, Paper
 from nlos_calibration.board_corners import Light
 from nlos_calibration.board_view import BoardView
-from nlos_calibration.board_wall import WallByBoard
+from nlos_calibration.board_wall import BoardRecord, WallByBoard
 from nlos_calibration.measured_wall import load_measured
+from nlos_calibration.uncertainty import INTERVAL_STDS
+from nlos_calibration.verdict import DISTANCE_RANGE_M, FACING_RANGE_DEG
 from nlos_calibration.wall import WallFit
 from nlos_calibration.wall_record import OccluderRecord, WallRecord, wall_record
 from numpy.typing import NDArray
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
 
+from nlos_cam.calibrate.board_pdf import write_sheet
 from nlos_cam.calibrate.color_view import look_in_colour
 from nlos_cam.calibrate.files import WallFiles, written
-from nlos_cam.calibrate.measure import Seen, by_board, by_depth, by_occluder, look
+from nlos_cam.calibrate.measure import Glance, Seen, by_board, by_depth, by_occluder, glance, look
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.protocol import Camera
-from nlos_cam.cli.calibrate_told import told
-from nlos_cam.cli.calibrate_watch import watch_until_enter
-from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, tracked
+from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stderr, tracked
+from nlos_cam.frames import MOST_SATURATED
+
+
+def told(record: WallRecord, files: WallFiles) -> str:
+    """What was measured, with the half width of each 95 % interval."""
+    colour = "green" if record.verdict == "good" else "yellow"
+    facing, yaw, pitch = (
+        f"{angle} ± {_interval(std):.4f}"
+        for angle, std in (
+            (f"{record.facing_deg:.2f}", record.facing_std_deg),
+            (f"{record.yaw_deg:+z.2f}", record.yaw_std_deg),
+            (f"{record.pitch_deg:+z.2f}", record.pitch_std_deg),
+        )
+    )
+    lines = [
+        f"distance  {record.distance_m:.4f} m ± {1e3 * _interval(record.distance_std_m):.4f} mm",
+        f"facing    {facing} degrees (yaw {yaw}, pitch {pitch})",
+    ]
+    if record.residual_m is not None:
+        share = f"{record.inlier_fraction:.1%} of the depth on the plane"
+        lines.append(f"residual  {record.residual_m * 1e3:.2f} mm RMS, {share}")
+    if record.occluder is not None:
+        lines.append(f"occluder  {_occluder_told(record.occluder)}")
+    if record.footprint_share is not None:
+        lines.append(f"footprint {record.footprint_share:.0%} of the map's cells are on the wall")
+    if record.board is not None:
+        lines.append(f"board     {_board_told(record.board)}")
+    if record.range_offset_std_m is not None:
+        offset, interval = 1e3 * record.range_offset_m, 1e3 * _interval(record.range_offset_std_m)
+        lines.append(f"offset    {offset:+.1f} ± {interval:.1f} mm of the lidar's {record.range_offset_cause}")
+    lines.append(f"verdict   [bold {colour}]{record.verdict}[/]: {record.advice}")
+    lines += [f"note      {warning}" for warning in record.warnings]
+    beside = [files.reference.name] if record.reference else []
+    return "\n".join([*lines, f"wrote {escape(', '.join([str(files.record), *beside, files.report.name]))}"])
+
+
+def _interval(std: float | None) -> float:
+    return INTERVAL_STDS * (std or 0.0)
+
+
+def _occluder_told(occluder: OccluderRecord) -> str:
+    if occluder.x_std_m is None or occluder.gap_std_m is None:
+        return f"{occluder.x_m:.3f} m from the foot, {occluder.gap_m:.3f} m off the wall (entered)"
+    x, gap = 1e3 * _interval(occluder.x_std_m), 1e3 * _interval(occluder.gap_std_m)
+    return f"{occluder.x_m:.4f} m ± {x:.2f} mm from the foot, {occluder.gap_m:.4f} m ± {gap:.2f} mm off the wall"
+
+
+def _board_told(board: BoardRecord) -> str:
+    found = f"{board.distance_m:.4f} m ± {1e3 * _interval(board.distance_std_m):.2f} mm, {board.facing_deg:.2f} degrees"
+    found += f" ± {_interval(board.facing_std_deg):.3f}, by {board.corners} corners"
+    if board.disagreement_m is None or board.disagreement_deg is None:
+        return found
+    apart = f"{1e3 * board.disagreement_m:+z.2f} mm and {board.disagreement_deg:.3f} degrees from the depth's plane"
+    return f"{found}; {apart} ({board.disagreement_sigmas:.1f} sigma); used: {board.used}"
+
+
+EVERY = 3
+"""Of 30 frames a second."""
+GAUGE_WIDTH = 31
+
+
+def watch(camera: Camera, stop: Callable[[], bool]) -> Glance | None:
+    """Show what each third frame of an entered camera says, until it ends or `stop` says so; returns the last."""
+    last: Glance | None = None
+    with Live(console=stderr, auto_refresh=False, transient=True) as live:
+        for number, frame in enumerate(camera):
+            if number % EVERY == 0:
+                last = glance(frame)
+                live.update(panel(last), refresh=True)
+            if stop():
+                break
+    return last
+
+
+def until_enter() -> Callable[[], bool]:
+    """Whether somebody has pressed Enter since; the end of the input counts as that."""
+    pressed = Event()
+
+    def wait() -> None:
+        sys.stdin.readline()
+        pressed.set()
+
+    Thread(target=wait, name="waits for Enter", daemon=True).start()
+    return pressed.is_set
+
+
+def watch_until_enter(camera: Camera) -> None:
+    """Show the wall until Enter is pressed."""
+    say("position the lidar; [bold]Enter[/] measures, Ctrl-C leaves", marked=True)
+    with camera as source:
+        last = watch(source, until_enter())
+    if last is not None:
+        stderr.print(panel(last))
+
+
+def panel(seen: Glance) -> Table:
+    """A glance as a few lines with gauges over the paper's ranges."""
+    table = Table.grid(padding=(0, 2))
+    if seen.fit is None:
+        table.add_row("wall", f"[yellow]not measured:[/] {escape(seen.refused)}")
+    else:
+        fit = seen.fit
+        table.add_row("distance", f"{fit.distance_m:.4f} m", gauge(fit.distance_m, *DISTANCE_RANGE_M))
+        table.add_row("facing", f"{fit.facing_deg:.2f} deg", gauge(fit.facing_deg, *FACING_RANGE_DEG))
+        table.add_row("yaw, pitch", f"{fit.yaw_deg:+z.2f}, {fit.pitch_deg:+z.2f} deg")
+        colour = "green" if fit.verdict == "good" else "yellow"
+        table.add_row("verdict", f"[{colour}]{fit.verdict}[/]", fit.advice)
+    if seen.saturated > MOST_SATURATED:
+        table.add_row("infrared", f"{seen.saturated:.1%} saturated", "lower the laser's power, or move back")
+    return table
+
+
+def gauge(value: float, low: float, high: float) -> str:
+    """Where a value lies on the way from `low` to `high`; at an end, with an arrow, where it is beyond."""
+    share = (value - low) / (high - low)
+    place = round(min(max(share, 0.0), 1.0) * (GAUGE_WIDTH - 1))
+    mark = "◀" if share < 0 else "▶" if share > 1 else "●"
+    return f"{low:g} {'─' * place}{mark}{'─' * (GAUGE_WIDTH - 1 - place)} {high:g}"
+
 
 Wall = Annotated[bool, typer.Option("--wall", help="Measure the bare wall: no object, no occluder.")]
 CameraUri = Annotated[str | None, typer.Option("--camera", help="l515, l515:SERIAL, sim:bare-wall, ...")]
@@ -185,3 +318,27 @@ def _record(
         occluder=occluder,
         others={**seen.facts(), **facts},
     )
+
+
+SheetOut = Annotated[Path | None, typer.Option("--out", help="The PDF to write.")]
+OnSheet = Annotated[Paper, typer.Option("--paper", help="What it will be printed on.")]
+
+
+def register_board(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(board)
+
+
+def board(out: SheetOut = None, paper: OnSheet = "a4", overwrite: Overwrite = False, json: Json = False) -> None:
+    """Write a ChArUco board as a PDF to scale, to be glued to the wall for `nlos-cam calibrate --wall --board`."""
+    path = output_path(out, "board", ".pdf", overwrite=overwrite)
+    write_sheet(path, paper)
+    printed = BOARDS[paper]
+    squares = f"{printed.squares_x} x {printed.squares_y} squares of {printed.square_mm:g} mm"
+    text = (
+        f"{squares} on {paper}\n"
+        "print at 100 % with a laser printer (dye ink is white in infrared), and measure the bar: 100 mm\n"
+        f"wrote {path}"
+    )
+    result = {"out": str(path), "paper": paper, "page_mm": list(PAPER_MM[paper]), **printed.model_dump()}
+    finish(result, as_json=json, text=text)

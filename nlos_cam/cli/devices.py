@@ -1,7 +1,12 @@
-"""`nlos-cam devices`: which cameras there are, as librealsense and as USB see them."""
+"""`nlos-cam devices`: which cameras there are, as librealsense and as USB see them.
 
+`nlos-cam doctor`: why a camera is not found, and exactly what to do.
+"""
+
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -9,10 +14,12 @@ from rich.table import Table
 
 from nlos_cam.camera import SIMULATED
 from nlos_cam.camera.l515 import DeviceInfo
-from nlos_cam.cli.common import Json, finish, show
-from nlos_cam.doctor import Facts, gather
+from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, show
+from nlos_cam.doctor import Check, Facts, diagnose, gather
 from nlos_cam.doctor.facts import Pair
+from nlos_cam.doctor.udev import install, rules
 from nlos_cam.doctor.usb import UsbDevice
+from nlos_cam.errors import NlosCamError
 
 SEEN = {True: "yes", False: "[red]no[/]", None: ""}
 """A camera seen, not seen, and not looked for."""
@@ -28,7 +35,7 @@ def devices(json: Json = False) -> None:
     facts = gather()
     if not json:
         show(_table(facts))
-    finish(_result(facts), as_json=json, text=_told(facts), marked=True)
+    finish(_result(facts), as_json=json, text=_format_device(facts), marked=True)
 
 
 def _result(facts: Facts) -> dict[str, Any]:
@@ -92,7 +99,7 @@ def _row(facts: Facts, pair: Pair) -> list[str]:
     return [_uri(pair.sdk), *map(escape, (pair.name, pair.serial, pair.firmware, pair.link)), *seen]
 
 
-def _told(facts: Facts) -> str:
+def _format_device(facts: Facts) -> str:
     """What is missing, and where to ask why."""
     told: list[str] = []
     if error := facts.sdk.error:
@@ -104,3 +111,46 @@ def _told(facts: Facts) -> str:
     if told or any(pair.usb is None or pair.sdk is None for pair in facts.pairs):
         told.append("`nlos-cam doctor` says why, and what to do")
     return "\n".join(told) or "librealsense and USB see the same"
+
+
+COLOURS = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
+WriteUdev = Annotated[Path | None, typer.Option("--write-udev", help="Write the udev rules for the L515 to this file.")]
+
+
+def register_doctor(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(doctor)
+
+
+def doctor(write_udev: WriteUdev = None, overwrite: Overwrite = False, json: Json = False) -> None:
+    """Check everything between a camera and this program, and say what to do; exit code 0 whatever is found."""
+    if write_udev is not None:
+        _write(output_path(write_udev, "", ".rules", overwrite=overwrite))
+    checks = diagnose(gather())
+    if not json:
+        show(_checks_table(checks))
+    failures = sum(check.status == "failed" for check in checks)
+    result = {"checks": [asdict(check) for check in checks], "ok": not failures}
+    finish(result, as_json=json, text=_format_check(checks, failures), marked=True)
+
+
+def _write(path: Path) -> None:
+    try:
+        path.write_text(rules(), encoding="utf-8")
+    except OSError as error:
+        raise NlosCamError(f"{path} cannot be written ({error.strerror}): write it here, then install it") from error
+    say(f"wrote {path!s}; to put it in force, run, and plug the camera in again:\n  {install(str(path))}")
+
+
+def _checks_table(checks: Sequence[Check]) -> Table:
+    table = Table("", "check", "what was seen", box=None, pad_edge=False)
+    for check in checks:
+        table.add_row(f"[{COLOURS[check.status]}]{check.status}[/]", check.name, escape(check.detail))
+    return table
+
+
+def _format_check(checks: Sequence[Check], failures: int) -> str:
+    """The fixes, each on a line that can be copied, and the sum."""
+    fixes = [f"[bold]{check.name}[/]: {escape(check.fix)}" for check in checks if check.fix]
+    told = f"{failures} of {len(checks)} checks failed" if failures else "nothing failed"
+    return "\n".join(["", *(["what to do, from the top:", *fixes, ""] if fixes else []), told])

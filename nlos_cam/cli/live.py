@@ -1,6 +1,15 @@
-"""`nlos-cam live` and `nlos-cam replay`: frames in, hidden depth out."""
+"""`nlos-cam live` and `nlos-cam replay`: frames in, hidden depth out.
 
-from dataclasses import asdict
+What `nlos-cam live` tells a person: warnings as they come, and a report at the end.
+
+What `nlos-cam live` leaves behind, where it is asked to: a recording, a log of its frames, a saved view.
+
+`nlos-cam live --budget-ms`: the setting that keeps a delay on this machine, found by measuring, and told.
+"""
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -8,8 +17,9 @@ from typing import Annotated
 import typer
 from nlos_models.doubt_inference import Doubter
 from nlos_models.inference import Reconstructor
+from rich.markup import escape
 
-from nlos_cam.camera import Camera, open_camera
+from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.protocol import WallClock
 from nlos_cam.camera.registry import Reader
 from nlos_cam.cli.common import (
@@ -24,21 +34,120 @@ from nlos_cam.cli.common import (
     stop_on_signals,
     tracked,
 )
-from nlos_cam.cli.live_budget import BudgetMs, Tradeoff
-from nlos_cam.cli.live_kept import Log, RecordTo, kept_of
-from nlos_cam.cli.live_told import told, warn
-from nlos_cam.cli.live_view import NoView, Open, ViewHost, ViewPort, tell_of_view, viewer_of
-from nlos_cam.cli.view import SaveReplayView, SaveView, Stills, Video, saving
+from nlos_cam.cli.view import (
+    SUFFIX,
+    NoView,
+    Open,
+    SaveReplayView,
+    SaveView,
+    Stills,
+    Video,
+    ViewHost,
+    ViewPort,
+    saving,
+    tell_of_view,
+    viewer_of,
+)
 from nlos_cam.live.budget import SHIPPED, Choice, loader, options_here, timer, within_budget
-from nlos_cam.live.loop import run_live, warm_up
+from nlos_cam.live.frame_log import SUFFIXES, FrameLog
+from nlos_cam.live.loop import in_words, run_live, warm_up
 from nlos_cam.live.physics_check_process import BackgroundChecks
 from nlos_cam.live.realtime import precedence, undisturbed
 from nlos_cam.live.replay import REPORT, replay
 from nlos_cam.live.replay_media import Looks
-from nlos_cam.live.statistics import LiveReport
+from nlos_cam.live.statistics import OUTSIDE_LATENCY, LiveReport
 from nlos_cam.reconstruct.bench import Bench, open_bench
 from nlos_cam.reconstruct.physics_check import Checks
 from nlos_cam.reconstruct.pipeline import Processing, load_doubt, load_networks, misfits, set_up
+from nlos_cam.view.viewer import Moment
+
+
+def warn(warning: str, begins: bool) -> None:
+    """Tell that a warning begins, or ends."""
+    say(f"[yellow]warning:[/] {escape(warning)}" if begins else f"no longer: {escape(warning)}", marked=True)
+
+
+def told(report: LiveReport) -> str:
+    """The report in a few lines."""
+    latency = report.latency_ms
+    lines = [
+        f"{report.frames} frames, {report.fps:.1f} per second, {report.dropped} dropped",
+        f"latency  {latency['p50']:.0f} ms median, {latency['p95']:.0f} ms p95, {latency['p99']:.0f} ms p99",
+        f"stages   {_stages(report)} (median and p99 in ms)",
+    ]
+    if report.verdicts:
+        lines.append(f"verdicts {', '.join(f'{count} {verdict}' for verdict, count in report.verdicts.items())}")
+    if seen := in_words(report.counts):
+        lines.append(f"seen     {seen}")
+    if report.stalled_s:
+        lines.append(f"stalled  {report.stalled_s:.1f} s without a frame")
+    lines += [f"warning  {frames} frames: {text}" for text, frames in report.warnings.items()]
+    return "\n".join(lines)
+
+
+def _stages(report: LiveReport) -> str:
+    """Those that make up the latency first, and then the others."""
+    stages = report.stages_percentiles_ms
+    ordered = sorted(stages, key=lambda name: name in OUTSIDE_LATENCY)
+    return ", ".join(f"{name} {stages[name]['p50']:.1f} {stages[name]['p99']:.1f}" for name in ordered)
+
+
+RecordTo = Annotated[Path | None, typer.Option("--record", help="Also record the camera's streams (F.bag).")]
+Log = Annotated[Path | None, typer.Option("--log", help="Write one line for each frame: F.csv, or F.jsonl.")]
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a live run leaves behind, where it was asked to."""
+
+    recording: Recording | None
+    log: Path | None
+    view: Path | None
+
+    def say(self) -> None:
+        """Where it is, once it is written."""
+        if self.recording:
+            say(f"recorded {self.recording.sets} frames to {self.recording.path}")
+        if self.view:
+            say(f"saved the view: nlos-cam view {self.view}")
+
+    @contextmanager
+    def logging(self) -> Generator[Callable[[Moment], None]]:
+        """What is called with each frame's moment: a log's `add`, if there is a path to write it to."""
+        if self.log is None:
+            yield lambda _: None
+            return
+        with FrameLog(self.log) as frame_log:
+            yield frame_log.add
+        say(f"logged each frame to {self.log}")
+
+
+def kept_of(record: Path | None, log: Path | None, save_view: Path | None, *, overwrite: bool) -> Kept:
+    """Raises typer.BadParameter for a name that is not of its kind, or that is taken."""
+    path = _named(record, "--record", "a recording", (".bag",), overwrite=overwrite)
+    frame_log = _named(log, "--log", "a log", SUFFIXES, overwrite=overwrite)
+    view = _named(save_view, "--save-view", "a saved view", (SUFFIX,), overwrite=overwrite)
+    return Kept(Recording(path, optional=True) if path else None, frame_log, view)
+
+
+def _named(path: Path | None, option: str, what: str, suffixes: tuple[str, ...], *, overwrite: bool) -> Path | None:
+    """Where something is written, if it is. Raises typer.BadParameter for a name that is not of its kind."""
+    if path is None:
+        return None
+    if path.suffix not in suffixes:
+        raise typer.BadParameter(f"{option} {path}: {what}'s name ends in {' or '.join(suffixes)}")
+    return output_path(path, "live", path.suffix, overwrite=overwrite)
+
+
+BudgetMs = Annotated[
+    float | None,
+    typer.Option("--budget-ms", min=0.1, help="Choose the most accurate setting whose delay stays below so much."),
+]
+Tradeoff = Annotated[
+    Path | None,
+    typer.Option("--tradeoff", help="What `tradeoff reconstruct` measured, for --budget-ms; else beside the weights."),
+]
+
 
 CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:scene.toml, bag:run.bag.")]
 Wall = Annotated[Path | None, typer.Option("--wall", help="The wall as `calibrate --wall` found it (wall.toml).")]

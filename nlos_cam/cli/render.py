@@ -1,4 +1,9 @@
-"""`render`: one hidden object to the maps that the lidar would report, with numbers and a picture."""
+"""`render`: one hidden object to the maps that the lidar would report, with numbers and a picture.
+
+How `render` renders: the options of surface, radiometry and accuracy, and the scene and setting that they make.
+
+OBJECT and the options that place it: what `render` hides, as the depth map that the wall sees.
+"""
 
 import time
 from dataclasses import replace
@@ -8,30 +13,165 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from nlos_calibration.arrays import Float32
+from nlos_calibration.rig import Rig, first_problem
 from nlos_calibration.wall_record import rig_named
+from pydantic import ValidationError
 from rich.table import Table
 
-from nlos_cam.cli import how
-from nlos_cam.cli.common import Json, Overwrite, finish, output_path, stderr
-from nlos_cam.cli.hidden_object import (
-    Front,
-    Object,
-    OffsetX,
-    OffsetY,
-    Seed,
-    Size,
-    TiltX,
-    TiltY,
-    Turn,
-    UpAxis,
-    hidden_depth,
-)
-from nlos_cam.render.accuracy_search import costs
+from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, stderr
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.meshes import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, Up, read_depth_map, read_mesh
+from nlos_cam.objects.placement import fit, nothing_to_see
+from nlos_cam.render.accuracy import Accuracy, accuracy_named
+from nlos_cam.render.accuracy_search import choose, costs
+from nlos_cam.render.effects import EFFECTS, Effects
+from nlos_cam.render.material import Material
 from nlos_cam.render.renderer import Rendering, render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_file import load_scene
+from nlos_cam.render.scene_file import HiddenObject, SceneFile, load_scene
 from nlos_cam.render.sensor.effects import sensor_effects
 from nlos_cam.render.sensor.model import SensorModel
+
+Stop = Annotated[str | None, typer.Option("--accuracy", help="draft, standard (the default), fine or reference.")]
+MaxError = Annotated[
+    float | None, typer.Option("--max-error", help="Cheapest accuracy whose peak intensities are within this share.")
+]
+MaxSeconds = Annotated[float | None, typer.Option("--max-seconds", help="Most accurate that takes no longer.")]
+BeamsPerCell = Annotated[int | None, typer.Option("--beams-per-cell", help="Beams along each axis of a map cell.")]
+EffectNames = Annotated[
+    str, typer.Option("--effects", help=f"auto: what the scene calls for. Or exactly these: {', '.join(EFFECTS)}.")
+]
+Backend = Annotated[str, typer.Option("--backend", help="cpu, torch (on the CPU) or cuda.")]
+RadiometryName = Annotated[str | None, typer.Option("--radiometry", help="paper (S1 to S5) or lambertian.")]
+MaterialKind = Annotated[str | None, typer.Option("--material", help="lambertian, phong or retroreflective.")]
+Specular = Annotated[float | None, typer.Option("--specular", help="Share of the albedo that a lobe takes.")]
+Exponent = Annotated[float | None, typer.Option("--exponent", help="Of the lobe's cosine: the larger, the narrower.")]
+Albedo = Annotated[
+    str | None, typer.Option("--albedo", help="One number, or three with commas between: red,green,blue.")
+]
+PulseNs = Annotated[float | None, typer.Option("--pulse-ns", help="Full width of the laser's pulse at half height.")]
+
+
+def scene_of(bare: Scene, material: dict[str, Any], options: dict[str, Any]) -> Scene:
+    """A scene with those of the options that were given (not None): fields of Material, and of Scene.
+
+    Raises typer.BadParameter or SceneError with the field, the value and the range.
+    """
+    given = {name: value for name, value in material.items() if value is not None}
+    if isinstance(text := given.get("albedo"), str):
+        given["albedo"] = _numbers(text)
+    if given:
+        try:
+            bare = replace(bare, surface=Material(**given).surface)
+        except ValidationError as error:
+            raise typer.BadParameter(first_problem(error)) from error
+    return replace(bare, **{name: value for name, value in options.items() if value is not None})
+
+
+def _numbers(text: str) -> float | tuple[float, ...]:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise typer.BadParameter(f"albedo {text!r} is not a number, nor three with commas between") from error
+    return values[0] if len(values) == 1 else values
+
+
+def effects_of(text: str) -> Effects:
+    """What `--effects` names."""
+    return "auto" if text == "auto" else [name for name in text.split(",") if name]
+
+
+def accuracy_of(
+    stop: str | None,
+    max_error: float | None,
+    max_seconds: float | None,
+    beams_per_cell: int | None,
+    scene: Scene,
+    effects: Effects,
+    backend: str,
+) -> Accuracy:
+    """The setting of a stop, or the one that keeps a bound. Raises typer.BadParameter where both are given."""
+    if max_error is None and max_seconds is None:
+        setting = accuracy_named(stop or "standard")
+        return setting if beams_per_cell is None else replace(setting, beams_per_cell=beams_per_cell)
+    if stop is not None or beams_per_cell is not None:
+        raise typer.BadParameter(
+            "--max-error and --max-seconds choose the accuracy: leave out --accuracy and --beams-per-cell"
+        )
+    return choose(scene, max_error, max_seconds, effects, backend).accuracy
+
+
+_KINDS = f"a mesh ({', '.join(MESH_SUFFIXES)}), a {DEPTH_MAP_SUFFIX} depth map (n, n) in metres"
+
+
+def _option(field: str, told: str) -> Any:
+    """An option of the same name as a field of HiddenObject: None where it is not given."""
+    default = HiddenObject.model_fields[field].default
+    return typer.Option(f"--{field.replace('_', '-')}", help=told, show_default=str(default))
+
+
+Object = Annotated[str, typer.Argument(metavar="OBJECT", help=f"A category's name, {_KINDS}.")]
+Seed = Annotated[int | None, _option("seed", "Which variation of a category.")]
+UpAxis = Annotated[Up | None, _option("up", "What points up in a mesh's file; -z (z up: its +y) faces the wall.")]
+Size = Annotated[float | None, _option("size_m", "Larger of its extents along x and y, once turned. It scales a mesh.")]
+TiltX = Annotated[float | None, _option("tilt_x_deg", "Its angle about wall x, turned first.")]
+TiltY = Annotated[float | None, _option("tilt_y_deg", "Then about wall y (up): 180 turns its back to the wall.")]
+Turn = Annotated[float | None, _option("turn_deg", "Then about wall z.")]
+OffsetX = Annotated[float | None, _option("x_m", "Its middle from the box's middle, away from the lidar.")]
+OffsetY = Annotated[float | None, _option("y_m", "Its middle from the box's middle, up.")]
+Front = Annotated[float | None, _option("front_m", "From the box to its nearest point; too deep a thing is flattened.")]
+
+
+def hidden_depth(hidden: str, rig: Rig, options: dict[str, Any]) -> Float32:
+    """The depth map (n, n) over the rig's object box of what OBJECT names; `options` are fields of HiddenObject.
+
+    Says on stderr what the box cuts off or flattens. Raises SceneError for an object that cannot be, and
+    typer.BadParameter for options (those that are not None) that do not go with it or are out of their range.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    if hidden in CATEGORIES:
+        _refuse(given, {"up"}, f"{hidden} is a category, which stands with y up")
+        return _placed({"category": hidden, **given}, rig)
+    suffix = Path(hidden).suffix.lower()
+    if suffix == DEPTH_MAP_SUFFIX:
+        _refuse(given, set(given), f"{hidden} is a depth map, which is placed already")
+        return _depth_map(Path(hidden))
+    if suffix in MESH_SUFFIXES:
+        _refuse(given, {"seed"}, f"{hidden} is a mesh, which has no variations")
+        return _placed({"file": read_mesh(Path(hidden)), **given}, rig)
+    raise SceneError(f"no object {hidden!r}: give {_KINDS}, or one of {', '.join(CATEGORIES)}")
+
+
+def _refuse(given: dict[str, Any], pointless: set[str], why: str) -> None:
+    if extra := [f"--{name.replace('_', '-')}" for name in given if name in pointless]:
+        raise typer.BadParameter(f"{why}: leave out {', '.join(extra)}")
+
+
+def _depth_map(path: Path) -> Float32:
+    depth_m = read_depth_map(path)
+    if np.isnan(depth_m).all():
+        say(f"{path} is an empty object (all of it is NaN): it hides nothing")
+    return depth_m
+
+
+def _placed(fields: dict[str, Any], rig: Rig) -> Float32:
+    try:
+        thing = HiddenObject(**fields)
+    except ValidationError as error:
+        raise typer.BadParameter(first_problem(error)) from error
+    box, scene = object_box(rig), SceneFile(name=thing.label, rig=rig, object=thing)
+    depth_m = scene.scene_at(0).object_depth_m
+    if depth_m is None or np.isnan(depth_m).all():
+        raise nothing_to_see(thing.label, box)
+    taken = fit(thing.triangles, scene.pose_at(thing, 0), box)
+    if taken.outside:
+        say(f"{thing.label}: {taken.outside:.0%} of its silhouette is outside the object box, and cut off")
+    if taken.depth_m > taken.room_m:
+        depths = f"{taken.depth_m:.3g} m deep, flattened to the {taken.room_m:.3g} m that the object box has for it"
+        say(f"{thing.label}: {depths}")
+    return depth_m
 
 
 def register(app: typer.Typer) -> None:
@@ -44,9 +184,9 @@ def command(
     out: Annotated[Path | None, typer.Option("--out", help="Maps (.npz); a picture goes beside them.")] = None,
     scene: Annotated[Path | None, typer.Option("--scene", help="A scene.toml: its object gives way to OBJECT.")] = None,
     rig: Annotated[str, typer.Option("--rig", help="A packaged rig's name, or a rig's TOML file.")] = "paper-rig",
-    accuracy: how.Stop = None,
-    max_error: how.MaxError = None,
-    max_seconds: how.MaxSeconds = None,
+    accuracy: Stop = None,
+    max_error: MaxError = None,
+    max_seconds: MaxSeconds = None,
     seed: Seed = None,
     up: UpAxis = None,
     size_m: Size = None,
@@ -56,15 +196,15 @@ def command(
     x_m: OffsetX = None,
     y_m: OffsetY = None,
     front_m: Front = None,
-    radiometry: how.RadiometryName = None,
-    material: how.MaterialKind = None,
-    specular: how.Specular = None,
-    exponent: how.Exponent = None,
-    albedo: how.Albedo = None,
-    pulse_ns: how.PulseNs = None,
-    beams_per_cell: how.BeamsPerCell = None,
-    effects: how.EffectNames = "auto",
-    backend: how.Backend = "cpu",
+    radiometry: RadiometryName = None,
+    material: MaterialKind = None,
+    specular: Specular = None,
+    exponent: Exponent = None,
+    albedo: Albedo = None,
+    pulse_ns: PulseNs = None,
+    beams_per_cell: BeamsPerCell = None,
+    effects: EffectNames = "auto",
+    backend: Backend = "cpu",
     explain: Annotated[bool, typer.Option("--explain", help="Tell which effects the scene calls for.")] = False,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -74,12 +214,12 @@ def command(
     file = load_scene(scene) if scene else None
     bare = file.bare if file else Scene(rig_named(rig))
     surface = {"kind": material, "specular": specular, "exponent": exponent, "albedo": albedo}
-    bare = how.scene_of(bare, surface, {"radiometry": radiometry, "pulse_ns": pulse_ns})
+    bare = scene_of(bare, surface, {"radiometry": radiometry, "pulse_ns": pulse_ns})
     angles = {"tilt_x_deg": tilt_x_deg, "tilt_y_deg": tilt_y_deg, "turn_deg": turn_deg}
     place = {"size_m": size_m, "x_m": x_m, "y_m": y_m, "front_m": front_m}
     depth_m = hidden_depth(hidden, bare.rig, {"seed": seed, "up": up, **angles, **place})
-    target, wanted = replace(bare, object_depth_m=depth_m), how.effects_of(effects)
-    setting = how.accuracy_of(accuracy, max_error, max_seconds, beams_per_cell, target, wanted, backend)
+    target, wanted = replace(bare, object_depth_m=depth_m), effects_of(effects)
+    setting = accuracy_of(accuracy, max_error, max_seconds, beams_per_cell, target, wanted, backend)
     started = time.perf_counter()
     rendering = render(target, setting, wanted, backend)
     seconds = time.perf_counter() - started

@@ -13,7 +13,7 @@ from nlos_models.inference import refuse_colour
 
 from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import INTERRUPTED, Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
-from nlos_cam.cli.hidden_object import hidden_depth
+from nlos_cam.cli.render import hidden_depth
 from nlos_cam.dataset.build import TEST_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import runtime_tradeoff as reconstruction

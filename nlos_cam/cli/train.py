@@ -1,23 +1,151 @@
-"""`train vae|compressor|transfer|doubt`: recipes to weights."""
+"""`train vae|compressor|transfer|doubt`: recipes to weights.
 
+The options that the three `train` commands share, each written once.
+
+`train doubt`: what a pipeline makes of ordinary objects, empty benches and outliers, to a network that doubts it.
+"""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from lightning_fabric import Fabric
 from nlos_calibration.wall_record import rig_named
-from nlos_models.checkpoint import load_encoder
-from nlos_models.processes import launched
-from nlos_models.recipe import SIMULATION_ONLY, Recipe
+from nlos_models.checkpoint import load_encoder, shipped_folder
+from nlos_models.doubt_calibration import calibrated
+from nlos_models.doubt_training import DoubtSet, train_doubt
+from nlos_models.doubt_weights import DOUBT_RECORD, DoubtRecord, checksum_of_watched, save_doubt
+from nlos_models.inference import load_reconstructor
+from nlos_models.processes import Accelerator, launched, open_fabric
+from nlos_models.recipe import SIMULATION_ONLY, Recipe, load_recipe
 from nlos_models.run_files import digest_of
+from nlos_models.sources import first_of
 
-from nlos_cam.cli.common import PAPER_RIG, finish, say
-from nlos_cam.cli.train_doubt import doubt
-from nlos_cam.cli.train_options import Budget, HeldOut, Maps, RunOptions, refuse_ignored, with_run_options
-from nlos_cam.cli.train_runs import job_of, run_compressor, run_transfer, run_vae
+from nlos_cam.cache import cache_folder
+from nlos_cam.cli.common import PAPER_RIG, Json, finish, say
+from nlos_cam.cli.train_runs import Figures, Job, job_of, run_compressor, run_transfer, run_vae, watched_run
 from nlos_cam.cli.train_start import compressor_start, transfer_start, vae_start
 from nlos_cam.dataset import build
+from nlos_cam.dataset.doubt_samples import HELD_OUT_SHARE, _check, _made, _whole_set, counts_of
+from nlos_cam.dataset.outliers import TO_LEARN
 from nlos_cam.dataset.training_maps import read_maps
+from nlos_cam.errors import OutputExistsError, SceneError
 from nlos_cam.objects.textures import TEXTURES
+
+Budget = Annotated[float, typer.Option("--budget", min=1e-4, max=1.0, help="Share of the recipe's budget.")]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What is run, where to, and how; each field is an option of every command."""
+
+    recipe_file: Annotated[
+        Path, typer.Option("--recipe", help="A training recipe (models/recipes).", show_default=False)
+    ]
+    out: Annotated[Path, typer.Option("--out", help="The run's folder: log, checkpoints, weights. Resumes there.")]
+    objects: Annotated[int | None, typer.Option("--objects", min=2, help="Train on so many, not on the recipe's.")] = (
+        None
+    )
+    devices: Annotated[int, typer.Option("--devices", min=1, help="Processes: one for each GPU, or on the CPU.")] = 1
+    accelerator: Annotated[Accelerator, typer.Option("--accelerator", help="auto is a GPU if there is one.")] = "auto"
+    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Log for TensorBoard too, beside log.csv.")] = False
+    compiled: Annotated[
+        bool, typer.Option("--compile", help="Networks through torch.compile: faster; needs a C++ compiler.")
+    ] = False
+    json: Json = False
+
+    def recipe(self, task: str, budget: float = 1.0) -> Recipe:
+        """The recipe, at a share of its budget. Raises SceneError where it is another task's."""
+        recipe = load_recipe(self.recipe_file)
+        if recipe.task != task:
+            told = f"{self.recipe_file} is a recipe for {recipe.task!r}, not {task!r}"
+            raise SceneError(f"{told}: choose another --recipe")
+        if self.objects is not None:
+            recipe = recipe.of_objects(self.objects)
+        return recipe.scaled(budget)
+
+    def fabric(self, recipe: Recipe) -> Fabric:
+        """What the recipe is run on."""
+        return open_fabric(recipe, accelerator=self.accelerator, devices=self.devices)
+
+
+def refuse_ignored(why: str, given: dict[str, bool]) -> None:
+    """Raise SceneError for the first option that is given and would be ignored."""
+    for option in (option for option, is_given in given.items() if is_given):
+        raise SceneError(f"{why}, so that {option} would do nothing: leave it out, or change the recipe")
+
+
+def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
+    """A command as typer wants it: the fields of RunOptions, spelt out, in the place of its parameter `run`."""
+    shared = inspect.signature(RunOptions).parameters
+    own = [each for name, each in inspect.signature(command).parameters.items() if name != "run"]
+
+    @wraps(command)
+    def spelt_out(**given: Any) -> None:
+        command(run=RunOptions(**{name: given.pop(name) for name in shared}), **given)
+
+    every = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*shared.values(), *own)]
+    spelt_out.__annotations__ = {each.name: each.annotation for each in every}
+    spelt_out.__dict__["__signature__"] = inspect.Signature(every)
+    return spelt_out
+
+
+Maps = Annotated[Path, typer.Option("--dataset", help="Training maps, from `dataset build` or of recordings.")]
+
+
+HeldOut = Annotated[Path, typer.Option("--held-out", help="Maps to judge by, of other objects.")]
+
+
+SAMPLES = "samples"
+
+
+def doubt(
+    run: RunOptions,
+    data: Maps,
+    held_out_data: HeldOut,
+    weights: Annotated[
+        Path | None, typer.Option("--weights", help="Whose images are doubted; the shipped ones unless given.")
+    ] = None,
+) -> None:
+    """Train a doubt network on what trained weights make of maps; the run's folder is then a folder of weights."""
+    recipe, watched = run.recipe("doubt"), weights or shipped_folder()
+    fabric = run.fabric(recipe)
+    pipeline = load_reconstructor(weights, cache_folder() / "onnx")
+    training, judging = (build.open_dataset(folder) for folder in (data, held_out_data))
+    _check(recipe, pipeline, training, judging)
+    about = DoubtRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=list(TO_LEARN))
+    if run.out.resolve() == watched.resolve() or (run.out / DOUBT_RECORD).exists():
+        raise OutputExistsError(f"{run.out} holds weights already: choose another --out")
+    counts = counts_of(recipe)
+    fewer = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
+    sets = [
+        _whole_set(pipeline, first_of(maps.arrays(), most), _made(run.out / SAMPLES, some, seed, maps.plan))
+        for maps, most, some, seed in (
+            (training, recipe.objects, counts, build.TRAINING_SEED),
+            (judging, recipe.held_out, fewer, build.HELD_OUT_SEED),
+        )
+    ]
+    job = Job(recipe, run.out, pipeline.record, run.tensorboard, run.compiled, about.watches)
+    figures = launched(fabric, run_doubt, job, about, watched, *sets)
+    finish({"out": str(run.out), **figures}, as_json=run.json, text=f"weights with their doubt in {run.out}: {figures}")
+
+
+def run_doubt(
+    fabric: Fabric, job: Job, about: DoubtRecord, watched: Path, training: DoubtSet, held_out: DoubtSet
+) -> Figures:
+    """Train, calibrate and save a doubt network; its held-out figures."""
+    with watched_run(fabric, job, "doubt network") as (on_step, running):
+        network, figures = train_doubt(job.recipe, training, held_out, job.out, on_step, running)
+    fitted = calibrated(network, held_out)
+    record = about.model_copy(update={**asdict(fitted), "figures": figures})
+    if fabric.is_global_zero:
+        save_doubt(job.out, network, record, watched)
+    return {**figures, "error_scale": fitted.error_scale, "outside_above": fitted.outside_above}
+
 
 Wall = Annotated[
     Path | None, typer.Option("--wall", help="The bare wall for difference maps (wall.toml); else it is rendered.")

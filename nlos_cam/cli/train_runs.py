@@ -21,7 +21,7 @@ from nlos_models.train import OnStep, Running
 from nlos_models.transfer import train_transfer
 
 from nlos_cam.cli.common import progress, say, stop_on_signals
-from nlos_cam.cli.train_options import RunOptions
+from nlos_cam.cli.train import RunOptions
 from nlos_cam.errors import OutputExistsError
 
 Figures = dict[str, float]

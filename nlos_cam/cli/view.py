@@ -1,15 +1,79 @@
-"""`nlos-cam view`, and what `live` and `replay` share with it: a saved view is looked at again."""
+"""`nlos-cam view`, and what `live` and `replay` share with it: a saved view is looked at again.
 
+Where `nlos-cam live` shows its view, and what it tells of that.
+"""
+
+import os
+import sys
+import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Protocol
+from urllib.parse import urlsplit
 
 import typer
 
-from nlos_cam.cli.common import INTERRUPTED, Json, finish, interrupted_by_signals, stop_on_signals
-from nlos_cam.cli.live_view import Open, ViewHost, ViewPort, tell_of_view
+from nlos_cam.cli.common import INTERRUPTED, Json, finish, interrupted_by_signals, say, stop_on_signals
 from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.view.assets import LOOPBACK
-from nlos_cam.view.viewer import Viewer, Viewers
+from nlos_cam.view.server import exposed
+from nlos_cam.view.viewer import NullViewer, Viewer, Viewers
+
+NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
+ViewPort = Annotated[
+    int | None, typer.Option("--view-port", min=1, max=65535, help="Serve the view here or nowhere; else 9090 or near.")
+]
+ViewHost = Annotated[
+    str | None,
+    typer.Option("--view-host", help="Serve the view to others, at this address of this machine (0.0.0.0: all)."),
+]
+Open = Annotated[bool, typer.Option("--open", help="Open the view in the default browser.")]
+DESKTOPS = "DISPLAY", "WAYLAND_DISPLAY", "BROWSER"
+
+
+def viewer_of(bench: Bench, *, no_view: bool, host: str | None = None, port: int | None = None) -> Viewer:
+    """What shows a live run. Raises typer.BadParameter where none is wanted and yet a place for it is named."""
+    if no_view:
+        if host is not None or port is not None:
+            raise typer.BadParameter("--view-host and --view-port say where the view is: leave --no-view away")
+        return NullViewer()
+    from nlos_cam.view.web import RerunViewer
+
+    return RerunViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port)
+
+
+class Addressed(Protocol):
+    """What a browser can find: a live view, or a saved one."""
+
+    @property
+    def address(self) -> str | None: ...
+
+
+def tell_of_view(
+    viewer: Addressed, *, host: str | None, port: int | None, open_it: bool, what: str = "live view"
+) -> None:
+    """Say where the view is, who else can see it, and open it if that is wanted."""
+    if not viewer.address:
+        say("running without a view (Ctrl-C ends it)")
+        return
+    from nlos_cam.view.web import PREFERRED_PORT
+
+    taken = port is None and urlsplit(viewer.address).port != PREFERRED_PORT
+    say(f"{what}: {viewer.address}  (Ctrl-C ends it{f'; port {PREFERRED_PORT} is taken' if taken else ''})")
+    if host and (told := exposed(host, urlsplit(viewer.address).port or 0)):
+        say(f"[yellow]note:[/] {told}", marked=True)
+    if open_it and not opened_in_browser(viewer.address):
+        say(f"note: no browser could be opened here: open {viewer.address} in one")
+
+
+def opened_in_browser(address: str) -> bool:
+    """Open an address in the default browser, in a window: one for terminals would take this one over."""
+    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in DESKTOPS):
+        return False
+    try:
+        return webbrowser.open(address)
+    except (webbrowser.Error, OSError):
+        return False
+
 
 SUFFIX = ".rrd"
 SaveView = Annotated[Path | None, typer.Option("--save-view", help="Also save the view (F.rrd), for `nlos-cam view`.")]

@@ -5,14 +5,14 @@ import pytest
 import typer
 from nlos_calibration.board import BOARDS, Board
 
-from nlos_cam.cli import board
+from nlos_cam.cli import calibrate
 from nlos_cam.cli.main import main
 from nlos_cam.errors import OutputExistsError
 
 
 def call(*arguments: str) -> None:
     app = typer.Typer()
-    board.register(app)
+    calibrate.register_board(app)
     app(list(arguments), standalone_mode=False)
 
 

@@ -9,7 +9,7 @@ from nlos_calibration.wall import wall_depth
 from rich.console import Console
 
 from nlos_cam.calibrate.measure import Glance, glance
-from nlos_cam.cli.calibrate_watch import EVERY, gauge, panel, until_enter, watch
+from nlos_cam.cli.calibrate import EVERY, gauge, panel, until_enter, watch
 from nlos_cam.frames import Frame
 
 INTRINSICS = load_rig("bare-wall").pinhole.scaled(160, 120)

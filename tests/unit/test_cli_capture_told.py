@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from nlos_cam.cli import capture
-from nlos_cam.cli.capture_told import ending, result, told
+from nlos_cam.cli.capture import ending, result, told
 from nlos_cam.cli.main import main
 from nlos_cam.errors import CameraLostError, DiskFullError
 from nlos_cam.recording.capture import Job, Take

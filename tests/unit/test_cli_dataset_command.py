@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from nlos_cam.cli.dataset_command import command_of
+from nlos_cam.cli.dataset import command_of
 
 
 def _told(*arguments: str) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import typer
 
-from nlos_cam.cli.dataset_label import add_label
+from nlos_cam.cli.dataset import add_label
 from nlos_cam.dataset import build
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.recording.playback import ReplayCamera

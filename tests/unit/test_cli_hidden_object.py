@@ -9,7 +9,7 @@ import trimesh
 import typer
 from nlos_calibration.rig import Rig, load_rig
 
-from nlos_cam.cli.hidden_object import hidden_depth
+from nlos_cam.cli.render import hidden_depth
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.meshes import read_mesh
 from nlos_cam.render.scene_file import HiddenObject, SceneFile

@@ -8,7 +8,7 @@ import pytest
 from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.cli import live_budget
+from nlos_cam.cli import live
 from nlos_cam.errors import BudgetError
 from nlos_cam.live.budget import CALLS, HANDOVER_MS, SHIPPED, Choice, Option, Timed, options_here, timer, within_budget
 from nlos_cam.reconstruct.bench import Bench
@@ -90,10 +90,10 @@ def test_only_what_can_run_here_is_considered(monkeypatch: pytest.MonkeyPatch) -
         option("gone", 1.0, 1.0, weights="/no/such/folder"),
         option("torch float32, cuda", 1.0, 1.0),
     ]
-    monkeypatch.setattr(live_budget, "load_tradeoff", lambda _: [*elsewhere, *ALL])
-    monkeypatch.setattr(live_budget.torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(live, "load_tradeoff", lambda _: [*elsewhere, *ALL])
+    monkeypatch.setattr(live.torch.cuda, "is_available", lambda: False)
     assert options_here(None, None) == ALL
-    monkeypatch.setattr(live_budget, "load_tradeoff", lambda _: elsewhere)
+    monkeypatch.setattr(live, "load_tradeoff", lambda _: elsewhere)
     with pytest.raises(BudgetError, match="no setting of this trade-off runs on this machine"):
         options_here(Path("other"), None)
 

@@ -1,4 +1,4 @@
-from nlos_cam.cli.live_told import told
+from nlos_cam.cli.live import told
 from nlos_cam.live.statistics import LiveReport
 
 TIMES = {"p50": 1.04, "p95": 2.0, "p99": 3.06}

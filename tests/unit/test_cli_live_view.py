@@ -8,8 +8,8 @@ import pytest
 import typer
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.cli import live_view
-from nlos_cam.cli.live_view import opened_in_browser, tell_of_view, viewer_of
+from nlos_cam.cli import view
+from nlos_cam.cli.view import opened_in_browser, tell_of_view, viewer_of
 from nlos_cam.errors import NlosCamError
 from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.view import web
@@ -27,7 +27,7 @@ def no_assets(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     lines: list[str] = []
-    monkeypatch.setattr(live_view, "say", lambda text, **_: lines.append(text))
+    monkeypatch.setattr(view, "say", lambda text, **_: lines.append(text))
     return lines
 
 
@@ -74,7 +74,7 @@ def test_a_browser_is_opened_or_its_lack_is_a_note(
     told: list[str], monkeypatch: pytest.MonkeyPatch, opens: bool
 ) -> None:
     asked: list[str] = []
-    monkeypatch.setattr(live_view, "opened_in_browser", lambda address: asked.append(address) or opens)
+    monkeypatch.setattr(view, "opened_in_browser", lambda address: asked.append(address) or opens)
     lines = shown(told, open_it=True)
     assert asked[0].startswith("http://127.0.0.1:")
     assert [line for line in lines[1:] if "no browser could be opened" in line] == lines[1:]
@@ -94,7 +94,7 @@ def failing(_: str) -> bool:
 def test_only_a_browser_with_a_window_is_opened(
     monkeypatch: pytest.MonkeyPatch, desktop: dict[str, str], opens: Callable[[str], bool], opened: bool
 ) -> None:
-    monkeypatch.setattr(live_view, "sys", SimpleNamespace(platform="linux"))
-    monkeypatch.setattr(live_view.os, "environ", desktop)
-    monkeypatch.setattr(live_view.webbrowser, "open", opens)
+    monkeypatch.setattr(view, "sys", SimpleNamespace(platform="linux"))
+    monkeypatch.setattr(view.os, "environ", desktop)
+    monkeypatch.setattr(view.webbrowser, "open", opens)
     assert opened_in_browser("http://127.0.0.1:9090/") == opened

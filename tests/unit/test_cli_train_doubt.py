@@ -13,7 +13,7 @@ from nlos_models import checkpoint
 from nlos_models.doubt_weights import load_doubt
 from small_maps import SmallDataset, small_maps, untrained_weights, use_small_networks
 
-from nlos_cam.cli import train_doubt
+from nlos_cam.cli import train
 from nlos_cam.cli.main import main
 from nlos_cam.dataset import build
 from nlos_cam.dataset.doubt_samples import EMPTY, ORDINARY, DoubtSamples
@@ -42,7 +42,7 @@ def _small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     torch.set_num_threads(1)
     use_small_networks(monkeypatch, checkpoint)
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(train_doubt, "samples_on_disk", small_samples)
+    monkeypatch.setattr(train, "samples_on_disk", small_samples)
     sets = {name: SmallDataset(small_maps(count, count), PLAN) for name, count in (("data", 8), ("held-out", 6))}
     monkeypatch.setattr(build, "open_dataset", lambda of, **_: sets[of.name])
     yield
@@ -118,7 +118,7 @@ def test_outliers_that_cannot_be_seen_are_not_learnt_from(go: Go, monkeypatch: p
         seen.extend(sets[-2:])
         return {}
 
-    monkeypatch.setattr(train_doubt, "run_doubt", note)
+    monkeypatch.setattr(train, "run_doubt", note)
     assert go()[0] == 0
     training = seen[0]
     every = small_samples(Path(), {EMPTY: 14, ORDINARY: 7 * len(TO_LEARN) // 2, **dict.fromkeys(TO_LEARN, 7)}, 0)

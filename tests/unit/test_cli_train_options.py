@@ -7,7 +7,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from nlos_cam.cli.train_options import RunOptions, refuse_ignored, with_run_options
+from nlos_cam.cli.train import RunOptions, refuse_ignored, with_run_options
 from nlos_cam.errors import SceneError
 
 RECIPE = 'task = "vae"\nobjects = 4\nheld_out = 2\nepochs = 2\nbatch = 2\nlearning_rate = 1e-3\n'

@@ -6,7 +6,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 from nlos_models.recipe import Recipe
 
-from nlos_cam.cli.train_options import RunOptions
+from nlos_cam.cli.train import RunOptions
 from nlos_cam.cli.train_runs import job_of
 from nlos_cam.errors import OutputExistsError
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from made_up_moments import RIG, Recorded, full_moment
 
-from nlos_cam.cli import live, live_view
+from nlos_cam.cli import live
+from nlos_cam.cli import view as live_view
 from nlos_cam.cli.main import main
 from nlos_cam.cli.view import saving
 from nlos_cam.reconstruct.bench import Bench

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.cli import doctor
+from nlos_cam.cli import devices
 from nlos_cam.cli.main import main
 from nlos_cam.doctor.diagnosis import CHECKS
 from nlos_cam.doctor.udev import rules
@@ -16,7 +16,7 @@ Run = Callable[..., tuple[int, str, str]]
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], bench: Any) -> Run:
     """The command on the bench: exit code, stdout and stderr."""
-    monkeypatch.setattr(doctor, "gather", bench.facts)
+    monkeypatch.setattr(devices, "gather", bench.facts)
     monkeypatch.setenv("COLUMNS", "160")
 
     def act(*arguments: str) -> tuple[int, str, str]:
