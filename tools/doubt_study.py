@@ -25,13 +25,13 @@ from nlos_models.doubt_inference import Doubter, load_doubter
 from nlos_models.inference import Reconstructor, load_reconstructor
 from numpy.typing import NDArray
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import build
 from nlos_cam.dataset.doubt_samples import EMPTY, ORDINARY, samples_on_disk
 from nlos_cam.dataset.outliers import IN_SHAPE, TO_JUDGE, TO_LEARN
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate.subjects import echoes_of, rig_of, sense, truth_of
+from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import depth_from_image, object_box

@@ -18,7 +18,7 @@ from nlos_models.metrics import silhouette_iou
 from nlos_cam.evaluate.metrics import BARS
 from nlos_cam.evaluate.report import in_words
 from nlos_cam.evaluate.subjects import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
-from nlos_cam.folders import file_when_whole
+from nlos_cam.files import file_when_whole
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box

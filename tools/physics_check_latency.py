@@ -16,11 +16,11 @@ from typing import Any, Self
 from nlos_calibration.arrays import Float32
 from nlos_models.inference import load_reconstructor
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.protocol import WallClock
 from nlos_cam.cli.common import say
 from nlos_cam.evaluate.render_tradeoff import machine
+from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live.loop import run_live, warm_up
 from nlos_cam.live.physics_check_process import BackgroundChecks

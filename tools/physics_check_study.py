@@ -19,10 +19,10 @@ from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.rig import load_rig
 from nlos_models.inference import Reconstructor, load_reconstructor
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import say, tracked
 from nlos_cam.dataset.build import TEST_SEED
 from nlos_cam.evaluate.subjects import seeded_objects, sense
+from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import depth_from_image, object_box

@@ -19,7 +19,6 @@ from nlos_calibration.rig import Rig, load_rig
 from nlos_models.checkpoint import load_record, shipped_folder
 from nlos_models.inference import Reconstructor, load_reconstructor
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset.build import TEST_SEED, DatasetPlan
 from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, judge, plain
@@ -33,7 +32,7 @@ from nlos_cam.evaluate.subjects import (
     sense,
     truth_of,
 )
-from nlos_cam.folders import file_when_whole
+from nlos_cam.files import cache_folder, file_when_whole
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.render.scene_file import RENDERING_VERSION

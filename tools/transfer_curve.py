@@ -21,10 +21,10 @@ from nlos_models.inference import load_reconstructor
 from transfer_bench import ADAPTATION, FRAMES, HELD_OUT, VALIDATION
 from transfer_figures import DOCS, judge, paper_box
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.dataset.labelled import read_labelled, recordings_in, write_shards
 from nlos_cam.errors import NlosCamError
+from nlos_cam.files import cache_folder
 
 COUNTS = 2, 5, 10, 20, 30
 FINISHED = "figures.json"

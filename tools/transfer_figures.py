@@ -19,11 +19,11 @@ from nlos_models.inference import Reconstructor, load_reconstructor
 from numpy.typing import NDArray
 from transfer_bench import ADAPTATION, HELD_OUT, VALIDATION, part_of
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset.labelled import read_labelled, recordings_in
 from nlos_cam.evaluate import metrics as evaluate
 from nlos_cam.evaluate.subjects import reconstruct_all
+from nlos_cam.files import cache_folder
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import image_from_depth, object_box

@@ -11,7 +11,7 @@ from nlos_calibration.wall_record import WallRecord
 
 from nlos_cam.calibrate.report import report
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.folders import file_when_whole
+from nlos_cam.files import file_when_whole
 
 
 @dataclass(frozen=True)

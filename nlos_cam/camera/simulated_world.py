@@ -9,8 +9,8 @@ import numpy as np
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.files import cache_folder
 from nlos_cam.render.renderer import MultiBounce
 from nlos_cam.render.scanning import render_scan
 from nlos_cam.render.scene_file import SceneFile, bare_wall_scene, load_scene, paper_scene

@@ -9,11 +9,11 @@ import typer
 from nlos_calibration.wall_record import rig_named
 from nlos_models.inference import load_reconstructor
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, say
 from nlos_cam.evaluate import subjects as judging
 from nlos_cam.evaluate.report import Judgement, as_figures, in_words, write
 from nlos_cam.evaluate.subjects import reconstruct_all
+from nlos_cam.files import cache_folder
 
 SHIPPED = "the shipped ones"
 

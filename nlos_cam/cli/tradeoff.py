@@ -11,7 +11,6 @@ from nlos_calibration.wall_record import rig_named
 from nlos_models.checkpoint import load_record, shipped_folder
 from nlos_models.inference import refuse_colour
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import INTERRUPTED, Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
 from nlos_cam.cli.render import hidden_depth
 from nlos_cam.dataset.build import TEST_SEED
@@ -20,7 +19,7 @@ from nlos_cam.evaluate import runtime_tradeoff as reconstruction
 from nlos_cam.evaluate import runtime_tradeoff as reconstruction_report
 from nlos_cam.evaluate.render_tradeoff import Row, as_markdown, as_table, draw, facts, machine, measure, settings
 from nlos_cam.evaluate.subjects import seeded_objects
-from nlos_cam.folders import renamed_when_whole
+from nlos_cam.files import cache_folder, renamed_when_whole
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.render.scene import Scene

@@ -25,7 +25,6 @@ from nlos_models.recipe import SIMULATION_ONLY, Recipe, load_recipe
 from nlos_models.run_files import digest_of
 from nlos_models.sources import first_of
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.cli.common import PAPER_RIG, Json, finish, say
 from nlos_cam.cli.train_runs import Figures, Job, job_of, run_compressor, run_transfer, run_vae, watched_run
 from nlos_cam.cli.train_start import compressor_start, transfer_start, vae_start
@@ -34,6 +33,7 @@ from nlos_cam.dataset.doubt_samples import HELD_OUT_SHARE, _check, _made, _whole
 from nlos_cam.dataset.outliers import TO_LEARN
 from nlos_cam.dataset.training_maps import read_maps
 from nlos_cam.errors import OutputExistsError, SceneError
+from nlos_cam.files import cache_folder
 from nlos_cam.objects.textures import TEXTURES
 
 Budget = Annotated[float, typer.Option("--budget", min=1e-4, max=1.0, help="Share of the recipe's budget.")]

@@ -19,7 +19,7 @@ from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import build
 from nlos_cam.dataset.outliers import SLIGHT, TO_JUDGE, TO_LEARN, Sight, ordinary, outlier, varied, varied_empty
 from nlos_cam.errors import SceneError
-from nlos_cam.folders import file_when_whole
+from nlos_cam.files import file_when_whole
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.render.renderer import Rendering, render

@@ -23,7 +23,7 @@ from nlos_cam.dataset.plan import scene_row
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import SHARDS, shard_path, store
 from nlos_cam.errors import DiskFullError, RecordingError
-from nlos_cam.folders import renamed_when_whole
+from nlos_cam.files import renamed_when_whole
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import image_from_depth, object_box

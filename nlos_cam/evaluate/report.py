@@ -25,7 +25,7 @@ from nlos_cam.evaluate.metrics import (
     per_object,
     plain,
 )
-from nlos_cam.folders import renamed_when_whole
+from nlos_cam.files import renamed_when_whole
 
 SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
 SILHOUETTE_ERROR, DEPTH_ERROR = "1 - silhouette IoU", "foreground RMSE, mm"

@@ -19,15 +19,14 @@ from nlos_models.data import MapSet
 from nlos_models.inference import Reconstructor
 from nlos_models.sources import less_bare_wall
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.camera.simulated_world import World
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import build
 from nlos_cam.dataset.training_maps import BareMaps, measured_bare_wall, render_bare_wall
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import baselines as trivial
-from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.map_mean import MapMean
+from nlos_cam.files import cache_folder
+from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import image_from_depth
 from nlos_cam.objects.placement import object_depth

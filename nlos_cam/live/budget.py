@@ -21,10 +21,10 @@ from nlos_models.checkpoint import load_record, shipped_folder
 from nlos_models.inference import Reconstructor
 from pydantic import BaseModel, Field, ValidationError
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.errors import BudgetError, RecordingError
+from nlos_cam.files import cache_folder
 from nlos_cam.live.loop import warm_up
 from nlos_cam.live.statistics import LiveReport
 from nlos_cam.objects.depth_map import object_box

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import RecordingError
-from nlos_cam.folders import renamed_when_whole
+from nlos_cam.files import renamed_when_whole
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.live.frame_queue import FrameReader
 from nlos_cam.live.loop import in_words, read_along, steps_ahead

@@ -14,9 +14,8 @@ from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.doubt_inference import Doubter, load_doubter
 from nlos_models.inference import Reconstructor, load_reconstructor
 
-from nlos_cam.cache import cache_folder
-from nlos_cam.frames import Frame, LidarMaps, maps_from_frame
-from nlos_cam.map_mean import MapMean
+from nlos_cam.files import cache_folder
+from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
 from nlos_cam.reconstruct.bench import Bench, Look
 from nlos_cam.reconstruct.network import Clock, Network, Reconstruction, reconstruct_all
 from nlos_cam.reconstruct.physics_check import UNEXPLAINED, Check, Checks, NoChecks

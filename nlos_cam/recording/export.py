@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.camera.streams import FORMATS, FrameSet, Pairing, Sample
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.folders import renamed_when_whole
+from nlos_cam.files import renamed_when_whole
 from nlos_cam.recording.bag_reader import BagFile
 
 POINTS = "points"

@@ -8,8 +8,7 @@ from nlos_calibration.measured_wall import load_measured
 from nlos_calibration.wall import wall_depth
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from nlos_cam.frames import Frame, LidarMaps, maps_from_frame
-from nlos_cam.map_mean import MapMean
+from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
 from nlos_cam.reconstruct.bench import Bench
 
 FRAMES = 30

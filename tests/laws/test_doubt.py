@@ -8,9 +8,9 @@ from nlos_calibration.rig import load_rig
 from nlos_models.doubt_inference import load_doubter
 from nlos_models.inference import load_reconstructor
 
-from nlos_cam.cache import cache_folder
 from nlos_cam.dataset.outliers import TO_LEARN, Sight, ordinary, outlier, varied_empty
 from nlos_cam.evaluate.subjects import echoes_of, sense
+from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.objects.benchmark import test_set
 from nlos_cam.objects.depth_map import object_box

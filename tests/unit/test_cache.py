@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nlos_cam.cache import cache_folder
+from nlos_cam.files import cache_folder
 
 
 def test_the_variable_decides(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.folders import renamed_when_whole
+from nlos_cam.files import renamed_when_whole
 
 
 def test_what_was_written_is_there_at_the_end_and_not_before(tmp_path: Path) -> None:

@@ -3,8 +3,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from nlos_cam.frames import LidarMaps
-from nlos_cam.map_mean import MapMean
+from nlos_cam.frames import LidarMaps, MapMean
 
 
 def noise(number: int, valid_share: float = 0.8) -> LidarMaps:

@@ -1,4 +1,7 @@
-"""Results, a file or a folder: written under another name, and renamed when whole."""
+"""Results, a file or a folder: written under another name, and renamed when whole.
+
+Where what can be made again is kept.
+"""
 
 import os
 import shutil
@@ -39,3 +42,10 @@ def file_when_whole(path: Path) -> Generator[Path]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def cache_folder() -> Path:
+    """NLOS_CAM_CACHE, or nlos-cam's place in the user's cache folder."""
+    if chosen := os.environ.get("NLOS_CAM_CACHE"):
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "nlos-cam"
