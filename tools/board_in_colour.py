@@ -12,11 +12,10 @@ import cv2
 import numpy as np
 from board_trials import FLAT, Bench, random_bench, summary, trials
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import BOARDS
-from nlos_calibration.board_corners import Corners
-from nlos_calibration.board_plane import BoardFit, PrintErrors
-from nlos_calibration.board_view import BoardView, CameraErrors, find_in_view, fit_in_lidar
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.board import BOARDS, Corners
+from nlos_calibration.board_pose import BoardFit, PrintErrors
+from nlos_calibration.board_wall import BoardView, CameraErrors, find_in_view, fit_in_lidar
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
 

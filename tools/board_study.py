@@ -14,9 +14,8 @@ import numpy as np
 from board_trials import FLAT, Bench, Trial, by_corners, by_image, random_bench, summary, trials
 from matplotlib.figure import Figure
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import BOARDS, Board
-from nlos_calibration.board_corners import find_corners
-from nlos_calibration.board_plane import BoardFit, PrintErrors, fit_board
+from nlos_calibration.board import BOARDS, Board, find_corners
+from nlos_calibration.board_pose import BoardFit, PrintErrors, fit_board
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.rig import load_rig
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import Board
-from nlos_calibration.board_corners import Corners, find_corners
-from nlos_calibration.board_plane import BoardFit, PrintErrors, fit_board
+from nlos_calibration.board import Board, Corners, find_corners
+from nlos_calibration.board_pose import BoardFit, PrintErrors, fit_board
 from nlos_calibration.errors import BoardRefusedError
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.uncertainty import INTERVAL_STDS, measures_of
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.wall import INTERVAL_STDS, measures_of
 from numpy.typing import NDArray
 
 from nlos_cam.calibrate.synthetic import Light, Placed, View, at_near_edge, clean_view, corners_px, frames_of, view

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from nlos_calibration.drift_window import WINDOW_FRAMES, Drift
+from nlos_calibration.drift import WINDOW_FRAMES, Drift
 
 from nlos_cam.calibrate.synthetic import Array, Hide, Pose, WallStream, both, detours, sheet
 

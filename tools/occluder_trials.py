@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import OccluderRefusedError
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.noise import DepthMean
 from nlos_calibration.occluder import MIN_COLUMNS, OccluderFit, find_occluder
-from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import LidarPose, Occluder, PinholeRecord, load_rig
 from wall_trials import NO_ECHO
 

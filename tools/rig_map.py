@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 from named_weights import by_name, errors_told, named
-from nlos_calibration.object_sight import lidar_sees
 from nlos_calibration.rig import Rig, load_rig
+from nlos_calibration.rig_check import lidar_sees
 from nlos_models.checkpoint import load_record, shipped_folder
 from nlos_models.inference import Reconstructor, load_reconstructor
 

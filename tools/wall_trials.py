@@ -6,13 +6,11 @@ from math import hypot
 
 import numpy as np
 from nlos_calibration.arrays import Float64
-from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.noise import DepthMean
 from nlos_calibration.rig import LidarPose, PinholeRecord, load_rig
-from nlos_calibration.uncertainty import INTERVAL_STDS
-from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
-from nlos_calibration.wall import WallFit, fit_wall
+from nlos_calibration.wall import INTERVAL_STDS, TOLERANCE_DEG, TOLERANCE_M, WallFit, fit_wall
 
 from nlos_cam.calibrate.synthetic import (
     View,

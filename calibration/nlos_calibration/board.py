@@ -1,9 +1,16 @@
 """The ChArUco board that is printed and put on the wall: its measures, its pattern, its corners.
 
 Board frame: origin at the pattern's upper left corner, x to the right, y down, z into the paper, as OpenCV has it.
+
+Where a board's corners are in images: a mean over frames, contrast made even, OpenCV's detector.
+
+One detection in the mean of many frames, not the mean of many detections: noise falls alike, but dim corners are found
+that no single frame shows, and what the image's pixels do to a corner is in the residuals instead of being averaged
+over copies of itself.
 """
 
-from typing import Annotated, Literal, Self
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self
 
 import cv2
 import numpy as np
@@ -11,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from nlos_calibration.arrays import Float64
+from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.rig import Positive, Record
 
 Dictionary = Literal["DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250"]
@@ -77,3 +85,69 @@ BOARDS: dict[Paper, Board] = {
     "letter": Board(squares_x=6, squares_y=8, square_mm=30.0, marker_mm=22.5),
 }
 """Squares of 30 mm: larger ones leave too few corners in view at 0.15 m, smaller ones drown in the laser's spot."""
+
+
+Light = Literal["infrared", "colour"]
+
+MIN_CORNERS = 8
+"""Fewer leave hardly a residual to judge the pose by."""
+BRIGHTEST_QUANTILE = 0.9995
+CONTRAST_LIMIT, CONTRAST_TILES = 4.0, (8, 8)
+UNSEEN: dict[Light, str] = {
+    "infrared": "put it where the view is bright, print it with toner (dye ink is white in infrared), and lower the "
+    "laser's power if it is washed out",
+    "colour": "put it where the colour camera sees it too, and light the room evenly, without gloss on the paper",
+}
+"""What to do where no marker is read."""
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Chessboard corners of a board as they were found in an image."""
+
+    ids: NDArray[np.int64]
+    """(n,)."""
+    pixels: Float64
+    """(n, 2); x, y in pixel centres."""
+
+
+def find_corners(image: NDArray[np.floating] | NDArray[np.uint8], board: Board, light: Light = "infrared") -> Corners:
+    """The corners of `board` in an image (height, width) of any gain; `light` is for the advice in a refusal.
+
+    Raises BoardRefusedError where fewer than MIN_CORNERS are found, or where the image is mirrored.
+    """
+    even = even_contrast(image)
+    corners, markers = _detect(even, board)
+    if len(corners.ids) >= MIN_CORNERS:
+        return corners
+    if len(_detect(np.ascontiguousarray(even[:, ::-1]), board)[0].ids) >= MIN_CORNERS:
+        raise BoardRefusedError("the board is seen mirrored: the image is flipped, or the print is; put neither right")
+    raise BoardRefusedError(_too_few(len(corners.ids), markers, board, light))
+
+
+def even_contrast(image: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image (height, width) with its contrast limited and made even, in 8 bits: dim parts as clear as bright."""
+    brightest = float(np.quantile(image, BRIGHTEST_QUANTILE))
+    fine = np.clip(image / max(brightest, 1e-9) * 65535.0, 0.0, 65535.0).astype(np.uint16)
+    even = np.asarray(cv2.createCLAHE(CONTRAST_LIMIT, CONTRAST_TILES).apply(fine), np.uint16)
+    return (even >> 8).astype(np.uint8)
+
+
+def _detect(image: NDArray[np.uint8], board: Board) -> tuple[Corners, int]:
+    """The corners, and how many markers were read."""
+    found: tuple[Any, ...] = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(image)
+    pixels, ids, _, markers = found  # each None where there are none, which OpenCV's types do not say
+    count = 0 if markers is None else len(markers)
+    if ids is None:
+        return Corners(np.zeros(0, np.int64), np.zeros((0, 2))), count
+    return Corners(np.asarray(ids, np.int64).ravel(), np.asarray(pixels, np.float64).reshape(-1, 2)), count
+
+
+def _too_few(corners: int, markers: int, board: Board, light: Light) -> str:
+    size = f"{board.squares_x} x {board.squares_y} squares of {board.square_mm:g} mm"
+    if markers == 0:
+        return f"no board of {size} is seen in {light}: {UNSEEN[light]}"
+    return (
+        f"{corners} corners of a board of {size} are seen ({markers} markers), {MIN_CORNERS} needed: bring more of it "
+        "into the near, bright side of the view, or average more frames"
+    )

@@ -1,17 +1,207 @@
-"""The occluder from a mean depth map of the bench with it in place: where its sheet stands, its gap, or a refusal."""
+"""The occluder from a mean depth map of the bench with it in place: where its sheet stands, its gap, or a refusal.
+
+What stands before the wall in a lidar's view, and the plane of it in the wall frame.
+
+The occluder's edge in the view: where, row by row, the sight passes from the wall to the sheet.
+"""
 
 from dataclasses import dataclass, field
-from math import degrees, hypot, radians
+from math import degrees, hypot, radians, sqrt
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.errors import OccluderRefusedError, WallRefusedError
-from nlos_calibration.occluder_edge import Edge, find_edge, rows_of
-from nlos_calibration.occluder_sheet import Scene, SheetFit, fit_sheet, look
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.range_noise import MeanNoise
+from nlos_calibration.flatness import ripples
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.noise import MeanNoise, depth_noise_m
+from nlos_calibration.plane import GATE_SIGMAS, PlaneFit, fit_depth, plane_depth_m
 from nlos_calibration.rig import Occluder, Rig
+
+WALL_BAND_M = 0.004
+"""What the wall's own pose and the lidar's ripples may put a point of it off the plane, beside noise."""
+NEIGHBOURS = 4.5 / 9.0
+"""Of a pixel and those around it, more than this share must stand out with it: scattered outliers do not."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the lidar saw, by the wall's plane."""
+
+    depth_m: Float64
+    """(height, width); NaN is no return."""
+    sigma_m: Float64
+    """(height, width); the noise of one sample there, since ripples do not fall with the number of samples."""
+    rays: Float64
+    """(height, width, 3); of unit depth, in the lidar frame."""
+    pose: Float64
+    """wall_from_lidar (4, 4)."""
+    near: Mask
+    """Pixels in front of the wall, together with their neighbours."""
+    passed: Mask
+    """Pixels on the wall, or behind it: nothing before the wall stopped them."""
+    behind_share: float
+    """Of the depths, those behind the wall."""
+
+    @property
+    def direction(self) -> Float64:
+        """The rays in the wall frame."""
+        return self.rays @ self.pose[:3, :3].T
+
+
+@dataclass(frozen=True)
+class SheetFit:
+    """A plane normal . p = 1 + normal . lidar_m in the wall frame, read as x = x_m + lean z + twist y."""
+
+    plane: PlaneFit
+    uneven_m: float
+    """RMS of the deviation of parts of it from the plane, beyond noise."""
+    normal: Float64
+    """(3,)."""
+    covariance: Float64
+    """(3, 3) of `normal`."""
+    lidar_m: Float64
+    """(3,)."""
+
+    @property
+    def lean(self) -> float:
+        """Positive where x grows with z."""
+        return float(-self.normal[2] / self.normal[0])
+
+    @property
+    def lean_std(self) -> float:
+        """How surely."""
+        return self._std(np.array([-self.lean, 0.0, -1.0]) / self.normal[0])
+
+    @property
+    def twist(self) -> float:
+        """Positive where x grows with y."""
+        return float(-self.normal[1] / self.normal[0])
+
+    @property
+    def tilt_deg(self) -> float:
+        """Against the plane x = const, whichever way."""
+        return degrees(np.arctan2(hypot(self.normal[1], self.normal[2]), abs(self.normal[0])))
+
+    @property
+    def tilt_std_deg(self) -> float:
+        """How surely, at most."""
+        twist_std = self._std(np.array([-self.twist, -1.0, 0.0]) / self.normal[0])
+        return degrees(hypot(self.lean_std, twist_std))
+
+    def x_m(self, z_m: float) -> float:
+        """Of the plane at a height over the wall and y = 0."""
+        return float((1.0 + self.normal @ self.lidar_m - self.normal[2] * z_m) / self.normal[0])
+
+    def x_std_m(self, z_m: float) -> float:
+        """How surely."""
+        return self._std((self.lidar_m - np.array([self.x_m(z_m), 0.0, z_m])) / self.normal[0])
+
+    def _std(self, gradient: Float64) -> float:
+        return float(np.sqrt(max(gradient @ self.covariance @ gradient, 0.0)))
+
+    def met_m(self, scene: Scene) -> Float64:
+        """Where each ray meets the plane (height, width, 3), far away where it never does."""
+        return scene.pose[:3, 3] + scene.direction * self._depth_m(scene)[..., np.newaxis]
+
+    def met_by(self, scene: Scene) -> Mask:
+        """The pixels that may be points of the plane, by their depth (height, width)."""
+        return np.abs(scene.depth_m - self._depth_m(scene)) <= GATE_SIGMAS * scene.sigma_m
+
+    def _depth_m(self, scene: Scene) -> Float64:
+        return plane_depth_m(scene.rays, self.plane.slopes)
+
+
+def look(depth_m: Float64, noise: MeanNoise, intrinsics: Intrinsics, pose: Float64) -> Scene:
+    """Each pixel before the wall, on it or behind it, by more than noise and the wall's own error explain."""
+    depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan)
+    rays = intrinsics.rays()
+    along = rays @ pose[2, :3]
+    sigma_m = max(noise.scale, 1.0) * depth_noise_m(depth_m)
+    height_m, band_m = pose[2, 3] + depth_m * along, WALL_BAND_M + GATE_SIGMAS * sigma_m * np.abs(along)
+    near = (height_m > band_m).astype(np.float32)
+    together = cv2.boxFilter(near, -1, (3, 3), borderType=cv2.BORDER_REPLICATE) > NEIGHBOURS
+    behind = float((height_m < -band_m).sum() / max(int(np.isfinite(depth_m).sum()), 1))
+    return Scene(depth_m, sigma_m, rays, pose, (near > 0) & together, height_m <= band_m, behind)
+
+
+def fit_sheet(scene: Scene, noise: MeanNoise, generator: np.random.Generator) -> SheetFit:
+    """The plane of most of what stands before the wall. Raises WallRefusedError where there is none."""
+    near_m = np.where(scene.near, scene.depth_m, np.nan)
+    plane = fit_depth(scene.rays.reshape(-1, 3), near_m.ravel(), generator, noise, min_extent=0.0)
+    turn, rippled = scene.pose[:3, :3], ripples(plane, scene.rays)
+    covariance = turn @ rippled.covariance @ turn.T
+    return SheetFit(plane, rippled.rms_m, turn @ plane.slopes, covariance, scene.pose[:3, 3])
+
+
+MIN_ROW_PIXELS = 2
+"""Of the sheet, in a row: fewer may be strays."""
+GATE_SCATTERS, REFITS = 3.0, 8
+SCATTER_PER_MEDIAN = 1.4826
+"""The standard deviation of a normal distribution over its median of |x|."""
+
+
+@dataclass(frozen=True)
+class Edge:
+    """The edge as a line z = gap_m + slope x y on the sheet, in the wall frame."""
+
+    gap_m: float
+    gap_std_m: float
+    """Of the resolution of the view and of the scatter of the rows; neither falls with the number of rows, which share
+    what moves them."""
+    slope: float
+    rows: int
+    """In how many rows of the image it is seen."""
+
+
+def find_edge(met_m: Float64, sheet: Mask, passed: Mask) -> Edge | None:
+    """The edge from where each pixel's ray meets the sheet's plane (height, width, 3); None where it is not seen.
+
+    `sheet` are pixels that return from the sheet, `passed` those whose beams went by it. A pixel that mixes both, reads
+    anything or nothing is neither: the edge is somewhere between the last that passed and the first that did not.
+    Heights must grow along each row.
+    """
+    height_m, y_m = met_m[..., 2], met_m[..., 1]
+    middle_m = np.median(height_m[sheet])  # what is seen past another edge of the sheet says nothing about this one
+    votes = np.where(height_m > middle_m, 0, passed.astype(np.int64) - sheet)
+    balance = np.cumsum(votes, axis=1)
+    best = balance == balance.max(axis=1, keepdims=True)
+    last, first = best.argmax(axis=1), votes.shape[1] - best[:, ::-1].argmax(axis=1)
+    seen = (balance.max(axis=1) > 0) & (first < votes.shape[1])
+    seen[seen] = _follow(votes[seen] < 0, first[seen]) >= MIN_ROW_PIXELS
+    if not seen.any():
+        return None
+    rows = np.flatnonzero(seen)
+    low_m, high_m = height_m[rows, last[rows]], height_m[rows, first[rows]]
+    across_m = (y_m[rows, last[rows]] + y_m[rows, first[rows]]) / 2.0
+    return _line(across_m, (low_m + high_m) / 2.0, high_m - low_m)
+
+
+def rows_of(sheet: Mask) -> Mask:
+    """(height,); the rows in which the sheet is seen."""
+    return sheet.sum(axis=1) >= MIN_ROW_PIXELS
+
+
+def _follow(marked: Mask, start: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many of each row are marked from its start on."""
+    columns = np.arange(marked.shape[1])
+    return (marked & (columns >= start[:, np.newaxis])).sum(axis=1)
+
+
+def _line(y_m: Float64, z_m: Float64, width_m: Float64) -> Edge:
+    """A line through the middles of brackets that are `width_m` wide; rows far off it are left out."""
+    line, inside = np.array([np.median(z_m), 0.0]), np.ones(len(z_m), np.bool_)
+    terms, resolution_m = np.column_stack([np.ones_like(y_m), y_m]), float(np.median(width_m)) / sqrt(12.0)
+    for _ in range(REFITS):
+        off_m = z_m - terms @ line
+        scatter_m = max(SCATTER_PER_MEDIAN * float(np.median(np.abs(off_m))), resolution_m)
+        inside = np.abs(off_m) <= GATE_SCATTERS * scatter_m
+        line = np.linalg.lstsq(terms[inside] / width_m[inside, None], z_m[inside] / width_m[inside])[0]
+    scatter_m = float(np.sqrt(np.mean((z_m - terms @ line)[inside] ** 2)))
+    return Edge(float(line[0]), max(resolution_m, scatter_m), float(line[1]), len(z_m))
+
 
 MIN_SHARE, MIN_PIXELS, MIN_COLUMNS = 0.002, 100, 4
 """Less in front of the wall is no occluder; of fewer columns nobody can tell how it stands."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.range_noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
+from nlos_calibration.noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
 
 GATE_SIGMAS = 5.0
 MIN_SCALE, MAX_SCALE = 0.25, 8.0

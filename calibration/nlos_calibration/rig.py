@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.geometry import facing_angle_rad, normal_from_angles, wall_from_plane
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

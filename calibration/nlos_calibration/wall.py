@@ -1,20 +1,202 @@
-"""The bare wall from the mean of depth frames: a plane, a pose, their uncertainty, a verdict; or a refusal."""
+"""The bare wall from the mean of depth frames: a plane, a pose, their uncertainty, a verdict; or a refusal.
+
+From distance, angle and flatness to a verdict, with what to move and by how much; or a refusal.
+
+What a plane's slopes say about distance and angles, and how surely: first-order propagation of their covariance.
+"""
 
 from dataclasses import dataclass, field, replace
+from math import ceil, degrees, sqrt
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.flatness import flatness
-from nlos_calibration.geometry import wall_from_plane
+from nlos_calibration.flatness import SURE_SIGMAS, Flatness, block_sums, flatness, ripples
+from nlos_calibration.geometry import Intrinsics, angles_from_normal, wall_from_plane
+from nlos_calibration.noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
 from nlos_calibration.plane import GATE_SIGMAS, fit_depth, plane_depth_m
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.range_noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
-from nlos_calibration.ripples import block_sums, ripples
-from nlos_calibration.uncertainty import WallMeasures, measures_of
-from nlos_calibration.verdict import Verdict, check_flat, judge, warnings
+
+Verdict = Literal["good", "out of range", "doubtful"]
+"""Doubtful: the plane itself may be off by more than `TOLERANCE_M` or `TOLERANCE_DEG`, and the depth cannot tell."""
+
+DISTANCE_RANGE_M, FACING_RANGE_DEG = (0.15, 0.30), (15.0, 75.0)
+"""The paper's ranges (SI 1)."""
+TOLERANCE_M, TOLERANCE_DEG = 0.001, 0.2
+"""What the measurement may err by: a wall on the edge of a range is in it, a bend that shifts it by less is none."""
+DOUBTED_TOLERANCES, REFUSED_TOLERANCES = 0.7, 5.0
+"""A wall is refused whose halves differ from the whole by this much: 5 mm or 1 degree (a bend of 2 degrees). Less could
+also be ripples of the lidar, 1 or 2 mm high and as wide as half the view: those are told, not refused. It is doubted
+from somewhat less than a tolerance on, since a half that bends itself says too little."""
+DOUBTED_RIPPLE_M, MAX_RIPPLE_M = 0.0009, 0.002
+"""RMS normal to the wall. The L515's ripples are a millimetre or two high; two panes 2 mm apart are 1 mm off a plane
+between them."""
+TOLD_RIPPLE_M, TOLD_NOISE_SCALE = 0.0003, 2.0
+
+
+def check_flat(flat: Flatness, ripple_m: float) -> None:
+    """Refuse a wall that surely bends, curves or steps, unless an offset of the lidar's range explains it."""
+    sure_m, sure_deg = flat.bend_m - SURE_SIGMAS * flat.bend_std_m, flat.bend_deg - SURE_SIGMAS * flat.bend_std_deg
+    if _tolerances(sure_m, sure_deg) > REFUSED_TOLERANCES and not _explained_by_offset(flat):
+        raise WallRefusedError(
+            f"the wall is not one flat wall: half of the view differs from the whole by {_amounts(flat)}, as of a "
+            "bend, a curve or a step; take a flat wall, or move so that only one is in view",
+        )
+    if ripple_m > MAX_RIPPLE_M:
+        raise WallRefusedError(
+            f"the wall is not flat: parts are {ripple_m * 1e3:.1f} mm RMS off the plane, {MAX_RIPPLE_M * 1e3:.1f} "
+            "mm allowed; take a flat, matt wall and let the lidar warm up",
+        )
+
+
+def judge(distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float) -> tuple[Verdict, str]:
+    """The verdict, and one sentence: what it rests on, or what to do."""
+    doubts = _doubts(flat, ripple_m)
+    if not doubts:
+        return range_verdict(distance_m, facing_deg)
+    return "doubtful", "; ".join(doubts + out_of_range(distance_m, facing_deg))
+
+
+def range_verdict(distance_m: float, facing_deg: float) -> tuple[Verdict, str]:
+    """The verdict on a plane that is not in doubt."""
+    if problems := out_of_range(distance_m, facing_deg):
+        return "out of range", "; ".join(problems)
+    return "good", "distance and angle are inside the paper's ranges"
+
+
+def warnings(ripple_m: float, noise_scale: float) -> tuple[str, ...]:
+    """What does not change the verdict but should be known."""
+    told: list[str] = []
+    if ripple_m > TOLD_RIPPLE_M:
+        told.append(f"the depth has ripples of {ripple_m * 1e3:.1f} mm RMS: the uncertainties allow for them")
+    if noise_scale > TOLD_NOISE_SCALE:
+        told.append(f"depth is {noise_scale:.1f} times as noisy as the lidar's should be: warm it up, dim the light")
+    return tuple(told)
+
+
+def _tolerances(bend_m: float, bend_deg: float) -> float:
+    return max(bend_m / TOLERANCE_M, bend_deg / TOLERANCE_DEG)
+
+
+def _explained_by_offset(flat: Flatness) -> bool:
+    return flat.offset_m != 0.0 and _tolerances(flat.offset_bend_m, flat.offset_bend_deg) <= 1.0
+
+
+def _amounts(flat: Flatness) -> str:
+    return f"{flat.bend_m * 1e3:.1f} mm and {flat.bend_deg:.2f} degrees"
+
+
+def _doubts(flat: Flatness, ripple_m: float) -> list[str]:
+    """Why the plane may be another than the wall's."""
+    bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTED_TOLERANCES
+    if bent and _explained_by_offset(flat):
+        why = f"the depths look as if {flat.offset_m * 1e3:+.1f} mm were missing from each (or the wall is curved): "
+        return [why + "measure the distance with a tape and give it with --tape-m"]
+    if ripple_m > DOUBTED_RIPPLE_M:
+        why = f"parts of the wall are {ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the lidar, or a wall "
+        return [why + "that is not flat; take a flat, matt wall and let the lidar warm up"]
+    if not bent:
+        return []
+    if flat.bend_m <= SURE_SIGMAS * flat.bend_std_m and flat.bend_deg <= SURE_SIGMAS * flat.bend_std_deg:
+        return [f"noise leaves {_amounts(flat)} between half of the view and the whole: average more frames"]
+    why = f"half of the view differs from the whole by {_amounts(flat)}: a bent wall, or ripples of the lidar; "
+    return [why + "take a flat wall and let the lidar warm up"]
+
+
+def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
+    """What is out of the paper's ranges, each with what to do."""
+    problems: list[str] = []
+    low, high = DISTANCE_RANGE_M
+    if not low - TOLERANCE_M <= distance_m <= high + TOLERANCE_M:
+        away = at_least(100.0 * (low - distance_m)), "back"
+        move = away if distance_m < low else (at_least(100.0 * (distance_m - high)), "closer")
+        problems.append(
+            f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar {move[0]} cm {move[1]}"
+        )
+    low, high = FACING_RANGE_DEG
+    if not low - TOLERANCE_DEG <= facing_deg <= high + TOLERANCE_DEG:
+        aside = at_least(low - facing_deg), "aside"
+        turn = aside if facing_deg < low else (at_least(facing_deg - high), "towards the wall")
+        plural = "" if turn[0] == 1 else "s"
+        problems.append(
+            f"{facing_deg:.1f} degrees is outside {low:.0f} to {high:.0f}: turn the lidar {turn[0]} degree{plural} "
+            f"{turn[1]}",
+        )
+    return problems
+
+
+def at_least(amount: float) -> int:
+    """The whole number that suffices; what lies a thousandth above one does not ask for the next."""
+    return max(ceil(amount - 1e-3), 1)
+
+
+INTERVAL_STDS = 1.96
+"""Half the width of a 95 % interval, in standard uncertainties."""
+
+
+@dataclass(frozen=True)
+class WallMeasures:
+    """Distance and angles of a plane 1 / z = slopes . ray, with standard uncertainties; 1.96 of them hold 95 %."""
+
+    distance_m: float
+    yaw_deg: float
+    pitch_deg: float
+    facing_deg: float
+    distance_std_m: float
+    yaw_std_deg: float
+    pitch_std_deg: float
+    facing_std_deg: float
+
+
+def measures_of(slopes: Float64, covariance: Float64) -> WallMeasures:
+    """Distance and angles of `slopes` (3,) = -normal / distance_m, uncertain by `covariance` (3, 3)."""
+    distance_m = 1.0 / float(np.linalg.norm(slopes))
+    normal = -slopes * distance_m
+    # a change of the slopes moves the distance along the normal and turns the normal across it
+    along, across = distance_m**2 * normal, -distance_m * (np.eye(3) - np.outer(normal, normal))
+    turn = across @ covariance @ across.T
+    x, z = normal[0], normal[2]
+    level = x**2 + z**2
+    yaw_rad, pitch_rad = angles_from_normal(normal)
+    return WallMeasures(
+        distance_m=distance_m,
+        yaw_deg=degrees(yaw_rad),
+        pitch_deg=degrees(pitch_rad),
+        facing_deg=degrees(_facing_rad(normal)),
+        distance_std_m=_std(along, covariance),
+        yaw_std_deg=degrees(_std(np.array([-z, 0.0, x]) / level, turn)),
+        pitch_std_deg=degrees(_std(np.array([0.0, -1.0, 0.0]) / sqrt(level), turn)),
+        facing_std_deg=degrees(_facing_std_rad(normal, turn)),
+    )
+
+
+def _facing_rad(normal: Float64) -> float:
+    """By the tangent: the cosine says nothing about small angles."""
+    return float(np.arctan2(np.hypot(normal[0], normal[1]), -normal[2]))
+
+
+def _facing_std_rad(normal: Float64, turn: Float64) -> float:
+    """How surely the facing angle f is known.
+
+    Turns towards the axis change it one for one. Turns aside by s change it to sqrt(f^2 + s^2): nothing while s is
+    small against f, s itself where the wall is faced squarely, s^2 / sqrt(f^2 + s^2) in between. There f is measured
+    too large by s: the least f that s allows is taken.
+    """
+    facing_rad, sideways = _facing_rad(normal), float(np.hypot(normal[0], normal[1]))
+    x, y = normal[:2] / sideways if sideways > 0.0 else (1.0, 0.0)
+    towards = np.array([x * -normal[2], y * -normal[2], sideways])
+    aside = np.array([-y, x, 0.0])
+    variance = float(aside @ turn @ aside)
+    least_rad = max(facing_rad - 2.0 * sqrt(max(variance, 0.0)), 0.0)
+    second_order = variance**2 / (variance + least_rad**2) if variance > 0.0 else 0.0
+    return sqrt(float(towards @ turn @ towards) + second_order)
+
+
+def _std(gradient: Float64, covariance: Float64) -> float:
+    return sqrt(max(float(gradient @ covariance @ gradient), 0.0))
+
 
 MIN_VALID_SHARE = 0.05
 STUCK_SHARE = 0.5

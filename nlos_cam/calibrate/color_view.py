@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 from nlos_calibration.arrays import Float64
-from nlos_calibration.bare_wall import Moments
-from nlos_calibration.board_view import BoardView, CameraErrors
+from nlos_calibration.board_wall import BoardView, CameraErrors
+from nlos_calibration.reference import Moments
 from numpy.typing import NDArray
 
 from nlos_cam.camera.l515 import find_l515, shared_context

@@ -4,10 +4,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from nlos_calibration.bare_wall import BareWall, save_reference
-from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.reference import BareWall, save_reference
 from nlos_calibration.rig import dump_toml
-from nlos_calibration.wall_record import WallRecord
+from nlos_calibration.wall_record import MeasuredWall, WallRecord
 
 from nlos_cam.calibrate.report import report
 from nlos_cam.errors import OutputExistsError

@@ -12,19 +12,23 @@ from math import hypot
 
 import numpy as np
 from nlos_calibration.arrays import Float32
-from nlos_calibration.bare_wall import BareWall, BareWallStatistics
 from nlos_calibration.board import Board
-from nlos_calibration.board_view import BoardView
-from nlos_calibration.board_wall import WallByBoard, wall_with_board
+from nlos_calibration.board_wall import BoardView, WallByBoard, wall_with_board
 from nlos_calibration.drift import settings_changed
 from nlos_calibration.errors import CalibrationError, WallRefusedError
-from nlos_calibration.measured_wall import MeasuredWall, depth_lacks_m, points_m, wall_from_zero
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.occluder import OccluderFit, find_occluder
-from nlos_calibration.projection import Intrinsics
 from nlos_calibration.range_offset import tape_the_wall
-from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
-from nlos_calibration.wall import WallFit, fit_wall
-from nlos_calibration.wall_record import WallRecord, with_occluder
+from nlos_calibration.reference import BareWall, BareWallStatistics
+from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M, WallFit, fit_wall
+from nlos_calibration.wall_record import (
+    MeasuredWall,
+    WallRecord,
+    depth_lacks_m,
+    points_m,
+    wall_from_zero,
+    with_occluder,
+)
 from numpy.typing import NDArray
 
 from nlos_cam.camera.protocol import Camera

@@ -12,11 +12,9 @@ from html import escape
 from string import Template
 
 from nlos_calibration.board_wall import BoardRecord
-from nlos_calibration.measured_wall import MeasuredWall
-from nlos_calibration.rig_verdict import GAP_RANGE_M
-from nlos_calibration.uncertainty import INTERVAL_STDS
-from nlos_calibration.verdict import DISTANCE_RANGE_M, FACING_RANGE_DEG, TOLERANCE_DEG, TOLERANCE_M
-from nlos_calibration.wall_record import WallRecord
+from nlos_calibration.rig_check import GAP_RANGE_M
+from nlos_calibration.wall import DISTANCE_RANGE_M, FACING_RANGE_DEG, INTERVAL_STDS, TOLERANCE_DEG, TOLERANCE_M
+from nlos_calibration.wall_record import MeasuredWall, WallRecord
 
 from nlos_cam.calibrate.report_drawings import bench_picture, footprint_picture
 from nlos_cam.calibrate.report_maps import Picture, wall_maps

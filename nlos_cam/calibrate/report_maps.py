@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from nlos_calibration.arrays import Float64
-from nlos_calibration.bare_wall import FULL_SCALE, BareWall
-from nlos_calibration.measured_wall import wall_points_m
-from nlos_calibration.range_noise import MeanNoise, depth_noise_m
-from nlos_calibration.wall_record import WallRecord
+from nlos_calibration.noise import MeanNoise, depth_noise_m
+from nlos_calibration.reference import FULL_SCALE, BareWall
+from nlos_calibration.wall_record import WallRecord, wall_points_m
 from numpy.typing import NDArray
 
 DRAWN_COLUMNS = 320

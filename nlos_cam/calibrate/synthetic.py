@@ -22,16 +22,14 @@ from typing import Any
 import cv2
 import numpy as np
 from nlos_calibration.arrays import Float64
-from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.board import Board
-from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.drift import DriftCheck
-from nlos_calibration.geometry import facing_angle_rad, normal_from_angles, wall_from_plane
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.range_noise import QUANTUM_M, depth_noise_m
+from nlos_calibration.geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
+from nlos_calibration.noise import QUANTUM_M, DepthMean, depth_noise_m
+from nlos_calibration.reference import BareWall
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_track import watched_pixels
+from nlos_calibration.wall_tracker import watched_pixels
 from numpy.typing import NDArray
 
 from nlos_cam.render.sensor.bias import patches, ripples

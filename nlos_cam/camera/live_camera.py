@@ -9,7 +9,7 @@ from threading import Event, RLock
 from typing import Any, Self
 
 from nlos_calibration.arrays import Float32
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Rig
 
 from nlos_cam.camera.protocol import Clock, WallClock

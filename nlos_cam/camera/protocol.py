@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from threading import Event
 from typing import Protocol, Self
 
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Rig
 
 from nlos_cam.frames import Frame

@@ -12,7 +12,7 @@ from threading import Condition
 from typing import Any
 
 from nlos_calibration.arrays import Float32
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.camera.streams import (
     FORMATS,

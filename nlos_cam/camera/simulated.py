@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 from nlos_calibration.arrays import Float32
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 

@@ -16,15 +16,10 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from nlos_calibration.board import BOARDS, PAPER_MM, Paper
-from nlos_calibration.board_corners import Light
-from nlos_calibration.board_view import BoardView
-from nlos_calibration.board_wall import BoardRecord, WallByBoard
-from nlos_calibration.measured_wall import load_measured
-from nlos_calibration.uncertainty import INTERVAL_STDS
-from nlos_calibration.verdict import DISTANCE_RANGE_M, FACING_RANGE_DEG
-from nlos_calibration.wall import WallFit
-from nlos_calibration.wall_record import OccluderRecord, WallRecord, wall_record
+from nlos_calibration.board import BOARDS, PAPER_MM, Light, Paper
+from nlos_calibration.board_wall import BoardRecord, BoardView, WallByBoard
+from nlos_calibration.wall import DISTANCE_RANGE_M, FACING_RANGE_DEG, INTERVAL_STDS, WallFit
+from nlos_calibration.wall_record import OccluderRecord, WallRecord, load_measured, wall_record
 from numpy.typing import NDArray
 from rich.live import Live
 from rich.markup import escape

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from nlos_calibration.arrays import Float16, Float32
-from nlos_calibration.bare_wall import Moments
-from nlos_calibration.measured_wall import load_measured
+from nlos_calibration.reference import Moments
+from nlos_calibration.wall_record import load_measured
 from nlos_models.data import MapBatch, MapSet
 from nlos_models.recipe import Recipe
 from nlos_models.sources import InMemory, MapSource, first_of, less_bare_wall

@@ -5,13 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.drift import DriftCheck
 from nlos_calibration.errors import CalibrationError
-from nlos_calibration.measured_wall import MeasuredWall, load_measured, wall_from_zero
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.reference import BareWall
 from nlos_calibration.rig import Rig, load_rig
-from nlos_calibration.wall_record import WallRecord
+from nlos_calibration.wall_record import MeasuredWall, WallRecord, load_measured, wall_from_zero
 
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.frames import Frame, LidarMaps

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_calibration.rig import Rig, load_rig
-from nlos_calibration.rig_difference import rig_difference
+from nlos_calibration.rig_check import rig_difference
 from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.doubt_inference import Doubter, load_doubter
 from nlos_models.inference import Reconstructor, load_reconstructor

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 from lz4.frame import LZ4FrameDecompressor
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from numpy.typing import NDArray
 
 from nlos_cam.camera.streams import Sample

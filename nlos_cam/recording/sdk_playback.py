@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Rig
 
 from nlos_cam.camera.sdk import load_sdk

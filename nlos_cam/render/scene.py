@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from nlos_calibration.arrays import Float32
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import ObjectBox, Rig
 
 from nlos_cam.errors import SceneError

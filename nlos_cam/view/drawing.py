@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import ObjectBox, Rig
+from nlos_calibration.wall_record import MeasuredWall
 from numpy.typing import NDArray
 
 from nlos_cam.frames import OBJECT_PIXELS

@@ -10,8 +10,8 @@ from pathlib import Path
 from threading import Event
 from typing import BinaryIO, Self
 
-from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Rig
+from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.live.realtime import after_the_loop

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from fake_wall import RIG, write_wall
-from nlos_calibration.bare_wall import BareWallStatistics
-from nlos_calibration.measured_wall import load_measured
+from nlos_calibration.reference import BareWallStatistics
 from nlos_calibration.wall import wall_depth
+from nlos_calibration.wall_record import load_measured
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame

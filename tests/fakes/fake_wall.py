@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from nlos_calibration.bare_wall import BareWall, BareWallStatistics, save_reference
-from nlos_calibration.measured_wall import MeasuredWall, load_measured
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.reference import BareWall, BareWallStatistics, save_reference
 from nlos_calibration.rig import dump_toml, load_rig
 from nlos_calibration.wall import WallFit, wall_depth
-from nlos_calibration.wall_record import wall_record
+from nlos_calibration.wall_record import MeasuredWall, load_measured, wall_record
 
 from nlos_cam.frames import Frame, maps_from_frame
 

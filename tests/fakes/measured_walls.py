@@ -4,12 +4,11 @@ from datetime import date
 from typing import Any
 
 import numpy as np
-from nlos_calibration.bare_wall import BareWall
-from nlos_calibration.measured_wall import MeasuredWall
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.reference import BareWall
 from nlos_calibration.rig import PinholeRecord, load_rig
 from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_record import WallRecord
+from nlos_calibration.wall_record import MeasuredWall, WallRecord
 
 WIDTH, HEIGHT = 96, 72
 

@@ -6,10 +6,9 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from nlos_calibration.board_view import EXACT, CameraErrors
-from nlos_calibration.board_wall import wall_with_board
-from nlos_calibration.depth_mean import DepthMean
+from nlos_calibration.board_wall import EXACT, CameraErrors, wall_with_board
 from nlos_calibration.errors import WallRefusedError
+from nlos_calibration.noise import DepthMean
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall
 from software_colour import SoftwareColour, record_with_colour

@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from nlos_calibration.drift import BLIND_FRAMES, DriftCheck
-from nlos_calibration.drift_window import WINDOW_FRAMES
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.verdict import TOLERANCE_DEG, TOLERANCE_M
-from nlos_calibration.wall import wall_depth
+from nlos_calibration.drift import BLIND_FRAMES, WINDOW_FRAMES, DriftCheck
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M, wall_depth
 
 from nlos_cam.calibrate.synthetic import PINHOLE, SMALL, Pose, WallStream, both, detours, sensed, sheet, wall_from_lidar
 

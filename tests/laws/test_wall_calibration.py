@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration.arrays import Float64
-from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import angles_from_normal, normal_from_angles, wall_from_plane
+from nlos_calibration.noise import DepthMean
 from nlos_calibration.plane import fit_plane
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth

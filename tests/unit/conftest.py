@@ -11,13 +11,12 @@ import pytest
 import torch
 from hypothesis import settings
 from nlos_calibration.arrays import Float32
-from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
-from nlos_calibration.measured_wall import MeasuredWall
-from nlos_calibration.range_noise import depth_noise_m
+from nlos_calibration.noise import depth_noise_m
+from nlos_calibration.reference import BareWall
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
-from nlos_calibration.wall_record import wall_record
+from nlos_calibration.wall_record import MeasuredWall, wall_record
 from nlos_models import colour_resnet, res_vae
 from rerun.chunk import RrdReader
 from rosbags.rosbag1 import Reader, Writer

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from nlos_calibration.bare_wall import BareWall, BareWallStatistics, Moments, load_reference, save_reference
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.reference import BareWall, BareWallStatistics, Moments, load_reference, save_reference
 
 INTRINSICS = Intrinsics(16, 12, 11.4, 11.5, 7.5, 5.5)
 SHAPE, CELLS, FRAMES = (12, 16), (64, 80), 20

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Extent, LidarPose, Occluder, Rig, load_rig
 
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, cast, gate_bins

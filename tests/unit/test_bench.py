@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fake_wall import RIG, SERIAL, SMALL, bare_wall, measured_wall, other_intrinsics, wall_frame, write_wall
 from nlos_calibration.errors import CalibrationError, RecordFileError
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import LidarMaps, maps_from_frame

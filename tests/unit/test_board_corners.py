@@ -5,8 +5,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import BOARDS
-from nlos_calibration.board_corners import MIN_CORNERS, even_contrast, find_corners
+from nlos_calibration.board import BOARDS, MIN_CORNERS, even_contrast, find_corners
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.rig import load_rig
 

@@ -3,13 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import BOARDS
-from nlos_calibration.board_corners import Corners
-from nlos_calibration.board_plane import PrintErrors, fit_board
+from nlos_calibration.board import BOARDS, Corners
+from nlos_calibration.board_pose import PrintErrors, fit_board
 from nlos_calibration.errors import BoardRefusedError
-from nlos_calibration.geometry import normal_from_angles
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.uncertainty import measures_of
+from nlos_calibration.geometry import Intrinsics, normal_from_angles
+from nlos_calibration.wall import measures_of
 
 A4 = BOARDS["a4"]
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)

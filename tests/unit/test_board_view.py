@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import BOARDS
-from nlos_calibration.board_corners import Corners, find_corners
-from nlos_calibration.board_plane import PrintErrors, fit_board
-from nlos_calibration.board_view import (
+from nlos_calibration.board import BOARDS, Corners, find_corners
+from nlos_calibration.board_pose import PrintErrors, fit_board
+from nlos_calibration.board_wall import (
     EXACT,
     BoardView,
     CameraErrors,
@@ -20,7 +19,7 @@ from nlos_calibration.board_view import (
     undistorted,
 )
 from nlos_calibration.errors import BoardRefusedError
-from nlos_calibration.uncertainty import measures_of
+from nlos_calibration.wall import measures_of
 
 TOOLS = Path(__file__).parents[2] / "tools"
 A4 = BOARDS["a4"]

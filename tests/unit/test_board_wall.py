@@ -5,10 +5,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from nlos_calibration.board import BOARDS
-from nlos_calibration.board_corners import Light
-from nlos_calibration.board_view import BoardView
-from nlos_calibration.board_wall import WallByBoard, wall_with_board
+from nlos_calibration.board import BOARDS, Light
+from nlos_calibration.board_wall import BoardView, WallByBoard, wall_with_board
 from nlos_calibration.errors import BoardRefusedError, WallRefusedError
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall

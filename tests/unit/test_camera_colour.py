@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from fake_librealsense import FakeSdk
 from fake_lidar import COLOUR_FROM_DEPTH, LENS, FakeLidar
-from nlos_calibration.board_corners import Corners
-from nlos_calibration.board_view import BoardView, CameraErrors, undistorted
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.board import Corners
+from nlos_calibration.board_wall import BoardView, CameraErrors, undistorted
+from nlos_calibration.geometry import Intrinsics
 from software_colour import SoftwareColour, record_with_colour
 
 from nlos_cam.calibrate.color_view import GREY, SETTLES, look_in_colour

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from fake_lidar import COLOUR_FROM_DEPTH, LENS
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from software_colour import SoftwareColour
 
 from nlos_cam.calibrate.color_view import look_in_colour

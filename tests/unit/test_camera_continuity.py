@@ -2,7 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.camera.timestamps import Continuity
 from nlos_cam.frames import Frame

@@ -3,7 +3,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.camera.recorder import RESERVE_BYTES, bytes_per_frame, can_grow, check_room, free_bytes, recording_s
 from nlos_cam.camera.streams import FORMATS

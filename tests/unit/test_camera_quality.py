@@ -2,7 +2,7 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.frames import Frame
 from nlos_cam.recording.quality import LEAST_PAIRS, Quality, QualityMeter

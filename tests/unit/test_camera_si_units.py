@@ -1,5 +1,5 @@
 import numpy as np
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.camera.streams import FrameSet, frame_in_si
 

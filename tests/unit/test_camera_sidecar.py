@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Rig, dump_toml, load_rig
 
 from nlos_cam.errors import DiskFullError, RecordingError

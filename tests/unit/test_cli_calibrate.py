@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import typer
 from nlos_calibration.errors import CalibrationError, WallRefusedError
-from nlos_calibration.measured_wall import load_measured
 from nlos_calibration.rig import Occluder, OccluderRecord, load_rig
 from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_record import load_wall
+from nlos_calibration.wall_record import load_measured, load_wall
 
 from nlos_cam.cli import calibrate
 from nlos_cam.cli.main import main

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.cli import live

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from nlos_calibration.combine import AGREE_SIGMAS, Plane, combine, disagreement
+from nlos_calibration.board_wall import AGREE_SIGMAS, Plane, combine, disagreement
 from nlos_calibration.geometry import normal_from_angles
 
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
-from nlos_calibration.depth_mean import FIRST_FRAMES, DepthMean
-from nlos_calibration.range_noise import depth_noise_m
+from nlos_calibration.noise import FIRST_FRAMES, DepthMean, depth_noise_m
 
 
 def mean_of(frames: Float64) -> DepthMean:

@@ -9,7 +9,7 @@ import pytest
 import rerun as rr
 from made_up_moments import NOTHING, RIG, SHEET, full_moment, moment
 from measured_walls import exact_wall
-from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.drawing import Drawing, new_recording

@@ -2,9 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.drift import MIN_PIXELS, TOLERANCE_C, DriftCheck, settings_changed
 from nlos_calibration.errors import CalibrationError
+from nlos_calibration.reference import BareWall
 
 from nlos_cam.calibrate.synthetic import SMALL, Pose, measured, wall_from_lidar
 

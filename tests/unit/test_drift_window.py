@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from nlos_calibration.drift_window import LEAST_FRAMES, WINDOW_FRAMES, Drift, DriftWindow
-from nlos_calibration.wall_track import Sight
+from nlos_calibration.drift import LEAST_FRAMES, WINDOW_FRAMES, Drift, DriftWindow
+from nlos_calibration.wall_tracker import Sight
 
 MANY = 10**6
 STILL = Drift(0.0, 0.0, 0.0, 0.0, 1e-5, 0.01, 0.01, 1e-5, uniform=False)

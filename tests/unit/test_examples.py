@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 import trimesh
-from nlos_calibration.measured_wall import load_measured
 from nlos_calibration.rig import load_rig
+from nlos_calibration.wall_record import load_measured
 
 from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera

@@ -3,8 +3,8 @@ import pytest
 from nlos_calibration.arrays import Float64
 from nlos_calibration.flatness import Flatness, flatness
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
+from nlos_calibration.noise import MeanNoise, depth_noise_m
 from nlos_calibration.plane import fit_depth
-from nlos_calibration.range_noise import MeanNoise, depth_noise_m
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import wall_depth
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from nlos_calibration.footprint import footprint, on_plane
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.rig import Extent, load_rig
+from nlos_calibration.rig_check import footprint, on_plane
 from numpy.typing import NDArray
 
 PINHOLE = load_rig("bare-wall").pinhole

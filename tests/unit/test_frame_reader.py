@@ -4,7 +4,7 @@ from threading import Event
 
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Frame, LidarMaps, _edges, maps_from_frame
 from nlos_cam.render.sensor.sensor import cell_of_pixels

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 import pytest
 from fake_wall import WallCamera, measured_wall
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import CameraLostError, SceneError

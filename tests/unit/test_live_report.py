@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.errors import NlosCamError, SceneError
 from nlos_cam.frames import Frame, maps_from_frame

@@ -2,12 +2,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nlos_calibration.bare_wall import BareWallStatistics, save_reference
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.measured_wall import load_measured
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.reference import BareWallStatistics, save_reference
 from nlos_calibration.rig import dump_toml
-from nlos_calibration.wall_record import load_wall
+from nlos_calibration.wall_record import load_measured, load_wall
 
 RECORD = Path(__file__).parent / "wall_v2.toml"
 

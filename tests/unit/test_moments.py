@@ -5,7 +5,7 @@ from threading import Event
 from typing import Self
 
 import numpy as np
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import Frame

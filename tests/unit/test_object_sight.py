@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from nlos_calibration.footprint import footprint
-from nlos_calibration.object_sight import lidar_sees, wall_sees
 from nlos_calibration.rig import Extent, LidarPose, ObjectBox, Occluder, Rig, load_rig
+from nlos_calibration.rig_check import footprint, lidar_sees, wall_sees
 from numpy.typing import NDArray
 
 PAPER = load_rig("paper-rig")

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.errors import OccluderRefusedError
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.noise import MeanNoise, depth_noise_m
 from nlos_calibration.occluder import MAX_BEHIND, OccluderFit, find_occluder, rig_with_occluder
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.range_noise import MeanNoise, depth_noise_m
 from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from nlos_calibration.occluder_edge import find_edge, rows_of
+from nlos_calibration.occluder import find_edge, rows_of
 from numpy.typing import NDArray
 
 ROWS, COLUMNS = 40, 100

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.occluder_sheet import SheetFit, fit_sheet, look
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.range_noise import MeanNoise
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.noise import MeanNoise
+from nlos_calibration.occluder import SheetFit, fit_sheet, look
 from nlos_calibration.rig import load_rig
 
 TOOLS = Path(__file__).parents[2] / "tools"

@@ -3,8 +3,8 @@ import pytest
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import normal_from_angles
+from nlos_calibration.noise import MeanNoise, depth_noise_m
 from nlos_calibration.plane import MIN_POINTS, fit_depth, fit_plane
-from nlos_calibration.range_noise import MeanNoise, depth_noise_m
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 318.0, 241.0)
 

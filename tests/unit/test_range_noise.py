@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from nlos_calibration.range_noise import QUANTUM_M, MeanNoise, depth_noise_m, measured_noise
+from nlos_calibration.noise import QUANTUM_M, MeanNoise, depth_noise_m, measured_noise
 
 
 def test_noise_grows_with_depth() -> None:

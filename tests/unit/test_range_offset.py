@@ -3,7 +3,7 @@ import pytest
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
-from nlos_calibration.range_noise import depth_noise_m
+from nlos_calibration.noise import depth_noise_m
 from nlos_calibration.range_offset import TAPE_STD_M, FitWith, tape_the_wall
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
 from fake_wall import WallCamera, measured_wall, wall_frame
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import OutputExistsError, RecordingError

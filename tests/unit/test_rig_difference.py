@@ -1,6 +1,6 @@
 import pytest
 from nlos_calibration.rig import DeviceConstants, LidarPose, ObjectBox, Occluder, PinholeRecord, Rig, load_rig
-from nlos_calibration.rig_difference import rig_difference
+from nlos_calibration.rig_check import rig_difference
 
 PAPER = load_rig("paper-rig")
 

@@ -2,10 +2,8 @@ import re
 from itertools import product
 
 import pytest
-from nlos_calibration.footprint import footprint
-from nlos_calibration.object_sight import lidar_sees, wall_sees
 from nlos_calibration.rig import Extent, LidarPose, Occluder, Rig, load_rig
-from nlos_calibration.rig_verdict import MIN_SEEN, MIN_SHARE, combined, judge_rig
+from nlos_calibration.rig_check import MIN_SEEN, MIN_SHARE, combined, footprint, judge_rig, lidar_sees, wall_sees
 from nlos_calibration.wall_record import OccluderRecord
 
 PAPER = load_rig("paper-rig")

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
+from nlos_calibration.flatness import Ripples, block_sums, ripples
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
+from nlos_calibration.noise import MeanNoise, depth_noise_m
 from nlos_calibration.plane import PlaneFit, fit_depth
-from nlos_calibration.range_noise import MeanNoise, depth_noise_m
 from nlos_calibration.rig import load_rig
-from nlos_calibration.ripples import Ripples, block_sums, ripples
 from nlos_calibration.wall import wall_depth
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)

@@ -2,7 +2,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.frames import Frame
 from nlos_cam.live.loop import in_words, watched

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from nlos_calibration.board import BOARDS
-from nlos_calibration.board_plane import PrintErrors
+from nlos_calibration.board_pose import PrintErrors
 from nlos_calibration.rig import load_rig
 
 TOOLS = Path(__file__).parents[2] / "tools"

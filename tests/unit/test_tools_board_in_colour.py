@@ -8,8 +8,8 @@ from types import ModuleType
 import cv2
 import numpy as np
 import pytest
-from nlos_calibration.board_corners import find_corners
-from nlos_calibration.board_view import EXACT, CameraErrors
+from nlos_calibration.board import find_corners
+from nlos_calibration.board_wall import EXACT, CameraErrors
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from nlos_calibration.bare_wall import BareWallStatistics
+from nlos_calibration.reference import BareWallStatistics
 from nlos_calibration.wall import wall_depth
 
 from nlos_cam.calibrate.synthetic import (

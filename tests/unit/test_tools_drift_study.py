@@ -10,8 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from drift_trials import AT_REST, KNOCKED, SHIFTS, Knock, Rest, Shift, at_rest, knock, poses
-from nlos_calibration.drift import BLIND_FRAMES
-from nlos_calibration.drift_window import Drift
+from nlos_calibration.drift import BLIND_FRAMES, Drift
 
 TRUE = Drift(0.002, 0.0, 0.0, 0.0, 0.0001, 0.02, 0.02, 0.0001, uniform=False)
 EVERY = 61

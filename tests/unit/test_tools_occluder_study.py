@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import LidarPose, Occluder, load_rig
 
 from nlos_cam.render.geometry import cast

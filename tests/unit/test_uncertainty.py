@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
 from nlos_calibration.geometry import normal_from_angles
-from nlos_calibration.uncertainty import WallMeasures, measures_of
+from nlos_calibration.wall import WallMeasures, measures_of
 
 SPREAD = np.array([[4.0, 1.0, -0.5], [1.0, 2.0, 0.3], [-0.5, 0.3, 1.0]])
 """The shape of a covariance; as large as the plane's slopes are uncertain."""

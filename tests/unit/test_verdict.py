@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.flatness import Flatness
-from nlos_calibration.verdict import check_flat, judge, warnings
+from nlos_calibration.wall import check_flat, judge, warnings
 
 FLAT = Flatness(
     bend_m=0.0,

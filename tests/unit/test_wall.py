@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.geometry import normal_from_angles, wall_from_plane
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics, normal_from_angles, wall_from_plane
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth
 

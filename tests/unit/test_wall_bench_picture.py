@@ -3,9 +3,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
-from nlos_calibration.footprint import footprint, on_plane
-from nlos_calibration.measured_wall import MeasuredWall
-from nlos_calibration.wall_record import OccluderRecord, WallRecord
+from nlos_calibration.rig_check import footprint, on_plane
+from nlos_calibration.wall_record import MeasuredWall, OccluderRecord, WallRecord
 
 from nlos_cam.calibrate.report_drawings import X, Y, Z, _corner_rays, _facing, _reached, bench_picture, drawn_limits
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from measured_walls import HEIGHT, WIDTH, exact_wall
-from nlos_calibration.bare_wall import BareWall
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
-from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.reference import BareWall
+from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.view.images import BACKGROUND_RGB, SATURATED_RGB
 from nlos_cam.view.wall_drawing import (

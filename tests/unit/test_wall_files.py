@@ -3,10 +3,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nlos_calibration.bare_wall import BareWall, BareWallStatistics
-from nlos_calibration.measured_wall import load_measured
-from nlos_calibration.projection import Intrinsics
-from nlos_calibration.wall_record import load_wall
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.reference import BareWall, BareWallStatistics
+from nlos_calibration.wall_record import load_measured, load_wall
 
 from nlos_cam.calibrate.files import WallFiles, written
 from nlos_cam.calibrate.report import report

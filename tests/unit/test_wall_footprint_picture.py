@@ -2,9 +2,8 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from nlos_calibration.measured_wall import MeasuredWall
 from nlos_calibration.rig import Extent, Rig
-from nlos_calibration.wall_record import WallRecord
+from nlos_calibration.wall_record import MeasuredWall, WallRecord
 
 from nlos_cam.calibrate.report_drawings import _holds, footprint_picture
 

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.calibrate.measure import CELSIUS_EVERY, look
 from nlos_cam.frames import Frame, maps_from_frame

@@ -3,14 +3,13 @@ from datetime import date
 
 import numpy as np
 import pytest
-from nlos_calibration.bare_wall import BareWallStatistics
 from nlos_calibration.board import BOARDS
 from nlos_calibration.errors import BoardRefusedError, CalibrationError, OccluderRefusedError, WallRefusedError
-from nlos_calibration.measured_wall import MeasuredWall
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.reference import BareWallStatistics
 from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
 from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_record import wall_record
+from nlos_calibration.wall_record import MeasuredWall, wall_record
 
 from nlos_cam.calibrate.measure import Seen, by_board, by_depth, by_occluder
 from nlos_cam.render.geometry import cast

@@ -4,8 +4,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from nlos_calibration.bare_wall import BareWall
-from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.reference import BareWall
+from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.calibrate.report_maps import Picture, figure_of, png, wall_maps
 

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.geometry import normal_from_angles, wall_from_plane
+from nlos_calibration.geometry import Intrinsics, normal_from_angles, wall_from_plane
 from nlos_calibration.occluder import OccluderFit
-from nlos_calibration.projection import Intrinsics
 from nlos_calibration.rig import ObjectBox, Occluder, dump_toml, load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import VERSION, WallRecord, load_wall, wall_record, with_occluder

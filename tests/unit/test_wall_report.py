@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 
 import cv2
 import numpy as np
-from nlos_calibration.measured_wall import MeasuredWall
+from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.calibrate.report import report
 

@@ -5,8 +5,7 @@ from html import unescape
 import pytest
 from nlos_calibration.board import BOARDS
 from nlos_calibration.board_wall import BoardRecord
-from nlos_calibration.measured_wall import MeasuredWall
-from nlos_calibration.wall_record import OccluderRecord
+from nlos_calibration.wall_record import MeasuredWall, OccluderRecord
 
 from nlos_cam.calibrate import report as text
 

@@ -3,9 +3,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from nlos_calibration.measured_wall import MeasuredWall
-from nlos_calibration.range_noise import depth_noise_m
+from nlos_calibration.noise import depth_noise_m
 from nlos_calibration.wall import wall_depth
+from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.calibrate.report_maps import block_side, expected_std_m, in_blocks, most_of_block, residual_m
 

@@ -2,10 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from nlos_calibration.bare_wall import BareWall
-from nlos_calibration.uncertainty import measures_of
-from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_track import GRID, WallTrack, noise_scale, watched_pixels
+from nlos_calibration.reference import BareWall
+from nlos_calibration.wall import measures_of, wall_depth
+from nlos_calibration.wall_tracker import GRID, WallTrack, noise_scale, watched_pixels
 
 from nlos_cam.calibrate.synthetic import SMALL, Pose, measured, wall_from_lidar
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.bare_wall import BareWall
-from nlos_calibration.range_noise import depth_noise_m, measured_noise
+from nlos_calibration.noise import depth_noise_m, measured_noise
+from nlos_calibration.reference import BareWall
 
 GRID = 18, 24
 """One pixel of each cell of such a grid of the view is watched."""

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.depth_mean import DepthMean
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.footprint import MAP_SHAPE
-from nlos_calibration.projection import Intrinsics
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.noise import DepthMean
+from nlos_calibration.rig_check import MAP_SHAPE
 
 FULL_SCALE = 255
 """IR counts that say no more than that there was too much light."""
