@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import torch
-from nlos_models.preprocess import Preprocess, split_and_stack
+from nlos_models.pipeline import Preprocess, split_and_stack
 from torch import nn
 
 from nlos_cam.dataset.build import open_dataset

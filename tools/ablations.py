@@ -17,7 +17,7 @@ from named_weights import by_name, errors_told, named
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
 from nlos_models.inference import refuse_colour
 from nlos_models.pipeline import Pipeline
-from nlos_models.remap import run
+from nlos_models.tasks import run
 
 from nlos_cam.evaluate.figures import LABELS
 from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, PerObject, advantage, over_objects, per_object, plain

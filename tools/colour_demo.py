@@ -19,8 +19,7 @@ import numpy as np
 from nlos_calibration.rig import load_rig
 from nlos_models.checkpoint import load_pipeline, load_vae
 from nlos_models.recipe import load_recipe
-from nlos_models.remap import run
-from nlos_models.tasks import rebuilt
+from nlos_models.tasks import rebuilt, run
 
 from nlos_cam.cli.common import PAPER_RIG, tracked
 from nlos_cam.cli.main import main as nlos_cam

@@ -21,7 +21,7 @@ from named_weights import errors_told
 from nlos_calibration.arrays import Float64
 from nlos_calibration.rig import Rig
 from nlos_models.checkpoint import shipped_folder
-from nlos_models.doubt_inference import Doubter, load_doubter
+from nlos_models.doubt_checkpoint import Doubter, load_doubter
 from nlos_models.inference import Reconstructor, load_reconstructor
 from numpy.typing import NDArray
 

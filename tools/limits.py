@@ -16,8 +16,8 @@ from nlos_calibration.arrays import Float32
 from nlos_models.checkpoint import load_encoder, load_pipeline, load_record, shipped_folder
 from nlos_models.data import MapSet
 from nlos_models.losses import latent_error
-from nlos_models.remap import run
-from nlos_models.silhouette import cut_silhouette, lift_edges
+from nlos_models.pipeline import cut_silhouette, lift_edges
+from nlos_models.tasks import run
 
 from nlos_cam.cli.common import say, tracked
 from nlos_cam.dataset.build import TEST_SEED, TRAINING_SEED, DatasetPlan

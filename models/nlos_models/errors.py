@@ -2,6 +2,7 @@
 
 ModelError (ValueError)          exit 1   root
 ├── TrainingError                exit 1   a run that cannot go on; what it did so far is kept
+├── OutputExistsError (FileExistsError)  exit 1   a run's folder that holds something else
 ├── CheckpointError              exit 4   weights that cannot be read or do not fit the model
 └── RecipeError                  exit 4   a training recipe that cannot be read
 """
@@ -15,6 +16,10 @@ class ModelError(ValueError):
 
 class TrainingError(ModelError):
     """A training run that cannot go on; what it did so far is kept."""
+
+
+class OutputExistsError(ModelError, FileExistsError):
+    """A run's folder that holds something else, which training would overwrite."""
 
 
 class CheckpointError(ModelError):

@@ -331,7 +331,8 @@ def _albedo(board: Board, seen: View, placed: Placed) -> Float64:
     board_from_texture = np.array([[texel_m, 0.0, first_m], [0.0, texel_m, first_m], [0.0, 0.0, 1.0]])
     lidar_from_board = (np.linalg.inv(seen.pose) @ placed.wall_from_board(board))[:3]
     warp = camera @ lidar_from_board @ board_from_texture
-    sharp = cv2.warpPerspective(_texture(board), warp, (fine.width, fine.height), borderValue=1.0)
+    texture = _texture(board)  # pyright: ignore[reportArgumentType]  a frozen model is hashable at run time
+    sharp = cv2.warpPerspective(texture, warp, (fine.width, fine.height), borderValue=1.0)
     shape = seen.pinhole.width, seen.pinhole.height
     return cv2.resize(sharp, shape, interpolation=cv2.INTER_AREA).astype(np.float64)
 

@@ -1,6 +1,7 @@
-"""Cameras by name. Backends are imported when asked for; simulation is never fallen back to."""
+"""Cameras by name, from a table of backends that are imported when used; simulation has to be asked for."""
 
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -20,6 +21,11 @@ SIMULATED = {
     "sim:bare-wall": "simulated: the same wall with nothing hidden",
 }
 """The packaged worlds; they are there for the asking."""
+REPLAY_BACKENDS = {
+    "plain": ("nlos_cam.recording.playback", "ReplayCamera"),
+    "sdk": ("nlos_cam.recording.sdk_playback", "SdkReplayCamera"),
+}
+"""Module and class of each reader of recordings: they stand in layers above this one."""
 NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or bag:FILE.bag"
 
 
@@ -48,13 +54,8 @@ def open_camera(
 def _replay(uri: str, path: Path, recording: "Recording | None", reader: Reader) -> Camera:
     if recording:
         raise NlosCamError(f"{uri} is a recording already: copy the file, or give a live camera (l515, sim)")
-    if reader == "sdk":
-        from nlos_cam.recording.sdk_playback import SdkReplayCamera
-
-        return SdkReplayCamera(path)
-    from nlos_cam.recording.playback import ReplayCamera
-
-    return ReplayCamera(path)
+    module, name = REPLAY_BACKENDS[reader]
+    return getattr(import_module(module), name)(path)
 
 
 def _simulated(uri: str, name: str, on_progress: OnProgress | None, recording: "Recording | None") -> Camera:

@@ -9,7 +9,7 @@ import typer
 from nlos_calibration.wall_record import rig_named
 from nlos_models.inference import load_reconstructor
 
-from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, say
+from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
 from nlos_cam.evaluate import subjects as judging
 from nlos_cam.evaluate.report import Judgement, as_figures, in_words, write
 from nlos_cam.evaluate.subjects import reconstruct_all
@@ -61,9 +61,9 @@ def evaluate(
         if data:
             judged = judging.stored_objects(data)
         else:
-            judged = judging.fresh_objects(rig_named(rig) if rig else judging.rig_of(record), count)
+            judged = judging.fresh_objects(rig_named(rig) if rig else judging.rig_of(record), count, tracked)
         bare = judging.bare_wall_for(record, judged.plan, wall)
-        guesses, among = judging.guesses(judged, training, nearest=not no_nearest)
+        guesses, among = judging.guesses(judged, training, nearest=not no_nearest, tracked=tracked)
         image = reconstruct_all(reconstructor, judging.as_eaten(judged.maps, bare))
     notes = judging.notes_on(record, judged, among)
     for note in notes:

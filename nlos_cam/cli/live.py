@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from nlos_models.doubt_inference import Doubter
+from nlos_models.doubt_checkpoint import Doubter
 from nlos_models.inference import Reconstructor
 from rich.markup import escape
 
@@ -48,6 +48,7 @@ from nlos_cam.cli.view import (
     tell_of_view,
     viewer_of,
 )
+from nlos_cam.evaluate.runtime_tradeoff import runtimes
 from nlos_cam.live.budget import SHIPPED, Choice, loader, options_here, timer, within_budget
 from nlos_cam.live.frame_log import SUFFIXES, FrameLog
 from nlos_cam.live.loop import in_words, run_live, warm_up
@@ -286,7 +287,7 @@ def _chosen(
     options = options_here(tradeoff, weights)
     doubter = load_doubt(weights)
     making = partial(set_up, bench, doubter=doubter)  # takes as long whatever it watches
-    network, choice = within_budget(budget_ms, options, making, loader(weights), timer(camera))
+    network, choice = within_budget(budget_ms, options, making, loader(weights, runtimes), timer(camera))
     say(choice.told())
     if choice.option.weights != SHIPPED:
         doubter = load_doubt(Path(choice.option.weights))

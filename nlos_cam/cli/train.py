@@ -6,30 +6,40 @@ The options that the three `train` commands share, each written once.
 """
 
 import inspect
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from lightning_fabric import Fabric
+from nlos_calibration.rig import Rig
 from nlos_calibration.wall_record import rig_named
 from nlos_models.checkpoint import load_encoder, shipped_folder
-from nlos_models.doubt_calibration import calibrated
-from nlos_models.doubt_training import DoubtSet, train_doubt
-from nlos_models.doubt_weights import DOUBT_RECORD, DoubtRecord, checksum_of_watched, save_doubt
+from nlos_models.distributed import Accelerator, launched, open_fabric
+from nlos_models.doubt_checkpoint import DOUBT_RECORD, DoubtRecord, checksum_of_watched
 from nlos_models.inference import load_reconstructor
-from nlos_models.processes import Accelerator, launched, open_fabric
 from nlos_models.recipe import SIMULATION_ONLY, Recipe, load_recipe
-from nlos_models.run_files import digest_of
-from nlos_models.sources import first_of
+from nlos_models.runs import (
+    Figures,
+    TrainingRun,
+    check_run_folder,
+    compressor_start,
+    new_record,
+    run_compressor,
+    run_doubt,
+    run_transfer,
+    run_vae,
+    transfer_start,
+    vae_start,
+)
+from nlos_models.train import OnStep, Running, digest_of
 
-from nlos_cam.cli.common import PAPER_RIG, Json, finish, say
-from nlos_cam.cli.train_runs import Figures, Job, job_of, run_compressor, run_transfer, run_vae, watched_run
-from nlos_cam.cli.train_start import compressor_start, transfer_start, vae_start
+from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say, stop_on_signals, tracked
 from nlos_cam.dataset import build
-from nlos_cam.dataset.doubt_samples import HELD_OUT_SHARE, _check, _made, _whole_set, counts_of
+from nlos_cam.dataset.doubt_samples import check_doubt_data, doubt_sets
 from nlos_cam.dataset.outliers import TO_LEARN
 from nlos_cam.dataset.training_maps import read_maps
 from nlos_cam.errors import OutputExistsError, SceneError
@@ -71,6 +81,31 @@ class RunOptions:
     def fabric(self, recipe: Recipe) -> Fabric:
         """What the recipe is run on."""
         return open_fabric(recipe, accelerator=self.accelerator, devices=self.devices)
+
+    def training(
+        self, recipe: Recipe, rig: Rig, before: list[Recipe], origin: str, *starts: Path | None
+    ) -> TrainingRun:
+        """Return the run of a recipe after earlier runs. Raises OutputExistsError where it would overwrite weights."""
+        record = new_record(recipe, (rig.name, rig.checksum), before)
+        check_run_folder(self.out, record, *starts)
+        return TrainingRun(recipe, self.out, record, self.tensorboard, self.compiled, origin, watched_run)
+
+
+@contextmanager
+def watched_run(fabric: Fabric, training: TrainingRun, name: str) -> Generator[tuple[OnStep, Running]]:
+    """Show a run's progress, in the leading process; Ctrl-C or SIGTERM ends it after the current step, saved."""
+    with progress() as bar, stop_on_signals() as stop:
+        title = f"training the {name}" + (f" in colour ({SIMULATION_ONLY})" if training.recipe.colour else "")
+        task = bar.add_task(title, total=None, visible=fabric.is_global_zero)
+
+        def on_step(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        def on_epoch(row: Figures) -> None:
+            text = f"epoch {row['epoch'] + 1:.0f} done, loss {row['loss']:.4g}, held out {row['held_out_loss']:.4g}"
+            bar.update(task, description=f"{title}: {text}")
+
+        yield on_step, replace(training.running(fabric), stop=stop.is_set, tell=say, on_epoch=on_epoch)
 
 
 def refuse_ignored(why: str, given: dict[str, bool]) -> None:
@@ -116,35 +151,15 @@ def doubt(
     fabric = run.fabric(recipe)
     pipeline = load_reconstructor(weights, cache_folder() / "onnx")
     training, judging = (build.open_dataset(folder) for folder in (data, held_out_data))
-    _check(recipe, pipeline, training, judging)
+    check_doubt_data(recipe, pipeline, training, judging)
     about = DoubtRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=list(TO_LEARN))
     if run.out.resolve() == watched.resolve() or (run.out / DOUBT_RECORD).exists():
         raise OutputExistsError(f"{run.out} holds weights already: choose another --out")
-    counts = counts_of(recipe)
-    fewer = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
-    sets = [
-        _whole_set(pipeline, first_of(maps.arrays(), most), _made(run.out / SAMPLES, some, seed, maps.plan))
-        for maps, most, some, seed in (
-            (training, recipe.objects, counts, build.TRAINING_SEED),
-            (judging, recipe.held_out, fewer, build.HELD_OUT_SEED),
-        )
-    ]
-    job = Job(recipe, run.out, pipeline.record, run.tensorboard, run.compiled, about.watches)
+    with tracked("rendering empty benches and outliers") as on_progress:
+        sets = doubt_sets(recipe, pipeline, (training, judging), run.out / SAMPLES, on_progress)
+    job = TrainingRun(recipe, run.out, pipeline.record, run.tensorboard, run.compiled, about.watches, watched_run)
     figures = launched(fabric, run_doubt, job, about, watched, *sets)
     finish({"out": str(run.out), **figures}, as_json=run.json, text=f"weights with their doubt in {run.out}: {figures}")
-
-
-def run_doubt(
-    fabric: Fabric, job: Job, about: DoubtRecord, watched: Path, training: DoubtSet, held_out: DoubtSet
-) -> Figures:
-    """Train, calibrate and save a doubt network; its held-out figures."""
-    with watched_run(fabric, job, "doubt network") as (on_step, running):
-        network, figures = train_doubt(job.recipe, training, held_out, job.out, on_step, running)
-    fitted = calibrated(network, held_out)
-    record = about.model_copy(update={**asdict(fitted), "figures": figures})
-    if fabric.is_global_zero:
-        save_doubt(job.out, network, record, watched)
-    return {**figures, "error_scale": fitted.error_scale, "outside_above": fitted.outside_above}
 
 
 Wall = Annotated[
@@ -177,7 +192,7 @@ def vae(
     refuse_ignored('the recipe has start = "scratch"', {"--weights": bool(weights) and recipe.start == "scratch"})
     fabric = run.fabric(recipe)
     start, runs = vae_start(recipe, weights) if recipe.start == "weights" else (None, [])
-    job = job_of(run, recipe, rig, runs, digest_of(start, rig.checksum), weights)
+    job = run.training(recipe, rig, runs, digest_of(start, rig.checksum), weights)
     box = build.DatasetPlan(rig, 0).box
     say(f"making {recipe.objects + recipe.held_out} objects")
     kinds, besides = build.Objects.without(recipe.left_out).categories, recipe.backgrounds
@@ -212,7 +227,7 @@ def compressor(
     start, runs = compressor_start(recipe, vae_folder, weights)
     maps = read_maps(recipe, data, held_out_data, wall, stream=stream)
     origin = digest_of(start.vae, start.pipeline, maps.digest)
-    job = job_of(run, maps.told(recipe), maps.plan.rig, runs, origin, weights, vae_folder)
+    job = run.training(maps.told(recipe), maps.plan.rig, runs, origin, weights, vae_folder)
     _tell(run, recipe, launched(fabric, run_compressor, job, start, maps.training, maps.held_out))
 
 
@@ -229,11 +244,11 @@ def transfer(
     """Train synthetic weights on, on a bench's recordings (SI 4): all layers, then the classifier alone."""
     recipe = run.recipe("transfer")
     fabric = run.fabric(recipe)
-    pipeline, runs = transfer_start(recipe, weights, partial=partial)
+    pipeline, runs = transfer_start(recipe, weights, partial=partial, on_report=say)
     encoder = load_encoder(weights)
     maps = read_maps(recipe, data, held_out_data, wall)
     origin = digest_of(pipeline, encoder, maps.digest)
-    job = job_of(run, maps.told(recipe), maps.plan.rig, runs, origin, weights)
+    job = run.training(maps.told(recipe), maps.plan.rig, runs, origin, weights)
     figures = launched(fabric, run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
     told = f"weights in {run.out}: {figures['after']}, from {figures['before']}"
     finish({"out": str(run.out), **figures["after"], "before": figures["before"]}, as_json=run.json, text=told)

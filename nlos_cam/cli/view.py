@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 import typer
 
 from nlos_cam.cli.common import INTERRUPTED, Json, finish, interrupted_by_signals, say, stop_on_signals
+from nlos_cam.live.realtime import after_the_loop
 from nlos_cam.reconstruct.bench import Bench
 from nlos_cam.view.assets import LOOPBACK
 from nlos_cam.view.server import exposed
@@ -38,7 +39,7 @@ def viewer_of(bench: Bench, *, no_view: bool, host: str | None = None, port: int
         return NullViewer()
     from nlos_cam.view.web import RerunViewer
 
-    return RerunViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port)
+    return RerunViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port, on_stream_thread=after_the_loop)
 
 
 class Addressed(Protocol):

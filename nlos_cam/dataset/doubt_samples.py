@@ -8,14 +8,13 @@ from zlib import crc32
 import numpy as np
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import Rig
-from nlos_models.data import MapSet
+from nlos_models.data import MapSet, first_of
 from nlos_models.doubt_training import DoubtSet
 from nlos_models.inference import Reconstructor
 from nlos_models.recipe import Recipe
-from nlos_models.remap import parts_of
+from nlos_models.tasks import parts_of
 from numpy.typing import NDArray
 
-from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import build
 from nlos_cam.dataset.outliers import SLIGHT, TO_JUDGE, TO_LEARN, Sight, ordinary, outlier, varied, varied_empty
 from nlos_cam.errors import SceneError
@@ -222,14 +221,33 @@ def _images(pipeline: Reconstructor, maps: MapSet) -> np.ndarray:
     return np.concatenate([pipeline(*pair) for pair in pairs]).astype(np.float16)
 
 
-def _made(folder: Path, counts: dict[str, int], seed: int, plan: build.DatasetPlan) -> DoubtSamples:
-    with tracked("rendering empty benches and outliers") as on_progress:
-        return samples_on_disk(
-            folder, counts, seed, plan.rig, plan.sensor, accuracy=plan.accuracy, on_progress=on_progress
+def doubt_sets(
+    recipe: Recipe,
+    pipeline: Reconstructor,
+    datasets: tuple[build.Dataset, build.Dataset],
+    folder: Path,
+    on_progress: OnProgress = lambda _done, _total: None,
+) -> list[DoubtSet]:
+    """Return the training set and the held-out set of an uncertainty network; rendered samples are kept in `folder`."""
+    counts = counts_of(recipe)
+    fewer = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
+    sets: list[DoubtSet] = []
+    for dataset, most, some, seed in zip(
+        datasets,
+        (recipe.objects, recipe.held_out),
+        (counts, fewer),
+        (build.TRAINING_SEED, build.HELD_OUT_SEED),
+        strict=True,
+    ):
+        plan = dataset.plan
+        samples = samples_on_disk(
+            folder, some, seed, plan.rig, plan.sensor, accuracy=plan.accuracy, on_progress=on_progress
         )
+        sets.append(_whole_set(pipeline, first_of(dataset.arrays(), most), samples))
+    return sets
 
 
-def _check(recipe: Recipe, pipeline: Reconstructor, training: build.Dataset, judging: build.Dataset) -> None:
+def check_doubt_data(recipe: Recipe, pipeline: Reconstructor, training: build.Dataset, judging: build.Dataset) -> None:
     if pipeline.record.input != "raw maps":
         raise SceneError(f"these weights eat {pipeline.record.input}, and doubt is learnt of raw maps: name others")
     if not training.plan.rig.checksum == judging.plan.rig.checksum == pipeline.record.rig_checksum:

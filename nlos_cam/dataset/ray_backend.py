@@ -4,10 +4,10 @@ Each machine needs this nlos-cam, and a folder of meshes at the same path. Shard
 """
 
 from collections.abc import Generator, Sequence
+from importlib.metadata import version
 from itertools import islice
 from typing import Any
 
-import nlos_cam
 from nlos_cam.dataset.build import one_thread
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import Samples, make_samples
@@ -15,6 +15,7 @@ from nlos_cam.errors import NlosCamError, SceneError, WorkersLostError
 
 TRIES = 5
 """Deaths of its worker that a piece survives."""
+VERSION = version("nlos-cam")
 AHEAD = 3
 """Pieces asked for at a time, for each processor of the cluster: what waits is little, and nobody waits."""
 
@@ -62,17 +63,17 @@ class RayFarm:
         ray, coming = self._ray, iter(pieces)
         work = ray.remote(num_cpus=1, max_retries=TRIES)(make_piece)
         ahead = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
-        waiting = {work.remote(plan, piece, nlos_cam.__version__): piece for piece in islice(coming, ahead)}
+        waiting = {work.remote(plan, piece, VERSION): piece for piece in islice(coming, ahead)}
         while waiting:
             (ready, *_), _ = ray.wait([*waiting], num_returns=1)
             yield waiting.pop(ready), ray.get(ready)
-            waiting |= {work.remote(plan, piece, nlos_cam.__version__): piece for piece in islice(coming, 1)}
+            waiting |= {work.remote(plan, piece, VERSION): piece for piece in islice(coming, 1)}
 
 
-def make_piece(plan: DatasetPlan, piece: range, version: str) -> Samples:
+def make_piece(plan: DatasetPlan, piece: range, wanted: str) -> Samples:
     """What a worker does. Raises SceneError where its machine has another nlos-cam than the one who asks."""
-    if version != nlos_cam.__version__:
-        raise SceneError(f"a worker has nlos-cam {nlos_cam.__version__}, not {version}: install the same everywhere")
+    if wanted != VERSION:
+        raise SceneError(f"a worker has nlos-cam {VERSION}, not {wanted}: install the same everywhere")
     one_thread()
     return make_samples(plan, piece)
 

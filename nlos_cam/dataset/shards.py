@@ -10,6 +10,7 @@ import platform
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,6 @@ import numpy as np
 from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
-import nlos_cam
 from nlos_cam.dataset.plan import SCENE_COLUMNS, DatasetPlan
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
@@ -127,7 +127,7 @@ def _as_bytes(samples: Samples, provenance: str, command: str) -> bytes:
     with h5py.File(memory, "w") as file:
         seeds = samples["seed"]
         file.attrs.update({"plan": provenance, "plan_sha256": _digest(provenance.encode()), "command": command})
-        file.attrs["package_version"] = nlos_cam.__version__
+        file.attrs["package_version"] = version("nlos-cam")
         file.attrs.update({"first_seed": int(seeds[0]), "last_seed": int(seeds[-1])})
         for name, values in samples.items():
             if values.dtype == object:

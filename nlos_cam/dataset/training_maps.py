@@ -11,9 +11,8 @@ import torch
 from nlos_calibration.arrays import Float16, Float32
 from nlos_calibration.reference import Moments
 from nlos_calibration.wall_record import load_measured
-from nlos_models.data import MapBatch, MapSet
+from nlos_models.data import InMemory, MapBatch, MapSet, MapSource, first_of, less_bare_wall
 from nlos_models.recipe import Recipe
-from nlos_models.sources import InMemory, MapSource, first_of, less_bare_wall
 
 from nlos_cam.dataset import build
 from nlos_cam.errors import SceneError
@@ -50,7 +49,7 @@ class TrainingMaps(NamedTuple):
 class Streamed:
     """A dataset on the disk as a source; `bare` is subtracted from its maps if there is one."""
 
-    build: build.Dataset
+    dataset: build.Dataset
     image: Float16
     """All images (n, 64, 64)."""
     bare: BareMaps | None = None

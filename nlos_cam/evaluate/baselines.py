@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from nlos_calibration.arrays import Float16, Float32
 from nlos_models.data import MapSet
-from nlos_models.preprocess import SMALLEST_SPREAD, channel_statistics, split_and_stack
+from nlos_models.pipeline import SMALLEST_SPREAD, channel_statistics, split_and_stack
 from torch import Tensor
 
 from nlos_cam.dataset import build

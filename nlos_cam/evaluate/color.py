@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from nlos_calibration.arrays import Float16, Float32
 from nlos_calibration.rig import Rig
-from nlos_models.colour_metrics import SMALLER_IS_BETTER, brightness, colour_metrics
 from nlos_models.data import MapSet
-from nlos_models.metrics import surface
+from nlos_models.metrics import SMALLER_IS_BETTER, brightness, colour_metrics, surface
 from nlos_models.recipe import SIMULATION_ONLY
 
 from nlos_cam.dataset.samples import sense_colour

@@ -15,8 +15,7 @@ import torch
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_models.checkpoint import load_pipeline
-from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, exported
-from nlos_models.quantise import Sample, quantise
+from nlos_models.inference import OnnxReconstructor, Reconstructor, Sample, TorchReconstructor, exported, quantise
 
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.dataset import build

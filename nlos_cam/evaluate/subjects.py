@@ -4,7 +4,8 @@ What weights are judged on: the test objects or a dataset, as maps that the weig
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -15,12 +16,10 @@ from nlos_calibration.errors import RecordFileError
 from nlos_calibration.rig import ObjectBox, Rig
 from nlos_calibration.wall_record import rig_named
 from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.data import MapSet
+from nlos_models.data import MapSet, less_bare_wall
 from nlos_models.inference import Reconstructor
-from nlos_models.sources import less_bare_wall
 
 from nlos_cam.camera.simulated_world import World
-from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import build
 from nlos_cam.dataset.training_maps import BareMaps, measured_bare_wall, render_bare_wall
 from nlos_cam.errors import SceneError
@@ -36,6 +35,16 @@ from nlos_cam.render.scene_file import SceneFile
 from nlos_cam.render.sensor.model import SensorModel
 
 OnProgress = Callable[[int, int], None]
+Tracked = Callable[[str], AbstractContextManager[OnProgress]]
+"""Opens a progress bar with a description; its function takes what is done and the total."""
+
+
+@contextmanager
+def untracked(description: str) -> Generator[OnProgress]:
+    """Show no progress."""
+    del description
+    yield lambda _done, _total: None
+
 
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 """A sensor without noise or dead pixels; saturation and quantisation stay."""
@@ -139,7 +148,7 @@ def rig_of(record: CheckpointRecord) -> Rig:
         ) from error
 
 
-def fresh_objects(rig: Rig, count: int | None = None) -> Judged:
+def fresh_objects(rig: Rig, count: int | None = None, tracked: Tracked = untracked) -> Judged:
     """The 54, or so many random objects, through the noise of the simulated camera on a rig."""
     plan = build.DatasetPlan(rig, build.TEST_SEED)
     subjects = seeded_objects(plan.first_seed, count, plan.box) if count else test_set(plan.box)
@@ -176,7 +185,9 @@ def as_eaten(maps: MapSet, bare: BareMaps | None) -> MapSet:
     return less_bare_wall(maps, *bare) if bare else maps
 
 
-def guesses(judged: Judged, training: Path | None, *, nearest: bool) -> tuple[dict[str, Float32], build.Dataset | None]:
+def guesses(
+    judged: Judged, training: Path | None, *, nearest: bool, tracked: Tracked = untracked
+) -> tuple[dict[str, Float32], build.Dataset | None]:
     """The baselines' images, and the training objects that the nearest was looked for among, if it is wanted."""
     if not nearest:
         images = build.procedural_images(build.TRAINING_SEED, trivial.NEIGHBOURS, judged.plan.box)

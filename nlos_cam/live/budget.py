@@ -9,13 +9,14 @@ measured on objects that stand still; what moves also smears.
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from nlos_calibration.rig import ObjectBox, Rig
 from nlos_calibration.wall_record import rig_named
 from nlos_models.checkpoint import load_record, shipped_folder
 from nlos_models.inference import Reconstructor
@@ -239,12 +240,14 @@ def options_here(tradeoff: Path | None, weights: Path | None) -> list[Option]:
     return here
 
 
-def loader(weights: Path | None) -> Callable[[Option], Reconstructor]:
-    """Makes the networks of options; `weights` are those that a table beside them calls shipped."""
+Runtimes = Callable[[Path | None, Rig, ObjectBox, Path], Mapping[str, Callable[[int], Reconstructor]]]
+"""Weights, rig, object box and cache folder to networks by runtime and number of threads."""
+
+
+def loader(weights: Path | None, runtimes: Runtimes) -> Callable[[Option], Reconstructor]:
+    """Return a function that loads the networks of an option; `weights` are those that its table calls shipped."""
 
     def load(option: Option) -> Reconstructor:
-        from nlos_cam.evaluate.runtime_tradeoff import runtimes
-
         folder = weights if option.weights == SHIPPED else Path(option.weights)
         rig = rig_named(load_record(folder or shipped_folder()).rig_name)
         if option.runtime.startswith("torch"):

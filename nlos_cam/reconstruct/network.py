@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
-from nlos_models.doubt_inference import Doubter
+from nlos_models.doubt_checkpoint import Doubter
 from nlos_models.metrics import LEAST_V
 from numpy.typing import NDArray
 

@@ -11,7 +11,7 @@ from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_calibration.rig import Rig, load_rig
 from nlos_calibration.rig_check import rig_difference
 from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.doubt_inference import Doubter, load_doubter
+from nlos_models.doubt_checkpoint import Doubter, load_doubter
 from nlos_models.inference import Reconstructor, load_reconstructor
 
 from nlos_cam.files import cache_folder

@@ -14,7 +14,6 @@ from nlos_calibration.rig import Rig
 from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.live.realtime import after_the_loop
 from nlos_cam.view.assets import LOOPBACK, page_assets
 from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.server import Send, ViewServer
@@ -41,8 +40,13 @@ class RerunViewer:
         *,
         host: str = LOOPBACK,
         port: int | None = None,
+        on_stream_thread: Callable[[], None] = lambda: None,
     ) -> None:
-        """At this `port` or nowhere; without one, at 9090 or where there is room."""
+        """Prepare a server at `port`, or without one at 9090 or the next free port.
+
+        `on_stream_thread` is called once in each browser's thread before it draws.
+        """
+        self._on_stream_thread = on_stream_thread
         self.address: str | None = None
         self._host, self._port = host, port
         self._rig, self._measured, self._clock = rig, measured, clock
@@ -69,7 +73,7 @@ class RerunViewer:
 
         While a slow browser keeps `send` waiting nothing is drawn for it: it skips moments, and memory stays as it is.
         """
-        after_the_loop()
+        self._on_stream_thread()
         recording = new_recording()
         stream, drawing = recording.binary_stream(), None
         count = drawn = 0

@@ -3,8 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from nlos_models.doubt_inference import SaidOf
-from nlos_models.doubt_weights import DoubtRecord
+from nlos_models.doubt_checkpoint import DoubtRecord, SaidOf
 from nlos_models.recipe import Recipe
 
 RECIPE = Recipe(task="doubt", objects=8, outliers=4, empties=4, held_out=4, epochs=1, batch=4, learning_rate=1e-3)

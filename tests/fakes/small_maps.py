@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 from nlos_calibration.arrays import Float16
-from nlos_models import checkpoint, networks
+from nlos_models import checkpoint
+from nlos_models import pipeline as networks
 from nlos_models.data import MapBatch, MapSet, map_batches
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe

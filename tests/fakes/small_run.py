@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from lightning_fabric import Fabric
-from nlos_models import run_files
+from nlos_models import train
 from nlos_models.recipe import Recipe
 from nlos_models.train import Running, fit
 from torch import Tensor, nn
@@ -112,11 +112,11 @@ def run_watched(recipe: Recipe, folder: Path, executioner: Executioner) -> Small
         executioner()
         return replace(path, target)
 
-    run_files.os.fsync, Path.replace = watched_fsync, watched_replace  # type: ignore[method-assign]
+    train.os.fsync, Path.replace = watched_fsync, watched_replace  # type: ignore[method-assign]
     try:
         run.go(stop=lambda: bool(executioner()), checkpoint_s=0.0)
     finally:
-        run_files.os.fsync, Path.replace = fsync, replace  # type: ignore[method-assign]
+        train.os.fsync, Path.replace = fsync, replace  # type: ignore[method-assign]
     return run
 
 

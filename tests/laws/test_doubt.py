@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from nlos_models.doubt_inference import load_doubter
+from nlos_models.doubt_checkpoint import load_doubter
 from nlos_models.inference import load_reconstructor
 
 from nlos_cam.dataset.outliers import TO_LEARN, Sight, ordinary, outlier, varied_empty

@@ -17,7 +17,7 @@ from nlos_calibration.reference import BareWall
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import MeasuredWall, wall_record
-from nlos_models import colour_resnet, res_vae
+from nlos_models import compressor, vae
 from rerun.chunk import RrdReader
 from rosbags.rosbag1 import Reader, Writer
 from view_streams import ASSETS, Streams
@@ -164,11 +164,11 @@ def straight_view() -> Callable[..., Float32]:
 def narrow_networks() -> Iterator[None]:
     """Res-VAE and ResNet50 with a sixteenth of their channels: all that their widths decide is time."""
     with pytest.MonkeyPatch.context() as patch:
-        (into, within, out), *rest = res_vae.UP_BLOCKS
+        (into, within, out), *rest = vae.UP_BLOCKS
         narrow = [(into, within // 16, out // 16), *(tuple(width // 16 for width in block) for block in rest)]
-        patch.setattr(res_vae, "UP_BLOCKS", tuple(narrow))
-        stages = tuple((within // 16, *others) for within, *others in colour_resnet.STAGES)
-        patch.setattr(colour_resnet, "STAGES", stages)
+        patch.setattr(vae, "UP_BLOCKS", tuple(narrow))
+        stages = tuple((within // 16, *others) for within, *others in compressor.COLOR_STAGES)
+        patch.setattr(compressor, "COLOR_STAGES", stages)
         yield
 
 

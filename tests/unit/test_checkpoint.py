@@ -22,7 +22,7 @@ from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
-from nlos_models.res_vae import Decoder, Encoder, ResVae
+from nlos_models.vae import Decoder, Encoder, ResVae
 from safetensors.torch import load_file, save_file
 from torch import nn
 

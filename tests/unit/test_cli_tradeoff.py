@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.recipe import Recipe
-from nlos_models.record import CheckpointRecord
 
 from nlos_cam.cli import tradeoff as command
 from nlos_cam.cli.main import main

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 from nlos_calibration.rig import load_rig
-from nlos_models.data import MapBatch
+from nlos_models.data import MapBatch, less_bare_wall
 from nlos_models.recipe import Recipe
-from nlos_models.sources import less_bare_wall
 from small_maps import SmallDataset, small_maps
 
 from nlos_cam.dataset import build, training_maps

@@ -10,7 +10,7 @@ import pytest
 import torch
 from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint
-from nlos_models.doubt_weights import load_doubt
+from nlos_models.doubt_checkpoint import load_doubt
 from small_maps import SmallDataset, small_maps, untrained_weights, use_small_networks
 
 from nlos_cam.cli import train

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float32
-from nlos_models.colour_metrics import (
+from nlos_models.metrics import (
     brightness,
     colour_accuracy_mean_abs,
     colour_error,

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from nlos_models.colour_resnet import Bottleneck, ResNet50
+from nlos_models.compressor import Bottleneck, ResNet50
 from torch import nn
 
 PUBLISHED = 25_557_032

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from nlos_models.compiled import compiled, compiling
 from nlos_models.errors import TrainingError
+from nlos_models.train import compiled, compiling
 from torch import Tensor, nn
 from torch._inductor import config
 from torch._inductor.exc import InductorError

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from nlos_models.doubt_calibration import error_scale, shared_errors, temperature
+from nlos_models.doubt_training import error_scale, shared_errors, temperature
 
 
 def laplace(expected: np.ndarray, seed: int = 0) -> np.ndarray:

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models.doubt_inference import Doubter, load_doubter
-from nlos_models.doubt_weights import load_doubt
+from nlos_models.doubt_checkpoint import Doubter, load_doubt, load_doubter
 from small_doubt import untrained_doubt, watched_weights
 
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 from fake_doubter import RECIPE
-from nlos_models.doubt_calibration import MOST_FALSE_ALARMS, calibrated
 from nlos_models.doubt_network import DoubtNetwork, DoubtOutput
 from nlos_models.doubt_training import (
+    MOST_FALSE_ALARMS,
     DoubtBatch,
     as_doubt_batch,
+    calibrated,
     doubt_batches,
     doubt_loss,
     said_of,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from nlos_models.doubt_weights import DOUBT_RECORD, WATCHED, checksum_of_watched, load_doubt, save_doubt
+from nlos_models.doubt_checkpoint import DOUBT_RECORD, WATCHED, checksum_of_watched, load_doubt, save_doubt
 from nlos_models.errors import CheckpointError
 from small_doubt import untrained_doubt, watched_weights
 

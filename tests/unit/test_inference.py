@@ -11,10 +11,9 @@ from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError, ModelError
 from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, load_reconstructor
 from nlos_models.metrics import LEAST_V
-from nlos_models.pipeline import Pipeline
-from nlos_models.preprocess import split_and_stack
+from nlos_models.pipeline import Pipeline, split_and_stack
 from nlos_models.recipe import Recipe
-from nlos_models.res_vae import Decoder
+from nlos_models.vae import Decoder
 
 RECORD = CheckpointRecord(
     rig_name="paper-rig",

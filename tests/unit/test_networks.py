@@ -2,9 +2,7 @@
 
 import pytest
 import torch
-from nlos_models.networks import CHANNELS, COLOUR_LATENT, new_pipeline, new_vae
-from nlos_models.pipeline import Pipeline
-from nlos_models.preprocess import split_and_stack
+from nlos_models.pipeline import CHANNELS, COLOUR_LATENT, Pipeline, new_pipeline, new_vae, split_and_stack
 from small_maps import hard_maps
 
 pytestmark = pytest.mark.usefixtures("one_thread")

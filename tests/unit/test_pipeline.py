@@ -6,7 +6,7 @@ from nlos_models.checkpoint import load_pipeline, shipped_folder
 from nlos_models.compressor import Compressor
 from nlos_models.metrics import LEAST_V
 from nlos_models.pipeline import Pipeline
-from nlos_models.res_vae import Decoder
+from nlos_models.vae import Decoder
 from safetensors.torch import load_file
 from small_maps import hard_maps
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from nlos_models.data import flip_some
-from nlos_models.preprocess import Preprocess, channel_statistics, split_and_stack, stacked_channels
+from nlos_models.pipeline import Preprocess, channel_statistics, split_and_stack, stacked_channels
 from torch import Tensor
 
 

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from nlos_models.distributed import launched, open_fabric, seed_of, share_of
 from nlos_models.errors import RecipeError, TrainingError
-from nlos_models.processes import launched, open_fabric, seed_of, share_of
 from small_run import SmallRun, on_two, small_recipe
 from torch import Tensor
 from torch.multiprocessing.spawn import ProcessExitedException

@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 import pytest
 from nlos_models.errors import ModelError
-from nlos_models.quantise import quantise
+from nlos_models.inference import quantise
 from onnx import TensorProto, helper, numpy_helper
 
 

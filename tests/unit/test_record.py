@@ -1,8 +1,8 @@
 """A record tells every run behind its weights: the last of each task by name, those before them in their order."""
 
 import pytest
+from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
-from nlos_models.record import CheckpointRecord
 
 RIG = ("paper-rig", "0123")
 

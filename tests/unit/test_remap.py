@@ -5,13 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models import remap
-from nlos_models.data import map_batches
+from nlos_models import tasks
+from nlos_models.data import InMemory, map_batches
 from nlos_models.errors import TrainingError
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
-from nlos_models.remap import Remapping, figures_of, latents_of, run
-from nlos_models.sources import InMemory
+from nlos_models.tasks import Remapping, figures_of, latents_of, run
 from nlos_models.train import Running
 from small_maps import SmallCompressor, SmallVae, small_images, small_maps
 
@@ -33,7 +32,7 @@ def _ignore(done: int, total: int) -> None:
 def test_the_latents_worked_out_ahead_are_those_of_the_images_and_of_their_mirrors(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(remap, "SCORING_BATCH", 3)
+    monkeypatch.setattr(tasks, "SCORING_BATCH", 3)
     encoder, maps = SmallVae().eval().encoder, small_maps(8, 3)
     straight, mirrored = latents_of(encoder, maps.image), latents_of(encoder, maps.image[:, ::-1])
     for batch in map_batches(maps, 4, torch.Generator().manual_seed(0)):
@@ -45,7 +44,7 @@ def test_running_in_parts_equals_running_one_by_one(monkeypatch: pytest.MonkeyPa
     pipeline, maps = Pipeline(SmallCompressor(), SmallVae().decoder).eval(), small_maps(5, 2)
     whole = run(pipeline, maps)
     assert whole.shape == (5, 64, 64)
-    monkeypatch.setattr(remap, "SCORING_BATCH", 2)
+    monkeypatch.setattr(tasks, "SCORING_BATCH", 2)
     np.testing.assert_allclose(run(pipeline, maps), whole, atol=1e-5)
 
 

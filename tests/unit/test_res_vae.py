@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from nlos_models.res_vae import LATENT, LOG_VARIANCE_LIMIT, Decoder, Encoder, ResBlock, ResVae
+from nlos_models.vae import LATENT, LOG_VARIANCE_LIMIT, Decoder, Encoder, ResBlock, ResVae
 from torch import nn
 
 TABLE_S1 = (

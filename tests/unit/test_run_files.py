@@ -9,7 +9,7 @@ from typing import NoReturn
 import pytest
 import torch
 from nlos_models.errors import CheckpointError, TrainingError
-from nlos_models.run_files import (
+from nlos_models.train import (
     BEST,
     LAST,
     LOG,

@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from nlos_models.recipe import Recipe
-from nlos_models.schedule import PLATEAU_PATIENCE, SMALLEST_RATE, has_ended, schedule_of
+from nlos_models.recipe import PLATEAU_PATIENCE, SMALLEST_RATE, Recipe, has_ended, schedule_of
 from torch import nn
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from nlos_models.metrics import LEAST_V
-from nlos_models.silhouette import KEPT_SHARE, WINDOW, cut_silhouette, lift_edges
+from nlos_models.pipeline import KEPT_SHARE, WINDOW, cut_silhouette, lift_edges
 
 
 def _blurred() -> torch.Tensor:

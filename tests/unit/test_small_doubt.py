@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from nlos_models.doubt_weights import load_doubt
+from nlos_models.doubt_checkpoint import load_doubt
 from small_doubt import small_doubt_set, untrained_doubt, watched_weights
 
 

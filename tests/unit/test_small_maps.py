@@ -8,7 +8,7 @@ import torch
 from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint
 from nlos_models.compressor import Compressor
-from nlos_models.res_vae import ResVae
+from nlos_models.vae import ResVae
 from small_maps import (
     SmallCompressor,
     SmallVae,

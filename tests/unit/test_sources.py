@@ -2,8 +2,7 @@
 
 import numpy as np
 import torch
-from nlos_models.data import map_batches
-from nlos_models.sources import InMemory, first_of, less_bare_wall
+from nlos_models.data import InMemory, first_of, less_bare_wall, map_batches
 from small_maps import small_maps
 
 

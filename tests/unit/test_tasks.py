@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 from nlos_models import tasks, train
+from nlos_models.data import InMemory
 from nlos_models.errors import TrainingError
-from nlos_models.pipeline import Pipeline
-from nlos_models.preprocess import channel_statistics, split_and_stack
+from nlos_models.pipeline import Pipeline, channel_statistics, split_and_stack
 from nlos_models.recipe import Recipe
-from nlos_models.sources import InMemory
 from nlos_models.tasks import Start, train_compressor, train_vae, turn_some
 from nlos_models.train import Running
 from small_maps import SmallCompressor, SmallVae, small_images, small_maps, use_small_networks

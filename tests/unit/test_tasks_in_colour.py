@@ -8,16 +8,13 @@ import pytest
 import torch
 from nlos_calibration.arrays import Float16
 from nlos_models.checkpoint import CheckpointRecord, load_encoder, load_pipeline, load_vae, save_pipeline, save_vae
-from nlos_models.data import MapSet
+from nlos_models.data import InMemory, MapSet
 from nlos_models.errors import CheckpointError
 from nlos_models.inference import load_reconstructor
-from nlos_models.pipeline import Pipeline
-from nlos_models.preprocess import channel_statistics, split_and_stack
+from nlos_models.pipeline import Pipeline, channel_statistics, split_and_stack
 from nlos_models.recipe import SIMULATION_ONLY, Recipe, load_recipe
-from nlos_models.remap import figures_of, run
-from nlos_models.res_vae import ResVae
-from nlos_models.sources import InMemory
-from nlos_models.tasks import Start, rebuilt, train_compressor, train_vae
+from nlos_models.tasks import Start, figures_of, rebuilt, run, train_compressor, train_vae
+from nlos_models.vae import ResVae
 
 pytestmark = pytest.mark.usefixtures("narrow_networks")
 

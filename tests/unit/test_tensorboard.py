@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from nlos_models.errors import TrainingError
-from nlos_models.tensorboard import Board
+from nlos_models.train import Board
 from small_run import SmallRun, small_recipe
 
 

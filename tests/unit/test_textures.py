@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from nlos_models.colour_metrics import BLACK_V
-from nlos_models.silhouette import KEPT_SHARE
+from nlos_models.metrics import BLACK_V
+from nlos_models.pipeline import KEPT_SHARE
 
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from nlos_models import schedule
+from nlos_models import recipe as schedule
 from nlos_models.errors import RecipeError, TrainingError
-from nlos_models.run_files import BEST, LAST, read_last, write_last
+from nlos_models.train import BEST, LAST, read_last, write_last
 from small_run import STEPS, Executioner, SmallRun, Stopped, be_killed, run_watched, small_recipe
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from nlos_models import remap, transfer
+from nlos_models import tasks
+from nlos_models.data import InMemory
 from nlos_models.errors import RecipeError
-from nlos_models.pipeline import Pipeline
-from nlos_models.preprocess import channel_statistics, split_and_stack
+from nlos_models.pipeline import Pipeline, channel_statistics, split_and_stack
 from nlos_models.recipe import Recipe
-from nlos_models.sources import InMemory
-from nlos_models.transfer import ALL_LAYERS, CLASSIFIER, train_transfer
+from nlos_models.tasks import ALL_LAYERS, CLASSIFIER, train_transfer
 from small_maps import SmallCompressor, SmallVae, small_maps
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -76,12 +75,12 @@ def test_in_the_first_phase_all_of_the_compressor_changes_batch_norms_too_and_th
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = Bench(tmp_path)
-    before, fit = bench.state, transfer.Remapping.fit
+    before, fit = bench.state, tasks.Remapping.fit
 
-    def first_alone(self: transfer.Remapping, recipe: Recipe, frozen: list, folder: Path, *rest: object) -> object:
+    def first_alone(self: tasks.Remapping, recipe: Recipe, frozen: list, folder: Path, *rest: object) -> object:
         return fit(self, recipe, frozen, folder, *rest) if folder.name == ALL_LAYERS else {}
 
-    monkeypatch.setattr(transfer.Remapping, "fit", first_alone)
+    monkeypatch.setattr(tasks.Remapping, "fit", first_alone)
     bench.go(_recipe())
     ours = {name for name in before if name.startswith("compressor")}
     assert any("running_mean" in name for name in ours)
@@ -108,7 +107,7 @@ def test_the_second_phase_sets_out_from_the_first_ones_best_epoch_where_that_is_
         found.append(bench.state)
         return {"held_out_loss": next(losses)}
 
-    monkeypatch.setattr(remap, "figures_of", figures)
+    monkeypatch.setattr(tasks, "figures_of", figures)
     bench.go(_recipe(all_layers_epochs=3, epochs=1, keep="best", dropout=0.0))
     after_best, last = (_changed(found[k], bench.state) for k in (1, 2))
     assert after_best == {"compressor.classifier.1.weight", "compressor.classifier.1.bias"}

@@ -1,15 +1,22 @@
-"""A doubt network's files, beside the weights that it watches: tensors, and a record that names those by checksum."""
+"""A doubt network's files, beside the weights that it watches: tensors, and a record that names those by checksum.
+
+Doubt at run time: a doubt network exported to ONNX and run by ONNX Runtime on one thread of a CPU.
+"""
 
 import hashlib
 import json
 import shutil
 from pathlib import Path
+from typing import NamedTuple, Protocol
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from nlos_models.checkpoint import RECORD, load_part, save_parts
-from nlos_models.doubt_network import DoubtNetwork, Told
+from nlos_models.arrays import Float32
+from nlos_models.checkpoint import RECORD, load_part, save_parts, shipped_folder
+from nlos_models.doubt_network import MAP_SHAPE, DoubtNetwork, Told
 from nlos_models.errors import CheckpointError
+from nlos_models.inference import checksum_of, open_session, write_onnx
 from nlos_models.recipe import Recipe
 
 DOUBT, DOUBT_RECORD = "doubt", "doubt.json"
@@ -87,3 +94,54 @@ def _record(path: Path) -> DoubtRecord:
         problem = error.errors()[0]
         field = ".".join(str(part) for part in problem["loc"])
         raise CheckpointError(f"{path} is not a doubt network's record: {field}: {problem['msg']}") from error
+
+
+INPUTS = {"depth_m": MAP_SHAPE, "intensity": MAP_SHAPE, "image": (64, 64)}
+
+
+class SaidOf(NamedTuple):
+    """What is said of n reconstructions, calibrated."""
+
+    nothing: Float32
+    """(n,); probability that nothing is hidden."""
+    outside: Float32
+    """(n,); probability that what is hidden is unlike what the networks were trained on."""
+    error_v: Float32
+    """(n, 64, 64); expected absolute error in v, were there a surface."""
+    surface: Float32
+    """(n, 64, 64); probability that there is a surface."""
+
+
+class Doubter(Protocol):
+    """A doubt network, ready to run."""
+
+    record: DoubtRecord
+
+    def __call__(self, depth_m: Float32, intensity: Float32, image: Float32) -> SaidOf:
+        """Maps (n, 64, 80), NaN depth where there is no return, and the images (n, 64, 64) made of them."""
+        ...
+
+
+class OnnxDoubter:
+    """A doubt network as ONNX Runtime runs it."""
+
+    def __init__(self, model: Path, record: DoubtRecord, threads: int = 1) -> None:
+        self.record, self._session = record, open_session(model, threads)
+
+    def __call__(self, depth_m: Float32, intensity: Float32, image: Float32) -> SaidOf:
+        arrays = (np.ascontiguousarray(array, np.float32) for array in (depth_m, intensity, image))
+        return SaidOf(*self._session.run(None, dict(zip(INPUTS, arrays, strict=True))))
+
+
+def load_doubter(folder: Path | None, cache: Path) -> Doubter | None:
+    """The doubt network beside the shipped weights (None), or beside those of a folder; None where there is none.
+
+    The ONNX file is exported once into the folder `cache`. Raises CheckpointError as `load_doubt` does.
+    """
+    if (found := load_doubt(folder or shipped_folder())) is None:
+        return None
+    network, record = found
+    model = cache / f"doubt-{checksum_of(network)}.onnx"
+    if not model.exists():
+        write_onnx(network, model, INPUTS, list(SaidOf._fields))
+    return OnnxDoubter(model, record)
