@@ -1,8 +1,8 @@
 """Screenshots of the view in a headless Chromium: docs/images/live.png, live_calibrated.png, replay_view.png.
 
-Run from the repository: `python tools/docs/screenshots.py` is the live view of the simulated camera. With `--wall bench.toml`
-it is that of a bench which was calibrated on sim:bare-wall and sim:examples/empty.toml; with `--view F.rrd` a saved
-one. Needs Chromium and the dev extra.
+`python tools/docs/screenshots.py`, from the repository, is the live view of the simulated camera. `--wall bench.toml`
+is that of a bench calibrated on sim:bare-wall and sim:examples/empty.toml; `--view F.rrd` is a saved one. Needs
+Chromium and the dev extra.
 """
 
 import argparse

@@ -1,30 +1,24 @@
 """Ways to train, side by side on the 54 test objects: docs/ablations.json and .md, docs/images/ablations.png.
 
-`python tools/ablations.py [NAME=]DIR [NAME=]DIR ... [--curve [NAME=]DIR ...] [--out docs]`: folders of weights. All are
-held against the first, object by object. Those of --curve are a learning curve, by the objects that each was trained
-on; one that is among the others too is judged once.
+`python tools/studies/ablations.py [NAME=]DIR [NAME=]DIR ... [--curve [NAME=]DIR ...] [--out docs]`: folders of weights,
+compared with the first object by object. Those of --curve form a learning curve over the number of training objects.
 """
 
-import json
-from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from markdown_tables import as_lines, told
-from named_weights import by_name, errors_told, named
-from nlos_models.checkpoint import CheckpointRecord, load_pipeline
-from nlos_models.inference import refuse_colour
-from nlos_models.pipeline import Pipeline
-from nlos_models.remap import run
+import harness
+from matplotlib.figure import Figure
+from nlos_models.checkpoint import CheckpointRecord, load_record
+from weights import values_of
 
-from nlos_cam.cli.evaluate_maps import Judged, as_eaten, bare_wall_for, fresh_objects, rig_of
-from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, PerObject, advantage, over_objects, per_object, plain
+from nlos_cam.cli.evaluate_maps import Judged, fresh_objects, rig_of
+from nlos_cam.evaluate import BARS, SMALLER_IS_BETTER, PerObject, advantage, over_objects, plain
 from nlos_cam.evaluate_pictures import LABELS
 from nlos_cam.evaluate_report import in_words
 
-DOCS = Path(__file__).parents[2] / "docs"
 NOTES = """Means over objects and their bootstrap 95 % intervals. Differences are taken object by object, and
 bootstrapped as such: positive is better, also where less is better, and **bold** where the interval leaves 0 out.
 Objects and epochs are those of the last run: one that went on from earlier weights (two-then-joint) has theirs behind
@@ -33,7 +27,7 @@ it too."""
 
 @dataclass(frozen=True)
 class Trained:
-    """Weights, and how well they do on every object."""
+    """Weights and their metrics for every object."""
 
     name: str
     record: CheckpointRecord
@@ -41,44 +35,36 @@ class Trained:
 
     @property
     def objects(self) -> int:
-        """That the compressor was trained on."""
+        """Number of objects that the compressor was trained on."""
         recipe = self.record.transfer_recipe or self.record.compressor_recipe
         return recipe.objects if recipe else 0
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What they are."""
+        """Name, rig, input and recipe."""
         recipe = self.record.transfer_recipe or self.record.compressor_recipe
-        told = recipe.model_dump(include={"steps", "objects", "epochs", "seed"}) if recipe else {}
-        return {"name": self.name, "rig": self.record.rig_name, "input": self.record.input, **told}
+        facts = recipe.model_dump(include={"steps", "objects", "epochs", "seed"}) if recipe else {}
+        return {"name": self.name, "rig": self.record.rig_name, "input": self.record.input, **facts}
 
 
 def judged(folders: Mapping[str, Path], count: int | None = None) -> list[Trained]:
-    """All weights, on the test objects or on so many random ones; objects of one rig are rendered once.
+    """Judge all weights on the test objects, or on `count` random ones; objects of one rig are rendered once.
 
-    Raises CheckpointError for weights of full colour, and for what holds none.
+    Raises CheckpointError for weights of full color, and for folders without weights.
     """
     by_rig: dict[str, Judged] = {}
     found = list[Trained]()
     for name, folder in folders.items():
-        pipeline, record = load_pipeline(folder)
-        refuse_colour(record, folder)
+        record = load_record(folder)
         rig = rig_of(record)
         if rig.checksum not in by_rig:
             by_rig[rig.checksum] = fresh_objects(rig, count)
-        here = by_rig[rig.checksum]
-        found.append(Trained(name, record, values_of(pipeline, record, here)))
+        found.append(Trained(name, record, values_of(folder, by_rig[rig.checksum])))
     return found
 
 
-def values_of(pipeline: Pipeline, record: CheckpointRecord, judged: Judged) -> PerObject:
-    """Every metric of every object, by weights."""
-    image = run(pipeline, as_eaten(judged.maps, bare_wall_for(record, judged.plan)))
-    return per_object(image, judged.maps.image, judged.plan.box)
-
-
 def as_table(compared: Sequence[Trained], curve: Sequence[Trained]) -> dict[str, Any]:
-    """Everything, ready for JSON."""
+    """Return the results for JSON."""
     first = compared[0]
     return {
         "objects": len(first.values["silhouette_iou"]),
@@ -93,12 +79,14 @@ def _row(one: Trained) -> dict[str, Any]:
 
 
 def as_markdown(table: Mapping[str, Any]) -> str:
-    """The tables for people."""
+    """Return docs/ablations.md."""
     parts = [f"# Ways to train, on {table['objects']} test objects", _figures(table["compared"])]
     if others := table["compared"][1:]:
         head = f"Better than {table['against']} by"
-        rows = [[one["name"], *(told(one["better_than_first"][metric]) for metric in BARS)] for one in others]
-        parts.append(as_lines([head, *BARS], rows))
+        rows = [
+            [one["name"], *(harness.difference(one["better_than_first"][metric]) for metric in BARS)] for one in others
+        ]
+        parts.append(harness.table([head, *BARS], rows))
     if table["learning_curve"]:
         parts += ["## With more objects", _figures(table["learning_curve"])]
     return "\n\n".join([*parts, NOTES, "![every metric, by the way to train](images/ablations.png)"]) + "\n"
@@ -108,13 +96,11 @@ def _figures(rows: Sequence[Mapping[str, Any]]) -> str:
     head = ["weights", "steps", "eats", "objects", "epochs", *BARS]
     facts = ("name", "steps", "input", "objects", "epochs")
     lines = [[*(str(row.get(fact, "")) for fact in facts), *(in_words(row[metric]) for metric in BARS)] for row in rows]
-    return as_lines(head, lines)
+    return harness.table(head, lines)
 
 
-def draw(path: Path, table: Mapping[str, Any]) -> None:
-    """Every metric with its interval for each of the weights; below them the learning curve, if there is one."""
-    from matplotlib.figure import Figure
-
+def draw(table: Mapping[str, Any]) -> Figure:
+    """Draw every metric with its interval for each of the weights, and below them the learning curve, if any."""
     compared, curve = table["compared"], table["learning_curve"]
     heights = [1.2 + 0.3 * len(compared), *([3.0] if curve else [])]
     figure = Figure(figsize=(13, sum(heights)), layout="constrained")
@@ -124,7 +110,7 @@ def draw(path: Path, table: Mapping[str, Any]) -> None:
         if curve:
             _curve(rows[1, column], curve, metric)
     rows[0, 0].set_yticks(range(len(compared)), [row["name"] for row in compared])
-    figure.savefig(path, dpi=100)
+    return figure
 
 
 def _points(axis: Any, rows: Sequence[Mapping[str, Any]], metric: str) -> None:
@@ -153,28 +139,27 @@ def _better(metric: str) -> str:
 
 
 def compare(compared: Mapping[str, Path], curve: Mapping[str, Path], out: Path, count: int | None = None) -> str:
-    """Judge all, write table, text and picture into a folder; returns the text."""
+    """Judge all weights, write table, text and picture into a folder, and return the text."""
     found = {one.name: one for one in judged({**curve, **compared}, count)}
     table = as_table([found[name] for name in compared], [found[name] for name in curve])
+    harness.write("ablations", table, out)
+    harness.save("ablations", draw(table), out)
     text = as_markdown(table)
-    (out / "images").mkdir(parents=True, exist_ok=True)
-    draw(out / "images" / "ablations.png", table)
-    (out / "ablations.json").write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
     (out / "ablations.md").write_text(text, encoding="utf-8")
     return text
 
 
 def main() -> None:
     """Measure, write, print."""
-    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
-    parser.add_argument("weights", type=named, nargs="+")
-    parser.add_argument("--curve", type=named, nargs="*", default=[])
-    parser.add_argument("--out", type=Path, default=DOCS)
+    parser = harness.options(__doc__)
+    parser.add_argument("weights", type=harness.named, nargs="+")
+    parser.add_argument("--curve", type=harness.named, nargs="*", default=[])
+    parser.add_argument("--out", type=Path, default=harness.DOCS)
     asked = parser.parse_args()
-    compared, curve = by_name(asked.weights), by_name(asked.curve)
+    compared, curve = harness.by_name(asked.weights), harness.by_name(asked.curve)
     if clash := [name for name in curve if compared.get(name, curve[name]) != curve[name]]:
-        raise SystemExit(f"two weights are called {clash[0]!r}: tell them apart by NAME=DIR")
-    with errors_told():
+        raise SystemExit(f"two weights are called {clash[0]!r}: give them names with NAME=DIR")
+    with harness.one_line_errors():
         print(compare(compared, curve, asked.out))
 
 

@@ -33,7 +33,7 @@ RECIPES = Path(__file__).parents[2] / "models" / "recipes"
 
 
 def commands(out: Path, accuracy: str, workers: int, *, small: bool) -> Iterator[list[str]]:
-    """What `nlos-cam` is called with, in turn."""
+    """Yield the arguments of each call of `nlos-cam`, in order."""
     vae, compressor = (RECIPES / f"colour-{task}{'-small' if small else ''}.toml" for task in ("vae", "compressor"))
     recipe = load_recipe(compressor)
     how = ["--accuracy", accuracy, "--workers", str(workers)]

@@ -42,14 +42,14 @@ def collect(
     settings: Sequence[Any],
     measure: Callable[[Any, np.random.Generator], Mapping[str, Any]],
     seeds: int = 1,
-    store: Path | None = None,
+    key: str = "",
 ) -> list[Record]:
     """Measure every setting (dataclass instances) with every seed; return one record each, settings outermost.
 
     Every record holds the setting's fields, `seed` and the measured values. Finished records are appended to a file in
-    the cache until all are there; a second call of the same study and state of the code resumes from it.
+    the cache until all are there; a second call of the same study, key and state of the code resumes from it.
     """
-    store = store or cache_folder() / "studies" / f"{name}-{fingerprint(settings, seeds)}.jsonl"
+    store = cache_folder() / "studies" / f"{name}-{fingerprint(settings, seeds, key)}.jsonl"
     store.parent.mkdir(parents=True, exist_ok=True)
     done = [json.loads(line) for line in store.read_text(encoding="utf-8").splitlines()] if store.exists() else []
     grid = [(i, seed) for i in range(len(settings)) for seed in range(seeds)]
@@ -64,11 +64,11 @@ def collect(
     return done
 
 
-def fingerprint(settings: Sequence[Any], seeds: int) -> str:
-    """Return a checksum of a grid and of the product's source files."""
+def fingerprint(settings: Sequence[Any], seeds: int, key: str = "") -> str:
+    """Return a checksum of a grid, a key and the state of the product's source files."""
     files = sorted(path for folder in PRODUCT for path in (ROOT / folder).rglob("*.py"))
     state = [(str(path), path.stat().st_mtime_ns) for path in files]
-    return hashlib.sha256(repr([state, list(settings), seeds]).encode()).hexdigest()[:16]
+    return hashlib.sha256(repr([state, list(settings), seeds, key]).encode()).hexdigest()[:16]
 
 
 def percentiles(values: Iterable[float]) -> dict[str, float] | None:

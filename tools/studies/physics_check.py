@@ -1,17 +1,16 @@
-"""How well the physics check tells right from wrong: docs/physics_check.json and docs/images/physics_check.png.
+"""Detection of wrong reconstructions by the physics check: docs/physics_check.json and docs/images/physics_check.png.
 
-Scores of what explains the maps, and of what does not: true objects, reconstructions by the shipped weights, those of
-another object, empty benches, and objects unlike the training set. The threshold is the least that at most 1 % of new
-ordinary objects reach; `nlos_cam.physics_check.UNEXPLAINED` holds it. `--new` and `--outside` tell how many.
+Scores of true objects, of reconstructions by the shipped weights and by those of another object, of empty benches, and
+of objects unlike the training set. The threshold is the smallest that at most 1 % of new ordinary objects reach;
+`nlos_cam.physics_check.UNEXPLAINED` holds it. `--new` and `--outside` set the numbers of objects.
 """
 
-import json
-from argparse import ArgumentParser
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import harness
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -32,53 +31,52 @@ from nlos_cam.render.accuracy import Stop
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 
-DOCS = Path(__file__).parents[2] / "docs"
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
 NOTHING = np.full((64, 64), np.nan, np.float32)
-MOST_FLAGGED = 0.01
+MAX_FLAGGED = 0.01
 OTHERS = 7, 19
-"""How far down the list the other objects stand whose reconstruction is held against an object's maps."""
+"""Offsets in the list of the other objects whose reconstruction is scored with an object's maps."""
 OUTSIDE_ACCURACY: Stop = "draft"
-"""At `standard` a glossy thing takes minutes, and these are far from what explains them in any case."""
+"""At `standard` a glossy object takes minutes, and its score is far above the threshold either way."""
 ORDINARY, TEST, WRONG, OUTSIDE = "new objects", "test objects", "another object's", "outside: "
 Scores = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What a lidar saw, and what the networks made of it."""
+    """Maps of one frame, and their reconstruction."""
 
     maps: LidarMaps
     found_m: Float32
 
 
 class Study:
-    """Sees, reconstructs and scores."""
+    """Sensor and networks of the study."""
 
     def __init__(self, network: Reconstructor) -> None:
         self._network = network
 
     def see(self, scene: Scene, sensor: Any = None, accuracy: Stop = "standard") -> Seen:
-        """One frame of a scene, with its own noise."""
+        """Sense and reconstruct one frame of a scene, with its own noise."""
         maps = sense([render(scene, accuracy).multi], scene.rig, sensor)[0]
         image = self._network(maps.depth_m[np.newaxis], maps.intensity[np.newaxis])[0]
         return Seen(maps, depth_from_image(image, BOX))
 
     def ordinary(self, depths_m: Iterable[Float32]) -> list[Seen]:
-        """One frame of each object on the paper's rig."""
+        """Sense and reconstruct one frame of each object on the paper's rig."""
         return [self.see(Scene(RIG, depth_m)) for depth_m in depths_m]
 
 
 def scores(pairs: Iterable[tuple[LidarMaps, Float32]], accuracy: Any = "standard") -> Scores:
-    """The score of each hidden depth, held against maps."""
+    """Return the score of each hidden depth with its maps."""
     return np.array([check(maps, depth_m, RIG, accuracy=accuracy).score for maps, depth_m in pairs])
 
 
 def populations(
     study: Study, new: int, outside: Mapping[str, Sequence[Any]], told: Callable[[int, int], None]
 ) -> dict[str, Scores]:
-    """Scores by what was held against the maps; `outside` are sights by kind."""
+    """Return scores by population; `outside` are stimuli by kind."""
     found, steps = dict[str, Scores](), 7 + len(outside)
 
     def add(name: str, values: Scores) -> None:
@@ -104,7 +102,7 @@ def populations(
 
 
 def outliers(each: int) -> dict[str, list[Any]]:
-    """Sights of every kind of outlier, always the same ones."""
+    """Return the same stimuli of every kind of outlier."""
     from nlos_cam.outliers import TO_JUDGE, TO_LEARN, Sight, outlier
     from nlos_cam.render.sensor_model import SensorModel
 
@@ -117,23 +115,23 @@ def outliers(each: int) -> dict[str, list[Any]]:
 
 
 def least_threshold(ordinary: Scores) -> float:
-    """The least, in hundredths, that at most MOST_FLAGGED of ordinary scores reach."""
+    """Return the smallest threshold, in hundredths, that at most MAX_FLAGGED of ordinary scores reach."""
     steps = np.arange(0, np.ceil(100 * ordinary.max()) + 2) / 100
-    return float(steps[[(ordinary >= step).mean() <= MOST_FLAGGED for step in steps]][0])
+    return float(steps[[(ordinary >= step).mean() <= MAX_FLAGGED for step in steps]][0])
 
 
 def flagged(values: Scores, threshold: float) -> float:
-    """The share that reaches a threshold."""
+    """Return the share of scores that reach a threshold."""
     return float((values >= threshold).mean())
 
 
 def told_apart(ordinary: Scores, other: Scores) -> float:
-    """The probability that the other's score is the higher (the area under the ROC curve)."""
+    """Return the probability that the other's score is the higher (the area under the ROC curve)."""
     return float(((other[:, None] > ordinary).mean() + (other[:, None] >= ordinary).mean()) / 2)
 
 
 def figures(found: Mapping[str, Scores], threshold: float) -> dict[str, Any]:
-    """What goes to the JSON file."""
+    """Return the results for JSON."""
     rows = {
         name: {
             "count": len(values),
@@ -150,8 +148,8 @@ def figures(found: Mapping[str, Scores], threshold: float) -> dict[str, Any]:
     return {"threshold": threshold, "exported": UNEXPLAINED, "scores": rows, "outside": outside}
 
 
-def draw(path: Path, found: Mapping[str, Scores], threshold: float) -> None:
-    """How scores spread, and what is flagged against how many ordinary frames are."""
+def draw(found: Mapping[str, Scores], threshold: float) -> Figure:
+    """Draw the distribution of scores, and detections against false alarms."""
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     shown = {name: values for name, values in found.items() if not name.startswith(OUTSIDE)}
@@ -159,8 +157,7 @@ def draw(path: Path, found: Mapping[str, Scores], threshold: float) -> None:
         shown["outside the trained range"] = np.concatenate(every)
     _spread(left, shown, threshold)
     _traded(right, shown)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure
 
 
 def _spread(axis: Axes, shown: Mapping[str, Scores], threshold: float) -> None:
@@ -177,27 +174,25 @@ def _traded(axis: Axes, shown: Mapping[str, Scores]) -> None:
     for name in (WRONG, "empty bench, an object shown", "outside the trained range"):
         if name in shown:
             axis.plot([flagged(ordinary, s) for s in steps], [flagged(shown[name], s) for s in steps], label=name)
-    axis.axvline(MOST_FLAGGED, color="0.5", linestyle=":")
+    axis.axvline(MAX_FLAGGED, color="0.5", linestyle=":")
     axis.set(xlabel="share of new ordinary objects flagged", ylabel="share flagged", xlim=(0, 0.5), ylim=(0, 1))
     axis.legend(fontsize=7)
 
 
 def main() -> None:
     """Run it."""
-    parser = ArgumentParser(description=__doc__)
+    parser = harness.options(__doc__)
     parser.add_argument("--new", type=int, default=300, help="new ordinary objects")
     parser.add_argument("--outside", type=int, default=20, help="outliers of each kind")
     parser.add_argument("--weights", type=Path, help="other weights than the shipped ones")
-    parser.add_argument("--out", type=Path, default=DOCS)
+    parser.add_argument("--out", type=Path, default=harness.DOCS)
     given = parser.parse_args()
     study = Study(load_reconstructor(given.weights, cache_folder() / "onnx"))
     with tracked("scoring") as on_progress:
         found = populations(study, given.new, outliers(given.outside) if given.outside else {}, on_progress)
     threshold = least_threshold(found[ORDINARY])
-    given.out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(figures(found, threshold), indent=1) + "\n"
-    (given.out / "physics_check.json").write_text(text, encoding="utf-8")
-    draw(given.out / "images" / "physics_check.png", found, threshold)
+    harness.write("physics_check", figures(found, threshold), given.out)
+    harness.save("physics_check", draw(found, threshold), given.out)
     for name, row in figures(found, threshold)["scores"].items():
         say(f"{name:34} median {row['median']:.2f}, p90 {row['p90']:.2f}, {row['flagged']:.1%} at {threshold:.2f}")
 

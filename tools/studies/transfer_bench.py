@@ -1,6 +1,6 @@
-"""The 54 test objects as labelled recordings of a simulated bench: to adapt to, to watch the training by, held out.
+"""The 54 test objects as labelled recordings of a simulated bench, for adaptation, validation and judging.
 
-`python tools/transfer_bench.py DIR [--scene examples/bench.toml] [--frames 8]` goes on where it was stopped. 54
+`python tools/studies/transfer_bench.py DIR [--scene examples/bench.toml] [--frames 8]` resumes. 54
 recordings of 8 frames of 640 x 480 take 0.4 GB and two minutes. Frames of a bench at rest differ by their noise alone,
 so that more of them would add little; a person's recordings of a few seconds have more.
 """
@@ -32,16 +32,16 @@ from nlos_cam.render.sensor import SensedImages
 
 SCENE = Path(__file__).parents[2] / "examples" / "bench.toml"
 ADAPTATION, VALIDATION, HELD_OUT = "adaptation", "validation", "held-out"
-"""30 objects, 6 that training's schedule looks at, and 18 that judge: no object is in two parts."""
+"""30 objects, 6 for the training's schedule, and 18 for judging: no object is in two parts."""
 HELD_OUT_NUMBER, VALIDATION_NUMBER, VALIDATION_EVERY = 3, 2, 3
 """Of each category's three objects, one is held out; of every third category, another is for validation."""
 FRAMES = 8
 BETWEEN_S = 30.0
-"""From the start of one recording to that of the next: somebody changes the object, and the lidar warms on."""
+"""Time between starts of recordings, in which the object is changed and the lidar warms."""
 
 
 class HurriedClock:
-    """A clock by which everything is due as soon as it is asked for: it moves only by waiting."""
+    """Clock that moves only by waiting, so that nothing has to wait."""
 
     def __init__(self, start_s: float = 1e9) -> None:
         self.time_s = start_s
@@ -55,7 +55,7 @@ class HurriedClock:
 
 
 class Later(World):
-    """A world at rest that a camera meets `since` frames after its device was switched on."""
+    """World at rest, seen by a camera that was switched on `since` frames ago."""
 
     def __init__(self, scene: SceneFile, shown: Scene, since: int) -> None:
         super().__init__(scene, [render(shown).multi], [shown.object_depth_m])
@@ -70,21 +70,20 @@ class Later(World):
 
 @dataclass(frozen=True)
 class Take:
-    """A recording to be made: of what, where to, and how long after the device was switched on."""
+    """Recording to be made: object, file, and frames since the device was switched on."""
 
     thing: FixedObject
     path: Path
     since: int
-    """Frames."""
 
     @property
     def truth(self) -> Path:
-        """What was hidden, beside the recording: labels stay true when a generator of objects changes."""
+        """Path of the hidden depth: labels stay true when a generator of objects changes."""
         return self.path.with_suffix(".npy")
 
     @property
     def is_whole(self) -> bool:
-        """Whether it was made already, of the object as it is now."""
+        """True where the recording exists, of the object in its present shape."""
         if not (self.path.is_file() and self.truth.is_file()):
             return False
         same = np.array_equal(np.load(self.truth), self.thing.depth_m, equal_nan=True)
@@ -95,7 +94,7 @@ class Take:
 
 
 def part_of(thing: FixedObject) -> str:
-    """Which of the three parts an object is in."""
+    """Return the part of an object."""
     if thing.number == HELD_OUT_NUMBER:
         return HELD_OUT
     looked_at = sorted(CATEGORIES).index(thing.category) % VALIDATION_EVERY == 0
@@ -103,7 +102,7 @@ def part_of(thing: FixedObject) -> str:
 
 
 def takes(things: Sequence[FixedObject], folder: Path) -> list[Take]:
-    """One take of each object, in order: F/adaptation/cup-1.bag, F/held-out/cup-3.bag, ..."""
+    """Return one take of each object, in order: F/adaptation/cup-1.bag, F/held-out/cup-3.bag, ..."""
     apart = round(BETWEEN_S * FRAMES_PER_S)
     return [Take(thing, folder / part_of(thing) / f"{thing.name}.bag", k * apart) for k, thing in enumerate(things)]
 
@@ -129,7 +128,7 @@ def record(take: Take, scene: SceneFile, frames: int) -> None:
 def record_all(
     scene: SceneFile, things: Sequence[FixedObject], folder: Path, frames: int, on_progress: Callable[[int, int], None]
 ) -> Iterator[Path]:
-    """Make what is missing, in order; yields each recording when it is there."""
+    """Make the missing recordings in order; yield each when it exists."""
     for done, take in enumerate(every := takes(things, folder)):
         on_progress(done, len(every))
         if not take.is_whole:

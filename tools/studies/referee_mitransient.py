@@ -1,12 +1,12 @@
-"""The other side of tools/referee.py: mitransient's Monte-Carlo transients of single beams, in our units.
+"""mitransient's side of the referee: its scenes, and Monte-Carlo transients of single beams in our units.
 
 A pixel of its sensor holds the radiance from a point of the wall, for a laser that puts its power on a square unit
-about the beam's foot. The three 1 / pi and the cosines of the two legs to the object are in it. What it lacks of S2 is
-the wall cell's area and the receiver's solid angle from there: those are multiplied in, and nothing is fitted.
+about the beam's foot. The three 1 / pi and the cosines of the two legs to the object are included; the wall cell's area
+and the receiver's solid angle from there are multiplied in. Nothing is fitted.
 
-Lengths go over in millimetres about the middle of the relay wall: a ray starts 9e-5 (1 + largest coordinate) off its
-surface, whatever the unit: 0.1 mm in metres, which shows, 0.02 mm so. `filter_bounces` is off by one in 1.3.1;
-max_depth 3 leaves but the three-bounce paths, as a flat wall sends nothing to itself.
+Lengths are passed in millimetres about the middle of the relay wall: a ray starts 9e-5 (1 + largest coordinate) off its
+surface, which is a visible 0.1 mm in metres, and 0.02 mm so. `filter_bounces` is off by one in 1.3.1; max_depth 3
+leaves only the three-bounce paths, because a flat wall sends nothing to itself.
 """
 
 import os
@@ -16,10 +16,76 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from nlos_calibration.rig import Extent, LidarPose, ObjectBox, Rig
 from numpy.typing import NDArray
-from referee_scene import RIG, Face
+
+from nlos_cam.objects.depth_image import cell_centres_m
+from nlos_cam.render.scene import Radiometry, Scene
 
 Array = NDArray[np.float64]
+
+SLOPE_X, SLOPE_Y = 0.3, 0.2
+"""dz/dx and dz/dy of every face."""
+WALL = Extent(x_min_m=0.05, x_max_m=0.45, y_min_m=-0.2, y_max_m=0.2)
+BOX = ObjectBox(x_min_m=0.25, x_max_m=0.45, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.12, z_far_m=0.4)
+RIG = Rig(name="referee", lidar=LidarPose(distance_m=0.2, yaw_deg=45.0), wall=WALL, relay=WALL, object_box=BOX)
+"""The paper's lidar without its occluder, in front of a wall that ends where the relay wall does."""
+
+
+@dataclass(frozen=True)
+class Face:
+    """A rectangle of the object box, seen along z, on a slanted plane."""
+
+    x_min_m: float
+    x_max_m: float
+    y_min_m: float
+    y_max_m: float
+    z_m: float
+    """Of the plane, at the middle of the object box."""
+
+    def depth_m(self, x_m: Array, y_m: Array) -> Array:
+        """Return the plane's depth at points of the wall."""
+        middle = (BOX.x_min_m + BOX.x_max_m) / 2, (BOX.y_min_m + BOX.y_max_m) / 2
+        return self.z_m + SLOPE_X * (x_m - middle[0]) + SLOPE_Y * (y_m - middle[1])
+
+    def covers(self, x_m: Array, y_m: Array) -> NDArray[np.bool_]:
+        """Mask the points of the wall in front of the face."""
+        return (x_m > self.x_min_m) & (x_m < self.x_max_m) & (y_m > self.y_min_m) & (y_m < self.y_max_m)
+
+    @property
+    def corners_m(self) -> Array:
+        """(4, 3); in the order that makes the face look at the wall."""
+        x = np.array([self.x_min_m, self.x_min_m, self.x_max_m, self.x_max_m])
+        y = np.array([self.y_min_m, self.y_max_m, self.y_max_m, self.y_min_m])
+        return np.stack([x, y, self.depth_m(x, y)], axis=-1)
+
+    @property
+    def sides_m(self) -> Array:
+        """(4, 4, 3); the walls of the column that a depth map makes of the face, down to the box's far end."""
+        rim = self.corners_m
+        foot = np.concatenate([rim[:, :2], np.full((4, 1), BOX.z_far_m)], axis=1)
+        return np.stack([rim, np.roll(rim, -1, 0), np.roll(foot, -1, 0), foot], axis=1)
+
+
+PLATE = (Face(0.25, 0.45, -0.1, 0.1, 0.22),)
+"""No part of it shades another."""
+STEP = (*PLATE, Face(0.3, 0.35, -0.05, 0.05, 0.18))
+"""The plate with a block on it, whose shadow falls on the plate."""
+
+
+def depth_map(faces: tuple[Face, ...], cells: int) -> NDArray[np.float32]:
+    """Return the depth (cells, cells) of the face nearest to the wall; NaN for none."""
+    x, y = np.meshgrid(*cell_centres_m(BOX, cells))
+    depths = [np.where(face.covers(x, y), face.depth_m(x, y), np.nan) for face in faces]
+    return np.fmin.reduce(depths).astype(np.float32)
+
+
+def hidden(
+    faces: tuple[Face, ...], cells: int, *, nearer_m: float = 0.0, radiometry: Radiometry = "lambertian"
+) -> Scene:
+    """Return the scene for our side; the changes test the referee's sensitivity."""
+    return Scene(RIG, depth_map(faces, cells) - np.float32(nearer_m), radiometry=radiometry)
+
 
 UNITS_PER_M = 1000.0
 CENTRE_M = np.array([(RIG.relay.x_min_m + RIG.relay.x_max_m) / 2, (RIG.relay.y_min_m + RIG.relay.y_max_m) / 2, 0.0])
@@ -28,7 +94,7 @@ HALF_M = np.array([RIG.relay.x_max_m - RIG.relay.x_min_m, RIG.relay.y_max_m - RI
 
 @dataclass(frozen=True)
 class Job:
-    """What to sample."""
+    """Scene, wall grid and number of paths of a run."""
 
     faces: tuple[Face, ...]
     columns: int
@@ -40,10 +106,10 @@ class Job:
 
     @property
     def aimed(self) -> bool:
-        """Whether the second bounce is sampled on the object alone.
+        """True where the second bounce is sampled on the object alone.
 
-        mitransient does so whatever stands before the point it aims at: an object that shades itself comes out too
-        bright. There, the few paths have to do that meet the object when drawn by the cosine.
+        mitransient ignores occluders of the point it aims at, so that a self-occluding object comes out too bright.
+        There the second bounce is drawn by the cosine, and few paths meet the object.
         """
         return len(self.faces) == 1
 
@@ -67,7 +133,7 @@ class Estimate:
 
 
 def load() -> ModuleType:
-    """Mitsuba with mitransient's plug-ins. Ends the program where they are missing."""
+    """Return Mitsuba with mitransient's plug-ins. Ends the program where they are missing."""
     try:
         import drjit
         import mitsuba
@@ -75,13 +141,13 @@ def load() -> ModuleType:
         mitsuba.set_variant("llvm_ad_mono")
         import mitransient  # noqa: F401  (registers its plug-ins)
     except ImportError as error:
-        raise SystemExit(f"{error}: the top of tools/referee.py says what to install") from error
+        raise SystemExit(f"{error}: tools/studies/referee.py lists the packages to install") from error
     drjit.set_thread_count(os.cpu_count() or 1)
     return mitsuba
 
 
 def sample(job: Job, feet_m: Array, seeds: NDArray[np.uint32]) -> Estimate:
-    """Histograms of the beams that land on `feet_m` (beams, 3), one run for each of their seeds (beams, runs)."""
+    """Sample the histograms of the beams that land on `feet_m` (beams, 3), one run for each of their seeds (beams, runs)."""
     mitsuba = load()
     scene, mean, error, seconds = mitsuba.load_dict(_scene(mitsuba, job)), [], [], []
     for foot_m, own in zip(feet_m, seeds.tolist(), strict=True):
@@ -102,7 +168,7 @@ def _units(point_m: Array) -> list[float]:
 
 
 def _mesh(mitsuba: ModuleType, quads_m: Array, albedo: float) -> Any:
-    """A mesh of quadrilaterals (n, 4, 3)."""
+    """Return a mesh of quadrilaterals (n, 4, 3)."""
     first = 4 * np.arange(len(quads_m))[:, None, None]
     triangles = first + np.array([[0, 1, 2], [0, 2, 3]])
     properties = mitsuba.Properties()
@@ -144,7 +210,7 @@ def _point_laser(mitsuba: ModuleType, scene: Any, foot_m: Array) -> None:
 
 
 def _run(scene: Any, job: Job, foot_m: Array, seed: int) -> Array:
-    """One run's histogram (bins,): the pixels' sum, each with its cell's area and the receiver's solid angle."""
+    """Return one run's histogram (bins,): pixels summed with their cell's area and the receiver's solid angle."""
     _, transient = scene.integrator().render(scene, scene.sensors()[0], seed=seed, spp=job.samples)
     radiance = np.array(transient, dtype=np.float64)[..., 0]  # (rows, columns, bins)
     lidar = RIG.wall_from_lidar[:3, 3]
