@@ -1,8 +1,8 @@
 """Live runs interrupted at random moments, and the files and processes they leave: docs/interruptions.json.
 
 `python tools/robustness/interrupt_live.py [--count N] [--seed S] [--out FILE]`. Each run records, logs and serves its
-view (mostly); it is ended by Ctrl-C, by a request to terminate, by the camera being unplugged for good, or by its --seconds
-after its watcher was killed or the camera was unplugged for a while. A second call resumes.
+view (mostly); it is ended by Ctrl-C, by a request to terminate, by the camera being unplugged for good, or by its
+--seconds after its watcher was killed or the camera was unplugged for a while. A second call resumes.
 Exits with 1 where a process is left, a file is half written, or an exit code is not the documented one.
 """
 

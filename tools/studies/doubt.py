@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import harness
+import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration.rig import Rig
 from nlos_models.checkpoint import shipped_folder
@@ -79,7 +79,7 @@ def verdicts_of(answers: Sequence[Answer]) -> dict[str, int]:
 
 
 def errors_of(answers: Sequence[Answer], truth_m: NDArray[np.float32]) -> tuple[Array, Array]:
-    """Return expected and observed absolute error in metres (pixels,), where image and truth (n, 64, 64) have surface."""
+    """Return expected and observed absolute error in metres (pixels,), where image and truth have surface."""
     expected, observed = list[Array](), list[Array]()
     for one, true_m in zip(answers, truth_m, strict=True):
         off_m = np.abs(one.found.depth_m - true_m)

@@ -186,7 +186,7 @@ def _wrong(case: Case, ours: Array, theirs: Estimate, which: Mask) -> dict[str, 
 
 
 def race(plate: Trial) -> dict[str, Any]:
-    """Return core-seconds to an error on the plate: ours for the map, theirs for one beam and, extrapolated, for the map.
+    """Return core-seconds to an error on the plate: ours for the map, theirs for one beam, extrapolated to it.
 
     Errors are against the limit that part one confirmed, over its bins. Theirs falls as 1 / sqrt(time), and beams are
     taken one by one: its exhaustive mode would share first legs, for a film of wall points x beams x bins.

@@ -147,7 +147,7 @@ def load() -> ModuleType:
 
 
 def sample(job: Job, feet_m: Array, seeds: NDArray[np.uint32]) -> Estimate:
-    """Sample the histograms of the beams that land on `feet_m` (beams, 3), one run for each of their seeds (beams, runs)."""
+    """Sample the histograms of the beams with spots at `feet_m` (beams, 3), one run for each seed (beams, runs)."""
     mitsuba = load()
     scene, mean, error, seconds = mitsuba.load_dict(_scene(mitsuba, job)), [], [], []
     for foot_m, own in zip(feet_m, seeds.tolist(), strict=True):

@@ -18,7 +18,7 @@ from nlos_cam.cli.main import main
 from nlos_cam.render.hidden_record import Motion
 from nlos_cam.render.scene_file import SceneFile, paper_scene
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SHORTER = {"--seconds": "0.5", "--count": "2", "--every": "5"}
 
 
@@ -55,6 +55,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]]
     return call
 
 
+@pytest.mark.slow
 def test_every_command_of_the_tutorial_does_its_work(tutorial: ModuleType, run: Callable[[list[str]], int]) -> None:
     text = tutorial.PAGE.read_text(encoding="utf-8")
     commands = tutorial.commands_of(text)
@@ -68,7 +69,7 @@ def test_every_command_of_the_tutorial_does_its_work(tutorial: ModuleType, run: 
 def test_every_command_block_is_followed_by_its_answer(tutorial: ModuleType) -> None:
     text = tutorial.PAGE.read_text(encoding="utf-8")
     assert text.count("```sh\n") == len(tutorial.STEP.findall(text))
-    assert all(found["answer"].strip() for found in tutorial.STEP.finditer(text)), "run `python tools/tutorial.py`"
+    assert all(found["answer"].strip() for found in tutorial.STEP.finditer(text)), "run `python tools/docs/tutorial.py`"
 
 
 def test_answers_take_the_place_of_those_before(tutorial: ModuleType) -> None:

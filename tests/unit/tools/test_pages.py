@@ -1,4 +1,4 @@
-"""The reference of commands, held against the program."""
+"""The generated pages are as the program and the measured figures are."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,17 +8,17 @@ from typing import Annotated, Literal
 import pytest
 import typer
 
-REFERENCE = Path(__file__).parents[2] / "docs" / "reference.md"
+REFERENCE = Path(__file__).parents[3] / "docs" / "reference.md"
 
 
 @pytest.fixture
 def commands(tool: Callable[[str], ModuleType]) -> ModuleType:
-    return tool("commands")
+    return tool("pages")
 
 
 def test_every_command_and_option_of_the_program_is_on_the_page(commands: ModuleType) -> None:
-    text = commands.PAGE.read_text(encoding="utf-8")
-    assert text == commands.page(), "run `python tools/commands.py`"
+    text = (commands.DOCS / "commands.md").read_text(encoding="utf-8")
+    assert text == commands.commands_page(), "run `python tools/docs/pages.py commands`"
 
 
 def test_every_command_is_in_the_table_of_what_they_answer(commands: ModuleType) -> None:
@@ -57,11 +57,36 @@ def test_a_command_is_told_with_all_that_it_takes(commands: ModuleType) -> None:
     assert "| `--json`" not in told
 
 
-def test_a_page_that_is_behind_is_told_and_mended(
+@pytest.mark.parametrize("name", ["comparison", "gallery"])
+def test_page_has_the_measured_figures(commands: ModuleType, name: str) -> None:
+    page = (commands.DOCS / f"{name}.md").read_text(encoding="utf-8")
+    assert commands.PAGES[name]() == page, "run `python tools/docs/pages.py`"
+
+
+def test_stale_page_fails_the_check_until_written(
     commands: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(commands, "PAGE", tmp_path / "commands.md")
+    monkeypatch.setattr(commands, "DOCS", tmp_path)
     for arguments, code in ((["--check"], 1), ([], 0), (["--check"], 0)):
-        monkeypatch.setattr(commands.sys, "argv", ["commands.py", *arguments])
+        monkeypatch.setattr("sys.argv", ["pages.py", "commands", *arguments])
         assert commands.main() == code
     assert "out of date" in capsys.readouterr().out
+
+
+def figures(value: float) -> dict[str, dict[str, float]]:
+    names = "silhouette_iou", "accuracy_mean_abs", "accuracy_within_2_percent", "foreground_rmse_mm"
+    return {name: {"value": value, "low": value - 0.1, "high": value + 0.1} for name in names}
+
+
+def test_the_worst_kind_comes_first_and_the_bar_last(commands: ModuleType) -> None:
+    table = commands.by_kind({**figures(0.5), "per_category": {"cup": figures(0.8), "car": figures(0.2)}})
+    names = [line.split(" | ")[0] for line in table.splitlines()[2:]]
+    assert names == ["| car", "| cup", "| **all 54**", "| **the bar**"]
+
+
+def test_tables_take_the_place_of_those_before_them_and_of_nothing_else(commands: ModuleType) -> None:
+    page = "a\n<!-- by kind -->\n<!-- end -->\nb\n<!-- by limit -->\nold\n<!-- end -->\nc\n"
+    tables = {"by kind": "1\n", "by limit": "2\n"}
+    filled = commands.filled(page, tables)
+    assert filled == "a\n<!-- by kind -->\n1\n<!-- end -->\nb\n<!-- by limit -->\n2\n<!-- end -->\nc\n"
+    assert commands.filled(filled, tables) == filled

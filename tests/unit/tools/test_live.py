@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -53,6 +51,7 @@ def test_what_is_left_or_half_written_or_ends_otherwise_is_not_good(interrupting
     assert not any(replace(good, **change).good for change in worse)
 
 
+@pytest.mark.slow
 def test_files_that_are_cut_or_left_over_are_found(
     interrupting: ModuleType, noise_bags: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -133,6 +132,7 @@ def test_what_a_process_leaves_running_is_found_and_ended(
     assert run.left() == []
 
 
+@pytest.mark.slow
 def test_its_address_and_what_it_told_are_read(
     tool: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -142,10 +142,3 @@ def test_its_address_and_what_it_told_are_read(
         assert run.wait_for_address(60.0) == "http://127.0.0.1:4711/"
         assert run.ended_within(60.0) is not None
         assert run.stdout == "{}\n"
-
-
-def test_the_watcher_is_a_program(interrupting: ModuleType) -> None:
-    ended = subprocess.run(
-        [sys.executable, "-c", interrupting.WATCHER, "http://127.0.0.1:1/"], capture_output=True, check=False
-    )
-    assert b"refused" in ended.stderr

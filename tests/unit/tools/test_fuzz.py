@@ -7,7 +7,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-TOOLS = Path(__file__).parents[2] / "tools"
 BAD_ACTIONS = """
 import mmap, os, time
 from pathlib import Path
@@ -40,12 +39,13 @@ VERDICTS = {
 Tool = Callable[[str], ModuleType]
 
 
+@pytest.mark.slow
 def test_the_watch_notices_each_kind_of_harm_and_goes_on(tool: Tool, tmp_path: Path) -> None:
     actions, whole = tmp_path / "actions.py", tmp_path / "whole"
     actions.write_text(BAD_ACTIONS)
     whole.write_text("whole")
     found: dict[str, str] = {}
-    with tool("fuzz_harness").Watched(actions, whole, timeout_s=3.0) as watched:
+    with tool("fuzz").Watched(actions, whole, timeout_s=3.0) as watched:
         for name in VERDICTS:
             path = tmp_path / name
             path.write_text(name)
@@ -54,17 +54,19 @@ def test_the_watch_notices_each_kind_of_harm_and_goes_on(tool: Tool, tmp_path: P
     assert found == VERDICTS
 
 
+@pytest.mark.slow
 def test_actions_that_fail_on_a_whole_recording_are_told(tool: Tool, tmp_path: Path) -> None:
     actions, whole = tmp_path / "actions.py", tmp_path / "whole"
     actions.write_text(BAD_ACTIONS)
     whole.write_text("unexpected")
     with (
-        tool("fuzz_harness").Watched(actions, whole) as watched,
+        tool("fuzz").Watched(actions, whole) as watched,
         pytest.raises(RuntimeError, match="fail on a whole recording"),
     ):
         watched.judge(whole)
 
 
+@pytest.mark.slow
 def test_a_bad_case_is_told_with_its_seed_and_kept(tool: Tool, tmp_path: Path) -> None:
     actions, whole, keep = tmp_path / "actions.py", tmp_path / "whole", tmp_path / "keep"
     actions.write_text(
@@ -73,7 +75,7 @@ def test_a_bad_case_is_told_with_its_seed_and_kept(tool: Tool, tmp_path: Path) -
     )
     whole.write_bytes(bytes(range(200)))
     keep.mkdir()
-    findings = tool("fuzz_recordings").fuzz({"whole": whole}, actions, 12, 7, keep)
+    findings = tool("fuzz").fuzz({"whole": whole}, actions, 12, 7, keep)
     assert findings.verdicts["unexpected"] == len(findings.bad) > 3
     for case in findings.bad:
         ways, content = tool("corruption").corrupt(whole.read_bytes(), np.random.default_rng(case["seed"]))
@@ -95,14 +97,6 @@ def test_corruption_is_the_same_for_the_same_seed_and_every_way_is_taken(
     assert taken == {way.__name__ for way in module.WAYS}
 
 
-@pytest.mark.parametrize("number", range(7))
-def test_each_way_changes_a_recording(tool: Tool, noise_bags: dict[str, Path], number: int) -> None:
-    content = noise_bags["plain"].read_bytes()
-    bad = bytearray(content)
-    tool("corruption").WAYS[number](bad, np.random.default_rng(number))
-    assert bad != content
-
-
 def test_recordings_of_noise_are_what_they_are_called(noise_bags: dict[str, Path]) -> None:
     for name, path in noise_bags.items():
         content = path.read_bytes()
@@ -110,10 +104,11 @@ def test_recordings_of_noise_are_what_they_are_called(noise_bags: dict[str, Path
         assert (b"index_pos=" + bytes(8) in content) == name.endswith("unindexed")
 
 
+@pytest.mark.slow
 def test_forty_corrupted_recordings_end_in_frames_or_a_line(
     tool: Tool, noise_bags: dict[str, Path], tmp_path: Path
 ) -> None:
-    findings = tool("fuzz_recordings").fuzz(noise_bags, TOOLS / "fuzz_actions.py", 40, 0, tmp_path)
+    findings = tool("fuzz").fuzz(noise_bags, Path(str(tool("fuzz").__file__)), 40, 0, tmp_path)
     assert findings.bad == []
     assert set(findings.verdicts) <= {"done", "refused"}
     assert findings.refused_by["replay"] > 10
