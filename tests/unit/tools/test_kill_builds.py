@@ -69,12 +69,6 @@ def test_children_are_found_and_their_end_is_seen(kills: ModuleType, monkeypatch
     assert kills._still_running([child.pid]) == 0
 
 
-def test_a_build_command_is_the_programs(kills: ModuleType, tmp_path: Path) -> None:
-    command = kills.build_command(tmp_path, 30, 10)
-    assert "dataset.SHARD = 10" in command[2]
-    assert command[3:] == ["dataset", "build", "--out", str(tmp_path), "--count", "30", "--workers", "2"]
-
-
 def test_kills_come_early_and_late_and_leave_work_to_the_last(kills: ModuleType) -> None:
     planned = kills.plan_kills(300, 10, 60.0, 10, 0)
     assert planned == kills.plan_kills(300, 10, 60.0, 10, 0)

@@ -28,7 +28,7 @@ def test_every_chunk_of_a_killed_capture_is_recovered(
     kills: ModuleType, noise_world: Any, tmp_path: Path, after_s: float
 ) -> None:
     path = tmp_path / "killed.bag"
-    kills.kill([sys.executable, "-c", CAPTURE, str(Path(__file__).parents[1]), str(path)], path, after_s)
+    kills.kill([sys.executable, "-c", CAPTURE, str(Path(__file__).parents[2]), str(path)], path, after_s)
     found = kills.examine(path, after_s, noise_world())
     assert found.good
     assert found.chunks_on_disk == found.chunks_recovered > 0
@@ -46,6 +46,7 @@ def test_the_count_of_what_is_on_disk_is_that_of_a_whole_recording(
         assert unfinished == chunks[:-1]
 
 
+@pytest.mark.slow
 def test_what_is_lost_or_wrong_is_not_good(kills: ModuleType, noise_bags: dict[str, Path], noise_world: Any) -> None:
     other_world = noise_world()
     found = kills.examine(noise_bags["packed-unindexed"], 1.0, other_world)
@@ -58,10 +59,3 @@ def test_a_capture_that_ends_by_itself_is_told(kills: ModuleType, tmp_path: Path
     path.write_bytes(b"x")
     with pytest.raises(RuntimeError, match="ended by itself, with exit code 3"):
         kills.kill([sys.executable, "-c", "raise SystemExit(3)"], path, 1.0)
-
-
-def test_nothing_to_recover_is_no_loss_where_nothing_was_on_disk(kills: ModuleType, tmp_path: Path) -> None:
-    path = tmp_path / "empty.bag"
-    path.write_bytes(b"#ROSBAG V2.0\n")
-    found = kills.examine(path, 0.0, None)
-    assert (found.chunks_on_disk, found.chunks_recovered, found.good) == (0, 0, True)

@@ -69,15 +69,6 @@ def test_files_that_are_cut_or_left_over_are_found(
     assert told == ["frames.123.part.npz", "run.csv", "run.bag"]
 
 
-def test_a_scene_unplugs_when_it_is_planned(interrupting: ModuleType, tmp_path: Path) -> None:
-    plan = interrupting.Plan(0, "unplugged, then ctrl-c", 1.0, 17, view=False)
-    assert "at_frame = 17" in interrupting.scene_of(plan)
-    assert "faults" not in interrupting.scene_of(replace(plan, kind="terminate"))
-    assert "--no-view" in interrupting.arguments_of(plan, tmp_path)
-    assert "--seconds" not in interrupting.arguments_of(plan, tmp_path)
-    assert "--seconds" in interrupting.arguments_of(replace(plan, kind="viewer killed"), tmp_path)
-
-
 @pytest.mark.parametrize(
     ("change", "missed"),
     [

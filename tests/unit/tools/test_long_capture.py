@@ -34,6 +34,7 @@ def test_memory_is_judged_after_warming_up(long: ModuleType) -> None:
     assert found.median_mib == pytest.approx(201.2, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="reads memory as Linux tells it")
 def test_memory_is_the_processs_own(long: ModuleType) -> None:
     before = long.memory_mib(os.getpid())
@@ -42,6 +43,7 @@ def test_memory_is_the_processs_own(long: ModuleType) -> None:
         assert long.memory_mib(os.getpid()) - before == pytest.approx(64, abs=8)
 
 
+@pytest.mark.slow
 def test_both_readers_give_the_same_and_the_digest_sees_every_bit(long: ModuleType, noise_bag: Path) -> None:
     seen: list[int] = []
     plain, sdk = (long.read(noise_bag, reader, lambda: seen.append(1)) for reader in long.READERS)

@@ -16,6 +16,7 @@ def commands(tool: Callable[[str], ModuleType]) -> ModuleType:
     return tool("pages")
 
 
+@pytest.mark.slow
 def test_every_command_and_option_of_the_program_is_on_the_page(commands: ModuleType) -> None:
     text = (commands.DOCS / "commands.md").read_text(encoding="utf-8")
     assert text == commands.commands_page(), "run `python tools/docs/pages.py commands`"
@@ -63,6 +64,7 @@ def test_page_has_the_measured_figures(commands: ModuleType, name: str) -> None:
     assert commands.PAGES[name]() == page, "run `python tools/docs/pages.py`"
 
 
+@pytest.mark.slow
 def test_stale_page_fails_the_check_until_written(
     commands: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -65,6 +65,7 @@ def test_no_object_is_in_two_parts_and_every_category_is_held_out_and_adapted_to
     assert np.diff([take.since for take in made]).min() > 0
 
 
+@pytest.mark.slow
 def test_a_recording_is_of_its_object_on_the_bench_and_labelled(
     bench: ModuleType, things: list[FixedObject], scene: SceneFile, rendered: list[Any], tmp_path: Path
 ) -> None:
