@@ -9,7 +9,7 @@ Random = np.random.Generator
 LENGTH = re.compile(rb"(?s)....(?=(?:compression|conn|count|index_pos|op|size|topic|time)=)")
 """The length of a record's field; what is 4 bytes before it may be the length of the record's header."""
 ABSURD = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0xFFFFFFF0)
-MOST_AT_ONCE = 3
+MAX_AT_ONCE = 3
 
 
 def _span(content: bytearray, random: Random, most: int = 1 << 18) -> slice:
@@ -67,7 +67,7 @@ WAYS: tuple[Callable[[bytearray, Random], None], ...] = (cut, flip, set_lengths,
 def corrupt(content: bytes, random: Random) -> tuple[str, bytes]:
     """A recording gone bad in one to three ways, and which."""
     bad, names = bytearray(content), list[str]()
-    for _ in range(int(random.integers(1, MOST_AT_ONCE + 1))):
+    for _ in range(int(random.integers(1, MAX_AT_ONCE + 1))):
         way = WAYS[int(random.integers(len(WAYS)))]
         if bad:
             way(bad, random)
