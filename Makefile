@@ -13,11 +13,11 @@ test: .venv/.test
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests/laws tests/unit
 
 check: .venv/.test
-	$(BIN)/python tools/check.py
+	$(BIN)/python tools/checks/check.py
 
 # The docs as a site, in site/; a link that leads nowhere ends it.
 docs: .venv/.docs
-	$(BIN)/python tools/docs.py
+	$(BIN)/python tools/docs/build_site.py
 
 $(BIN)/python:
 	$(PYTHON) -m venv .venv

@@ -1,4 +1,4 @@
-"""Some live runs interrupted at random moments; tools/interrupt_live.py does the same fifty times."""
+"""Some live runs interrupted at random moments; tools/robustness/interrupt_live.py does the same fifty times."""
 
 import importlib
 from pathlib import Path

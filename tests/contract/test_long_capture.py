@@ -1,4 +1,4 @@
-"""Thirty seconds of `nlos-cam capture` as a person runs it; tools/long_capture.py does the same for ten minutes."""
+"""Thirty seconds of `nlos-cam capture`; tools/robustness/long_capture.py does the same for ten minutes."""
 
 import importlib
 from collections.abc import Iterator

@@ -12,12 +12,11 @@ import pytest
 import torch
 from nlos_calibration.arrays import Float16
 from nlos_calibration.rig import load_rig
-from nlos_models import checkpoint, tasks
+from nlos_models import checkpoint, runs, tasks
 from nlos_models.checkpoint import load_pipeline, load_record
 from safetensors.torch import load_file, save_file
 from small_maps import SmallDataset, small_images, small_maps, use_small_networks
 
-from nlos_cam.cli import train_runs, train_start
 from nlos_cam.cli.main import main
 from nlos_cam.dataset import build, training_maps
 from nlos_cam.objects.generators import CATEGORIES
@@ -43,7 +42,7 @@ def _small_networks_and_data() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        use_small_networks(patch, tasks, checkpoint, train_start)
+        use_small_networks(patch, tasks, checkpoint, runs)
         sets = {name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in COUNTS.items()}
         patch.setattr(build, "open_dataset", lambda of, **_: sets[of.name])
         patch.setattr(build, "procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
@@ -122,8 +121,8 @@ def test_an_interrupted_run_is_130_says_so_and_goes_on_to_the_same_weights(
     stop, told = Event(), list[str]()
     stop.set()
     with monkeypatch.context() as patch:
-        patch.setattr(train_runs, "stop_on_signals", lambda: nullcontext(stop))
-        patch.setattr(train_runs, "say", told.append)
+        patch.setattr(runs, "stop_on_signals", lambda: nullcontext(stop))
+        patch.setattr(runs, "say", told.append)
         assert go("vae")[0] == 130
     assert told == ["stopped in epoch 0: the same command goes on from step 1"]
     assert not (tmp_path / "out" / "decoder.safetensors").exists()
@@ -142,7 +141,7 @@ def test_two_step_weights_know_both_recipes_and_take_the_encoder_along(folder: P
 def test_the_shipped_vae_is_aimed_at_where_none_is_named(
     go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train_start, "shipped_folder", lambda: folder / "vae")
+    monkeypatch.setattr(runs, "shipped_folder", lambda: folder / "vae")
     assert go("two")[0] == 0
     assert _same_file("compressor", tmp_path / "out", folder / "two")
 
@@ -204,7 +203,7 @@ def test_weights_of_another_architecture_are_4_or_taken_in_part_with_a_report(
     code, answer = go("transfer", "--weights", str(other))
     assert (code, "does not fit this network" in answer["error"]["message"]) == (4, True)
     told: list[str] = []
-    monkeypatch.setattr(train_start, "say", told.append)
+    monkeypatch.setattr(runs, "say", told.append)
     assert go("transfer", "--weights", str(other), "--partial")[0] == 0
     assert told == ["compressor: 8 tensors loaded; 1 left over (more), 1 misshapen (classifier.1.weight)"]
 

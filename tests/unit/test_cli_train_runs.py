@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from nlos_calibration.rig import load_rig
 from nlos_models.recipe import Recipe
+from nlos_models.runs import job_of
 
 from nlos_cam.cli.train import RunOptions
-from nlos_cam.cli.train_runs import job_of
 from nlos_cam.errors import OutputExistsError
 
 RIG = load_rig("paper-rig")

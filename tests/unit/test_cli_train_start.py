@@ -4,15 +4,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from nlos_cam.cli.train_start import compressor_start, transfer_start, vae_start
 from nlos_models import checkpoint
+from nlos_models import runs as train_start
 from nlos_models.checkpoint import CheckpointRecord, save_pipeline, save_vae
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
+from nlos_models.runs import compressor_start, transfer_start, vae_start
 from safetensors.torch import load_file, save_file
 from small_maps import SmallCompressor, SmallVae, use_small_networks
 
-from nlos_cam.cli import train_start
 from nlos_cam.errors import SceneError
 
 RIG = ("paper-rig", "0123")

@@ -1,0 +1,323 @@
+"""Each study on a few settings: its JSON and figure are written, and its summary is right where the answer is known."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_doubter import FakeDoubter
+from nlos_calibration.arrays import Float32
+from nlos_calibration.rig import load_rig
+from nlos_models import checkpoint
+from nlos_models.data import MapSet
+from small_maps import small_maps, untrained_weights, use_small_networks
+
+from nlos_cam.dataset.build import TEST_SEED, DatasetPlan
+from nlos_cam.evaluate.metrics import BARS
+from nlos_cam.evaluate.subjects import Judged, seeded_objects
+from nlos_cam.objects.depth_map import object_box
+
+RIG = load_rig("paper-rig")
+Tool = Callable[[str], ModuleType]
+Read = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class Size:
+    size: int
+
+
+@pytest.fixture
+def harness(tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = tool("harness")
+    monkeypatch.setattr(module, "DOCS", tmp_path / "docs")
+    monkeypatch.setattr(module, "cache_folder", lambda: tmp_path / "cache")
+    return module
+
+
+@pytest.fixture
+def run(tool: Tool, harness: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Read:
+    """Run a study's main with arguments, and return its JSON."""
+
+    def call(name: str, result: str, *arguments: object) -> Any:
+        monkeypatch.setattr("sys.argv", [name, *map(str, arguments)])
+        tool(name).main()
+        return json.loads((harness.DOCS / f"{result}.json").read_text(encoding="utf-8"))
+
+    return call
+
+
+def plate(*_: object) -> Float32:
+    return np.full((1, 64, 64), 0.5, np.float32)
+
+
+def test_interrupted_collection_resumes_with_the_same_records(harness: ModuleType) -> None:
+    measured: list[int] = []
+
+    def measure(one: Size, generator: np.random.Generator) -> dict[str, float]:
+        if len(measured) == 3:
+            measured.append(-1)
+            raise KeyboardInterrupt
+        measured.append(one.size)
+        return {"drawn": generator.uniform()}
+
+    grid = [Size(1), Size(2)]
+    with pytest.raises(KeyboardInterrupt):
+        harness.collect("sizes", grid, measure, 2)
+    resumed = harness.collect("sizes", grid, measure, 2)
+    assert measured == [1, 1, 2, -1, 2]
+    assert [(one["size"], one["seed"]) for one in resumed] == [(1, 0), (1, 1), (2, 0), (2, 1)]
+    measured.clear()
+    assert harness.collect("sizes", grid[:1], measure, 2) == resumed[:2]
+    assert harness.fingerprint(grid, 2) != harness.fingerprint(grid, 2, "other weights")
+
+
+def test_shares_and_percentiles_are_those_of_the_values(harness: ModuleType) -> None:
+    assert harness.percentiles([]) is None
+    assert harness.percentiles([1.0, 3.0]) == {"p50": 2.0, "p95": pytest.approx(2.9), "max": 3.0}
+    assert harness.coverage([[True, False], [True, True]], "ab") == {"a": 1.0, "b": 0.5}
+    few, many = harness.wilson(1, 10), harness.wilson(100, 1000)
+    assert few["low"] < few["share"] == many["share"] < few["high"]
+    assert few["high"] - few["low"] > 3 * (many["high"] - many["low"])
+
+
+@pytest.mark.slow
+def test_wall_study_calls_no_wrong_wall_good(tool: Tool, run: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+    wall = tool("wall")
+    few = [one for one in wall.settings() if (one.frames, one.noise, one.outliers) == (8, 1.0, 0.0)]
+    monkeypatch.setattr(wall, "settings", lambda: few)
+    monkeypatch.setattr(wall, "fit_milliseconds", lambda: 1.0)
+    table = run("wall", "wall_study", "--runs", 1)
+    assert table["all"][0]["distance_mm"]["p95"] < 1.0
+    assert sum(one["wrong_and_good"] for rows in table.values() if isinstance(rows, list) for one in rows) == 0
+    wrong = {"refused": "", "verdict": "good", "wrong": True, "distance_error_m": 0.002, "facing_error_deg": 0.0}
+    row = wall.row("lie", [wrong | {"inside": [False] * 4}, {"refused": "no wall"}])
+    assert (row["wrong"], row["wrong_and_good"], row["refused"]) == (1, 1, 0.5)
+
+
+@pytest.mark.slow
+def test_occluder_study_finds_sheets_in_view(tool: Tool, run: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = tool("occluder").settings()[::97]
+    monkeypatch.setattr(tool("occluder"), "settings", lambda: few)
+    table = run("occluder", "occluder_study")
+    in_view, _, edge_hidden, out_of_view = table["what there is to see"]
+    assert in_view["found"] > 0.8
+    assert in_view["x_mm"]["p95"] < 0.5
+    assert out_of_view["found"] == edge_hidden["found"] == 0.0
+
+
+@pytest.mark.slow
+def test_board_study_measures_every_group(tool: Tool, run: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+    board = tool("board")
+    few = {"DISTANCES_M": (0.2,), "FACING_DEG": (45.0,), "SPOTS_MM": (1.0,), "COUNTS": (48.0,), "FRAMES": 2}
+    for name, value in (few | {"TO_FILL_A4": {30.0: board.TO_FILL_A4[30.0]}}).items():
+        monkeypatch.setattr(board, name, value)
+    table = run("board", "board_study", "--scale", 0.003)
+    assert (table["grid_told"]["found"], len(table["grid"])) == (1.0, 1)
+    assert table["squares_by_spot_mm"]["30"]["1"]["found"] == 1.0
+    assert table["random_benches_and_bows_by_sigma_px"]["0.05"]["measured"] > 0
+
+
+@pytest.mark.slow
+def test_drift_study_reports_turns_and_no_rest(tool: Tool, run: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tool("drift"), "look_ms", lambda: 1.0)
+    table = run("drift", "drift_study", "--every", 301)
+    assert table["at_rest"][0]["warned_per_10000"] == 0.0
+    turned = [one for one in table["knocks"] if "yaw" in one["name"]]
+    assert sum(one["told"] for one in turned) == sum(one["tried"] for one in turned) > 0
+
+
+def test_drift_estimates_count_within_their_uncertainty(tool: Tool) -> None:
+    drift = SimpleNamespace(distance_m=0.0023, distance_std_m=1e-4, yaw_deg=0.0, yaw_std_deg=0.02, uniform=False)
+    drift.pitch_deg, drift.pitch_std_deg, drift.range_m, drift.range_std_m = 0.0, 0.02, 0.0016, 1e-4
+    shift = tool("drift").Shift
+    assert shift(0.002).inside(drift) == pytest.approx(2 / 3)
+    assert shift(range_m=0.0015).inside(drift) == 0.0
+    drift.uniform = True
+    assert shift(range_m=0.0015).inside(drift) == 1.0
+
+
+@pytest.mark.slow
+def test_renderer_study_fits_lines_and_refines(
+    tool: Tool, harness: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    renderer = tool("renderer")
+    monkeypatch.setattr(renderer, "REPEATS", 1)
+    lines = {"patches": renderer.against_patches((4, 8)), "beams": renderer.against_beams((1, 2))}
+    harness.save("lines", renderer.draw_lines(lines))
+    assert renderer.fitted([1, 2, 3], [3.0, 5.0, 7.0]).seconds_each == pytest.approx(2.0)
+    numbers, rendered = renderer.series()["sub-bins of path length"]
+    coarse, fine = renderer.refined(numbers[:2], rendered)
+    assert coarse["intensity_error_p99"] > fine["intensity_error_p99"] == 0.0
+
+
+@pytest.mark.slow
+def test_renderer_bench_agrees_with_the_cpu(tool: Tool, run: Read, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(FileNotFoundError):  # it writes no file
+        run(
+            "renderer",
+            "cuda",
+            *["cuda", "--backend", "torch", "--accuracy", "draft", "--objects", "1", "--batch", "1", "--repeats", "1"],
+        )
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["difference_from_cpu"] < 1e-3
+    assert tool("renderer").peak_mib() > 1
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Two untrained networks that take no time."""
+    use_small_networks(monkeypatch, checkpoint)
+    for seed, name in enumerate(("two", "one")):
+        untrained_weights(tmp_path / name, rig=RIG, seed=seed, steps=name, objects=40 - 30 * seed)
+    return [tmp_path / "two", tmp_path / "one"]
+
+
+def judged(*_: object) -> Judged:
+    kinds = ["airplane", "table", "cup"]
+    return Judged("some", kinds, kinds, small_maps(3, 0), DatasetPlan(RIG, TEST_SEED))
+
+
+@pytest.mark.slow
+def test_limits_leave_out_the_latent_of_weights_without_one(tool: Tool, weights: list[Path]) -> None:
+    some = seeded_objects(0, 1, object_box(RIG))
+    rows = list(tool("weights").experiments(weights[1], some, some, frames=()))
+    assert [row.name for row in rows] == ["as evaluated", "no silhouette step", "noise off", "training's objects"]
+    assert len(tool("weights").limits_table(rows).splitlines()) == 2 + len(rows)
+
+
+@pytest.mark.slow
+def test_rig_map_has_a_cell_for_every_place(
+    tool: Tool, run: Read, weights: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = tool("weights")
+    network = type("Plate", (), {"record": SimpleNamespace(input="raw maps"), "__call__": plate})()
+    monkeypatch.setattr(module, "load_reconstructor", lambda *_: network)
+    monkeypatch.setattr(module, "test_set", lambda box: seeded_objects(0, 1, box))
+    monkeypatch.setattr(module, "DISTANCES_M", (0.2,))
+    monkeypatch.setattr(module, "ANGLES_DEG", (15.0, 45.0))
+    table = run("weights", "rig_map", "rigs", "--weights", f"plate={weights[0]}")
+    assert [(cell["distance_m"], cell["yaw_deg"]) for cell in table["cells"]] == [(0.2, 15.0), (0.2, 45.0)]
+    assert set(table["cells"][0]["weights"]["plate"]) >= set(BARS)
+
+
+def test_unseen_kinds_of_equal_weights_cost_nothing(
+    tool: Tool, run: Read, weights: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tool("weights"), "stored_objects", judged)
+    rows = run("weights", "unseen_kinds", "unseen", weights[0], f"again={weights[0]}")["rows"]
+    assert {row["without_better_by"]["silhouette_iou"]["value"] for row in rows} == {0}
+    with pytest.raises(SystemExit, match="no boat among the maps"):
+        run("weights", "unseen_kinds", "unseen", *weights, "--left-out", "boat")
+
+
+@pytest.mark.slow
+def test_ablations_compare_and_draw(
+    tool: Tool, run: Read, weights: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tool("ablations"), "fresh_objects", judged)
+    folder = tmp_path / "docs"
+    table = run("ablations", "ablations", *weights, "--curve", *weights, "--out", folder)
+    assert [row["name"] for row in table["compared"]] == ["two", "one"]
+    assert [(row["name"], row["objects"]) for row in table["learning_curve"]] == [("one", 10), ("two", 40)]
+    assert table["compared"][0]["better_than_first"]["silhouette_iou"]["value"] == 0
+    with pytest.raises(SystemExit, match="two weights are called 'two'"):
+        run("ablations", "ablations", weights[0], weights[0])
+
+
+def test_transfer_curve_trains_on_nested_sets(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    transfer, calls = tool("transfer"), list[list[str]]()
+    sets = transfer.nested([Path(f"{k}.bag") for k in range(9)], (2, 5, 30))
+    assert list(sets) == [2, 5, 9]
+    assert set(sets[2]) < set(sets[5]) < set(sets[9])
+    monkeypatch.setattr(transfer, "nlos_cam", lambda arguments: calls.append(arguments) or len(calls) - 1)
+    lesson = transfer.Lesson(Path("data"), Path("val"), 24, Path("run"))
+    train = transfer.commanded("transfer", Path("r.toml"), "--weights", Path("w"))
+    assert train(lesson) == Path("run")
+    assert " ".join(calls[0]).endswith("--dataset data --held-out val --objects 24 --out run --weights w")
+    with pytest.raises(Exception, match=r"train transfer .* ended with 1"):
+        train(lesson)
+
+
+def test_transfer_figures_of_exact_images_are_perfect(tool: Tool) -> None:
+    image = np.where(np.indices((1, 64, 64))[2] > 20, np.float32(0.5), np.float32(0.0))
+    maps = MapSet(np.zeros((1, 64, 80), np.float32), np.zeros((1, 64, 80), np.float32), image)
+    box = tool("transfer").paper_box()
+    exact = tool("transfer").judge(lambda *_: image, maps, box)
+    near = tool("transfer").judge(lambda *_: image + np.float32(0.1) * (image > 0), maps, box)
+    assert (exact["silhouette_iou"]["value"], exact["foreground_rmse_mm"]["value"]) == (1, 0)
+    assert near["foreground_too_far_mm"]["value"] == pytest.approx(-0.1 * 280 / 0.9, rel=1e-3)
+
+
+def test_doubt_study_is_right_for_laplace_errors(tool: Tool, harness: ModuleType) -> None:
+    doubt, generator = tool("doubt"), np.random.default_rng(0)
+    expected = generator.uniform(0.005, 0.05, 100_000)
+    observed = np.abs(generator.laplace(0.0, expected))
+    rows, covered = doubt.reliability(expected, observed), doubt.coverage(expected, observed)
+    assert all(row["observed_mm"] == pytest.approx(row["expected_mm"], rel=0.05) for row in rows)
+    assert all(row["observed"] == pytest.approx(row["level"], abs=0.01) for row in covered)
+    pipeline = doubt.Pipeline(RIG, plate, FakeDoubter(error_v=0.2))
+    answer = pipeline.answer(np.full((64, 80), 0.3, np.float32), np.ones((64, 80), np.float32))
+    assert doubt.of_outliers([answer, answer], np.array([100, 0]))["cannot_be_seen"] == 1
+    parts = {"reliability": rows, "coverage": covered, "surface": [{"expected": 0.5, "observed": 0.6}]}
+    harness.save("reliability", doubt.draw({"test_objects": parts, "held_out_objects": parts}))
+
+
+@pytest.mark.slow
+def test_physics_check_scores_true_objects_lowest(
+    tool: Tool, run: Read, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = tool("physics_check")
+    monkeypatch.setattr(study, "test_set", lambda box: seeded_objects(20_000_000, 3, box))
+    monkeypatch.setattr(study, "load_reconstructor", lambda *_: plate)
+    table = run("physics_check", "physics_check", "--new", 2, "--outside", 0, "--out", tmp_path / "docs")
+    scores = table["scores"]
+    assert scores["the true object, standard"]["most"] < 0.1 < scores["test objects"]["median"]
+    ordinary = np.arange(200) / 200
+    threshold = study.least_threshold(ordinary)
+    assert study.flagged(ordinary, threshold) <= 0.01 < study.flagged(ordinary, threshold - 0.01)
+    assert study.told_apart(np.array([0.1, 0.2]), np.array([0.3, 0.4])) == 1.0
+
+
+def test_referee_statistics_find_noise_bias_and_scale(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    referee, generator = tool("referee"), np.random.default_rng(0)
+    truth, error = generator.uniform(1, 2, (20, 100)), generator.uniform(0.01, 0.05, (20, 100))
+    which = generator.uniform(size=truth.shape) < 0.7
+    estimate = truth + error * generator.standard_normal(truth.shape) + 100 * ~which
+    assert abs(referee.reduced_chi_square(truth, estimate, error, which) - 1) < 4 * np.sqrt(2 / which.sum())
+    assert referee.reduced_chi_square(truth + 3 * error, estimate, error, which) == pytest.approx(10, rel=0.1)
+    scale, scale_error = referee.best_scale(truth / 3, estimate, error, which)
+    assert abs(scale - 3) < 4 * scale_error < 0.04
+    depth = tool("referee_mitransient").depth_map(referee.STEP, 64)
+    assert not np.isnan(depth).any()
+    monkeypatch.setitem(__import__("sys").modules, "mitsuba", None)
+    with pytest.raises(SystemExit, match="lists the packages to install"):
+        tool("referee_mitransient").load()
+
+
+def test_color_demonstration_passes_each_step_on_to_the_next(tool: Tool) -> None:
+    *builds, vae, compressor = tool("color").commands(Path("out"), "draft", 3, small=True)
+    assert all(command[:3] == ["dataset", "build", "--colour"] for command in builds)
+    options = dict(zip(compressor[2::2], compressor[3::2], strict=True))
+    assert options["--vae"] == vae[vae.index("--out") + 1]
+
+
+def test_word_check_counts_patterns_with_their_lines(
+    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = tool("words")
+    monkeypatch.setattr(words, "ROOT", tmp_path)
+    (tmp_path / "a.py").write_text('"""What is told\nmeanwhile."""\nMOST_X = 1\n', encoding="utf-8")
+    found = words.findings(*words.scan(tmp_path), docstrings=True)
+    assert {key: len(lines) for key, (_, lines) in found.items()} == {
+        "begin": 1,
+        "what": 1,
+        "tell": 1,
+        "so": 0,
+        "rare": 1,
+        "names": 1,
+    }
+    assert found["rare"][1][0].startswith("a.py:2:")

@@ -1,0 +1,96 @@
+"""The simulated bench's recordings: which objects are in which part, what a recording holds, going on after a stop."""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.dataset.labelled import read_labelled
+from nlos_cam.objects.benchmark import FixedObject
+from nlos_cam.objects.benchmark import test_set as fixed_set
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.recording.sidecar import load_sidecar
+from nlos_cam.render.renderer import MultiBounce
+from nlos_cam.render.scene_file import SceneFile, load_scene
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "bench.toml"
+
+
+@pytest.fixture(scope="module")
+def bench(tool: Callable[[str], ModuleType]) -> ModuleType:
+    return tool("transfer_bench")
+
+
+@pytest.fixture(scope="module")
+def things() -> list[FixedObject]:
+    return fixed_set(object_box(load_rig("paper-rig")))
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneFile:
+    """The example's bench with few pixels."""
+    whole = load_scene(EXAMPLE)
+    small = whole.rig.intrinsics.model_copy(update=vars(whole.rig.pinhole.scaled(80, 64)))
+    return whole.model_copy(update={"rig": whole.rig.model_copy(update={"intrinsics": small})})
+
+
+@pytest.fixture
+def rendered(bench: ModuleType, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What was rendered; echoes are of nothing but a depth, which takes no time."""
+    scenes: list[Any] = []
+
+    def render(scene: Any) -> Any:
+        scenes.append(scene)
+        peak = np.full((64, 80), 1e-4, np.float32)
+        path_m = np.full((64, 80), 2 * np.nanmin(scene.object_depth_m), np.float32)
+        return type("Rendering", (), {"multi": MultiBounce(peak, peak / 4, path_m, direct_included=True)})
+
+    monkeypatch.setattr(bench, "render", render)
+    return scenes
+
+
+def test_no_object_is_in_two_parts_and_every_category_is_held_out_and_adapted_to(
+    bench: ModuleType, things: list[FixedObject]
+) -> None:
+    made = bench.takes(things, Path("F"))
+    assert Counter(take.path.parent.name for take in made) == {"adaptation": 30, "validation": 6, "held-out": 18}
+    assert len({take.path for take in made}) == len(made)
+    for part in ("adaptation", "held-out"):
+        assert len({take.thing.category for take in made if take.path.parent.name == part}) == 18
+    assert np.diff([take.since for take in made]).min() > 0
+
+
+@pytest.mark.slow
+def test_a_recording_is_of_its_object_on_the_bench_and_labelled(
+    bench: ModuleType, things: list[FixedObject], scene: SceneFile, rendered: list[Any], tmp_path: Path
+) -> None:
+    paths = list(bench.record_all(scene, things[:2], tmp_path, 3, lambda *_: None))
+    assert [path.name for path in paths] == ["airplane-1.bag", "airplane-2.bag"]
+    for path, thing, shown in zip(paths, things, rendered, strict=False):
+        sidecar = load_sidecar(path.with_suffix(".json"))
+        assert (sidecar.label, sidecar.state, sidecar.rig) == (thing.name, "complete", scene.rig)
+        np.testing.assert_array_equal(shown.object_depth_m, thing.depth_m)
+        assert (shown.rig, shown.pulse_ns) == (scene.rig, scene.sensor.pulse_ns)
+        read = read_labelled([path], known=lambda _: {})
+        np.testing.assert_array_equal(read.object_depth_m, np.stack([thing.depth_m] * 3))
+
+
+def test_the_examples_bench_differs_from_the_papers_as_benches_do() -> None:
+    scene, paper = load_scene(EXAMPLE), load_rig("paper-rig")
+    off_mm = 1e3 * abs(scene.rig.lidar.distance_m - paper.lidar.distance_m)
+    assert 1 <= off_mm <= 20
+    assert 0.5 <= abs(scene.rig.lidar.yaw_deg - paper.lidar.yaw_deg) <= 5
+    box, own = object_box(paper), object_box(scene.rig)
+    for one, other in ((box.x_max_m - box.x_min_m, own.x_max_m - own.x_min_m), (box.z_far_m, own.z_far_m)):
+        assert one == pytest.approx(other)  # a truth is the same image on both
+    assert scene.rig.device.receiver_cell_m2 != paper.device.receiver_cell_m2
+    sensor = scene.sensor
+    assert scene.radiometry == "paper"
+    assert sensor.pulse_ns == 1.0
+    for field in ("ambient_counts", "ripple_m", "wall_texture", "patch_drift_m", "drift_m_per_celsius"):
+        assert getattr(sensor, field) > 0

@@ -1,0 +1,196 @@
+"""Pictures of the docs: the gallery's failures, sheets of the hidden objects, stills and video of a replay.
+
+`python tools/docs/pictures.py [failures] [objects] [replay] [--out docs/images]`: all without names. Frames of the
+replay come as fast as they are reconstructed, so that a slow machine drops none.
+"""
+
+import argparse
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event
+from typing import Self
+
+import numpy as np
+from matplotlib.figure import Figure
+from nlos_calibration.arrays import Float32, Float64
+from nlos_calibration.rig import ObjectBox, load_rig
+from nlos_models.metrics import silhouette_iou
+
+from nlos_cam.camera.simulated_world import World, open_world
+from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.cli.common import tracked
+from nlos_cam.evaluate.subjects import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
+from nlos_cam.files import file_when_whole
+from nlos_cam.frames import OBJECT_PIXELS, Frame
+from nlos_cam.live.replay import replay
+from nlos_cam.live.replay_media import VIDEO, Looks
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import image_from_depth, object_box, orthographic_depth
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import category_triangles, place, random_pose
+from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.pipeline import load_doubt, load_networks, set_up
+
+ROOT = Path(__file__).parents[2]
+WORST, NEAR_M, FAR_M = 6, 0.16, 0.24
+VARIATIONS, SIDE_BY_SIDE, INCHES = 5, 2, 0.85
+SCENES = {"airplane": "", "cup": "examples/cup.toml", "empty": "examples/empty.toml"}
+"""Scenes by the names of their stills."""
+FILMED, FILM_S, STILL_FRAMES, MAX_BYTES = "airplane", 4.0, 2, 1_000_000
+
+
+def unlike_training() -> list[SeededObject]:
+    """Return shapes unlike any training object, and nothing at all."""
+    y, x = (np.mgrid[:OBJECT_PIXELS, :OBJECT_PIXELS] - (OBJECT_PIXELS - 1) / 2) / OBJECT_PIXELS
+    radius = np.hypot(x, y)
+    shapes = {
+        "a ring": np.where(abs(radius - 0.3) < 0.06, NEAR_M, np.nan),
+        "two posts": np.where((abs(abs(x) - 0.25) < 0.06) & (abs(y) < 0.4), NEAR_M, np.nan),
+        "a slanted plate": np.where(np.maximum(abs(x), abs(y)) < 0.35, (NEAR_M + FAR_M) / 2 + 0.15 * x, np.nan),
+        "a wall of steps": np.where(abs(y) < 0.4, np.where(np.floor(8 * x) % 2 == 0, NEAR_M, FAR_M), np.nan),
+        "nothing": np.full_like(x, np.nan),
+    }
+    return [SeededObject(name, name, depth_m.astype(np.float32)) for name, depth_m in shapes.items()]
+
+
+def reconstructed(subjects: Sequence[Subject]) -> tuple[Float32, Float32, Float64]:
+    """Return the shipped networks' images of objects (n, 64, 64), the truth, and the silhouettes' IoU."""
+    rig = load_rig("paper-rig")
+    truth = truth_of(subjects, object_box(rig))
+    maps = as_map_set(sense(echoes_of(subjects, rig, lambda *_: None), rig), truth)
+    image = reconstruct_all(load_networks(), maps)
+    return image, truth, silhouette_iou(image, truth)
+
+
+def draw_pairs(path: Path, rows: Sequence[tuple[str, Sequence[Subject], Float32, Float32, Float64]]) -> None:
+    """Draw truth above reconstruction, one block of two rows for each of `rows`."""
+    columns = max(len(subjects) for _, subjects, *_ in rows)
+    figure = Figure(figsize=(1.35 * columns, 3.1 * len(rows)), layout="constrained")
+    parts = np.atleast_1d(figure.subfigures(len(rows)))
+    for part, (title, subjects, image, truth, iou) in zip(parts, rows, strict=True):
+        part.suptitle(title, fontsize=10)
+        axes = part.subplots(2, columns)
+        for axis in axes.flat:
+            axis.set_axis_off()
+        for k, subject in enumerate(subjects):
+            for axis, picture in zip(axes[:, k], (truth[k], image[k]), strict=True):
+                axis.imshow(picture, cmap="magma", vmin=0, vmax=1)
+            axes[0, k].set_title(subject.name, fontsize=8)
+            axes[1, k].set_title("no truth to meet" if not truth[k].any() else f"IoU {iou[k]:.2f}", fontsize=7)
+    with file_when_whole(path) as unfinished:
+        figure.savefig(unfinished, dpi=90, format="png")
+
+
+def failures(out: Path) -> None:
+    """Draw the worst of the test objects, and shapes unlike training."""
+    fixed, others = test_set(object_box(load_rig("paper-rig"))), unlike_training()
+    image, truth, iou = reconstructed(fixed)
+    worst = np.argsort(iou, kind="stable")[:WORST]
+    rows = [
+        ("the six worst of the 54 test objects", [fixed[k] for k in worst], image[worst], truth[worst], iou[worst]),
+        ("unlike anything trained on, and nothing at all", others, *reconstructed(others)),
+    ]
+    draw_pairs(out / "failures.png", rows)
+
+
+def variations(category: str, box: ObjectBox) -> list[Float32]:
+    """Return images of a category as training has them, each with another seed and pose."""
+    poses = [random_pose(np.random.default_rng([k, *category.encode()]), box) for k in range(VARIATIONS)]
+    placed = [place(category_triangles(category, k), pose, box) for k, pose in enumerate(poses)]
+    return [image_from_depth(orthographic_depth(triangles, box), box) for triangles in placed]
+
+
+def fixed_objects(box: ObjectBox) -> dict[str, list[Float32]]:
+    """Return images of the test set by category."""
+    objects = test_set(box)
+    return {n: [image_from_depth(thing.depth_m, box) for thing in objects if thing.category == n] for n in CATEGORIES}
+
+
+def draw_sheet(path: Path, images: dict[str, list[Float32]]) -> Figure:
+    """Draw one line per category with its name, two categories side by side."""
+    wide, lines = max(len(row) for row in images.values()), -(-len(images) // SIDE_BY_SIDE)
+    figure = Figure(figsize=(INCHES * SIDE_BY_SIDE * wide, 1.25 * INCHES * lines), layout="constrained")
+    axes = figure.subplots(lines, SIDE_BY_SIDE * wide)
+    for axis in axes.ravel():
+        axis.axis("off")
+    for number, (name, row) in enumerate(images.items()):
+        side, line = divmod(number, lines)
+        for k, image in enumerate(row):
+            axes[line, side * wide + k].imshow(image, vmin=0, vmax=1, cmap="magma")
+        axes[line, side * wide].set_title(name, loc="left", fontsize=8, pad=2)
+    figure.savefig(path, dpi=100)
+    return figure
+
+
+def objects(out: Path) -> None:
+    """Draw the sheets of training's and of the test set's objects."""
+    box = object_box(load_rig("paper-rig"))
+    draw_sheet(out / "objects.png", {name: variations(name, box) for name in CATEGORIES})
+    draw_sheet(out / "test_objects.png", fixed_objects(box))
+
+
+class Unhurried:
+    """Camera that yields the frames of a simulated world with their truth, each as soon as it is asked for."""
+
+    def __init__(self, world: World, frames: int) -> None:
+        self.uri, self.rig, self.identity = f"sim:{world.scene.name}", world.rig, {"serial": ""}
+        self.intrinsics, self.incomplete, self.dropped = world.rig.pinhole, 0, 0
+        self.counts: Counter[str] = Counter()
+        self._world, self._frames, self._number = world, frames, 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Frame]:
+        for number in range(self._frames):
+            self._number = number
+            frame = self._world.images(number).frame(self.intrinsics)
+            truth_m, time_s = self._world.truth_depth_m(number), number / FRAMES_PER_S
+            yield replace(frame, frame_number=number, timestamp_s=time_s, truth_depth_m=truth_m)
+
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        return {name: celsius for name, celsius in self._world.celsius(self._number).items() if name.endswith(ending)}
+
+
+def replays(out: Path) -> None:
+    """Draw a still of each scene, and the video of one."""
+    for name, scene in SCENES.items():
+        frames = round(FILM_S * FRAMES_PER_S) if name == FILMED else STILL_FRAMES
+        with tracked(f"rendering {name}") as on_progress:
+            world = open_world(str(ROOT / scene) if scene else "", on_progress)
+        bench = Bench(world.rig if world.rig.object_box else load_rig("paper-rig"))
+        processing = set_up(bench, load_networks(), doubter=load_doubt())
+        looks, camera = Looks(bench, stills=2, video=name == FILMED), Unhurried(world, frames)
+        with TemporaryDirectory() as folder, tracked(f"reconstructing {name}") as update:
+            made, done = Path(folder) / "replay", iter(range(1, frames + 1))
+            replay(camera, processing, made, stop=Event(), on_frame=lambda: update(next(done), frames), looks=looks)  # noqa: B023
+            shutil.copyfile(max(made.glob("still-*.png")), out / f"gallery-{name}.png")
+            if looks.video:
+                shutil.copyfile(made / VIDEO, out / VIDEO)
+    if (size := (out / VIDEO).stat().st_size) > MAX_BYTES:
+        print(f"{VIDEO} has {size / 1e6:.1f} MB, and the docs have room for {MAX_BYTES / 1e6:.0f}: shorten it")
+
+
+PICTURES: dict[str, Callable[[Path], None]] = {"failures": failures, "objects": objects, "replay": replays}
+
+
+def main() -> None:
+    """Draw the named pictures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="PICTURE", help=f"some of {', '.join(PICTURES)} (default: all)")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images")
+    asked = parser.parse_args()
+    asked.out.mkdir(parents=True, exist_ok=True)
+    for name in asked.names or PICTURES:
+        PICTURES[name](asked.out)
+
+
+if __name__ == "__main__":
+    main()

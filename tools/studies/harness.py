@@ -1,0 +1,162 @@
+"""Harness of the studies: a grid of settings times seeds gives records, and from them tables, a figure and a JSON.
+
+A study names its settings and a function that measures one of them; `collect` runs the grid with a progress bar and
+resumes where an interrupted run stopped. `write` and `save` put the results into docs/, `table` prints Markdown.
+"""
+
+import hashlib
+import json
+import sys
+from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from nlos_calibration.errors import CalibrationError
+from nlos_models.errors import ModelError
+
+from nlos_cam.cli.common import progress
+from nlos_cam.errors import NlosCamError
+from nlos_cam.evaluate.report import in_words
+from nlos_cam.files import cache_folder
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PRODUCT = "nlos_cam", "calibration", "models"
+sys.path.append(str(ROOT / "tools"))  # the synthetic scenes are modules of tools/
+
+Record = dict[str, Any]
+
+
+def options(doc: str | None) -> ArgumentParser:
+    """Return a parser whose help is a tool's docstring."""
+    return ArgumentParser(description=doc, formatter_class=RawDescriptionHelpFormatter)
+
+
+def collect(
+    name: str,
+    settings: Sequence[Any],
+    measure: Callable[[Any, np.random.Generator], Mapping[str, Any]],
+    seeds: int = 1,
+    key: str = "",
+) -> list[Record]:
+    """Measure every setting (dataclass instances) with every seed; return one record each, settings outermost.
+
+    Every record holds the setting's fields, `seed` and the measured values. Finished records are appended to a file in
+    the cache until all are there; a second call of the same study, key and state of the code resumes from it.
+    """
+    store = cache_folder() / "studies" / f"{name}-{fingerprint(settings, seeds, key)}.jsonl"
+    store.parent.mkdir(parents=True, exist_ok=True)
+    done = [json.loads(line) for line in store.read_text(encoding="utf-8").splitlines()] if store.exists() else []
+    grid = [(i, seed) for i in range(len(settings)) for seed in range(seeds)]
+    with progress() as bar, store.open("a", encoding="utf-8") as file:
+        for i, seed in bar.track(grid[len(done) :], total=len(grid), completed=len(done), description=name):
+            measured = measure(settings[i], np.random.default_rng([i, seed]))
+            line = json.dumps(asdict(settings[i]) | {"seed": seed} | dict(measured))
+            file.write(line + "\n")
+            file.flush()
+            done.append(json.loads(line))
+    store.unlink()
+    return done
+
+
+def fingerprint(settings: Sequence[Any], seeds: int, key: str = "") -> str:
+    """Return a checksum of a grid, a key and the state of the product's source files."""
+    files = sorted(path for folder in PRODUCT for path in (ROOT / folder).rglob("*.py"))
+    state = [(str(path), path.stat().st_mtime_ns) for path in files]
+    return hashlib.sha256(repr([state, list(settings), seeds, key]).encode()).hexdigest()[:16]
+
+
+def percentiles(values: Iterable[float]) -> dict[str, float] | None:
+    """Return median, 95th percentile and maximum of values; None without any."""
+    values = list(values)
+    parts = ("p50", 50), ("p95", 95), ("max", 100)
+    return {name: float(np.percentile(values, at)) for name, at in parts} if values else None
+
+
+def coverage(inside: Iterable[Sequence[bool]], names: Sequence[str]) -> dict[str, float] | None:
+    """Return the share of records whose truth lies in the stated interval, by quantity; None without records."""
+    rows = np.array(list(inside), float).reshape(-1, len(names))
+    return dict(zip(names, rows.mean(axis=0).tolist(), strict=True)) if len(rows) else None
+
+
+def wilson(count: int, of: int) -> dict[str, Any]:
+    """Return a share and its 95 % interval by Wilson's score."""
+    z, share = 1.96, count / of
+    middle = (share + z * z / (2 * of)) / (1 + z * z / of)
+    half = z / (1 + z * z / of) * np.sqrt(share * (1 - share) / of + z * z / (4 * of * of))
+    return {"count": count, "of": of, "share": share, "low": max(0.0, middle - half), "high": min(1.0, middle + half)}
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in [head, ["---"] * len(head), *rows])
+
+
+def joined(values: Mapping[str, float] | None, form: str = "{:.3f}", between: str = " / ") -> str:
+    """Format the values of a cell; an empty cell where there are none."""
+    return between.join(form.format(value) for value in values.values()) if values else ""
+
+
+def difference(figure: Mapping[str, float | None]) -> str:
+    """Format a difference with its interval, in bold where the interval excludes 0."""
+    low, high = figure["low"], figure["high"]
+    apart = low is not None and high is not None and not low <= 0 <= high
+    return f"**{in_words(figure)}**" if apart else in_words(figure)
+
+
+def write(name: str, facts: Any, folder: Path | None = None) -> None:
+    """Write docs/NAME.json, or the same in another folder."""
+    path = (folder or DOCS) / f"{name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+
+
+def save(name: str, figure: Figure, folder: Path | None = None, dpi: int = 100) -> None:
+    """Write docs/images/NAME.png, or the same in another folder."""
+    path = (folder or DOCS) / "images" / f"{name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=dpi)
+
+
+def draw_coverage(axis: Any, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
+    """Draw the coverage of the stated 95 % intervals, one line per row of a table."""
+    rows = [row for row in rows if row["inside_95"]]
+    for name, marker in zip(names, "osv^", strict=False):
+        axis.plot([100 * row["inside_95"][name] for row in rows], range(len(rows)), marker, label=name)
+    axis.axvspan(93, 97, color="0.9")
+    axis.axvline(95, color="0.6", lw=1)
+    axis.set_yticks(range(len(rows)), [row["name"] for row in rows], fontsize=8)
+    axis.set(xlabel="truth inside the stated 95 % interval, %", xlim=(85, 101))
+    axis.invert_yaxis()
+    axis.legend(fontsize=8)
+
+
+def named(text: str) -> tuple[str, Path]:
+    """Parse DIR or NAME=DIR, a folder of weights, as an argument's `type`."""
+    name, equals, folder = text.partition("=")
+    path = Path(folder if equals else text)
+    if not (path / "checkpoint.json").is_file():
+        raise ArgumentTypeError(f"no weights in {path}: name a folder that `nlos-cam train` wrote")
+    return name if equals else path.resolve().name, path
+
+
+def by_name(weights: Sequence[tuple[str, Path]]) -> dict[str, Path]:
+    """Return folders by name. Ends the program where two have the same name."""
+    names = [name for name, _ in weights]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise SystemExit(f"two weights are called {twice[0]!r}: give them names with NAME=DIR")
+    return dict(weights)
+
+
+@contextmanager
+def one_line_errors() -> Generator[None]:
+    """End the program with one line on an error of the project's own kinds."""
+    try:
+        yield
+    except (NlosCamError, CalibrationError, ModelError) as error:
+        raise SystemExit(f"error: {error}") from error

@@ -1,0 +1,255 @@
+"""Transfer to a bench: figures on the simulated bench and the paper's rig, and the learning curve over recordings.
+
+python tools/studies/transfer.py figures DIR [--weights W]      docs/transfer.json
+python tools/studies/transfer.py curve DIR RUNS --recipe models/recipes/paper-rig-transfer.toml [--weights W]
+    [--scratch models/recipes/paper-rig-compressor-scratch.toml]  docs/transfer_curve.json and .png
+
+DIR holds the recordings of transfer_bench.py; one frame of each of 18 objects that no run trains on is judged. RUNS
+holds the trainings, which resume. With --scratch the same recordings also train a compressor from nothing, onto the
+latent of the weights' VAE.
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import harness
+import numpy as np
+from matplotlib.figure import Figure
+from nlos_calibration.arrays import Float32
+from nlos_calibration.rig import ObjectBox, load_rig
+from nlos_models import metrics
+from nlos_models.data import MapSet
+from nlos_models.inference import Reconstructor, load_reconstructor
+from numpy.typing import NDArray
+from transfer_bench import ADAPTATION, FRAMES, HELD_OUT, VALIDATION, part_of
+
+from nlos_cam.cli.common import tracked
+from nlos_cam.cli.main import main as nlos_cam
+from nlos_cam.dataset.labelled import read_labelled, recordings_in, write_shards
+from nlos_cam.errors import NlosCamError
+from nlos_cam.evaluate import metrics as evaluate
+from nlos_cam.evaluate.subjects import reconstruct_all
+from nlos_cam.files import cache_folder
+from nlos_cam.frames import maps_from_frame
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import image_from_depth, object_box
+from nlos_cam.render.renderer import render
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
+
+PARTS = ADAPTATION, VALIDATION, HELD_OUT
+COUNTS = 2, 5, 10, 20, 30
+FINISHED = "figures.json"
+OnProgress = Callable[[int, int], None]
+
+
+def judge(reconstructor: Reconstructor, maps: MapSet, box: ObjectBox) -> dict[str, Any]:
+    """Return the metrics by name over samples, each {value, low, high}, and the number of samples."""
+    image, truth = reconstruct_all(reconstructor, maps), maps.image.astype(np.float32)
+    too_far_mm = evaluate.mm_per_v(box) * too_far(image, truth)
+    values = {**evaluate.per_object(image, truth, box), "foreground_too_far_mm": too_far_mm}
+    return {"objects": len(truth), **evaluate.plain(evaluate.over_objects(values))}
+
+
+def too_far(image: Float32, truth: Float32) -> NDArray[np.float64]:
+    """Return the mean shortfall of v where both show surface, (n,); NaN where they share none.
+
+    Training by squared error turns uncertainty into distance, which is this part of the RMSE.
+    """
+    both = metrics.surface(image) & metrics.surface(truth)
+    count = both.sum((-2, -1))
+    sums = np.where(both, truth.astype(np.float64) - image, 0.0).sum((-2, -1))
+    return np.where(count > 0, sums / np.maximum(count, 1), np.nan)
+
+
+def paper_box() -> ObjectBox:
+    """Return the paper's object box; the bench's has the same depth."""
+    return object_box(load_rig("paper-rig"))
+
+
+def on_paper_rig(on_progress: OnProgress) -> dict[str, MapSet]:
+    """Render each part of the test set on the paper's rig, with the sensor's noise."""
+    rig = load_rig("paper-rig")
+    box, sensor = object_box(rig), Sensor(rig, SensorModel())
+    parts: dict[str, list[tuple[Float32, Float32, Float32]]] = {part: [] for part in PARTS}
+    for number, thing in enumerate(things := test_set(box)):
+        images = sensor.expose(render(Scene(rig, thing.depth_m)).multi, np.random.default_rng([number, 1]))
+        maps = maps_from_frame(images.frame(rig.pinhole))
+        parts[part_of(thing)].append((maps.depth_m, maps.intensity, image_from_depth(thing.depth_m, box)))
+        on_progress(number + 1, len(things))
+    return {part: MapSet(*map(np.stack, zip(*samples, strict=True))) for part, samples in parts.items()}
+
+
+def on_bench(folder: Path, on_progress: OnProgress) -> dict[str, MapSet]:
+    """Read one frame of each recording of each folder."""
+    return {part: read_labelled(recordings_in(folder / part), frames=1, on_progress=on_progress).maps for part in PARTS}
+
+
+def figures(asked: argparse.Namespace) -> None:
+    """Judge weights on the simulated bench and on the paper's rig."""
+    reconstructor = load_reconstructor(asked.weights, cache_folder() / "onnx")
+    with tracked("rendering the paper's rig") as on_progress:
+        rigs = {"paper-rig": on_paper_rig(on_progress)}
+    with tracked("reading recordings") as on_progress:
+        rigs["bench"] = on_bench(asked.folder, on_progress)
+    box = paper_box()
+    found = {
+        rig: {part: judge(reconstructor, maps, box) for part, maps in parts.items()} for rig, parts in rigs.items()
+    }
+    harness.write("transfer", {"weights": str(asked.weights or "shipped"), **found}, asked.out)
+    for rig, parts in found.items():
+        for part, one in parts.items():
+            iou, rmse_mm = one["silhouette_iou"]["value"], one["foreground_rmse_mm"]["value"]
+            print(f"{rig} {part}: {one['objects']} objects, silhouette IoU {iou:.3f}, foreground RMSE {rmse_mm:.1f} mm")
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """Data, number of frames (not recordings) and run folder of one training; a second call resumes there."""
+
+    dataset: Path
+    validation: Path
+    samples: int
+    out: Path
+
+
+Trainer = Callable[[Lesson], Path]
+"""Trains on a lesson and returns the folder of the weights."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One point of a curve."""
+
+    trainer: str
+    recordings: int
+    figures: Mapping[str, Any]
+
+
+def commanded(task: str, recipe: Path, *others: object) -> Trainer:
+    """Return `nlos-cam train TASK` as a trainer, which raises NlosCamError where the command fails."""
+
+    def train(lesson: Lesson) -> Path:
+        given = {
+            "--recipe": recipe,
+            "--dataset": lesson.dataset,
+            "--held-out": lesson.validation,
+            "--objects": lesson.samples,
+            "--out": lesson.out,
+        }
+        arguments = ["train", task, *(str(part) for pair in given.items() for part in pair), *map(str, others)]
+        if code := nlos_cam(arguments):
+            raise NlosCamError(f"nlos-cam {' '.join(arguments)} ended with {code}: see above; run this again to go on")
+        return lesson.out
+
+    return train
+
+
+def nested(recordings: Sequence[Path], counts: Sequence[int], seed: int = 0) -> dict[int, list[Path]]:
+    """Return for each count that number of recordings, at most all, in a random order: each set is within the next."""
+    order = np.random.default_rng(seed).permutation(len(recordings))
+    sizes = sorted({min(count, len(recordings)) for count in counts})
+    return {size: [recordings[k] for k in order[:size]] for size in sizes}
+
+
+def curve(
+    folder: Path,
+    runs: Path,
+    trainers: Mapping[str, Trainer],
+    before: Path | None,
+    counts: Sequence[int] = COUNTS,
+    frames: int = FRAMES,
+) -> Iterator[Point]:
+    """Yield the points: the initial weights, then every trainer at each number of recordings.
+
+    Points of an earlier call are read from `runs`.
+    """
+    held_out = read_labelled(recordings_in(folder / HELD_OUT), frames=1).maps
+    validation = runs / "validation"
+    write_shards(read_labelled(recordings_in(folder / VALIDATION), frames=frames), validation)
+    yield Point("before", 0, _judged(before, held_out))
+    for count, chosen in nested(recordings_in(folder / ADAPTATION), counts).items():
+        data = runs / f"{count:02d}-recordings"
+        labelled = read_labelled(chosen, frames=frames)
+        write_shards(labelled, data)
+        for name, trainer in trainers.items():
+            lesson = Lesson(data, validation, len(labelled.label), runs / f"{count:02d}-{name}")
+            yield Point(name, count, _reached(lesson, trainer, held_out))
+
+
+def _reached(lesson: Lesson, trainer: Trainer, held_out: MapSet) -> dict[str, Any]:
+    done = lesson.out / FINISHED
+    if not done.is_file():
+        figures = _judged(trainer(lesson), held_out)
+        done.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    return json.loads(done.read_text(encoding="utf-8"))
+
+
+def _judged(weights: Path | None, maps: MapSet) -> dict[str, Any]:
+    return judge(load_reconstructor(weights, cache_folder() / "onnx"), maps, paper_box())
+
+
+def draw(points: Sequence[Point]) -> Figure:
+    """Draw foreground RMSE and silhouette IoU against the number of recordings, with their intervals."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    named = {"foreground_rmse_mm": "foreground RMSE, mm", "silhouette_iou": "silhouette IoU"}
+    for axis, (metric, title) in zip(figure.subplots(1, 2), named.items(), strict=True):
+        start = points[0].figures[metric]["value"]
+        axis.axhline(start, color="grey", linestyle=":", label="before")
+        for trainer in dict.fromkeys(point.trainer for point in points[1:]):
+            own = [point for point in points if point.trainer == trainer]
+            value, low, high = np.array(
+                [[point.figures[metric][part] for part in ("value", "low", "high")] for point in own], float
+            ).T
+            at = [point.recordings for point in own]
+            axis.plot(at, value, marker="o", label=trainer)
+            axis.fill_between(at, low, high, alpha=0.2)
+        axis.set(xlabel="recordings adapted to", ylabel=title, ylim=(0, None))
+        axis.legend(frameon=False)
+    return figure
+
+
+def run_curve(asked: argparse.Namespace) -> None:
+    """Train on growing numbers of recordings, and judge."""
+    weights = {flag: [flag, asked.weights] if asked.weights else [] for flag in ("--weights", "--vae")}
+    trainers = {"transfer": commanded("transfer", asked.recipe, *weights["--weights"])}
+    if asked.scratch:
+        trainers["from scratch"] = commanded("compressor", asked.scratch, *weights["--vae"])
+    points: list[Point] = []
+    for point in curve(asked.folder, asked.runs, trainers, asked.weights, asked.counts):
+        points.append(point)
+        names = "foreground_rmse_mm", "foreground_too_far_mm", "silhouette_iou"
+        values = ", ".join(f"{name} {point.figures[name]['value']}" for name in names)
+        print(f"{point.trainer}, {point.recordings} recordings: {values}", flush=True)
+    reached = {"frames_each": FRAMES, "points": [asdict(point) for point in points]}
+    harness.write("transfer_curve", reached, asked.out)
+    harness.save("transfer_curve", draw(points), asked.out, dpi=110)
+
+
+def main() -> None:
+    """Run the named study."""
+    parser = harness.options(__doc__)
+    commands = parser.add_subparsers(required=True)
+    parts = {"figures": figures, "curve": run_curve}
+    for name, work in parts.items():
+        part = commands.add_parser(name, help=work.__doc__)
+        part.set_defaults(run=work)
+        part.add_argument("folder", type=Path)
+        if work is run_curve:
+            part.add_argument("runs", type=Path)
+            part.add_argument("--recipe", type=Path, required=True)
+            part.add_argument("--scratch", type=Path, help="recipe for `train compressor` on the same recordings")
+            part.add_argument("--counts", type=int, nargs="+", default=COUNTS)
+        part.add_argument("--weights", type=Path, help="initial weights (default: the shipped ones)")
+        part.add_argument("--out", type=Path, help="folder of the results (default: docs)")
+    asked = parser.parse_args()
+    asked.run(asked)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,318 @@
+"""Weights: the limits of their figures, their range of rigs, and kinds of objects they never saw.
+
+python tools/studies/weights.py limits [--weights DIR] [--frames 10 100]   docs/limits.json
+python tools/studies/weights.py rigs [--weights [NAME=]DIR ...]            docs/rig_map.json and images/rig_map.png
+python tools/studies/weights.py unseen WITHOUT WITH [--held-out DIR]       docs/unseen_kinds.json
+
+`limits` evaluates with one thing removed or added at a time. `rigs` moves the lidar over the distances and angles of
+SI 1, while occluder and object box stay, and resumes. `unseen` compares weights trained without and with some kinds.
+"""
+
+import argparse
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import harness
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from nlos_calibration.arrays import Float32
+from nlos_calibration.rig import Rig, load_rig
+from nlos_calibration.rig_check import lidar_sees
+from nlos_models.checkpoint import load_encoder, load_pipeline, load_record, shipped_folder
+from nlos_models.data import MapSet
+from nlos_models.inference import Reconstructor, load_reconstructor, refuse_colour
+from nlos_models.losses import latent_error
+from nlos_models.pipeline import cut_silhouette, lift_edges
+from nlos_models.tasks import run
+
+from nlos_cam.cli.common import tracked
+from nlos_cam.dataset.build import TEST_SEED, TRAINING_SEED, DatasetPlan
+from nlos_cam.evaluate.metrics import (
+    BARS,
+    SMALLER_IS_BETTER,
+    Figures,
+    PerObject,
+    advantage,
+    judge,
+    over_objects,
+    per_object,
+    plain,
+)
+from nlos_cam.evaluate.report import in_words
+from nlos_cam.evaluate.subjects import (
+    QUIET,
+    Judged,
+    Subject,
+    as_eaten,
+    as_map_set,
+    bare_wall_for,
+    echoes_of,
+    reconstruct_all,
+    rig_of,
+    seeded_objects,
+    sense,
+    stored_objects,
+    truth_of,
+)
+from nlos_cam.files import cache_folder
+from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.depth_map import object_box
+
+FRAMES, LEFT_OUT = (10, 100), "airplane,table"
+DISTANCES_M, ANGLES_DEG = (0.15, 0.2, 0.25, 0.3), (15.0, 30.0, 45.0, 60.0, 75.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one experiment; the latent error is in units of the encoder's spread, None without an encoder."""
+
+    name: str
+    tells: str
+    """Change from the evaluation."""
+    figures: Figures
+    latent_error: float | None = None
+
+
+class Network:
+    """The two steps of a pipeline, apart and together."""
+
+    def __init__(self, folder: Path) -> None:
+        self.pipeline, self.record = load_pipeline(folder)
+        recipe = self.record.compressor_recipe
+        joint = recipe and recipe.steps == "two-then-joint"  # its decoder has left the encoder's latent
+        self.encoder = None if joint else load_encoder(folder)
+        self.rig = rig_of(self.record)
+        self.bare = bare_wall_for(self.record, DatasetPlan(self.rig, TEST_SEED))
+
+    @torch.inference_mode()
+    def raw_image(self, maps: MapSet) -> Float32:
+        """Return the decoder's image, without the silhouette step."""
+        return self.pipeline.decoder(self._latent(maps))[:, 0].numpy()
+
+    @torch.inference_mode()
+    def rebuilt(self, truth: Float32) -> Float32 | None:
+        """Return the image of the true latent, cut and lifted as the pipeline does; None without an encoder."""
+        if self.encoder is None:
+            return None
+        image = self.pipeline.decoder(self.encoder(torch.from_numpy(truth)[:, None])[0])
+        return torch.where(cut_silhouette(image) > 0, lift_edges(image), 0.0)[:, 0].numpy()
+
+    @torch.inference_mode()
+    def latent_error(self, maps: MapSet) -> float | None:
+        """Return the error of the compressor's latent; None without an encoder."""
+        truth = torch.from_numpy(maps.image)[:, None]
+        return None if self.encoder is None else float(latent_error(self._latent(maps), *self.encoder(truth)))
+
+    def _latent(self, maps: MapSet) -> torch.Tensor:
+        return self.pipeline.latent(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
+
+
+def experiments(
+    folder: Path, subjects: Sequence[Subject], trained: Sequence[Subject], frames: Sequence[int] = FRAMES
+) -> Iterator[Row]:
+    """Yield one row per experiment; `trained` are objects of the training set.
+
+    Weights trained in one step, or jointly at last, have no latent of the VAE: its experiments are left out.
+    """
+    network = Network(folder)
+    rig, box = network.rig, object_box(network.rig)
+    truth, count = truth_of(subjects, box), len(subjects)
+    with tracked("rendering") as on_progress:
+        echoes = echoes_of([*subjects, *trained], rig, on_progress)
+
+    def row(name: str, change: str, sensed: Any, images: Float32 = truth) -> Row:
+        maps = as_eaten(as_map_set(sensed, images), network.bare)
+        return Row(name, change, judge(run(network.pipeline, maps), maps.image, box), network.latent_error(maps))
+
+    first = sense(echoes[:count], rig)
+    maps = as_eaten(as_map_set(first, truth), network.bare)
+    yield row("as evaluated", "both steps, noise on, one frame", first)
+    if (rebuilt := network.rebuilt(truth)) is not None:
+        yield Row("VAE alone", "no compressor: the decoder on the true latent", judge(rebuilt, truth, box))
+        against = judge(run(network.pipeline, maps), rebuilt, box)
+        yield Row("compressor alone", "no VAE error: against the decoder's image of the true latent", against)
+    raw = judge(network.raw_image(maps), truth, box)
+    yield Row("no silhouette step", "the decoder's image, neither cut nor lifted", raw)
+    yield row("noise off", "no noise, no dead pixels", sense(echoes[:count], rig, QUIET))
+    for number in frames:
+        yield row(f"{number} frames", "averaged", sense(echoes[:count], rig, frames=number))
+    yield row(
+        "training's objects", "by their seeds, with other noise", sense(echoes[count:], rig), truth_of(trained, box)
+    )
+
+
+def limits(asked: argparse.Namespace) -> None:
+    """Measure the limits of the figures of `evaluate`."""
+    box = object_box(rig_of(load_record(asked.weights)))
+    subjects = test_set(box)
+    trained = seeded_objects(TRAINING_SEED, len(subjects), box)
+    rows = [*experiments(asked.weights, subjects, trained, asked.frames)]
+    harness.write("limits", {"objects": len(subjects), "rows": [asdict(row) for row in rows]}, asked.out)
+    print(limits_table(rows))
+
+
+def limits_table(rows: Sequence[Row]) -> str:
+    """Return the experiments as Markdown."""
+    latent = ["" if row.latent_error is None else f"{row.latent_error:.0f}" for row in rows]
+    cells = [
+        [row.name, row.tells, *(in_words(row.figures[name]) for name in BARS), e]
+        for row, e in zip(rows, latent, strict=True)
+    ]
+    return harness.table(["experiment", "change", *BARS, "latent error"], cells)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Place of the lidar before the relay wall."""
+
+    distance_m: float
+    yaw_deg: float
+
+    def rig(self, rig: Rig) -> Rig:
+        """Return the rig with its lidar here."""
+        lidar = rig.lidar.model_copy(update=asdict(self))
+        name = f"{rig.name} at {self.distance_m:g} m, {self.yaw_deg:g} degrees"
+        return rig.model_copy(update={"name": name, "lidar": lidar})
+
+
+def cell(rig: Rig, subjects: Sequence[Subject], networks: Mapping[str, Reconstructor]) -> dict[str, Any]:
+    """Return the figures of all networks on one rig; difference maps are relative to its own bare wall."""
+    box, plan = object_box(rig), DatasetPlan(rig, TEST_SEED)
+    truth = truth_of(subjects, box)
+    maps = as_map_set(sense(echoes_of(subjects, rig, lambda *_: None), rig), truth)
+    inputs = {name: as_eaten(maps, bare_wall_for(network.record, plan)) for name, network in networks.items()}
+    found = {name: judge(reconstruct_all(network, inputs[name]), truth, box) for name, network in networks.items()}
+    return {
+        "rig_checksum": rig.checksum,
+        "share_of_box_in_direct_sight": lidar_sees(rig, box),
+        "share_of_cells_with_a_return": float(np.mean(~np.isnan(maps.depth_m))),
+        "weights": {name: plain(figures) for name, figures in found.items()},
+    }
+
+
+def rigs(asked: argparse.Namespace) -> None:
+    """Map the figures of weights over the rigs of SI 1."""
+    folders: dict[str, Path | None] = harness.by_name(asked.weights) or {"shipped": None}
+    networks = {name: load_reconstructor(folder, cache_folder() / "onnx") for name, folder in folders.items()}
+    rig = load_rig(asked.rig)
+    subjects = test_set(object_box(rig))
+    places = [Place(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG]
+    files = [file for folder in folders.values() for file in sorted((folder or shipped_folder()).iterdir())]
+    key = hashlib.sha256(b"".join(file.read_bytes() for file in files if file.is_file())).hexdigest()
+    cells = harness.collect("rigs", places, lambda place, _: cell(place.rig(rig), subjects, networks), key=key)
+    harness.write("rig_map", {"objects": len(subjects), "cells": cells}, asked.out)
+    harness.save("rig_map", draw_rigs(cells, rig), asked.out, dpi=80)
+    for one in cells:
+        ious = {name: figures["silhouette_iou"]["value"] for name, figures in one["weights"].items()}
+        print(f"{one['distance_m']:g} m, {one['yaw_deg']:g} degrees: IoU {ious}")
+
+
+def draw_rigs(cells: Sequence[Mapping[str, Any]], rig: Rig) -> Figure:
+    """Draw a heat map of each metric for each of the weights; the weights' own rig is framed."""
+    names = list(cells[0]["weights"])
+    distances, angles = (sorted({one[of] for one in cells}) for of in ("distance_m", "yaw_deg"))
+    figure = Figure(figsize=(3.4 * len(BARS), 2.9 * len(names)), layout="constrained")
+    for row, name in zip(figure.subplots(len(names), len(BARS), squeeze=False), names, strict=True):
+        for axis, metric in zip(row, BARS, strict=True):
+            values = np.full((len(distances), len(angles)), np.nan)
+            for one in cells:
+                at = distances.index(one["distance_m"]), angles.index(one["yaw_deg"])
+                value = one["weights"][name][metric]["value"]
+                values[at] = np.nan if value is None else value
+            draw_heat(axis, values, metric)
+            axis.set(xticks=range(len(angles)), xticklabels=[f"{angle:g}" for angle in angles], xlabel="angle, degrees")
+            axis.set(yticks=range(len(distances)), yticklabels=[f"{distance:g}" for distance in distances])
+            if rig.lidar.distance_m in distances and rig.lidar.yaw_deg in angles:
+                corner = angles.index(rig.lidar.yaw_deg) - 0.5, distances.index(rig.lidar.distance_m) - 0.5
+                axis.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor="red", linewidth=2))
+        row[0].set_ylabel(f"{name}\ndistance, m")
+    return figure
+
+
+def draw_heat(axis: Any, values: Any, metric: str) -> None:
+    """Draw one metric over distances and angles, with its numbers."""
+    smaller = metric in SMALLER_IS_BETTER
+    known = values[~np.isnan(values)]
+    low, high = (known.min(), known.max()) if known.size else (0.0, 0.0)
+    axis.imshow(values, cmap="viridis_r" if smaller else "viridis", aspect="auto", origin="lower")
+    for (i, j), value in np.ndenumerate(values):
+        bright = (value - low) / max(high - low, 1e-9)
+        ink = "white" if (1 - bright if smaller else bright) <= 0.55 else "black"  # cells without a value are white
+        words = "none" if np.isnan(value) else f"{value:.0f}" if smaller else f"{value:.2f}"
+        axis.text(j, i, words, ha="center", va="center", fontsize=8, color=ink)
+    axis.set_title(metric.replace("_", " "), fontsize=9)
+
+
+def values_of(folder: Path, judged: Judged) -> PerObject:
+    """Return every metric of every object. Raises CheckpointError for weights of full color."""
+    pipeline, record = load_pipeline(folder)
+    refuse_colour(record, folder)
+    image = run(pipeline, as_eaten(judged.maps, bare_wall_for(record, judged.plan)))
+    return per_object(image, judged.maps.image, judged.plan.box)
+
+
+def compared(
+    without: PerObject, with_them: PerObject, categories: Sequence[str], left_out: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return a row for each kind that was left out, and one for all others."""
+    of = np.array(categories)
+    if missing := sorted(set(left_out) - set(categories)):
+        raise SystemExit(f"no {missing[0]} among the maps: choose from {', '.join(sorted(set(categories)))}")
+    groups = {kind: of == kind for kind in left_out} | {"all others": ~np.isin(of, left_out)}
+    rows = list[dict[str, Any]]()
+    for name, chosen in groups.items():
+        one, other = ({metric: v[chosen] for metric, v in values.items()} for values in (without, with_them))
+        figures = {
+            "without": over_objects(one),
+            "with": over_objects(other),
+            "without_better_by": advantage(one, other),
+        }
+        rows.append(
+            {"objects": name, "count": int(chosen.sum()), **{key: plain(value) for key, value in figures.items()}}
+        )
+    return rows
+
+
+def unseen(asked: argparse.Namespace) -> None:
+    """Compare weights trained without and with some kinds of objects."""
+    judged = stored_objects(asked.held_out)
+    without, with_them = (values_of(folder, judged) for _, folder in (asked.without, asked.with_them))
+    rows = compared(without, with_them, judged.categories, asked.left_out)
+    harness.write("unseen_kinds", {"left_out": asked.left_out, "rows": rows}, asked.out)
+    parts = ("without", in_words), ("with", in_words), ("without_better_by", harness.difference)
+    cells = [
+        [f"{row['objects']} ({row['count']})", part.replace("_", " "), *(words(row[part][metric]) for metric in BARS)]
+        for row in rows
+        for part, words in parts
+    ]
+    print(harness.table(["objects", "training", *BARS], cells))
+
+
+def main() -> None:
+    """Run the named study."""
+    parser = harness.options(__doc__)
+    commands = parser.add_subparsers(required=True)
+    parts = {work.__name__: commands.add_parser(work.__name__, help=work.__doc__) for work in (limits, rigs, unseen)}
+    for work in (limits, rigs, unseen):
+        parts[work.__name__].set_defaults(run=work)
+        parts[work.__name__].add_argument("--out", type=Path, help="folder of the results (default: docs)")
+    parts["limits"].add_argument("--weights", type=Path, default=shipped_folder())
+    parts["limits"].add_argument("--frames", type=int, nargs="*", default=list(FRAMES))
+    parts["rigs"].add_argument("--weights", type=harness.named, action="append", default=[])
+    parts["rigs"].add_argument("--rig", default="paper-rig")
+    parts["unseen"].add_argument("without", type=harness.named)
+    parts["unseen"].add_argument("with_them", type=harness.named, metavar="with")
+    parts["unseen"].add_argument("--held-out", type=Path, default=Path("data/held-out"))
+    parts["unseen"].add_argument("--left-out", default=LEFT_OUT, type=lambda text: text.split(","))
+    asked = parser.parse_args()
+    with harness.one_line_errors():
+        asked.run(asked)
+
+
+if __name__ == "__main__":
+    main()
