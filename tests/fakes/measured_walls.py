@@ -4,6 +4,8 @@ from datetime import date
 from typing import Any
 
 import numpy as np
+from nlos_calibration.board import BOARDS
+from nlos_calibration.board_wall import BoardRecord
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.reference import BareWall
 from nlos_calibration.rig import PinholeRecord, load_rig
@@ -11,6 +13,23 @@ from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import MeasuredWall, WallRecord
 
 WIDTH, HEIGHT = 96, 72
+BOARD = BoardRecord(
+    printed=BOARDS["a4"],
+    measured=True,
+    corners=24,
+    residual_px=0.07,
+    stretch=0.001,
+    bow_m=0.0002,
+    distance_m=0.2034,
+    distance_std_m=0.0005,
+    used="depth",
+    disagreement_m=0.0034,
+    disagreement_deg=0.117,
+    disagreement_sigmas=6.5,
+    causes=("printed at 97 %",),
+    **{f"{angle}_deg": 40.1 for angle in ("yaw", "pitch", "facing")},
+    **{f"{angle}_std_deg": 0.02 for angle in ("yaw", "pitch", "facing")},
+)
 
 
 def exact_wall(**fields: Any) -> MeasuredWall:

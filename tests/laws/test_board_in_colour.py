@@ -1,11 +1,11 @@
-"""What a board seen by another camera must tell: the wall of the lidar, as surely as it is calibrated."""
+"""A board seen by the colour camera gives the lidar's wall, as certainly as the camera is calibrated."""
 
-import importlib
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
+from board_in_colour import A4, COLOUR, LENS, ROOM, TOLD, as_told, colour_frames, coverage
+from board_trials import Bench
 from nlos_calibration.board_wall import EXACT, CameraErrors, wall_with_board
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.noise import DepthMean
@@ -14,71 +14,65 @@ from nlos_calibration.wall import WallFit, fit_wall
 from software_colour import SoftwareColour, record_with_colour
 
 from nlos_cam.calibrate.color_view import look_in_colour
+from nlos_cam.calibrate.synthetic import View, at_near_edge, frame_of
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
 
-TOOLS = Path(__file__).parents[2] / "tools"
 
-
-@pytest.fixture
-def colour(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(TOOLS)
-    return importlib.import_module("board_in_colour")
-
-
-def recorded(colour: ModuleType, path: Path, frames: int = 4) -> Path:
-    """A recording of the rig's bare wall with a board on it: depth, infrared without the board, and colour."""
+def recorded(path: Path, frames: int = 4) -> Path:
+    """Record the rig's bare wall with a board on it: depth, infrared without the board, and colour."""
     rig, generator = load_rig("bare-wall"), np.random.default_rng(0)
-    scenes, views = importlib.import_module("wall_scenes"), importlib.import_module("board_view")
-    seen = views.View(rig.wall_from_lidar, rig.pinhole)
-    bench = colour.Bench(colour.A4, seen, views.at_near_edge(colour.A4, seen), colour.ROOM)
-    depth_m = [np.nan_to_num(scenes.frame_of(seen.depth_m, generator)) for _ in range(frames)]
+    seen = View(rig.wall_from_lidar, rig.pinhole)
+    bench = Bench(A4, seen, at_near_edge(A4, seen), ROOM)
+    depth_m = [np.nan_to_num(frame_of(seen.depth_m, generator)) for _ in range(frames)]
     dim = np.full(depth_m[0].shape, 15, np.uint8)
     images = [SensedImages(np.rint(each / DEPTH_UNIT_M).astype(np.uint16), dim, dim) for each in depth_m]
-    grey = colour.colour_frames(bench, colour.as_told(), frames, generator)
+    grey = colour_frames(bench, as_told(), frames, generator)
     lidar = SoftwareLidar(rig.pinhole, load_sdk())
-    camera = SoftwareColour(lidar, colour.COLOUR, colour.LENS, colour.TOLD.lidar_from_camera)
+    camera = SoftwareColour(lidar, COLOUR, LENS, TOLD.lidar_from_camera)
     return record_with_colour(path, lidar, camera, images, [np.repeat(each[..., np.newaxis], 3, 2) for each in grey])
 
 
-def test_a_board_in_a_recordings_colour_tells_the_lidars_wall(colour: ModuleType, tmp_path: Path) -> None:
-    """From a .bag by librealsense's recorder to the wall: pixels, lens and pose all the way, beside depth and alone."""
-    uri = f"bag:{recorded(colour, tmp_path / 'board.bag')}"
+def test_board_in_a_recordings_colour_gives_the_lidars_wall(tmp_path: Path) -> None:
+    """From a .bag by librealsense's recorder to the wall, by pixels, lens and pose; beside depth and alone."""
+    uri = f"bag:{recorded(tmp_path / 'board.bag')}"
     view = look_in_colour(uri, 30)
     with open_camera(uri) as camera:
         mean = DepthMean(camera.intrinsics.height, camera.intrinsics.width)
         for frame in camera:
             mean.add(frame.depth_m)
     depth = fit_wall(mean.mean_m(), camera.intrinsics, np.random.default_rng(0), mean.noise())
-    both, record = wall_with_board(depth, view, colour.A4, measured=True)
+    both, record = wall_with_board(depth, view, A4, measured=True)
     assert isinstance(both, WallFit)
     assert (both.verdict, record.used, record.seen_in) == ("good", "both", "colour")
     assert record.corners > 15
     assert record.facing_std_deg == pytest.approx(view.errors.turn_std_deg, rel=0.3)
-    alone, _ = wall_with_board(WallRefusedError("it drifts"), view, colour.A4, measured=True)
+    alone, _ = wall_with_board(WallRefusedError("it drifts"), view, A4, measured=True)
     assert alone.verdict == "doubtful"
     assert alone.distance_m == pytest.approx(0.2, abs=0.001)
     assert (alone.yaw_deg, alone.pitch_deg) == pytest.approx((45.0, 0.0), abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "errors",
     [CameraErrors(), EXACT, CameraErrors(0.0, 0.0, 0.003), CameraErrors(1.0, 0.0, 0.0), CameraErrors(0.0, 0.005, 0.0)],
     ids=["all", "none", "focal length", "turn", "shift"],
 )
-def test_the_truth_is_in_the_interval_as_often_as_it_should_be(colour: ModuleType, errors: CameraErrors) -> None:
-    """Of each error by itself it would not be, if that one were left out of what is told."""
-    told = colour.coverage(300, 0.05, 7, errors)
+def test_board_in_colour_interval_holds_the_truth_as_stated(errors: CameraErrors) -> None:
+    """For each calibration error by itself: it would not, were that error left out of the uncertainty."""
+    told = coverage(300, 0.05, 7, errors)
     assert told["refused"] <= 3
     for share in told["in_95_percent_interval"].values():
         assert 0.91 < share < 0.985
 
 
-def test_rendered_boards_are_as_sure_as_they_say(colour: ModuleType) -> None:
-    """15 benches, three figures of each: pooled, a share of 95 % is found above 84 % but for once in 1000."""
-    told = colour.coverage(15, None, 8)
+@pytest.mark.slow
+def test_rendered_board_in_colour_interval_holds_the_truth() -> None:
+    """Of 15 benches, three quantities each: pooled, a share of 95 % is found above 84 % but once in 1000."""
+    told = coverage(15, None, 8)
     assert told["refused"] <= 1
     assert told["in_95_percent_interval_pooled"] > 0.84
     assert told["p95"]["distance_mm"] < 3.0

@@ -1,4 +1,4 @@
-"""What a calibration of the wall must be, whatever the wall: exact enough, repeatable, and never wrong and content."""
+"""A calibrated wall is accurate and repeatable for any wall, and never wrong without a warning."""
 
 import numpy as np
 import pytest
@@ -6,81 +6,69 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.geometry import angles_from_normal, normal_from_angles, wall_from_plane
-from nlos_calibration.noise import DepthMean
+from nlos_calibration.geometry import angles_from_normal, wall_from_plane
 from nlos_calibration.plane import fit_plane
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth
+from numpy.typing import NDArray
+
+from nlos_cam.calibrate.synthetic import View, looked_at, view
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 LONGEST_DEPTH_M = 4.0
-FRAMES = 8
-
 distances_m = st.floats(0.15, 0.30)
 yaws_deg = st.floats(15.0, 70.0) | st.floats(-70.0, -15.0)
 pitches_deg = st.floats(-15.0, 15.0)
 few = settings(derandomize=True, deadline=None, max_examples=15)
 
 
-def pose_of(distance_m: float, yaw_deg: float, pitch_deg: float) -> Float64:
-    return wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m)
-
-
-def through_sensor(depth_m: Float64, generator: np.random.Generator, dead: float) -> Float64:
-    """One frame of `depth_m` as an L515 would give it: noise, steps of 0.25 mm, a limited range, dead pixels."""
-    seen = np.where(depth_m < LONGEST_DEPTH_M, depth_m, np.nan)
-    noisy = seen + generator.standard_normal(seen.shape) * (0.0005 + 0.002 * seen)
-    return np.where(generator.random(seen.shape) < dead, np.nan, np.round(noisy / 0.00025) * 0.00025)
-
-
-def measured(depth_m: Float64, seed: int = 0, frames: int = FRAMES, dead: float = 0.03) -> WallFit:
-    mean, generator = DepthMean(*depth_m.shape), np.random.default_rng(seed)
-    for _ in range(frames):
-        mean.add(through_sensor(depth_m, generator, dead).astype(np.float32))
+def measured(depth_m: Float64, seed: int = 0, frames: int = 8) -> WallFit:
+    generator = np.random.default_rng(seed)
+    mean = looked_at(depth_m, generator, frames=frames, noise=1.0)
     return fit_wall(mean.mean_m(), PINHOLE, generator, mean.noise())
 
 
-def assert_close(fit: WallFit, distance_m: float, pose: Float64) -> None:
-    assert abs(fit.distance_m - distance_m) < 1e-3
-    tilt = np.arccos(np.clip(fit.wall_from_lidar[2, :3] @ pose[2, :3], -1.0, 1.0))
+def assert_close(fit: WallFit, wall: View) -> None:
+    assert abs(fit.distance_m - wall.pose[2, 3]) < 1e-3
+    tilt = np.arccos(np.clip(fit.wall_from_lidar[2, :3] @ wall.pose[2, :3], -1.0, 1.0))
     assert np.degrees(tilt) < 0.2
 
 
 @pytest.mark.parametrize("pitch_deg", [-12.0, 0.0, 8.0])
 @pytest.mark.parametrize("yaw_deg", [-45.0, 15.0, 30.0, 45.0, 60.0, 74.0])
 @pytest.mark.parametrize("distance_m", [0.15, 0.20, 0.30])
-def test_every_wall_of_the_papers_ranges_is_measured(distance_m: float, yaw_deg: float, pitch_deg: float) -> None:
-    pose = pose_of(distance_m, yaw_deg, pitch_deg)
-    fit = measured(wall_depth(pose, PINHOLE))
-    assert_close(fit, distance_m, pose)
+def test_wall_fit_measures_every_wall_of_the_papers_ranges(distance_m: float, yaw_deg: float, pitch_deg: float) -> None:
+    wall = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
+    fit = measured(wall.depth_m)
+    assert_close(fit, wall)
     assert fit.verdict == "good"
 
 
 @few
 @given(distances_m, yaws_deg, pitches_deg, st.floats(0.0, 0.3), st.integers(0, 1000))
-def test_one_frame_with_dead_pixels_is_enough(
+def test_wall_fit_needs_one_frame_even_with_dead_pixels(
     distance_m: float, yaw_deg: float, pitch_deg: float, dead: float, seed: int
 ) -> None:
-    pose = pose_of(distance_m, yaw_deg, pitch_deg)
-    assert_close(measured(wall_depth(pose, PINHOLE), seed, frames=1, dead=dead), distance_m, pose)
+    wall = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
+    alive = np.random.default_rng(seed).random(wall.depth_m.shape) >= dead
+    assert_close(measured(np.where(alive, wall.depth_m, np.nan), seed, frames=1), wall)
 
 
 @few
 @given(distances_m, yaws_deg, pitches_deg, st.floats(0.0, 0.4), st.integers(0, 1000))
-def test_outliers_up_to_forty_percent_are_tolerated(
+def test_wall_fit_tolerates_forty_percent_of_outliers(
     distance_m: float, yaw_deg: float, pitch_deg: float, share: float, seed: int
 ) -> None:
-    pose, generator = pose_of(distance_m, yaw_deg, pitch_deg), np.random.default_rng(seed)
-    depth_m = wall_depth(pose, PINHOLE)
-    stray = generator.random(depth_m.shape) < share
-    depth_m[stray] = generator.uniform(0.05, 2.0, int(stray.sum()))
-    assert_close(measured(depth_m, seed), distance_m, pose)
+    wall = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
+    generator, shape = np.random.default_rng(seed), wall.depth_m.shape
+    stray = generator.random(shape) < share  # also where no wall is met
+    assert_close(measured(np.where(stray, generator.uniform(0.05, 2.0, shape), wall.depth_m), seed), wall)
 
 
 @few
 @given(distances_m, st.floats(-80.0, 80.0), st.floats(-80.0, 80.0))
-def test_angles_make_a_pose_and_the_pose_its_angles(distance_m: float, yaw_deg: float, pitch_deg: float) -> None:
-    pose = pose_of(distance_m, yaw_deg, pitch_deg)
+def test_wall_pose_and_angles_are_inverse(distance_m: float, yaw_deg: float, pitch_deg: float) -> None:
+    pose = view(distance_m, yaw_deg, pitch_deg, PINHOLE).pose
     assert np.degrees(angles_from_normal(pose[2, :3])) == pytest.approx((yaw_deg, pitch_deg), abs=1e-9)
     np.testing.assert_allclose(wall_from_plane(pose[2, :3], pose[2, 3]), pose, atol=1e-12)
 
@@ -92,29 +80,31 @@ def test_angles_make_a_pose_and_the_pose_its_angles(distance_m: float, yaw_deg: 
     st.floats(-3.0, 3.0),
     st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(0.0, 0.1)),
 )
-def test_a_plane_moves_with_its_points(
+def test_fit_plane_moves_with_its_points(
     yaw_rad: float, pitch_rad: float, roll_rad: float, shift: tuple[float, ...]
 ) -> None:
-    pose = pose_of(0.2, 20.0, 5.0)
-    points = (PINHOLE.scaled(40, 30).rays() * wall_depth(pose, PINHOLE.scaled(40, 30))[..., np.newaxis]).reshape(-1, 3)
+    wall = view(0.2, 20.0, 5.0, PINHOLE.scaled(40, 30))
+    points = (PINHOLE.scaled(40, 30).rays() * wall.depth_m[..., np.newaxis]).reshape(-1, 3)
     roll = np.array([[np.cos(roll_rad), -np.sin(roll_rad), 0], [np.sin(roll_rad), np.cos(roll_rad), 0], [0, 0, 1]])
-    turn = roll @ pose_of(1.0, np.degrees(yaw_rad), np.degrees(pitch_rad))[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    turn = (
+        roll @ view(1.0, np.degrees(yaw_rad), np.degrees(pitch_rad), PINHOLE).pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    )
     fit = fit_plane(points @ turn.T + shift, np.random.default_rng(0))
-    normal = turn @ pose[2, :3]
+    normal = turn @ wall.pose[2, :3]
     np.testing.assert_allclose(fit.normal, normal, atol=1e-6)
     assert fit.distance_m == pytest.approx(0.2 - normal @ shift, abs=1e-6)
 
 
-def test_the_same_frames_give_the_same_wall() -> None:
-    depth_m = wall_depth(pose_of(0.2, 45.0, 0.0), PINHOLE)
+def test_wall_fit_is_repeatable() -> None:
+    depth_m = view(0.2, 45.0, 0.0, PINHOLE).depth_m
     np.testing.assert_array_equal(measured(depth_m).wall_from_lidar, measured(depth_m).wall_from_lidar)
 
 
 @few
 @given(distances_m, st.floats(-60.0, 60.0), st.floats(15.0, 120.0))
-def test_two_walls_in_a_corner_are_refused(distance_m: float, yaw_deg: float, bend_deg: float) -> None:
+def test_wall_fit_refuses_two_walls_in_a_corner(distance_m: float, yaw_deg: float, bend_deg: float) -> None:
     """The second wall turns `bend_deg` from the first along an edge through the middle of the view."""
-    first = wall_depth(pose_of(distance_m, yaw_deg, 0.0), PINHOLE)
+    first = view(distance_m, yaw_deg, 0.0, PINHOLE).depth_m
     middle_m = first[:, 80:81]
     second = middle_m / (1.0 + np.arange(-80, 80) / PINHOLE.fx * np.tan(np.radians(bend_deg / 2.0 + 8.0)))
     corner = np.where(np.arange(160) < 80, first, np.where(second > 0.0, second, np.nan))
@@ -122,9 +112,9 @@ def test_two_walls_in_a_corner_are_refused(distance_m: float, yaw_deg: float, be
         measured(corner)
 
 
-def three_bounce_depth(rig_name: str = "paper-rig") -> tuple[Float64, Float64, Float64]:
-    """(wall, occluder, three-bounce) depth maps of the paper's rig with a point in the middle of the object box."""
-    rig = load_rig(rig_name)
+def three_bounce_depth() -> tuple[Float64, Float64, Float64]:
+    """Return (wall, occluder, three-bounce) depth of the paper's rig with a point in its object box."""
+    rig = load_rig("paper-rig")
     pose, rays = rig.wall_from_lidar, PINHOLE.rays()
     lidar, directions = pose[:3, 3], rays @ pose[:3, :3].T
     wall_m = wall_depth(pose, PINHOLE)
@@ -140,24 +130,22 @@ def three_bounce_depth(rig_name: str = "paper-rig") -> tuple[Float64, Float64, F
     return wall_m, occluder_m, bounced_m
 
 
+def cells_won(share: float) -> NDArray[np.bool_]:
+    """Return random cells of 8 x 8 pixels that report the three-bounce path, as a share of all."""
+    return np.kron(np.random.default_rng(2).random((15, 20)) < share, np.ones((8, 8))) > 0.0
+
+
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9, 1.0])
-def test_the_paper_rig_with_a_hidden_object_is_refused(share: float) -> None:
-    """`share` of the wall's cells of 8 x 8 pixels that see the box report the three-bounce path."""
+def test_wall_fit_refuses_a_hidden_object_behind_an_occluder(share: float) -> None:
     wall_m, occluder_m, bounced_m = three_bounce_depth()
-    wins = np.kron(np.random.default_rng(2).random((15, 20)) < share, np.ones((8, 8))) > 0.0
-    depth_m = np.where(wins & ~np.isnan(bounced_m), bounced_m, wall_m)
+    depth_m = np.where(cells_won(share) & ~np.isnan(bounced_m), bounced_m, wall_m)
     with pytest.raises(WallRefusedError, match="behind"):
         measured(np.where(np.isnan(occluder_m), depth_m, occluder_m))
 
 
-def test_a_hidden_object_without_an_occluder_is_refused() -> None:
-    wall_m, _, bounced_m = three_bounce_depth()
-    wins = np.kron(np.random.default_rng(2).random((15, 20)) < 0.2, np.ones((8, 8))) > 0.0
+def test_wall_fit_refuses_a_hidden_object_or_an_occluder_alone() -> None:
+    wall_m, occluder_m, bounced_m = three_bounce_depth()
     with pytest.raises(WallRefusedError, match="behind"):
-        measured(np.where(wins & ~np.isnan(bounced_m), bounced_m, wall_m))
-
-
-def test_an_occluder_without_an_object_is_refused() -> None:
-    wall_m, occluder_m, _ = three_bounce_depth()
+        measured(np.where(cells_won(0.2) & ~np.isnan(bounced_m), bounced_m, wall_m))
     with pytest.raises(WallRefusedError, match="in front"):
         measured(np.where(np.isnan(occluder_m), wall_m, occluder_m))

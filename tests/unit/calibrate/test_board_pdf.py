@@ -1,0 +1,73 @@
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from nlos_calibration.board import BOARDS, PAPER_MM, Board, Paper
+
+from nlos_cam.calibrate.board_pdf import BAR_MM, bar_mm, black_cells, pattern_origin_mm, sheet_figure, write_sheet
+
+DPI = 254
+PIXELS_PER_MM = DPI / 25.4
+
+
+@pytest.fixture(scope="module", params=list(BOARDS))
+def page(request: pytest.FixtureRequest) -> tuple[Paper, np.ndarray]:
+    """A sheet as printed, at ten dots per millimetre."""
+    figure = sheet_figure(request.param)
+    figure.set_dpi(DPI)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return request.param, np.asarray(canvas.buffer_rgba())[..., 0].copy()
+
+
+def test_board_sheet_corners_are_detected_where_drawn(page: tuple[Paper, np.ndarray]) -> None:
+    paper, dots = page
+    board, (left_mm, top_mm) = BOARDS[paper], pattern_origin_mm(paper)
+    pixels, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(dots)
+    assert len(markers) == board.squares_x * board.squares_y // 2
+    assert len(ids) == len(board.corners_m)
+    expected = (board.corners_m[ids.ravel(), :2] * 1e3 + [left_mm, top_mm]) * PIXELS_PER_MM - 0.5
+    np.testing.assert_allclose(pixels, expected, atol=0.6)  # 0.06 mm
+
+
+def test_board_sheet_scale_bar_measures_100_mm(page: tuple[Paper, np.ndarray]) -> None:
+    paper, dots = page
+    (_, top_mm, _, height_mm), *_ = bar_mm(paper)
+    black = np.flatnonzero(dots[int((top_mm + height_mm / 2.0) * PIXELS_PER_MM)] < 128)
+    assert len(black) == black[-1] - black[0] + 1
+    assert len(black) / PIXELS_PER_MM == pytest.approx(BAR_MM, abs=0.15)
+
+
+def test_board_sheet_leaves_margin_and_pattern_clear(page: tuple[Paper, np.ndarray]) -> None:
+    paper, dots = page
+    edge = int(5.0 * PIXELS_PER_MM)
+    frame = dots.copy()
+    frame[edge:-edge, edge:-edge] = 255
+    assert (frame == 255).all()
+    bottom = int((pattern_origin_mm(paper)[1] + BOARDS[paper].size_mm[1]) * PIXELS_PER_MM) + 1
+    quiet = dots[bottom : bottom + int(2.0 * PIXELS_PER_MM)]
+    assert (quiet == 255).all()
+
+
+def test_black_cells_are_those_that_opencv_draws() -> None:
+    """For a board whose marker does not fill a whole number of the drawing's cells."""
+    board, k = Board(squares_x=4, squares_y=5, square_mm=24.0, marker_mm=18.0), 48
+    drawn = np.full((5 * k, 4 * k), 255, np.uint8)
+    for left, top, width, height in black_cells(board, 0.0, 0.0):
+        rows, columns = ((start, start + size) for start, size in ((top, height), (left, width)))
+        drawn[slice(*(round(2 * at) for at in rows)), slice(*(round(2 * at) for at in columns))] = 0
+    np.testing.assert_array_equal(drawn, board.pattern(k))
+
+
+@pytest.mark.parametrize("paper", list(BOARDS))
+def test_write_sheet_makes_a_vector_page_of_the_paper(tmp_path: Path, paper: Paper) -> None:
+    write_sheet(tmp_path / "board.pdf", paper)
+    content = (tmp_path / "board.pdf").read_bytes()
+    assert content.startswith(b"%PDF-")
+    (box,) = re.findall(rb"/MediaBox \[([^\]]*)\]", content)
+    points = [0.0, 0.0, *(72.0 * mm / 25.4 for mm in PAPER_MM[paper])]
+    assert [float(number) for number in box.split()] == pytest.approx(points, abs=0.01)
+    assert b"/Subtype /Image" not in content

@@ -1,0 +1,218 @@
+import struct
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_librealsense import FakeSdk
+from fake_lidar import COLOUR_FROM_DEPTH, LENS, FakeLidar
+from nlos_calibration.board import Corners
+from nlos_calibration.board_wall import BoardView, CameraErrors, undistorted
+from nlos_calibration.geometry import Intrinsics
+from software_colour import SoftwareColour, record_with_colour
+
+from nlos_cam.calibrate.color_view import GREY, SETTLES, look_in_colour
+from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera.simulated import SoftwareLidar
+from nlos_cam.errors import (
+    CameraError,
+    CameraLostError,
+    CameraNotFoundError,
+    NlosCamError,
+    RecordingError,
+    StreamMissingError,
+)
+from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.render.sensor.sensor import SensedImages
+
+SMALL = Intrinsics(64, 48, 60.0, 61.0, 33.0, 22.0)
+FLAT = SensedImages(np.full((48, 64), 800, np.uint16), np.full((48, 64), 48, np.uint8), np.full((48, 64), 15, np.uint8))
+LIDAR_FROM_COLOUR = np.linalg.inv(np.vstack([COLOUR_FROM_DEPTH, [0.0, 0.0, 0.0, 1.0]]))
+FRAMES = 4
+
+
+class Desk:
+    """The pyrealsense2 module, whose context holds a software device: an L515 with a colour camera."""
+
+    def __init__(self) -> None:
+        self.sdk = load_sdk()
+        self.lidar, self._context = SoftwareLidar(SMALL, self.sdk), self.sdk.context()
+        self.colour = SoftwareColour(self.lidar, SMALL, np.array(LENS), LIDAR_FROM_COLOUR)
+        self.lidar.device.add_to(self._context)
+        self.looked_at, self._stop = 0, threading.Event()
+        self._thread = threading.Thread(target=self._deliver, name="colour")
+        self._thread.start()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.sdk, name)
+
+    def context(self) -> Any:
+        return self._context
+
+    def _deliver(self) -> None:
+        number = 0
+        while not self._stop.wait(0.005):
+            if self.colour.sensor.get_active_streams():
+                self.colour.push(number, np.full((48, 64, 3), 90, np.uint8))
+                number += 1
+
+    def on_frame(self) -> None:
+        """End the delivery with the last frame: a stopped software device must get none."""
+        self.looked_at += 1
+        if self.looked_at == FRAMES:
+            self.end()
+
+    def end(self) -> None:
+        self._stop.set()
+        self._thread.join(5.0)
+
+
+def recorded(path: Path, greys: list[int], form: str = "rgb8") -> Path:
+    lidar = SoftwareLidar(SMALL, load_sdk())
+    colour = SoftwareColour(lidar, replace(SMALL, width=32, height=24), np.array(LENS), LIDAR_FROM_COLOUR, form)
+    channels = 3 if form in {"rgb8", "bgr8"} else 2 if form in {"yuyv", "uyvy"} else 4
+    return record_with_colour(
+        path, lidar, colour, [FLAT], [np.full((24, 32, channels), grey, np.uint8) for grey in greys]
+    )
+
+
+def test_look_in_colour_averages_the_last_frames(tmp_path: Path) -> None:
+    path, told = recorded(tmp_path / "a.bag", [0, 10, 20, 40]), list[int]()
+    view = look_in_colour(f"bag:{path}", 2, on_frame=lambda: told.append(1))
+    np.testing.assert_array_equal(view.image, np.full((24, 32), 30.0))
+    assert len(told) == 2
+    np.testing.assert_array_equal(look_in_colour(f"bag:{path}", 99).image, np.full((24, 32), 17.5))
+
+
+def assert_same_as_the_sdk(path: Path) -> None:
+    view = look_in_colour(f"bag:{path}", 1)
+    sensors = load_sdk().context().load_device(str(path)).as_playback().query_sensors()
+    profiles = {profile.stream_type().name: profile for s in sensors for profile in s.get_stream_profiles()}
+    told = profiles["color"].as_video_stream_profile().get_intrinsics()
+    np.testing.assert_allclose(view.distortion, told.coeffs)
+    assert (view.intrinsics.fx, view.intrinsics.ppy) == (told.fx, told.ppy)
+    extrinsics = profiles["color"].get_extrinsics_to(profiles["depth"])
+    np.testing.assert_allclose(view.lidar_from_camera[:3, :3], np.reshape(extrinsics.rotation, (3, 3)).T, atol=1e-6)
+    np.testing.assert_allclose(view.lidar_from_camera[:3, 3], extrinsics.translation, atol=1e-7)
+    assert (view.light, view.errors) == ("colour", CameraErrors())
+
+
+def test_look_in_colour_reads_lens_and_pose_like_the_sdk(tmp_path: Path) -> None:
+    assert_same_as_the_sdk(recorded(tmp_path / "a.bag", [5]))
+
+
+def test_look_in_colour_reads_a_real_recording_like_the_sdk(real_bag: Path) -> None:
+    assert_same_as_the_sdk(real_bag)
+    rgb = BagFile(real_bag).sample("color", 0).pixels
+    grey = look_in_colour(f"bag:{real_bag}", 1).image
+    np.testing.assert_allclose(grey, rgb @ [0.299, 0.587, 0.114], atol=1.0)
+
+
+def test_undistorted_inverts_the_sdks_lens() -> None:
+    """The lens model and the order of its coefficients are librealsense's."""
+    sdk = load_sdk()
+    made = sdk.intrinsics()
+    made.width, made.height, made.fx, made.fy, made.ppx, made.ppy = 1280, 720, 907.0, 908.0, 660.0, 367.0
+    made.model, made.coeffs = sdk.distortion.brown_conrady, LENS
+    rays = np.random.default_rng(0).uniform([-0.65, -0.38], [0.65, 0.38], (50, 2))
+    seen = np.array([sdk.rs2_project_point_to_pixel(made, [x, y, 1.0]) for x, y in rays])
+    view = BoardView(np.zeros((720, 1280)), Intrinsics(1280, 720, 907.0, 908.0, 660.0, 367.0), np.array(LENS))
+    straight = undistorted(Corners(np.arange(50), seen), view).pixels
+    np.testing.assert_allclose(straight, rays * [907.0, 908.0] + [660.0, 367.0], atol=1e-3)
+    assert np.abs(seen - straight).max() > 1.0
+
+
+@pytest.mark.parametrize("form", GREY)
+def test_look_in_colour_makes_every_format_grey(tmp_path: Path, form: str) -> None:
+    image = look_in_colour(f"bag:{recorded(tmp_path / 'a.bag', [77], form)}", 1).image
+    np.testing.assert_array_equal(image, np.full((24, 32), 77.0))
+
+
+def test_grey_weighs_each_channel_by_its_luminance() -> None:
+    pixel = np.array([[[200, 100, 50, 255]]], np.uint8)
+    expected = 0.299 * 200 + 0.587 * 100 + 0.114 * 50
+    for form, order in {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2, 3], "bgra8": [2, 1, 0, 3]}.items():
+        assert GREY[form](np.ascontiguousarray(pixel[..., order]))[0, 0] == pytest.approx(expected, abs=0.6)
+    luma = np.array([[91, 7]], np.uint8).view("<u2")
+    assert (GREY["yuyv"](luma)[0, 0], GREY["uyvy"](luma)[0, 0]) == (91, 7)
+
+
+def test_look_in_colour_refuses_unusable_recordings(noise_bag: Path, rewritten: Any, tmp_path: Path) -> None:
+    """Without colour, without the colour camera's pose, with images of another size than the lens is for."""
+
+    def narrower(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
+        if topic.endswith("Color_0/image/data"):
+            raw = raw.replace(struct.pack("<II", 24, 32), struct.pack("<II", 48, 16), 1)
+            raw = raw.replace(b"rgb8\0" + struct.pack("<I", 96), b"rgb8\0" + struct.pack("<I", 48), 1)
+        return [(time_ns, raw)]
+
+    with pytest.raises(StreamMissingError, match=r"noise\.bag.*color"):
+        look_in_colour(f"bag:{noise_bag}", 5)
+    source = recorded(tmp_path / "a.bag", [5])
+    path = rewritten(lambda topic, time, raw: [] if "Color_0/tf" in topic else [(time, raw)], source=source)
+    with pytest.raises(RecordingError, match="color"):
+        look_in_colour(f"bag:{path}", 1)
+    path.unlink()
+    with pytest.raises(RecordingError, match="16 x 48 rgb8"):
+        look_in_colour(f"bag:{rewritten(narrower, source=source)}", 1)
+
+
+@pytest.mark.parametrize("uri", ["sim", "sim:bare-wall", "bag:", "kinect", "l515:x"])
+def test_look_in_colour_refuses_a_camera_that_is_not_there(uri: str) -> None:
+    with pytest.raises(CameraError if uri.startswith("sim") else CameraNotFoundError, match=uri.removeprefix("l515:")):
+        look_in_colour(uri, 5, sdk=FakeSdk(fake()))
+
+
+def fake(brightness: Callable[[int], int] = lambda _: 100, **how: Any) -> FakeLidar:
+    lidar = FakeLidar(**({"runs": (200,)} | how))
+    lidar.colour = brightness
+    return lidar
+
+
+def test_look_in_colour_waits_for_a_live_cameras_exposure() -> None:
+    lidar = fake(lambda number: 100 if number >= SETTLES else 200)
+    view = look_in_colour("l515", 3, sdk=FakeSdk(lidar))
+    np.testing.assert_array_equal(view.image, np.full((720, 1280), 100.0))
+    np.testing.assert_array_equal(view.distortion, LENS)
+    np.testing.assert_allclose(view.lidar_from_camera, LIDAR_FROM_COLOUR, atol=1e-12)
+    assert lidar.did == ["start", "stop", "close"]
+
+
+def test_look_in_colour_on_usb_2_takes_the_size_offered() -> None:
+    view = look_in_colour("l515:f0246262", 1, sdk=FakeSdk(fake(usb="2.1")))
+    assert (view.intrinsics.width, view.intrinsics.height) == (640, 480)
+
+
+def test_look_in_colour_refuses_no_colour_and_unknown_lenses() -> None:
+    with pytest.raises(CameraError, match="colour"):
+        look_in_colour("l515", 1, sdk=FakeSdk(FakeLidar()))
+    lidar = fake()
+    lidar.lens_model = "inverse_brown_conrady"
+    with pytest.raises(NlosCamError, match="inverse_brown_conrady"):
+        look_in_colour("l515", 2, sdk=FakeSdk(lidar))
+
+
+def test_look_in_colour_closes_a_camera_that_fails() -> None:
+    silent, busy = fake(runs=(SETTLES + 1,)), fake()
+    with pytest.raises(CameraLostError, match=r"0\.2 s"):
+        look_in_colour("l515", 2, sdk=FakeSdk(silent), silence_s=0.2)
+    assert silent.did[-2:] == ["stop", "close"]
+    busy.start_error = RuntimeError("busy")
+    with pytest.raises(CameraError, match="busy"):
+        look_in_colour("l515", 2, sdk=FakeSdk(busy))
+    assert busy.did[-1] == "close"
+
+
+def test_look_in_colour_works_on_librealsense_itself() -> None:
+    desk = Desk()
+    try:
+        view = look_in_colour("l515", FRAMES, sdk=desk, on_frame=desk.on_frame)
+    finally:
+        desk.end()
+    np.testing.assert_array_equal(view.image, np.full((48, 64), 90.0))
+    np.testing.assert_allclose(view.distortion, LENS, rtol=1e-6)
+    np.testing.assert_allclose(view.lidar_from_camera, LIDAR_FROM_COLOUR, atol=1e-6)
+    assert view.intrinsics == SMALL

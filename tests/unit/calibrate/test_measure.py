@@ -1,0 +1,201 @@
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from datetime import date
+
+import numpy as np
+import pytest
+from nlos_calibration.board import BOARDS
+from nlos_calibration.errors import BoardRefusedError, CalibrationError, OccluderRefusedError, WallRefusedError
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.reference import BareWallStatistics
+from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
+from nlos_calibration.wall import wall_depth
+from nlos_calibration.wall_record import MeasuredWall, wall_record
+
+from nlos_cam.calibrate.measure import CELSIUS_EVERY, Seen, by_board, by_depth, by_occluder, glance, look
+from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.render.geometry import cast
+
+RIG = load_rig("bare-wall")
+BENCH = load_rig("paper-rig")
+INTRINSICS = RIG.pinhole.scaled(160, 120)
+SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
+SHAPE = (64, 80)
+
+
+class Warming:
+    """Camera of a wall of one depth, with noise, whose temperature rises by a degree with each reading."""
+
+    uri, intrinsics = "l515", SMALL
+
+    def __init__(self, frames: int) -> None:
+        self.identity = {"serial": "f1"}
+        self.celsius = 30.0
+        generator = np.random.default_rng(0)
+        depths_m = 0.2 + 0.001 * generator.standard_normal((frames, *SHAPE))
+        counts = np.full(SHAPE, 48, np.uint8)
+        self.given = [
+            Frame(depth_m.astype(np.float32), counts, counts, number / 30, number, SMALL, {"laser_power": 40.0})
+            for number, depth_m in enumerate(depths_m)
+        ]
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.given)
+
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        assert ending == "_temperature"
+        self.celsius += 1.0
+        return {"ldd_temperature": self.celsius}
+
+
+def test_look_collects_statistics_of_all_frames() -> None:
+    camera = Warming(20)
+    wall = look(camera, 1000).reference(np.ones(SHAPE, np.bool_))
+    depths_m = np.stack([frame.depth_m for frame in camera.given]).astype(np.float64)
+    maps_m = np.stack([maps_from_frame(frame).depth_m for frame in camera.given])
+    np.testing.assert_allclose(wall.depth_m, depths_m.mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(wall.map_depth_m, maps_m.mean(axis=0), rtol=1e-6)
+    np.testing.assert_array_equal(wall.map_intensity, 48.0)
+    assert (wall.frames, wall.serial, wall.settings) == (20, "f1", {"laser_power": 40.0})
+    assert look(Warming(10), 4).statistics.depth.frames == 4
+
+
+def test_look_reads_temperatures_now_and_then() -> None:
+    seen = look(Warming(2 * CELSIUS_EVERY + 1), 1000)
+    assert seen.facts()["temperatures_c"] == {"ldd_temperature": 32.0}
+    assert seen.reference(np.ones(SHAPE, np.bool_)).celsius_span == {"ldd_temperature": 2.0}
+
+
+def test_look_refuses_a_camera_without_frames() -> None:
+    with pytest.raises(WallRefusedError, match="l515"):
+        look(Warming(0), 1000)
+
+
+def seen_of(depth_m: np.ndarray, frames: int, intrinsics: Intrinsics = INTRINSICS, seed: int = 0) -> Seen:
+    statistics, dark = BareWallStatistics(intrinsics), np.zeros(depth_m.shape, np.uint8)
+    cells, generator = np.full((64, 80), 0.2, np.float32), np.random.default_rng(seed)
+    for _ in range(frames):
+        noise_m = generator.standard_normal(depth_m.shape) * (0.0005 + 0.002 * depth_m)
+        statistics.add((depth_m + noise_m).astype(np.float32), dark, cells, cells)
+    return Seen("sim", statistics, intrinsics, "", "", {})
+
+
+def bench_seen(intrinsics: Intrinsics = INTRINSICS, **changes: object) -> Seen:
+    """What the lidar of the paper's rig sees with its occluder in place and nothing hidden, by its beams."""
+    beams = cast(BENCH.model_copy(update=changes), intrinsics)
+    return seen_of((beams.length_m * beams.cos_axis).reshape(intrinsics.height, intrinsics.width), 20, intrinsics, 1)
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    return seen_of(wall_depth(RIG.wall_from_lidar, INTRINSICS), 10)
+
+
+def measured(seen: Seen, tape_m: float | None = None) -> MeasuredWall:
+    fit, facts = by_depth(seen, tape_m)
+    about = {"camera": "sim", "frames": 10, "created": date(2026, 1, 2)}
+    return MeasuredWall(wall_record(fit, INTRINSICS, **about, others=facts), None)
+
+
+@pytest.fixture(scope="module")
+def bare(seen: Seen) -> MeasuredWall:
+    return measured(seen)
+
+
+def test_by_depth_measures_the_wall_and_the_tapes_offset(seen: Seen) -> None:
+    fit, facts = by_depth(seen)
+    assert facts == {}
+    assert fit.distance_m == pytest.approx(0.2, abs=4 * fit.distance_std_m)
+    fit, facts = by_depth(seen, 0.204)
+    assert fit.distance_m == pytest.approx(0.204, abs=1e-5)
+    assert facts["range_offset_m"] == pytest.approx(0.004 * np.sqrt(2.0), abs=2e-5)
+
+
+def test_by_depth_and_by_board_refuse_what_they_cannot_find(seen: Seen) -> None:
+    with pytest.raises(CalibrationError, match=r"0\.3"):
+        by_depth(seen, 0.3)
+    with pytest.raises(WallRefusedError):
+        by_depth(Seen("sim", BareWallStatistics(INTRINSICS), INTRINSICS, "", "", {}))
+    with pytest.raises(BoardRefusedError):
+        by_board(seen, BOARDS["a4"], None)
+
+
+@pytest.mark.parametrize(("x_m", "gap_m"), [(0.2, 0.1), (0.22, 0.08), (0.19, 0.11)])
+def test_by_occluder_finds_it_beside_the_known_wall(bare: MeasuredWall, x_m: float, gap_m: float) -> None:
+    seen = bench_seen(occluder=Occluder(x_m=x_m, z_min_m=gap_m))
+    record, inliers = by_occluder(seen, bare)
+    assert record.occluder is not None
+    assert (record.occluder.source, record.verdict) == ("detected", "good")
+    assert (record.occluder.x_m, record.occluder.gap_m) == pytest.approx((x_m, gap_m), abs=0.002)
+    assert record.rig.occluder == Occluder(x_m=record.occluder.x_m, z_min_m=record.occluder.gap_m)
+    assert record.rig.lidar == bare.record.rig.lidar
+    far = np.abs(wall_depth(RIG.wall_from_lidar, INTRINSICS) - seen.statistics.depth.mean_m()) > 0.02
+    assert 0.1 < far.mean() < 0.5
+    assert not (inliers & far).any()
+    assert inliers[~far].mean() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("lidar", "amount"),
+    [
+        (LidarPose(distance_m=0.203, yaw_deg=45.0), r"3\.0 mm"),
+        (LidarPose(distance_m=0.2, yaw_deg=45.0, pitch_deg=1.0), r"\+1\.00"),  # facing the wall at 45 degrees as before
+    ],
+)
+def test_by_occluder_refuses_a_lidar_that_moved(bare: MeasuredWall, lidar: LidarPose, amount: str) -> None:
+    with pytest.raises(WallRefusedError, match=amount):
+        by_occluder(bench_seen(lidar=lidar), bare)
+
+
+def test_by_occluder_is_not_moved_by_an_origin_offset(seen: Seen) -> None:
+    """The beams meet 4 sqrt(2) mm before the glass at 45 degrees: x and distance of the glass are 4 mm from theirs."""
+    wall = measured(seen, 0.204)
+    assert wall.record.range_offset_cause == "origin"
+    told, _ = by_occluder(bench_seen(), wall)
+    assert told.occluder is not None
+    assert told.occluder.x_m == pytest.approx(0.204, abs=2e-4)
+    assert told.occluder.gap_m == pytest.approx(0.1, abs=0.002)
+    assert told.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
+
+
+def test_by_occluder_notices_another_camera_and_settings(bare: MeasuredWall, seen: Seen) -> None:
+    with pytest.raises(CalibrationError, match=r"160x120.*80x60"):
+        by_occluder(bench_seen(RIG.pinhole.scaled(80, 60)), bare)
+    now = replace(bench_seen(), serial="f2", settings={"laser_power": 40.0})
+    with pytest.raises(CalibrationError, match=r"f1.*f2"):
+        by_occluder(now, replace(bare, record=bare.record.model_copy(update={"serial": "f1"})))
+    then = replace(seen, settings={"laser_power": 80.0}).reference(np.ones((120, 160), np.bool_))
+    record, _ = by_occluder(now, replace(bare, reference=then))
+    assert re.search("laser_power.*80.*40", record.warnings[-1])
+    with pytest.raises(OccluderRefusedError, match="--occluder-x-m"):
+        by_occluder(seen, bare)
+
+
+def frame_of(rig: Rig, width: int = 640, height: int = 480) -> Frame:
+    intrinsics = rig.pinhole.scaled(width, height)
+    depth_m = wall_depth(rig.wall_from_lidar, intrinsics)
+    depth_m[depth_m > 5.0] = np.nan
+    depth_m += np.random.default_rng(0).standard_normal(depth_m.shape) * (0.0005 + 0.002 * depth_m)
+    counts = np.full(depth_m.shape, 48, np.uint8)
+    return Frame(depth_m.astype(np.float32), counts, counts, 0.0, 0, intrinsics)
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (1024, 768), (100, 75)])
+@pytest.mark.parametrize(("distance_m", "yaw_deg"), [(0.2, 45.0), (0.15, 15.0), (0.3, -60.0)])
+def test_glance_measures_the_wall_in_one_thinned_frame(
+    width: int, height: int, distance_m: float, yaw_deg: float
+) -> None:
+    pose = LidarPose(distance_m=distance_m, yaw_deg=yaw_deg)
+    seen = glance(frame_of(RIG.model_copy(update={"lidar": pose}), width, height))
+    assert seen.fit is not None
+    assert seen.fit.distance_m == pytest.approx(distance_m, abs=max(0.0005, 4 * seen.fit.distance_std_m))
+    assert seen.fit.yaw_deg == pytest.approx(yaw_deg, abs=max(0.1, 4 * seen.fit.yaw_std_deg))
+
+
+def test_glance_tells_refusal_and_saturation() -> None:
+    frame = frame_of(RIG)
+    seen = glance(replace(frame, depth_m=np.full_like(frame.depth_m, np.nan), ir=np.full_like(frame.ir, 255)))
+    assert seen.fit is None
+    assert "0.0%" in seen.refused
+    assert seen.saturated == 1.0

@@ -1,0 +1,221 @@
+import base64
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from html import unescape
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+from measured_walls import BOARD
+from nlos_calibration.wall_record import MeasuredWall, OccluderRecord, WallRecord
+
+from nlos_cam.calibrate import report as text
+from nlos_cam.calibrate.report import page, range_bar, report
+
+Measured = Callable[..., MeasuredWall]
+VOID = {"meta", "img", "rect", "path"}
+PNG = "data:image/png;base64,"
+
+
+class Reader(HTMLParser):
+    """Reader of what a browser finds: text, pictures, and what it would fetch or run."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.text, self.pictures, self.fetched = "", list[str](), list[str]()
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name in {"src", "href", "srcset", "data", "action"} or name.startswith("on"):
+                (self.pictures if (value or "").startswith(PNG) else self.fetched).append(value or "")
+        if tag in {"script", "link", "iframe", "object", "embed", "base"}:
+            self.fetched.append(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def read(wall: MeasuredWall, record_file: str = "wall.toml") -> Reader:
+    """Read the report, which must be well-formed and self-contained."""
+    page = report(wall, record_file)
+    found = Reader(page)
+    assert found.open == []
+    assert found.fetched == []
+    assert "url(" not in page
+    assert "@import" not in page
+    for picture in found.pictures:
+        raw = np.frombuffer(base64.b64decode(picture.removeprefix(PNG), validate=True), np.uint8)
+        assert cv2.imdecode(raw, cv2.IMREAD_COLOR) is not None
+    return found
+
+
+def recorded(measured: Measured, **fields: object) -> WallRecord:
+    return measured().record.model_copy(update=fields)
+
+
+def test_report_is_self_contained(measured: Measured) -> None:
+    found = read(measured(warnings=("ripples of 0.5 mm RMS", "noise > 2 & rising")))
+    assert len(found.pictures) == 6
+    for words in ("Good", "2026-01-31", "l515:f0246262", "ripples of 0.5 mm RMS", "noise > 2 & rising"):
+        assert words in found.text
+
+
+@pytest.mark.slow
+def test_report_out_of_range_advises_what_to_move(measured: Measured) -> None:
+    found = read(measured(0.35, 80.0, 0.0))
+    for words in ("Out of range", "5 cm", "5 deg"):
+        assert words in found.text
+
+
+@pytest.mark.slow
+def test_report_escapes_hostile_names(measured: Measured) -> None:
+    hostile = "<img src=http://evil/x onerror=alert(1)> & \"'"
+    wall = measured(serial=hostile, firmware=hostile, reference=hostile, settings={hostile: 1.0})
+    changed = wall.record.model_copy(update={"camera": hostile, "advice": hostile, "warnings": (hostile,)})
+    found = read(MeasuredWall(changed, wall.reference), f"{hostile}.toml")
+    assert found.text.count(hostile) >= 8
+
+
+def test_report_shows_maps_only_of_a_reference_with_depth(measured: Measured) -> None:
+    wall = measured()
+    assert wall.reference is not None
+    assert len(read(MeasuredWall(wall.record, None)).pictures) == 2
+    nothing = np.full_like(wall.reference.depth_m, np.nan)
+    depth_less = replace(wall.reference, depth_m=nothing, depth_std_m=nothing, inliers=nothing > 0.0)
+    gone = dict.fromkeys(("residual_m", "noise_scale", "inlier_fraction", "ripple_m", "bend_m", "bend_deg"))
+    assert len(read(MeasuredWall(wall.record.model_copy(update=gone), depth_less)).pictures) == 3
+
+
+@pytest.mark.slow
+def test_report_of_noise_stays_small(measured: Measured) -> None:
+    wall, noise = measured(width=640), np.random.default_rng(0)
+    assert wall.reference is not None
+    shape = wall.reference.depth_m.shape
+    loud = replace(
+        wall.reference,
+        depth_m=(wall.reference.depth_m + noise.normal(0.0, 0.001, shape)).astype(np.float32),
+        depth_std_m=noise.uniform(0.0, 0.002, shape).astype(np.float32),
+        ir=noise.uniform(0.0, 255.0, shape).astype(np.float32),
+        saturated=noise.uniform(0.0, 1.0, shape).astype(np.float32),
+    )
+    assert len(report(MeasuredWall(wall.record, loud), "wall.toml")) < 1_500_000
+
+
+def test_report_page_may_hold_dollars_and_braces() -> None:
+    made = page("$title", "{under}", ["<p>$body ${style}</p>"])
+    for part in ("<title>$title</title>", "{under}", "<p>$body ${style}</p>"):
+        assert part in made
+
+
+def marker_and_range(value: float) -> tuple[float, float, float]:
+    """Return the places of the marker and of both ends of the range from 15 to 30."""
+    drawn = range_bar("distance", value, (15.0, 30.0), 0.1, "cm", 45.0)
+    marker = re.search(r"M ([\d.]+) ", drawn)
+    allowed = re.search(r"x='([\d.]+)' y='14' width='([\d.]+)' height='14' class='allowed'", drawn)
+    assert marker is not None
+    assert allowed is not None
+    return float(marker[1]), float(allowed[1]), float(allowed[1]) + float(allowed[2])
+
+
+def test_range_bar_marker_is_where_the_value_is() -> None:
+    for value, ends in ((15.0, 1), (30.0, 2)):
+        places = marker_and_range(value)
+        assert places[0] == pytest.approx(places[ends], abs=0.2)
+    at, low, high = marker_and_range(22.5)
+    assert at == pytest.approx((low + high) / 2.0, abs=0.2)
+    assert marker_and_range(60.0)[0] == marker_and_range(45.0)[0] < 680.0
+    assert marker_and_range(-5.0)[0] == marker_and_range(0.0)[0] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("value", "drawn"), [(14.85, "outside"), (14.95, "inside"), (30.05, "inside"), (31.0, "outside")]
+)
+def test_range_bar_shows_whether_the_value_is_inside(value: float, drawn: str) -> None:
+    made = range_bar("distance", value, (15.0, 30.0), 0.1, "cm", 45.0)
+    assert f"{value:.1f} cm" in made
+    assert f"class='{drawn}'" in made
+
+
+@pytest.mark.parametrize("verdict", ["good", "out of range", "doubtful"])
+def test_report_banner_holds_verdict_advice_and_warnings(measured: Measured, verdict: str) -> None:
+    told = {"verdict": verdict, "advice": "move <4 cm> back", "warnings": ("ripples & noise", "cold")}
+    banner = text.verdict(recorded(measured, **told))
+    assert f"class='verdict {verdict.replace(' ', '-')}'" in banner
+    for sentence in (verdict, "move <4 cm> back", "ripples & noise", "cold"):
+        assert sentence in unescape(banner).lower()
+
+
+def test_report_bars_are_of_what_is_known(measured: Measured) -> None:
+    record = measured(0.35, 80.0, 0.0).record
+    bars = text.ranges(record)
+    assert "35.0 cm" in bars
+    assert "80.0 degrees" in bars
+    assert "gap" not in bars
+    wide = OccluderRecord(source="entered", x_m=0.2, gap_m=0.25)
+    assert "25.0 cm" in text.ranges(record.model_copy(update={"occluder": wide}))
+
+
+def test_report_measures_have_their_uncertainty(measured: Measured) -> None:
+    stds = {"distance_std_m": 0.001, "facing_std_deg": 0.1, "yaw_std_deg": 0.2, "pitch_std_deg": 1e-6}
+    record = measured(0.2, 40.0, -3.0).record.model_copy(update=stds)
+    told = text.measures(record)
+    for words in ("0.2000 m ± 2 mm", "40.09° ± 0.2°", "40.00° ± 0.39°", "-3.00° ± ", "0.001°"):
+        assert words in told
+    assert "occluder" not in told
+    assert "0.2000 m</td>" in text.measures(record.model_copy(update={"distance_std_m": None}))
+
+
+def test_report_measures_hold_offset_occluder_and_footprint(measured: Measured) -> None:
+    found = OccluderRecord(source="detected", x_m=0.21, gap_m=0.09, x_std_m=0.001, gap_std_m=0.001, tilt_deg=-1.5)
+    told = {"range_offset_m": -0.0045, "range_offset_std_m": 0.0005, "range_offset_cause": "depth"}
+    made = unescape(text.measures(recorded(measured, **told, occluder=found, footprint_share=0.875)))
+    for words in ("-4.50 mm ± 0.98 mm", "0.2100 m ± 2 mm", "0.0900 m ± 2 mm", "-1.50°", "87.5%"):
+        assert words in made
+    refused = text.measures(recorded(measured, residual_m=None))
+    assert "refused" in refused
+    assert "ripples" not in refused
+
+
+def test_report_compares_the_board_with_the_record(measured: Measured) -> None:
+    assert not text.board(measured().record)
+    made = unescape(text.board(recorded(measured, board=BOARD)))
+    for words in ("0.2034 m ± 0.98 mm", "0.2000 m", "+3.40 mm", "0.117°", "6.5", "at 97 %"):
+        assert words in made
+    alone = {"used": "board", "disagreement_m": None, "depth_refused": "a <mirror>"}
+    assert "a <mirror>" in unescape(text.board(recorded(measured, board=BOARD.model_copy(update=alone))))
+
+
+def test_report_device_has_temperatures_and_settings(measured: Measured) -> None:
+    device = {"serial": "f0246262", "firmware": "1.5.8.1", "settings": {"laser_power": 80.0}}
+    wall = measured(**device, temperatures_c={"LLD": 41.26})
+    assert wall.reference is not None
+    made = text.device(MeasuredWall(wall.record, replace(wall.reference, celsius_span={"LLD": 1.5})))
+    for words in ("f0246262", "1.5.8.1", "laser_power", "80", "41.3 °C", "1.5", "2026-01-31", "64 x 48"):
+        assert words in made
+    assert "°C" not in text.device(MeasuredWall(measured().record, None))
+
+
+@pytest.mark.parametrize(
+    ("camera", "record_file", "live"),
+    [
+        ("l515:f0246262", "wall.toml", "live --camera l515:f0246262 --wall wall.toml"),
+        ("sim:bare-wall", "wall.toml", "live --camera sim --wall wall.toml"),
+        ("bag:my wall.bag", "my wall.toml", "live --camera l515 --wall 'my wall.toml'"),
+    ],
+)
+def test_report_commands_can_be_pasted(measured: Measured, camera: str, record_file: str, live: str) -> None:
+    record = measured(reference="wall.npz", reference_sha256="ab" * 32).record.model_copy(update={"camera": camera})
+    made = unescape(text.files(record, record_file))
+    assert f"nlos-cam {live}\n" in made
+    assert all(words in made for words in ("render cup --rig", "wall.npz", "ab" * 32, record.rig.checksum))

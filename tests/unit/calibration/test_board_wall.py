@@ -1,0 +1,280 @@
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from board_in_colour import LIDAR, TOLD, as_told, through_lens
+from board_trials import Bench
+from nlos_calibration.arrays import Float64
+from nlos_calibration.board import BOARDS, Corners, Light, find_corners
+from nlos_calibration.board_pose import PrintErrors, fit_board
+from nlos_calibration.board_wall import (
+    AGREE_SIGMAS,
+    EXACT,
+    BoardView,
+    Plane,
+    WallByBoard,
+    combine,
+    disagreement,
+    find_in_view,
+    fit_in_lidar,
+    plane_in_lidar,
+    wall_with_board,
+)
+from nlos_calibration.errors import BoardRefusedError, WallRefusedError
+from nlos_calibration.geometry import normal_from_angles
+from nlos_calibration.rig import load_rig
+from nlos_calibration.wall import WallFit, WallMeasures, fit_wall, measures_of
+
+from nlos_cam.calibrate.synthetic import View, at_near_edge, clean_view, corners_px, frames_of, looked_at, view
+
+RIG = load_rig("bare-wall")
+PINHOLE, A4 = RIG.pinhole, BOARDS["a4"]
+SLOPES = np.array([1.2, -0.4, 3.5])
+POSE = np.eye(4)
+POSE[:3, :3] = cv2.Rodrigues(np.array([0.1, -0.3, 0.05]))[0]
+POSE[:3, 3] = [0.02, -0.014, 0.007]
+NO_PRINT = PrintErrors(0.0, 1e-9, 1e-9)
+
+
+def bench_at(distance_m: float, yaw_deg: float, pitch_deg: float) -> Bench:
+    seen = view(distance_m, yaw_deg, pitch_deg, LIDAR)
+    return Bench(A4, seen, at_near_edge(A4, seen))
+
+
+@pytest.fixture
+def corners() -> Corners:
+    """Exact corners of a board on a wall at 0.25 m, as a colour camera without calibration errors sees them."""
+    bench = bench_at(0.25, 40.0, 5.0)
+    straight = corners_px(A4, as_told().seen(bench), bench.placed)
+    inside = np.flatnonzero(((straight > 0.0) & (straight < [1280.0, 720.0])).all(axis=1))
+    return Corners(inside, through_lens(straight[inside]))
+
+
+def moved(slopes: Float64) -> Float64:
+    return plane_in_lidar(slopes, np.zeros((3, 3)), POSE, EXACT)[0]
+
+
+def test_find_in_view_of_infrared_is_the_lidars_own_view() -> None:
+    image = bench_at(0.2, 45.0, 0.0).frames(4, np.random.default_rng(0)).mean(axis=0)
+    ours, direct = find_in_view(BoardView(image, LIDAR), A4), fit_board(find_corners(image, A4), A4, LIDAR)
+    np.testing.assert_allclose(ours.slopes, direct.slopes, rtol=1e-12)
+    np.testing.assert_allclose(ours.covariance, direct.covariance, rtol=1e-12)
+
+
+def test_plane_in_lidar_moves_plane_and_covariance() -> None:
+    rays = np.column_stack([np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2)), np.ones(20)])
+    points = rays / (rays @ SLOPES)[:, np.newaxis]
+    there = points @ POSE[:3, :3].T + POSE[:3, 3]
+    np.testing.assert_allclose(there @ moved(SLOPES), 1.0, rtol=1e-12)
+    steps = 1e-6 * np.eye(3)
+    by_slopes = np.stack([(moved(SLOPES + step) - moved(SLOPES - step)) / 2e-6 for step in steps], axis=1)
+    root = np.random.default_rng(1).standard_normal((3, 3)) * 1e-3
+    covariance = plane_in_lidar(SLOPES, root @ root.T, POSE, EXACT)[1]
+    np.testing.assert_allclose(covariance, by_slopes @ root @ root.T @ by_slopes.T, rtol=1e-5, atol=1e-12)
+
+
+def test_plane_in_lidar_between_camera_and_lidar_is_refused() -> None:
+    behind = POSE.copy()
+    behind[:3, 3] = POSE[:3, :3] @ (-2.0 * SLOPES / (SLOPES @ SLOPES))
+    with pytest.raises(BoardRefusedError, match="between"):
+        plane_in_lidar(SLOPES, np.zeros((3, 3)), behind, EXACT)
+
+
+def test_fit_in_lidar_of_exact_corners_needs_lens_and_pose(corners: Corners) -> None:
+    def found(**change: Any) -> WallMeasures:
+        fit = fit_in_lidar(corners, A4, replace(TOLD, **change), NO_PRINT)
+        return measures_of(fit.slopes, fit.covariance)
+
+    exact = found(errors=EXACT)
+    assert (exact.distance_m, exact.yaw_deg, exact.pitch_deg) == pytest.approx((0.25, 40.0, 5.0), abs=1e-4)
+    for wrong in (found(distortion=np.zeros(5)), found(lidar_from_camera=np.eye(4))):
+        assert abs(wrong.distance_m - 0.25) > 3.0 * wrong.distance_std_m
+
+
+def test_find_in_view_refusal_names_the_light() -> None:
+    with pytest.raises(BoardRefusedError, match="colour"):
+        find_in_view(TOLD, A4)
+
+
+@cache
+def infrared(scale: float = 1.0) -> BoardView:
+    """The mean of 20 frames of a board of that scale on the wall of the rig."""
+    seen = View(RIG.wall_from_lidar, PINHOLE)
+    placed = replace(at_near_edge(A4, seen), scale=scale)
+    frames = frames_of(clean_view(A4, seen, placed), np.random.default_rng(0), 20)
+    return BoardView(frames.mean(axis=0), PINHOLE)
+
+
+@pytest.fixture(scope="module")
+def depth() -> WallFit:
+    """The wall of the rig by 20 frames of depth."""
+    depth_m = View(RIG.wall_from_lidar, PINHOLE).depth_m
+    mean = looked_at(depth_m, np.random.default_rng(0), frames=20, noise=1.0)
+    return fit_wall(mean.mean_m(), PINHOLE, np.random.default_rng(0), mean.noise())
+
+
+def test_wall_with_board_combines_planes_that_agree(depth: WallFit) -> None:
+    fit, record = wall_with_board(depth, infrared(), A4, measured=False)
+    assert isinstance(fit, WallFit)
+    assert (fit.verdict, record.used, record.causes, record.depth_refused) == ("good", "both", (), "")
+    assert (fit.distance_m, fit.facing_deg) == pytest.approx((0.2, 45.0), abs=0.02)
+    assert fit.distance_std_m <= depth.distance_std_m
+    assert record.disagreement_m == pytest.approx(record.distance_m - depth.distance_m)
+    assert record.disagreement_sigmas is not None
+    assert record.disagreement_sigmas < 4.0
+    np.testing.assert_allclose(fit.wall_from_lidar[2, 3], fit.distance_m)
+
+
+@pytest.mark.parametrize(("measured", "used"), [(False, "depth"), (True, "board")])
+def test_wall_with_board_doubts_a_print_at_97_percent(depth: WallFit, measured: bool, used: str) -> None:
+    fit, record = wall_with_board(depth, infrared(0.97), A4, measured=measured)
+    assert (fit.verdict, record.used) == ("doubtful", used)
+    assert record.disagreement_m == pytest.approx(0.2 / 0.97 - 0.2, abs=5e-4)
+    assert used in fit.advice
+    assert ("scale" in fit.advice) is not measured
+    assert fit.distance_m == pytest.approx(0.2 / 0.97 if measured else 0.2, abs=5e-4)
+
+
+def test_wall_with_board_measured_at_97_percent_agrees(depth: WallFit) -> None:
+    _, record = wall_with_board(depth, infrared(0.97), A4.measured(29.1), measured=True)
+    assert (record.used, record.printed.square_mm) == ("both", 29.1)
+
+
+@pytest.mark.parametrize("light", ["infrared", "colour"])
+def test_wall_with_board_in_colour_may_blame_the_colour_camera(depth: WallFit, light: Light) -> None:
+    fit, record = wall_with_board(depth, replace(infrared(0.97), light=light), A4, measured=False)
+    assert record.seen_in == light
+    for told in (fit.advice, record.causes[-1]):
+        assert ("colour camera" in told) is (light == "colour")
+    _, agreed = wall_with_board(depth, replace(infrared(), light=light), A4, measured=False)
+    assert (agreed.seen_in, agreed.causes) == (light, ())
+
+
+def test_wall_with_board_doubts_a_board_without_depth() -> None:
+    refusal = WallRefusedError("the wall is not flat: take another")
+    fit, record = wall_with_board(refusal, infrared(), A4, measured=False)
+    assert isinstance(fit, WallByBoard)
+    assert (fit.verdict, record.used, record.depth_refused) == ("doubtful", "board", str(refusal))
+    assert str(refusal) in fit.advice
+    assert record.disagreement_m is record.disagreement_deg is record.disagreement_sigmas is None
+    assert fit.distance_m == pytest.approx(0.2, abs=3.0 * fit.distance_std_m)
+    assert fit.distance_m == record.distance_m
+    np.testing.assert_allclose(fit.wall_from_lidar, RIG.wall_from_lidar, atol=3e-3)
+
+
+def test_wall_with_board_keeps_the_doubt_of_the_depth(depth: WallFit) -> None:
+    doubted = replace(depth, verdict="doubtful", advice="half of the view differs")
+    fit, _ = wall_with_board(doubted, infrared(), A4, measured=False)
+    assert (fit.verdict, fit.advice) == ("doubtful", "half of the view differs")
+
+
+def test_wall_with_board_out_of_range_gives_advice() -> None:
+    """Squares measured as 60 mm put the same board at twice the distance."""
+    fit, _ = wall_with_board(WallRefusedError("none"), infrared(), A4.measured(60.0), measured=True)
+    assert fit.distance_m == pytest.approx(0.4, abs=0.005)
+    assert "10 cm" in fit.advice
+
+
+def test_wall_with_board_refuses_a_view_without_a_board(depth: WallFit) -> None:
+    with pytest.raises(BoardRefusedError):
+        wall_with_board(depth, BoardView(np.full((480, 640), 40.0), PINHOLE), A4, measured=False)
+
+
+def plane(distance_m: float, yaw_deg: float = 45.0, *, std_m: float = 1e-4, std_deg: float = 0.02) -> Plane:
+    normal = normal_from_angles(np.radians(yaw_deg), 0.1)
+    along = np.outer(normal, normal)
+    covariance = (std_m / distance_m**2) ** 2 * along
+    return Plane(-normal / distance_m, covariance + (np.radians(std_deg) / distance_m) ** 2 * (np.eye(3) - along))
+
+
+def shaken(of: Plane, generator: np.random.Generator) -> Plane:
+    return Plane(generator.multivariate_normal(of.slopes, of.covariance), of.covariance)
+
+
+def test_combine_of_equal_planes_halves_the_covariance() -> None:
+    both = combine(plane(0.2), plane(0.2), measured=False)
+    assert (both.used, both.causes) == ("both", ())
+    np.testing.assert_allclose(both.plane.slopes, plane(0.2).slopes)
+    np.testing.assert_allclose(both.plane.covariance, 0.5 * plane(0.2).covariance)
+    assert both.disagreement.sigmas == pytest.approx(0.0, abs=1e-9)
+
+
+def test_combine_takes_each_quantity_from_the_better_plane() -> None:
+    """Depth is certain of the distance, the board of the angle."""
+    depth, board = plane(0.2, 45.0, std_m=1e-5, std_deg=1.0), plane(0.2005, 45.5, std_m=1e-3, std_deg=0.01)
+    both = combine(depth, board, measured=False)
+    assert both.plane.distance_m == pytest.approx(0.2, abs=2e-5)
+    assert both.plane.normal @ board.normal == pytest.approx(1.0, abs=1e-7)
+    for one in (depth, board):
+        assert (np.linalg.eigvalsh(one.covariance - both.plane.covariance) > -1e-9).all()
+
+
+def test_combine_keeps_an_exact_plane() -> None:
+    exact = Plane(plane(0.2).slopes, np.zeros((3, 3)))
+    both = combine(exact, plane(0.2001), measured=False)
+    np.testing.assert_allclose(both.plane.slopes, exact.slopes)
+    np.testing.assert_allclose(both.plane.covariance, 0.0, atol=1e-15)
+
+
+def test_disagreement_has_distance_angle_and_sigmas() -> None:
+    apart = disagreement(plane(0.2, 45.0), plane(0.2003, 45.0))
+    assert apart.distance_m == pytest.approx(0.0003)
+    assert apart.angle_deg == pytest.approx(0.0, abs=1e-6)
+    assert apart.distance_sigmas == pytest.approx(0.3 / np.hypot(0.1, 0.1), rel=0.01)
+    assert apart.angle_sigmas < 1e-6
+    turned = disagreement(plane(0.2, 45.0), plane(0.2, 45.1))
+    expected_deg = 0.1 * np.cos(0.1)
+    assert turned.angle_deg == pytest.approx(expected_deg, rel=1e-3)
+    assert turned.angle_sigmas == pytest.approx(expected_deg / np.hypot(0.02, 0.02), rel=0.01)
+    assert turned.distance_sigmas < 0.1
+
+
+def test_disagreement_by_chance_is_rare() -> None:
+    generator, depth, board = np.random.default_rng(0), plane(0.2), plane(0.2, std_m=5e-4, std_deg=0.05)
+    sigmas = [disagreement(shaken(depth, generator), shaken(board, generator)).sigmas for _ in range(1000)]
+    assert np.mean(np.square(sigmas)) == pytest.approx(3.0, rel=0.1)
+    assert np.mean(np.array(sigmas) > AGREE_SIGMAS) < 0.004
+
+
+def test_combine_interval_holds_the_truth_as_often_as_stated() -> None:
+    generator, depth, board = np.random.default_rng(1), plane(0.2), plane(0.2, std_m=2e-4, std_deg=0.05)
+    inside = []
+    for _ in range(1000):
+        both = combine(shaken(depth, generator), shaken(board, generator), measured=False).plane
+        off = both.slopes - depth.slopes
+        inside.append(off @ np.linalg.solve(both.covariance, off) < 7.815)  # 95 % of a chi-square of three
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
+
+
+@pytest.mark.parametrize(("measured", "used"), [(False, "depth"), (True, "board")])
+def test_combine_of_planes_that_disagree_takes_one(measured: bool, used: str) -> None:
+    depth, board = plane(0.2), plane(0.206)
+    both = combine(depth, board, measured=measured)
+    assert both.used == used
+    assert both.plane is (board if measured else depth)
+    assert both.disagreement.sigmas > AGREE_SIGMAS
+
+
+def test_combine_names_causes_with_amounts_that_explain_it() -> None:
+    """Squares taken for 30 mm that are 29.1 mm put the wall 3 % too far away."""
+    causes = combine(plane(0.2), plane(0.2 / 0.97, std_m=5e-4), measured=False).causes
+    assert any("97.0 %" in cause for cause in causes)
+    # along the axis the same wall is farther than along its normal
+    offset_mm = 1e3 * 0.2 * (1 / 0.97 - 1) / (np.cos(np.radians(45.0)) * np.cos(0.1))
+    assert any(f"{offset_mm:+.1f} mm" in cause for cause in causes)
+    assert not any("angle" in cause for cause in causes)
+    (cause,) = combine(plane(0.2, 45.0), plane(0.2, 46.005), measured=False).causes
+    assert "1.00 degrees" in cause
+
+
+def test_combine_names_no_cause_that_cannot_be() -> None:
+    """Measured squares have the right scale; no printer and no lidar errs by a factor of two."""
+    causes = combine(plane(0.2), plane(0.204), measured=True).causes
+    assert [cause for cause in causes if "offset" in cause]
+    assert not [cause for cause in causes if "scale" in cause]
+    causes = combine(plane(0.2), plane(0.4), measured=False).causes
+    assert causes
+    assert not [cause for cause in causes if "scale" in cause or "offset" in cause]

@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+from nlos_calibration.arrays import Float64
+from nlos_calibration.errors import WallRefusedError
+from nlos_calibration.geometry import normal_from_angles
+from nlos_calibration.noise import MeanNoise, depth_noise_m
+from nlos_calibration.plane import MIN_POINTS, fit_depth, fit_plane
+
+
+@pytest.fixture
+def generator() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+def wall_points(generator: np.random.Generator, count: int = 2000, *, noise: float = 1.0) -> tuple[Float64, Float64]:
+    """Points (count, 3) on a wall 0.2 m away under random rays of the lidar's field, and the wall's normal."""
+    normal = normal_from_angles(np.radians(40.0), np.radians(5.0))
+    rays = np.column_stack([generator.uniform([-0.7, -0.52], [0.6, 0.52], (count, 2)), np.ones(count)])
+    depth_m = 0.2 / -(rays @ normal)
+    depth_m += noise * generator.standard_normal(count) * depth_noise_m(depth_m)
+    return rays * depth_m[:, np.newaxis], normal
+
+
+def angle_deg(a: Float64, b: Float64) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))
+
+
+def test_fit_plane_finds_an_exact_plane_exactly(generator: np.random.Generator) -> None:
+    points, normal = wall_points(generator, noise=0.0)
+    before = points.copy()
+    fit = fit_plane(points, generator)
+    np.testing.assert_allclose(fit.normal, normal, atol=1e-9)
+    assert np.linalg.norm(fit.normal) == pytest.approx(1.0)
+    assert fit.distance_m == pytest.approx(0.2, abs=1e-9)
+    assert fit.inlier_fraction == 1.0
+    assert fit.residual_m < 1e-9
+    np.testing.assert_array_equal(points, before)
+
+
+def test_fit_plane_residual_is_the_rms_distance_of_inliers(generator: np.random.Generator) -> None:
+    points, _ = wall_points(generator)
+    points[::10] += [0.0, 0.0, 0.1]
+    fit = fit_plane(points, generator)
+    distances = points[fit.inliers] @ fit.normal + fit.distance_m
+    assert fit.residual_m == pytest.approx(np.sqrt(np.mean(distances**2)))
+    assert fit.inliers.mean() == pytest.approx(fit.inlier_fraction)
+    assert not fit.inliers[::10].any()
+
+
+def test_fit_plane_weighs_points_by_their_samples(generator: np.random.Generator) -> None:
+    points, _ = wall_points(generator, 1000)
+    one = fit_plane(points, generator, MeanNoise(np.full(1000, 4.0)))
+    half = np.where(points[:, 0] > 0.0, 400.0, 4.0)
+    both = fit_plane(points, generator, MeanNoise(half))
+    assert one.noise_scale == pytest.approx(2.0, rel=0.1)  # the points are as noisy as single samples
+    assert not np.allclose(both.slopes, one.slopes, rtol=1e-6)
+
+
+def test_fit_plane_inlier_gate_follows_the_noise_of_the_mean(generator: np.random.Generator) -> None:
+    """Points 3 mm behind the wall are within the noise of one sample, but not of a mean of a hundred."""
+    points, normal = wall_points(generator, 4000, noise=0.1)
+    away = generator.random(4000) < 0.1
+    points[away] *= 1.0 + 0.003 / np.linalg.norm(points[away], axis=1)[:, np.newaxis]
+    fit = fit_plane(points, generator, MeanNoise(np.full(4000, 100.0)))
+    assert fit.inlier_fraction == pytest.approx(0.9, abs=0.03)
+    assert fit.distance_m == pytest.approx(0.2, abs=2e-5)
+    assert angle_deg(fit.normal, normal) < 0.02
+
+
+@pytest.mark.parametrize("count", [0, 3, MIN_POINTS - 1])
+def test_fit_plane_refuses_too_few_points(generator: np.random.Generator, count: int) -> None:
+    with pytest.raises(WallRefusedError, match=f"{count} points"):
+        fit_plane(wall_points(generator, count)[0], generator)
+    with pytest.raises(WallRefusedError, match="0 points"):
+        fit_plane(-wall_points(generator, MIN_POINTS)[0], generator)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -0.2, 1e-3])
+def test_fit_plane_refuses_points_that_are_not_in_front(generator: np.random.Generator, value: float) -> None:
+    with pytest.raises(WallRefusedError, match="0 points"):
+        fit_plane(np.full((500, 3), value), generator)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+@pytest.mark.parametrize("stray_share", [0.0, 0.2, 0.4])
+def test_fit_plane_refuses_collinear_points(generator: np.random.Generator, noise: float, stray_share: float) -> None:
+    depth_m = np.linspace(0.2, 0.5, 1000)
+    depth_m += noise * generator.standard_normal(1000) * depth_noise_m(depth_m)
+    points = np.linspace(-0.5, 0.5, 1000)[:, np.newaxis] * [1.0, 0.3, 0.0] + [0.0, 0.05, 1.0]
+    points *= depth_m[:, np.newaxis]
+    stray = generator.random(1000) < stray_share
+    points[stray] = wall_points(generator, 1000)[0][stray] * generator.uniform(0.3, 4.0, (int(stray.sum()), 1))
+    with pytest.raises(WallRefusedError):
+        fit_plane(points, generator)
+
+
+def test_fit_plane_refuses_what_is_no_plane(generator: np.random.Generator) -> None:
+    """One point many times; a plane x = 0.1 z, which holds the lidar itself; a cloud."""
+    in_plane = generator.uniform([-0.5, 0.2], [0.5, 1.0], (1000, 2))
+    edge_on = np.column_stack([0.1 * in_plane[:, 1], in_plane])
+    cloud = generator.uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 1.0], (2000, 3))
+    for points, word in ((np.tile([0.1, 0.0, 0.2], (500, 1)), "line"), (edge_on, "edge on"), (cloud, "plane")):
+        with pytest.raises(WallRefusedError, match=word):
+            fit_plane(points, generator)
+
+
+def test_fit_depth_accepts_a_narrow_strip_if_allowed(generator: np.random.Generator) -> None:
+    normal = normal_from_angles(np.radians(40.0), 0.0)
+    rays = np.column_stack([generator.uniform([0.55, -0.5], [0.6, 0.5], (3000, 2)), np.ones(3000)])
+    depth_m = 0.2 / -(rays @ normal)
+    with pytest.raises(WallRefusedError, match="line"):
+        fit_depth(rays, depth_m, generator)
+    assert angle_deg(fit_depth(rays, depth_m, generator, min_extent=0.02).normal, normal) < 1e-3

@@ -1,0 +1,291 @@
+import re
+from itertools import product
+
+import numpy as np
+import pytest
+from nlos_calibration.geometry import normal_from_angles, wall_from_plane
+from nlos_calibration.rig import DeviceConstants, Extent, LidarPose, ObjectBox, Occluder, PinholeRecord, Rig, load_rig
+from nlos_calibration.rig_check import (
+    MIN_SEEN,
+    MIN_SHARE,
+    Footprint,
+    combined,
+    footprint,
+    judge_rig,
+    lidar_sees,
+    on_plane,
+    rig_difference,
+    wall_sees,
+)
+from nlos_calibration.wall_record import OccluderRecord
+from numpy.typing import NDArray
+
+PAPER = load_rig("paper-rig")
+BOX = PAPER.object_box or pytest.fail("the paper's rig hides something")
+PINHOLE = load_rig("bare-wall").pinhole
+WALL = Extent(x_min_m=-1.0, x_max_m=2.0, y_min_m=-1.5, y_max_m=1.5)
+
+
+def rig(
+    x_m: float = 0.2, gap_m: float = 0.1, distance_m: float = 0.2, yaw_deg: float = 45.0, pitch_deg: float = 0.0
+) -> Rig:
+    lidar = LidarPose(distance_m=distance_m, yaw_deg=yaw_deg, pitch_deg=pitch_deg)
+    return PAPER.model_copy(update={"lidar": lidar, "occluder": Occluder(x_m=x_m, z_min_m=gap_m)})
+
+
+def on_wall(bench: Rig, x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float) -> Rig:
+    wall = Extent(x_min_m=x_min_m, x_max_m=x_max_m, y_min_m=y_min_m, y_max_m=y_max_m)
+    return bench.model_copy(update={"wall": wall})
+
+
+def seen_by(bench: Rig) -> Footprint:
+    return footprint(bench.wall_from_lidar, bench.pinhole, bench.wall)
+
+
+def problems(bench: Rig, *, tilt_deg: float | None = None, measured: bool = True) -> tuple[str, ...]:
+    if not measured or bench.occluder is None:
+        return judge_rig(bench, seen_by(bench), None)
+    at = bench.occluder
+    record = OccluderRecord(source="detected", x_m=at.x_m, gap_m=at.z_min_m, tilt_deg=tilt_deg)
+    return judge_rig(bench, seen_by(bench), record)
+
+
+def amount(told: str, unit: str) -> int:
+    """Return the last whole number of that unit: the advice comes after the problem."""
+    return int(re.findall(rf" (\d+) {unit}", told)[-1])
+
+
+@pytest.mark.parametrize(("distance_m", "yaw_deg"), list(product((0.15, 0.2, 0.3), (15.0, 30.0, 45.0, 60.0, 75.0))))
+def test_judge_rig_finds_no_problems_in_the_papers_poses(distance_m: float, yaw_deg: float) -> None:
+    assert problems(rig(distance_m=distance_m, yaw_deg=yaw_deg)) == ()
+    assert problems(rig(distance_m=distance_m, yaw_deg=yaw_deg), measured=False) == ()
+
+
+def test_judge_rig_leaves_distance_and_angle_to_the_wall() -> None:
+    for bench in (load_rig("bare-wall"), rig(distance_m=0.36), rig(yaw_deg=79.0, distance_m=0.3)):
+        assert problems(bench) == ()
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "advice"),
+    [(0.032, r"0\.032 m.* 2 cm away"), (0.23, r"0\.230 m.* 3 cm towards"), (0.0485, r"0\.04[89] m")],
+)
+def test_judge_rig_advises_on_a_gap_out_of_range(gap_m: float, advice: str) -> None:
+    assert any(re.search(advice, told) for told in problems(rig(gap_m=gap_m)))
+    assert any("assumed" in told for told in problems(rig(gap_m=gap_m), measured=False))
+    assert problems(rig(gap_m=0.0495)) == ()  # a gap is not judged more finely than it is measured
+
+
+@pytest.mark.parametrize(("x_m", "move"), [(-0.05, "25 cm away"), (0.4, "20 cm towards")])
+def test_judge_rig_advises_on_a_sheet_not_before_the_object(x_m: float, move: str) -> None:
+    (told,) = problems(rig(x_m))
+    assert f"x = {x_m:.3f} m" in told
+    assert move in told
+
+
+@pytest.mark.parametrize(("tilt_deg", "way"), [(3.0, "towards"), (-3.0, "away")])
+def test_judge_rig_advises_on_a_leaning_sheet(tilt_deg: float, way: str) -> None:
+    (told,) = problems(rig(), tilt_deg=tilt_deg)
+    assert f"{tilt_deg:+.1f} degrees" in told
+    assert way in told
+    assert problems(rig(), tilt_deg=tilt_deg / 2) == ()
+
+
+@pytest.mark.parametrize("bench", [rig(gap_m=0.2), rig(0.3, 0.15), rig(gap_m=0.18, distance_m=0.15, yaw_deg=70.0)])
+def test_judge_rig_advises_the_least_move_that_hides(bench: Rig) -> None:
+    (told,) = problems(bench)
+    assert re.search(r"\d+\.\d%", told)
+    by_m = amount(told, "cm") / 100
+
+    def leak(closer_m: float) -> float:
+        nearer = Occluder(x_m=bench.occluder.x_m, z_min_m=bench.occluder.z_min_m - closer_m)
+        return lidar_sees(bench.model_copy(update={"occluder": nearer}), bench.object_box)
+
+    assert leak(by_m) <= 0.001 < leak(by_m - 0.01)
+
+
+def low_box(x_min_m: float) -> object:
+    update = {"x_min_m": x_min_m, "x_max_m": x_min_m + 0.05, "z_near_m": 0.01, "z_far_m": 0.06}
+    return PAPER.object_box.model_copy(update=update)
+
+
+def test_judge_rig_moves_sheet_or_object_if_no_gap_hides_it() -> None:
+    (told,) = problems(rig(0.32, 0.06, distance_m=0.3, yaw_deg=50.0).model_copy(update={"object_box": low_box(0.33)}))
+    assert "cm towards the lidar" in told
+    (told,) = problems(rig(0.05, 0.055, distance_m=0.05, yaw_deg=70.0).model_copy(update={"object_box": low_box(0.1)}))
+    assert "move the object" in told
+    (told,) = problems(rig(yaw_deg=70.0).model_copy(update={"occluder": None}))
+    assert "0.20 m" in told
+
+
+def test_judge_rig_advises_the_least_turn_to_the_occluder() -> None:
+    (told,) = problems(rig(yaw_deg=-45.0))
+    turn = amount(told, "degrees")
+
+    def seen(yaw_deg: float) -> float:
+        bench = rig(yaw_deg=yaw_deg)
+        return wall_sees(bench, bench.object_box, seen_by(bench))
+
+    assert seen(turn - 45.0) >= MIN_SEEN > seen(turn - 46.0)
+
+
+def test_judge_rig_widens_an_aperture_that_no_turn_opens() -> None:
+    narrow = -1.0, 0.15, -1.5, 1.5
+    (told,) = problems(on_wall(rig(0.3, 0.05, yaw_deg=15.0), *narrow))
+    assert problems(on_wall(rig(0.3, 0.05 + amount(told, "cm") / 100, yaw_deg=15.0), *narrow)) == ()
+
+
+def test_judge_rig_advises_the_least_turn_onto_the_wall() -> None:
+    wall = -0.1, 0.25, -0.2, 0.2
+    told = problems(on_wall(rig(yaw_deg=60.0), *wall))[0]
+    assert f"{MIN_SHARE:.0%}" in told
+    yaw_deg = 60.0 - amount(told, "degrees")
+    shares = [seen_by(on_wall(rig(yaw_deg=each), *wall)).share for each in (yaw_deg, yaw_deg + 1.0)]
+    assert shares[0] >= MIN_SHARE > shares[1]
+    assert any("larger wall" in told for told in problems(on_wall(rig(), 0.0, 0.05, 0.0, 0.05)))
+
+
+def test_combined_verdict_joins_wall_and_rig() -> None:
+    assert combined("good", "all is well", ()) == ("good", "all is well")
+    assert combined("good", "all is well", ("a: b", "c: d")) == ("out of range", "all is well; a: b; c: d")
+    assert combined("doubtful", "bent", ("a: b",)) == ("doubtful", "bent; a: b")
+    assert combined("out of range", "far", ("a: b",)) == ("out of range", "far; a: b")
+
+
+def points_in(box: ObjectBox, count: int = 40_000) -> NDArray[np.float64]:
+    low = [box.x_min_m, box.y_min_m, box.z_near_m]
+    return np.random.default_rng(0).uniform(low, [box.x_max_m, box.y_max_m, box.z_far_m], (count, 3))
+
+
+def passes(rig: Rig, eye_m: NDArray[np.float64], points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether the straight line from the eye (3,) to points (n, 3) misses the occluder."""
+    share = (rig.occluder.x_m - eye_m[0]) / (points_m[:, 0] - eye_m[0])
+    return eye_m[2] + share * (points_m[:, 2] - eye_m[2]) < rig.occluder.z_min_m
+
+
+@pytest.mark.parametrize(
+    "bench",
+    [
+        rig(0.2, 0.1),
+        rig(0.2, 0.2),
+        rig(0.3, 0.15, yaw_deg=50.0, pitch_deg=10.0),
+        rig(0.2, 0.18, 0.15, 70.0),
+        rig(0.25, 0.22, 0.2, 75.0, -30.0),
+    ],
+)
+def test_lidar_sees_the_share_of_sampled_points(bench: Rig) -> None:
+    points_m, pose, pinhole = points_in(BOX), bench.wall_from_lidar, bench.pinhole
+    seen = (points_m - pose[:3, 3]) @ pose[:3, :3]
+    with np.errstate(divide="ignore"):
+        column, row = pinhole.fx * seen[:, 0] / seen[:, 2] + pinhole.ppx, pinhole.fy * seen[:, 1] / seen[:, 2]
+    row = row + pinhole.ppy
+    inside = (seen[:, 2] > 0) & (column > -0.5) & (column < 639.5) & (row > -0.5) & (row < 479.5)
+    share = (inside & passes(bench, pose[:3, 3], points_m)).mean()
+    assert lidar_sees(bench, BOX) == pytest.approx(share, abs=0.008)
+
+
+def test_lidar_sees_without_occluder_what_is_in_its_field() -> None:
+    bare = rig(0.2, 0.1, yaw_deg=70.0).model_copy(update={"occluder": None})
+    assert lidar_sees(bare, BOX) > 0.7
+    assert lidar_sees(rig(0.2, 0.1, yaw_deg=70.0), BOX) == 0.0
+
+
+@pytest.mark.parametrize("bench", [rig(0.2, 0.1, yaw_deg=-45.0), rig(0.3, 0.05, 0.15, 15.0), rig(0.2, 0.1)])
+def test_wall_sees_as_much_as_its_best_lit_cell(bench: Rig) -> None:
+    seen = seen_by(bench)
+    cells = seen.cells_m[32][seen.on_wall[32]]
+    points_m, lidar_m = points_in(BOX, 4000), bench.wall_from_lidar[:3, 3]
+    feet_m = np.column_stack([cells, np.zeros(len(cells))])
+    lit = [foot for foot in feet_m if foot[0] <= bench.occluder.x_m or passes(bench, lidar_m, foot[np.newaxis])[0]]
+    best = max((passes(bench, foot, points_m) | (foot[0] >= bench.occluder.x_m)).mean() for foot in lit)
+    assert wall_sees(bench, BOX, seen) == pytest.approx(best, abs=0.03)
+
+
+def test_wall_sees_nothing_from_unlit_wall() -> None:
+    def share(bench: Rig, x_min_m: float, x_max_m: float) -> float:
+        return wall_sees(bench, BOX, seen_by(on_wall(bench, x_min_m, x_max_m, -1.0, 1.0)))
+
+    assert share(rig(), -3.0, -2.0) == 0.0
+    assert share(rig(0.2, 0.001, yaw_deg=60.0), 0.21, 2.0) == 0.0  # behind the sheet it is dark
+    assert share(rig(0.2, 0.1, yaw_deg=60.0), 0.21, 2.0) == 1.0
+
+
+def pose(yaw_deg: float, pitch_deg: float = 0.0, distance_m: float = 0.2) -> NDArray[np.float64]:
+    return wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m)
+
+
+def test_footprint_faced_squarely_is_the_field_of_view() -> None:
+    seen = footprint(pose(0.0), PINHOLE, WALL)
+    wide, tall = 0.2 * np.tan(np.radians(35.0)), 0.2 * np.tan(np.radians(27.5))
+    expected = [[-wide, tall], [wide, tall], [wide, -tall], [-wide, -tall]]
+    np.testing.assert_allclose(seen.corners_m, expected, atol=1e-6)
+    assert seen.cells_m.shape == (64, 80, 2)
+    assert seen.share == 1.0
+
+
+def test_footprint_of_the_paper_runs_from_near_to_far() -> None:
+    seen = footprint(pose(45.0), PINHOLE, WALL)
+    assert (np.diff(seen.cells_m[..., 0], axis=1) > 0.0).all()
+    assert (np.diff(seen.cells_m[..., 1], axis=0) < 0.0).all()
+    assert seen.corners_m[[0, 3], 0] == pytest.approx(0.2 * np.tan(np.radians(10.0)))
+    assert seen.corners_m[[1, 2], 0] == pytest.approx(0.2 * np.tan(np.radians(80.0)))
+
+
+def test_footprint_cells_lie_on_the_plane_along_their_beams() -> None:
+    wall_from_lidar = pose(40.0, 10.0)
+    rays = PINHOLE.scaled(80, 64).rays()
+    points = footprint(wall_from_lidar, PINHOLE, WALL).cells_m
+    world = np.concatenate([points, np.zeros((64, 80, 1)), np.ones((64, 80, 1))], axis=-1)
+    lidar = (world @ np.linalg.inv(wall_from_lidar).T)[..., :3]
+    np.testing.assert_allclose(lidar / lidar[..., 2:], rays, atol=1e-9)
+
+
+def test_footprint_of_beams_that_miss_the_wall_is_nan() -> None:
+    seen = footprint(pose(75.0), PINHOLE, WALL)
+    away = np.isnan(seen.cells_m).any(axis=-1)
+    assert away.any()
+    assert not seen.on_wall[away].any()
+    assert np.isnan(seen.corners_m[1]).all()
+    assert np.isfinite(seen.corners_m[0]).all()
+    assert np.isnan(on_plane(pose(180.0), np.array([[0.0, 0.0, 1.0]]))).all()
+
+
+def test_footprint_share_counts_cells_within_the_extent() -> None:
+    half = Extent(x_min_m=-1.0, x_max_m=0.0, y_min_m=-1.0, y_max_m=1.0)
+    assert footprint(pose(0.0), PINHOLE, half).share == pytest.approx(0.5)
+    assert footprint(pose(0.0), PINHOLE, half, shape=(3, 4)).on_wall.tolist() == [[True, True, False, False]] * 3
+
+
+def changed(**fields: object) -> Rig:
+    return PAPER.model_copy(update=fields)
+
+
+def test_rig_difference_ignores_calibration_error_and_size() -> None:
+    measured = LidarPose(distance_m=0.2008, yaw_deg=44.9, pitch_deg=0.1)
+    small = PinholeRecord.model_validate(vars(PAPER.pinhole.scaled(320, 240)))
+    for rig in (PAPER, changed(name="measured", lidar=measured), changed(intrinsics=small)):
+        assert rig_difference(rig, PAPER) == ()
+
+
+SMALL_BOX = ObjectBox(x_min_m=0.3, x_max_m=0.5, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.1, z_far_m=0.4)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "amounts"),
+    [
+        ("lidar", LidarPose(distance_m=0.25, yaw_deg=45.0), "50 mm farther"),
+        ("lidar", LidarPose(distance_m=0.15, yaw_deg=45.0), "50 mm closer"),
+        ("lidar", LidarPose(distance_m=0.2, yaw_deg=30.0), "yaw -15.0 degrees"),
+        ("lidar", LidarPose(distance_m=0.2, yaw_deg=45.0, pitch_deg=2.0), "pitch +2.0 degrees"),
+        ("occluder", Occluder(x_m=0.25, z_min_m=0.1), "50 mm farther"),
+        ("occluder", Occluder(x_m=0.2, z_min_m=0.06), "40 mm narrower"),
+        ("occluder", None, "no occluder"),
+        ("intrinsics", PinholeRecord(fx=400.0), "77.3 x 55.0"),
+        ("device", DeviceConstants(receiver_cell_m2=1e-3), "device"),
+        ("object_box", SMALL_BOX, "object box"),
+    ],
+)
+def test_rig_difference_names_field_and_amount(field: str, value: object, amounts: str) -> None:
+    (told,) = rig_difference(changed(**{field: value}), PAPER)
+    assert amounts in told
+    assert rig_difference(PAPER, changed(occluder=None)) == ("an occluder",)

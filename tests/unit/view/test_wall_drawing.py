@@ -1,0 +1,223 @@
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from measured_walls import BOARD, HEIGHT, WIDTH, exact_wall
+from nlos_calibration.geometry import normal_from_angles, wall_from_plane
+from nlos_calibration.reference import BareWall
+from nlos_calibration.rig import OccluderRecord
+from nlos_calibration.wall_record import MeasuredWall
+
+from nlos_cam.view.images import BACKGROUND_RGB, SATURATED_RGB
+from nlos_cam.view.wall_drawing import (
+    ALL_IS_WELL,
+    MOST_POINTS,
+    NOT_WATCHED,
+    OFF_WALL_M,
+    bench_drawings,
+    calibration_text,
+    every_nth,
+    outline_m,
+    wall_names,
+    wall_pictures,
+    wall_points_m,
+)
+
+SHAPE = HEIGHT, WIDTH
+NOTHING = np.full(SHAPE, np.nan, np.float32)
+PATHS = {
+    f"bench/measured/{name}"
+    for name in ("footprint", "distance", "distance/end", "axis", "axis/end", "frame", "points")
+}
+RECORD = exact_wall().record.model_copy(update={"reference": "wall.npz", "reference_sha256": "0" * 64})
+
+
+def reference_of(wall: MeasuredWall) -> BareWall:
+    assert wall.reference is not None
+    return wall.reference
+
+
+def points(drawing: Any) -> np.ndarray:
+    return np.array(drawing.positions.as_arrow_array().to_pylist())
+
+
+def with_record(wall: MeasuredWall, **fields: Any) -> MeasuredWall:
+    return dataclasses.replace(wall, record=wall.record.model_copy(update=fields))
+
+
+def test_wall_points_lie_on_the_plane_in_the_outline() -> None:
+    wall = exact_wall()
+    points_m = wall_points_m(wall.record, reference_of(wall))
+    np.testing.assert_allclose(points_m[..., 2], 0.0, atol=1e-6)
+    outline = outline_m(wall)
+    assert (points_m[..., :2].min(axis=(0, 1)) > outline.min(axis=0) - 0.01).all()
+    assert (points_m[..., :2].max(axis=(0, 1)) < outline.max(axis=0) + 0.01).all()
+
+
+@pytest.mark.parametrize("cause", ["origin", "depth"])
+def test_wall_points_allow_for_the_range_offset(cause: str) -> None:
+    offset_m, wall = 0.0045, exact_wall()
+    depth_m = reference_of(wall).depth_m
+    if cause == "depth":
+        short = exact_wall(depth_m=depth_m - np.float32(offset_m))
+    else:  # the zero of depth lies nearer to the wall than the glass
+        seen_m = 0.2 - offset_m * np.cos(np.pi / 4)
+        short = exact_wall(depth_m=depth_m * np.float32(seen_m / 0.2))
+    offset = with_record(short, range_offset_m=offset_m, range_offset_cause=cause)
+    np.testing.assert_allclose(wall_points_m(offset.record, reference_of(offset))[..., 2], 0.0, atol=1e-6)
+    assert np.abs(wall_points_m(wall.record, reference_of(short))[..., 2]).max() > 0.003
+
+
+@given(st.integers(1, 700), st.integers(1, 700), st.integers(1, 9000))
+def test_every_nth_keeps_about_as_many_as_allowed(height: int, width: int, most: int) -> None:
+    kept = np.zeros((height, width), np.bool_)[every_nth((height, width), most)]
+    assert 1 <= kept.size <= most
+    if min(height, width) >= 50 and most >= 50:
+        assert kept.size > min(most, height * width) / 8
+
+
+def test_wall_outline_is_closed_finite_and_on_the_wall() -> None:
+    wall = exact_wall()
+    outline, extent = outline_m(wall), wall.record.rig.wall
+    np.testing.assert_array_equal(outline[0], outline[-1])
+    assert (outline >= [extent.x_min_m - 1e-6, extent.y_min_m - 1e-6]).all()
+    assert (outline <= [extent.x_max_m + 1e-6, extent.y_max_m + 1e-6]).all()
+    pose = wall_from_plane(normal_from_angles(np.radians(75.0), 0.0), 0.2)
+    oblique = outline_m(with_record(wall, wall_from_lidar=pose.tolist(), yaw_deg=75.0, facing_deg=75.0))
+    assert len(oblique) > 3
+    assert np.isfinite(oblique).all()
+    assert oblique[:, 0].max() == pytest.approx(extent.x_max_m, abs=0.5)
+    far = extent.model_copy(update={"x_min_m": -1.0, "x_max_m": -0.9})
+    past = with_record(wall, rig=wall.record.rig.model_copy(update={"wall": far}))
+    assert len(outline_m(past)) == 0
+    assert "bench/measured/footprint" not in dict(bench_drawings(past))
+
+
+def test_bench_drawings_label_distance_and_angle() -> None:
+    drawings = dict(bench_drawings(exact_wall()))
+    assert set(drawings) == PATHS
+    assert drawings["bench/measured/distance/end"].labels.as_arrow_array().to_pylist() == ["0.2000 m"]
+    assert drawings["bench/measured/axis/end"].labels.as_arrow_array().to_pylist() == ["45.0 degrees"]
+    np.testing.assert_allclose(points(drawings["bench/measured/distance/end"]), [[0.0, 0.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(points(drawings["bench/measured/axis/end"]), [[0.2, 0.0, 0.0]], atol=1e-6)
+
+
+def test_bench_drawings_without_a_reference_have_no_points() -> None:
+    wall = exact_wall(reference=None)
+    assert set(dict(bench_drawings(wall))) == PATHS - {"bench/measured/points"}
+    assert wall_pictures(wall) == {}
+    assert wall_names(wall, None).pictures() == []
+
+
+def test_bench_drawings_without_returns_have_no_points() -> None:
+    wall = exact_wall(depth_m=NOTHING, depth_std_m=NOTHING, ir=NOTHING, inliers=np.zeros(SHAPE, np.bool_))
+    assert set(dict(bench_drawings(wall))) == PATHS - {"bench/measured/points"}
+    pictures = wall_pictures(wall)
+    assert (pictures["residual"] == BACKGROUND_RGB).all()
+    assert (pictures["noise"] == BACKGROUND_RGB).all()
+
+
+def test_bench_drawings_leave_out_holes_and_strays() -> None:
+    depth_m = reference_of(exact_wall()).depth_m.copy()
+    chance = np.random.default_rng(0).random(SHAPE)
+    depth_m[chance < 0.6], depth_m[chance > 0.9] = np.nan, 2.0
+    wall = exact_wall(depth_m=depth_m)
+    drawn_m = points(dict(bench_drawings(wall))["bench/measured/points"])
+    near = np.abs(wall_points_m(wall.record, reference_of(wall))[..., 2]) <= OFF_WALL_M
+    assert 0 < len(drawn_m) <= MOST_POINTS
+    assert 0 < near.sum() < depth_m.size / 2
+    assert np.isfinite(drawn_m).all()
+    assert np.abs(drawn_m[:, 2]).max() <= OFF_WALL_M
+
+
+def test_saturated_pixels_are_marked_in_bench_and_picture() -> None:
+    saturated = np.zeros(SHAPE, np.float32)
+    saturated[31, 17] = 0.1
+    wall = exact_wall(saturated=saturated)
+    marked_m = points(dict(bench_drawings(wall))["bench/measured/saturated"])
+    np.testing.assert_allclose(marked_m, [wall_points_m(wall.record, reference_of(wall))[31, 17]], atol=1e-6)
+    is_marked = (wall_pictures(wall)["saturated"] == SATURATED_RGB).all(axis=-1)
+    assert np.argwhere(is_marked).tolist() == [[31, 17]]
+
+
+def test_saturated_pixel_survives_thinning() -> None:
+    shape = 480, 641
+    saturated = np.zeros(shape, np.float32)
+    saturated[301, 17] = 1.0
+    large = reference_of(exact_wall()).intrinsics.scaled(641, 480)
+    blank = np.full(shape, 0.3, np.float32)
+    fields = {"depth_m": blank, "depth_std_m": blank, "ir": blank, "saturated": saturated}
+    wall = exact_wall()
+    reference = dataclasses.replace(reference_of(wall), **fields, inliers=blank > 0, intrinsics=large)
+    picture = wall_pictures(dataclasses.replace(wall, reference=reference))["saturated"]
+    assert picture.shape == (240, 321, 3)
+    assert np.argwhere((picture == SATURATED_RGB).all(axis=-1)).tolist() == [[150, 8]]
+
+
+def test_wall_names_state_their_scales() -> None:
+    names = wall_names(exact_wall(), 0.3)
+    for name, scale in ((names.difference, "30 cm"), (names.residual, "±2 mm"), (names.noise, "0.5 mm")):
+        assert scale in name
+    assert wall_names(exact_wall(), None).difference == ""
+
+
+def row(text: str, name: str) -> str:
+    (found,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
+    return found.split("|")[2].strip()
+
+
+def text_with(**fields: Any) -> str:
+    return calibration_text(RECORD.model_copy(update=fields))
+
+
+def test_calibration_text_holds_measures_with_intervals() -> None:
+    text = calibration_text(RECORD)
+    assert text.startswith("**GOOD**")
+    assert row(text, "distance") == "0.2000 m ± 0.20 mm"
+    assert row(text, "facing") == "45.00° ± 0.020°"
+    assert row(text, "yaw") == "+45.00° ± 0.020°"
+    assert row(text, "pitch") == "+0.00° ± 0.039°"
+    assert row(text, "temperature") == "41.7 °C"
+    assert row(text, "date") == "2026-11-22, 30 frames"
+    assert row(text_with(facing_std_deg=1e-7), "facing") == "45.00° ± 0.001°"
+    assert not any(word in text_with(temperatures_c={}) for word in ("temperature", "offset", "Board", "Note"))
+
+
+def test_calibration_text_shows_warnings_instead_of_all_well() -> None:
+    calm, alarmed = calibration_text(RECORD), calibration_text(RECORD, ["the lidar has moved", "it is warm"])
+    assert ALL_IS_WELL in calm
+    assert "WARNING" not in calm
+    assert ALL_IS_WELL not in alarmed
+    assert "> - the lidar has moved\n> - it is warm" in alarmed
+    assert alarmed.index("it is warm") < alarmed.index("| distance |")  # visible without scrolling
+    unwatched = text_with(reference="", reference_sha256="")
+    assert NOT_WATCHED in unwatched
+    assert ALL_IS_WELL not in unwatched
+
+
+def test_calibration_text_holds_offset_board_and_notes() -> None:
+    offset = {"range_offset_m": -0.0045, "range_offset_std_m": 0.0005, "range_offset_cause": "depth"}
+    text = text_with(**offset, board=BOARD, warnings=("it has ripples",))
+    assert row(text, "offset of depth") == "-4.5 mm ± 0.98 mm"
+    for words in ("+3.40 mm", "0.12°", "6.5 sigma", "used: depth", "Note: it has ripples"):
+        assert words in text
+    alone = {"disagreement_m": None, "disagreement_deg": None, "disagreement_sigmas": None, "used": "board"}
+    assert "24 corners" in text_with(board=BOARD.model_copy(update=alone))
+
+
+def test_calibration_text_holds_occluder_and_temperatures() -> None:
+    occluder = OccluderRecord(source="entered", x_m=0.21, gap_m=0.09)
+    text = text_with(occluder=occluder, temperatures_c={"ldd_temperature": 40.0, "apd_temperature": 35.5})
+    assert row(text, "occluder") == "0.210 m, gap 0.090 m"
+    assert row(text, "temperature") == "35.5 to 40.0 °C"
+    assert "occluder" not in calibration_text(RECORD)
+
+
+@pytest.mark.parametrize(
+    "stds", [{}, dict.fromkeys(("distance_std_m", "facing_std_deg", "yaw_std_deg", "pitch_std_deg"))]
+)
+def test_calibration_text_of_a_version_1_record_has_no_interval(stds: dict[str, None]) -> None:
+    assert ("±" in row(text_with(**stds), "distance")) == (not stds)
