@@ -1,4 +1,4 @@
-"""A doubt network that was trained on nothing, on disk beside weights of no network at all, and sets to learn from."""
+"""Untrained doubt network on disk beside random bytes as its pipeline's weights, and small training sets."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ DARK_V = 0.3
 
 
 def watched_weights(folder: Path, seed: int = 0) -> Path:
-    """Files by the names of a pipeline's, of random bytes."""
+    """Write files of random bytes named like a pipeline's."""
     folder.mkdir()
     generator = np.random.default_rng(seed)
     for name in (*WATCHED, "checkpoint.json"):
@@ -22,12 +22,12 @@ def watched_weights(folder: Path, seed: int = 0) -> Path:
 
 
 def untrained_doubt(folder: Path, watched: Path, seed: int = 0) -> DoubtRecord:
-    """Write a doubt network of random weights, with batch norms that have seen something."""
+    """Write a doubt network of random weights whose batch norms hold statistics."""
     torch.manual_seed(seed)
     network = DoubtNetwork()
     with torch.no_grad():
-        for _ in range(20):
-            network.train()(torch.rand(8, 64, 80), 40 * torch.rand(8, 64, 80), torch.rand(8, 64, 64))
+        for _ in range(3):
+            network.train()(torch.rand(4, 64, 80), 40 * torch.rand(4, 64, 80), torch.rand(4, 64, 64))
     record = DoubtRecord(
         watches=checksum_of_watched(watched),
         recipe=RECIPE,
@@ -42,9 +42,9 @@ def untrained_doubt(folder: Path, watched: Path, seed: int = 0) -> DoubtRecord:
 
 
 def small_doubt_set(count: int, seed: int) -> DoubtSet:
-    """Squares: half of the samples have none, half of the others are told to be outside, and are brighter.
+    """Return squares: half of the samples are empty, half of the others are outside the trained range and brighter.
 
-    Maps have the truth in their middle; images are the truth, a dark square's (v = 0.3) off by a tenth.
+    Maps show the truth in their middle; images are the truth, with an error of 0.1 for dark squares (v = 0.3).
     """
     generator = np.random.default_rng(seed)
     truth, intensity = np.zeros((count, 64, 64), np.float16), np.full((count, 64, 80), 10.0, np.float32)

@@ -1,4 +1,4 @@
-"""Images of plates, maps that show them as no lidar would, and networks that learn from them in a moment."""
+"""Images of plates, simplified maps of them, and networks that learn from them in a moment."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nlos_calibration.arrays import Float16
 from nlos_models import checkpoint
 from nlos_models import pipeline as networks
+from nlos_models.arrays import Float16
 from nlos_models.data import MapBatch, MapSet, map_batches
 from nlos_models.pipeline import Pipeline
 from nlos_models.recipe import Recipe
@@ -17,10 +17,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 LATENT = 256
+HARD_MAPS = ("constant", "all zero", "saturated", "half invalid", "all invalid")
 
 
 def small_images(count: int, seed: int) -> Float16:
-    """Images (n, 64, 64): one bright square each."""
+    """Return images (n, 64, 64) of one bright square each."""
     generator, images = np.random.default_rng(seed), np.zeros((count, 64, 64), np.float16)
     for image in images:
         row, column = generator.integers(8, 30, 2)
@@ -29,7 +30,7 @@ def small_images(count: int, seed: int) -> Float16:
 
 
 def small_maps(count: int, seed: int) -> MapSet:
-    """The same images, and maps (n, 64, 80) in which they are to be seen; no return beside them."""
+    """Return the same images with maps (n, 64, 80) that show them, without returns beside them."""
     images = small_images(count, seed)
     intensity = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8))) * 50
     depth = np.where(intensity > 0, intensity / 100, np.float32(np.nan)).astype(np.float32)
@@ -37,7 +38,7 @@ def small_maps(count: int, seed: int) -> MapSet:
 
 
 def hard_maps(name: str, channels: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-    """Depth (1, 64, 80) and intensity (1, *channels, 64, 80) that a bench may well deliver, each in one extreme."""
+    """Return depth (1, 64, 80) and intensity (1, *channels, 64, 80) at an extreme that a camera can deliver."""
     depth, intensity = torch.full((1, 64, 80), 0.3), torch.full((1, *channels, 64, 80), 10.0)
     if name == "all zero":
         depth, intensity = torch.zeros_like(depth), torch.zeros_like(intensity)
@@ -51,7 +52,7 @@ def hard_maps(name: str, channels: tuple[int, ...] = ()) -> tuple[Tensor, Tensor
 
 
 class SmallDataset:
-    """Stands for a dataset on the disk, of two shards."""
+    """Stand-in for a dataset of two shards on disk."""
 
     def __init__(self, maps: MapSet, plan: Any) -> None:
         self._maps, self.plan = maps, plan
@@ -75,7 +76,7 @@ class SmallDataset:
 
 
 class SmallEncoder(nn.Module):
-    """Stands for Encoder: coarse pixels, a batch norm, two linear maps."""
+    """Stand-in for Encoder: coarse pixels, a batch norm, two linear maps."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -88,7 +89,7 @@ class SmallEncoder(nn.Module):
 
 
 class SmallDecoder(nn.Module):
-    """Stands for Decoder: a batch norm, and one linear map to coarse pixels."""
+    """Stand-in for Decoder: a batch norm, and one linear map to coarse pixels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -100,7 +101,7 @@ class SmallDecoder(nn.Module):
 
 
 class SmallVae(nn.Module):
-    """Stands for ResVae."""
+    """Stand-in for ResVae."""
 
     latent = LATENT
 
@@ -114,7 +115,7 @@ class SmallVae(nn.Module):
 
 
 class SmallCompressor(nn.Module):
-    """Stands for Compressor of any width: features with a batch norm, then dropout and a linear classifier."""
+    """Stand-in for Compressor of any width: features with a batch norm, then dropout and a linear classifier."""
 
     def __init__(self, dropout: float = 0.5, width: float = 1.0) -> None:  # noqa: ARG002  small is small
         super().__init__()
@@ -127,7 +128,7 @@ class SmallCompressor(nn.Module):
 
 
 def use_small_networks(patch: pytest.MonkeyPatch, *modules: object) -> None:
-    """Let networks be made small, and by modules that make their own."""
+    """Replace the networks by small ones, also in modules that import the classes."""
     small_ones = {"ResVae": SmallVae, "Encoder": SmallEncoder, "Decoder": SmallDecoder, "Compressor": SmallCompressor}
     for module in (networks, *modules):
         for name, small in small_ones.items():
@@ -135,7 +136,7 @@ def use_small_networks(patch: pytest.MonkeyPatch, *modules: object) -> None:
 
 
 def untrained_weights(folder: Path, *, rig: Any, seed: int = 0, **recipe: Any) -> None:
-    """Write weights of small networks (see `use_small_networks`) that were trained on nothing, by a recipe."""
+    """Write a checkpoint of untrained small networks (see `use_small_networks`) with this recipe."""
     facts = {"objects": 10, "held_out": 2, "epochs": 1, "batch": 2, "learning_rate": 1e-3, "image_weight": 1.0}
     facts |= {"latent_weight": 0.0} if recipe.get("steps") == "one" else {}
     made = Recipe.model_validate({"task": "compressor", **facts, **recipe})

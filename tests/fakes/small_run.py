@@ -1,4 +1,4 @@
-"""A training run small enough to end in a moment, in this process, in one that is killed, or in several at once."""
+"""Training runs that take a moment: in this process, in a process that is killed, or in several processes."""
 
 import csv
 import os
@@ -19,23 +19,46 @@ STEPS = SAMPLES // BATCH
 
 
 def small_recipe(**changes: object) -> Recipe:
-    """Four epochs of six steps, unless changed."""
+    """Return a recipe of four epochs of six steps, with these changes."""
     facts = {"task": "vae", "objects": SAMPLES, "held_out": 4, "epochs": 4, "batch": BATCH, "learning_rate": 1e-2}
     return Recipe.model_validate(facts | changes)
 
 
+def log_rows(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of a run's log.csv without the column that depends on the clock."""
+    with (folder / "log.csv").open(encoding="utf-8") as file:
+        return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+
+
+def state_of(module: nn.Module) -> dict[str, Tensor]:
+    """Return a copy of a network's state."""
+    return {name: tensor.clone() for name, tensor in module.state_dict().items()}
+
+
+def changed_tensors(before: dict[str, Tensor], after: dict[str, Tensor]) -> set[str]:
+    """Return the names of the tensors that differ by any bit."""
+    assert before.keys() == after.keys()
+    return {name for name, tensor in before.items() if not torch.equal(tensor, after[name])}
+
+
 class Stopped(Exception):  # noqa: N818  a stand-in for a fault
-    """Someone pulled the plug."""
+    """Fault that ends a run."""
+
+
+def stop_halfway(step: int, total: int) -> None:
+    """Fail one step after the middle of a run."""
+    if step == total // 2 + 1:
+        raise Stopped
 
 
 class SmallRun:
-    """A regression with noise and, unless `plain`, dropout and a batch norm: all that a resumed run could get wrong."""
+    """Regression with noise and, unless `plain`, dropout and a batch norm: all state that resuming must restore."""
 
     def __init__(self, recipe: Recipe, folder: Path, *, plain: bool = False) -> None:
         torch.manual_seed(7)
         self.recipe, self.folder, self.steps, self.scored = recipe, folder, list[tuple[int, int]](), 0
         self.done = list[float]()
-        """What the loss was told of the run's progress, step by step."""
+        """The share of the run that the loss was given at each step."""
         self.x = torch.rand(SAMPLES, 3)
         self.y = self.x.sum(1, keepdim=True)
         middle = [] if plain else [nn.BatchNorm1d(16), nn.Dropout(0.1)]
@@ -53,14 +76,14 @@ class SmallRun:
         return (self.net(x + self.noise * torch.randn(x.shape)) - y).square().mean()
 
     def score(self) -> dict[str, float]:
-        """The held-out loss."""
+        """Return the held-out loss."""
         assert not self.net.training
         self.scored += 1
         with torch.inference_mode():
             return {"held_out_loss": (self.net(self.x) - self.y).square().mean().item()}
 
     def go(self, fail_at: int | None = None, **running: Any) -> dict[str, float]:
-        """Train to the end, or to a fault."""
+        """Train to the end, or to a fault at step `fail_at`."""
 
         def on_step(done: int, total: int) -> None:
             self.steps.append((done, total))
@@ -81,26 +104,25 @@ class SmallRun:
 
     @property
     def log(self) -> list[dict[str, str]]:
-        """The rows of log.csv, but for what depends on the clock."""
-        with (self.folder / "log.csv").open(encoding="utf-8") as file:
-            return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+        """Rows of log.csv without the column that depends on the clock."""
+        return log_rows(self.folder)
 
 
 class Executioner:
-    """Counts the moments of a run, and kills its process at one of them."""
+    """Counter of the moments of a run; kills its process at one of them."""
 
     def __init__(self, moment: int | None = None) -> None:
         self.seen, self.moment = 0, moment
 
     def __call__(self) -> None:
-        """One more moment."""
+        """Count one more moment."""
         self.seen += 1
         if self.seen == self.moment:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
 def run_watched(recipe: Recipe, folder: Path, executioner: Executioner) -> SmallRun:
-    """Train with a checkpoint after each step; a moment is before a step, while a file is written, before a rename."""
+    """Train with a checkpoint after each step; moments are before a step, during a write and before a rename."""
     run, fsync, replace = SmallRun(recipe, folder), os.fsync, Path.replace
 
     def watched_fsync(file: int) -> None:
@@ -121,13 +143,13 @@ def run_watched(recipe: Recipe, folder: Path, executioner: Executioner) -> Small
 
 
 def be_killed(recipe_json: str, folder: str, moment: int) -> None:
-    """What a process does that is killed at a moment of its run."""
+    """Run in a child process until it is killed at this moment."""
     torch.set_num_threads(1)
     run_watched(Recipe.model_validate_json(recipe_json), Path(folder), Executioner(moment))
 
 
 def on_two(fabric: Fabric, folder: Path) -> dict[str, Any]:
-    """What each of several processes does: a run, and the same stopped by the other one's wish and gone on with."""
+    """Run in each of two processes: train once in one go, and once stopped by the other process and resumed."""
     recipe = small_recipe(epochs=3, schedule="one-cycle")
     whole = SmallRun(recipe, folder / "whole", plain=True)
     figures = whole.go(fabric=fabric)

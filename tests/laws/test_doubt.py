@@ -1,4 +1,4 @@
-"""What doubt promises of the shipped weights, through all that `live` does with a frame."""
+"""Verdicts and expected errors of the shipped weights, through the whole processing of a frame."""
 
 from collections.abc import Sequence
 
@@ -21,6 +21,8 @@ from nlos_cam.render.renderer import render
 from nlos_cam.render.sensor.model import SensorModel
 from nlos_cam.render.sensor.sensor import Sensor
 
+pytestmark = pytest.mark.slow
+
 RIG = load_rig("paper-rig")
 
 
@@ -33,7 +35,7 @@ def processing() -> Processing:
 
 
 def frames_of(sight: Sight, count: int, seed: int) -> list[Frame]:
-    """Frames of one instant, with other noise in each."""
+    """Return frames of one scene with different noise."""
     sensor, echoes = Sensor(sight.rig, sight.sensor), render(sight.scene, "draft").multi
     noises = (np.random.default_rng([seed, number]) for number in range(count))
     return [sensor.expose(echoes, noise).frame(sight.rig.pinhole) for noise in noises]
@@ -44,14 +46,14 @@ def steps_of(processing: Processing, frames: Sequence[Frame]) -> list[Step]:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_an_empty_bench_never_shows_an_object(processing: Processing, seed: int) -> None:
+def test_empty_bench_never_shows_an_object(processing: Processing, seed: int) -> None:
     bench = varied_empty(RIG, SensorModel(), np.random.default_rng([seed, 77]))
     for step in steps_of(processing, frames_of(Sight(*bench), 3, seed)):
         assert step.verdict == Verdict.NOTHING
         assert not step.reconstruction.shows
 
 
-def test_test_objects_are_seen_and_errors_are_expected_where_they_are_large(processing: Processing) -> None:
+def test_known_objects_are_seen_with_honest_expected_errors(processing: Processing) -> None:
     subjects = test_set(object_box(RIG))[::3]
     expected, observed, verdicts = list[float](), list[float](), list[Verdict | None]()
     for subject, maps in zip(subjects, sense(echoes_of(subjects, RIG, lambda *_: None), RIG), strict=True):
@@ -73,24 +75,22 @@ def test_test_objects_are_seen_and_errors_are_expected_where_they_are_large(proc
 
 
 def frame_of(maps: LidarMaps) -> Frame:
-    """A frame of one pixel for each cell, whose maps are these."""
+    """Return a frame of one pixel per cell that yields these maps."""
     ir = np.clip(np.round(maps.intensity), 0, 255).astype(np.uint8)
     return Frame(maps.depth_m, ir, ir, 0.0, 0, RIG.pinhole.scaled(80, 64))
 
 
 @pytest.mark.parametrize("name", ["plates", "other rig", "other sensor", "large"])
-def test_outliers_of_the_plainest_kinds_are_told(processing: Processing, name: str) -> None:
-    told = list[Verdict | None]()
+def test_plain_outliers_are_reported_as_unusual(processing: Processing, name: str) -> None:
+    verdicts = list[Verdict | None]()
     for seed in range(8):
         sight = outlier(TO_LEARN[name], np.random.default_rng([seed, 78]), Sight(RIG, SensorModel()))
-        told.append(steps_of(processing, frames_of(sight, 5, seed))[-1].verdict)
-    assert told.count(Verdict.OUTSIDE) + told.count(Verdict.SATURATED) >= 6
+        verdicts.append(steps_of(processing, frames_of(sight, 5, seed))[-1].verdict)
+    assert verdicts.count(Verdict.OUTSIDE) + verdicts.count(Verdict.SATURATED) >= 6
 
 
-def test_an_object_that_comes_and_goes_is_told_with_its_first_frame_and_gone_with_the_next(
-    processing: Processing,
-) -> None:
+def test_object_shows_in_its_first_frame_and_not_after(processing: Processing) -> None:
     sight = ordinary(np.random.default_rng(5), Sight(RIG, SensorModel()))
     with_it, without = frames_of(sight, 1, 0), frames_of(Sight(RIG, SensorModel()), 1, 0)
-    told = [step.reconstruction.shows for step in steps_of(processing, [*without, *with_it, *without])]
-    assert told == [False, True, False]
+    shown = [step.reconstruction.shows for step in steps_of(processing, [*without, *with_it, *without])]
+    assert shown == [False, True, False]

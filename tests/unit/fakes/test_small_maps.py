@@ -1,4 +1,4 @@
-"""What stands for the networks has their shapes and parts, and the small maps show the small images."""
+"""Stand-ins for networks have the shapes and parts of the real ones, and small maps show the small images."""
 
 from pathlib import Path
 
@@ -8,8 +8,11 @@ import torch
 from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint
 from nlos_models.compressor import Compressor
+from nlos_models.doubt_checkpoint import load_doubt
 from nlos_models.vae import ResVae
+from small_doubt import small_doubt_set, untrained_doubt, watched_weights
 from small_maps import (
+    HARD_MAPS,
     SmallCompressor,
     SmallVae,
     hard_maps,
@@ -20,6 +23,8 @@ from small_maps import (
 )
 from torch import nn
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def _shapes(vae: nn.Module, compressor: nn.Module) -> list[torch.Size]:
     rebuilt, mean, log_variance = vae.eval()(torch.rand(2, 1, 64, 64), torch.zeros(2, 256))
@@ -27,13 +32,12 @@ def _shapes(vae: nn.Module, compressor: nn.Module) -> list[torch.Size]:
 
 
 @torch.no_grad()
-def test_small_networks_have_the_shapes_and_the_parts_of_the_real_ones() -> None:
+def test_small_networks_have_shapes_and_parts_of_real_ones() -> None:
     assert _shapes(SmallVae(), SmallCompressor()) == _shapes(ResVae(), Compressor())
     for compressor in (SmallCompressor(0.25, 0.5), Compressor(0.25, 0.5)):
         dropout, linear = compressor.classifier
         assert isinstance(compressor.features, nn.Module)
-        assert dropout.p == 0.25
-        assert linear.out_features == 256
+        assert (dropout.p, linear.out_features) == (0.25, 256)
     for vae in (SmallVae(), ResVae()):
         assert any(isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d) for part in vae.decoder.modules())
         assert vae.decoder.output.weight.requires_grad
@@ -48,11 +52,11 @@ def test_small_maps_show_their_images_and_nothing_else(seed: int) -> None:
 
 
 @pytest.mark.parametrize("steps", ["two", "one"])
-def test_untrained_weights_are_a_checkpoint_of_small_networks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: str
-) -> None:
+def test_untrained_weights_load_and_differ_by_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: str) -> None:
     rig = load_rig("paper-rig")
+    watched = watched_weights(tmp_path / "watched")
     for seed in (0, 1):
+        untrained_doubt(tmp_path / f"doubt{seed}", watched, seed)
         untrained_weights(tmp_path / str(seed), rig=rig, seed=seed, steps=steps, maps="difference maps")
     use_small_networks(monkeypatch, checkpoint)
     (one, record), (other, _) = (checkpoint.load_pipeline(tmp_path / name) for name in "01")
@@ -64,12 +68,23 @@ def test_untrained_weights_are_a_checkpoint_of_small_networks(
         made = [pipeline.latent(*maps) for pipeline in (one, other)]
     assert made[0].shape == (2, 256)
     assert not torch.allclose(*made)
+    doubts = [load_doubt(tmp_path / f"doubt{seed}")[0] for seed in (0, 1)]
+    assert not torch.equal(*(doubt.network.pixels.weight for doubt in doubts))
 
 
 @pytest.mark.parametrize("channels", [(), (3,)])
-def test_hard_maps_are_as_hard_as_they_are_called(channels: tuple[int, ...]) -> None:
-    names = ["constant", "all zero", "saturated", "half invalid", "all invalid"]
-    depth, intensity = zip(*(hard_maps(name, channels) for name in names), strict=True)
+def test_hard_maps_have_the_named_extremes(channels: tuple[int, ...]) -> None:
+    depth, intensity = zip(*(hard_maps(name, channels) for name in HARD_MAPS), strict=True)
     assert [float(d.isnan().float().mean()) for d in depth] == [0, 0, 0, 0.5, 1]
     assert [float(i.max()) for i in intensity] == [10, 0, 255, 10, 10]
     assert {i.shape for i in intensity} == {(1, *channels, 64, 80)}
+
+
+def test_small_doubt_set_has_all_kinds_and_varying_errors() -> None:
+    some = small_doubt_set(40, 0)
+    assert (some.nothing.sum(), some.outside.sum()) == (20, 10)
+    assert not (some.nothing & some.outside).any()
+    assert not some.truth[some.nothing].any()
+    off = np.abs(some.made.astype(float) - some.truth)
+    dark, bright = (off[(some.truth > 0) & (some.truth.astype(float) < 0.5)], off[some.truth.astype(float) > 0.5])
+    assert dark.min() > 5 * bright.max() > 0

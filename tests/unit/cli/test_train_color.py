@@ -1,0 +1,133 @@
+"""`train` on rendered datasets, in color and of depth: both steps, streams, and refused combinations of the two."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nlos_calibration.rig import load_rig
+from nlos_models.checkpoint import load_encoder, load_pipeline, load_record, load_vae
+from nlos_models.errors import CheckpointError
+from nlos_models.inference import load_reconstructor
+from nlos_models.recipe import SIMULATION_ONLY
+from nlos_models.tasks import run
+from small_run import log_rows
+
+from nlos_cam.cli.main import main
+from nlos_cam.dataset import build
+from nlos_cam.dataset.samples import make_samples
+from nlos_cam.dataset.shards import shard_path, store
+from nlos_cam.errors import RecordingError
+from nlos_cam.objects.textures import TEXTURES
+
+pytestmark = [pytest.mark.usefixtures("narrow_networks", "one_thread"), pytest.mark.slow]
+
+BASE = "objects = 2\nheld_out = 2\nepochs = 3\nbatch = 2\nlearning_rate = 1e-3\nimage_weight = 1\n"
+RECIPES = {
+    "vae": 'task = "vae"\ncolour = true\n',
+    "vae-of-depth": 'task = "vae"\n',
+    "compressor": 'task = "compressor"\ncolour = true\n',
+    "compressor-on": 'task = "compressor"\ncolour = true\nstart = "weights"\n',
+    "compressor-of-depth": 'task = "compressor"\n',
+    "transfer-of-depth": 'task = "transfer"\n',
+}
+Answer = dict[str, Any]
+Go = Callable[..., tuple[int, Answer]]
+
+
+@pytest.fixture(scope="module")
+def folder(one_thread: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recipes, training and held-out datasets in color and of depth, and a VAE of each."""
+    del one_thread
+    folder = tmp_path_factory.mktemp("color")
+    for name, textures in (("data", tuple(TEXTURES)), ("depth", ())):
+        for seed, of in ((40, name), (50, f"{name}-held-out")):
+            plan = build.DatasetPlan(load_rig("paper-rig"), seed, accuracy="draft", textures=textures)
+            (folder / of).mkdir()
+            store(shard_path(folder / of, seed), make_samples(plan, range(seed, seed + 2)), plan.provenance, "")
+    for name, text in RECIPES.items():
+        (folder / f"{name}.toml").write_text(text + BASE, encoding="utf-8")
+    for name in ("vae", "vae-of-depth"):
+        assert main(["train", "vae", "--recipe", str(folder / f"{name}.toml"), "--out", str(folder / name)]) == 0
+    return folder
+
+
+@pytest.fixture
+def go(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Go:
+    def train(recipe: str, *flags: str, data: str = "data", **options: str) -> tuple[int, Answer]:
+        maps = ["--dataset", str(folder / data), "--held-out", str(folder / f"{data}-held-out"), *flags]
+        named = [part for name, value in options.items() for part in (f"--{name}", str(folder / value))]
+        task, out = recipe.split("-", maxsplit=1)[0], tmp_path / "out"
+        code = main(["train", task, "--recipe", f"{folder / recipe}.toml", "--out", str(out), *maps, *named, "--json"])
+        return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+
+    return train
+
+
+def test_trained_depth_pipeline_has_decoder_of_vae(go: Go, folder: Path, tmp_path: Path) -> None:
+    code, answer = go("compressor-of-depth", data="depth", vae="vae-of-depth")
+    pipeline, record = load_pipeline(tmp_path / "out")
+    vae, _ = load_vae(folder / "vae-of-depth")
+    assert (code, answer) == (0, {"out": str(tmp_path / "out"), **record.figures})
+    assert [run.task for run in record.runs] == ["vae", "compressor"]
+    torch.testing.assert_close(pipeline.decoder.state_dict(), vae.decoder.state_dict(), rtol=0, atol=0)
+
+
+def test_color_training_notes_simulation_and_continues(go: Go, folder: Path, tmp_path: Path) -> None:
+    code, answer = go("compressor", vae="vae")
+    assert (code, answer["note"]) == (0, SIMULATION_ONLY)
+    pipeline, record = load_pipeline(tmp_path / "out")
+    held_out = build.open_dataset(folder / "data-held-out", colour=True).arrays()
+    assert run(pipeline, held_out).shape == held_out.image.shape == (2, 3, 64, 64)
+    encoder, vae = load_encoder(tmp_path / "out"), load_vae(folder / "vae")[0]
+    assert encoder is not None
+    torch.testing.assert_close(encoder.state_dict(), vae.encoder.state_dict(), rtol=0, atol=0)
+    with pytest.raises(CheckpointError, match="simulation only"):
+        load_reconstructor(tmp_path / "out", tmp_path / "onnx")
+    for log in (log_rows(tmp_path / "out"), log_rows(folder / "vae")):
+        assert float(log[-1]["loss"]) < float(log[0]["loss"])
+    assert set(record.figures) == {"held_out_loss", "held_out_iou", "held_out_colour_error"}
+    assert record.figures == {name: value for name, value in answer.items() if name not in {"out", "note"}}
+    assert (record.colour, record.note) == (True, SIMULATION_ONLY)
+    assert record.vae_recipe == load_record(folder / "vae").vae_recipe
+    assert go("compressor", vae="vae") == (code, answer)  # it had finished
+    (tmp_path / "out").rename(folder / "first")
+    assert go("compressor-on", vae="vae", weights="first")[0] == 0
+    assert [run.start for run in load_record(tmp_path / "out").runs] == ["scratch", "scratch", "weights"]
+    code, answer = go("transfer-of-depth", data="depth", weights="first")
+    assert code == 1
+    assert all(word in answer["error"]["message"] for word in (str(folder / "first"), "simulation only"))
+
+
+def test_streamed_color_maps_train_like_those_in_memory(go: Go, tmp_path: Path) -> None:
+    assert go("compressor", "--stream", "--tensorboard", vae="vae")[0] == 0
+    streamed, record = load_pipeline(tmp_path / "out")
+    assert (tmp_path / "out" / "tensorboard").is_dir()
+    (tmp_path / "out").rename(tmp_path / "streamed")
+    assert go("compressor", vae="vae")[0] == 0
+    held, same = load_pipeline(tmp_path / "out")
+    assert torch.equal(streamed.preprocess.mean, held.preprocess.mean)
+    assert record.runs == same.runs
+
+
+@pytest.mark.parametrize(
+    ("recipe", "options", "code", "word"),
+    [
+        ("compressor", {}, 1, "simulation only"),
+        ("compressor", {"data": "depth", "vae": "vae"}, 4, "depth"),
+        ("compressor-on", {"vae": "vae"}, 1, "simulation only"),
+        ("compressor-of-depth", {"vae": "vae"}, 1, "simulation only"),
+        ("compressor-of-depth", {"vae": "vae-of-depth"}, 4, "simulation only"),
+        ("compressor-of-depth", {"vae": "data"}, 4, "data"),
+    ],
+)
+def test_train_refuses_mixture_of_depth_and_color(
+    go: Go, folder: Path, tmp_path: Path, recipe: str, options: dict[str, str], code: int, word: str
+) -> None:
+    with pytest.raises(RecordingError, match="simulation only"):
+        build.read(folder / "data")
+    ended, answer = go(recipe, **options)
+    assert (ended, word in answer["error"]["message"]) == (code, True), answer
+    assert not (tmp_path / "out").exists()

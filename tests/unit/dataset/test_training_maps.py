@@ -1,0 +1,125 @@
+"""Training maps of a recipe, in memory or streamed, and the bare wall that difference maps subtract."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from nlos_calibration.rig import load_rig
+from nlos_models.data import flip_some, less_bare_wall
+from small_maps import SmallDataset, small_maps
+from small_run import small_recipe
+
+from nlos_cam.dataset import build, training_maps
+from nlos_cam.dataset.training_maps import Streamed, TrainingMaps, measured_bare_wall, read_maps, render_bare_wall
+from nlos_cam.errors import SceneError
+from nlos_cam.frames import maps_from_frame
+from nlos_cam.render.renderer import render
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.sensor.sensor import Sensor
+
+PLAN = build.DatasetPlan(load_rig("paper-rig"), 0)
+OTHER = replace(PLAN, rig=PLAN.rig.model_copy(update={"name": "other"}))
+RECIPE = small_recipe(task="compressor", objects=4, held_out=2)
+WALL = Path("wall.toml")
+
+
+@pytest.fixture(autouse=True)
+def _datasets(monkeypatch: pytest.MonkeyPatch) -> None:
+    def opened(of: Path, *, colour: bool) -> SmallDataset:
+        assert not colour
+        return SmallDataset(small_maps(6, len(of.name)), OTHER if "rig" in of.name else PLAN)
+
+    monkeypatch.setattr(build, "open_dataset", opened)
+
+
+def _read(
+    data: str = "data", other: str = "other", wall: Path | None = None, *, stream: bool = False, **changes: object
+) -> TrainingMaps:
+    return read_maps(RECIPE.model_copy(update=changes), Path(data), Path(other), wall, stream=stream)
+
+
+def test_read_maps_takes_first_objects_of_recipe() -> None:
+    maps = _read()
+    np.testing.assert_array_equal(maps.training.image, small_maps(6, 4).image[:4])
+    np.testing.assert_array_equal(maps.held_out.image, small_maps(6, 5).image[:2])
+    assert maps.told(RECIPE) == RECIPE
+    assert _read(held_out=400).told(RECIPE).held_out == 6  # all that there are
+
+
+def test_digest_depends_on_objects_and_rig() -> None:
+    pairs = (("data", "other"), ("also", "other"), ("others", "other"), ("rig1", "rig2"))
+    digests = [_read(*pair).digest for pair in pairs]
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 3
+
+
+@pytest.mark.parametrize(
+    ("held_out", "wall", "stream", "word"),
+    [
+        ("other/../data", None, False, "--held-out"),
+        ("other", WALL, False, r"wall\.toml"),
+        ("other-rig", None, False, "rigs"),
+        ("other", None, True, "--objects 6"),
+    ],
+)
+def test_read_maps_refuses_what_does_not_fit(held_out: str, wall: Path | None, stream: bool, word: str) -> None:
+    with pytest.raises(SceneError, match=word):
+        _read("data", held_out, wall, stream=stream)
+
+
+def test_rendered_bare_wall_cancels_a_frame_of_bare_wall() -> None:
+    depth_m, intensity = render_bare_wall(PLAN, frames=8)
+    images = Sensor(PLAN.rig, PLAN.sensor).expose(render(Scene(PLAN.rig)).multi, np.random.default_rng(99))
+    maps = maps_from_frame(images.frame(PLAN.rig.pinhole))
+    valid = maps.valid & ~np.isnan(depth_m)
+    assert valid.mean() > 0.5
+    assert abs(np.median((maps.depth_m - depth_m)[valid])) < 1e-3
+    assert abs(np.median((maps.intensity - intensity)[valid])) < 0.05 * np.median(intensity[valid])
+    assert np.median(depth_m[valid]) > 0.1
+
+
+def test_render_bare_wall_refuses_varying_rigs() -> None:
+    with pytest.raises(SceneError, match="--wall"):
+        render_bare_wall(replace(PLAN, spread=build.RigSpread(place_m=0.01)))
+
+
+def test_measured_bare_wall_is_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    reference = SimpleNamespace(map_depth_m=np.ones((64, 80)), map_intensity=np.zeros((64, 80)))
+    monkeypatch.setattr(training_maps, "load_measured", lambda _: SimpleNamespace(reference=reference))
+    depth_m, intensity = measured_bare_wall(WALL)
+    assert depth_m is reference.map_depth_m
+    assert intensity is reference.map_intensity
+    monkeypatch.setattr(training_maps, "load_measured", lambda _: SimpleNamespace(reference=None))
+    with pytest.raises(SceneError, match=r"wall\.toml"):
+        measured_bare_wall(WALL)
+
+
+@pytest.mark.parametrize("wall", [None, WALL])
+def test_difference_maps_subtract_measured_or_rendered_wall(monkeypatch: pytest.MonkeyPatch, wall: Path | None) -> None:
+    flat = np.zeros((64, 80), np.float32)
+    monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (flat, flat + 1))
+    monkeypatch.setattr(training_maps, "measured_bare_wall", lambda _: (flat, flat + 2))
+    made = _read(wall=wall, maps="difference maps")
+    for maps, raw in ((made.training.first(4), small_maps(6, 4)), (made.held_out, small_maps(6, 5))):
+        difference = raw.intensity[: len(maps.image)] - maps.intensity
+        np.testing.assert_allclose(difference[~np.isnan(maps.depth_m)], 2.0 if wall else 1.0)
+
+
+def test_streamed_maps_equal_maps_in_memory() -> None:
+    maps, generator = small_maps(8, 0), np.random.default_rng(0)
+    bare = tuple(generator.random((64, 80), np.float32) for _ in range(2))
+    stream, whole = Streamed(SmallDataset(maps, PLAN), maps.image, bare), less_bare_wall(maps, *bare)
+    batches, again = (list(stream.batches(4, torch.Generator().manual_seed(3))) for _ in "ab")
+    for batch, same in zip(batches, again, strict=True):
+        wanted = [torch.from_numpy(part)[batch.row] for part in (whole.depth_m, whole.intensity)]
+        found, wanted = [batch.depth_m, batch.intensity], flip_some(wanted, batch.mirrored)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
+        assert torch.equal(batch.row, same.row)
+        assert torch.equal(batch.mirrored, same.mirrored)
+    assert sorted(torch.cat([batch.row for batch in batches]).tolist()) == list(range(8))
+    np.testing.assert_array_equal(stream.first(6).depth_m, whole.depth_m[:6])
+    assert len(stream.first(99).image) == 8
+    assert isinstance(_read(stream=True, objects=6).training, Streamed)

@@ -1,0 +1,246 @@
+"""From lidar maps to hidden images: split and stack, normalisation, networks of depth and color, silhouettes."""
+
+import numpy as np
+import pytest
+import torch
+from nlos_models.compressor import Compressor, ResNet50
+from nlos_models.data import flip_some
+from nlos_models.metrics import LEAST_V
+from nlos_models.pipeline import (
+    CHANNELS,
+    KEPT_SHARE,
+    WINDOW,
+    Pipeline,
+    Preprocess,
+    channel_statistics,
+    cut_silhouette,
+    lift_edges,
+    new_pipeline,
+    new_vae,
+    split_and_stack,
+    stacked_channels,
+)
+from small_maps import HARD_MAPS, hard_maps
+from torch import Tensor
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def _maps(n: int = 3, colors: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    depth = 0.2 + torch.rand(n, 64, 80, generator=generator)
+    intensity = 50 * torch.rand((n, colors, 64, 80) if colors else (n, 64, 80), generator=generator)
+    depth[torch.rand(depth.shape, generator=generator) < 0.1] = torch.nan
+    return depth, intensity
+
+
+def _fitted(maps: tuple[Tensor, Tensor], intensities: int = 1) -> Preprocess:
+    preprocess = Preprocess(intensities=intensities).eval()
+    preprocess.learn(split_and_stack(*maps))
+    return preprocess
+
+
+def test_split_and_stack_puts_halves_in_documented_channels() -> None:
+    column = torch.arange(80.0).expand(1, 64, 80)
+    left_depth, right_depth, left_intensity, right_intensity = split_and_stack(column, 100 + column)[0]
+    assert torch.equal(left_depth[0], torch.arange(40.0))
+    assert torch.equal(right_depth[0], torch.arange(40.0, 80.0))
+    assert torch.equal(left_intensity, 100 + left_depth)
+    assert torch.equal(right_intensity, 100 + right_depth)
+
+
+def test_split_and_stack_marks_missing_return_in_all_channels() -> None:
+    depth, intensity = torch.ones(1, 64, 80), torch.ones(1, 64, 80)
+    depth[0, 5, 10], depth[0, 6, 70] = torch.nan, torch.nan
+    missing = torch.isnan(split_and_stack(depth, intensity))[0].nonzero().tolist()
+    assert missing == [[0, 5, 10], [1, 6, 30], [2, 5, 10], [3, 6, 30]]
+
+
+@pytest.mark.parametrize("colors", [0, 3])
+def test_split_and_stack_commutes_with_mirroring(colors: int) -> None:
+    maps, flips = _maps(colors=colors), torch.tensor([True, False, True])
+    before = split_and_stack(*flip_some(list(maps), flips))
+    (after,) = flip_some([split_and_stack(*maps)], flips)
+    torch.testing.assert_close(before, after, rtol=0, atol=0, equal_nan=True)
+
+
+def test_split_and_stack_treats_each_color_like_intensity() -> None:
+    depth, intensity = _maps(colors=3)
+    stacked = split_and_stack(depth, intensity)
+    assert stacked.shape == (3, stacked_channels(3), 64, 40)
+    for color in range(3):
+        chosen = stacked[:, [0, 1, 2 + 2 * color, 3 + 2 * color]]
+        of_one = split_and_stack(depth, intensity[:, color])
+        torch.testing.assert_close(chosen, of_one, rtol=0, atol=0, equal_nan=True)
+
+
+def test_channel_statistics_ignore_missing_returns() -> None:
+    stacked = split_and_stack(*_maps())
+    mean, spread = channel_statistics(stacked)
+    values = stacked.double().numpy()
+    np.testing.assert_allclose(mean, np.nanmean(values, (0, 2, 3)), rtol=1e-6)
+    np.testing.assert_allclose(spread, np.nanstd(values, (0, 2, 3)), rtol=1e-6)
+    for statistic in channel_statistics(torch.full((2, 4, 64, 40), torch.nan)):
+        assert torch.equal(statistic, torch.zeros(4))
+
+
+def test_preprocess_normalises_training_maps() -> None:
+    maps = _maps()
+    preprocess, stacked = _fitted(maps), split_and_stack(*maps)
+    mean, spread = channel_statistics((stacked - preprocess.mean[:, None, None]) / preprocess.spread[:, None, None])
+    torch.testing.assert_close(mean, torch.zeros(4), atol=1e-5, rtol=0)
+    torch.testing.assert_close(spread, torch.ones(4), atol=1e-5, rtol=0)
+
+
+def test_preprocess_gives_missing_return_the_channel_mean() -> None:
+    depth, intensity = _maps()
+    preprocess, hole = _fitted((depth, intensity)), torch.isnan(depth)
+    mean = preprocess.mean
+    depth_mean, intensity_mean = (torch.cat([m.expand(40), n.expand(40)]) for m, n in (mean[:2], mean[2:]))
+    filled = torch.where(hole, depth_mean, depth), torch.where(hole, intensity_mean, intensity)
+    torch.testing.assert_close(preprocess(depth, intensity), preprocess(*filled), atol=1e-5, rtol=0)
+    assert torch.equal(preprocess(depth, intensity), preprocess(depth, torch.where(hole, 1e6, intensity)))
+
+
+def test_preprocess_noise_falls_on_left_channels_in_training() -> None:
+    torch.manual_seed(0)
+    maps, preprocess = _maps(8), Preprocess(left_noise=0.2)
+    kept = [part.clone() for part in maps]
+    quiet = preprocess.eval()(*maps)
+    difference = preprocess.train()(*maps) - quiet
+    assert (difference[:, [1, 3]] == 0).all()
+    assert torch.equal(Preprocess(left_noise=0.0).train()(*maps), quiet)
+    stacked = torch.zeros(8, 64, 80)
+    rows = preprocess(stacked, stacked)[:, [0, 2]]
+    # bilinear weights only average: the noise of 0.2 comes out smaller, never larger
+    assert 0.08 < rows.std().item() < 0.2
+    torch.testing.assert_close(list(maps), kept, rtol=0, atol=0, equal_nan=True)
+
+
+def test_preprocess_noise_in_color_is_independent_per_channel() -> None:
+    torch.manual_seed(0)
+    maps, preprocess = _maps(colors=3), Preprocess(left_noise=0.2, intensities=3)
+    difference = preprocess.train()(*maps) - preprocess.eval()(*maps)
+    assert [bool((difference[:, channel] != 0).any()) for channel in range(8)] == [True, False] * 4
+    left = difference[:, ::2].transpose(0, 1).flatten(1)
+    assert (torch.corrcoef(left) - torch.eye(4)).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("name", HARD_MAPS)
+def test_preprocess_of_hard_maps_is_finite(name: str) -> None:
+    hard, others = hard_maps(name), _maps()
+    for learnt, maps in ((hard, hard), (others, hard), (hard, others)):
+        out = _fitted(learnt)(*maps)
+        assert out.shape == (len(maps[0]), 4, 100, 100)
+        assert torch.isfinite(out).all()
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> Pipeline:
+    torch.manual_seed(0)
+    return new_pipeline(colour=False).eval()
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("name", HARD_MAPS)
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_pipeline_makes_possible_image_of_hard_maps(pipeline: Pipeline, name: str, bfloat16: bool) -> None:
+    with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+        image = pipeline(*hard_maps(name))
+    assert image.shape == (1, 64, 64)
+    assert ((image == 0) | ((image >= LEAST_V) & (image <= 1))).all()
+
+
+@pytest.mark.slow
+def test_color_pipeline_handles_hard_maps() -> None:
+    torch.manual_seed(0)
+    pipeline = new_pipeline(colour=True)
+    for maps in (hard_maps(name, (CHANNELS,)) for name in HARD_MAPS):
+        pipeline.preprocess.learn(split_and_stack(*maps))
+        pipeline.train().zero_grad()
+        pipeline.latent(*maps).square().sum().backward()
+        assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in pipeline.compressor.parameters())
+        with torch.inference_mode():
+            image = pipeline.eval()(*maps)
+        bright = image.amax(1)
+        assert image.shape == (1, CHANNELS, 64, 64)
+        assert torch.isfinite(image).all()
+        assert ((bright == 0) | ((bright >= 0.1) & (bright <= 1))).all()
+
+
+@torch.inference_mode()
+def test_pipeline_latent_depends_on_neither_batch_nor_layout(pipeline: Pipeline) -> None:
+    depth, intensity = torch.rand(3, 64, 80), 50 * torch.rand(3, 64, 80)
+    latents = pipeline.latent(depth, intensity)
+    alone = torch.cat([pipeline.latent(d[None], i[None]) for d, i in zip(depth, intensity, strict=True)])
+    torch.testing.assert_close(latents, alone, atol=1e-4, rtol=1e-3)
+    strided = (part.transpose(1, 2).contiguous().transpose(1, 2) for part in (depth, intensity))
+    torch.testing.assert_close(pipeline.latent(*strided), latents, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("color", "channels", "latent"), [(False, 4, 256), (True, 8, 512)])
+def test_new_pipeline_is_of_depth_or_color(color: bool, channels: int, latent: int) -> None:
+    with torch.device("meta"):
+        vae = new_vae(colour=color)
+        made = new_pipeline(vae.decoder, colour=color, dropout=0.3, left_noise=0.1)
+        own = new_pipeline(colour=color)
+    assert made.decoder is vae.decoder
+    assert own.decoder.state_dict().keys() == vae.decoder.state_dict().keys()
+    assert vae.latent == latent
+    assert made.preprocess.mean.shape == (channels,)
+    assert type(made.compressor) is (ResNet50 if color else Compressor)
+    assert [m.p for m in made.compressor.modules() if isinstance(m, torch.nn.Dropout)] == [0.3]
+    assert made.preprocess.left_noise == 0.1
+
+
+def _blurred() -> Tensor:
+    noise = torch.rand(4, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.avg_pool2d(noise, 9, stride=1, padding=4) * 1.5
+
+
+def test_cut_silhouette_keeps_pixel_or_clears_it() -> None:
+    image = _blurred()
+    cut = cut_silhouette(image)
+    assert ((cut == 0) | ((cut == image) & (cut >= LEAST_V))).all()
+    peak = image.flatten(1).argmax(1)
+    assert (cut.flatten(1).gather(1, peak[:, None]) > 0).all()
+
+
+def test_cut_silhouette_clears_faint_skirt_beside_bright_surface() -> None:
+    image, faint = torch.zeros(1, 1, 64, 64), 0.9 * KEPT_SHARE * 0.9
+    image[..., 10:30, 10:20] = 0.9
+    image[..., 10:30, 20:23] = faint
+    image[..., 50:60, 50:60] = faint
+    cut = cut_silhouette(image)
+    assert (cut[..., 20:23] == 0).all()
+    assert torch.equal(cut[..., 10:20], image[..., 10:20])
+    assert (cut[..., 50:60, 50:60] == faint).all()
+    assert WINDOW < 30
+
+
+@pytest.mark.parametrize("value", [0.0, 0.05, LEAST_V, 1.0])
+def test_cut_silhouette_of_constant_image_is_all_or_nothing(value: float) -> None:
+    image = torch.full((1, 1, 64, 64), value)
+    assert torch.equal(cut_silhouette(image), image if value >= LEAST_V else torch.zeros_like(image))
+
+
+def test_cut_silhouette_of_color_uses_brightest_channel() -> None:
+    image = torch.zeros(1, 3, 64, 64)
+    image[0, :, 10:40, 10:40] = torch.tensor([0.9, 0.02, 0.5])[:, None, None]
+    image[0, :, 10:40, 40:43] = torch.tensor([0.3, 0.35, 0.3])[:, None, None]
+    cut = cut_silhouette(image)
+    assert torch.equal(cut[..., 10:40, 10:40], image[..., 10:40, 10:40])
+    assert (cut[..., 40:43] == 0).all()
+    assert torch.equal(cut_silhouette(image[:, [1, 2, 0]]), cut[:, [1, 2, 0]])
+
+
+def test_lift_edges_brightens_blurred_edge_of_plateau() -> None:
+    blurred = _blurred()
+    assert (lift_edges(blurred) >= blurred).all()
+    assert (lift_edges(blurred) <= blurred.amax((2, 3), keepdim=True) + 1e-6).all()
+    image = torch.zeros(1, 1, 64, 64)
+    image[..., 10:40, 20:50] = 0.8
+    image[..., 10:40, 50:52] = 0.5
+    lifted = lift_edges(image)
+    torch.testing.assert_close(lifted[..., 10:40, 20:48], image[..., 10:40, 20:48])
+    assert (lifted[..., 15:35, 50:52] > 0.7).all()

@@ -1,0 +1,157 @@
+"""Training recipes: the committed ones, budgets, refusals that name the field, and learning-rate schedules."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from nlos_models.errors import ModelError, RecipeError
+from nlos_models.recipe import PLATEAU_PATIENCE, SMALLEST_RATE, Recipe, has_ended, load_recipe, schedule_of
+from small_run import small_recipe
+from torch import nn
+
+RECIPES = Path(__file__).parents[3] / "models" / "recipes"
+LEAST = 'task = "vae"\nobjects = 10\nheld_out = 2\nepochs = 1\nbatch = 2\nlearning_rate = 1e-3\n'
+
+
+def _load(folder: Path, text: str) -> Recipe:
+    path = folder / "recipe.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_recipe(path)
+
+
+@pytest.mark.parametrize("path", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
+def test_committed_recipes_load_and_state_deviations(path: Path) -> None:
+    recipe = load_recipe(path)
+    assert recipe.task in path.stem
+    assert recipe.deviations
+
+
+def test_si_recipes_have_the_values_of_the_paper() -> None:
+    vae, compressor, transfer = (load_recipe(RECIPES / f"si-{task}.toml") for task in ("vae", "compressor", "transfer"))
+    assert {recipe.schedule for recipe in (vae, compressor, transfer)} == {"plateau"}
+    assert (vae.learning_rate, vae.betas, vae.kl_weight, vae.augmentation) == (1e-3, (0.5, 0.999), 0.05, "turns")
+    assert (compressor.learning_rate, compressor.left_noise, compressor.dropout) == (0.01, 0.2, 0.5)
+    assert (compressor.latent_weight, compressor.image_weight, compressor.steps) == (1.0, 0.0, "two")
+    assert 3 <= transfer.all_layers_epochs <= 5
+    assert (transfer.learning_rate, transfer.epochs, transfer.statistics) == (1e-3, 10, "kept")
+
+
+@pytest.mark.parametrize("task", ["vae", "compressor"])
+@pytest.mark.parametrize(("scale", "schedule"), [("", "plateau"), ("-small", "one-cycle")])
+def test_color_recipes_have_kl_weight_of_si_3(task: str, scale: str, schedule: str) -> None:
+    recipe = load_recipe(RECIPES / f"colour-{task}{scale}.toml")
+    assert (recipe.task, recipe.colour, recipe.kl_weight, recipe.schedule) == (task, True, 0.03, schedule)
+
+
+@pytest.mark.parametrize("name", ["difference", "one-step"])
+def test_compared_recipes_have_the_same_budget(name: str) -> None:
+    one, other = (load_recipe(RECIPES / f"paper-rig-compressor-{part}gpu.toml") for part in ("", f"{name}-"))
+    for field in ("objects", "held_out", "epochs", "batch", "learning_rate", "schedule", "dropout", "seed", "keep"):
+        assert getattr(one, field) == getattr(other, field)
+
+
+@pytest.mark.parametrize(
+    ("share", "epochs", "objects"), [(1.0, 34, 6000), (0.1, 3, 6000), (0.5, 17, 6000), (0.01, 1, 2040), (0.0001, 1, 64)]
+)
+def test_scaled_recipe_has_share_of_objects_times_epochs(share: float, epochs: int, objects: int) -> None:
+    scaled = small_recipe(objects=6000, epochs=34, batch=64, deviations=["a"]).scaled(share)
+    assert (scaled.epochs, scaled.objects) == (epochs, objects)
+    assert scaled.deviations[0] == "a"
+    assert (len(scaled.deviations) == 1) == (share == 1)
+    assert Recipe.model_validate_json(scaled.model_dump_json()) == scaled
+
+
+def test_of_objects_limits_batch_and_refuses_bad_numbers() -> None:
+    recipe = small_recipe(objects=100, batch=8)
+    assert (recipe.of_objects(5).objects, recipe.of_objects(5).batch) == (5, 5)
+    assert (recipe.of_objects(50).objects, recipe.of_objects(50).batch) == (50, 8)
+    with pytest.raises(RecipeError, match="1"):
+        recipe.of_objects(1)
+    for share in (0.0, -1.0, 1.5, float("nan")):
+        with pytest.raises(RecipeError, match=f"{share:g}"):
+            recipe.scaled(share)
+
+
+@pytest.mark.parametrize(
+    ("task", "lines", "word"),
+    [
+        ("compressor", 'augmentation = "turns"', "augmentation"),
+        ("transfer", 'steps = "one"\nlatent_weight = 0\nimage_weight = 1', "steps"),
+        ("compressor", "latent_weight = 0", "latent_weight"),
+        ("compressor", 'steps = "one"\nimage_weight = 1', "latent"),
+        ("compressor", 'steps = "two-then-joint"', "image_weight"),
+        ("transfer", 'start = "weights"', "start"),
+        ("compressor", 'start = "weights"\nsteps = "one"\nlatent_weight = 0\nimage_weight = 1', "start"),
+        ("compressor", 'start = "weights"\nsteps = "two-then-joint"\nimage_weight = 1', "start"),
+        ("compressor", "latent_warm_up = 0.1", "latent_warm_up"),
+        ("transfer", "colour = true", "simulation only"),
+        ("compressor", 'colour = true\nmaps = "difference maps"', "simulation only"),
+    ],
+)
+def test_contradictory_recipe_is_refused_in_one_line(tmp_path: Path, task: str, lines: str, word: str) -> None:
+    with pytest.raises(RecipeError, match=word) as caught:
+        _load(tmp_path, LEAST.replace("vae", task) + lines)
+    assert "\n" not in str(caught.value)
+    assert "{" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("batch = 2", "batch = 1", "batch.*1"),
+        ("epochs = 1", "epochs = 0", "epochs.*0"),
+        ("learning_rate = 1e-3", "learning_rate = 1e-08", "learning_rate.*1e-08"),
+        ('task = "vae"', 'task = "guess"', "task.*guess"),
+        ("batch = 2", 'batch = 2\nschedule = "cosine"', "schedule.*cosine"),
+        ("batch = 2", "batch = 2\nbetas = [0.5]", r"betas.*0\.5"),
+        ("batch = 2", "batch = 2\nlearning_rat = 1e-3", "learning_rat"),
+        ("objects = 10", "", "objects"),
+        ("batch = 2", "batch = 64", "objects"),
+    ],
+)
+def test_load_recipe_names_wrong_field_and_value(tmp_path: Path, old: str, new: str, words: str) -> None:
+    with pytest.raises(RecipeError, match=words) as caught:
+        _load(tmp_path, LEAST.replace(old, new))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"task = ", b"\xff\xfe\x00", b"", None])
+def test_load_recipe_names_unreadable_file(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "recipe.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(RecipeError, match=r"recipe\.toml") as caught:
+        load_recipe(path)
+    assert isinstance(caught.value, ModelError)
+    assert caught.value.exit_code == 4
+
+
+def _optimizer(rate: float) -> torch.optim.Optimizer:
+    return torch.optim.SGD([nn.Parameter(torch.zeros(1))], rate)
+
+
+@pytest.mark.parametrize("rate", [1e-2, 2e-3, 1e-3, 1.3e-8])
+def test_plateau_schedule_ends_without_progress(rate: float) -> None:
+    recipe, optimizer = small_recipe(schedule="plateau", learning_rate=rate), _optimizer(rate)
+    schedule, rates = schedule_of(recipe, optimizer, 1), [rate]
+    while not has_ended(recipe, rates[-1]):
+        assert len(rates) < 100
+        schedule.step(1.0)
+        rates.append(optimizer.param_groups[0]["lr"])
+    assert rates[-2] >= SMALLEST_RATE > rates[-1]
+    assert rates[1 : PLATEAU_PATIENCE + 2] == [rate] * (PLATEAU_PATIENCE + 1)
+    assert rates[PLATEAU_PATIENCE + 2 :][:1] in ([], [pytest.approx(0.3 * rate)])
+
+
+def test_one_cycle_schedule_rises_to_rate_and_falls_to_end() -> None:
+    recipe, optimizer = small_recipe(schedule="one-cycle", learning_rate=1e-3), _optimizer(1e-3)
+    schedule, rates = schedule_of(recipe, optimizer, 101), list[float]()
+    for _ in range(100):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    peak = rates.index(max(rates))
+    assert max(rates) == pytest.approx(1e-3, rel=1e-2)
+    assert rates == sorted(rates[: peak + 1]) + sorted(rates[peak + 1 :], reverse=True)
+    assert optimizer.param_groups[0]["lr"] < SMALLEST_RATE
+    assert not has_ended(recipe, 0.0)

@@ -1,0 +1,145 @@
+"""Training runs: the weights and earlier runs that they start from, and outputs that are not overwritten."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from nlos_calibration.rig import load_rig
+from nlos_models import checkpoint
+from nlos_models import runs as train_start
+from nlos_models.checkpoint import CheckpointRecord, save_pipeline, save_vae
+from nlos_models.pipeline import Pipeline
+from nlos_models.recipe import Recipe
+from nlos_models.runs import TrainingRun, compressor_start, job_of, transfer_start, vae_start
+from safetensors.torch import load_file, save_file
+from small_maps import SmallCompressor, SmallVae, use_small_networks
+from small_run import small_recipe
+
+from nlos_cam.cli.train import RunOptions
+from nlos_cam.errors import OutputExistsError, SceneError
+
+RIG = load_rig("paper-rig")
+NAMED = (RIG.name, RIG.checksum)
+VAE, OTHER_VAE, TWO = small_recipe(), small_recipe(seed=1), small_recipe(task="compressor")
+AGAIN = small_recipe(task="compressor", start="weights", seed=1)
+JOINT = small_recipe(task="compressor", steps="two-then-joint", image_weight=1.0)
+TRANSFER = small_recipe(task="transfer")
+IMAGES_ALONE = {"latent_weight": 0, "image_weight": 1.0}
+
+
+@pytest.fixture(autouse=True)
+def _small_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_small_networks(monkeypatch, checkpoint, train_start)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """Two-step weights with their encoder, so that they are a VAE too."""
+    torch.manual_seed(1)
+    vae = SmallVae()
+    record = CheckpointRecord.of([VAE, TWO], NAMED)
+    save_pipeline(tmp_path / "two", Pipeline(SmallCompressor(), vae.decoder), record, vae.encoder)
+    return tmp_path / "two"
+
+
+def test_vae_start_lists_runs_of_vae_alone(weights: Path) -> None:
+    trained, runs = vae_start(VAE, weights)
+    assert runs == [VAE]
+    stored = load_file(weights / "decoder.safetensors")["output.weight"].float()
+    assert torch.equal(trained.decoder.output.weight, stored)
+
+
+def test_compressor_start_lists_runs_of_weights_and_vae(weights: Path, tmp_path: Path) -> None:
+    start, runs = compressor_start(TWO, weights, None)
+    assert (runs, start.pipeline) == ([VAE], None)
+    save_vae(tmp_path / "other", SmallVae(), CheckpointRecord.of([OTHER_VAE], NAMED))
+    start, runs = compressor_start(AGAIN, tmp_path / "other", weights)
+    assert runs == [VAE, TWO, OTHER_VAE]
+    assert start.pipeline is not None
+    assert start.vae is not None
+    assert not torch.equal(start.vae.decoder.output.weight, start.pipeline.decoder.output.weight)
+    assert compressor_start(AGAIN, weights, weights)[1] == [TWO, VAE]
+    start, runs = compressor_start(small_recipe(task="compressor", steps="one", **IMAGES_ALONE), None, None)
+    assert (start.vae, start.pipeline, runs) == (None, None, [])
+
+
+def _start(recipe: Recipe, weights: Path) -> object:
+    if recipe.task == "vae":
+        return vae_start(recipe, weights)
+    if recipe.task == "transfer":
+        return transfer_start(recipe, weights, partial=False)
+    return compressor_start(recipe, weights, weights)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "changes", "words"),
+    [
+        *((recipe, {"maps": "difference maps"}, "raw maps.* difference maps") for recipe in (AGAIN, JOINT, TRANSFER)),
+        *((recipe, {"width": 0.5}, r"1 .*0\.5") for recipe in (AGAIN, JOINT)),
+        *((recipe, {"colour": True}, "simulation only") for recipe in (VAE, AGAIN, JOINT)),
+    ],
+)
+def test_start_refuses_weights_of_other_kind(weights: Path, recipe: Recipe, changes: dict, words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        _start(recipe.model_copy(update=changes), weights)
+
+
+def test_start_refuses_color_weights_for_depth(weights: Path) -> None:
+    record = CheckpointRecord.of([small_recipe(colour=True)], NAMED).model_dump_json()
+    (weights / "checkpoint.json").write_text(record, encoding="utf-8")
+    for recipe in (AGAIN, JOINT, TRANSFER):
+        with pytest.raises(SceneError, match="simulation only"):
+            _start(recipe, weights)
+
+
+def test_joint_start_needs_encoder_for_latent_loss(weights: Path) -> None:
+    (weights / "encoder.safetensors").unlink()
+    with pytest.raises(SceneError, match="encoder"):
+        _start(JOINT, weights)
+    _start(JOINT.model_copy(update=IMAGES_ALONE), weights)
+
+
+def test_partial_start_fills_missing_tensors_by_seed(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tensors, messages = load_file(weights / "compressor.safetensors"), list[str]()
+    missing = tensors.pop("classifier.1.weight")
+    save_file({**tensors, "more": missing}, weights / "compressor.safetensors")
+    monkeypatch.setattr(train_start, "say", messages.append)
+    rows: list[torch.Tensor] = []
+    for seed in (3, 3, 4):
+        torch.rand(1)
+        pipeline, runs = transfer_start(small_recipe(task="transfer", seed=seed), weights, partial=True)
+        rows.append(pipeline.compressor.get_parameter("classifier.1.weight").detach())
+        assert runs == [VAE, TWO]
+        assert all(word in messages[-1] for word in ("more", "classifier.1.weight"))
+    assert torch.equal(rows[0], rows[1])
+    assert not torch.equal(rows[0], rows[2])
+
+
+def _job(out: Path, *runs: Recipe, starts: tuple[Path | None, ...] = ()) -> TrainingRun:
+    return job_of(RunOptions(Path("r.toml"), out, tensorboard=True), runs[-1], RIG, list(runs[:-1]), "origin", *starts)
+
+
+def test_job_records_run_after_earlier_ones(tmp_path: Path) -> None:
+    job = _job(tmp_path / "run", VAE, OTHER_VAE, starts=(None, tmp_path / "start"))
+    assert (job.record.vae_recipe, job.record.earlier) == (OTHER_VAE, [VAE])
+    assert (job.record.rig_name, job.record.rig_checksum) == NAMED
+    assert (job.recipe, job.out, job.origin) == (OTHER_VAE, tmp_path / "run", "origin")
+    assert (job.tensorboard, job.compiled) == (True, False)
+
+
+@pytest.mark.parametrize("runs", [(VAE,), (OTHER_VAE,), (OTHER_VAE, VAE)])
+def test_job_does_not_overwrite_weights_of_another_run(tmp_path: Path, runs: tuple[Recipe, ...]) -> None:
+    out = tmp_path / "run"
+    record = _job(out, VAE, OTHER_VAE).made({"held_out_loss": 1.5})
+    out.mkdir()
+    (out / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
+    _job(out, VAE, OTHER_VAE)  # the same run may be repeated
+    with pytest.raises(OutputExistsError, match="--out"):
+        _job(out, *runs)
+
+
+def test_job_refuses_file_and_folder_it_starts_from(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for name, starts in (("file", ()), ("run", (tmp_path / "x" / ".." / "run",))):
+        with pytest.raises(OutputExistsError, match="--out"):
+            _job(tmp_path / name, VAE, starts=starts)

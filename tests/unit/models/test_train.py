@@ -1,0 +1,367 @@
+"""The training loop on a tiny network: exact resuming after any stop, the run's files, TensorBoard, torch.compile."""
+
+import copy
+import errno
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import sys
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+import torch
+from nlos_models import recipe as schedule
+from nlos_models.errors import CheckpointError, RecipeError, TrainingError
+from nlos_models.train import (
+    BEST,
+    LAST,
+    LOG,
+    PREVIOUS,
+    Board,
+    compiled,
+    compiling,
+    digest_of,
+    read_best,
+    read_last,
+    write_best,
+    write_last,
+    write_log,
+)
+from small_run import (
+    STEPS,
+    Executioner,
+    SmallRun,
+    Stopped,
+    be_killed,
+    changed_tensors,
+    run_watched,
+    small_recipe,
+    state_of,
+)
+from torch import Tensor, nn
+from torch._inductor import config
+from torch._inductor.exc import InductorError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def _trained(folder: Path, **changes: object) -> SmallRun:
+    run = SmallRun(small_recipe(**changes), folder)
+    run.go()
+    return run
+
+
+def _assert_same(one: SmallRun, other: SmallRun) -> None:
+    assert not changed_tensors(one.net.state_dict(), other.net.state_dict())
+    assert one.log == other.log
+
+
+@pytest.mark.parametrize("schedule", ["one-cycle", "plateau"])
+@pytest.mark.parametrize("fail_at", [1, STEPS, STEPS + 2, 3 * STEPS])
+def test_resumed_run_equals_uninterrupted(tmp_path: Path, schedule: str, fail_at: int) -> None:
+    whole = _trained(tmp_path / "whole", schedule=schedule)
+    with pytest.raises(Stopped):
+        SmallRun(whole.recipe, tmp_path / "failed").go(fail_at)
+    torch.manual_seed(99)
+    _assert_same(_trained(tmp_path / "failed", schedule=schedule), whole)
+
+
+@pytest.mark.slow
+def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> None:
+    recipe = small_recipe(schedule="one-cycle", epochs=2)
+    clerk = Executioner()
+    whole = run_watched(recipe, tmp_path / "whole", clerk)
+    moments = random.Random(0).sample(range(2, clerk.seen // 2), 4)  # noqa: S311  each start resumes the last one
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["nlos_models.train", "pytest"])  # each process begins with them imported
+    ends: list[int | None] = []
+    for moment in moments:
+        child = context.Process(target=be_killed, args=(recipe.model_dump_json(), str(tmp_path / "killed"), moment))
+        child.start()
+        child.join()
+        ends.append(child.exitcode)
+    assert ends[:3] == [-signal.SIGKILL] * 3
+    assert (tmp_path / "killed" / LAST).exists()
+    _assert_same(_trained(tmp_path / "killed", schedule="one-cycle", epochs=2), whole)
+
+
+def test_stopped_run_names_step_and_resumes_there(tmp_path: Path) -> None:
+    whole, calls, messages = _trained(tmp_path / "whole"), count(1), list[str]()
+    run = SmallRun(whole.recipe, tmp_path / "stopped")
+    with pytest.raises(KeyboardInterrupt):
+        run.go(stop=lambda: next(calls) == STEPS + 2, tell=messages.append)
+    assert len(messages) == 1
+    assert "epoch 1" in messages[0]
+    assert "step 2" in messages[0]
+    again = _trained(tmp_path / "stopped")
+    assert again.steps[0] == (STEPS + 3, 4 * STEPS)
+    _assert_same(again, whole)
+
+
+def test_run_saves_state_at_checkpoint_interval(tmp_path: Path) -> None:
+    seconds = count(0.0, 1.0)
+    run = SmallRun(small_recipe(epochs=1), tmp_path)
+    with pytest.raises(Stopped):
+        run.go(fail_at=5, clock=lambda: next(seconds), checkpoint_s=2.5)  # saved after steps 2 and 4
+    assert _trained(tmp_path, epochs=1).steps[0][0] in {3, 4, 5}
+
+
+def test_run_is_decided_by_seed(tmp_path: Path) -> None:
+    first, again = (_trained(tmp_path / name) for name in ("first", "again"))
+    _assert_same(first, again)
+    assert _trained(tmp_path / "other", seed=1).log != first.log
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_held_out_loss_falls(tmp_path: Path, precision: str) -> None:
+    log = _trained(tmp_path, epochs=10, precision=precision).log
+    assert [int(row["epoch"]) for row in log] == list(range(10))
+    assert float(log[-1]["held_out_loss"]) < 0.5 * float(log[0]["held_out_loss"])
+
+
+def test_progress_counts_every_step_and_epoch(tmp_path: Path) -> None:
+    run, epochs = SmallRun(small_recipe(), tmp_path), list[dict[str, float]]()
+    run.go(on_epoch=epochs.append)
+    assert run.steps == [(k + 1, 4 * STEPS) for k in range(4 * STEPS)]
+    assert run.done == [k / (4 * STEPS) for k in range(4 * STEPS)]
+    assert [row["epoch"] for row in epochs] == [0, 1, 2, 3]
+    assert not (tmp_path / "tensorboard").exists()
+
+
+def test_finished_run_returns_figures_without_training(tmp_path: Path) -> None:
+    run, again = (SmallRun(small_recipe(), tmp_path) for _ in range(2))
+    figures = run.go()
+    assert again.go() == figures == run.score()
+    assert again.steps == []
+    _assert_same(again, run)
+
+
+def test_run_of_other_recipe_or_origin_is_refused(tmp_path: Path) -> None:
+    run = SmallRun(small_recipe(epochs=1), tmp_path)
+    run.go(origin="these weights")
+    with pytest.raises(RecipeError, match="recipe"):
+        _trained(tmp_path, learning_rate=0.5)
+    with pytest.raises(RecipeError, match="weights"):
+        SmallRun(run.recipe, tmp_path).go(origin="those weights")
+    state = read_last(tmp_path, pytest.fail)
+    assert state is not None
+    del state["origin"]  # a state that does not name its origin is accepted
+    write_last(tmp_path, state)
+    SmallRun(run.recipe, tmp_path).go(origin="those weights")
+
+
+def test_keep_best_restores_first_best_epoch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    judged = list[dict[str, Tensor]]()
+
+    def score(run: SmallRun) -> dict[str, float]:
+        judged.append(state_of(run.net))
+        return {"held_out_loss": [3.0, 1.0, 2.0, 1.0][(len(judged) - 1) % 4]}
+
+    monkeypatch.setattr(SmallRun, "score", score)
+    best, last = (SmallRun(small_recipe(keep=keep), tmp_path / keep) for keep in ("best", "last"))
+    assert best.go() == {"held_out_loss": 1.0}
+    last.go()
+    assert not changed_tensors(judged[1], best.net.state_dict())
+    assert not changed_tensors(judged[3], last.net.state_dict())
+
+
+def test_plateau_run_ends_with_its_rate_and_stays_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schedule, "PLATEAU_PATIENCE", 0)
+    monkeypatch.setattr(schedule, "SMALLEST_RATE", 2e-3)
+    monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": 1.0})
+    done = _trained(tmp_path, epochs=20).steps
+    assert 2 * STEPS <= len(done) <= 5 * STEPS  # the rate falls to 1e-2, 3e-3 and 9e-4
+    assert _trained(tmp_path, epochs=20).steps == []
+
+
+def test_diverged_run_keeps_earlier_epochs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Stopped):
+        SmallRun(small_recipe(), tmp_path).go(fail_at=STEPS + 1)
+    broken = SmallRun(small_recipe(), tmp_path)
+    broken.y = broken.y * float("nan")
+    with pytest.raises(TrainingError, match=r"nan .*epoch 1.*learning_rate"):
+        broken.go()
+    _assert_same(_trained(tmp_path), _trained(tmp_path / "whole"))
+    monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": float("nan")})
+    with pytest.raises(TrainingError, match="epoch 0"):
+        _trained(tmp_path / "nan")
+    assert not (tmp_path / "nan" / BEST).exists()
+
+
+def test_frozen_parameters_stay_unchanged(tmp_path: Path) -> None:
+    run = SmallRun(small_recipe(), tmp_path)
+    run.net[0].weight.requires_grad_(requires_grad=False)
+    before = state_of(run.net)
+    run.go()
+    changed = changed_tensors(before, run.net.state_dict())
+    assert "0.weight" not in changed
+    assert {"0.bias", f"{len(run.net) - 1}.weight"} <= changed
+
+
+def test_fewer_objects_than_batch_are_refused(tmp_path: Path) -> None:
+    run = SmallRun(small_recipe(), tmp_path)
+    run.recipe = run.recipe.model_copy(update={"batch": 32})
+    with pytest.raises(RecipeError, match="32"):
+        run.go()
+
+
+def _state(step: int) -> dict[str, object]:
+    return {"step": step, "module": {"weight": torch.arange(4.0) + step}, "rows": [{"loss": float(step)}]}
+
+
+def _damage(path: Path, how: str) -> None:
+    raw = bytearray(path.read_bytes())
+    if how == "cut":
+        raw = raw[: len(raw) // 2]
+    if how == "flipped":
+        raw[-20] ^= 1
+    path.write_bytes(b"" if how == "empty" else raw)
+
+
+def _step_of(state: dict[str, object] | None) -> object:
+    assert state is not None
+    return state["step"]
+
+
+def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
+    assert read_last(tmp_path, pytest.fail) is None
+    for step in range(3):
+        write_last(tmp_path, _state(step))
+    state = read_last(tmp_path, pytest.fail)
+    assert state is not None
+    assert (state["step"], state["rows"]) == (2, [{"loss": 2.0}])
+    assert torch.equal(state["module"]["weight"], torch.arange(4.0) + 2)
+    assert {path.name for path in tmp_path.iterdir()} == {LAST, PREVIOUS}
+    (tmp_path / LAST).unlink()  # as a kill between the two renames leaves it
+    assert _step_of(read_last(tmp_path, pytest.fail)) == 1
+
+
+@pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
+def test_read_last_falls_back_to_previous_state(tmp_path: Path, how: str) -> None:
+    for step in (1, 2):
+        write_last(tmp_path, _state(step))
+    _damage(tmp_path / LAST, how)
+    messages: list[str] = []
+    assert _step_of(read_last(tmp_path, messages.append)) == 1
+    assert len(messages) == 1
+    assert str(tmp_path / LAST) in messages[0]
+    _damage(tmp_path / PREVIOUS, "flipped")
+    with pytest.raises(CheckpointError, match=LAST) as caught:
+        read_last(tmp_path, pytest.fail)
+    assert caught.value.exit_code == 4
+    assert "\n" not in str(caught.value)
+
+
+def test_full_disk_keeps_earlier_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_last(tmp_path, _state(1))
+    write_log(tmp_path, [{"loss": 1.0}])
+
+    def full(file: int) -> NoReturn:
+        raise OSError(errno.ENOSPC, "No space left on device", str(file))
+
+    monkeypatch.setattr(os, "fsync", full)
+    for write in (lambda: write_last(tmp_path, _state(2)), lambda: write_log(tmp_path, [{"loss": 2.0}])):
+        with pytest.raises(TrainingError, match="No space left on device"):
+            write()
+    assert _step_of(read_last(tmp_path, pytest.fail)) == 1
+    assert {path.name for path in tmp_path.iterdir()} == {LAST, LOG}
+    assert "1.0" in (tmp_path / LOG).read_text(encoding="utf-8")
+
+
+def test_read_best_refuses_missing_or_damaged_state(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=BEST):
+        read_best(tmp_path)
+    write_best(tmp_path, _state(3))
+    assert read_best(tmp_path)["step"] == 3
+    _damage(tmp_path / BEST, "cut")
+    with pytest.raises(CheckpointError, match=BEST):
+        read_best(tmp_path)
+
+
+def test_digest_depends_on_every_bit_and_order() -> None:
+    torch.manual_seed(0)
+    net, digests = nn.Linear(3, 2), {digest_of(), digest_of("a"), digest_of("b"), digest_of(None)}
+    digests.add(before := digest_of(net))
+    assert digest_of(copy.deepcopy(net)) == before
+    net.bias.data[0] += 1e-3
+    digests |= {digest_of(net), digest_of(net, "a"), digest_of("a", net), digest_of(nn.Linear(3, 2).half())}
+    assert len(digests) == 9
+
+
+@pytest.mark.slow
+def test_tensorboard_logs_figures_of_each_epoch(tmp_path: Path) -> None:
+    accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    run = SmallRun(small_recipe(), tmp_path)
+    run.go(tensorboard=True)
+    events = accumulators.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert set(events.Tags()["scalars"]) == {"rate", "loss", "held_out_loss", "seconds"}
+    drawn = events.Scalars("held_out_loss")
+    assert [event.step for event in drawn] == [0, 1, 2, 3]
+    assert [event.value for event in drawn] == pytest.approx([float(row["held_out_loss"]) for row in run.log])
+
+
+def test_missing_tensorboard_names_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", None)
+    with pytest.raises(TrainingError, match=r"nlos-cam\[train\]"):
+        Board(tmp_path, 0)
+
+
+@pytest.fixture
+def compiler() -> Iterator[None]:
+    torch.compiler.reset()
+    with config.patch(compile_threads=1):  # else torch keeps some for later
+        yield
+    torch.compiler.reset()
+
+
+class Noisy(nn.Module):
+    """Linear map with dropout and noise of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear, self.dropout = nn.Linear(3, 2), nn.Dropout(0.5)
+
+    def noisy(self, x: Tensor) -> Tensor:
+        """Return a noisy linear map of x, as a part of a network that is compiled alone."""
+        return self.dropout(self.linear(x + 0.2 * torch.randn_like(x)))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not any(map(shutil.which, filter(None, config.cpp.cxx))), reason="torch.compile needs a compiler")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+@pytest.mark.usefixtures("compiler")
+def test_compiled_part_has_loss_and_gradients_of_plain_one() -> None:
+    network, x, found = Noisy(), torch.rand(8, 3), []
+    for part in (network.noisy, compiled(network.noisy)):
+        network.zero_grad()
+        torch.manual_seed(5)
+        loss = part(x).square().sum()
+        loss.backward()
+        found.append((loss.detach(), network.linear.weight.grad.clone()))
+    torch.testing.assert_close(*found)
+
+
+def _no_compiler(*_: object) -> None:
+    raise RuntimeError("No g++\nand a page of other words")
+
+
+def _no_gradients(_: Tensor) -> None:
+    raise InductorError(RuntimeError("No g++\nand more"), None)
+
+
+@pytest.mark.usefixtures("compiler")
+@pytest.mark.parametrize("network", [torch.compile(nn.Linear(3, 2), backend=_no_compiler), _no_gradients])
+def test_failed_compilation_is_one_line(network: nn.Module) -> None:
+    with pytest.raises(TrainingError, match=r"--compile .*No g\+\+") as caught, compiling():
+        network(torch.rand(1, 3))
+    assert "\n" not in str(caught.value)
+
+
+def test_error_of_network_is_not_blamed_on_compiler() -> None:
+    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"), compiling():
+        nn.Linear(3, 2)(torch.rand(1, 4))
