@@ -1,4 +1,4 @@
-"""Every script in examples/ does what it says, in the small."""
+"""Every script in examples/ does what it promises, on small inputs."""
 
 import re
 import runpy
@@ -22,7 +22,9 @@ from nlos_cam.render.scene_file import load_scene
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCENE = 'name = "still"\nrig = "paper-rig"\nobject = { category = "cup", seed = 4, size_m = 0.17 }\n'
+RIG = load_rig("paper-rig")
 Run = Callable[..., str]
+Record = Callable[[str, int], Path]
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture
 def run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run one as a person would, in an empty folder; returns what it prints."""
+    """Run an example as a user would, in an empty folder; returns what it prints."""
     assert folder.is_dir()
 
     def call(name: str, *arguments: str) -> str:
@@ -48,8 +50,8 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
 
 
 @pytest.fixture
-def recording(folder: Path, hurried_clock: Any) -> Callable[[str, int], Path]:
-    """So many frames of a scene, recorded in no time."""
+def recording(folder: Path, hurried_clock: Any) -> Record:
+    """Record the first frames of a scene."""
 
     def make(name: str, frames: int) -> Path:
         path = folder / f"{Path(name).stem}.bag"
@@ -62,8 +64,9 @@ def recording(folder: Path, hurried_clock: Any) -> Callable[[str, int], Path]:
     return make
 
 
-def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Callable[[str, int], Path], folder: Path) -> None:
-    bag, box = recording("still.toml", 3), load_rig("paper-rig").object_box
+@pytest.mark.slow
+def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Record, folder: Path) -> None:
+    bag, box = recording("still.toml", 3), RIG.object_box
     assert box is not None
     lines = run("live_depth", f"bag:{bag}").splitlines()
     assert len(lines) == 3
@@ -78,26 +81,24 @@ def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Callable[[
     assert points[:, 2].min() >= box.z_near_m - 1e-6
 
 
+@pytest.mark.slow
 def test_hide_and_seek_overlaps_more_than_chance(run: Run) -> None:
-    told = run("hide_and_seek", "cup", "4")
-    overlap, off_mm = (int(figure) for figure in re.findall(r"(\d+)(?:%| mm)", told))
+    overlap, off_mm = (int(figure) for figure in re.findall(r"(\d+)(?:%| mm)", run("hide_and_seek", "cup", "4")))
     assert overlap > 40
     assert off_mm < 60
 
 
-def test_calibrate_bag_writes_a_record_that_can_be_read(
-    run: Run, recording: Callable[[str, int], Path], folder: Path
-) -> None:
-    bag = recording("bare-wall", 6)
-    assert run("calibrate_bag", str(bag)).startswith("200.0 mm to the wall, 45.00 degrees: good")
+@pytest.mark.slow
+def test_calibrate_bag_writes_readable_record(run: Run, recording: Record, folder: Path) -> None:
+    assert run("calibrate_bag", str(recording("bare-wall", 6))).startswith("200.0 mm to the wall, 45.00 degrees: good")
     measured = load_measured(folder / "wall.toml")
     assert measured.record.frames == 6
     assert measured.reference is not None
 
 
-def test_judge_weights_tells_each_kind(run: Run) -> None:
-    lines = run("judge_weights", "3").splitlines()
-    counted = [re.fullmatch(r"\S+ +([01]\.\d\d) over (\d)", line) for line in lines]
+@pytest.mark.slow
+def test_judge_weights_prints_each_category(run: Run) -> None:
+    counted = [re.fullmatch(r"\S+ +([01]\.\d\d) over (\d)", line) for line in run("judge_weights", "3").splitlines()]
     assert sum(int(found[2]) for found in counted if found) == 3
 
 
@@ -106,20 +107,20 @@ def in_this_process(plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tup
         yield piece, make_samples(plan, piece)
 
 
-def test_own_training_learns(run: Run, folder: Path) -> None:
-    plan = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")
+@pytest.mark.slow
+def test_own_training_reduces_the_loss(run: Run, folder: Path) -> None:
+    plan = DatasetPlan(RIG, 0, accuracy="draft")
     build(plan, 24, folder / "data", workers=1, on_progress=lambda *_: None, farm=in_this_process)
-    told = run("own_training", "data", "3")
-    losses = [float(line.split()[-1]) for line in told.splitlines()]
+    losses = [float(line.split()[-1]) for line in run("own_training", "data", "3").splitlines()]
     assert len(losses) == 3
     assert losses[-1] < losses[0]
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
-def test_every_example_scene_can_be_read(path: Path) -> None:
+def test_example_scene_is_readable(path: Path) -> None:
     assert load_scene(path).poses >= 1
 
 
-def test_every_script_is_run_here() -> None:
+def test_every_example_script_is_run_here() -> None:
     text = Path(__file__).read_text(encoding="utf-8")
     assert [path.stem for path in EXAMPLES.glob("*.py") if f'run("{path.stem}"' not in text] == []

@@ -1,4 +1,4 @@
-"""Outliers: each kind is outside what training's objects are, by its own measure."""
+"""Outliers lie outside the range of training objects by their own measure; varied rigs stay within their spread."""
 
 from collections.abc import Callable
 
@@ -6,13 +6,27 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset.outliers import IN_SHAPE, LEAST_PIXELS, TO_JUDGE, TO_LEARN, Sight, ordinary, outlier
+from nlos_cam.dataset.outliers import (
+    IN_SHAPE,
+    LEAST_PIXELS,
+    SLIGHT,
+    TO_JUDGE,
+    TO_LEARN,
+    WIDE,
+    Sight,
+    Spread,
+    moved,
+    ordinary,
+    outlier,
+    varied,
+    varied_empty,
+)
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.render.sensor.model import SensorModel
 
-RIG = load_rig("paper-rig")
+RIG, SENSOR = load_rig("paper-rig"), SensorModel()
 BOX = object_box(RIG)
-PLAIN = Sight(RIG, SensorModel())
+PLAIN = Sight(RIG, SENSOR)
 SEEDS = range(6)
 
 
@@ -30,8 +44,13 @@ def width_m(depth_m: np.ndarray) -> float:
     return float(max(np.ptp(rows), np.ptp(columns)) + 1) * 0.25 / 64
 
 
+def touches_edge(sight: Sight) -> bool:
+    seen = np.isfinite(depth_of(sight))
+    return bool(seen[[0, -1]].any() or seen[:, [0, -1]].any())
+
+
 @pytest.mark.parametrize("name", [*TO_LEARN, *TO_JUDGE])
-def test_every_kind_shows_some_surface_before_the_wall_and_the_same_for_the_same_seed(name: str) -> None:
+def test_outlier_shows_surface_before_wall_and_repeats_by_seed(name: str) -> None:
     for seed in SEEDS:
         one, again = made(name, seed), made(name, seed)
         np.testing.assert_array_equal(depth_of(one), depth_of(again))
@@ -41,11 +60,8 @@ def test_every_kind_shows_some_surface_before_the_wall_and_the_same_for_the_same
         assert one.scene.rig == one.rig
 
 
-def test_no_kind_is_both_learnt_from_and_judged_by() -> None:
+def test_outlier_kinds_to_learn_and_to_judge_differ() -> None:
     assert not set(TO_LEARN) & set(TO_JUDGE)
-
-
-def test_kinds_of_both_sorts_are_learnt_from_and_judged_by() -> None:
     for kinds in (TO_LEARN, TO_JUDGE):
         assert set(kinds) & IN_SHAPE
         assert set(kinds) - IN_SHAPE
@@ -54,7 +70,7 @@ def test_kinds_of_both_sorts_are_learnt_from_and_judged_by() -> None:
 
 OUTSIDE: dict[str, Callable[[Sight], bool]] = {
     "small": lambda s: width_m(depth_of(s)) < 0.5 * 0.25,
-    "large": lambda s: bool(np.isfinite(depth_of(s)[[0, -1]]).any() or np.isfinite(depth_of(s)[:, [0, -1]]).any()),
+    "large": touches_edge,
     "far": lambda s: float(np.nanmin(depth_of(s))) > BOX.z_near_m + 0.119,
     "near": lambda s: float(np.nanmin(depth_of(s))) < BOX.z_near_m,
     "dim": lambda s: float(np.max(s.surface.albedo)) <= 0.4,
@@ -62,25 +78,25 @@ OUTSIDE: dict[str, Callable[[Sight], bool]] = {
     "glossy": lambda s: s.surface.brdf is not None,
     "other rig": lambda s: abs(s.rig.lidar.distance_m - RIG.lidar.distance_m) >= 0.015,
     "other sensor": lambda s: not 0.65 < s.sensor.bare_wall_counts / 48.0 < 1.6,
-    "half out": lambda s: bool(np.isfinite(depth_of(s)[[0, -1]]).any() or np.isfinite(depth_of(s)[:, [0, -1]]).any()),
+    "half out": touches_edge,
     "noise sheet": lambda s: float(np.nanstd(depth_of(s))) > 0.07,
 }
 
 
 @pytest.mark.parametrize("name", list(OUTSIDE))
-def test_a_kind_is_outside_by_its_own_measure(name: str) -> None:
+def test_outlier_is_outside_by_its_own_measure(name: str) -> None:
     assert all(OUTSIDE[name](made(name, seed)) for seed in SEEDS)
 
 
-def test_an_ordinary_thing_is_none_of_this() -> None:
+def test_ordinary_object_is_no_outlier() -> None:
     for seed in SEEDS:
         sight = ordinary(np.random.default_rng(seed), PLAIN)
-        assert (sight.rig, sight.sensor) == (RIG, PLAIN.sensor)
+        assert (sight.rig, sight.sensor) == (RIG, SENSOR)
         for name in ("far", "near", "dim", "glossy", "other rig", "other sensor"):
             assert not OUTSIDE[name](sight)
 
 
-def test_an_outlier_that_shows_nothing_is_made_again() -> None:
+def test_outlier_without_surface_is_drawn_again() -> None:
     tries = list[int]()
 
     def shy(generator: np.random.Generator, sight: Sight) -> Sight:
@@ -90,3 +106,29 @@ def test_an_outlier_that_shows_nothing_is_made_again() -> None:
 
     assert np.isfinite(depth_of(outlier(shy, np.random.default_rng(0), PLAIN))).any()
     assert len(tries) == 3
+
+
+def test_moved_rig_differs_in_lidar_pose_alone() -> None:
+    other = moved(RIG, 0.01, 2.0, -3.0)
+    assert other.lidar.distance_m == pytest.approx(RIG.lidar.distance_m + 0.01)
+    assert other.facing_deg == pytest.approx(47.0, abs=0.2)
+    assert other.model_copy(update={"lidar": RIG.lidar}) == RIG
+
+
+@pytest.mark.parametrize("spread", [Spread(*(0.0,) * len(SLIGHT)), SLIGHT, WIDE])
+def test_varied_rig_lies_within_its_spread(spread: Spread) -> None:
+    for seed in range(50):
+        rig, sensor = varied(RIG, SENSOR, spread, np.random.default_rng(seed))
+        assert abs(rig.lidar.distance_m - RIG.lidar.distance_m) <= spread.place_m
+        assert max(abs(rig.lidar.yaw_deg - 45.0), abs(rig.lidar.pitch_deg)) <= spread.angle_deg
+        assert abs(np.log(sensor.bare_wall_counts / SENSOR.bare_wall_counts)) <= spread.gain + 1e-9
+        assert sensor.ambient_counts <= spread.ambient_counts
+        assert sensor.ripple_m <= spread.ripple_m
+        assert any(spread) or (rig, sensor) == (RIG, SENSOR)
+
+
+def test_varied_empty_benches_are_plain_wide_or_without_occluder() -> None:
+    benches = [varied_empty(RIG, SENSOR, np.random.default_rng(seed)) for seed in range(200)]
+    assert any(sensor == SENSOR for _, sensor in benches)
+    assert any(abs(rig.lidar.distance_m - 0.2) > SLIGHT.place_m for rig, _ in benches)
+    assert 5 < sum(rig.occluder is None for rig, _ in benches) < 50

@@ -1,4 +1,4 @@
-"""Samples: the same bits for the same seeds, kept on disk, and made only where they are missing."""
+"""Samples for the doubt network: determined by their seeds, cached on disk, made only where they are missing."""
 
 from pathlib import Path
 
@@ -7,7 +7,16 @@ import pytest
 from nlos_calibration.rig import Rig, load_rig
 
 from nlos_cam.dataset import doubt_samples
-from nlos_cam.dataset.doubt_samples import BENCH, EMPTY, ORDINARY, DoubtSamples, make_samples, samples_on_disk
+from nlos_cam.dataset.doubt_samples import (
+    BENCH,
+    EMPTY,
+    ORDINARY,
+    DoubtSamples,
+    _generator,
+    _sight,
+    make_samples,
+    samples_on_disk,
+)
 from nlos_cam.dataset.outliers import TO_JUDGE, TO_LEARN
 from nlos_cam.render.sensor.model import SensorModel
 
@@ -19,47 +28,44 @@ def some() -> dict[str, DoubtSamples]:
     return {kind: make_samples(kind, range(2), RIG, SENSOR) for kind in (EMPTY, ORDINARY, "plates")}
 
 
-def test_an_empty_bench_hides_nothing_and_shows_in_no_cell(some: dict[str, DoubtSamples]) -> None:
+def test_empty_bench_has_no_image_and_no_cells(some: dict[str, DoubtSamples]) -> None:
     assert not some[EMPTY].image.any()
     assert not some[EMPTY].cells.any()
 
 
 @pytest.mark.parametrize("kind", [ORDINARY, "plates"])
-def test_what_is_hidden_shows_in_the_maps(some: dict[str, DoubtSamples], kind: str) -> None:
+def test_hidden_object_shows_in_maps(some: dict[str, DoubtSamples], kind: str) -> None:
     assert (some[kind].image > 0).any((1, 2)).all()
     assert (some[kind].cells > 50).all()
     beyond = np.abs(some[kind].depth_m - some[EMPTY].depth_m[0]) > 0.02
     assert (beyond.sum((1, 2)) > 50).all()
 
 
-def test_the_same_seed_is_the_same_sample_in_whatever_company(some: dict[str, DoubtSamples]) -> None:
+def test_sample_depends_on_its_seed_alone(some: dict[str, DoubtSamples]) -> None:
     alone = make_samples(ORDINARY, [1], RIG, SENSOR)
     np.testing.assert_array_equal(alone.depth_m[0], some[ORDINARY].depth_m[1])
     np.testing.assert_array_equal(alone.intensity[0], some[ORDINARY].intensity[1])
 
 
-def test_ordinary_objects_and_every_second_bench_of_outliers_lie_slightly_off() -> None:
+def test_ordinary_and_half_of_outlier_benches_lie_slightly_off() -> None:
     seeds = 0, BENCH - 1, BENCH
-    rigs = {
-        kind: [doubt_samples._sight(kind, seed, RIG, SENSOR).rig for seed in seeds] for kind in (ORDINARY, "plates")
-    }
-    assert [rig == RIG for rig in rigs["plates"]] == [True, True, False]
-    assert RIG not in rigs[ORDINARY]
-    assert rigs[ORDINARY][0] == rigs[ORDINARY][1] != rigs[ORDINARY][2]
+    ordinary, plates = ([_sight(kind, seed, RIG, SENSOR).rig for seed in seeds] for kind in (ORDINARY, "plates"))
+    assert [rig == RIG for rig in plates] == [True, True, False]
+    assert RIG not in ordinary
+    assert ordinary[0] == ordinary[1] != ordinary[2]
 
 
-def test_no_two_kinds_share_a_bench_or_noise_which_would_tell_outliers_from_ordinary_objects() -> None:
+def test_kinds_share_no_bench_and_no_noise() -> None:
+    """A shared bench would let a network tell outliers from ordinary objects."""
     kinds = [EMPTY, ORDINARY, *TO_LEARN, *TO_JUDGE]
     for of in range(3):
-        assert len({doubt_samples._generator(kind, 3, of).bytes(8) for kind in kinds}) == len(kinds)
-    slight = [doubt_samples._sight(kind, BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)]
+        assert len({_generator(kind, 3, of).bytes(8) for kind in kinds}) == len(kinds)
+    slight = [_sight(kind, BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)]
     assert len({sight.rig.checksum for sight in slight}) == 3
     assert len({sight.sensor.bare_wall_counts for sight in slight}) == 3
 
 
-def test_what_is_on_disk_is_read_and_only_what_is_missing_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_samples_on_disk_makes_only_missing_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = list[tuple[str, int]]()
 
     def quick(kind: str, seeds: range, rig: Rig, sensor: SensorModel, accuracy: str) -> DoubtSamples:
@@ -72,10 +78,8 @@ def test_what_is_on_disk_is_read_and_only_what_is_missing_is_made(
     monkeypatch.setattr(doubt_samples, "make_samples", quick)
     first = samples_on_disk(tmp_path, {EMPTY: 150}, 7, RIG, SENSOR)
     assert made == [(EMPTY, 7), (EMPTY, 107)]
-    told = list[tuple[int, int]]()
-    both = samples_on_disk(
-        tmp_path, {EMPTY: 150, "far": 20}, 7, RIG, SENSOR, on_progress=lambda done, of: told.append((done, of))
-    )
+    told, asked = list[tuple[int, int]](), {EMPTY: 150, "far": 20}
+    both = samples_on_disk(tmp_path, asked, 7, RIG, SENSOR, on_progress=lambda *at: told.append(at))
     assert made[2:] == [("far", 7)]
     np.testing.assert_array_equal(both.cells[:150], first.cells)
     assert both.kind.tolist() == [EMPTY] * 150 + ["far"] * 20

@@ -1,0 +1,196 @@
+"""`dataset build` turns options into a plan and shards; `dataset label` turns labelled recordings into a dataset."""
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from fake_farm import FakeFarm, samples_of
+from nlos_calibration.rig import load_rig
+from nlos_models.recipe import SIMULATION_ONLY
+from rich.progress import Progress
+
+from nlos_cam.cli.dataset import Rate
+from nlos_cam.cli.main import main
+from nlos_cam.dataset import build
+from nlos_cam.dataset.build import DatasetPlan, RigSpread, open_dataset, read
+from nlos_cam.dataset.shards import head_of
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.textures import TEXTURES
+from nlos_cam.recording.playback import ReplayCamera
+from nlos_cam.recording.sidecar import SidecarFile, sidecar_path
+
+Run = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture(autouse=True)
+def _no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def processes(workers: int) -> FakeFarm:
+        assert workers > 0
+        return FakeFarm()
+
+    monkeypatch.setattr(build, "processes", processes)
+
+
+def _build(folder: Path, *options: str) -> int:
+    return main(["dataset", "build", "--out", str(folder), "--count", "4", *options, "--json"])
+
+
+@pytest.fixture
+def built(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Build a dataset; returns what is printed, without the times."""
+
+    def call(folder: Path, *options: str, code: int = 0) -> dict[str, Any]:
+        assert _build(folder, *options) == code
+        result = json.loads(capsys.readouterr().out.splitlines()[-1])
+        if made := result.get("made"):
+            assert result.pop("objects_per_s") == pytest.approx(made / result.pop("seconds"))
+        return result
+
+    return call
+
+
+def _command(folder: Path) -> str:
+    with h5py.File(open_dataset(folder).shards[0].path) as file:
+        return str(file.attrs["command"])
+
+
+def test_build_reports_and_resumes(tmp_path: Path, built: Run) -> None:
+    assert built(tmp_path) == {"objects": 4, "made": 4, "damaged": [], "out": str(tmp_path)}
+    assert built(tmp_path, "--count", "6")["made"] == 6  # a shard that was not full is made again
+    result = built(tmp_path, "--count", "6")
+    assert (result["made"], result["objects_per_s"]) == (0, None)
+    assert open_dataset(tmp_path).plan == DatasetPlan(load_rig("paper-rig"), 0)
+
+
+def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path) -> None:
+    spread = ["--rig-spread-mm", "10", "--rig-spread-deg", "3", "--gain-spread-percent", "20"]
+    others = ["--without", "hat, boat", "--backgrounds", "0.25", "--accuracy", "draft", "--seed", "7"]
+    folder = tmp_path / "a b"
+    assert _build(folder, *spread, *others, "--workers", "1") == 0
+    plan = open_dataset(folder).plan
+    assert plan.spread == RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
+    assert set(CATEGORIES) - set(plan.objects.categories) == {"hat", "boat"}
+    assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed) == (0.25, "draft", 7)
+    assert _command(folder).startswith(f"nlos-cam dataset build --out '{folder}' --count 4 --seed 7 ")
+    assert " --without 'hat, boat' " in _command(folder)
+    assert _command(folder).endswith(" --workers 1")
+
+
+def test_build_in_color_is_noted_as_simulation_only(tmp_path: Path, built: Run) -> None:
+    assert built(tmp_path, "--colour")["note"] == SIMULATION_ONLY
+    assert open_dataset(tmp_path, colour=True).plan.textures == tuple(TEXTURES)
+    assert "textures" in built(tmp_path, code=4)["error"]["message"]
+
+
+def test_build_takes_rig_and_sensor_of_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text('name = "s"\nrig = "paper-rig"\n[sensor]\nambient_counts = 20.0\n', encoding="utf-8")
+    assert _build(tmp_path / "d", "--scene", str(scene)) == 0
+    assert open_dataset(tmp_path / "d").plan.sensor.ambient_counts == 20
+    assert _build(tmp_path / "d", "--scene", str(scene), "--rig", "paper-rig") == 2
+    assert "--rig" in capsys.readouterr().err
+
+
+def test_build_reports_damaged_shard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _build(tmp_path) == 0
+    (shard := tmp_path / "shard-000000000.h5").write_bytes(b"")
+    capsys.readouterr()
+    assert _build(tmp_path) == 0
+    captured = capsys.readouterr()
+    assert shard.name in captured.err
+    assert json.loads(captured.out)["damaged"] == [str(shard)]
+    assert len(head_of(shard).seeds) == 4
+
+
+def test_build_keeps_finished_shards_at_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "SHARD", 2)
+    monkeypatch.setattr(build, "processes", lambda _: FakeFarm(fails_after=1))
+    assert _build(tmp_path) == 130
+    assert read(tmp_path)[0].image.tolist() == samples_of(range(2))["image"].tolist()
+
+
+def test_build_hides_meshes_of_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.stl")
+    assert _build(tmp_path / "d", "--objects", str(tmp_path)) == 0
+    assert [name for name, _ in open_dataset(tmp_path / "d").plan.objects.meshes] == ["cube.stl"]
+    assert _build(tmp_path / "e", "--objects", str(tmp_path), "--without", "hat") == 2
+    assert "--without" in capsys.readouterr().err
+
+
+WRONG = {
+    1: ("--without hut", "--accuracy wrong", "--rig-spread-mm 500", "--rig bare-wall", "--objects none"),
+    2: ("--count 0", "--count many", "--backgrounds 2"),
+}
+
+
+@pytest.mark.parametrize(("options", "code"), [(options, code) for code, some in WRONG.items() for options in some])
+def test_build_refuses_bad_options_before_writing(tmp_path: Path, options: str, code: int) -> None:
+    assert _build(tmp_path / "d", *options.split()) == code
+    assert not (tmp_path / "d").exists()
+
+
+def test_build_without_ray_names_the_extra(tmp_path: Path, built: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert "nlos-cam[many]" in built(tmp_path / "d", "--ray", "auto", code=1)["error"]["message"]
+
+
+def test_rate_is_objects_per_second_once_known() -> None:
+    clock = iter(range(100))
+    bar = Progress(get_time=lambda: float(next(clock)))
+    task = bar.add_task("x", total=100)
+    assert Rate().render(bar.tasks[0]).plain == ""
+    for done in (1, 2, 3):
+        bar.update(task, completed=done)
+    assert Rate().render(bar.tasks[0]).plain.endswith("/s")
+
+
+@pytest.fixture
+def recordings(noise_bag: Path, tmp_path: Path) -> Path:
+    """Two recordings with a depth map for each: one named after its label, one after its recording."""
+    (folder := tmp_path / "recordings").mkdir()
+    for name, label, truth, depth_m in (("a", "mug", "mug", 0.2), ("b", "jug", "b", 0.3)):
+        shutil.copy(noise_bag, bag := folder / f"{name}.bag")
+        SidecarFile(sidecar_path(bag), ReplayCamera(bag), label=label)
+        np.save(folder / f"{truth}.npy", np.full((64, 64), depth_m, np.float32))
+    return folder
+
+
+@pytest.fixture
+def label(recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    def call(*options: str, code: int = 0) -> dict[str, Any]:
+        command = ["dataset", "label", str(recordings), "--out", str(tmp_path / "my data")]
+        assert main([*command, *options, "--json"]) == code
+        return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+    return call
+
+
+def test_label_makes_dataset_of_single_frames(label: Run, tmp_path: Path) -> None:
+    result = label("--frames", "3")
+    maps, plan = read(out := tmp_path / "my data")
+    assert len(maps.image) == result["samples"] == 6
+    assert (result["recordings"], result["labels"], result["out"]) == (2, ["jug", "mug"], str(out))
+    assert (result["rig_name"], result["rig_checksum"]) == (plan.rig.name, plan.rig.checksum)
+    assert [len(np.unique(image)) for image in maps.image] == [1] * 6
+    assert maps.image[0, 0, 0] > maps.image[5, 0, 0]
+
+
+def test_label_replaces_dataset_only_with_overwrite(label: Run, recordings: Path, tmp_path: Path) -> None:
+    out = tmp_path / "my data"
+    label("--frames", "2")
+    assert label("--frames", "1", code=1)["error"]["type"] == "OutputExistsError"
+    assert len(read(out)[0].image) == 4
+    label("--frames", "1", "--overwrite")
+    assert len(read(out)[0].image) == 2
+    assert _command(out) == f"nlos-cam dataset label {recordings} --out '{out}' --frames 1 --overwrite"
+    (recordings / "b.npy").unlink()
+    error = label("--overwrite", code=4)["error"]
+    assert (error["type"], "'jug'" in error["message"]) == ("RecordingError", True)
+    assert len(read(out)[0].image) == 2

@@ -1,0 +1,206 @@
+"""Frame of the command line: exit codes, one line for an error, one JSON object for a machine, outputs kept safe."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from nlos_calibration.errors import CalibrationError, RecordFileError, WallRefusedError
+from nlos_models.errors import CheckpointError, ModelError, RecipeError
+
+from nlos_cam import errors
+from nlos_cam.cli import main as module
+from nlos_cam.cli.common import Json, finish, output_path, say
+from nlos_cam.cli.main import COMMANDS, build_app, main, run
+
+CODES = {
+    1: (errors.SceneError, errors.OutputExistsError, WallRefusedError, CalibrationError, ModelError),
+    3: (errors.CameraNotFoundError, errors.CameraLostError),
+    4: (errors.RecordingError, errors.StreamMissingError, RecordFileError, CheckpointError, RecipeError),
+}
+Act = Callable[[], object]
+Capsys = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def does(monkeypatch: pytest.MonkeyPatch) -> Callable[[Act | BaseException], None]:
+    """A command line whose only command, `act`, calls a function or raises an error."""
+
+    def install(act: Act | BaseException) -> None:
+        app = typer.Typer()
+
+        @app.callback()
+        def root() -> None: ...
+
+        @app.command("act")
+        def command(count: int = 1, json: Json = False) -> None:
+            if isinstance(act, BaseException):
+                raise act
+            act()
+            finish({"count": count}, as_json=json, text=f"{count} done")
+
+        monkeypatch.setattr(module, "build_app", lambda _: app)
+
+    return install
+
+
+Does = Callable[[Act | BaseException], None]
+
+
+def _json(capsys: Capsys) -> dict[str, Any]:
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def test_command_prints_its_sentence_or_one_json_object(does: Does, capsys: Capsys) -> None:
+    does(lambda: None)
+    assert main(["act"]) == 0
+    assert capsys.readouterr().out == "1 done\n"
+    does(lambda: sys.stdout.write("a line of the command's own\n"))
+    assert main(["act", "--count", "3", "--json"]) == 0
+    assert _json(capsys) == {"count": 3}
+
+
+@pytest.mark.parametrize(("kind", "code"), [(kind, code) for code, kinds in CODES.items() for kind in kinds])
+def test_foreseen_error_has_its_exit_code_and_one_line(
+    does: Does, capsys: Capsys, kind: type[Exception], code: int
+) -> None:
+    message = "a depth of [3] m\nin [red]"
+    does(kind(message))
+    assert main(["act"]) == code
+    assert capsys.readouterr() == ("", "error: a depth of [3] m in [red]\n")
+    assert main(["act", "--json"]) == code
+    assert _json(capsys) == {"error": {"type": kind.__name__, "message": message}}
+
+
+DISK, FILE = (errno.ENOSPC, errno.EROFS, errno.EIO), (errno.EACCES, errno.ENOENT, errno.EISDIR)
+
+
+@pytest.mark.parametrize(
+    ("code", "kind"), [*((c, "DiskFullError") for c in DISK), *((c, "NlosCamError") for c in FILE)]
+)
+def test_system_error_names_file_and_reason(does: Does, capsys: Capsys, code: int, kind: str) -> None:
+    does(OSError(code, os.strerror(code), "out/F.npz"))
+    assert main(["act", "--json"]) == 1
+    error = _json(capsys)["error"]
+    assert error["type"] == kind
+    assert "out/F.npz" in error["message"]
+    assert os.strerror(code) in error["message"]
+
+
+@pytest.mark.parametrize("bug", [OSError(errno.EINVAL, "without a file"), ZeroDivisionError("a bug")])
+def test_unforeseen_error_is_not_hidden(does: Does, bug: Exception) -> None:
+    does(bug)
+    with pytest.raises(type(bug)):
+        main(["act"])
+
+
+def _swallowed() -> None:
+    with suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def _made_an_error() -> None:
+    try:
+        signal.raise_signal(signal.SIGTERM)
+    except KeyboardInterrupt:
+        raise errors.CameraError("initialization failed") from None
+
+
+@pytest.mark.parametrize("act", [KeyboardInterrupt(), typer.Abort(), _swallowed, _made_an_error])
+def test_ctrl_c_exits_with_130_even_if_a_library_catches_it(does: Does, capsys: Capsys, act: Any) -> None:
+    does(act)
+    assert main(["act"]) == 130
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal here")
+def test_ctrl_c_while_loading_exits_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: str) -> Callable[..., int]:
+        os.kill(os.getpid(), signal.SIGINT)
+        return lambda *_, **__: 0
+
+    monkeypatch.setattr(module, "build_app", interrupted)
+    assert main(["live"]) == 130
+
+
+@pytest.mark.parametrize("arguments", [["act", "--cuont", "3"], ["act", "--count", "many"], ["nothing"], ["act", "3"]])
+def test_wrong_usage_exits_with_2(does: Does, capsys: Capsys, arguments: list[str]) -> None:
+    does(lambda: None)
+    assert main(arguments) == 2
+    shown = capsys.readouterr()
+    assert (shown.out, bool(shown.err)) == ("", True)
+
+
+def test_console_script_exits_with_the_code(does: Does, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
+    does(errors.CameraNotFoundError("no device"))
+    monkeypatch.setattr(sys, "argv", ["nlos-cam", "act"])
+    with pytest.raises(SystemExit) as caught:
+        run()
+    assert caught.value.code == 3
+    assert "no device" in capsys.readouterr().err
+
+
+def leaves(app: typer.Typer, path: str = "") -> list[tuple[str, object]]:
+    commands = app.registered_commands
+    found = [(f"{path} {c.name or getattr(c.callback, '__name__', None)}".strip(), c.callback) for c in commands]
+    for group in app.registered_groups:
+        assert group.typer_instance is not None
+        found += leaves(group.typer_instance, f"{path} {group.name}".strip())
+    return found
+
+
+def test_help_names_every_command_and_all_take_json(capsys: Capsys) -> None:
+    assert main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    named = "devices doctor capture calibrate live replay render dataset train evaluate tradeoff"
+    for name in {*named.split(), *COMMANDS}:
+        assert name in shown
+    commands = leaves(build_app())
+    assert len(commands) >= 10
+    for name, callback in commands:
+        assert "json" in getattr(callback, "__annotations__", {}), name
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_command_table_names_the_right_module(command: str) -> None:
+    names = {name for name, _ in leaves(build_app(command))}
+    assert any(name.split()[0] == command for name in names)
+    assert names <= {name for name, _ in leaves(build_app())}
+
+
+def test_devices_command_does_not_import_torch() -> None:
+    program = "import sys; from nlos_cam.cli.main import build_app; build_app('devices'); print('torch' in sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    assert ended.stdout == "False\n"
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_output_path_refuses_file_in_place_of_folder(tmp_path: Path, *, overwrite: bool) -> None:
+    (out := tmp_path / "figures").write_text("mine", encoding="utf-8")
+    with pytest.raises(errors.OutputExistsError, match="figures"):
+        output_path(out, "figures", "", overwrite=overwrite)
+    assert out.read_text(encoding="utf-8") == "mine"
+
+
+def test_output_path_refuses_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system's answer is replaced, since the tests may run as a user who may write anywhere."""
+    out = tmp_path / "wall.toml"
+    assert output_path(out, "wall", ".toml", overwrite=False) == out
+    monkeypatch.setattr(os, "access", lambda path, mode: not (path == tmp_path and mode == os.W_OK))
+    with pytest.raises(errors.OutputExistsError, match=r"wall\.toml"):
+        output_path(out, "wall", ".toml", overwrite=True)
+
+
+def test_printed_text_is_literal_unless_marked(capsys: Capsys) -> None:
+    finish({}, as_json=False, text="wrote runs/[bold]x")
+    finish({}, as_json=False, text="[bold]good[/]", marked=True)
+    say("kept in [red]")
+    assert capsys.readouterr() == ("wrote runs/[bold]x\ngood\n", "kept in [red]\n")

@@ -1,0 +1,286 @@
+"""Dataset builds: equal shards for any workers, order or interruption; damaged shards are rebuilt, others refused."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from multiprocessing import active_children
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from fake_farm import FakeFarm, samples_of
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.dataset import build
+from nlos_cam.dataset import build as dataset
+from nlos_cam.dataset import build as dataset_worker
+from nlos_cam.dataset.build import Built, DatasetPlan, open_dataset, processes
+from nlos_cam.dataset.samples import make_samples
+from nlos_cam.dataset.shards import LOCK, SHARDS, only_builder, store
+from nlos_cam.errors import (
+    DiskFullError,
+    FolderBusyError,
+    OutputExistsError,
+    RecordingError,
+    SceneError,
+    WorkersLostError,
+)
+
+PLAN = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft")
+COUNT, LAST = 23, "shard-000000060.h5"  # the last shard holds three objects, the others five
+BLAS = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
+PARENT = """
+import multiprocessing, time
+from threading import Thread
+from nlos_cam.dataset_worker import end_with_parent
+def wait(connection):
+    Thread(target=end_with_parent, daemon=True).start()
+    connection.send("ready")
+    time.sleep(60)
+if __name__ == "__main__":
+    mine, other = multiprocessing.get_context("fork").Pipe()
+    child = multiprocessing.get_context("fork").Process(target=wait, args=(other,))
+    child.start()
+    mine.recv()
+    print(child.pid, flush=True)
+    time.sleep(60)
+"""
+Shards = dict[str, bytes]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _small_shards() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "SHARD", 5)
+        patch.setattr(dataset, "PIECE", 2)
+        yield
+
+
+def _build(folder: Path, farm: Any = None, count: int = COUNT, **others: Any) -> Built:
+    options = {"workers": 1, "on_progress": lambda *_: None, "farm": farm or FakeFarm(), **others}
+    return build(options.pop("plan", PLAN), count, folder, **options)
+
+
+def _bytes(folder: Path) -> Shards:
+    return {path.name: path.read_bytes() for path in folder.glob("*") if not path.name.startswith(".")}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Shards:
+    """Shards of an undisturbed build."""
+    _build(folder := tmp_path_factory.mktemp("whole"))
+    return _bytes(folder)
+
+
+@pytest.fixture
+def finished(tmp_path: Path, whole: Shards) -> Path:
+    """Folder of an undisturbed build."""
+    (folder := tmp_path / "finished").mkdir()
+    for name, content in whole.items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def test_build_stores_samples_in_seed_order(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    built = _build(tmp_path, on_progress=lambda *at: seen.append(at))
+    found = open_dataset(tmp_path)
+    assert (built.objects, built.made, built.damaged) == (COUNT, COUNT, ())
+    assert (len(found), found.plan) == (COUNT, PLAN)
+    for name, values in samples_of(range(40, 40 + COUNT)).items():
+        np.testing.assert_array_equal(found.column(name), values)
+    assert seen == [(done, COUNT) for done in (0, 2, 4, 5, 7, 9, 10, 12, 14, 15, 17, 19, 20, 22, 23)]
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 3, 7, 11, 13])
+@pytest.mark.parametrize("order", [None, 3])
+def test_interrupted_build_resumes(tmp_path: Path, whole: Shards, after: int, order: int | None) -> None:
+    """Every finished shard is kept, and no sample is made twice."""
+    farm, rest = FakeFarm(order, fails_after=after), FakeFarm()
+    with pytest.raises(KeyboardInterrupt):
+        _build(tmp_path, farm)
+    assert farm.closed
+    kept = _bytes(tmp_path)
+    assert kept.items() <= whole.items()
+    if order is None:
+        assert len(kept) == after // 3  # a shard is made in three pieces
+    built = _build(tmp_path, rest)
+    assert _bytes(tmp_path) == whole
+    again = [seed for piece in rest.made for seed in piece]
+    assert len(again) == len(set(again)) == built.made == COUNT - sum(3 if name == LAST else 5 for name in kept)
+
+
+def test_build_raises_error_of_an_object(tmp_path: Path) -> None:
+    farm = FakeFarm(fails_after=4, error=SceneError("cup.stl shows nothing"))
+    with pytest.raises(SceneError, match=r"cup\.stl"):
+        _build(tmp_path, farm)
+    assert farm.closed
+    assert len(_bytes(tmp_path)) == 1
+
+
+def test_build_cleans_up_partial_files_of_a_kill(tmp_path: Path, whole: Shards) -> None:
+    _build(tmp_path, count=10)
+    content = (tmp_path / "shard-000000040.h5").read_bytes()
+    (tmp_path / "shard-000000045.h5").rename(tmp_path / "shard-000000045.part")
+    (tmp_path / "shard-000000050.part").write_bytes(content[:100])
+    assert len(open_dataset(tmp_path)) == 5
+    _build(tmp_path)
+    assert _bytes(tmp_path) == whole
+
+
+@pytest.mark.parametrize(
+    ("name", "keep", "count", "made"),
+    [*(("shard-000000045.h5", share, COUNT, 5) for share in (0.0, 0.3, 0.99)), (LAST, 0.0, 10, 0)],
+)
+def test_build_replaces_only_damaged_shards_it_needs(
+    finished: Path, whole: Shards, name: str, keep: float, count: int, made: int
+) -> None:
+    told, path = list[str](), finished / name
+    path.write_bytes(whole[name][: int(keep * len(whole[name]))])
+    built = _build(finished, count=count, tell=told.append)
+    assert [str(path) in line for line in told] == [True]
+    assert (built.made, built.damaged) == (made, (path,) if made else ())
+    assert (_bytes(finished) == whole) == bool(made)
+
+
+def test_build_leaves_finished_dataset_alone(finished: Path, whole: Shards) -> None:
+    farm, checked = FakeFarm(), list[tuple[int, int]]()
+    built = _build(finished, farm, on_check=lambda *at: checked.append(at))
+    assert (farm.made, built.made) == ([], 0)
+    assert checked == [(k, 5) for k in range(1, 6)]
+    assert _bytes(finished) == whole
+
+
+@pytest.mark.parametrize("first", [1, 5, 7, 22])
+def test_build_grows_dataset_to_count(tmp_path: Path, whole: Shards, first: int) -> None:
+    """7 objects leave a shard half full, which a larger count must fill."""
+    _build(tmp_path, count=first)
+    assert len(open_dataset(tmp_path)) == first
+    assert _build(tmp_path).made == COUNT - first // 5 * 5
+    assert _bytes(tmp_path) == whole
+
+
+def test_build_refuses_other_plan_and_shard_size(
+    finished: Path, whole: Shards, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = replace(PLAN, accuracy="fine", rig=PLAN.rig.model_copy(update={"name": "other"}))
+    with pytest.raises(RecordingError, match=r"rig.*accuracy"):
+        _build(finished, plan=other)
+    monkeypatch.setattr(dataset, "SHARD", 4)
+    with pytest.raises(RecordingError, match=r"shard-000000040\.h5"):
+        _build(finished)
+    assert _bytes(finished) == whole
+
+
+def test_build_refuses_shard_of_newer_program(tmp_path: Path) -> None:
+    newer = PLAN.provenance.replace('{"rig"', '{"lens": 1, "rig"', 1)
+    store(tmp_path / "shard-000000040.h5", samples_of(range(40, 45)), newer, "")
+    before = _bytes(tmp_path)
+    with pytest.raises(RecordingError, match="lens"):
+        _build(tmp_path)
+    assert _bytes(tmp_path) == before
+
+
+def test_build_locks_its_folder_and_refuses_a_file(tmp_path: Path) -> None:
+    with only_builder(tmp_path), pytest.raises(FolderBusyError, match=str(os.getpid())):
+        _build(tmp_path)
+    _build(tmp_path)
+    assert (tmp_path / LOCK).exists()
+    (tmp_path / "file").write_text("here")
+    with pytest.raises(OutputExistsError, match="--out"):
+        _build(tmp_path / "file")
+
+
+def test_build_keeps_shards_when_disk_is_full(tmp_path: Path, whole: Shards, monkeypatch: pytest.MonkeyPatch) -> None:
+    stores, farm = list[Path](), FakeFarm()
+
+    def full(path: Path, *others: Any) -> None:
+        stores.append(path)
+        if len(stores) == 3:
+            raise DiskFullError(str(path))
+        store(path, *others)
+
+    monkeypatch.setattr(dataset, "store", full)
+    with pytest.raises(DiskFullError):
+        _build(tmp_path, farm)
+    assert farm.closed
+    assert len(list(tmp_path.glob(SHARDS))) == 2
+    _build(tmp_path)
+    assert _bytes(tmp_path) == whole
+
+
+class InThisProcess(Executor):
+    """Process pool without processes, which breaks after a number of pieces."""
+
+    dies_after: list[int]
+
+    def __init__(self, *_: object, **__: object) -> None:
+        self.left = self.dies_after.pop(0)
+
+    def submit(self, work: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self.left -= 1
+        if self.left >= 0:
+            future.set_result(work(*arguments))
+        else:
+            future.set_exception(BrokenProcessPool("killed"))
+        return future
+
+
+def test_processes_replace_killed_workers_or_give_up(
+    tmp_path: Path, whole: Shards, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset, "ProcessPoolExecutor", InThisProcess)
+    monkeypatch.setattr(dataset, "make_samples", lambda _, piece: samples_of(piece))
+    InThisProcess.dies_after = [7, 0, 1, 4, 100]
+    with pytest.raises(WorkersLostError, match="--workers"):  # the second pool makes nothing
+        _build(tmp_path, processes(2))
+    assert 0 < len(_bytes(tmp_path)) <= 2
+    _build(tmp_path, processes(2))
+    assert _bytes(tmp_path) == whole
+
+
+@pytest.mark.slow
+def test_processes_make_the_samples_of_one_process(tmp_path: Path) -> None:
+    build(PLAN, 4, tmp_path, workers=2, on_progress=lambda *_: None)
+    for name, values in make_samples(PLAN, range(40, 44)).items():
+        np.testing.assert_array_equal(open_dataset(tmp_path).column(name), values)
+    assert not active_children()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_worker_ends_with_killed_parent() -> None:
+    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline().strip().isdigit()
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+        assert parent.stdout.read() == ""  # end of file: the worker held this pipe open, and ended
+
+
+def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset_worker, "parent_process", lambda: None)
+    for name in BLAS:
+        monkeypatch.setenv(name, "2")
+    threads, handler = numba.get_num_threads(), signal.getsignal(signal.SIGINT)
+    try:
+        dataset_worker.begin_worker()
+        assert numba.get_num_threads() == 1
+        assert {os.environ[name] for name in BLAS} == {"1"}
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        numba.set_num_threads(threads)
+        signal.signal(signal.SIGINT, handler)
+
+
+def test_worker_module_does_not_import_numpy() -> None:
+    """BLAS counts the processors when numpy is imported, which must happen after `begin_worker`."""
+    program = "import sys, nlos_cam.cli.main, nlos_cam.dataset_worker; raise SystemExit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -1,0 +1,137 @@
+"""Dataset plans: equal after writing and reading, older plans at their defaults, drawn rigs within their bounds."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+from nlos_models.recipe import SIMULATION_ONLY
+from pydantic import ValidationError
+
+from nlos_cam.dataset.plan import FIRST_OBJECTS, SCENE_COLUMNS, DatasetPlan, Objects, RigSpread, scene_row
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.textures import TEXTURES
+from nlos_cam.render.material import Material
+from nlos_cam.render.scene_file import SceneFile
+from nlos_cam.render.sensor.model import SensorModel
+
+RIG, SENSOR = load_rig("paper-rig"), SensorModel()
+assert RIG.occluder is not None
+PLAN = DatasetPlan(RIG, 7)
+SPREAD = RigSpread(place_m=0.02, angle_deg=5, gain_share=0.3)
+CHANGES: dict[str, Any] = {
+    "rig": RIG.model_copy(update={"name": "other"}),
+    "first_seed": 8,
+    "sensor": SensorModel(shot_noise=0),
+    "accuracy": "fine",
+    "objects": Objects((), (("a/b.stl", "0" * 64),), folder=Path("/somewhere")),
+    "spread": SPREAD,
+    "radiometry": "lambertian",
+    "jump_m": 0.5,
+    "material": Material(kind="phong"),
+    "rendering_version": 1,
+    "textures": tuple(TEXTURES),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_plan_survives_json_and_names_the_field_that_differs(name: str) -> None:
+    other = replace(PLAN, **{name: CHANGES[name]})
+    assert DatasetPlan.from_provenance(other.provenance) == other
+    assert other.differences(PLAN) == [name.replace("_", " ")]
+    assert PLAN.differences(replace(PLAN)) == []
+    assert "somewhere" not in other.provenance  # the folder of meshes differs between machines
+
+
+def test_plan_with_textures_is_noted_as_simulation_only() -> None:
+    in_color = replace(PLAN, textures=tuple(TEXTURES))
+    assert json.loads(in_color.provenance)["note"] == SIMULATION_ONLY
+    assert not {"textures", "note"} & json.loads(PLAN.provenance).keys()
+
+
+def test_plan_of_older_version_has_defaults() -> None:
+    facts = json.loads(PLAN.provenance)
+    for name in ("objects", "spread", "radiometry", "jump_m", "material"):
+        del facts[name]
+    for name in ("ripple_m", "warm_up", "range_offset_m"):
+        del facts["sensor"][name]
+    older = DatasetPlan.from_provenance(json.dumps(facts))
+    assert PLAN.differences(older) == ["objects"]  # the generators of the first version were others
+    assert (older.objects.categories, older.objects.version) == (FIRST_OBJECTS["categories"], 1)
+    facts["objects"] = {"categories": list(CATEGORIES)}
+    assert DatasetPlan.from_provenance(json.dumps(facts)) == PLAN
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [("", "."), ("{}", "."), ('{"rig": 1}', "."), (json.dumps(json.loads(PLAN.provenance) | {"lens": 2}), "lens")],
+)
+def test_plan_refuses_other_json_and_newer_plans(text: str, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        DatasetPlan.from_provenance(text)
+
+
+def test_objects_without_leaves_categories_out() -> None:
+    assert set(CATEGORIES) - set(Objects.without(["hat", "boat"]).categories) == {"hat", "boat"}
+    with pytest.raises(SceneError, match="hut"):
+        Objects.without(["hut"])
+    with pytest.raises(SceneError):
+        Objects.without(list(CATEGORIES))
+
+
+def test_plan_of_scene_takes_all_but_the_object() -> None:
+    hidden = {"category": "cup", "material": {"kind": "phong"}}
+    facts = {"rig": "paper-rig", "radiometry": "lambertian", "jump_m": 0.03, "sensor": {"pulse_ns": 1.0}}
+    scene = SceneFile.model_validate({"name": "s", "object": hidden, **facts})
+    plan = DatasetPlan.of_scene(scene, 3, accuracy="draft")
+    assert (plan.rig, plan.first_seed, plan.accuracy) == (scene.rig, 3, "draft")
+    assert (plan.sensor, plan.radiometry, plan.jump_m) == (scene.sensor, "lambertian", 0.03)
+    assert (plan.material, plan.objects) == (Material(kind="phong"), Objects())
+
+
+def test_spread_draws_rigs_uniformly_within_bounds() -> None:
+    drawn = np.array([scene_row(*SPREAD.drawn(RIG, SENSOR, seed)) for seed in range(300)])
+    half = np.array([0.02, 5, 5, 0.02, 0.02, 0.3 * SENSOR.bare_wall_counts])
+    share = (drawn - np.array(scene_row(RIG, SENSOR))) / half
+    assert drawn.shape[1] == len(SCENE_COLUMNS)
+    assert np.abs(share).max() <= 1 + 1e-9
+    assert share.min(0).max() < -0.95
+    assert share.max(0).min() > 0.95
+    assert np.abs(np.corrcoef(share.T) - np.eye(6)).max() < 0.25
+
+
+def test_spread_draws_by_seed_and_none_keeps_the_rig() -> None:
+    assert SPREAD.drawn(RIG, SENSOR, 5) == SPREAD.drawn(RIG, SENSOR, 5)
+    assert SPREAD.drawn(RIG, SENSOR, 5) != SPREAD.drawn(RIG, SENSOR, 6)
+    assert RigSpread().drawn(RIG, SENSOR, 5) == (RIG, SENSOR)
+    rig, sensor = SPREAD.drawn(RIG.model_copy(update={"occluder": None}), SENSOR, 1)
+    assert rig.occluder is None
+    assert np.isnan(scene_row(rig, sensor)).tolist() == [False, False, False, True, True, False]
+
+
+NEAR = RIG.model_copy(update={"occluder": RIG.occluder.model_copy(update={"x_m": 0.31})})
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"spread": RigSpread(place_m=0.1)}, "100 mm"),
+        ({"spread": RigSpread(angle_deg=45)}, "45 degrees"),
+        ({"spread": RigSpread(gain_share=1.0)}, "100%"),
+        ({"rig": NEAR, "spread": SPREAD}, "15 mm"),  # would move the occluder into the object box
+        ({"material": Material(albedo=(1, 0, 0))}, "one intensity"),
+        ({"material": Material(albedo=0.5), "textures": tuple(TEXTURES)}, "textures"),
+        ({"material": Material(albedo=(1.0, 0.5, 0.5)), "textures": tuple(TEXTURES)}, "textures"),
+        ({"rig": load_rig("bare-wall")}, "object_box"),
+    ],
+)
+def test_plan_check_refuses_impossible_plans(changes: dict[str, Any], words: str) -> None:
+    replace(PLAN, textures=changes.get("textures", ())).check()
+    with pytest.raises(SceneError, match=words):
+        replace(PLAN, **changes).check()
+    with pytest.raises(ValidationError, match="place_m"):
+        RigSpread(place_m=-1)

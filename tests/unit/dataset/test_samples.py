@@ -1,0 +1,226 @@
+"""Dataset samples: maps of the objects of their seeds on the rigs of their seeds, in one color or in three."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from nlos_calibration.arrays import Float32
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.dataset import samples as dataset_samples
+from nlos_cam.dataset.plan import DatasetPlan, Objects, RigSpread, scene_row
+from nlos_cam.dataset.samples import (
+    Samples,
+    hidden_object,
+    joined,
+    make_samples,
+    objects_of,
+    procedural_images,
+    sense_colour,
+    sense_object,
+)
+from nlos_cam.errors import SceneError
+from nlos_cam.frames import LidarMaps
+from nlos_cam.objects.depth_map import image_from_depth
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import object_depth
+from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
+from nlos_cam.render.material import Surface
+from nlos_cam.render.renderer import render
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render.sensor.sensor import Sensor
+
+RIG = load_rig("paper-rig")
+PLAN = DatasetPlan(RIG, 0, accuracy="draft")
+BOX = PLAN.box
+COLOR = replace(PLAN, first_seed=40, textures=tuple(TEXTURES))
+SILENT = SensorModel(range_noise_m=0.0, range_noise_per_m=0.0, read_noise_counts=0.0, shot_noise=0.0, dead_share=0.0)
+NOISY, QUIET = Sensor(RIG, SensorModel()), Sensor(RIG, SILENT)
+GREY = np.full((64, 64, 3), 0.5, np.float32)
+SHAPE = np.full((64, 64), np.nan, np.float32)  # a tilted slab without a corner, whose echo wins in many cells
+SHAPE[8:56, 4:52] = np.linspace(0.14, 0.2, 48, dtype=np.float32)
+SHAPE[:20, :20] = np.nan
+PAINT = np.random.default_rng(0).choice([0.25, 0.5, 1.0], (64, 64, 3)).astype(np.float32)  # exact in any order of sums
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    return make_samples(PLAN, range(3))
+
+
+def test_samples_are_rendered_and_sensed_objects_of_their_seeds(samples: Samples) -> None:
+    for seed in (0, 2):
+        category, depth_m = object_depth(seed, BOX)
+        sensed = sense_object(Scene(RIG, depth_m), NOISY, seed, "draft")
+        np.testing.assert_array_equal(samples["depth_m"][seed], sensed.depth_m)
+        np.testing.assert_array_equal(samples["intensity"][seed], sensed.intensity)
+        np.testing.assert_array_equal(samples["object_depth_m"][seed], depth_m)
+        np.testing.assert_array_equal(samples["image"][seed], image_from_depth(depth_m, BOX).astype(np.float16))
+        assert samples["category"][seed] == category
+    np.testing.assert_array_equal(samples["image"], procedural_images(0, 3, BOX))
+    np.testing.assert_array_equal(samples["scene"], [[0.2, 45.0, 0.0, 0.2, 0.1, 48.0]] * 3)
+
+
+def test_samples_are_independent_of_pieces(samples: Samples) -> None:
+    pieces = joined([make_samples(PLAN, [0]), make_samples(PLAN, [1, 2])])
+    assert pieces.keys() == samples.keys()
+    for name, values in pieces.items():
+        assert values.dtype == samples[name].dtype
+        np.testing.assert_array_equal(values, samples[name])
+
+
+def test_sense_object_draws_noise_by_seed() -> None:
+    scene = Scene(RIG, object_depth(0, BOX)[1])
+    first, again, other = (sense_object(scene, NOISY, seed, "draft") for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first.depth_m, again.depth_m)
+    assert not np.array_equal(first.depth_m, other.depth_m, equal_nan=True)
+
+
+def test_samples_are_rendered_with_pulse_and_radiometry_of_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Scene] = []
+
+    def sense(scene: Scene, *_: object) -> LidarMaps:
+        seen.append(scene)
+        blank = np.zeros((64, 80), np.float32)
+        return LidarMaps(blank, blank, blank > 0)
+
+    monkeypatch.setattr(dataset_samples, "sense_object", sense)
+    make_samples(replace(PLAN, sensor=SensorModel(pulse_ns=1.0), radiometry="lambertian", jump_m=0.5), [0])
+    assert (seen[0].pulse_ns, seen[0].radiometry, seen[0].jump_m) == (1.0, "lambertian", 0.5)
+
+
+def test_hidden_object_draws_no_category_left_out() -> None:
+    kept = Objects.without(["hat", "boat", "cup"])
+    drawn = {hidden_object(kept, seed, BOX)[0] for seed in range(150)}
+    assert drawn == set(CATEGORIES) - {"hat", "boat", "cup"}
+
+
+def test_backgrounds_fill_empty_pixels_of_some_objects() -> None:
+    alone = [hidden_object(Objects(), seed, BOX)[1] for seed in range(20)]
+    beside = [hidden_object(Objects(backgrounds=0.5), seed, BOX)[1] for seed in range(20)]
+    more = [np.isfinite(two).sum() > np.isfinite(one).sum() for one, two in zip(alone, beside, strict=True)]
+    assert 3 < sum(more) < 17
+
+
+@pytest.fixture
+def meshes(tmp_path: Path) -> Path:
+    (tmp_path / "sub").mkdir()
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.stl")
+    trimesh.creation.icosphere(subdivisions=1).export(tmp_path / "sub" / "ball.ply")
+    return tmp_path
+
+
+def test_objects_of_hides_meshes_of_a_folder_by_seed(meshes: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    objects = objects_of(meshes, lambda *at: seen.append(at))
+    assert seen == [(1, 2), (2, 2)]
+    assert [name for name, _ in objects.meshes] == ["cube.stl", "sub/ball.ply"]
+    found = [hidden_object(objects, seed, BOX) for seed in range(12)]
+    assert {name for name, _ in found} == {"cube.stl", "sub/ball.ply"}
+    np.testing.assert_array_equal(hidden_object(objects_of(meshes), 3, BOX)[1], found[3][1])
+    assert make_samples(replace(PLAN, objects=objects), [0])["category"][0] == found[0][0]
+
+
+def test_meshes_are_identified_by_content_not_by_folder(meshes: Path) -> None:
+    before = objects_of(meshes)
+    moved = meshes.rename(meshes.with_name("moved"))
+    assert objects_of(moved) == before
+    trimesh.creation.box((1, 2, 1)).export(moved / "cube.stl")
+    assert objects_of(moved) != before
+    with pytest.raises(SceneError, match=r"cube\.stl"):
+        hidden_object(replace(before, folder=moved, meshes=before.meshes[:1]), 0, BOX)
+    with pytest.raises(SceneError, match=moved.parent.name):
+        objects_of(moved.parent / "none")
+    with pytest.raises(SceneError, match="--objects"):
+        hidden_object(replace(before, folder=None), 0, BOX)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes here")
+def test_objects_of_refuses_mesh_name_that_is_not_utf8(meshes: Path) -> None:
+    (meshes / "cube.stl").rename(meshes / os.fsdecode(b"caf\xe9.stl"))
+    with pytest.raises(SceneError, match="UTF-8"):
+        objects_of(meshes)
+
+
+@pytest.mark.slow
+def test_samples_module_does_not_import_torch() -> None:
+    program = "import sys, nlos_cam.dataset_samples; raise SystemExit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def _sensed(depth_m: Float32, albedo: Float32, sensor: Sensor, seed: int = 0) -> LidarMaps:
+    return sense_colour(Scene(RIG, depth_m, Surface(albedo)), sensor, seed, "draft")
+
+
+@pytest.mark.slow
+def test_swapped_colors_swap_intensities_and_keep_depth() -> None:
+    before = _sensed(SHAPE, PAINT, QUIET)
+    assert not np.array_equal(before.intensity[0], before.intensity[1])
+    for order in ([0, 2, 1], [1, 2, 0], [2, 1, 0]):
+        after = _sensed(SHAPE, PAINT[..., order], QUIET)
+        np.testing.assert_array_equal(after.intensity, before.intensity[order])
+        np.testing.assert_array_equal(after.depth_m, before.depth_m)
+
+
+@pytest.mark.slow
+def test_grey_object_is_sensed_as_in_one_color() -> None:
+    scene = Scene(RIG, SHAPE, Surface(0.5))
+    maps, alone = _sensed(SHAPE, GREY, QUIET), sense_object(scene, QUIET, 0, "draft")
+    np.testing.assert_array_equal(maps.depth_m, alone.depth_m)
+    for intensity in maps.intensity:
+        np.testing.assert_array_equal(intensity, alone.intensity)
+    white = sense_object(scene, NOISY, 7, "draft")  # the noise of the depth is that of the white exposure
+    np.testing.assert_array_equal(_sensed(SHAPE, GREY, NOISY, 7).depth_m, white.depth_m)
+
+
+@pytest.mark.slow
+def test_exposures_match_rendered_colors_where_one_echo_wins() -> None:
+    whole = render(Scene(RIG, SHAPE, Surface(PAINT)), "draft")
+    assert whole.colour is not None
+    for channel in range(3):
+        alone = render(Scene(RIG, SHAPE, Surface(PAINT[..., channel])), "draft")
+        same = (alone.depth_m == whole.depth_m) & (alone.intensity == alone.multi.peak)
+        assert same.sum() > 100
+        np.testing.assert_allclose(alone.intensity[same], whole.colour[same, channel], rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_each_exposure_has_its_own_noise_by_seed() -> None:
+    one, again, other = (_sensed(SHAPE, GREY, NOISY, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.intensity, again.intensity)
+    assert not np.array_equal(one.intensity, other.intensity)
+    assert not np.array_equal(one.intensity[0], one.intensity[1])
+
+
+@pytest.mark.slow
+def test_mirrored_object_gives_mirrored_color_maps() -> None:
+    straight, mirrored = _sensed(SHAPE, PAINT, QUIET), _sensed(SHAPE[::-1].copy(), PAINT[::-1], QUIET)
+    valid = ~np.isnan(straight.depth_m) & ~np.isnan(mirrored.depth_m[::-1])
+    apart = np.abs(mirrored.intensity[:, ::-1] - straight.intensity)[:, valid]
+    assert (apart <= 1.0).mean() > 0.99  # rounding decides some ties between echoes
+
+
+def test_color_samples_are_painted_depth_samples_on_drawn_rig() -> None:
+    plan = replace(COLOR, spread=RigSpread(place_m=0.02, angle_deg=5, gain_share=0.2), sensor=SILENT)
+    made, plain = make_samples(plan, [41]), make_samples(replace(plan, textures=()), [41])
+    assert made["intensity"].shape == (1, 3, 64, 80)
+    for name in ("object_depth_m", "seed", "scene", "category"):
+        np.testing.assert_array_equal(made[name], plain[name])
+    depth_m = hidden_object(plan.objects, 41, plan.box)[1]
+    coat = painted(41, depth_m, plan.textures)
+    assert made["texture"][0] == coat.texture
+    np.testing.assert_array_equal(made["image"][0], image_from_albedo(coat.albedo, depth_m).astype(np.float16))
+    np.testing.assert_array_equal(made["image"], procedural_images(41, 1, plan.box, textures=plan.textures))
+    rig, model = plan.spread.drawn(plan.rig, plan.sensor, 41)
+    np.testing.assert_array_equal(made["scene"][0], scene_row(rig, model))
+    sensor = Sensor(rig, model)
+    in_color = sense_colour(Scene(rig, depth_m, Surface(coat.albedo)), sensor, 41, "draft")
+    for samples, maps in ((made, in_color), (plain, sense_object(Scene(rig, depth_m), sensor, 41, "draft"))):
+        np.testing.assert_array_equal(samples["depth_m"][0], maps.depth_m)
+        np.testing.assert_array_equal(samples["intensity"][0], maps.intensity)

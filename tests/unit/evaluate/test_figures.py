@@ -1,0 +1,87 @@
+"""Figures of an evaluation: every object is on the sheet, drawn in the colors of its values."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib import colormaps
+
+from nlos_cam.evaluate import figures as evaluate_pictures
+from nlos_cam.evaluate.figures import (
+    BLOCK,
+    DIFFERENCE,
+    HEAD,
+    ROWS,
+    TILE,
+    VALUE,
+    _figure,
+    draw_categories,
+    draw_gallery,
+    draw_sheet,
+    mosaic,
+)
+from nlos_cam.evaluate.metrics import BARS, over_objects
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The figures that are drawn."""
+    made, original = list[Any](), _figure
+
+    def kept(size: tuple[float, float]) -> Any:
+        made.append(original(size))
+        return made[-1]
+
+    monkeypatch.setattr(evaluate_pictures, "_figure", kept)
+    return made
+
+
+def _images(count: int) -> np.ndarray:
+    return np.random.default_rng(count).random((count, 64, 64)).astype(np.float32)
+
+
+def _titles(figure: Any) -> list[str]:
+    return [text.get_text() for axis in figure.axes for text in axis.texts if text.get_text() not in ROWS]
+
+
+def test_mosaic_shows_truth_reconstruction_and_difference() -> None:
+    truth, image = _images(5), _images(5)[::-1].copy()
+    canvas = mosaic(image, truth, columns=3)
+    assert canvas.shape == (2 * BLOCK, 3 * TILE, 3)
+    for k in range(5):
+        top, left = k // 3 * BLOCK + HEAD, k % 3 * TILE
+        tiles = [canvas[top + row * TILE :, left:][:64, :64] for row in range(3)]
+        rows = zip(tiles, (truth[k], image[k], image[k] - truth[k]), (VALUE, VALUE, DIFFERENCE), strict=True)
+        for tile, picture, (name, low, high) in rows:
+            expected = colormaps[name]((picture - low) / (high - low), bytes=True)[..., :3].astype(int)
+            assert np.abs(expected - tile).max() <= 3
+    assert (canvas[BLOCK:, 2 * TILE :] == 255).all()
+
+
+@pytest.mark.parametrize("count", [1, 4, 54, 130])
+def test_sheet_names_up_to_54_objects_from_first_to_last(tmp_path: Path, figures: list[Any], count: int) -> None:
+    draw_sheet(tmp_path / "sheet.png", _images(count), _images(count), [str(k) for k in range(count)])
+    assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
+    shown = [int(title) for title in _titles(figures[0])]
+    assert (len(shown), shown[0], shown[-1]) == (min(count, 54), 0, count - 1)
+    assert shown == sorted(set(shown))
+
+
+def test_categories_are_drawn_from_worst_to_best(tmp_path: Path, figures: list[Any]) -> None:
+    levels = {"cup": 0.9, "hat": 0.5}
+    by = {kind: over_objects({name: np.array([level] * 2) for name in BARS}) for kind, level in levels.items()}
+    draw_categories(tmp_path / "categories.png", by, by["cup"])
+    axis = figures[0].axes[0]
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["hat", "cup"]
+    assert [text.get_text().count("0.9") for text in axis.get_legend().texts] == [1, 1]  # the estimate and the bar
+    nothing = {"cup": over_objects({name: np.array([np.nan]) for name in BARS})}
+    draw_categories(tmp_path / "empty.png", nothing, nothing["cup"])
+    assert (tmp_path / "empty.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_gallery_shows_the_worst_and_the_best(tmp_path: Path, figures: list[Any]) -> None:
+    iou = np.random.default_rng(0).permutation(20) / 20
+    draw_gallery(tmp_path / "gallery.png", _images(20), _images(20), [str(k) for k in range(20)], iou)
+    order = [f"{k}: {iou[k]:.2f}" for k in np.argsort(iou)]
+    assert _titles(figures[0]) == [*order[:6], *order[::-1][:6]]

@@ -1,0 +1,178 @@
+"""Evaluation metrics, their confidence intervals, and the error by size, by detail and by place in the image."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.dataset.build import procedural_images
+from nlos_cam.evaluate.metrics import (
+    BARS,
+    advantage,
+    bars_met,
+    curve,
+    detail_per_cm,
+    interval,
+    judge,
+    meets,
+    over_objects,
+    per_category,
+    per_object,
+    plain,
+    rank_correlation,
+    surface_cm2,
+    where_the_error_is,
+)
+from nlos_cam.objects.depth_map import depth_from_image, object_box
+
+BOX = object_box(load_rig("paper-rig"))
+PITCH_CM = 25 / 64
+PERFECT = {"silhouette_iou": 1, "accuracy_mean_abs": 1, "accuracy_within_2_percent": 1, "foreground_rmse_mm": 0}
+EMPTY = np.zeros((1, 64, 64), np.float32)
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    return procedural_images(0, 12, BOX).astype(np.float32)
+
+
+def test_judge_scores_perfect_image_without_uncertainty(images: np.ndarray) -> None:
+    figures = judge(images, images, BOX)
+    assert {name: figure.value for name, figure in figures.items()} == PERFECT
+    assert all(figure.low == figure.value == figure.high for figure in figures.values())
+    assert all(bar["met"] for bar in bars_met(figures).values())
+
+
+def test_judge_scores_worse_image_worse(images: np.ndarray) -> None:
+    near, far = judge(0.99 * images, images, BOX), judge(0.8 * np.roll(images, 10, axis=2), images, BOX)
+    for name, sign in (("silhouette_iou", 1), ("accuracy_mean_abs", 1), ("foreground_rmse_mm", -1)):
+        assert sign * near[name].value > sign * far[name].value
+    for name, figure in plain(near).items():
+        assert figure == {end: getattr(near[name], end) for end in ("value", "low", "high")}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_foreground_rmse_is_that_of_the_depth_live_shows(images: np.ndarray, seed: int) -> None:
+    guess = np.random.default_rng(seed).random(images.shape).astype(np.float32)
+    guess[:, ::2] *= 0.15  # background, and depths beyond the box
+    apart_mm = 1000 * (depth_from_image(guess, BOX).astype(np.float64) - depth_from_image(images, BOX))
+    expected = np.sqrt(np.nanmean(np.square(apart_mm), axis=(1, 2)))
+    np.testing.assert_allclose(per_object(guess, images, BOX)["foreground_rmse_mm"], expected, rtol=1e-4)
+
+
+def test_interval_contains_its_mean_and_repeats() -> None:
+    values = np.random.default_rng(1).random(50)
+    found = interval(values)
+    assert found.value == pytest.approx(values.mean())
+    assert found.low < found.value < found.high
+    assert interval(values) == found
+    for some, expected in (([np.nan] * 2, None), ([0.5], 0.5), ([np.nan, 2], 2)):  # without a value, left out
+        found = interval(np.array(some))
+        assert found.value == found.low == found.high == expected
+
+
+def test_interval_shrinks_with_root_of_object_count() -> None:
+    values = np.random.default_rng(2).normal(size=1600)
+    wide, narrow = interval(values[:100]), interval(values)
+    assert (wide.high - wide.low) / (narrow.high - narrow.low) == pytest.approx(4, rel=0.3)
+    assert narrow.high - narrow.low == pytest.approx(2 * 1.96 / 40, rel=0.15)
+
+
+def test_interval_covers_the_truth_at_its_confidence() -> None:
+    generator = np.random.default_rng(3)
+    found = [interval(generator.exponential(1.0, 54)) for _ in range(150)]
+    assert 0.86 < np.mean([one.low <= 1.0 <= one.high for one in found]) <= 1.0
+
+
+def test_categories_average_to_the_whole(images: np.ndarray) -> None:
+    categories = ["cup"] * 2 + ["hat"] * 7 + ["car"] * 3
+    values = per_object(0.9 * np.roll(images, 3, axis=2), images, BOX)
+    by, whole = per_category(values, categories), over_objects(values)
+    assert list(by) == ["cup", "hat", "car"]
+    for name in BARS:
+        weighed = sum(categories.count(category) * by[category][name].value for category in by) / len(images)
+        assert weighed == pytest.approx(whole[name].value)
+
+
+def test_advantage_is_positive_for_the_better_image(images: np.ndarray) -> None:
+    good, bad = (per_object(share * np.roll(images, by, 2), images, BOX) for share, by in ((0.99, 1), (0.9, 9)))
+    for name in BARS:
+        gained, lost = advantage(good, bad)[name], advantage(bad, good)[name]
+        assert gained.value > 0
+        assert gained.value == pytest.approx(-lost.value)
+        assert advantage(good, good)[name].value == 0
+
+
+def test_bar_is_met_from_its_better_side() -> None:
+    for name, values in {"silhouette_iou": (0.95, 0.85), "foreground_rmse_mm": (7.9, 8.1, np.nan)}.items():
+        assert [meets(name, interval(np.array([value]))) for value in values] == [True, False, False][: len(values)]
+
+
+def plate(side: int, v: float = 0.6, start: int = 10) -> np.ndarray:
+    image = EMPTY.copy()
+    image[:, start : start + side, start : start + side] = v
+    return image
+
+
+@pytest.mark.parametrize("side", [4, 20, 64])
+def test_surface_and_detail_of_square_plate(side: int) -> None:
+    image, edge_cm = plate(side, start=0), side * PITCH_CM
+    assert surface_cm2(image, BOX)[0] == pytest.approx(edge_cm**2)
+    assert detail_per_cm(image, BOX)[0] == pytest.approx(4 / edge_cm)
+    assert surface_cm2(EMPTY, BOX)[0] == 0
+    assert np.isnan(detail_per_cm(EMPTY, BOX)[0])
+    wide = BOX.model_copy(update={"x_max_m": BOX.x_min_m + 2 * (BOX.x_max_m - BOX.x_min_m)})
+    assert surface_cm2(image, wide)[0] == pytest.approx(2 * edge_cm**2)
+
+
+def test_detail_grows_with_holes_and_steps_not_slopes() -> None:
+    whole, holed, stepped, sloping = (plate(20) for _ in range(4))
+    holed[:, 15:20, 15:20] = 0
+    stepped[:, 20:30, 10:30] += 0.1  # 31 mm
+    sloping[:, 10:30, 10:30] += np.linspace(0, 0.3, 20, dtype=np.float32)
+    base = detail_per_cm(whole, BOX)[0]
+    assert detail_per_cm(holed, BOX)[0] > base
+    assert detail_per_cm(stepped, BOX)[0] == pytest.approx(base + 20 * PITCH_CM / (20 * PITCH_CM) ** 2)
+    assert detail_per_cm(sloping, BOX)[0] == pytest.approx(base)
+
+
+def test_curve_bins_every_object_once_and_follows_error() -> None:
+    like = np.random.default_rng(0).random(54)
+    bins = curve(like, 10 * like)
+    assert sum(one.objects for one in bins) == 54
+    assert all(one.high <= following.low for one, following in pairwise(bins))
+    assert all(10 * one.low <= one.error.value <= 10 * one.high for one in bins)
+    assert len(curve(like[:2], like[:2])) == 2
+
+
+def test_rank_correlation_is_of_order_alone() -> None:
+    like = np.random.default_rng(1).random(54)
+    coarse = np.round(4 * like)  # equal values share a rank, whatever order they come in
+    order = np.random.default_rng(3).permutation(54)
+    with_gaps = np.where(like > 0.9, np.nan, like)
+    pairs = (like, np.exp(9 * like)), (like, -(like**3)), (coarse, coarse**3), (like, with_gaps)
+    assert [rank_correlation(*pair).value for pair in pairs] == pytest.approx([1, -1, 1, 1])
+    assert rank_correlation(coarse[order], like[order]).value == pytest.approx(rank_correlation(coarse, like).value)
+    assert rank_correlation(like, np.ones(54)).value is rank_correlation(like[:2], like[:2]).value is None
+    none = rank_correlation(like, np.random.default_rng(2).random(54))
+    assert none.low < 0 < none.high
+
+
+@pytest.mark.parametrize(
+    ("at", "zone"),
+    [((20, 20), "core"), ((10, 20), "rim inside"), ((8, 20), "rim outside"), ((50, 50), "far background")],
+)
+def test_zones_locate_an_error(at: tuple[int, int], zone: str) -> None:
+    truth = plate(20)
+    image = truth.copy()
+    image[0][at] += 0.2
+    zones = where_the_error_is(image, truth)
+    assert zones[zone].share_of_error == pytest.approx(1)
+    assert sum(one.share_of_pixels for one in zones.values()) == pytest.approx(1)
+    assert zones["core"].share_of_pixels == pytest.approx(16**2 / 64**2)
+
+
+def test_zones_of_perfect_image_and_of_empty_truth() -> None:
+    assert {zone.share_of_error for zone in where_the_error_is(plate(9), plate(9)).values()} == {None}
+    assert where_the_error_is(plate(9), EMPTY)["far background"].share_of_error == pytest.approx(1)

@@ -1,0 +1,24 @@
+"""The farm that renders nothing keeps the promises of a real farm."""
+
+import numpy as np
+from fake_farm import FakeFarm, samples_of
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.dataset.build import DatasetPlan
+from nlos_cam.dataset.samples import make_samples
+
+PLAN = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")
+PIECES = [range(2), range(2, 4), range(4, 5)]
+
+
+def test_fake_samples_have_names_and_types_of_real_ones() -> None:
+    real, fake = make_samples(PLAN, range(1)), samples_of(range(1))
+    types = {name: values.dtype for name, values in fake.items()}
+    assert {name: values.dtype for name, values in real.items()} == types | {"scene": np.dtype(np.float64)}
+
+
+def test_fake_farm_makes_every_piece_once_in_its_order() -> None:
+    assert [piece for piece, _ in FakeFarm()(PLAN, PIECES)] == PIECES
+    shuffled = [piece for piece, _ in FakeFarm(order=2)(PLAN, PIECES)]
+    assert shuffled != PIECES
+    assert sorted(shuffled, key=lambda piece: piece.start) == PIECES
