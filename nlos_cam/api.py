@@ -31,12 +31,12 @@ from nlos_cam.camera.registry import OnProgress
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.loop import read_along, steps, warm_up
-from nlos_cam.live.statistics import Tally
+from nlos_cam.live.loop import iterate_results, warm_up, with_telemetry
+from nlos_cam.live.statistics import RunStatistics
 from nlos_cam.objects.depth_map import cell_centres_m, object_box
 from nlos_cam.reconstruct.bench import open_bench
 from nlos_cam.reconstruct.network import Clock
-from nlos_cam.reconstruct.pipeline import Processing, Step, load_doubt, load_networks, misfits, set_up
+from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline, load_doubt, load_networks, misfits, set_up
 from nlos_cam.reconstruct.verdict import Verdict
 
 
@@ -44,7 +44,7 @@ from nlos_cam.reconstruct.verdict import Verdict
 class Glimpse:
     """What one frame tells of the hidden object."""
 
-    step: Step
+    step: FrameResult
     """The frame's whole way: the frame itself, the reconstruction with its pose, timings, the physics check."""
     box: ObjectBox
     """Where on the bench the object is looked for, in the wall frame."""
@@ -114,14 +114,14 @@ class Stream:
     """
 
     def __init__(
-        self, camera: Camera, processing: Processing, *, keeps_all: bool, notes: tuple[str, ...] = (), clock: Clock
+        self, camera: Camera, processing: Pipeline, *, keeps_all: bool, notes: tuple[str, ...] = (), clock: Clock
     ) -> None:
         self.camera = camera
         self.notes = notes
         """What does not fit between the networks and this bench: believe less where there is any."""
         self._processing, self._keeps_all, self._clock = processing, keeps_all, clock
         self._box = object_box(self.rig)
-        self._tally, self._inside = Tally(), ExitStack()
+        self._tally, self._inside = RunStatistics(), ExitStack()
         self._reader: FrameReader | None = None
 
     @property
@@ -137,14 +137,14 @@ class Stream:
 
     def __enter__(self) -> Self:
         camera = self._inside.enter_context(self.camera)
-        frames, thermometer = read_along(camera, camera)
+        frames, thermometer = with_telemetry(camera, camera)
 
         def leave() -> None:
             camera.__exit__(None, None, None)
 
         reader = FrameReader(frames, keeps_all=self._keeps_all, stop=Event(), clock=self._clock, let_go=leave)
         self._reader = self._inside.enter_context(reader)
-        self._steps = steps(reader, self._processing, self._clock, self._tally.fail, thermometer)
+        self._steps = iterate_results(reader, self._processing, self._clock, self._tally.fail, thermometer)
         return self
 
     def __exit__(

@@ -14,7 +14,7 @@ from nlos_cam.errors import OutputExistsError
 
 
 @contextmanager
-def renamed_when_whole(out: Path) -> Generator[Path]:
+def atomic_directory(out: Path) -> Generator[Path]:
     """A folder to write in, beside `out`; its contents replace those of the same names in `out` at the end.
 
     After an error it is removed. Raises OutputExistsError where `out` is a file.
@@ -34,7 +34,7 @@ def renamed_when_whole(out: Path) -> Generator[Path]:
 
 
 @contextmanager
-def file_when_whole(path: Path) -> Generator[Path]:
+def atomic_file(path: Path) -> Generator[Path]:
     """A file to write beside `path`, which it replaces at the end; after an error it is removed."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

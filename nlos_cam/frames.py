@@ -151,7 +151,7 @@ def maps_from_frame(frame: Frame) -> LidarMaps:
     return LidarMaps(depth, intensity, ~np.isnan(depth))
 
 
-MOST_SATURATED = 0.001
+MAX_SATURATED = 0.001
 """Share of infrared pixels; the L515 under-estimates depth where they are."""
 
 

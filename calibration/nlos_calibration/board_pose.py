@@ -140,7 +140,7 @@ def _printed(seen: SeenCorners, how: Float64) -> tuple[Float64, Float64]:
 
 
 OUTLIER_SIGMAS, SIGMA_FLOOR_PX = 5.0, 0.02
-LEAST_SQUARES, MAGSAC_PX = 0, 1.0
+MIN_SQUARES, MAGSAC_PX = 0, 1.0
 MEDIAN_PER_SIGMA = 0.67449
 """The median of |x| of a normal distribution."""
 MIN_GOOD_SHARE = 0.7
@@ -258,7 +258,7 @@ def _off_a_plane_px(points_m: Float64, pixels: Float64, method: int) -> Float64:
 
 def _plane_variance_px2(points_m: Float64, pixels: Float64) -> float:
     """Of the residuals of any plane seen by any pinhole. Raises BoardRefusedError where it is no noise."""
-    variance_px2 = _variance_px2(_off_a_plane_px(points_m, pixels, LEAST_SQUARES), spent=8)
+    variance_px2 = _variance_px2(_off_a_plane_px(points_m, pixels, MIN_SQUARES), spent=8)
     if variance_px2 > MAX_RESIDUAL_PX**2:
         raise BoardRefusedError(
             f"the board is not flat: its corners are {sqrt(variance_px2):.2f} pixels RMS off a plane, "

@@ -14,9 +14,9 @@ from nlos_calibration.errors import CalibrationError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.reference import BareWall
 from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M
-from nlos_calibration.wall_tracker import Sight, WallTrack
+from nlos_calibration.wall_tracker import WallObservation, WallTrack
 
-WINDOW_FRAMES, LEAST_FRAMES = 30, 15
+WINDOW_FRAMES, MIN_FRAMES = 30, 15
 """What is told is the median over the first, of at least so many that showed the wall."""
 UNIFORM_MISFIT = 3.0
 """In one frame. The plane's two parameters more take up a sum of squares of 2 that is noise."""
@@ -90,10 +90,10 @@ class DriftWindow:
 
     def __init__(self, reference_frames: int) -> None:
         self._reference_frames, self._frames = reference_frames, 0
-        self._sights = np.full((WINDOW_FRAMES, len(Sight._fields)), np.nan)
+        self._sights = np.full((WINDOW_FRAMES, len(WallObservation._fields)), np.nan)
         self._shares = np.zeros(WINDOW_FRAMES)
 
-    def add(self, sight: Sight | None, share: float) -> None:
+    def add(self, sight: WallObservation | None, share: float) -> None:
         """Take in what a frame said, and the share of the watched pixels that showed the wall."""
         place = self._frames % WINDOW_FRAMES
         self._sights[place] = np.nan if sight is None else sight
@@ -112,7 +112,7 @@ class DriftWindow:
         a mean's, and the reference was taken with the same noise.
         """
         seen = self._sights[~np.isnan(self._sights[:, 0])]
-        if len(seen) < LEAST_FRAMES:
+        if len(seen) < MIN_FRAMES:
             return None
         middle = len(seen) // 2
         median = np.sort(seen, axis=0)[middle]
@@ -129,7 +129,7 @@ SURE_SIGMAS = 4.0
 """A drift is told that is beyond a tolerance by so many standard uncertainties."""
 ENDS_AT = 0.7
 """What is told stays told until it is below this share of what it took, so that it does not flicker."""
-MOST_RANGE_DRIFT_M = 0.005
+MAX_RANGE_DRIFT_M = 0.005
 """What a temperature may do to the range, by the data sheet's accuracy; beyond it the lidar has moved straight back or
 forth."""
 BLIND_FRAMES, BLIND_ENDS = 300, 10
@@ -197,7 +197,7 @@ class DriftCheck:
         """
         if (told := self._told) is None:
             return bool(self._blindness)
-        return not told.uniform or abs(told.range_m) > MOST_RANGE_DRIFT_M
+        return not told.uniform or abs(told.range_m) > MAX_RANGE_DRIFT_M
 
     def look(self, depth_m: Float32, settings: Mapping[str, float]) -> None:
         """Take a frame (height, width) in, NaN where there is no return, and the settings it was taken with.

@@ -205,13 +205,13 @@ def _line(y_m: Float64, z_m: Float64, width_m: Float64) -> Edge:
 
 MIN_SHARE, MIN_PIXELS, MIN_COLUMNS = 0.002, 100, 4
 """Less in front of the wall is no occluder; of fewer columns nobody can tell how it stands."""
-MIN_ON_SHEET, TOLD_ON_SHEET = 0.7, 0.95
+MIN_ON_SHEET, WARN_ON_SHEET_SHARE = 0.7, 0.95
 """Of what stands in front of the wall."""
 MAX_UNEVEN_M = 0.003
 """RMS off its plane, beyond noise: more than the lidar's ripples."""
 MIN_ROWS = 0.6
 """Of the rows in which a sheet without end would be seen."""
-MAX_BEHIND, TOLD_BEHIND = 0.5, 0.02
+MAX_BEHIND, WARN_BEHIND_SHARE = 0.5, 0.02
 """Of the depths, those behind the wall: light by way of a hidden object. The sheet is still seen beside a few."""
 MAX_TILT_DEG, SURE_SIGMAS = 5.0, 2.0
 MIN_GAP_M = 0.005
@@ -393,9 +393,9 @@ def _check_fit(found: OccluderFit) -> None:
 def _warnings(seen: Scene, sheet: SheetFit) -> tuple[str, ...]:
     """What leaves the occluder found but should be known."""
     told: list[str] = []
-    if seen.behind_share > TOLD_BEHIND:
+    if seen.behind_share > WARN_BEHIND_SHARE:
         told.append(f"{seen.behind_share:.0%} of the depth is behind the wall: is an object hidden? Take it away")
-    if sheet.plane.inlier_fraction < TOLD_ON_SHEET:
+    if sheet.plane.inlier_fraction < WARN_ON_SHEET_SHARE:
         off = 1.0 - sheet.plane.inlier_fraction
         told.append(f"{off:.0%} of what stands before the wall is not on the occluder: take away what else is there")
     return tuple(told)

@@ -42,7 +42,7 @@ class TapedWall:
     cause: Cause
 
 
-def tape_the_wall(fit_with: FitWith, tape_m: float) -> TapedWall:
+def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
     """The offset with which the wall is at `tape_m`, as the cause that lets the wall look flatter.
 
     Raises CalibrationError where tape and lidar cannot both be right.

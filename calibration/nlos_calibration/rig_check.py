@@ -191,7 +191,7 @@ def _area(corners: Float64) -> float:
 GAP_RANGE_M = 0.05, 0.20
 """The paper's (SI 1): less lets too little light through, more lets the lidar see the object."""
 PAPER_X_M = 0.20
-TOLD_TILT_DEG = 2.0
+WARN_TILT_DEG = 2.0
 MIN_SHARE = 0.55
 """Of the map's cells on the wall. The paper's rig keeps 57 % at its worst: 75 degrees, 0.30 m."""
 MAX_LEAK = 0.001
@@ -252,7 +252,7 @@ def _stand(occluder: Occluder, box: ObjectBox | None, tilt_deg: float, name: str
             f"{name} stands at x = {occluder.x_m:.3f} m, not between {ends}: move it {by_cm} cm {way} the lidar, to "
             f"the paper's {PAPER_X_M:.2f} m"
         )
-    if abs(tilt_deg) > TOLD_TILT_DEG:
+    if abs(tilt_deg) > WARN_TILT_DEG:
         way = "towards the lidar" if tilt_deg > 0.0 else "away from the lidar"
         problems.append(f"{name} leans by {tilt_deg:+.1f} degrees, 0 assumed: tilt its upper end back {way}")
     return problems

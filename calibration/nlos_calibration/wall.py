@@ -33,7 +33,7 @@ from somewhat less than a tolerance on, since a half that bends itself says too 
 DOUBTED_RIPPLE_M, MAX_RIPPLE_M = 0.0009, 0.002
 """RMS normal to the wall. The L515's ripples are a millimetre or two high; two panes 2 mm apart are 1 mm off a plane
 between them."""
-TOLD_RIPPLE_M, TOLD_NOISE_SCALE = 0.0003, 2.0
+WARN_RIPPLE_M, WARN_NOISE_SCALE = 0.0003, 2.0
 
 
 def check_flat(flat: Flatness, ripple_m: float) -> None:
@@ -69,9 +69,9 @@ def range_verdict(distance_m: float, facing_deg: float) -> tuple[Verdict, str]:
 def warnings(ripple_m: float, noise_scale: float) -> tuple[str, ...]:
     """What does not change the verdict but should be known."""
     told: list[str] = []
-    if ripple_m > TOLD_RIPPLE_M:
+    if ripple_m > WARN_RIPPLE_M:
         told.append(f"the depth has ripples of {ripple_m * 1e3:.1f} mm RMS: the uncertainties allow for them")
-    if noise_scale > TOLD_NOISE_SCALE:
+    if noise_scale > WARN_NOISE_SCALE:
         told.append(f"depth is {noise_scale:.1f} times as noisy as the lidar's should be: warm it up, dim the light")
     return tuple(told)
 

@@ -38,7 +38,7 @@ RIDGE = 1e-6
 """Of information, in units in which a pixel has some 1000: enough to solve for no step where there is none."""
 
 
-class Sight(NamedTuple):
+class WallObservation(NamedTuple):
     """What one frame says of the wall, as changes against the reference; positive distances are farther."""
 
     distance_m: float
@@ -99,7 +99,7 @@ class WallTrack:
         self.share = 0.0
         """Of the pixels, those that showed the wall in the last frame."""
 
-    def follow(self, depth_m: Float32) -> Sight | None:
+    def follow(self, depth_m: Float32) -> WallObservation | None:
         """What a frame (height, width) says; None where too few pixels agree on a wall."""
         if len(self.pixels) == 0:
             return None
@@ -145,7 +145,7 @@ class WallTrack:
         self._grid.flat[self._cells] = inside - PATCH_SHARE * returned
         return cv2.blur(self._grid, (3, 3), borderType=cv2.BORDER_CONSTANT).flat[self._cells] >= 0.0
 
-    def _sight(self, seen_m: Float64, weight: Float64) -> Sight | None:
+    def _sight(self, seen_m: Float64, weight: Float64) -> WallObservation | None:
         distance_m, yaw_deg, pitch_deg = _pose(self._slopes + self._change)
         distance_m, yaw_deg, pitch_deg = distance_m - self._pose[0], yaw_deg - self._pose[1], pitch_deg - self._pose[2]
         turn_deg = hypot(yaw_deg, pitch_deg)
@@ -158,7 +158,7 @@ class WallTrack:
         range_m = float(gain @ longer) / float(gain @ self._per_m)
         plane_m = 1.0 / (self._inverse + self._rows @ self._change / self._per_inverse_m)
         misfit = float(weight @ ((longer - range_m * self._per_m) ** 2 - ((seen_m - plane_m) * self._per_m) ** 2))
-        return Sight(distance_m, yaw_deg, pitch_deg, range_m, misfit)
+        return WallObservation(distance_m, yaw_deg, pitch_deg, range_m, misfit)
 
 
 def _share(chosen: NDArray[np.bool_]) -> float:

@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from nlos_models.errors import CheckpointError
-from nlos_models.pipeline import Pipeline, new_pipeline, new_vae
+from nlos_models.pipeline import RemappingNetwork, new_pipeline, new_vae
 from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
 from nlos_models.vae import Encoder, ResVae
 
@@ -115,7 +115,9 @@ def save_vae(folder: Path, vae: ResVae, record: CheckpointRecord) -> None:
     _save(folder, {"encoder": vae.encoder, "decoder": vae.decoder}, record)
 
 
-def save_pipeline(folder: Path, pipeline: Pipeline, record: CheckpointRecord, encoder: Encoder | None = None) -> None:
+def save_pipeline(
+    folder: Path, pipeline: RemappingNetwork, record: CheckpointRecord, encoder: Encoder | None = None
+) -> None:
     """Write compressor, decoder and the preprocessing's statistics, with their record, into a folder.
 
     The encoder, if there is one, goes along: who trains these weights on aims at its latent.
@@ -134,12 +136,12 @@ def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
     return vae.eval(), record
 
 
-def load_pipeline(folder: Path | None = None) -> tuple[Pipeline, CheckpointRecord]:
+def load_pipeline(folder: Path | None = None) -> tuple[RemappingNetwork, CheckpointRecord]:
     """Compressor and decoder in eval mode, from a folder or as shipped. Raises CheckpointError as `load_vae` does."""
     return _load_pipeline(folder or shipped_folder(), ("compressor", "preprocess", "decoder"))
 
 
-def load_pipeline_partly(folder: Path) -> tuple[Pipeline, CheckpointRecord, LoadReport]:
+def load_pipeline_partly(folder: Path) -> tuple[RemappingNetwork, CheckpointRecord, LoadReport]:
     """The same, where the compressor may lack tensors, or hold other ones; what it lacks is as torch's seed has it.
 
     Raises CheckpointError where no tensor of the compressor fits, or one of the rest does not.
@@ -148,7 +150,7 @@ def load_pipeline_partly(folder: Path) -> tuple[Pipeline, CheckpointRecord, Load
     return pipeline, record, load_fitting(folder / "compressor.safetensors", pipeline.compressor)
 
 
-def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[Pipeline, CheckpointRecord]:
+def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[RemappingNetwork, CheckpointRecord]:
     record = load_record(folder)
     if not (folder / "compressor.safetensors").exists() and (folder / "encoder.safetensors").exists():
         raise CheckpointError(f"{folder} holds a VAE alone, with no compressor: name weights of `train compressor`")

@@ -112,7 +112,7 @@ class SaidOf(NamedTuple):
     """(n, 64, 64); probability that there is a surface."""
 
 
-class Doubter(Protocol):
+class UncertaintyModel(Protocol):
     """A doubt network, ready to run."""
 
     record: DoubtRecord
@@ -122,7 +122,7 @@ class Doubter(Protocol):
         ...
 
 
-class OnnxDoubter:
+class OnnxUncertaintyModel:
     """A doubt network as ONNX Runtime runs it."""
 
     def __init__(self, model: Path, record: DoubtRecord, threads: int = 1) -> None:
@@ -133,7 +133,7 @@ class OnnxDoubter:
         return SaidOf(*self._session.run(None, dict(zip(INPUTS, arrays, strict=True))))
 
 
-def load_doubter(folder: Path | None, cache: Path) -> Doubter | None:
+def load_uncertainty_model(folder: Path | None, cache: Path) -> UncertaintyModel | None:
     """The doubt network beside the shipped weights (None), or beside those of a folder; None where there is none.
 
     The ONNX file is exported once into the folder `cache`. Raises CheckpointError as `load_doubt` does.
@@ -144,4 +144,4 @@ def load_doubter(folder: Path | None, cache: Path) -> Doubter | None:
     model = cache / f"doubt-{checksum_of(network)}.onnx"
     if not model.exists():
         write_onnx(network, model, INPUTS, list(SaidOf._fields))
-    return OnnxDoubter(model, record)
+    return OnnxUncertaintyModel(model, record)

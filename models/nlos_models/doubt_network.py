@@ -16,7 +16,7 @@ MAP_SHAPE = (64, 80)
 DEPTH_SCALES_M = (0.1, 0.005)
 INTENSITY_SCALES = (10.0, 1.0)
 """By which what differs from the bare wall is told: coarsely, for what is hidden, and finely, for whether it is."""
-LEAST_ERROR_V, MOST_ERROR_V = 1e-3, 1.0
+MIN_ERROR_V, MAX_ERROR_V = 1e-3, 1.0
 """Between which an expected error lies."""
 
 
@@ -111,5 +111,5 @@ class Told(nn.Module):
         """Probabilities of nothing and of outside (n,); expected error in v, probability of surface (n, 64, 64)."""
         said = self.network(depth_m, intensity, image)
         nothing, outside = said.nothing / self.temperature[0], said.outside / self.temperature[1]
-        error_v = (self.error_scale * said.log_error.exp()).clamp(LEAST_ERROR_V, MOST_ERROR_V)
+        error_v = (self.error_scale * said.log_error.exp()).clamp(MIN_ERROR_V, MAX_ERROR_V)
         return torch.sigmoid(nothing), torch.sigmoid(outside), error_v, torch.sigmoid(said.surface)

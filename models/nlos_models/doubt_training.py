@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from nlos_models.arrays import Float16, Float32, Float64, Mask
 from nlos_models.data import flip_some, shuffled
-from nlos_models.doubt_network import LEAST_ERROR_V, MOST_ERROR_V, DoubtNetwork, DoubtOutput
+from nlos_models.doubt_network import MAX_ERROR_V, MIN_ERROR_V, DoubtNetwork, DoubtOutput
 from nlos_models.recipe import Recipe
 from nlos_models.tasks import in_channels_last, parts_of
 from nlos_models.train import OnStep, Running, fit
@@ -86,7 +86,7 @@ def doubt_loss(said: DoubtOutput, batch: DoubtBatch) -> Tensor:
     loss = loss + verdicts(said.surface, there)
     shared = (there > 0) & (batch.made > 0)
     error = (batch.made - batch.truth).abs()[shared]
-    log_error = said.log_error.float()[shared].clamp(min=float(np.log(LEAST_ERROR_V)))
+    log_error = said.log_error.float()[shared].clamp(min=float(np.log(MIN_ERROR_V)))
     if not error.numel():
         return loss
     return loss + (log_error + error * torch.exp(-log_error)).mean()
@@ -136,10 +136,10 @@ def train_doubt(
 
 TEMPERATURES = np.geomspace(1.0, 5.0, 65)
 """Never below 1: where all are told apart, the likeliest is 0, which says no more than that."""
-MOST_FALSE_ALARMS = 0.15
+MAX_FALSE_ALARMS = 0.15
 """Of ordinary objects, the share that may be told to be outside the trained range: what it costs to find nine in ten of
 those that are."""
-MOST_FALSE_OBJECTS = 0.001
+MAX_FALSE_OBJECTS = 0.001
 """Of empty benches, the share that may be told to hide something: a tenth of what is asked for."""
 
 
@@ -183,12 +183,12 @@ def calibrated(network: DoubtNetwork, held_out: DoubtSet) -> Calibration:
     nothing, outside = (_sigmoid(logits[name] / t) for name, t in zip(("nothing", "outside"), hot, strict=True))
     usual = ~held_out.nothing & ~held_out.outside
     shared, error = shared_errors(held_out.made[usual], held_out.truth[usual])
-    expected = np.exp(said.log_error.numpy()[usual][shared].astype(np.float64)).clip(LEAST_ERROR_V, MOST_ERROR_V)
+    expected = np.exp(said.log_error.numpy()[usual][shared].astype(np.float64)).clip(MIN_ERROR_V, MAX_ERROR_V)
     return Calibration(
         hot,
         error_scale(expected, error),
-        min(0.5, float(np.quantile(nothing[held_out.nothing], MOST_FALSE_OBJECTS))),
-        float(np.quantile(outside[usual], 1 - MOST_FALSE_ALARMS)),
+        min(0.5, float(np.quantile(nothing[held_out.nothing], MAX_FALSE_OBJECTS))),
+        float(np.quantile(outside[usual], 1 - MAX_FALSE_ALARMS)),
     )
 
 

@@ -18,7 +18,7 @@ from torch import nn
 from nlos_models.arrays import Float32
 from nlos_models.checkpoint import CheckpointRecord, load_pipeline
 from nlos_models.errors import CheckpointError, ModelError
-from nlos_models.pipeline import Pipeline
+from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import SIMULATION_ONLY
 
 MAP_SHAPE = (64, 80)
@@ -40,7 +40,7 @@ class TorchReconstructor:
     """The pipeline as torch runs it; in float32 the definition that the others are held against."""
 
     def __init__(
-        self, pipeline: Pipeline, record: CheckpointRecord, device: str, dtype: torch.dtype = torch.float32
+        self, pipeline: RemappingNetwork, record: CheckpointRecord, device: str, dtype: torch.dtype = torch.float32
     ) -> None:
         self.record, self.runtime = record, f"torch on {device}"
         self._pipeline, self._device, self._dtype = pipeline.to(device).eval(), device, dtype
@@ -96,7 +96,7 @@ def refuse_colour(record: CheckpointRecord, folder: Path | None) -> None:
         )
 
 
-def exported(pipeline: Pipeline, cache: Path) -> Path:
+def exported(pipeline: RemappingNetwork, cache: Path) -> Path:
     """The pipeline's ONNX file in the folder `cache`, written unless it is there."""
     model = cache / f"{checksum_of(pipeline)}.onnx"
     if not model.exists():
@@ -104,7 +104,7 @@ def exported(pipeline: Pipeline, cache: Path) -> Path:
     return model
 
 
-def export_onnx(pipeline: Pipeline, path: Path) -> None:
+def export_onnx(pipeline: RemappingNetwork, path: Path) -> None:
     """Write the whole pipeline, preprocessing included, as one ONNX file with a free batch size.
 
     Raises ModelError for one of full colour.

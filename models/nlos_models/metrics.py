@@ -10,7 +10,7 @@ from nlos_models.arrays import Float32, Float64
 
 BACKGROUND_BELOW_V = 0.05
 CLOSE = 0.02
-LEAST_V = 0.1
+MIN_V = 0.1
 """v of the farthest surface (z_far)."""
 
 
@@ -39,10 +39,10 @@ def silhouette_iou(image: Float32, truth: Float32) -> Float64:
 def foreground_rmse_mm(image: Float32, truth: Float32, mm_per_v: float) -> Float64:
     """RMSE of depth over pixels that are surface in both, (n,); NaN where they share none.
 
-    Depth is what `live` shows: a v between background's and LEAST_V is at z_far.
+    Depth is what `live` shows: a v between background's and MIN_V is at z_far.
     """
     both = surface(image) & surface(truth)
-    apart = np.maximum(image.astype(np.float64), LEAST_V) - np.maximum(truth, LEAST_V)
+    apart = np.maximum(image.astype(np.float64), MIN_V) - np.maximum(truth, MIN_V)
     squares = np.where(both, np.square(apart), 0.0).sum((-2, -1))
     count = both.sum((-2, -1))
     return np.where(count > 0, mm_per_v * np.sqrt(squares / np.maximum(count, 1)), np.nan)

@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from nlos_models.compressor import COLOR_OUTPUTS as COLOUR_LATENT
 from nlos_models.compressor import DROPOUT, Compressor, ResNet50
-from nlos_models.metrics import LEAST_V
+from nlos_models.metrics import MIN_V
 from nlos_models.vae import Decoder, ResVae
 
 RESIZED = 100
@@ -99,7 +99,7 @@ def cut_silhouette(image: Tensor) -> Tensor:
     """Decoded images (n, channels, h, w) as hidden images: 0 for background; a pixel's brightest channel tells."""
     bright = image.amax(1, keepdim=True)
     brightest = functional.max_pool2d(bright, WINDOW, stride=1, padding=WINDOW // 2)
-    kept = (bright >= KEPT_SHARE * brightest) & (bright >= LEAST_V)
+    kept = (bright >= KEPT_SHARE * brightest) & (bright >= MIN_V)
     return torch.where(kept, image, torch.zeros_like(image))
 
 
@@ -110,7 +110,7 @@ def lift_edges(image: Tensor) -> Tensor:
     return torch.maximum(image, functional.avg_pool2d(brightest, LIFT_WINDOW, 1, pad, count_include_pad=False))
 
 
-class Pipeline(nn.Module):
+class RemappingNetwork(nn.Module):
     """Maps (n, 64, 80) to images (n, 64, 64) in [0, 1]: preprocessing, compressor, decoder, silhouette.
 
     In colour (simulation only: the L515's laser is infrared) intensities (n, 3, 64, 80) to images (n, 3, 64, 64).
@@ -151,8 +151,10 @@ def new_pipeline(
     dropout: float = DROPOUT,
     left_noise: float = 0.2,
     width: float = 1.0,
-) -> Pipeline:
+) -> RemappingNetwork:
     """A new compressor before a decoder, a new one unless given: MobileNetV2, or in colour ResNet50 (SI 4)."""
     if not colour:
-        return Pipeline(Compressor(dropout, width), decoder or Decoder(), left_noise)
-    return Pipeline(ResNet50(dropout=dropout), decoder or Decoder(CHANNELS, COLOUR_LATENT), left_noise, CHANNELS)
+        return RemappingNetwork(Compressor(dropout, width), decoder or Decoder(), left_noise)
+    return RemappingNetwork(
+        ResNet50(dropout=dropout), decoder or Decoder(CHANNELS, COLOUR_LATENT), left_noise, CHANNELS
+    )

@@ -25,7 +25,7 @@ from nlos_models.data import MapSet, MapSource
 from nlos_models.doubt_checkpoint import DoubtRecord, save_doubt
 from nlos_models.doubt_training import DoubtSet, calibrated, train_doubt
 from nlos_models.errors import OutputExistsError, TrainingError
-from nlos_models.pipeline import Pipeline, new_vae
+from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
 from nlos_models.tasks import Start, figures_of, run, train_compressor, train_transfer, train_vae
 from nlos_models.train import OnStep, Running
@@ -106,7 +106,7 @@ def run_compressor(fabric: Fabric, training: TrainingRun, start: Start, maps: Ma
 def run_transfer(
     fabric: Fabric,
     training: TrainingRun,
-    pipeline: Pipeline,
+    pipeline: RemappingNetwork,
     encoder: Encoder | None,
     maps: MapSource,
     held_out: MapSet,
@@ -169,7 +169,7 @@ def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | No
 
 def transfer_start(
     recipe: Recipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
-) -> tuple[Pipeline, list[Recipe]]:
+) -> tuple[RemappingNetwork, list[Recipe]]:
     """Load the pipeline that a transfer starts from, and the runs that made it.
 
     If `partial`, only matching layers are loaded, `on_report` is called with a summary of them, and the others are
@@ -185,7 +185,7 @@ def transfer_start(
     return pipeline, record.runs
 
 
-def _pipeline_start(recipe: Recipe, weights: Path | None) -> tuple[Pipeline, list[Recipe]]:
+def _pipeline_start(recipe: Recipe, weights: Path | None) -> tuple[RemappingNetwork, list[Recipe]]:
     _check_fits(recipe, weights)
     pipeline, record = load_pipeline(weights)
     return pipeline, record.runs

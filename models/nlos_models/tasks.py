@@ -21,7 +21,14 @@ from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapSet, MapSource, as
 from nlos_models.errors import TrainingError
 from nlos_models.losses import image_error, kl_divergence, latent_error, variational_share
 from nlos_models.metrics import colour_error, colour_silhouette_iou, silhouette_iou
-from nlos_models.pipeline import Pipeline, channel_statistics, cut_silhouette, new_pipeline, new_vae, split_and_stack
+from nlos_models.pipeline import (
+    RemappingNetwork,
+    channel_statistics,
+    cut_silhouette,
+    new_pipeline,
+    new_vae,
+    split_and_stack,
+)
 from nlos_models.recipe import Recipe
 from nlos_models.train import OnStep, Running, fit
 from nlos_models.vae import Encoder, ResVae
@@ -35,7 +42,7 @@ Module = TypeVar("Module", bound=nn.Module)
 class Remapping:
     """A pipeline that learns from maps, by the latents of a frozen encoder, by images, or by both."""
 
-    pipeline: Pipeline
+    pipeline: RemappingNetwork
     encoder: Encoder | None
     """Of the VAE whose latent is aimed at; None where only images are."""
     source: MapSource
@@ -106,7 +113,7 @@ def in_channels_last(module: Module) -> Module:
     return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub lacks it)
 
 
-def set_for_training(pipeline: Pipeline, recipe: Recipe) -> None:
+def set_for_training(pipeline: RemappingNetwork, recipe: Recipe) -> None:
     """Give a loaded pipeline the recipe's dropout and noise, which weights do not hold."""
     pipeline.preprocess.left_noise = recipe.left_noise
     for module in pipeline.compressor.modules():
@@ -121,7 +128,7 @@ def statistics_of(source: MapSource) -> tuple[Tensor, Tensor]:
 
 
 @torch.inference_mode()
-def run(pipeline: Pipeline, maps: MapSet) -> Float32:
+def run(pipeline: RemappingNetwork, maps: MapSet) -> Float32:
     """Images (n, 64, 64) that the pipeline makes of maps, in eval mode; in colour (n, 3, 64, 64)."""
     device = next(pipeline.parameters()).device
     pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
@@ -204,7 +211,7 @@ class Start:
 
     vae: ResVae | None = None
     """Whose latent is aimed at, and whose decoder is used; None for steps "one"."""
-    pipeline: Pipeline | None = None
+    pipeline: RemappingNetwork | None = None
     """Two-step weights, for steps "two-then-joint" (its decoder is the VAE's) or for a start from weights."""
 
 
@@ -216,7 +223,7 @@ def train_compressor(
     folder: Path,
     on_step: OnStep,
     running: Running | None = None,
-) -> tuple[Pipeline, dict[str, float]]:
+) -> tuple[RemappingNetwork, dict[str, float]]:
     """Train a compressor as the recipe's `steps` say (SI 4: onto the latent of a frozen VAE); a second call resumes.
 
     Returns the network in eval mode and its held-out figures. Raises TrainingError where the start does not hold what
@@ -232,7 +239,7 @@ def train_compressor(
     return pipeline.cpu().eval(), figures
 
 
-def _set_out(recipe: Recipe, start: Start) -> Pipeline:
+def _set_out(recipe: Recipe, start: Start) -> RemappingNetwork:
     if recipe.steps == "one":
         return new_pipeline(
             colour=recipe.colour, dropout=recipe.dropout, left_noise=recipe.left_noise, width=recipe.width
@@ -273,14 +280,14 @@ CHANNELS = {"own": slice(None), "own intensity": slice(2, None)}
 
 def train_transfer(
     recipe: Recipe,
-    pipeline: Pipeline,
+    pipeline: RemappingNetwork,
     encoder: Encoder | None,
     maps: MapSource,
     held_out: MapSet,
     folder: Path,
     on_step: OnStep,
     running: Running | None = None,
-) -> tuple[Pipeline, dict[str, float]]:
+) -> tuple[RemappingNetwork, dict[str, float]]:
     """Train synthetic weights on, in place, on recordings' maps; a second call resumes. The decoder stays as it is.
 
     In the first phase batch norms go over to the recordings' statistics; in the second they are frozen with the

@@ -10,7 +10,7 @@ from nlos_calibration.wall_record import MeasuredWall, WallRecord
 
 from nlos_cam.calibrate.report import report
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.files import file_when_whole
+from nlos_cam.files import atomic_file
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ def written(files: WallFiles, record: WallRecord, reference: BareWall | None) ->
     Each is whole before one takes its place, so that what ends this early leaves earlier ones that belong together.
     """
     with ExitStack() as whole:
-        part = whole.enter_context(file_when_whole(files.record))
+        part = whole.enter_context(atomic_file(files.record))
         if reference is not None:
-            digest = save_reference(whole.enter_context(file_when_whole(files.reference)), reference)
+            digest = save_reference(whole.enter_context(atomic_file(files.reference)), reference)
             record = record.model_copy(update={"reference": files.reference.name, "reference_sha256": digest})
-        told = whole.enter_context(file_when_whole(files.report))
+        told = whole.enter_context(atomic_file(files.report))
         told.write_text(report(MeasuredWall(record, reference), files.record.name), encoding="utf-8")
         part.write_text(dump_toml(record), encoding="utf-8")
     return record

@@ -18,7 +18,7 @@ from nlos_calibration.drift import settings_changed
 from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.occluder import OccluderFit, find_occluder
-from nlos_calibration.range_offset import tape_the_wall
+from nlos_calibration.range_offset import fit_with_tape_distance
 from nlos_calibration.reference import BareWall, BareWallStatistics
 from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M, WallFit, fit_wall
 from nlos_calibration.wall_record import (
@@ -40,7 +40,7 @@ CELSIUS_EVERY = 30
 
 
 @dataclass(frozen=True)
-class Seen:
+class CaptureStatistics:
     """What was looked at, and by what."""
 
     camera: str
@@ -61,7 +61,7 @@ class Seen:
         return {**told, "settings": dict(self.settings), "temperatures_c": self.statistics.celsius()}
 
 
-def look(camera: Camera, frames: int, on_frame: Callable[[], None] = lambda: None) -> Seen:
+def look(camera: Camera, frames: int, on_frame: Callable[[], None] = lambda: None) -> CaptureStatistics:
     """The statistics over at most `frames` frames of an entered camera. Raises WallRefusedError where none comes."""
     statistics, settings = BareWallStatistics(camera.intrinsics), dict[str, float]()
     for number, frame in enumerate(islice(camera, frames)):
@@ -74,14 +74,14 @@ def look(camera: Camera, frames: int, on_frame: Callable[[], None] = lambda: Non
     if statistics.depth.frames == 0:
         raise WallRefusedError(f"{camera.uri} gave no frames: record the wall again, or look at it live")
     serial, firmware = (camera.identity.get(name, "") for name in ("serial", "firmware"))
-    return Seen(camera.uri, statistics, camera.intrinsics, serial, firmware, settings)
+    return CaptureStatistics(camera.uri, statistics, camera.intrinsics, serial, firmware, settings)
 
 
 NEAR_WALL_M = 0.02
 """Off the plane; what is farther away when the occluder stands is the occluder, or between both."""
 
 
-def by_depth(seen: Seen, tape_m: float | None = None) -> tuple[WallFit, dict[str, object]]:
+def by_depth(seen: CaptureStatistics, tape_m: float | None = None) -> tuple[WallFit, dict[str, object]]:
     """The wall by its depth, and what the record says of the lidar's offset where a distance was measured by hand.
 
     Raises WallRefusedError, and CalibrationError where tape and lidar cannot both be right.
@@ -93,7 +93,7 @@ def by_depth(seen: Seen, tape_m: float | None = None) -> tuple[WallFit, dict[str
 
     if tape_m is None:
         return fit_with(0.0, 0.0), {}
-    taped = tape_the_wall(fit_with, tape_m)
+    taped = fit_with_tape_distance(fit_with, tape_m)
     return taped.fit, {
         "range_offset_m": taped.offset_m,
         "range_offset_std_m": taped.offset_std_m,
@@ -102,7 +102,7 @@ def by_depth(seen: Seen, tape_m: float | None = None) -> tuple[WallFit, dict[str
 
 
 def by_board(
-    seen: Seen, printed: Board, square_mm: float | None, colour: BoardView | None = None
+    seen: CaptureStatistics, printed: Board, square_mm: float | None, colour: BoardView | None = None
 ) -> tuple[WallFit | WallByBoard, dict[str, object]]:
     """The wall by its depth, where that is not refused, and by a board, with what the record says of that.
 
@@ -119,7 +119,7 @@ def by_board(
     return fit, {"board": record}
 
 
-def by_occluder(seen: Seen, bare: MeasuredWall) -> tuple[WallRecord, NDArray[np.bool_]]:
+def by_occluder(seen: CaptureStatistics, bare: MeasuredWall) -> tuple[WallRecord, NDArray[np.bool_]]:
     """The record of a bare wall with the occluder that stands before it now, and the wall's pixels beside that.
 
     Nothing may be hidden yet. Raises OccluderRefusedError, CalibrationError for another camera, and WallRefusedError

@@ -123,7 +123,7 @@ VERDICTS = {
     "doubtful": "? Doubtful: the wall may be elsewhere than measured",
 }
 """Words and a sign beside the colour, for those who do not see it."""
-LEAST_TOLD = 0.001
+MIN_REPORTED = 0.001
 Row = tuple[str, str, str]
 """What, how much, what that means."""
 
@@ -283,7 +283,9 @@ def _plus_minus(std: float | None, unit: str, scale: float = 1.0) -> str:
     if std is None:
         return ""
     half = INTERVAL_STDS * scale * std
-    return (f" ± {half:.2g} {unit}" if half >= LEAST_TOLD else f" ± less than {LEAST_TOLD} {unit}").replace(" °", "°")
+    return (f" ± {half:.2g} {unit}" if half >= MIN_REPORTED else f" ± less than {MIN_REPORTED} {unit}").replace(
+        " °", "°"
+    )
 
 
 def _metres(value_m: float, std_m: float | None) -> str:

@@ -76,7 +76,7 @@ STRAY, STRIPE, NO_RETURN = (0.72, 0.72, 0.72, 1.0), (0.35, 0.35, 0.35, 1.0), (0.
 STRIPE_BLOCKS = 4
 LEVELS = 21
 """Of colour: noise in more of them makes files large. Odd, so that the middle one is white."""
-LEAST_RESIDUAL_MM = 0.5
+MIN_RESIDUAL_MM = 0.5
 """A finer scale would make the noise of a good wall look like trouble."""
 ROUND = 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0
 SPREAD_POINTS = 500
@@ -126,7 +126,7 @@ def _residuals(record: WallRecord, reference: BareWall) -> Picture:
     stray = known & ~reference.inliers
     drawn = np.where(stray, np.nan, off_mm)
     side = block_side(drawn.shape[1])
-    limit_mm = max(_limit(np.abs(in_blocks(drawn, side))), LEAST_RESIDUAL_MM)
+    limit_mm = max(_limit(np.abs(in_blocks(drawn, side))), MIN_RESIDUAL_MM)
     figure = figure_of(8.6, 5.4)
     axis = figure.add_subplot()
     scale: dict[str, Any] = {"extend": "both", "cmap": "RdBu_r", "vmin": -limit_mm, "vmax": limit_mm}

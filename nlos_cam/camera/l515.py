@@ -11,14 +11,14 @@ from typing import Any
 
 from nlos_calibration.arrays import Float32
 
-from nlos_cam.camera.laser_power import Limits, turn_down
+from nlos_cam.camera.laser_power import PowerLimits, turn_down
 from nlos_cam.camera.live_camera import LiveCamera
 from nlos_cam.camera.protocol import Clock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import Inbox, Size
+from nlos_cam.camera.session import SampleQueue, Size
 from nlos_cam.errors import CameraError, CameraNotFoundError
-from nlos_cam.frames import MOST_SATURATED, saturated_share
+from nlos_cam.frames import MAX_SATURATED, saturated_share
 
 TOLERANCE = 1e-3
 NOT_OFFERED = "not offered by this firmware"
@@ -30,13 +30,13 @@ class Options:
     def __init__(self, sensor: Any, sdk: Any) -> None:
         self._sensor, self._sdk = sensor, sdk
 
-    def limits(self, name: str) -> Limits | None:
+    def limits(self, name: str) -> PowerLimits | None:
         """The range that the firmware tells; None where it tells none."""
         try:
             told = self._sensor.get_option_range(self._option(name))
         except RuntimeError:
             return None
-        return Limits(told.min, told.max, told.step if told.step > 0 else 1.0)
+        return PowerLimits(told.min, told.max, told.step if told.step > 0 else 1.0)
 
     def get(self, name: str) -> float | None:
         """The value now; None where it cannot be read."""
@@ -219,7 +219,7 @@ class L515Camera(LiveCamera):
         self._laser_power = settled.power
         if settled.power < power:
             log.warning("%s: laser power %g saturated: turned down to %g", self.uri, power, settled.power)
-        if (settled.saturated or 0.0) > MOST_SATURATED:
+        if (settled.saturated or 0.0) > MAX_SATURATED:
             log.warning(
                 "%s: %.1f %% of the infrared image is saturated at laser power %g: go farther from the wall, or tilt "
                 "the camera by 5 to 15 degrees",
@@ -248,7 +248,7 @@ class L515Camera(LiveCamera):
     def _reset(self) -> None:
         self._device.hardware_reset()
 
-    def _begin(self, inbox: Inbox) -> None:
+    def _begin(self, inbox: SampleQueue) -> None:
         """It runs already."""
 
     def _end(self) -> None:

@@ -3,14 +3,14 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from nlos_cam.frames import MOST_SATURATED
+from nlos_cam.frames import MAX_SATURATED
 
 STRIDES = 10
 """Strides from the strongest laser to the weakest."""
 
 
 @dataclass(frozen=True)
-class Limits:
+class PowerLimits:
     """What an option of the device can be set to."""
 
     least: float
@@ -33,7 +33,7 @@ class Settled:
     """Share of infrared pixels at that power; None where no frame came to look at."""
 
 
-def weaker(power: float, limits: Limits) -> Iterator[float]:
+def weaker(power: float, limits: PowerLimits) -> Iterator[float]:
     """Every power to try below this one, down to the weakest that is no darkness: 0 turns the laser off."""
     weakest = limits.least if limits.least > 0 else limits.least + limits.step
     stride = max(1, round((limits.most - limits.least) / STRIDES / limits.step)) * limits.step
@@ -42,14 +42,16 @@ def weaker(power: float, limits: Limits) -> Iterator[float]:
         yield power
 
 
-def turn_down(power: float, limits: Limits, look: Callable[[], float | None], put: Callable[[float], bool]) -> Settled:
+def turn_down(
+    power: float, limits: PowerLimits, look: Callable[[], float | None], put: Callable[[float], bool]
+) -> Settled:
     """Turn down while too much saturates, no further than that takes.
 
     `look` gives the share that saturates now, None where it cannot see; `put` sets a power, and whether it took.
     """
     saturated = look()
     for lower in weaker(power, limits):
-        if saturated is None or saturated <= MOST_SATURATED or not put(lower):
+        if saturated is None or saturated <= MAX_SATURATED or not put(lower):
             break
         power, saturated = lower, look()
     return Settled(power, saturated)

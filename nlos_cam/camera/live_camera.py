@@ -15,7 +15,7 @@ from nlos_calibration.rig import Rig
 from nlos_cam.camera.protocol import Clock, WallClock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.recovery import NO_INTRINSICS, Hooks, Recovery
-from nlos_cam.camera.session import Inbox, Session, Size, find_streams
+from nlos_cam.camera.session import SampleQueue, Session, Size, find_streams
 from nlos_cam.camera.streams import FORMATS, FrameSet
 from nlos_cam.camera.timestamps import Continuity
 from nlos_cam.errors import CameraError, CameraLostError
@@ -70,7 +70,7 @@ class LiveCamera(ABC):
         """Set up the sensor, which runs; no frame is delivered or recorded before this is done."""
 
     @abstractmethod
-    def _begin(self, inbox: Inbox) -> None:
+    def _begin(self, inbox: SampleQueue) -> None:
         """Frames may come now."""
 
     @abstractmethod
@@ -96,7 +96,7 @@ class LiveCamera(ABC):
         try:
             sensor, profiles = find_streams(self._device, self._size)
             if not (missing := [stream for stream in FORMATS if stream not in profiles]):
-                return Session(sensor, profiles, Inbox(lossless=False, on_set=self._on_set))
+                return Session(sensor, profiles, SampleQueue(lossless=False, on_set=self._on_set))
         except RuntimeError as error:
             raise CameraError(f"{self.uri} cannot be read ({error}): unplug it, wait 10 s, plug it in again") from error
         width, height = self._size
@@ -181,7 +181,7 @@ class LiveCamera(ABC):
             if self._recording:
                 self._recording.close()
 
-    def _count_session(self, inbox: Inbox) -> None:
+    def _count_session(self, inbox: SampleQueue) -> None:
         told = self.incomplete + self.dropped
         self._count(inbox)
         self._continuity.restart(counted=self.incomplete + self.dropped - told)
@@ -190,7 +190,7 @@ class LiveCamera(ABC):
         self._past_counts += inbox.counts
         self._arrived += inbox.arrived
 
-    def _count(self, inbox: Inbox) -> None:
+    def _count(self, inbox: SampleQueue) -> None:
         self.incomplete = self._past_incomplete + inbox.incomplete
         self.dropped = self._past_dropped + inbox.dropped + self._continuity.missed
         self.counts.update({name: self._past_counts[name] + n - self.counts[name] for name, n in inbox.counts.items()})
@@ -214,7 +214,7 @@ class LiveCamera(ABC):
         self._count(session.inbox)
         return frame
 
-    def _recover(self, inbox: Inbox) -> None:
+    def _recover(self, inbox: SampleQueue) -> None:
         arrived = self._arrived + inbox.arrived
         came = ", ".join(f"{arrived[stream]} {stream}" for stream in FORMATS)
         silence = f"{self.uri} gave no whole frame for {self.silence_s:.0f} s (so far {came})"

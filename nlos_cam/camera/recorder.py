@@ -140,9 +140,9 @@ class SdkRecorder:
 
     def _flush(self) -> None:
         for _ in range(FLUSHES):
-            begun_s = self._now()
+            start_s = self._now()
             self.pause()
-            if self.failure or self._now() - begun_s < FLUSH_S:
+            if self.failure or self._now() - start_s < FLUSH_S:
                 return
         self.failure = "the disk takes nothing any more"
 

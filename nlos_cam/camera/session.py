@@ -19,7 +19,7 @@ from nlos_cam.camera.streams import (
     FRAMES_PER_S,
     SAME_INSTANT_S,
     FrameSet,
-    Pairing,
+    FrameSynchronizer,
     Sample,
     frame_in_si,
     intrinsics_of,
@@ -34,7 +34,7 @@ CAPACITY = 8
 """Sets: a quarter of a second, and 10 MB at 640 x 480."""
 
 
-class Inbox:
+class SampleQueue:
     """Pairs what the SDK's threads put, and keeps the sets until they are taken.
 
     A full inbox drops its oldest set and counts it, so that a live device never waits; a `lossless` one makes the SDK
@@ -45,7 +45,7 @@ class Inbox:
         self.arrived: Counter[str] = Counter()
         """Samples so far, by stream."""
         self._lossless, self._on_set = lossless, on_set
-        self._pairing = Pairing()
+        self._pairing = FrameSynchronizer()
         self._evicted = 0
         self._sets: deque[FrameSet] = deque()
         self._changed = Condition()
@@ -176,7 +176,7 @@ def _depth_unit_m(sensor: Any) -> float:
 class Session:
     """Three streams of one sensor, delivered to an inbox from `start` to `stop`. Errors are the SDK's RuntimeError."""
 
-    def __init__(self, sensor: Any, profiles: Mapping[str, Any], inbox: Inbox) -> None:
+    def __init__(self, sensor: Any, profiles: Mapping[str, Any], inbox: SampleQueue) -> None:
         self.inbox = inbox
         self.settings: dict[str, float] = {}
         self.intrinsics: Intrinsics = intrinsics_of(profiles["depth"])
@@ -185,7 +185,7 @@ class Session:
         self._profiles = list(profiles.values())
         self._unit_m = _depth_unit_m(sensor)
         self._clocks = {stream: ClockUnwrap() for stream in profiles}
-        self._preview = Inbox(lossless=False)
+        self._preview = SampleQueue(lossless=False)
         """Of frames from before the settings hold."""
         self._listening = False
         self._previewed_s = -inf

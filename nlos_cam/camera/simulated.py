@@ -18,7 +18,7 @@ from nlos_cam.camera.live_camera import LiveCamera
 from nlos_cam.camera.protocol import Clock, WallClock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import Inbox
+from nlos_cam.camera.session import SampleQueue
 from nlos_cam.camera.simulated_world import World
 from nlos_cam.camera.streams import BYTES_PER_PIXEL, FORMATS, FRAMES_PER_S
 from nlos_cam.errors import CameraLostError
@@ -107,7 +107,7 @@ class SoftwareLidar:
         self._sensor.on_video_frame(frame)
 
 
-MOST_LATE = FRAMES_PER_S
+MAX_LATENESS = FRAMES_PER_S
 """Frames that a world may deliver late, when the machine is busy; beyond that it drops numbers."""
 JOIN_TIMEOUT_S = 5.0
 RESET_INSTANTS = FRAMES_PER_S
@@ -166,7 +166,7 @@ class SimulatedCamera(LiveCamera):
     def _prepare(self, sensor: Any) -> None:
         """Nothing to set."""
 
-    def _begin(self, inbox: Inbox) -> None:
+    def _begin(self, inbox: SampleQueue) -> None:
         first = self._instant() + 1 if self._start_s is not None else 0
         self._start_s = self._clock.now() if self._start_s is None else self._start_s
         self._stopping.clear()
@@ -209,7 +209,7 @@ class SimulatedCamera(LiveCamera):
         told, celsius = super().telemetry(ending), self._world.celsius(self._instant())
         return {name: celsius.get(name, value) for name, value in told.items()}
 
-    def _run(self, inbox: Inbox, first: int) -> None:
+    def _run(self, inbox: SampleQueue, first: int) -> None:
         try:
             self._deliver(first)
         except Exception as error:  # noqa: BLE001  whatever it is, it is for the consumer's thread
@@ -229,7 +229,7 @@ class SimulatedCamera(LiveCamera):
             for delivery in self._model.hand_over(instant, due_s, images):
                 self._push(delivery)
             late = int((self._clock.now() - start_s) * FRAMES_PER_S) - instant
-            instant += max(1, late - MOST_LATE)
+            instant += max(1, late - MAX_LATENESS)
 
     def _push(self, delivery: Delivery) -> None:
         self._instants[delivery.number] = delivery.instant

@@ -24,7 +24,7 @@ TELLING = 3
 """Numbers in a row of which the streams' timestamps differ by the same number of frames."""
 
 
-class Alignment:
+class StreamOffsets:
     """Raises the numbers of a stream that is behind, once timestamps have told by how much."""
 
     def __init__(self, frames_per_s: float) -> None:
@@ -59,7 +59,7 @@ WAITING_SETS = 30
 """Numbers that may wait for a stream; beyond that, the one that waited longest is given up."""
 LATE_NUMBERS = 30
 """A number this little behind the last one decided is late; one further back is of a count that began anew."""
-MOST_GAP = 300 * FRAMES_PER_S
+MAX_GAP = 300 * FRAMES_PER_S
 """Numbers between two sets that are taken as dropped (5 minutes' worth); beyond a wider gap the count began anew."""
 STALL_S = 5 / FRAMES_PER_S
 """Two sets that are further apart in time than their numbers say, by more than this, were held up."""
@@ -127,12 +127,12 @@ class Occurrences:
             del self._streams[next(iter(self._streams))]
 
 
-class Pairing:
+class FrameSynchronizer:
     """Makes sets of samples with one number and instant, each once and in order, and counts what did not become one.
 
     Every number is decided once, in order: a set, incomplete, or dropped. A set decides all numbers before it, since
     streams come in order. Memory is bounded whatever comes. Samples must have `shape` (rows, columns), where given.
-    Streams that are counted apart are numbered alike, by `Alignment`.
+    Streams that are counted apart are numbered alike, by `StreamOffsets`.
     """
 
     def __init__(self, shape: tuple[int, int] | None = None) -> None:
@@ -142,7 +142,7 @@ class Pairing:
         self.dropped = 0
         """Numbers of which nothing came, after the first that was decided."""
         self._occurrences = Occurrences()
-        self._alignment = Alignment(FRAMES_PER_S)
+        self._alignment = StreamOffsets(FRAMES_PER_S)
         self._waiting: dict[int, dict[str, Sample]] = {}
         self._decided: int | None = None
         """The highest number that is."""
@@ -204,7 +204,7 @@ class Pairing:
         before, self._decided = self._decided, number
         if before is None:
             self._pass_over(lambda waiting: waiting < number)
-        elif before < number <= before + MOST_GAP:
+        elif before < number <= before + MAX_GAP:
             incomplete = self._pass_over(lambda waiting: before < waiting < number)
             self.dropped += number - before - 1 - incomplete
         else:
@@ -224,7 +224,7 @@ class Pairing:
     def _give_up(self, number: int) -> None:
         """Decide a number that waited in vain, if it is the next one that can be; else forget it."""
         after = self._decided
-        ahead = [waiting for waiting in self._waiting if after is None or after < waiting <= after + MOST_GAP]
+        ahead = [waiting for waiting in self._waiting if after is None or after < waiting <= after + MAX_GAP]
         del self._waiting[number]
         if ahead and number == min(ahead):
             self._decide(number)

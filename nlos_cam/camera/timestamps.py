@@ -41,7 +41,7 @@ SAME_CLOCK_S = 1.0
 
 
 @dataclass(frozen=True)
-class Seen:
+class LastFrame:
     """The last frame that was passed on, and when."""
 
     number: int
@@ -59,7 +59,7 @@ class Continuity:
     def __init__(self) -> None:
         self.missed = 0
         self._later, self._later_s = 0, 0.0
-        self._last: Seen | None = None
+        self._last: LastFrame | None = None
         self._anew = False
         self._counted = 0
 
@@ -74,10 +74,10 @@ class Continuity:
             self._splice(self._last, frame, arrived_s)
         self._anew, self._counted = False, 0
         number, timestamp_s = frame.frame_number + self._later, frame.timestamp_s + self._later_s
-        self._last = Seen(number, timestamp_s, arrived_s)
+        self._last = LastFrame(number, timestamp_s, arrived_s)
         return replace(frame, frame_number=number, timestamp_s=timestamp_s) if self._later or self._later_s else frame
 
-    def _splice(self, last: Seen, frame: Frame, arrived_s: float) -> None:
+    def _splice(self, last: LastFrame, frame: Frame, arrived_s: float) -> None:
         host_s = max(FRAME_PERIOD_S, arrived_s - last.arrived_s)
         device_s = frame.timestamp_s + self._later_s - last.timestamp_s
         if device_s < FRAME_PERIOD_S / 2 or abs(device_s - host_s) > SAME_CLOCK_S:

@@ -28,11 +28,11 @@ from rich.table import Table
 from nlos_cam.calibrate.board_pdf import write_sheet
 from nlos_cam.calibrate.color_view import look_in_colour
 from nlos_cam.calibrate.files import WallFiles, written
-from nlos_cam.calibrate.measure import Glance, Seen, by_board, by_depth, by_occluder, glance, look
+from nlos_cam.calibrate.measure import CaptureStatistics, Glance, by_board, by_depth, by_occluder, glance, look
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stderr, tracked
-from nlos_cam.frames import MOST_SATURATED
+from nlos_cam.frames import MAX_SATURATED
 
 
 def told(record: WallRecord, files: WallFiles) -> str:
@@ -139,7 +139,7 @@ def panel(seen: Glance) -> Table:
         table.add_row("yaw, pitch", f"{fit.yaw_deg:+z.2f}, {fit.pitch_deg:+z.2f} deg")
         colour = "green" if fit.verdict == "good" else "yellow"
         table.add_row("verdict", f"[{colour}]{fit.verdict}[/]", fit.advice)
-    if seen.saturated > MOST_SATURATED:
+    if seen.saturated > MAX_SATURATED:
         table.add_row("infrared", f"{seen.saturated:.1%} saturated", "lower the laser's power, or move back")
     return table
 
@@ -286,7 +286,7 @@ def _opened(uri: str) -> Camera:
         return open_camera(uri, on_progress=on_progress)
 
 
-def _look(uri: str, frames: int) -> Seen:
+def _look(uri: str, frames: int) -> CaptureStatistics:
     """What at most `frames` frames show."""
     with _opened(uri) as source, progress() as bar:
         task = bar.add_task("looking at the wall", total=frames)
@@ -301,7 +301,7 @@ def _look_in_colour(uri: str, frames: int) -> BoardView:
 
 
 def _record(
-    seen: Seen, fit: WallFit | WallByBoard, facts: dict[str, object], occluder: OccluderRecord | None
+    seen: CaptureStatistics, fit: WallFit | WallByBoard, facts: dict[str, object], occluder: OccluderRecord | None
 ) -> WallRecord:
     """The record of a wall that was measured now."""
     return wall_record(

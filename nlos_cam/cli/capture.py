@@ -31,14 +31,14 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.errors import NlosCamError
-from nlos_cam.recording.capture import Job, Take, Takes, settle
+from nlos_cam.recording.capture import CaptureResult, CaptureSession, CaptureTarget, settle
 from nlos_cam.recording.playback import Verified, verify
 from nlos_cam.recording.sidecar import State, Summary, sidecar_path, wall_of
 
 FIGURES = ("saturated_share", "invalid_share", "temporal_noise_mm")
 
 
-def result(takes: Sequence[Take], *, several: bool) -> dict[str, Any]:
+def result(takes: Sequence[CaptureResult], *, several: bool) -> dict[str, Any]:
     """One take as it is, several as {"takes": [...]} with totals; with the error that ended them, if one did."""
     made = _all([_one(take) for take in takes], several=several)
     if error := ending(takes[-1]):
@@ -46,7 +46,7 @@ def result(takes: Sequence[Take], *, several: bool) -> dict[str, Any]:
     return made
 
 
-def nothing(jobs: Sequence[Job], *, several: bool) -> dict[str, Any]:
+def nothing(jobs: Sequence[CaptureTarget], *, several: bool) -> dict[str, Any]:
     """The same where it was interrupted before the camera ran."""
     none = Summary(frames=0, dropped=0, seconds=0.0, streams={}, events={})
     return _all([_told_of(job, "interrupted", none, sidecar_path(job.path)) for job in jobs[:1]], several=several)
@@ -57,11 +57,11 @@ def _all(each: list[dict[str, Any]], *, several: bool) -> dict[str, Any]:
     return {"takes": each} | totals if several else each[0]
 
 
-def _one(take: Take) -> dict[str, Any]:
+def _one(take: CaptureResult) -> dict[str, Any]:
     return _told_of(take.job, take.state, take.summary, take.sidecar.path)
 
 
-def _told_of(job: Job, state: State, summary: Summary, sidecar: Path) -> dict[str, Any]:
+def _told_of(job: CaptureTarget, state: State, summary: Summary, sidecar: Path) -> dict[str, Any]:
     made: dict[str, Any] = {
         "frames": summary.frames,
         "dropped": summary.dropped,
@@ -75,7 +75,7 @@ def _told_of(job: Job, state: State, summary: Summary, sidecar: Path) -> dict[st
     return made if job.label is None else made | {"label": job.label}
 
 
-def ending(take: Take) -> NlosCamError | None:
+def ending(take: CaptureResult) -> NlosCamError | None:
     """What ended a take and is no one's wish, and how much of it is kept."""
     if take.error is None:
         return None
@@ -83,7 +83,7 @@ def ending(take: Take) -> NlosCamError | None:
     return take.error if take.sets and not take.found else type(take.error)(f"{take.error}; {kept}")
 
 
-def told(take: Take) -> str:
+def told(take: CaptureResult) -> str:
     """A take for a person."""
     if take.sets == 0:
         return f"{take.state} before the first frame: nothing is kept"
@@ -156,7 +156,7 @@ def capture(
     each = frames or (round(seconds * FRAMES_PER_S) if seconds else None)
     _check_disk(source, jobs, each)
     with stop_on_signals() as stop:
-        made = _make(Takes(source, recording, jobs, wall=measured), stop, each, pause_s)
+        made = _make(CaptureSession(source, recording, jobs, wall=measured), stop, each, pause_s)
         interrupted = stop.is_set() or made[-1].state == "interrupted"
     finish(result(made, several=takes > 1), as_json=json, text="\n".join(map(told, made)))
     if failure := ending(made[-1]):
@@ -177,14 +177,18 @@ def _base(seconds: float | None, frames: int | None, takes: int, out: Path | Non
     return out or output_path(None, "capture", ".bag", overwrite=False)
 
 
-def _jobs(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> list[Job]:
+def _jobs(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> list[CaptureTarget]:
     """What is to be recorded where. Raises OutputExistsError where that would replace something unasked."""
     if len(labels) not in {0, 1, takes}:
         raise typer.BadParameter(f"{len(labels)} --label for {takes} takes: give one for all, or one for each")
     digits = max(2, len(str(takes)))
     paths = [base.with_stem(f"{base.stem}-{number:0{digits}}") for number in range(1, takes + 1)]
     jobs = list(
-        map(Job, paths if takes > 1 else [base], labels * takes if len(labels) == 1 else labels or [None] * takes)
+        map(
+            CaptureTarget,
+            paths if takes > 1 else [base],
+            labels * takes if len(labels) == 1 else labels or [None] * takes,
+        )
     )
     for job in jobs:
         for path in (job.path, sidecar_path(job.path)):
@@ -192,7 +196,7 @@ def _jobs(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> list
     return jobs
 
 
-def _check_disk(camera: Camera, jobs: list[Job], each: int | None) -> None:
+def _check_disk(camera: Camera, jobs: list[CaptureTarget], each: int | None) -> None:
     """Raises DiskFullError where they may not fit; says how long there is room where no limit was given."""
     path, free = jobs[0].path, free_bytes(jobs[0].path)
     check_room(path, camera.intrinsics, (each or 0) * len(jobs), free)
@@ -201,9 +205,9 @@ def _check_disk(camera: Camera, jobs: list[Job], each: int | None) -> None:
         say(f"there is room for {minutes:.1f} minutes or more ({free / 1e9:.1f} GB free); Ctrl-C ends it")
 
 
-def _make(takes: Takes, stop: Event, each: int | None, pause_s: float | None) -> list[Take]:
+def _make(takes: CaptureSession, stop: Event, each: int | None, pause_s: float | None) -> list[CaptureResult]:
     """Record the takes, one after another, and read each back."""
-    made: list[Take] = []
+    made: list[CaptureResult] = []
     with progress() as bar:
         task = bar.add_task("recording", total=each)
         with closing(takes.record(stop, lambda sets: bar.update(task, completed=sets))) as recorded:

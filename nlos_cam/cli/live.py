@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from nlos_models.doubt_checkpoint import Doubter
+from nlos_models.doubt_checkpoint import UncertaintyModel
 from nlos_models.inference import Reconstructor
 from rich.markup import escape
 
@@ -52,14 +52,14 @@ from nlos_cam.evaluate.runtime_tradeoff import runtimes
 from nlos_cam.live.budget import SHIPPED, Choice, loader, options_here, timer, within_budget
 from nlos_cam.live.frame_log import SUFFIXES, FrameLog
 from nlos_cam.live.loop import in_words, run_live, warm_up
-from nlos_cam.live.physics_check_process import BackgroundChecks
+from nlos_cam.live.physics_check_process import BackgroundPhysicsCheck
 from nlos_cam.live.realtime import precedence, undisturbed
 from nlos_cam.live.replay import REPORT, replay
 from nlos_cam.live.replay_media import Looks
-from nlos_cam.live.statistics import OUTSIDE_LATENCY, LiveReport
-from nlos_cam.reconstruct.bench import Bench, open_bench
-from nlos_cam.reconstruct.physics_check import Checks
-from nlos_cam.reconstruct.pipeline import Processing, load_doubt, load_networks, misfits, set_up
+from nlos_cam.live.statistics import OUTSIDE_LATENCY, RunReport
+from nlos_cam.reconstruct.bench import CalibratedRig, open_bench
+from nlos_cam.reconstruct.physics_check import PhysicsCheck
+from nlos_cam.reconstruct.pipeline import Pipeline, load_doubt, load_networks, misfits, set_up
 from nlos_cam.view.viewer import Moment
 
 
@@ -68,7 +68,7 @@ def warn(warning: str, begins: bool) -> None:
     say(f"[yellow]warning:[/] {escape(warning)}" if begins else f"no longer: {escape(warning)}", marked=True)
 
 
-def told(report: LiveReport) -> str:
+def told(report: RunReport) -> str:
     """The report in a few lines."""
     latency = report.latency_ms
     lines = [
@@ -86,7 +86,7 @@ def told(report: LiveReport) -> str:
     return "\n".join(lines)
 
 
-def _stages(report: LiveReport) -> str:
+def _stages(report: RunReport) -> str:
     """Those that make up the latency first, and then the others."""
     stages = report.stages_percentiles_ms
     ordered = sorted(stages, key=lambda name: name in OUTSIDE_LATENCY)
@@ -195,7 +195,7 @@ def live(
         with tracked("rendering the scene ahead") as on_progress:
             opened = open_camera(camera, on_progress=on_progress, recording=kept.recording)
         bench = open_bench(wall, opened)
-        checks = BackgroundChecks(bench.rig, on_error=_warn_once)
+        checks = BackgroundPhysicsCheck(bench.rig, on_error=_warn_once)
         processing, choice = _chosen(opened, bench, weights, average, budget_ms, tradeoff, checks)
         warm_up(opened, processing)
     viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, kept.view)
@@ -265,7 +265,7 @@ def replay_bag(
         raise typer.Exit(INTERRUPTED)
 
 
-def _finish_live(report: LiveReport, choice: Choice | None, *, as_json: bool) -> None:
+def _finish_live(report: RunReport, choice: Choice | None, *, as_json: bool) -> None:
     """What the run did, and what became of its budget."""
     budget = {"budget": choice.outcome(report)} if choice else {}
     text = [told(report), *([choice.outcome_told(report)] if choice else [])]
@@ -274,13 +274,13 @@ def _finish_live(report: LiveReport, choice: Choice | None, *, as_json: bool) ->
 
 def _chosen(
     camera: Camera,
-    bench: Bench,
+    bench: CalibratedRig,
     weights: Path | None,
     average: int,
     budget_ms: float | None,
     tradeoff: Path | None,
-    checks: Checks,
-) -> tuple[Processing, Choice | None]:
+    checks: PhysicsCheck,
+) -> tuple[Pipeline, Choice | None]:
     """What is made of frames: as is usual, or within a budget, which then was chosen so."""
     if budget_ms is None:
         return _processing(bench, load_networks(weights), load_doubt(weights), average, checks), None
@@ -299,8 +299,8 @@ def _warn_once(warning: str) -> None:
 
 
 def _processing(
-    bench: Bench, network: Reconstructor, doubter: Doubter | None, average: int, checks: Checks
-) -> Processing:
+    bench: CalibratedRig, network: Reconstructor, doubter: UncertaintyModel | None, average: int, checks: PhysicsCheck
+) -> Pipeline:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
     processing = set_up(bench, network, average, doubter=doubter, checks=checks)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")

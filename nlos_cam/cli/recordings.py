@@ -31,7 +31,7 @@ Ply = Annotated[
 ]
 Streams = Annotated[str, typer.Option("--streams", help="Only these: names with commas between.")]
 Every = Annotated[int, typer.Option("--every", min=1, help="Only frames whose number this divides.")]
-MOST_TOLD = 5
+MAX_REPORTED = 5
 
 
 def register(app: typer.Typer) -> None:
@@ -60,8 +60,8 @@ def _told_repair(found: Repaired) -> str:
     frames = ", ".join(f"{count} {stream}" for stream, count in found.recovered_frames.items())
     lost = sum(damage.bytes for damage in found.damages)
     told = [f"recovered {found.chunks} pieces with {frames} frames; lost {lost} bytes"]
-    told += [f"at byte {damage.position}: {damage.why}" for damage in found.damages[:MOST_TOLD]]
-    if (more := len(found.damages) - MOST_TOLD) > 0:
+    told += [f"at byte {damage.position}: {damage.why}" for damage in found.damages[:MAX_REPORTED]]
+    if (more := len(found.damages) - MAX_REPORTED) > 0:
         told.append(f"and at {more} more places")
     return "\n".join([*told, f"wrote {found.out}"])
 

@@ -19,8 +19,8 @@ from nlos_cam.evaluate import runtime_tradeoff as reconstruction
 from nlos_cam.evaluate import runtime_tradeoff as reconstruction_report
 from nlos_cam.evaluate.render_tradeoff import Row, as_markdown, as_table, draw, facts, machine, measure, settings
 from nlos_cam.evaluate.subjects import seeded_objects
-from nlos_cam.files import cache_folder, renamed_when_whole
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.files import atomic_directory, cache_folder
+from nlos_cam.objects.benchmark import benchmark_objects
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_file import paper_scene
@@ -89,7 +89,7 @@ def reconstruct(
     interrupted = _collect(reconstruction.measure(asked, makes, bench), rows, len(asked))
     table = reconstruction_report.facts(rows, len(asked), len(bench.truth), machine())
     if rows:
-        with renamed_when_whole(folder) as part:
+        with atomic_directory(folder) as part:
             _write_files(part, table, reconstruction_report.as_markdown(table))
             reconstruction_report.draw(part / "tradeoff.png", rows)
     text = f"{len(rows)} of {len(asked)} settings measured: {folder}" if rows else "nothing was measured"
@@ -113,7 +113,7 @@ def _bench(folders: dict[str, Path | None], count: int | None) -> reconstruction
         raise SceneError(f"these weights eat {eaten.pop()}, and test maps are raw maps: use other weights")
     rig = rig_named(rigs.pop())
     box = object_box(rig)
-    subjects = seeded_objects(TEST_SEED, count, box) if count else test_set(box)
+    subjects = seeded_objects(TEST_SEED, count, box) if count else benchmark_objects(box)
     with tracked("rendering") as on_progress:
         return reconstruction.Bench.of(subjects, rig, box, on_progress)
 
@@ -152,6 +152,6 @@ def _write_files(folder: Path, table: dict[str, Any], text: str) -> None:
 
 def _write(folder: Path, table: dict[str, Any], rows: list[Row], name: str) -> None:
     title = f"{name}: {table['patches']} patches, {table['beams_on_wall']} beams on the wall"
-    with renamed_when_whole(folder) as part:
+    with atomic_directory(folder) as part:
         _write_files(part, table, as_markdown(table))
         draw(part / "tradeoff.png", rows, title)

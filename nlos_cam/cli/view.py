@@ -14,7 +14,7 @@ import typer
 
 from nlos_cam.cli.common import INTERRUPTED, Json, finish, interrupted_by_signals, say, stop_on_signals
 from nlos_cam.live.realtime import after_the_loop
-from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.view.assets import LOOPBACK
 from nlos_cam.view.server import exposed
 from nlos_cam.view.viewer import NullViewer, Viewer, Viewers
@@ -31,15 +31,15 @@ Open = Annotated[bool, typer.Option("--open", help="Open the view in the default
 DESKTOPS = "DISPLAY", "WAYLAND_DISPLAY", "BROWSER"
 
 
-def viewer_of(bench: Bench, *, no_view: bool, host: str | None = None, port: int | None = None) -> Viewer:
+def viewer_of(bench: CalibratedRig, *, no_view: bool, host: str | None = None, port: int | None = None) -> Viewer:
     """What shows a live run. Raises typer.BadParameter where none is wanted and yet a place for it is named."""
     if no_view:
         if host is not None or port is not None:
             raise typer.BadParameter("--view-host and --view-port say where the view is: leave --no-view away")
         return NullViewer()
-    from nlos_cam.view.web import RerunViewer
+    from nlos_cam.view.web import WebViewer
 
-    return RerunViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port, on_stream_thread=after_the_loop)
+    return WebViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port, on_stream_thread=after_the_loop)
 
 
 class Addressed(Protocol):
@@ -112,10 +112,10 @@ def view(
         raise typer.Exit(INTERRUPTED)
 
 
-def saving(viewer: Viewer, bench: Bench, path: Path | None) -> Viewer:
+def saving(viewer: Viewer, bench: CalibratedRig, path: Path | None) -> Viewer:
     """The viewer, and beside it one that saves what it shows, if there is a path to save it to."""
     if path is None:
         return viewer
-    from nlos_cam.view.rrd_file import SavedView
+    from nlos_cam.view.rrd_file import RrdFile
 
-    return Viewers([viewer, SavedView(path, bench.rig, bench.measured)])
+    return Viewers([viewer, RrdFile(path, bench.rig, bench.measured)])

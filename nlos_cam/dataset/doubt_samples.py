@@ -16,9 +16,9 @@ from nlos_models.tasks import parts_of
 from numpy.typing import NDArray
 
 from nlos_cam.dataset import build
-from nlos_cam.dataset.outliers import SLIGHT, TO_JUDGE, TO_LEARN, Sight, ordinary, outlier, varied, varied_empty
+from nlos_cam.dataset.outliers import SLIGHT, TO_JUDGE, TO_LEARN, Stimulus, ordinary, outlier, varied, varied_empty
 from nlos_cam.errors import SceneError
-from nlos_cam.files import file_when_whole
+from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.render.renderer import Rendering, render
@@ -89,31 +89,31 @@ def _generator(kind: str, seed: int, of: int) -> np.random.Generator:
     return np.random.default_rng([crc32(kind.encode()), seed, _STREAM, of])
 
 
-def _sensed(sight: Sight, rendered: Rendering, noise: np.random.Generator) -> LidarMaps:
+def _sensed(sight: Stimulus, rendered: Rendering, noise: np.random.Generator) -> LidarMaps:
     sensor = _sensor(sight)
     images = sensor.expose(rendered.multi, noise)
     return maps_from_frame(images.frame(sensor.rig.pinhole))
 
 
-def _truth(sight: Sight) -> NDArray[np.float16]:
+def _truth(sight: Stimulus) -> NDArray[np.float16]:
     nothing = np.full((OBJECT_PIXELS, OBJECT_PIXELS), np.nan, np.float32)
     hidden_m = nothing if sight.depth_m is None else sight.depth_m
     return image_from_depth(hidden_m, object_box(sight.rig)).astype(np.float16)
 
 
-def _cells(sight: Sight, rendered: Rendering) -> int:
+def _cells(sight: Stimulus, rendered: Rendering) -> int:
     """In how many cells the depth is not the bare wall's."""
     bare_m = render(replace(sight.scene, object_depth_m=None)).depth_m
     return int(np.count_nonzero(np.abs(rendered.depth_m - bare_m) > BESIDE_M))
 
 
-def _sight(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Sight:
+def _sight(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Stimulus:
     of_bench = _generator(kind, seed // BENCH, 0)
     if kind == EMPTY:
-        return Sight(*varied_empty(rig, sensor, of_bench))
+        return Stimulus(*varied_empty(rig, sensor, of_bench))
     slight = kind == ORDINARY or seed // BENCH % 2
     bench = varied(rig, sensor, SLIGHT, of_bench) if slight else (rig, sensor)
-    return outlier(KINDS[kind], _generator(kind, seed, 1), Sight(*bench))
+    return outlier(KINDS[kind], _generator(kind, seed, 1), Stimulus(*bench))
 
 
 KINDS = {ORDINARY: ordinary, **TO_LEARN, **TO_JUDGE}
@@ -126,7 +126,7 @@ class _Last:
     sensor: Sensor | None = None
 
 
-def _sensor(sight: Sight) -> Sensor:
+def _sensor(sight: Stimulus) -> Sensor:
     key = sight.rig, sight.sensor
     if _Last.sensor is None or _Last.key != key:
         _Last.key, _Last.sensor = key, Sensor(*key)
@@ -178,11 +178,11 @@ def _read(path: Path) -> DoubtSamples | None:
 
 
 def _write(path: Path, samples: DoubtSamples) -> None:
-    with file_when_whole(path) as part, part.open("wb") as file:
+    with atomic_file(path) as part, part.open("wb") as file:
         np.savez(file, **vars(samples))
 
 
-LEAST_CELLS = 8
+MIN_CELLS = 8
 """An outlier that shows in fewer cells of the maps is not learnt from: it can hardly be told from nothing at all."""
 
 
@@ -209,7 +209,7 @@ def doubt_set(pipeline: Reconstructor, samples: DoubtSamples) -> DoubtSet:
 def _whole_set(pipeline: Reconstructor, usual: MapSet, samples: DoubtSamples) -> DoubtSet:
     """Ordinary maps of a dataset, and the samples that can be seen."""
     made = doubt_set(pipeline, samples)
-    made = made.where((samples.cells >= LEAST_CELLS) | made.nothing)
+    made = made.where((samples.cells >= MIN_CELLS) | made.nothing)
     of_dataset, no = _images(pipeline, usual), np.zeros(len(usual.image), np.bool_)
     ordinary = DoubtSet(usual.depth_m, usual.intensity, of_dataset, usual.image.astype(np.float16), no, no)
     pairs = {name: (values, vars(made)[name]) for name, values in vars(ordinary).items()}

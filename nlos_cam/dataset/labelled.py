@@ -23,13 +23,13 @@ from nlos_cam.dataset.plan import scene_row
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import SHARDS, shard_path, store
 from nlos_cam.errors import DiskFullError, RecordingError
-from nlos_cam.files import renamed_when_whole
+from nlos_cam.files import atomic_directory
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.benchmark import benchmark_objects
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.objects.meshes import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, read_depth_map
 from nlos_cam.objects.placement import nothing_to_see
-from nlos_cam.reconstruct.bench import Bench, open_bench
+from nlos_cam.reconstruct.bench import CalibratedRig, open_bench
 from nlos_cam.recording.playback import ReplayCamera, open_lidar_bag
 from nlos_cam.recording.sidecar import Sidecar, load_sidecar, sidecar_path
 from nlos_cam.render.scene_file import HiddenObject, SceneFile
@@ -40,7 +40,7 @@ TRUTH_SUFFIX = ".truth.toml"
 
 def fixed_objects(box: ObjectBox) -> Mapping[str, Float32]:
     """The test objects, whose label alone tells them: their depths (64, 64) over a box, by name."""
-    return {thing.name: thing.depth_m for thing in test_set(box)}
+    return {thing.name: thing.depth_m for thing in benchmark_objects(box)}
 
 
 def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Float32]) -> Float32:
@@ -220,14 +220,14 @@ def spread(count: int, wanted: int) -> frozenset[int]:
     )
 
 
-def _bench(path: Path, sidecar: Sidecar, wall: Path | None, camera: ReplayCamera) -> Bench:
+def _bench(path: Path, sidecar: Sidecar, wall: Path | None, camera: ReplayCamera) -> CalibratedRig:
     if wall is not None:
         return open_bench(wall, camera)
     if sidecar.wall is not None:
         raise RecordingError(
             f"{path} was captured with --wall {sidecar.wall.path}, by which maps are corrected: give --wall here too"
         )
-    return Bench(sidecar.rig if sidecar.rig and sidecar.rig.object_box else load_rig("paper-rig"))
+    return CalibratedRig(sidecar.rig if sidecar.rig and sidecar.rig.object_box else load_rig("paper-rig"))
 
 
 def _joined(read: Sequence[_Recorded]) -> Labelled:
@@ -262,7 +262,7 @@ def write_shards(labelled: Labelled, folder: Path, command: str = "") -> None:
     """
     provenance, samples = plan_of(labelled).provenance, _samples(labelled)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with renamed_when_whole(folder) as whole:
+    with atomic_directory(folder) as whole:
         for start in range(0, len(labelled.label), SHARD):
             part = {name: values[start : start + SHARD] for name, values in samples.items()}
             try:

@@ -33,7 +33,7 @@ Generator = np.random.Generator
 
 
 @dataclass(frozen=True)
-class Sight:
+class Stimulus:
     """What the lidar is shown, on which rig, and by which sensor it is seen."""
 
     rig: Rig
@@ -48,7 +48,7 @@ class Sight:
         return Scene(self.rig, self.depth_m, self.surface, pulse_ns=self.sensor.pulse_ns)
 
 
-Kind = Callable[[Generator, Sight], Sight]
+Kind = Callable[[Generator, Stimulus], Stimulus]
 """Makes an outlier of a sight that is ordinary, but for its object, which is still to come."""
 
 
@@ -73,7 +73,7 @@ def smooth_pattern(generator: Generator, across: int) -> Float32:
     return ((pattern - pattern.min()) / np.ptp(pattern)).astype(np.float32)
 
 
-def ordinary(generator: Generator, sight: Sight) -> Sight:
+def ordinary(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing as training has them."""
     return replace(sight, depth_m=placed(generator, object_box(sight.rig)))
 
@@ -140,32 +140,32 @@ def varied_empty(rig: Rig, sensor: SensorModel, generator: Generator) -> tuple[R
     return bench, seen_by
 
 
-def small(generator: Generator, sight: Sight) -> Sight:
+def small(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing of 15 to 35 % of the box."""
     box = object_box(sight.rig)
     size_m, (right, up) = width_m(box) * generator.uniform(0.15, 0.35), generator.uniform(-0.3, 0.3, 2) * width_m(box)
     return replace(sight, depth_m=placed(generator, box, size_m=size_m, x_m=right, y_m=up))
 
 
-def large(generator: Generator, sight: Sight) -> Sight:
+def large(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing of 125 to 180 % of the box, whose sides are cut off."""
     box = object_box(sight.rig)
     return replace(sight, depth_m=placed(generator, box, size_m=width_m(box) * generator.uniform(1.25, 1.8)))
 
 
-def far(generator: Generator, sight: Sight) -> Sight:
+def far(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing 0.12 to 0.35 m farther from the wall, most of it beyond the box."""
     return replace(sight, depth_m=placed(generator, object_box(sight.rig)) + np.float32(generator.uniform(0.12, 0.35)))
 
 
-def near(generator: Generator, sight: Sight) -> Sight:
+def near(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing that stands out of the box, 40 to 90 mm nearer to the wall."""
     box = object_box(sight.rig)
     depth_m = placed(generator, box, front_m=0.0) - np.float32(generator.uniform(0.04, 0.09))
     return replace(sight, depth_m=depth_m)
 
 
-def half_out(generator: Generator, sight: Sight) -> Sight:
+def half_out(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing of ordinary size, 35 to 60 % of which lies beside the box."""
     box = object_box(sight.rig)
     pose = random_pose(generator, box)
@@ -174,7 +174,7 @@ def half_out(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=placed(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle)))
 
 
-def several(generator: Generator, sight: Sight) -> Sight:
+def several(generator: Generator, sight: Stimulus) -> Stimulus:
     """Two or three things apart from each other."""
     box = object_box(sight.rig)
     count, start = int(generator.integers(2, 4)), generator.uniform(0, 2 * np.pi)
@@ -188,7 +188,7 @@ def several(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=np.fmin.reduce(depths_m))
 
 
-def blobs(generator: Generator, sight: Sight) -> Sight:
+def blobs(generator: Generator, sight: Stimulus) -> Stimulus:
     """Smooth random shapes of smooth random depth."""
     box = object_box(sight.rig)
     covered = smooth_pattern(generator, int(generator.integers(3, 9))) > generator.uniform(0.35, 0.75)
@@ -197,12 +197,12 @@ def blobs(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=np.where(covered, depth_m, np.float32(np.nan)))
 
 
-def dim(generator: Generator, sight: Sight) -> Sight:
+def dim(generator: Generator, sight: Stimulus) -> Stimulus:
     """A grey or black thing: 5 to 40 % of a white one's light."""
     return replace(ordinary(generator, sight), surface=Surface(float(generator.uniform(0.05, 0.4))))
 
 
-def posts(generator: Generator, sight: Sight) -> Sight:
+def posts(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing on a post, with another above it."""
     depth_m = placed(generator, object_box(sight.rig))
     for _ in range(2):
@@ -210,14 +210,14 @@ def posts(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=np.ascontiguousarray(depth_m))
 
 
-def tilted(generator: Generator, sight: Sight) -> Sight:
+def tilted(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing tilted by 40 to 75 degrees, up or down and to a side."""
     tilts = np.radians(generator.uniform(40, 75, 2)) * generator.choice([-1, 1], 2)
     pose = {"tilt_x_rad": float(tilts[0]), "tilt_y_rad": float(tilts[1])}
     return replace(sight, depth_m=placed(generator, object_box(sight.rig), **pose))
 
 
-def plates(generator: Generator, sight: Sight) -> Sight:
+def plates(generator: Generator, sight: Stimulus) -> Stimulus:
     """A large slanted plate without any relief."""
     box, steps = object_box(sight.rig), np.linspace(-0.5, 0.5, OBJECT_PIXELS)
     x, y = np.meshgrid(steps, -steps)
@@ -228,21 +228,21 @@ def plates(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=np.where(covered, depth_m, np.nan).astype(np.float32))
 
 
-def other_rig(generator: Generator, sight: Sight) -> Sight:
+def other_rig(generator: Generator, sight: Stimulus) -> Stimulus:
     """An ordinary thing seen by a lidar that stands 15 to 50 mm off, turned by 2 to 8 degrees."""
     signs = generator.choice([-1, 1], 3)
     place_m, yaw, pitch = signs * generator.uniform([0.015, 2, 2], [0.05, 8, 8])
     return replace(ordinary(generator, sight), rig=moved(sight.rig, place_m, yaw, pitch))
 
 
-def other_sensor(generator: Generator, sight: Sight) -> Sight:
+def other_sensor(generator: Generator, sight: Stimulus) -> Stimulus:
     """An ordinary thing seen with a third to two thirds of the gain, or half as much again to three times it."""
     gain = float(generator.choice([generator.uniform(0.3, 0.65), generator.uniform(1.6, 3.0)]))
     sensor = sight.sensor.model_copy(update={"bare_wall_counts": sight.sensor.bare_wall_counts * gain})
     return replace(ordinary(generator, sight), sensor=sensor)
 
 
-def warped(generator: Generator, sight: Sight) -> Sight:
+def warped(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing bent out of shape: every pixel is taken from up to a sixth of the box away, smoothly."""
     whole_m, steps = placed(generator, object_box(sight.rig)), np.arange(OBJECT_PIXELS, dtype=np.float32)
     x, y = np.meshgrid(steps, steps)
@@ -251,7 +251,7 @@ def warped(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=bent.astype(np.float32))
 
 
-def inside_out(generator: Generator, sight: Sight) -> Sight:
+def inside_out(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing whose far parts are near and whose near parts are far, and twice as deep."""
     box = object_box(sight.rig)
     whole_m = placed(generator, box)
@@ -259,7 +259,7 @@ def inside_out(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=np.minimum(depth_m, np.float32(1.5 * box.z_far_m)))
 
 
-def cut_out(generator: Generator, sight: Sight) -> Sight:
+def cut_out(generator: Generator, sight: Stimulus) -> Stimulus:
     """The silhouette of a thing, flat, with holes in it."""
     whole_m = placed(generator, object_box(sight.rig))
     holes = smooth_pattern(generator, int(generator.integers(4, 10))) > generator.uniform(0.45, 0.75)
@@ -267,7 +267,7 @@ def cut_out(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=flat.astype(np.float32))
 
 
-def scrambled(generator: Generator, sight: Sight) -> Sight:
+def scrambled(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing cut into 3 x 3 or 4 x 4 tiles, which are shuffled."""
     whole_m, n = placed(generator, object_box(sight.rig)), int(generator.choice([3, 4]))
     side = OBJECT_PIXELS // n
@@ -291,18 +291,18 @@ __all__ = ["IN_SHAPE", "TO_JUDGE", "TO_LEARN", "outlier"]
 
 LOBES = phong(0.1, 0.9, 80.0), retroreflective(0.1, 0.9, 80.0)
 """Made once: each is compiled."""
-LEAST_PIXELS = 12
+MIN_PIXELS = 12
 """An outlier of fewer pixels is made again: too little to be hidden."""
 
 
-def panels(generator: Generator, sight: Sight) -> Sight:
+def panels(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing before a panel that fills most of the box."""
     box = object_box(sight.rig)
     depth_m = placed(generator, box)
     return replace(sight, depth_m=np.where(np.isnan(depth_m), panel(depth_m, box, generator), depth_m))
 
 
-def noise_sheet(generator: Generator, sight: Sight) -> Sight:
+def noise_sheet(generator: Generator, sight: Stimulus) -> Stimulus:
     """A sheet whose every pixel lies elsewhere in the box."""
     box = object_box(sight.rig)
     depth_m = generator.uniform(box.z_near_m, box.z_far_m, (OBJECT_PIXELS, OBJECT_PIXELS))
@@ -310,7 +310,7 @@ def noise_sheet(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=depth_m.astype(np.float32))
 
 
-def bars(generator: Generator, sight: Sight) -> Sight:
+def bars(generator: Generator, sight: Stimulus) -> Stimulus:
     """A cage: parallel bars, upright or lying, with gaps between them."""
     box, period = object_box(sight.rig), int(generator.integers(10, 24))
     at = (np.arange(OBJECT_PIXELS) + int(generator.integers(period))) % period < max(2, period // 4)
@@ -319,7 +319,7 @@ def bars(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=sheet if generator.random() < 0.5 else np.ascontiguousarray(sheet.T))
 
 
-def rings(generator: Generator, sight: Sight) -> Sight:
+def rings(generator: Generator, sight: Stimulus) -> Stimulus:
     """A torus that is turned any way."""
     box = object_box(sight.rig)
     ring = trimesh.creation.torus(1.0, generator.uniform(0.15, 0.35), major_sections=32, minor_sections=16)
@@ -328,12 +328,12 @@ def rings(generator: Generator, sight: Sight) -> Sight:
     return replace(sight, depth_m=orthographic_depth(place(np.asarray(ring.triangles) @ turn.T, pose, box), box))
 
 
-def glossy(generator: Generator, sight: Sight) -> Sight:
+def glossy(generator: Generator, sight: Stimulus) -> Stimulus:
     """A mirror-like thing, or one that sends light back to where it came from."""
     return replace(ordinary(generator, sight), surface=Surface(1.0, LOBES[int(generator.integers(2))]))
 
 
-def two_tone(generator: Generator, sight: Sight) -> Sight:
+def two_tone(generator: Generator, sight: Stimulus) -> Stimulus:
     """A thing of which one half is nearly black."""
     seen = ordinary(generator, sight)
     dark = smooth_pattern(generator, 3) > 0.5
@@ -363,9 +363,9 @@ IN_SHAPE = frozenset(
 light, rig or sensor."""
 
 
-def outlier(kind: Kind, generator: Generator, sight: Sight) -> Sight:
+def outlier(kind: Kind, generator: Generator, sight: Stimulus) -> Stimulus:
     """One outlier of a kind that shows some surface."""
     while True:
         made = kind(generator, sight)
-        if made.depth_m is not None and np.isfinite(made.depth_m).sum() >= LEAST_PIXELS:
+        if made.depth_m is not None and np.isfinite(made.depth_m).sum() >= MIN_PIXELS:
             return made

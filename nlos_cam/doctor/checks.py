@@ -20,7 +20,7 @@ NOT_LINUX = "only Linux needs this"
 NO_CAMERA_IN_KERNEL = "the kernel sees no L515"
 HID_MODULES = ("hid_sensor_hub", "hid_sensor_accel_3d", "hid_sensor_gyro_3d")
 HID_OPTIONS = "CONFIG_HID_SENSOR_HUB, CONFIG_HID_SENSOR_ACCEL_3D and CONFIG_HID_SENSOR_GYRO_3D"
-LEAST_SENSORS = 2
+MIN_SENSORS = 2
 """librealsense on Linux leaves out an L515 of which it does not see accelerometer and gyroscope."""
 JOIN = "`sudo usermod -aG plugdev,video $USER`, and log in again"
 PASSERS_BY = {"pipewire", "wireplumber"}
@@ -112,7 +112,7 @@ def hid_sensors(facts: Facts) -> Finding:
     if not cameras:
         return skipped(NO_CAMERA_IN_KERNEL)
     for camera in cameras:
-        if len(camera.hid_sensors) < LEAST_SENSORS:
+        if len(camera.hid_sensors) < MIN_SENSORS:
             return _without_sensors(facts, camera)
     return ok("; ".join(f"{camera.port}: {', '.join(camera.hid_sensors)}" for camera in cameras))
 
@@ -121,7 +121,7 @@ def _without_sensors(facts: Facts, camera: KernelCamera) -> Finding:
     seen = ", ".join(camera.hid_sensors) or "none"
     drivers = ", ".join(camera.hid_devices) or "no HID device"
     detail = (
-        f"the L515 at {camera.port} shows fewer than {LEAST_SENSORS} motion sensors ({seen}; {drivers}): librealsense "
+        f"the L515 at {camera.port} shows fewer than {MIN_SENSORS} motion sensors ({seen}; {drivers}): librealsense "
         "then leaves it out without a word"
     )
     return failed(detail, _sensor_fix(facts, camera))
@@ -316,7 +316,7 @@ def libusb(facts: Facts) -> Finding:
 
 
 NO_CAMERA = "no L515 is seen, neither on USB nor by librealsense"
-LEAST_FIRMWARE = (1, 5, 1, 3)
+MIN_FIRMWARE = (1, 5, 1, 3)
 BEST_FIRMWARE = (1, 5, 8, 1)
 FLASH = (
     "with librealsense 2.54.2's realsense-viewer (More > Update Firmware), or `rs-fw-update -f "
@@ -396,7 +396,7 @@ def firmware(facts: Facts) -> Finding:
         return skipped("no camera tells its firmware" if told else NO_CAMERA)
     detail = ", ".join(f"{label}: {version}" for label, version in known.items())
     oldest = min(map(numbers, known.values()))
-    if oldest < LEAST_FIRMWARE[: len(oldest)]:
+    if oldest < MIN_FIRMWARE[: len(oldest)]:
         return failed(f"{detail}; librealsense takes 1.5.1.3 and later", f"update to 1.5.8.1 {FLASH}")
     if oldest < BEST_FIRMWARE[: len(oldest)]:
         return warning(f"{detail}; librealsense asks for 1.5.8.1", f"update to 1.5.8.1 {FLASH}")

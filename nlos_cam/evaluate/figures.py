@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, Bin, Figures, Interval
 
 SHEET_COLUMNS = 18
-MOST_ON_A_SHEET = 54
+MAX_PER_SHEET = 54
 GALLERY = 6
 DIFFERENCE_V = 0.5
 """The difference that has the full colour; 0.1 is 31 mm in the paper's box."""
@@ -33,7 +33,7 @@ LABELS = {
 
 def draw_sheet(path: Path, image: Float32, truth: Float32, titles: Sequence[str]) -> None:
     """Truth, reconstruction and difference of up to 54 objects, evenly chosen where there are more (Figure S2)."""
-    shown = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), MOST_ON_A_SHEET)).astype(int))
+    shown = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), MAX_PER_SHEET)).astype(int))
     columns = min(SHEET_COLUMNS, len(shown))
     figure = _figure((0.8 * columns + 1.6, 2.7 * -(-len(shown) // columns) + 0.2))
     axis = figure.subplots()

@@ -45,7 +45,7 @@ Figures = dict[str, Interval]
 
 def mm_per_v(box: ObjectBox) -> float:
     """Millimetres of depth that one unit of v stands for."""
-    return 1000 * (box.z_far_m - box.z_near_m) / (1 - metrics.LEAST_V)
+    return 1000 * (box.z_far_m - box.z_near_m) / (1 - metrics.MIN_V)
 
 
 def per_object(image: Float32, truth: Float32, box: ObjectBox) -> PerObject:

@@ -19,7 +19,7 @@ from nlos_cam.render.effects import Effects
 from nlos_cam.render.planning import Prepared, plan
 from nlos_cam.render.renderer import Rendering, render, three_bounce
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_facts import Stage
+from nlos_cam.render.scene_facts import SceneFacts
 
 Part = Literal["stop", "sub_bins", "relay grid", "object_stride", "beams_per_cell", "effect left out"]
 
@@ -66,7 +66,7 @@ def settings(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> list[Settin
     ordered = sorted(stops.values(), key=lambda stop: stop.sub_bins > 0)
     columns, rows = standard.relay_columns, standard.relay_rows
     grids = [(max(int(columns * share), 1), max(int(rows * share), 1)) for share in (0.25, 0.5, 1, 2)]
-    called_for = [effect.name for effect in plan(Stage(scene, standard)) if effect.included]
+    called_for = [effect.name for effect in plan(SceneFacts(scene, standard)) if effect.included]
     return [
         *(Setting(stop.name, "stop", stop) for stop in ordered),
         *(Setting(f"sub_bins {n}", "sub_bins", replace(standard, sub_bins=n)) for n in (1, 2, 4, 8, 16, 32, 64)),

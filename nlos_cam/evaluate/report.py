@@ -25,7 +25,7 @@ from nlos_cam.evaluate.metrics import (
     per_object,
     plain,
 )
-from nlos_cam.files import renamed_when_whole
+from nlos_cam.files import atomic_directory
 
 SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
 SILHOUETTE_ERROR, DEPTH_ERROR = "1 - silhouette IoU", "foreground RMSE, mm"
@@ -108,7 +108,7 @@ def _by_shown(judgement: Judgement) -> dict[str, Any] | None:
 
 def write(folder: Path, judgement: Judgement, figures: Mapping[str, Any]) -> None:
     """The whole folder, in a folder that is there; what was in it is replaced once all is written."""
-    with renamed_when_whole(folder) as part:
+    with atomic_directory(folder) as part:
         (part / "figures.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
         _write_objects(part / "objects.csv", judgement)
         _draw(part, judgement)

@@ -28,7 +28,7 @@ FRAMES = 1, 4, 16
 THREADS = 1, 2
 CALIBRATING = 32
 """Training objects that the ranges of 8-bit activations are learnt from."""
-LEAST_CALLS = 50
+MIN_CALLS = 50
 """Few objects are reconstructed again and again, until there are so many calls to take the median of."""
 AS_GOOD = {
     "silhouette_iou": 0.005,
@@ -189,7 +189,7 @@ def _timed(
     reconstructor(both.depth_m[:1], both.intensity[:1])
     images: list[Float32] = []
     seconds: list[float] = []
-    for _ in range(-(-LEAST_CALLS // len(truth))):
+    for _ in range(-(-MIN_CALLS // len(truth))):
         images.clear()
         for depth_m, intensity in zip(both.depth_m, both.intensity, strict=True):
             started = clock()

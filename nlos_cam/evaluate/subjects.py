@@ -26,7 +26,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import baselines as trivial
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.benchmark import benchmark_objects
 from nlos_cam.objects.depth_map import image_from_depth
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.renderer import MultiBounce, render
@@ -151,7 +151,7 @@ def rig_of(record: CheckpointRecord) -> Rig:
 def fresh_objects(rig: Rig, count: int | None = None, tracked: Tracked = untracked) -> Judged:
     """The 54, or so many random objects, through the noise of the simulated camera on a rig."""
     plan = build.DatasetPlan(rig, build.TEST_SEED)
-    subjects = seeded_objects(plan.first_seed, count, plan.box) if count else test_set(plan.box)
+    subjects = seeded_objects(plan.first_seed, count, plan.box) if count else benchmark_objects(plan.box)
     with tracked("rendering test objects") as on_progress:
         echoes = echoes_of(subjects, rig, on_progress)
     maps = as_map_set(sense(echoes, rig), truth_of(subjects, plan.box))

@@ -27,9 +27,9 @@ from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.errors import BudgetError, RecordingError
 from nlos_cam.files import cache_folder
 from nlos_cam.live.loop import warm_up
-from nlos_cam.live.statistics import LiveReport
+from nlos_cam.live.statistics import RunReport
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.reconstruct.pipeline import Processing
+from nlos_cam.reconstruct.pipeline import Pipeline
 
 TRADEOFF = "tradeoff.json"
 """What `tradeoff reconstruct` writes; one lies beside the shipped weights."""
@@ -136,7 +136,7 @@ CALLS = 30
 LATE_PERCENT = 95
 
 
-Make = Callable[[Reconstructor, int], Processing]
+Make = Callable[[Reconstructor, int], Pipeline]
 """What is made of frames, by a network and the mean over so many frames."""
 
 
@@ -164,14 +164,14 @@ class Choice:
             f"RMSE {option.rmse_mm:.1f} mm, {cost}"
         )
 
-    def outcome(self, report: LiveReport) -> dict[str, Any]:
+    def outcome(self, report: RunReport) -> dict[str, Any]:
         """What became of it in a run, ready for JSON; the delay of averaging counts."""
         p95_ms = report.latency_ms["p95"] + self.option.averaging_ms
         option = self.option.model_dump(include={"name", "weights", "runtime", "threads", "frames"})
         figures = {"expected_ms": self.expected_ms, "rmse_mm": self.option.rmse_mm, "best_rmse_mm": self.best.rmse_mm}
         return {"ms": self.budget_ms, **option, **figures, "p95_ms": p95_ms, "kept": p95_ms <= self.budget_ms}
 
-    def outcome_told(self, report: LiveReport) -> str:
+    def outcome_told(self, report: RunReport) -> str:
         """The same in a line."""
         outcome = self.outcome(report)
         kept = "kept" if outcome["kept"] else "NOT kept"
@@ -191,7 +191,7 @@ def within_budget(
     options: Sequence[Option],
     make: Make,
     load: Callable[[Option], Reconstructor],
-    measure: Callable[[Processing], Timed],
+    measure: Callable[[Pipeline], Timed],
 ) -> tuple[Reconstructor, Choice]:
     """The networks of the setting that keeps the budget: chosen by the table, and then tried.
 
@@ -257,16 +257,16 @@ def loader(weights: Path | None, runtimes: Runtimes) -> Callable[[Option], Recon
     return load
 
 
-def timer(camera: Camera, clock: Clock = time.perf_counter) -> Callable[[Processing], Timed]:
+def timer(camera: Camera, clock: Clock = time.perf_counter) -> Callable[[Pipeline], Timed]:
     """Measures what is made of frames on this machine, as it is now; a first call, which allocates, is not counted."""
 
-    def measure(processing: Processing) -> Timed:
+    def measure(processing: Pipeline) -> Timed:
         warm_up(camera, processing)
         network_s, rest_s = np.empty(CALLS), np.empty(CALLS)
         for call in range(CALLS):
-            begun_s = clock()
+            start_s = clock()
             network_s[call] = warm_up(camera, processing, clock)["network"]
-            rest_s[call] = clock() - begun_s - network_s[call]
+            rest_s[call] = clock() - start_s - network_s[call]
         return Timed(*(1e3 * float(np.percentile(each, LATE_PERCENT)) for each in (network_s, rest_s)))
 
     return measure

@@ -18,11 +18,11 @@ import numpy as np
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.statistics import DELIVERY, LiveReport, OnWarning, Tally, say_nothing
-from nlos_cam.live.telemetry import Thermometer, thermometer_of
+from nlos_cam.live.statistics import DELIVERY, OnWarning, RunReport, RunStatistics, say_nothing
+from nlos_cam.live.telemetry import Telemetry, telemetry_of
 from nlos_cam.reconstruct.network import Clock, Reconstruction, reconstruct
-from nlos_cam.reconstruct.pipeline import Arrival, Processing, Seen, Step
-from nlos_cam.reconstruct.verdict import Verdict, amiss
+from nlos_cam.reconstruct.pipeline import Arrival, FrameResult, Pipeline, PreparedFrame
+from nlos_cam.reconstruct.verdict import Verdict, frame_issues
 from nlos_cam.view.viewer import Moment, Viewer
 
 
@@ -34,14 +34,14 @@ class Moments:
         viewer: Viewer,
         dropped: Callable[[], int],
         reader: FrameReader,
-        thermometer: Thermometer,
+        thermometer: Telemetry,
         clock: Clock,
     ) -> None:
         self._viewer, self._dropped, self._reader = viewer, dropped, reader
         self._thermometer, self._clock = thermometer, clock
         self._last: Moment | None = None
 
-    def show(self, step: Step) -> Moment:
+    def show(self, step: FrameResult) -> Moment:
         """Of one step, as it is shown."""
         stages_s = {**self._delivery_s(step), **step.stages_s}
         self._last = moment = Moment(
@@ -68,7 +68,7 @@ class Moments:
             again = replace(self._last, published_s=now_s, latency_s=age_s, verdict=verdict, dropped=self._dropped())
             self._viewer.show(again)
 
-    def _delivery_s(self, step: Step) -> dict[str, float]:
+    def _delivery_s(self, step: FrameResult) -> dict[str, float]:
         return {} if step.arrived_s is None else {DELIVERY: self._age_s(step.frame, step.arrived_s)}
 
     def _age_s(self, frame: Frame, now_s: float) -> float:
@@ -83,14 +83,14 @@ def in_words(counts: Mapping[str, int]) -> str:
 def watched(frames: Iterable[Frame], seen: Counter[str]) -> Iterator[Frame]:
     """The same frames; what is amiss with them is counted in `seen`."""
     for frame in frames:
-        seen.update(amiss(frame))
+        seen.update(frame_issues(frame))
         yield frame
 
 
 USUAL_DEPTH_M = 0.3
 
 
-def warm_up(camera: Camera, processing: Processing, clock: Clock = time.perf_counter) -> Mapping[str, float]:
+def warm_up(camera: Camera, processing: Pipeline, clock: Clock = time.perf_counter) -> Mapping[str, float]:
     """Reconstruct a frame that is all the same, before the camera is entered; seconds by stage.
 
     What is compiled or allocated on first use would otherwise hold up the first frame, and drop those after it.
@@ -104,17 +104,17 @@ def warm_up(camera: Camera, processing: Processing, clock: Clock = time.perf_cou
 
 def run_live(
     camera: Camera,
-    processing: Processing,
+    processing: Pipeline,
     viewer: Viewer,
     *,
     stop: Event,
     seconds: float | None = None,
     recorded: bool = False,
     clock: Clock = time.time,
-    on_error: Callable[[LiveReport], None] = lambda _: None,
+    on_error: Callable[[RunReport], None] = lambda _: None,
     on_warning: OnWarning = say_nothing,
     on_moment: Callable[[Moment], None] = lambda _: None,
-) -> LiveReport:
+) -> RunReport:
     """Reconstruct an entered camera's frames and show them, until it ends, `stop` is set, or `seconds` have passed.
 
     One that is `recorded` loses no frame and is shown at the speed it was recorded. A camera that keeps the loop's end
@@ -122,8 +122,8 @@ def run_live(
     `on_warning` hears when a warning begins and ends, `on_moment` of each frame's result once it is shown.
     Raises what the camera raises, and NlosCamError where none comes to a result, once `on_error` has had the report.
     """
-    tally = Tally(on_warning)
-    frames, thermometer = read_along(camera, camera)
+    tally = RunStatistics(on_warning)
+    frames, thermometer = with_telemetry(camera, camera)
     frames = watched(paced(frames, stop, clock) if recorded else frames, tally.seen)
 
     def enough() -> bool:
@@ -136,7 +136,7 @@ def run_live(
         if tally.stall.look(clock(), reader.newest_s):
             moments.stalled()
 
-    def report() -> LiveReport:
+    def report() -> RunReport:
         tally.stall.close(clock())
         return tally.report(camera, reader)
 
@@ -146,7 +146,7 @@ def run_live(
     moments = Moments(viewer, lambda: sum(tally.lost(camera, reader).values()), reader, thermometer, clock)
     try:
         with reader, processing.checks:
-            for step in steps(reader, processing, clock, tally.fail, thermometer):
+            for step in iterate_results(reader, processing, clock, tally.fail, thermometer):
                 moment = moments.show(step)
                 tally.add(step, clock() - step.published_s)
                 on_moment(moment)
@@ -170,7 +170,7 @@ FRAMES_TOGETHER = 4
 """Where nobody waits for them, the networks take so many frames at once: two thirds of the time for each."""
 
 
-MOST_AHEAD = 2
+MAX_BATCHES_AHEAD = 2
 """So many times as many are worked on while others are judged: for about as long as a physics check takes."""
 
 
@@ -183,76 +183,76 @@ def _refuse(frame: Frame, error: Exception, in_a_row: int) -> None:
     raise error
 
 
-def read_along(frames: Iterable[Frame], camera: Camera) -> tuple[Iterable[Frame], Thermometer]:
+def with_telemetry(frames: Iterable[Frame], camera: Camera) -> tuple[Iterable[Frame], Telemetry]:
     """The same frames, and the camera's thermometer, read as they pass."""
-    thermometer = thermometer_of(camera)
+    thermometer = telemetry_of(camera)
     return thermometer.watch(frames), thermometer
 
 
-def steps(
+def iterate_results(
     reader: FrameReader,
-    processing: Processing,
+    processing: Pipeline,
     clock: Clock = time.time,
     on_failure: OnFailure = _refuse,
-    thermometer: Thermometer | None = None,
-) -> Generator[Step]:
+    thermometer: Telemetry | None = None,
+) -> Generator[FrameResult]:
     """Reconstruct every frame that the reader gives, in order."""
-    begun_s, in_a_row = clock(), 0
+    start_s, in_a_row = clock(), 0
     for arrival in reader:
         try:
             _follow(thermometer, arrival, processing)
-            step = processing.step(arrival, clock, begun_s)
+            step = processing.step(arrival, clock, start_s)
         except Exception as error:  # noqa: BLE001  whatever an odd frame leads to, who called decides
             in_a_row += 1
             on_failure(arrival.frame, error, in_a_row)
         else:
             in_a_row = 0
             yield step
-        begun_s = clock()
+        start_s = clock()
 
 
-def steps_ahead(
-    reader: FrameReader, processing: Processing, clock: Clock = time.time, thermometer: Thermometer | None = None
-) -> Generator[Step]:
+def iterate_batched(
+    reader: FrameReader, processing: Pipeline, clock: Clock = time.time, thermometer: Telemetry | None = None
+) -> Generator[FrameResult]:
     """The same steps in the same order, for frames that nobody waits for: the networks take several at once.
 
     Which ones does not depend on how fast they come, so the same frames give the same bits. What one leads to ends it.
     """
-    ahead = deque[tuple[Sequence[Seen], Future[list[Reconstruction]]]]()
+    ahead = deque[tuple[Sequence[PreparedFrame], Future[list[Reconstruction]]]]()
     with ThreadPoolExecutor(os.cpu_count(), "networks") as threads:
-        for together in _lots(reader, processing, clock, thermometer):
+        for together in _batches(reader, processing, clock, thermometer):
             ahead.append((together, threads.submit(processing.reconstruct, together, clock)))
-            if len(ahead) > MOST_AHEAD:
+            if len(ahead) > MAX_BATCHES_AHEAD:
                 yield from _finished(*ahead.popleft(), processing, clock)
         for lot in ahead:
             yield from _finished(*lot, processing, clock)
 
 
-def _lots(
-    reader: FrameReader, processing: Processing, clock: Clock, thermometer: Thermometer | None
-) -> Generator[Sequence[Seen]]:
+def _batches(
+    reader: FrameReader, processing: Pipeline, clock: Clock, thermometer: Telemetry | None
+) -> Generator[Sequence[PreparedFrame]]:
     """What the lidar saw, FRAMES_TOGETHER at a time; fewer at the end."""
-    together, begun_s = list[Seen](), clock()
+    together, start_s = list[PreparedFrame](), clock()
     for arrival in reader:
         _follow(thermometer, arrival, processing)
-        together.append(processing.see(arrival, clock, begun_s))
+        together.append(processing.see(arrival, clock, start_s))
         if len(together) == FRAMES_TOGETHER:
             yield together
             together = []
-        begun_s = clock()
+        start_s = clock()
     if together:
         yield together
 
 
 def _finished(
-    together: Sequence[Seen], making: Future[list[Reconstruction]], processing: Processing, clock: Clock
-) -> Generator[Step]:
+    together: Sequence[PreparedFrame], making: Future[list[Reconstruction]], processing: Pipeline, clock: Clock
+) -> Generator[FrameResult]:
     """The steps of frames taken together, once they are made."""
     for seen, made in zip(together, making.result(), strict=True):
         yield processing.finish(seen, made, clock)
 
 
-def _follow(thermometer: Thermometer | None, arrival: Arrival, processing: Processing) -> None:
+def _follow(thermometer: Telemetry | None, arrival: Arrival, processing: Pipeline) -> None:
     """Have the bench follow the lidar's temperature."""
     if thermometer and (celsius := thermometer.at(arrival.frame)):
         processing.bench.look_at(celsius)

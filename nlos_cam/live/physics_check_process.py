@@ -23,7 +23,7 @@ from nlos_calibration.rig import Rig
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live.realtime import as_any_other
 from nlos_cam.reconstruct.network import Clock
-from nlos_cam.reconstruct.physics_check import Check, failure, log_warning
+from nlos_cam.reconstruct.physics_check import PhysicsCheckResult, failure, log_warning
 from nlos_cam.render.accuracy import Stop
 
 PERIOD_S = 1.0
@@ -32,7 +32,7 @@ END_WITHIN_S = 2.0
 """What has not ended by then is killed."""
 
 
-class BackgroundChecks:
+class BackgroundPhysicsCheck:
     """Checks the newest frame about once a period, in a process of its own while entered.
 
     `offer` returns at once. What is due while another is worked on waits, one frame at most: a newer one takes its
@@ -49,7 +49,7 @@ class BackgroundChecks:
         on_error: Callable[[str], None] = log_warning,
         command: Sequence[str] = WORKER,
     ) -> None:
-        self.newest: Check | None = None
+        self.newest: PhysicsCheckResult | None = None
         self.dropped = 0
         """Frames that were due, and that a newer one took the place of."""
         self._about, self._period_s, self._clock = (rig, accuracy), period_s, clock
@@ -124,7 +124,7 @@ class BackgroundChecks:
         while (frame := self._taken()) is not None:
             _send(asked, frame)
             answer = pickle.load(told)  # noqa: S301  of our own process, through a pipe that nobody else has
-            if isinstance(answer, Check):
+            if isinstance(answer, PhysicsCheckResult):
                 self.newest = answer
             else:
                 self._say(failure(frame[0], str(answer)))
@@ -169,7 +169,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-LEAST_URGENT = 19
+LOWEST_PRIORITY = 19
 """`nice` of the process: it gets what the loop leaves."""
 
 
@@ -204,7 +204,7 @@ def main() -> None:
     """Work for the parent, as little urgent as can be."""
     as_any_other()
     if hasattr(os, "nice"):
-        os.nice(LEAST_URGENT)
+        os.nice(LOWEST_PRIORITY)
     told, sys.stdout = sys.stdout.buffer, sys.stderr  # what anybody prints is no answer
     serve(sys.stdin.buffer, told, leave=lambda: os._exit(0))
 

@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import RecordingError
-from nlos_cam.files import renamed_when_whole
+from nlos_cam.files import atomic_directory
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.loop import in_words, read_along, steps_ahead
+from nlos_cam.live.loop import in_words, iterate_batched, with_telemetry
 from nlos_cam.live.replay_media import Looks, Samples, draw_sheet
 from nlos_cam.live.statistics import OnWarning, Warned, frames_by_verdict, say_nothing
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.network import Clock
 from nlos_cam.reconstruct.physics_check import UNEXPLAINED
-from nlos_cam.reconstruct.pipeline import Processing, Step
+from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline
 from nlos_cam.reconstruct.verdict import Verdict
 
 RESULT, DIFFERENCE, SHEET, REPORT = "reconstruction.npz", "difference.npz", "frames.png", "report.md"
@@ -79,7 +79,7 @@ class _Results:
         """Scores by the number of the frame that was checked."""
         self.samples, self.warned = Samples(SHEET_FRAMES), Warned(on_warning)
 
-    def add(self, step: Step) -> None:
+    def add(self, step: FrameResult) -> None:
         depth_m = step.reconstruction.depth_m
         self.hidden_m.add(depth_m)
         uncertainty_m = step.reconstruction.uncertainty_m
@@ -101,7 +101,7 @@ class _Results:
 
 def replay(
     camera: Camera,
-    processing: Processing,
+    processing: Pipeline,
     out: Path,
     *,
     stop: Event,
@@ -116,13 +116,13 @@ def replay(
     early and keeps what is done. Raises RecordingError for a recording without a whole frame, and what the camera
     raises.
     """
-    begun_s, bench = clock(), processing.bench
-    with renamed_when_whole(out) as part, ExitStack() as files:
+    start_s, bench = clock(), processing.bench
+    with atomic_directory(out) as part, ExitStack() as files:
         results = _Results(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
         looking = files.enter_context((looks or Looks(bench)).into(part))
-        frames, thermometer = read_along(camera, camera)
+        frames, thermometer = with_telemetry(camera, camera)
         with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader, processing.checks:
-            for step in steps_ahead(reader, processing, clock, thermometer):
+            for step in iterate_batched(reader, processing, clock, thermometer):
                 results.add(step)
                 looking.add(step, thermometer.celsius)
                 on_frame()
@@ -137,7 +137,7 @@ def replay(
         (out / DIFFERENCE).unlink(missing_ok=True)
     looking.forget_others(out)
     told = results.warned.frames(), frames_by_verdict(results.verdicts)
-    return ReplayReport(len(results.numbers), clock() - begun_s, str(out), *told)
+    return ReplayReport(len(results.numbers), clock() - start_s, str(out), *told)
 
 
 def _of_frames(results: _Results, rig: Rig) -> dict[str, Any]:
@@ -167,7 +167,7 @@ def _hidden(results: _Results, rig: Rig) -> dict[str, Any]:
     }
 
 
-def _difference(results: _Results, bench: Bench) -> dict[str, Any]:
+def _difference(results: _Results, bench: CalibratedRig) -> dict[str, Any]:
     return {
         "depth_m": results.difference_m.all(),
         "intensity": results.difference_intensity.all(),
@@ -175,7 +175,7 @@ def _difference(results: _Results, bench: Bench) -> dict[str, Any]:
     }
 
 
-def _report(camera: Camera, bench: Bench, results: _Results, *, stopped: bool) -> str:
+def _report(camera: Camera, bench: CalibratedRig, results: _Results, *, stopped: bool) -> str:
     frames, times_s, rig = len(results.numbers), results.timestamps_s, bench.rig
     lines = [
         f"# Replay of {camera.uri}",
@@ -205,7 +205,7 @@ def _checks_told(scores: Mapping[int, float]) -> list[str]:
     return [f"- physics check of {len(scores)} frames: {told}, {flagged} at {UNEXPLAINED:g} or more"]
 
 
-def _bench_told(bench: Bench, warned: Warned) -> list[str]:
+def _bench_told(bench: CalibratedRig, warned: Warned) -> list[str]:
     lines: list[str] = []
     if bench.reference:
         lines.append(f"- difference from the bare wall, the mean of {bench.reference.frames} frames: in `{DIFFERENCE}`")

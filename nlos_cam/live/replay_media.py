@@ -14,9 +14,9 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.reconstruct.pipeline import Step
-from nlos_cam.view.images import MOST_UNCERTAIN_M
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import FrameResult
+from nlos_cam.view.images import MAX_UNCERTAINTY_M
 from nlos_cam.view.viewer import Moment, Viewer
 
 
@@ -25,16 +25,16 @@ class Samples:
 
     def __init__(self, most: int) -> None:
         self._most, self._stride, self._seen = most, 1, 0
-        self._kept: list[Step] = []
+        self._kept: list[FrameResult] = []
 
-    def add(self, step: Step) -> None:
+    def add(self, step: FrameResult) -> None:
         if self._seen % self._stride == 0:
             self._kept.append(step)
         self._seen += 1
         if len(self._kept) > 2 * self._most:
             self._kept, self._stride = self._kept[::2], self._stride * 2
 
-    def chosen(self) -> list[Step]:
+    def chosen(self) -> list[FrameResult]:
         """At most `most` steps, first and last kept one included."""
         count = min(self._most, len(self._kept))
         return [self._kept[i] for i in np.linspace(0, len(self._kept) - 1, count).round().astype(int)]
@@ -47,7 +47,7 @@ VIEW, VIDEO, STILL, STILLS = "view.rrd", "replay.webm", "still-{:06d}.png", "sti
 class Looks:
     """What was asked for."""
 
-    bench: Bench
+    bench: CalibratedRig
     view: bool = False
     stills: int = 0
     video: bool = False
@@ -58,14 +58,14 @@ class Looks:
         with ExitStack() as entered:
             viewers: list[Viewer] = []
             if self.view:
-                from nlos_cam.view.rrd_file import SavedView
+                from nlos_cam.view.rrd_file import RrdFile
 
-                saved = SavedView(folder / VIEW, self.bench.rig, self.bench.measured, keeps_all=True)
+                saved = RrdFile(folder / VIEW, self.bench.rig, self.bench.measured, keeps_all=True)
                 viewers.append(entered.enter_context(saved))
             if self.video:
-                from nlos_cam.view.video import Film
+                from nlos_cam.view.video import VideoFile
 
-                viewers.append(entered.enter_context(Film(folder / VIDEO, self.bench.rig)))
+                viewers.append(entered.enter_context(VideoFile(folder / VIDEO, self.bench.rig)))
             looking = Looking(viewers, Samples(self.stills) if self.stills else None)
             yield looking
         if looking.samples:
@@ -93,7 +93,7 @@ class Looking:
             if path.name not in self.made:
                 path.unlink()
 
-    def add(self, step: Step, celsius: Mapping[str, float]) -> None:
+    def add(self, step: FrameResult, celsius: Mapping[str, float]) -> None:
         if self._viewers:
             moment = moment_of(step, celsius)
             for viewer in self._viewers:
@@ -106,7 +106,7 @@ def _looks_in(folder: Path) -> list[Path]:
     return [folder / name for name in (VIEW, VIDEO) if (folder / name).exists()] + list(folder.glob(STILLS))
 
 
-def moment_of(step: Step, celsius: Mapping[str, float] = MappingProxyType({})) -> Moment:
+def moment_of(step: FrameResult, celsius: Mapping[str, float] = MappingProxyType({})) -> Moment:
     """A step of a recording at the time when it was recorded; its latency is what its own stages took."""
     took_s = sum(seconds for name, seconds in step.stages_s.items() if name != "wait")
     return Moment(
@@ -127,7 +127,7 @@ USUAL_PERCENT = 95
 Images = list[NDArray[np.float32]]
 
 
-def draw_sheet(path: Path, chosen: list[Step]) -> None:
+def draw_sheet(path: Path, chosen: list[FrameResult]) -> None:
     """A picture of some frames, one column each with its verdict: lidar depth, infrared, difference, hidden depth.
 
     And its uncertainty; what there is none of is left out.
@@ -147,7 +147,7 @@ def draw_sheet(path: Path, chosen: list[Step]) -> None:
     figure.savefig(path, dpi=80)
 
 
-def _looks(chosen: list[Step]) -> dict[str, tuple[str, tuple[float, float], Images]]:
+def _looks(chosen: list[FrameResult]) -> dict[str, tuple[str, tuple[float, float], Images]]:
     """The rows of the sheet: by title, their colours, limits and images."""
     depths_m, intensities = [step.maps.depth_m for step in chosen], [step.maps.intensity for step in chosen]
     differences_mm = [1e3 * step.difference.depth_m for step in chosen if step.difference]
@@ -162,7 +162,7 @@ def _looks(chosen: list[Step]) -> dict[str, tuple[str, tuple[float, float], Imag
         "infrared (counts)": ("gray", _limits(intensities), intensities),
         "difference (mm)": ("coolwarm", _even_limits(differences_mm), differences_mm),
         "hidden depth (m)": ("inferno_r", _limits(hidden_m), hidden_m),
-        "uncertainty (mm)": ("viridis", (0.0, 1e3 * MOST_UNCERTAIN_M), uncertainties_mm),
+        "uncertainty (mm)": ("viridis", (0.0, 1e3 * MAX_UNCERTAINTY_M), uncertainties_mm),
     }
     return {title: look for title, look in looks.items() if look[2]}
 

@@ -18,7 +18,7 @@ from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
 from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.reconstruct.pipeline import Step
+from nlos_cam.reconstruct.pipeline import FrameResult
 from nlos_cam.reconstruct.verdict import Verdict
 
 REMEMBERED = 100_000
@@ -110,7 +110,7 @@ class StallWatch:
             self._since_s = None
 
 
-MOST_FAILED = 30
+MAX_FAILED_IN_A_ROW = 30
 """Frames in a row that come to no result: so many are not the frames' fault."""
 OUTSIDE_LATENCY = "wait", "view"
 """Stages before a frame's arrival and after its result: the others are parts of its latency."""
@@ -149,7 +149,7 @@ class Warned:
         self._held: dict[str, Held] = {}
         self._on_warning, self._now = on_warning, set[str]()
 
-    def add(self, step: Step) -> None:
+    def add(self, step: FrameResult) -> None:
         number, before = step.frame.frame_number, self._now
         self._now = {self._note(warning, number) for warning in step.warnings}
         for subject, held in self._held.items():
@@ -174,7 +174,7 @@ class Warned:
 
 
 @dataclass(frozen=True)
-class LiveReport:
+class RunReport:
     """What a live run did. Start-up, until the first frame's result, is in no figure."""
 
     frames: int
@@ -199,8 +199,8 @@ class LiveReport:
     """For how long, in all, the camera gave no frame; see `stall`."""
 
 
-class Tally:
-    """Collects what LiveReport tells, in memory that does not grow with the frames."""
+class RunStatistics:
+    """Collects what RunReport tells, in memory that does not grow with the frames."""
 
     def __init__(self, on_warning: OnWarning = say_nothing) -> None:
         self.warned = Warned(on_warning)
@@ -215,7 +215,7 @@ class Tally:
         """With latency and delivery as by two clocks, the frames' and the loop's."""
         self._first_s = self._last_s = 0.0
 
-    def add(self, step: Step, view_s: float) -> None:
+    def add(self, step: FrameResult, view_s: float) -> None:
         if self.frames == 0:
             self._first_s = step.published_s
         self.frames += 1
@@ -230,12 +230,12 @@ class Tally:
             self.verdicts[step.verdict] += 1
 
     def fail(self, frame: Frame, error: Exception, in_a_row: int) -> None:
-        """Count a frame that came to no result. Raises an error that is not the frame's, and after MOST_FAILED."""
+        """Count a frame that came to no result. Raises an error that is not the frame's, and after MAX_FAILED_IN_A_ROW."""
         if isinstance(error, NlosCamError):
             raise error
         self.failed += 1
         what = f"{type(error).__name__}: {error}"
-        if in_a_row >= MOST_FAILED:
+        if in_a_row >= MAX_FAILED_IN_A_ROW:
             message = f"{in_a_row} frames in a row came to no result ({what}): record some with `capture`, report it"
             raise NlosCamError(message) from error
         log.warning("frame %d came to no result (%s)", frame.frame_number, what)
@@ -249,7 +249,7 @@ class Tally:
         lost = {"incomplete": camera.incomplete, "dropped_camera": camera.dropped, "dropped_loop": len(reader.dropped)}
         return {**lost, "failed": self.failed}
 
-    def report(self, camera: Camera, reader: FrameReader) -> LiveReport:
+    def report(self, camera: Camera, reader: FrameReader) -> RunReport:
         stages = self._percentiles_ms(reader.offset_s)
         latency_ms = stages.pop(LATENCY)
         stages_ms = {name: stage["p50"] for name, stage in stages.items()}
@@ -258,7 +258,7 @@ class Tally:
         lost = self.lost(camera, reader)
         counts = {**camera.counts, **lost, **self.seen, "stalls": self.stall.stalls}
         told = {name: count for name, count in counts.items() if count}
-        report = LiveReport(self.frames, fps, sum(lost.values()), latency_ms, stages_ms, told, self.warned.frames())
+        report = RunReport(self.frames, fps, sum(lost.values()), latency_ms, stages_ms, told, self.warned.frames())
         return replace(
             report,
             stages_percentiles_ms=stages,

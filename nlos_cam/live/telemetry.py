@@ -16,7 +16,7 @@ Celsius = Mapping[str, float]
 log = logging.getLogger(__name__)
 
 
-class Thermometer:
+class Telemetry:
     """Reads temperatures, by `read` of the seconds since the first frame, in the thread that reads the frames.
 
     Asking a real device takes time on its link: it is done every `every_s` of the frames' time, and not by who
@@ -48,11 +48,11 @@ class Thermometer:
         return newest
 
 
-def thermometer_of(camera: Camera) -> Thermometer:
+def telemetry_of(camera: Camera) -> Telemetry:
     """Of a device, or of the sidecar that lies beside a recording."""
     path = sidecar_path(Path(camera.uri.removeprefix(RECORDED)))
     if not camera.uri.startswith(RECORDED) or not path.is_file():
-        return Thermometer(lambda _: camera.telemetry("_temperature"))
+        return Telemetry(lambda _: camera.telemetry("_temperature"))
     try:
         series = load_sidecar(path).temperatures
     except RecordingError as error:
@@ -62,4 +62,4 @@ def thermometer_of(camera: Camera) -> Thermometer:
     def recorded(time_s: float) -> Celsius:
         return next((look.celsius for look in reversed(series) if look.time_s <= time_s), {})
 
-    return Thermometer(recorded)
+    return Telemetry(recorded)

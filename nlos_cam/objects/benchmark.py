@@ -38,12 +38,12 @@ class FixedObject:
     """(64, 64), NaN for background."""
 
 
-def test_set(box: ObjectBox) -> list[FixedObject]:
+def benchmark_objects(box: ObjectBox) -> list[FixedObject]:
     """The 54 objects in the order of the categories: the same bits in every run."""
     return list(_objects(box))
 
 
-test_set.__test__ = False  # pyright: ignore[reportFunctionMemberAccess]  (its name is no test's, whatever pytest thinks)
+benchmark_objects.__test__ = False  # pyright: ignore[reportFunctionMemberAccess]  (its name is no test's, whatever pytest thinks)
 
 
 def _objects(box: ObjectBox) -> Iterator[FixedObject]:

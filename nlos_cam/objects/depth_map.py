@@ -7,7 +7,7 @@ import numba
 import numpy as np
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
-from nlos_models.metrics import BACKGROUND_BELOW_V, LEAST_V
+from nlos_models.metrics import BACKGROUND_BELOW_V, MIN_V
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
@@ -23,13 +23,13 @@ def object_box(rig: Rig) -> ObjectBox:
 
 def image_from_depth(depth_m: NDArray[np.floating], box: ObjectBox) -> Float32:
     """Depth (..., 64, 64) in metres, NaN for background, as v: 0 background, else 0.1 (far) to 1 (near the wall)."""
-    v = LEAST_V + (1 - LEAST_V) * (box.z_far_m - depth_m) / (box.z_far_m - box.z_near_m)
-    return np.where(np.isnan(depth_m), 0.0, np.clip(v, LEAST_V, 1.0)).astype(np.float32)
+    v = MIN_V + (1 - MIN_V) * (box.z_far_m - depth_m) / (box.z_far_m - box.z_near_m)
+    return np.where(np.isnan(depth_m), 0.0, np.clip(v, MIN_V, 1.0)).astype(np.float32)
 
 
 def depth_from_image(v: NDArray[np.floating], box: ObjectBox) -> Float32:
     """The way back: v (..., 64, 64) as depth in metres, NaN where v < 0.05."""
-    share = np.clip((v - LEAST_V) / (1 - LEAST_V), 0.0, 1.0)
+    share = np.clip((v - MIN_V) / (1 - MIN_V), 0.0, 1.0)
     depth_m = box.z_far_m - share * (box.z_far_m - box.z_near_m)
     return np.where(v < BACKGROUND_BELOW_V, np.nan, depth_m).astype(np.float32)
 

@@ -89,14 +89,14 @@ def _number(seen: int, back: re.Match[bytes]) -> bytes:
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply")
 DEPTH_MAP_SUFFIX = ".npy"
-MOST_FACES = 2_000_000
+MAX_FACES = 2_000_000
 """So many are read in 2 s (binary .stl) to 16 s (.ply as text) and placed in 4 s, on two busy cores."""
-MOST_BYTES = 2**28
+MAX_BYTES = 2**28
 """A quarter of a gibibyte: as text, .stl takes 300 bytes a face, and four times that in memory while it is read."""
 LARGEST = 1e30
 """Of a vertex's coordinates, in whatever unit: their squares stay finite."""
 _FEWER = "reduce the mesh, or save it as binary"
-LEAST_CELLS, MOST_CELLS = 8, 256
+MIN_CELLS, MAX_CELLS = 8, 256
 DEEPEST_M = 10.0
 """No bench is deeper; a depth map in millimetres is."""
 
@@ -120,8 +120,8 @@ def read_mesh(path: Path) -> MeshFile:
     if suffix not in MESH_SUFFIXES:
         raise SceneError(f"{path} is no mesh: give a file that ends in {', '.join(MESH_SUFFIXES)}")
     with _readable(path, f"{suffix} file", "export it again, as triangles"):
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise SceneError(f"{path} has {size / 2**20:.0f} MiB: at most {MOST_BYTES >> 20} are read; {_FEWER}")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise SceneError(f"{path} has {size / 2**20:.0f} MiB: at most {MAX_BYTES >> 20} are read; {_FEWER}")
         content = path.read_bytes()
         parts = _parts(content, suffix)
         triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
@@ -147,8 +147,8 @@ def read_depth_map(path: Path) -> Float32:
         stored = np.lib.format.open_memmap(path, mode="r")  # no pickles; a header that claims too much costs nothing
     if stored.dtype.kind not in "fiu":
         raise SceneError(f"{path} holds {stored.dtype} values: a depth map holds real numbers, in metres")
-    if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or not LEAST_CELLS <= len(stored) <= MOST_CELLS:
-        size = f"(n, n) with n from {LEAST_CELLS} to {MOST_CELLS}"
+    if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or not MIN_CELLS <= len(stored) <= MAX_CELLS:
+        size = f"(n, n) with n from {MIN_CELLS} to {MAX_CELLS}"
         raise SceneError(f"{path} has shape {stored.shape}: a depth map has shape {size}")
     surface = stored[~np.isnan(stored)]
     if surface.size and not (surface.min() >= 0 and surface.max() <= DEEPEST_M):
@@ -208,8 +208,8 @@ def _problem(triangles: Float64) -> str:
     """Why nobody could place triangles (n, 3, 3); empty where one can."""
     if not len(triangles):
         return "has no faces: it is empty, cut short or a point cloud; export a mesh of triangles"
-    if len(triangles) > MOST_FACES:
-        return f"has {len(triangles)} faces: at most {MOST_FACES} are rendered; {_FEWER}"
+    if len(triangles) > MAX_FACES:
+        return f"has {len(triangles)} faces: at most {MAX_FACES} are rendered; {_FEWER}"
     if not np.abs(triangles).max() <= LARGEST:  # false for NaN too
         return f"has a vertex that is NaN, infinite or beyond {LARGEST:g}: repair or export it again"
     extent = np.ptp(triangles.reshape(-1, 3), axis=0).max()

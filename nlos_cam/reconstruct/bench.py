@@ -15,12 +15,12 @@ from nlos_calibration.wall_record import MeasuredWall, WallRecord, load_measured
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.frames import Frame, LidarMaps
 
-MOST_APART_PIXELS = 0.25
+MAX_INTRINSICS_MISMATCH_PX = 0.25
 """By which a beam of the camera may miss the pixel that it was measured at: 0.14 mm of depth at 0.25 m, 45 degrees."""
 
 
 @dataclass(frozen=True)
-class Look:
+class BenchObservation:
     """What the bench makes of a frame."""
 
     difference: LidarMaps | None
@@ -30,7 +30,7 @@ class Look:
     """Whether the lidar has moved, or no longer sees the wall where it was."""
 
 
-class Bench:
+class CalibratedRig:
     """A rig and, where the wall was measured, what is known of it. One thread looks at frames, in their order."""
 
     def __init__(self, rig: Rig, measured: MeasuredWall | None = None, notes: tuple[str, ...] = ()) -> None:
@@ -47,13 +47,13 @@ class Bench:
         if self._drift:
             self._drift.look_at(celsius)
 
-    def look(self, frame: Frame, maps: LidarMaps) -> Look:
+    def look(self, frame: Frame, maps: LidarMaps) -> BenchObservation:
         """The difference of the maps, which need not be of this frame alone, and what has drifted up to this frame."""
         if self.reference is None or self._drift is None:
-            return Look(None, self.notes)
+            return BenchObservation(None, self.notes)
         self._drift.look(frame.depth_m, frame.settings)
         difference = self._levelled(difference_of(maps, self.reference))
-        return Look(difference, self.notes + self._drift.warnings, self._drift.moved)
+        return BenchObservation(difference, self.notes + self._drift.warnings, self._drift.moved)
 
     def _levelled(self, difference: LidarMaps) -> LidarMaps:
         """The difference less what the range has drifted by over the last second, if it has drifted alike everywhere.
@@ -78,18 +78,18 @@ def difference_of(maps: LidarMaps, reference: BareWall) -> LidarMaps:
     return LidarMaps(depth_m, np.where(valid, maps.intensity - reference.map_intensity, np.float32(0.0)), valid)
 
 
-def open_bench(wall: Path | None, camera: Camera) -> Bench:
+def open_bench(wall: Path | None, camera: Camera) -> CalibratedRig:
     """The bench of a wall record, else the camera's own where that can hide something, else the paper's.
 
     Raises RecordFileError, and CalibrationError where the record is of a wall that another camera sees.
     """
     if wall is None:
-        return Bench(camera.rig if camera.rig and camera.rig.object_box else load_rig("paper-rig"))
+        return CalibratedRig(camera.rig if camera.rig and camera.rig.object_box else load_rig("paper-rig"))
     measured = load_measured(wall)
     known = [measured.record.rig.pinhole, *([measured.reference.intrinsics] if measured.reference else [])]
     for intrinsics in known:
         check_intrinsics(intrinsics, camera.intrinsics)
-    return Bench(measured.record.rig, measured, _notes(measured.record, camera))
+    return CalibratedRig(measured.record.rig, measured, _notes(measured.record, camera))
 
 
 def check_intrinsics(measured: Intrinsics, given: Intrinsics) -> None:
@@ -101,7 +101,7 @@ def check_intrinsics(measured: Intrinsics, given: Intrinsics) -> None:
             "halves the size), or calibrate the wall again"
         )
     apart = _apart_pixels(measured, given)
-    if not apart <= MOST_APART_PIXELS:  # NaN is not
+    if not apart <= MAX_INTRINSICS_MISMATCH_PX:  # NaN is not
         raise CalibrationError(
             f"the wall was measured with other intrinsics (fx {measured.fx:.2f}, ppx {measured.ppx:.2f}) than the "
             f"camera's (fx {given.fx:.2f}, ppx {given.ppx:.2f}), {apart:.1f} pixels apart: calibrate the wall with "

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, Rig
-from nlos_models.doubt_checkpoint import Doubter
-from nlos_models.metrics import LEAST_V
+from nlos_models.doubt_checkpoint import UncertaintyModel
+from nlos_models.metrics import MIN_V
 from numpy.typing import NDArray
 
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps
@@ -32,10 +32,10 @@ class Doubt:
     """(64, 64): probability that there is a surface."""
 
 
-def doubt_of(doubter: Doubter, maps: LidarMaps, image: Float32, box: ObjectBox) -> Doubt:
+def doubt_of(doubter: UncertaintyModel, maps: LidarMaps, image: Float32, box: ObjectBox) -> Doubt:
     """The doubt of an image (64, 64) in v that networks made of maps."""
     said = doubter(*(array[None] for array in (maps.depth_m, maps.intensity, image)))
-    error_m = said.error_v[0] * ((box.z_far_m - box.z_near_m) / (1 - LEAST_V))
+    error_m = said.error_v[0] * ((box.z_far_m - box.z_near_m) / (1 - MIN_V))
     return Doubt(float(said.nothing[0]), float(said.outside[0]), error_m, said.surface[0])
 
 
@@ -83,7 +83,7 @@ def reconstruct(
     rig: Rig,
     network: Network,
     clock: Clock = time.perf_counter,
-    doubter: Doubter | None = None,
+    doubter: UncertaintyModel | None = None,
 ) -> Reconstruction:
     """The hidden depth behind one frame's maps, and its doubt. Raises SceneError for a rig without an object box."""
     return reconstruct_all([maps], rig, network, clock, doubter)[0]
@@ -94,16 +94,16 @@ def reconstruct_all(
     rig: Rig,
     network: Network,
     clock: Clock = time.perf_counter,
-    doubter: Doubter | None = None,
+    doubter: UncertaintyModel | None = None,
 ) -> list[Reconstruction]:
     """The hidden depth behind each of several frames' maps, and its doubt; an equal share of the networks' time each.
 
     Raises SceneError for a rig without an object box.
     """
     box = object_box(rig)
-    begun_s = clock()
+    start_s = clock()
     images = _images(several, network)
-    each_s = (clock() - begun_s) / len(several)
+    each_s = (clock() - start_s) / len(several)
     made = zip(several, images, strict=True)
     return [_doubted(_found(image, box, each_s), maps, image, doubter, box, clock) for maps, image in made]
 
@@ -126,11 +126,16 @@ def _found(image: Float32, box: ObjectBox, network_s: float) -> Reconstruction:
 
 
 def _doubted(
-    found: Reconstruction, maps: LidarMaps, image: Float32, doubter: Doubter | None, box: ObjectBox, clock: Clock
+    found: Reconstruction,
+    maps: LidarMaps,
+    image: Float32,
+    doubter: UncertaintyModel | None,
+    box: ObjectBox,
+    clock: Clock,
 ) -> Reconstruction:
     if doubter is None:
         return found
-    begun_s = clock()
+    start_s = clock()
     doubt = doubt_of(doubter, maps, image, box)
-    timings_s = {**found.timings_s, "doubt": clock() - begun_s}
+    timings_s = {**found.timings_s, "doubt": clock() - start_s}
     return replace(found, uncertainty_m=doubt.error_m, timings_s=timings_s, doubt=doubt)

@@ -9,10 +9,10 @@ seen, and the one that explains it better counts. With r = seen less expected an
     h = (depth r / s)^2 + (log intensity r / s)^2 + (log of how much the other echo is stronger / s)^2
     cost = h / (1 + h)                          0 explained, 1 not at all; and the mean of it over the cells
     score = (cost - NOISE_COST) / (cost of the bare bench - NOISE_COST), the one above at least 0, the one below at
-            least LEAST_UNEXPLAINED
+            least MIN_UNEXPLAINED
 
 Two things are not known beforehand and fitted: the device's gain, from the cells that show the bare wall, and the
-object's albedo, to within a factor of MOST_ALBEDO, as the one of the least cost. A wider range of albedos would explain
+object's albedo, to within a factor of MAX_ALBEDO, as the one of the least cost. A wider range of albedos would explain
 any object that is not there as a dark one.
 
 The physics check itself: a reconstruction rendered again, through the expected sensor, against the lidar's maps.
@@ -55,7 +55,7 @@ def failure(frame_number: int, what: str) -> str:
 
 
 @dataclass(frozen=True)
-class Check:
+class PhysicsCheckResult:
     """What one frame's check found."""
 
     frame_number: int
@@ -72,10 +72,10 @@ class Check:
     """Of the object, against what the networks were trained on: the one that explains the maps best."""
 
 
-class Checks(Protocol):
-    """Checks some of the frames that it is shown, beside the loop or in its midst, while it is entered."""
+class PhysicsCheck(Protocol):
+    """PhysicsCheck some of the frames that it is shown, beside the loop or in its midst, while it is entered."""
 
-    newest: Check | None
+    newest: PhysicsCheckResult | None
     """None until there is one."""
 
     def __enter__(self) -> Self: ...
@@ -87,10 +87,10 @@ class Checks(Protocol):
         ...
 
 
-class NoChecks:
+class NullPhysicsCheck:
     """For loops that nothing is checked of."""
 
-    newest: Check | None = None
+    newest: PhysicsCheckResult | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -108,10 +108,10 @@ ECHO_TOLERANCE_M = 0.01
 """Of a three-bounce echo's depth: two bins, and the least that reconstructions err by."""
 LOG_TOLERANCE = 0.6
 """Of an intensity's logarithm, a factor of 1.8: what distance and slope of a reconstruction err by."""
-MOST_ALBEDO, ALBEDOS = 4 / 3, 5
+MAX_ALBEDO, ALBEDOS = 4 / 3, 5
 NOISE_COST = 0.006
 """What the sensor's noise, and cells of many pixels, leave of a bare bench that is explained."""
-LEAST_UNEXPLAINED = 0.02
+MIN_UNEXPLAINED = 0.02
 """With less than this left by a bare bench nothing is to be explained. Objects leave 0.14 or more."""
 FEWEST_BARE = 50
 """Cells that show the bare wall, for them to tell the gain."""
@@ -155,10 +155,10 @@ class Explanation:
 def explanation(seen: LidarMaps, expected: Expected, bare: Expected) -> Explanation:
     """The best explanation of maps by an object, against that of the bare bench."""
     gain = fitted_gain(seen, bare)
-    albedos = np.geomspace(1 / MOST_ALBEDO, MOST_ALBEDO, ALBEDOS) if (expected.echo > 0).any() else np.ones(1)
+    albedos = np.geomspace(1 / MAX_ALBEDO, MAX_ALBEDO, ALBEDOS) if (expected.echo > 0).any() else np.ones(1)
     costs = [mean_cost(seen, expected, gain, albedo) for albedo in albedos]
     best = int(np.argmin(costs))
-    unexplained = max(mean_cost(seen, bare, gain, 1.0) - NOISE_COST, LEAST_UNEXPLAINED)
+    unexplained = max(mean_cost(seen, bare, gain, 1.0) - NOISE_COST, MIN_UNEXPLAINED)
     return Explanation(max(costs[best] - NOISE_COST, 0.0) / unexplained, float(albedos[best]), gain)
 
 
@@ -224,13 +224,13 @@ def check(
     frame_number: int = 0,
     accuracy: Stop = "standard",
     clock: Clock = time.perf_counter,
-) -> Check:
+) -> PhysicsCheckResult:
     """Render a hidden depth (64, 64) again, and hold what a lidar would see of it against the maps that it gave.
 
     Without any surface, and on a rig without an object box, the bare bench is held against them. The depth of the maps
     is that of the rig: what the lidar is known to lack was added (`Bench.corrected`).
     """
-    begun_s = clock()
+    start_s = clock()
     bare = _bare(rig)  # pyright: ignore[reportArgumentType]  frozen, so hashable
     hides = depth_m is not None and rig.object_box is not None and bool(np.isfinite(depth_m).any())
     expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare) if hides else bare
@@ -238,7 +238,7 @@ def check(
     rendered_m, rendered = expected.seen(best.albedo, best.gain)
     seen_m = np.where(maps.valid, maps.depth_m, np.float32(np.nan))
     residuals = seen_m - rendered_m, maps.intensity - rendered
-    return Check(frame_number, *residuals, best.score, clock() - begun_s, best.albedo)
+    return PhysicsCheckResult(frame_number, *residuals, best.score, clock() - start_s, best.albedo)
 
 
 @lru_cache(maxsize=4)
@@ -259,7 +259,7 @@ def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected
 
 
 class EveryFrames:
-    """Checks every so many frames on the spot: of the same frames always the same ones, to the bit.
+    """PhysicsCheck every so many frames on the spot: of the same frames always the same ones, to the bit.
 
     `on_error` hears of the first check that fails.
     """
@@ -272,7 +272,7 @@ class EveryFrames:
         accuracy: Stop = "standard",
         on_error: Callable[[str], None] = log_warning,
     ) -> None:
-        self.newest: Check | None = None
+        self.newest: PhysicsCheckResult | None = None
         self._rig, self._every, self._offered = rig, every, 0
         self._accuracy: Stop = accuracy
         self._on_error, self._said = on_error, False
@@ -284,7 +284,7 @@ class EveryFrames:
         pass
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
-        """Check this frame if it is one of those."""
+        """PhysicsCheckResult this frame if it is one of those."""
         self._offered += 1
         if (self._offered - 1) % self._every:
             return

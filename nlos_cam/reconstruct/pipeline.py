@@ -11,15 +11,15 @@ from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_calibration.rig import Rig, load_rig
 from nlos_calibration.rig_check import rig_difference
 from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.doubt_checkpoint import Doubter, load_doubter
+from nlos_models.doubt_checkpoint import UncertaintyModel, load_uncertainty_model
 from nlos_models.inference import Reconstructor, load_reconstructor
 
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
-from nlos_cam.reconstruct.bench import Bench, Look
+from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.network import Clock, Network, Reconstruction, reconstruct_all
-from nlos_cam.reconstruct.physics_check import UNEXPLAINED, Check, Checks, NoChecks
-from nlos_cam.reconstruct.verdict import Judge, Limits, Signs, Verdict, amiss
+from nlos_cam.reconstruct.physics_check import UNEXPLAINED, NullPhysicsCheck, PhysicsCheck, PhysicsCheckResult
+from nlos_cam.reconstruct.verdict import FrameConditions, Verdict, VerdictFilter, VerdictLimits, frame_issues
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Arrival:
 
 
 @dataclass(frozen=True)
-class Step:
+class FrameResult:
     """One frame's way through the loop."""
 
     frame: Frame
@@ -44,26 +44,26 @@ class Step:
     warnings: tuple[str, ...] = ()
     verdict: Verdict | None = None
     """None from networks that do not tell."""
-    check: Check | None = None
+    check: PhysicsCheckResult | None = None
     """The newest physics check, of this frame or an earlier one."""
     arrived_s: float | None = None
     """When the loop's reader had the frame."""
 
 
 @dataclass(frozen=True)
-class Seen:
+class PreparedFrame:
     """A frame, and what the networks eat of it."""
 
     arrival: Arrival
     maps: LidarMaps
-    look: Look
+    look: BenchObservation
     corrected: LidarMaps
     """Raw maps with the range that the lidar is known to lack added."""
     eaten: LidarMaps
     stages_s: Mapping[str, float]
 
 
-class Processing:
+class Pipeline:
     """What is made of a camera's frames, in their order: maps, their difference from the bare wall, the hidden depth.
 
     Maps are the mean over the last `average` frames. With a doubt network each reconstruction has an uncertainty and a
@@ -74,30 +74,30 @@ class Processing:
 
     def __init__(
         self,
-        bench: Bench,
+        bench: CalibratedRig,
         network: Network,
         *,
         eats_difference: bool = False,
         average: int = 1,
-        doubter: Doubter | None = None,
-        checks: Checks | None = None,
+        doubter: UncertaintyModel | None = None,
+        checks: PhysicsCheck | None = None,
     ) -> None:
         if eats_difference and bench.reference is None:
             raise CalibrationError(
                 "these weights eat difference maps: give --wall with a reference (calibrate the wall again)"
             )
         self.bench, self.network, self.doubter = bench, network, doubter
-        self._judge = Judge(limits_of(doubter) if doubter else None)
-        self.checks = checks or NoChecks()
+        self._judge = VerdictFilter(limits_of(doubter) if doubter else None)
+        self.checks = checks or NullPhysicsCheck()
         self._eats_difference, self._mean = eats_difference, MapMean(average)
 
-    def step(self, arrival: Arrival, clock: Clock, begun_s: float) -> Step:
-        """All of it, for one frame that is waited for since `begun_s`."""
-        seen = self.see(arrival, clock, begun_s)
+    def step(self, arrival: Arrival, clock: Clock, start_s: float) -> FrameResult:
+        """All of it, for one frame that is waited for since `start_s`."""
+        seen = self.see(arrival, clock, start_s)
         (made,) = self.reconstruct([seen], clock)
         return self.finish(seen, made, clock)
 
-    def see(self, arrival: Arrival, clock: Clock, begun_s: float) -> Seen:
+    def see(self, arrival: Arrival, clock: Clock, start_s: float) -> PreparedFrame:
         """What the lidar saw, up to what the networks eat; frames in their order."""
         got_s = clock()
         maps = maps_from_frame(arrival.frame)
@@ -105,37 +105,37 @@ class Processing:
         maps = self._mean.add(maps)
         look = self.bench.look(arrival.frame, maps)
         looked_s = clock()
-        stages_s = {"wait": got_s - begun_s, "queue": got_s - arrival.arrived_s}
+        stages_s = {"wait": got_s - start_s, "queue": got_s - arrival.arrived_s}
         stages_s |= {"maps": mapped_s - got_s, "bench": looked_s - mapped_s}
         corrected = self.bench.corrected(maps)
         eaten = look.difference if self._eats_difference and look.difference else corrected
-        return Seen(arrival, maps, look, corrected, eaten, stages_s)
+        return PreparedFrame(arrival, maps, look, corrected, eaten, stages_s)
 
-    def reconstruct(self, several: Sequence[Seen], clock: Clock) -> list[Reconstruction]:
+    def reconstruct(self, several: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
         """What the networks make of each, and of no other frame: what it takes does not change, nor is it changed."""
         eaten = [seen.eaten for seen in several]
         return reconstruct_all(eaten, self.bench.rig, self.network, clock, self.doubter)
 
-    def finish(self, seen: Seen, made: Reconstruction, clock: Clock) -> Step:
+    def finish(self, seen: PreparedFrame, made: Reconstruction, clock: Clock) -> FrameResult:
         """What is shown of it, and what is said; frames in their order."""
         frame, look = seen.arrival.frame, seen.look
         shown, verdict = self._judge.look(made, signs_of(frame, look, self.checks.newest))
         self.checks.offer(frame.frame_number, seen.corrected, shown.depth_m)
         stages_s = {**seen.stages_s, **made.timings_s}
         told = shown, clock(), stages_s, look.difference, look.warnings, verdict
-        return Step(frame, seen.maps, *told, check=self.checks.newest, arrived_s=seen.arrival.arrived_s)
+        return FrameResult(frame, seen.maps, *told, check=self.checks.newest, arrived_s=seen.arrival.arrived_s)
 
 
-def limits_of(doubter: Doubter) -> Limits:
+def limits_of(doubter: UncertaintyModel) -> VerdictLimits:
     """The limits that a doubt network was calibrated with."""
-    return Limits(doubter.record.nothing_above, doubter.record.outside_above, UNEXPLAINED)
+    return VerdictLimits(doubter.record.nothing_above, doubter.record.outside_above, UNEXPLAINED)
 
 
-def signs_of(frame: Frame, look: Look, check: Check | None) -> Signs:
+def signs_of(frame: Frame, look: BenchObservation, check: PhysicsCheckResult | None) -> FrameConditions:
     """What is amiss with a frame itself, with its bench, and with what was made of the last frame that was checked."""
-    names = amiss(frame)
+    names = frame_issues(frame)
     invalid = "blank" in names or "half_invalid" in names
-    return Signs("saturated" in names, invalid, look.moved, check)
+    return FrameConditions("saturated" in names, invalid, look.moved, check)
 
 
 NO_DOUBT = "these weights have no doubt network (`train doubt`): no uncertainty is told, and no verdict"
@@ -146,25 +146,25 @@ def load_networks(weights: Path | None = None) -> Reconstructor:
     return load_reconstructor(weights, cache_folder() / "onnx")
 
 
-def load_doubt(weights: Path | None = None) -> Doubter | None:
+def load_doubt(weights: Path | None = None) -> UncertaintyModel | None:
     """The doubt network beside the shipped weights, or a folder's; None where there is none."""
-    return load_doubter(weights, cache_folder() / "onnx")
+    return load_uncertainty_model(weights, cache_folder() / "onnx")
 
 
 def set_up(
-    bench: Bench,
+    bench: CalibratedRig,
     network: Reconstructor,
     average: int = 1,
     *,
-    doubter: Doubter | None = None,
-    checks: Checks | None = None,
-) -> Processing:
+    doubter: UncertaintyModel | None = None,
+    checks: PhysicsCheck | None = None,
+) -> Pipeline:
     """What these networks make of frames of this bench: raw maps or difference maps, as the networks eat."""
     eats_difference = network.record.input == "difference maps"
-    return Processing(bench, network, eats_difference=eats_difference, average=average, doubter=doubter, checks=checks)
+    return Pipeline(bench, network, eats_difference=eats_difference, average=average, doubter=doubter, checks=checks)
 
 
-def misfits(bench: Bench, trained: CheckpointRecord, doubter: Doubter | None) -> list[str]:
+def misfits(bench: CalibratedRig, trained: CheckpointRecord, doubter: UncertaintyModel | None) -> list[str]:
     """What a person should know of networks on this bench before believing them; empty where all fits."""
     return [*_of_rig(bench.rig, trained), *_of_reference(bench), *([] if doubter else [NO_DOUBT])]
 
@@ -184,7 +184,7 @@ def _of_rig(rig: Rig, trained: CheckpointRecord) -> list[str]:
     )
 
 
-def _of_reference(bench: Bench) -> list[str]:
+def _of_reference(bench: CalibratedRig) -> list[str]:
     if not bench.measured or bench.reference:
         return []
     told = "no difference maps are formed, and a lidar that moves is not noticed: calibrate the wall again"

@@ -6,9 +6,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from nlos_cam.frames import MOST_SATURATED, Frame, saturated_share
+from nlos_cam.frames import MAX_SATURATED, Frame, saturated_share
 from nlos_cam.reconstruct.network import Reconstruction
-from nlos_cam.reconstruct.physics_check import Check
+from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
 
 STEADY_FRAMES = 5
 """Doubt about the range is averaged over so many frames (0.17 s), so that the verdict does not flicker."""
@@ -33,7 +33,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Limits:
+class VerdictLimits:
     """From which probabilities on it is told; they come with a doubt network."""
 
     nothing: float
@@ -43,28 +43,28 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Signs:
+class FrameConditions:
     """What else is known of a frame."""
 
     saturated: bool = False
     invalid: bool = False
     """At least half of the pixels have no depth."""
     moved: bool = False
-    check: Check | None = None
+    check: PhysicsCheckResult | None = None
 
 
-class Judge:
+class VerdictFilter:
     """Passes a verdict on each frame, in their order.
 
     Whether nothing is there is a matter of the frame alone: a shown object is gone with the first frame without it.
     """
 
-    def __init__(self, limits: Limits | None) -> None:
+    def __init__(self, limits: VerdictLimits | None) -> None:
         """None, where there is no doubt network: then only what the lidar saw is judged."""
         self._limits = limits
         self._outside: deque[float] = deque(maxlen=STEADY_FRAMES)
 
-    def look(self, found: Reconstruction, signs: Signs) -> tuple[Reconstruction, Verdict | None]:
+    def look(self, found: Reconstruction, signs: FrameConditions) -> tuple[Reconstruction, Verdict | None]:
         """The reconstruction as it is to be shown, and the verdict; None where there is no telling."""
         told = Verdict.WALL_MOVED if signs.moved else Verdict.SATURATED if signs.saturated else None
         if (limits := self._limits) is None or (doubt := found.doubt) is None:
@@ -79,7 +79,7 @@ class Judge:
         return found, told or (Verdict.OUTSIDE if outside else Verdict.SEEN)
 
 
-def amiss(frame: Frame) -> list[str]:
+def frame_issues(frame: Frame) -> list[str]:
     """By name: blank (no depth at all), else half_invalid (for half the pixels or more); and saturated."""
     pixels, with_depth = frame.depth_m.size, np.count_nonzero(frame.depth_m > 0)  # NaN is not
     names: list[str] = []
@@ -87,6 +87,6 @@ def amiss(frame: Frame) -> list[str]:
         names.append("blank")
     elif 2 * with_depth <= pixels:
         names.append("half_invalid")
-    if saturated_share(frame.ir) > MOST_SATURATED:
+    if saturated_share(frame.ir) > MAX_SATURATED:
         names.append("saturated")
     return names

@@ -152,7 +152,7 @@ def metadata(pairs: list[Any]) -> FrameMetadata:
     return FrameMetadata(domain, {name: float(value) for name, value in found.items()})
 
 
-MOST_BYTES = CHUNK_LIMIT
+MAX_BYTES = CHUNK_LIMIT
 """Of a chunk; librealsense begins a new one after 768 kB."""
 DECOMPRESSORS = {"lz4": LZ4FrameDecompressor, "bz2": BZ2Decompressor}
 
@@ -176,7 +176,7 @@ class _BoundedFile(BufferedReader):
 
     def read(self, size: int | None = -1, /) -> bytes:
         wanted = self._left if size is None or size < 0 else size
-        found = super().read(min(wanted, self._left, MOST_BYTES))
+        found = super().read(min(wanted, self._left, MAX_BYTES))
         self._left -= len(found)
         return found
 
@@ -274,7 +274,7 @@ class BagContainer:
 
 def _unpacked(packed: bytes, compression: str, size: int) -> bytes:
     """A chunk's content, which must be of `size`. Raises ValueError where it is not, or that is absurd."""
-    if size > MOST_BYTES:
+    if size > MAX_BYTES:
         raise ValueError(f"a chunk of {size} bytes")
     if compression == "none":
         content, whole = packed, True

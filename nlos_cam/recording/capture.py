@@ -1,4 +1,4 @@
-"""Takes: one recording after another of a camera that stays on, each with its sidecar, read back and summed up."""
+"""CaptureSession: one recording after another of a camera that stays on, each with its sidecar, read back and summed up."""
 
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -23,7 +23,7 @@ OnSets = Callable[[int], None]
 
 
 @dataclass(frozen=True)
-class Job:
+class CaptureTarget:
     """A take to be made."""
 
     path: Path
@@ -31,10 +31,10 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Take:
+class CaptureResult:
     """A take that was made."""
 
-    job: Job
+    job: CaptureTarget
     state: State
     sets: int
     """That came while it recorded."""
@@ -56,19 +56,21 @@ class Take:
         return summary_of(self.found, self.quality, self.events)
 
 
-class Takes:
+class CaptureSession:
     """Records `jobs` one after another while a camera runs, which was opened with `recording`: the first of them."""
 
-    def __init__(self, camera: Camera, recording: Recording, jobs: Sequence[Job], *, wall: Wall | None = None) -> None:
+    def __init__(
+        self, camera: Camera, recording: Recording, jobs: Sequence[CaptureTarget], *, wall: Wall | None = None
+    ) -> None:
         self.jobs = jobs
         self._camera, self._recording, self._wall = camera, recording, wall
 
-    def record(self, stop: Event, on_sets: OnSets) -> Generator[Take]:
+    def record(self, stop: Event, on_sets: OnSets) -> Generator[CaptureResult]:
         """Each take when it is closed; the camera runs on meanwhile, and is left before the last one is yielded.
 
         A take that was ended before its limit is the last. Raises CameraError where the camera does not start.
         """
-        take: Take | None = None
+        take: CaptureResult | None = None
         try:
             with ExitStack() as entered:
                 frames = self._enter(entered)
@@ -97,7 +99,7 @@ class Takes:
                 self._recording.path.unlink(missing_ok=True)
             raise
 
-    def _take(self, job: Job, frames: Iterator[Frame], stop: Event, on_sets: OnSets) -> Take:
+    def _take(self, job: CaptureTarget, frames: Iterator[Frame], stop: Event, on_sets: OnSets) -> CaptureResult:
         sidecar = SidecarFile(sidecar_path(job.path), self._camera, label=job.label, wall=self._wall)
         meter = QualityMeter()
         state: State = "complete"
@@ -115,7 +117,7 @@ class Takes:
         if self._recording.disk_full:
             state, error = "disk full", _short_of_space(job.path)
         events = Counter(self._camera.counts)
-        return Take(job, state, self._recording.sets, meter.quality(), sidecar, error, events=events)
+        return CaptureResult(job, state, self._recording.sets, meter.quality(), sidecar, error, events=events)
 
     def _recorded(self, frames: Iterator[Frame]) -> Iterator[Frame]:
         """The frames that are in the take, until it is done."""
@@ -131,7 +133,7 @@ def _short_of_space(path: Path) -> DiskFullError:
     return DiskFullError(f"less than {left_mb:.0f} MB were left for {path}: free some, or name a --out on another disk")
 
 
-def settle(take: Take, read_back: Callable[[Path], Verified | None]) -> Take:
+def settle(take: CaptureResult, read_back: Callable[[Path], Verified | None]) -> CaptureResult:
     """Read a closed take back, unless that is impossible, and write into its sidecar how it ended.
 
     `read_back` gives None when it was interrupted. What holds no frame at all is removed.
@@ -148,7 +150,7 @@ def settle(take: Take, read_back: Callable[[Path], Verified | None]) -> Take:
     return settled
 
 
-def _read_back(take: Take, read_back: Callable[[Path], Verified | None]) -> Take:
+def _read_back(take: CaptureResult, read_back: Callable[[Path], Verified | None]) -> CaptureResult:
     try:
         found = read_back(take.job.path)
     except RecordingError as error:

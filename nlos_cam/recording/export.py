@@ -19,9 +19,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from nlos_cam.camera.streams import FORMATS, FrameSet, Pairing, Sample
+from nlos_cam.camera.streams import FORMATS, FrameSet, FrameSynchronizer, Sample
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.files import renamed_when_whole
+from nlos_cam.files import atomic_directory
 from nlos_cam.recording.bag_reader import BagFile
 
 POINTS = "points"
@@ -114,7 +114,7 @@ class PointSink:
     def __init__(self, folder: Path, rays: NDArray[np.float64], unit_m: float, most: int | None = None) -> None:
         self._folder, self._rays, self._unit_m, self._most = folder / POINTS, rays, unit_m, most
         self._folder.mkdir()
-        self._pairing = Pairing(rays.shape[:2])
+        self._pairing = FrameSynchronizer(rays.shape[:2])
         self.written = 0
 
     def add(self, sample: Sample) -> None:
@@ -179,7 +179,7 @@ def export(
     streams = _streams(bag, wanted)
     written: Counter[str] = Counter(dict.fromkeys(streams, 0))
     damage = ""
-    with renamed_when_whole(out) as part:
+    with atomic_directory(out) as part:
         (part / INFO).write_text(json.dumps(_info(bag, wanted), indent=1) + "\n", encoding="utf-8")
         with ExitStack() as closing:
             sinks = {stream: _sink(bag, stream, part, wanted.format) for stream in streams}

@@ -9,7 +9,7 @@ from typing import Self
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Rig
 
-from nlos_cam.camera.streams import FORMATS, Pairing, frame_in_si
+from nlos_cam.camera.streams import FORMATS, FrameSynchronizer, frame_in_si
 from nlos_cam.camera.timestamps import ClockUnwrap
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
@@ -60,14 +60,14 @@ class ReplayCamera:
             raise CameraError(f"{self.uri} is not started: iterate inside `with`")
         self._iterations += 1
         self.arrived = Counter()
-        pairing = Pairing((self.intrinsics.height, self.intrinsics.width))
+        pairing = FrameSynchronizer((self.intrinsics.height, self.intrinsics.width))
         try:
             yield from self._frames(pairing, self._iterations)
         except RecordingError:
             self._end(pairing)
             raise
 
-    def _frames(self, pairing: Pairing, iteration: int) -> Iterator[Frame]:
+    def _frames(self, pairing: FrameSynchronizer, iteration: int) -> Iterator[Frame]:
         clock = device_clock(self._bag)
         for place in self._bag.order(FORMATS):
             sample = self._bag.sample(place.stream, place.index)
@@ -81,11 +81,11 @@ class ReplayCamera:
                 return
         self._end(pairing)
 
-    def _end(self, pairing: Pairing) -> None:
+    def _end(self, pairing: FrameSynchronizer) -> None:
         pairing.finish()
         self._count(pairing)
 
-    def _count(self, pairing: Pairing) -> None:
+    def _count(self, pairing: FrameSynchronizer) -> None:
         self.incomplete, self.dropped, self.counts = pairing.incomplete, pairing.dropped, pairing.counts
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:

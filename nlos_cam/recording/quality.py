@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.frames import SATURATED, Frame
 
-LEAST_PAIRS = 8
+MIN_PAIRS = 8
 """Pairs of frames in which a pixel must be valid for its noise to count; with fewer in all, no noise is told."""
 SAMPLED_EVERY = 8
 """Pixels, along rows and along columns, from which the shift of a whole scene is estimated."""
@@ -116,7 +116,7 @@ def _shift_m(depth_m: Float32, before_m: Float32) -> float:
 
 
 def _noise_mm(squares: Float32, pairs: NDArray[np.float32]) -> float | None:
-    enough = pairs >= LEAST_PAIRS
+    enough = pairs >= MIN_PAIRS
     if not enough.any():
         return None
     return 1e3 * sqrt(float(np.median(squares[enough] / pairs[enough])) / 2)

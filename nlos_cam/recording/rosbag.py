@@ -53,7 +53,7 @@ class Op(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class BagRecord:
     """A record's fields, and where its data lies; whether all of it is there, is for the reader to check."""
 
     op: Op
@@ -84,7 +84,7 @@ class Connection:
         return (self.topic, self.kind, self.md5sum) == (other.topic, other.kind, other.md5sum)
 
 
-def read_record(read: Read, at: int) -> Record:
+def read_record(read: Read, at: int) -> BagRecord:
     """The record at that place. Raises BagFormatError where there is none."""
     head = read(at, 4)
     if len(head) < 4:
@@ -96,7 +96,7 @@ def read_record(read: Read, at: int) -> Record:
     if len(header) < header_bytes + 4:
         raise BagCutError(CUT)
     fields = parse_fields(header[:header_bytes])
-    return Record(_op(fields), fields, at + 8 + header_bytes, _number(header[header_bytes:], 4))
+    return BagRecord(_op(fields), fields, at + 8 + header_bytes, _number(header[header_bytes:], 4))
 
 
 def parse_fields(header: bytes) -> dict[str, bytes]:
@@ -146,7 +146,7 @@ def text(fields: Fields, name: str) -> str:
         raise BagFormatError(f"a record's field {name!r} is not text") from error
 
 
-def message_key(record: Record) -> tuple[int, bytes]:
+def message_key(record: BagRecord) -> tuple[int, bytes]:
     """A message's connection number and time (8 bytes: seconds, nanoseconds). Raises BagFormatError."""
     time = _field(record.fields, "time")
     if len(time) != len(SET_UP_TIME):
@@ -154,7 +154,7 @@ def message_key(record: Record) -> tuple[int, bytes]:
     return number(record.fields, "conn"), time
 
 
-def read_connection(read: Read, record: Record) -> Connection:
+def read_connection(read: Read, record: BagRecord) -> Connection:
     """What a connection record says. Raises BagFormatError where any reader of bags would stumble over it."""
     if record.data_bytes > HEADER_LIMIT:
         raise BagFormatError(f"the description of a connection claims {record.data_bytes} bytes")
@@ -172,7 +172,7 @@ def read_connection(read: Read, record: Record) -> Connection:
     return Connection(number(record.fields, "conn"), topic, kind, _field(described, "md5sum"), written)
 
 
-def check_bookkeeping(read: Read, record: Record) -> None:
+def check_bookkeeping(read: Read, record: BagRecord) -> None:
     """Raise BagFormatError for a file header, index or chunk info whose length cannot be right."""
     if record.op is Op.INDEX and record.data_bytes != ENTRY_BYTES * number(record.fields, "count"):
         raise BagFormatError("an index's length does not fit its entries")
@@ -291,7 +291,7 @@ def read_content(read: Read, at: int, end: int, expected_bytes: int) -> Content:
     return Content(connections, index, reached - at, ending, why)
 
 
-def _records(read: Read, at: int, end: int, expected_bytes: int) -> Iterator[tuple[int, Record]]:
+def _records(read: Read, at: int, end: int, expected_bytes: int) -> Iterator[tuple[int, BagRecord]]:
     """Messages and connections, and where each starts. Raises BagFormatError where neither comes."""
     expected_end = at + expected_bytes
     while at != expected_end and read(at, 1):
@@ -306,9 +306,9 @@ def _records(read: Read, at: int, end: int, expected_bytes: int) -> Iterator[tup
         at = record.end
 
 
-def _confirmed(records: Iterator[tuple[int, Record]]) -> Iterator[tuple[int, Record]]:
+def _confirmed(records: Iterator[tuple[int, BagRecord]]) -> Iterator[tuple[int, BagRecord]]:
     """All but the one before damage: its length may be what is wrong."""
-    last: tuple[int, Record] | None = None
+    last: tuple[int, BagRecord] | None = None
     try:
         for found in records:
             if last:
@@ -327,7 +327,7 @@ def _time(entry: bytes) -> tuple[int, int]:
     return seconds, nanoseconds
 
 
-def set_up_records(read: Read) -> Iterator[tuple[int, Record]]:
+def set_up_records(read: Read) -> Iterator[tuple[int, BagRecord]]:
     """What describes the device, and the connections, and where each starts; as far as records are whole."""
     with suppress(BagFormatError):
         for start, record in _records(read, 0, CHUNK_LIMIT, CHUNK_LIMIT):

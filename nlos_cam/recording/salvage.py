@@ -18,11 +18,11 @@ from nlos_cam.recording.rosbag import (
     MAGIC,
     SET_UP_TIME,
     BagFormatError,
+    BagRecord,
     Connection,
     Ending,
     Op,
     Read,
-    Record,
     check_bookkeeping,
     read_connection,
     read_content,
@@ -31,7 +31,7 @@ from nlos_cam.recording.rosbag import (
     set_up_records,
 )
 
-LEAST_PIECE_BYTES, MOST_PIECE_BYTES = 1 << 16, 4 << 20
+MIN_PIECE_BYTES, MAX_PIECE_BYTES = 1 << 16, 4 << 20
 LZ4_MAGIC = b'\x04"M\x18'
 LZ4_TAIL_BYTES = 8
 """End mark and checksum of an lz4 frame."""
@@ -65,20 +65,20 @@ class Examined:
     """What is wrong with it; empty if nothing is."""
 
 
-def find_chunk(read: Read, at: int) -> Record | None:
+def find_chunk(read: Read, at: int) -> BagRecord | None:
     """The chunk that begins there, or the data of one that lost its header; None where neither does.
 
     Raises BagFormatError where no record begins either.
     """
     if read(at, len(LZ4_MAGIC)) == LZ4_MAGIC:
-        return Record(Op.CHUNK, {"compression": b"lz4"}, at, 0)
+        return BagRecord(Op.CHUNK, {"compression": b"lz4"}, at, 0)
     record = read_record(read, at)
     if record.op is Op.MESSAGE or (record.op is Op.CONNECTION and _is_message(read, record.end)):
-        return Record(Op.CHUNK, {"compression": b"none"}, at, 0)
+        return BagRecord(Op.CHUNK, {"compression": b"none"}, at, 0)
     return record if record.op is Op.CHUNK else None
 
 
-def is_headless(chunk: Record) -> bool:
+def is_headless(chunk: BagRecord) -> bool:
     """Whether `find_chunk` found data without its header."""
     return "size" not in chunk.fields
 
@@ -89,7 +89,7 @@ def _is_message(read: Read, at: int) -> bool:
     return False
 
 
-def examine(read: Read, at: int, record: Record, file_end: int) -> Examined:
+def examine(read: Read, at: int, record: BagRecord, file_end: int) -> Examined:
     """Unpack and check the chunk that `record`, which starts at `at`, says is there.
 
     Its lengths are not believed: lz4 data says itself where it ends, other data ends where messages do.
@@ -102,7 +102,7 @@ def examine(read: Read, at: int, record: Record, file_end: int) -> Examined:
     return Examined(None, {}, record.data_at, Ending.BROKEN, "its compression is neither lz4 nor none")
 
 
-def _examine_plain(read: Read, at: int, record: Record) -> Examined:
+def _examine_plain(read: Read, at: int, record: BagRecord) -> Examined:
     found = read_content(read, record.data_at, record.data_at + CHUNK_LIMIT, record.data_bytes or CHUNK_LIMIT)
     end = record.data_at + found.bytes
     chunk = Chunk(at, "none", found.bytes, record.data_at, found.bytes, None, found.index)
@@ -110,7 +110,7 @@ def _examine_plain(read: Read, at: int, record: Record) -> Examined:
     return Examined(chunk if found.index else None, found.connections, end, found.ending, why)
 
 
-def _examine_lz4(read: Read, at: int, record: Record, file_end: int) -> Examined:
+def _examine_lz4(read: Read, at: int, record: BagRecord, file_end: int) -> Examined:
     unpacked, end, ending, why = unpack(read, record.data_at, file_end, _piece_bytes(record))
     if ending is Ending.BROKEN:
         return Examined(None, {}, record.data_at, ending, why)
@@ -125,12 +125,12 @@ def _examine_lz4(read: Read, at: int, record: Record, file_end: int) -> Examined
     return Examined(chunk if found.index else None, found.connections, end, ending, why)
 
 
-def _piece_bytes(record: Record) -> int:
+def _piece_bytes(record: BagRecord) -> int:
     """All of a chunk at once, if its length is sensible."""
-    return min(max(record.data_bytes, LEAST_PIECE_BYTES), MOST_PIECE_BYTES)
+    return min(max(record.data_bytes, MIN_PIECE_BYTES), MAX_PIECE_BYTES)
 
 
-def _wrong_lengths(record: Record, end: int, size: int) -> str:
+def _wrong_lengths(record: BagRecord, end: int, size: int) -> str:
     if is_headless(record):
         return ""  # the damage is before it
     if record.data_bytes == 0:
@@ -151,7 +151,7 @@ def unpack(read: Read, at: int, end: int, piece_bytes: int) -> tuple[bytes, int,
         if decoder.needs_input and not piece:
             return b"".join(parts), at, Ending.CUT, CUT
         try:
-            parts.append(decoder.decompress(piece, min(room + 1, MOST_PIECE_BYTES)))
+            parts.append(decoder.decompress(piece, min(room + 1, MAX_PIECE_BYTES)))
         except RuntimeError:
             return b"".join(parts), at, Ending.BROKEN, "its data is damaged"
         at, room = at + len(piece), room - len(parts[-1])
@@ -160,13 +160,13 @@ def unpack(read: Read, at: int, end: int, piece_bytes: int) -> tuple[bytes, int,
     return b"".join(parts), at - len(decoder.unused_data or b""), Ending.WHOLE, ""
 
 
-def salvage_set_up(read: Read, at: int, record: Record, file_end: int) -> tuple[Chunk | None, dict[int, Connection]]:
+def salvage_set_up(read: Read, at: int, record: BagRecord, file_end: int) -> tuple[Chunk | None, dict[int, Connection]]:
     """What describes the device and its streams, out of a broken lz4 chunk, as far as its checksum can be passed over.
 
     Not one frame can be read without it, and a recording holds it once. It may be wrong, where frames are not taken.
     """
     end = min(record.end, file_end) - LZ4_TAIL_BYTES
-    unpacked = reader(unpack(read, record.data_at, end, LEAST_PIECE_BYTES)[0])
+    unpacked = reader(unpack(read, record.data_at, end, MIN_PIECE_BYTES)[0])
     connections = read_content(unpacked, 0, CHUNK_LIMIT, CHUNK_LIMIT).connections
     content = b"".join(unpacked(start, found.end - start) for start, found in set_up_records(unpacked))
     index = read_content(reader(content), 0, len(content), len(content)).index
@@ -258,7 +258,7 @@ class _Walk:
             return self._lose(at, str(error), search_at=at + 1)
         return record.end
 
-    def _take_other(self, record: Record) -> None:
+    def _take_other(self, record: BagRecord) -> None:
         """Note a connection, pass over the index. Raises BagFormatError where that is damaged."""
         if record.op is Op.CONNECTION:
             found = read_connection(self.read, record)
@@ -267,7 +267,7 @@ class _Walk:
         if record.end > self.end:
             raise BagFormatError("the file ends within its index")
 
-    def _take_chunk(self, at: int, record: Record) -> int:
+    def _take_chunk(self, at: int, record: BagRecord) -> int:
         found = examine(self.read, at, record, self.end)
         if found.ending is Ending.WHOLE:
             if self._take(found) and found.why:
@@ -306,7 +306,7 @@ class _Walk:
         self.chunks.append(chunk)
         self._set_up |= any(entries.startswith(SET_UP_TIME) for entries in chunk.index.values())
 
-    def _lose_chunk(self, at: int, record: Record, resumed: int, why: str) -> None:
+    def _lose_chunk(self, at: int, record: BagRecord, resumed: int, why: str) -> None:
         if not self._set_up and record.fields.get("compression") == b"lz4":
             chunk, connections = salvage_set_up(self.read, at, record, self.end)
             self.trailing = connections | self.trailing
@@ -348,7 +348,7 @@ class _Walk:
         """Whether this may follow a connection of the file's end; in a chunk, a message does."""
         return at == self.end or read_record(self.read, at).op in {Op.CONNECTION, Op.CHUNK_INFO}
 
-    def _find_chunk(self, at: int) -> Record | None:
+    def _find_chunk(self, at: int) -> BagRecord | None:
         """As `find_chunk`. Messages that show in packed data are no chunk, though: half of them is elsewhere."""
         chunk = find_chunk(self.read, at)
         if chunk and is_headless(chunk) and chunk.fields["compression"] == b"none" and not self._is_plain:

@@ -11,7 +11,7 @@ from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Rig
 
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import Inbox, Session, find_streams
+from nlos_cam.camera.session import SampleQueue, Session, find_streams
 from nlos_cam.camera.streams import FORMATS, FrameSet
 from nlos_cam.errors import CameraError, RecordingError
 from nlos_cam.frames import Frame
@@ -57,7 +57,7 @@ class SdkReplayCamera:
         try:
             playback = self._sdk.context().load_device(str(self._path)).as_playback()
             playback.set_real_time(False)
-            return playback, Session(*find_streams(playback), Inbox(lossless=True))
+            return playback, Session(*find_streams(playback), SampleQueue(lossless=True))
         except RuntimeError as error:
             raise self._damaged(f"is cut short or damaged ({error})") from error
         except KeyError as error:  # it takes a damaged description for one of another stream
@@ -112,11 +112,11 @@ class SdkReplayCamera:
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
         return self._session.telemetry(ending) if self._session else {}
 
-    def _count(self, inbox: Inbox) -> None:
+    def _count(self, inbox: SampleQueue) -> None:
         self.incomplete, self.dropped, self.arrived = inbox.incomplete, inbox.dropped, inbox.arrived
         self.counts = inbox.counts
 
-    def _next(self, inbox: Inbox, playback: Any) -> FrameSet | None:
+    def _next(self, inbox: SampleQueue, playback: Any) -> FrameSet | None:
         waited_s = 0.0
         while (found := inbox.take(POLL_S)) is None and not inbox.ended:
             waited_s += POLL_S

@@ -32,7 +32,7 @@ Count = Annotated[int, Field(ge=0)]
 PACKAGES = ("nlos-cam", "pyrealsense2")
 LOOK_S = 10.0
 """Temperatures are looked at, and the file is written anew, about so often."""
-MOST_LOOKS = 1000
+MAX_LOOKS = 1000
 """Beyond so many, every other one is forgotten, and only every other one is kept from then on."""
 
 
@@ -193,7 +193,7 @@ class SidecarFile:
         if not celsius:
             return
         series = [*self._sidecar.temperatures, Temperatures(time_s=time_s, celsius=celsius)]
-        if len(series) > MOST_LOOKS:
+        if len(series) > MAX_LOOKS:
             series, self._every_s = series[::2], 2 * self._every_s
         self._sidecar = self._sidecar.model_copy(update={"temperatures": series})
 

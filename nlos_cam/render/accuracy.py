@@ -6,9 +6,9 @@ from typing import Literal
 from nlos_cam.errors import SceneError
 
 Stop = Literal["draft", "standard", "fine", "reference"]
-MOST_RELAY_CELLS = 512
+MAX_RELAY_CELLS = 512
 """Along a side of the relay wall."""
-MOST_BEAMS_PER_CELL = 8
+MAX_BEAMS_PER_CELL = 8
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Accuracy:
 
     def __post_init__(self) -> None:
         ranges = {
-            "relay_columns": (1, MOST_RELAY_CELLS),
-            "relay_rows": (1, MOST_RELAY_CELLS),
+            "relay_columns": (1, MAX_RELAY_CELLS),
+            "relay_rows": (1, MAX_RELAY_CELLS),
             "object_stride": (1, 16),
             "sectors": (1, 256),
-            "beams_per_cell": (1, MOST_BEAMS_PER_CELL),
+            "beams_per_cell": (1, MAX_BEAMS_PER_CELL),
             "scatter_error": (1e-4, 1),
             "tolerance": (0, 1),
         }

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.render.brdf_table import nodes, scattering
 from nlos_cam.render.interreflection import with_inter_reflection
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.visibility import HeightField, blocked, horizon_table
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -309,7 +309,7 @@ def shift_and_add(
     return histogram
 
 
-def histograms(job: Job) -> Float32:
+def histograms(job: TransportJob) -> Float32:
     """Histograms (n, bins) of I_multi over path length, for the job's beams.
 
     Does not depend on the number of threads: each histogram is summed by one thread, patches in order.
@@ -327,7 +327,7 @@ def histograms(job: Job) -> Float32:
 class _Stage:
     """A job in float32, with what does not depend on the BRDF made once."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: TransportJob) -> None:
         patches, relay = job.patches, job.relay
         self.job, accuracy = job, job.accuracy
         self.surface = Surface32(
@@ -382,7 +382,7 @@ def _columns(points: Float64) -> tuple[Float32, Float32, Float32]:
     return _single(points[:, 0]), _single(points[:, 1]), _single(points[:, 2])
 
 
-def horizons(job: Job) -> tuple[Float32, Float32]:
+def horizons(job: TransportJob) -> tuple[Float32, Float32]:
     """The horizon tables (n, directions) that the job's accuracy asks for; empty where nothing shades."""
     patches, field, accuracy = job.patches, job.field, job.accuracy
     if not field.shades:
@@ -395,7 +395,7 @@ def horizons(job: Job) -> tuple[Float32, Float32]:
     return horizon_table(field, *where, accuracy.sectors)
 
 
-def table_width(job: Job) -> int:
+def table_width(job: TransportJob) -> int:
     """Bins from the shortest to the longest d3 + d4 of any patch, in whole vectors.
 
     The sum is convex over the wall: longest at a corner of the relay, and never shorter than the straight way to the

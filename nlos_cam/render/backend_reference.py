@@ -13,24 +13,24 @@ from nlos_cam.errors import SceneError
 from nlos_cam.render.brdf_table import scattering
 from nlos_cam.render.geometry import softened
 from nlos_cam.render.interreflection import object_factors, wall_cells, wall_factors
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.visibility import HeightField, occluded, visible
 
-MOST_PATHS = 3e10
+MAX_PATHS = 3e10
 """Some minutes' worth."""
 
 
-def more_paths(job: Job, taken: Float64, given: Float64) -> Float64:
+def more_paths(job: TransportJob, taken: Float64, given: Float64) -> Float64:
     """Histograms (n, bins) of the paths that meet the object twice.
 
     `taken` (n, patches) is the light that each patch gives on of each beam, `given` (patches, m) what the lidar gets of
-    it by each relay cell. Raises SceneError where there are more than MOST_PATHS.
+    it by each relay cell. Raises SceneError where there are more than MAX_PATHS.
     """
     point, cells = job.patches.point_m, wall_cells(job)
     count = taken.size * given.size * len(cells)
-    if count > MOST_PATHS:
+    if count > MAX_PATHS:
         raise SceneError(
-            f"inter-reflection path by path would sum {count:.1g} paths, at most {MOST_PATHS:.0e}: choose fine, "
+            f"inter-reflection path by path would sum {count:.1g} paths, at most {MAX_PATHS:.0e}: choose fine, "
             "or leave inter-reflection out of the effects"
         )
     relay = np.stack([job.relay.x_m, job.relay.y_m, np.zeros_like(job.relay.x_m)], 1)
@@ -208,13 +208,13 @@ def _ends(
     return taken, given
 
 
-def histograms(job: Job) -> Float64:
+def histograms(job: TransportJob) -> Float64:
     """Histograms (n, bins) of I_multi over path length, for the job's beams."""
     more = _more_bounces(job) if job.more_bounces else 0.0  # first: it refuses what would take too long
     return _three_bounces(job) + more
 
 
-def _three_bounces(job: Job) -> Float64:
+def _three_bounces(job: TransportJob) -> Float64:
     """In groups of beams, between which Ctrl-C is heard: one beam at a time where a BRDF couples the legs."""
     patches, relay, count = job.patches, job.relay, len(job.foot_m)
     seen = _visible(job, relay.x_m, relay.y_m)
@@ -228,7 +228,7 @@ def _three_bounces(job: Job) -> Float64:
     return histogram
 
 
-def _more_bounces(job: Job) -> Float64:
+def _more_bounces(job: TransportJob) -> Float64:
     p, relay = job.patches, job.relay
     surface = p.point_m, p.normal, job.strength, job.soft_patch_m2
     lit = _visible(job, job.foot_m[:, 0].copy(), job.foot_m[:, 1].copy())
@@ -237,13 +237,13 @@ def _more_bounces(job: Job) -> Float64:
     return more_paths(job, taken, given)
 
 
-def _visible(job: Job, x_m: Float64, y_m: Float64) -> Mask:
+def _visible(job: TransportJob, x_m: Float64, y_m: Float64) -> Mask:
     """V (n, m) of the legs between the job's patches and points of the wall."""
     p = job.patches
     return legs(p.point_m, p.normal, p.row, p.column, x_m, y_m, *job.edge_m, job.field)
 
 
-def _some(job: Job, which: slice, seen: Mask, factor: Float64) -> Float64:
+def _some(job: TransportJob, which: slice, seen: Mask, factor: Float64) -> Float64:
     patches, relay, foot = job.patches, job.relay, np.ascontiguousarray(job.foot_m[which])
     return _paths(
         foot,

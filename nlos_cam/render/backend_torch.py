@@ -22,7 +22,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.render.backend_numba import horizons, table_width
 from nlos_cam.render.brdf_table import nodes
 from nlos_cam.render.interreflection import with_inter_reflection
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Brdf
 from nlos_cam.render.visibility import FACES, bias_m
 
@@ -63,7 +63,7 @@ class Sites(NamedTuple):
         return Sites(*(column[start:end] for column in self))
 
 
-def lay_out(jobs: Sequence[Job], device: torch.device) -> tuple[Fields, Sites]:
+def lay_out(jobs: Sequence[TransportJob], device: torch.device) -> tuple[Fields, Sites]:
     """The fields and sites of jobs that share a grid; an object that shades nothing has bounds of 0."""
     fields = [job.field for job in jobs]
     size = len(fields[0].depth_m)
@@ -80,7 +80,7 @@ def lay_out(jobs: Sequence[Job], device: torch.device) -> tuple[Fields, Sites]:
     return shared, Sites(*together)
 
 
-def _sites(job: Job, index: int, fields: Fields, size: int) -> tuple[np.ndarray, ...]:
+def _sites(job: TransportJob, index: int, fields: Fields, size: int) -> tuple[np.ndarray, ...]:
     """The columns of one object's sites: depth, low, high, start and across."""
     row, column = job.patches.row, job.patches.column
     free = np.zeros((len(row), FACES * fields.sectors), np.float32)
@@ -146,7 +146,7 @@ class Surface(NamedTuple):
     strength: Tensor
 
     @classmethod
-    def of(cls, jobs: Sequence[Job], device: torch.device) -> "Surface":
+    def of(cls, jobs: Sequence[TransportJob], device: torch.device) -> "Surface":
         """The patches of all jobs, one after another."""
         columns = [
             np.column_stack([j.patches.point_m, j.patches.normal, j.soft_patch_m2, j.strength]).T[..., None]
@@ -266,12 +266,12 @@ def chunk_for(device: torch.device) -> int:
     return min(half // BYTES_PER_ELEMENT, CUDA_CHUNK)
 
 
-def histograms(job: Job, device: torch.device) -> Float32:
+def histograms(job: TransportJob, device: torch.device) -> Float32:
     """Histograms (n, bins) of I_multi over path length, for the job's beams."""
     return histograms_of_all([job], device)[0]
 
 
-def histograms_of_all(jobs: Sequence[Job], device: torch.device) -> list[Float32]:
+def histograms_of_all(jobs: Sequence[TransportJob], device: torch.device) -> list[Float32]:
     """The same of many jobs; those that differ in the object alone are worked out together."""
     alike: dict[object, list[int]] = {}
     for index, job in enumerate(jobs):
@@ -283,7 +283,7 @@ def histograms_of_all(jobs: Sequence[Job], device: torch.device) -> list[Float32
     return [found[index] for index in range(len(jobs))]
 
 
-def _shared(job: Job) -> tuple[object, ...] | None:
+def _shared(job: TransportJob) -> tuple[object, ...] | None:
     """What jobs of one batch have in common; None for a job that is worked out alone."""
     if job.brdf is not None or job.more_bounces:
         return None
@@ -297,7 +297,7 @@ def _shared(job: Job) -> tuple[object, ...] | None:
 class _Batch:
     """Jobs that differ in the object alone, on a device."""
 
-    def __init__(self, jobs: Sequence[Job], device: torch.device) -> None:
+    def __init__(self, jobs: Sequence[TransportJob], device: torch.device) -> None:
         job = self.job = jobs[0]
         self.jobs, self.device, self.chunk = jobs, device, chunk_for(device)
         fields, self.sites = lay_out(jobs, device) if any(j.field.shades for j in jobs) else (None, None)

@@ -8,12 +8,12 @@ import numba
 import numpy as np
 from nlos_calibration.arrays import Float64
 
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Brdf
 
 PROBES = 4096
 """Legs on which an interpolation is tried."""
-MOST_NODES = 64
+MAX_NODES = 64
 """Along each axis."""
 Scattering = Callable[[Float64, Float64, Float64, Float64, Float64], Float64]
 
@@ -54,7 +54,7 @@ def scattered(brdf: Brdf, foot: Float64, point: Float64, normal: Float64, out: F
     return brdf(np.maximum(cos_in, 0.0), np.maximum(cos_out, 0.0), (to_foot * to_wall).sum(1)) + np.zeros(len(foot))
 
 
-def nodes(job: Job, brdf: Brdf) -> Iterator[tuple[Float64, Float64]]:
+def nodes(job: TransportJob, brdf: Brdf) -> Iterator[tuple[Float64, Float64]]:
     """Feet (3,) that stand for those around them, and to what share (n,) each beam is one's: linear in between.
 
     Their columns and rows are quantiles of the feet's own, so that they are dense where the beams are.
@@ -72,7 +72,7 @@ def _lines(foot_m: Float64, count: int) -> list[Float64]:
     return [np.unique(np.quantile(foot_m[:, axis], np.linspace(0, 1, count))) for axis in (0, 1)]
 
 
-def node_count(job: Job, brdf: Brdf) -> int:
+def node_count(job: TransportJob, brdf: Brdf) -> int:
     """As many nodes along each axis as keep the interpolation, tried on some legs, within the accuracy's error."""
     generator, patches, relay = np.random.default_rng(0), job.patches, job.relay
     s, q = generator.integers(len(patches.beta), size=PROBES), generator.integers(len(relay.x_m), size=PROBES)
@@ -81,7 +81,7 @@ def node_count(job: Job, brdf: Brdf) -> int:
     exact, count = scattered(brdf, foot, patches.point_m[s], patches.normal[s], out), 4
     # legs to the dark side carry nothing, and are cut off where their weight is told
     lit = np.all([((end - patches.point_m[s]) * patches.normal[s]).sum(1) > 0 for end in (foot, out)], axis=0)
-    while count < MOST_NODES:
+    while count < MAX_NODES:
         corners = [_bracket(foot[:, axis], line) for axis, line in enumerate(_lines(job.map_foot_m, count))]
         guess = np.zeros(PROBES)
         for i in (0, 1):

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from nlos_cam.render.geometry import NO_OCCLUDER, Beams, Relay, softened
 from nlos_cam.render.interreflection import AROUND_M
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.patches import Patches
 from nlos_cam.render.visibility import BIAS_CELLS, HeightField, occluded
 
-SOME_BEAMS, SOME_CELLS = 160, 96
+SAMPLE_BEAMS, SAMPLE_CELLS = 160, 96
 CAUTION = 1.5
 """What is told from a coarse look is taken this much larger before it is called a bound."""
 
 
 @dataclass(frozen=True)
-class Survey:
+class EnergySurvey:
     """For each patch (n,): the light that reaches it from the beams, and that which the lidar gets of what it gives."""
 
     taken: Float64
@@ -57,14 +57,14 @@ class Survey:
         return self.share((self.taken + self.taken_cut) * (self.given + self.given_cut) - self.energy)
 
 
-def survey(job: Job, uneven: float) -> Survey:
+def survey(job: TransportJob, uneven: float) -> EnergySurvey:
     """Look at some beams of a job, and some cells of its relay, which is whole: none cut off by the occluder.
 
     `uneven` is how many times as much a BRDF may make one patch give as another.
     """
     patches, relay = job.patches, job.relay
-    lit = slice(None, None, max(len(job.foot_m) // SOME_BEAMS, 1))
-    some = slice(None, None, max(len(relay.x_m) // SOME_CELLS, 1))
+    lit = slice(None, None, max(len(job.foot_m) // SAMPLE_BEAMS, 1))
+    some = slice(None, None, max(len(relay.x_m) // SAMPLE_CELLS, 1))
     shape, start = (patches.point_m, patches.normal, patches.beta), job.beam_weight[lit]
     feet = job.foot_m[lit, 0], job.foot_m[lit, 1], start, np.zeros(len(start), np.bool_)
     hidden = relay.behind(job.edge_m, job.lidar_m)[some]
@@ -73,7 +73,7 @@ def survey(job: Job, uneven: float) -> Survey:
     taken = _sums(*shape, *feet, job.soft_patch_m2, job.near_m, *job.edge_m, job.lambertian, False)
     given = _sums(*shape, *cells, soft_wall, job.near_m, *job.edge_m, job.lambertian, True)
     scale = job.strength / len(start)
-    return Survey(taken[0] * scale, given[0], taken[1] * scale, given[1], taken[2] * scale, given[2], uneven)
+    return EnergySurvey(taken[0] * scale, given[0], taken[1] * scale, given[1], taken[2] * scale, given[2], uneven)
 
 
 @numba.njit(cache=True, parallel=True)

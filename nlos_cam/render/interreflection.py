@@ -10,12 +10,12 @@ from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.render.geometry import contact_m2, softened
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.visibility import HeightField, occluded, segment_blocked, visible
 
 WALL_CELLS = 24
 """Along each side of the wall that the light may go over."""
-SOME_PATCHES = 256
+SAMPLE_PATCHES = 256
 AROUND_M = 0.4
 """How far about the object that wall reaches: beyond, less than a hundredth of a patch's light arrives."""
 
@@ -165,7 +165,7 @@ def _carry(factor: Float64, steps: Int64, histogram: Float32, width: int) -> Flo
     return out
 
 
-def with_inter_reflection(job: Job, first: NDArray[np.int32], histogram: Float32) -> Float32:
+def with_inter_reflection(job: TransportJob, first: NDArray[np.int32], histogram: Float32) -> Float32:
     """The patches' histograms (n, k) in sub-bins, from their bins `first` (n,) on, with one bounce more on the object.
 
     They come out wider by the longest detour.
@@ -184,18 +184,18 @@ def with_inter_reflection(job: Job, first: NDArray[np.int32], histogram: Float32
     return np.pad(histogram, [(0, 0), (0, width - histogram.shape[1])]) + by_wall + straight
 
 
-def _patches(job: Job) -> tuple[Float64, Float64, Float64, Float64, Int64, Int64, HeightField, float, bool]:
+def _patches(job: TransportJob) -> tuple[Float64, Float64, Float64, Float64, Int64, Int64, HeightField, float, bool]:
     p = job.patches
     where = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
     return *where, job.field, job.near_m, job.lambertian
 
 
-def object_factors(job: Job) -> Float64:
+def object_factors(job: TransportJob) -> Float64:
     """Form factors (n, n) from patch to patch of a job."""
     return patch_to_patch(*_patches(job))
 
 
-def wall_factors(job: Job, cells: Float64) -> tuple[Float64, Float64]:
+def wall_factors(job: TransportJob, cells: Float64) -> tuple[Float64, Float64]:
     """Form factors (n, m) from the patches of a job to cells of the wall (m, 3), and back."""
     p, cell_m2 = job.patches, wall_cell_m2(job)
     where = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
@@ -203,19 +203,19 @@ def wall_factors(job: Job, cells: Float64) -> tuple[Float64, Float64]:
     return patch_to_wall(*where, *wall, *job.edge_m, job.field, job.near_m, job.lambertian)
 
 
-def _wall_extent(job: Job) -> Float64:
+def _wall_extent(job: TransportJob) -> Float64:
     """(2, 2); least and most x and y of the wall that inter-reflection goes over."""
     wall = np.array(job.wall_m)
     low, high = job.patches.point_m[:, :2].min(0) - AROUND_M, job.patches.point_m[:, :2].max(0) + AROUND_M
     return np.stack([np.maximum(low, wall[[0, 2]]), np.minimum(high, wall[[1, 3]])])
 
 
-def wall_cell_m2(job: Job) -> float:
+def wall_cell_m2(job: TransportJob) -> float:
     """Area of a cell of that wall."""
     return float(np.prod(np.maximum(np.diff(_wall_extent(job), axis=0), 0.0)) / WALL_CELLS**2)
 
 
-def wall_cells(job: Job) -> Float64:
+def wall_cells(job: TransportJob) -> Float64:
     """The middles (m, 3) of its cells."""
     low, high = _wall_extent(job)
     steps = (np.arange(WALL_CELLS) + 0.5) / WALL_CELLS
@@ -223,12 +223,12 @@ def wall_cells(job: Job) -> Float64:
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
 
 
-def share_of_more_bounces(job: Job, taken: Float64, given: Float64) -> float:
+def share_of_more_bounces(job: TransportJob, taken: Float64, given: Float64) -> float:
     """How much energy one bounce more carries, against three bounces, told from some of the patches.
 
     `taken` and `given` (n,) are the light that each patch gives on, and what the lidar gets of it.
     """
-    step = -(-len(taken) // SOME_PATCHES)
+    step = -(-len(taken) // SAMPLE_PATCHES)
     some = slice(None, None, step)
     p = job.patches
     where = p.point_m[some].copy(), p.normal[some].copy(), step * job.strength[some], step * job.soft_patch_m2[some]

@@ -15,7 +15,7 @@ from nlos_cam.render.visibility import HeightField
 
 
 @dataclass(frozen=True)
-class Job:
+class TransportJob:
     """Some beams, the patches, the relay wall and all that decides their three-bounce histograms."""
 
     foot_m: Float64
@@ -45,7 +45,7 @@ class Job:
     more_bounces: bool = False
     """Whether inter-reflection is wanted."""
 
-    def some(self, which: NDArray[np.int64]) -> "Job":
+    def some(self, which: NDArray[np.int64]) -> "TransportJob":
         """The same for some of the beams."""
         beams = {name: getattr(self, name)[which] for name in ("foot_m", "length_m", "cos_incidence")}
         return replace(self, **beams)
@@ -89,7 +89,7 @@ class Job:
         return self.patches.albedo * self.patches.area_m2
 
 
-def near_legs(job: Job) -> int:
+def near_legs(job: TransportJob) -> int:
     """How many legs between patches and wall are shorter than near contact."""
     reach, count = job.near_m**2, 0
     for point in job.patches.point_m[job.patches.point_m[:, 2] < job.near_m]:

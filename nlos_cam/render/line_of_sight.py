@@ -81,7 +81,7 @@ def first_hits(
 
 
 @dataclass(frozen=True)
-class Sight:
+class DirectVisibility:
     """What of the object stands in the lidar's own sight."""
 
     beam: NDArray[np.int64]
@@ -97,7 +97,7 @@ class Sight:
     """(m,); the relay cells from which no light gets to the lidar."""
 
 
-def look(beams: Beams, relay: Relay, field: HeightField, depth_m: Float64, jump_m: float) -> Sight | None:
+def look(beams: Beams, relay: Relay, field: HeightField, depth_m: Float64, jump_m: float) -> DirectVisibility | None:
     """Follow every beam, and every way from a relay cell to the lidar; None where the object is in none's way."""
     to_cells = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1) - beams.lidar_m
     directions = np.concatenate([beams.direction, to_cells / relay.length_m[:, None]])
@@ -112,4 +112,4 @@ def look(beams: Beams, relay: Relay, field: HeightField, depth_m: Float64, jump_
     if length[hit].min() <= 0:
         raise SceneError(f"the object surrounds the lidar, {beams.lidar_m[2]:g} m off the wall: move it or the lidar")
     which = np.flatnonzero(hit[:count])
-    return Sight(which, length[which], cosine[which], row[which], column[which], hit[count:])
+    return DirectVisibility(which, length[which], cosine[which], row[which], column[which], hit[count:])

@@ -17,41 +17,41 @@ from nlos_cam.render.effects import Effects, Plan, decide, included
 from nlos_cam.render.energy_survey import CAUTION, occluder_meets, shaded
 from nlos_cam.render.geometry import NO_OCCLUDER, Beams, Relay, gate_bins, occluder_edge, solid_angle
 from nlos_cam.render.interreflection import AROUND_M
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.patches import Patches
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_facts import Stage
+from nlos_cam.render.scene_facts import SceneFacts
 
 Finding = tuple[str, float, str]
 """Name, bound and reason."""
 
 
-def plan(stage: Stage, effects: Effects = "auto") -> Plan:
+def plan(stage: SceneFacts, effects: Effects = "auto") -> Plan:
     """The verdicts for a scene at an accuracy, in the order in which light meets the effects."""
     findings = [verdict(stage) for verdict in (_direct, _three_bounce, _line_of_sight, _occluder, _self_occlusion)]
     findings += [verdict(stage) for verdict in (_tilt, _brdf, _colour, _inter_reflection, _pulse)]
     return decide(findings, stage.accuracy.tolerance, effects)
 
 
-def _direct(stage: Stage) -> Finding:
+def _direct(stage: SceneFacts) -> Finding:
     count = int((stage.beams().direct > 0).sum())
     return "direct", float(count > 0), f"{count} beams return from wall or occluder inside the gate"
 
 
-def _three_bounce(stage: Stage) -> Finding:
+def _three_bounce(stage: SceneFacts) -> Finding:
     if stage.patches is None:
         return "three-bounce", 0.0, "nothing is hidden inside the gate, or no beam lights the wall"
     return "three-bounce", 1.0, f"{len(stage.patches.beta)} patches lie inside the gate"
 
 
-def _line_of_sight(stage: Stage) -> Finding:
+def _line_of_sight(stage: SceneFacts) -> Finding:
     if stage.sight is None:
         return "line-of-sight", 0.0, "no part of the object is in the lidar's sight"
     beams, cells = len(stage.sight.beam), int(stage.sight.hidden.sum())
     return "line-of-sight", 1.0, f"the object stops {beams} beams and hides {cells} relay cells"
 
 
-def _occluder(stage: Stage) -> Finding:
+def _occluder(stage: SceneFacts) -> Finding:
     if stage.rig.occluder is None:
         return "occluder", 0.0, "the rig has none"
     beams = stage.beams()
@@ -65,7 +65,7 @@ def _occluder(stage: Stage) -> Finding:
     return "occluder", max(stage.light.occluder, 1 / len(beams.length_m)), "legs cross it"
 
 
-def _self_occlusion(stage: Stage) -> Finding:
+def _self_occlusion(stage: SceneFacts) -> Finding:
     if stage.patches is None or stage.light is None:
         return "self-occlusion", 0.0, "nothing to shade"
     behind = shaded(stage.patches, stage.field)
@@ -76,7 +76,7 @@ def _self_occlusion(stage: Stage) -> Finding:
     return "self-occlusion", bound, f"{int(behind.sum())} of {len(behind)} patches have another rise above their plane"
 
 
-def _tilt(stage: Stage) -> Finding:
+def _tilt(stage: SceneFacts) -> Finding:
     if stage.patches is None or stage.light is None:
         return "tilt", 0.0, "nothing to tilt"
     steepest = sqrt(max(float(stage.patches.beta.max()) ** 2 - 1, 0.0))
@@ -85,7 +85,7 @@ def _tilt(stage: Stage) -> Finding:
     return "tilt", bound if steepest else 0.0, f"steepest slope {steepest:.3g}"
 
 
-def _brdf(stage: Stage) -> Finding:
+def _brdf(stage: SceneFacts) -> Finding:
     brdf = stage.scene.surface.brdf
     if stage.patches is None or brdf is None:
         return "brdf", 0.0, "the surface is Lambertian" if brdf is None else "nothing is hidden"
@@ -98,7 +98,7 @@ def _brdf(stage: Stage) -> Finding:
     )
 
 
-def _colour(stage: Stage) -> Finding:
+def _colour(stage: SceneFacts) -> Finding:
     if stage.patches is None or not stage.scene.surface.coloured:
         return "colour", 0.0, "the albedo has one channel"
     albedo = np.asarray(stage.scene.surface.albedo, np.float64)
@@ -107,7 +107,7 @@ def _colour(stage: Stage) -> Finding:
     return "colour", min(apart, 1.0), f"channels differ by up to {apart:.3g} of their mean"
 
 
-def _inter_reflection(stage: Stage) -> Finding:
+def _inter_reflection(stage: SceneFacts) -> Finding:
     if stage.patches is None:
         return "inter-reflection", 0.0, "nothing is hidden"
     if not stage.lambertian:
@@ -116,14 +116,14 @@ def _inter_reflection(stage: Stage) -> Finding:
     return "inter-reflection", min(share, 1.0), f"five bounces and object to object carry up to {share:.3g} of three"
 
 
-def _pulse(stage: Stage) -> Finding:
+def _pulse(stage: SceneFacts) -> Finding:
     if stage.scene.pulse_ns == 0:
         return "pulse", 0.0, "the pulse has no width"
     sigma = pulse_bins(stage.scene.pulse_ns, stage.rig.device.bin_m)
     return "pulse", min(4 * sigma, 1.0), f"{stage.scene.pulse_ns:g} ns spread an echo by {sigma:.3g} bins"
 
 
-MOST_BYTES = 4 << 30
+MAX_BYTES = 4 << 30
 """Of histograms: more than this is refused before it is tried."""
 
 
@@ -131,7 +131,7 @@ MOST_BYTES = 4 << 30
 class Prepared:
     """A plan carried out up to the histograms."""
 
-    stage: Stage
+    stage: SceneFacts
     plan: Plan
     beams: Beams
     """Those of the rows that are wanted."""
@@ -145,7 +145,7 @@ class Prepared:
     @classmethod
     def of(cls, scene: Scene, accuracy: Accuracy, effects: Effects, rows: tuple[int, int] | None = None) -> Self:
         """Plan a scene and apply what the plan says of beams and wall; keep the beams of some rows of the map."""
-        stage = Stage(scene, accuracy)
+        stage = SceneFacts(scene, accuracy)
         verdicts = plan(stage, effects)
         stands = included(verdicts, "occluder")
         edge = occluder_edge(scene.rig) if stands else NO_OCCLUDER
@@ -163,7 +163,7 @@ class Prepared:
         coloured = scene.surface.coloured and included(verdicts, "colour")
         return cls(stage, verdicts, part, first, beams, stage.relay.kept(~hidden), edge, 3 if coloured else 1)
 
-    def job(self, channel: int | None = None) -> Job | None:
+    def job(self, channel: int | None = None) -> TransportJob | None:
         """The job of one channel of the albedo, or of their mean; None where no three-bounce path is wanted."""
         wanted = included(self.plan, "three-bounce")
         if not (wanted and self.relay.x_m.size and self.beams.on_wall.any()):
@@ -180,7 +180,7 @@ class Prepared:
         _refuse_too_large(job)
         return job
 
-    def _of_rows(self, job: Job) -> Job:
+    def _of_rows(self, job: TransportJob) -> TransportJob:
         lit = np.flatnonzero(self.map_beams.on_wall)
         wanted = (lit >= self.first_beam) & (lit < self.first_beam + len(self.beams.on_wall))
         return job if wanted.all() else job.some(np.flatnonzero(wanted))
@@ -194,17 +194,17 @@ class Prepared:
             patches = replace(patches, albedo=patches.albedo * np.mean(stage.brdf_range))
         return patches
 
-    def _bins_with_detours(self, job: Job) -> int:
+    def _bins_with_detours(self, job: TransportJob) -> int:
         """By way of another patch, or of the wall about it, a path is longer by at most twice across that wall."""
         most = 2 * np.linalg.norm(np.ptp(job.patches.point_m, axis=0) + 2 * AROUND_M)
         return min(job.bins + int(np.ceil(most / job.bin_m)), gate_bins(self.stage.rig.device))
 
 
-def _refuse_too_large(job: Job) -> None:
-    """Raise SceneError where the histograms alone would take more than MOST_BYTES."""
+def _refuse_too_large(job: TransportJob) -> None:
+    """Raise SceneError where the histograms alone would take more than MAX_BYTES."""
     size = len(job.foot_m) * job.bins * (8 if job.accuracy.sub_bins == 0 else 4)
-    if size > MOST_BYTES:
+    if size > MAX_BYTES:
         raise SceneError(
-            f"{len(job.foot_m)} beams of {job.bins} bins need {size / 2**30:.1f} GiB, at most {MOST_BYTES >> 30}: "
+            f"{len(job.foot_m)} beams of {job.bins} bins need {size / 2**30:.1f} GiB, at most {MAX_BYTES >> 30}: "
             f"lower beams_per_cell ({job.accuracy.beams_per_cell}), widen bin_m ({job.bin_m:g}) or shorten gate_s"
         )

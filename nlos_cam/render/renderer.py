@@ -17,11 +17,11 @@ from nlos_cam.render.accuracy import Accuracy, accuracy_named
 from nlos_cam.render.echoes import MultiBounce, add_direct, compete, nothing, spread, strongest
 from nlos_cam.render.effects import Effects, Plan, included
 from nlos_cam.render.geometry import gate_bins
-from nlos_cam.render.job import Job, near_legs
+from nlos_cam.render.job import TransportJob, near_legs
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
 
-Implementation = Callable[[Job], NDArray[np.floating[Any]]]
+Implementation = Callable[[TransportJob], NDArray[np.floating[Any]]]
 BACKENDS = "cpu", "torch", "cuda"
 """numba; torch on the CPU; torch on a GPU."""
 TOGETHER = 16
@@ -64,7 +64,9 @@ def render(
     return _rendered(ready, job, None if job is None else implementation(job.accuracy, backend)(job), backend)
 
 
-def _rendered(ready: Prepared, job: Job | None, found: NDArray[np.floating[Any]] | None, backend: str) -> Rendering:
+def _rendered(
+    ready: Prepared, job: TransportJob | None, found: NDArray[np.floating[Any]] | None, backend: str
+) -> Rendering:
     """What the lidar reports, from the histograms (n, bins) of a job's beams."""
     multi = _echoes(ready, found).of(ready.beams.shape)
     maps = compete(ready.beams, multi)
@@ -113,7 +115,7 @@ def three_bounce(
 
 
 def histograms(
-    ready: Prepared, job: Job | None, backend: str, chosen: NDArray[np.int64] | None = None
+    ready: Prepared, job: TransportJob | None, backend: str, chosen: NDArray[np.int64] | None = None
 ) -> NDArray[np.floating[Any]]:
     """The same of what is prepared already; 0 where a beam does not light the wall."""
     lit = ready.beams.on_wall
@@ -147,7 +149,9 @@ def implementation(accuracy: Accuracy, backend: str) -> Implementation:
     return partial(backend_torch.histograms, device=backend_torch.device_named(backend))
 
 
-def _histograms_of_all(jobs: Sequence[Job], accuracy: Accuracy, backend: str) -> list[NDArray[np.floating[Any]]]:
+def _histograms_of_all(
+    jobs: Sequence[TransportJob], accuracy: Accuracy, backend: str
+) -> list[NDArray[np.floating[Any]]]:
     one_by_one = implementation(accuracy, backend)
     if backend == "cpu" or accuracy.sub_bins == 0:
         return [one_by_one(job) for job in jobs]
@@ -165,7 +169,7 @@ def _echoes(ready: Prepared, found: NDArray[np.floating[Any]] | None) -> MultiBo
     return nothing(len(lit)) if found is None else strongest(found, bin_m).spread_over(lit)
 
 
-def _of_all(ready: Prepared, job: Job | None, backend: str) -> Float32:
+def _of_all(ready: Prepared, job: TransportJob | None, backend: str) -> Float32:
     return histograms(ready, job, backend).astype(np.float32, copy=False)
 
 

@@ -8,11 +8,11 @@ from nlos_calibration.arrays import Float64
 from nlos_calibration.rig import DeviceConstants, Rig
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.energy_survey import Survey, survey
+from nlos_cam.render.energy_survey import EnergySurvey, survey
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, Beams, Relay, cast, gate_bins, occluder_edge, relay_cells
 from nlos_cam.render.interreflection import share_of_more_bounces
-from nlos_cam.render.job import Job
-from nlos_cam.render.line_of_sight import Sight, look
+from nlos_cam.render.job import TransportJob
+from nlos_cam.render.line_of_sight import DirectVisibility, look
 from nlos_cam.render.material import brdf_range
 from nlos_cam.render.patches import Patches, clustered, coarser
 from nlos_cam.render.scene import Scene
@@ -20,7 +20,7 @@ from nlos_cam.render.visibility import HeightField, height_field
 
 
 @dataclass(frozen=True)
-class Stage:
+class SceneFacts:
     """The facts."""
 
     scene: Scene
@@ -87,14 +87,14 @@ class Stage:
         return relay_cells(self.rig, self.beams().lidar_m, self.accuracy.relay_columns, self.accuracy.relay_rows)
 
     @cached_property
-    def _whole_job(self) -> Job | None:
+    def _whole_job(self) -> TransportJob | None:
         """What is looked at for verdicts: every effect in, the whole relay wall."""
         if self.patches is None:
             return None
         return self.job(self.beams(), self.patches, self.relay, occluder_edge(self.rig), self.field)
 
     @cached_property
-    def light(self) -> Survey | None:
+    def light(self) -> EnergySurvey | None:
         """The coarse look at the patches."""
         low, high = self.brdf_range
         return None if self._whole_job is None else survey(self._whole_job, high / max(low, 1e-9))
@@ -106,7 +106,7 @@ class Stage:
         return (1.0, 1.0) if brdf is None else brdf_range(brdf)
 
     @cached_property
-    def sight(self) -> Sight | None:
+    def sight(self) -> DirectVisibility | None:
         """What of the object stands in the lidar's own sight; None where nothing does."""
         if np.isnan(self.depth_m).all():  # or there is none
             return None
@@ -119,10 +119,12 @@ class Stage:
             return 0.0
         return share_of_more_bounces(self._whole_job, self.light.taken, self.light.given)
 
-    def job(self, beams: Beams, patches: Patches, relay: Relay, edge_m: tuple[float, float], field: HeightField) -> Job:
+    def job(
+        self, beams: Beams, patches: Patches, relay: Relay, edge_m: tuple[float, float], field: HeightField
+    ) -> TransportJob:
         """The three-bounce histograms of all beams that light the wall, as a job."""
         lit, device, wall = beams.on_wall, self.rig.device, self.rig.wall
-        return Job(
+        return TransportJob(
             foot_m=beams.foot_m[lit],
             length_m=beams.length_m[lit],
             cos_incidence=beams.cos_incidence[lit],

@@ -31,11 +31,11 @@ SATURATED_RGB = (255, 0, 200)
 ROUND_STEPS = 1.0, 2.0, 3.0, 5.0, 10.0
 CHANGED_M, FEW_CHANGED, QUIET_SPAN_M = 0.01, 0.02, 0.02
 """Less is noise and ripples; where few cells differ by more, the span shows these."""
-MOST_UNCERTAIN_M = 0.03
+MAX_UNCERTAINTY_M = 0.03
 """What is drawn brightest: the object box is 0.28 m deep."""
 RESIDUAL_SPAN_M = 0.02
 """Of the physics check; the lidar's own noise is a tenth of it."""
-MOST_CONFIDENT = 15
+MAX_CONFIDENCE = 15
 FADED = 0.35
 """The share of its colour that is left to what may not be believed."""
 
@@ -63,12 +63,12 @@ def infrared_grey(ir: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def confidence_rgb(confidence: NDArray[np.uint8]) -> UInt8:
     """Confidence 0 to 15 (height, width) as a picture, dark to bright."""
-    return _coloured(np.minimum(confidence, MOST_CONFIDENT) * (255.0 / MOST_CONFIDENT), cv2.COLORMAP_BONE)
+    return _coloured(np.minimum(confidence, MAX_CONFIDENCE) * (255.0 / MAX_CONFIDENCE), cv2.COLORMAP_BONE)
 
 
 def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> UInt8:
     """How uncertain the hidden depth is (64, 64) as a picture, bright where it is; dark where there is no surface."""
-    share = np.clip(np.nan_to_num(uncertainty_m, nan=np.inf) / MOST_UNCERTAIN_M, 0.0, 1.0)
+    share = np.clip(np.nan_to_num(uncertainty_m, nan=np.inf) / MAX_UNCERTAINTY_M, 0.0, 1.0)
     rgb = _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_VIRIDIS)
     rgb[np.isnan(depth_m)] = BACKGROUND_RGB
     return rgb

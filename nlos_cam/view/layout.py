@@ -7,7 +7,7 @@ import rerun.blueprint as rrb
 from nlos_calibration.rig import Rig
 
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.view.images import BACKGROUND_RGB, BANNER_HEIGHT, BANNER_WIDTH, MOST_UNCERTAIN_M, RESIDUAL_SPAN_M
+from nlos_cam.view.images import BACKGROUND_RGB, BANNER_HEIGHT, BANNER_WIDTH, MAX_UNCERTAINTY_M, RESIDUAL_SPAN_M
 
 TIMELINE, FRAME_TIMELINE = "time", "frame"
 PLOT_WINDOW_S = 20.0
@@ -50,7 +50,7 @@ def layout(rig: Rig, shown: Shown) -> rrb.Blueprint:
     """What a newcomer sees: verdict, reconstruction, its uncertainty and the bench; below, what they were made from."""
     hidden = rrb.Horizontal(
         _picture("reconstruction", "Reconstruction (bright: near the wall)"),
-        _picture("uncertainty", f"Uncertainty (bright: {1e3 * MOST_UNCERTAIN_M:g} mm)"),
+        _picture("uncertainty", f"Uncertainty (bright: {1e3 * MAX_UNCERTAINTY_M:g} mm)"),
     )
     found = rrb.Vertical(_banner(), hidden, row_shares=[BANNER_SHARE, PICTURES_SHARE])
     top = rrb.Horizontal(found, _bench_tabs(rig, shown.wall), column_shares=[HIDDEN_SHARE, BENCH_SHARE])

@@ -21,11 +21,11 @@ SLACK_S = 0.01
 QUEUE_MOMENTS = 4
 BATCH_S = 1.0
 """What a kill may cost of the end."""
-MOST_BYTES = 2 << 30
+MAX_BYTES = 2 << 30
 """A file ends there, two hours on: browsers cannot load more."""
 
 
-class SavedView:
+class RrdFile:
     """Writes to `path` while entered, in a thread of its own: ten moments per second.
 
     Of five of them it writes the surface in 3D, of two the lidar's pictures. A moment for which there is no room in the
@@ -101,6 +101,6 @@ class SavedView:
                 kept = self.kept
                 drawing.draw(moment, with_lidar=kept % LIDAR_EVERY == 0, with_surface=kept % SURFACE_EVERY == 0)
                 self.kept += 1
-                self.full = self._path.stat().st_size > MOST_BYTES
+                self.full = self._path.stat().st_size > MAX_BYTES
         finally:
             recording.disconnect()

@@ -30,7 +30,7 @@ WRITE_TIMEOUT_S = 5.0
 """A browser that takes no data, or gives no request, for this long is let go."""
 PIECE_BYTES = 1 << 18
 """A file goes out in pieces, each within that time: the viewer has 30 MB, and a link may be slow."""
-MOST_STREAMS = 8
+MAX_STREAMS = 8
 """Browsers that watch at once; each costs a drawing, 12 times a second."""
 POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
@@ -200,7 +200,7 @@ def _is_address(name: str) -> bool:
 
 __all__ = ["Send", "ViewServer"]
 
-MOST_CONNECTIONS = 32
+MAX_CONNECTIONS = 32
 """At once; a further one is closed."""
 CLOSE_AFTER_S = 1.0
 """Streams that were told to end have so long to do so, before their connections are cut."""
@@ -215,7 +215,7 @@ class _Threads(ThreadingHTTPServer):
 
     def __init__(self, family: socket.AddressFamily, host: str, port: int, handler: Any) -> None:
         self.address_family = family
-        self._room = BoundedSemaphore(MOST_CONNECTIONS)
+        self._room = BoundedSemaphore(MAX_CONNECTIONS)
         self._open: set[socket.socket] = set()
         self._changed = Condition()
         super().__init__((host, port), handler)
@@ -269,7 +269,7 @@ class ViewServer:
         *,
         host: str = LOOPBACK,
         exact: bool = False,
-        most_streams: int = MOST_STREAMS,
+        most_streams: int = MAX_STREAMS,
     ) -> None:
         family, self._host = resolved(host)
         handler = handler_of(assets, stream, names_of(host, self._host), most_streams)

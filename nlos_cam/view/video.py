@@ -19,7 +19,7 @@ from nlos_cam.errors import NlosCamError
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.view.images import (
     BACKGROUND_RGB,
-    MOST_UNCERTAIN_M,
+    MAX_UNCERTAINTY_M,
     PALE_RGB,
     as_believed,
     banner_rgb,
@@ -76,8 +76,8 @@ class Still:
         x, y = MIDDLE_AT
         if (uncertainty_m := moment.reconstruction.uncertainty_m) is not None:
             page.picture(MIDDLE_AT, "Uncertainty", uncertainty_rgb(uncertainty_m, depth_m), (SMALL, SMALL))
-            scale = np.linspace(MOST_UNCERTAIN_M, 0.0, BAR_STEPS, dtype=np.float32)[:, np.newaxis]
-            page.bar(MIDDLE_AT, SMALL, uncertainty_rgb(scale, scale), f"{1e3 * MOST_UNCERTAIN_M:.0f} mm", "0")
+            scale = np.linspace(MAX_UNCERTAINTY_M, 0.0, BAR_STEPS, dtype=np.float32)[:, np.newaxis]
+            page.bar(MIDDLE_AT, SMALL, uncertainty_rgb(scale, scale), f"{1e3 * MAX_UNCERTAINTY_M:.0f} mm", "0")
         else:
             page.picture(MIDDLE_AT, "Relief", relief_rgb(depth_m, box), (SMALL, SMALL))
         below = (x, y + LOWER)
@@ -147,7 +147,7 @@ LIDAR_EVERY = 5
 CODEC = "VP80"
 
 
-class Film:
+class VideoFile:
     """Films moments while entered, 15 per second of their own clock; drawing is done by whoever shows them."""
 
     address: str | None = None
@@ -167,7 +167,7 @@ class Film:
         self._writer.release()
 
     def show(self, moment: Moment) -> None:
-        """Film a moment if one is due."""
+        """VideoFile a moment if one is due."""
         if moment.published_s < self._due_s:
             return
         self._due_s = moment.published_s + 1.0 / FRAMES_PER_S - SLACK_S

@@ -11,7 +11,7 @@ from typing import Generic, Protocol, Self, TypeVar
 
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.reconstruct.network import Reconstruction
-from nlos_cam.reconstruct.physics_check import Check
+from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
 from nlos_cam.reconstruct.verdict import Verdict
 
 
@@ -31,7 +31,7 @@ class Moment:
     """What the person at the bench should know now, such as that the lidar has moved."""
     verdict: Verdict | None = None
     """None from networks that do not tell."""
-    check: Check | None = None
+    check: PhysicsCheckResult | None = None
     """The newest physics check, of this frame or an earlier one; None until there is one."""
     stages_s: Mapping[str, float] = field(default_factory=dict[str, float])
     """Seconds by stage."""

@@ -25,7 +25,7 @@ from nlos_cam.view.images import PICTURE_WIDTH, SATURATED_RGB, difference_rgb, n
 from nlos_cam.view.layout import WallNames
 
 RESIDUAL_SPAN_M, USUAL_NOISE_M = 0.002, 0.001
-MOST_POINTS, MOST_SATURATED = 6000, 1500
+MAX_POINTS, MAX_SATURATED = 6000, 1500
 OFF_WALL_M = 0.05
 """What strays farther from the plane is in the picture only: in 3D it would hide the bench."""
 OUTLIER_RGB = (70, 70, 70)
@@ -92,13 +92,13 @@ def _points(record: WallRecord, reference: BareWall) -> Iterator[tuple[str, Any]
     near = np.abs(points_m[..., 2]) <= OFF_WALL_M  # False for NaN
     rgb = difference_rgb(-points_m[..., 2], RESIDUAL_SPAN_M)
     rgb[~reference.inliers] = OUTLIER_RGB
-    kept = every_nth(near.shape, MOST_POINTS)
+    kept = every_nth(near.shape, MAX_POINTS)
     if near[kept].any():
         drawn = rr.Points3D(points_m[kept][near[kept]], colors=rgb[kept][near[kept]], radii=rr.Radius.ui_points(1.5))
         yield "bench/measured/points", drawn
     blinded_m = points_m[near & (reference.saturated > 0.0)]
     if len(blinded_m):
-        some_m = blinded_m[:: ceil(len(blinded_m) / MOST_SATURATED)]
+        some_m = blinded_m[:: ceil(len(blinded_m) / MAX_SATURATED)]
         yield "bench/measured/saturated", rr.Points3D(some_m, colors=[SATURATED_RGB], radii=0.003)
 
 

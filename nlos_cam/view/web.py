@@ -29,7 +29,7 @@ and takes nothing from it."""
 WAIT_S = 0.5
 
 
-class RerunViewer:
+class WebViewer:
     """Serves the view while entered. Nobody watching costs nothing: drawing is done for each browser, in its thread."""
 
     def __init__(
@@ -79,7 +79,7 @@ class RerunViewer:
         count = drawn = 0
         try:
             while not self._closed.is_set():
-                begun_s = self._clock()
+                start_s = self._clock()
                 newest = self._moments.fresh(count, PATIENCE_S, WAIT_S)
                 if newest is None:
                     continue
@@ -88,7 +88,7 @@ class RerunViewer:
                 drawing.draw(moment, with_lidar=drawn % LIDAR_EVERY == 0)
                 send(stream.read() or b"")
                 drawn += 1
-                self._closed.wait(max(0.0, begun_s + DRAW_PERIOD_S - self._clock()))
+                self._closed.wait(max(0.0, start_s + DRAW_PERIOD_S - self._clock()))
         finally:
             recording.disconnect()
 

@@ -9,7 +9,7 @@ from nlos_calibration.wall_record import load_measured
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
-from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.bench import CalibratedRig
 
 FRAMES = 30
 
@@ -33,7 +33,7 @@ def seen() -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
-def bench(seen: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Bench:
+def bench(seen: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> CalibratedRig:
     statistics = BareWallStatistics(RIG.pinhole)
     for frame in seen:
         maps = maps_from_frame(frame)
@@ -41,12 +41,12 @@ def bench(seen: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Bench:
     inliers = np.isfinite(statistics.depth.mean_m())
     reference = statistics.reference(inliers, serial="", settings={"laser_power": 40.0})
     path = write_wall(tmp_path_factory.mktemp("wall") / "wall.toml", reference, RIG.pinhole)
-    return Bench(RIG, load_measured(path))
+    return CalibratedRig(RIG, load_measured(path))
 
 
 @pytest.mark.bench
 @pytest.mark.parametrize("part", ["maps", "bench", "both", "both, 100 averaged"])
-def test_a_frame(benchmark: BenchmarkFixture, seen: list[Frame], bench: Bench, part: str) -> None:
+def test_a_frame(benchmark: BenchmarkFixture, seen: list[Frame], bench: CalibratedRig, part: str) -> None:
     turn, mean = iter(range(10**9)), MapMean(100 if "averaged" in part else 1)
     maps = [maps_from_frame(frame) for frame in seen]
 

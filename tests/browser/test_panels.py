@@ -13,9 +13,9 @@ from measured_walls import exact_wall
 
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.images import LOOKS
-from nlos_cam.view.rrd_file import SavedView
+from nlos_cam.view.rrd_file import RrdFile
 from nlos_cam.view.viewer import Moment
-from nlos_cam.view.web import RecordedView, RerunViewer
+from nlos_cam.view.web import RecordedView, WebViewer
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 
@@ -88,7 +88,7 @@ def at(moment: Moment, number: int) -> Moment:
 
 
 def test_each_panel_changes_with_its_part_of_a_moment_and_a_page_opened_again_shows_it_all(browser: Any) -> None:
-    with RerunViewer(RIG) as viewer, Feed(viewer, still) as feed:
+    with WebViewer(RIG) as viewer, Feed(viewer, still) as feed:
         page = Page(browser, viewer.address or "")
         before = page.until(is_drawn, "every panel is drawn")
         for what, (moment, regions) in CHANGES.items():
@@ -108,7 +108,7 @@ def test_each_panel_changes_with_its_part_of_a_moment_and_a_page_opened_again_sh
 
 
 def test_the_calibrated_view_shows_what_changed_and_the_calibration(browser: Any) -> None:
-    with RerunViewer(RIG, exact_wall()) as viewer, Feed(viewer, still) as feed:
+    with WebViewer(RIG, exact_wall()) as viewer, Feed(viewer, still) as feed:
         page = Page(browser, viewer.address or "")
         before = page.until(is_drawn, "every panel is drawn")
         wide = np.full((64, 80), -0.02, np.float32)
@@ -130,7 +130,7 @@ def test_the_calibrated_view_shows_what_changed_and_the_calibration(browser: Any
 
 def test_a_saved_view_is_gone_through_by_its_time(browser: Any, tmp_path: Path) -> None:
     """Ten minutes, of which the second half is doubted: playing alone would take five to get there."""
-    with SavedView(tmp_path / "view.rrd", RIG, keeps_all=True) as saved:
+    with RrdFile(tmp_path / "view.rrd", RIG, keeps_all=True) as saved:
         for number in range(60):
             verdict = Verdict.SEEN if number < 30 else Verdict.OUTSIDE
             saved.show(replace(full_moment(number, verdict), published_s=10.0 * number))

@@ -16,9 +16,9 @@ from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
 from nlos_cam.live import frame_queue
 from nlos_cam.live.loop import run_live
-from nlos_cam.live.statistics import LiveReport
-from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.reconstruct.pipeline import Processing
+from nlos_cam.live.statistics import RunReport
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import Pipeline
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.recording.playback import ReplayCamera
 from nlos_cam.recording.sdk_playback import SdkReplayCamera
@@ -88,10 +88,10 @@ def instant_of(frame: Frame) -> int:
     return int(frame.truth_depth_m[0, 0])
 
 
-def live(camera: SimulatedCamera, last: int = LAST, **options: Any) -> tuple[list[Moment], LiveReport]:
+def live(camera: SimulatedCamera, last: int = LAST, **options: Any) -> tuple[list[Moment], RunReport]:
     viewer = ListViewer()
     with camera:
-        processing = Processing(Bench(RIG), network)
+        processing = Pipeline(CalibratedRig(RIG), network)
         report = run_live(Until(camera, last), processing, viewer, stop=Event(), **options)  # type: ignore[arg-type]
     moments = [moment for moment in viewer.moments if moment.verdict != Verdict.STALLED]  # the last one, shown again
     assert report.frames == len(moments)
@@ -191,7 +191,7 @@ def test_a_long_stall_has_the_streams_restarted(camera: Make, hurried_clock: Any
 def test_a_device_that_never_comes_back_ends_the_run_with_one_line_and_what_was_counted(
     camera: Make, kind: Any, told: str, counts: dict[str, int]
 ) -> None:
-    until_then: list[LiveReport] = []
+    until_then: list[RunReport] = []
     with pytest.raises(CameraLostError, match=told) as error:
         live(camera(fault(kind, FOREVER), Fault(kind="duplicate", at_frame=2)), on_error=until_then.append)
     assert "\n" not in str(error.value)
@@ -208,7 +208,7 @@ def test_stopping_ends_a_wait_for_a_device_that_is_gone(camera: Make, monkeypatc
     timer = Timer(1.0, stop.set)
     timer.start()
     with gone:
-        report = run_live(gone, Processing(Bench(RIG), network), NullViewer(), stop=stop)
+        report = run_live(gone, Pipeline(CalibratedRig(RIG), network), NullViewer(), stop=stop)
     assert report.frames == 5
     timer.join()
 

@@ -10,7 +10,7 @@ import pytest
 
 SECONDS = 30
 FRAMES = 900
-MOST_GROWTH_MIB = 30.0
+MAX_GROWTH_MIB = 30.0
 Long = tuple[dict[str, Any], list[Any], Path]
 
 
@@ -45,7 +45,7 @@ def test_memory_stays_flat(tool: ModuleType, long: Long) -> None:
     looks = long[1]
     assert len(looks) > SECONDS / 2
     warm = [look.memory_mib for look in looks if look.time_s >= tool.WARM_UP * looks[-1].time_s]
-    assert max(warm) - warm[0] < MOST_GROWTH_MIB
+    assert max(warm) - warm[0] < MAX_GROWTH_MIB
 
 
 def test_both_readers_give_every_frame_alike(tool: ModuleType, long: Long) -> None:

@@ -12,11 +12,11 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import Frame
 from nlos_cam.live.loop import run_live
-from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.reconstruct.pipeline import Processing
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import Pipeline
 from nlos_cam.view import web
 from nlos_cam.view.server import Send
-from nlos_cam.view.web import RerunViewer
+from nlos_cam.view.web import WebViewer
 
 RIG = load_rig("paper-rig")
 MEANWHILE = 100
@@ -24,7 +24,7 @@ MEANWHILE = 100
 PATIENCE = 100_000
 
 
-class Noted(RerunViewer):
+class Noted(WebViewer):
     """Counts the pieces of its streams that a browser was given, and those that it took."""
 
     given = taken = 0
@@ -76,7 +76,7 @@ def test_the_loop_never_waits_for_a_browser_that_reads_nothing(monkeypatch: pyte
         deaf.connect((place.hostname, place.port))
         deaf.sendall(b"GET /live.rrd HTTP/1.0\r\nHost: localhost\r\n\r\n")
         camera: Any = Camera(viewer)
-        method = Processing(Bench(RIG), lambda *_: np.full((1, 64, 64), 0.5, np.float32))
+        method = Pipeline(CalibratedRig(RIG), lambda *_: np.full((1, 64, 64), 0.5, np.float32))
         report = run_live(camera, method, viewer, stop=Event(), recorded=True)
     assert camera.kept_waiting == MEANWHILE
     assert report.frames > MEANWHILE

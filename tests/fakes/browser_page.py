@@ -18,7 +18,7 @@ from nlos_cam.view.viewer import Moment, Viewer
 
 SIZE = {"width": 1280, "height": 800}
 DRAW_TIMEOUT_S = 180.0
-BUTTONS_PX, TAB_GAP_PX, LEAST_TAB_PX, HEADER_PX = 105, 10, 24, 14
+BUTTONS_PX, TAB_GAP_PX, MIN_TAB_PX, HEADER_PX = 105, 10, 24, 14
 """Of a panel's header: what its buttons take on the right, what parts its tabs, and what is no tab; its middle."""
 NOWHERE = 620, 107
 """Where the mouse hovers over nothing: what it hovers over looks otherwise."""
@@ -93,7 +93,7 @@ def tab_middles(header: Pixels) -> list[float]:
     if len(written) == 0:
         return []
     runs = np.split(written, np.flatnonzero(np.diff(written) > TAB_GAP_PX) + 1)
-    return [float(run.mean()) for run in runs if np.ptp(run) >= LEAST_TAB_PX]
+    return [float(run.mean()) for run in runs if np.ptp(run) >= MIN_TAB_PX]
 
 
 def share_like(image: Pixels, rgb: tuple[int, int, int]) -> float:

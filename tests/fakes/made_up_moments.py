@@ -11,7 +11,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.reconstruct.network import Reconstruction, pose_of
-from nlos_cam.reconstruct.physics_check import Check
+from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.viewer import Moment
 
@@ -51,7 +51,7 @@ def full_moment(number: int, verdict: Verdict = Verdict.SEEN, size: tuple[int, i
         reconstruction=replace(plain.reconstruction, uncertainty_m=spread_m),
         difference=LidarMaps(cells, cells, np.isfinite(cells)),
         verdict=verdict,
-        check=Check(number - number % 30, cells, cells, 0.2 + 0.1 * (number % 3), 0.5),
+        check=PhysicsCheckResult(number - number % 30, cells, cells, 0.2 + 0.1 * (number % 3), 0.5),
         stages_s={"wait": 0.02, "maps": 0.002, "bench": 0.0001, "network": 0.009 + 0.001 * (number % 4)},
         dropped=number // 50,
         celsius={"ldd_temperature": 40.0 + number / 100, "mc_temperature": 35.0},

@@ -11,7 +11,7 @@ from nlos_models import checkpoint
 from nlos_models import pipeline as networks
 from nlos_models.arrays import Float16
 from nlos_models.data import MapBatch, MapSet, map_batches
-from nlos_models.pipeline import Pipeline
+from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import Recipe
 from torch import Tensor, nn
 from torch.nn import functional
@@ -144,6 +144,6 @@ def untrained_weights(folder: Path, *, rig: Any, seed: int = 0, **recipe: Any) -
         rig_name=rig.name, rig_checksum=rig.checksum, input=made.maps, compressor_recipe=made
     )
     torch.manual_seed(seed)
-    pipeline = Pipeline(SmallCompressor(), SmallDecoder())  # type: ignore[arg-type]
+    pipeline = RemappingNetwork(SmallCompressor(), SmallDecoder())  # type: ignore[arg-type]
     encoder = None if made.steps == "one" else SmallEncoder()
     checkpoint.save_pipeline(folder, pipeline, record, encoder)  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ import pytest
 from nlos_cam.render import renderer
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.effects import Effects
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.scene import Scene
 
 IMPLEMENTATIONS = ("cpu", "reference")
@@ -45,7 +45,7 @@ class Implementation:
         setting, backend = self._how(accuracy)
         return renderer.three_bounce(scene, setting, effects, backend, chosen)
 
-    def histograms(self, job: Job) -> np.ndarray:
+    def histograms(self, job: TransportJob) -> np.ndarray:
         setting, backend = self._how(job.accuracy)
         return renderer.implementation(setting, backend)(replace(job, accuracy=setting))
 

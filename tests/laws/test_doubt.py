@@ -5,17 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from nlos_models.doubt_checkpoint import load_doubter
+from nlos_models.doubt_checkpoint import load_uncertainty_model
 from nlos_models.inference import load_reconstructor
 
-from nlos_cam.dataset.outliers import TO_LEARN, Sight, ordinary, outlier, varied_empty
+from nlos_cam.dataset.outliers import TO_LEARN, Stimulus, ordinary, outlier, varied_empty
 from nlos_cam.evaluate.subjects import echoes_of, sense
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.benchmark import benchmark_objects
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.reconstruct.pipeline import Arrival, Processing, Step
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import Arrival, FrameResult, Pipeline
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.render.renderer import render
 from nlos_cam.render.sensor.model import SensorModel
@@ -27,34 +27,34 @@ RIG = load_rig("paper-rig")
 
 
 @pytest.fixture(scope="module")
-def processing() -> Processing:
+def processing() -> Pipeline:
     cache = cache_folder() / "onnx"
-    doubter = load_doubter(None, cache)
+    doubter = load_uncertainty_model(None, cache)
     assert doubter is not None
-    return Processing(Bench(RIG), load_reconstructor(None, cache), doubter=doubter)
+    return Pipeline(CalibratedRig(RIG), load_reconstructor(None, cache), doubter=doubter)
 
 
-def frames_of(sight: Sight, count: int, seed: int) -> list[Frame]:
+def frames_of(sight: Stimulus, count: int, seed: int) -> list[Frame]:
     """Return frames of one scene with different noise."""
     sensor, echoes = Sensor(sight.rig, sight.sensor), render(sight.scene, "draft").multi
     noises = (np.random.default_rng([seed, number]) for number in range(count))
     return [sensor.expose(echoes, noise).frame(sight.rig.pinhole) for noise in noises]
 
 
-def steps_of(processing: Processing, frames: Sequence[Frame]) -> list[Step]:
+def steps_of(processing: Pipeline, frames: Sequence[Frame]) -> list[FrameResult]:
     return [processing.step(Arrival(frame, 0.0), lambda: 0.0, 0.0) for frame in frames]
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_empty_bench_never_shows_an_object(processing: Processing, seed: int) -> None:
+def test_empty_bench_never_shows_an_object(processing: Pipeline, seed: int) -> None:
     bench = varied_empty(RIG, SensorModel(), np.random.default_rng([seed, 77]))
-    for step in steps_of(processing, frames_of(Sight(*bench), 3, seed)):
+    for step in steps_of(processing, frames_of(Stimulus(*bench), 3, seed)):
         assert step.verdict == Verdict.NOTHING
         assert not step.reconstruction.shows
 
 
-def test_known_objects_are_seen_with_honest_expected_errors(processing: Processing) -> None:
-    subjects = test_set(object_box(RIG))[::3]
+def test_known_objects_are_seen_with_honest_expected_errors(processing: Pipeline) -> None:
+    subjects = benchmark_objects(object_box(RIG))[::3]
     expected, observed, verdicts = list[float](), list[float](), list[Verdict | None]()
     for subject, maps in zip(subjects, sense(echoes_of(subjects, RIG, lambda *_: None), RIG), strict=True):
         frame = frame_of(maps)
@@ -81,16 +81,16 @@ def frame_of(maps: LidarMaps) -> Frame:
 
 
 @pytest.mark.parametrize("name", ["plates", "other rig", "other sensor", "large"])
-def test_plain_outliers_are_reported_as_unusual(processing: Processing, name: str) -> None:
+def test_plain_outliers_are_reported_as_unusual(processing: Pipeline, name: str) -> None:
     verdicts = list[Verdict | None]()
     for seed in range(8):
-        sight = outlier(TO_LEARN[name], np.random.default_rng([seed, 78]), Sight(RIG, SensorModel()))
+        sight = outlier(TO_LEARN[name], np.random.default_rng([seed, 78]), Stimulus(RIG, SensorModel()))
         verdicts.append(steps_of(processing, frames_of(sight, 5, seed))[-1].verdict)
     assert verdicts.count(Verdict.OUTSIDE) + verdicts.count(Verdict.SATURATED) >= 6
 
 
-def test_object_shows_in_its_first_frame_and_not_after(processing: Processing) -> None:
-    sight = ordinary(np.random.default_rng(5), Sight(RIG, SensorModel()))
-    with_it, without = frames_of(sight, 1, 0), frames_of(Sight(RIG, SensorModel()), 1, 0)
+def test_object_shows_in_its_first_frame_and_not_after(processing: Pipeline) -> None:
+    sight = ordinary(np.random.default_rng(5), Stimulus(RIG, SensorModel()))
+    with_it, without = frames_of(sight, 1, 0), frames_of(Stimulus(RIG, SensorModel()), 1, 0)
     shown = [step.reconstruction.shows for step in steps_of(processing, [*without, *with_it, *without])]
     assert shown == [False, True, False]

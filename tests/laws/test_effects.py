@@ -16,7 +16,7 @@ from nlos_cam.render.material import Surface, phong
 from nlos_cam.render.planning import plan
 from nlos_cam.render.renderer import transient
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_facts import Stage
+from nlos_cam.render.scene_facts import SceneFacts
 
 RIG = load_rig("paper-rig")
 OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
@@ -96,7 +96,7 @@ def _change(other: np.ndarray, whole: np.ndarray) -> float:
 
 
 def _left_out(scene: Scene, accuracy: Accuracy = COARSE) -> set[str]:
-    return {effect.name for effect in plan(Stage(scene, accuracy)) if not effect.included}
+    return {effect.name for effect in plan(SceneFacts(scene, accuracy)) if not effect.included}
 
 
 def test_every_effect_has_its_two_scenes() -> None:
@@ -156,7 +156,7 @@ scenes = st.builds(
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(scene=scenes, stop=st.sampled_from(sorted(STOPS)))
 def test_what_is_left_out_together_is_bounded_by_the_tolerance(scene: Scene, stop: str) -> None:
-    verdicts = plan(Stage(scene, STOPS[stop]))
+    verdicts = plan(SceneFacts(scene, STOPS[stop]))
     assert tuple(effect.name for effect in verdicts) == EFFECTS
     assert sum(effect.bound for effect in verdicts if not effect.included) <= STOPS[stop].tolerance
     assert all(0 <= effect.bound <= 1 and effect.reason for effect in verdicts)
@@ -173,7 +173,7 @@ def test_a_bound_is_never_below_what_leaving_the_effect_out_changes(
 ) -> None:
     accuracy = replace(COARSE, relay_columns=cells[0], relay_rows=cells[1])
     every = set(EFFECTS) - ({"inter-reflection"} if scene.radiometry == "paper" else set())
-    bound = next(effect.bound for effect in plan(Stage(scene, accuracy)) if effect.name == name)
+    bound = next(effect.bound for effect in plan(SceneFacts(scene, accuracy)) if effect.name == name)
     if bound < 1:
         whole, without = (transient(scene, accuracy, names) for names in (every, every - {name}))
         whole, without = (part if part.ndim == 4 else part[..., None] for part in (whole, without))
@@ -182,7 +182,7 @@ def test_a_bound_is_never_below_what_leaving_the_effect_out_changes(
 
 def test_a_brdfs_bound_counts_what_takes_its_place() -> None:
     scene = Scene(RIG, _plate(), Surface(1.0, phong(0.8, 0.2, 1)))
-    verdicts = plan(Stage(scene, COARSE))
+    verdicts = plan(SceneFacts(scene, COARSE))
     assert included(verdicts, "brdf")
     bound = next(effect.bound for effect in verdicts if effect.name == "brdf")
     whole, without = (transient(scene, COARSE, names) for names in (set(EFFECTS), set(EFFECTS) - {"brdf"}))

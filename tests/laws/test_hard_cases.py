@@ -20,7 +20,7 @@ from nlos_cam.render.scene import Scene
 RIG = load_rig("paper-rig")
 OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
 FEW = Accuracy("few", relay_columns=4, relay_rows=4)
-MOST_EFFECTS = sorted(set(EFFECTS) - {"inter-reflection", "pulse"})
+MAX_EFFECTS = sorted(set(EFFECTS) - {"inter-reflection", "pulse"})
 
 
 def _grid(value: float = np.nan, cells: int = 8) -> np.ndarray:
@@ -75,7 +75,7 @@ def _lidar(distance_m: float, yaw_deg: float, rig: Rig = RIG) -> Rig:
 def test_objects(implementation: Any, name: str, radiometry: Any) -> None:
     for jump_m in (0.02, 10.0):
         scene = Scene(RIG, OBJECTS[name], radiometry=radiometry, jump_m=jump_m)
-        _check(implementation.render(scene, MOST_EFFECTS, FEW))
+        _check(implementation.render(scene, MAX_EFFECTS, FEW))
 
 
 @pytest.mark.parametrize("distance_m", [0.15, 0.3])
@@ -203,7 +203,7 @@ def test_whatever_the_depths(
     depth = np.array(cells, np.float32).reshape(size, size)
     scene = Scene(rig, depth, Surface(albedo), radiometry, jump_m)
     try:
-        rendering = implementation.render(scene, MOST_EFFECTS, FEW)
+        rendering = implementation.render(scene, MAX_EFFECTS, FEW)
     except SceneError as error:
         assert "surrounds the lidar" in str(error)  # noqa: PT017
         return

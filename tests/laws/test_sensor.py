@@ -14,7 +14,7 @@ from nlos_cam.render.geometry import cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor.bias import PATCHES_SEED, RIPPLES_SEED, WAVES, patches, ripples, texture
-from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MOST_CONFIDENT, SensorModel, WarmUp
+from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MAX_CONFIDENCE, SensorModel, WarmUp
 from nlos_cam.render.sensor.sensor import SensedImages, Sensor
 
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
@@ -231,7 +231,7 @@ def test_no_input_makes_an_image_that_cannot_be(seed: int, included: bool, model
     one, same = (Sensor(RIG, model).expose(multi, _generator(seed), celsius=CELSIUS) for _ in range(2))
     for name in ("depth_z16", "ir", "confidence"):
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
-    assert one.confidence.max() <= MOST_CONFIDENT
+    assert one.confidence.max() <= MAX_CONFIDENCE
     assert not one.depth_z16[one.confidence == 0].any()
     if included:
         assert not one.depth_z16[np.isnan(path)].any()

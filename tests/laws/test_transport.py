@@ -12,7 +12,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.geometry import Relay
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Surface, phong
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Radiometry, Scene
@@ -39,13 +39,13 @@ def _rough(seed: int, low_m: float = 0.15, high_m: float = 0.35) -> np.ndarray:
     return np.random.default_rng(seed).uniform(low_m, high_m, (8, 8)).astype(np.float32)
 
 
-def _job(scene: Scene, accuracy: Accuracy = COARSE) -> Job:
+def _job(scene: Scene, accuracy: Accuracy = COARSE) -> TransportJob:
     job = Prepared.of(scene, accuracy, ALL_BUT_MORE).job()
     assert job is not None
     return job
 
 
-def _arrived(implementation: Any, job: Job) -> np.ndarray:
+def _arrived(implementation: Any, job: TransportJob) -> np.ndarray:
     """What of the light of each beam's foot arrives on the relay: before the detector's leg, here the same for all."""
     far_m = 10.0
     there = np.full_like(job.relay.x_m, far_m)
@@ -69,7 +69,7 @@ def test_less_light_arrives_than_left_the_foot(
     assert arrived.max() > 0
 
 
-def _swapped(job: Job) -> Job:
+def _swapped(job: TransportJob) -> TransportJob:
     """The same with the feet where the relay cells were and the other way round."""
     relay, foot = job.relay, job.foot_m
     there = Relay(*foot[:, :2].T.copy(), job.length_m, np.ones(len(foot)), relay.cell_m2, relay.diagonal_m)

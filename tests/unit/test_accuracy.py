@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.accuracy import MOST_BEAMS_PER_CELL, MOST_RELAY_CELLS, STOPS, Accuracy, accuracy_named
+from nlos_cam.render.accuracy import MAX_BEAMS_PER_CELL, MAX_RELAY_CELLS, STOPS, Accuracy, accuracy_named
 
 
 def test_a_stop_goes_by_its_name_and_a_setting_is_itself() -> None:
@@ -32,10 +32,10 @@ def test_another_name_is_refused_with_those_that_are() -> None:
     ("field", "value"),
     [
         ("relay_columns", 0),
-        ("relay_rows", MOST_RELAY_CELLS + 1),
+        ("relay_rows", MAX_RELAY_CELLS + 1),
         ("object_stride", 0),
         ("sectors", 0),
-        ("beams_per_cell", MOST_BEAMS_PER_CELL + 1),
+        ("beams_per_cell", MAX_BEAMS_PER_CELL + 1),
         ("scatter_error", 0.0),
         ("tolerance", -1e-9),
         ("tolerance", float("nan")),

@@ -11,7 +11,7 @@ from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.reconstruct.bench import Bench, Look, difference_of, open_bench
+from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig, difference_of, open_bench
 
 
 def camera(intrinsics: Intrinsics = SMALL, **others: Any) -> Any:
@@ -32,7 +32,7 @@ def test_without_a_record_the_rig_is_the_cameras_if_it_can_hide_something_else_t
 
 def test_a_bench_without_a_record_has_no_difference_and_nothing_to_warn_of() -> None:
     frame = wall_frame(0)
-    bench = Bench(RIG)
+    bench = CalibratedRig(RIG)
     bench.look_at({"ldd_temperature": 90.0})
     look = bench.look(frame, maps_from_frame(frame))
     assert (look.difference, look.warnings, bench.reference) == (None, (), None)
@@ -54,7 +54,7 @@ def test_a_record_without_a_reference_has_no_difference(tmp_path: Path) -> None:
 
 
 def test_the_bare_wall_differs_from_itself_by_its_noise_alone(tmp_path: Path) -> None:
-    frame, bench = wall_frame(999), Bench(RIG, measured_wall(tmp_path))
+    frame, bench = wall_frame(999), CalibratedRig(RIG, measured_wall(tmp_path))
     difference = bench.look(frame, maps_from_frame(frame)).difference
     assert difference is not None
     off_m = difference.depth_m[difference.valid]
@@ -64,7 +64,7 @@ def test_the_bare_wall_differs_from_itself_by_its_noise_alone(tmp_path: Path) ->
 
 
 def test_a_drift_of_the_whole_range_is_taken_out_of_the_difference(tmp_path: Path) -> None:
-    bench = Bench(RIG, measured_wall(tmp_path))
+    bench = CalibratedRig(RIG, measured_wall(tmp_path))
     levels_m = list[float]()
     for number in range(100, 160):
         frame = wall_frame(number, nearer_m=0.0006)
@@ -92,7 +92,7 @@ def test_a_difference_is_what_was_added_to_the_wall_valid_where_both_are() -> No
     assert found.depth_m.dtype == found.intensity.dtype == np.float32
 
 
-def last_warnings(bench: Bench, nearer_m: float = 0.0, frames: int = 40) -> tuple[str, ...]:
+def last_warnings(bench: CalibratedRig, nearer_m: float = 0.0, frames: int = 40) -> tuple[str, ...]:
     found: tuple[str, ...] = ()
     for number in range(frames):
         frame = wall_frame(number + 500, nearer_m)
@@ -102,15 +102,15 @@ def last_warnings(bench: Bench, nearer_m: float = 0.0, frames: int = 40) -> tupl
 
 def test_a_lidar_that_stays_is_no_cause_for_a_warning_and_one_that_moves_is(tmp_path: Path) -> None:
     measured = measured_wall(tmp_path)
-    assert last_warnings(Bench(RIG, measured)) == ()
-    assert last_warnings(Bench(RIG, measured), nearer_m=0.01) != ()
+    assert last_warnings(CalibratedRig(RIG, measured)) == ()
+    assert last_warnings(CalibratedRig(RIG, measured), nearer_m=0.01) != ()
 
 
 @pytest.mark.parametrize(("nearer_m", "moved"), [(0.0, False), (0.002, False), (0.01, True)])
 def test_a_range_that_drifts_a_little_has_not_moved_the_lidar_and_by_a_centimetre_it_has(
     tmp_path: Path, nearer_m: float, moved: bool
 ) -> None:
-    bench, looks = Bench(RIG, measured_wall(tmp_path)), list[Look]()
+    bench, looks = CalibratedRig(RIG, measured_wall(tmp_path)), list[BenchObservation]()
     for number in range(40):
         frame = wall_frame(number + 500, nearer_m)
         looks.append(bench.look(frame, maps_from_frame(frame)))
@@ -119,14 +119,14 @@ def test_a_range_that_drifts_a_little_has_not_moved_the_lidar_and_by_a_centimetr
 
 
 def test_a_lidar_that_no_longer_sees_the_wall_has_moved(tmp_path: Path) -> None:
-    bench, frame = Bench(RIG, measured_wall(tmp_path)), wall_frame(0)
+    bench, frame = CalibratedRig(RIG, measured_wall(tmp_path)), wall_frame(0)
     looks = [bench.look(replace(frame, depth_m=frame.depth_m + 1.0), maps_from_frame(frame)) for _ in range(300)]
     assert not looks[0].moved
     assert looks[-1].moved
 
 
 def test_a_lidar_that_is_hotter_by_far_is_a_cause_for_a_warning(tmp_path: Path) -> None:
-    bench = Bench(RIG, measured_wall(tmp_path))
+    bench = CalibratedRig(RIG, measured_wall(tmp_path))
     bench.look_at({"ldd_temperature": 41.0})
     assert last_warnings(bench) == ()
     bench.look_at({"ldd_temperature": 75.0})

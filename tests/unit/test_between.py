@@ -13,7 +13,7 @@ from nlos_cam.render.interreflection import (
     wall_cells,
     wall_factors,
 )
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
 
@@ -22,7 +22,7 @@ UP, DOWN = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
 
 
 @pytest.fixture(scope="module")
-def job() -> Job:
+def job() -> TransportJob:
     at = np.linspace(-1, 1, 6)
     depth = (0.2 - 0.06 * (at[:, None] ** 2 + at**2)).astype(np.float32)
     scene = Scene(RIG, depth, radiometry="lambertian", jump_m=0.5)
@@ -41,7 +41,7 @@ def test_two_squares_face_to_face_see_each_other_as_s2_says(lambertian: bool) ->
         assert form_factor(*back, 1e-4, 1.0, 0.1, lambertian) == 0
 
 
-def test_patches_of_a_bowl_see_each_other_alike_both_ways_and_give_less_than_all(job: Job) -> None:
+def test_patches_of_a_bowl_see_each_other_alike_both_ways_and_give_less_than_all(job: TransportJob) -> None:
     p = job.patches
     surface = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
     table = patch_to_patch(*surface, job.field, 1e-9, True)  # beyond near contact
@@ -53,7 +53,7 @@ def test_patches_of_a_bowl_see_each_other_alike_both_ways_and_give_less_than_all
     assert near.sum(1).max() <= 1
 
 
-def test_the_wall_about_the_object_takes_less_than_all(job: Job) -> None:
+def test_the_wall_about_the_object_takes_less_than_all(job: TransportJob) -> None:
     cells = wall_cells(job)
     assert len(cells) == WALL_CELLS**2
     extent = np.ptp(cells[:, :2], axis=0) * WALL_CELLS / (WALL_CELLS - 1)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from nlos_cam.camera.streams import FORMATS, FRAMES_PER_S, TELLING, Alignment, Pairing, Sample
+from nlos_cam.camera.streams import FORMATS, FRAMES_PER_S, TELLING, FrameSynchronizer, Sample, StreamOffsets
 
 STREAMS = tuple(FORMATS)
 PIXELS = np.zeros((1, 1), np.uint16)
@@ -24,7 +24,7 @@ def counted_apart(instants: range, lost: dict[str, int]) -> Iterator[Sample]:
 @pytest.mark.parametrize("stream", STREAMS)
 @pytest.mark.parametrize("instant", [0, 20])
 def test_a_stream_that_lost_a_frame_is_paired_by_time_again(stream: str, instant: int) -> None:
-    pairing = Pairing()
+    pairing = FrameSynchronizer()
     found = [one for sample in counted_apart(range(60), {stream: instant}) if (one := pairing.add(sample))]
     assert len(found) == 60 - 1 - TELLING
     assert pairing.incomplete == 60 - len(found)
@@ -34,7 +34,7 @@ def test_a_stream_that_lost_a_frame_is_paired_by_time_again(stream: str, instant
 
 
 def test_two_streams_may_be_behind() -> None:
-    pairing = Pairing()
+    pairing = FrameSynchronizer()
     lost = {"infrared": 0, "confidence": 30}
     found = [one for sample in counted_apart(range(90), lost) if (one := pairing.add(sample))]
     assert len(found) >= 90 - 2 * (2 + TELLING)
@@ -42,7 +42,7 @@ def test_two_streams_may_be_behind() -> None:
 
 
 def test_numbers_stay_where_the_timestamps_agree_or_differ_once() -> None:
-    alignment = Alignment(FRAMES_PER_S)
+    alignment = StreamOffsets(FRAMES_PER_S)
     late = {"depth": 1.0, "infrared": 1.0 + 1 / FRAMES_PER_S}
     for _ in range(10):
         for times_s in (late, late, {"depth": 1.0, "infrared": 1.01}):
@@ -52,7 +52,7 @@ def test_numbers_stay_where_the_timestamps_agree_or_differ_once() -> None:
 
 
 def test_a_lag_is_taken_once_until_it_is_told_anew() -> None:
-    alignment = Alignment(FRAMES_PER_S)
+    alignment = StreamOffsets(FRAMES_PER_S)
     for _ in range(TELLING + 1):
         alignment.note({"depth": 1.0, "infrared": 1.0 + 2 / FRAMES_PER_S})
     assert alignment.add(Sample("infrared", 7, 1.0, PIXELS)).number == 9

@@ -8,10 +8,10 @@ import pytest
 from nlos_cam.recording import rosbag, salvage
 from nlos_cam.recording.rosbag import (
     BagFormatError,
+    BagRecord,
     Ending,
     Op,
     Read,
-    Record,
     pack_chunk_head,
     pack_index,
     pack_record,
@@ -156,7 +156,7 @@ def test_data_that_lost_its_header_is_found() -> None:
 def test_an_unknown_compression_is_no_chunk() -> None:
     found, _ = examined(CONTENT, "bz2")
     assert (found.chunk, found.ending) == (None, Ending.BROKEN)
-    record = Record(Op.CHUNK, {}, 0, 0)
+    record = BagRecord(Op.CHUNK, {}, 0, 0)
     assert examine(reader(b""), 0, record, 0).chunk is None
 
 

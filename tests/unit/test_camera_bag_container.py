@@ -43,7 +43,7 @@ def test_the_end_is_the_last_message(noise_bag: Path) -> None:
 
 
 def test_no_more_is_unpacked_than_the_bound(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bag_container, "MOST_BYTES", 10_000)
+    monkeypatch.setattr(bag_container, "MAX_BYTES", 10_000)
     bag = BagContainer(noise_bag)
     with pytest.raises(RecordingError, match="a chunk of"):
         bag.read("/file_version", bag.entries["/file_version"][0])

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording.bag_container import MOST_BYTES
+from nlos_cam.recording.bag_container import MAX_BYTES
 from nlos_cam.recording.bag_reader import BagFile
 from nlos_cam.recording.playback import verify
 
@@ -68,4 +68,4 @@ def test_an_absurd_size_is_not_allocated(
             read_all(path)
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        assert peak < 2 * MOST_BYTES
+        assert peak < 2 * MAX_BYTES

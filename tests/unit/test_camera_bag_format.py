@@ -9,9 +9,9 @@ from nlos_cam.recording.rosbag import (
     HEADER_LIMIT,
     BagCutError,
     BagFormatError,
+    BagRecord,
     Op,
     Read,
-    Record,
     check_bookkeeping,
     message_key,
     number,
@@ -43,7 +43,7 @@ def connection(topic: bytes = b"/a", **changed: bytes) -> bytes:
     return pack_record({"conn": bytes([7, 0, 0, 0]), "op": b"\x07", "topic": topic}, packed(DESCRIBED | changed))
 
 
-def described(content: bytes) -> tuple[Read, Record]:
+def described(content: bytes) -> tuple[Read, BagRecord]:
     return reader(content), read_record(reader(content), 0)
 
 
@@ -113,7 +113,7 @@ def test_a_missing_field_and_one_of_another_size_are_errors() -> None:
     with pytest.raises(BagFormatError, match="4 bytes has 3"):
         number({"count": b"123"}, "count")
     with pytest.raises(BagFormatError, match="time is damaged"):
-        message_key(Record(Op.MESSAGE, {"conn": bytes(4), "time": bytes(7)}, 0, 0))
+        message_key(BagRecord(Op.MESSAGE, {"conn": bytes(4), "time": bytes(7)}, 0, 0))
     with pytest.raises(BagFormatError, match="no known kind"):
         read_record(reader(pack_record({"op": b"\x09"}, b"")), 0)
 

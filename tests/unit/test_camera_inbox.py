@@ -4,17 +4,17 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from nlos_cam.camera.session import CAPACITY, Inbox
+from nlos_cam.camera.session import CAPACITY, SampleQueue
 from nlos_cam.camera.streams import FORMATS, Sample
 
 
-def put(inbox: Inbox, numbers: range) -> None:
+def put(inbox: SampleQueue, numbers: range) -> None:
     for number in numbers:
         for stream in FORMATS:
             inbox.put(Sample(stream, number, number / 30, np.zeros((1, 1))))
 
 
-def take_all(inbox: Inbox) -> list[int]:
+def take_all(inbox: SampleQueue) -> list[int]:
     taken: list[int] = []
     while (found := inbox.take(0.0)) is not None:
         taken.append(found.number)
@@ -22,14 +22,14 @@ def take_all(inbox: Inbox) -> list[int]:
 
 
 def test_a_full_live_inbox_drops_its_oldest_and_counts_it() -> None:
-    inbox = Inbox(lossless=False)
+    inbox = SampleQueue(lossless=False)
     put(inbox, range(CAPACITY + 3))
     assert take_all(inbox) == list(range(3, CAPACITY + 3))
     assert inbox.dropped == 3
 
 
 def test_a_full_lossless_inbox_makes_the_sender_wait() -> None:
-    inbox = Inbox(lossless=True)
+    inbox = SampleQueue(lossless=True)
     sender = Thread(target=put, args=(inbox, range(5 * CAPACITY)))
     sender.start()
     taken: list[int] = []
@@ -43,7 +43,7 @@ def test_a_full_lossless_inbox_makes_the_sender_wait() -> None:
 
 
 def test_a_lossless_inbox_holds_no_more_than_its_capacity() -> None:
-    inbox = Inbox(lossless=True)
+    inbox = SampleQueue(lossless=True)
     sender = Thread(target=put, args=(inbox, range(5 * CAPACITY)))
     sender.start()
     while inbox.arrived.total() < 3 * CAPACITY:
@@ -55,7 +55,7 @@ def test_a_lossless_inbox_holds_no_more_than_its_capacity() -> None:
 
 
 def test_closing_lets_a_waiting_sender_go() -> None:
-    inbox = Inbox(lossless=True)
+    inbox = SampleQueue(lossless=True)
     sender = Thread(target=put, args=(inbox, range(2 * CAPACITY)))
     sender.start()
     inbox.close()
@@ -65,7 +65,7 @@ def test_closing_lets_a_waiting_sender_go() -> None:
 
 
 def test_what_came_before_the_end_can_still_be_taken() -> None:
-    inbox = Inbox(lossless=True)
+    inbox = SampleQueue(lossless=True)
     put(inbox, range(2))
     inbox.finish()
     assert not inbox.ended
@@ -74,7 +74,7 @@ def test_what_came_before_the_end_can_still_be_taken() -> None:
 
 
 def test_half_a_set_at_the_end_of_a_recording_is_counted() -> None:
-    live, recording = Inbox(lossless=False), Inbox(lossless=True)
+    live, recording = SampleQueue(lossless=False), SampleQueue(lossless=True)
     for inbox in (live, recording):
         inbox.put(Sample("depth", 0, 0.0, np.zeros((1, 1))))
         inbox.finish()
@@ -82,7 +82,7 @@ def test_half_a_set_at_the_end_of_a_recording_is_counted() -> None:
 
 
 def test_a_failure_reaches_the_taker_after_the_sets_before_it() -> None:
-    inbox = Inbox(lossless=False)
+    inbox = SampleQueue(lossless=False)
     put(inbox, range(1))
     inbox.fail(ZeroDivisionError("far away"))
     assert inbox.take(0.0) is not None
@@ -91,17 +91,17 @@ def test_a_failure_reaches_the_taker_after_the_sets_before_it() -> None:
 
 
 def test_a_taker_that_waits_in_vain_is_told_none() -> None:
-    assert Inbox(lossless=False).take(0.001) is None
+    assert SampleQueue(lossless=False).take(0.001) is None
 
 
 def test_each_set_is_shown_as_it_passes() -> None:
     seen: list[int] = []
-    put(Inbox(lossless=False, on_set=lambda found: seen.append(found.number)), range(4))
+    put(SampleQueue(lossless=False, on_set=lambda found: seen.append(found.number)), range(4))
     assert seen == [0, 1, 2, 3]
 
 
 def test_what_is_expected_is_a_shape_and_the_rest_is_counted() -> None:
-    inbox = Inbox(lossless=False)
+    inbox = SampleQueue(lossless=False)
     inbox.expect((1, 1))
     for number, shape in enumerate([(1, 1), (2, 1), (1, 1)]):
         for stream in FORMATS:

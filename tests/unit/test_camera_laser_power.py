@@ -5,10 +5,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from nlos_cam.camera.laser_power import STRIDES, Limits, turn_down, weaker
-from nlos_cam.frames import MOST_SATURATED, saturated_share
+from nlos_cam.camera.laser_power import STRIDES, PowerLimits, turn_down, weaker
+from nlos_cam.frames import MAX_SATURATED, saturated_share
 
-RANGES = [Limits(0, 100, 1), Limits(5, 95, 5), Limits(0, 100, 30), Limits(1, 3, 1), Limits(0, 1, 0.01)]
+RANGES = [
+    PowerLimits(0, 100, 1),
+    PowerLimits(5, 95, 5),
+    PowerLimits(0, 100, 30),
+    PowerLimits(1, 3, 1),
+    PowerLimits(0, 1, 0.01),
+]
 
 
 class Wall:
@@ -29,7 +35,7 @@ class Wall:
 
 @pytest.mark.parametrize("limits", RANGES)
 @pytest.mark.parametrize("part", [0.0, 0.15, 0.5, 0.77, 1.0, 2.0])
-def test_it_ends_falling_above_darkness_and_no_further_than_needed(limits: Limits, part: float) -> None:
+def test_it_ends_falling_above_darkness_and_no_further_than_needed(limits: PowerLimits, part: float) -> None:
     threshold = limits.least + part * (limits.most - limits.least)
     wall = Wall(limits.most, threshold)
     settled = turn_down(limits.most, limits, wall.look, wall.put)
@@ -47,31 +53,31 @@ def test_it_ends_falling_above_darkness_and_no_further_than_needed(limits: Limit
         assert settled.saturated == 0.0
 
 
-@pytest.mark.parametrize("share", [0.0, MOST_SATURATED])
+@pytest.mark.parametrize("share", [0.0, MAX_SATURATED])
 def test_an_image_that_is_good_enough_is_left_alone(share: float) -> None:
-    assert turn_down(93, Limits(0, 100, 1), lambda: share, lambda _: pytest.fail("was set")).power == 93
+    assert turn_down(93, PowerLimits(0, 100, 1), lambda: share, lambda _: pytest.fail("was set")).power == 93
 
 
 def test_without_frames_nothing_is_changed() -> None:
-    settled = turn_down(93, Limits(0, 100, 1), lambda: None, lambda _: pytest.fail("was set"))
+    settled = turn_down(93, PowerLimits(0, 100, 1), lambda: None, lambda _: pytest.fail("was set"))
     assert (settled.power, settled.saturated) == (93, None)
 
 
 def test_a_power_that_does_not_take_ends_it() -> None:
     put: list[float] = []
-    settled = turn_down(93, Limits(0, 100, 1), lambda: 0.5, put.append)
+    settled = turn_down(93, PowerLimits(0, 100, 1), lambda: 0.5, put.append)
     assert put == [83]
     assert (settled.power, settled.saturated) == (93, 0.5)
 
 
 def test_strides_are_whole_steps() -> None:
-    assert list(weaker(95, Limits(0, 100, 30))) == [65, 35, 30]
-    assert list(weaker(30, Limits(0, 100, 1))) == [20, 10, 1]
+    assert list(weaker(95, PowerLimits(0, 100, 30))) == [65, 35, 30]
+    assert list(weaker(30, PowerLimits(0, 100, 1))) == [20, 10, 1]
 
 
 @pytest.mark.parametrize(("value", "nearest"), [(-1, 5), (5, 5), (7, 5), (8, 10), (94, 95), (1000, 95)])
 def test_the_nearest_allowed_value(value: float, nearest: float) -> None:
-    assert Limits(5, 95, 5).nearest(value) == nearest
+    assert PowerLimits(5, 95, 5).nearest(value) == nearest
 
 
 def test_the_share_of_saturated_pixels() -> None:

@@ -5,7 +5,7 @@ import pytest
 from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.frames import Frame
-from nlos_cam.recording.quality import LEAST_PAIRS, Quality, QualityMeter
+from nlos_cam.recording.quality import MIN_PAIRS, Quality, QualityMeter
 
 SHAPE = 48, 64
 PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
@@ -76,7 +76,7 @@ def test_noise_is_of_the_pixels_that_are_valid_in_both_frames_of_a_pair() -> Non
 
 @pytest.mark.parametrize("spoil", ["too few", "all invalid", "nothing twice"])
 def test_no_noise_is_told_where_there_is_too_little(spoil: str) -> None:
-    frames = noisy(count=LEAST_PAIRS if spoil == "too few" else FRAMES)
+    frames = noisy(count=MIN_PAIRS if spoil == "too few" else FRAMES)
     for frame in frames:
         if spoil == "all invalid" or (spoil == "nothing twice" and frame.frame_number % 2):
             frame.depth_m[:] = np.nan

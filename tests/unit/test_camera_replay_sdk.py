@@ -14,7 +14,7 @@ import pytest
 
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import Inbox
+from nlos_cam.camera.session import SampleQueue
 from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.errors import RecordingError, StreamMissingError
@@ -211,4 +211,4 @@ def test_a_playback_that_never_begins_is_told(noise_bag: Path, monkeypatch: pyte
     monkeypatch.setattr("nlos_cam.recording.sdk_playback.START_TIMEOUT_S", 0.0)
     stopped = SimpleNamespace(current_status=lambda: load_sdk().playback_status.stopped)
     with SdkReplayCamera(noise_bag) as camera, pytest.raises(RecordingError, match="gave no frame"):
-        camera._next(Inbox(lossless=True), stopped)
+        camera._next(SampleQueue(lossless=True), stopped)

@@ -8,7 +8,7 @@ import pytest
 from fake_librealsense import FakeDevice, FakeSensor
 from fake_lidar import FakeLidar
 
-from nlos_cam.camera.session import Inbox, Session, find_streams, read_settings
+from nlos_cam.camera.session import SampleQueue, Session, find_streams, read_settings
 from nlos_cam.camera.streams import FORMATS
 
 
@@ -58,7 +58,7 @@ def test_what_is_not_measured_yet_is_no_setting(fake_l515: Any) -> None:
 
 
 def session_of(lidar: FakeLidar) -> Session:
-    return Session(*find_streams(FakeDevice(lidar, 0)), Inbox(lossless=False))
+    return Session(*find_streams(FakeDevice(lidar, 0)), SampleQueue(lossless=False))
 
 
 def heard(session: Session) -> list[int]:
@@ -96,9 +96,9 @@ def test_while_a_sensor_is_prepared_the_next_set_can_be_looked_at(preparing: Any
 
 def test_a_look_ends_when_nothing_comes_or_nobody_waits_any_more(preparing: Any) -> None:
     def look(session: Session, _: FakeLidar) -> list[Any]:
-        nothing, begun_s = session.look(0.01), monotonic()
+        nothing, start_s = session.look(0.01), monotonic()
         Timer(0.1, session.end_wait).start()
-        return [nothing, session.look(10.0), monotonic() - begun_s < 5.0]
+        return [nothing, session.look(10.0), monotonic() - start_s < 5.0]
 
     assert preparing(look) == [None, None, True]
 

@@ -19,7 +19,7 @@ from nlos_cam.recording.playback import Verified
 from nlos_cam.recording.quality import Quality
 from nlos_cam.recording.sidecar import (
     LOOK_S,
-    MOST_LOOKS,
+    MAX_LOOKS,
     SidecarFile,
     load_sidecar,
     sidecar_path,
@@ -104,8 +104,8 @@ def test_a_camera_without_thermometers_has_no_series(path: Path) -> None:
 
 
 def test_a_long_series_is_thinned_and_still_spans_the_recording(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.recording.sidecar.MOST_LOOKS", 10)
-    assert MOST_LOOKS > 10
+    monkeypatch.setattr("nlos_cam.recording.sidecar.MAX_LOOKS", 10)
+    assert MAX_LOOKS > 10
     sidecar = SidecarFile(path, Warm())
     for number in range(100):
         sidecar.on_frame(frame(number * LOOK_S))

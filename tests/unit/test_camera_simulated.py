@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nlos_cam.camera.recorder import Recording
-from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MOST_LATE, SimulatedCamera
+from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MAX_LATENESS, SimulatedCamera
 from nlos_cam.recording.playback import ReplayCamera
 
 
@@ -61,11 +61,11 @@ def test_frames_are_due_every_thirtieth_of_a_second(noise_world: Any, hurried_cl
 def test_a_frame_is_exposed_late_but_in_time(
     noise_world: Any, hurried_clock: Any, takes_s: float, ahead_s: float
 ) -> None:
-    clock, begun_s = hurried_clock(0.0), dict[int, float]()
+    clock, start_s = hurried_clock(0.0), dict[int, float]()
 
     class Timed(noise_world):
         def images(self, number: int) -> Any:
-            begun_s[number] = clock.now()
+            start_s[number] = clock.now()
             clock.time_s += takes_s
             return super().images(number)
 
@@ -75,7 +75,7 @@ def test_a_frame_is_exposed_late_but_in_time(
         for _ in zip(range(6), camera, strict=False):
             pass
     for number in range(2, 6):
-        assert zero_s + number / 30 - begun_s[number] == pytest.approx(ahead_s, abs=1e-6)
+        assert zero_s + number / 30 - start_s[number] == pytest.approx(ahead_s, abs=1e-6)
 
 
 def test_frames_carry_the_truth_of_their_number(noise_world: Any, hurried_clock: Any) -> None:
@@ -110,15 +110,15 @@ def test_a_world_that_fails_fails_its_reader(noise_world: Any, hurried_clock: An
 
 
 def test_a_world_that_is_a_little_late_catches_up(noise_world: Any, tmp_path: Path) -> None:
-    clock = BusyClock(gap_s=0.9 * MOST_LATE / 30)
+    clock = BusyClock(gap_s=0.9 * MAX_LATENESS / 30)
     assert numbers_recorded(tmp_path / "late.bag", noise_world(), clock, 40) == list(range(40))
 
 
 def test_a_world_that_is_very_late_drops_numbers(noise_world: Any, tmp_path: Path) -> None:
-    clock = BusyClock(gap_s=3 * MOST_LATE / 30)
+    clock = BusyClock(gap_s=3 * MAX_LATENESS / 30)
     numbers = numbers_recorded(tmp_path / "late.bag", noise_world(), clock, 10)
     gaps = np.diff(numbers) - 1
-    assert gaps.max() == pytest.approx(2 * MOST_LATE, abs=3)
+    assert gaps.max() == pytest.approx(2 * MAX_LATENESS, abs=3)
     assert np.count_nonzero(gaps) == 1
 
 

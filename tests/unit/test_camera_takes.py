@@ -9,11 +9,11 @@ import pytest
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.errors import CameraLostError, DiskFullError, RecordingError
-from nlos_cam.recording.capture import Job, Take, Takes, settle
+from nlos_cam.recording.capture import CaptureResult, CaptureSession, CaptureTarget, settle
 from nlos_cam.recording.playback import Verified, verify
 from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
 
-Run = Callable[..., list[Take]]
+Run = Callable[..., list[CaptureResult]]
 
 
 @pytest.fixture
@@ -40,8 +40,8 @@ def run(world: Any, hurried_clock: Any, tmp_path: Path) -> Run:
         stop_at: int | None = None,
         read_back: Callable[[Path], Verified | None] = verify,
         **limits: Any,
-    ) -> list[Take]:
-        jobs = [Job(tmp_path / f"{number}.bag", label=f"object {number}") for number in range(count)]
+    ) -> list[CaptureResult]:
+        jobs = [CaptureTarget(tmp_path / f"{number}.bag", label=f"object {number}") for number in range(count)]
         recording, stop = Recording(jobs[0].path, last=count == 1, **limits), Event()
         camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
 
@@ -49,7 +49,7 @@ def run(world: Any, hurried_clock: Any, tmp_path: Path) -> Run:
             if stop_at is not None and sets >= stop_at:
                 stop.set()
 
-        with closing(Takes(camera, recording, jobs).record(stop, on_sets)) as takes:
+        with closing(CaptureSession(camera, recording, jobs).record(stop, on_sets)) as takes:
             return [settle(take, read_back) for take in takes]
 
     return call
@@ -127,7 +127,8 @@ def test_a_camera_that_gave_nothing_leaves_nothing(world: Any, tmp_path: Path, h
     camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
     world.vanishes_at = 0
     (take,) = [
-        settle(one, verify) for one in Takes(camera, recording, [Job(tmp_path / "0.bag")]).record(Event(), print)
+        settle(one, verify)
+        for one in CaptureSession(camera, recording, [CaptureTarget(tmp_path / "0.bag")]).record(Event(), print)
     ]
     assert (take.state, take.sets, take.found) == ("lost", 0, None)
     assert list(tmp_path.iterdir()) == []
@@ -142,7 +143,7 @@ def test_a_camera_that_does_not_start_leaves_nothing(world: Any, tmp_path: Path,
 
     camera._prepare = fail
     with pytest.raises(CameraLostError, match="does not start"):
-        list(Takes(camera, recording, [Job(tmp_path / "0.bag")]).record(Event(), print))
+        list(CaptureSession(camera, recording, [CaptureTarget(tmp_path / "0.bag")]).record(Event(), print))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -212,10 +213,10 @@ def test_a_first_set_that_was_on_its_way_is_no_damage_to_a_later_take(run: Run) 
 
 
 def test_leaving_between_takes_leaves_the_camera(world: Any, hurried_clock: Any, tmp_path: Path) -> None:
-    jobs = [Job(tmp_path / "0.bag"), Job(tmp_path / "1.bag")]
+    jobs = [CaptureTarget(tmp_path / "0.bag"), CaptureTarget(tmp_path / "1.bag")]
     recording = Recording(jobs[0].path, frames=3, last=False)
     camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
-    takes = Takes(camera, recording, jobs).record(Event(), print)
+    takes = CaptureSession(camera, recording, jobs).record(Event(), print)
     next(takes)
     assert camera._thread
     takes.close()

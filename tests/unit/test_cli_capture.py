@@ -15,7 +15,7 @@ from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.cli import capture
 from nlos_cam.errors import CameraNotFoundError, DiskFullError, NlosCamError, OutputExistsError
-from nlos_cam.recording.capture import Job, Take
+from nlos_cam.recording.capture import CaptureResult, CaptureTarget
 from nlos_cam.recording.playback import Verified, verify
 from nlos_cam.recording.quality import Quality
 from nlos_cam.recording.sidecar import load_sidecar
@@ -30,10 +30,10 @@ sys.exit(app(sys.argv[1:], standalone_mode=False) or 0)
 """
 
 
-def ended_at_once(folder: Path) -> Take:
+def ended_at_once(folder: Path) -> CaptureResult:
     """A take that was interrupted before its first frame."""
     beside = SimpleNamespace(path=folder / "a.json")
-    return Take(Job(folder / "a.bag"), "interrupted", 0, Quality(), beside)
+    return CaptureResult(CaptureTarget(folder / "a.bag"), "interrupted", 0, Quality(), beside)
 
 
 def app() -> typer.Typer:

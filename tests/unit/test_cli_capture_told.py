@@ -9,7 +9,7 @@ from nlos_cam.cli import capture
 from nlos_cam.cli.capture import ending, result, told
 from nlos_cam.cli.main import main
 from nlos_cam.errors import CameraLostError, DiskFullError
-from nlos_cam.recording.capture import Job, Take
+from nlos_cam.recording.capture import CaptureResult, CaptureTarget
 from nlos_cam.recording.playback import Verified
 from nlos_cam.recording.quality import Quality
 
@@ -30,10 +30,17 @@ def bag(tmp_path: Path) -> Path:
     return path
 
 
-def take(path: Path, **changes: Any) -> Take:
+def take(path: Path, **changes: Any) -> CaptureResult:
     found = Verified(30, 1, 1.00049, STREAMS)
-    values = {"job": Job(path), "state": "complete", "sets": 30, "quality": SEEN, "sidecar": Beside(), "found": found}
-    return Take(**values | changes)
+    values = {
+        "job": CaptureTarget(path),
+        "state": "complete",
+        "sets": 30,
+        "quality": SEEN,
+        "sidecar": Beside(),
+        "found": found,
+    }
+    return CaptureResult(**values | changes)
 
 
 def test_one_take_is_told_as_it_is(bag: Path) -> None:
@@ -52,7 +59,7 @@ def test_one_take_is_told_as_it_is(bag: Path) -> None:
 
 
 def test_a_label_is_told_where_there_is_one(bag: Path) -> None:
-    assert result([take(bag, job=Job(bag, "a cup"))], several=False)["label"] == "a cup"
+    assert result([take(bag, job=CaptureTarget(bag, "a cup"))], several=False)["label"] == "a cup"
 
 
 def test_several_takes_have_totals(bag: Path) -> None:

@@ -11,8 +11,8 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.cli import live
 from nlos_cam.errors import BudgetError
 from nlos_cam.live.budget import CALLS, HANDOVER_MS, SHIPPED, Choice, Option, Timed, options_here, timer, within_budget
-from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.reconstruct.pipeline import Processing
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import Pipeline
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 
@@ -110,6 +110,6 @@ def test_a_machine_is_measured_by_its_late_calls_without_the_first() -> None:
         return now_s[0]
 
     camera: Any = SimpleNamespace(intrinsics=SMALL)
-    timed = timer(camera, clock)(Processing(Bench(load_rig("paper-rig")), network))
+    timed = timer(camera, clock)(Pipeline(CalibratedRig(load_rig("paper-rig")), network))
     assert len(calls) == CALLS + 1
     assert (timed.network_ms, timed.rest_ms) == pytest.approx((4.0, 8.0))

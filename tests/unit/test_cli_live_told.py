@@ -1,13 +1,13 @@
 from nlos_cam.cli.live import told
-from nlos_cam.live.statistics import LiveReport
+from nlos_cam.live.statistics import RunReport
 
 TIMES = {"p50": 1.04, "p95": 2.0, "p99": 3.06}
 
 
-def report(**others: object) -> LiveReport:
+def report(**others: object) -> RunReport:
     stages = {"wait": TIMES, "delivery": TIMES, "network": TIMES}
     given = {"stages_percentiles_ms": stages, **others}
-    return LiveReport(10, 29.97, 2, {"p50": 9.0, "p95": 14.0, "p99": 21.0}, {}, {}, {}, **given)  # type: ignore[arg-type]
+    return RunReport(10, 29.97, 2, {"p50": 9.0, "p95": 14.0, "p99": 21.0}, {}, {}, {}, **given)  # type: ignore[arg-type]
 
 
 def test_what_makes_up_the_latency_is_told_first() -> None:

@@ -11,11 +11,11 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.cli import view
 from nlos_cam.cli.view import opened_in_browser, tell_of_view, viewer_of
 from nlos_cam.errors import NlosCamError
-from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.view import web
 from nlos_cam.view.viewer import NullViewer
 
-BENCH = Bench(load_rig("paper-rig"))
+BENCH = CalibratedRig(load_rig("paper-rig"))
 EVERYWHERE = "0.0.0.0"  # noqa: S104  on purpose: what it exposes is told
 
 

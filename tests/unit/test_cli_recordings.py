@@ -59,7 +59,7 @@ def test_a_person_is_told_what_was_recovered_and_what_was_lost(
 def test_many_damages_are_told_in_a_few_lines(
     capsys: pytest.CaptureFixture[str], noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recordings, "MOST_TOLD", 1)
+    monkeypatch.setattr(recordings, "MAX_TOLD", 1)
     content = noise_bags["plain"].read_bytes()
     (tmp_path / "bad.bag").write_bytes(b"X" + content[1:-1])
     recordings.repair_bag(tmp_path / "bad.bag", tmp_path / "a.bag")

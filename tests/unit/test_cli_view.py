@@ -16,16 +16,16 @@ from nlos_cam.cli import live
 from nlos_cam.cli import view as live_view
 from nlos_cam.cli.main import main
 from nlos_cam.cli.view import saving
-from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.view import web
-from nlos_cam.view.rrd_file import SavedView
+from nlos_cam.view.rrd_file import RrdFile
 from nlos_cam.view.viewer import NullViewer
 
 
 @pytest.fixture
 def saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(web, "page_assets", lambda **_: {"/": ("text/html", b"page")})
-    with SavedView(tmp_path / "view.rrd", RIG) as view:
+    with RrdFile(tmp_path / "view.rrd", RIG) as view:
         view.show(full_moment(0))
     return tmp_path / "view.rrd"
 
@@ -64,7 +64,7 @@ def test_no_such_file_is_an_unreadable_recording(tmp_path: Path, capsys: pytest.
 
 
 def test_saving_goes_beside_whoever_else_looks(tmp_path: Path) -> None:
-    nobody, bench = NullViewer(), Bench(RIG)
+    nobody, bench = NullViewer(), CalibratedRig(RIG)
     assert saving(nobody, bench, None) is nobody
     with saving(nobody, bench, tmp_path / "view.rrd") as viewers:
         viewers.show(full_moment(0))

@@ -10,17 +10,17 @@ from matplotlib.figure import Figure
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.live.replay_media import _even_limits, _limits, draw_sheet
 from nlos_cam.reconstruct.network import Reconstruction
-from nlos_cam.reconstruct.pipeline import Step
+from nlos_cam.reconstruct.pipeline import FrameResult
 from nlos_cam.reconstruct.verdict import Verdict
 
 
-def step(number: int, difference: LidarMaps | None = None) -> Step:
+def step(number: int, difference: LidarMaps | None = None) -> FrameResult:
     frame = wall_frame(number)
     hidden = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})
-    return Step(frame, maps_from_frame(frame), hidden, 0.0, {}, difference)
+    return FrameResult(frame, maps_from_frame(frame), hidden, 0.0, {}, difference)
 
 
-def titles(tmp_path: Path, steps: list[Step], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def titles(tmp_path: Path, steps: list[FrameResult], monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What the sheet's colour bars and columns say."""
     saved: list[Any] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: saved.append(figure))

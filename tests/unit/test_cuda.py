@@ -14,7 +14,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.render import backend_numba, backend_torch
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.geometry import NO_OCCLUDER
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import phong
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.renderer import render
@@ -32,7 +32,7 @@ def _scene(size: int = 12, step_m: float = 0.01) -> Scene:
     return Scene(RIG, depth)
 
 
-def _job(scene: Scene, beams: int = 30, accuracy: Accuracy = SMALL) -> Job:
+def _job(scene: Scene, beams: int = 30, accuracy: Accuracy = SMALL) -> TransportJob:
     job = Prepared.of(scene, accuracy, "auto").job()
     assert job is not None
     return job.some(np.arange(0, len(job.foot_m), len(job.foot_m) // beams))

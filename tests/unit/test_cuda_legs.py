@@ -9,7 +9,7 @@ from nlos_cam.render.backend_reference import legs as exact_legs
 from nlos_cam.render.backend_torch import Optics, Surface, Wall, legs, scattered
 from nlos_cam.render.brdf_table import scattered as scattered_on_arrays
 from nlos_cam.render.geometry import softened
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import phong
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
@@ -19,7 +19,7 @@ RIG = load_rig("paper-rig")
 SMALL = Accuracy("small", relay_columns=12, relay_rows=10)
 
 
-def _job(nearest_m: float = 0.2, occluder_x_m: float = 0.2, radiometry: str = "paper") -> Job:
+def _job(nearest_m: float = 0.2, occluder_x_m: float = 0.2, radiometry: str = "paper") -> TransportJob:
     depth = np.full((12, 12), np.nan, np.float32)
     depth[2:9, 2:9] = nearest_m + 0.01 * np.arange(7) + 0.005 * np.arange(7)[:, None]
     rig = RIG.model_copy(update={"occluder": Occluder(x_m=occluder_x_m, z_min_m=0.1)})
@@ -29,11 +29,11 @@ def _job(nearest_m: float = 0.2, occluder_x_m: float = 0.2, radiometry: str = "p
     return job
 
 
-def _optics(job: Job) -> Optics:
+def _optics(job: TransportJob) -> Optics:
     return Optics(job.edge_m, True, job.near_m**2, job.soft_wall_m2, job.lambertian, None, 1 << 18)
 
 
-def _relay(job: Job) -> Wall:
+def _relay(job: TransportJob) -> Wall:
     relay = job.relay
     return Wall.of(relay.x_m, relay.y_m, relay.length_m, job.relay_weight, device=CPU)
 

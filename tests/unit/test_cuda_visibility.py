@@ -10,7 +10,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.backend_torch import lay_out, shade
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.visibility import visible
@@ -20,7 +20,7 @@ RIG = load_rig("paper-rig")
 SMALL = Accuracy("small", relay_columns=12, relay_rows=10)
 
 
-def _job(depth: np.ndarray) -> Job:
+def _job(depth: np.ndarray) -> TransportJob:
     job = Prepared.of(Scene(RIG, depth), SMALL, {"direct", "three-bounce", "self-occlusion", "tilt"}).job()
     assert job is not None
     return job.some(np.arange(0, len(job.foot_m), 60))
@@ -48,7 +48,7 @@ OBJECTS = {
 }
 
 
-def _shaded(jobs: list[Job], job: Job, first: int, chunk: int = 1 << 18) -> np.ndarray:
+def _shaded(jobs: list[TransportJob], job: TransportJob, first: int, chunk: int = 1 << 18) -> np.ndarray:
     """V (n, m) of a job's legs to its feet, worked out within a batch."""
     fields, sites = lay_out(jobs, CPU)
     count = len(job.patches.beta)
@@ -59,7 +59,7 @@ def _shaded(jobs: list[Job], job: Job, first: int, chunk: int = 1 << 18) -> np.n
     return weight.numpy() > 0
 
 
-def _walked(job: Job) -> np.ndarray:
+def _walked(job: TransportJob) -> np.ndarray:
     p, free = job.patches, np.zeros((len(job.patches.beta), len(job.foot_m)), bool)
     for s in range(len(p.beta)):
         for w, (x, y, _) in enumerate(job.foot_m):

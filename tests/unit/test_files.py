@@ -200,9 +200,7 @@ def test_a_vertex_that_no_face_uses_may_be_anything(tmp_path: Path) -> None:
     assert len(_read(tmp_path, "thing.obj", VERTICES + b"v nan inf 1e300\nf 1 2 3\n").triangles) == 1
 
 
-@pytest.mark.parametrize(
-    ("limit", "value", "words"), [("MOST_FACES", 89, "has 90 faces.*89"), ("MOST_BYTES", 99, "MiB")]
-)
+@pytest.mark.parametrize(("limit", "value", "words"), [("MAX_FACES", 89, "has 90 faces.*89"), ("MAX_BYTES", 99, "MiB")])
 def test_too_large_a_file_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, words: str
 ) -> None:

@@ -6,7 +6,7 @@ import pytest
 from made_up_moments import RIG, full_moment
 
 from nlos_cam.errors import NlosCamError
-from nlos_cam.view.video import FRAMES_PER_S, HEIGHT, WIDTH, Film, Still
+from nlos_cam.view.video import FRAMES_PER_S, HEIGHT, WIDTH, Still, VideoFile
 
 
 def read(path: Path) -> list[np.ndarray]:
@@ -19,7 +19,7 @@ def read(path: Path) -> list[np.ndarray]:
 
 def test_every_second_frame_is_filmed_and_can_be_read_back(tmp_path: Path) -> None:
     path = tmp_path / "film.webm"
-    with Film(path, RIG) as film:
+    with VideoFile(path, RIG) as film:
         for number in range(20):
             film.show(full_moment(number))
     frames = read(path)
@@ -31,7 +31,7 @@ def test_every_second_frame_is_filmed_and_can_be_read_back(tmp_path: Path) -> No
 
 
 def test_a_film_is_what_browsers_play(tmp_path: Path) -> None:
-    with Film(tmp_path / "film.webm", RIG) as film:
+    with VideoFile(tmp_path / "film.webm", RIG) as film:
         film.show(full_moment(0))
     content = (tmp_path / "film.webm").read_bytes()
     assert content.startswith(b"\x1a\x45\xdf\xa3")
@@ -41,11 +41,11 @@ def test_a_film_is_what_browsers_play(tmp_path: Path) -> None:
 
 def test_a_missing_codec_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.view.video.CODEC", "none")
-    with pytest.raises(NlosCamError, match="no none codec"), Film(tmp_path / "film.webm", RIG):
+    with pytest.raises(NlosCamError, match="no none codec"), VideoFile(tmp_path / "film.webm", RIG):
         pass
 
 
 def test_nothing_of_the_codecs_talk_reaches_the_terminal(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    with Film(tmp_path / "film.webm", RIG) as film:
+    with VideoFile(tmp_path / "film.webm", RIG) as film:
         film.show(full_moment(0))
     assert capfd.readouterr().err == ""

@@ -11,13 +11,13 @@ from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.material import Surface, phong
 from nlos_cam.render.planning import plan
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_facts import Stage
+from nlos_cam.render.scene_facts import SceneFacts
 
 RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
 
 
 def _called_for(scene: Scene, stop: str = "standard") -> set[str]:
-    return {effect.name for effect in plan(Stage(scene, STOPS[stop])) if effect.included}
+    return {effect.name for effect in plan(SceneFacts(scene, STOPS[stop])) if effect.included}
 
 
 def _plate(slope: float = 0.0) -> np.ndarray:
@@ -60,7 +60,7 @@ def test_a_shiny_surface_calls_for_its_tilt_however_small() -> None:
 
 @pytest.mark.parametrize("specular", [0.01, 0.1, 0.5])
 def test_a_brdfs_bound_is_what_its_mean_may_be_off(specular: float) -> None:
-    verdicts = plan(Stage(Scene(RIG, _plate(), Surface(1.0, phong(1 - specular, specular, 4))), STOPS["standard"]))
+    verdicts = plan(SceneFacts(Scene(RIG, _plate(), Surface(1.0, phong(1 - specular, specular, 4))), STOPS["standard"]))
     low, high = 1 - specular, 1 - specular + 3 * specular
     bound = next(effect.bound for effect in verdicts if effect.name == "brdf")
     assert bound == pytest.approx(min((high - low) / 2 / low, 1))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from nlos_cam.reconstruct.network import Doubt, Reconstruction
-from nlos_cam.reconstruct.physics_check import Check
-from nlos_cam.reconstruct.verdict import STEADY_FRAMES, Judge, Limits, Signs, Verdict
+from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
+from nlos_cam.reconstruct.verdict import STEADY_FRAMES, FrameConditions, Verdict, VerdictFilter, VerdictLimits
 
-LIMITS = Limits(nothing=0.5, outside=0.3, unexplained=0.8)
+LIMITS = VerdictLimits(nothing=0.5, outside=0.3, unexplained=0.8)
 SURFACE_M = np.full((64, 64), 0.2, np.float32)
 
 
@@ -16,34 +16,36 @@ def found(nothing: float = 0.0, outside: float = 0.0, depth_m: np.ndarray = SURF
     return Reconstruction(depth_m, np.eye(4), doubt.error_m, {}, doubt)
 
 
-def checked(score: float) -> Signs:
+def checked(score: float) -> FrameConditions:
     blank = np.zeros((64, 80), np.float32)
-    return Signs(check=Check(0, blank, blank, score, 0.1))
+    return FrameConditions(check=PhysicsCheckResult(0, blank, blank, score, 0.1))
 
 
-ALL = Signs(saturated=True, invalid=True, moved=True, check=checked(1.0).check)
+ALL = FrameConditions(saturated=True, invalid=True, moved=True, check=checked(1.0).check)
 
 
 @pytest.mark.parametrize(
     ("made", "signs", "told"),
     [
-        (found(), Signs(), Verdict.SEEN),
-        (found(nothing=0.5), Signs(), Verdict.NOTHING),
-        (found(nothing=0.9, outside=0.9), Signs(), Verdict.NOTHING),
-        (found(outside=0.3), Signs(), Verdict.OUTSIDE),
+        (found(), FrameConditions(), Verdict.SEEN),
+        (found(nothing=0.5), FrameConditions(), Verdict.NOTHING),
+        (found(nothing=0.9, outside=0.9), FrameConditions(), Verdict.NOTHING),
+        (found(outside=0.3), FrameConditions(), Verdict.OUTSIDE),
         (found(), checked(0.8), Verdict.OUTSIDE),
         (found(), checked(0.79), Verdict.SEEN),
         (found(nothing=0.9), checked(1.0), Verdict.NOTHING),
-        (found(nothing=0.9), Signs(invalid=True), Verdict.OUTSIDE),
-        (found(), Signs(invalid=True), Verdict.OUTSIDE),
-        (found(depth_m=np.full((64, 64), np.nan, np.float32)), Signs(), Verdict.OUTSIDE),
-        (found(nothing=0.9, outside=0.9), Signs(saturated=True, invalid=True), Verdict.SATURATED),
+        (found(nothing=0.9), FrameConditions(invalid=True), Verdict.OUTSIDE),
+        (found(), FrameConditions(invalid=True), Verdict.OUTSIDE),
+        (found(depth_m=np.full((64, 64), np.nan, np.float32)), FrameConditions(), Verdict.OUTSIDE),
+        (found(nothing=0.9, outside=0.9), FrameConditions(saturated=True, invalid=True), Verdict.SATURATED),
         (found(outside=0.9), ALL, Verdict.WALL_MOVED),
         (found(nothing=0.9), ALL, Verdict.WALL_MOVED),
     ],
 )
-def test_of_several_that_hold_the_last_in_the_list_is_told(made: Reconstruction, signs: Signs, told: Verdict) -> None:
-    assert Judge(LIMITS).look(made, signs)[1] == told
+def test_of_several_that_hold_the_last_in_the_list_is_told(
+    made: Reconstruction, signs: FrameConditions, told: Verdict
+) -> None:
+    assert VerdictFilter(LIMITS).look(made, signs)[1] == told
 
 
 def test_the_list_is_in_the_order_in_which_they_overrule_each_other() -> None:
@@ -51,46 +53,46 @@ def test_the_list_is_in_the_order_in_which_they_overrule_each_other() -> None:
     assert list(Verdict) == order
 
 
-@pytest.mark.parametrize("signs", [Signs(), ALL])
-def test_where_nothing_is_there_no_surface_is_shown_whatever_is_told(signs: Signs) -> None:
-    shown, _ = Judge(LIMITS).look(found(nothing=0.9), signs)
+@pytest.mark.parametrize("signs", [FrameConditions(), ALL])
+def test_where_nothing_is_there_no_surface_is_shown_whatever_is_told(signs: FrameConditions) -> None:
+    shown, _ = VerdictFilter(LIMITS).look(found(nothing=0.9), signs)
     assert np.isnan(shown.depth_m).all()
     assert shown.uncertainty_m is not None
     assert np.isfinite(shown.uncertainty_m).all()
 
 
-@pytest.mark.parametrize("signs", [Signs(), ALL])
-def test_what_is_there_is_shown_even_if_it_is_not_to_be_believed(signs: Signs) -> None:
-    shown, _ = Judge(LIMITS).look(found(outside=0.9), signs)
+@pytest.mark.parametrize("signs", [FrameConditions(), ALL])
+def test_what_is_there_is_shown_even_if_it_is_not_to_be_believed(signs: FrameConditions) -> None:
+    shown, _ = VerdictFilter(LIMITS).look(found(outside=0.9), signs)
     np.testing.assert_array_equal(shown.depth_m, SURFACE_M)
 
 
-@pytest.mark.parametrize("judge", [Judge(None), Judge(LIMITS)])
-def test_without_doubt_only_what_the_lidar_saw_is_judged(judge: Judge) -> None:
+@pytest.mark.parametrize("judge", [VerdictFilter(None), VerdictFilter(LIMITS)])
+def test_without_doubt_only_what_the_lidar_saw_is_judged(judge: VerdictFilter) -> None:
     plain = replace(found(), doubt=None, uncertainty_m=None)
-    assert judge.look(plain, Signs()) == (plain, None)
-    assert judge.look(plain, Signs(saturated=True))[1] == Verdict.SATURATED
-    assert judge.look(plain, Signs(moved=True, saturated=True))[1] == Verdict.WALL_MOVED
+    assert judge.look(plain, FrameConditions()) == (plain, None)
+    assert judge.look(plain, FrameConditions(saturated=True))[1] == Verdict.SATURATED
+    assert judge.look(plain, FrameConditions(moved=True, saturated=True))[1] == Verdict.WALL_MOVED
 
 
 def test_one_frame_in_doubt_of_the_range_does_not_flicker_and_it_is_told_in_time() -> None:
-    judge = Judge(LIMITS)
-    told = [judge.look(found(outside=p), Signs())[1] for p in [0.0] * 10 + [1.0] + [0.0] * 10]
+    judge = VerdictFilter(LIMITS)
+    told = [judge.look(found(outside=p), FrameConditions())[1] for p in [0.0] * 10 + [1.0] + [0.0] * 10]
     assert set(told) == {Verdict.SEEN}
-    after = [judge.look(found(outside=1.0), Signs())[1] for _ in range(STEADY_FRAMES)]
+    after = [judge.look(found(outside=1.0), FrameConditions())[1] for _ in range(STEADY_FRAMES)]
     assert after[-1] == Verdict.OUTSIDE
     assert STEADY_FRAMES / 30 < 0.2
 
 
 def test_an_object_is_gone_with_the_first_frame_without_it_and_there_with_the_first_that_has_it() -> None:
-    judge = Judge(LIMITS)
-    told = [judge.look(found(nothing=p), Signs())[1] for p in (0.0, 0.0, 0.9, 0.9, 0.0)]
+    judge = VerdictFilter(LIMITS)
+    told = [judge.look(found(nothing=p), FrameConditions())[1] for p in (0.0, 0.0, 0.9, 0.9, 0.0)]
     assert told == [Verdict.SEEN, Verdict.SEEN, Verdict.NOTHING, Verdict.NOTHING, Verdict.SEEN]
 
 
 def test_doubt_of_the_range_does_not_outlast_an_empty_frame() -> None:
-    judge = Judge(LIMITS)
+    judge = VerdictFilter(LIMITS)
     for _ in range(STEADY_FRAMES):
-        judge.look(found(outside=1.0), Signs())
-    judge.look(found(nothing=1.0), Signs())
-    assert judge.look(found(), Signs())[1] == Verdict.SEEN
+        judge.look(found(outside=1.0), FrameConditions())
+    judge.look(found(nothing=1.0), FrameConditions())
+    assert judge.look(found(), FrameConditions())[1] == Verdict.SEEN

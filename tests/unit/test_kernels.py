@@ -7,14 +7,14 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.render import backend_numba, backend_reference
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.backend_numba import LANES, tables
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
 
 RIG = load_rig("paper-rig")
 
 
-def _job(sub_bins: int, sectors: int = 8) -> Job:
+def _job(sub_bins: int, sectors: int = 8) -> TransportJob:
     depth = np.random.default_rng(0).uniform(0.15, 0.3, (6, 6)).astype(np.float32)
     accuracy = Accuracy("own", 5, 4, sub_bins=sub_bins, sectors=sectors)
     effects = ["three-bounce", "tilt", "occluder", "self-occlusion"]

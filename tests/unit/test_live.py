@@ -15,9 +15,9 @@ from nlos_cam.errors import CameraLostError, SceneError
 from nlos_cam.frames import Frame
 from nlos_cam.live import frame_queue
 from nlos_cam.live.loop import paced, run_live, warm_up
-from nlos_cam.live.statistics import OUTSIDE_LATENCY, LiveReport
-from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.reconstruct.pipeline import Processing
+from nlos_cam.live.statistics import OUTSIDE_LATENCY, RunReport
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import Pipeline
 from nlos_cam.view.viewer import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
@@ -29,8 +29,8 @@ def network(*_: np.ndarray) -> np.ndarray:
     return np.full((1, 64, 64), 0.5, np.float32)
 
 
-def processing(by: Callable[..., np.ndarray] = network) -> Processing:
-    return Processing(Bench(RIG), by)
+def processing(by: Callable[..., np.ndarray] = network) -> Pipeline:
+    return Pipeline(CalibratedRig(RIG), by)
 
 
 def frame(number: int, offset_s: float = 0.0) -> Frame:
@@ -174,7 +174,10 @@ def test_warming_up_runs_the_way_of_a_frame_once_and_takes_none_from_the_camera(
 
 def test_a_lidar_that_moves_is_warned_of_while_it_is_elsewhere(tmp_path: Path) -> None:
     told, viewer = list[tuple[str, bool]](), ListViewer()
-    camera, method = WallCamera(150, moved=range(30, 80)), Processing(Bench(RIG, measured_wall(tmp_path)), network)
+    camera, method = (
+        WallCamera(150, moved=range(30, 80)),
+        Pipeline(CalibratedRig(RIG, measured_wall(tmp_path)), network),
+    )
     run: Any = {"stop": Event(), "recorded": True, "clock": Hurried(), "on_warning": lambda *about: told.append(about)}
     report = run_live(camera, method, viewer, **run)
     [(warning, frames)] = report.warnings.items()
@@ -210,7 +213,7 @@ def test_a_frame_that_comes_to_no_result_is_counted_and_survived(caplog: pytest.
 
 
 def test_an_error_that_is_not_the_frames_ends_the_run_at_once() -> None:
-    bare = Processing(Bench(load_rig("bare-wall")), network)
+    bare = Pipeline(CalibratedRig(load_rig("bare-wall")), network)
     with pytest.raises(SceneError, match="object_box"):
         run_live(FakeCamera(9), bare, ListViewer(), stop=Event(), recorded=True)
 
@@ -220,7 +223,7 @@ def test_what_the_camera_raises_is_raised_once_the_report_is_told() -> None:
         if number == 2:
             raise CameraLostError("unplugged")
 
-    camera, until_then = FakeCamera(None, fail_at_two), list[LiveReport]()
+    camera, until_then = FakeCamera(None, fail_at_two), list[RunReport]()
     camera.counts = Counter(restarted=3)
     with pytest.raises(CameraLostError, match="unplugged"):
         run_live(camera, processing(), NullViewer(), stop=Event(), recorded=True, on_error=until_then.append)

@@ -9,9 +9,9 @@ from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.errors import NlosCamError, SceneError
 from nlos_cam.frames import Frame, maps_from_frame
-from nlos_cam.live.statistics import MOST_FAILED, Held, LiveReport, Tally, Warned
+from nlos_cam.live.statistics import MAX_FAILED_IN_A_ROW, Held, RunReport, RunStatistics, Warned
 from nlos_cam.reconstruct.network import Reconstruction
-from nlos_cam.reconstruct.pipeline import Step
+from nlos_cam.reconstruct.pipeline import FrameResult
 from nlos_cam.reconstruct.verdict import Verdict
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
@@ -23,25 +23,27 @@ def frame(number: int) -> Frame:
     return Frame(depth_m, ir, ir, number / 30, number, SMALL)
 
 
-def reported(tally: Tally, camera: dict[str, Any] | None = None, dropped: int = 0, offset_s: float = 0.0) -> LiveReport:
+def reported(
+    tally: RunStatistics, camera: dict[str, Any] | None = None, dropped: int = 0, offset_s: float = 0.0
+) -> RunReport:
     of_camera = {"incomplete": 0, "dropped": 0, "counts": Counter[str](), **(camera or {})}
     reader: Any = SimpleNamespace(dropped=list(range(dropped)), offset_s=offset_s)
     seen_through: Any = SimpleNamespace(**of_camera)
     return tally.report(seen_through, reader)
 
 
-def tally_of(ages_s: list[float]) -> Tally:
+def tally_of(ages_s: list[float]) -> RunStatistics:
     """A frame every thirtieth of a second, each published so long after its timestamp."""
-    tally = Tally()
+    tally = RunStatistics()
     for number, age_s in enumerate(ages_s):
         one = frame(number)
         stages_s = {"wait": 0.001, "network": 0.01 * (number + 1)}
-        tally.add(Step(one, maps_from_frame(one), NOTHING, one.timestamp_s + age_s, stages_s), view_s=0.002)
+        tally.add(FrameResult(one, maps_from_frame(one), NOTHING, one.timestamp_s + age_s, stages_s), view_s=0.002)
     return tally
 
 
 def test_a_run_without_a_frame_reports_zeros() -> None:
-    report = reported(Tally())
+    report = reported(RunStatistics())
     assert (report.frames, report.fps, report.dropped, report.stages_ms, report.counts) == (0, 0.0, 0, {}, {})
     assert set(report.latency_ms.values()) == {0.0}
 
@@ -55,7 +57,7 @@ def test_rate_latency_and_stages_are_those_of_the_frames() -> None:
 
 
 def test_each_verdict_is_counted_by_frames() -> None:
-    tally, passed = Tally(), [Verdict.SEEN, None, Verdict.NOTHING, Verdict.SEEN, Verdict.WALL_MOVED]
+    tally, passed = RunStatistics(), [Verdict.SEEN, None, Verdict.NOTHING, Verdict.SEEN, Verdict.WALL_MOVED]
     for number, verdict in enumerate(passed):
         tally.add(replace(warned(number), verdict=verdict), view_s=0.0)
     verdicts = reported(tally).verdicts
@@ -64,7 +66,7 @@ def test_each_verdict_is_counted_by_frames() -> None:
 
 
 def test_delivery_is_told_by_the_loops_clock_and_a_step_without_an_arrival_has_none() -> None:
-    tally = Tally()
+    tally = RunStatistics()
     for number in range(9):
         step = warned(number)
         tally.add(replace(step, published_s=number / 30 + 0.012, arrived_s=number / 30 + 0.007), view_s=0.0)
@@ -75,12 +77,12 @@ def test_delivery_is_told_by_the_loops_clock_and_a_step_without_an_arrival_has_n
 
 
 def test_a_run_lasts_from_its_first_result() -> None:
-    assert Tally().lasted_s(1e9) == 0.0
+    assert RunStatistics().lasted_s(1e9) == 0.0
     assert tally_of([0.5, 0.1]).lasted_s(4.5) == pytest.approx(4.0)
 
 
 def test_counts_say_what_was_seen_and_where_frames_were_lost() -> None:
-    tally = Tally()
+    tally = RunStatistics()
     tally.seen.update(["blank", "blank"])
     tally.fail(frame(1), ZeroDivisionError("odd"), 1)
     report = reported(tally, {"incomplete": 2, "dropped": 3, "counts": Counter(duplicate=1, stalled=0)}, dropped=4)
@@ -96,17 +98,17 @@ def test_counts_say_what_was_seen_and_where_frames_were_lost() -> None:
 
 
 def test_frames_that_fail_are_borne_until_they_are_many_in_a_row() -> None:
-    tally = Tally()
-    for in_a_row in range(1, MOST_FAILED):
+    tally = RunStatistics()
+    for in_a_row in range(1, MAX_FAILED_IN_A_ROW):
         tally.fail(frame(in_a_row), ZeroDivisionError("an odd frame"), in_a_row)
-    with pytest.raises(NlosCamError, match=f"{MOST_FAILED} frames in a row .*ZeroDivisionError: an odd frame"):
-        tally.fail(frame(99), ZeroDivisionError("an odd frame"), MOST_FAILED)
-    assert tally.failed == MOST_FAILED
+    with pytest.raises(NlosCamError, match=f"{MAX_FAILED_IN_A_ROW} frames in a row .*ZeroDivisionError: an odd frame"):
+        tally.fail(frame(99), ZeroDivisionError("an odd frame"), MAX_FAILED_IN_A_ROW)
+    assert tally.failed == MAX_FAILED_IN_A_ROW
 
 
-def warned(number: int, *warnings: str) -> Step:
+def warned(number: int, *warnings: str) -> FrameResult:
     one = frame(number)
-    return Step(one, maps_from_frame(one), NOTHING, 0.0, {}, warnings=warnings)
+    return FrameResult(one, maps_from_frame(one), NOTHING, 0.0, {}, warnings=warnings)
 
 
 def test_a_warning_is_told_when_it_begins_and_when_it_ends_and_its_frames_are_counted() -> None:
@@ -131,7 +133,7 @@ def test_a_warning_whose_figures_change_is_the_same_one() -> None:
 
 
 def test_a_report_says_for_how_many_frames_each_warning_held() -> None:
-    tally = Tally()
+    tally = RunStatistics()
     for step in (warned(1), warned(2, "hot"), warned(3, "hot")):
         tally.add(step, view_s=0.0)
     assert reported(tally).warnings == {"hot": 2}
@@ -139,4 +141,4 @@ def test_a_report_says_for_how_many_frames_each_warning_held() -> None:
 
 def test_an_error_that_is_not_the_frames_is_not_borne() -> None:
     with pytest.raises(SceneError, match="no object_box"):
-        Tally().fail(frame(1), SceneError("no object_box"), 1)
+        RunStatistics().fail(frame(1), SceneError("no object_box"), 1)

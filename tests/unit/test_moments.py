@@ -11,8 +11,8 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.frames import Frame
 from nlos_cam.live.loop import run_live
 from nlos_cam.live.statistics import STALLED
-from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.reconstruct.pipeline import Processing
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import Pipeline
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.viewer import Moment, NullViewer
 
@@ -66,7 +66,7 @@ class Stalling(NullViewer):
 
 def test_a_stall_is_shown_with_the_last_moment_told_once_and_counted_and_frames_go_on() -> None:
     camera, told = Stalling(), list[tuple[str, bool]]()
-    method = Processing(Bench(load_rig("paper-rig")), lambda *_: np.full((1, 64, 64), 0.5, np.float32))
+    method = Pipeline(CalibratedRig(load_rig("paper-rig")), lambda *_: np.full((1, 64, 64), 0.5, np.float32))
     report = run_live(
         camera, method, camera, stop=Event(), recorded=True, clock=camera.clock, on_warning=lambda *a: told.append(a)
     )
@@ -83,6 +83,6 @@ def test_a_stall_is_shown_with_the_last_moment_told_once_and_counted_and_frames_
 
 def test_a_moment_carries_the_temperature_read_last() -> None:
     camera = Stalling()
-    method = Processing(Bench(load_rig("paper-rig")), lambda *_: np.full((1, 64, 64), 0.5, np.float32))
+    method = Pipeline(CalibratedRig(load_rig("paper-rig")), lambda *_: np.full((1, 64, 64), 0.5, np.float32))
     run_live(camera, method, camera, stop=Event(), recorded=True, clock=camera.clock)
     assert {moment.celsius["ldd_temperature"] for moment in camera.moments} == {40.0}

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from nlos_cam.frames import LidarMaps
-from nlos_cam.reconstruct.physics_check import NoChecks, failure, log_warning
+from nlos_cam.reconstruct.physics_check import NullPhysicsCheck, failure, log_warning
 
 
 def test_where_nothing_is_checked_there_is_never_a_check() -> None:
     nothing = np.zeros((64, 80), np.float32)
-    with NoChecks() as checks:
+    with NullPhysicsCheck() as checks:
         checks.offer(1, LidarMaps(nothing, nothing, nothing > 0), nothing[:, :64])
         assert checks.newest is None
 

@@ -14,9 +14,9 @@ from nlos_cam.live.replay import REPORT, RESULT, replay
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.reconstruct import physics_check
-from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.physics_check import EveryFrames, check
-from nlos_cam.reconstruct.pipeline import Processing
+from nlos_cam.reconstruct.pipeline import Pipeline
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.view.viewer import Moment, NullViewer
@@ -123,7 +123,7 @@ def test_a_check_that_fails_is_told_once_and_frames_go_on() -> None:
 
 def test_a_replay_writes_its_checks_and_the_same_bits_each_time(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        processing = Processing(Bench(RIG), network, checks=EveryFrames(RIG, every=3, accuracy="draft"))
+        processing = Pipeline(CalibratedRig(RIG), network, checks=EveryFrames(RIG, every=3, accuracy="draft"))
         replay(WallCamera(7), processing, tmp_path / name, stop=Event())
     for file in (RESULT, REPORT):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
@@ -135,7 +135,7 @@ def test_a_replay_writes_its_checks_and_the_same_bits_each_time(tmp_path: Path) 
 
 
 def test_a_replay_without_checks_tells_of_none(tmp_path: Path) -> None:
-    replay(WallCamera(2), Processing(Bench(RIG), network), tmp_path / "out", stop=Event())
+    replay(WallCamera(2), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=Event())
     with np.load(tmp_path / "out" / RESULT) as result:
         assert result["check_score"].size == result["check_frame_number"].size == 0
     assert "physics" not in (tmp_path / "out" / REPORT).read_text()
@@ -155,6 +155,6 @@ def test_a_live_loop_shows_the_newest_check_with_each_frame() -> None:
             assert moment.check is not None
             shown.append(moment.check.frame_number)
 
-    processing = Processing(Bench(RIG), network, checks=EveryFrames(RIG, every=2, accuracy="draft"))
+    processing = Pipeline(CalibratedRig(RIG), network, checks=EveryFrames(RIG, every=2, accuracy="draft"))
     run_live(WallCamera(5, period_s=0.0), processing, Viewer(), stop=Event(), recorded=True)
     assert shown == [0, 0, 2, 2, 4]

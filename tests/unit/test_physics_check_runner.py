@@ -9,7 +9,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import LidarMaps
-from nlos_cam.live.physics_check_process import BackgroundChecks
+from nlos_cam.live.physics_check_process import BackgroundPhysicsCheck
 from nlos_cam.reconstruct.physics_check import check
 
 RIG = load_rig("bare-wall")
@@ -56,7 +56,7 @@ class Clock:
 
 def test_a_frame_is_checked_in_another_process_as_it_would_be_here() -> None:
     told = list[str]()
-    with BackgroundChecks(RIG, accuracy="draft", on_error=told.append) as checks:
+    with BackgroundPhysicsCheck(RIG, accuracy="draft", on_error=told.append) as checks:
         assert checks.newest is None
         checks.offer(5, DARK, NOTHING)
         until(lambda: checks.newest is not None or bool(told))
@@ -72,7 +72,7 @@ def test_a_frame_is_checked_in_another_process_as_it_would_be_here() -> None:
 
 def test_a_frame_is_due_once_a_period_and_the_newest_takes_the_place_of_one_that_waits() -> None:
     clock = Clock()
-    with BackgroundChecks(RIG, period_s=2.0, clock=clock, command=python(SILENT)) as checks:
+    with BackgroundPhysicsCheck(RIG, period_s=2.0, clock=clock, command=python(SILENT)) as checks:
         checks.offer(1, DARK, NOTHING)
         until(lambda: not checks.waits)
         for number, (later_s, waits, dropped) in enumerate(
@@ -84,7 +84,7 @@ def test_a_frame_is_due_once_a_period_and_the_newest_takes_the_place_of_one_that
 
 
 def test_a_process_that_never_answers_holds_nobody_up_and_is_gone_at_the_end() -> None:
-    with BackgroundChecks(RIG, period_s=0.0, clock=Clock(), command=python(SILENT)) as checks:
+    with BackgroundPhysicsCheck(RIG, period_s=0.0, clock=Clock(), command=python(SILENT)) as checks:
         for number in range(1000):
             checks.offer(number, DARK, NOTHING)
         assert checks.dropped >= 1000 - 3
@@ -95,7 +95,7 @@ def test_a_process_that_never_answers_holds_nobody_up_and_is_gone_at_the_end() -
 
 def test_a_process_that_will_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.live.physics_check_process.END_WITHIN_S", 0.2)
-    with BackgroundChecks(RIG, command=python(DEAF)) as checks:
+    with BackgroundPhysicsCheck(RIG, command=python(DEAF)) as checks:
         checks.offer(0, DARK, NOTHING)
         until(lambda: checks.over)  # what it printed is no answer
     assert checks.process is not None
@@ -104,7 +104,9 @@ def test_a_process_that_will_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_check_that_fails_is_told_once_and_later_frames_are_asked_for() -> None:
     told = list[str]()
-    with BackgroundChecks(RIG, period_s=0.0, clock=Clock(), command=python(REFUSES), on_error=told.append) as checks:
+    with BackgroundPhysicsCheck(
+        RIG, period_s=0.0, clock=Clock(), command=python(REFUSES), on_error=told.append
+    ) as checks:
         for number in range(4):
             checks.offer(number, DARK, NOTHING)
             until(lambda: not checks.waits)
@@ -118,7 +120,7 @@ def test_a_check_that_fails_is_told_once_and_later_frames_are_asked_for() -> Non
 )
 def test_a_process_that_is_not_there_is_told_once_and_frames_go_on(command: tuple[str, ...], why: str) -> None:
     told = list[str]()
-    with BackgroundChecks(RIG, period_s=0.0, clock=Clock(), command=command, on_error=told.append) as checks:
+    with BackgroundPhysicsCheck(RIG, period_s=0.0, clock=Clock(), command=command, on_error=told.append) as checks:
         checks.offer(0, DARK, NOTHING)
         until(lambda: checks.over)
         checks.offer(1, DARK, NOTHING)
@@ -130,7 +132,7 @@ def test_a_process_that_is_not_there_is_told_once_and_frames_go_on(command: tupl
 
 def test_an_end_by_us_is_no_error() -> None:
     told = list[str]()
-    with BackgroundChecks(RIG, command=python(SILENT), on_error=told.append) as checks:
+    with BackgroundPhysicsCheck(RIG, command=python(SILENT), on_error=told.append) as checks:
         checks.offer(0, DARK, NOTHING)
     assert not told
 
@@ -147,6 +149,6 @@ def test_the_process_ends_with_a_parent_that_is_killed() -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="process groups are POSIX")
 def test_a_ctrl_c_at_the_terminal_does_not_reach_it() -> None:
-    with BackgroundChecks(RIG, command=python(SILENT)) as checks:
+    with BackgroundPhysicsCheck(RIG, command=python(SILENT)) as checks:
         assert checks.process is not None
         assert os.getpgid(checks.process.pid) != os.getpgrp()

@@ -12,7 +12,7 @@ from nlos_cam.view.images import (
     BACKGROUND_RGB,
     FADED,
     JUMP_M,
-    MOST_UNCERTAIN_M,
+    MAX_UNCERTAINTY_M,
     QUIET_SPAN_M,
     SATURATED_RGB,
     change_span_m,
@@ -162,7 +162,7 @@ def test_the_span_of_a_change_is_of_what_has_changed() -> None:
 def test_uncertainty_is_brighter_the_larger_and_shown_only_where_there_is_a_surface() -> None:
     depth_m = flat(0.2)
     depth_m[0] = np.nan
-    spread_m = np.linspace(0.0, 2 * MOST_UNCERTAIN_M, 64, dtype=np.float32) * np.ones((64, 1), np.float32)
+    spread_m = np.linspace(0.0, 2 * MAX_UNCERTAINTY_M, 64, dtype=np.float32) * np.ones((64, 1), np.float32)
     rgb = uncertainty_rgb(spread_m, depth_m)
     assert (rgb[0] == BACKGROUND_RGB).all()
     brightness = rgb[1].sum(axis=-1).astype(int)

@@ -8,7 +8,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.geometry import NEAR_DIAGONALS, NO_OCCLUDER
-from nlos_cam.render.job import Job, near_legs
+from nlos_cam.render.job import TransportJob, near_legs
 from nlos_cam.render.material import Surface, phong
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Radiometry, Scene
@@ -23,7 +23,7 @@ def _without(*names: str) -> Prepared:
     return Prepared.of(SCENE, COARSE, set(EFFECTS) - set(names))
 
 
-def _job(ready: Prepared) -> Job:
+def _job(ready: Prepared) -> TransportJob:
     job = ready.job()
     assert job is not None
     return job

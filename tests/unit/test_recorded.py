@@ -10,13 +10,13 @@ from made_up_moments import RIG, full_moment
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.view import web
-from nlos_cam.view.rrd_file import SavedView
+from nlos_cam.view.rrd_file import RrdFile
 from nlos_cam.view.web import RecordedView, whole_bytes
 
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
-    with SavedView(tmp_path / "view.rrd", RIG, keeps_all=True) as view:
+    with RrdFile(tmp_path / "view.rrd", RIG, keeps_all=True) as view:
         for number in range(0, 30, 3):
             view.show(full_moment(number))
     return tmp_path / "view.rrd"

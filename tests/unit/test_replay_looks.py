@@ -11,10 +11,10 @@ from nlos_cam.frames import maps_from_frame
 from nlos_cam.live.replay import REPORT, RESULT, SHEET, replay
 from nlos_cam.live.replay_media import VIDEO, VIEW, Looks, moment_of
 from nlos_cam.objects.depth_map import image_from_depth, object_box
-from nlos_cam.reconstruct.bench import Bench
-from nlos_cam.reconstruct.pipeline import Processing, Step
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline
 
-BENCH = Bench(RIG)
+BENCH = CalibratedRig(RIG)
 NAMES = {REPORT, RESULT, SHEET}
 
 
@@ -24,7 +24,7 @@ def network(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
 
 
 def replayed(out: Path, count: int, **asked: Any) -> set[str]:
-    processing = Processing(BENCH, network)
+    processing = Pipeline(BENCH, network)
     replay(Recorded(count), processing, out, stop=Event(), looks=Looks(BENCH, **asked))
     return {file.name for file in out.iterdir()}
 
@@ -79,7 +79,9 @@ def test_there_are_as_many_stills_as_asked_for_or_frames(tmp_path: Path, count: 
 
 
 def test_an_error_leaves_no_thread_and_draws_no_stills(tmp_path: Path) -> None:
-    step = Step(full_moment(0).frame, maps_from_frame(full_moment(0).frame), full_moment(0).reconstruction, 0.0, {})
+    step = FrameResult(
+        full_moment(0).frame, maps_from_frame(full_moment(0).frame), full_moment(0).reconstruction, 0.0, {}
+    )
     looks = Looks(BENCH, view=True, stills=2).into(tmp_path)
     looks.__enter__().add(step, {})
     assert not looks.__exit__(ZeroDivisionError, ZeroDivisionError(), None), "it goes on to whoever replays"
@@ -91,7 +93,7 @@ def test_a_step_is_shown_at_its_own_time_with_all_that_is_known_of_it() -> None:
     stages_s = {"wait": 9.0, "maps": 0.001, "network": 0.01}
     known = full.difference, (), full.verdict, full.check
     shown = moment_of(
-        Step(full.frame, maps_from_frame(full.frame), full.reconstruction, 77.0, stages_s, *known),
+        FrameResult(full.frame, maps_from_frame(full.frame), full.reconstruction, 77.0, stages_s, *known),
         full.celsius,
     )
     assert shown.published_s == full.frame.timestamp_s

@@ -12,23 +12,23 @@ from measured_walls import exact_wall
 from nlos_cam.view import web
 from nlos_cam.view.drawing import Drawing
 from nlos_cam.view.viewer import Moment
-from nlos_cam.view.web import RerunViewer
+from nlos_cam.view.web import WebViewer
 
 
 @pytest.fixture
-def viewer(monkeypatch: pytest.MonkeyPatch) -> Iterator[RerunViewer]:
+def viewer(monkeypatch: pytest.MonkeyPatch) -> Iterator[WebViewer]:
     monkeypatch.setattr(web, "page_assets", lambda: {"/": ("text/html", b"page")})
-    with RerunViewer(RIG) as viewer:
+    with WebViewer(RIG) as viewer:
         yield viewer
     with pytest.raises(ConnectionRefusedError):
         connected(viewer).connect()
 
 
-def connected(viewer: RerunViewer) -> HTTPConnection:
+def connected(viewer: WebViewer) -> HTTPConnection:
     return HTTPConnection(urlsplit(viewer.address or "").netloc, timeout=10.0)
 
 
-def test_a_browser_gets_the_moments_shown_while_it_watches(viewer: RerunViewer) -> None:
+def test_a_browser_gets_the_moments_shown_while_it_watches(viewer: WebViewer) -> None:
     viewer.show(moment(0))
     with closing(connected(viewer)) as browser:
         browser.request("GET", "/live.rrd")
@@ -39,7 +39,7 @@ def test_a_browser_gets_the_moments_shown_while_it_watches(viewer: RerunViewer) 
                 assert answer.read(2000)
 
 
-def test_two_browsers_watch_independently(viewer: RerunViewer) -> None:
+def test_two_browsers_watch_independently(viewer: WebViewer) -> None:
     viewer.show(moment(0))
     for _ in range(2):
         with closing(connected(viewer)) as browser:
@@ -50,7 +50,7 @@ def test_two_browsers_watch_independently(viewer: RerunViewer) -> None:
 
 def test_leaving_ends_the_streams_of_browsers_that_still_watch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web, "page_assets", dict)
-    with RerunViewer(RIG) as viewer:
+    with WebViewer(RIG) as viewer:
         browser = connected(viewer)
         browser.request("GET", "/live.rrd")
         answer = browser.getresponse()
@@ -61,7 +61,7 @@ def test_leaving_ends_the_streams_of_browsers_that_still_watch(monkeypatch: pyte
     browser.close()
 
 
-def test_showing_costs_nothing_when_nobody_watches(viewer: RerunViewer) -> None:
+def test_showing_costs_nothing_when_nobody_watches(viewer: WebViewer) -> None:
     for number in range(1000):
         viewer.show(moment(number))
     assert threading.active_count() <= 3
@@ -69,7 +69,7 @@ def test_showing_costs_nothing_when_nobody_watches(viewer: RerunViewer) -> None:
 
 def test_a_measured_wall_reaches_each_browser(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web, "page_assets", dict)
-    with RerunViewer(RIG, exact_wall()) as viewer:
+    with WebViewer(RIG, exact_wall()) as viewer:
         viewer.show(moment(0))
         for _ in range(2):
             with closing(connected(viewer)) as browser:
@@ -106,7 +106,7 @@ def test_nothing_is_drawn_or_kept_for_a_browser_that_takes_nothing(monkeypatch: 
 
     monkeypatch.setattr(Drawing, "draw", noted)
     browser = Starved()
-    with RerunViewer(RIG) as viewer:
+    with WebViewer(RIG) as viewer:
         thread = threading.Thread(target=viewer._stream, args=(browser,))
         thread.start()
         viewer.show(full_moment(0))
@@ -123,7 +123,7 @@ def test_nothing_is_drawn_or_kept_for_a_browser_that_takes_nothing(monkeypatch: 
     assert len(browser.taken) == len(drawn)
 
 
-def test_a_page_that_is_opened_again_begins_anew(viewer: RerunViewer) -> None:
+def test_a_page_that_is_opened_again_begins_anew(viewer: WebViewer) -> None:
     viewer.show(full_moment(0))
     for _ in range(3):
         with closing(connected(viewer)) as browser:

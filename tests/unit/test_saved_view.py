@@ -11,7 +11,7 @@ from measured_walls import exact_wall
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view import rrd_file
 from nlos_cam.view.drawing import Drawing
-from nlos_cam.view.rrd_file import QUEUE_MOMENTS, SavedView
+from nlos_cam.view.rrd_file import QUEUE_MOMENTS, RrdFile
 
 Chunks = Callable[[Path], list[Any]]
 
@@ -31,7 +31,7 @@ def frames_of(chunks: list[Any], path: str) -> list[int]:
 
 def test_ten_moments_of_a_second_are_kept_and_less_of_what_is_large(tmp_path: Path, chunks_of: Chunks) -> None:
     path = tmp_path / "view.rrd"
-    with SavedView(path, RIG, keeps_all=True) as view:
+    with RrdFile(path, RIG, keeps_all=True) as view:
         for number in range(60):
             view.show(full_moment(number))
     assert (view.kept, view.left_out, view.full) == (20, 0, False)
@@ -46,7 +46,7 @@ def test_ten_moments_of_a_second_are_kept_and_less_of_what_is_large(tmp_path: Pa
 
 def test_a_measured_wall_and_every_verdict_are_in_the_file(tmp_path: Path, chunks_of: Chunks) -> None:
     path = tmp_path / "view.rrd"
-    with SavedView(path, RIG, exact_wall(), keeps_all=True) as view:
+    with RrdFile(path, RIG, exact_wall(), keeps_all=True) as view:
         for number, verdict in enumerate(Verdict):
             view.show(full_moment(3 * number, verdict))
     counted = rows(chunks_of(path))
@@ -71,7 +71,7 @@ class Slow:
 
 def test_a_live_run_never_waits_for_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     slow = Slow(monkeypatch)
-    with SavedView(tmp_path / "view.rrd", RIG) as view:
+    with RrdFile(tmp_path / "view.rrd", RIG) as view:
         view.show(moment(0))
         assert slow.began.wait(10.0)
         for number in range(1, 100):
@@ -82,9 +82,9 @@ def test_a_live_run_never_waits_for_the_file(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_file_ends_where_it_is_too_large_to_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rrd_file, "MOST_BYTES", 50_000)
+    monkeypatch.setattr(rrd_file, "MAX_BYTES", 50_000)
     monkeypatch.setattr(rrd_file, "BATCH_S", 0.001)
-    with SavedView(tmp_path / "view.rrd", RIG, keeps_all=True) as view:
+    with RrdFile(tmp_path / "view.rrd", RIG, keeps_all=True) as view:
         for number in range(0, 600, 3):
             view.show(full_moment(number))
     assert view.full
@@ -98,7 +98,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_and_keeps_nobody_waiting(
         raise ZeroDivisionError("drawing failed")
 
     monkeypatch.setattr(Drawing, "draw", fail)
-    view = SavedView(tmp_path / "a.rrd", RIG, keeps_all=True)
+    view = RrdFile(tmp_path / "a.rrd", RIG, keeps_all=True)
     view.__enter__()
     for number in range(0, 60, 3):
         view.show(moment(number))
@@ -107,12 +107,12 @@ def test_what_goes_wrong_in_the_thread_is_raised_and_keeps_nobody_waiting(
 
 
 def test_a_path_that_cannot_be_written_to_is_told_at_once(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="No such file"), SavedView(tmp_path / "none" / "view.rrd", RIG):
+    with pytest.raises(OSError, match="No such file"), RrdFile(tmp_path / "none" / "view.rrd", RIG):
         pass
 
 
 def test_a_run_without_moments_leaves_a_file_without_any(tmp_path: Path) -> None:
-    with SavedView(tmp_path / "view.rrd", RIG) as view:
+    with RrdFile(tmp_path / "view.rrd", RIG) as view:
         pass
     assert view.kept == 0
     assert (tmp_path / "view.rrd").read_bytes().startswith(b"RRF2")

@@ -13,7 +13,7 @@ from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MOST_CONFIDENT, SensorModel
+from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MAX_CONFIDENCE, SensorModel
 from nlos_cam.render.sensor.sensor import SensedImages, Sensor, cell_of_pixels
 
 RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
@@ -74,7 +74,7 @@ def test_a_strong_echo_saturates_at_255() -> None:
     flood = replace(NO_ECHO, peak=np.full((64, 80), 1e6, np.float32), path_m=np.full((64, 80), 1.0, np.float32))
     images = Sensor(RIG, SensorModel()).expose(flood, _generator())
     assert (images.ir == SATURATED).all()
-    assert images.confidence.max() == MOST_CONFIDENT
+    assert images.confidence.max() == MAX_CONFIDENCE
 
 
 def test_dead_pixels_are_a_matter_of_the_sensor_not_of_the_frame() -> None:
@@ -97,7 +97,7 @@ def test_no_confidence_gives_no_depth(rendering: Rendering) -> None:
     images = Sensor(RIG, SensorModel(bare_wall_counts=0.3)).expose(rendering.multi, _generator())
     assert (images.confidence == 0).any()
     assert (images.depth_z16[images.confidence == 0] == 0).all()
-    assert images.confidence.max() <= MOST_CONFIDENT
+    assert images.confidence.max() <= MAX_CONFIDENCE
 
 
 def test_confidence_grows_with_the_margin() -> None:

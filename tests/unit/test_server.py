@@ -24,7 +24,7 @@ def test_files_come_whole_with_their_type_and_nothing_may_come_from_elsewhere(se
 def test_connections_beyond_the_room_are_closed_and_those_before_live_on(
     streams: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server_module, "MOST_CONNECTIONS", 1)
+    monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 1)
     server = ViewServer(ASSETS, streams, 0)
     with closing(ask(server.address, "/live.rrd")) as first:
         with pytest.raises((HTTPException, OSError)):

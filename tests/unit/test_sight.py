@@ -10,7 +10,7 @@ from nlos_cam.render.line_of_sight import first_hits
 from nlos_cam.render.material import Surface
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_facts import Stage
+from nlos_cam.render.scene_facts import SceneFacts
 from nlos_cam.render.visibility import height_field
 
 PAPER = load_rig("paper-rig")
@@ -42,12 +42,12 @@ def test_a_ray_meets_a_column_by_its_front_or_by_its_side() -> None:
 
 
 def test_the_papers_rig_sees_nothing_of_its_box() -> None:
-    assert Stage(Scene(PAPER, np.full((8, 8), 0.12, np.float32)), COARSE).sight is None
+    assert SceneFacts(Scene(PAPER, np.full((8, 8), 0.12, np.float32)), COARSE).sight is None
 
 
 def test_what_is_in_sight_stops_beams_before_the_wall_and_hides_relay_cells_behind_it() -> None:
     depth = np.full((8, 8), 0.06, np.float32)
-    stage = Stage(Scene(OPEN, depth, Surface(0.5)), COARSE)
+    stage = SceneFacts(Scene(OPEN, depth, Surface(0.5)), COARSE)
     sight, beams = stage.sight, stage.beams()
     assert sight is not None
     assert sight.beam.size
@@ -69,4 +69,4 @@ def test_a_lidar_inside_the_object_is_refused() -> None:
     box = ObjectBox(x_min_m=-0.1, x_max_m=0.1, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.05, z_far_m=0.4)
     around = OPEN.model_copy(update={"object_box": box})
     with pytest.raises(SceneError, match=r"surrounds the lidar, 0.2 m off the wall: move it or the lidar"):
-        _ = Stage(Scene(around, np.full((8, 8), 0.1, np.float32)), COARSE).sight
+        _ = SceneFacts(Scene(around, np.full((8, 8), 0.1, np.float32)), COARSE).sight

@@ -6,7 +6,7 @@ from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.frames import Frame
 from nlos_cam.live.loop import in_words, watched
-from nlos_cam.reconstruct.verdict import amiss
+from nlos_cam.reconstruct.verdict import frame_issues
 
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 PIXELS = 80 * 64
@@ -34,7 +34,7 @@ def frame(with_depth: int, at_255: int = 0) -> Frame:
     ],
 )
 def test_what_is_amiss_is_told_by_name(seen: Frame, names: list[str]) -> None:
-    assert amiss(seen) == names
+    assert frame_issues(seen) == names
 
 
 def test_frames_that_are_watched_are_the_same_and_counted() -> None:

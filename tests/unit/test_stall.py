@@ -46,9 +46,9 @@ def test_frames_that_come_to_no_result_end_a_stall_too(watch: StallWatch, told: 
 
 
 def test_each_stall_is_told_and_the_last_may_last_to_the_end(watch: StallWatch, told: list[tuple[str, bool]]) -> None:
-    for begun_s in (0.0, 10.0):
-        assert watch.look(begun_s + 1.0, begun_s)
-        watch.came(begun_s + 2.0)
+    for start_s in (0.0, 10.0):
+        assert watch.look(start_s + 1.0, start_s)
+        watch.came(start_s + 2.0)
     watch.look(21.0, 20.0)
     watch.close(23.0)
     watch.close(99.0)

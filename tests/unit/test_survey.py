@@ -5,17 +5,17 @@ import pytest
 from nlos_calibration.rig import Occluder, Rig, load_rig
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.energy_survey import CAUTION, Survey, occluder_meets, shaded
+from nlos_cam.render.energy_survey import CAUTION, EnergySurvey, occluder_meets, shaded
 from nlos_cam.render.geometry import NO_OCCLUDER, occluder_edge
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_facts import Stage
+from nlos_cam.render.scene_facts import SceneFacts
 
 RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
 
 
-def _stage(depth: np.ndarray, rig: Rig = RIG) -> Stage:
-    return Stage(Scene(rig, depth.astype(np.float32), jump_m=0.5), COARSE)
+def _stage(depth: np.ndarray, rig: Rig = RIG) -> SceneFacts:
+    return SceneFacts(Scene(rig, depth.astype(np.float32), jump_m=0.5), COARSE)
 
 
 def _shaded(depth: np.ndarray) -> np.ndarray:
@@ -36,14 +36,14 @@ def test_a_plane_and_a_dome_shade_nothing_and_a_pit_all_but_its_rim() -> None:
 
 def test_a_share_is_cautious_and_never_more_than_all() -> None:
     two = np.ones(2)
-    found = Survey(two, two, 0 * two, 0 * two, 0 * two, 0 * two, 1.0)
+    found = EnergySurvey(two, two, 0 * two, 0 * two, 0 * two, 0 * two, 1.0)
     assert found.share(np.array([0.1, 0.0])) == pytest.approx(CAUTION * 0.05)
     assert found.share(np.array([5.0, 0.0])) == 1
     assert found.tilt == found.occluder == 0
-    dark = Survey(0 * two, two, two, two, two, two, 1.0)
+    dark = EnergySurvey(0 * two, two, two, two, two, two, 1.0)
     assert dark.share(two) == 1
     assert dark.share(0 * two) == 0
-    uneven = Survey(two, two, 0 * two, 0 * two, 0 * two, 0 * two, 4.0)
+    uneven = EnergySurvey(two, two, 0 * two, 0 * two, 0 * two, 0 * two, 4.0)
     assert uneven.share(np.array([0.1, 0.0])) == pytest.approx(4 * found.share(np.array([0.1, 0.0])))
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.objects.benchmark import FixedObject, test_set
+from nlos_cam.objects.benchmark import FixedObject, benchmark_objects
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import Pose
 
 BOX = object_box(load_rig("paper-rig"))
-OBJECTS = test_set(BOX)
+OBJECTS = benchmark_objects(BOX)
 
 
 def test_there_are_three_of_each_category_each_with_its_name() -> None:
@@ -22,7 +22,7 @@ def test_there_are_three_of_each_category_each_with_its_name() -> None:
 
 
 def test_they_are_the_same_bits_each_time() -> None:
-    again = test_set(BOX)
+    again = benchmark_objects(BOX)
     assert again == OBJECTS
     for thing, same in zip(OBJECTS, again, strict=True):
         assert thing.depth_m.tobytes() == same.depth_m.tobytes()

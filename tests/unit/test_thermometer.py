@@ -8,7 +8,7 @@ import pytest
 from fake_wall import SMALL, wall_frame
 
 from nlos_cam.frames import Frame
-from nlos_cam.live.telemetry import Thermometer, thermometer_of
+from nlos_cam.live.telemetry import Telemetry, telemetry_of
 from nlos_cam.recording.sidecar import Sidecar, Temperatures, sidecar_path
 
 FRAMES = [wall_frame(number) for number in range(1, 100, 10)]
@@ -28,19 +28,19 @@ class Asked:
 
 def test_it_is_asked_from_time_to_time_by_the_frames_own_clock() -> None:
     asked = Asked()
-    assert list(Thermometer(asked, every_s=1.0).watch(FRAMES)) == FRAMES
+    assert list(Telemetry(asked, every_s=1.0).watch(FRAMES)) == FRAMES
     assert asked.times_s == pytest.approx([0.0, 1.0, 2.0, 3.0])
 
 
 def test_a_reading_is_told_once_with_the_frame_it_was_made_at() -> None:
-    thermometer = Thermometer(Asked(), every_s=1.0)
+    thermometer = Telemetry(Asked(), every_s=1.0)
     told = [thermometer.at(frame) for frame in thermometer.watch(FRAMES)]
     assert [bool(celsius) for celsius in told] == [number % 3 == 0 for number in range(10)]
     assert told[3] == {"ldd_temperature": 42.0}
 
 
 def test_a_reader_that_is_ahead_does_not_change_what_a_frame_is_told() -> None:
-    thermometer = Thermometer(Asked(), every_s=1.0)
+    thermometer = Telemetry(Asked(), every_s=1.0)
     ahead = list(thermometer.watch(FRAMES))
     assert thermometer.at(ahead[2]) == {"ldd_temperature": 41.0}
     assert thermometer.at(ahead[2]) is None
@@ -54,17 +54,17 @@ def camera(uri: str, **told: float) -> Any:
     return SimpleNamespace(uri=uri, telemetry=telemetry)
 
 
-def all_told(thermometer: Thermometer, frames: list[Frame]) -> list[Mapping[str, float] | None]:
+def all_told(thermometer: Telemetry, frames: list[Frame]) -> list[Mapping[str, float] | None]:
     return [thermometer.at(frame) for frame in thermometer.watch(frames)]
 
 
 def test_a_device_is_asked_for_its_temperatures_alone() -> None:
-    thermometer = thermometer_of(camera("l515", ldd_temperature=41.0, laser_power=40.0))
+    thermometer = telemetry_of(camera("l515", ldd_temperature=41.0, laser_power=40.0))
     assert all_told(thermometer, FRAMES[:1]) == [{"ldd_temperature": 41.0}]
 
 
 def test_a_device_that_has_none_tells_none() -> None:
-    assert all_told(thermometer_of(camera("sim")), FRAMES[:2]) == [None, None]
+    assert all_told(telemetry_of(camera("sim")), FRAMES[:2]) == [None, None]
 
 
 def write_sidecar(path: Path) -> None:
@@ -86,19 +86,19 @@ def write_sidecar(path: Path) -> None:
 def test_a_recordings_are_read_from_its_sidecar_as_time_passes(tmp_path: Path) -> None:
     bag = tmp_path / "wall.bag"
     write_sidecar(sidecar_path(bag))
-    thermometer = thermometer_of(camera(f"bag:{bag}", ldd_temperature=99.0))
+    thermometer = telemetry_of(camera(f"bag:{bag}", ldd_temperature=99.0))
     frames = [wall_frame(300 * k) for k in range(5)]  # 10 s apart
     told = [celsius and celsius["ldd_temperature"] for celsius in all_told(thermometer, frames)]
     assert told == [40.0, 41.0, 42.0, 43.0, 43.0]
 
 
 def test_a_recording_without_a_sidecar_tells_what_it_has_in_it(tmp_path: Path) -> None:
-    thermometer = thermometer_of(camera(f"bag:{tmp_path}/wall.bag", ldd_temperature=39.0))
+    thermometer = telemetry_of(camera(f"bag:{tmp_path}/wall.bag", ldd_temperature=39.0))
     assert all_told(thermometer, FRAMES[:1]) == [{"ldd_temperature": 39.0}]
 
 
 def test_a_broken_sidecar_is_told_and_done_without(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bag = tmp_path / "wall.bag"
     sidecar_path(bag).write_text("{")
-    assert all_told(thermometer_of(camera(f"bag:{bag}", ldd_temperature=39.0)), FRAMES[:2]) == [None, None]
+    assert all_told(telemetry_of(camera(f"bag:{bag}", ldd_temperature=39.0)), FRAMES[:2]) == [None, None]
     assert "wall.json is not a sidecar" in caplog.text

@@ -24,15 +24,15 @@ from nlos_cam.camera.simulated_world import World, open_world
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.cli.common import tracked
 from nlos_cam.evaluate.subjects import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
-from nlos_cam.files import file_when_whole
+from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, Frame
 from nlos_cam.live.replay import replay
 from nlos_cam.live.replay_media import VIDEO, Looks
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.benchmark import benchmark_objects
 from nlos_cam.objects.depth_map import image_from_depth, object_box, orthographic_depth
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import category_triangles, place, random_pose
-from nlos_cam.reconstruct.bench import Bench
+from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import load_doubt, load_networks, set_up
 
 ROOT = Path(__file__).parents[2]
@@ -81,13 +81,13 @@ def draw_pairs(path: Path, rows: Sequence[tuple[str, Sequence[Subject], Float32,
                 axis.imshow(picture, cmap="magma", vmin=0, vmax=1)
             axes[0, k].set_title(subject.name, fontsize=8)
             axes[1, k].set_title("no truth to meet" if not truth[k].any() else f"IoU {iou[k]:.2f}", fontsize=7)
-    with file_when_whole(path) as unfinished:
+    with atomic_file(path) as unfinished:
         figure.savefig(unfinished, dpi=90, format="png")
 
 
 def failures(out: Path) -> None:
     """Draw the worst of the test objects, and shapes unlike training."""
-    fixed, others = test_set(object_box(load_rig("paper-rig"))), unlike_training()
+    fixed, others = benchmark_objects(object_box(load_rig("paper-rig"))), unlike_training()
     image, truth, iou = reconstructed(fixed)
     worst = np.argsort(iou, kind="stable")[:WORST]
     rows = [
@@ -106,7 +106,7 @@ def variations(category: str, box: ObjectBox) -> list[Float32]:
 
 def fixed_objects(box: ObjectBox) -> dict[str, list[Float32]]:
     """Return images of the test set by category."""
-    objects = test_set(box)
+    objects = benchmark_objects(box)
     return {n: [image_from_depth(thing.depth_m, box) for thing in objects if thing.category == n] for n in CATEGORIES}
 
 
@@ -165,7 +165,7 @@ def replays(out: Path) -> None:
         frames = round(FILM_S * FRAMES_PER_S) if name == FILMED else STILL_FRAMES
         with tracked(f"rendering {name}") as on_progress:
             world = open_world(str(ROOT / scene) if scene else "", on_progress)
-        bench = Bench(world.rig if world.rig.object_box else load_rig("paper-rig"))
+        bench = CalibratedRig(world.rig if world.rig.object_box else load_rig("paper-rig"))
         processing = set_up(bench, load_networks(), doubter=load_doubt())
         looks, camera = Looks(bench, stills=2, video=name == FILMED), Unhurried(world, frames)
         with TemporaryDirectory() as folder, tracked(f"reconstructing {name}") as update:

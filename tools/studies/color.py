@@ -25,7 +25,7 @@ from nlos_cam.cli.common import PAPER_RIG, tracked
 from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.dataset.build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, open_dataset
 from nlos_cam.evaluate.color import draw_colour_sheet, figures_of_colour, painted_maps
-from nlos_cam.objects.benchmark import OF_EACH, test_set
+from nlos_cam.objects.benchmark import OF_EACH, benchmark_objects
 from nlos_cam.objects.depth_map import object_box
 
 RECIPES = Path(__file__).parents[2] / "models" / "recipes"
@@ -49,7 +49,7 @@ def commands(out: Path, accuracy: str, workers: int, *, small: bool) -> Iterator
 def judge_all(out: Path, accuracy: str) -> dict[str, Any]:
     """Figures of the pipeline, of the VAE alone and of what needs no network, on the test objects; and the pictures."""
     rig = load_rig(PAPER_RIG)
-    depths = [one.depth_m for one in test_set(object_box(rig))]
+    depths = [one.depth_m for one in benchmark_objects(object_box(rig))]
     with tracked("rendering test objects in colour") as on_progress:
         maps = painted_maps(depths, rig, TEST_SEED, accuracy, on_progress)
     truth = maps.image.astype(np.float32)

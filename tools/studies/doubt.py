@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from nlos_calibration.arrays import Float64
 from nlos_calibration.rig import Rig
 from nlos_models.checkpoint import shipped_folder
-from nlos_models.doubt_checkpoint import Doubter, load_doubter
+from nlos_models.doubt_checkpoint import UncertaintyModel, load_uncertainty_model
 from nlos_models.inference import Reconstructor, load_reconstructor
 from numpy.typing import NDArray
 
@@ -31,11 +31,11 @@ from nlos_cam.errors import SceneError
 from nlos_cam.evaluate.subjects import echoes_of, rig_of, sense, truth_of
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.benchmark import benchmark_objects
 from nlos_cam.objects.depth_map import depth_from_image, object_box
 from nlos_cam.reconstruct.network import Reconstruction, reconstruct
 from nlos_cam.reconstruct.pipeline import limits_of
-from nlos_cam.reconstruct.verdict import Judge, Signs, Verdict
+from nlos_cam.reconstruct.verdict import FrameConditions, Verdict, VerdictFilter
 from nlos_cam.render.sensor.model import SensorModel
 
 BINS = 10
@@ -58,7 +58,7 @@ class Answer:
 class Pipeline:
     """Pipeline of `live` for single frames, without a memory."""
 
-    def __init__(self, rig: Rig, network: Reconstructor, doubter: Doubter) -> None:
+    def __init__(self, rig: Rig, network: Reconstructor, doubter: UncertaintyModel) -> None:
         self.rig, self.limits = rig, limits_of(doubter)
         self._network, self._doubter = network, doubter
 
@@ -66,7 +66,7 @@ class Pipeline:
         """Return the answer to maps (64, 80)."""
         maps = LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
         found = reconstruct(maps, self.rig, self._network, doubter=self._doubter)
-        shown, verdict = Judge(self.limits).look(found, Signs())
+        shown, verdict = VerdictFilter(self.limits).look(found, FrameConditions())
         return Answer(found, verdict, shown.shows)
 
 
@@ -150,7 +150,7 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
     """Run the study; rows of the held-out maps before `start` were used in calibration and are skipped."""
     rig, sensor = pipeline.rig, SensorModel()
     with tracked("rendering the test objects") as on_progress:
-        subjects = test_set(object_box(rig))
+        subjects = benchmark_objects(object_box(rig))
         maps = sense(echoes_of(subjects, rig, on_progress), rig)
     answers = [pipeline.answer(one.depth_m, one.intensity) for one in maps]
     result: dict[str, Any] = {"test_objects": of_objects(answers, truth_of(subjects, object_box(rig)), rig)}
@@ -241,7 +241,7 @@ def main() -> None:
     asked = parser.parse_args()
     with harness.one_line_errors():
         network = load_reconstructor(asked.weights, cache_folder() / "onnx")
-        doubter = load_doubter(asked.weights, cache_folder() / "onnx")
+        doubter = load_uncertainty_model(asked.weights, cache_folder() / "onnx")
         if doubter is None:
             raise SceneError(f"{asked.weights or shipped_folder()} has no doubt network: train one with `train doubt`")
         pipeline = Pipeline(rig_of(network.record), network, doubter)

@@ -23,7 +23,7 @@ from nlos_cam.dataset.build import TEST_SEED
 from nlos_cam.evaluate.subjects import seeded_objects, sense
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.benchmark import benchmark_objects
 from nlos_cam.objects.depth_map import depth_from_image, object_box
 from nlos_cam.reconstruct.physics_check import UNEXPLAINED, check
 from nlos_cam.render.accuracy import Stop
@@ -81,7 +81,7 @@ def populations(
         found[name] = values
         told(len(found), steps)
 
-    truth_m = [one.depth_m for one in test_set(BOX)]
+    truth_m = [one.depth_m for one in benchmark_objects(BOX)]
     seen = study.ordinary(truth_m)
     for stop in ("draft", "standard"):
         pairs = ((one.maps, depth_m) for one, depth_m in zip(seen, truth_m, strict=True))
@@ -101,10 +101,10 @@ def populations(
 
 def outliers(each: int) -> dict[str, list[Any]]:
     """Return the same stimuli of every kind of outlier."""
-    from nlos_cam.dataset.outliers import TO_JUDGE, TO_LEARN, Sight, outlier
+    from nlos_cam.dataset.outliers import TO_JUDGE, TO_LEARN, Stimulus, outlier
     from nlos_cam.render.sensor.model import SensorModel
 
-    plain = Sight(RIG, SensorModel())
+    plain = Stimulus(RIG, SensorModel())
     kinds = {**TO_LEARN, **TO_JUDGE}
     return {
         name: [outlier(kind, np.random.default_rng([which, number]), plain) for number in range(each)]

@@ -31,7 +31,7 @@ from nlos_cam.render import backend_numba, backend_torch
 from nlos_cam.render.accuracy import STOPS, Accuracy, accuracy_named
 from nlos_cam.render.accuracy_search import Echoes, Work, agreement, least_seconds, some_of
 from nlos_cam.render.effects import Effects, included
-from nlos_cam.render.job import Job
+from nlos_cam.render.job import TransportJob
 from nlos_cam.render.planning import Prepared
 from nlos_cam.render.renderer import Rendering, render, render_all, three_bounce
 from nlos_cam.render.scene import Scene
@@ -234,14 +234,14 @@ def convergence(_: argparse.Namespace) -> None:
         print(name, *rows, sep="\n   ")
 
 
-def jobs_of(scenes: Sequence[Scene], accuracy: str) -> Iterator[Job]:
+def jobs_of(scenes: Sequence[Scene], accuracy: str) -> Iterator[TransportJob]:
     """Plan scenes for the GPU."""
     for scene in scenes:
         if (job := Prepared.of(scene, accuracy_named(accuracy), "auto").job()) is not None:
             yield job
 
 
-def deviation(jobs: Sequence[Job], device: torch.device) -> float:
+def deviation(jobs: Sequence[TransportJob], device: torch.device) -> float:
     """Return the relative L1 deviation of some histograms from the numba renderer's."""
     some = [job.some(np.arange(0, len(job.foot_m), 50)) for job in jobs]
     pairs = zip(backend_torch.histograms_of_all(some, device), map(backend_numba.histograms, some), strict=True)

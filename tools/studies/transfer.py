@@ -35,7 +35,7 @@ from nlos_cam.evaluate import metrics as evaluate
 from nlos_cam.evaluate.subjects import reconstruct_all
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.benchmark import benchmark_objects
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
@@ -77,7 +77,7 @@ def on_paper_rig(on_progress: OnProgress) -> dict[str, MapSet]:
     rig = load_rig("paper-rig")
     box, sensor = object_box(rig), Sensor(rig, SensorModel())
     parts: dict[str, list[tuple[Float32, Float32, Float32]]] = {part: [] for part in PARTS}
-    for number, thing in enumerate(things := test_set(box)):
+    for number, thing in enumerate(things := benchmark_objects(box)):
         images = sensor.expose(render(Scene(rig, thing.depth_m)).multi, np.random.default_rng([number, 1]))
         maps = maps_from_frame(images.frame(rig.pinhole))
         parts[part_of(thing)].append((maps.depth_m, maps.intensity, image_from_depth(thing.depth_m, box)))

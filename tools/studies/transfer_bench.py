@@ -19,10 +19,10 @@ from nlos_cam.camera.simulated_world import World
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
-from nlos_cam.objects.benchmark import FixedObject, test_set
+from nlos_cam.objects.benchmark import FixedObject, benchmark_objects
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.recording.capture import Job, Takes, settle
+from nlos_cam.recording.capture import CaptureSession, CaptureTarget, settle
 from nlos_cam.recording.playback import verify
 from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
 from nlos_cam.render.renderer import render
@@ -118,8 +118,8 @@ def record(take: Take, scene: SceneFile, frames: int) -> None:
     camera = SimulatedCamera(
         f"sim:{scene.rig.name}", Later(scene, shown, take.since), clock=HurriedClock(), recording=recording
     )
-    job = Job(take.path, take.thing.name)
-    for made in Takes(camera, recording, [job]).record(Event(), lambda _: None):
+    job = CaptureTarget(take.path, take.thing.name)
+    for made in CaptureSession(camera, recording, [job]).record(Event(), lambda _: None):
         settled = settle(made, verify)
         if settled.error:
             raise settled.error
@@ -144,7 +144,9 @@ def main() -> None:
     asked = parser.parse_args()
     scene = load_scene(asked.scene)
     with tracked("recording the test objects") as on_progress:
-        made = list(record_all(scene, test_set(object_box(scene.rig)), asked.folder, asked.frames, on_progress))
+        made = list(
+            record_all(scene, benchmark_objects(object_box(scene.rig)), asked.folder, asked.frames, on_progress)
+        )
     size_gb = sum(path.stat().st_size for path in made) / 1e9
     print(f"{len(made)} recordings of {asked.frames} frames, {size_gb:.2f} GB: {asked.folder}")
 

@@ -60,7 +60,7 @@ from nlos_cam.evaluate.subjects import (
     truth_of,
 )
 from nlos_cam.files import cache_folder
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.benchmark import benchmark_objects
 from nlos_cam.objects.depth_map import object_box
 
 FRAMES, LEFT_OUT = (10, 100), "airplane,table"
@@ -149,7 +149,7 @@ def experiments(
 def limits(asked: argparse.Namespace) -> None:
     """Measure the limits of the figures of `evaluate`."""
     box = object_box(rig_of(load_record(asked.weights)))
-    subjects = test_set(box)
+    subjects = benchmark_objects(box)
     trained = seeded_objects(TRAINING_SEED, len(subjects), box)
     rows = [*experiments(asked.weights, subjects, trained, asked.frames)]
     harness.write("limits", {"objects": len(subjects), "rows": [asdict(row) for row in rows]}, asked.out)
@@ -200,7 +200,7 @@ def rigs(asked: argparse.Namespace) -> None:
     folders: dict[str, Path | None] = harness.by_name(asked.weights) or {"shipped": None}
     networks = {name: load_reconstructor(folder, cache_folder() / "onnx") for name, folder in folders.items()}
     rig = load_rig(asked.rig)
-    subjects = test_set(object_box(rig))
+    subjects = benchmark_objects(object_box(rig))
     places = [Place(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG]
     files = [file for folder in folders.values() for file in sorted((folder or shipped_folder()).iterdir())]
     key = hashlib.sha256(b"".join(file.read_bytes() for file in files if file.is_file())).hexdigest()

@@ -12,7 +12,7 @@ DEPTH_UNIT_M = 0.00025
 """The L515's Z16 unit."""
 FARTHEST = 65535
 """The most that Z16 holds, in its unit."""
-MOST_CONFIDENT = 15
+MAX_CONFIDENCE = 15
 SURE_COUNTS = 6.0
 """IR counts at which the signal alone gives 63 % of the confidence it can give."""
 STEADY_CELSIUS = 40.0

@@ -33,7 +33,7 @@ from nlos_cam.render.renderer import MultiBounce
 from nlos_cam.render.scene import Radiometry
 from nlos_cam.render.sensor.bias import DepthBias, texture
 from nlos_cam.render.sensor.effects import sensor_effects
-from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, MOST_CONFIDENT, SURE_COUNTS, SensorModel
+from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, MAX_CONFIDENCE, SURE_COUNTS, SensorModel
 
 
 class Chain(NamedTuple):
@@ -146,7 +146,7 @@ def expose(
             light += light_deviates[i] * noise_counts(light, chain)
         ir[i] = quantise(saturate(light, chain), SATURATED)
         # half of the signal's own surety is the winner's lead
-        confidence[i] = int(MOST_CONFIDENT * (surety * (0.5 + 0.5 * (1 - second / intensity))) + 0.5)
+        confidence[i] = int(MAX_CONFIDENCE * (surety * (0.5 + 0.5 * (1 - second / intensity))) + 0.5)
         if confidence[i] == 0 or (optics.dead.size and optics.dead[i]):
             continue
         depth_m = length_m * optics.cos_axis[i]

@@ -13,7 +13,7 @@ from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import MeasuredWall, wall_record
 
-from nlos_cam.calibrate.measure import CELSIUS_EVERY, Seen, by_board, by_depth, by_occluder, glance, look
+from nlos_cam.calibrate.measure import CELSIUS_EVERY, CaptureStatistics, by_board, by_depth, by_occluder, glance, look
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.render.geometry import cast
 
@@ -72,38 +72,38 @@ def test_look_refuses_a_camera_without_frames() -> None:
         look(Warming(0), 1000)
 
 
-def seen_of(depth_m: np.ndarray, frames: int, intrinsics: Intrinsics = INTRINSICS, seed: int = 0) -> Seen:
+def seen_of(depth_m: np.ndarray, frames: int, intrinsics: Intrinsics = INTRINSICS, seed: int = 0) -> CaptureStatistics:
     statistics, dark = BareWallStatistics(intrinsics), np.zeros(depth_m.shape, np.uint8)
     cells, generator = np.full((64, 80), 0.2, np.float32), np.random.default_rng(seed)
     for _ in range(frames):
         noise_m = generator.standard_normal(depth_m.shape) * (0.0005 + 0.002 * depth_m)
         statistics.add((depth_m + noise_m).astype(np.float32), dark, cells, cells)
-    return Seen("sim", statistics, intrinsics, "", "", {})
+    return CaptureStatistics("sim", statistics, intrinsics, "", "", {})
 
 
-def bench_seen(intrinsics: Intrinsics = INTRINSICS, **changes: object) -> Seen:
+def bench_seen(intrinsics: Intrinsics = INTRINSICS, **changes: object) -> CaptureStatistics:
     """What the lidar of the paper's rig sees with its occluder in place and nothing hidden, by its beams."""
     beams = cast(BENCH.model_copy(update=changes), intrinsics)
     return seen_of((beams.length_m * beams.cos_axis).reshape(intrinsics.height, intrinsics.width), 20, intrinsics, 1)
 
 
 @pytest.fixture(scope="module")
-def seen() -> Seen:
+def seen() -> CaptureStatistics:
     return seen_of(wall_depth(RIG.wall_from_lidar, INTRINSICS), 10)
 
 
-def measured(seen: Seen, tape_m: float | None = None) -> MeasuredWall:
+def measured(seen: CaptureStatistics, tape_m: float | None = None) -> MeasuredWall:
     fit, facts = by_depth(seen, tape_m)
     about = {"camera": "sim", "frames": 10, "created": date(2026, 1, 2)}
     return MeasuredWall(wall_record(fit, INTRINSICS, **about, others=facts), None)
 
 
 @pytest.fixture(scope="module")
-def bare(seen: Seen) -> MeasuredWall:
+def bare(seen: CaptureStatistics) -> MeasuredWall:
     return measured(seen)
 
 
-def test_by_depth_measures_the_wall_and_the_tapes_offset(seen: Seen) -> None:
+def test_by_depth_measures_the_wall_and_the_tapes_offset(seen: CaptureStatistics) -> None:
     fit, facts = by_depth(seen)
     assert facts == {}
     assert fit.distance_m == pytest.approx(0.2, abs=4 * fit.distance_std_m)
@@ -112,11 +112,11 @@ def test_by_depth_measures_the_wall_and_the_tapes_offset(seen: Seen) -> None:
     assert facts["range_offset_m"] == pytest.approx(0.004 * np.sqrt(2.0), abs=2e-5)
 
 
-def test_by_depth_and_by_board_refuse_what_they_cannot_find(seen: Seen) -> None:
+def test_by_depth_and_by_board_refuse_what_they_cannot_find(seen: CaptureStatistics) -> None:
     with pytest.raises(CalibrationError, match=r"0\.3"):
         by_depth(seen, 0.3)
     with pytest.raises(WallRefusedError):
-        by_depth(Seen("sim", BareWallStatistics(INTRINSICS), INTRINSICS, "", "", {}))
+        by_depth(CaptureStatistics("sim", BareWallStatistics(INTRINSICS), INTRINSICS, "", "", {}))
     with pytest.raises(BoardRefusedError):
         by_board(seen, BOARDS["a4"], None)
 
@@ -148,7 +148,7 @@ def test_by_occluder_refuses_a_lidar_that_moved(bare: MeasuredWall, lidar: Lidar
         by_occluder(bench_seen(lidar=lidar), bare)
 
 
-def test_by_occluder_is_not_moved_by_an_origin_offset(seen: Seen) -> None:
+def test_by_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatistics) -> None:
     """The beams meet 4 sqrt(2) mm before the glass at 45 degrees: x and distance of the glass are 4 mm from theirs."""
     wall = measured(seen, 0.204)
     assert wall.record.range_offset_cause == "origin"
@@ -159,7 +159,7 @@ def test_by_occluder_is_not_moved_by_an_origin_offset(seen: Seen) -> None:
     assert told.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
 
 
-def test_by_occluder_notices_another_camera_and_settings(bare: MeasuredWall, seen: Seen) -> None:
+def test_by_occluder_notices_another_camera_and_settings(bare: MeasuredWall, seen: CaptureStatistics) -> None:
     with pytest.raises(CalibrationError, match=r"160x120.*80x60"):
         by_occluder(bench_seen(RIG.pinhole.scaled(80, 60)), bare)
     now = replace(bench_seen(), serial="f2", settings={"laser_power": 40.0})

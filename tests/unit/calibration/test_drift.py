@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from nlos_calibration.drift import (
-    LEAST_FRAMES,
+    MIN_FRAMES,
     MIN_PIXELS,
     TOLERANCE_C,
     WINDOW_FRAMES,
@@ -14,7 +14,7 @@ from nlos_calibration.drift import (
 )
 from nlos_calibration.errors import CalibrationError
 from nlos_calibration.reference import BareWall
-from nlos_calibration.wall_tracker import Sight
+from nlos_calibration.wall_tracker import WallObservation
 
 from nlos_cam.calibrate.synthetic import SMALL, Pose, measured, wall_from_lidar
 
@@ -128,7 +128,7 @@ def test_drift_check_warns_of_too_few_good_pixels(wall: BareWall, left: int) -> 
 def filled(sights: np.ndarray, reference_frames: int = MANY) -> DriftWindow:
     window = DriftWindow(reference_frames)
     for sight in sights:
-        window.add(Sight(*sight.tolist()), 0.5)
+        window.add(WallObservation(*sight.tolist()), 0.5)
     return window
 
 
@@ -145,10 +145,10 @@ def sights(count: int, seed: int = 0) -> np.ndarray:
 
 
 def test_drift_window_needs_enough_frames() -> None:
-    assert filled(sights(LEAST_FRAMES - 1)).drift() is None
-    window = filled(sights(LEAST_FRAMES))
+    assert filled(sights(MIN_FRAMES - 1)).drift() is None
+    window = filled(sights(MIN_FRAMES))
     assert window.drift() is not None
-    for _ in range(WINDOW_FRAMES - LEAST_FRAMES + 1):
+    for _ in range(WINDOW_FRAMES - MIN_FRAMES + 1):
         window.add(None, 0.0)
     assert window.drift() is None
 

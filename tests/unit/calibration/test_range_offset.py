@@ -4,7 +4,7 @@ from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.noise import depth_noise_m
-from nlos_calibration.range_offset import TAPE_STD_M, FitWith, tape_the_wall
+from nlos_calibration.range_offset import TAPE_STD_M, FitWith, fit_with_tape_distance
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth
 
@@ -34,7 +34,7 @@ def bare(distance_m: float, yaw_deg: float) -> Float64:
 @pytest.mark.parametrize("yaw_deg", [20.0, 45.0, 65.0])
 def test_tape_offset_is_added_to_depth_that_is_too_short(yaw_deg: float, offset_m: float) -> None:
     """The beams meet at the front glass and every depth lacks the offset: the corrected pose is the true one."""
-    taped = tape_the_wall(seen(bare(0.2, yaw_deg) - offset_m), 0.2)
+    taped = fit_with_tape_distance(seen(bare(0.2, yaw_deg) - offset_m), 0.2)
     assert taped.cause == "depth"
     assert taped.offset_m == pytest.approx(offset_m, abs=3e-5)
     np.testing.assert_allclose(taped.fit.wall_from_lidar, pose(0.2, yaw_deg), atol=3e-4)
@@ -47,7 +47,7 @@ def test_tape_offset_of_the_origin_moves_the_pose_along_the_axis(yaw_deg: float,
     """Depth is right, but its zero lies offset_m nearer to the wall than the front glass."""
     true = pose(0.2, yaw_deg)
     cosine = -true[2, 2]
-    taped = tape_the_wall(seen(bare(0.2, yaw_deg)), 0.2 + offset_m * cosine)
+    taped = fit_with_tape_distance(seen(bare(0.2, yaw_deg)), 0.2 + offset_m * cosine)
     assert taped.cause == "origin"
     assert taped.offset_m == pytest.approx(offset_m, abs=3e-5)
     assert taped.fit.distance_m == pytest.approx(0.2 + offset_m * cosine, abs=1e-9)
@@ -58,14 +58,14 @@ def test_tape_offset_of_the_origin_moves_the_pose_along_the_axis(yaw_deg: float,
 def test_tape_that_agrees_changes_only_the_uncertainty() -> None:
     fit_with = seen(bare(0.2, 45.0))
     plain = fit_with(0.0, 0.0)
-    taped = tape_the_wall(fit_with, plain.distance_m)
+    taped = fit_with_tape_distance(fit_with, plain.distance_m)
     assert taped.offset_m == 0.0
     np.testing.assert_array_equal(taped.fit.wall_from_lidar, plain.wall_from_lidar)
     assert taped.fit.distance_std_m == TAPE_STD_M
 
 
 def test_tape_offset_is_less_certain_on_an_oblique_wall() -> None:
-    squarely, obliquely = (tape_the_wall(seen(bare(0.2, yaw_deg)), 0.201) for yaw_deg in (20.0, 65.0))
+    squarely, obliquely = (fit_with_tape_distance(seen(bare(0.2, yaw_deg)), 0.201) for yaw_deg in (20.0, 65.0))
     assert squarely.offset_std_m == pytest.approx(TAPE_STD_M / np.cos(np.radians(20.0)), rel=0.02)
     assert obliquely.offset_std_m > 1.5 * squarely.offset_std_m
 
@@ -73,4 +73,4 @@ def test_tape_offset_is_less_certain_on_an_oblique_wall() -> None:
 @pytest.mark.parametrize("tape_m", [0.1, 0.3])
 def test_tape_far_from_the_measured_distance_is_refused(tape_m: float) -> None:
     with pytest.raises(CalibrationError, match=str(tape_m)):
-        tape_the_wall(seen(bare(0.2, 45.0)), tape_m)
+        fit_with_tape_distance(seen(bare(0.2, 45.0)), tape_m)

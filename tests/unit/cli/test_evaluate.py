@@ -20,7 +20,7 @@ from nlos_cam.dataset import build
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED, DatasetPlan, procedural_images
 from nlos_cam.evaluate import baselines, subjects
 from nlos_cam.evaluate.metrics import BARS
-from nlos_cam.objects.benchmark import test_set
+from nlos_cam.objects.benchmark import benchmark_objects
 
 RIG = load_rig("paper-rig")
 STORED = ["--dataset", "held-out", "--training", "held-out"]
@@ -109,10 +109,10 @@ def test_evaluate_writes_figures_of_dataset_beside_baselines(tmp_path: Path, run
 def test_evaluate_uses_test_set_without_dataset(
     run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, guessing: list[DatasetPlan]
 ) -> None:
-    monkeypatch.setattr(subjects, "test_set", lambda box: test_set(box)[:2])
+    monkeypatch.setattr(subjects, "test_set", lambda box: benchmark_objects(box)[:2])
     result = run()
     assert (result["objects"], result["rig"], guessing[0].rig) == (2, RIG.name, RIG)
-    assert list(result["per_category"]) == [test_set(DatasetPlan(RIG, 0).box)[0].category]
+    assert list(result["per_category"]) == [benchmark_objects(DatasetPlan(RIG, 0).box)[0].category]
     assert "nearest_neighbour" in result["baselines"]
 
 

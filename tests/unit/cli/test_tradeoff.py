@@ -56,7 +56,7 @@ def plates(monkeypatch: pytest.MonkeyPatch) -> None:
 
     made = {name: lambda _: plate for name in ("torch float32, cpu", "ONNX Runtime float32")}
     monkeypatch.setattr(command.reconstruction, "runtimes", lambda *_: made)
-    monkeypatch.setattr(command.reconstruction, "LEAST_CALLS", 2)
+    monkeypatch.setattr(command.reconstruction, "MIN_CALLS", 2)
 
 
 Run = Callable[..., dict[str, Any]]

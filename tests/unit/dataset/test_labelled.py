@@ -33,7 +33,7 @@ from nlos_cam.dataset.labelled import (
 from nlos_cam.dataset.shards import store
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError, SceneError
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.objects.benchmark import test_set as fixed_set
+from nlos_cam.objects.benchmark import benchmark_objects as fixed_set
 from nlos_cam.objects.depth_map import cell_centres_m, image_from_depth, object_box
 from nlos_cam.recording.playback import ReplayCamera
 from nlos_cam.recording.sidecar import SidecarFile, WallFile, sidecar_path

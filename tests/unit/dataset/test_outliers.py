@@ -8,13 +8,13 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset.outliers import (
     IN_SHAPE,
-    LEAST_PIXELS,
+    MIN_PIXELS,
     SLIGHT,
     TO_JUDGE,
     TO_LEARN,
     WIDE,
-    Sight,
     Spread,
+    Stimulus,
     moved,
     ordinary,
     outlier,
@@ -26,15 +26,15 @@ from nlos_cam.render.sensor.model import SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
 BOX = object_box(RIG)
-PLAIN = Sight(RIG, SENSOR)
+PLAIN = Stimulus(RIG, SENSOR)
 SEEDS = range(6)
 
 
-def made(name: str, seed: int) -> Sight:
+def made(name: str, seed: int) -> Stimulus:
     return outlier({**TO_LEARN, **TO_JUDGE}[name], np.random.default_rng(seed), PLAIN)
 
 
-def depth_of(sight: Sight) -> np.ndarray:
+def depth_of(sight: Stimulus) -> np.ndarray:
     assert sight.depth_m is not None
     return sight.depth_m
 
@@ -44,7 +44,7 @@ def width_m(depth_m: np.ndarray) -> float:
     return float(max(np.ptp(rows), np.ptp(columns)) + 1) * 0.25 / 64
 
 
-def touches_edge(sight: Sight) -> bool:
+def touches_edge(sight: Stimulus) -> bool:
     seen = np.isfinite(depth_of(sight))
     return bool(seen[[0, -1]].any() or seen[:, [0, -1]].any())
 
@@ -55,7 +55,7 @@ def test_outlier_shows_surface_before_wall_and_repeats_by_seed(name: str) -> Non
         one, again = made(name, seed), made(name, seed)
         np.testing.assert_array_equal(depth_of(one), depth_of(again))
         surface_m = depth_of(one)[np.isfinite(depth_of(one))]
-        assert surface_m.size >= LEAST_PIXELS
+        assert surface_m.size >= MIN_PIXELS
         assert surface_m.min() > 0.0
         assert one.scene.rig == one.rig
 
@@ -68,7 +68,7 @@ def test_outlier_kinds_to_learn_and_to_judge_differ() -> None:
     assert {*TO_LEARN, *TO_JUDGE} > IN_SHAPE
 
 
-OUTSIDE: dict[str, Callable[[Sight], bool]] = {
+OUTSIDE: dict[str, Callable[[Stimulus], bool]] = {
     "small": lambda s: width_m(depth_of(s)) < 0.5 * 0.25,
     "large": touches_edge,
     "far": lambda s: float(np.nanmin(depth_of(s))) > BOX.z_near_m + 0.119,
@@ -99,7 +99,7 @@ def test_ordinary_object_is_no_outlier() -> None:
 def test_outlier_without_surface_is_drawn_again() -> None:
     tries = list[int]()
 
-    def shy(generator: np.random.Generator, sight: Sight) -> Sight:
+    def shy(generator: np.random.Generator, sight: Stimulus) -> Stimulus:
         tries.append(1)
         seen = ordinary(generator, sight)
         return sight if len(tries) < 3 else seen

@@ -15,7 +15,7 @@ from nlos_cam.dataset.build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.evaluate import runtime_tradeoff
 from nlos_cam.evaluate.metrics import Interval
 from nlos_cam.evaluate.runtime_tradeoff import (
-    LEAST_CALLS,
+    MIN_CALLS,
     Bench,
     Row,
     Setting,
@@ -95,7 +95,7 @@ def test_measure_takes_median_and_restores_threads() -> None:
     asked = [Setting("plate", "mine", "any", 2, 1), Setting("plate", "mine", "any", 1, 2)]
     rows = list(measure(asked, {"mine": {"any": lambda _: plate}}, bench, lambda: next(seconds)))  # type: ignore[dict-item]
     assert torch.get_num_threads() == before
-    assert [threads.count(count) for count in (1, 2)] == [1 + LEAST_CALLS] * 2
+    assert [threads.count(count) for count in (1, 2)] == [1 + MIN_CALLS] * 2
     assert [row.milliseconds for row in rows] == pytest.approx([3, 3])
     assert 0 < rows[0].figures["silhouette_iou"].value < 1
     assert rows[1].wait_ms == pytest.approx(2 * rows[0].wait_ms)

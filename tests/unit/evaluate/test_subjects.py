@@ -29,7 +29,7 @@ from nlos_cam.evaluate.subjects import (
     truth_of,
 )
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.objects.benchmark import test_set as fixed_set
+from nlos_cam.objects.benchmark import benchmark_objects as fixed_set
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.renderer import MultiBounce

@@ -21,7 +21,7 @@ from nlos_models.checkpoint import (
 )
 from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
-from nlos_models.pipeline import Pipeline, new_vae
+from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.recipe import SIMULATION_ONLY
 from nlos_models.vae import Decoder, Encoder, ResVae
 from safetensors.torch import load_file, save_file
@@ -53,7 +53,7 @@ def _used(module: nn.Module) -> nn.Module:
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("pipeline")
-    save_pipeline(folder, Pipeline(_used(Compressor()), Decoder()), RECORD)
+    save_pipeline(folder, RemappingNetwork(_used(Compressor()), Decoder()), RECORD)
     return folder
 
 
@@ -75,7 +75,7 @@ def _replace(path: Path, content: bytes | dict[str, torch.Tensor]) -> None:
 
 def test_pipeline_round_trip_is_float16_with_exact_statistics(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    pipeline = Pipeline(_used(Compressor()), _used(Decoder()))
+    pipeline = RemappingNetwork(_used(Compressor()), _used(Decoder()))
     pipeline.preprocess.mean.copy_(torch.tensor([0.1, 1e-9, 20.0, 3.0]))
     pipeline.preprocess.spread.copy_(torch.tensor([1e-8, 0.2, 100_000.0, 3.0]))
     save_pipeline(tmp_path, pipeline, RECORD)
@@ -93,7 +93,7 @@ def test_pipeline_round_trip_is_float16_with_exact_statistics(tmp_path: Path) ->
 
 def test_load_pipeline_restores_narrow_compressor(tmp_path: Path) -> None:
     narrow = small_recipe(task="compressor", width=0.5)
-    save_pipeline(tmp_path, Pipeline(Compressor(width=0.5), Decoder()), CheckpointRecord.of([narrow], RIG))
+    save_pipeline(tmp_path, RemappingNetwork(Compressor(width=0.5), Decoder()), CheckpointRecord.of([narrow], RIG))
     loaded, _ = load_pipeline(tmp_path)
     assert 2 * sum(p.numel() for p in loaded.compressor.parameters()) < 2_552_096
 
@@ -234,7 +234,7 @@ def test_save_pipeline_refuses_weights_beyond_float16(tmp_path: Path, value: flo
     decoder = Decoder()
     nn.init.constant_(decoder.output.weight, value)
     with pytest.raises(CheckpointError, match=r"output\.weight"):
-        save_pipeline(tmp_path, Pipeline(Compressor(), decoder), RECORD)
+        save_pipeline(tmp_path, RemappingNetwork(Compressor(), decoder), RECORD)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from nlos_models.doubt_checkpoint import (
     DoubtRecord,
     checksum_of_watched,
     load_doubt,
-    load_doubter,
+    load_uncertainty_model,
     save_doubt,
 )
 from nlos_models.doubt_network import Told
@@ -50,7 +50,7 @@ def test_saved_doubt_restores_with_watched_weights(tmp_path: Path, watched: Path
 
 def test_weights_without_doubt_network_load_none(tmp_path: Path, watched: Path) -> None:
     assert load_doubt(watched) is None
-    assert load_doubter(watched, tmp_path) is None
+    assert load_uncertainty_model(watched, tmp_path) is None
 
 
 @pytest.mark.usefixtures("record")
@@ -89,11 +89,11 @@ def test_checksum_of_watched_refuses_folder_without_weights(tmp_path: Path) -> N
 @pytest.mark.slow
 def test_doubter_onnx_equals_torch_and_is_exported_once(tmp_path: Path, record: DoubtRecord) -> None:
     folder, cache = tmp_path / "run", tmp_path / "cache"
-    doubter = load_doubter(folder, cache)
+    doubter = load_uncertainty_model(folder, cache)
     assert doubter is not None
     (model,) = cache.glob("doubt-*.onnx")
     written_ns = model.stat().st_mtime_ns
-    again = load_doubter(folder, cache)
+    again = load_uncertainty_model(folder, cache)
     assert again is not None
     assert again.record == doubter.record == record
     assert model.stat().st_mtime_ns == written_ns

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from nlos_models.doubt_network import LEAST_ERROR_V, MOST_ERROR_V, DoubtNetwork, Told
+from nlos_models.doubt_network import MAX_ERROR_V, MIN_ERROR_V, DoubtNetwork, Told
 from small_maps import hard_maps
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -37,8 +37,8 @@ def test_doubt_of_hard_maps_is_finite_and_in_range(network: DoubtNetwork, name: 
     nothing, outside, error_v, surface = calibrated(*hard_maps(name), torch.full((1, 64, 64), v))
     for probability in (nothing, outside, surface):
         assert bool(((probability >= 0) & (probability <= 1)).all())
-    assert float(error_v.min()) >= LEAST_ERROR_V
-    assert float(error_v.max()) <= MOST_ERROR_V
+    assert float(error_v.min()) >= MIN_ERROR_V
+    assert float(error_v.max()) <= MAX_ERROR_V
     assert error_v.shape == surface.shape == (1, 64, 64)
 
 

@@ -8,7 +8,7 @@ import torch
 from fake_doubter import RECIPE
 from nlos_models.doubt_network import DoubtNetwork, DoubtOutput
 from nlos_models.doubt_training import (
-    MOST_FALSE_ALARMS,
+    MAX_FALSE_ALARMS,
     as_doubt_batch,
     calibrated,
     doubt_batches,
@@ -73,7 +73,7 @@ def test_calibrated_limits_keep_their_false_alarm_rates(trained: Trained) -> Non
         torch.sigmoid(logits / t).numpy() for logits, t in zip(said[:2], fitted.temperatures, strict=True)
     )
     usual = ~some.nothing & ~some.outside
-    assert (outside[usual] > fitted.outside_above + 1e-6).mean() <= MOST_FALSE_ALARMS + 1 / usual.sum()
+    assert (outside[usual] > fitted.outside_above + 1e-6).mean() <= MAX_FALSE_ALARMS + 1 / usual.sum()
     assert (nothing[some.nothing] < fitted.nothing_above).mean() <= 1 / some.nothing.sum()
     assert fitted.nothing_above <= 0.5
     assert fitted.error_scale > 0

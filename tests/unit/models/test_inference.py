@@ -12,8 +12,8 @@ from nlos_models.checkpoint import CheckpointRecord, save_pipeline
 from nlos_models.compressor import Compressor
 from nlos_models.errors import ModelError
 from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, load_reconstructor, quantise
-from nlos_models.metrics import LEAST_V
-from nlos_models.pipeline import Pipeline, split_and_stack
+from nlos_models.metrics import MIN_V
+from nlos_models.pipeline import RemappingNetwork, split_and_stack
 from nlos_models.vae import Decoder
 from onnx import TensorProto, helper, numpy_helper
 from onnxruntime import quantization
@@ -36,9 +36,9 @@ def _maps(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def pipeline() -> Pipeline:
+def pipeline() -> RemappingNetwork:
     torch.manual_seed(0)
-    made, maps = Pipeline(Compressor(), Decoder()), [torch.from_numpy(m) for m in _maps(8)]
+    made, maps = RemappingNetwork(Compressor(), Decoder()), [torch.from_numpy(m) for m in _maps(8)]
     made.preprocess.learn(split_and_stack(*maps))
     with torch.no_grad():
         made.train()(*maps)  # statistics that are not those of a new network
@@ -50,7 +50,7 @@ def pipeline() -> Pipeline:
 
 
 @pytest.fixture(scope="module")
-def folders(pipeline: Pipeline, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def folders(pipeline: RemappingNetwork, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     weights, cache = tmp_path_factory.mktemp("weights"), tmp_path_factory.mktemp("cache")
     save_pipeline(weights, pipeline, RECORD)
     return weights, cache
@@ -89,7 +89,7 @@ def test_onnx_reconstruction_equals_torch(pair: Pair, batch: int) -> None:
 def test_reconstruction_of_hard_maps_is_a_possible_image(pair: Pair, name: str) -> None:
     for reconstructor in pair:
         image = reconstructor(*(part.numpy() for part in hard_maps(name)))
-        assert ((image == 0) | ((image >= LEAST_V) & (image <= 1))).all()
+        assert ((image == 0) | ((image >= MIN_V) & (image <= 1))).all()
 
 
 @pytest.mark.slow
@@ -106,7 +106,9 @@ def _interrupted(path: Path) -> None:
     raise KeyboardInterrupt
 
 
-def test_interrupted_export_leaves_no_file(tmp_path: Path, pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_export_leaves_no_file(
+    tmp_path: Path, pipeline: RemappingNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Program:
         def save(self, path: Path, **_: object) -> None:
             _interrupted(path)
@@ -117,17 +119,17 @@ def test_interrupted_export_leaves_no_file(tmp_path: Path, pipeline: Pipeline, m
     assert not list(tmp_path.iterdir())
 
 
-def test_color_networks_are_not_exported(pipeline: Pipeline, tmp_path: Path) -> None:
-    color = Pipeline(pipeline.compressor, Decoder(3, 512), intensities=3)
+def test_color_networks_are_not_exported(pipeline: RemappingNetwork, tmp_path: Path) -> None:
+    color = RemappingNetwork(pipeline.compressor, Decoder(3, 512), intensities=3)
     with pytest.raises(ModelError, match="simulation only"):
         inference.exported(color, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def test_export_checksum_depends_on_weights(pipeline: Pipeline) -> None:
+def test_export_checksum_depends_on_weights(pipeline: RemappingNetwork) -> None:
     before = inference.checksum_of(pipeline)
     assert inference.checksum_of(pipeline) == before
-    assert inference.checksum_of(Pipeline(pipeline.compressor, Decoder())) != before
+    assert inference.checksum_of(RemappingNetwork(pipeline.compressor, Decoder())) != before
 
 
 @pytest.fixture(scope="module")

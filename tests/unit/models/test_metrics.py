@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from nlos_models.arrays import Float32
 from nlos_models.metrics import (
-    LEAST_V,
+    MIN_V,
     accuracy_mean_abs,
     accuracy_within_2_percent,
     brightness,
@@ -63,7 +63,7 @@ def test_foreground_rmse_is_over_shared_pixels_in_mm() -> None:
 
 
 def test_foreground_rmse_clips_at_farthest_surface() -> None:
-    assert foreground_rmse_mm(_square(0.06), _square(LEAST_V), 300.0)[0] == pytest.approx(0, abs=1e-6)
+    assert foreground_rmse_mm(_square(0.06), _square(MIN_V), 300.0)[0] == pytest.approx(0, abs=1e-6)
     assert foreground_rmse_mm(_square(0.06), _square(0.2), 300.0)[0] == pytest.approx(30, rel=1e-5)
 
 

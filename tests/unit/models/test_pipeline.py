@@ -5,13 +5,13 @@ import pytest
 import torch
 from nlos_models.compressor import Compressor, ResNet50
 from nlos_models.data import flip_some
-from nlos_models.metrics import LEAST_V
+from nlos_models.metrics import MIN_V
 from nlos_models.pipeline import (
     CHANNELS,
     KEPT_SHARE,
     WINDOW,
-    Pipeline,
     Preprocess,
+    RemappingNetwork,
     channel_statistics,
     cut_silhouette,
     lift_edges,
@@ -136,7 +136,7 @@ def test_preprocess_of_hard_maps_is_finite(name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def pipeline() -> Pipeline:
+def pipeline() -> RemappingNetwork:
     torch.manual_seed(0)
     return new_pipeline(colour=False).eval()
 
@@ -144,11 +144,11 @@ def pipeline() -> Pipeline:
 @torch.inference_mode()
 @pytest.mark.parametrize("name", HARD_MAPS)
 @pytest.mark.parametrize("bfloat16", [False, True])
-def test_pipeline_makes_possible_image_of_hard_maps(pipeline: Pipeline, name: str, bfloat16: bool) -> None:
+def test_pipeline_makes_possible_image_of_hard_maps(pipeline: RemappingNetwork, name: str, bfloat16: bool) -> None:
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         image = pipeline(*hard_maps(name))
     assert image.shape == (1, 64, 64)
-    assert ((image == 0) | ((image >= LEAST_V) & (image <= 1))).all()
+    assert ((image == 0) | ((image >= MIN_V) & (image <= 1))).all()
 
 
 @pytest.mark.slow
@@ -169,7 +169,7 @@ def test_color_pipeline_handles_hard_maps() -> None:
 
 
 @torch.inference_mode()
-def test_pipeline_latent_depends_on_neither_batch_nor_layout(pipeline: Pipeline) -> None:
+def test_pipeline_latent_depends_on_neither_batch_nor_layout(pipeline: RemappingNetwork) -> None:
     depth, intensity = torch.rand(3, 64, 80), 50 * torch.rand(3, 64, 80)
     latents = pipeline.latent(depth, intensity)
     alone = torch.cat([pipeline.latent(d[None], i[None]) for d, i in zip(depth, intensity, strict=True)])
@@ -201,7 +201,7 @@ def _blurred() -> Tensor:
 def test_cut_silhouette_keeps_pixel_or_clears_it() -> None:
     image = _blurred()
     cut = cut_silhouette(image)
-    assert ((cut == 0) | ((cut == image) & (cut >= LEAST_V))).all()
+    assert ((cut == 0) | ((cut == image) & (cut >= MIN_V))).all()
     peak = image.flatten(1).argmax(1)
     assert (cut.flatten(1).gather(1, peak[:, None]) > 0).all()
 
@@ -218,10 +218,10 @@ def test_cut_silhouette_clears_faint_skirt_beside_bright_surface() -> None:
     assert WINDOW < 30
 
 
-@pytest.mark.parametrize("value", [0.0, 0.05, LEAST_V, 1.0])
+@pytest.mark.parametrize("value", [0.0, 0.05, MIN_V, 1.0])
 def test_cut_silhouette_of_constant_image_is_all_or_nothing(value: float) -> None:
     image = torch.full((1, 1, 64, 64), value)
-    assert torch.equal(cut_silhouette(image), image if value >= LEAST_V else torch.zeros_like(image))
+    assert torch.equal(cut_silhouette(image), image if value >= MIN_V else torch.zeros_like(image))
 
 
 def test_cut_silhouette_of_color_uses_brightest_channel() -> None:

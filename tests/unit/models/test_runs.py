@@ -8,7 +8,7 @@ from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint
 from nlos_models import runs as train_start
 from nlos_models.checkpoint import CheckpointRecord, save_pipeline, save_vae
-from nlos_models.pipeline import Pipeline
+from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import Recipe
 from nlos_models.runs import TrainingRun, compressor_start, job_of, transfer_start, vae_start
 from safetensors.torch import load_file, save_file
@@ -38,7 +38,7 @@ def weights(tmp_path: Path) -> Path:
     torch.manual_seed(1)
     vae = SmallVae()
     record = CheckpointRecord.of([VAE, TWO], NAMED)
-    save_pipeline(tmp_path / "two", Pipeline(SmallCompressor(), vae.decoder), record, vae.encoder)
+    save_pipeline(tmp_path / "two", RemappingNetwork(SmallCompressor(), vae.decoder), record, vae.encoder)
     return tmp_path / "two"
 
 

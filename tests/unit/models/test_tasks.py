@@ -11,7 +11,7 @@ from nlos_models import tasks as remap
 from nlos_models import tasks as transfer
 from nlos_models.data import InMemory, map_batches
 from nlos_models.errors import TrainingError
-from nlos_models.pipeline import Pipeline, channel_statistics, split_and_stack
+from nlos_models.pipeline import RemappingNetwork, channel_statistics, split_and_stack
 from nlos_models.recipe import Recipe
 from nlos_models.tasks import (
     ALL_LAYERS,
@@ -75,7 +75,7 @@ def _vae(
 
 def _compressor(
     recipe: Recipe, start: Start, folder: Path, on_step: OnStep = _ignore, running: Running | None = None
-) -> tuple[Pipeline, Figures]:
+) -> tuple[RemappingNetwork, Figures]:
     return train_compressor(recipe, start, InMemory(small_maps(COUNT, 0)), small_maps(4, 1), folder, on_step, running)
 
 
@@ -153,7 +153,7 @@ def test_one_step_training_trains_own_decoder(tmp_path: Path) -> None:
 def test_joint_training_moves_both_networks_but_not_encoder(trained: Trained, tmp_path: Path) -> None:
     vae = SmallVae()
     vae.load_state_dict(state_of(trained[0]))
-    two = Pipeline(SmallCompressor(), vae.decoder)
+    two = RemappingNetwork(SmallCompressor(), vae.decoder)
     two.preprocess.mean.fill_(0.25)
     before, encoder = state_of(two), state_of(vae.encoder)
     recipe = _recipe("compressor", steps="two-then-joint", epochs=1, image_weight=1.0, dropout=0.2, learning_rate=1e-6)
@@ -168,7 +168,7 @@ def test_joint_training_moves_both_networks_but_not_encoder(trained: Trained, tm
 
 
 def test_compressor_continues_from_weights_with_decoder_of_vae(trained: Trained, tmp_path: Path) -> None:
-    earlier = Pipeline(SmallCompressor(), SmallVae().decoder)
+    earlier = RemappingNetwork(SmallCompressor(), SmallVae().decoder)
     before = state_of(earlier.compressor)
     recipe = _recipe("compressor", start="weights", epochs=1, image_weight=1.0, learning_rate=1e-7, dropout=0.2)
     pipeline, _ = _compressor(recipe, Start(trained[0], earlier), tmp_path)
@@ -236,7 +236,7 @@ def test_latents_of_batches_equal_those_of_encoder(monkeypatch: pytest.MonkeyPat
 
 
 def test_run_in_parts_equals_run_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    pipeline, maps = Pipeline(SmallCompressor(), SmallVae().decoder).eval(), small_maps(5, 2)
+    pipeline, maps = RemappingNetwork(SmallCompressor(), SmallVae().decoder).eval(), small_maps(5, 2)
     whole = run(pipeline, maps)
     assert whole.shape == (5, 64, 64)
     monkeypatch.setattr(remap, "SCORING_BATCH", 2)
@@ -262,7 +262,7 @@ def _first_loss(folder: Path, encoder: bool = True, **changes: float) -> float:
     vae = SmallVae().eval()
     still = {"objects": 8, "epochs": 1, "dropout": 0.0, "left_noise": 0.0, "schedule": "plateau"}
     recipe = _recipe("compressor").model_copy(update={**still, **changes})
-    pipeline, source = Pipeline(SmallCompressor(), vae.decoder), InMemory(small_maps(8, 0))
+    pipeline, source = RemappingNetwork(SmallCompressor(), vae.decoder), InMemory(small_maps(8, 0))
     task, rows = Remapping(pipeline, vae.encoder if encoder else None, source, small_maps(4, 1)), list[Figures]()
     task.fit(recipe, [vae.decoder], folder, _ignore, Running(on_epoch=rows.append))
     return rows[0]["loss"]
@@ -289,7 +289,7 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         torch.manual_seed(5)
         self.vae, self.folder, self.steps = SmallVae().eval(), folder, list[tuple[int, int]]()
-        self.pipeline = Pipeline(SmallCompressor(), self.vae.decoder).eval()
+        self.pipeline = RemappingNetwork(SmallCompressor(), self.vae.decoder).eval()
         self.pipeline.preprocess.mean.fill_(0.25)
         self.maps, self.held_out = small_maps(COUNT, 0), small_maps(4, 1)
 

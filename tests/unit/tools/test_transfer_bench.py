@@ -12,7 +12,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset.labelled import read_labelled
 from nlos_cam.objects.benchmark import FixedObject
-from nlos_cam.objects.benchmark import test_set as fixed_set
+from nlos_cam.objects.benchmark import benchmark_objects as fixed_set
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.recording.sidecar import load_sidecar
 from nlos_cam.render.renderer import MultiBounce

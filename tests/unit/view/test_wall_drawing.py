@@ -14,7 +14,7 @@ from nlos_calibration.wall_record import MeasuredWall
 from nlos_cam.view.images import BACKGROUND_RGB, SATURATED_RGB
 from nlos_cam.view.wall_drawing import (
     ALL_IS_WELL,
-    MOST_POINTS,
+    MAX_POINTS,
     NOT_WATCHED,
     OFF_WALL_M,
     bench_drawings,
@@ -127,7 +127,7 @@ def test_bench_drawings_leave_out_holes_and_strays() -> None:
     wall = exact_wall(depth_m=depth_m)
     drawn_m = points(dict(bench_drawings(wall))["bench/measured/points"])
     near = np.abs(wall_points_m(wall.record, reference_of(wall))[..., 2]) <= OFF_WALL_M
-    assert 0 < len(drawn_m) <= MOST_POINTS
+    assert 0 < len(drawn_m) <= MAX_POINTS
     assert 0 < near.sum() < depth_m.size / 2
     assert np.isfinite(drawn_m).all()
     assert np.abs(drawn_m[:, 2]).max() <= OFF_WALL_M
