@@ -4,10 +4,9 @@ import sys
 from datetime import datetime
 from pathlib import Path
 
-from nlos_calibration.wall_record import wall_record
+from nlos_calibration import new_wall_record
 
-from nlos_cam.calibrate.files import WallFiles, written
-from nlos_cam.calibrate.measure import by_depth, look
+from nlos_cam.calibrate import WallFiles, by_depth, look, written
 from nlos_cam.camera import open_camera
 
 
@@ -18,7 +17,7 @@ def main(bag: Path, out: Path) -> None:
     fit, facts = by_depth(seen)
     about = {"camera": seen.camera, "frames": seen.statistics.depth.frames}
     today, others = datetime.now().astimezone().date(), seen.facts() | facts
-    record = wall_record(fit, seen.intrinsics, **about, created=today, others=others)
+    record = new_wall_record(fit, seen.intrinsics, **about, created=today, others=others)
     written(WallFiles.beside(out, overwrite=False), record, seen.reference(fit.inliers))
     print(f"{1e3 * record.distance_m:.1f} mm to the wall, {record.facing_deg:.2f} degrees: {record.verdict}")
 

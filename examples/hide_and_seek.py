@@ -3,16 +3,12 @@
 import sys
 
 import numpy as np
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.dataset.samples import sense_object
-from nlos_cam.objects.depth_map import object_box, orthographic_depth
-from nlos_cam.objects.placement import Pose, category_triangles, place
-from nlos_cam.reconstruct.network import reconstruct
-from nlos_cam.reconstruct.pipeline import load_networks
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.dataset import sense_object
+from nlos_cam.objects import Pose, category_triangles, object_box, orthographic_depth, place
+from nlos_cam.reconstruct import load_networks, reconstruct
+from nlos_cam.render import Scene, Sensor, SensorModel
 
 
 def main(category: str = "cup", seed: int = 0) -> None:

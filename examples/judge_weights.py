@@ -4,12 +4,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from nlos_calibration.rig import load_rig
-from nlos_models.metrics import silhouette_iou
+from nlos_calibration import load_rig
+from nlos_models import silhouette_iou
 
-from nlos_cam.evaluate.subjects import as_map_set, echoes_of, seeded_objects, sense, truth_of
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.reconstruct.pipeline import load_networks
+from nlos_cam.evaluate import as_map_set, echoes_of, seeded_objects, sense, truth_of
+from nlos_cam.objects import object_box
+from nlos_cam.reconstruct import load_networks
 
 FIRST_SEED = 20_000_000
 """Training draws none from here on."""

@@ -4,10 +4,10 @@ import sys
 from pathlib import Path
 
 import torch
-from nlos_models.pipeline import Preprocess, split_and_stack
+from nlos_models import Preprocess, split_and_stack
 from torch import nn
 
-from nlos_cam.dataset.build import open_dataset
+from nlos_cam.dataset import open_dataset
 
 BATCH = 8
 

@@ -22,22 +22,25 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
+from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import ObjectBox, Rig
 
-from nlos_cam.camera import open_camera
-from nlos_cam.camera.protocol import Camera
-from nlos_cam.camera.registry import OnProgress
+from nlos_cam.camera import Camera, OnProgress, open_camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import LidarMaps
-from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.loop import iterate_results, warm_up, with_telemetry
-from nlos_cam.live.statistics import RunStatistics
-from nlos_cam.objects.depth_map import cell_centres_m, object_box
-from nlos_cam.reconstruct.bench import open_bench
-from nlos_cam.reconstruct.network import Clock
-from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline, load_doubt, load_networks, misfits, set_up
-from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.live import FrameReader, RunStatistics, iterate_results, warm_up, with_telemetry
+from nlos_cam.objects import cell_centres_m, object_box
+from nlos_cam.reconstruct import (
+    Clock,
+    FrameResult,
+    Pipeline,
+    Verdict,
+    load_doubt,
+    load_networks,
+    misfits,
+    open_bench,
+    set_up,
+)
 
 
 @dataclass(frozen=True)

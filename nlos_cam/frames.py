@@ -9,8 +9,8 @@ from math import ceil
 
 import numba
 import numpy as np
+from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float32, Int32
-from nlos_calibration.geometry import Intrinsics
 from numpy.typing import NDArray
 
 MAP_ROWS, MAP_COLUMNS = 64, 80

@@ -111,7 +111,7 @@ class WallRecord(Record):
         return self
 
 
-def wall_record(
+def new_wall_record(
     fit: WallFit | WallByBoard,
     intrinsics: Intrinsics,
     *,

@@ -1,0 +1,5 @@
+"""Measurement of a bench with a camera: wall, occluder, printed board, report."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from nlos_calibration.board import BOARDS, PAPER_MM, Board, Paper
+from nlos_calibration import BOARDS, PAPER_MM, Board, Paper
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:

@@ -14,16 +14,21 @@ from typing import Any
 
 import cv2
 import numpy as np
+from nlos_calibration import BoardView, CameraErrors, Moments
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board_wall import BoardView, CameraErrors
-from nlos_calibration.reference import Moments
 from numpy.typing import NDArray
 
-from nlos_cam.camera.l515 import find_l515, shared_context
-from nlos_cam.camera.registry import NAMES
-from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import find_streams
-from nlos_cam.camera.streams import FRAMES_PER_S, intrinsics_of, sample_from_sdk, stream_name
+from nlos_cam.camera import (
+    FRAMES_PER_S,
+    NAMES,
+    find_l515,
+    find_streams,
+    intrinsics_of,
+    load_sdk,
+    sample_from_sdk,
+    shared_context,
+    stream_name,
+)
 from nlos_cam.errors import (
     CameraError,
     CameraLostError,
@@ -32,7 +37,7 @@ from nlos_cam.errors import (
     RecordingError,
     StreamMissingError,
 )
-from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording import BagFile
 
 COLOUR, FORMAT = "color", "rgb8"
 """The SDK's names of the stream, and of the format that a live camera is asked for."""

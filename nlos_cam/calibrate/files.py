@@ -4,9 +4,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from nlos_calibration.reference import BareWall, save_reference
-from nlos_calibration.rig import dump_toml
-from nlos_calibration.wall_record import MeasuredWall, WallRecord
+from nlos_calibration import BareWall, MeasuredWall, WallRecord, dump_toml, save_reference
 
 from nlos_cam.calibrate.report import report
 from nlos_cam.errors import OutputExistsError

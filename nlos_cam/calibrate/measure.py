@@ -11,29 +11,36 @@ from itertools import islice
 from math import hypot
 
 import numpy as np
-from nlos_calibration.arrays import Float32
-from nlos_calibration.board import Board
-from nlos_calibration.board_wall import BoardView, WallByBoard, wall_with_board
-from nlos_calibration.drift import settings_changed
-from nlos_calibration.errors import CalibrationError, WallRefusedError
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.occluder import OccluderFit, find_occluder
-from nlos_calibration.range_offset import fit_with_tape_distance
-from nlos_calibration.reference import BareWall, BareWallStatistics
-from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M, WallFit, fit_wall
-from nlos_calibration.wall_record import (
+from nlos_calibration import (
+    TOLERANCE_DEG,
+    TOLERANCE_M,
+    BareWall,
+    BareWallStatistics,
+    Board,
+    BoardView,
+    Intrinsics,
     MeasuredWall,
+    OccluderFit,
+    WallByBoard,
+    WallFit,
     WallRecord,
     depth_lacks_m,
+    find_occluder,
+    fit_wall,
+    fit_with_tape_distance,
     points_m,
+    settings_changed,
     wall_from_zero,
+    wall_with_board,
     with_occluder,
 )
+from nlos_calibration.arrays import Float32
+from nlos_calibration.errors import CalibrationError, WallRefusedError
 from numpy.typing import NDArray
 
-from nlos_cam.camera.protocol import Camera
+from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame, maps_from_frame, saturated_share
-from nlos_cam.reconstruct.bench import check_intrinsics
+from nlos_cam.reconstruct import check_intrinsics
 
 CELSIUS_EVERY = 30
 """Frames between two looks at the thermometers: each costs a device a command."""

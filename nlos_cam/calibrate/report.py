@@ -11,10 +11,17 @@ from collections.abc import Iterable, Mapping
 from html import escape
 from string import Template
 
-from nlos_calibration.board_wall import BoardRecord
-from nlos_calibration.rig_check import GAP_RANGE_M
-from nlos_calibration.wall import DISTANCE_RANGE_M, FACING_RANGE_DEG, INTERVAL_STDS, TOLERANCE_DEG, TOLERANCE_M
-from nlos_calibration.wall_record import MeasuredWall, WallRecord
+from nlos_calibration import (
+    DISTANCE_RANGE_M,
+    FACING_RANGE_DEG,
+    GAP_RANGE_M,
+    INTERVAL_STDS,
+    TOLERANCE_DEG,
+    TOLERANCE_M,
+    BoardRecord,
+    MeasuredWall,
+    WallRecord,
+)
 
 from nlos_cam.calibrate.report_drawings import bench_picture, footprint_picture
 from nlos_cam.calibrate.report_maps import Picture, wall_maps

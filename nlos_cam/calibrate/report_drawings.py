@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from nlos_calibration import MAP_SHAPE, Extent, ObjectBox, Rig, WallRecord, footprint, on_plane
 from nlos_calibration.arrays import Float64
-from nlos_calibration.rig import Extent, ObjectBox, Rig
-from nlos_calibration.rig_check import MAP_SHAPE, footprint, on_plane
-from nlos_calibration.wall_record import WallRecord
 
 from nlos_cam.calibrate.report_maps import Picture, figure_of, png
 

@@ -9,10 +9,8 @@ from math import ceil, floor, log10
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from nlos_calibration import FULL_SCALE, BareWall, MeanNoise, WallRecord, depth_noise_m, wall_points_m
 from nlos_calibration.arrays import Float64
-from nlos_calibration.noise import MeanNoise, depth_noise_m
-from nlos_calibration.reference import FULL_SCALE, BareWall
-from nlos_calibration.wall_record import WallRecord, wall_points_m
 from numpy.typing import NDArray
 
 DRAWN_COLUMNS = 320

@@ -21,18 +21,25 @@ from typing import Any
 
 import cv2
 import numpy as np
+from nlos_calibration import (
+    QUANTUM_M,
+    BareWall,
+    Board,
+    DepthMean,
+    DriftCheck,
+    Intrinsics,
+    depth_noise_m,
+    facing_angle_rad,
+    load_rig,
+    normal_from_angles,
+    wall_depth,
+    wall_from_plane,
+    watched_pixels,
+)
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import Board
-from nlos_calibration.drift import DriftCheck
-from nlos_calibration.geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
-from nlos_calibration.noise import QUANTUM_M, DepthMean, depth_noise_m
-from nlos_calibration.reference import BareWall
-from nlos_calibration.rig import load_rig
-from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_tracker import watched_pixels
 from numpy.typing import NDArray
 
-from nlos_cam.render.sensor.bias import patches, ripples
+from nlos_cam.render import ripples, smooth_patches
 
 LONGEST_DEPTH_M = 4.0
 DEAD_SHARE = 0.03
@@ -136,7 +143,7 @@ def rippled(seen: View, amplitude_m: float, waves: float, generator: np.random.G
 
 def patchy(seen: View, rms_m: float, generator: np.random.Generator) -> Float64:
     """Depth that drifts here this way and there that way."""
-    return seen.depth_m + rms_m * patches((seen.pinhole.height, seen.pinhole.width), generator)
+    return seen.depth_m + rms_m * smooth_patches((seen.pinhole.height, seen.pinhole.width), generator)
 
 
 def with_outliers(depth_m: Float64, share: float, generator: np.random.Generator) -> Float64:

@@ -1,7 +1,5 @@
-"""Cameras behind one protocol."""
+"""Cameras behind one protocol: an L515, or a simulated one; other packages open them by name."""
 
-from nlos_cam.camera.protocol import Camera
-from nlos_cam.camera.recorder import Recording
-from nlos_cam.camera.registry import SIMULATED, open_camera
+import lazy_loader
 
-__all__ = ["SIMULATED", "Camera", "Recording", "open_camera"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

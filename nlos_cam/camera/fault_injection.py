@@ -7,8 +7,7 @@ import numpy as np
 
 from nlos_cam.camera.streams import FORMATS, FRAMES_PER_S
 from nlos_cam.camera.timestamps import WRAP_PERIOD_S
-from nlos_cam.render.scene_file import Fault, FaultKind
-from nlos_cam.render.sensor.sensor import SensedImages
+from nlos_cam.render import Fault, FaultKind, SensedImages
 
 
 @dataclass(frozen=True)

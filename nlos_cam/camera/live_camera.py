@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator, Mapping
 from threading import Event, RLock
 from typing import Any, Self
 
+from nlos_calibration import Intrinsics, Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import Rig
 
 from nlos_cam.camera.protocol import Clock, WallClock
 from nlos_cam.camera.recorder import Recording

@@ -9,8 +9,7 @@ from collections.abc import Iterator, Mapping
 from threading import Event
 from typing import Protocol, Self
 
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import Rig
+from nlos_calibration import Intrinsics, Rig
 
 from nlos_cam.frames import Frame
 

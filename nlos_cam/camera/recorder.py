@@ -17,7 +17,7 @@ from shlex import quote
 from threading import Event
 from typing import Any
 
-from nlos_calibration.geometry import Intrinsics
+from nlos_calibration import Intrinsics
 
 from nlos_cam.camera.streams import BYTES_PER_PIXEL, FRAMES_PER_S, SAME_INSTANT_S, FrameSet
 from nlos_cam.errors import DiskFullError, RecordingError

@@ -11,8 +11,8 @@ from math import inf
 from threading import Condition
 from typing import Any
 
+from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float32
-from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.camera.streams import (
     FORMATS,

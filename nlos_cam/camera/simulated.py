@@ -8,9 +8,8 @@ from threading import Event, Thread
 from typing import Any, Self
 
 import numpy as np
+from nlos_calibration import Intrinsics, Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
 from nlos_cam.camera.fault_injection import Delivery, FaultyDevice
@@ -22,8 +21,7 @@ from nlos_cam.camera.session import SampleQueue
 from nlos_cam.camera.simulated_world import World
 from nlos_cam.camera.streams import BYTES_PER_PIXEL, FORMATS, FRAMES_PER_S
 from nlos_cam.errors import CameraLostError
-from nlos_cam.render.scene_file import Fault
-from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
+from nlos_cam.render import DEPTH_UNIT_M, Fault, SensedImages
 
 NAME, SERIAL = "Simulated L515", "simulated"
 SENSOR_NAME = "L500 Depth Sensor"

@@ -6,15 +6,21 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import Rig
 
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.files import cache_folder
-from nlos_cam.render.renderer import MultiBounce
-from nlos_cam.render.scanning import render_scan
-from nlos_cam.render.scene_file import SceneFile, bare_wall_scene, load_scene, paper_scene
-from nlos_cam.render.sensor.sensor import SensedImages, Sensor
+from nlos_cam.render import (
+    MultiBounce,
+    SceneFile,
+    SensedImages,
+    Sensor,
+    bare_wall_scene,
+    load_scene,
+    paper_scene,
+    render_scan,
+)
 
 Loop = tuple[list[MultiBounce], list[Float32]]
 """Echoes of each frame, and hidden depth in the middle of its scan."""

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float32
-from nlos_calibration.geometry import Intrinsics
 from numpy.typing import NDArray
 
 from nlos_cam.frames import Frame

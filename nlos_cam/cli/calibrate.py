@@ -16,21 +16,42 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from nlos_calibration.board import BOARDS, PAPER_MM, Light, Paper
-from nlos_calibration.board_wall import BoardRecord, BoardView, WallByBoard
-from nlos_calibration.wall import DISTANCE_RANGE_M, FACING_RANGE_DEG, INTERVAL_STDS, WallFit
-from nlos_calibration.wall_record import OccluderRecord, WallRecord, load_measured, wall_record
+from nlos_calibration import (
+    BOARDS,
+    DISTANCE_RANGE_M,
+    FACING_RANGE_DEG,
+    INTERVAL_STDS,
+    PAPER_MM,
+    BoardRecord,
+    BoardView,
+    Light,
+    OccluderRecord,
+    Paper,
+    WallByBoard,
+    WallFit,
+    WallRecord,
+    load_measured,
+    new_wall_record,
+)
 from numpy.typing import NDArray
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from nlos_cam.calibrate.board_pdf import write_sheet
-from nlos_cam.calibrate.color_view import look_in_colour
-from nlos_cam.calibrate.files import WallFiles, written
-from nlos_cam.calibrate.measure import CaptureStatistics, Glance, by_board, by_depth, by_occluder, glance, look
-from nlos_cam.camera import open_camera
-from nlos_cam.camera.protocol import Camera
+from nlos_cam.calibrate import (
+    CaptureStatistics,
+    Glance,
+    WallFiles,
+    by_board,
+    by_depth,
+    by_occluder,
+    glance,
+    look,
+    look_in_colour,
+    write_sheet,
+    written,
+)
+from nlos_cam.camera import Camera, open_camera
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stderr, tracked
 from nlos_cam.frames import MAX_SATURATED
 
@@ -304,7 +325,7 @@ def _record(
     seen: CaptureStatistics, fit: WallFit | WallByBoard, facts: dict[str, object], occluder: OccluderRecord | None
 ) -> WallRecord:
     """The record of a wall that was measured now."""
-    return wall_record(
+    return new_wall_record(
         fit,
         seen.intrinsics,
         camera=seen.camera,

@@ -15,9 +15,7 @@ import typer
 from rich.markup import escape
 from rich.progress import Progress
 
-from nlos_cam.camera import Camera, Recording, open_camera
-from nlos_cam.camera.recorder import check_room, free_bytes, recording_s
-from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.camera import FRAMES_PER_S, Camera, Recording, check_room, free_bytes, open_camera, recording_s
 from nlos_cam.cli.common import (
     INTERRUPTED,
     Json,
@@ -31,9 +29,18 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.errors import NlosCamError
-from nlos_cam.recording.capture import CaptureResult, CaptureSession, CaptureTarget, settle
-from nlos_cam.recording.playback import Verified, verify
-from nlos_cam.recording.sidecar import State, Summary, sidecar_path, wall_of
+from nlos_cam.recording import (
+    CaptureResult,
+    CaptureSession,
+    CaptureTarget,
+    State,
+    Summary,
+    Verified,
+    settle,
+    sidecar_path,
+    verify,
+    wall_of,
+)
 
 FIGURES = ("saturated_share", "invalid_share", "temporal_noise_mm")
 

@@ -11,17 +11,26 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from nlos_calibration.wall_record import rig_named
-from nlos_models.recipe import SIMULATION_ONLY
+from nlos_calibration import rig_named
+from nlos_models import SIMULATION_ONLY
 from rich.progress import ProgressColumn, Task
 from rich.text import Text
 
 from nlos_cam.cli.common import PAPER_RIG, Json, Overwrite, finish, output_path, progress, say, tracked
-from nlos_cam.dataset import build as dataset
-from nlos_cam.dataset.labelled import FRAMES_EACH, read_labelled, recordings_in, write_shards
-from nlos_cam.objects.textures import TEXTURES
-from nlos_cam.render.accuracy import accuracy_named
-from nlos_cam.render.scene_file import load_scene
+from nlos_cam.dataset import (
+    FRAMES_EACH,
+    Built,
+    DatasetPlan,
+    Objects,
+    RigSpread,
+    build_dataset,
+    objects_of,
+    read_labelled,
+    recordings_in,
+    write_shards,
+)
+from nlos_cam.objects import TEXTURES
+from nlos_cam.render import accuracy_named, load_scene
 
 
 def command_of(context: typer.Context, name: str) -> str:
@@ -144,9 +153,7 @@ def build(
 ) -> None:
     """Render random objects into HDF5 shards; run it again after a stop and it goes on."""
     kinds = _objects(objects, without, backgrounds)
-    spread = dataset.RigSpread(
-        place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100
-    )
+    spread = RigSpread(place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100)
     others = {"accuracy": accuracy_named(accuracy).name, "objects": kinds, "spread": spread}
     others |= {"textures": tuple(TEXTURES) if colour else ()}
     plan = _plan(rig, scene, seed, others)
@@ -159,21 +166,21 @@ def build(
     finish(result, as_json=json, text=f"{built.objects} objects in {out}{told}", note=note)
 
 
-def _objects(objects: str, without: str, backgrounds: float) -> dataset.Objects:
+def _objects(objects: str, without: str, backgrounds: float) -> Objects:
     if objects == PROCEDURAL:
-        return dataset.Objects.without([name.strip() for name in without.split(",") if name.strip()], backgrounds)
+        return Objects.without([name.strip() for name in without.split(",") if name.strip()], backgrounds)
     if without or backgrounds:
         raise typer.BadParameter("--without and --backgrounds are for procedural objects: leave them out")
     with tracked("reading meshes") as on_progress:
-        return dataset.objects_of(Path(objects), on_progress)
+        return objects_of(Path(objects), on_progress)
 
 
-def _plan(rig: str | None, scene: Path | None, seed: int, others: dict[str, Any]) -> dataset.DatasetPlan:
+def _plan(rig: str | None, scene: Path | None, seed: int, others: dict[str, Any]) -> DatasetPlan:
     if scene is None:
-        return dataset.DatasetPlan(rig_named(rig or PAPER_RIG), seed, **others)
+        return DatasetPlan(rig_named(rig or PAPER_RIG), seed, **others)
     if rig is not None:
         raise typer.BadParameter(f"{scene} has a rig of its own: leave out --rig")
-    return dataset.DatasetPlan.of_scene(load_scene(scene), seed, **others)
+    return DatasetPlan.of_scene(load_scene(scene), seed, **others)
 
 
 class Rate(ProgressColumn):
@@ -184,12 +191,10 @@ class Rate(ProgressColumn):
         return Text(f"{task.speed:.1f}/s" if task.speed else "")
 
 
-def _watched(
-    plan: dataset.DatasetPlan, count: int, out: Path, workers: int, ray: str | None, command: str
-) -> dataset.Built:
+def _watched(plan: DatasetPlan, count: int, out: Path, workers: int, ray: str | None, command: str) -> Built:
     farm = None
     if ray:
-        from nlos_cam.dataset.ray_backend import cluster
+        from nlos_cam.dataset import cluster
 
         farm = cluster(ray)
     with progress(Rate()) as bar:
@@ -199,7 +204,7 @@ def _watched(
             bar.update(tasks[which], completed=done, total=total, visible=which == 1 or done < total)
 
         try:
-            return dataset.build(
+            return build_dataset(
                 plan,
                 count,
                 out,

@@ -12,13 +12,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from nlos_cam.camera import SIMULATED
-from nlos_cam.camera.l515 import DeviceInfo
+from nlos_cam.camera import SIMULATED, DeviceInfo
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, show
-from nlos_cam.doctor import Check, Facts, diagnose, gather
-from nlos_cam.doctor.facts import Pair
-from nlos_cam.doctor.udev import install, rules
-from nlos_cam.doctor.usb import UsbDevice
+from nlos_cam.doctor import Check, Facts, Pair, UsbDevice, diagnose, gather, install, rules
 from nlos_cam.errors import NlosCamError
 
 SEEN = {True: "yes", False: "[red]no[/]", None: ""}

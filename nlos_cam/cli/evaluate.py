@@ -6,13 +6,25 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from nlos_calibration.wall_record import rig_named
-from nlos_models.inference import load_reconstructor
+from nlos_calibration import rig_named
+from nlos_models import load_reconstructor
 
 from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
-from nlos_cam.evaluate import subjects as judging
-from nlos_cam.evaluate.report import Judgement, as_figures, in_words, write
-from nlos_cam.evaluate.subjects import reconstruct_all
+from nlos_cam.evaluate import (
+    Judgement,
+    as_eaten,
+    as_figures,
+    bare_wall_for,
+    baseline_images,
+    fresh_objects,
+    in_words,
+    left_out_of,
+    notes_on,
+    reconstruct_all,
+    rig_of,
+    stored_objects,
+    write,
+)
 from nlos_cam.files import cache_folder
 
 SHIPPED = "the shipped ones"
@@ -59,13 +71,13 @@ def evaluate(
     record = reconstructor.record
     with interrupted_by_signals():
         if data:
-            judged = judging.stored_objects(data)
+            judged = stored_objects(data)
         else:
-            judged = judging.fresh_objects(rig_named(rig) if rig else judging.rig_of(record), count, tracked)
-        bare = judging.bare_wall_for(record, judged.plan, wall)
-        guesses, among = judging.guesses(judged, training, nearest=not no_nearest, tracked=tracked)
-        image = reconstruct_all(reconstructor, judging.as_eaten(judged.maps, bare))
-    notes = judging.notes_on(record, judged, among)
+            judged = fresh_objects(rig_named(rig) if rig else rig_of(record), count, tracked)
+        bare = bare_wall_for(record, judged.plan, wall)
+        guesses, among = baseline_images(judged, training, nearest=not no_nearest, tracked=tracked)
+        image = reconstruct_all(reconstructor, as_eaten(judged.maps, bare))
+    notes = notes_on(record, judged, among)
     for note in notes:
         say(f"note: {note}")
     facts = {
@@ -78,7 +90,7 @@ def evaluate(
         "notes": notes,
     }
     truth = judged.maps.image.astype(np.float32)
-    left_out = judging.left_out_of(record)
+    left_out = left_out_of(record)
     judgement = Judgement(judged.names, judged.categories, truth, image, guesses, judged.plan.box, facts, left_out)
     figures: dict[str, Any] = as_figures(judgement) | {"seconds": time.perf_counter() - started}
     write(folder, judgement, figures)

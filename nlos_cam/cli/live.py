@@ -15,13 +15,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from nlos_models.doubt_checkpoint import UncertaintyModel
-from nlos_models.inference import Reconstructor
+from nlos_models import Reconstructor, UncertaintyModel
 from rich.markup import escape
 
-from nlos_cam.camera import Camera, Recording, open_camera
-from nlos_cam.camera.protocol import WallClock
-from nlos_cam.camera.registry import Reader
+from nlos_cam.camera import Camera, Reader, Recording, WallClock, open_camera
 from nlos_cam.cli.common import (
     INTERRUPTED,
     Json,
@@ -48,19 +45,39 @@ from nlos_cam.cli.view import (
     tell_of_view,
     viewer_of,
 )
-from nlos_cam.evaluate.runtime_tradeoff import runtimes
-from nlos_cam.live.budget import SHIPPED, Choice, loader, options_here, timer, within_budget
-from nlos_cam.live.frame_log import SUFFIXES, FrameLog
-from nlos_cam.live.loop import in_words, run_live, warm_up
-from nlos_cam.live.physics_check_process import BackgroundPhysicsCheck
-from nlos_cam.live.realtime import precedence, undisturbed
-from nlos_cam.live.replay import REPORT, replay
-from nlos_cam.live.replay_media import Looks
-from nlos_cam.live.statistics import OUTSIDE_LATENCY, RunReport
-from nlos_cam.reconstruct.bench import CalibratedRig, open_bench
-from nlos_cam.reconstruct.physics_check import PhysicsCheck
-from nlos_cam.reconstruct.pipeline import Pipeline, load_doubt, load_networks, misfits, set_up
-from nlos_cam.view.viewer import Moment
+from nlos_cam.evaluate import runtimes
+from nlos_cam.live import (
+    OUTSIDE_LATENCY,
+    REPORT,
+    SHIPPED,
+    SUFFIXES,
+    BackgroundPhysicsCheck,
+    Choice,
+    FrameLog,
+    Looks,
+    RunReport,
+    in_words,
+    loader,
+    options_here,
+    precedence,
+    replay_recording,
+    run_live,
+    timer,
+    undisturbed,
+    warm_up,
+    within_budget,
+)
+from nlos_cam.reconstruct import (
+    CalibratedRig,
+    PhysicsCheck,
+    Pipeline,
+    load_doubt,
+    load_networks,
+    misfits,
+    open_bench,
+    set_up,
+)
+from nlos_cam.view import Moment
 
 
 def warn(warning: str, begins: bool) -> None:
@@ -244,13 +261,13 @@ def replay_bag(
     with interrupted_by_signals():
         opened = open_camera(f"bag:{bag}", reader=reader)
         bench = open_bench(wall, opened)
-        from nlos_cam.reconstruct.physics_check import EveryFrames  # the renderer takes a second to import
+        from nlos_cam.reconstruct import EveryFrames  # the renderer takes a second to import
 
         checks = EveryFrames(bench.rig, on_error=_warn_once)
         processing = _processing(bench, load_networks(weights), load_doubt(weights), average, checks)
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
-        report = replay(
+        report = replay_recording(
             source,
             processing,
             path,

@@ -17,9 +17,7 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording.bag_reader import BagFile
-from nlos_cam.recording.export import Exported, Format, Wanted, export
-from nlos_cam.recording.repair import Repaired, repair
+from nlos_cam.recording import BagFile, Exported, Format, Repaired, Wanted, export_recording, repair_recording
 
 DamagedBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="A recording that was killed, cut short or damaged.")]
 NewBag = Annotated[Path | None, typer.Option("--out", help="The recording to write (.bag).")]
@@ -46,7 +44,7 @@ def repair_bag(bag: DamagedBag, out: NewBag = None, overwrite: Overwrite = False
         raise typer.BadParameter(f"--out {out}: a recording's name ends in .bag")
     path = output_path(out, "repaired", ".bag", overwrite=overwrite)
     with interrupted_by_signals(), tracked("repairing") as report:
-        found = repair(bag, path, report)
+        found = repair_recording(bag, path, report)
     result = {
         "recovered_frames": found.recovered_frames,
         "chunks": found.chunks,
@@ -83,7 +81,7 @@ def export_bag(
     total = sum(info.frames for name, info in found.streams.items() if not names or name in names)
     with stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("exporting", total=total)
-        made = export(found, folder, wanted, stop=stop, on_frame=lambda: bar.advance(task))
+        made = export_recording(found, folder, wanted, stop=stop, on_frame=lambda: bar.advance(task))
     if made.damage:
         raise RecordingError(f"{made.damage}; what comes before that is in {folder}")
     finish({"frames": made.frames, "out": made.out}, as_json=json, text=_told_export(made))

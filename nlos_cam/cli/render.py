@@ -12,27 +12,41 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from nlos_calibration import Rig, first_problem, rig_named
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import Rig, first_problem
-from nlos_calibration.wall_record import rig_named
 from pydantic import ValidationError
 from rich.table import Table
 
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, stderr
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.meshes import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, Up, read_depth_map, read_mesh
-from nlos_cam.objects.placement import fit, nothing_to_see
-from nlos_cam.render.accuracy import Accuracy, accuracy_named
-from nlos_cam.render.accuracy_search import choose, costs
-from nlos_cam.render.effects import EFFECTS, Effects
-from nlos_cam.render.material import Material
-from nlos_cam.render.renderer import Rendering, render
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_file import HiddenObject, SceneFile, load_scene
-from nlos_cam.render.sensor.effects import sensor_effects
-from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.objects import (
+    CATEGORIES,
+    DEPTH_MAP_SUFFIX,
+    MESH_SUFFIXES,
+    Up,
+    fit,
+    nothing_to_see,
+    object_box,
+    read_depth_map,
+    read_mesh,
+)
+from nlos_cam.render import (
+    EFFECTS,
+    Accuracy,
+    Effects,
+    HiddenObject,
+    Material,
+    Rendering,
+    Scene,
+    SceneFile,
+    SensorModel,
+    accuracy_named,
+    choose,
+    costs,
+    load_scene,
+    render,
+    sensor_effects,
+)
 
 Stop = Annotated[str | None, typer.Option("--accuracy", help="draft, standard (the default), fine or reference.")]
 MaxError = Annotated[

@@ -7,23 +7,35 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
-from nlos_calibration.wall_record import rig_named
-from nlos_models.checkpoint import load_record, shipped_folder
-from nlos_models.inference import refuse_colour
+from nlos_calibration import rig_named
+from nlos_models import load_record, refuse_colour, shipped_folder
 
 from nlos_cam.cli.common import INTERRUPTED, Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
 from nlos_cam.cli.render import hidden_depth
-from nlos_cam.dataset.build import TEST_SEED
+from nlos_cam.dataset import TEST_SEED
 from nlos_cam.errors import SceneError
-from nlos_cam.evaluate import runtime_tradeoff as reconstruction
-from nlos_cam.evaluate import runtime_tradeoff as reconstruction_report
-from nlos_cam.evaluate.render_tradeoff import Row, as_markdown, as_table, draw, facts, machine, measure, settings
-from nlos_cam.evaluate.subjects import seeded_objects
+from nlos_cam.evaluate import (
+    RenderRow,
+    RuntimeBench,
+    RuntimeRow,
+    as_table,
+    draw_renders,
+    draw_runtimes,
+    machine,
+    measure_renders,
+    measure_runtimes,
+    render_facts,
+    render_markdown,
+    render_settings,
+    runtime_facts,
+    runtime_markdown,
+    runtime_settings,
+    runtimes,
+    seeded_objects,
+)
 from nlos_cam.files import atomic_directory, cache_folder
-from nlos_cam.objects.benchmark import benchmark_objects
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_file import paper_scene
+from nlos_cam.objects import benchmark_objects, object_box
+from nlos_cam.render import Scene, paper_scene
 
 R = TypeVar("R")
 
@@ -51,7 +63,7 @@ def render(
         raise typer.BadParameter("--seed varies an --object: give both")
     folder = output_path(out, "tradeoff", "", overwrite=overwrite)
     scene = _scene(category, seed or 0)
-    size, planned = facts(scene), len(settings(scene))
+    size, planned = render_facts(scene), len(render_settings(scene))
     rows, interrupted = _measured(scene, planned)
     table = as_table(size, rows, planned)
     if rows:
@@ -77,28 +89,25 @@ def reconstruct(
     """Measure number formats, runtimes, threads and averaged frames on the 54 test objects (a minute or two)."""
     folder = output_path(out, "tradeoff", "", overwrite=overwrite)
     folders: dict[str, Path | None] = {str(path): path for path in weights} if weights else {"shipped": None}
-    rows: list[reconstruction.Row] = []
+    rows: list[RuntimeRow] = []
     with interrupted_by_signals():
         say("rendering, exporting and quantising first")
         bench = _bench(folders, count)
-        makes = {
-            name: reconstruction.runtimes(path, bench.rig, bench.box, cache_folder() / "onnx")
-            for name, path in folders.items()
-        }
-    asked = reconstruction.settings([*makes], [*next(iter(makes.values()))])
-    interrupted = _collect(reconstruction.measure(asked, makes, bench), rows, len(asked))
-    table = reconstruction_report.facts(rows, len(asked), len(bench.truth), machine())
+        makes = {name: runtimes(path, bench.rig, bench.box, cache_folder() / "onnx") for name, path in folders.items()}
+    asked = runtime_settings([*makes], [*next(iter(makes.values()))])
+    interrupted = _collect(measure_runtimes(asked, makes, bench), rows, len(asked))
+    table = runtime_facts(rows, len(asked), len(bench.truth), machine())
     if rows:
         with atomic_directory(folder) as part:
-            _write_files(part, table, reconstruction_report.as_markdown(table))
-            reconstruction_report.draw(part / "tradeoff.png", rows)
+            _write_files(part, table, runtime_markdown(table))
+            draw_runtimes(part / "tradeoff.png", rows)
     text = f"{len(rows)} of {len(asked)} settings measured: {folder}" if rows else "nothing was measured"
     finish({**table, "out": str(folder) if rows else None}, as_json=json, text=text)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
 
 
-def _bench(folders: dict[str, Path | None], count: int | None) -> reconstruction.Bench:
+def _bench(folders: dict[str, Path | None], count: int | None) -> RuntimeBench:
     """The objects on the rig of all these weights.
 
     Raises SceneError where they are for different rigs, CheckpointError where some are of full colour.
@@ -115,7 +124,7 @@ def _bench(folders: dict[str, Path | None], count: int | None) -> reconstruction
     box = object_box(rig)
     subjects = seeded_objects(TEST_SEED, count, box) if count else benchmark_objects(box)
     with tracked("rendering") as on_progress:
-        return reconstruction.Bench.of(subjects, rig, box, on_progress)
+        return RuntimeBench.of(subjects, rig, box, on_progress)
 
 
 def _scene(category: str | None, seed: int) -> Scene:
@@ -125,11 +134,11 @@ def _scene(category: str | None, seed: int) -> Scene:
     return replace(scene, object_depth_m=hidden_depth(category, scene.rig, {"seed": seed or None}))
 
 
-def _measured(scene: Scene, planned: int) -> tuple[list[Row], bool]:
+def _measured(scene: Scene, planned: int) -> tuple[list[RenderRow], bool]:
     """The rows, as far as they were measured, and whether somebody cut it short."""
-    rows: list[Row] = []
+    rows: list[RenderRow] = []
     say("brute force first: that takes longest")
-    return rows, _collect(measure(scene), rows, planned)
+    return rows, _collect(measure_renders(scene), rows, planned)
 
 
 def _collect(measured: Iterator[R], rows: list[R], planned: int) -> bool:
@@ -150,8 +159,8 @@ def _write_files(folder: Path, table: dict[str, Any], text: str) -> None:
     (folder / "tradeoff.md").write_text(text, encoding="utf-8")
 
 
-def _write(folder: Path, table: dict[str, Any], rows: list[Row], name: str) -> None:
+def _write(folder: Path, table: dict[str, Any], rows: list[RenderRow], name: str) -> None:
     title = f"{name}: {table['patches']} patches, {table['beams_on_wall']} beams on the wall"
     with atomic_directory(folder) as part:
-        _write_files(part, table, as_markdown(table))
-        draw(part / "tradeoff.png", rows, title)
+        _write_files(part, table, render_markdown(table))
+        draw_renders(part / "tradeoff.png", rows, title)

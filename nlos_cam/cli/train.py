@@ -15,36 +15,52 @@ from typing import Annotated, Any
 
 import typer
 from lightning_fabric import Fabric
-from nlos_calibration.rig import Rig
-from nlos_calibration.wall_record import rig_named
-from nlos_models.checkpoint import load_encoder, shipped_folder
-from nlos_models.distributed import Accelerator, launched, open_fabric
-from nlos_models.doubt_checkpoint import DOUBT_RECORD, DoubtRecord, checksum_of_watched
-from nlos_models.inference import load_reconstructor
-from nlos_models.recipe import SIMULATION_ONLY, Recipe, load_recipe
-from nlos_models.runs import (
+from nlos_calibration import Rig, rig_named
+from nlos_models import (
+    DOUBT_RECORD,
+    SIMULATION_ONLY,
+    Accelerator,
+    DoubtRecord,
     Figures,
+    OnStep,
+    Recipe,
+    Running,
     TrainingRun,
     check_run_folder,
+    checksum_of_watched,
     compressor_start,
+    digest_of,
+    launched,
+    load_encoder,
+    load_recipe,
+    load_reconstructor,
     new_record,
+    open_fabric,
     run_compressor,
     run_doubt,
     run_transfer,
     run_vae,
+    shipped_folder,
     transfer_start,
     vae_start,
 )
-from nlos_models.train import OnStep, Running, digest_of
 
 from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say, stop_on_signals, tracked
-from nlos_cam.dataset import build
-from nlos_cam.dataset.doubt_samples import check_doubt_data, doubt_sets
-from nlos_cam.dataset.outliers import TO_LEARN
-from nlos_cam.dataset.training_maps import read_maps
+from nlos_cam.dataset import (
+    HELD_OUT_SEED,
+    TO_LEARN,
+    TRAINING_SEED,
+    DatasetPlan,
+    Objects,
+    check_doubt_data,
+    doubt_sets,
+    open_dataset,
+    procedural_images,
+    read_maps,
+)
 from nlos_cam.errors import OutputExistsError, SceneError
 from nlos_cam.files import cache_folder
-from nlos_cam.objects.textures import TEXTURES
+from nlos_cam.objects import TEXTURES
 
 Budget = Annotated[float, typer.Option("--budget", min=1e-4, max=1.0, help="Share of the recipe's budget.")]
 
@@ -150,7 +166,7 @@ def doubt(
     recipe, watched = run.recipe("doubt"), weights or shipped_folder()
     fabric = run.fabric(recipe)
     pipeline = load_reconstructor(weights, cache_folder() / "onnx")
-    training, judging = (build.open_dataset(folder) for folder in (data, held_out_data))
+    training, judging = (open_dataset(folder) for folder in (data, held_out_data))
     check_doubt_data(recipe, pipeline, training, judging)
     about = DoubtRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=list(TO_LEARN))
     if run.out.resolve() == watched.resolve() or (run.out / DOUBT_RECORD).exists():
@@ -193,13 +209,13 @@ def vae(
     fabric = run.fabric(recipe)
     start, runs = vae_start(recipe, weights) if recipe.start == "weights" else (None, [])
     job = run.training(recipe, rig, runs, digest_of(start, rig.checksum), weights)
-    box = build.DatasetPlan(rig, 0).box
+    box = DatasetPlan(rig, 0).box
     say(f"making {recipe.objects + recipe.held_out} objects")
-    kinds, besides = build.Objects.without(recipe.left_out).categories, recipe.backgrounds
+    kinds, besides = Objects.without(recipe.left_out).categories, recipe.backgrounds
     textures = tuple(TEXTURES) if recipe.colour else ()
     images, held_out = (
-        build.procedural_images(seed, count, box, kinds, backgrounds=besides, textures=textures)
-        for seed, count in ((build.TRAINING_SEED, recipe.objects), (build.HELD_OUT_SEED, recipe.held_out))
+        procedural_images(seed, count, box, kinds, backgrounds=besides, textures=textures)
+        for seed, count in ((TRAINING_SEED, recipe.objects), (HELD_OUT_SEED, recipe.held_out))
     )
     _tell(run, recipe, launched(fabric, run_vae, job, start, images, held_out))
 

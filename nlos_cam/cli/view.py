@@ -13,11 +13,9 @@ from urllib.parse import urlsplit
 import typer
 
 from nlos_cam.cli.common import INTERRUPTED, Json, finish, interrupted_by_signals, say, stop_on_signals
-from nlos_cam.live.realtime import after_the_loop
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.view.assets import LOOPBACK
-from nlos_cam.view.server import exposed
-from nlos_cam.view.viewer import NullViewer, Viewer, Viewers
+from nlos_cam.live import after_the_loop
+from nlos_cam.reconstruct import CalibratedRig
+from nlos_cam.view import LOOPBACK, NullViewer, Viewer, Viewers, exposed
 
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 ViewPort = Annotated[
@@ -37,7 +35,7 @@ def viewer_of(bench: CalibratedRig, *, no_view: bool, host: str | None = None, p
         if host is not None or port is not None:
             raise typer.BadParameter("--view-host and --view-port say where the view is: leave --no-view away")
         return NullViewer()
-    from nlos_cam.view.web import WebViewer
+    from nlos_cam.view import WebViewer
 
     return WebViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port, on_stream_thread=after_the_loop)
 
@@ -56,7 +54,7 @@ def tell_of_view(
     if not viewer.address:
         say("running without a view (Ctrl-C ends it)")
         return
-    from nlos_cam.view.web import PREFERRED_PORT
+    from nlos_cam.view import PREFERRED_PORT
 
     taken = port is None and urlsplit(viewer.address).port != PREFERRED_PORT
     say(f"{what}: {viewer.address}  (Ctrl-C ends it{f'; port {PREFERRED_PORT} is taken' if taken else ''})")
@@ -99,7 +97,7 @@ def view(
     json: Json = False,
 ) -> None:
     """Look at a saved view in a browser, with play, pause and scrubbing."""
-    from nlos_cam.view.web import RecordedView
+    from nlos_cam.view import RecordedView
 
     with interrupted_by_signals():
         recorded = RecordedView(file, host=view_host or LOOPBACK, port=view_port)
@@ -116,6 +114,6 @@ def saving(viewer: Viewer, bench: CalibratedRig, path: Path | None) -> Viewer:
     """The viewer, and beside it one that saves what it shows, if there is a path to save it to."""
     if path is None:
         return viewer
-    from nlos_cam.view.rrd_file import RrdFile
+    from nlos_cam.view import RrdFile
 
     return Viewers([viewer, RrdFile(path, bench.rig, bench.measured)])

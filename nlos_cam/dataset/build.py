@@ -18,7 +18,7 @@ from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from threading import Thread
 
-from nlos_models.data import MapSet
+from nlos_models import MapSet
 
 from nlos_cam.dataset.plan import DatasetPlan, Objects, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset, read
@@ -57,7 +57,7 @@ __all__ = [
     "MapSet",
     "Objects",
     "RigSpread",
-    "build",
+    "build_dataset",
     "objects_of",
     "open_dataset",
     "procedural_images",
@@ -91,7 +91,7 @@ class Built:
     """Shards that were made anew because their content was not what was written."""
 
 
-def build(
+def build_dataset(
     plan: DatasetPlan,
     count: int,
     folder: Path,

@@ -6,13 +6,9 @@ from pathlib import Path
 from zlib import crc32
 
 import numpy as np
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import Rig
-from nlos_models.data import MapSet, first_of
-from nlos_models.doubt_training import DoubtSet
-from nlos_models.inference import Reconstructor
-from nlos_models.recipe import Recipe
-from nlos_models.tasks import parts_of
+from nlos_models import DoubtSet, MapSet, Recipe, Reconstructor, first_of, parts_of
 from numpy.typing import NDArray
 
 from nlos_cam.dataset import build
@@ -20,10 +16,8 @@ from nlos_cam.dataset.outliers import SLIGHT, TO_JUDGE, TO_LEARN, Stimulus, ordi
 from nlos_cam.errors import SceneError
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
-from nlos_cam.objects.depth_map import image_from_depth, object_box
-from nlos_cam.render.renderer import Rendering, render
-from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.objects import image_from_depth, object_box
+from nlos_cam.render import Rendering, Sensor, SensorModel, render
 
 EMPTY, ORDINARY = "empty", "ordinary"
 PIECE = 100

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration import ObjectBox, Rig, first_problem, load_rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import ObjectBox, Rig, first_problem, load_rig
-from nlos_models.data import MapSet
+from nlos_models import MapSet
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
@@ -25,14 +25,18 @@ from nlos_cam.dataset.shards import SHARDS, shard_path, store
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
-from nlos_cam.objects.benchmark import benchmark_objects
-from nlos_cam.objects.depth_map import image_from_depth, object_box
-from nlos_cam.objects.meshes import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, read_depth_map
-from nlos_cam.objects.placement import nothing_to_see
-from nlos_cam.reconstruct.bench import CalibratedRig, open_bench
-from nlos_cam.recording.playback import ReplayCamera, open_lidar_bag
-from nlos_cam.recording.sidecar import Sidecar, load_sidecar, sidecar_path
-from nlos_cam.render.scene_file import HiddenObject, SceneFile
+from nlos_cam.objects import (
+    DEPTH_MAP_SUFFIX,
+    MESH_SUFFIXES,
+    benchmark_objects,
+    image_from_depth,
+    nothing_to_see,
+    object_box,
+    read_depth_map,
+)
+from nlos_cam.reconstruct import CalibratedRig, open_bench
+from nlos_cam.recording import ReplayCamera, Sidecar, load_sidecar, open_lidar_bag, sidecar_path
+from nlos_cam.render import HiddenObject, SceneFile
 
 TRUTH_SUFFIX = ".truth.toml"
 """Of a file with the fields of a scene file's [object]: what it is, and how it stands in the rig's object box."""

@@ -17,17 +17,23 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import trimesh
+from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.rig import ObjectBox, Rig
 from trimesh.transformations import euler_matrix
 
 from nlos_cam.frames import OBJECT_PIXELS
-from nlos_cam.objects.depth_map import object_box, orthographic_depth
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.placement import Pose, category_triangles, panel, place, post, random_pose
-from nlos_cam.render.material import Surface, phong, retroreflective
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.objects import (
+    CATEGORIES,
+    Pose,
+    category_triangles,
+    object_box,
+    orthographic_depth,
+    panel,
+    place,
+    post,
+    random_pose,
+)
+from nlos_cam.render import Scene, SensorModel, Surface, phong, retroreflective
 
 Generator = np.random.Generator
 

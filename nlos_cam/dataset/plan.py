@@ -7,18 +7,13 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from nlos_calibration.rig import NotNegative, ObjectBox, Record, Rig
-from nlos_models.recipe import SIMULATION_ONLY
+from nlos_calibration import NotNegative, ObjectBox, Record, Rig
+from nlos_models import SIMULATION_ONLY
 from pydantic import TypeAdapter
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.render.material import Material
-from nlos_cam.render.patches import JUMP_M
-from nlos_cam.render.scene import Radiometry
-from nlos_cam.render.scene_file import RENDERING_VERSION, SceneFile
-from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.objects import CATEGORIES, object_box
+from nlos_cam.render import JUMP_M, RENDERING_VERSION, Material, Radiometry, SceneFile, SensorModel
 
 OBJECTS_VERSION = 2
 """Raised with any change of what a seed makes of its categories."""

@@ -10,22 +10,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import ObjectBox, Rig
 from numpy.typing import NDArray
 
 from nlos_cam.dataset.plan import DatasetPlan, Objects, scene_row
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.objects.depth_map import image_from_depth
-from nlos_cam.objects.meshes import MeshFile, folder_objects, mesh_depth, read_mesh
-from nlos_cam.objects.placement import object_depth, object_depths
-from nlos_cam.objects.textures import Coat, image_from_albedo, painted
-from nlos_cam.render.material import Surface
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.objects import (
+    Coat,
+    MeshFile,
+    folder_objects,
+    image_from_albedo,
+    image_from_depth,
+    mesh_depth,
+    object_depth,
+    object_depths,
+    painted,
+    read_mesh,
+)
+from nlos_cam.render import Radiometry, Scene, Sensor, SensorModel, Surface, render
 
 Samples = Mapping[str, NDArray[Any]]
 """By name, one row for each object: depth_m and intensity (n, 64, 80), image and object_depth_m (n, 64, 64), seed (n,),

@@ -8,18 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from nlos_calibration import Moments, load_measured
 from nlos_calibration.arrays import Float16, Float32
-from nlos_calibration.reference import Moments
-from nlos_calibration.wall_record import load_measured
-from nlos_models.data import InMemory, MapBatch, MapSet, MapSource, first_of, less_bare_wall
-from nlos_models.recipe import Recipe
+from nlos_models import InMemory, MapBatch, MapSet, MapSource, Recipe, first_of, less_bare_wall
 
 from nlos_cam.dataset import build
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.render import Scene, Sensor, render
 
 BARE_WALL_FRAMES = 60
 """As many as `calibrate` takes."""

@@ -1,6 +1,5 @@
-"""Why a camera is not found, and what to do about it."""
+"""Diagnosis of why no camera is found, and of the host it is attached to."""
 
-from nlos_cam.doctor.diagnosis import diagnose
-from nlos_cam.doctor.facts import Check, Facts, gather
+import lazy_loader
 
-__all__ = ["Check", "Facts", "diagnose", "gather"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,7 +7,7 @@ Checks of the camera itself: is it on USB, in its normal mode, on a fast link, w
 
 import re
 
-from nlos_cam.camera.sdk import WHEEL
+from nlos_cam.camera import WHEEL
 from nlos_cam.doctor.facts import Facts, Finding, failed, ok, skipped, warning
 from nlos_cam.doctor.host import L515, LIDARS, Host, KernelCamera
 from nlos_cam.doctor.udev import RELOAD, WRITE_AND_INSTALL

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import Any, Literal
 
-from nlos_cam.camera.l515 import DeviceInfo, connected, shared_context
-from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera import DeviceInfo, connected, load_sdk, shared_context
 from nlos_cam.doctor.host import Host, read_host
 from nlos_cam.doctor.usb import UsbDevice, UsbScan, scan, sdk_serial
 from nlos_cam.errors import CameraError

@@ -1,0 +1,5 @@
+"""Metrics with intervals, baselines, reports, and trade-offs of accuracy against time."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

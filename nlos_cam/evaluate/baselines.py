@@ -9,11 +9,18 @@ from typing import Protocol
 import numpy as np
 import torch
 from nlos_calibration.arrays import Float16, Float32
-from nlos_models.data import MapSet
-from nlos_models.pipeline import SMALLEST_SPREAD, channel_statistics, split_and_stack
+from nlos_models import SMALLEST_SPREAD, MapSet, channel_statistics, split_and_stack
 from torch import Tensor
 
-from nlos_cam.dataset import build
+from nlos_cam.dataset import (
+    TRAINING_SEED,
+    Dataset,
+    DatasetPlan,
+    Objects,
+    build_dataset,
+    open_dataset,
+    procedural_images,
+)
 
 NEIGHBOURS = 2000
 """Training objects that the nearest one is searched among, unless a training set is given."""
@@ -94,19 +101,19 @@ def _statistics(training: TrainingMaps) -> tuple[Tensor, Tensor]:
     return channel_statistics(torch.cat(parts))
 
 
-def training_maps(plan: build.DatasetPlan, cache: Path, workers: int, on_progress: OnProgress) -> build.Dataset:
+def training_maps(plan: DatasetPlan, cache: Path, workers: int, on_progress: OnProgress) -> Dataset:
     """The first NEIGHBOURS training objects as this plan's rig and sensor see them, built once into a cache folder.
 
     A build that was cut short goes on where it was. The folder is named by a checksum of rig, sensor and objects.
     """
-    plan = replace(plan, first_seed=build.TRAINING_SEED, objects=build.Objects())
+    plan = replace(plan, first_seed=TRAINING_SEED, objects=Objects())
     folder = cache / "neighbours" / f"{_checksum(plan)}-{NEIGHBOURS}"
-    build.build(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
-    return build.open_dataset(folder)
+    build_dataset(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
+    return open_dataset(folder)
 
 
-def _checksum(plan: build.DatasetPlan) -> str:
+def _checksum(plan: DatasetPlan) -> str:
     """Of the plan, and of what its objects look like: another shape of cup is another training set."""
     digest = hashlib.sha256(plan.provenance.encode())
-    digest.update(build.procedural_images(plan.first_seed, TOLD_BY, plan.box).tobytes())
+    digest.update(procedural_images(plan.first_seed, TOLD_BY, plan.box).tobytes())
     return digest.hexdigest()[:16]

@@ -5,19 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float16, Float32
-from nlos_calibration.rig import Rig
-from nlos_models.data import MapSet
-from nlos_models.metrics import SMALLER_IS_BETTER, brightness, colour_metrics, surface
-from nlos_models.recipe import SIMULATION_ONLY
+from nlos_models import SIMULATION_ONLY, SMALLER_IS_BETTER, MapSet, brightness, colour_metrics, surface
 
-from nlos_cam.dataset.samples import sense_colour
+from nlos_cam.dataset import sense_colour
 from nlos_cam.evaluate.metrics import advantage, over_objects, plain
-from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
-from nlos_cam.render.material import Surface
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.objects import TEXTURES, image_from_albedo, painted
+from nlos_cam.render import Scene, Sensor, SensorModel, Surface
 
 ROWS = ("truth", "reconstruction", "difference")
 

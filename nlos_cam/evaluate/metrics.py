@@ -9,10 +9,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.rig import ObjectBox
-from nlos_models import metrics
-from nlos_models.metrics import surface
+from nlos_models import MIN_V, accuracy_mean_abs, accuracy_within_2_percent, foreground_rmse_mm, silhouette_iou, surface
 from numpy.typing import NDArray
 
 PerObject = dict[str, Float64]
@@ -45,16 +44,16 @@ Figures = dict[str, Interval]
 
 def mm_per_v(box: ObjectBox) -> float:
     """Millimetres of depth that one unit of v stands for."""
-    return 1000 * (box.z_far_m - box.z_near_m) / (1 - metrics.MIN_V)
+    return 1000 * (box.z_far_m - box.z_near_m) / (1 - MIN_V)
 
 
 def per_object(image: Float32, truth: Float32, box: ObjectBox) -> PerObject:
     """Every metric of images (n, 64, 64) against the truth."""
     return {
-        "silhouette_iou": metrics.silhouette_iou(image, truth),
-        "accuracy_mean_abs": metrics.accuracy_mean_abs(image, truth),
-        "accuracy_within_2_percent": metrics.accuracy_within_2_percent(image, truth),
-        "foreground_rmse_mm": metrics.foreground_rmse_mm(image, truth, mm_per_v(box)),
+        "silhouette_iou": silhouette_iou(image, truth),
+        "accuracy_mean_abs": accuracy_mean_abs(image, truth),
+        "accuracy_within_2_percent": accuracy_within_2_percent(image, truth),
+        "foreground_rmse_mm": foreground_rmse_mm(image, truth, mm_per_v(box)),
     }
 
 

@@ -13,13 +13,23 @@ import numba
 import numpy as np
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.accuracy_search import Agreement, Echoes, Stopwatch, agreement, least_seconds
-from nlos_cam.render.effects import Effects
-from nlos_cam.render.planning import Prepared, plan
-from nlos_cam.render.renderer import Rendering, render, three_bounce
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_facts import SceneFacts
+from nlos_cam.render import (
+    STOPS,
+    Accuracy,
+    Agreement,
+    Echoes,
+    Effects,
+    Prepared,
+    Rendering,
+    Scene,
+    SceneFacts,
+    Stopwatch,
+    agreement,
+    least_seconds,
+    plan,
+    render,
+    three_bounce,
+)
 
 Part = Literal["stop", "sub_bins", "relay grid", "object_stride", "beams_per_cell", "effect left out"]
 
@@ -30,7 +40,7 @@ FINEST_BEAMS = 4
 
 
 @dataclass(frozen=True)
-class Setting:
+class RenderSetting:
     """One thing to measure: a stop, or `standard` with one ingredient changed."""
 
     name: str
@@ -40,7 +50,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Row:
+class RenderRow:
     """What was measured of a setting."""
 
     name: str
@@ -53,14 +63,14 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Facts:
+class RenderFacts:
     """How large the scene is."""
 
     patches: int
     beams_on_wall: int
 
 
-def settings(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> list[Setting]:
+def render_settings(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> list[RenderSetting]:
     """All that is measured of a scene, brute force first."""
     standard = stops["standard"]
     ordered = sorted(stops.values(), key=lambda stop: stop.sub_bins > 0)
@@ -68,39 +78,41 @@ def settings(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> list[Settin
     grids = [(max(int(columns * share), 1), max(int(rows * share), 1)) for share in (0.25, 0.5, 1, 2)]
     called_for = [effect.name for effect in plan(SceneFacts(scene, standard)) if effect.included]
     return [
-        *(Setting(stop.name, "stop", stop) for stop in ordered),
-        *(Setting(f"sub_bins {n}", "sub_bins", replace(standard, sub_bins=n)) for n in (1, 2, 4, 8, 16, 32, 64)),
+        *(RenderSetting(stop.name, "stop", stop) for stop in ordered),
+        *(RenderSetting(f"sub_bins {n}", "sub_bins", replace(standard, sub_bins=n)) for n in (1, 2, 4, 8, 16, 32, 64)),
         *(
-            Setting(f"relay grid {x} x {y}", "relay grid", replace(standard, relay_columns=x, relay_rows=y))
+            RenderSetting(f"relay grid {x} x {y}", "relay grid", replace(standard, relay_columns=x, relay_rows=y))
             for x, y in grids
         ),
-        *(Setting(f"object_stride {n}", "object_stride", replace(standard, object_stride=n)) for n in (1, 2, 4)),
-        *(Setting(f"beams_per_cell {n}", "beams_per_cell", replace(standard, beams_per_cell=n)) for n in (1, 2)),
+        *(RenderSetting(f"object_stride {n}", "object_stride", replace(standard, object_stride=n)) for n in (1, 2, 4)),
+        *(RenderSetting(f"beams_per_cell {n}", "beams_per_cell", replace(standard, beams_per_cell=n)) for n in (1, 2)),
         *(
-            Setting(f"without {name}", "effect left out", standard, tuple(e for e in called_for if e != name))
+            RenderSetting(f"without {name}", "effect left out", standard, tuple(e for e in called_for if e != name))
             for name in called_for
         ),
     ]
 
 
-def facts(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> Facts:
+def render_facts(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> RenderFacts:
     """The scene's size. Raises SceneError where no three-bounce path is possible: there is nothing to trade."""
     ready = Prepared.of(scene, stops["reference"], "auto")
     job = ready.job()
     if job is None:
         raise SceneError("nothing is hidden, or no light reaches it and returns: give an object within the gate")
-    return Facts(len(job.patches.beta), len(job.foot_m))
+    return RenderFacts(len(job.patches.beta), len(job.foot_m))
 
 
-def measure(scene: Scene, stops: Mapping[str, Accuracy] = STOPS, stopwatch: Stopwatch = least_seconds) -> Iterator[Row]:
+def measure_renders(
+    scene: Scene, stops: Mapping[str, Accuracy] = STOPS, stopwatch: Stopwatch = least_seconds
+) -> Iterator[RenderRow]:
     """One row for each of `settings`, as they are measured."""
-    brute, *others = settings(scene, stops)
+    brute, *others = render_settings(scene, stops)
     lit = Prepared.of(scene, brute.accuracy, "auto").beams.on_wall
     bin_m = scene.rig.device.bin_m
     three_bounce(scene, brute.accuracy, chosen=np.flatnonzero(lit)[:1])  # compiles
     slow_s, slow = _timed(scene, brute, stopwatch, 1)
     truth = Echoes.of_beams(slow).some(lit)
-    yield Row(brute.name, brute.part, slow_s, 1.0, agreement(truth, truth, bin_m))
+    yield RenderRow(brute.name, brute.part, slow_s, 1.0, agreement(truth, truth, bin_m))
     finest = render(scene, replace(stops["standard"], beams_per_cell=FINEST_BEAMS))
     true_cells = Echoes.of_cells(finest, scene).some(lit)
     for setting in others:
@@ -110,25 +122,25 @@ def measure(scene: Scene, stops: Mapping[str, Accuracy] = STOPS, stopwatch: Stop
             errors = agreement(Echoes.of_cells(found, scene).some(lit), true_cells, bin_m)
         else:
             errors = agreement(Echoes.of_beams(found).some(lit), truth, bin_m)
-        yield Row(setting.name, setting.part, seconds, slow_s / seconds, errors)
+        yield RenderRow(setting.name, setting.part, seconds, slow_s / seconds, errors)
 
 
-def _timed(scene: Scene, setting: Setting, stopwatch: Stopwatch, repeats: int) -> tuple[float, Rendering]:
+def _timed(scene: Scene, setting: RenderSetting, stopwatch: Stopwatch, repeats: int) -> tuple[float, Rendering]:
     kept: list[Rendering] = []
     seconds = stopwatch(lambda: kept.append(render(scene, setting.accuracy, setting.effects)), repeats)
     return seconds, kept[-1]
 
 
-def pareto_front(rows: list[Row]) -> list[Row]:
+def pareto_front(rows: list[RenderRow]) -> list[RenderRow]:
     """The rows held against brute force of which no other is both quicker and nearer, from quick to slow."""
-    front: list[Row] = []
+    front: list[RenderRow] = []
     for row in sorted(_alike(rows), key=lambda row: (row.seconds, row.errors.intensity_error_p99)):
         if not front or row.errors.intensity_error_p99 < front[-1].errors.intensity_error_p99:
             front.append(row)
     return front
 
 
-def _alike(rows: list[Row]) -> list[Row]:
+def _alike(rows: list[RenderRow]) -> list[RenderRow]:
     """Those whose intensity error tells what they miss: an effect left out may change the map alone."""
     return [row for row in rows if row.part not in {"beams_per_cell", "effect left out"}]
 
@@ -156,7 +168,7 @@ def machine() -> str:
     return f"{numba.get_num_threads()} threads, {model}, {platform.system()}, Python {platform.python_version()}"
 
 
-def as_table(facts: Facts, rows: list[Row], planned: int) -> dict[str, Any]:
+def as_table(facts: RenderFacts, rows: list[RenderRow], planned: int) -> dict[str, Any]:
     """Everything, in the order of `measure`, ready for JSON; `complete` tells whether all that was planned is in it."""
     flat = [
         {"name": row.name, "part": row.part, "seconds": row.seconds, "speedup": row.speedup, **asdict(row.errors)}
@@ -173,7 +185,7 @@ def as_table(facts: Facts, rows: list[Row], planned: int) -> dict[str, Any]:
     }
 
 
-def as_markdown(table: dict[str, Any]) -> str:
+def render_markdown(table: dict[str, Any]) -> str:
     """The table for people."""
     size = f"{table['patches']} patches, {table['beams_on_wall']} beams on the wall"
     parts = [
@@ -195,7 +207,7 @@ def _line(row: dict[str, Any]) -> str:
     return f"| {' | '.join([*first, *errors, *bins, *depths])} |"
 
 
-def draw(path: Path, rows: list[Row], title: str) -> None:
+def draw_renders(path: Path, rows: list[RenderRow], title: str) -> None:
     """Error against time, both logarithmic; what has no error stands on the lower edge."""
     from matplotlib.figure import Figure
 
@@ -204,7 +216,7 @@ def draw(path: Path, rows: list[Row], title: str) -> None:
     shown = [row for row in rows if row.part != "beams_per_cell"]
     floor = 0.5 * min((error for row in shown if (error := row.errors.intensity_error_p99) > 0), default=1e-6)
 
-    def places(of: list[Row]) -> tuple[list[float], list[float]]:
+    def places(of: list[RenderRow]) -> tuple[list[float], list[float]]:
         return [1000 * row.seconds for row in of], [100 * max(row.errors.intensity_error_p99, floor) for row in of]
 
     axis.plot(*places(pareto_front(rows)), color="0.8", linewidth=6, solid_capstyle="round", label="Pareto front")
@@ -224,7 +236,7 @@ def draw(path: Path, rows: list[Row], title: str) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _label(axis: Any, rows: list[Row], places: tuple[list[float], list[float]], colour: Any, size: int) -> None:
+def _label(axis: Any, rows: list[RenderRow], places: tuple[list[float], list[float]], colour: Any, size: int) -> None:
     for row, x, y in zip(rows, *places, strict=True):
         name = row.name.removeprefix(row.part).strip()
         style = {"fontsize": size, "color": colour, "ha": "center"}

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.evaluate import figures as pictures
 from nlos_cam.evaluate import metrics as surfaces

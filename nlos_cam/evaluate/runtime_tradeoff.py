@@ -12,17 +12,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import ObjectBox, Rig
-from nlos_models.checkpoint import load_pipeline
-from nlos_models.inference import OnnxReconstructor, Reconstructor, Sample, TorchReconstructor, exported, quantise
+from nlos_models import OnnxReconstructor, Reconstructor, Sample, TorchReconstructor, exported, load_pipeline, quantise
 
-from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.dataset import build
+from nlos_cam.camera import FRAMES_PER_S
+from nlos_cam.dataset import TRAINING_SEED
 from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, Figures, judge, plain
 from nlos_cam.evaluate.subjects import Subject, as_map_set, echoes_of, seeded_objects, sense, truth_of
 from nlos_cam.frames import LidarMaps
-from nlos_cam.render.renderer import MultiBounce
+from nlos_cam.render import MultiBounce
 
 FRAMES = 1, 4, 16
 THREADS = 1, 2
@@ -45,7 +44,7 @@ Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
-class Setting:
+class RuntimeSetting:
     """One way to reconstruct."""
 
     name: str
@@ -57,10 +56,10 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Row:
+class RuntimeRow:
     """What was measured of a setting."""
 
-    setting: Setting
+    setting: RuntimeSetting
     milliseconds: float
     """Of one call on one object's maps: the median."""
     milliseconds_p90: float
@@ -73,7 +72,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Bench:
+class RuntimeBench:
     """Objects in front of the sensor: what every setting is measured on."""
 
     rig: Rig
@@ -82,7 +81,7 @@ class Bench:
     echoes: list[MultiBounce]
 
     @classmethod
-    def of(cls, subjects: Sequence[Subject], rig: Rig, box: ObjectBox, on_progress: OnProgress) -> "Bench":
+    def of(cls, subjects: Sequence[Subject], rig: Rig, box: ObjectBox, on_progress: OnProgress) -> "RuntimeBench":
         """Render the objects."""
         return cls(rig, box, truth_of(subjects, box), echoes_of(subjects, rig, on_progress))
 
@@ -123,7 +122,7 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
 
 def calibration(rig: Rig, box: ObjectBox) -> Iterator[Sample]:
     """Maps of training objects, one at a time."""
-    subjects = seeded_objects(build.TRAINING_SEED, CALIBRATING, box)
+    subjects = seeded_objects(TRAINING_SEED, CALIBRATING, box)
     for maps in sense(echoes_of(subjects, rig, _untold), rig):
         yield maps.depth_m[None], maps.intensity[None]
 
@@ -132,17 +131,17 @@ def _untold(done: int, total: int) -> None:
     del done, total
 
 
-def settings(weights: Sequence[str], runtime_names: Sequence[str]) -> list[Setting]:
+def runtime_settings(weights: Sequence[str], runtime_names: Sequence[str]) -> list[RuntimeSetting]:
     """All that is measured: every runtime on one frame, and more frames on the one that `live` uses."""
     singles = [
-        Setting(f"{runtime}, {_threads(threads)}", name, runtime, threads, 1)
+        RuntimeSetting(f"{runtime}, {_threads(threads)}", name, runtime, threads, 1)
         for name in weights
         for runtime in runtime_names
         for threads in THREADS
         if "cuda" not in runtime or threads == THREADS[0]
     ]
     averaged = [
-        Setting(f"ONNX Runtime float32, {frames} frames", name, "ONNX Runtime float32", 1, frames)
+        RuntimeSetting(f"ONNX Runtime float32, {frames} frames", name, "ONNX Runtime float32", 1, frames)
         for name in weights
         for frames in FRAMES[1:]
     ]
@@ -153,12 +152,12 @@ def _threads(count: int) -> str:
     return f"{count} thread{'s' if count > 1 else ''}"
 
 
-def measure(
-    asked: Sequence[Setting],
+def measure_runtimes(
+    asked: Sequence[RuntimeSetting],
     makes: Mapping[str, Mapping[str, Make]],
-    bench: Bench,
+    bench: RuntimeBench,
     clock: Clock = time.perf_counter,
-) -> Iterator[Row]:
+) -> Iterator[RuntimeRow]:
     """One row for each setting, as they are measured; `makes` has the runtimes of each weights by name."""
     seen: dict[int, list[LidarMaps]] = {}
     for setting in asked:
@@ -168,7 +167,7 @@ def measure(
             reconstructor = makes[setting.weights][setting.runtime](setting.threads)
             image, seconds = _timed(reconstructor, seen[setting.frames], bench.truth, clock)
         middle, late = 1000 * np.quantile(seconds, [0.5, 0.9])
-        yield Row(setting, float(middle), float(late), judge(image, bench.truth, bench.box))
+        yield RuntimeRow(setting, float(middle), float(late), judge(image, bench.truth, bench.box))
 
 
 @contextmanager
@@ -198,7 +197,7 @@ def _timed(
     return np.concatenate(images), seconds
 
 
-def losses(row: Row, base: Row) -> dict[str, float]:
+def losses(row: RuntimeRow, base: RuntimeRow) -> dict[str, float]:
     """By how much a row is worse than another, by metric; infinite where it has no value."""
     worse: dict[str, float] = {}
     for name in BARS:
@@ -208,7 +207,7 @@ def losses(row: Row, base: Row) -> dict[str, float]:
     return worse
 
 
-def recommended(rows: Sequence[Row]) -> Row | None:
+def recommended(rows: Sequence[RuntimeRow]) -> RuntimeRow | None:
     """The quickest setting of one frame that loses nothing to speak of against the first row; None without rows."""
     if not rows:
         return None
@@ -221,16 +220,16 @@ def recommended(rows: Sequence[Row]) -> Row | None:
     return min(kept, key=lambda row: row.milliseconds, default=base)
 
 
-def pareto_front(rows: Sequence[Row]) -> list[Row]:
+def pareto_front(rows: Sequence[RuntimeRow]) -> list[RuntimeRow]:
     """The rows of one frame of which no other is both quicker and better in silhouette, from quick to slow."""
-    front: list[Row] = []
+    front: list[RuntimeRow] = []
     for row in sorted((row for row in rows if row.setting.frames == 1), key=lambda row: row.milliseconds):
         if not front or _iou(row) > _iou(front[-1]):
             front.append(row)
     return front
 
 
-def _iou(row: Row) -> float:
+def _iou(row: RuntimeRow) -> float:
     return row.figures["silhouette_iou"].value or 0.0
 
 
@@ -244,7 +243,7 @@ are averaged while the next come, and the picture is as old as the wait. "Loses 
 more than any of {", ".join(f"{least:g} of {name}" for name, least in AS_GOOD.items())}."""
 
 
-def facts(rows: Sequence[Row], planned: int, objects: int, machine: str) -> dict[str, Any]:
+def runtime_facts(rows: Sequence[RuntimeRow], planned: int, objects: int, machine: str) -> dict[str, Any]:
     """Everything, ready for JSON; `complete` tells whether all that was planned is in it."""
     pick = recommended(rows)
     return {
@@ -267,7 +266,7 @@ def facts(rows: Sequence[Row], planned: int, objects: int, machine: str) -> dict
     }
 
 
-def as_markdown(table: Mapping[str, Any]) -> str:
+def runtime_markdown(table: Mapping[str, Any]) -> str:
     """The table for people."""
     whole = "" if table["complete"] else " Interrupted: not all was measured."
     parts = [
@@ -292,7 +291,7 @@ def _line(row: Mapping[str, Any]) -> str:
     return f"| {' | '.join([_called(row), *times, *told, 'yes' if row['loses_accuracy'] else 'no'])} |"
 
 
-def draw(path: Path, rows: Sequence[Row]) -> None:
+def draw_runtimes(path: Path, rows: Sequence[RuntimeRow]) -> None:
     """Silhouette IoU against milliseconds of one call, and against the frames averaged."""
     from matplotlib.figure import Figure
 
@@ -315,7 +314,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     figure.savefig(path, dpi=100)
 
 
-def _series(axis: Any, rows: Sequence[Row]) -> None:
+def _series(axis: Any, rows: Sequence[RuntimeRow]) -> None:
     """One runtime with its numbers of threads."""
     setting = rows[0].setting
     label = setting.runtime if setting.weights == "shipped" else f"{setting.weights}: {setting.runtime}"
@@ -329,7 +328,7 @@ def _series(axis: Any, rows: Sequence[Row]) -> None:
         axis.annotate(words, (row.milliseconds, iou.value), (4, 4), textcoords="offset points", fontsize=8)
 
 
-def _against_frames(axis: Any, weights: str, rows: Sequence[Row]) -> None:
+def _against_frames(axis: Any, weights: str, rows: Sequence[RuntimeRow]) -> None:
     """The runtime that more frames were tried on."""
     tried = {row.setting.runtime for row in rows if row.setting.frames > 1}
     some = [row for row in rows if row.setting.runtime in tried and row.setting.threads == 1]

@@ -11,28 +11,29 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from nlos_calibration import ObjectBox, Rig, rig_named
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.rig import ObjectBox, Rig
-from nlos_calibration.wall_record import rig_named
-from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.data import MapSet, less_bare_wall
-from nlos_models.inference import Reconstructor
+from nlos_models import CheckpointRecord, MapSet, Reconstructor, less_bare_wall
 
-from nlos_cam.camera.simulated_world import World
-from nlos_cam.dataset import build
-from nlos_cam.dataset.training_maps import BareMaps, measured_bare_wall, render_bare_wall
+from nlos_cam.camera import World
+from nlos_cam.dataset import (
+    TEST_SEED,
+    TRAINING_SEED,
+    BareMaps,
+    Dataset,
+    DatasetPlan,
+    measured_bare_wall,
+    open_dataset,
+    procedural_images,
+    render_bare_wall,
+)
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import baselines as trivial
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
-from nlos_cam.objects.benchmark import benchmark_objects
-from nlos_cam.objects.depth_map import image_from_depth
-from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.renderer import MultiBounce, render
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_file import SceneFile
-from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.objects import benchmark_objects, image_from_depth, object_depth
+from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
 
 OnProgress = Callable[[int, int], None]
 Tracked = Callable[[str], AbstractContextManager[OnProgress]]
@@ -135,7 +136,7 @@ class Judged:
     categories: list[str]
     maps: MapSet
     """Raw ones, whatever the weights eat: the baselines look at these."""
-    plan: build.DatasetPlan
+    plan: DatasetPlan
 
 
 def rig_of(record: CheckpointRecord) -> Rig:
@@ -150,7 +151,7 @@ def rig_of(record: CheckpointRecord) -> Rig:
 
 def fresh_objects(rig: Rig, count: int | None = None, tracked: Tracked = untracked) -> Judged:
     """The 54, or so many random objects, through the noise of the simulated camera on a rig."""
-    plan = build.DatasetPlan(rig, build.TEST_SEED)
+    plan = DatasetPlan(rig, TEST_SEED)
     subjects = seeded_objects(plan.first_seed, count, plan.box) if count else benchmark_objects(plan.box)
     with tracked("rendering test objects") as on_progress:
         echoes = echoes_of(subjects, rig, on_progress)
@@ -162,13 +163,13 @@ def fresh_objects(rig: Rig, count: int | None = None, tracked: Tracked = untrack
 
 def stored_objects(folder: Path) -> Judged:
     """Those of a dataset."""
-    opened = build.open_dataset(folder)
+    opened = open_dataset(folder)
     categories = [str(category) for category in opened.column("category")]
     names = [f"{category} {seed}" for category, seed in zip(categories, opened.column("seed"), strict=True)]
     return Judged(f"Maps of {folder}", names, categories, opened.arrays(), opened.plan)
 
 
-def bare_wall_for(record: CheckpointRecord, plan: build.DatasetPlan, wall: Path | None = None) -> BareMaps | None:
+def bare_wall_for(record: CheckpointRecord, plan: DatasetPlan, wall: Path | None = None) -> BareMaps | None:
     """The bare wall that weights want their maps less of, as `train` took it; None where they eat raw maps.
 
     Raises SceneError for a measured wall that would be of no use.
@@ -185,15 +186,15 @@ def as_eaten(maps: MapSet, bare: BareMaps | None) -> MapSet:
     return less_bare_wall(maps, *bare) if bare else maps
 
 
-def guesses(
+def baseline_images(
     judged: Judged, training: Path | None, *, nearest: bool, tracked: Tracked = untracked
-) -> tuple[dict[str, Float32], build.Dataset | None]:
+) -> tuple[dict[str, Float32], Dataset | None]:
     """The baselines' images, and the training objects that the nearest was looked for among, if it is wanted."""
     if not nearest:
-        images = build.procedural_images(build.TRAINING_SEED, trivial.NEIGHBOURS, judged.plan.box)
+        images = procedural_images(TRAINING_SEED, trivial.NEIGHBOURS, judged.plan.box)
         return trivial.without_maps(len(judged.names), trivial.mean_image(images)), None
     if training:
-        opened = build.open_dataset(training)
+        opened = open_dataset(training)
     else:
         with tracked("rendering training objects for the nearest neighbour, once") as on_progress:
             opened = trivial.training_maps(judged.plan, cache_folder(), os.cpu_count() or 1, on_progress)
@@ -201,7 +202,7 @@ def guesses(
         return trivial.with_nearest(judged.maps, opened, on_progress), opened
 
 
-def notes_on(record: CheckpointRecord, judged: Judged, training: build.Dataset | None) -> list[str]:
+def notes_on(record: CheckpointRecord, judged: Judged, training: Dataset | None) -> list[str]:
     """What a reader has to know to read the figures."""
     rig, told = judged.plan.rig, list[str]()
     if record.rig_checksum != rig.checksum:

@@ -16,20 +16,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from nlos_calibration.rig import ObjectBox, Rig
-from nlos_calibration.wall_record import rig_named
-from nlos_models.checkpoint import load_record, shipped_folder
-from nlos_models.inference import Reconstructor
+from nlos_calibration import ObjectBox, Rig, rig_named
+from nlos_models import Reconstructor, load_record, shipped_folder
 from pydantic import BaseModel, Field, ValidationError
 
-from nlos_cam.camera.protocol import Camera
-from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.camera import FRAMES_PER_S, Camera
 from nlos_cam.errors import BudgetError, RecordingError
 from nlos_cam.files import cache_folder
 from nlos_cam.live.loop import warm_up
 from nlos_cam.live.statistics import RunReport
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.reconstruct.pipeline import Pipeline
+from nlos_cam.objects import object_box
+from nlos_cam.reconstruct import Pipeline
 
 TRADEOFF = "tradeoff.json"
 """What `tradeoff reconstruct` writes; one lies beside the shipped weights."""

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import IO, Any, Self
 
-from nlos_cam.view.viewer import Moment
+from nlos_cam.view import Moment
 
 SUFFIXES = ".csv", ".jsonl"
 FLUSHED_EVERY_S = 1.0

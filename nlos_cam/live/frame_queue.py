@@ -9,8 +9,7 @@ from typing import Self
 
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
-from nlos_cam.reconstruct.network import Clock
-from nlos_cam.reconstruct.pipeline import Arrival
+from nlos_cam.reconstruct import Arrival, Clock
 
 QUEUE_FRAMES = 3
 LET_GO_AFTER_S = 1.0

@@ -15,15 +15,23 @@ from threading import Event
 
 import numpy as np
 
-from nlos_cam.camera.protocol import Camera
+from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.live.frame_queue import FrameReader
 from nlos_cam.live.statistics import DELIVERY, OnWarning, RunReport, RunStatistics, say_nothing
 from nlos_cam.live.telemetry import Telemetry, telemetry_of
-from nlos_cam.reconstruct.network import Clock, Reconstruction, reconstruct
-from nlos_cam.reconstruct.pipeline import Arrival, FrameResult, Pipeline, PreparedFrame
-from nlos_cam.reconstruct.verdict import Verdict, frame_issues
-from nlos_cam.view.viewer import Moment, Viewer
+from nlos_cam.reconstruct import (
+    Arrival,
+    Clock,
+    FrameResult,
+    Pipeline,
+    PreparedFrame,
+    Reconstruction,
+    Verdict,
+    frame_issues,
+    reconstruct,
+)
+from nlos_cam.view import Moment, Viewer
 
 
 class Moments:

@@ -17,14 +17,13 @@ from queue import SimpleQueue
 from threading import Condition, Thread
 from typing import IO, Any, Self
 
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import Rig
 
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live.realtime import as_any_other
-from nlos_cam.reconstruct.network import Clock
-from nlos_cam.reconstruct.physics_check import PhysicsCheckResult, failure, log_warning
-from nlos_cam.render.accuracy import Stop
+from nlos_cam.reconstruct import Clock, PhysicsCheckResult, failure, log_warning
+from nlos_cam.render import Stop
 
 PERIOD_S = 1.0
 WORKER = sys.executable, "-m", "nlos_cam.live.physics_check_process"
@@ -178,7 +177,7 @@ def serve(asked: IO[bytes], told: IO[bytes], leave: Callable[[], None]) -> None:
     questions: SimpleQueue[Any] = SimpleQueue()
     Thread(target=_listen, args=(asked, questions, leave), daemon=True).start()
     rig, accuracy = questions.get()
-    from nlos_cam.reconstruct.physics_check import check  # takes a second to import: stdin is listened to meanwhile
+    from nlos_cam.reconstruct import check  # takes a second to import: stdin is listened to meanwhile
 
     while (question := questions.get()) is not None:
         frame_number, maps, depth_m = question

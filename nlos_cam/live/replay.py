@@ -11,10 +11,10 @@ from threading import Event
 from typing import IO, Any
 
 import numpy as np
-from nlos_calibration.rig import Rig
+from nlos_calibration import Rig
 from numpy.typing import NDArray
 
-from nlos_cam.camera.protocol import Camera
+from nlos_cam.camera import Camera
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
@@ -22,12 +22,8 @@ from nlos_cam.live.frame_queue import FrameReader
 from nlos_cam.live.loop import in_words, iterate_batched, with_telemetry
 from nlos_cam.live.replay_media import Looks, Samples, draw_sheet
 from nlos_cam.live.statistics import OnWarning, Warned, frames_by_verdict, say_nothing
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.network import Clock
-from nlos_cam.reconstruct.physics_check import UNEXPLAINED
-from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline
-from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.objects import object_box
+from nlos_cam.reconstruct import UNEXPLAINED, CalibratedRig, Clock, FrameResult, Pipeline, Verdict
 
 RESULT, DIFFERENCE, SHEET, REPORT = "reconstruction.npz", "difference.npz", "frames.png", "report.md"
 SHEET_FRAMES = 6
@@ -99,7 +95,7 @@ class _Results:
             self.verdicts[step.verdict] += 1
 
 
-def replay(
+def replay_recording(
     camera: Camera,
     processing: Pipeline,
     out: Path,

@@ -14,10 +14,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.pipeline import FrameResult
-from nlos_cam.view.images import MAX_UNCERTAINTY_M
-from nlos_cam.view.viewer import Moment, Viewer
+from nlos_cam.reconstruct import CalibratedRig, FrameResult
+from nlos_cam.view import MAX_UNCERTAINTY_M, Moment, Viewer
 
 
 class Samples:
@@ -58,12 +56,12 @@ class Looks:
         with ExitStack() as entered:
             viewers: list[Viewer] = []
             if self.view:
-                from nlos_cam.view.rrd_file import RrdFile
+                from nlos_cam.view import RrdFile
 
                 saved = RrdFile(folder / VIEW, self.bench.rig, self.bench.measured, keeps_all=True)
                 viewers.append(entered.enter_context(saved))
             if self.video:
-                from nlos_cam.view.video import VideoFile
+                from nlos_cam.view import VideoFile
 
                 viewers.append(entered.enter_context(VideoFile(folder / VIDEO, self.bench.rig)))
             looking = Looking(viewers, Samples(self.stills) if self.stills else None)
@@ -73,7 +71,7 @@ class Looks:
         looking.made = {path.name for path in _looks_in(folder)}
 
     def _draw_stills(self, folder: Path, moments: list[Moment]) -> None:
-        from nlos_cam.view.video import Still
+        from nlos_cam.view import Still
 
         for moment in moments:
             Still(self.bench.rig, moments[0]).save(folder / STILL.format(moment.frame.frame_number), moment)

@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos_cam.camera.protocol import Camera
+from nlos_cam.camera import Camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
 from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.reconstruct.pipeline import FrameResult
-from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.reconstruct import FrameResult, Verdict
 
 REMEMBERED = 100_000
 """Frames: 55 minutes at 30 frames/s, and 0.8 MB for each stage, which are taken at the first frame."""

@@ -5,10 +5,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from nlos_cam.camera.protocol import Camera
+from nlos_cam.camera import Camera
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.sidecar import LOOK_S, load_sidecar, sidecar_path
+from nlos_cam.recording import LOOK_S, load_sidecar, sidecar_path
 
 RECORDED = "bag:"
 Celsius = Mapping[str, float]

@@ -7,8 +7,8 @@ there (`nlos_cam.objects.settings`); other settings and the poses are spread eve
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.objects.depth_map import orthographic_depth
 from nlos_cam.objects.generators import CATEGORIES

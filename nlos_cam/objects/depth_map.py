@@ -5,9 +5,9 @@ Hidden depth in its two forms: metres over the object box, and the image v in [0
 
 import numba
 import numpy as np
+from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import ObjectBox, Rig
-from nlos_models.metrics import BACKGROUND_BELOW_V, MIN_V
+from nlos_models import BACKGROUND_BELOW_V, MIN_V
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError

@@ -19,8 +19,8 @@ from typing import Literal, TypeVar
 
 import numpy as np
 import trimesh
+from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.rig import ObjectBox
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import OBJECT_PIXELS

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from math import radians
 
 import numpy as np
+from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.rig import ObjectBox
 from trimesh.transformations import euler_matrix
 
 from nlos_cam.errors import SceneError

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from nlos_calibration.arrays import Float32, Float64
-from nlos_models.metrics import BLACK_V
+from nlos_models import BLACK_V
 from numpy.typing import NDArray
 
 SATURATION, VALUE = (0.5, 0.9), (0.7, 1.0)

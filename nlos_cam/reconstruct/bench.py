@@ -5,14 +5,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from nlos_calibration.drift import DriftCheck
+from nlos_calibration import (
+    BareWall,
+    DriftCheck,
+    Intrinsics,
+    MeasuredWall,
+    Rig,
+    WallRecord,
+    load_measured,
+    load_rig,
+    wall_from_zero,
+)
 from nlos_calibration.errors import CalibrationError
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.reference import BareWall
-from nlos_calibration.rig import Rig, load_rig
-from nlos_calibration.wall_record import MeasuredWall, WallRecord, load_measured, wall_from_zero
 
-from nlos_cam.camera.protocol import Camera
+from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame, LidarMaps
 
 MAX_INTRINSICS_MISMATCH_PX = 0.25

@@ -8,14 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import ObjectBox, Rig
-from nlos_models.doubt_checkpoint import UncertaintyModel
-from nlos_models.metrics import MIN_V
+from nlos_models import MIN_V, UncertaintyModel
 from numpy.typing import NDArray
 
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps
-from nlos_cam.objects.depth_map import depth_from_image, object_box
+from nlos_cam.objects import depth_from_image, object_box
 
 
 @dataclass(frozen=True)

@@ -26,16 +26,12 @@ from functools import lru_cache
 from typing import Protocol, Self
 
 import numpy as np
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.rig import Rig
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
 from nlos_cam.reconstruct.network import Clock
-from nlos_cam.render.accuracy import Stop
-from nlos_cam.render.geometry import cast
-from nlos_cam.render.renderer import Rendering, render
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.render import Rendering, Scene, SensorModel, Stop, cast, render
 
 UNEXPLAINED = 0.91
 """The score from which on what is shown does not explain the maps: 1 % of the 300 new objects that it was chosen on

@@ -7,12 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from nlos_calibration import Rig, load_rig, rig_difference
 from nlos_calibration.errors import CalibrationError, RecordFileError
-from nlos_calibration.rig import Rig, load_rig
-from nlos_calibration.rig_check import rig_difference
-from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.doubt_checkpoint import UncertaintyModel, load_uncertainty_model
-from nlos_models.inference import Reconstructor, load_reconstructor
+from nlos_models import CheckpointRecord, Reconstructor, UncertaintyModel, load_reconstructor, load_uncertainty_model
 
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame

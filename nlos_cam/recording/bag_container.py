@@ -15,14 +15,14 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 from lz4.frame import LZ4FrameDecompressor
-from nlos_calibration.geometry import Intrinsics
+from nlos_calibration import Intrinsics
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from nlos_cam.camera.recorder import repair_command
+from nlos_cam.camera import repair_command
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording.rosbag import CHUNK_LIMIT, MAGIC
 

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration.geometry import Intrinsics
+from nlos_calibration import Intrinsics
 from numpy.typing import NDArray
 
-from nlos_cam.camera.streams import Sample
+from nlos_cam.camera import Sample
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording import bag_container
 from nlos_cam.recording.bag_container import ENCODINGS, BagContainer, Entry, FrameMetadata, sdk_name

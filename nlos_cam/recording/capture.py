@@ -7,10 +7,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event
 
-from nlos_calibration.rig import Rig
+from nlos_calibration import Rig
 
-from nlos_cam.camera.protocol import Camera
-from nlos_cam.camera.recorder import RESERVE_BYTES, Recording
+from nlos_cam.camera import RESERVE_BYTES, Camera, Recording
 from nlos_cam.errors import CameraError, DiskFullError, NlosCamError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording.playback import Verified

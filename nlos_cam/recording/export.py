@@ -19,7 +19,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from nlos_cam.camera.streams import FORMATS, FrameSet, FrameSynchronizer, Sample
+from nlos_cam.camera import FORMATS, FrameSet, FrameSynchronizer, Sample
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.recording.bag_reader import BagFile
@@ -163,7 +163,7 @@ class Wanted:
     """Only frames whose number this divides."""
 
 
-def export(
+def export_recording(
     bag: BagFile,
     out: Path,
     wanted: Wanted,

@@ -6,11 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import Rig
+from nlos_calibration import Intrinsics, Rig
 
-from nlos_cam.camera.streams import FORMATS, FrameSynchronizer, frame_in_si
-from nlos_cam.camera.timestamps import ClockUnwrap
+from nlos_cam.camera import FORMATS, ClockUnwrap, FrameSynchronizer, frame_in_si
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording.bag_reader import BagFile

@@ -8,7 +8,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32
 from numpy.typing import NDArray
 
-from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.camera import FRAMES_PER_S
 from nlos_cam.frames import SATURATED, Frame
 
 MIN_PAIRS = 8

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
-from nlos_cam.camera.streams import FORMATS
+from nlos_cam.camera import FORMATS
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
 from nlos_cam.recording.rosbag import (
     ENTRY_BYTES,
@@ -43,7 +43,7 @@ class Repaired:
     out: Path
 
 
-def repair(path: Path, out: Path, report: OnProgress = unreported) -> Repaired:
+def repair_recording(path: Path, out: Path, report: OnProgress = unreported) -> Repaired:
     """Write what is whole in the recording `path` to `out`, which is replaced; `path` is only read.
 
     `out` appears when all of it is written. Raises RecordingError where nothing can be recovered, OutputExistsError if

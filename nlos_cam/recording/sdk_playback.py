@@ -7,12 +7,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import Rig
+from nlos_calibration import Intrinsics, Rig
 
-from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import SampleQueue, Session, find_streams
-from nlos_cam.camera.streams import FORMATS, FrameSet
+from nlos_cam.camera import FORMATS, FrameSet, SampleQueue, Session, find_streams, load_sdk
 from nlos_cam.errors import CameraError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording.bag_container import advice, told

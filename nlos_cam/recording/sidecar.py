@@ -12,11 +12,10 @@ from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from nlos_calibration.rig import Finite, PinholeRecord, Record, Rig, first_problem
-from nlos_calibration.wall_record import load_wall
+from nlos_calibration import Finite, PinholeRecord, Record, Rig, first_problem, load_wall
 from pydantic import AwareDatetime, Field, ValidationError
 
-from nlos_cam.camera.protocol import Camera
+from nlos_cam.camera import Camera
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording.playback import Verified

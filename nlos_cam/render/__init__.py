@@ -1,1 +1,5 @@
-"""The physics renderer."""
+"""Physics renderer: scene to transient to echoes to sensor images."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -11,9 +11,8 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
+from nlos_calibration import DeviceConstants, Intrinsics, Rig
 from nlos_calibration.arrays import Float64, Mask
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import DeviceConstants, Rig
 from numpy.typing import NDArray
 
 NEAR_DIAGONALS = 4

@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float64
-from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 
-from nlos_cam.objects.depth_map import cell_centres_m
+from nlos_cam.objects import cell_centres_m
 
 JUMP_M = 0.02
 """Neighbours further apart in depth than this are not one surface: beta (S3) must not join them by a curtain."""

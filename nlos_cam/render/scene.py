@@ -4,13 +4,12 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
+from nlos_calibration import Intrinsics, ObjectBox, Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import ObjectBox, Rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS
-from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects import object_box
 from nlos_cam.render.material import Surface
 from nlos_cam.render.patches import JUMP_M, Patches, make_patches
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from nlos_calibration import DeviceConstants, Rig
 from nlos_calibration.arrays import Float64
-from nlos_calibration.rig import DeviceConstants, Rig
 
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.energy_survey import EnergySurvey, survey

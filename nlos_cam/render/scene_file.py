@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from nlos_calibration import Record, Rig, first_problem, load_rig, rig_named
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.rig import Record, Rig, first_problem, load_rig
-from nlos_calibration.wall_record import rig_named
 from pydantic import (
     AfterValidator,
     ConfigDict,
@@ -30,10 +29,19 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.depth_map import object_box, orthographic_depth
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.meshes import MeshFile, Up, read_mesh, upright
-from nlos_cam.objects.placement import Pose, category_triangles, nothing_to_see, place
+from nlos_cam.objects import (
+    CATEGORIES,
+    MeshFile,
+    Pose,
+    Up,
+    category_triangles,
+    nothing_to_see,
+    object_box,
+    orthographic_depth,
+    place,
+    read_mesh,
+    upright,
+)
 from nlos_cam.render.material import Material
 from nlos_cam.render.patches import JUMP_M
 from nlos_cam.render.scene import Radiometry, Scene

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64, Int64
-from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 
-from nlos_cam.objects.depth_map import cell_centres_m
+from nlos_cam.objects import cell_centres_m
 from nlos_cam.render.patches import cell_pitch_m
 
 FACES = 4

@@ -1,1 +1,5 @@
-"""The live view."""
+"""Live view: in a browser, as a saved .rrd file, or as video."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

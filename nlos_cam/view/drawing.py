@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-from nlos_calibration.rig import ObjectBox, Rig
-from nlos_calibration.wall_record import MeasuredWall
+from nlos_calibration import MeasuredWall, ObjectBox, Rig
 from numpy.typing import NDArray
 
 from nlos_cam.frames import OBJECT_PIXELS
-from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects import object_box
 from nlos_cam.view.images import (
     NOTED_PIXELS,
     PICTURE_WIDTH,

@@ -9,13 +9,13 @@ from math import floor, log10
 
 import cv2
 import numpy as np
+from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, UInt8
-from nlos_calibration.rig import ObjectBox
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from nlos_cam.objects.depth_map import cell_centres_m, image_from_depth
-from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.objects import cell_centres_m, image_from_depth
+from nlos_cam.reconstruct import Verdict
 
 BACKGROUND_RGB = (13, 16, 17)
 """The page's own dark: what has no surface has no colour."""

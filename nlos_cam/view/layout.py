@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import rerun.blueprint as rrb
-from nlos_calibration.rig import Rig
+from nlos_calibration import Rig
 
-from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects import object_box
 from nlos_cam.view.images import BACKGROUND_RGB, BANNER_HEIGHT, BANNER_WIDTH, MAX_UNCERTAINTY_M, RESIDUAL_SPAN_M
 
 TIMELINE, FRAME_TIMELINE = "time", "frame"

@@ -7,8 +7,7 @@ from threading import Condition, Thread
 from typing import Self
 
 import rerun as rr
-from nlos_calibration.rig import Rig
-from nlos_calibration.wall_record import MeasuredWall
+from nlos_calibration import MeasuredWall, Rig
 
 from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.viewer import Moment

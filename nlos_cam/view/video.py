@@ -11,12 +11,12 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
+from nlos_calibration import Rig
 from nlos_calibration.arrays import UInt8
-from nlos_calibration.rig import Rig
 from PIL import Image, ImageDraw
 
 from nlos_cam.errors import NlosCamError
-from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects import object_box
 from nlos_cam.view.images import (
     BACKGROUND_RGB,
     MAX_UNCERTAINTY_M,

@@ -10,9 +10,7 @@ from threading import Condition
 from typing import Generic, Protocol, Self, TypeVar
 
 from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.reconstruct.network import Reconstruction
-from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
-from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.reconstruct import PhysicsCheckResult, Reconstruction, Verdict
 
 
 @dataclass(frozen=True)

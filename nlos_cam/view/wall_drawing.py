@@ -12,13 +12,19 @@ from typing import Any
 import cv2
 import numpy as np
 import rerun as rr
+from nlos_calibration import (
+    INTERVAL_STDS,
+    BareWall,
+    BoardRecord,
+    Extent,
+    MeasuredWall,
+    Verdict,
+    WallRecord,
+    footprint,
+    on_plane,
+    wall_points_m,
+)
 from nlos_calibration.arrays import Float64, Mask
-from nlos_calibration.board_wall import BoardRecord
-from nlos_calibration.reference import BareWall
-from nlos_calibration.rig import Extent
-from nlos_calibration.rig_check import footprint, on_plane
-from nlos_calibration.wall import INTERVAL_STDS, Verdict
-from nlos_calibration.wall_record import MeasuredWall, WallRecord, wall_points_m
 from numpy.typing import NDArray
 
 from nlos_cam.view.images import PICTURE_WIDTH, SATURATED_RGB, difference_rgb, noise_rgb, round_span, saturated_rgb

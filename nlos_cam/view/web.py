@@ -10,8 +10,7 @@ from pathlib import Path
 from threading import Event
 from typing import BinaryIO, Self
 
-from nlos_calibration.rig import Rig
-from nlos_calibration.wall_record import MeasuredWall
+from nlos_calibration import MeasuredWall, Rig
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.view.assets import LOOPBACK, page_assets

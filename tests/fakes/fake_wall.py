@@ -12,7 +12,7 @@ from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.reference import BareWall, BareWallStatistics, save_reference
 from nlos_calibration.rig import dump_toml, load_rig
 from nlos_calibration.wall import WallFit, wall_depth
-from nlos_calibration.wall_record import MeasuredWall, load_measured, wall_record
+from nlos_calibration.wall_record import MeasuredWall, load_measured, new_wall_record
 
 from nlos_cam.frames import Frame, maps_from_frame
 
@@ -61,7 +61,7 @@ def write_wall(path: Path, reference: BareWall | None = None, intrinsics: Intrin
         npz = path.with_suffix(".npz")
         others |= {"reference": npz.name, "reference_sha256": save_reference(npz, reference)}
     about: dict[str, Any] = {"camera": "sim:bare-wall", "frames": 20, "created": date(2026, 1, 2)}
-    record = wall_record(FIT, intrinsics, **about, others={"serial": SERIAL, **others})
+    record = new_wall_record(FIT, intrinsics, **about, others={"serial": SERIAL, **others})
     path.write_text(dump_toml(record), encoding="utf-8")
     return path
 

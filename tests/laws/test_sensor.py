@@ -13,7 +13,7 @@ from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.geometry import cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor.bias import PATCHES_SEED, RIPPLES_SEED, WAVES, patches, ripples, texture
+from nlos_cam.render.sensor.bias import PATCHES_SEED, RIPPLES_SEED, WAVES, ripples, smooth_patches, texture
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MAX_CONFIDENCE, SensorModel, WarmUp
 from nlos_cam.render.sensor.sensor import SensedImages, Sensor
 
@@ -81,7 +81,7 @@ def _bias_m(model: SensorModel) -> np.ndarray:
     """At CELSIUS, a quarter of the way from cold to warm."""
     wave, pattern = (
         ripples((64, 80), WAVES, _generator(RIPPLES_SEED)).ravel(),
-        patches((64, 80), _generator(PATCHES_SEED)).ravel(),
+        smooth_patches((64, 80), _generator(PATCHES_SEED)).ravel(),
     )
     drift_m = 0.25 * model.patch_drift_m * (pattern - pattern.mean()) - 15 * model.drift_m_per_celsius
     return model.ripple_m * wave - model.range_offset_m + drift_m

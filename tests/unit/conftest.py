@@ -16,7 +16,7 @@ from nlos_calibration.noise import depth_noise_m
 from nlos_calibration.reference import BareWall
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
-from nlos_calibration.wall_record import MeasuredWall, wall_record
+from nlos_calibration.wall_record import MeasuredWall, new_wall_record
 from nlos_models import compressor, vae
 from rerun.chunk import RrdReader
 from rosbags.rosbag1 import Reader, Writer
@@ -139,7 +139,7 @@ def fitted_wall(
         intrinsics=pinhole,
     )
     fields = {"noise_scale": 1.0, **others}
-    record = wall_record(fit, pinhole, camera="l515:f0246262", frames=60, created=date(2026, 1, 31), others=fields)
+    record = new_wall_record(fit, pinhole, camera="l515:f0246262", frames=60, created=date(2026, 1, 31), others=fields)
     return MeasuredWall(record, reference)
 
 

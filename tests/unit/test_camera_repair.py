@@ -12,7 +12,7 @@ from rosbags.rosbag1 import Reader
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
 from nlos_cam.recording import repair as module
 from nlos_cam.recording.playback import verify
-from nlos_cam.recording.repair import Repaired, repair
+from nlos_cam.recording.repair import Repaired, repair_recording
 from nlos_cam.recording.sdk_playback import SdkReplayCamera
 
 KINDS = ("packed", "plain", "packed-unindexed", "plain-unindexed")
@@ -26,28 +26,28 @@ def bag(request: pytest.FixtureRequest, noise_bags: dict[str, Path]) -> Path:
 def repaired(tmp_path: Path, content: bytes) -> Repaired:
     path = tmp_path / "bad.bag"
     path.write_bytes(content)
-    return repair(path, tmp_path / "good.bag")
+    return repair_recording(path, tmp_path / "good.bag")
 
 
 @pytest.mark.parametrize("name", ["packed", "plain"])
 def test_a_whole_recording_is_repaired_to_the_same_bytes(
     noise_bags: dict[str, Path], tmp_path: Path, name: str
 ) -> None:
-    found = repair(noise_bags[name], tmp_path / "good.bag")
+    found = repair_recording(noise_bags[name], tmp_path / "good.bag")
     assert found.recovered_frames == {"depth": 40, "infrared": 40, "confidence": 40}
     assert found.damages == []
     assert (tmp_path / "good.bag").read_bytes() == noise_bags[name].read_bytes()
 
 
 def test_a_recording_of_an_old_sdk_is_too(real_bag: Path, tmp_path: Path) -> None:
-    found = repair(real_bag, tmp_path / "good.bag")
+    found = repair_recording(real_bag, tmp_path / "good.bag")
     assert found.recovered_frames == {"depth": 2, "infrared": 0, "confidence": 0, "color": 1}
     assert found.out.read_bytes() == real_bag.read_bytes()
 
 
 def test_what_is_repaired_needs_no_repair(bag: Path, tmp_path: Path) -> None:
-    once = repair(bag, tmp_path / "once.bag")
-    twice = repair(once.out, tmp_path / "twice.bag")
+    once = repair_recording(bag, tmp_path / "once.bag")
+    twice = repair_recording(once.out, tmp_path / "twice.bag")
     assert twice.out.read_bytes() == once.out.read_bytes()
     assert (twice.recovered_frames, twice.damages) == (once.recovered_frames, [])
 
@@ -55,7 +55,7 @@ def test_what_is_repaired_needs_no_repair(bag: Path, tmp_path: Path) -> None:
 def test_both_readers_read_what_is_claimed_and_librealsense_bit_for_bit(
     bag: Path, tmp_path: Path, tool: Callable[[str], ModuleType]
 ) -> None:
-    found = repair(bag, tmp_path / "good.bag")
+    found = repair_recording(bag, tmp_path / "good.bag")
     assert verify(found.out).streams == found.recovered_frames
     with Reader(found.out) as reader:
         images = [connection for connection in reader.connections if connection.topic.endswith("/image/data")]
@@ -90,7 +90,7 @@ def test_the_unfinished_chunk_of_a_plain_recording_gives_its_messages(
 ) -> None:
     whole, killed = noise_bags["plain"], noise_bags["plain-unindexed"]
     lost = whole.stat().st_size - killed.stat().st_size
-    found = repair(killed, tmp_path / "good.bag")
+    found = repair_recording(killed, tmp_path / "good.bag")
     assert sum(found.recovered_frames.values()) > 3 * 40 - lost // 19_000
     assert found.damages[-1].position + found.damages[-1].bytes == killed.stat().st_size
 
@@ -150,16 +150,16 @@ def test_a_recording_that_ends_before_its_first_frame_has_nothing_to_recover(
 
 def test_a_missing_path_and_a_folder_are_told(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="No such file"):
-        repair(tmp_path / "none.bag", tmp_path / "good.bag")
+        repair_recording(tmp_path / "none.bag", tmp_path / "good.bag")
     with pytest.raises(RecordingError, match=r"cannot be read \("):
-        repair(tmp_path, tmp_path / "good.bag")
+        repair_recording(tmp_path, tmp_path / "good.bag")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes have names here")
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.bag")
     with pytest.raises(RecordingError, match="is no file"):
-        repair(tmp_path / "pipe.bag", tmp_path / "good.bag")
+        repair_recording(tmp_path / "pipe.bag", tmp_path / "good.bag")
 
 
 @pytest.mark.parametrize("link", [None, os.link, os.symlink])
@@ -169,7 +169,7 @@ def test_the_original_is_never_the_output(bag: Path, tmp_path: Path, link: Calla
     if link:
         link(path, out)
     with pytest.raises(OutputExistsError, match="is the recording itself"):
-        repair(path, out)
+        repair_recording(path, out)
     assert path.read_bytes() == bag.read_bytes()
 
 
@@ -177,7 +177,7 @@ def test_the_original_is_left_as_it_was(bag: Path, tmp_path: Path) -> None:
     path = shutil.copy2(bag, tmp_path / "original.bag")
     before = path.stat()
     path.chmod(0o400)
-    repair(path, tmp_path / "good.bag")
+    repair_recording(path, tmp_path / "good.bag")
     assert path.read_bytes() == bag.read_bytes()
     assert path.stat().st_mtime_ns == before.st_mtime_ns
 
@@ -191,7 +191,7 @@ def test_an_interruption_leaves_nothing_behind_and_what_was_there(bag: Path, tmp
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        repair(bag, out, interrupt)
+        repair_recording(bag, out, interrupt)
     assert out.read_bytes() == b"as it was"
     assert list(tmp_path.iterdir()) == [out]
 
@@ -201,18 +201,18 @@ def test_a_full_disk_is_told_before_anything_is_written(
 ) -> None:
     monkeypatch.setattr(module.shutil, "disk_usage", lambda _: SimpleNamespace(free=1_500_000))
     with pytest.raises(NlosCamError, match=r"needs \d+ MB, and 1 MB are free") as raised:
-        repair(bag, tmp_path / "good.bag")
+        repair_recording(bag, tmp_path / "good.bag")
     assert not isinstance(raised.value, RecordingError)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_written_to_is_told(bag: Path, tmp_path: Path) -> None:
     with pytest.raises(NlosCamError, match="cannot be written"):
-        repair(bag, tmp_path / "nowhere" / "good.bag")
+        repair_recording(bag, tmp_path / "nowhere" / "good.bag")
 
 
 def test_progress_ends_at_all_of_it(bag: Path, tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
-    repair(bag, tmp_path / "good.bag", lambda done, total: told.append((done, total)))
+    repair_recording(bag, tmp_path / "good.bag", lambda done, total: told.append((done, total)))
     assert told == sorted(told)
     assert told[-1][0] == told[-1][1] == 2 * bag.stat().st_size

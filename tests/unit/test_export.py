@@ -13,13 +13,13 @@ from nlos_cam.camera import open_camera
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording.bag_reader import BagFile
-from nlos_cam.recording.export import INFO, Exported, Wanted, export
+from nlos_cam.recording.export import INFO, Exported, Wanted, export_recording
 
 FRAMES = 20
 
 
 def exported(bag: Path, out: Path, stop: Event | None = None, **wanted: Any) -> Exported:
-    return export(BagFile(bag), out, Wanted(**wanted), stop=stop or Event())
+    return export_recording(BagFile(bag), out, Wanted(**wanted), stop=stop or Event())
 
 
 def samples(bag: Path, stream: str) -> list[Any]:
@@ -99,7 +99,7 @@ def test_stopping_keeps_what_is_done(noise_bag: Path, tmp_path: Path) -> None:
         if len(seen) == 6:
             stop.set()
 
-    made = export(BagFile(noise_bag), tmp_path / "out", Wanted(format="npz"), stop=stop, on_frame=after_six)
+    made = export_recording(BagFile(noise_bag), tmp_path / "out", Wanted(format="npz"), stop=stop, on_frame=after_six)
     assert made.frames == {"depth": 2, "infrared": 2, "confidence": 2, "points": 1}
     with np.load(tmp_path / "out" / "depth.npz") as found:
         assert found["pixels"].shape == (2, 48, 64)

@@ -10,7 +10,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live.loop import run_live
-from nlos_cam.live.replay import REPORT, RESULT, replay
+from nlos_cam.live.replay import REPORT, RESULT, replay_recording
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.reconstruct import physics_check
@@ -124,7 +124,7 @@ def test_a_check_that_fails_is_told_once_and_frames_go_on() -> None:
 def test_a_replay_writes_its_checks_and_the_same_bits_each_time(tmp_path: Path) -> None:
     for name in ("a", "b"):
         processing = Pipeline(CalibratedRig(RIG), network, checks=EveryFrames(RIG, every=3, accuracy="draft"))
-        replay(WallCamera(7), processing, tmp_path / name, stop=Event())
+        replay_recording(WallCamera(7), processing, tmp_path / name, stop=Event())
     for file in (RESULT, REPORT):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
     with np.load(tmp_path / "a" / RESULT) as result:
@@ -135,7 +135,7 @@ def test_a_replay_writes_its_checks_and_the_same_bits_each_time(tmp_path: Path) 
 
 
 def test_a_replay_without_checks_tells_of_none(tmp_path: Path) -> None:
-    replay(WallCamera(2), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=Event())
+    replay_recording(WallCamera(2), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=Event())
     with np.load(tmp_path / "out" / RESULT) as result:
         assert result["check_score"].size == result["check_frame_number"].size == 0
     assert "physics" not in (tmp_path / "out" / REPORT).read_text()

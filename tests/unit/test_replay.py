@@ -18,7 +18,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.live.loop import FRAMES_TOGETHER, MAX_BATCHES_AHEAD
-from nlos_cam.live.replay import DIFFERENCE, REPORT, RESULT, SHEET, replay
+from nlos_cam.live.replay import DIFFERENCE, REPORT, RESULT, SHEET, replay_recording
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import Pipeline
 
@@ -59,7 +59,7 @@ class Recorded:
 def test_every_frame_is_written_with_its_number_time_and_place(tmp_path: Path) -> None:
     counted = []
     out = tmp_path / "out"
-    report = replay(
+    report = replay_recording(
         Recorded(40), Pipeline(CalibratedRig(RIG), network), out, stop=Event(), on_frame=lambda: counted.append(1)
     )
     assert (report.frames, report.out, len(counted)) == (40, str(out), 40)
@@ -84,7 +84,9 @@ def test_every_frame_is_written_with_its_number_time_and_place(tmp_path: Path) -
 def test_each_frames_uncertainty_and_verdict_are_written_beside_its_depth(tmp_path: Path) -> None:
     says = iter([(0.0, 0.0), (0.9, 0.0), (0.0, 0.9)])
     doubter = FakeDoubter(lambda *_: next(says), error_v=0.1)
-    replay(Recorded(3), Pipeline(CalibratedRig(RIG), network, doubter=doubter), tmp_path / "out", stop=Event())
+    replay_recording(
+        Recorded(3), Pipeline(CalibratedRig(RIG), network, doubter=doubter), tmp_path / "out", stop=Event()
+    )
     with np.load(tmp_path / "out" / RESULT) as file:
         assert file["verdict"].tolist() == ["object seen", "nothing there", "outside the trained range"]
         assert np.isfinite(file["depth_m"]).any((1, 2)).tolist() == [True, False, True]
@@ -93,7 +95,7 @@ def test_each_frames_uncertainty_and_verdict_are_written_beside_its_depth(tmp_pa
 
 
 def test_without_a_doubt_network_verdicts_are_empty_and_uncertainties_are_not_a_number(tmp_path: Path) -> None:
-    replay(Recorded(2), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=Event())
+    replay_recording(Recorded(2), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=Event())
     with np.load(tmp_path / "out" / RESULT) as file:
         assert file["verdict"].tolist() == ["", ""]
         assert np.isnan(file["uncertainty_m"]).all()
@@ -101,7 +103,7 @@ def test_without_a_doubt_network_verdicts_are_empty_and_uncertainties_are_not_a_
 
 def test_two_replays_are_equal_to_the_bit(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        replay(Recorded(12), Pipeline(CalibratedRig(RIG), network), tmp_path / name, stop=Event())
+        replay_recording(Recorded(12), Pipeline(CalibratedRig(RIG), network), tmp_path / name, stop=Event())
     for file in (RESULT, SHEET, REPORT):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
@@ -114,7 +116,7 @@ def test_an_interrupted_replay_keeps_what_is_done_and_says_so(tmp_path: Path) ->
         if len(done) == 7:
             stop.set()
 
-    report = replay(
+    report = replay_recording(
         Recorded(1000), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=stop, on_frame=on_frame
     )
     assert report.frames == FRAMES_TOGETHER * (MAX_BATCHES_AHEAD + 2)
@@ -125,14 +127,14 @@ def test_an_interrupted_replay_keeps_what_is_done_and_says_so(tmp_path: Path) ->
 
 def test_a_recording_without_frames_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no frame"):
-        replay(Recorded(0), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=Event())
+        replay_recording(Recorded(0), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=Event())
     assert list(tmp_path.iterdir()) == []
 
 
 def test_only_files_of_the_same_name_are_replaced(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("keep me")
     (tmp_path / REPORT).write_text("old")
-    replay(Recorded(2), Pipeline(CalibratedRig(RIG), network), tmp_path, stop=Event())
+    replay_recording(Recorded(2), Pipeline(CalibratedRig(RIG), network), tmp_path, stop=Event())
     assert (tmp_path / "mine.txt").read_text() == "keep me"
     assert "Replay" in (tmp_path / REPORT).read_text()
 
@@ -140,13 +142,13 @@ def test_only_files_of_the_same_name_are_replaced(tmp_path: Path) -> None:
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
     with pytest.raises(OutputExistsError, match="is a file"):
-        replay(Recorded(2), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=Event())
+        replay_recording(Recorded(2), Pipeline(CalibratedRig(RIG), network), tmp_path / "out", stop=Event())
     assert (tmp_path / "out").read_text() == "mine"
 
 
 def replay_wall(tmp_path: Path, camera: WallCamera, out: str = "out") -> Path:
     method = Pipeline(CalibratedRig(RIG, measured_wall(tmp_path)), network)
-    replay(camera, method, tmp_path / out, stop=Event())
+    replay_recording(camera, method, tmp_path / out, stop=Event())
     return tmp_path / out
 
 
@@ -172,7 +174,7 @@ def test_difference_maps_are_written_with_what_they_were_formed_from(tmp_path: P
 
 def test_a_replay_without_a_reference_leaves_no_difference_maps_of_another(tmp_path: Path) -> None:
     out = replay_wall(tmp_path, WallCamera(2))
-    replay(WallCamera(2), Pipeline(CalibratedRig(RIG), network), out, stop=Event())
+    replay_recording(WallCamera(2), Pipeline(CalibratedRig(RIG), network), out, stop=Event())
     assert not (out / DIFFERENCE).exists()
     assert "difference" not in (out / REPORT).read_text()
 

@@ -8,7 +8,7 @@ import pytest
 from made_up_moments import RIG, Recorded, bump, full_moment
 
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.live.replay import REPORT, RESULT, SHEET, replay
+from nlos_cam.live.replay import REPORT, RESULT, SHEET, replay_recording
 from nlos_cam.live.replay_media import VIDEO, VIEW, Looks, moment_of
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.reconstruct.bench import CalibratedRig
@@ -25,7 +25,7 @@ def network(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
 
 def replayed(out: Path, count: int, **asked: Any) -> set[str]:
     processing = Pipeline(BENCH, network)
-    replay(Recorded(count), processing, out, stop=Event(), looks=Looks(BENCH, **asked))
+    replay_recording(Recorded(count), processing, out, stop=Event(), looks=Looks(BENCH, **asked))
     return {file.name for file in out.iterdir()}
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nlos_cam.render.sensor.bias import BIASES, DepthBias, patches, ripples
+from nlos_cam.render.sensor.bias import BIASES, DepthBias, ripples, smooth_patches
 from nlos_cam.render.sensor.effects import sensor_effects
 from nlos_cam.render.sensor.model import STEADY_CELSIUS, SensorModel, WarmUp
 
@@ -42,10 +42,10 @@ def test_a_ripple_runs_any_way_and_any_phase() -> None:
 
 
 def test_patches_are_smooth_and_of_unit_spread() -> None:
-    pattern = patches(SHAPE, np.random.default_rng(0))
+    pattern = smooth_patches(SHAPE, np.random.default_rng(0))
     assert pattern.std() == pytest.approx(1.0)
     assert np.abs(np.diff(pattern)).max() < 0.5
-    few, many = (patches(SHAPE, np.random.default_rng(0), across) for across in (4, 24))
+    few, many = (smooth_patches(SHAPE, np.random.default_rng(0), across) for across in (4, 24))
     assert np.diff(few).std() < np.diff(many).std() / 2
 
 

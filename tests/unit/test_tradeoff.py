@@ -9,7 +9,15 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.evaluate.render_tradeoff import REPEATS, Part, Row, facts, measure, pareto_front, settings
+from nlos_cam.evaluate.render_tradeoff import (
+    REPEATS,
+    Part,
+    RenderRow,
+    measure_renders,
+    pareto_front,
+    render_facts,
+    render_settings,
+)
 from nlos_cam.render.accuracy import STOPS
 from nlos_cam.render.accuracy_search import Agreement, Work
 from nlos_cam.render.scene import Scene
@@ -39,16 +47,16 @@ class CountedSeconds:
 
 
 @pytest.fixture(scope="module")
-def rows() -> list[Row]:
-    return list(measure(_scene(), SMALL, CountedSeconds()))
+def rows() -> list[RenderRow]:
+    return list(measure_renders(_scene(), SMALL, CountedSeconds()))
 
 
-def _of(rows: list[Row], part: Part) -> list[Row]:
+def _of(rows: list[RenderRow], part: Part) -> list[RenderRow]:
     return [row for row in rows if row.part == part]
 
 
-def test_every_setting_is_measured_once_brute_force_first(rows: list[Row]) -> None:
-    planned = settings(_scene(), SMALL)
+def test_every_setting_is_measured_once_brute_force_first(rows: list[RenderRow]) -> None:
+    planned = render_settings(_scene(), SMALL)
     assert [(row.name, row.part) for row in rows] == [(setting.name, setting.part) for setting in planned]
     assert len({row.name for row in rows}) == len(rows)
     assert [row.name for row in _of(rows, "stop")] == ["reference", "draft", "standard", "fine"]
@@ -56,7 +64,7 @@ def test_every_setting_is_measured_once_brute_force_first(rows: list[Row]) -> No
 
 def test_ingredients_are_the_standard_stop_with_one_thing_changed() -> None:
     standard = SMALL["standard"]
-    for setting in settings(_scene(), SMALL):
+    for setting in render_settings(_scene(), SMALL):
         changed = {name for name in vars(standard) if getattr(setting.accuracy, name) != getattr(standard, name)}
         allowed = {
             "sub_bins": {"sub_bins"},
@@ -70,11 +78,11 @@ def test_ingredients_are_the_standard_stop_with_one_thing_changed() -> None:
 
 
 def test_on_the_default_dial_the_relay_grid_runs_from_a_quarter_to_twice() -> None:
-    names = [s.name for s in settings(_scene()) if s.part == "relay grid"]
+    names = [s.name for s in render_settings(_scene()) if s.part == "relay grid"]
     assert names == [f"relay grid {grid}" for grid in ("20 x 16", "40 x 32", "80 x 64", "160 x 128")]
 
 
-def test_each_effect_that_the_scene_calls_for_is_left_out_once(rows: list[Row]) -> None:
+def test_each_effect_that_the_scene_calls_for_is_left_out_once(rows: list[RenderRow]) -> None:
     names = {row.name.removeprefix("without ") for row in _of(rows, "effect left out")}
     assert {"direct", "three-bounce", "occluder", "tilt"} <= names
     assert "colour" not in names
@@ -86,31 +94,31 @@ def test_each_effect_that_the_scene_calls_for_is_left_out_once(rows: list[Row]) 
     assert nothing.errors.bin_within_1 == 0
 
 
-def test_brute_force_is_itself_and_runs_once(rows: list[Row]) -> None:
+def test_brute_force_is_itself_and_runs_once(rows: list[RenderRow]) -> None:
     assert rows[0].speedup == 1
     assert rows[0].errors.intensity_error_max == 0
     assert rows[0].errors.bin_exact == 1
     watch = CountedSeconds()
-    next(measure(_scene(), SMALL, watch))
+    next(measure_renders(_scene(), SMALL, watch))
     assert watch.repeats == [1]
 
 
-def test_times_and_ratios_are_those_of_the_stopwatch(rows: list[Row]) -> None:
+def test_times_and_ratios_are_those_of_the_stopwatch(rows: list[RenderRow]) -> None:
     assert [row.seconds for row in rows] == list(range(1, len(rows) + 1))
     assert all(row.speedup == rows[0].seconds / row.seconds for row in rows)
     watch = CountedSeconds()
-    some = measure(_scene(), SMALL, watch)
+    some = measure_renders(_scene(), SMALL, watch)
     next(some), next(some)
     assert watch.repeats == [1, REPEATS]
 
 
-def test_more_sub_bins_are_nearer(rows: list[Row]) -> None:
+def test_more_sub_bins_are_nearer(rows: list[RenderRow]) -> None:
     errors = [row.errors.intensity_error_median for row in _of(rows, "sub_bins")]
     assert errors[0] > errors[3] > errors[-1]
     assert errors[-1] < 0.1 * errors[0]
 
 
-def test_the_same_setting_has_the_same_errors_wherever_it_stands(rows: list[Row]) -> None:
+def test_the_same_setting_has_the_same_errors_wherever_it_stands(rows: list[RenderRow]) -> None:
     same = [
         row.errors for row in rows if row.name in {"standard", "sub_bins 8", "object_stride 1", "relay grid 12 x 8"}
     ]
@@ -118,14 +126,14 @@ def test_the_same_setting_has_the_same_errors_wherever_it_stands(rows: list[Row]
     assert len(set(same)) == 1
 
 
-def test_beams_per_cell_are_held_against_more_of_them(rows: list[Row]) -> None:
+def test_beams_per_cell_are_held_against_more_of_them(rows: list[RenderRow]) -> None:
     one, two = _of(rows, "beams_per_cell")
     assert one.errors.intensity_error_median > two.errors.intensity_error_median > 0
     assert one.errors.intensity_error_p99 > two.errors.intensity_error_p99
 
 
 def test_facts_count_what_brute_force_goes_over() -> None:
-    size = facts(_scene(), SMALL)
+    size = render_facts(_scene(), SMALL)
     assert size.patches == 32
     assert 3000 < size.beams_on_wall < 5120
 
@@ -134,11 +142,11 @@ def test_facts_count_what_brute_force_goes_over() -> None:
 def test_where_nothing_is_hidden_there_is_nothing_to_trade(hidden: str | None) -> None:
     depth = None if hidden is None else np.full((16, 16), np.nan, np.float32)
     with pytest.raises(SceneError, match="nothing is hidden"):
-        facts(Scene(RIG, depth), SMALL)
+        render_facts(Scene(RIG, depth), SMALL)
 
 
-def _row(name: str, seconds: float, error: float, part: Part = "sub_bins") -> Row:
-    return Row(name, part, seconds, 1 / seconds, Agreement(0, error, error, 1, 1, 0, 0))
+def _row(name: str, seconds: float, error: float, part: Part = "sub_bins") -> RenderRow:
+    return RenderRow(name, part, seconds, 1 / seconds, Agreement(0, error, error, 1, 1, 0, 0))
 
 
 def test_the_front_holds_what_nothing_beats() -> None:

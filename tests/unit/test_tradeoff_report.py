@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nlos_cam.evaluate.render_tradeoff import Facts, Row, as_markdown, as_table, draw, machine
+from nlos_cam.evaluate.render_tradeoff import RenderFacts, RenderRow, as_table, draw_renders, machine, render_markdown
 from nlos_cam.render.accuracy_search import Agreement
 
 KEYS = [
@@ -19,13 +19,13 @@ KEYS = [
     "depth_error_mm",
 ]
 ROWS = [
-    Row("reference", "stop", 20.0, 1.0, Agreement(0, 0, 0, 1, 1, 0, 0)),
-    Row("draft", "stop", 0.005, 4000.0, Agreement(0.005, 0.03, 0.05, 0.8, 0.99, 0, 1.4)),
-    Row("sub_bins 2", "sub_bins", 0.01, 2000.0, Agreement(0.001, 0.005, 0.007, 0.9, 1, 0, 0.4)),
-    Row("beams_per_cell 2", "beams_per_cell", 0.1, 200.0, Agreement(0, 0.001, 0.002, 1, 1, 0, 0)),
-    Row("without tilt", "effect left out", 0.02, 1000.0, Agreement(0.2, 0.3, 0.4, 0.1, 0.7, 0, 11)),
+    RenderRow("reference", "stop", 20.0, 1.0, Agreement(0, 0, 0, 1, 1, 0, 0)),
+    RenderRow("draft", "stop", 0.005, 4000.0, Agreement(0.005, 0.03, 0.05, 0.8, 0.99, 0, 1.4)),
+    RenderRow("sub_bins 2", "sub_bins", 0.01, 2000.0, Agreement(0.001, 0.005, 0.007, 0.9, 1, 0, 0.4)),
+    RenderRow("beams_per_cell 2", "beams_per_cell", 0.1, 200.0, Agreement(0, 0.001, 0.002, 1, 1, 0, 0)),
+    RenderRow("without tilt", "effect left out", 0.02, 1000.0, Agreement(0.2, 0.3, 0.4, 0.1, 0.7, 0, 11)),
 ]
-FACTS = Facts(patches=702, beams_on_wall=3776)
+FACTS = RenderFacts(patches=702, beams_on_wall=3776)
 
 
 def test_the_table_is_json_with_the_names_that_scripts_depend_on() -> None:
@@ -44,11 +44,11 @@ def test_a_run_cut_short_says_so(measured: int) -> None:
     assert not table["complete"]
     assert len(table["stops"]) + len(table["ingredients"]) == measured
     if measured:
-        assert "Interrupted" in as_markdown(table)
+        assert "Interrupted" in render_markdown(table)
 
 
 def test_every_row_is_a_line_for_people() -> None:
-    text = as_markdown(as_table(FACTS, ROWS, len(ROWS)))
+    text = render_markdown(as_table(FACTS, ROWS, len(ROWS)))
     assert all(f"| {row.name} |" in text for row in ROWS)
     assert "| draft | 0.0050 | 4000 | 0.5 % | 3 % | 5 % | 80.00 % | 99.00 % | 0 mm | 1.4 mm |" in text
     assert "Interrupted" not in text
@@ -62,6 +62,6 @@ def test_the_machine_is_told_in_words() -> None:
 
 
 @pytest.mark.parametrize("rows", [ROWS, ROWS[:1]])
-def test_the_plot_is_drawn_whatever_was_measured(tmp_path: Path, rows: list[Row]) -> None:
-    draw(tmp_path / "plot.png", rows, "a title")
+def test_the_plot_is_drawn_whatever_was_measured(tmp_path: Path, rows: list[RenderRow]) -> None:
+    draw_renders(tmp_path / "plot.png", rows, "a title")
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")

@@ -14,10 +14,9 @@ from typing import Any, get_args, get_origin
 
 import typer
 
-from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.camera import FRAMES_PER_S
 from nlos_cam.cli.main import build_app
-from nlos_cam.evaluate.metrics import BARS
-from nlos_cam.evaluate.report import in_words
+from nlos_cam.evaluate import BARS, in_words
 
 DOCS = Path(__file__).parents[2] / "docs"
 HEAD = """# Every command and option

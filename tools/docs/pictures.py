@@ -16,24 +16,27 @@ from typing import Self
 
 import numpy as np
 from matplotlib.figure import Figure
+from nlos_calibration import ObjectBox, load_rig
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.rig import ObjectBox, load_rig
-from nlos_models.metrics import silhouette_iou
+from nlos_models import silhouette_iou
 
-from nlos_cam.camera.simulated_world import World, open_world
-from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.camera import FRAMES_PER_S, World, open_world
 from nlos_cam.cli.common import tracked
-from nlos_cam.evaluate.subjects import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
+from nlos_cam.evaluate import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, Frame
-from nlos_cam.live.replay import replay
-from nlos_cam.live.replay_media import VIDEO, Looks
-from nlos_cam.objects.benchmark import benchmark_objects
-from nlos_cam.objects.depth_map import image_from_depth, object_box, orthographic_depth
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.placement import category_triangles, place, random_pose
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.pipeline import load_doubt, load_networks, set_up
+from nlos_cam.live import VIDEO, Looks, replay_recording
+from nlos_cam.objects import (
+    CATEGORIES,
+    benchmark_objects,
+    category_triangles,
+    image_from_depth,
+    object_box,
+    orthographic_depth,
+    place,
+    random_pose,
+)
+from nlos_cam.reconstruct import CalibratedRig, load_doubt, load_networks, set_up
 
 ROOT = Path(__file__).parents[2]
 WORST, NEAR_M, FAR_M = 6, 0.16, 0.24
@@ -170,7 +173,9 @@ def replays(out: Path) -> None:
         looks, camera = Looks(bench, stills=2, video=name == FILMED), Unhurried(world, frames)
         with TemporaryDirectory() as folder, tracked(f"reconstructing {name}") as update:
             made, done = Path(folder) / "replay", iter(range(1, frames + 1))
-            replay(camera, processing, made, stop=Event(), on_frame=lambda: update(next(done), frames), looks=looks)  # noqa: B023
+            replay_recording(
+                camera, processing, made, stop=Event(), on_frame=lambda: update(next(done), frames), looks=looks  # noqa: B023
+            )
             shutil.copyfile(max(made.glob("still-*.png")), out / f"gallery-{name}.png")
             if looks.video:
                 shutil.copyfile(made / VIDEO, out / VIDEO)

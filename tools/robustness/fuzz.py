@@ -26,11 +26,8 @@ from noise_recordings import make_all
 from rosbags.rosbag1 import Reader
 
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.evaluate.render_tradeoff import machine
-from nlos_cam.recording.bag_reader import BagFile
-from nlos_cam.recording.export import Wanted, export
-from nlos_cam.recording.playback import ReplayCamera
-from nlos_cam.recording.repair import repair
+from nlos_cam.evaluate import machine
+from nlos_cam.recording import BagFile, ReplayCamera, Wanted, export_recording, repair_recording
 
 DOCS = Path(__file__).parents[2] / "docs"
 MEMORY_BYTES = 1 << 30
@@ -47,7 +44,7 @@ Verdict = tuple[str, str]
 def repair_and_read(path: Path, folder: Path) -> None:
     """Repair, and check that the result holds each of the claimed frames once."""
     out = folder / "repaired.bag"
-    claimed = repair(path, out).recovered_frames
+    claimed = repair_recording(path, out).recovered_frames
     with Reader(out) as reader:
         images = [connection for connection in reader.connections if connection.topic.endswith("/image/data")]
         found = [(connection.id, time_ns) for connection, time_ns, _ in reader.messages(images)]
@@ -72,7 +69,7 @@ def replay_all(path: Path, _: Path) -> None:
 
 def export_all(path: Path, folder: Path) -> None:
     """Export, and check that the reported number of files was written."""
-    made = export(BagFile(path), folder / "export", Wanted(points=True), stop=Event())
+    made = export_recording(BagFile(path), folder / "export", Wanted(points=True), stop=Event())
     for stream, count in made.frames.items():
         if len(list((folder / "export" / stream).iterdir())) != count:
             raise AssertionError(f"reported {count} {stream}, and wrote others")

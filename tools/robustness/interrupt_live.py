@@ -23,9 +23,8 @@ from live_process import LiveProcess
 
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
-from nlos_cam.evaluate.render_tradeoff import machine
-from nlos_cam.recording.bag_reader import BagFile
-from nlos_cam.recording.repair import repair
+from nlos_cam.evaluate import machine
+from nlos_cam.recording import BagFile, repair_recording
 
 DOCS = Path(__file__).parents[2] / "docs"
 KINDS = "ctrl-c", "terminate", "viewer killed", "unplugged a while", "unplugged, then ctrl-c", "unplugged for good"
@@ -159,7 +158,7 @@ def _frames_in(bag: Path) -> int:
         streams = BagFile(bag).streams
     except RecordingError:
         fixed = bag.with_name("repaired.bag")
-        recovered = repair(bag, fixed).recovered_frames
+        recovered = repair_recording(bag, fixed).recovered_frames
         return min(recovered.values(), default=0)
     return min((info.frames for info in streams.values()), default=0)
 

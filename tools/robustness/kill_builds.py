@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 from processes import children_of, runs
 
-from nlos_cam.dataset.reader import open_dataset
-from nlos_cam.dataset.shards import FIRST_ARRAYS, PARTS, SHARDS
-from nlos_cam.evaluate.render_tradeoff import machine
+from nlos_cam.dataset import FIRST_ARRAYS, PARTS, SHARDS, open_dataset
+from nlos_cam.evaluate import machine
 
 DOCS = Path(__file__).parents[2] / "docs"
 DEFAULTS = (300, 10, 0, 10)

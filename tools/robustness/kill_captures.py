@@ -22,13 +22,11 @@ import lz4.frame
 import numpy as np
 from processes import PROGRAM
 
-from nlos_cam.camera.simulated_world import open_world
+from nlos_cam.camera import open_world
 from nlos_cam.errors import RecordingError
-from nlos_cam.evaluate.render_tradeoff import machine
-from nlos_cam.recording.bag_reader import BagFile
-from nlos_cam.recording.repair import repair
-from nlos_cam.recording.sdk_playback import SdkReplayCamera
-from nlos_cam.render.sensor.sensor import SensedImages
+from nlos_cam.evaluate import machine
+from nlos_cam.recording import BagFile, SdkReplayCamera, repair_recording
+from nlos_cam.render import SensedImages
 
 DOCS = Path(__file__).parents[2] / "docs"
 CAMERA, LONGEST_S = "sim:bare-wall", 6.0
@@ -135,7 +133,7 @@ def examine(path: Path, after_s: float, world: World) -> Kill:
     size, out = path.stat().st_size, path.with_suffix(".repaired.bag")
     started_s = time.monotonic()
     try:
-        recovered = repair(path, out).recovered_frames
+        recovered = repair_recording(path, out).recovered_frames
     except RecordingError as error:
         print(f"after {after_s:.2f} s: {error}")
         none = dict.fromkeys(STREAMS, 0)

@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 from live_process import LiveProcess
 from processes import PROGRAM, Look, memory, memory_mib
 
-from nlos_cam.evaluate.render_tradeoff import machine
+from nlos_cam.evaluate import machine
 
 DOCS = Path(__file__).parents[2] / "docs"
 START_TIMEOUT_S, END_TIMEOUT_S = 300.0, 60.0

@@ -21,10 +21,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from processes import PROGRAM, WARM_UP, Look, memory, memory_mib
 
-from nlos_cam.camera import open_camera
-from nlos_cam.camera.registry import Reader
+from nlos_cam.camera import Reader, open_camera
 from nlos_cam.cli.common import tracked
-from nlos_cam.evaluate.render_tradeoff import machine
+from nlos_cam.evaluate import machine
 
 __all__ = ["READERS", "WARM_UP", "Look", "capture", "memory", "read"]
 

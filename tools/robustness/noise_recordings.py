@@ -5,11 +5,10 @@ import re
 from pathlib import Path
 
 import numpy as np
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.simulated import SoftwareLidar
-from nlos_cam.render.sensor.sensor import SensedImages
+from nlos_cam.camera import SoftwareLidar, load_sdk
+from nlos_cam.render import SensedImages
 
 WIDTH, HEIGHT = 160, 120
 FRAMES = 40

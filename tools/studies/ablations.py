@@ -11,13 +11,22 @@ from typing import Any
 
 import harness
 from matplotlib.figure import Figure
-from nlos_models.checkpoint import CheckpointRecord, load_record
+from nlos_models import CheckpointRecord, load_record
 from weights import values_of
 
-from nlos_cam.evaluate.figures import LABELS
-from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, PerObject, advantage, over_objects, plain
-from nlos_cam.evaluate.report import in_words
-from nlos_cam.evaluate.subjects import Judged, fresh_objects, rig_of
+from nlos_cam.evaluate import (
+    BARS,
+    LABELS,
+    SMALLER_IS_BETTER,
+    Judged,
+    PerObject,
+    advantage,
+    fresh_objects,
+    in_words,
+    over_objects,
+    plain,
+    rig_of,
+)
 
 NOTES = """Means over objects and their bootstrap 95 % intervals. Differences are taken object by object, and
 bootstrapped as such: positive is better, also where less is better, and **bold** where the interval leaves 0 out.

@@ -11,23 +11,22 @@ from typing import Any
 import harness  # before the synthetic scenes: it puts their folder on the path
 import numpy as np
 from matplotlib.figure import Figure
-from nlos_calibration.board import BOARDS, Board, Corners, find_corners
-from nlos_calibration.board_pose import BoardFit, PrintErrors, fit_board
+from nlos_calibration import (
+    BOARDS,
+    INTERVAL_STDS,
+    Board,
+    BoardFit,
+    Corners,
+    PrintErrors,
+    find_corners,
+    fit_board,
+    load_rig,
+    measures_of,
+)
 from nlos_calibration.errors import BoardRefusedError
-from nlos_calibration.rig import load_rig
-from nlos_calibration.wall import INTERVAL_STDS, measures_of
 from wall import DISTANCES_M, FACING_DEG
 
-from nlos_cam.calibrate.synthetic import (
-    Light,
-    Placed,
-    at_near_edge,
-    clean_view,
-    corners_px,
-    frames_of,
-    in_the_middle,
-    view,
-)
+from nlos_cam.calibrate import Light, Placed, at_near_edge, clean_view, corners_px, frames_of, in_the_middle, view
 
 Generator = np.random.Generator
 

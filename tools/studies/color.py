@@ -16,17 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration.rig import load_rig
-from nlos_models.checkpoint import load_pipeline, load_vae
-from nlos_models.recipe import load_recipe
-from nlos_models.tasks import rebuilt, run
+from nlos_calibration import load_rig
+from nlos_models import load_pipeline, load_recipe, load_vae, rebuilt, run
 
 from nlos_cam.cli.common import PAPER_RIG, tracked
 from nlos_cam.cli.main import main as nlos_cam
-from nlos_cam.dataset.build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, open_dataset
-from nlos_cam.evaluate.color import draw_colour_sheet, figures_of_colour, painted_maps
-from nlos_cam.objects.benchmark import OF_EACH, benchmark_objects
-from nlos_cam.objects.depth_map import object_box
+from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, open_dataset
+from nlos_cam.evaluate import draw_colour_sheet, figures_of_colour, painted_maps
+from nlos_cam.objects import OF_EACH, benchmark_objects, object_box
 
 RECIPES = Path(__file__).parents[2] / "models" / "recipes"
 

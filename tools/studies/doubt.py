@@ -16,27 +16,20 @@ from typing import Any
 import harness
 import numpy as np
 from matplotlib.figure import Figure
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float64
-from nlos_calibration.rig import Rig
-from nlos_models.checkpoint import shipped_folder
-from nlos_models.doubt_checkpoint import UncertaintyModel, load_uncertainty_model
-from nlos_models.inference import Reconstructor, load_reconstructor
+from nlos_models import Reconstructor, UncertaintyModel, load_reconstructor, load_uncertainty_model, shipped_folder
 from numpy.typing import NDArray
 
 from nlos_cam.cli.common import tracked
-from nlos_cam.dataset import build
-from nlos_cam.dataset.doubt_samples import EMPTY, ORDINARY, samples_on_disk
-from nlos_cam.dataset.outliers import IN_SHAPE, TO_JUDGE, TO_LEARN
+from nlos_cam.dataset import EMPTY, IN_SHAPE, ORDINARY, TEST_SEED, TO_JUDGE, TO_LEARN, open_dataset, samples_on_disk
 from nlos_cam.errors import SceneError
-from nlos_cam.evaluate.subjects import echoes_of, rig_of, sense, truth_of
+from nlos_cam.evaluate import echoes_of, rig_of, sense, truth_of
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
-from nlos_cam.objects.benchmark import benchmark_objects
-from nlos_cam.objects.depth_map import depth_from_image, object_box
-from nlos_cam.reconstruct.network import Reconstruction, reconstruct
-from nlos_cam.reconstruct.pipeline import limits_of
-from nlos_cam.reconstruct.verdict import FrameConditions, Verdict, VerdictFilter
-from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.objects import benchmark_objects, depth_from_image, object_box
+from nlos_cam.reconstruct import FrameConditions, Reconstruction, Verdict, VerdictFilter, limits_of, reconstruct
+from nlos_cam.render import SensorModel
 
 BINS = 10
 LEVELS = 0.5, 0.68, 0.8, 0.9, 0.95
@@ -154,7 +147,7 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
         maps = sense(echoes_of(subjects, rig, on_progress), rig)
     answers = [pipeline.answer(one.depth_m, one.intensity) for one in maps]
     result: dict[str, Any] = {"test_objects": of_objects(answers, truth_of(subjects, object_box(rig)), rig)}
-    usual = build.open_dataset(held_out).arrays()
+    usual = open_dataset(held_out).arrays()
     answers = [pipeline.answer(*pair) for pair in zip(usual.depth_m[start:], usual.intensity[start:], strict=True)]
     result["held_out_objects"] = of_objects(answers, usual.image[start:], rig)
     for kind in (EMPTY, ORDINARY, *TO_LEARN, *TO_JUDGE):
@@ -163,7 +156,7 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
             made = samples_on_disk(
                 samples,
                 wanted,
-                build.TEST_SEED,
+                TEST_SEED,
                 rig,
                 sensor,
                 accuracy="draft" if kind in FEWER else "standard",

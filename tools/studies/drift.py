@@ -12,8 +12,7 @@ from itertools import product
 
 import harness  # before the synthetic scenes: it puts their folder on the path
 import numpy as np
-from nlos_calibration.drift import WINDOW_FRAMES, Drift
-from nlos_calibration.wall import INTERVAL_STDS, wall_depth
+from nlos_calibration import INTERVAL_STDS, WINDOW_FRAMES, Drift, wall_depth
 from wall import DISTANCES_M, FACING_DEG
 
 from nlos_cam.calibrate.synthetic import (

@@ -21,7 +21,7 @@ from nlos_models.errors import ModelError
 
 from nlos_cam.cli.common import progress
 from nlos_cam.errors import NlosCamError
-from nlos_cam.evaluate.report import in_words
+from nlos_cam.evaluate import in_words
 from nlos_cam.files import cache_folder
 
 ROOT = Path(__file__).parents[2]

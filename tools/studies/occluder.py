@@ -15,13 +15,11 @@ from typing import Any
 import harness  # before the synthetic scenes: it puts their folder on the path
 import numpy as np
 from matplotlib.figure import Figure
+from nlos_calibration import INTERVAL_STDS, MIN_COLUMNS, LidarPose, Occluder, PinholeRecord, find_occluder, load_rig
 from nlos_calibration.errors import OccluderRefusedError
-from nlos_calibration.occluder import MIN_COLUMNS, find_occluder
-from nlos_calibration.rig import LidarPose, Occluder, PinholeRecord, load_rig
-from nlos_calibration.wall import INTERVAL_STDS
 from wall import DISTANCES_M, FACING_DEG, SENSOR_SIZE, SIZE, sensor_mean
 
-from nlos_cam.calibrate.synthetic import Sheet, View, bench, looked_at, view, with_outliers
+from nlos_cam.calibrate import Sheet, View, bench, looked_at, view, with_outliers
 
 Generator = np.random.Generator
 

@@ -14,21 +14,18 @@ import harness
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float32, Float64
-from nlos_calibration.rig import load_rig
-from nlos_models.inference import Reconstructor, load_reconstructor
+from nlos_models import Reconstructor, load_reconstructor
 
 from nlos_cam.cli.common import say, tracked
-from nlos_cam.dataset.build import TEST_SEED
-from nlos_cam.evaluate.subjects import seeded_objects, sense
+from nlos_cam.dataset import TEST_SEED
+from nlos_cam.evaluate import seeded_objects, sense
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
-from nlos_cam.objects.benchmark import benchmark_objects
-from nlos_cam.objects.depth_map import depth_from_image, object_box
-from nlos_cam.reconstruct.physics_check import UNEXPLAINED, check
-from nlos_cam.render.accuracy import Stop
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene import Scene
+from nlos_cam.objects import benchmark_objects, depth_from_image, object_box
+from nlos_cam.reconstruct import UNEXPLAINED, check
+from nlos_cam.render import Scene, Stop, render
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -101,8 +98,8 @@ def populations(
 
 def outliers(each: int) -> dict[str, list[Any]]:
     """Return the same stimuli of every kind of outlier."""
-    from nlos_cam.dataset.outliers import TO_JUDGE, TO_LEARN, Stimulus, outlier
-    from nlos_cam.render.sensor.model import SensorModel
+    from nlos_cam.dataset import TO_JUDGE, TO_LEARN, Stimulus, outlier
+    from nlos_cam.render import SensorModel
 
     plain = Stimulus(RIG, SensorModel())
     kinds = {**TO_LEARN, **TO_JUDGE}

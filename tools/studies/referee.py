@@ -28,10 +28,7 @@ from nlos_calibration.arrays import Mask
 from referee_mitransient import PLATE, RIG, STEP, Array, Estimate, Face, Job, hidden, load, sample
 
 from nlos_cam.frames import OBJECT_PIXELS
-from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.geometry import cast
-from nlos_cam.render.renderer import three_bounce
-from nlos_cam.render.scene import Scene
+from nlos_cam.render import Accuracy, Scene, cast, three_bounce
 
 BEAMS = np.add.outer(80 * np.array([20, 31, 42]), [20, 38, 56]).ravel()
 """Flat indices into the map of 64 x 80: rows and columns that spread over the wall."""

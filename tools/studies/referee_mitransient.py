@@ -16,12 +16,12 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from nlos_calibration import Extent, LidarPose, ObjectBox, Rig
 from nlos_calibration.arrays import Float64
-from nlos_calibration.rig import Extent, LidarPose, ObjectBox, Rig
 from numpy.typing import NDArray
 
-from nlos_cam.objects.depth_map import cell_centres_m
-from nlos_cam.render.scene import Radiometry, Scene
+from nlos_cam.objects import cell_centres_m
+from nlos_cam.render import Radiometry, Scene
 
 SLOPE_X, SLOPE_Y = 0.3, 0.2
 """dz/dx and dz/dy of every face."""

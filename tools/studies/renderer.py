@@ -22,20 +22,41 @@ import harness
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.evaluate.render_tradeoff import as_markdown, as_table, draw, facts, machine, measure, settings
-from nlos_cam.objects.depth_map import object_box, orthographic_depth
-from nlos_cam.objects.placement import Pose, category_triangles, object_depth, place
-from nlos_cam.render import backend_numba, backend_torch
-from nlos_cam.render.accuracy import STOPS, Accuracy, accuracy_named
-from nlos_cam.render.accuracy_search import Echoes, Work, agreement, least_seconds, some_of
-from nlos_cam.render.effects import Effects, included
-from nlos_cam.render.job import TransportJob
-from nlos_cam.render.planning import Prepared
-from nlos_cam.render.renderer import Rendering, render, render_all, three_bounce
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_file import paper_scene
+from nlos_cam.evaluate import (
+    as_table,
+    draw_renders,
+    machine,
+    measure_renders,
+    render_facts,
+    render_markdown,
+    render_settings,
+)
+from nlos_cam.objects import Pose, category_triangles, object_box, object_depth, orthographic_depth, place
+from nlos_cam.render import (
+    STOPS,
+    Accuracy,
+    Echoes,
+    Effects,
+    Prepared,
+    Rendering,
+    Scene,
+    TransportJob,
+    Work,
+    accuracy_named,
+    agreement,
+    device_named,
+    histograms,
+    histograms_of_all,
+    included,
+    least_seconds,
+    paper_scene,
+    render,
+    render_all,
+    some_of,
+    three_bounce,
+)
 
 STANDARD, FINE = STOPS["standard"], STOPS["fine"]
 DENSE = replace(STANDARD, beams_per_cell=2)
@@ -46,12 +67,12 @@ REPEATS = 15
 def tradeoff(_: argparse.Namespace) -> None:
     """Measure accuracy against time on the default scene; most of the time goes to brute force."""
     scene = paper_scene().scene_at(0)
-    size, rows = facts(scene), list(measure(scene))
-    table = as_table(size, rows, len(settings(scene)))
+    size, rows = render_facts(scene), list(measure_renders(scene))
+    table = as_table(size, rows, len(render_settings(scene)))
     harness.write("renderer", table)
     path = harness.DOCS / "images" / "tradeoff.png"
-    draw(path, rows, f"airplane: {size.patches} patches, {size.beams_on_wall} beams")
-    print(as_markdown(table))
+    draw_renders(path, rows, f"airplane: {size.patches} patches, {size.beams_on_wall} beams")
+    print(render_markdown(table))
 
 
 @dataclass(frozen=True)
@@ -244,7 +265,7 @@ def jobs_of(scenes: Sequence[Scene], accuracy: str) -> Iterator[TransportJob]:
 def deviation(jobs: Sequence[TransportJob], device: torch.device) -> float:
     """Return the relative L1 deviation of some histograms from the numba renderer's."""
     some = [job.some(np.arange(0, len(job.foot_m), 50)) for job in jobs]
-    pairs = zip(backend_torch.histograms_of_all(some, device), map(backend_numba.histograms, some), strict=True)
+    pairs = zip(histograms_of_all(some, device), map(histograms, some), strict=True)
     return max(float(np.abs(found - other).sum() / other.sum()) for found, other in pairs)
 
 
@@ -260,13 +281,13 @@ def shortest(work: Callable[[], object], repeats: int) -> float:
 
 def bench_cuda(options: argparse.Namespace) -> None:
     """Measure objects a second by batch size."""
-    device, rig = backend_torch.device_named(options.backend), load_rig("paper-rig")
+    device, rig = device_named(options.backend), load_rig("paper-rig")
     scenes = [Scene(rig, object_depth(seed, object_box(rig))[1]) for seed in range(options.objects)]
     jobs = list(jobs_of(scenes, options.accuracy))
 
     def in_batches(size: int) -> None:
         for start in range(0, len(jobs), size):
-            backend_torch.histograms_of_all(jobs[start : start + size], device)
+            histograms_of_all(jobs[start : start + size], device)
 
     rates = {size: len(jobs) / shortest(partial(in_batches, size), options.repeats) for size in options.batch}
     planning_s = shortest(lambda: list(jobs_of(scenes, options.accuracy)), 1) / len(scenes)

@@ -19,28 +19,21 @@ from typing import Any
 import harness
 import numpy as np
 from matplotlib.figure import Figure
+from nlos_calibration import ObjectBox, load_rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import ObjectBox, load_rig
-from nlos_models import metrics
-from nlos_models.data import MapSet
-from nlos_models.inference import Reconstructor, load_reconstructor
+from nlos_models import MapSet, Reconstructor, load_reconstructor, surface
 from numpy.typing import NDArray
 from transfer_bench import ADAPTATION, FRAMES, HELD_OUT, VALIDATION, part_of
 
 from nlos_cam.cli.common import tracked
 from nlos_cam.cli.main import main as nlos_cam
-from nlos_cam.dataset.labelled import read_labelled, recordings_in, write_shards
+from nlos_cam.dataset import read_labelled, recordings_in, write_shards
 from nlos_cam.errors import NlosCamError
-from nlos_cam.evaluate import metrics as evaluate
-from nlos_cam.evaluate.subjects import reconstruct_all
+from nlos_cam.evaluate import mm_per_v, over_objects, per_object, plain, reconstruct_all
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.objects.benchmark import benchmark_objects
-from nlos_cam.objects.depth_map import image_from_depth, object_box
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.objects import benchmark_objects, image_from_depth, object_box
+from nlos_cam.render import Scene, Sensor, SensorModel, render
 
 PARTS = ADAPTATION, VALIDATION, HELD_OUT
 COUNTS = 2, 5, 10, 20, 30
@@ -51,9 +44,9 @@ OnProgress = Callable[[int, int], None]
 def judge(reconstructor: Reconstructor, maps: MapSet, box: ObjectBox) -> dict[str, Any]:
     """Return the metrics by name over samples, each {value, low, high}, and the number of samples."""
     image, truth = reconstruct_all(reconstructor, maps), maps.image.astype(np.float32)
-    too_far_mm = evaluate.mm_per_v(box) * too_far(image, truth)
-    values = {**evaluate.per_object(image, truth, box), "foreground_too_far_mm": too_far_mm}
-    return {"objects": len(truth), **evaluate.plain(evaluate.over_objects(values))}
+    too_far_mm = mm_per_v(box) * too_far(image, truth)
+    values = {**per_object(image, truth, box), "foreground_too_far_mm": too_far_mm}
+    return {"objects": len(truth), **plain(over_objects(values))}
 
 
 def too_far(image: Float32, truth: Float32) -> NDArray[np.float64]:
@@ -61,7 +54,7 @@ def too_far(image: Float32, truth: Float32) -> NDArray[np.float64]:
 
     Training by squared error turns uncertainty into distance, which is this part of the RMSE.
     """
-    both = metrics.surface(image) & metrics.surface(truth)
+    both = surface(image) & surface(truth)
     count = both.sum((-2, -1))
     sums = np.where(both, truth.astype(np.float64) - image, 0.0).sum((-2, -1))
     return np.where(count > 0, sums / np.maximum(count, 1), np.nan)

@@ -13,22 +13,12 @@ from threading import Event
 
 import numpy as np
 
-from nlos_cam.camera.recorder import Recording
-from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.camera.simulated_world import World
-from nlos_cam.camera.streams import FRAMES_PER_S
+from nlos_cam.camera import FRAMES_PER_S, Recording, SimulatedCamera, World
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
-from nlos_cam.objects.benchmark import FixedObject, benchmark_objects
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.recording.capture import CaptureSession, CaptureTarget, settle
-from nlos_cam.recording.playback import verify
-from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_file import SceneFile, load_scene
-from nlos_cam.render.sensor.sensor import SensedImages
+from nlos_cam.objects import CATEGORIES, FixedObject, benchmark_objects, object_box
+from nlos_cam.recording import CaptureSession, CaptureTarget, load_sidecar, settle, sidecar_path, verify
+from nlos_cam.render import Scene, SceneFile, SensedImages, load_scene, render
 
 SCENE = Path(__file__).parents[2] / "examples" / "bench.toml"
 ADAPTATION, VALIDATION, HELD_OUT = "adaptation", "validation", "held-out"

@@ -16,14 +16,23 @@ from typing import Any
 import harness  # before the synthetic scenes: it puts their folder on the path
 import numpy as np
 from matplotlib.figure import Figure
+from nlos_calibration import (
+    INTERVAL_STDS,
+    TOLERANCE_DEG,
+    TOLERANCE_M,
+    DepthMean,
+    LidarPose,
+    PinholeRecord,
+    Rig,
+    WallFit,
+    fit_wall,
+    load_rig,
+)
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.noise import DepthMean
-from nlos_calibration.rig import LidarPose, PinholeRecord, Rig, load_rig
-from nlos_calibration.wall import INTERVAL_STDS, TOLERANCE_DEG, TOLERANCE_M, WallFit, fit_wall
 from numpy.typing import NDArray
 
-from nlos_cam.calibrate.synthetic import (
+from nlos_cam.calibrate import (
     View,
     bent,
     curved,
@@ -36,9 +45,7 @@ from nlos_cam.calibrate.synthetic import (
     window,
     with_outliers,
 )
-from nlos_cam.render.echoes import MultiBounce
-from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.render import MultiBounce, Sensor, SensorModel
 
 Generator = np.random.Generator
 Scene = Callable[[View, Generator], tuple[Float64, View]]

@@ -20,38 +20,43 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from nlos_calibration import Rig, lidar_sees, load_rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import Rig, load_rig
-from nlos_calibration.rig_check import lidar_sees
-from nlos_models.checkpoint import load_encoder, load_pipeline, load_record, shipped_folder
-from nlos_models.data import MapSet
-from nlos_models.inference import Reconstructor, load_reconstructor, refuse_colour
-from nlos_models.losses import latent_error
-from nlos_models.pipeline import cut_silhouette, lift_edges
-from nlos_models.tasks import run
+from nlos_models import (
+    MapSet,
+    Reconstructor,
+    cut_silhouette,
+    latent_error,
+    lift_edges,
+    load_encoder,
+    load_pipeline,
+    load_reconstructor,
+    load_record,
+    refuse_colour,
+    run,
+    shipped_folder,
+)
 
 from nlos_cam.cli.common import tracked
-from nlos_cam.dataset.build import TEST_SEED, TRAINING_SEED, DatasetPlan
-from nlos_cam.evaluate.metrics import (
+from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan
+from nlos_cam.evaluate import (
     BARS,
+    QUIET,
     SMALLER_IS_BETTER,
     Figures,
-    PerObject,
-    advantage,
-    judge,
-    over_objects,
-    per_object,
-    plain,
-)
-from nlos_cam.evaluate.report import in_words
-from nlos_cam.evaluate.subjects import (
-    QUIET,
     Judged,
+    PerObject,
     Subject,
+    advantage,
     as_eaten,
     as_map_set,
     bare_wall_for,
     echoes_of,
+    in_words,
+    judge,
+    over_objects,
+    per_object,
+    plain,
     reconstruct_all,
     rig_of,
     seeded_objects,
@@ -60,8 +65,7 @@ from nlos_cam.evaluate.subjects import (
     truth_of,
 )
 from nlos_cam.files import cache_folder
-from nlos_cam.objects.benchmark import benchmark_objects
-from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects import benchmark_objects, object_box
 
 FRAMES, LEFT_OUT = (10, 100), "airplane,table"
 DISTANCES_M, ANGLES_DEG = (0.15, 0.2, 0.25, 0.3), (15.0, 30.0, 45.0, 60.0, 75.0)

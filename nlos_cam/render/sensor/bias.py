@@ -40,7 +40,7 @@ def ripples(shape: tuple[int, int], waves: float, generator: np.random.Generator
     return np.sin(2.0 * np.pi * waves * (columns * np.cos(way) + rows * np.sin(way)) + phase)
 
 
-def patches(shape: tuple[int, int], generator: np.random.Generator, across: int = 12) -> Float64:
+def smooth_patches(shape: tuple[int, int], generator: np.random.Generator, across: int = 12) -> Float64:
     """A smooth pattern (height, width) of standard deviation 1, in about `across` patches across the width."""
     height, width = shape
     coarse = generator.standard_normal((across * height // width + 3, across + 3)).astype(np.float32)
@@ -63,7 +63,7 @@ class DepthBias:
             wave = ripples(shape, WAVES, np.random.default_rng(RIPPLES_SEED))
             self._fixed_m = (ripple_m * wave - offset_m).astype(np.float32).ravel()
         if patch_m:
-            pattern = patches(shape, np.random.default_rng(PATCHES_SEED))
+            pattern = smooth_patches(shape, np.random.default_rng(PATCHES_SEED))
             self._patches_m = (patch_m * (pattern - pattern.mean())).astype(np.float32).ravel()
 
     def at_m(self, celsius: float | None) -> Float32:
@@ -98,6 +98,6 @@ def texture(shape: tuple[int, int], strength: float) -> Float32:
     if not strength:
         return EVEN
     generator = np.random.default_rng(TEXTURE_SEED)
-    pattern = patches(shape, generator, STAINS) + patches(shape, generator, GRAINS)
+    pattern = smooth_patches(shape, generator, STAINS) + smooth_patches(shape, generator, GRAINS)
     factor = np.exp(strength * (pattern - pattern.mean()) / pattern.std())
     return (factor / factor.mean()).astype(np.float32).ravel()

@@ -3,7 +3,7 @@
 from math import exp
 from typing import Annotated, Self
 
-from nlos_calibration.rig import Record
+from nlos_calibration import Record
 from pydantic import Field, model_validator
 
 from nlos_cam.frames import SATURATED

@@ -19,9 +19,8 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from nlos_calibration import Intrinsics, Rig
 from nlos_calibration.arrays import Float32, Float64, UInt8
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import Rig
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError

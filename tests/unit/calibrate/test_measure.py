@@ -11,7 +11,7 @@ from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.reference import BareWallStatistics
 from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
 from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_record import MeasuredWall, wall_record
+from nlos_calibration.wall_record import MeasuredWall, new_wall_record
 
 from nlos_cam.calibrate.measure import CELSIUS_EVERY, CaptureStatistics, by_board, by_depth, by_occluder, glance, look
 from nlos_cam.frames import Frame, maps_from_frame
@@ -95,7 +95,7 @@ def seen() -> CaptureStatistics:
 def measured(seen: CaptureStatistics, tape_m: float | None = None) -> MeasuredWall:
     fit, facts = by_depth(seen, tape_m)
     about = {"camera": "sim", "frames": 10, "created": date(2026, 1, 2)}
-    return MeasuredWall(wall_record(fit, INTRINSICS, **about, others=facts), None)
+    return MeasuredWall(new_wall_record(fit, INTRINSICS, **about, others=facts), None)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from nlos_calibration.occluder import OccluderFit
 from nlos_calibration.reference import BareWallStatistics, save_reference
 from nlos_calibration.rig import ObjectBox, Occluder, dump_toml, load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
-from nlos_calibration.wall_record import VERSION, WallRecord, load_measured, load_wall, wall_record, with_occluder
+from nlos_calibration.wall_record import VERSION, WallRecord, load_measured, load_wall, new_wall_record, with_occluder
 
 PINHOLE = Intrinsics(160, 120, 114.0, 115.0, 80.5, 59.0)
 EXAMPLE = Path(__file__).parents[3] / "calibration/records/wall.toml"
@@ -21,7 +21,7 @@ VERSION_1, VERSION_2 = Path(__file__).parent / "wall_v1.toml", Path(__file__).pa
 def record() -> WallRecord:
     pose = wall_from_plane(normal_from_angles(np.radians(40.0), np.radians(3.0)), 0.21)
     fit = fit_wall(wall_depth(pose, PINHOLE), PINHOLE, np.random.default_rng(0))
-    return wall_record(fit, PINHOLE, camera="l515:f0246262", frames=60, created=date(2026, 1, 31))
+    return new_wall_record(fit, PINHOLE, camera="l515:f0246262", frames=60, created=date(2026, 1, 31))
 
 
 def written(folder: Path, record: WallRecord) -> Path:

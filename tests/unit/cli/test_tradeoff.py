@@ -15,7 +15,7 @@ from nlos_models.recipe import Recipe
 
 from nlos_cam.cli import tradeoff as command
 from nlos_cam.cli.main import main
-from nlos_cam.evaluate.render_tradeoff import Row, measure, settings
+from nlos_cam.evaluate.render_tradeoff import RenderRow, measure_renders, render_settings
 from nlos_cam.render.accuracy import STOPS
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
@@ -37,12 +37,12 @@ def small(monkeypatch: pytest.MonkeyPatch) -> list[Scene]:
         depth[4:12, 4:12] = scene.object_depth_m[24:40:2, 24:40:2]
         return replace(scene, object_depth_m=depth)
 
-    def measured(scene: Scene) -> Iterator[Row]:
+    def measured(scene: Scene) -> Iterator[RenderRow]:
         asked.append(scene)
-        return islice(measure(shrunk(scene), SMALL, lambda work, _: (work(), 0.5)[1]), FIRST)
+        return islice(measure_renders(shrunk(scene), SMALL, lambda work, _: (work(), 0.5)[1]), FIRST)
 
     monkeypatch.setattr(command, "measure", measured)
-    monkeypatch.setattr(command, "settings", lambda scene: settings(shrunk(scene), SMALL)[:FIRST])
+    monkeypatch.setattr(command, "settings", lambda scene: render_settings(shrunk(scene), SMALL)[:FIRST])
     return asked
 
 

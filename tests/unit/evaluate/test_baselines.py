@@ -84,7 +84,7 @@ def test_nearest_neighbour_weighs_channels_by_their_spread(images: np.ndarray, s
 def test_training_maps_are_cached_by_what_determines_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[tuple[DatasetPlan, int, Path]] = []
     shapes = {"images": np.zeros((2, 64, 64), np.float16)}
-    monkeypatch.setattr(build, "build", lambda plan, count, folder, **_: built.append((plan, count, folder)))
+    monkeypatch.setattr(build, "build_dataset", lambda plan, count, folder, **_: built.append((plan, count, folder)))
     monkeypatch.setattr(build, "open_dataset", lambda folder: folder)
     monkeypatch.setattr(build, "procedural_images", lambda *_: shapes["images"])
     monkeypatch.setattr(baselines, "NEIGHBOURS", 7)

@@ -16,18 +16,18 @@ from nlos_cam.evaluate import runtime_tradeoff
 from nlos_cam.evaluate.metrics import Interval
 from nlos_cam.evaluate.runtime_tradeoff import (
     MIN_CALLS,
-    Bench,
-    Row,
-    Setting,
-    as_markdown,
+    RuntimeBench,
+    RuntimeRow,
+    RuntimeSetting,
     calibration,
-    draw,
-    facts,
+    draw_runtimes,
     losses,
-    measure,
+    measure_runtimes,
     pareto_front,
     recommended,
-    settings,
+    runtime_facts,
+    runtime_markdown,
+    runtime_settings,
 )
 from nlos_cam.evaluate.subjects import seeded_objects
 from nlos_cam.objects.depth_map import object_box
@@ -36,17 +36,17 @@ RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
 
 
-def _row(name: str, milliseconds: float, iou: float, frames: int = 1) -> Row:
+def _row(name: str, milliseconds: float, iou: float, frames: int = 1) -> RuntimeRow:
     figures = {"silhouette_iou": Interval(iou, iou - 0.1, iou + 0.1), "accuracy_mean_abs": Interval(0.9, 0.8, 1.0)}
     figures |= {"accuracy_within_2_percent": Interval(0.7, 0.6, 0.8), "foreground_rmse_mm": Interval(20.0, 10.0, 30.0)}
-    return Row(Setting(name, "shipped", name, 1, frames), milliseconds, 2 * milliseconds, figures)
+    return RuntimeRow(RuntimeSetting(name, "shipped", name, 1, frames), milliseconds, 2 * milliseconds, figures)
 
 
 ROWS = [_row("exact", 80, 0.8), _row("quick", 20, 0.799), _row("quicker", 10, 0.7), _row("many", 5, 0.9, frames=16)]
 
 
-def _facts(rows: list[Row], planned: int) -> dict[str, Any]:
-    return json.loads(json.dumps(facts(rows, planned, 54, "a machine"), allow_nan=False))
+def _facts(rows: list[RuntimeRow], planned: int) -> dict[str, Any]:
+    return json.loads(json.dumps(runtime_facts(rows, planned, 54, "a machine"), allow_nan=False))
 
 
 def test_recommended_is_fastest_setting_without_loss() -> None:
@@ -73,7 +73,7 @@ def test_pareto_front_has_no_row_both_slower_and_worse() -> None:
 
 def test_settings_combine_weights_runtimes_and_threads_once() -> None:
     runtimes = ["torch float32, cpu", "torch float32, cuda", "ONNX Runtime float32"]
-    asked = settings(["small", "large"], runtimes)
+    asked = runtime_settings(["small", "large"], runtimes)
     assert len({(one.weights, one.name) for one in asked}) == len(asked)
     for weights in ("small", "large"):
         mine = [one for one in asked if one.weights == weights]
@@ -84,7 +84,7 @@ def test_settings_combine_weights_runtimes_and_threads_once() -> None:
 
 
 def test_measure_takes_median_and_restores_threads() -> None:
-    bench = Bench.of(seeded_objects(TEST_SEED, 1, BOX), RIG, BOX, lambda *_: None)
+    bench = RuntimeBench.of(seeded_objects(TEST_SEED, 1, BOX), RIG, BOX, lambda *_: None)
     before, threads, seconds = torch.get_num_threads(), list[int](), ticking(0.0, 0.003)  # each call lasts one tick
 
     def plate(depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
@@ -92,8 +92,8 @@ def test_measure_takes_median_and_restores_threads() -> None:
         threads.append(torch.get_num_threads())
         return np.full((1, 64, 64), 0.5, np.float32)
 
-    asked = [Setting("plate", "mine", "any", 2, 1), Setting("plate", "mine", "any", 1, 2)]
-    rows = list(measure(asked, {"mine": {"any": lambda _: plate}}, bench, lambda: next(seconds)))  # type: ignore[dict-item]
+    asked = [RuntimeSetting("plate", "mine", "any", 2, 1), RuntimeSetting("plate", "mine", "any", 1, 2)]
+    rows = list(measure_runtimes(asked, {"mine": {"any": lambda _: plate}}, bench, lambda: next(seconds)))  # type: ignore[dict-item]
     assert torch.get_num_threads() == before
     assert [threads.count(count) for count in (1, 2)] == [1 + MIN_CALLS] * 2
     assert [row.milliseconds for row in rows] == pytest.approx([3, 3])
@@ -121,10 +121,10 @@ def test_table_and_plot_show_measured_rows(tmp_path: Path, measured: int) -> Non
     assert table["complete"] == (measured == len(ROWS))
     assert [row["name"] for row in table["settings"]] == [row.setting.name for row in ROWS[:measured]]
     assert [row["loses_accuracy"] for row in table["settings"]] == [False, False, True, False][:measured]
-    assert as_markdown(table)
+    assert runtime_markdown(table)
     if measured:
         assert table["recommended"]["name"] == ("quick" if measured > 1 else "exact")
-        draw(tmp_path / "plot.png", ROWS[:measured])
+        draw_runtimes(tmp_path / "plot.png", ROWS[:measured])
         assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     else:
         assert table["recommended"] is None
@@ -135,4 +135,4 @@ def test_table_of_several_weights_names_the_recommended() -> None:
     table = _facts(rows, 8)
     assert table["recommended"] == {"name": "quick", "weights": "large"}
     assert {"name": "quicker", "weights": "large"} in table["pareto_front"]
-    assert "large: quick" in as_markdown(table)
+    assert "large: quick" in runtime_markdown(table)

@@ -18,9 +18,9 @@ from nlos_cam.evaluate.subjects import (
     QUIET,
     Judged,
     as_map_set,
+    baseline_images,
     echoes_of,
     fresh_objects,
-    guesses,
     notes_on,
     reconstruct_all,
     rig_of,
@@ -115,7 +115,7 @@ def test_rig_of_weights_that_is_missing_is_asked_for() -> None:
 
 def test_guesses_without_nearest_take_mean_of_training_images(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "NEIGHBOURS", 3)
-    images, among = guesses(JUDGED, None, nearest=False)
+    images, among = baseline_images(JUDGED, None, nearest=False)
     assert (set(images), among) == ({"all_background", "mean_object"}, None)
     mean = procedural_images(TRAINING_SEED, 3, BOX).astype(np.float32).mean(0)
     np.testing.assert_allclose(images["mean_object"][1], mean, atol=1e-3)

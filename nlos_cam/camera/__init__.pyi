@@ -1,0 +1,59 @@
+__all__ = [
+    "FORMATS",
+    "FRAMES_PER_S",
+    "NAMES",
+    "RESERVE_BYTES",
+    "SIMULATED",
+    "WHEEL",
+    "Camera",
+    "ClockUnwrap",
+    "DeviceInfo",
+    "FrameSet",
+    "FrameSynchronizer",
+    "OnProgress",
+    "Reader",
+    "Recording",
+    "Sample",
+    "SampleQueue",
+    "Session",
+    "SimulatedCamera",
+    "SoftwareLidar",
+    "WallClock",
+    "World",
+    "check_room",
+    "connected",
+    "find_l515",
+    "find_streams",
+    "frame_in_si",
+    "free_bytes",
+    "intrinsics_of",
+    "load_sdk",
+    "open_camera",
+    "open_world",
+    "recording_s",
+    "repair_command",
+    "sample_from_sdk",
+    "shared_context",
+    "stream_name",
+]
+
+from .l515 import DeviceInfo, connected, find_l515, shared_context
+from .protocol import Camera, WallClock
+from .recorder import RESERVE_BYTES, Recording, check_room, free_bytes, recording_s, repair_command
+from .registry import NAMES, SIMULATED, OnProgress, Reader, open_camera
+from .sdk import WHEEL, load_sdk
+from .session import SampleQueue, Session, find_streams
+from .simulated import SimulatedCamera, SoftwareLidar
+from .simulated_world import World, open_world
+from .streams import (
+    FORMATS,
+    FRAMES_PER_S,
+    FrameSet,
+    FrameSynchronizer,
+    Sample,
+    frame_in_si,
+    intrinsics_of,
+    sample_from_sdk,
+    stream_name,
+)
+from .timestamps import ClockUnwrap

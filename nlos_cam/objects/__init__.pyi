@@ -1,0 +1,62 @@
+__all__ = [
+    "CATEGORIES",
+    "DEPTH_MAP_SUFFIX",
+    "MESH_SUFFIXES",
+    "OF_EACH",
+    "TEXTURES",
+    "Coat",
+    "FixedObject",
+    "MeshFile",
+    "Pose",
+    "Up",
+    "benchmark_objects",
+    "category_triangles",
+    "cell_centres_m",
+    "depth_from_image",
+    "fit",
+    "folder_objects",
+    "image_from_albedo",
+    "image_from_depth",
+    "mesh_depth",
+    "nothing_to_see",
+    "object_box",
+    "object_depth",
+    "object_depths",
+    "orthographic_depth",
+    "painted",
+    "panel",
+    "place",
+    "post",
+    "random_pose",
+    "read_depth_map",
+    "read_mesh",
+    "upright",
+]
+
+from .benchmark import OF_EACH, FixedObject, benchmark_objects
+from .depth_map import cell_centres_m, depth_from_image, image_from_depth, object_box, orthographic_depth
+from .generators import CATEGORIES
+from .meshes import (
+    DEPTH_MAP_SUFFIX,
+    MESH_SUFFIXES,
+    MeshFile,
+    Up,
+    folder_objects,
+    mesh_depth,
+    read_depth_map,
+    read_mesh,
+    upright,
+)
+from .placement import (
+    Pose,
+    category_triangles,
+    fit,
+    nothing_to_see,
+    object_depth,
+    object_depths,
+    panel,
+    place,
+    post,
+    random_pose,
+)
+from .textures import TEXTURES, Coat, image_from_albedo, painted

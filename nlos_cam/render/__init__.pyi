@@ -1,0 +1,85 @@
+__all__ = [
+    "DEPTH_UNIT_M",
+    "EFFECTS",
+    "JUMP_M",
+    "RENDERING_VERSION",
+    "STOPS",
+    "Accuracy",
+    "Agreement",
+    "Echoes",
+    "Effects",
+    "Fault",
+    "FaultKind",
+    "HiddenObject",
+    "Material",
+    "MultiBounce",
+    "Prepared",
+    "Radiometry",
+    "Rendering",
+    "Scene",
+    "SceneFacts",
+    "SceneFile",
+    "SensedImages",
+    "Sensor",
+    "SensorModel",
+    "Stop",
+    "Stopwatch",
+    "Surface",
+    "TransportJob",
+    "Work",
+    "accuracy_named",
+    "agreement",
+    "bare_wall_scene",
+    "cast",
+    "choose",
+    "costs",
+    "device_named",
+    "histograms",
+    "histograms_of_all",
+    "included",
+    "least_seconds",
+    "load_scene",
+    "paper_scene",
+    "phong",
+    "plan",
+    "render",
+    "render_all",
+    "render_scan",
+    "retroreflective",
+    "ripples",
+    "sensor_effects",
+    "smooth_patches",
+    "some_of",
+    "three_bounce",
+    "transient",
+]
+
+from .accuracy import STOPS, Accuracy, Stop, accuracy_named
+from .accuracy_search import Agreement, Echoes, Stopwatch, Work, agreement, choose, costs, least_seconds, some_of
+from .backend_numba import histograms
+from .backend_torch import device_named, histograms_of_all
+from .echoes import MultiBounce
+from .effects import EFFECTS, Effects, included
+from .geometry import cast
+from .job import TransportJob
+from .material import Material, Surface, phong, retroreflective
+from .patches import JUMP_M
+from .planning import Prepared, plan
+from .renderer import Rendering, render, render_all, three_bounce, transient
+from .scanning import render_scan
+from .scene import Radiometry, Scene
+from .scene_facts import SceneFacts
+from .scene_file import (
+    RENDERING_VERSION,
+    Fault,
+    FaultKind,
+    HiddenObject,
+    SceneFile,
+    bare_wall_scene,
+    load_scene,
+    paper_scene,
+)
+from .sensor.bias import ripples, smooth_patches
+from .sensor.effects import sensor_effects
+from .sensor.model import DEPTH_UNIT_M, SensorModel
+from .sensor.sensor import SensedImages, Sensor
