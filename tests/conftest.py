@@ -26,7 +26,7 @@ def nothing_left_running() -> Iterator[None]:
 
 
 class NoiseWorld:
-    """A world of noise, small and quick to make: every bit of every frame is known from its number."""
+    """A small world of noise: every bit of a frame follows from its number."""
 
     width, height = 64, 48
 
@@ -52,7 +52,7 @@ class NoiseWorld:
 
 
 class HurriedClock:
-    """A clock by which everything is due as soon as it is asked for: it moves only by waiting."""
+    """A clock that moves only by waiting, and at once."""
 
     def __init__(self, start_s: float = 1e9) -> None:
         self.time_s = start_s
@@ -76,7 +76,7 @@ def hurried_clock() -> type[HurriedClock]:
 
 
 def record_noise(path: Path, frames: int) -> Path:
-    """A recording of a NoiseWorld's first frames, made in no time."""
+    """Record a NoiseWorld's first frames without waiting for real time."""
     recording = Recording(path, frames=frames)
     with SimulatedCamera("sim:noise", NoiseWorld(), clock=HurriedClock(), recording=recording) as camera:
         for _ in camera:
@@ -91,7 +91,7 @@ def recorded() -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def noise_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twenty frames of a NoiseWorld, recorded."""
+    """A recording of twenty frames of a NoiseWorld."""
     return record_noise(tmp_path_factory.mktemp("bags") / "noise.bag", 20)
 
 
@@ -107,7 +107,7 @@ def fake_sdk() -> type[FakeSdk]:
 
 @pytest.fixture
 def fake_camera() -> Callable[..., L515Camera]:
-    """An L515Camera on a fake SDK that sees these lidars, by a clock that moves only by waiting."""
+    """Make an L515Camera on a fake SDK that sees these lidars, with a clock that moves only by waiting."""
 
     def make(
         *lidars: FakeLidar, serial: str = "", clock: NapClock | None = None, recording: Recording | None = None

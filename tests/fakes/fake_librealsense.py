@@ -1,7 +1,7 @@
-"""Stands for pyrealsense2: what the camera layer uses of it, over fake lidars.
+"""Stands for the parts of pyrealsense2 that the camera package uses, over fake lidars.
 
-Devices and sensors are handles on a `FakeLidar`, which fail once it was unplugged, as librealsense's do.
-tests/unit/test_fake_librealsense.py holds the names against the real module.
+Devices and sensors are handles on a `FakeLidar` that fail once it was unplugged, as librealsense's do.
+tests/unit/camera/test_fake_librealsense.py holds the names against the real module.
 """
 
 from collections.abc import Callable
@@ -97,7 +97,7 @@ class FakeDevice:
         return [depth, FakeSensor(self.lidar, self.generation, colour=True)] if self.lidar.colour else [depth]
 
     def hardware_reset(self) -> None:
-        """It leaves the bus and comes back, with its calibration."""
+        """Leave the bus and come back with a calibration."""
         if self.generation != self.lidar.generation:
             raise RuntimeError("hwmon command 0x20 failed. Error type: no device")
         self.lidar.did.append("reset")
@@ -106,7 +106,7 @@ class FakeDevice:
 
 
 class FakeRecorder:
-    """Makes a file, and notes when it began: it has no frames to put into it."""
+    """Creates an empty file, and notes its start."""
 
     def __init__(self, path: str, device: FakeDevice) -> None:
         device.lidar.did.append("record")
@@ -128,7 +128,7 @@ class FakeContext:
 
 
 class Names:
-    """Stands for an enumeration: any member is its own name. Keeps what was asked for."""
+    """Stands for an enumeration, whose members are their own names; keeps the names in use."""
 
     def __init__(self, make: Callable[[str], Any]) -> None:
         self.make, self.asked = make, set[str]()

@@ -1,4 +1,4 @@
-"""An L515 on USB, with the faults that they have; what librealsense makes of it is in fake_librealsense.py."""
+"""A fake L515 on USB with its typical faults; fake_librealsense.py is the SDK over it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from nlos_cam.camera.streams import FORMATS
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M
 
 COLOUR_FROM_DEPTH = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.6, 0.8, 0.014], [0.0, -0.8, 0.6, -0.007]])
-"""Where the colour camera is: far from the L515's, so that nothing passes by chance."""
+"""Pose of the color camera: far from the L515's, so that no test passes by chance."""
 LENS = [0.15, -0.5, -0.001, 0.0006, 0.47]
 Named = SimpleNamespace  # a member of one of the SDK's enumerations
 PACE_S = 0.002
 
 
 class NapClock:
-    """A clock that moves only by waiting, and notes how long it was asked to."""
+    """A clock that moves only by waiting, and notes each wait."""
 
     def __init__(self) -> None:
         self.time_s, self.naps = 1e9, list[float]()
@@ -67,7 +67,7 @@ class FakeProfile:
         return made
 
     def get_extrinsics_to(self, other: "FakeProfile") -> SimpleNamespace:
-        """From colour to depth, the only ones that are asked for."""
+        """Return the extrinsics from color to depth, the only ones in use."""
         assert (self.stream, other.stream) == ("color", "depth")
         turn, shift = COLOUR_FROM_DEPTH[:, :3], COLOUR_FROM_DEPTH[:, 3]
         return SimpleNamespace(rotation=turn.ravel().tolist(), translation=(-turn.T @ shift).tolist())
@@ -98,11 +98,10 @@ class FakeFrame:
 
 
 class FakeLidar:
-    """An L515 on USB. Each start of its sensor takes the next of `runs`, and gives that many frames from number 0.
+    """An L515 on USB. Each start of its sensor takes the next of `runs`: a number of frames, from number 0.
 
-    While it `flaps` more than once, it stays with the first.
-
-    Without `runs` it gives one frame on starting, and then what it is told to `deliver`.
+    While it `flaps` more than once, it repeats the first run. Without `runs` it gives one frame on starting, and then
+    those of each call of `deliver`.
     """
 
     def __init__(
@@ -129,18 +128,17 @@ class FakeLidar:
         self.start_error: Exception | None = None
         self.uncalibrated = False
         self.reset_takes = 2
-        """Looks until it is back."""
+        """Number of look-ups until it is back after a reset."""
         self.plugged, self.generation = True, 0
         self.flaps = 0
-        """How often it is still to be unplugged at the end of a run, and plugged in when it was looked for twice."""
+        """Number of times that it will be unplugged at the end of a run, and plugged in after two look-ups."""
         self.back_after = 0
-        """After unplugging itself, it is plugged in when it was looked for so often; never, if 0."""
+        """Number of look-ups after which an unplugged device is plugged in; never, if 0."""
         self.saturated_share: Callable[[float], float] = lambda _: 0.0
         """Share of infrared pixels at 255, by laser power."""
         self.zero_ms, self.period_ms = 0.0, 1000 / 30
         self.colour: Callable[[int], int] | None = None
-        """What its colour camera sees, one grey, by frame number; None where it has no such camera. Of two sensors one
-        runs at a time."""
+        """Gray level of the color image by frame number; None without a color camera. One sensor runs at a time."""
         self.lens_model = "brown_conrady"
         self._callback: Callable[[FakeFrame], None] | None = None
         self._stopping, self._thread = Event(), None
@@ -155,7 +153,7 @@ class FakeLidar:
         self.plugged = True
 
     def look_for(self) -> bool:
-        """Whether it is on USB, now that somebody looks."""
+        """Look the device up on USB; returns whether it is there."""
         if not self.plugged and self.back_after:
             self.back_after -= 1
             self.plugged = self.back_after == 0
@@ -175,7 +173,7 @@ class FakeLidar:
         self._thread.start()
 
     def finish_run(self) -> bool:
-        """Wait until a run has given its frames; whether it did in good time."""
+        """Wait until a run has given its frames; returns whether it did within 5 s."""
         self._thread.join(5.0)
         return not self._thread.is_alive()
 

@@ -36,7 +36,7 @@ def camera() -> Camera:
 
 @pytest.fixture
 def at_the_bench(camera: Camera, capsys: pytest.CaptureFixture[str]) -> Callable[[str], None]:
-    """Asks the person at the bench for something."""
+    """Ask the person at the bench for something."""
     assert camera
     if not os.environ.get("NLOS_CAM_AT_THE_BENCH"):
         pytest.skip("nobody is at the bench (NLOS_CAM_AT_THE_BENCH=1)")
@@ -48,7 +48,7 @@ def at_the_bench(camera: Camera, capsys: pytest.CaptureFixture[str]) -> Callable
     return ask
 
 
-def test_five_seconds_come_without_a_gap(camera: Camera) -> None:
+def test_camera_runs_five_seconds_without_a_gap(camera: Camera) -> None:
     with camera:
         frames = list(islice(camera, 30 * SECONDS))
     assert (camera.dropped, camera.incomplete) == (0, 0)
@@ -56,7 +56,7 @@ def test_five_seconds_come_without_a_gap(camera: Camera) -> None:
     assert frames[-1].timestamp_s - frames[0].timestamp_s == pytest.approx(SECONDS, abs=0.1)
 
 
-def test_near_wall_settings_are_taken(camera: Camera) -> None:
+def test_near_wall_settings_take(camera: Camera) -> None:
     assert isinstance(camera, L515Camera)
     with camera:
         settings = next(iter(camera)).settings
@@ -64,8 +64,8 @@ def test_near_wall_settings_are_taken(camera: Camera) -> None:
     assert {name: settings[name] for name in NEAR_WALL} == NEAR_WALL
 
 
-def test_the_wall_is_seen_near_and_unsaturated(camera: Camera) -> None:
-    """The laser was turned down as far as that takes, and not off."""
+def test_wall_is_near_and_unsaturated(camera: Camera) -> None:
+    """The laser is turned down as far as needed, and not off."""
     with camera:
         frame = list(islice(camera, 30))[-1]
     assert 0.1 < np.nanmedian(frame.depth_m) < 1.5
@@ -74,7 +74,7 @@ def test_the_wall_is_seen_near_and_unsaturated(camera: Camera) -> None:
     assert frame.settings["laser_power"] > 0
 
 
-def test_colour_is_looked_at_before_depth_and_leaves_it_alone(camera: Camera) -> None:
+def test_color_is_captured_before_depth_and_leaves_it_alone(camera: Camera) -> None:
     view = look_in_colour(camera.uri, 10)
     assert view.image.shape == (view.intrinsics.height, view.intrinsics.width)
     assert 5.0 < view.image.mean() < 250.0
@@ -84,7 +84,7 @@ def test_colour_is_looked_at_before_depth_and_leaves_it_alone(camera: Camera) ->
         assert next(iter(camera)).depth_m.shape == (480, 640)
 
 
-def test_temperatures_are_told_from_five_seconds_after_the_start(camera: Camera) -> None:
+def test_temperatures_are_reported_after_five_seconds(camera: Camera) -> None:
     with camera:
         assert next(iter(camera)).settings.get("apd_temperature", 20.0) > -100
         list(islice(camera, 30 * 6))
@@ -94,7 +94,7 @@ def test_temperatures_are_told_from_five_seconds_after_the_start(camera: Camera)
     assert camera.telemetry() == {}
 
 
-def test_a_recording_holds_every_frame_and_the_settings_that_held(camera: Camera, tmp_path: Path) -> None:
+def test_recording_holds_every_frame_and_its_settings(camera: Camera, tmp_path: Path) -> None:
     recording = Recording(tmp_path / "wall.bag", seconds=SECONDS)
     with open_camera(camera.uri, recording=recording) as source:
         seen = list(source)
@@ -108,9 +108,7 @@ def test_a_recording_holds_every_frame_and_the_settings_that_held(camera: Camera
     }
 
 
-def test_it_is_survived_when_its_cable_is_pulled_and_plugged_in(
-    camera: Camera, at_the_bench: Callable[[str], None]
-) -> None:
+def test_camera_survives_a_pulled_cable(camera: Camera, at_the_bench: Callable[[str], None]) -> None:
     with camera:
         before = list(islice(camera, 30))
         at_the_bench("pull the L515's cable, wait 10 s, plug it into the same port")
@@ -126,7 +124,7 @@ def test_it_is_survived_when_its_cable_is_pulled_and_plugged_in(
     assert frames[-1].settings == pytest.approx(before[-1].settings, abs=10.0)  # temperatures and noise drift
 
 
-def test_a_recording_whose_cable_is_pulled_can_be_read(
+def test_recording_of_a_pulled_cable_can_be_read(
     camera: Camera, at_the_bench: Callable[[str], None], tmp_path: Path
 ) -> None:
     recording = Recording(tmp_path / "pulled.bag", optional=True)

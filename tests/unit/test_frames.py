@@ -1,4 +1,6 @@
-"""Frames to maps: which pixel falls in which cell, and what a cell makes of its pixels."""
+"""Frames to maps: which pixel falls in which cell, and the values of a cell; and running means of maps."""
+
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -6,10 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration.geometry import Intrinsics
 
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Frame, LidarMaps, _edges, maps_from_frame
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Frame, LidarMaps, MapMean, _edges, maps_from_frame
 from nlos_cam.render.sensor.sensor import cell_of_pixels
 
 SIZES = [(480, 640), (240, 320), (768, 1024), (64, 80), (100, 90), (32, 40)]
+
+
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)
 
 
@@ -28,7 +32,7 @@ def _cell(k: int, pixels: int, cells: int) -> int:
 
 
 @pytest.mark.parametrize(("pixels", "cells"), [(size[k], (MAP_ROWS, MAP_COLUMNS)[k]) for size in SIZES for k in (0, 1)])
-def test_edges_part_the_pixels_among_the_cells_that_hold_their_centres(pixels: int, cells: int) -> None:
+def test_edges_give_pixels_to_cells_that_hold_their_centres(pixels: int, cells: int) -> None:
     edges = _edges(pixels, cells)
     assert (edges[0], edges[-1], len(edges)) == (0, pixels, cells + 1)
     assert (np.diff(edges) >= 0).all()
@@ -37,7 +41,7 @@ def test_edges_part_the_pixels_among_the_cells_that_hold_their_centres(pixels: i
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_pixel_belongs_to_one_cell(size: tuple[int, int]) -> None:
+def test_pixel_belongs_to_one_cell(size: tuple[int, int]) -> None:
     generator = np.random.default_rng(0)
     for row, column in generator.integers((0, 0), size, (40, 2)):
         depth = np.full(size, np.nan)
@@ -46,23 +50,10 @@ def test_a_pixel_belongs_to_one_cell(size: tuple[int, int]) -> None:
         assert found == [[_cell(row, size[0], MAP_ROWS), _cell(column, size[1], MAP_COLUMNS)]]
 
 
-@pytest.mark.parametrize("size", SIZES[:4])
-def test_a_constant_frame_gives_constant_maps(size: tuple[int, int]) -> None:
-    maps = _maps(np.full(size, 0.375), 77)
-    assert maps.depth_m.shape == maps.intensity.shape == maps.valid.shape == (MAP_ROWS, MAP_COLUMNS)
-    assert maps.depth_m.dtype == maps.intensity.dtype == np.float32
-    assert maps.valid.all()
-    assert (maps.depth_m == np.float32(0.375)).all()
-    assert (maps.intensity == 77).all()
-
-
-def test_a_frame_of_the_maps_own_size_is_its_maps() -> None:
-    depth = np.random.default_rng(0).uniform(0.2, 1, (64, 80)).astype(np.float32)
-    np.testing.assert_array_equal(_maps(depth).depth_m, depth)
-
-
 def test_depth_is_the_median_of_the_valid_samples() -> None:
     generator = np.random.default_rng(1)
+    same_size = generator.uniform(0.2, 1, (64, 80)).astype(np.float32)
+    np.testing.assert_array_equal(_maps(same_size).depth_m, same_size)
     depth = generator.uniform(0.2, 1, (480, 640)).astype(np.float32)
     depth[generator.random(depth.shape) < 0.3] = np.nan
     maps = _maps(depth)
@@ -74,7 +65,7 @@ def test_depth_is_the_median_of_the_valid_samples() -> None:
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**16), valid=st.integers(0, 60), values=st.sampled_from([1, 2, 5, 1000]))
-def test_every_count_of_samples_and_ties_has_numpys_median(seed: int, valid: int, values: int) -> None:
+def test_median_equals_numpys_for_every_count_and_tie(seed: int, valid: int, values: int) -> None:
     generator = np.random.default_rng(seed)
     cells = np.full((64 * 80, 60), np.nan, np.float32)
     cells[:, :valid] = 0.2 + 0.001 * generator.integers(0, values, (64 * 80, valid))
@@ -87,7 +78,7 @@ def test_every_count_of_samples_and_ties_has_numpys_median(seed: int, valid: int
     np.testing.assert_allclose(maps.depth_m.ravel(), expected, rtol=1e-6)
 
 
-def test_intensity_is_the_mean_over_the_samples_near_the_median() -> None:
+def test_intensity_is_the_mean_over_samples_near_the_median() -> None:
     depth, ir = np.full((512, 640), 0.5), np.full((512, 640), 20, np.uint8)
     depth[:8, :3], ir[:8, :3] = 0.8, 200  # another winner in 24 of the first cell's 64 pixels
     depth[0, 7], ir[0, 7] = 0.509, 60
@@ -98,7 +89,7 @@ def test_intensity_is_the_mean_over_the_samples_near_the_median() -> None:
     assert maps.intensity[0, 1] == 20
 
 
-def test_two_winners_in_balance_still_give_an_intensity() -> None:
+def test_two_balanced_winners_give_an_intensity() -> None:
     depth, ir = np.full((512, 640), 0.4), np.full((512, 640), 10, np.uint8)
     depth[:, ::2], ir[:, ::2] = 0.8, 30
     maps = _maps(depth, ir)
@@ -108,31 +99,21 @@ def test_two_winners_in_balance_still_give_an_intensity() -> None:
 
 
 @pytest.mark.parametrize("nothing", [np.nan, 0.0, -0.1, np.inf, -np.inf])
-def test_what_is_no_depth_does_not_count(nothing: float) -> None:
-    depth = np.full((480, 640), 0.5)
-    depth[::2] = nothing
-    ir = np.full((480, 640), 10, np.uint8)
-    ir[::2] = 255
+def test_invalid_depth_does_not_count_in_a_cell(nothing: float) -> None:
+    depth, ir = np.full((480, 640), 0.5), np.full((480, 640), 10, np.uint8)
+    depth[::2], ir[::2] = nothing, 255
+    depth[:15, :8] = nothing  # two whole cells
     maps = _maps(depth, ir)
-    assert maps.valid.all()
-    assert (maps.depth_m == np.float32(0.5)).all()
-    assert (maps.intensity == 10).all()
-
-
-@pytest.mark.parametrize("nothing", [np.nan, 0.0, -0.1, np.inf, -np.inf])
-def test_a_cell_with_no_depth_is_nan_0_and_not_valid(nothing: float) -> None:
-    depth = np.full((480, 640), 0.5)
-    depth[:15, :8] = nothing
-    maps = _maps(depth, 90)
-    assert np.isnan(maps.depth_m[:2, 0]).all()
-    assert (maps.intensity[:2, 0] == 0).all()
-    assert not maps.valid[:2, 0].any()
-    assert maps.valid.sum() == MAP_ROWS * MAP_COLUMNS - 2
+    assert maps.depth_m.shape == maps.intensity.shape == maps.valid.shape == (MAP_ROWS, MAP_COLUMNS)
+    assert maps.depth_m.dtype == maps.intensity.dtype == np.float32
+    np.testing.assert_array_equal(np.argwhere(~maps.valid), [[0, 0], [1, 0]])
+    np.testing.assert_array_equal(maps.depth_m, np.where(maps.valid, np.float32(0.5), np.nan))
+    np.testing.assert_array_equal(maps.intensity, np.where(maps.valid, 10, 0))
 
 
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**16), size=st.sampled_from(SIZES[:4]), share=st.floats(0, 1))
-def test_maps_stay_within_what_the_frame_holds(seed: int, size: tuple[int, int], share: float) -> None:
+def test_maps_stay_within_the_range_of_the_frame(seed: int, size: tuple[int, int], share: float) -> None:
     generator = np.random.default_rng(seed)
     depth = generator.uniform(0.1, 9, size).astype(np.float32)
     depth[generator.random(size) < share] = np.nan
@@ -156,7 +137,73 @@ def test_mirroring_the_frame_mirrors_the_maps() -> None:
 
 
 @pytest.mark.parametrize("size", SIZES[:3])
-def test_the_simulated_sensor_spreads_cells_as_maps_gather_them(size: tuple[int, int]) -> None:
+def test_simulated_sensor_spreads_cells_as_maps_gather_them(size: tuple[int, int]) -> None:
     cell = cell_of_pixels(size, (MAP_ROWS, MAP_COLUMNS)).reshape(size)
     maps = _maps(cell + 1)
     np.testing.assert_array_equal(maps.depth_m.ravel(), np.arange(MAP_ROWS * MAP_COLUMNS) + 1)
+
+
+def noise(number: int, valid_share: float = 0.8) -> LidarMaps:
+    """Make maps as of a device: depth in quarters of a millimetre, and no return here and there."""
+    generator = np.random.default_rng(number)
+    depth_m = (0.00025 * generator.integers(1, 40_000, (64, 80))).astype(np.float32)
+    depth_m[generator.random((64, 80)) > valid_share] = np.nan
+    valid = ~np.isnan(depth_m)
+    return LidarMaps(depth_m, np.where(valid, generator.uniform(1, 255, (64, 80)), 0.0).astype(np.float32), valid)
+
+
+def mean_of(maps: list[LidarMaps]) -> LidarMaps:
+    """Compute the mean by its definition."""
+    valid = np.stack([each.valid for each in maps])
+    count, seen = valid.sum(axis=0), valid.any(axis=0)
+    depth_m = np.stack([each.depth_m for each in maps]).astype(np.float64).sum(axis=0, where=valid)
+    intensity = np.stack([each.intensity for each in maps]).astype(np.float64).sum(axis=0, where=valid)
+    depth_m, intensity = (np.where(seen, total / np.maximum(count, 1), np.nan) for total in (depth_m, intensity))
+    return LidarMaps(depth_m.astype(np.float32), np.nan_to_num(intensity).astype(np.float32), seen)
+
+
+def assert_equal(one: LidarMaps, other: LidarMaps) -> None:
+    np.testing.assert_array_equal(one.depth_m, other.depth_m)
+    np.testing.assert_array_equal(one.intensity, other.intensity)
+    np.testing.assert_array_equal(one.valid, other.valid)
+    assert one.depth_m.dtype == one.intensity.dtype == np.float32
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+@pytest.mark.parametrize("valid_share", [1.0, 0.5, 0.05])
+def test_map_mean_is_over_the_last_valid_values(frames: int, valid_share: float) -> None:
+    mean, given = MapMean(frames), [noise(number, valid_share) for number in range(12)]
+    for number, maps in enumerate(given):
+        found = mean.add(maps)
+        assert_equal(found, mean_of(given[max(0, number + 1 - frames) : number + 1]))
+        assert frames > 1 or found is maps
+
+
+def test_map_mean_accumulates_no_error() -> None:
+    mean, given = MapMean(7), [noise(number) for number in range(50)]
+    for turn in range(4000):
+        found = mean.add(given[turn % 50])
+    assert_equal(found, mean_of([given[turn % 50] for turn in range(3993, 4000)]))
+
+
+def test_map_mean_neither_changes_nor_keeps_its_input() -> None:
+    mean, maps, again = MapMean(2), noise(3), noise(3)
+    first = mean.add(maps)
+    kept = first.depth_m.copy()
+    maps.depth_m[:] = 9.0
+    mean.add(noise(4))
+    np.testing.assert_array_equal(first.depth_m, kept)
+    assert_equal(mean.add(noise(5)), mean_of([noise(4), noise(5)]))
+    np.testing.assert_array_equal(kept, again.depth_m)
+
+
+def test_map_mean_memory_does_not_grow() -> None:
+    mean, maps = MapMean(10), noise(0)
+    for _ in range(20):
+        mean.add(maps)
+    tracemalloc.start()
+    for _ in range(200):
+        mean.add(maps)
+    grown, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert grown < 100_000

@@ -174,7 +174,12 @@ def replays(out: Path) -> None:
         with TemporaryDirectory() as folder, tracked(f"reconstructing {name}") as update:
             made, done = Path(folder) / "replay", iter(range(1, frames + 1))
             replay_recording(
-                camera, processing, made, stop=Event(), on_frame=lambda: update(next(done), frames), looks=looks  # noqa: B023
+                camera,
+                processing,
+                made,
+                stop=Event(),
+                on_frame=lambda: update(next(done), frames),
+                looks=looks,  # noqa: B023
             )
             shutil.copyfile(max(made.glob("still-*.png")), out / f"gallery-{name}.png")
             if looks.video:

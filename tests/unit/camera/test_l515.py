@@ -1,0 +1,247 @@
+"""The L515's logic on a fake SDK; tests/hardware holds what only a device can show."""
+
+from collections.abc import Callable
+from itertools import islice
+from threading import Event
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_librealsense import FakeSdk, FakeSensor
+from fake_lidar import FakeLidar, NapClock
+
+from nlos_cam.camera.l515 import NEAR_WALL, NOT_OFFERED, L515Camera, Options, connected
+from nlos_cam.camera.streams import FORMATS
+from nlos_cam.errors import CameraError, CameraNotFoundError
+
+Make = Callable[..., Any]
+ENDLESS = (10**6,)
+
+
+class HookClock(NapClock):
+    """A clock that calls `hook` with the number of earlier waits before each wait."""
+
+    def __init__(self, hook: Callable[[int], object]) -> None:
+        super().__init__()
+        self.hook = hook
+
+    def wait(self, stop: Event, seconds: float) -> bool:
+        self.hook(len(self.naps))
+        return super().wait(stop, seconds)
+
+
+@pytest.mark.parametrize(
+    ("lidars", "serial", "words"),
+    [
+        ([], "", "USB 3"),
+        ([FakeLidar("123", name="Intel RealSense D435")], "", "Intel RealSense D435 123"),
+        ([FakeLidar("f1"), FakeLidar("f2")], "", "l515:f1, l515:f2"),
+        ([FakeLidar("f1")], "f9", "f9"),
+    ],
+)
+def test_camera_that_is_not_found_lists_what_is(
+    fake_camera: Make, lidars: list[FakeLidar], serial: str, words: str
+) -> None:
+    with pytest.raises(CameraNotFoundError, match=words):
+        fake_camera(*lidars, serial=serial)
+
+
+def test_serial_number_chooses_the_device(fake_camera: Make) -> None:
+    one, other = FakeLidar("f1"), FakeLidar("f2")
+    with fake_camera(one, other, serial="f2"):
+        assert other.opened
+    assert not one.opened
+
+
+@pytest.mark.parametrize(("usb", "size"), [("3.2", (640, 480)), ("2.1", (320, 240))])
+def test_usb_link_decides_the_resolution(
+    fake_camera: Make, caplog: pytest.LogCaptureFixture, usb: str, size: tuple[int, int]
+) -> None:
+    device = FakeLidar(usb=usb)
+    with fake_camera(device) as camera:
+        assert (camera.intrinsics.width, camera.intrinsics.height) == size
+        assert [(profile.stream, profile.size) for profile in device.opened] == [(one, size) for one in FORMATS]
+    assert ("USB 2.1" in caplog.text) == (usb == "2.1")
+    assert usb == "2.1" or not caplog.records  # settings that take are not logged
+
+
+def test_near_wall_settings_follow_start_and_preset(fake_camera: Make) -> None:
+    device, clock = FakeLidar(), NapClock()
+    with fake_camera(device, clock=clock):
+        did = device.did
+        assert did.index("start") < did.index("visual_preset") < min(did.index(name) for name in NEAR_WALL)
+    assert clock.naps == [0.5, 0.5]
+    assert device.options["visual_preset"] == 5.0
+
+
+def test_settings_that_do_not_take_are_logged_once(fake_camera: Make, caplog: pytest.LogCaptureFixture) -> None:
+    lidar = FakeLidar()
+    lidar.stubborn = {"min_distance"}
+    lidar.refused = {"noise_filtering"}
+    del lidar.options["invalidation_bypass"]
+    camera = fake_camera(lidar)
+    for _ in range(2):
+        with camera:
+            assert set(camera.differences) == {"min_distance", "noise_filtering", "invalidation_bypass"}
+            lidar.deliver(range(1, 2))
+            frame = next(iter(camera))
+            assert frame.settings == lidar.options  # as read back
+            assert frame.settings["min_distance"] == 9.0
+    for name, word in (("min_distance", "9"), ("noise_filtering", "out of range"), ("invalidation_bypass", "")):
+        [record] = [record for record in caplog.records if name in record.message]
+        assert word in record.message
+
+
+@pytest.mark.parametrize("share", [None, "f2"])
+def test_device_that_cannot_be_asked_is_reported(share: str | None) -> None:
+    def broken(device: Any) -> Any:
+        def fail(_: str) -> bool:
+            raise RuntimeError("no such luck")
+
+        device.supports = fail
+        return device
+
+    sdk = FakeSdk(FakeLidar("f1"), FakeLidar("f2"))
+    one, other = sdk.context().query_devices()
+    if share:  # it does not hide another
+        [(_, info)] = connected(sdk, SimpleNamespace(query_devices=lambda: [broken(one), other]))
+        assert info.serial == share
+    else:
+        with pytest.raises(CameraError, match="no such luck"):
+            connected(sdk, SimpleNamespace(query_devices=lambda: [broken(one)]))
+
+
+def test_setting_that_takes_late_is_set_once_more(fake_camera: Make) -> None:
+    """The preset may still be changing."""
+    lidar = FakeLidar()
+    clock = HookClock(lambda naps: lidar.stubborn.clear() if naps == 1 else None)
+    lidar.stubborn = {"min_distance"}
+    with fake_camera(lidar, clock=clock) as camera:
+        assert camera.differences == {}
+    assert clock.naps == [0.5, 0.5]
+    assert (lidar.did.count("min_distance"), lidar.did.count("noise_filtering")) == (2, 1)
+
+
+@pytest.mark.parametrize(("name", "nap", "wanted"), [("visual_preset", 0, 5.0), ("min_distance", 1, 0.0)])
+def test_setting_that_the_start_resets_is_set_again(fake_camera: Make, name: str, nap: int, wanted: float) -> None:
+    lidar = FakeLidar()
+    reset = {name: lidar.factory[name]}
+    with fake_camera(lidar, clock=HookClock(lambda naps: lidar.options.update(reset if naps == nap else {}))) as camera:
+        assert camera.differences == {}
+    assert lidar.options[name] == wanted
+
+
+def test_modes_that_alter_infrared_are_turned_off(fake_camera: Make) -> None:
+    lidar = FakeLidar()
+    lidar.options |= {"alternate_ir": 1.0, "enable_max_usable_range": 0.0}
+    with fake_camera(lidar):
+        assert lidar.options["alternate_ir"] == 0.0
+        assert not {"enable_max_usable_range", "enable_ir_reflectivity"} & set(lidar.did)
+
+
+@pytest.mark.parametrize(("threshold", "found"), [(100.0, 93.0), (60.0, 53.0), (53.0, 53.0), (20.0, 13.0), (-1.0, 1.0)])
+def test_laser_is_turned_down_until_little_saturates(
+    fake_camera: Make, caplog: pytest.LogCaptureFixture, threshold: float, found: float
+) -> None:
+    lidar = FakeLidar(usb="2.1", runs=ENDLESS, laser_power=93.0)
+    lidar.saturated_share = lambda power: 0.02 if power > threshold else 0.0005
+    with fake_camera(lidar) as camera:
+        frame = next(iter(camera))
+    assert frame.settings["laser_power"] == found
+    if found > 1.0:
+        assert np.count_nonzero(frame.ir == 255) <= 0.001 * frame.ir.size  # none from before it was found
+    assert ("laser power 1:" in caplog.text) == ("2.0 %" in caplog.text) == (found == 1.0)  # with advice
+    assert ("turned down" in caplog.text) == (found < 93.0)
+
+
+def test_laser_power_is_kept_when_a_device_comes_back(fake_camera: Make) -> None:
+    lidar = FakeLidar(usb="2.1", runs=(100, 10**6), laser_power=93.0)
+    lidar.saturated_share = lambda power: 0.3 if power > 60.0 else 0.0
+    lidar.flaps = 1
+    with fake_camera(lidar) as camera:
+        camera.silence_s = 0.3
+        frames = iter(camera)
+        while not camera.counts["replugged"]:
+            found = next(frames)
+        assert found.settings["laser_power"] == 53.0
+    assert lidar.did[lidar.did.index("unplugged") :].count("laser_power") == 1
+
+
+def test_two_cameras_share_a_context_and_keep_their_devices() -> None:
+    sdk = FakeSdk(*(FakeLidar(serial, usb="2.1", runs=ENDLESS) for serial in ("f1", "f2")))
+    made = [L515Camera(f"l515:{serial}", serial, sdk=sdk, clock=NapClock()) for serial in ("f1", "f2")]
+    with made[0] as first, made[1] as second:
+        for camera, serial in ((first, "f1"), (second, "f2")):
+            assert camera.identity["serial"] == serial
+            assert len(list(islice(camera, 5))) == 5
+    assert sdk.contexts == 1
+
+
+def test_identity_holds_what_the_device_reports(fake_camera: Make) -> None:
+    lidar = FakeLidar()
+    del lidar.info["usb_type_descriptor"]
+    expected = {"name": "Intel RealSense L515", "serial": "f0246262", "firmware": "01.05.08.01"}
+    assert fake_camera(lidar).identity == expected
+
+
+def test_telemetry_omits_values_not_measured_yet(fake_camera: Make) -> None:
+    lidar = FakeLidar(apd_temperature=-9999.0, ldd_temperature=41.5)
+    camera = fake_camera(lidar)
+    assert camera.telemetry() == {}
+    with camera:
+        assert camera.telemetry()["ldd_temperature"] == 41.5
+        assert "apd_temperature" not in camera.telemetry()
+        lidar.options["apd_temperature"] = 38.0
+        assert camera.telemetry()["apd_temperature"] == 38.0
+        assert set(camera.telemetry("_temperature")) == {"ldd_temperature", "apd_temperature"}
+        lidar.unplug()
+        assert camera.telemetry() == {}
+    assert camera.telemetry() == {}
+
+
+def test_device_that_vanishes_during_set_up_is_an_error(fake_camera: Make) -> None:
+    lidar = FakeLidar()
+    with pytest.raises(CameraError, match="vanished"):
+        fake_camera(lidar, clock=HookClock(lambda _: lidar.unplug())).__enter__()
+
+
+@pytest.fixture
+def lidar() -> FakeLidar:
+    return FakeLidar(laser_power=93.0)
+
+
+@pytest.fixture
+def options(lidar: FakeLidar) -> Options:
+    return Options(FakeSensor(lidar, 0), FakeSdk())
+
+
+@pytest.mark.parametrize(
+    ("wanted", "value"), [(0.0, 190.0), (194.0, 190.0), (197.0, 200.0), (9000.0, 6000.0), (200.0, 200.0)]
+)
+def test_option_is_set_to_the_nearest_value_in_range(
+    lidar: FakeLidar, options: Options, wanted: float, value: float
+) -> None:
+    lidar.ranges["min_distance"] = (190.0, 6000.0, 10.0)
+    difference = options.put("min_distance", wanted)
+    assert bool(difference) == (wanted != value)
+    assert not difference or (f"{wanted:g}" in difference and f"{value:g}" in difference)
+    assert lidar.options["min_distance"] == options.get("min_distance") == value
+
+
+def test_option_that_is_missing_or_refused_is_reported(lidar: FakeLidar, options: Options) -> None:
+    assert options.put("alternate_ir", 1.0) == NOT_OFFERED
+    assert options.get("alternate_ir") is options.limits("alternate_ir") is None
+    assert "alternate_ir" not in lidar.did
+    lidar.refused = {"laser_power"}
+    assert "out of range" in options.put("laser_power", 50.0)
+    lidar.unplug()
+    assert options.limits("laser_power") is options.get("laser_power") is None
+    assert "failed to set power state" in options.put("laser_power", 50.0)
+
+
+def test_options_are_set_in_order_and_report_differences(lidar: FakeLidar, options: Options) -> None:
+    lidar.stubborn = {"noise_filtering"}
+    differences = options.put_all({"min_distance": 0.0, "noise_filtering": 2.0, "laser_power": 40.0})
+    assert set(differences) == {"noise_filtering"}
+    assert lidar.did == ["min_distance", "noise_filtering", "laser_power"]

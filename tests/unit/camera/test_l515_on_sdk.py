@@ -1,0 +1,105 @@
+"""The L515's camera on librealsense itself: a software device with an L515's options, delivering from a thread."""
+
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_lidar import NapClock
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.camera.l515 import NEAR_WALL, PRESET, L515Camera
+from nlos_cam.camera.recorder import Recording
+from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera.simulated import SoftwareLidar
+from nlos_cam.recording.playback import ReplayCamera, verify
+from nlos_cam.render.sensor.sensor import SensedImages
+
+SATURATES_ABOVE = 60.0
+
+
+RANGES = dict.fromkeys(NEAR_WALL, (0.0, 6.0)) | {"visual_preset": (0.0, 6.0), "laser_power": (0.0, 100.0)}
+
+
+class Desk:
+    """Stands for pyrealsense2; its context sees a software device with an L515's options."""
+
+    def __init__(self) -> None:
+        self.sdk = load_sdk()
+        pinhole = load_rig("paper-rig").pinhole
+        self.lidar, self._context = SoftwareLidar(pinhole, self.sdk), self.sdk.context()
+        for name, (low, high) in RANGES.items():
+            self.lidar._sensor.add_option(getattr(self.sdk.option, name), self._range(low, high), True)
+        self.lidar.device.add_to(self._context)
+        shape = pinhole.height, pinhole.width
+        self.dim = SensedImages(
+            np.full(shape, 800, np.uint16), np.full(shape, 48, np.uint8), np.full(shape, 15, np.uint8)
+        )
+        self.bright = SensedImages(self.dim.depth_z16, np.full(shape, 255, np.uint8), self.dim.confidence)
+
+    def _range(self, low: float, high: float) -> Any:
+        made = self.sdk.option_range()
+        made.min, made.max, made.step, made.default = low, high, 1.0, high
+        return made
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.sdk, name)
+
+    def context(self) -> Any:
+        return self._context
+
+    def deliver(self, stop: threading.Event) -> None:
+        number = 0
+        while not stop.wait(0.03):
+            power = self.lidar._sensor.get_option(self.sdk.option.laser_power)
+            images = self.bright if power > SATURATES_ABOVE else self.dim
+            self.lidar.push(number, 1e9 + number / 30, images)
+            number += 1
+
+
+class Delivering(L515Camera):
+    """A software device accepts frames only while it streams."""
+
+    thread: threading.Thread | None = None
+
+    def __init__(self, desk: Desk, recording: Recording) -> None:
+        self.desk, self.stop = desk, threading.Event()
+        super().__init__("l515", "", sdk=desk, clock=NapClock(), recording=recording)
+
+    def _prepare(self, sensor: Any) -> None:
+        self.thread = threading.Thread(target=self.desk.deliver, args=(self.stop,), name="lidar")
+        self.thread.start()
+        super()._prepare(sensor)
+
+    def _end(self) -> None:
+        self.stop.set()
+        if self.thread:
+            self.thread.join(5.0)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, dict[str, float], dict[str, str]]:
+    path = tmp_path_factory.mktemp("l515") / "wall.bag"
+    recording = Recording(path, frames=20)
+    with Delivering(Desk(), recording) as camera:
+        frames = list(camera)
+    return recording, dict(frames[-1].settings), dict(camera.differences)
+
+
+def test_settings_take_on_librealsense(recorded: Any) -> None:
+    _, settings, differences = recorded
+    assert set(differences) == {"global_time_enabled"}
+    wanted = NEAR_WALL | {"visual_preset": PRESET["visual_preset"], "laser_power": 60.0}
+    assert {name: settings[name] for name in wanted} == wanted
+
+
+def test_recording_on_a_running_sensor_is_whole_and_settled(recorded: Any) -> None:
+    recording, settings, _ = recorded
+    found = verify(recording.path)
+    assert found.frames >= recording.sets == 20
+    assert found.dropped == 0
+    assert found.streams == dict.fromkeys(("depth", "infrared", "confidence"), found.frames)
+    with ReplayCamera(recording.path) as replayed:
+        frames = list(replayed)
+    assert {name: frames[0].settings[name] for name in RANGES} == {name: settings[name] for name in RANGES}
+    assert all(frame.ir.max() == 48 for frame in frames)  # none from before the laser was turned down

@@ -1,0 +1,267 @@
+"""LiveCamera over an L515's faults, on a fake SDK that delivers from its own thread, and their recordings."""
+
+import time
+from collections.abc import Callable
+from itertools import islice, pairwise
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_lidar import FakeLidar
+
+from nlos_cam.camera.l515 import NEAR_WALL, L515Camera
+from nlos_cam.camera.recorder import Recording
+from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.errors import CameraError, CameraLostError
+from nlos_cam.frames import Frame
+from nlos_cam.recording.playback import verify
+from nlos_cam.render.scene_file import Fault
+
+Make = Callable[..., Any]
+SILENCE_S = 0.3
+ENDLESS = 10**6
+
+
+def impatient(camera: L515Camera, silence_s: float = SILENCE_S) -> L515Camera:
+    camera.silence_s = silence_s
+    return camera
+
+
+def rises(frames: list[Frame]) -> bool:
+    """Whether numbers and timestamps rise together."""
+    steps = [
+        (next_one.frame_number - one.frame_number, next_one.timestamp_s - one.timestamp_s)
+        for one, next_one in pairwise(frames)
+    ]
+    return all(count > 0 and seconds * 30 == pytest.approx(count, abs=0.5) for count, seconds in steps)
+
+
+def holes(frames: list[Frame]) -> int:
+    return frames[-1].frame_number - frames[0].frame_number + 1 - len(frames)
+
+
+def test_frames_are_in_metres_and_levels_and_none_is_early(fake_camera: Make) -> None:
+    device = FakeLidar()
+    with fake_camera(device) as camera:
+        device.deliver(range(5, 8))
+        frames = list(islice(camera, 3))
+    assert device.did[-2:] == ["stop", "close"]
+    assert [frame.frame_number for frame in frames] == [5, 6, 7]  # none from before the settings
+    np.testing.assert_allclose(frames[0].depth_m, 240 * 0.00025, rtol=1e-6)
+    assert (frames[0].ir == 240).all()
+    assert (frames[0].confidence == 15).all()
+    assert frames[0].truth_depth_m is None
+
+
+def test_device_without_a_stream_or_unit_is_an_error(fake_camera: Make) -> None:
+    with pytest.raises(CameraError, match=r"confidence.*640 x 480"):
+        fake_camera(FakeLidar(streams=("depth", "infrared")))
+    device = FakeLidar()
+    del device.options["depth_units"]
+    with pytest.raises(CameraError, match="depth unit"):
+        fake_camera(device)
+
+
+def test_device_that_does_not_start_is_left_closed(fake_camera: Make) -> None:
+    device = FakeLidar()
+    device.start_error = RuntimeError("failed to set power state")
+    with pytest.raises(CameraError, match="failed to set power state"):
+        fake_camera(device).__enter__()
+    assert device.did == ["stop", "close"]
+
+
+def test_stall_is_cured_by_restarting_the_streams(fake_camera: Make) -> None:
+    with impatient(fake_camera(FakeLidar(usb="2.1", runs=(30, ENDLESS)))) as camera:
+        frames = list(islice(camera, 50))
+        assert camera.counts == {"restarted": 1}
+    assert rises(frames)
+    assert camera.dropped + camera.incomplete == holes(frames) > 0
+
+
+def test_each_silence_starts_with_a_restart(fake_camera: Make) -> None:
+    with impatient(fake_camera(FakeLidar(usb="2.1", runs=(30, 30, 30, 30, 30, ENDLESS))), 0.1) as camera:
+        while camera.counts["restarted"] < 5:
+            next(iter(camera))
+        assert camera.counts == {"restarted": 5}
+
+
+def test_device_is_reset_where_restarts_do_not_help(fake_camera: Make) -> None:
+    lidar = FakeLidar(usb="2.1", runs=(30, 0, 0, 0, ENDLESS))
+    with impatient(fake_camera(lidar)) as camera:
+        frames = list(islice(camera, 50))
+        assert camera.counts == {"restarted": 3, "reset": 1}
+    assert rises(frames)
+    assert lidar.did.count("reset") == 1
+
+
+def test_device_that_nothing_helps_is_lost_with_counts(fake_camera: Make) -> None:
+    lidar = FakeLidar(usb="2.1", runs=(30,))
+    with (
+        impatient(fake_camera(lidar)) as camera,
+        pytest.raises(CameraLostError, match=r"(\d+) depth, \1 infrared, \1 confidence.*3 restarts"),
+    ):
+        list(camera)
+    assert lidar.did[-1] == "close"
+
+
+def test_frames_of_some_streams_count_as_incomplete(fake_camera: Make) -> None:
+    lidar = FakeLidar()
+    with impatient(fake_camera(lidar)) as camera:
+        frames = iter(camera)
+        lidar.deliver(range(1, 3))
+        seen = [next(frames), next(frames)]
+        lidar.deliver(range(3, 103), streams=("depth",))
+        lidar.runs = [ENDLESS]
+        seen.append(next(frames))
+        assert camera.incomplete == 70  # the youngest 30 may yet have become sets
+        assert camera.incomplete + camera.dropped >= holes(seen)
+    assert rises(seen)
+
+
+def test_replugged_device_gets_the_same_settings(fake_camera: Make) -> None:
+    lidar = FakeLidar(usb="2.1", runs=(30, ENDLESS))
+    lidar.flaps = 1
+    with impatient(fake_camera(lidar)) as camera:
+        frames = list(islice(camera, 50))
+        assert camera.counts == {"replugged": 1}
+    assert rises(frames)
+    assert {name: lidar.options[name] for name in NEAR_WALL} == NEAR_WALL
+    assert (lidar.options["visual_preset"], frames[-1].settings["min_distance"]) == (5.0, 0.0)
+
+
+def test_unplugged_device_that_stays_away_is_lost(fake_camera: Make, caplog: pytest.LogCaptureFixture) -> None:
+    lidar, other = FakeLidar("f1"), FakeLidar("f2")
+    with impatient(fake_camera(lidar, other, serial="f1")) as camera:
+        lidar.unplug()
+        with pytest.raises(CameraLostError, match="60 s"):
+            list(camera)
+        assert camera.telemetry() == {}
+    assert caplog.text.count("60 s") == 1
+    assert not other.did
+
+
+def test_device_back_on_a_slow_port_is_lost(fake_camera: Make) -> None:
+    lidar = FakeLidar()
+    with impatient(fake_camera(lidar)) as camera:
+        lidar.unplug()
+        lidar.info["usb_type_descriptor"] = "2.1"
+        lidar.plug_in()
+        with pytest.raises(CameraLostError, match="640 x 480"):
+            list(camera)
+
+
+@pytest.mark.slow
+def test_device_unplugged_twenty_times_comes_back_each_time(fake_camera: Make) -> None:
+    """The fixture `nothing_left_running` fails if a thread is left."""
+    lidar = FakeLidar(usb="2.1", runs=(20, ENDLESS))
+    lidar.flaps = 20
+    with impatient(fake_camera(lidar), 0.2) as camera:
+        frames = list[Frame]()
+        while camera.counts["replugged"] < 20 or len(frames) % 5:
+            frames += islice(camera, 1)
+        assert camera.counts["replugged"] == 20
+        assert camera.dropped + camera.incomplete == holes(frames)
+    assert rises(frames)
+    assert lidar.did.count("unplugged") == 20
+
+
+@pytest.mark.parametrize("reset_helps", [True, False])
+def test_lost_calibration_is_cured_by_one_reset_or_an_error(fake_camera: Make, reset_helps: bool) -> None:
+    lidar = FakeLidar()
+    lidar.uncalibrated = True
+    if reset_helps:
+        camera = fake_camera(lidar)
+        assert camera.counts == {"reset": 1}
+        assert camera.intrinsics.width == 640
+    else:
+        lidar.reset_takes = 0
+        with pytest.raises(CameraError, match="doesn't exist"):
+            fake_camera(lidar)
+
+
+def test_leaving_ends_a_recovery_and_may_be_repeated(fake_camera: Make) -> None:
+    lidar, failures, waits = FakeLidar(), list[Exception](), Event()
+
+    class RealPace:
+        """A clock that waits as long as it is asked to."""
+
+        def now(self) -> float:
+            return time.monotonic()
+
+        def wait(self, stop: Event, seconds: float) -> bool:
+            if not lidar.plugged:
+                waits.set()
+            return stop.wait(seconds)
+
+    def iterate() -> None:
+        try:
+            list(camera)
+        except Exception as error:  # noqa: BLE001  whatever it is, the test looks at it
+            failures.append(error)
+
+    with impatient(fake_camera(lidar, clock=RealPace()), 0.05) as camera:
+        lidar.unplug()
+        thread = Thread(target=iterate)
+        thread.start()
+        assert waits.wait(30.0)  # of the 60 s in which it may come back
+        assert thread.is_alive()
+        camera.__exit__(None, None, None)
+        thread.join(30.0)
+        assert not thread.is_alive()
+    assert not failures
+    lidar = FakeLidar()
+    with fake_camera(lidar) as camera:
+        camera.__exit__(None, None, None)
+    assert lidar.did.count("stop") == lidar.did.count("close") == 1
+
+
+FAULTS = [Fault(kind=kind, at_frame=15, frames=2000) for kind in ("unplug", "stall")]
+
+
+@pytest.mark.parametrize("optional", [True, False])
+@pytest.mark.parametrize("fault", FAULTS, ids=["unplug", "stall"])
+def test_recording_of_a_lost_device_ends_whole(
+    noise_world: Make, hurried_clock: Any, fault: Fault, optional: bool, tmp_path: Path, caplog: Any
+) -> None:
+    class Impatient(hurried_clock):
+        """Waits for the next frame of its world only; any longer wait lasts until the fault is over."""
+
+        def wait(self, stop: Event, seconds: float) -> bool:
+            return super().wait(stop, seconds if seconds < 0.2 else 100.0)
+
+    recording = Recording(tmp_path / "run.bag", optional=optional)
+    simulated = SimulatedCamera("sim", noise_world(), clock=Impatient(), recording=recording, faults=[fault])
+    simulated.silence_s, simulated.replug_s = 0.5, 1000.0
+    if optional:  # the camera goes on
+        with simulated as camera:
+            numbers = [frame.frame_number for frame in islice(camera, 40)]
+            assert camera.counts["replugged"] + camera.counts["restarted"] > 0
+            found = verify(recording.path)  # while the camera goes on
+        assert all(one < next_one for one, next_one in pairwise(numbers))
+        assert f"{recording.sets} frames" in caplog.text
+    else:
+        with pytest.raises(CameraLostError, match="whole"), simulated as camera:
+            list(camera)
+        assert not camera.counts["replugged"]
+        found = verify(recording.path)
+    assert found.frames == recording.sets > 0
+    assert found.dropped == 0
+
+
+def test_recording_without_a_frame_restarts_with_the_streams(fake_camera: Make, tmp_path: Path) -> None:
+    lidar, recording = FakeLidar(usb="2.1", runs=(0, 0, ENDLESS)), Recording(tmp_path / "run.bag", frames=5)
+    with impatient(fake_camera(lidar, recording=recording)) as camera:
+        assert len(list(camera)) == recording.sets == 5
+        assert camera.counts == {"restarted": 2}
+        assert camera.dropped == camera.incomplete == 0
+    assert [did for did in lidar.did if did in {"start", "record", "stop"}] == ["start", "record", "stop"] * 3
+
+
+def test_recording_starts_when_the_settings_hold(fake_camera: Make, tmp_path: Path) -> None:
+    lidar = FakeLidar(usb="2.1", runs=(ENDLESS,), laser_power=93.0)
+    lidar.saturated_share = lambda power: 0.3 if power > 60 else 0.0
+    with fake_camera(lidar, recording=Recording(tmp_path / "run.bag", frames=5)) as camera:
+        assert len(list(camera)) == 5
+    assert lidar.did.index("record") > max(at for at, did in enumerate(lidar.did) if did in lidar.options)

@@ -1,0 +1,333 @@
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from nlos_calibration.geometry import Intrinsics
+
+from nlos_cam.camera.recorder import (
+    FLUSH_S,
+    FLUSHES,
+    RESERVE_BYTES,
+    STILL_S,
+    Recording,
+    SdkRecorder,
+    bytes_per_frame,
+    can_grow,
+    check_room,
+    free_bytes,
+    recording_s,
+)
+from nlos_cam.camera.session import CAPACITY
+from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera.streams import FORMATS
+from nlos_cam.errors import DiskFullError, RecordingError
+from nlos_cam.frames import Frame
+from nlos_cam.recording.playback import ReplayCamera, verify
+
+Make = Callable[[Recording], SimulatedCamera]
+
+
+@pytest.fixture
+def camera(noise_world: Any, hurried_clock: Any) -> Make:
+    return lambda recording: SimulatedCamera("sim", noise_world(), clock=hurried_clock(), recording=recording)
+
+
+@pytest.mark.parametrize(
+    ("limit", "frames"),
+    [({"frames": 1}, 1), ({"frames": 31}, 31), *(({"seconds": s}, n) for s, n in ((0.01, 1), (0.1, 3), (1.0, 30)))],
+)
+def test_recording_ends_after_its_frames_or_device_seconds(
+    camera: Make, tmp_path: Path, limit: dict[str, Any], frames: int
+) -> None:
+    path = tmp_path / "a.bag"
+    path.write_text("an old file")
+    recording = Recording(path, **limit)
+    with camera(recording) as source:
+        for _ in source:
+            pass
+    found = verify(path)
+    assert (found.frames, found.dropped, recording.sets) == (frames, 0, frames)
+    assert set(found.streams.values()) == {frames}
+
+
+def test_leaving_early_keeps_whole_sets(camera: Make, tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "a.bag")
+    with camera(recording) as source:
+        last = [frame.frame_number for frame in islice(source, 10)][-1]
+    found = verify(recording.path)
+    assert found.frames == recording.sets > last
+    assert set(found.streams.values()) == {found.frames}
+
+
+def test_slow_reader_costs_the_recording_nothing(camera: Make, tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "a.bag", frames=60)
+    with camera(recording) as source:
+        while recording.sets < 60:
+            source._thread.join(0.01)
+        count = len(list(source))
+    assert count < 60
+    assert source.dropped == 60 - count
+    assert verify(recording.path).frames == 60
+
+
+def watch(recording: Recording, frames: Iterator[Frame]) -> list[int]:
+    """Return the numbers of a take's frames that a reader of the camera got."""
+    numbers: list[int] = []
+    for frame in frames:
+        if recording.covers(frame.timestamp_s):
+            numbers.append(frame.frame_number)
+        elif recording.done:
+            break
+    return numbers
+
+
+@pytest.mark.parametrize("limit", [{"frames": 6}, {"seconds": 0.2}])
+def test_takes_follow_each_other_on_a_running_camera(camera: Make, tmp_path: Path, limit: dict[str, Any]) -> None:
+    paths = [tmp_path / f"{number}.bag" for number in range(3)]
+    recording, numbers = Recording(paths[0], **limit, last=False), list[int]()
+    with camera(recording) as source:
+        frames = iter(source)
+        for path in paths:
+            if path != paths[0]:
+                recording.next_take(path, last=path == paths[-1])
+            seen = watch(recording, frames)
+            recording.close()
+            with ReplayCamera(path) as replayed:
+                recorded = [frame.frame_number for frame in replayed]
+            assert path == paths[0] or set(seen) <= set(recorded)
+            numbers += recorded
+    for path in paths:
+        found = verify(path)
+        assert (found.frames, found.dropped) == (6, 0)
+        assert set(found.streams.values()) == {6}
+    assert numbers == sorted(set(numbers))
+
+
+def test_only_the_last_take_ends_the_iteration(camera: Make, tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "a.bag", frames=3, last=False)
+    with camera(recording) as source:
+        assert len(list(islice(source, 20))) == 20
+        assert recording.done
+        recording.close()
+        recording.next_take(tmp_path / "b.bag", last=True)
+        assert len(list(source)) <= CAPACITY + 1 + 3
+    assert recording.sets == 3
+
+
+def test_next_take_starts_though_no_frame_comes(camera: Make, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("nlos_cam.camera.recorder.BOUNDARY_WAIT_S", 0.01)
+    recording = Recording(tmp_path / "a.bag", frames=1, last=False)
+    with camera(recording) as source:
+        next(iter(source))
+        source._end()
+        recording.close()
+        recording.next_take(tmp_path / "b.bag", last=True)
+        assert recording.begun
+        assert not recording.done
+    assert (tmp_path / "b.bag").exists()
+
+
+@pytest.mark.parametrize(("looks", "last", "frames"), [(2, True, 61), (0, False, 1)])
+def test_recording_ends_whole_where_disk_space_is_low(
+    camera: Make, tmp_path: Path, looks: int, last: bool, frames: int
+) -> None:
+    left = iter([RESERVE_BYTES] * looks + [RESERVE_BYTES - 1])
+    recording = Recording(tmp_path / "a.bag", last=last, free=lambda _: next(left, 0))
+    with camera(recording) as source:
+        assert list(source)
+    assert recording.disk_full
+    found = verify(recording.path)
+    assert found.frames == recording.sets == frames
+    assert set(found.streams.values()) == {frames}
+
+
+@pytest.mark.parametrize("ending", ["little space", "no index"])
+def test_camera_goes_on_without_an_optional_recording(
+    camera: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, ending: str
+) -> None:
+    if ending == "no index":
+        monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: False)
+    left = 0 if ending == "little space" else 2 * RESERVE_BYTES
+    recording = Recording(tmp_path / "a.bag", optional=True, free=lambda _: left)
+    with camera(recording) as source:
+        assert len(list(islice(source, 40))) == 40
+    assert recording.sets == 1 or ending == "no index"
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert "a.bag" in warning
+
+
+UNTIL_THE_LIMIT = """
+import importlib.util, resource, sys
+from pathlib import Path
+sys.path.insert(0, str(Path(sys.argv[1]).parent / "fakes"))
+spec = importlib.util.spec_from_file_location("fakes", sys.argv[1])
+fakes = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(fakes)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
+from nlos_cam.errors import DiskFullError
+try:
+    fakes.record_noise(Path(sys.argv[2]), 200)
+except DiskFullError as error:
+    print(error)
+"""
+
+
+class FakeRecorder:
+    """An `rs.recorder` that writes a file, and calls `on_pause` when it pauses."""
+
+    def __init__(self, path: str, device: Any) -> None:
+        Path(path).write_bytes(b"recorded")
+        self.device, self.pauses = device, 0
+        self.on_pause: Callable[[], None] = lambda: None
+
+    def pause(self) -> None:
+        self.pauses += 1
+        self.on_pause()
+
+
+class FakeTime:
+    def __init__(self) -> None:
+        self.time_s = 0.0
+
+    def now(self) -> float:
+        return self.time_s
+
+    def pass_by(self, seconds: float) -> None:
+        self.time_s += seconds
+
+
+@pytest.fixture
+def clock() -> FakeTime:
+    return FakeTime()
+
+
+@pytest.fixture
+def made(tmp_path: Path, clock: FakeTime) -> SdkRecorder:
+    path = tmp_path / "a.bag"
+    path.write_bytes(b"something else, and longer")
+    made = SdkRecorder(path, "device", SimpleNamespace(recorder=FakeRecorder), now=clock.now)
+    assert path.read_bytes() == b"recorded"
+    return made
+
+
+def test_recorder_reports_a_place_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no folder"):
+        SdkRecorder(tmp_path / "no folder" / "a.bag", "device", SimpleNamespace(recorder=FakeRecorder))
+
+
+@pytest.mark.parametrize(("slow", "pauses"), [(0, 1), (3, 4), (10**6, FLUSHES)])
+def test_recorder_pauses_again_while_a_disk_is_behind(
+    made: SdkRecorder, clock: FakeTime, slow: int, pauses: int
+) -> None:
+    fake = made._recorder
+    fake.on_pause = lambda: clock.pass_by(FLUSH_S + 1 if fake.pauses <= slow else 1.0)
+    if pauses == FLUSHES:
+        with pytest.raises(DiskFullError, match=r"a\.bag"):
+            made.close()
+    else:
+        made.close()
+        assert made._recorder is None
+    assert fake.pauses == pauses
+
+
+def test_recorder_whose_file_grows_no_more_fails(made: SdkRecorder, clock: FakeTime) -> None:
+    for _ in range(10):  # now and then
+        made.watch()
+        clock.pass_by(STILL_S / 2)
+        made.watch()
+        with made.path.open("ab") as file:
+            file.write(b"more")
+    made.watch()
+    assert made.failure is None
+    clock.pass_by(STILL_S + 1)
+    made.watch()
+    with pytest.raises(DiskFullError, match=r"nlos-cam repair .*a\.bag --out .*a-repaired\.bag") as raised:
+        made.close()
+    assert "\n" not in str(raised.value)
+
+
+def test_recorder_checks_room_for_the_index(made: SdkRecorder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: False)
+    with pytest.raises(DiskFullError, match="index"):
+        made.close()
+
+
+def whole_chunks(content: bytes) -> int:
+    """Count the whole chunks of a .bag: the length of one that is still written reads as 0."""
+    at, count = content.index(b"\n") + 1, 0
+    while at + 4 <= len(content):
+        data = at + 4 + int.from_bytes(content[at : at + 4], "little")
+        length = int.from_bytes(content[data : data + 4], "little")
+        if b"op=\x05" in content[at:data]:
+            if length == 0 or data + 4 + length > len(content):
+                break
+            count += 1
+        at = data + 4 + length
+    return count
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [5_000, 1_700_000])
+def test_librealsense_at_a_file_size_limit_keeps_whole_chunks(tmp_path: Path, limit: int) -> None:
+    """The limit is the process's own, on the size of files: it fails as a full disk does."""
+    pytest.importorskip("resource")
+    path = tmp_path / "a.bag"
+    arguments = [Path(__file__).parents[2] / "conftest.py", path, str(limit)]
+    ended = subprocess.run(  # noqa: PLW1510  the code is what is tested
+        [sys.executable, "-c", UNTIL_THE_LIMIT, *arguments], capture_output=True, text=True, timeout=120
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.count("\n") == 1
+    assert f"nlos-cam repair {path} --out" in ended.stdout
+    assert path.stat().st_size <= limit
+    assert whole_chunks(path.read_bytes()) == limit // 800_000
+
+
+VGA, SMALL = Intrinsics(640, 480, 460.0, 460.0, 320.0, 240.0), Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
+
+
+def test_bytes_per_frame_bounds_a_recording(noise_world: type, recorded: Any, tmp_path: Path) -> None:
+    images, frames = noise_world().images(0), 200
+    streams = images.depth_z16, images.ir, images.confidence
+    assert len(streams) == len(FORMATS)
+    assert bytes_per_frame(SMALL) == sum(pixels.nbytes for pixels in streams)
+    size = recorded(tmp_path / "noise.bag", frames).stat().st_size
+    overhead = 3 * 600 * frames  # metadata and index of a stream's frame, which count where frames are this small
+    assert 0.5 * frames * bytes_per_frame(SMALL) < size < frames * bytes_per_frame(SMALL) + overhead
+
+
+def test_free_bytes_are_those_of_a_future_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert free_bytes(tmp_path / "none.bag") > 0
+    monkeypatch.chdir(tmp_path)
+    assert free_bytes(Path("none.bag")) > 0
+
+
+@pytest.mark.parametrize("seconds", [0, 1, 10, 600])
+def test_check_room_needs_frames_and_a_reserve(tmp_path: Path, seconds: int) -> None:
+    path, free = tmp_path / "a.bag", RESERVE_BYTES + 30 * seconds * bytes_per_frame(VGA)
+    assert recording_s(VGA, free) == seconds
+    assert recording_s(VGA, 0) == 0
+    check_room(path, VGA, 30 * seconds, free)
+    with pytest.raises(DiskFullError, match=rf"a\.bag.*{30 * seconds or ''}"):
+        check_room(path, VGA, 30 * seconds, free - 1)
+
+
+def test_can_grow_finds_a_limit_and_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    path.write_bytes(b"precious")
+    assert can_grow(path, 1_000_000)
+    assert path.read_bytes() == b"precious"
+    pytest.importorskip("resource")
+    program = (
+        "import pathlib, resource, sys\nfrom nlos_cam.camera.disk import can_grow\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))\n"
+        "path = pathlib.Path(sys.argv[1])\nprint(can_grow(path, 4000), can_grow(path, 6000))"
+    )
+    ended = subprocess.run([sys.executable, "-c", program, path], capture_output=True, text=True, check=True)
+    assert ended.stdout == "True False\n"
+    assert path.read_bytes() == b"precious"

@@ -1,0 +1,200 @@
+import time
+from collections.abc import Callable, Iterator
+from threading import Thread, Timer
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_librealsense import FakeDevice, FakeSensor
+from fake_lidar import FakeLidar
+
+from nlos_cam.camera.session import CAPACITY, SampleQueue, Session, find_streams, read_settings
+from nlos_cam.camera.streams import FORMATS, Sample
+
+
+def put(inbox: SampleQueue, numbers: range) -> None:
+    for number in numbers:
+        for stream in FORMATS:
+            inbox.put(Sample(stream, number, number / 30, np.zeros((1, 1))))
+
+
+def take_all(inbox: SampleQueue) -> list[int]:
+    taken: list[int] = []
+    while (found := inbox.take(0.0)) is not None:
+        taken.append(found.number)
+    return taken
+
+
+def test_live_inbox_drops_its_oldest_when_full() -> None:
+    numbers: list[int] = []
+    inbox = SampleQueue(lossless=False, on_set=lambda found: numbers.append(found.number))
+    put(inbox, range(CAPACITY + 3))
+    assert take_all(inbox) == list(range(3, CAPACITY + 3))
+    assert inbox.dropped == 3
+    assert numbers == list(range(CAPACITY + 3))
+    assert inbox.take(0.001) is None
+
+
+@pytest.fixture
+def sending() -> Iterator[tuple[SampleQueue, Thread]]:
+    """A lossless inbox, and a thread that puts five times its capacity into it."""
+    inbox = SampleQueue(lossless=True)
+    sender = Thread(target=put, args=(inbox, range(5 * CAPACITY)))
+    sender.start()
+    yield inbox, sender
+    inbox.close()
+    sender.join()
+
+
+def test_full_lossless_inbox_makes_the_sender_wait(sending: tuple[SampleQueue, Thread]) -> None:
+    inbox, sender = sending
+    while inbox.arrived.total() < 3 * CAPACITY:
+        time.sleep(0.001)
+    sender.join(0.05)
+    assert inbox.arrived.total() == 3 * CAPACITY
+    taken = [found.number for _ in range(5 * CAPACITY) if (found := inbox.take(30.0))]
+    sender.join()
+    assert taken == list(range(5 * CAPACITY))
+    assert inbox.dropped == 0
+
+
+def test_closing_an_inbox_releases_its_sender(sending: tuple[SampleQueue, Thread]) -> None:
+    inbox, sender = sending
+    inbox.close()
+    sender.join(30.0)
+    assert not sender.is_alive()
+    assert inbox.ended
+
+
+def test_finished_inbox_still_gives_what_it_holds() -> None:
+    inbox = SampleQueue(lossless=True)
+    put(inbox, range(2))
+    inbox.finish()
+    assert not inbox.ended
+    assert take_all(inbox) == [0, 1]
+    assert inbox.ended
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_finish_counts_half_a_set_of_a_recording(lossless: bool) -> None:
+    inbox = SampleQueue(lossless=lossless)
+    inbox.put(Sample("depth", 0, 0.0, np.zeros((1, 1))))
+    inbox.finish()
+    assert inbox.incomplete == int(lossless)
+
+
+def test_failure_is_raised_after_the_sets_before_it() -> None:
+    inbox = SampleQueue(lossless=False)
+    put(inbox, range(1))
+    inbox.fail(ZeroDivisionError("far away"))
+    assert inbox.take(0.0) is not None
+    with pytest.raises(ZeroDivisionError, match="far away"):
+        inbox.take(0.0)
+
+
+def test_inbox_counts_samples_of_another_shape() -> None:
+    inbox = SampleQueue(lossless=False)
+    inbox.expect((1, 1))
+    for number, shape in enumerate([(1, 1), (2, 1), (1, 1)]):
+        for stream in FORMATS:
+            inbox.put(Sample(stream, number, number / 30, np.zeros(shape)))
+    assert take_all(inbox) == [0, 2]
+    assert inbox.counts == {"wrong_size": 1}
+    inbox.counts["wrong_size"] = 9  # changes a copy
+    assert inbox.counts == {"wrong_size": 1}
+
+
+class Shy:
+    """A sensor that lists an option that cannot be read."""
+
+    def get_supported_options(self) -> list[Any]:
+        return [SimpleNamespace(name=name) for name in ("min_distance", "apd_temperature", "depth_units")]
+
+    def get_option(self, option: Any) -> float:
+        if option.name == "apd_temperature":
+            raise RuntimeError("not while idle")
+        return 1.0
+
+
+def test_read_settings_omits_what_cannot_be_read() -> None:
+    assert read_settings(Shy()) == {"min_distance": 1.0, "depth_units": 1.0}
+    settings = read_settings(FakeSensor(FakeLidar(apd_temperature=-9999.0, ldd_temperature=40.0), 0))
+    assert settings["ldd_temperature"] == 40.0
+    assert "apd_temperature" not in settings  # not measured yet
+
+
+def test_find_streams_takes_the_sensor_with_most_streams() -> None:
+    partial, whole = FakeSensor(FakeLidar(streams=("infrared",)), 0), FakeSensor(FakeLidar(), 0)
+    sensor, profiles = find_streams(SimpleNamespace(query_sensors=lambda: [partial, whole]))
+    assert sensor is whole
+    assert set(profiles) == set(FORMATS)
+    assert find_streams(SimpleNamespace(query_sensors=list)) == (None, {})
+
+
+@pytest.mark.parametrize("size", [(1024, 768), (640, 480), (320, 240), (100, 100)])
+def test_find_streams_takes_profiles_of_the_size(size: tuple[int, int]) -> None:
+    _, profiles = find_streams(FakeDevice(FakeLidar(), 0), size)
+    assert {profile.size for profile in profiles.values()} == ({size} if size[0] > 100 else set())
+
+
+def session_of(lidar: FakeLidar) -> Session:
+    return Session(*find_streams(FakeDevice(lidar, 0)), SampleQueue(lossless=False))
+
+
+def while_preparing(act: Callable[[Session, FakeLidar], Any]) -> Any:
+    """Return what `act` gives while a session prepares its sensor, of which no frame is delivered."""
+    lidar, given = FakeLidar(usb="2.1"), list[Any]()
+    session = session_of(lidar)
+    session.start(lambda _: given.append(act(session, lidar)))
+    session.stop()
+    assert session.inbox.arrived.total() == 0
+    return given[0]
+
+
+def test_look_returns_the_next_set_while_preparing() -> None:
+    def look(session: Session, lidar: FakeLidar) -> int:
+        lidar.deliver(range(1, 4))
+        Timer(0.1, lidar.deliver, [range(4, 5)]).start()
+        return session.look(30.0).number
+
+    assert while_preparing(look) == 4
+
+
+def test_look_ends_by_timeout_or_end_of_wait() -> None:
+    def look(session: Session, _: FakeLidar) -> list[Any]:
+        nothing = session.look(0.01)
+        Timer(0.1, session.end_wait).start()
+        return [nothing, session.look(10_000.0)]
+
+    assert while_preparing(look) == [None, None]
+
+
+def test_device_that_vanishes_while_preparing_is_an_error() -> None:
+    with pytest.raises(RuntimeError, match="vanished"):
+        while_preparing(lambda _, lidar: lidar.unplug())
+
+
+@pytest.mark.parametrize("clock_stands", [False, True])
+def test_set_from_before_the_settings_is_not_delivered(clock_stands: bool) -> None:
+    """A clock that stands still holds no more than one set back."""
+    lidar = FakeLidar(usb="2.1")
+    session, begun = session_of(lidar), ("depth",)
+    if clock_stands:
+        lidar.period_ms = 0.0
+        session.start(lambda _: None)
+        lidar.deliver(range(5, 6))
+    else:
+        session.start(lambda _: None, ready=lambda: lidar.deliver(range(5, 6), streams=begun))
+        lidar.deliver(range(5, 6), streams=("infrared", "confidence"))
+    lidar.deliver(range(6, 8))
+    assert take_all(session.inbox) == [6, 7]
+    assert clock_stands or session.inbox.incomplete == session.inbox.dropped == 0
+    session.stop()
+
+
+def test_telemetry_of_a_stopped_session_is_empty() -> None:
+    session = session_of(FakeLidar(usb="2.1"))
+    assert session.telemetry()
+    session.stop()
+    assert session.telemetry() == {}

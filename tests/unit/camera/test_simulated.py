@@ -1,0 +1,160 @@
+from dataclasses import astuple
+from itertools import islice
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.camera.recorder import Recording
+from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera.session import read_settings
+from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MAX_LATENESS, SimulatedCamera, SoftwareLidar
+from nlos_cam.camera.streams import intrinsics_of, is_needed, stream_name
+from nlos_cam.recording.playback import ReplayCamera
+
+
+class JumpClock:
+    """A clock that moves only by waiting; `jumps` are seconds lost, by number of the wait."""
+
+    def __init__(self, jumps: dict[int, float]) -> None:
+        self.time_s, self.jumps, self.waits = 0.0, jumps, 0
+
+    def now(self) -> float:
+        return self.time_s
+
+    def wait(self, stop: Event, seconds: float) -> bool:
+        self.waits += 1
+        self.time_s += max(seconds, 0.0) + self.jumps.get(self.waits, 0.0)
+        return stop.wait(0.001)
+
+
+class SetClock:
+    """A clock that stands until it is set."""
+
+    def __init__(self) -> None:
+        self.time_s = 0.0
+
+    def now(self) -> float:
+        return self.time_s
+
+    def wait(self, stop: Event, seconds: float) -> bool:
+        due_s = self.time_s + seconds
+        while self.time_s < due_s and not stop.wait(0.001):
+            pass
+        return stop.is_set()
+
+
+def numbers_recorded(path: Path, world: Any, gap_s: float, frames: int) -> list[int]:
+    recording = Recording(path, frames=frames)
+    with SimulatedCamera("sim", world, clock=JumpClock({3: gap_s}), recording=recording) as camera:
+        assert all(frame is not None for frame in camera)
+    with ReplayCamera(path) as replayed:
+        return [frame.frame_number for frame in replayed]
+
+
+def test_frames_are_due_at_30_per_second_with_their_truth(noise_world: Any, hurried_clock: Any) -> None:
+    with SimulatedCamera("sim", noise_world(), clock=hurried_clock(1e9)) as camera:
+        for frame in islice(camera, 6):
+            assert frame.timestamp_s == pytest.approx(1e9 + frame.frame_number / 30, abs=1e-6)
+            np.testing.assert_array_equal(frame.truth_depth_m, noise_world().truth_depth_m(frame.frame_number))
+
+
+@pytest.mark.parametrize(("takes_s", "ahead_s"), [(0.001, EXPOSED_AHEAD_S), (0.012, 0.024)])
+def test_frames_are_exposed_late_but_in_time(
+    noise_world: Any, hurried_clock: Any, takes_s: float, ahead_s: float
+) -> None:
+    clock, start_s = hurried_clock(0.0), dict[int, float]()
+
+    class Timed(noise_world):
+        def images(self, number: int) -> Any:
+            start_s[number] = clock.now()
+            clock.time_s += takes_s
+            return super().images(number)
+
+    camera = SimulatedCamera("sim", Timed(), clock=clock)
+    zero_s = clock.now()
+    with camera:
+        for _ in zip(range(6), camera, strict=False):
+            pass
+    for number in range(2, 6):
+        assert zero_s + number / 30 - start_s[number] == pytest.approx(ahead_s, abs=1e-6)
+
+
+def test_telemetry_holds_the_temperatures_of_the_instant(noise_world: Any, noise_bag: Path) -> None:
+    clock = SetClock()
+    with SimulatedCamera("sim", noise_world(), clock=clock) as camera:
+        assert next(iter(camera)).settings["ldd_temperature"] == 20.0  # as it started
+        for instant in (0, 30, 45):
+            clock.time_s = (instant + 0.5) / 30
+            assert camera.telemetry("_temperature") == {"ldd_temperature": 20.0 + instant}
+        assert set(camera.telemetry()) >= {"depth_units", "ldd_temperature"}
+    assert camera.telemetry() == camera.telemetry("_temperature") == {}
+    with ReplayCamera(noise_bag) as replayed:  # a recording holds the first
+        assert next(iter(replayed)).settings["ldd_temperature"] == 20.0
+        assert replayed.telemetry("_temperature") == {"ldd_temperature": 20.0}
+
+
+def test_failing_world_fails_its_reader(noise_world: Any, hurried_clock: Any) -> None:
+    with (
+        pytest.raises(ZeroDivisionError, match="the world ended"),
+        SimulatedCamera("sim", noise_world(fails_at=3), clock=hurried_clock()) as camera,
+    ):
+        list(camera)
+
+
+def test_late_world_catches_up_or_drops_numbers(noise_world: Any, tmp_path: Path) -> None:
+    assert numbers_recorded(tmp_path / "late.bag", noise_world(), 0.9 * MAX_LATENESS / 30, 40) == list(range(40))
+    gaps = np.diff(numbers_recorded(tmp_path / "very late.bag", noise_world(), 3 * MAX_LATENESS / 30, 10)) - 1
+    assert gaps.max() == pytest.approx(2 * MAX_LATENESS, abs=3)
+    assert np.count_nonzero(gaps) == 1
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts native threads, as Linux lists them")
+def test_native_threads_do_not_pile_up(noise_world: Any, hurried_clock: Any) -> None:
+    def run() -> int:
+        with SimulatedCamera("sim", noise_world(), clock=hurried_clock()) as camera:
+            next(iter(camera))
+        return len(list(Path("/proc/self/task").iterdir()))
+
+    before = run()
+    assert [run() for _ in range(20)][-1] < before + 10
+
+
+PINHOLE = load_rig("paper-rig").pinhole
+
+
+CELSIUS = {"ldd_temperature": 41.5, "apd_temperature": 36.25}
+
+
+def test_software_lidar_looks_like_an_l515() -> None:
+    sdk = load_sdk()
+    info, lidar = sdk.camera_info, SoftwareLidar(PINHOLE, sdk, celsius=CELSIUS)
+    names = [lidar.device.get_info(key) for key in (info.name, info.serial_number, info.product_line)]
+    assert names == ["Simulated L515", "simulated", "L500"]
+    [sensor] = lidar.device.query_sensors()
+    assert sensor.get_info(info.name) == "L500 Depth Sensor"
+    assert sensor.as_depth_sensor().get_depth_scale() == pytest.approx(0.00025)
+    assert read_settings(sensor, "_temperature") == CELSIUS
+    [cold] = SoftwareLidar(PINHOLE, sdk).device.query_sensors()
+    assert read_settings(cold, "_temperature") == {}
+    profiles = {stream_name(profile): profile for profile in sensor.get_stream_profiles()}
+    assert set(profiles) == {"depth", "infrared", "confidence"}
+    for profile in profiles.values():
+        assert is_needed(profile)
+        assert profile.fps() == 30
+        np.testing.assert_allclose(astuple(intrinsics_of(profile)), astuple(PINHOLE), rtol=1e-6)
+        same = profiles["depth"].get_extrinsics_to(profile)
+        np.testing.assert_array_equal(np.reshape(same.rotation, (3, 3)), np.eye(3))
+        np.testing.assert_array_equal(same.translation, np.zeros(3))
+
+
+@pytest.mark.parametrize(("other", "sizes"), [(False, [(640, 480)]), (True, [(640, 480), (320, 240)])])
+def test_software_lidar_has_another_size_on_request(other: bool, sizes: list[tuple[int, int]]) -> None:
+    [sensor] = SoftwareLidar(PINHOLE, load_sdk(), has_other_size=other).device.query_sensors()
+    videos = [profile.as_video_stream_profile() for profile in sensor.get_stream_profiles()]
+    assert sorted({(video.width(), video.height()) for video in videos}) == sorted(sizes)
+    assert len(videos) == 3 * len(sizes)
+    assert {(v.width(), v.height()) for v in videos if v.is_default()} == {(640, 480)}

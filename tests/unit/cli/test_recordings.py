@@ -1,0 +1,139 @@
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from nlos_cam.cli import recordings
+from nlos_cam.cli.main import main
+from nlos_cam.errors import OutputExistsError
+from nlos_cam.recording.playback import verify
+
+Run = Callable[..., tuple[int, dict[str, Any], str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run `nlos-cam repair --json`; returns the exit code, the last line of stdout, and stderr."""
+
+    def call(*arguments: Path | str) -> tuple[int, dict[str, Any], str]:
+        code = main(["repair", *map(str, arguments), "--json"])
+        captured = capsys.readouterr()
+        lines = captured.out.splitlines()
+        return code, json.loads(lines[-1]) if lines else {}, captured.err
+
+    return call
+
+
+def test_repair_json_reports_the_new_file(run: Run, noise_bags: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "good.bag"
+    code, found, _ = run(noise_bags["packed-unindexed"], "--out", out)
+    assert code == 0
+    assert set(found) == {"recovered_frames", "chunks", "damaged", "out"}
+    assert found["recovered_frames"] == verify(out).streams
+    assert (found["damaged"], found["out"]) == (1, str(out))
+    assert found["chunks"] > 2
+
+
+def test_repair_prints_what_was_recovered_and_lost(
+    capsys: pytest.CaptureFixture[str], noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recordings.repair_bag(noise_bags["packed"], tmp_path / "a.bag")
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("40 depth", "40 infrared", "40 confidence", " 0 bytes"))
+    content = bytearray(noise_bags["packed"].read_bytes())
+    for at in range(1_000_000, len(content), 500_000):
+        content[at] ^= 1
+    (tmp_path / "bad.bag").write_bytes(content)
+    recordings.repair_bag(tmp_path / "bad.bag", tmp_path / "b.bag")
+    shown = capsys.readouterr().out
+    assert " 0 bytes" not in shown
+    assert str(tmp_path / "b.bag") in shown
+    lines = len(shown.splitlines())
+    monkeypatch.setattr(recordings, "MAX_TOLD", 1)  # many damages in few lines
+    recordings.repair_bag(tmp_path / "bad.bag", tmp_path / "c.bag")
+    assert 1 < len(capsys.readouterr().out.splitlines()) < lines
+
+
+def test_repair_without_frames_is_exit_code_4(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "bad.bag").write_bytes(b"nothing")
+    for path in (tmp_path / "bad.bag", tmp_path / "none.bag"):
+        code, found, shown = run(path, "--out", tmp_path / "a.bag")
+        assert (code, found["error"]["type"]) == (4, "RecordingError")
+        assert "Traceback" not in shown
+    assert not (tmp_path / "a.bag").exists()
+
+
+def test_repair_overwrites_with_the_option_but_not_its_input(
+    run: Run, noise_bags: dict[str, Path], tmp_path: Path
+) -> None:
+    out, bag = tmp_path / "a.bag", noise_bags["plain"]
+    out.write_bytes(b"mine")
+    code, found, _ = run(bag, "--out", out)
+    assert (code, found["error"]["type"], out.read_bytes()) == (1, "OutputExistsError", b"mine")
+    assert run(bag, "--out", out, "--overwrite")[0] == 0
+    before = bag.read_bytes()
+    assert run(bag, "--out", bag, "--overwrite")[0] == 1
+    assert bag.read_bytes() == before == out.read_bytes()
+    with pytest.raises(OutputExistsError):
+        recordings.repair_bag(bag, out)
+    with pytest.raises(typer.BadParameter, match=r"\.bag"):
+        recordings.repair_bag(bag, tmp_path / "a.txt")
+
+
+def test_repair_interrupted_is_exit_code_130_without_output(
+    run: Run, noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repair = recordings.repair
+
+    def interrupted(path: Path, out: Path, report: Callable[[int, int], None]) -> Any:
+        def once_half_way(done: int, total: int) -> None:
+            report(done, total)
+            if done > 0.7 * total:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        return repair(path, out, once_half_way)
+
+    monkeypatch.setattr(recordings, "repair", interrupted)
+    code, _, _ = run(noise_bags["plain"], "--out", tmp_path / "a.bag")
+    assert code == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_export_json_reports_what_was_written(
+    noise_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["export", str(noise_bag), "--out", str(out), "--ply", "--every", "10", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found == {"frames": {"depth": 2, "infrared": 2, "confidence": 2, "points": 2}, "out": str(out)}
+    assert len(list((out / "points").glob("*.ply"))) == 2
+
+
+def test_export_overwrites_only_with_the_option(noise_bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "depth.csv").write_text("precious")
+    arguments = ["export", str(noise_bag), "--out", str(tmp_path)]
+    assert main(arguments) == 1
+    assert (tmp_path / "depth.csv").read_text() == "precious"
+    assert main([*arguments, "--overwrite"]) == 0
+    assert (tmp_path / "depth.csv").read_text() != "precious"
+
+
+def test_export_of_wrong_streams_or_damage_is_exit_code_4(
+    noise_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["export", str(noise_bag), "--streams", "color", *out]) == 4
+    assert "color" in capsys.readouterr().err
+    assert main(["export", str(tmp_path / "none.bag"), *out]) == 4
+    assert list(tmp_path.iterdir()) == []
+    content = bytearray(noise_bag.read_bytes())
+    middle = len(content) // 3
+    content[middle : middle + 200] = bytes(200)
+    (tmp_path / "damaged.bag").write_bytes(content)
+    assert main(["export", str(tmp_path / "damaged.bag"), *out]) == 4
+    assert "nlos-cam repair" in capsys.readouterr().err

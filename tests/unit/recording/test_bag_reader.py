@@ -1,0 +1,187 @@
+import re
+import struct
+import tracemalloc
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from nlos_cam.errors import RecordingError
+from nlos_cam.recording.bag_container import MAX_BYTES, BagContainer
+from nlos_cam.recording.bag_reader import BagFile, RecordedOptions
+from nlos_cam.recording.playback import verify
+
+
+@pytest.fixture(params=["noise_bag", "noise_bag_uncompressed", "real_bag"])
+def bag(request: pytest.FixtureRequest) -> BagFile:
+    return BagFile(request.getfixturevalue(request.param))
+
+
+def test_frames_come_in_recorded_order_and_by_index(bag: BagFile) -> None:
+    bag.check()
+    places = list(bag.order(bag.streams))
+    assert all(one.time_ns <= other.time_ns for one, other in pairwise(places))
+    for stream, info in bag.streams.items():
+        assert [place.index for place in places if place.stream == stream] == list(range(info.frames))
+    assert places[-1].time_ns <= bag.end_ns
+    for place, sample in reversed(list(zip(places, bag.samples(bag.streams), strict=True))):
+        again = bag.sample(place.stream, place.index)
+        assert (again.stream, again.number, again.timestamp_s) == (sample.stream, sample.number, sample.timestamp_s)
+        np.testing.assert_array_equal(again.pixels, sample.pixels)
+
+
+def test_sample_owns_its_pixels_and_ends_at_the_last(noise_bag: Path) -> None:
+    bag = BagFile(noise_bag)
+    bag.sample("depth", 0).pixels[:] = 0
+    assert bag.sample("depth", 0).pixels.any()
+    with pytest.raises(IndexError):
+        bag.sample("depth", 20)
+
+
+def with_unit(*, option: bool, tail_m: float | None) -> Callable[[str, int, bytes], list[tuple[int, bytes]]]:
+    """Put the depth unit into an option, after the images (librealsense before 2.49 did not), or nowhere."""
+
+    def edit(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
+        if topic.endswith("/image/data"):
+            raw = raw[:16] + b"0" + raw[17:-4] if tail_m is None else raw[:-4] + struct.pack("<f", tail_m)
+        return [(time_ns, raw)] if option or "/Depth_Units/value" not in topic else []
+
+    return edit
+
+
+@pytest.mark.parametrize(("option", "tail_m"), [(True, None), (True, 0.5), (False, 0.00025)])
+def test_depth_unit_is_an_option_or_follows_the_images(rewritten: Any, option: bool, tail_m: float | None) -> None:
+    path = rewritten(with_unit(option=option, tail_m=tail_m))
+    assert BagFile(path).depth_unit_m() == pytest.approx(0.00025)
+
+
+@pytest.mark.parametrize("tail_m", [None, 0.0, -1.0, float("nan"), float("inf")])
+def test_bag_without_a_depth_unit_is_an_error(rewritten: Any, tail_m: float | None) -> None:
+    with pytest.raises(RecordingError, match="depth unit"):
+        BagFile(rewritten(with_unit(option=False, tail_m=tail_m))).depth_unit_m()
+
+
+def test_bag_without_intrinsics_is_an_error(rewritten: Any) -> None:
+    path = rewritten(lambda topic, time_ns, raw: [] if topic.endswith("camera_info") else [(time_ns, raw)])
+    with pytest.raises(RecordingError, match="camera_info"):
+        BagFile(path)
+
+
+def test_unknown_encoding_is_an_error_when_read(rewritten: Any) -> None:
+    bag = BagFile(rewritten(lambda _, time_ns, raw: [(time_ns, raw.replace(b"8UC1", b"Y10B"))]))
+    assert not bag.streams["infrared"].format
+    assert bag.sample("depth", 0).number == 0
+    with pytest.raises(RecordingError, match="Y10B"):
+        bag.sample("infrared", 0)
+
+
+def test_streams_of_one_kind_differ_by_their_index(noise_bag_uncompressed: Path, tmp_path: Path) -> None:
+    path = tmp_path / "stereo.bag"
+    path.write_bytes(noise_bag_uncompressed.read_bytes().replace(b"Infrared_0", b"Infrared_2"))
+    assert set(BagFile(path).streams) == {"depth", "infrared_2", "confidence"}
+    assert BagFile(path).sample("infrared_2", 19).number == 19
+
+
+@pytest.mark.parametrize("topic", ["/sensor_0/info", "/Depth_Units/description", "/Infrared_0/tf/1", "/image/data"])
+def test_check_finds_damage_in_any_message(noise_bag_uncompressed: Path, tmp_path: Path, topic: str) -> None:
+    bag, path = BagContainer(noise_bag_uncompressed), tmp_path / "damaged.bag"
+    name = next(name for name in bag.entries if name.endswith(topic))
+    content, message = noise_bag_uncompressed.read_bytes(), bytes(bag.raw(bag.entries[name][-1]))
+    where = content.rindex(message) - 4  # its length
+    path.write_bytes(content[:where] + b"\xff\xff" + content[where + 2 :])
+    with pytest.raises(RecordingError, match=r"damaged\.bag"):
+        BagFile(path).check()
+
+
+def test_check_finds_an_image_smaller_than_its_header(rewritten: Any) -> None:
+    def wider(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
+        doubled = raw.replace(struct.pack("<II", 48, 64), struct.pack("<II", 48, 128), 1)
+        return [(time_ns, doubled if topic.endswith("Depth_0/image/data") else raw)]
+
+    with pytest.raises(RecordingError, match="128 x 48"):
+        BagFile(rewritten(wider)).check()
+
+
+OPTION = "/device_0/sensor_0/option/Frames_Queue_Size/value"
+UNIT = "/device_0/sensor_0/option/Depth_Units/value"
+CHANGES = {10_000_000: 3.0, 20_000_000: 5.0, 30_000_000: 4.0}
+
+
+def test_options_at_a_time_are_those_last_set(rewritten: Any) -> None:
+    def edit(topic: str, time_ns: int, raw: bytes) -> Iterable[tuple[int, bytes]]:
+        yield time_ns, raw
+        for later_ns, value in CHANGES.items() if topic == OPTION else ():
+            yield later_ns, struct.pack("<f", value)
+
+    bag = BagContainer(rewritten(edit))
+
+    def options() -> RecordedOptions:
+        return RecordedOptions(bag, {OPTION: "Frames_Queue_Size", UNIT: "Depth_Units"})
+
+    found = options()
+    for time_ns, value in {1: 0.0, 9_999_999: 0.0, **CHANGES, 10**12: 4.0}.items():
+        assert found.at(time_ns)["frames_queue_size"] == value
+        assert found.at(time_ns)["depth_units"] == pytest.approx(0.00025)
+    for time_ns in (10**12, 1, 25_000_000, 15_000_000, 35_000_000, 0):  # in any order
+        assert found.at(time_ns) == options().at(time_ns)
+    assert options().at(0) == {}
+    before = found.at(11_000_000)
+    assert found.at(12_000_000) is before
+    assert found.at(21_000_000) is not before
+    assert before["frames_queue_size"] == 3.0
+
+
+ABSURD = b"\xff\xff\xff\xff"
+
+
+SIZES = (b"size=", b"count=", b"chunk_count=", b"conn_count=", b"index_pos=", b"chunk_pos=")
+"""Fields that say how much to read, or where."""
+
+
+def read_all(path: Path) -> None:
+    """Read everything in a recording. Raises RecordingError."""
+    verify(path)
+    bag = BagFile(path)
+    for place in bag.order(bag.streams):
+        bag.sample(place.stream, place.index)
+        bag.metadata(place.stream, place.index)
+        bag.settings(place.time_ns)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["noise_bag", "noise_bag_uncompressed"])
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_reader_of_a_damaged_bag_raises_one_line(
+    kind: str, seed: int, request: pytest.FixtureRequest, tool: Any, tmp_path: Path
+) -> None:
+    content, path = request.getfixturevalue(kind).read_bytes(), tmp_path / "damaged.bag"
+    path.write_bytes(tool("corruption").corrupt(content, np.random.default_rng(seed))[1])
+    message = str(path)
+    try:
+        read_all(path)
+    except RecordingError as error:
+        message = str(error)
+    assert message.startswith(str(path))
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("kind", ["noise_bag", "noise_bag_uncompressed"])
+@pytest.mark.parametrize("field", SIZES)
+def test_reader_does_not_allocate_an_absurd_size(
+    kind: str, field: bytes, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    content, path = request.getfixturevalue(kind).read_bytes(), tmp_path / "absurd.bag"
+    for at in [found.end() for found in re.finditer(re.escape(field), content)][:3]:
+        path.write_bytes(content[:at] + ABSURD + content[at + 4 :])
+        tracemalloc.start()
+        with pytest.raises(RecordingError):
+            read_all(path)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 2 * MAX_BYTES

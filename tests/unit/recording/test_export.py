@@ -1,0 +1,124 @@
+import csv
+import json
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from nlos_cam.camera import open_camera
+from nlos_cam.camera.streams import FORMATS
+from nlos_cam.errors import RecordingError
+from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.export import INFO, Exported, Wanted, export_recording
+
+FRAMES = 20
+
+
+def exported(bag: Path, out: Path, stop: Event | None = None, **wanted: Any) -> Exported:
+    return export_recording(BagFile(bag), out, Wanted(**wanted), stop=stop or Event())
+
+
+def samples(bag: Path, stream: str) -> list[Any]:
+    return list(BagFile(bag).samples([stream]))
+
+
+def rows(out: Path, stream: str) -> list[dict[str, str]]:
+    with (out / f"{stream}.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_export_writes_every_bit_into_png(noise_bag: Path, tmp_path: Path) -> None:
+    made = exported(noise_bag, tmp_path / "out")
+    assert made.frames == dict.fromkeys(FORMATS, FRAMES) | {"points": 1}
+    for stream in FORMATS:
+        for row, sample in zip(rows(tmp_path / "out", stream), samples(noise_bag, stream), strict=True):
+            pixels = cv2.imread(str(tmp_path / "out" / row["file"]), cv2.IMREAD_UNCHANGED)
+            np.testing.assert_array_equal(pixels, sample.pixels)
+            assert pixels.dtype == sample.pixels.dtype
+            assert int(row["frame_number"]) == sample.number
+            assert float(row["timestamp_s"]) == pytest.approx(sample.timestamp_s, abs=1e-6)
+
+
+def test_export_writes_every_bit_into_npz(noise_bag: Path, tmp_path: Path) -> None:
+    exported(noise_bag, tmp_path / "out", format="npz")
+    for stream in FORMATS:
+        expected = samples(noise_bag, stream)
+        with np.load(tmp_path / "out" / f"{stream}.npz") as found:
+            np.testing.assert_array_equal(found["pixels"], [sample.pixels for sample in expected])
+            np.testing.assert_array_equal(found["frame_number"], [sample.number for sample in expected])
+            np.testing.assert_array_equal(found["timestamp_s"], [sample.timestamp_s for sample in expected])
+            assert (found["width"], found["fx"]) == (64, pytest.approx(45.7, abs=0.1))
+            assert ("depth_unit_m" in found) == (stream == "depth")
+    assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == ["", ".json", ".npz", ".npz", ".npz"]
+
+
+def test_export_points_are_depth_along_the_rays(noise_bag: Path, tmp_path: Path) -> None:
+    assert exported(noise_bag, tmp_path / "out", points=True).frames["points"] == FRAMES
+    with open_camera(f"bag:{noise_bag}") as camera:
+        frame = next(iter(camera))
+    seen = ~np.isnan(frame.depth_m)
+    cloud = trimesh.load(tmp_path / "out" / "points" / "000000.ply")
+    expected_m = frame.intrinsics.rays()[seen] * frame.depth_m[seen][:, np.newaxis]
+    np.testing.assert_allclose(cloud.vertices, expected_m, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(cloud.colors[:, 0], frame.ir[seen])
+
+
+def test_export_writes_only_chosen_streams_and_frames(noise_bag: Path, tmp_path: Path) -> None:
+    made = exported(noise_bag, tmp_path / "out", streams=["infrared"], every=6)
+    assert made.frames == {"infrared": 4}
+    assert not (tmp_path / "out" / "points").exists()
+    assert not (tmp_path / "out" / "depth").exists()
+    assert [row["frame_number"] for row in rows(tmp_path / "out", "infrared")] == ["0", "6", "12", "18"]
+    with pytest.raises(RecordingError, match="color"):
+        exported(noise_bag, tmp_path / "none", streams=["color"])
+    assert not (tmp_path / "none").exists()
+
+
+def test_export_writes_common_facts_once(noise_bag: Path, tmp_path: Path) -> None:
+    exported(noise_bag, tmp_path / "out")
+    info = json.loads((tmp_path / "out" / INFO).read_text())
+    assert info["device"]["name"] == "Simulated L515"
+    assert info["depth_unit_m"] == pytest.approx(0.00025)
+    assert set(info["streams"]) == set(FORMATS)
+    assert info["streams"]["depth"]["intrinsics"]["height"] == 48
+    assert info["capture"] is None
+
+
+def test_export_that_is_stopped_keeps_written_frames(noise_bag: Path, tmp_path: Path) -> None:
+    stop, seen = Event(), []
+
+    def after_six() -> None:
+        seen.append(1)
+        if len(seen) == 6:
+            stop.set()
+
+    made = export_recording(BagFile(noise_bag), tmp_path / "out", Wanted(format="npz"), stop=stop, on_frame=after_six)
+    assert made.frames == {"depth": 2, "infrared": 2, "confidence": 2, "points": 1}
+    with np.load(tmp_path / "out" / "depth.npz") as found:
+        assert found["pixels"].shape == (2, 48, 64)
+
+
+def test_export_keeps_the_frames_before_damage(recorded: Any, tmp_path: Path) -> None:
+    path = recorded(tmp_path / "damaged.bag", frames=150)  # more than librealsense writes as one chunk
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 500] = bytes(500)
+    path.write_bytes(content)
+    made = exported(path, tmp_path / "out")
+    assert "damaged.bag" in made.damage
+    assert 0 < made.frames["depth"] < 150
+    assert len(rows(tmp_path / "out", "depth")) == made.frames["depth"]
+
+
+def test_export_of_another_camera_writes_its_streams(real_bag: Path, tmp_path: Path) -> None:
+    made = exported(real_bag, tmp_path / "out")
+    assert made.frames == {"depth": 2, "color": 1}
+    depth = cv2.imread(str(tmp_path / "out" / rows(tmp_path / "out", "depth")[0]["file"]), cv2.IMREAD_UNCHANGED)
+    colour = cv2.imread(str(tmp_path / "out" / rows(tmp_path / "out", "color")[0]["file"]))
+    assert (depth.dtype, depth.shape, colour.shape) == (np.uint16, (480, 640), (480, 640, 3))
+    rgb = samples(real_bag, "color")[0].pixels
+    np.testing.assert_array_equal(colour[..., ::-1], rgb)

@@ -1,0 +1,194 @@
+import os
+import re
+import struct
+import subprocess
+import sys
+import threading
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nlos_cam.camera import open_camera
+from nlos_cam.camera.recorder import Recording
+from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera.streams import FORMATS
+from nlos_cam.errors import RecordingError, StreamMissingError
+from nlos_cam.recording.playback import ReplayCamera, verify
+
+UNREADABLE = 100
+"""Bytes of damage."""
+
+
+def write(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def without_index(path: Path) -> bytes:
+    """Return the file as a killed recording leaves it: the header's index_pos is 0."""
+    return re.sub(rb"(?s)(index_pos=).{8}", rb"\1" + bytes(8), path.read_bytes(), count=1)
+
+
+def test_replay_returns_every_recorded_bit(noise_bag: Path, noise_world: Any) -> None:
+    world, threads = noise_world(), threading.active_count()
+    with ReplayCamera(noise_bag) as camera:
+        for count, frame in enumerate(camera):
+            images = world.images(frame.frame_number)
+            assert frame.frame_number == count
+            assert threading.active_count() == threads
+            np.testing.assert_array_equal(np.isnan(frame.depth_m), images.depth_z16 == 0)
+            np.testing.assert_array_equal(np.nan_to_num(frame.depth_m / np.float32(0.00025)).round(), images.depth_z16)
+            np.testing.assert_array_equal(frame.ir, images.ir)
+            np.testing.assert_array_equal(frame.confidence, images.confidence)
+    assert count == 19
+    assert camera.identity == {"name": "Simulated L515", "serial": "simulated"}
+
+
+def test_iterating_again_restarts_frames_and_counters(noise_bag: Path) -> None:
+    with ReplayCamera(noise_bag) as camera:
+        first = iter(camera)
+        assert next(first).frame_number == 0
+        for _ in range(2):
+            assert len(list(camera)) == 20
+            assert list(first) == []
+            assert set(camera.arrived.values()) == {20}
+
+
+def test_verify_reports_frames_seconds_and_streams(noise_bag: Path) -> None:
+    found = verify(noise_bag)
+    assert (found.frames, found.dropped) == (20, 0)
+    assert found.seconds == pytest.approx(19 / 30, abs=1e-3)
+    assert found.streams == {"depth": 20, "infrared": 20, "confidence": 20}
+
+
+@pytest.mark.parametrize("content", [b"", b"a text file\n", b"#ROSBAG V2.0\n", 0.1, 0.5, 0.99, "killed"])
+def test_replay_refuses_a_broken_file_in_one_line(
+    noise_bag: Path, tmp_path: Path, content: bytes | float | str
+) -> None:
+    if isinstance(content, float):
+        content = noise_bag.read_bytes()[: int(content * noise_bag.stat().st_size)]
+    content = without_index(noise_bag) if isinstance(content, str) else content
+    path = write(tmp_path / "broken.bag", content)
+    with pytest.raises(RecordingError, match=str(path)) as raised:
+        ReplayCamera(path)
+    assert "\n" not in str(raised.value)
+    assert ("nlos-cam repair" in str(raised.value)) == (content.startswith(b"#ROSBAG"))
+
+
+def test_replay_refuses_missing_paths_folders_and_pipes(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.bag", tmp_path):
+        with pytest.raises(RecordingError, match=str(path)):
+            ReplayCamera(path)
+    if sys.platform != "win32":  # pipes have names
+        os.mkfifo(tmp_path / "pipe.bag")
+        with pytest.raises(RecordingError, match=r"pipe\.bag"):
+            ReplayCamera(tmp_path / "pipe.bag")
+
+
+def test_repair_command_in_the_error_is_quoted(tmp_path: Path, noise_bag: Path) -> None:
+    path = write(tmp_path / "my run.bag", without_index(noise_bag))
+    with pytest.raises(RecordingError, match=r"nlos-cam repair '.*/my run\.bag' --out 'my run-repaired\.bag'"):
+        ReplayCamera(path)
+
+
+def test_replay_gives_the_frames_before_damage(recorded: Any, tmp_path: Path) -> None:
+    path = recorded(tmp_path / "damaged.bag", frames=150)  # more than the SDK writes as one compressed chunk
+    assert verify(path).frames == 150
+    content = path.read_bytes()
+    where = content.rindex(b"compression=lz4") + 200
+    write(path, content[:where] + bytes(UNREADABLE) + content[where + UNREADABLE :])
+    frames: list[int] = []
+    with ReplayCamera(path) as camera, pytest.raises(RecordingError, match=r"\d+\.\d s") as raised:
+        frames.extend(frame.frame_number for frame in camera)
+    assert f"`nlos-cam repair {path} --out damaged-repaired.bag`" in str(raised.value)
+    assert frames == list(range(len(frames)))
+    assert max(camera.arrived.values()) - len(frames) == camera.incomplete <= 1
+    assert 0 < len(frames) < 150
+    with pytest.raises(RecordingError, match=r"damaged\.bag"):
+        verify(path)
+
+
+def test_settings_are_those_at_the_time_of_the_frame(rewritten: Any) -> None:
+    value, changed_ns = "/device_0/sensor_0/option/Frames_Queue_Size/value", 5_000_000
+
+    def changing(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
+        number = int.from_bytes(raw[:4], "little")
+        time_ns = time_ns if topic.endswith(value) or time_ns == 1 else 1000 + number * 1_000_000
+        changes = [(changed_ns, struct.pack("<f", 7.0))] if topic == value else []
+        return [] if topic.endswith("/metadata") else [(time_ns, raw), *changes]
+
+    with ReplayCamera(rewritten(changing)) as camera:
+        for frame in camera:
+            assert frame.settings["frames_queue_size"] == (7.0 if frame.frame_number >= 5 else 0.0)
+            assert camera.telemetry() == frame.settings
+
+
+@pytest.mark.parametrize("missing", [("infrared", "confidence"), ("confidence",), ("depth",)])
+def test_replay_names_missing_streams(noise_bag_uncompressed: Path, tmp_path: Path, missing: tuple[str, ...]) -> None:
+    content = noise_bag_uncompressed.read_bytes()
+    for stream in missing:  # as of another camera
+        content = content.replace(f"{stream.title()}_0".encode(), f"{stream.title()}_2".encode())
+    with pytest.raises(StreamMissingError, match="--camera l515") as raised:
+        ReplayCamera(write(tmp_path / "partial.bag", content))
+    for stream in FORMATS:
+        assert (f"no {stream}" in str(raised.value)) == (stream in missing)
+
+
+def test_replay_refuses_a_recording_of_no_frames(noise_world: Any, hurried_clock: Any, tmp_path: Path) -> None:
+    path = tmp_path / "nothing.bag"
+    camera = SimulatedCamera("sim", noise_world(), clock=hurried_clock(), recording=Recording(path))
+    camera._world.fails_at = 0
+    with pytest.raises(ZeroDivisionError), camera:
+        next(iter(camera))
+    with pytest.raises(RecordingError, match=r"nothing\.bag"):
+        ReplayCamera(path)
+
+
+def test_replay_refuses_a_recording_of_another_camera(real_bag: Path) -> None:
+    with pytest.raises(StreamMissingError, match=r"infrared.*confidence.*--camera l515"):
+        ReplayCamera(real_bag)
+
+
+WITHOUT_SDK = """
+import sys
+sys.modules["pyrealsense2"] = None
+from nlos_cam.camera import open_camera
+from nlos_cam.errors import CameraError
+uri = sys.argv[1]
+with open_camera(uri) as camera:
+    print(len(list(camera)))
+try:
+    open_camera(uri, reader="sdk")
+except CameraError as error:
+    print(error)
+"""
+
+
+def test_replay_works_without_the_sdk(noise_bag: Path) -> None:
+    run = [sys.executable, "-c", WITHOUT_SDK, f"bag:{noise_bag}"]
+    lines = subprocess.run(run, capture_output=True, text=True, check=True, timeout=120).stdout.splitlines()
+    assert lines[0] == "20"
+    assert "librealsense" in lines[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reads", ["list(camera)", "next(iter(camera))", "None"])
+@pytest.mark.parametrize("leaves", ["camera.__exit__(None, None, None)", "None"])
+def test_process_that_replays_ends_cleanly(noise_bag: Path, reads: str, leaves: str) -> None:
+    program = (
+        "from nlos_cam.camera import open_camera\n"
+        f"camera = open_camera('bag:{noise_bag}').__enter__()\nfound = {reads}\n{leaves}\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)  # noqa: PLW1510  the code is what is tested
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", ["plain", "sdk"])
+def test_leaving_early_and_restarting_gives_first_frames(noise_bag: Path, reader: Any) -> None:
+    with open_camera(f"bag:{noise_bag}", reader=reader) as camera:
+        for taken in (1, 9, 20, 3):
+            assert [frame.frame_number for frame in islice(camera, taken)] == list(range(taken))

@@ -1,0 +1,181 @@
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Reader
+
+from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
+from nlos_cam.recording.playback import verify
+from nlos_cam.recording.repair import Repaired, repair_recording
+from nlos_cam.recording.sdk_playback import SdkReplayCamera
+
+ALL = {"depth": 40, "infrared": 40, "confidence": 40}
+
+
+@pytest.fixture(params=["packed", "plain", "packed-unindexed", "plain-unindexed"])
+def bag(request: pytest.FixtureRequest, noise_bags: dict[str, Path]) -> Path:
+    return noise_bags[request.param]
+
+
+def repaired(tmp_path: Path, content: bytes) -> Repaired:
+    path = tmp_path / "bad.bag"
+    path.write_bytes(content)
+    return repair_recording(path, tmp_path / "good.bag")
+
+
+def whys(found: Repaired) -> str:
+    return "; ".join(damage.why for damage in found.damages)
+
+
+@pytest.mark.parametrize("name", ["packed", "plain"])
+def test_repair_of_a_whole_recording_changes_no_byte(noise_bags: dict[str, Path], tmp_path: Path, name: str) -> None:
+    path, progress = shutil.copy2(noise_bags[name], tmp_path / "original.bag"), list[tuple[int, int]]()
+    before, content = path.stat(), path.read_bytes()
+    path.chmod(0o400)
+    found = repair_recording(path, tmp_path / "good.bag", lambda done, total: progress.append((done, total)))
+    assert (found.recovered_frames, found.damages) == (ALL, [])
+    assert (tmp_path / "good.bag").read_bytes() == path.read_bytes() == content
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+    assert progress == sorted(progress)
+    assert progress[-1][0] == progress[-1][1] == 2 * before.st_size
+
+
+def test_repair_of_an_old_sdks_recording_changes_no_byte(real_bag: Path, tmp_path: Path) -> None:
+    found = repair_recording(real_bag, tmp_path / "good.bag")
+    assert found.recovered_frames == {"depth": 2, "infrared": 0, "confidence": 0, "color": 1}
+    assert found.out.read_bytes() == real_bag.read_bytes()
+
+
+def test_repaired_bag_is_read_bit_for_bit_by_every_reader(
+    bag: Path, tmp_path: Path, tool: Callable[[str], ModuleType]
+) -> None:
+    found = repair_recording(bag, tmp_path / "good.bag")
+    twice = repair_recording(found.out, tmp_path / "twice.bag")
+    assert twice.out.read_bytes() == found.out.read_bytes()
+    assert (twice.recovered_frames, twice.damages) == (found.recovered_frames, [])
+    assert verify(found.out).streams == found.recovered_frames
+    with Reader(found.out) as reader:
+        images = [connection for connection in reader.connections if connection.topic.endswith("/image/data")]
+        assert sum(1 for _ in reader.messages(images)) == sum(found.recovered_frames.values())
+        assert sum(1 for _ in reader.messages()) == reader.message_count
+    noise = tool("noise_recordings").noise
+    with SdkReplayCamera(found.out) as camera:
+        frames = list(camera)
+    assert [frame.frame_number for frame in frames] == list(range(min(found.recovered_frames.values())))
+    for frame in frames:
+        images = noise(frame.frame_number)
+        np.testing.assert_array_equal(frame.ir, images.ir)
+        np.testing.assert_array_equal(frame.confidence, images.confidence)
+        np.testing.assert_array_equal(np.nan_to_num(frame.depth_m / np.float32(0.00025)).round(), images.depth_z16)
+
+
+@pytest.mark.parametrize("name", ["packed", "plain"])
+def test_repair_recovers_more_where_more_is_left(noise_bags: dict[str, Path], tmp_path: Path, name: str) -> None:
+    content, frames = noise_bags[name].read_bytes(), list[int]()
+    for share in (0.4, 0.6, 0.8, 1.0):
+        found = repaired(tmp_path, content[: int(share * len(content))])
+        frames.append(found.recovered_frames["depth"])
+        assert verify(found.out).streams == found.recovered_frames
+    assert frames == sorted(frames)
+    assert frames[0] >= 10
+    assert frames[-1] == 40
+
+
+def test_repair_takes_messages_of_an_unfinished_chunk(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+    whole, killed = noise_bags["plain"], noise_bags["plain-unindexed"]
+    lost = whole.stat().st_size - killed.stat().st_size
+    found = repair_recording(killed, tmp_path / "good.bag")
+    assert sum(found.recovered_frames.values()) > 3 * 40 - lost // 19_000
+    assert found.damages[-1].position + found.damages[-1].bytes == killed.stat().st_size
+
+
+def test_repair_takes_repeated_frames_once(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+    content = noise_bags["plain"].read_bytes()
+    start, end = (content.index(b"\x04\0\0\0op=\x02", after) - 17 for after in (2_000_000, 2_500_000))
+    found = repaired(tmp_path, content[:end] + content[start:end] + content[end:])
+    assert found.recovered_frames == verify(found.out).streams == ALL
+    assert "twice" in whys(found)
+
+
+def test_repair_leaves_out_messages_without_description(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+    content = noise_bags["plain-unindexed"].read_bytes()
+    described = content.index(b"topic=/device_0/sensor_0/Infrared_0/image/data")
+    found = repaired(tmp_path, content[:described] + b"tonic" + content[described + 5 :])
+    assert found.recovered_frames["infrared"] == 0
+    assert found.recovered_frames["depth"] > 30
+    assert len(found.damages) > len(repair_recording(noise_bags["plain-unindexed"], tmp_path / "other.bag").damages)
+
+
+def test_repair_warns_where_librealsense_will_not_play(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+    content = noise_bags["plain"].read_bytes()
+    found = repaired(tmp_path, content[:4117] + bytes(500) + content[4617:])
+    assert "librealsense" in whys(found)
+    with pytest.raises(RecordingError):
+        SdkReplayCamera(found.out)
+    with Reader(found.out) as reader:
+        assert sum(1 for _ in reader.messages()) == reader.message_count
+
+
+def test_repair_refuses_a_file_without_frames(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+    content = noise_bags["plain"].read_bytes()
+    first = content.index(b"\x04\0\0\0op=\x07", content.index(b"/option/Depth_Units/description"))
+    for part in (b"", b"a text file\n", b"#ROSBAG V2.0\n" + bytes(9000), content[:first]):
+        with pytest.raises(RecordingError, match=r"bad\.bag") as raised:
+            repaired(tmp_path, part)
+        assert "\n" not in str(raised.value)
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.bag"]
+
+
+def test_repair_refuses_missing_paths_folders_and_pipes(tmp_path: Path) -> None:
+    paths = [tmp_path / "none.bag", tmp_path]
+    if sys.platform != "win32":  # pipes have names
+        os.mkfifo(tmp_path / "pipe.bag")
+        paths.append(tmp_path / "pipe.bag")
+    for path in paths:
+        with pytest.raises(RecordingError, match=str(path)):
+            repair_recording(path, tmp_path / "good.bag")
+
+
+@pytest.mark.parametrize("link", [None, os.link, os.symlink])
+def test_repair_never_writes_to_the_original(
+    noise_bags: dict[str, Path], tmp_path: Path, link: Callable[[Path, Path], None] | None
+) -> None:
+    bag = noise_bags["packed"]
+    path = shutil.copy(bag, tmp_path / "original.bag")
+    out = tmp_path / "link.bag" if link else path
+    if link:
+        link(path, out)
+    with pytest.raises(OutputExistsError, match=out.name):
+        repair_recording(path, out)
+    assert path.read_bytes() == bag.read_bytes()
+
+
+def test_repair_that_is_interrupted_leaves_the_old_output(bag: Path, tmp_path: Path) -> None:
+    out = tmp_path / "good.bag"
+    out.write_bytes(b"as it was")
+
+    def interrupt(done: int, total: int) -> None:
+        if done > 0.8 * total:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        repair_recording(bag, out, interrupt)
+    assert out.read_bytes() == b"as it was"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_repair_refuses_a_full_disk_and_a_missing_folder(
+    noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(NlosCamError, match="nowhere"):
+        repair_recording(noise_bags["plain"], tmp_path / "nowhere" / "good.bag")
+    monkeypatch.setattr("nlos_cam.recording.repair.shutil.disk_usage", lambda _: SimpleNamespace(free=1_500_000))
+    with pytest.raises(NlosCamError, match=r"\d+ MB.* 1 MB") as raised:
+        repair_recording(noise_bags["plain"], tmp_path / "good.bag")
+    assert not isinstance(raised.value, RecordingError)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,254 @@
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+
+from nlos_cam.recording.rosbag import (
+    BagFormatError,
+    BagRecord,
+    Ending,
+    Op,
+    pack_chunk_head,
+    pack_index,
+    pack_record,
+    read_record,
+    reader,
+)
+from nlos_cam.recording.salvage import Scan, examine, find_chunk, is_headless, salvage_set_up, scan_bag, unpack
+
+DESCRIPTION = {"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"string data"}
+CONNECTION = pack_record({"conn": bytes(4), "op": b"\x07", "topic": b"/topic"}, pack_record(DESCRIPTION, b"")[4:-4])
+SET_UP_S, FIRST_S = (0, 1), (0, 500)
+FIRST_CHUNK_AT = 4117
+MESSAGE = b"\x04\0\0\0op=\x02"
+Scanned = Callable[[bytes], Scan]
+
+
+def message(time: tuple[int, int], data: bytes = b"data") -> bytes:
+    return pack_record({"conn": bytes(4), "op": b"\x02", "time": struct.pack("<II", *time)}, data)
+
+
+def packed(content: bytes) -> bytes:
+    options = {"block_size": lz4.frame.BLOCKSIZE_MAX64KB, "block_linked": False, "content_checksum": True}
+    return lz4.frame.compress(content, **options)
+
+
+NOISE = np.random.default_rng(0).bytes(90_000)
+CONTENT = CONNECTION + message(SET_UP_S) + b"".join(message((1, number), NOISE) for number in (3, 1, 2))
+AFTER = pack_index(0, bytes(12))
+DATA = {"lz4": packed(CONTENT), "none": CONTENT}
+compressions = pytest.mark.parametrize("compression", DATA)
+
+
+def examined(data: bytes, compression: str = "lz4", size: int = len(CONTENT), length: int | None = None) -> tuple:
+    """Examine a chunk of that data; returns what was found and the file that it is in."""
+    file = pack_chunk_head(compression, size, len(data) if length is None else length) + data
+    found = find_chunk(reader(file), 0)
+    assert found
+    return examine(reader(file), 0, found, len(file)), file
+
+
+@compressions
+@pytest.mark.parametrize("length", [0, 1, 1000, 10**6, 0xFFFFFFFF])
+@pytest.mark.parametrize("size", [0, len(CONTENT), 0xFFFFFFFF])
+def test_examine_ignores_a_wrong_length_in_the_header(compression: str, length: int, size: int) -> None:
+    found, file = examined(DATA[compression] + AFTER, compression, size, length)
+    assert (found.ending, found.end) == (Ending.WHOLE, len(file) - len(AFTER))
+    assert found.why
+    assert (found.chunk.size, found.chunk.data_bytes) == (len(CONTENT), len(DATA[compression]))
+    entries = list(struct.iter_unpack("<III", found.chunk.index[0]))
+    assert [entry[:2] for entry in entries] == [SET_UP_S, (1, 1), (1, 2), (1, 3)]
+
+
+def test_examine_never_accepts_a_flipped_bit_of_packed_data() -> None:
+    for at in np.random.default_rng(1).integers(7, len(DATA["lz4"]), 50):
+        bad = bytearray(DATA["lz4"])
+        bad[at] ^= 1
+        found, _ = examined(bytes(bad))
+        assert found.chunk is None or found.ending is Ending.CUT
+
+
+@compressions
+def test_examine_keeps_whole_messages_of_a_cut_chunk(compression: str) -> None:
+    data, block = DATA[compression], 1 << 16 if compression == "lz4" else 1
+    for length in (len(data) - 20, 190_000, 100_000):
+        found, file = examined(data[:length], compression, 0, 0)
+        chunk = found.chunk
+        content = chunk.content or file[chunk.data_at :][: chunk.data_bytes]
+        assert (found.ending, chunk.compression) == (Ending.CUT, "none")
+        assert content == CONTENT[: len(content)]
+        assert length - block - len(message((1, 1), NOISE)) < len(content) <= length
+        assert len(chunk.index[0]) // 12 == 1 + len(content) // len(NOISE)
+
+
+def test_unpack_refuses_a_bomb(monkeypatch: pytest.MonkeyPatch) -> None:
+    bomb = packed(bytes(300 << 20))
+    assert len(bomb) < 2 << 20
+    content, read_bytes, ending, why = unpack(reader(bomb), 0, len(bomb), 1 << 16)
+    assert (content, ending, "64 MiB" in why) == (b"", Ending.BROKEN, True)
+    assert read_bytes < len(bomb) / 3
+    for module in ("bag_chunk", "bag_content"):
+        monkeypatch.setattr(f"nlos_cam.camera.{module}.CHUNK_LIMIT", len(CONTENT) - 1)
+    assert examined(DATA["lz4"])[0].chunk is None
+    assert examined(CONTENT, "none")[0].ending == Ending.BROKEN
+
+
+def test_salvage_set_up_takes_descriptions_from_a_broken_chunk() -> None:
+    data = bytearray(DATA["lz4"])
+    data[-20] ^= 1
+    file = pack_chunk_head("lz4", len(CONTENT), len(data)) + data
+    record = read_record(reader(file), 0)
+    chunk, connections = salvage_set_up(reader(file), 0, record, len(file))
+    assert chunk is not None
+    assert chunk.content == CONNECTION + message(SET_UP_S)
+    assert list(chunk.index) == list(connections) == [0]
+    data[7:] = bytes(len(data) - 7)
+    assert salvage_set_up(reader(file[: record.data_at] + data), 0, record, len(file)) == (None, {})
+
+
+@pytest.mark.parametrize(
+    ("start", "compression"), [(DATA["lz4"], b"lz4"), (CONTENT, b"none"), (message(FIRST_S) * 2, b"none")]
+)
+def test_find_chunk_finds_data_without_its_header(start: bytes, compression: bytes) -> None:
+    found = find_chunk(reader(start + AFTER), 0)
+    assert found is not None
+    assert is_headless(found)
+    assert found.fields["compression"] == compression
+    ended = examine(reader(start + AFTER), 0, found, len(start + AFTER))
+    assert (ended.ending, ended.end, ended.why) == (Ending.WHOLE, len(start), "")
+
+
+def test_find_chunk_refuses_other_records_and_compressions() -> None:
+    assert find_chunk(reader(CONNECTION + CONNECTION), 0) is None
+    assert find_chunk(reader(AFTER), 0) is None
+    with pytest.raises(BagFormatError):
+        find_chunk(reader(b"no record at all"), 0)
+    found, _ = examined(CONTENT, "bz2")
+    assert (found.chunk, found.ending) == (None, Ending.BROKEN)
+    assert examine(reader(b""), 0, BagRecord(Op.CHUNK, {}, 0, 0), 0).chunk is None
+
+
+@pytest.fixture(params=["packed", "plain"])
+def bag(request: pytest.FixtureRequest, noise_bags: dict[str, Path]) -> Path:
+    return noise_bags[request.param]
+
+
+def chunk_places(content: bytes) -> list[tuple[int, int]]:
+    """List where the chunks of a whole recording start and end."""
+    places, at = list[tuple[int, int]](), FIRST_CHUNK_AT
+    while at < len(content):
+        record = read_record(reader(content), at)
+        if record.op is Op.CHUNK:
+            places.append((at, record.end))
+        at = record.end
+    return places
+
+
+@pytest.fixture
+def scanned(tmp_path: Path) -> Scanned:
+    def scan(content: bytes) -> Scan:
+        (tmp_path / "scanned.bag").write_bytes(content)
+        return scan_bag(tmp_path / "scanned.bag")
+
+    return scan
+
+
+def indexes(scan: Scan) -> list[dict[int, bytes]]:
+    return [chunk.index for chunk in scan.chunks]
+
+
+def count(scan: Scan) -> int:
+    return sum(len(entries) for index in indexes(scan) for entries in index.values()) // 12
+
+
+def test_scan_of_a_whole_bag_finds_every_chunk_and_index(bag: Path, scanned: Scanned) -> None:
+    content, progress = bag.read_bytes(), list[tuple[int, int]]()
+    scan = scan_bag(bag, lambda done, total: progress.append((done, total)))
+    assert progress == sorted(progress)
+    assert progress[-1] == (scan.bytes, scan.bytes) == (len(content), len(content))
+    assert not scan.damages
+    places = chunk_places(content)
+    assert [chunk.at for chunk in scan.chunks] == [at for at, _ in places]
+    assert len(scan.chunks) > 3
+    assert {connection.topic for connection in scan.connections.values()} >= {
+        f"/device_0/sensor_0/{stream}_0/image/data" for stream in ("Depth", "Infrared", "Confidence")
+    }
+    for (_, end), chunk in zip(places, scan.chunks, strict=True):
+        written = b"".join(pack_index(number, entries) for number, entries in chunk.index.items())
+        assert content[end:].startswith(written)
+    short = scanned(content[: places[-1][1]])
+    assert (short.chunks, short.connections, short.damages) == (scan.chunks, scan.connections, [])
+    assert [damage.bytes > 0 for damage in scanned(content[:-1]).damages] == [True]  # the index is cut
+
+
+def test_scan_loses_only_the_damaged_chunk(noise_bags: dict[str, Path], scanned: Scanned) -> None:
+    whole = noise_bags["packed"].read_bytes()
+    before = indexes(scan_bag(noise_bags["packed"]))
+    for number, (at, end) in enumerate(chunk_places(whole)[1:], start=1):
+        assert number > 1 or whole.count(MESSAGE, at, end) > 1  # though messages show in packed noise
+        content = bytearray(whole)
+        content[(at + end) // 2] ^= 16
+        scan = scanned(bytes(content))
+        assert indexes(scan) == before[:number] + before[number + 1 :]
+        assert [(damage.position, damage.bytes) for damage in scan.damages] == [(at, end - at)]
+
+
+def test_scan_loses_few_messages_of_a_damaged_plain_chunk(noise_bags: dict[str, Path], scanned: Scanned) -> None:
+    whole = noise_bags["plain"].read_bytes()
+    at, end = chunk_places(whole)[1]
+    middle = whole.index(MESSAGE, (at + end) // 2)
+    scan = scanned(whole[:middle] + bytes(8) + whole[middle + 8 :])
+    assert 1 <= count(scan_bag(noise_bags["plain"])) - count(scan) <= 2
+    assert len(scan.damages) == 1
+
+
+def test_scan_bridges_lost_headers_ranges_and_repeats(bag: Path, scanned: Scanned) -> None:
+    whole = bag.read_bytes()
+    expected, places = indexes(scan_bag(bag)), chunk_places(whole)
+    at = places[2][0]
+    scan = scanned(whole[:at] + bytes(40) + whole[at + 40 :])
+    assert indexes(scan) == expected
+    assert [damage.position for damage in scan.damages] == [at]
+    scan = scanned(whole[: places[1][0] + 500_000] + whole[places[2][0] + 500_000 :])
+    assert indexes(scan)[0] == expected[0]
+    assert indexes(scan)[-len(expected) + 3 :] == expected[3:]
+    scan = scanned(whole[: places[2][0]] + whole[places[1][0] :])
+    assert indexes(scan) == expected
+    assert ["twice" in damage.why for damage in scan.damages] == [True]
+
+
+def test_scan_finds_connections_without_the_first_chunk(noise_bags: dict[str, Path], scanned: Scanned) -> None:
+    whole, expected = noise_bags["packed"].read_bytes(), scan_bag(noise_bags["packed"]).connections
+    assert scanned(whole[:FIRST_CHUNK_AT] + whole[chunk_places(whole)[1][0] :]).connections == expected
+    content = bytearray(noise_bags["packed-unindexed"].read_bytes())
+    content[400_000] ^= 1  # within the first chunk, and no copy at the end of the file
+    scan = scanned(bytes(content))
+    assert scan.connections == expected
+    assert len(scan.damages) > 0
+    assert scan.chunks[0].content is not None
+    assert count(scan) > 0.5 * count(scan_bag(noise_bags["packed-unindexed"]))
+
+
+def test_scan_refuses_a_chunk_of_another_recording(noise_bags: dict[str, Path], scanned: Scanned) -> None:
+    whole = noise_bags["plain"].read_bytes()
+    at, end = chunk_places(whole)[0]
+    scan = scanned(whole[:end] + whole[at:end].replace(b"topic=/device_0", b"topic=/device_1") + whole[end:])
+    assert indexes(scan) == indexes(scan_bag(noise_bags["plain"]))
+    assert ["topics" in damage.why for damage in scan.damages] == [True]
+
+
+@pytest.mark.parametrize("content", [b"", b"#ROSBAG V2.0\n", b"no recording", bytes(3 << 20), b"\0\0\0op=" * 9999])
+def test_scan_of_other_bytes_finds_nothing(scanned: Scanned, content: bytes) -> None:
+    scan = scanned(content)
+    assert (scan.chunks, scan.connections, scan.bytes) == ([], {}, len(content))
+
+
+def test_scan_finds_a_record_across_windows(bag: Path, scanned: Scanned, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, expected = bag.read_bytes(), indexes(scan_bag(bag))[1:3]
+    _, (start, _), (_, end), *_ = chunk_places(whole)
+    for window in range(40, 90):
+        monkeypatch.setattr("nlos_cam.recording.salvage.WINDOW_BYTES", window)
+        assert indexes(scanned(b"\1" * 200 + whole[start:end])) == expected

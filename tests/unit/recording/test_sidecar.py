@@ -1,0 +1,207 @@
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nlos_calibration.errors import RecordFileError
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.rig import Rig, dump_toml, load_rig
+from nlos_calibration.wall_record import WallRecord
+
+from nlos_cam.errors import DiskFullError, RecordingError
+from nlos_cam.frames import Frame
+from nlos_cam.recording.playback import Verified
+from nlos_cam.recording.quality import Quality
+from nlos_cam.recording.sidecar import LOOK_S, SidecarFile, load_sidecar, sidecar_path, summary_of, versions, wall_of
+
+PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
+
+
+DARK = np.zeros((48, 64), np.uint8)
+
+
+WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
+
+
+SEEN = Quality(9, 0.25, 0.5, 7.0, 1.5, 0.1)
+
+
+READ = Verified(frames=9, dropped=2, seconds=0.5, streams={"depth": 9, "infrared": 9, "confidence": 9})
+
+
+@dataclass
+class Warm:
+    """A camera that warms by a degree at each call of `telemetry`."""
+
+    uri: str = "l515"
+    intrinsics: Intrinsics = PINHOLE
+    rig: Rig | None = None
+    identity: Mapping[str, str] = field(default_factory=lambda: {"name": "L515", "serial": "f0246262"})
+    counts: Counter[str] = field(default_factory=Counter[str])
+    celsius: float = 30.0
+
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        self.celsius += 1.0
+        fields = {"laser_power": 40.0, "ldd_temperature": self.celsius, "broken_temperature": float("nan")}
+        return {name: value for name, value in fields.items() if name.endswith(ending)}
+
+
+def frame(timestamp_s: float, **settings: float) -> Frame:
+    return Frame(np.zeros((48, 64), np.float32), DARK, DARK, timestamp_s, 0, PINHOLE, settings)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "a.json"
+
+
+def test_sidecar_exists_from_the_start_of_a_recording(path: Path) -> None:
+    SidecarFile(path, Warm(), label="a cup", started=WHEN)
+    found, fields = load_sidecar(path), json.loads(path.read_text())
+    assert (found.label, found.camera, found.state, found.summary) == ("a cup", "l515", "recording", None)
+    assert found.started == WHEN
+    assert found.device == {"name": "L515", "serial": "f0246262"}
+    assert (found.intrinsics.fx, found.intrinsics.width) == (46.0, 64)
+    assert found.settings["laser_power"] == 40.0
+    assert (fields["label"], fields["camera"], fields["started"][-1]) == ("a cup", "l515", "Z")
+
+
+def test_sidecar_takes_settings_from_the_first_frame(path: Path) -> None:
+    sidecar = SidecarFile(path, Warm())
+    sidecar.on_frame(frame(5.0, laser_power=31.0))
+    sidecar.on_frame(frame(5.1, laser_power=99.0))
+    sidecar.finish("complete", summary_of(READ, SEEN, {}))
+    assert load_sidecar(path).settings == {"laser_power": 31.0}
+
+
+def test_sidecar_samples_temperatures_over_device_time(path: Path) -> None:
+    sidecar = SidecarFile(path, Warm())
+    for number in range(900):
+        sidecar.on_frame(frame(1e9 + number / 30))
+    series = load_sidecar(path).temperatures
+    assert [look.time_s for look in series] == pytest.approx([0.0, LOOK_S, 2 * LOOK_S], abs=0.05)
+    celsius = [look.celsius["ldd_temperature"] for look in series]
+    assert celsius == sorted(celsius)
+    assert set(series[0].celsius) == {"ldd_temperature"}
+    camera = Warm()
+    camera.telemetry = lambda ending="": {} if ending else {"laser_power": 40.0}
+    SidecarFile(path, camera).on_frame(frame(0.0))
+    assert load_sidecar(path).temperatures == []
+
+
+def test_sidecar_thins_a_long_series_evenly(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.recording.sidecar.MAX_LOOKS", 10)
+    sidecar = SidecarFile(path, Warm())
+    for number in range(100):
+        sidecar.on_frame(frame(number * LOOK_S))
+    times = [look.time_s for look in load_sidecar(path).temperatures]
+    assert 5 <= len(times) <= 10
+    assert times[0] == 0.0
+    assert times[-1] >= 900.0
+    assert len(set(np.diff(times).tolist())) == 1
+
+
+def test_sidecar_ends_with_a_state_and_a_summary(path: Path) -> None:
+    SidecarFile(path, Warm()).finish("lost", summary_of(READ, SEEN, {"restarted": 1}))
+    found = load_sidecar(path)
+    assert found.state == "lost"
+    assert found.summary
+    assert (found.summary.frames, found.summary.dropped, found.summary.frames_per_s) == (9, 2, 16.0)
+    assert (found.summary.saturated_share, found.summary.temporal_noise_mm) == (0.25, 1.5)
+    assert found.summary.events == {"restarted": 1}
+
+
+def test_summary_writes_unknown_values_as_null(path: Path) -> None:
+    SidecarFile(path, Warm()).finish("disk full", summary_of(None, Quality(), {}))
+    assert "NaN" not in path.read_text()
+    summary = json.loads(path.read_text())["summary"]
+    assert summary["frames"] is summary["temporal_noise_mm"] is summary["saturated_share"] is None
+    assert load_sidecar(path).summary == summary_of(None, Quality(), {})
+    assert summary_of(Verified(1, 0, 0.0, {"depth": 1}), Quality(), {}).frames_per_s is None
+
+
+def test_sidecar_stays_whole_on_a_full_disk(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sidecar = SidecarFile(path, Warm())
+    before = path.read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("nlos_cam.recording.sidecar.os.fsync", full)
+    sidecar.on_frame(frame(0.0))  # goes on: the end of the recording raises
+    with pytest.raises(DiskFullError, match=r"a\.json.*No space left on device"):
+        sidecar.finish("complete", summary_of(READ, SEEN, {}))
+    assert [entry.name for entry in path.parent.iterdir()] == ["a.json"]
+    assert path.read_bytes() == before
+
+
+def test_sidecar_prefers_the_rig_of_a_measured_wall(path: Path, tmp_path: Path) -> None:
+    bench, rig = load_rig("bare-wall"), load_rig("paper-rig").model_copy(update={"name": "measured"})
+    record = WallRecord(
+        **rig.lidar.model_dump(include={"distance_m", "yaw_deg", "pitch_deg"}),
+        **dict.fromkeys(("camera", "advice"), "sim"),
+        created=date(2026, 1, 2),
+        frames=30,
+        facing_deg=45.0,
+        residual_m=0.001,
+        inlier_fraction=0.99,
+        verdict="good",
+        rig=rig,
+        wall_from_lidar=tuple(map(tuple, rig.wall_from_lidar.tolist())),
+    )
+    wall_toml = tmp_path / "wall.toml"
+    wall_toml.write_text(dump_toml(record))
+    SidecarFile(path, Warm(rig=bench))
+    assert load_sidecar(path).rig == bench
+    measured, wall = wall_of(wall_toml)
+    SidecarFile(path, Warm(rig=bench), wall=(measured, wall))
+    found = load_sidecar(path)
+    assert found.rig == measured == rig != bench
+    assert found.wall
+    assert found.wall.sha256 == hashlib.sha256(wall_toml.read_bytes()).hexdigest()
+    with pytest.raises(RecordFileError):
+        wall_of(tmp_path / "none.toml")
+
+
+def test_versions_name_the_program_and_no_machine() -> None:
+    found = versions()
+    assert set(found) <= {"nlos-cam", "pyrealsense2", "python", "platform"}
+    assert found["platform"].count(" ") == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "key"),
+    [
+        ({"colour": "red"}, "colour"),
+        ({"state": "asleep"}, "state"),
+        ({"schema_version": 2}, "schema_version"),
+        ({"intrinsics": "wide"}, "intrinsics"),
+        ({"settings": {"laser_power": "40"}}, "laser_power"),
+        ({"label": ...}, "label"),
+    ],
+)
+def test_load_sidecar_names_the_wrong_field_in_one_line(path: Path, changed: dict[str, Any], key: str) -> None:
+    SidecarFile(path, Warm())
+    fields = json.loads(path.read_text()) | changed
+    path.write_text(json.dumps({name: value for name, value in fields.items() if value is not ...}))
+    with pytest.raises(RecordingError, match=rf"a\.json .*{key}") as raised:
+        load_sidecar(path)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", None])
+def test_load_sidecar_refuses_other_files_in_one_line(path: Path, content: bytes | None) -> None:
+    assert sidecar_path(path.with_suffix(".bag")) == path
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"a\.json") as raised:
+        load_sidecar(path)
+    assert "\n" not in str(raised.value)
+    with pytest.raises(RecordingError, match=path.parent.name):
+        load_sidecar(path.parent)
