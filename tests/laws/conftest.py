@@ -36,11 +36,7 @@ class Implementation:
         return renderer.render(scene, setting, effects, backend)
 
     def three_bounce(
-        self,
-        scene: Scene,
-        chosen: np.ndarray | None = None,
-        effects: Effects = "auto",
-        accuracy: Accuracy = COARSE,
+        self, scene: Scene, chosen: np.ndarray | None = None, effects: Effects = "auto", accuracy: Accuracy = COARSE
     ) -> np.ndarray:
         setting, backend = self._how(accuracy)
         return renderer.three_bounce(scene, setting, effects, backend, chosen)

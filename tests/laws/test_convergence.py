@@ -1,4 +1,4 @@
-"""Refining any one grid changes the result towards a limit, and the winner does not drift with the grids."""
+"""Laws of accuracy: refining any grid converges, and the stops keep their promised errors against brute force."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import STOPS, Accuracy
 from nlos_cam.render.renderer import render, three_bounce, transient
 from nlos_cam.render.scene import Scene
@@ -15,7 +16,7 @@ from nlos_cam.render.scene import Scene
 RIG = load_rig("paper-rig")
 SOME = np.arange(5120)[::23]
 BLUR = 16
-"""Bins taken together: finer, what moves from bin to bin is the grid's own noise and not its limit."""
+"""Number of bins summed, so that light moving between bins does not hide the convergence."""
 
 
 def _hill(cells: int) -> np.ndarray:
@@ -61,7 +62,7 @@ def test_refining_a_grid_changes_less_each_time(grid: Any, sizes: tuple[int, ...
     assert steps[-1] < 0.05
 
 
-def test_refining_sub_bins_ends_at_the_brute_force() -> None:
+def test_refining_sub_bins_converges_to_brute_force() -> None:
     base, scene = Accuracy("coarse", relay_columns=20, relay_rows=16), Scene(RIG, _hill(16))
     exact = three_bounce(scene, replace(base, sub_bins=0), chosen=SOME)
     errors = [
@@ -71,7 +72,7 @@ def test_refining_sub_bins_ends_at_the_brute_force() -> None:
     assert all(later < 0.7 * earlier for earlier, later in pairwise(errors)), errors
 
 
-def test_which_echo_wins_does_not_drift_with_the_grid() -> None:
+def test_share_of_winning_echoes_does_not_drift_with_the_grid() -> None:
     shares: list[float] = []
     for cells in (20, 40, 80, 160):
         rendering = render(Scene(RIG, _hill(32)), replace(STOPS["draft"], relay_columns=cells, relay_rows=cells))
@@ -79,3 +80,66 @@ def test_which_echo_wins_does_not_drift_with_the_grid() -> None:
         shares.append(float((rendering.intensity > direct).mean()))
     assert 0.1 < shares[-1] < 0.95
     assert np.ptp(shares[1:]) < 0.03
+
+
+BEAMS = 70
+Case = tuple[Scene, np.ndarray, np.ndarray]
+"""A scene, beams that find something, and their brute-force histograms."""
+
+
+@pytest.fixture(scope="module", params=[3, 20_000_009])
+def case(request: pytest.FixtureRequest) -> Case:
+    assert RIG.object_box is not None
+    scene = Scene(RIG, object_depth(request.param, RIG.object_box)[1])
+    chosen = np.arange(5120)
+    chosen = chosen[three_bounce(scene, "draft").any(1)]
+    chosen = chosen[:: len(chosen) // BEAMS]
+    return scene, chosen, three_bounce(scene, "reference", chosen=chosen)
+
+
+def _errors(case: Case, stop: str) -> tuple[np.ndarray, np.ndarray]:
+    """Relative error of the peak and its offset in bins, beam by beam."""
+    scene, chosen, slow = case
+    fast = three_bounce(scene, stop, chosen=chosen)
+    return np.abs(fast.max(1) - slow.max(1)) / slow.max(1), np.abs(fast.argmax(1) - slow.argmax(1))
+
+
+@pytest.mark.slow
+def test_standard_keeps_its_promised_error(case: Case) -> None:
+    error, off = _errors(case, "standard")
+    assert np.median(error) < 3e-3
+    assert np.quantile(error, 0.99) < 1e-2
+    assert (off <= 1).mean() >= 0.995
+    assert np.median(off) == 0  # 0 mm of depth
+
+
+@pytest.mark.slow
+def test_fine_keeps_its_promised_error(case: Case) -> None:
+    error, off = _errors(case, "fine")
+    assert np.quantile(error, 0.99) < 1e-3
+    assert (off <= 1).mean() >= 0.995
+
+
+def test_finer_stop_is_nearer_to_brute_force(case: Case) -> None:
+    scene, chosen, slow = case
+    errors: list[float] = []
+    for stop in ("draft", "standard", "fine"):
+        fast = three_bounce(scene, stop, chosen=chosen)
+        bins = max(fast.shape[1], slow.shape[1])
+        fast, exact = (np.pad(part, [(0, 0), (0, bins - part.shape[1])]) for part in (fast, slow))
+        errors.append(float(np.abs(fast - exact).sum() / exact.sum()))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[1] < 1e-2
+    assert errors[2] < 2e-3
+
+
+def test_float32_light_is_within_1e_5_of_float64(case: Case) -> None:
+    scene, chosen, slow = case
+    fast = three_bounce(scene, replace(STOPS["fine"], tolerance=0.0), chosen=chosen)
+    np.testing.assert_allclose(fast.sum(1, dtype=np.float64), slow.sum(1), rtol=1e-5)
+
+
+def test_sectors_do_not_change_a_bit_of_the_result(case: Case) -> None:
+    scene, chosen, _ = case
+    few, many = (three_bounce(scene, replace(STOPS["draft"], sectors=n), chosen=chosen) for n in (1, 16))
+    np.testing.assert_array_equal(few, many)

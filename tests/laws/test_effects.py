@@ -1,4 +1,4 @@
-"""Every effect, two-sided on the transient in relative L1: where called for it matters, elsewhere it does not."""
+"""Laws of effects: each matters where the plan calls for it and not elsewhere (relative L1 of the transient)."""
 
 from dataclasses import replace
 from typing import Any
@@ -18,12 +18,11 @@ from nlos_cam.render.renderer import transient
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_facts import SceneFacts
 
+pytestmark = pytest.mark.slow
 RIG = load_rig("paper-rig")
 OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
 BEHIND = OPEN.model_copy(update={"occluder": Occluder(x_m=-3.0, z_min_m=0.05)})
-BLIND = RIG.model_copy(
-    update={"device": RIG.device.model_copy(update={"gate_s": 0.1 / SPEED_OF_LIGHT_M_PER_S})},
-)
+BLIND = RIG.model_copy(update={"device": RIG.device.model_copy(update={"gate_s": 0.1 / SPEED_OF_LIGHT_M_PER_S})})
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
 SOME = np.arange(5120)[::61]
 SHINY, NEARLY_DULL = phong(0.4, 0.6, 10), phong(1.0, 1e-5, 1)
@@ -99,14 +98,12 @@ def _left_out(scene: Scene, accuracy: Accuracy = COARSE) -> set[str]:
     return {effect.name for effect in plan(SceneFacts(scene, accuracy)) if not effect.included}
 
 
-def test_every_effect_has_its_two_scenes() -> None:
+def test_every_effect_has_two_scenes() -> None:
     assert set(CALLED_FOR) == set(NOT_CALLED_FOR) == set(EFFECTS)
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_what_is_called_for_is_included_and_leaving_it_out_changes_more_than_the_tolerance(
-    implementation: Any, name: str
-) -> None:
+def test_effect_called_for_changes_more_than_the_tolerance(implementation: Any, name: str) -> None:
     scene = CALLED_FOR[name]
     if name == "inter-reflection" and implementation.name == "reference":
         scene = replace(scene, object_depth_m=_bowl()[3:6, 3:6])  # path by path it is for a few patches only
@@ -118,7 +115,7 @@ def test_what_is_called_for_is_included_and_leaving_it_out_changes_more_than_the
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_what_is_not_called_for_is_left_out_and_forcing_it_in_changes_less(implementation: Any, name: str) -> None:
+def test_effect_not_called_for_changes_less_than_the_tolerance(implementation: Any, name: str) -> None:
     scene = NOT_CALLED_FOR[name]
     left_out = _left_out(scene)
     assert name in left_out
@@ -155,7 +152,7 @@ scenes = st.builds(
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(scene=scenes, stop=st.sampled_from(sorted(STOPS)))
-def test_what_is_left_out_together_is_bounded_by_the_tolerance(scene: Scene, stop: str) -> None:
+def test_plan_leaves_out_bounds_within_the_tolerance(scene: Scene, stop: str) -> None:
     verdicts = plan(SceneFacts(scene, STOPS[stop]))
     assert tuple(effect.name for effect in verdicts) == EFFECTS
     assert sum(effect.bound for effect in verdicts if not effect.included) <= STOPS[stop].tolerance
@@ -168,9 +165,7 @@ BOUNDED = tuple(name for name in EFFECTS if name not in {"direct", "three-bounce
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(scene=scenes, name=st.sampled_from(BOUNDED), cells=st.sampled_from([(8, 6), (3, 11), (1, 1)]))
-def test_a_bound_is_never_below_what_leaving_the_effect_out_changes(
-    scene: Scene, name: str, cells: tuple[int, int]
-) -> None:
+def test_bound_is_never_below_the_change_without_the_effect(scene: Scene, name: str, cells: tuple[int, int]) -> None:
     accuracy = replace(COARSE, relay_columns=cells[0], relay_rows=cells[1])
     every = set(EFFECTS) - ({"inter-reflection"} if scene.radiometry == "paper" else set())
     bound = next(effect.bound for effect in plan(SceneFacts(scene, accuracy)) if effect.name == name)
@@ -180,7 +175,7 @@ def test_a_bound_is_never_below_what_leaving_the_effect_out_changes(
         assert _change(without, whole) <= bound + 3e-6  # float32
 
 
-def test_a_brdfs_bound_counts_what_takes_its_place() -> None:
+def test_bound_of_a_brdf_counts_its_replacement() -> None:
     scene = Scene(RIG, _plate(), Surface(1.0, phong(0.8, 0.2, 1)))
     verdicts = plan(SceneFacts(scene, COARSE))
     assert included(verdicts, "brdf")

@@ -1,4 +1,4 @@
-"""Laws of meshes: a file, its unit, its axes and its faces' order change no depth map; a depth map is a mesh."""
+"""Laws of meshes: format, unit, axes and order of faces do not change the depth map, which is itself a mesh."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +18,9 @@ from nlos_cam.objects.meshes import read_mesh, upright
 from nlos_cam.objects.placement import Pose, category_triangles, object_depth, place
 
 PAPER = load_rig("paper-rig").object_box
+
 assert PAPER is not None
+
 BOX: ObjectBox = PAPER
 POSE = Pose(tilt_x_rad=0.2, tilt_y_rad=-0.3, turn_z_rad=0.4, size_m=0.19, x_m=0.01, y_m=-0.02)
 EXPORTS: dict[str, Callable[[trimesh.Trimesh], bytes]] = {
@@ -30,7 +32,6 @@ EXPORTS: dict[str, Callable[[trimesh.Trimesh], bytes]] = {
 }
 SINGLE_M = 2e-6
 """Depth that single precision of a file's vertices may move, on a surface as steep as 10."""
-
 Triangles = np.ndarray
 
 
@@ -53,7 +54,7 @@ def _assert_same(depth: np.ndarray, other: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_a_solid_written_and_read_back_has_the_same_depth_map(tmp_path: Path, category: str) -> None:
+def test_mesh_written_and_read_back_keeps_its_depth_map(tmp_path: Path, category: str) -> None:
     triangles = category_triangles(category, 3)
     for name, export in EXPORTS.items():
         (tmp_path / name).write_bytes(export(_mesh(triangles)))
@@ -62,7 +63,7 @@ def test_a_solid_written_and_read_back_has_the_same_depth_map(tmp_path: Path, ca
 
 @pytest.mark.parametrize("name", ["text.obj", "binary.stl", "binary.ply"])
 @pytest.mark.parametrize("unit", [1e-3, 0.0254, 1000.0, 1e12])
-def test_the_files_unit_does_not_matter(tmp_path: Path, name: str, unit: float) -> None:
+def test_unit_of_a_file_does_not_matter(tmp_path: Path, name: str, unit: float) -> None:
     triangles = category_triangles("cup", 1)
     (tmp_path / name).write_bytes(EXPORTS[name](_mesh(triangles * unit)))
     _assert_same(_depth(read_mesh(tmp_path / name).triangles), _depth(triangles))
@@ -70,7 +71,7 @@ def test_the_files_unit_does_not_matter(tmp_path: Path, name: str, unit: float) 
 
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-6, 6), st.tuples(*[st.floats(-1e3, 1e3)] * 3), st.sampled_from(sorted(CATEGORIES)))
-def test_neither_scale_nor_origin_of_the_file_matters(
+def test_scale_and_origin_of_a_mesh_do_not_matter(
     exponent: float, origin: tuple[float, float, float], category: str
 ) -> None:
     triangles = category_triangles(category, 5)
@@ -78,7 +79,7 @@ def test_neither_scale_nor_origin_of_the_file_matters(
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_a_quarter_turn_about_z_turns_the_depth_map(category: str) -> None:
+def test_quarter_turn_about_z_turns_the_depth_map(category: str) -> None:
     """Counter-clockwise, as the map shows x to the right and y up."""
     triangles = category_triangles(category, 2)
     quarter = triangles @ rotation_matrix(np.pi / 2, (0, 0, 1))[:3, :3].T
@@ -89,7 +90,7 @@ def test_a_quarter_turn_about_z_turns_the_depth_map(category: str) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from(sorted(CATEGORIES)))
-def test_neither_winding_nor_order_nor_repetition_of_faces_matters(seed: int, category: str) -> None:
+def test_winding_order_and_repetition_of_faces_do_not_matter(seed: int, category: str) -> None:
     generator = np.random.default_rng(seed)
     triangles = category_triangles(category, 4)
     corners = generator.permuted(np.tile(np.arange(3), (len(triangles), 1)), axis=1)
@@ -97,7 +98,7 @@ def test_neither_winding_nor_order_nor_repetition_of_faces_matters(seed: int, ca
     _assert_same(_depth(np.concatenate([shuffled, shuffled[:50]])), _depth(triangles))
 
 
-def test_a_file_with_z_up_is_the_same_solid_with_y_up(tmp_path: Path) -> None:
+def test_mesh_with_z_up_equals_the_same_with_y_up(tmp_path: Path) -> None:
     triangles = category_triangles("airplane", 1)
     z_up = triangles @ rotation_matrix(np.pi / 2, (1, 0, 0))[:3, :3].T
     (tmp_path / "thing.stl").write_bytes(EXPORTS["binary.stl"](_mesh(z_up)))
@@ -129,9 +130,10 @@ def _sheet(depth_m: np.ndarray) -> Triangles:
     return both[~np.isnan(both).any(axis=(1, 2))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [8, 64, 256])
 @pytest.mark.parametrize("name", [None, *EXPORTS])
-def test_a_depth_map_made_of_plates_rasterises_back_to_it(tmp_path: Path, pixels: int, name: str | None) -> None:
+def test_plates_of_a_depth_map_rasterize_back_to_it(tmp_path: Path, pixels: int, name: str | None) -> None:
     """Within single precision, cell by cell: no map is too ragged."""
     generator = np.random.default_rng(pixels)
     depth = generator.uniform(BOX.z_near_m, BOX.z_far_m, (pixels, pixels)).astype(np.float32)
@@ -143,7 +145,7 @@ def test_a_depth_map_made_of_plates_rasterises_back_to_it(tmp_path: Path, pixels
     np.testing.assert_allclose(orthographic_depth(triangles, BOX, pixels), depth, rtol=0, atol=1e-7)
 
 
-def test_the_sheet_through_a_depth_map_rasterises_back_to_it() -> None:
+def test_sheet_through_a_depth_map_rasterizes_back_to_it() -> None:
     """In every cell that has three neighbours of a square; the others are in no triangle."""
     for seed in range(20):
         depth = object_depth(seed, BOX)[1]
@@ -154,7 +156,7 @@ def test_the_sheet_through_a_depth_map_rasterises_back_to_it() -> None:
         assert lost.sum() < 0.1 * drawn.sum()
 
 
-def test_placing_what_is_placed_moves_nothing() -> None:
+def test_placing_a_placed_mesh_moves_nothing() -> None:
     placed = place(category_triangles("hat", 2), POSE, BOX)
     again = place(placed, Pose(size_m=POSE.size_m, x_m=POSE.x_m, y_m=POSE.y_m, front_m=POSE.front_m), BOX)
     np.testing.assert_allclose(again, placed, atol=1e-12)

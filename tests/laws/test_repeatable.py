@@ -1,4 +1,4 @@
-"""The same scene gives the same bits: again, by any number of threads, and whatever else is rendered with it."""
+"""Laws of repeatability: the same bits again, on any number of threads, and in any batch."""
 
 from dataclasses import replace
 from typing import Any
@@ -16,6 +16,7 @@ from nlos_cam.render.material import Surface, phong
 from nlos_cam.render.renderer import render, render_all
 from nlos_cam.render.scene import Scene
 
+pytestmark = pytest.mark.slow
 RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=7, relay_rows=5, scatter_error=0.1)
 FEW = replace(COARSE, relay_columns=2, relay_rows=2)
@@ -36,7 +37,7 @@ def _effects(name: str) -> set[str]:
 
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("name", SCENES)
-def test_again_and_on_one_thread(implementation: Any, name: str) -> None:
+def test_result_repeats_again_and_on_one_thread(implementation: Any, name: str) -> None:
     first = implementation.three_bounce(SCENES[name], DISTANT, _effects(name), FEW)
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     for _ in range(2):
@@ -54,7 +55,7 @@ def whole(implementation: Any) -> dict[str, np.ndarray]:
 
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(name=st.sampled_from(sorted(SCENES)), start=st.integers(0, 5000), step=st.integers(1, 900))
-def test_the_other_beams_do_not_matter(implementation: Any, whole: Any, name: str, start: int, step: int) -> None:
+def test_beams_do_not_depend_on_other_beams(implementation: Any, whole: Any, name: str, start: int, step: int) -> None:
     known = whole[name]
     if len(known) == len(EVERY):
         some = EVERY[start::step]
@@ -67,7 +68,7 @@ def test_the_other_beams_do_not_matter(implementation: Any, whole: Any, name: st
 
 
 @pytest.mark.parametrize("name", ["plain", "lambertian"])
-def test_rows_alone_are_rows_of_the_whole(name: str) -> None:
+def test_rows_alone_equal_rows_of_the_whole(name: str) -> None:
     scene = SCENES[name]
     every, part = render(scene, COARSE), render(scene, COARSE, rows=(17, 40))
     np.testing.assert_array_equal(part.intensity, every.intensity[17:40])
@@ -75,14 +76,14 @@ def test_rows_alone_are_rows_of_the_whole(name: str) -> None:
     np.testing.assert_array_equal(part.margin, every.margin[17:40])
 
 
-def test_rows_of_a_shiny_object_and_of_many_beams_per_cell_too() -> None:
+def test_rows_of_a_shiny_object_equal_rows_of_the_whole() -> None:
     scene = SCENES["shiny"]
     accuracy = replace(FEW, scatter_error=0.5, beams_per_cell=2)
     every, part = render(scene, accuracy), render(scene, accuracy, rows=(30, 33))
     np.testing.assert_array_equal(part.intensity, every.intensity[30:33])
 
 
-def test_a_batch_gives_what_each_gives_alone_also_a_batch_of_one() -> None:
+def test_batch_gives_each_scene_as_alone() -> None:
     scenes = [SCENES["plain"], SCENES["lambertian"], Scene(RIG)]
     for batch in (scenes, scenes[:1]):
         for one, scene in zip(render_all(batch, COARSE), batch, strict=True):
@@ -90,7 +91,7 @@ def test_a_batch_gives_what_each_gives_alone_also_a_batch_of_one() -> None:
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_a_whole_object_at_the_named_stops() -> None:
+def test_whole_object_repeats_at_a_named_stop() -> None:
     depth = np.random.default_rng(1).uniform(0.13, 0.35, (32, 32)).astype(np.float32)
     first = render(Scene(RIG, depth), STOPS["draft"])
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)

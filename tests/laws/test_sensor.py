@@ -1,4 +1,4 @@
-"""Laws of the sensor's chain: fast == slow, mean and variance of its noise, what ambient light may do, hard inputs."""
+"""Laws of the sensor: fast equals slow, moments of the noise, ambient light, and hard inputs."""
 
 from itertools import pairwise
 
@@ -49,7 +49,7 @@ def _generator(seed: int = 0) -> np.random.Generator:
 
 
 def _echo(counts: np.ndarray | float, path_m: np.ndarray | float = 1.0) -> MultiBounce:
-    """Echoes of so many counts, with no direct return beside them."""
+    """Echoes of these counts without a direct return."""
     peak = np.broadcast_to(np.asarray(counts) * BRIGHTEST / 48, (64, 80)).astype(np.float32)
     path = np.broadcast_to(path_m, (64, 80)).astype(np.float32)
     return MultiBounce(peak, np.zeros((64, 80), np.float32), path, direct_included=True)
@@ -66,7 +66,7 @@ def rendering() -> Rendering:
     return render(Scene(scene.rig, object_depth(3, scene.box)[1]))
 
 
-def test_without_noise_it_reports_the_renderers_winner_within_quantisation(rendering: Rendering) -> None:
+def test_quiet_sensor_reports_the_rendering_within_rounding(rendering: Rendering) -> None:
     images = Sensor(RIG, QUIET).expose(rendering.multi, _generator())
     returned = images.depth_z16 > 0
     assert returned.mean() > 0.5
@@ -90,7 +90,7 @@ def _bias_m(model: SensorModel) -> np.ndarray:
 @pytest.mark.parametrize(
     "model", [SensorModel(), RICH, BIASED, ROUGH, QUIET], ids=["default", "rich", "biased", "rough", "quiet"]
 )
-def test_fast_is_slow(rendering: Rendering, model: SensorModel) -> None:
+def test_sensor_equals_plain_float64_array_steps(rendering: Rendering, model: SensorModel) -> None:
     """The same chain written as plain array steps, in float64."""
     fast, beams, generator = (
         Sensor(RIG, model).expose(rendering.multi, _generator(3), celsius=CELSIUS),
@@ -123,7 +123,7 @@ def test_fast_is_slow(rendering: Rendering, model: SensorModel) -> None:
 
 
 @pytest.mark.parametrize("ambient", [0.0, 40.0])
-def test_the_mean_over_frames_is_the_chain_without_noise(ambient: float) -> None:
+def test_mean_over_frames_is_the_image_without_noise(ambient: float) -> None:
     counts, echo = 60.3, _echo(60.3)
     frames = _frames(RICH.model_copy(update={"ambient_counts": ambient}), echo)
     assert np.mean([f.ir for f in frames]) == pytest.approx(counts, abs=0.03)
@@ -133,7 +133,7 @@ def test_the_mean_over_frames_is_the_chain_without_noise(ambient: float) -> None
 
 
 @pytest.mark.parametrize("path_m", [0.4, 1.0, 3.0])
-def test_a_bias_is_the_same_for_a_near_and_a_far_return_in_every_frame(path_m: float) -> None:
+def test_bias_is_the_same_for_near_and_far_returns(path_m: float) -> None:
     plain = QUIET.model_copy(update={name: value for name, value in BIASED if name in BIAS_FIELDS})
     echo, free = _echo(60.0, path_m), Sensor(BARE, QUIET)
     apart = [
@@ -147,13 +147,13 @@ def test_a_bias_is_the_same_for_a_near_and_a_far_return_in_every_frame(path_m: f
 
 @pytest.mark.parametrize("counts", [15.0, 60.3, 120.0])
 @pytest.mark.parametrize("ambient", [0.0, 40.0, 90.0])
-def test_the_variance_is_read_plus_shot_plus_ambient(counts: float, ambient: float) -> None:
+def test_variance_is_read_plus_shot_plus_ambient_noise(counts: float, ambient: float) -> None:
     frames = _frames(RICH.model_copy(update={"ambient_counts": ambient}), _echo(counts))
     variance = 1.5**2 + 0.3**2 * (counts + ambient) + 1 / 12  # the last: rounding to whole counts
     assert np.var([f.ir for f in frames]) == pytest.approx(variance, rel=0.01)
 
 
-def test_noise_is_white_and_that_of_range_is_its_own() -> None:
+def test_noise_is_white_and_independent_of_range_noise() -> None:
     echo = _echo(60.0)
     truth = Sensor(BARE, QUIET).expose(echo, _generator()).depth_z16.astype(float)
     frames = _frames(RICH, echo)
@@ -171,7 +171,7 @@ def test_noise_is_white_and_that_of_range_is_its_own() -> None:
 
 
 @pytest.mark.parametrize("ambient", [0.0, 40.0, 254.0])
-def test_ir_rises_with_intensity_and_saturates_short_by_the_ambient_light(ambient: float) -> None:
+def test_ir_rises_with_intensity_and_saturates(ambient: float) -> None:
     counts = np.geomspace(1e-3, 1e3, 5120).reshape(64, 80)
     model = QUIET.model_copy(update={"ambient_counts": ambient})
     ir = Sensor(BARE, model).expose(_echo(counts), _generator()).ir.astype(float)
@@ -221,7 +221,7 @@ ODD = np.array([0, -0.0, -1, 1e-38, 1e-6, 1e-3, 1, 1e6, 1e38, np.nan, np.inf, -n
         warm_up=st.sampled_from([None, BIASED.warm_up]),
     ),
 )
-def test_no_input_makes_an_image_that_cannot_be(seed: int, included: bool, model: SensorModel) -> None:
+def test_any_input_gives_a_possible_image(seed: int, included: bool, model: SensorModel) -> None:
     generator = _generator(seed)
     spread = (10 ** generator.uniform(-9, 3, 5120)).astype(np.float32)
     peak, runner_up, path = (

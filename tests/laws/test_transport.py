@@ -1,4 +1,4 @@
-"""Laws of the transport on every implementation: energy, reciprocity, causality, symmetry, scaling, superposition."""
+"""Laws of transport on every backend: energy, reciprocity, causality, symmetry, scaling, superposition."""
 
 from dataclasses import replace
 from typing import Any
@@ -46,7 +46,7 @@ def _job(scene: Scene, accuracy: Accuracy = COARSE) -> TransportJob:
 
 
 def _arrived(implementation: Any, job: TransportJob) -> np.ndarray:
-    """What of the light of each beam's foot arrives on the relay: before the detector's leg, here the same for all."""
+    """Share of the light of each laser spot that arrives on the relay wall, before the leg to the detector."""
     far_m = 10.0
     there = np.full_like(job.relay.x_m, far_m)
     relay = replace(job.relay, length_m=there, cos_lidar=np.ones_like(there))
@@ -55,10 +55,11 @@ def _arrived(implementation: Any, job: TransportJob) -> np.ndarray:
     return implementation.histograms(even).sum(1) * job.solid_angle * far_m**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radiometry", RADIOMETRIES)
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(base_m=st.floats(1e-3, 0.4), rough_m=st.sampled_from([0.0, 0.01, 0.1]), seed=st.integers(0, 99))
-def test_less_light_arrives_than_left_the_foot(
+def test_relay_receives_less_light_than_left_the_spot(
     implementation: Any, radiometry: Radiometry, base_m: float, rough_m: float, seed: int
 ) -> None:
     depth = _rough(seed, base_m, base_m + rough_m)
@@ -77,12 +78,13 @@ def _swapped(job: TransportJob) -> TransportJob:
     return replace(job, foot_m=feet, length_m=relay.length_m, cos_incidence=np.ones(len(feet)), relay=there)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("brdf", [None, PHONG], ids=["diffuse", "phong"])
-def test_light_goes_the_same_way_back(implementation: Any, brdf: Any) -> None:
-    """In Lambertian radiometry what passes from foot p by the object to cell q passes from q to p, as late."""
+def test_transport_is_reciprocal(implementation: Any, brdf: Any) -> None:
+    """Light from spot p over the object to cell q equals that from q to p, with the same delay (Lambertian)."""
     scene = Scene(OPEN, _rough(1, 0.25, 0.35), Surface(0.7, brdf), "lambertian", jump_m=0.5)
     job = _job(scene, replace(COARSE, relay_columns=40, relay_rows=40))
-    assert job.near_m < 0.25  # near contact is told from patch and cell apart, and so has a direction
+    assert job.near_m < 0.25  # near contact depends on the direction
     job = replace(job, relay=job.relay.kept(np.arange(len(job.relay.x_m)) == 905)).some(np.array([1500]))
     job = replace(job, map_foot_m=job.foot_m)
     there, back = job, _swapped(job)
@@ -95,7 +97,7 @@ def test_light_goes_the_same_way_back(implementation: Any, brdf: Any) -> None:
     assert moved < 0.1  # bins: a fast renderer may round a path across an edge
 
 
-def test_no_echo_before_the_shortest_path_or_after_the_longest(implementation: Any) -> None:
+def test_echoes_lie_between_shortest_and_longest_path(implementation: Any) -> None:
     scene = Scene(RIG, _rough(2))
     job = _job(scene).some(np.arange(0, 2700, 50))
     histogram, point, relay = implementation.histograms(job), job.patches.point_m, job.relay
@@ -112,7 +114,7 @@ def test_no_echo_before_the_shortest_path_or_after_the_longest(implementation: A
     assert histogram.any()
 
 
-def test_the_one_path_of_one_pixel_and_one_cell_is_in_its_own_bin(implementation: Any) -> None:
+def test_single_path_has_its_bin_and_the_weight_of_s2(implementation: Any) -> None:
     depth = np.full((8, 8), np.nan, np.float32)
     depth[3, 3] = 0.3
     job = _job(Scene(OPEN, depth), replace(COARSE, relay_columns=40, relay_rows=40, sub_bins=64))
@@ -133,7 +135,8 @@ def test_the_one_path_of_one_pixel_and_one_cell_is_in_its_own_bin(implementation
     np.testing.assert_allclose(histogram.sum(1), expected, rtol=1e-5)
 
 
-def test_a_mirrored_object_is_seen_as_mirrored_maps(implementation: Any) -> None:
+@pytest.mark.slow
+def test_mirrored_object_gives_mirrored_maps(implementation: Any) -> None:
     depth = _plate(0.25)  # level: the forward differences of S3 are not symmetric on a slope
     depth[4:7, 4:7] = 0.2
     one = implementation.render(Scene(RIG, depth))
@@ -145,13 +148,13 @@ def test_a_mirrored_object_is_seen_as_mirrored_maps(implementation: Any) -> None
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.25, 1.0])
-def test_three_bounces_scale_with_the_albedo(implementation: Any, albedo: float) -> None:
+def test_three_bounce_scales_with_the_albedo(implementation: Any, albedo: float) -> None:
     white = implementation.three_bounce(Scene(RIG, _rough(3)), SOME)
     grey = implementation.three_bounce(Scene(RIG, _rough(3), Surface(albedo)), SOME)
     np.testing.assert_allclose(grey, albedo * white, rtol=1e-5, atol=1e-30)
 
 
-def test_the_albedo_of_each_cell_weighs_that_cell(implementation: Any) -> None:
+def test_albedo_of_each_cell_weighs_that_cell(implementation: Any) -> None:
     albedo = np.zeros((8, 8))
     albedo[:, :4] = 1
     left = np.where(albedo > 0, _rough(4), np.nan).astype(np.float32)
@@ -163,7 +166,7 @@ def test_the_albedo_of_each_cell_weighs_that_cell(implementation: Any) -> None:
     assert not painted[:, bins:].any()
 
 
-def test_two_parts_that_do_not_shade_each_other_return_what_each_returns(implementation: Any) -> None:
+def test_parts_that_do_not_shade_each_other_add_up(implementation: Any) -> None:
     both, left, right = (np.full((8, 8), np.nan, np.float32) for _ in range(3))
     left[1:4, 1:3], right[5:7, 5:8] = 0.22, 0.22
     both[:] = np.where(np.isnan(left), right, left)
@@ -175,7 +178,7 @@ def test_two_parts_that_do_not_shade_each_other_return_what_each_returns(impleme
     np.testing.assert_allclose(whole, parts, rtol=1e-4, atol=1e-6 * whole.max())
 
 
-def test_a_front_part_shades_the_part_behind_it(implementation: Any) -> None:
+def test_front_part_shades_the_part_behind_it(implementation: Any) -> None:
     behind, front = (np.full((8, 8), np.nan, np.float32) for _ in range(2))
     behind[2:6, 5:8], front[2:6, 2:5] = 0.35, 0.14
     together = np.where(np.isnan(front), behind, front)
@@ -183,10 +186,9 @@ def test_a_front_part_shades_the_part_behind_it(implementation: Any) -> None:
     assert implementation.three_bounce(Scene(RIG, together), SOME).sum() < 0.98 * apart
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radiometry", RADIOMETRIES)
-def test_the_transient_is_three_bounces_and_the_direct_return_and_render_reports_its_highest_bin(
-    implementation: Any, radiometry: Radiometry
-) -> None:
+def test_transient_is_three_bounces_plus_the_direct_return(implementation: Any, radiometry: Radiometry) -> None:
     scene = Scene(RIG, _rough(5), radiometry=radiometry)
     three = implementation.three_bounce(scene, effects=ALL_BUT_MORE)
     whole = implementation.transient(scene, ALL_BUT_MORE).reshape(5120, -1)

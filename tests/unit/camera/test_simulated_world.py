@@ -1,0 +1,167 @@
+"""World of the simulated camera: frames by number, loops, warm-up, and the cache of renderings."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nlos_cam.camera.simulated_world import World, open_world
+from nlos_cam.errors import SceneError
+from nlos_cam.render.sensor.sensor import SensedImages
+
+SCENE = """
+name = "two poses"
+rig = "paper-rig"
+object = { category = "cup", seed = 1, size_m = 0.08 }
+motion = { poses = 2, approach_m = 0.01 }
+"""
+WARMING = """
+name = "warming"
+rig = "bare-wall"
+
+[sensor]
+drift_m_per_celsius = 0.0005
+
+[sensor.warm_up]
+from_celsius = 25.0
+to_celsius = 45.0
+time_constant_s = 600.0
+"""
+EXAMPLE = Path(__file__).parents[3] / "examples" / "warming.toml"
+NAMES = ("depth_z16", "ir", "confidence")
+
+
+def _equal(one: SensedImages, other: SensedImages) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in NAMES)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("world")
+
+
+@pytest.fixture(scope="module")
+def scene(folder: Path) -> Path:
+    (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
+    return folder / "scene.toml"
+
+
+@pytest.fixture(autouse=True)
+def _cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NLOS_CAM_CACHE", str(folder / "cache"))
+
+
+@pytest.fixture
+def world(scene: Path) -> World:
+    return open_world(str(scene))
+
+
+def test_world_frame_is_bit_identical_by_number(world: World) -> None:
+    later = world.images(7)
+    assert _equal(world.images(7), later)
+    assert not _equal(world.images(0), world.images(1))
+    assert world.celsius(0) == world.celsius(1_000_000)
+
+
+def test_world_loop_repeats_with_other_noise(world: World) -> None:
+    first, again = world.images(0), world.images(2)
+    assert not _equal(first, again)
+    np.testing.assert_array_equal(first.confidence, again.confidence)
+    both = (first.depth_z16 > 0) & (again.depth_z16 > 0)
+    difference = first.depth_z16[both].astype(int) - again.depth_z16[both].astype(int)
+    assert np.abs(difference).max() * 0.00025 < 0.05
+    assert not np.array_equal(world.images(1).confidence, first.confidence)
+
+
+def test_world_truth_is_the_object_at_half_the_scan(world: World) -> None:
+    for number in range(4):
+        truth = world.truth_depth_m(number)
+        expected = world.scene.scene_at(number % 2 + 0.5).object_depth_m
+        assert truth is not None
+        np.testing.assert_array_equal(truth, expected)
+
+
+@pytest.mark.slow
+def test_world_from_the_cache_equals_the_rendered_one(
+    scene: Path, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, int]] = []
+    monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
+    fresh = open_world(str(scene), lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 2), (2, 2)]
+    monkeypatch.setattr("nlos_cam.camera.simulated_world.render_scan", lambda *_: pytest.fail("rendered again"))
+    cached = open_world(str(scene), lambda done, total: seen.append((done, total)))
+    assert len(seen) == 2
+    for number in (0, 1, 5):
+        assert _equal(cached.images(number), fresh.images(number))
+        assert _equal(world.images(number), fresh.images(number))
+    assert [path.name for path in (tmp_path / "worlds").iterdir()] == [f"{fresh.scene.checksum}.npz"]
+    other = tmp_path / "scene.toml"
+    other.write_text(scene.read_text(encoding="utf-8") + "sensor = { dead_share = 0.5 }\n", encoding="utf-8")
+    harmed = open_world(str(other)).images(0)  # another sensor, the same rendering
+    assert (harmed.depth_z16 > 0).sum() < 0.7 * (world.images(0).depth_z16 > 0).sum()
+
+
+@pytest.fixture
+def warming(tmp_path: Path) -> World:
+    """A bare wall whose device warms from 25 to 45 degrees, with its depth shifted by 10 mm all the way."""
+    (tmp_path / "warming.toml").write_text(WARMING, encoding="utf-8")
+    return open_world(str(tmp_path / "warming.toml"))
+
+
+def _depth_m(world: World, number: int) -> float:
+    depth_m = world.images(number).frame(world.rig.pinhole).depth_m
+    return float(np.nanmean(depth_m))
+
+
+def test_world_warms_by_the_frame_number_beyond_the_loop(warming: World) -> None:
+    assert warming.scene.poses == 1
+    after = [warming.celsius(round(30 * 60 * minutes)) for minutes in (0, 10, 100)]
+    ldd = [celsius["ldd_temperature"] for celsius in after]
+    assert ldd == pytest.approx([25.0, 45 - 20 / np.e, 45.0], abs=0.01)
+    for celsius in after:
+        assert set(celsius) == {f"{part}_temperature" for part in ("ldd", "mc", "ma", "apd", "humidity")}
+        assert {name: celsius[name] - after[0][name] for name in celsius} == pytest.approx(
+            dict.fromkeys(celsius, celsius["ldd_temperature"] - 25.0)
+        )
+
+
+def test_world_depth_drifts_with_its_temperature(warming: World) -> None:
+    cold_m, later_m, warm_m = (_depth_m(warming, number) for number in (0, 18_000, 180_000))
+    reported = warming.celsius(18_000)["ldd_temperature"]
+    assert warm_m - cold_m == pytest.approx(0.0005 * 20, abs=2e-5)
+    assert later_m - warm_m == pytest.approx(0.0005 * (reported - 45), abs=2e-5)
+    assert _equal(warming.images(18_000), warming.images(18_000))
+
+
+def test_world_of_the_warming_example_is_a_warming_bare_wall() -> None:
+    example, bare = open_world(str(EXAMPLE)), open_world("bare-wall")
+    assert example.scene.checksum == bare.scene.checksum
+    assert example.celsius(0)["ldd_temperature"] < example.celsius(9000)["ldd_temperature"]
+    apart = example.images(0).depth_z16.astype(int) - bare.images(0).depth_z16
+    both = (example.images(0).depth_z16 > 0) & (bare.images(0).depth_z16 > 0)
+    assert 1e-3 < np.abs(apart[both]).mean() * 0.00025 < 0.02
+    np.testing.assert_array_equal(example.images(0).ir, bare.images(0).ir)
+
+
+def test_world_with_a_wide_pulse_survives_the_cache(tmp_path: Path) -> None:
+    wide = tmp_path / "wide.toml"
+    wide.write_text(SCENE.replace("poses = 2", "poses = 1") + "sensor = { pulse_ns = 1.0 }\n", encoding="utf-8")
+    rendered, cached = open_world(str(wide)), open_world(str(wide))
+    assert _equal(rendered.images(0), cached.images(0))
+    plain = tmp_path / "plain.toml"
+    plain.write_text(SCENE.replace("poses = 2", "poses = 1"), encoding="utf-8")
+    assert not np.array_equal(rendered.images(0).ir, open_world(str(plain)).images(0).ir)
+
+
+def test_world_of_the_bare_wall_hides_nothing() -> None:
+    world = open_world("bare-wall")
+    assert world.truth_depth_m(0) is None
+    assert world.truth_depth_m(11) is None
+    assert world.rig.occluder is None
+    assert not _equal(world.images(0), world.images(1))
+
+
+def test_open_world_names_a_missing_scene(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"none\.toml"):
+        open_world(str(tmp_path / "none.toml"))

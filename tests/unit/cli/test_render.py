@@ -1,0 +1,276 @@
+"""`render`: objects to files of maps, options that reach the scene or the accuracy, and exit codes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from nlos_calibration.rig import Rig, dump_toml, load_rig
+
+from nlos_cam.cli.main import main
+from nlos_cam.cli.render import hidden_depth
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.placement import object_depth
+from nlos_cam.render.effects import EFFECTS
+from nlos_cam.render.renderer import render
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.scene_file import HiddenObject, SceneFile
+from nlos_cam.render.sensor.effects import sensor_effects
+from nlos_cam.render.sensor.model import SensorModel
+
+RIG = load_rig("paper-rig")
+NAMES = [*EFFECTS, *(effect.name for effect in sensor_effects(SensorModel()))]
+
+
+def _depth() -> np.ndarray:
+    assert RIG.object_box is not None
+    return object_depth(2, RIG.object_box)[1]
+
+
+def _render(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return the JSON result and the contents of the file."""
+    assert main(["render", *map(str, arguments), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    with np.load(result["out"]) as file:
+        return result, dict(file)
+
+
+def test_render_writes_maps_a_picture_and_reports_effects(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "cup.npz"
+    assert main(["render", "cup", "--accuracy", "draft", "--out", str(out), "--explain", "--json"]) == 0
+    shown = capsys.readouterr()
+    result = json.loads(shown.out.splitlines()[-1])
+    assert (result["accuracy"], result["out"]) == ("draft", str(out))
+    assert result["seconds"] > 0
+    assert [effect["name"] for effect in result["effects"]] == NAMES
+    assert all(set(e) == {"name", "included", "reason", "bound", "seconds"} for e in result["effects"])
+    assert "self-occlusion" in shown.err
+    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    with np.load(out) as file:
+        assert {name: file[name].shape for name in ("depth_m", "intensity", "margin", "object_depth_m")} == {
+            "depth_m": (64, 80),
+            "intensity": (64, 80),
+            "margin": (64, 80),
+            "object_depth_m": (64, 64),
+        }
+        assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
+
+
+def test_render_of_a_depth_map_equals_the_library(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "thing.npy", _depth())
+    _, file = _render(capsys, tmp_path / "thing.npy", "--accuracy", "draft", "--out", tmp_path / "maps.npz")
+    expected = render(Scene(RIG, _depth()), "draft")
+    np.testing.assert_array_equal(file["depth_m"], expected.depth_m)
+    np.testing.assert_array_equal(file["intensity"], expected.intensity)
+    np.testing.assert_array_equal(file["object_depth_m"], _depth())
+
+
+@pytest.mark.parametrize("kind", ["category", "file"])
+def test_render_places_its_object_as_a_scene_file_does(
+    mesh: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """Every option is given, and each arrives."""
+    name, only = {"category": ("hat", {"seed": 4}), "file": (mesh, {"up": "z"})}[kind]
+    pose = {"size_m": 0.15, "tilt_x_deg": -10.0, "tilt_y_deg": 200.0, "turn_deg": 30.0}
+    fields = {**pose, "x_m": -0.01, "y_m": 0.02, "front_m": 0.05, **only}
+    options = [text for field, value in fields.items() for text in (f"--{field.replace('_', '-')}", value)]
+    _, file = _render(capsys, name, *options, "--accuracy", "draft", "--out", tmp_path / "maps.npz")
+    np.testing.assert_array_equal(file["object_depth_m"], _of_scene(**{kind: name, **fields}))
+
+
+def test_render_overwrites_only_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "cup.npz"
+    out.write_bytes(b"precious")
+    arguments = ["render", "cup", "--accuracy", "draft", "--out", str(out), "--json"]
+    assert main(arguments) == 1
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["error"]["type"] == "OutputExistsError"
+    assert out.read_bytes() == b"precious"
+    assert main([*arguments, "--overwrite"]) == 0
+    assert out.read_bytes() != b"precious"
+
+
+def test_render_takes_the_rig_of_a_scene_and_reports_its_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, out = tmp_path / "scene.toml", tmp_path / "maps.npz"
+    lent = SceneFile(name="a scene", rig=RIG.model_copy(update={"name": "lent"}))
+    scene.write_text(dump_toml(lent), encoding="utf-8")
+    _, file = _render(capsys, "hat", "--scene", scene, "--accuracy", "draft", "--out", out)
+    assert str(file["rig_name"]) == "lent"
+    result, _ = _render(capsys, "cup", "--accuracy", "draft", "--out", tmp_path / "other")
+    assert Path(result["out"]).is_file()
+
+
+@pytest.mark.parametrize(
+    ("code", "arguments", "word"),
+    [
+        *[
+            (1, name, name)
+            for name in ("teapot", "none.stl", "none.PLY", "none.npy", "none.NPY", "none.glb", "words.npy")
+        ],
+        *[(1, f"cup {options}", "cup") for options in ("--x-m 1", "--y-m -0.5", "--size-m 0.002")],
+        (1, "cup --accuracy perfect", "perfect"),
+        (1, "cup --front-m 0.5", "0.5 m"),
+        (1, "cup --rig bare-wall", "object_box"),
+        (1, "cup --scene none.toml", "none.toml"),
+        (4, "cup --rig no-rig", "no-rig"),
+        (2, "", ""),
+        *[(2, f"cup --{name} {value}", word) for name, value, word in (("seed", -1, "seed"), ("size-m", "nan", "nan"))],
+        *[(2, f"cup --{name} inf", name.replace("-", "_")) for name in ("turn-deg", "front-m")],
+        (2, "cup --up z", "--up"),
+        (2, "cup --up w", "z"),
+        (2, "none.stl --seed 1", "--seed"),
+        (2, "plate.npy --size-m 0.1 --up z", "--size-m"),
+        *[(1, f"plate.npy --{name} {value}", value) for name, value in (("radiometry", "magic"), ("pulse-ns", "-1"))],
+        *[(1, f"plate.npy --{name} {value}", value) for name, value in (("effects", "rain"), ("backend", "abacus"))],
+        *[(1, f"plate.npy --{name}", word) for name, word in (("beams-per-cell 0", "0"), ("max-error -1", "-1"))],
+        *[(2, f"plate.npy --albedo {value}", "albedo") for value in ("1.5", "white")],
+        (2, "plate.npy --material glass", "kind"),
+        (2, "plate.npy --exponent 0", "exponent"),
+        (2, "plate.npy --max-error 0.1 --accuracy fine", "--accuracy"),
+    ],
+)
+def test_render_refuses_bad_arguments_with_a_code_and_one_line(
+    plate: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    code: int,
+    arguments: str,
+    word: str,
+) -> None:
+    folder = Path(plate).parent
+    monkeypatch.chdir(folder)
+    (folder / "words.npy").write_bytes(b"hello")
+    assert main(["render", *arguments.split(), "--out", "maps.npz"]) == code
+    shown = capsys.readouterr()
+    assert word in shown.err
+    assert not shown.err or shown.err.count("\n") == 1
+    assert "Traceback" not in shown.err
+    assert not (folder / "maps.npz").exists()
+
+
+@pytest.fixture
+def plate(tmp_path: Path) -> str:
+    depth = np.full((16, 16), np.nan, np.float32)
+    depth[4:12, 4:12] = 0.2
+    np.save(tmp_path / "plate.npy", depth)
+    return str(tmp_path / "plate.npy")
+
+
+def _rendered(
+    plate: str, capsys: pytest.CaptureFixture[str], *options: str
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    chosen = () if any(option.startswith("--max") for option in options) else ("--accuracy", "draft")
+    return _render(capsys, plate, "--out", Path(plate).with_name("maps.npz"), "--overwrite", *chosen, *options)
+
+
+def _included(result: dict[str, Any]) -> set[str]:
+    return {effect["name"] for effect in result["effects"] if effect["included"]}
+
+
+def test_render_keeps_the_radiometry_in_its_file(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
+    _, paper = _rendered(plate, capsys)
+    _, lambertian = _rendered(plate, capsys, "--radiometry", "lambertian")
+    assert (str(paper["radiometry"]), str(lambertian["radiometry"])) == ("paper", "lambertian")
+    assert lambertian["intensity"].max() > 1.5 * paper["intensity"].max()  # 1/pi in place of 1/(2 pi)
+
+
+@pytest.mark.slow
+def test_render_takes_a_material_and_an_albedo(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
+    result, _ = _rendered(
+        plate, capsys, "--material", "phong", "--specular", "0.3", "--exponent", "4", "--accuracy", "draft"
+    )
+    assert "brdf" in _included(result)
+    _, black = _rendered(plate, capsys, "--albedo", "0")
+    _, white = _rendered(plate, capsys, "--albedo", "1")
+    assert (white["intensity"] > black["intensity"]).any()
+
+
+def test_render_with_three_albedos_gives_color(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
+    result, file = _rendered(plate, capsys, "--albedo", "0.9,0.5,0.1")
+    assert "colour" in _included(result)
+    assert file["colour"].shape == (64, 80, 3)
+    assert (file["colour"][..., 0] >= file["colour"][..., 2]).all()
+    assert (file["colour"][..., 0] > file["colour"][..., 2]).any()
+
+
+def test_render_includes_the_named_effects(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
+    result, file = _rendered(plate, capsys, "--effects", "three-bounce")
+    assert _included(result) & {"direct", "occluder", "three-bounce"} == {"three-bounce"}
+    assert (file["intensity"] > 0).any()
+
+
+def test_render_takes_a_pulse_and_beams_per_cell(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
+    plain, sharp = _rendered(plate, capsys)
+    wide, blurred = _rendered(plate, capsys, "--pulse-ns", "1")
+    assert "pulse" in _included(wide) - _included(plain)
+    assert not np.array_equal(sharp["intensity"], blurred["intensity"])
+    _, finer = _rendered(plate, capsys, "--beams-per-cell", "2")
+    assert not np.array_equal(sharp["intensity"], finer["intensity"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bound", [["--max-error", "0.9"], ["--max-seconds", "1000"]])
+def test_render_chooses_an_accuracy_within_a_bound(
+    plate: str, capsys: pytest.CaptureFixture[str], bound: list[str]
+) -> None:
+    result, _ = _rendered(plate, capsys, *bound)
+    assert result["accuracy"] in {"draft", "standard", "fine", "reference"}
+    if bound[0] == "--max-seconds":
+        assert result["accuracy"] == "reference"  # time for everything
+
+
+@pytest.fixture
+def mesh(tmp_path: Path) -> str:
+    corners = [(0, 0, 0), (1, 0, 0), (0, 0.6, 0), (0, 0, 0.4)]
+    solid = trimesh.Trimesh(corners, [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], process=False)
+    solid.export(tmp_path / "wedge [b].stl")
+    return str(tmp_path / "wedge [b].stl")
+
+
+def _of_scene(rig: Rig = RIG, **fields: Any) -> np.ndarray:
+    depth_m = SceneFile(name="same", rig=rig, object=HiddenObject(**fields)).scene_at(0).object_depth_m
+    assert depth_m is not None
+    return depth_m
+
+
+def test_hidden_depth_takes_a_depth_map_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    depth = _of_scene(category="hat")
+    np.save(tmp_path / "hat.NPY.npy", depth)
+    np.testing.assert_array_equal(hidden_depth(str(tmp_path / "hat.NPY.npy"), RIG, {"size_m": None}), depth)
+    assert capsys.readouterr().err == ""
+    np.save(tmp_path / "none [b].npy", np.full((64, 64), np.nan))
+    assert np.isnan(hidden_depth(str(tmp_path / "none [b].npy"), RIG, {})).all()
+    warning = capsys.readouterr().err
+    assert "none [b].npy" in warning
+    assert warning.count("\n") == 1
+
+
+def test_hidden_depth_warns_of_an_object_cut_by_the_box(mesh: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Half a wide plate: the box ends in its middle."""
+    plate = str(Path(mesh).with_name("plate [b].ply"))
+    trimesh.creation.box(extents=(1, 0.2, 0.01)).export(plate)
+    depth = hidden_depth(plate, RIG, {"size_m": 0.2, "x_m": 0.125})
+    warning = capsys.readouterr().err
+    assert f"{plate}: 50%" in warning
+    assert warning.count("\n") == 1
+    assert np.isfinite(depth[:, -1]).any()
+    assert np.isnan(depth[:, 0]).all()
+
+
+def test_hidden_depth_warns_of_a_flattened_object(mesh: str, capsys: pytest.CaptureFixture[str]) -> None:
+    depth = hidden_depth(mesh, RIG, {"tilt_y_deg": 90, "front_m": 0.2})
+    assert RIG.object_box is not None
+    assert np.nanmax(depth) <= RIG.object_box.z_far_m + 1e-6
+    warning = capsys.readouterr().err
+    assert all(word in warning for word in (mesh, "0.3 m", "0.08 m"))
+    assert warning.count("\n") == 1
+
+
+def test_hidden_depth_refuses_an_edge_on_plate(tmp_path: Path) -> None:
+    plate = tmp_path / "plate.obj"
+    plate.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", encoding="utf-8")
+    with pytest.raises(SceneError, match=r"plate\.obj"):
+        hidden_depth(str(plate), RIG, {"tilt_y_deg": 90})

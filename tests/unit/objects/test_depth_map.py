@@ -1,0 +1,136 @@
+"""Rasteriser and depth images: planes, boxes and spheres of known depth, and the image v of a depth map."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nlos_calibration.rig import ObjectBox, load_rig
+
+from nlos_cam.objects.depth_map import (
+    cell_centres_m,
+    depth_from_image,
+    image_from_depth,
+    orthographic_depth,
+    share_outside,
+)
+
+BOX = ObjectBox(x_min_m=0.0, x_max_m=0.64, y_min_m=-0.32, y_max_m=0.32, z_near_m=0.1, z_far_m=0.6)
+X, Y = np.meshgrid(*cell_centres_m(BOX))
+
+
+def _quad(z: tuple[float, float, float, float], low: float = -1.0, high: float = 1.0) -> np.ndarray:
+    """Two triangles over a square; z at (low, low), (high, low), (high, high), (low, high)."""
+    a, b, c, d = ((x, y, k) for (x, y), k in zip([(low, low), (high, low), (high, high), (low, high)], z, strict=True))
+    return np.array([[a, b, c], [a, c, d]])
+
+
+def _triangles(mesh: trimesh.Trimesh, centre: tuple[float, float, float]) -> np.ndarray:
+    return np.asarray(mesh.triangles, float) + centre
+
+
+def test_tilted_plane_has_its_depth_at_every_cell_center() -> None:
+    def plane(x: float, y: float) -> float:
+        return 0.3 + 0.1 * x - 0.05 * y
+
+    corners = plane(-1, -1), plane(1, -1), plane(1, 1), plane(-1, 1)
+    np.testing.assert_allclose(orthographic_depth(_quad(corners), BOX), plane(X, Y), rtol=1e-6)
+
+
+@pytest.mark.parametrize("corner", [0.0, 0.1, 1 / 3, 0.123456789])
+def test_triangles_sharing_an_edge_leave_no_hole(corner: float) -> None:
+    """The shared edge runs through the centres of many cells."""
+    middle_x, middle_y = X[31, 31] + corner * 0.01, Y[31, 31]
+    ring = [(-3, -3), (3, -3), (3, 3), (-3, 3), (-3, -3)]
+    fan = [[(middle_x, middle_y, 0.3), (*a, 0.3), (*b, 0.3)] for a, b in pairwise(ring)]
+    assert np.isfinite(orthographic_depth(np.array(fan, float), BOX)).all()
+
+
+def test_sphere_shows_its_near_half() -> None:
+    radius, centre = 0.2, (0.3, 0.05, 0.4)
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+    depth = orthographic_depth(_triangles(sphere, centre), BOX)
+    from_axis = np.hypot(X - centre[0], Y - centre[1])
+    assert np.isnan(depth[from_axis > radius]).all()
+    inside = from_axis < 0.95 * radius
+    np.testing.assert_allclose(depth[inside], centre[2] - np.sqrt(radius**2 - from_axis[inside] ** 2), atol=1e-3)
+
+
+def test_box_shows_its_front_in_the_cells_it_covers() -> None:
+    solid = trimesh.creation.box(extents=(0.2, 0.1, 0.08))
+    depth = orthographic_depth(_triangles(solid, (0.32, 0.1, 0.3)), BOX)
+    inside = (np.abs(X - 0.32) < 0.1) & (np.abs(Y - 0.1) < 0.05)
+    np.testing.assert_allclose(depth[inside], 0.26, rtol=1e-6)
+    assert np.isnan(depth[~inside]).all()
+
+
+def test_edge_on_distant_or_no_triangles_leave_no_depth() -> None:
+    edge_on = np.array([[(0.3, -1, 0.2), (0.3, 1, 0.2), (0.3, 0, 0.5)]])
+    elsewhere = np.array([[(2.0, 0, 0.3), (3.0, 0, 0.3), (2.5, 1, 0.3)]])
+    for triangles in (edge_on, elsewhere, np.empty((0, 3, 3))):
+        assert np.isnan(orthographic_depth(triangles, BOX)).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("side", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_share_outside_is_the_part_of_a_plate_beyond_the_box(share: float, side: tuple[int, int]) -> None:
+    plate = trimesh.creation.box(extents=(0.1, 0.1, 0.01))
+    x, y = (s * (0.32 - 0.05 + 0.1 * share) for s in side)
+    assert share_outside(_triangles(plate, (0.32 + x, y, 0.3)), BOX) == pytest.approx(share, abs=0.01)
+
+
+def test_share_outside_counts_the_silhouette_once_and_no_edges() -> None:
+    inside, outside = _quad((0.3, 0.3, 0.3, 0.3), 0.1, 0.2), _quad((0.3, 0.3, 0.3, 0.3), 0.65, 0.75)
+    layers = [outside + np.array((0, 0, 0.1 * k)) for k in range(4)]
+    assert share_outside(np.concatenate([inside, *layers]), BOX) == pytest.approx(0.5)
+    edge_on = np.array([[(3.0, -1, 0.2), (3.0, 1, 0.2), (3.0, 0, 0.5)]])
+    sliver = np.array(
+        [
+            [(3.0, -1, 0.2), (3.5, 0.37, 0.2), (3.5, 0.37 + 1e-9, 0.5)],
+            [(4.0, 1, 0.2), (4.0 - 1e-6, 1, 0.2), (4, 1 - 1e-6, 0.2)],
+        ]
+    )
+    exact = np.array([[(0.0, -0.32, 0.2), (0.64, -0.32, 0.2), (0.64, 0.32 + 1e-12, 0.2)]])
+    assert [share_outside(triangles, BOX) for triangles in (edge_on, sliver, exact)] == [0, 0, 0]
+
+
+PAPER = load_rig("paper-rig").object_box
+
+
+def test_image_maps_near_to_1_far_to_a_tenth_and_background_to_0() -> None:
+    near, far = PAPER.z_near_m, PAPER.z_far_m
+    depth = np.array([near, far, (near + far) / 2, np.nan, near - 0.05, far + 1, np.inf])
+    np.testing.assert_allclose(image_from_depth(depth, PAPER), [1.0, 0.1, 0.55, 0.0, 1.0, 0.1, 0.1], rtol=1e-6)
+    depth = depth_from_image(np.array([0.0, 0.049, 0.051, 0.1]), PAPER)
+    assert np.isnan(depth).tolist() == [True, True, False, False]
+    np.testing.assert_allclose(depth[2:], PAPER.z_far_m, rtol=1e-6)
+
+
+@settings(max_examples=20, derandomize=True, deadline=None)
+@given(near=st.floats(0.05, 0.5), deep=st.floats(0.01, 2), seed=st.integers(0, 1000))
+def test_depth_survives_the_image_and_back(near: float, deep: float, seed: int) -> None:
+    box = PAPER.model_copy(update={"z_near_m": near, "z_far_m": near + deep})
+    generator = np.random.default_rng(seed)
+    depth = generator.uniform(near, near + deep, (64, 64)).astype(np.float32)
+    depth[generator.random(depth.shape) < 0.5] = np.nan
+    back = depth_from_image(image_from_depth(depth, box), box)
+    np.testing.assert_allclose(back, depth, atol=1e-6 * (1 + deep))
+
+
+def test_image_survives_the_depth_map_and_back_in_float16() -> None:
+    image = np.linspace(0.1, 1, 4096, dtype=np.float32).reshape(64, 64)
+    image[:10] = 0
+    np.testing.assert_allclose(image_from_depth(depth_from_image(image, PAPER), PAPER), image, atol=1e-6)
+    half = image.astype(np.float16)
+    np.testing.assert_allclose(image_from_depth(depth_from_image(half, PAPER), PAPER), half, atol=2e-3)
+
+
+def test_cell_centers_grow_with_wall_x_and_against_wall_y() -> None:
+    x_m, y_m = cell_centres_m(PAPER)
+    pitch = (PAPER.x_max_m - PAPER.x_min_m) / 64
+    np.testing.assert_allclose(np.diff(x_m), pitch)
+    np.testing.assert_allclose(np.diff(y_m), -pitch)
+    np.testing.assert_allclose([x_m[0], x_m[-1]], [PAPER.x_min_m + pitch / 2, PAPER.x_max_m - pitch / 2])
+    np.testing.assert_allclose([y_m[0], y_m[-1]], [PAPER.y_max_m - pitch / 2, PAPER.y_min_m + pitch / 2])

@@ -1,0 +1,386 @@
+"""Meshes and depth maps from files, folders of meshes, and errors that name the file."""
+
+import logging
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from nlos_calibration.rig import ObjectBox, load_rig
+from trimesh.exchange.ply import export_ply
+
+from nlos_cam.errors import SceneError
+from nlos_cam.objects import meshes as files
+from nlos_cam.objects import meshes as mesh_folder
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.meshes import POSES, MeshFile, folder_objects, mesh_depth, plain, read_depth_map, read_mesh
+from nlos_cam.objects.placement import Pose, random_pose
+
+SOLID = trimesh.creation.torus(0.3, 0.1, major_sections=9, minor_sections=5)
+EXPORTS = {
+    "text.obj": SOLID.export(file_type="obj").encode(),
+    "binary.stl": SOLID.export(file_type="stl"),
+    "text.stl": SOLID.export(file_type="stl_ascii").encode(),
+    "binary.ply": export_ply(SOLID, "binary"),
+    "text.ply": export_ply(SOLID, "ascii"),
+}
+VERTICES = b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+PLY = b"""ply
+format ascii 1.0
+comment TextureFile none.png
+element vertex 4
+property float x
+property float y
+property float z
+property float s
+property float t
+element face 2
+property list uchar int vertex_indices
+element edge 1
+property int vertex1
+property int vertex2
+end_header
+0 0 0 0 0
+1 0 0 1 0
+1 1 0 1 1
+0 1 0 0 1
+3 0 1 2
+3 0 2 3
+0 1
+"""
+UNREADABLE = "string or file could not be read to its end due to unmatched data"
+WITHOUT_EXTRAS = """
+import sys
+from importlib.machinery import PathFinder
+blocked = {"PIL", "networkx", "scipy", "lxml", "charset_normalizer", "chardet", "shapely", "rtree"}
+find = PathFinder.find_spec
+PathFinder.find_spec = lambda name, *rest: None if name.split(".")[0] in blocked else find(name, *rest)
+from pathlib import Path
+from nlos_cam.objects.files import read_mesh
+print(*(len(read_mesh(Path(name)).triangles) for name in sys.argv[1:]))
+assert not blocked & set(sys.modules)
+"""
+
+
+def _write(folder: Path, name: str, content: bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+def _assert_refused(path: Path, word: str, read: Callable[[Path], object] = read_mesh) -> None:
+    """The error is one line that begins with the path and holds the word."""
+    with pytest.raises(SceneError) as caught:
+        read(path)
+    assert str(caught.value).startswith(str(path))
+    assert word in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def _read(folder: Path, name: str, content: bytes) -> MeshFile:
+    return read_mesh(_write(folder, name, content))
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+@pytest.mark.parametrize("letters", ["lower", "upper"])
+def test_read_mesh_gives_the_same_triangles_for_every_format(tmp_path: Path, name: str, letters: str) -> None:
+    mesh = _read(tmp_path, getattr(name, letters)(), EXPORTS[name])
+    np.testing.assert_allclose(mesh.triangles, SOLID.triangles, atol=1e-6)
+
+
+def test_read_mesh_needs_no_optional_package(tmp_path: Path) -> None:
+    """Reads materials, textures, edges and non-ASCII names without any optional package."""
+    names = [str(_write(tmp_path, name, content)) for name, content in EXPORTS.items()]
+    faces = b"mtllib none.mtl\nusemtl fa\xe7ade\nvt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1//1 3//1 4//1\n"
+    names += [str(_write(tmp_path, "square.obj", VERTICES + faces)), str(_write(tmp_path, "square.ply", PLY))]
+    command = [sys.executable, "-c", WITHOUT_EXTRAS, *names]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.stdout.split(), done.stderr) == ([str(len(SOLID.faces))] * 5 + ["2", "2"], "")
+
+
+def test_read_mesh_silences_the_log_of_the_parser(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, load = logging.getLogger("trimesh").level, trimesh.load_scene
+
+    def wordy(*arguments: object, **named: object) -> object:
+        logging.getLogger("trimesh").error("look at me")
+        return load(*arguments, **named)
+
+    monkeypatch.setattr(trimesh, "load_scene", wordy)
+    _read(tmp_path, "thing.stl", EXPORTS["binary.stl"])
+    assert not caplog.records
+    assert logging.getLogger("trimesh").level == before
+
+
+@pytest.mark.parametrize(("warning", "is_damage"), [(UNREADABLE, True), ("old fashioned", False)])
+def test_read_mesh_refuses_unreadable_numbers_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, warning: str, is_damage: bool
+) -> None:
+    """An older numpy only warns about unreadable numbers and returns those before them."""
+    load = trimesh.load_scene
+
+    def warns(*arguments: object, **named: object) -> object:
+        warnings.warn(warning, DeprecationWarning, stacklevel=1)
+        return load(*arguments, **named)
+
+    monkeypatch.setattr(trimesh, "load_scene", warns)
+    if is_damage:
+        _assert_refused(_write(tmp_path, "thing.stl", EXPORTS["text.stl"]), "")
+    else:
+        assert len(_read(tmp_path, "thing.stl", EXPORTS["text.stl"]).triangles) == len(SOLID.faces)
+
+
+@pytest.mark.parametrize(
+    ("faces", "corners"),
+    [
+        (b"f 1 2 3 4\n", [[0, 1, 2], [0, 2, 3]]),
+        (b"f 1 2 3\nf 1 2 3 4\n", [[0, 1, 2], [0, 1, 2], [0, 2, 3]]),
+        (b"f -4 -3 -2\n", [[0, 1, 2]]),
+        (b"o a\nf 1 2 3\no b\nusemtl c\nf 1 3 4\n", [[0, 1, 2], [0, 2, 3]]),
+        (b"v nan inf 1e300\nf 1 2 3\n", [[0, 1, 2]]),  # a vertex of no face
+    ],
+)
+def test_read_mesh_joins_faces_of_every_kind(tmp_path: Path, faces: bytes, corners: list[list[int]]) -> None:
+    triangles = {t.tobytes() for t in np.sort(_read(tmp_path, "thing.obj", VERTICES + faces).triangles, axis=1)}
+    assert triangles == {t.tobytes() for t in np.sort(SQUARE[np.array(corners)], axis=1)}
+
+
+def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) -> None:
+    other = b"v 5 0 0\nv 6 0 0\nv 6 1 0\nf -3 -2 -1\n"
+    mesh = _read(tmp_path, "thing.obj", VERTICES + b"f -4 -3 -2\n" + other)
+    assert sorted(mesh.triangles[..., 0].max(1)) == [1, 6]
+    assert len(_read(tmp_path, "two.stl", EXPORTS["text.stl"] * 2).triangles) == 2 * len(SOLID.faces)
+    mesh = _read(tmp_path, "thing.stl", EXPORTS["binary.stl"])
+    assert _read(tmp_path, "thing.stl", EXPORTS["binary.stl"]) == mesh
+    assert _read(tmp_path, "other.stl", EXPORTS["binary.stl"]).sha256 == mesh.sha256
+    assert _read(tmp_path, "thing.stl", EXPORTS["text.stl"]) != mesh
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "word"),
+    [
+        ("thing.glb", b"glTF", ".ply"),
+        ("points.ply", trimesh.PointCloud(SQUARE).export(file_type="ply"), "faces"),
+        ("short.stl", EXPORTS["text.stl"][:900], "faces"),
+        *[(name, content, "faces") for name, content in (("a.obj", VERTICES), ("a.obj", b""), ("a.stl", b""))],
+        ("none.stl", bytes(84), "faces"),
+        ("empty.ply", b"", ".ply"),
+        ("cut.stl", EXPORTS["binary.stl"][:900], "900"),
+        ("odd.stl", bytes(80) + b"\2\0\0\0" + bytes(60), "184"),
+        ("cut.ply", EXPORTS["binary.ply"][:900], ""),
+        ("word.obj", VERTICES.replace(b"v 1", b"v one") + b"f 1 2 3\n", ""),
+        ("wide.obj", "v 0 0 0".encode("utf-16"), ""),
+        ("word.stl", EXPORTS["text.stl"].replace(b"vertex ", b"vertex x", 1), ""),
+        *[("face.obj", VERTICES + b"f " + face, "") for face in (b"1 2 9", b"1 2 -5", b"1/1 0/2 3/3", b"1 00 2")],
+        *[("face.ply", PLY.replace(b"3 0 2 3", face), "") for face in (b"3 0 2 4", b"3 0 2 -1")],
+        *[("far.obj", VERTICES + b"v " + x + b" 0 0\nf 1 2 5\n", "NaN") for x in (b"nan", b"1e200")],
+        ("inf.ply", PLY.replace(b"1 1 0 1", b"1 inf 0 1"), "NaN"),
+        *[("flat.obj", VERTICES + b"v 2 0 0\nf " + face, "area") for face in (b"1 2 5\n", b"2 2 2\n")],
+    ],
+)
+def test_read_mesh_refuses_damaged_files(tmp_path: Path, name: str, content: bytes, word: str) -> None:
+    _assert_refused(_write(tmp_path, name, content), word)
+
+
+@pytest.mark.parametrize("name", ["none.obj", "none.stl", "none.ply", "none.npy"])
+def test_reader_names_a_missing_file_and_a_folder(tmp_path: Path, name: str) -> None:
+    read = read_depth_map if name.endswith("npy") else read_mesh
+    _assert_refused(tmp_path / name, "No such file", read)
+    (tmp_path / name).mkdir()
+    _assert_refused(tmp_path / name, "directory", read)
+
+
+@pytest.mark.parametrize(("limit", "value", "word"), [("MAX_FACES", 89, "89"), ("MAX_BYTES", 99, "MiB")])
+def test_read_mesh_refuses_too_large_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, word: str
+) -> None:
+    monkeypatch.setattr(files, limit, value)
+    _assert_refused(_write(tmp_path, "thing.stl", EXPORTS["binary.stl"]), word)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(sorted(EXPORTS)), st.data())
+def test_read_mesh_raises_scene_errors_only_on_damage(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    content = bytearray(EXPORTS[name])
+    place = data.draw(st.integers(0, len(content) - 1))
+    content[place : place + data.draw(st.integers(0, 40))] = data.draw(st.binary(max_size=40))
+    try:
+        mesh = _read(tmp_path, name, bytes(content))
+    except SceneError as error:
+        assert "\n" not in str(error)  # noqa: PT017  damage that leaves a mesh is none
+    else:
+        assert np.isfinite(mesh.triangles).all()
+
+
+@pytest.mark.parametrize(
+    ("odd", "usual"),
+    [
+        (b"\xef\xbb\xbfv 0 0 0\n", b"v 0 0 0\n"),
+        (b"v\t0\t0 0\r\nf 1 2 3\r\n", b"v 0 0 0\nf 1 2 3\n"),
+        (b"o fa\xe7ade\nv 0 0 0\n", b"o fa?ade\nv 0 0 0\n"),
+        (b"v 0 0 0# the first\n# a line\n", b"v 0 0 0\n\n"),
+        (b"f 1 2 \\\n3\n", b"f 1 2  3\n"),
+        *[(text, text) for text in (b"v -1e-5 0 -2\nf 10 20 30\n", b"f 1/0 2/0 3/0", b"f 1 2 05")],
+        (
+            2 * (VERTICES + b"f -4 -3/-1 -2/-1/-1\n"),
+            VERTICES + b"f 1 2/-1 3/-1/-1\n" + VERTICES + b"f 5 6/-1 7/-1/-1\n",
+        ),
+    ],
+)
+def test_plain_makes_odd_obj_text_usual(odd: bytes, usual: bytes) -> None:
+    assert plain(odd, ".obj") == usual
+
+
+def test_plain_renames_ply_edges_and_keeps_binary_bodies() -> None:
+    body = b"\n\0element edge 7"
+    assert plain(b"ply\nelement edge 2\nend_header" + body, ".ply") == b"ply\nelement wire 2\nend_header" + body
+    stl = bytes(80) + (1).to_bytes(4, "little") + b"\t#\xe7\r\n" * 10
+    assert plain(stl, ".stl") == stl
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "g", ">f4", "i1", "u1", "i2", ">i4", "i8", "u8"])
+@pytest.mark.parametrize("size", [8, 64, 256])
+def test_read_depth_map_takes_every_real_type_and_size(tmp_path: Path, dtype: str, size: int) -> None:
+    depth = np.arange(size * size).reshape(size, size) % 4 / (1 if np.dtype(dtype).kind in "iu" else 8)
+    if dtype == "f2":
+        depth[:] = np.nan  # an empty object
+    np.save(tmp_path / "map.npy", depth.astype(dtype, order="F" if dtype == "f8" else "C"))
+    read = read_depth_map(tmp_path / "map.npy")
+    np.testing.assert_array_equal(read, depth)
+    assert (read.dtype, type(read)) == (np.float32, np.ndarray)
+    assert read.flags.c_contiguous or dtype == "f8"
+
+
+def _map(value: complex, shape: tuple[int, ...] = (16, 16), dtype: str = "f8") -> np.ndarray:
+    depth = np.full(shape, 0.3, dtype)
+    depth.reshape(-1)[:1] = value
+    return depth
+
+
+@pytest.mark.parametrize(
+    ("depth", "word"),
+    [
+        (_map(-0.01), "-0.01 m"),
+        (_map(300), "300 m"),
+        (_map(300, dtype="u2"), "300 m"),
+        (_map(np.inf), "inf m"),
+        (_map(-np.inf, dtype="f2"), "-inf m"),
+        *[(_map(0.3, s), str(s)) for s in ((16,), (16, 16, 1), (16, 17), (7, 7), (257, 257), ())],
+        (_map(0.3, (0, 0)), ""),
+        (_map(0.3, dtype="c8"), "complex64"),
+        (_map(True, dtype="?"), "bool"),
+        (np.full((16, 16), "a"), "U1"),
+        (np.full((16, 16), None), ""),
+        (np.zeros((16, 16), "M8[s]"), "datetime"),
+        (np.zeros((16, 16), [("depth_m", "f4")]), "depth_m"),
+    ],
+)
+def test_read_depth_map_refuses_other_arrays(tmp_path: Path, depth: np.ndarray, word: str) -> None:
+    np.save(tmp_path / "map.npy", depth, allow_pickle=True)
+    _assert_refused(tmp_path / "map.npy", word, read_depth_map)
+
+
+def test_read_depth_map_refuses_a_header_that_claims_too_much(tmp_path: Path) -> None:
+    np.save(tmp_path / "map.npy", _map(0.3))
+    content = (tmp_path / "map.npy").read_bytes()
+    claimed = content.replace(b"(16, 16), }            ", b"(1600000, 1600000), }  ")
+    assert claimed != content
+    _assert_refused(_write(tmp_path, "map.npy", claimed), "", read_depth_map)
+    np.savez(tmp_path / "maps.npz", depth_m=_map(0.3))
+    _assert_refused(tmp_path / "maps.npz", "", read_depth_map)
+
+
+@pytest.mark.parametrize("cut", [0, 5, 60, 128, 400])
+@pytest.mark.parametrize("junk", [b"", b"hello"])
+def test_read_depth_map_refuses_damaged_files(tmp_path: Path, cut: int, junk: bytes) -> None:
+    np.save(tmp_path / "map.npy", _map(0.3))
+    content = (tmp_path / "map.npy").read_bytes()
+    _assert_refused(_write(tmp_path, "map.npy", content[:cut] + junk), "", read_depth_map)
+
+
+BOX = object_box(load_rig("paper-rig"))
+TORUS = trimesh.creation.torus(30, 10, major_sections=16, minor_sections=8)
+
+
+def _save(path: Path, mesh: trimesh.Trimesh = TORUS) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mesh.export(path, file_type=path.suffix[1:].lower())
+    return path
+
+
+def test_folder_objects_finds_meshes_in_a_fixed_order(tmp_path: Path) -> None:
+    tmp_path /= ".cache"  # a hidden folder named on purpose is searched
+    names = ["b.obj", "a/z.STL", "a/deep/er/y.ply", "c/x.stl"]
+    for name in names:
+        _save(tmp_path / name)
+    for other in ("readme.txt", ".hidden/w.stl", "._b.obj", "a/picture.png"):
+        (tmp_path / other).parent.mkdir(exist_ok=True)
+        (tmp_path / other).write_bytes(b"no mesh")
+    (tmp_path / "folder.obj").mkdir()
+    found = [path.relative_to(tmp_path).as_posix() for path in folder_objects(tmp_path)]
+    assert found == ["a/deep/er/y.ply", "a/z.STL", "b.obj", "c/x.stl"]
+
+
+def test_folder_objects_refuses_missing_empty_and_file_paths(tmp_path: Path) -> None:
+    (tmp_path / "empty" / "sub").mkdir(parents=True)
+    for path in (tmp_path / "gone", _save(tmp_path / "a.stl"), tmp_path / "empty"):
+        with pytest.raises(SceneError, match=str(path)):
+            folder_objects(path)
+
+
+def test_mesh_depth_is_one_mesh_at_one_pose_per_seed(tmp_path: Path) -> None:
+    meshes = [_save(tmp_path / "a.stl"), _save(tmp_path / "b.ply", trimesh.creation.box((3, 2, 1)))]
+    made = [mesh_depth(seed, meshes, BOX, read=read_mesh) for seed in range(12)]
+    assert {path for path, _ in made} == set(meshes)
+    assert len({depth.tobytes() for _, depth in made}) == 12
+    for seed, (path, depth) in enumerate(made):
+        again = mesh_depth(seed, meshes, BOX, read=read_mesh)
+        assert again[0] == path
+        np.testing.assert_array_equal(again[1], depth)
+        assert depth.shape == (64, 64)
+        assert BOX.z_near_m - 1e-6 <= np.nanmin(depth) <= np.nanmax(depth) <= BOX.z_far_m + 1e-6
+        assert 0.03 < np.isfinite(depth).mean() < 0.85
+        lying = mesh_depth(seed, meshes, BOX, up="z", read=read_mesh)[1]
+        assert not np.array_equal(lying, depth, equal_nan=True)
+
+
+def test_mesh_depth_names_a_broken_or_invisible_mesh(tmp_path: Path) -> None:
+    (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
+    with pytest.raises(SceneError, match=r"broken\.ply"):
+        mesh_depth(0, folder_objects(tmp_path), BOX, read=read_mesh)
+    needle = trimesh.Trimesh([[0, 0, 0], [0, 1, 0], [1e-5, 0.5, 0]], [[0, 1, 2]], process=False)
+    with pytest.raises(SceneError, match=r"needle\.ply"):
+        mesh_depth(0, [_save(tmp_path / "needle.ply", needle)], BOX, read=read_mesh)
+
+
+def test_mesh_depth_reads_only_the_mesh_it_picks() -> None:
+    read: list[str] = []
+
+    def ball(name: str) -> MeshFile:
+        read.append(name)
+        return MeshFile(Path(name), "", np.asarray(TORUS.triangles, np.float64))
+
+    names = [f"mesh-{k}" for k in range(1000)]
+    assert [mesh_depth(seed, names, BOX, read=ball)[0] for seed in range(4)] == read
+
+
+def test_mesh_depth_draws_another_pose_for_an_edge_on_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
+    poses: list[Pose] = []
+
+    def first_along_the_sight(generator: np.random.Generator, box: ObjectBox) -> Pose:
+        poses.append(Pose() if not poses else random_pose(generator, box))
+        return poses[-1]
+
+    monkeypatch.setattr(mesh_folder, "random_pose", first_along_the_sight)
+    lying = np.array([[[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[1, 0, 0], [1, 0, 1], [0, 0, 1]]], np.float64)
+    _, depth_m = mesh_depth(3, ["sheet"], BOX, read=lambda name: MeshFile(Path(name), "", lying))
+    assert 1 < len(poses) <= POSES
+    assert np.isfinite(depth_m).any()

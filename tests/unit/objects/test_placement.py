@@ -1,0 +1,244 @@
+"""Placement of objects in the box, the objects of a seed, backgrounds, and the 54 objects of the benchmark."""
+
+import numpy as np
+import pytest
+from nlos_calibration.arrays import Float32
+from nlos_calibration.rig import ObjectBox, load_rig
+
+from nlos_cam.dataset.build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.benchmark import FixedObject, benchmark_objects
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects.placement import (
+    POSE_UNITS,
+    Pose,
+    category_triangles,
+    fit,
+    object_depth,
+    object_depths,
+    panel,
+    place,
+    pose_from,
+    post,
+    random_pose,
+    with_background,
+)
+
+BOX = object_box(load_rig("paper-rig"))
+CUP = category_triangles("cup", 0)
+
+
+def _points(pose: Pose, box: ObjectBox = BOX) -> np.ndarray:
+    return place(CUP, pose, box).reshape(-1, 3)
+
+
+def test_place_gives_size_offset_front_and_turn_of_the_pose() -> None:
+    points = _points(Pose(turn_z_rad=0.4, tilt_x_rad=0.2, size_m=0.15, x_m=0.02, y_m=-0.03, front_m=0.04))
+    assert np.ptp(points[:, :2], axis=0).max() == pytest.approx(0.15)
+    middle = (points.min(0) + points.max(0)) / 2
+    np.testing.assert_allclose(middle[:2], [0.45 + 0.02, -0.03], atol=1e-12)
+    assert points[:, 2].min() == pytest.approx(BOX.z_near_m + 0.04)
+    straight, turned = _points(Pose()), _points(Pose(turn_z_rad=np.pi / 2))
+    straight, turned = straight - straight.mean(0), turned - turned.mean(0)
+    scale = np.ptp(turned[:, :2], axis=0).max() / np.ptp(straight[:, :2], axis=0).max()
+    np.testing.assert_allclose(turned[:, 0], -scale * straight[:, 1], atol=1e-9)
+    np.testing.assert_allclose(turned[:, 1], scale * straight[:, 0], atol=1e-9)
+
+
+def test_deep_mesh_is_flattened_and_fit_reports_it() -> None:
+    inside, beside = fit(CUP, Pose(size_m=0.2), BOX), fit(CUP, Pose(size_m=0.2, x_m=0.25), BOX)
+    assert inside.outside == 0
+    assert beside.outside == 1
+    assert inside.depth_m == pytest.approx(np.ptp(_points(Pose(size_m=0.2))[:, 2]))
+    assert inside.room_m == pytest.approx(BOX.z_far_m - BOX.z_near_m - Pose().front_m)
+    shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
+    flattened = fit(CUP, Pose(size_m=0.2), shallow)
+    assert flattened.depth_m == inside.depth_m > flattened.room_m == pytest.approx(0.03)
+    shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
+    deep, flat = _points(Pose()), _points(Pose(), shallow)
+    assert flat[:, 2].max() == pytest.approx(shallow.z_far_m)
+    np.testing.assert_allclose(flat[:, :2], deep[:, :2])
+
+
+@pytest.mark.parametrize("front_m", [0.3, 1.0])
+def test_place_refuses_a_front_beyond_the_box(front_m: float) -> None:
+    with pytest.raises(SceneError, match="front_m"):
+        place(CUP, Pose(front_m=front_m), BOX)
+
+
+def test_object_depths_come_in_the_order_of_their_seeds() -> None:
+    for seed, depth in zip((9, 3, 7), object_depths((9, 3, 7), BOX), strict=True):
+        assert depth.shape == (64, 64)
+        for categories in (None, tuple(CATEGORIES)):
+            np.testing.assert_array_equal(depth, object_depth(seed, BOX, *filter(None, [categories]))[1])
+
+
+def test_training_held_out_and_test_objects_all_differ() -> None:
+    groups = [
+        {object_depth(first + k, BOX)[1].tobytes() for k in range(25)}
+        for first in (TRAINING_SEED, HELD_OUT_SEED, TEST_SEED)
+    ]
+    assert [len(group) for group in groups] == [25, 25, 25]
+    assert len(set.union(*groups)) == 75
+
+
+def test_object_depth_draws_all_or_the_chosen_categories() -> None:
+    assert {object_depth(seed, BOX, ("cup", "hat"))[0] for seed in range(12)} == {"cup", "hat"}
+    for seed, depth in zip((5, 6), object_depths((5, 6), BOX, ["boat"]), strict=True):
+        np.testing.assert_array_equal(depth, object_depth(seed, BOX, ["boat"])[1])
+    assert {object_depth(seed, BOX)[0] for seed in range(250)} == set(CATEGORIES)
+
+
+@pytest.mark.parametrize(("categories", "word"), [((), "category"), (("cup", "teapot"), "teapot")])
+def test_object_depth_refuses_no_and_unknown_categories(categories: tuple[str, ...], word: str) -> None:
+    with pytest.raises(SceneError, match=word):
+        object_depth(0, BOX, categories)
+
+
+def test_backgrounds_come_at_their_share_behind_the_same_objects() -> None:
+    """Each object has its own background from some share on, and keeps it at any larger share."""
+    seeds = range(40)
+    alone, some, each = (list(object_depths(seeds, BOX, backgrounds=share)) for share in (0.0, 0.3, 1.0))
+    has = [not np.array_equal(a, s, equal_nan=True) for a, s in zip(alone, some, strict=True)]
+    assert 4 <= sum(has) <= 20
+    for thing, with_some, with_each, seed_has in zip(alone, some, each, has, strict=True):
+        surface = ~np.isnan(thing)
+        np.testing.assert_array_equal(with_each[surface], thing[surface])
+        np.testing.assert_array_equal(with_some, with_each if seed_has else thing)
+
+
+def test_pose_from_reaches_both_ends_of_training_in_the_box() -> None:
+    least, most = pose_from([0.0] * POSE_UNITS, BOX), pose_from([1.0] * POSE_UNITS, BOX)
+    assert (least.size_m, most.size_m) == (pytest.approx(0.55 * 0.25), pytest.approx(0.9 * 0.25))
+    assert (least.turn_z_rad, most.turn_z_rad) == (pytest.approx(-np.radians(35)), pytest.approx(np.radians(35)))
+    assert (least.front_m, most.front_m) == (0, pytest.approx(0.35 * 0.28))
+    for pose in (least, most):
+        assert abs(pose.x_m) + pose.size_m / 2 == pytest.approx(0.125)
+        assert abs(pose.y_m) + pose.size_m / 2 == pytest.approx(0.125)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_pose_is_pose_from_seven_random_numbers(seed: int) -> None:
+    units = np.random.default_rng(seed).random(POSE_UNITS).tolist()
+    assert random_pose(np.random.default_rng(seed), BOX) == pose_from(units, BOX)
+
+
+OBJECTS = [object_depth(seed, BOX)[1] for seed in range(20)]
+
+
+def _generator(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_background_leaves_the_object_and_stays_in_the_box(seed: int) -> None:
+    thing = OBJECTS[seed]
+    depth = with_background(thing, BOX, _generator(seed))
+    surface = ~np.isnan(thing)
+    np.testing.assert_array_equal(depth[surface], thing[surface])
+    added = depth[~surface & ~np.isnan(depth)]
+    assert added.size
+    assert (added >= np.nanmin(thing) - 1e-6).all()
+    assert (added <= BOX.z_far_m + 1e-6).all()
+    assert depth.dtype == np.float32
+
+
+def test_background_is_a_post_or_a_panel() -> None:
+    shares = [np.isfinite(with_background(OBJECTS[0], BOX, _generator(seed))).mean() for seed in range(20)]
+    assert min(shares) < np.isfinite(OBJECTS[0]).mean() + 0.1
+    assert max(shares) > 0.4
+
+
+@pytest.mark.parametrize("thing", OBJECTS)
+def test_post_is_level_from_the_underside_to_the_bottom(thing: Float32) -> None:
+    below = ~np.isnan(post(thing, _generator(1)))
+    surface = ~np.isnan(thing)
+    for column in np.flatnonzero(below.any(axis=0)):
+        lowest = np.flatnonzero(surface[:, column]).max()
+        np.testing.assert_array_equal(np.flatnonzero(below[:, column]), np.arange(lowest + 1, 64))
+    assert np.ptp(post(thing, _generator(1))[below]) == 0 if below.any() else surface[-1].any()
+
+
+@pytest.mark.parametrize("thing", OBJECTS)
+def test_panel_is_a_rectangle_behind_the_object(thing: Float32) -> None:
+    board = panel(thing, BOX, _generator(2))
+    there = ~np.isnan(board)
+    rows, columns = there.any(axis=1), there.any(axis=0)
+    np.testing.assert_array_equal(there, rows[:, None] & columns)
+    assert 36 <= rows.sum() <= 64
+    assert 36 <= columns.sum() <= 64
+    assert np.ptp(board[there]) == 0
+    assert board[there][0] >= np.nanmax(thing) - 1e-6
+
+
+BENCHMARK = benchmark_objects(BOX)
+
+
+def test_benchmark_has_three_named_objects_per_category() -> None:
+    assert len(BENCHMARK) == len({thing.name for thing in BENCHMARK}) == 54
+    assert [(thing.category, thing.number) for thing in BENCHMARK] == [(c, k) for c in CATEGORIES for k in (1, 2, 3)]
+    assert BENCHMARK[0].name == "airplane-1"
+
+
+def test_benchmark_is_bit_identical_each_time() -> None:
+    again = benchmark_objects(BOX)
+    assert again == BENCHMARK
+    for thing, same in zip(BENCHMARK, again, strict=True):
+        assert thing.depth_m.tobytes() == same.depth_m.tobytes()
+        assert thing.triangles.tobytes() == same.triangles.tobytes()
+
+
+@pytest.mark.parametrize("thing", BENCHMARK, ids=lambda thing: thing.name)
+def test_benchmark_object_takes_held_out_settings(thing: FixedObject) -> None:
+    """No seed reaches these intervals (test_generators.py)."""
+    kind = CATEGORIES[thing.category]
+    assert list(thing.settings) == list(kind.settings)
+    for name, setting in kind.settings.items():
+        if setting.held_out:
+            assert setting.held_out[0] < thing.settings[name] < setting.held_out[1]
+        else:
+            assert setting.low < thing.settings[name] < setting.high
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_benchmark_spreads_settings_evenly_within_category(category: str) -> None:
+    three = [thing.settings for thing in BENCHMARK if thing.category == category]
+    for name in three[0]:
+        low, middle, high = sorted(settings[name] for settings in three)
+        assert high - middle == pytest.approx(middle - low)
+        assert high > low
+
+
+def test_benchmark_objects_lie_inside_the_box_and_show() -> None:
+    for thing in BENCHMARK:
+        low, high = thing.triangles.reshape(-1, 3).min(0), thing.triangles.reshape(-1, 3).max(0)
+        assert (low >= np.array([BOX.x_min_m, BOX.y_min_m, BOX.z_near_m]) - 1e-9).all()
+        assert (high <= np.array([BOX.x_max_m, BOX.y_max_m, BOX.z_far_m]) + 1e-9).all()
+        assert thing.depth_m.shape == (64, 64)
+        assert thing.depth_m.dtype == np.float32
+        assert 0.03 < np.isfinite(thing.depth_m).mean() < 0.6
+
+
+def test_benchmark_poses_cover_the_training_range_evenly() -> None:
+    spare = {thing.name: (0.25 - thing.pose.size_m) / 2 for thing in BENCHMARK}
+    spans = {
+        "size_m": (0.25 * 0.55, 0.25 * 0.9, [o.pose.size_m for o in BENCHMARK]),
+        "tilt_x_rad": (*np.radians([-15, 15]), [o.pose.tilt_x_rad for o in BENCHMARK]),
+        "tilt_y_rad": (*np.radians([-20, 20]), [o.pose.tilt_y_rad for o in BENCHMARK]),
+        "turn_z_rad": (*np.radians([-35, 35]), [o.pose.turn_z_rad for o in BENCHMARK]),
+        "x_m": (-1, 1, [o.pose.x_m / spare[o.name] for o in BENCHMARK]),
+        "y_m": (-1, 1, [o.pose.y_m / spare[o.name] for o in BENCHMARK]),
+        "front_m": (0, 0.35 * 0.28, [o.pose.front_m for o in BENCHMARK]),
+    }
+    assert set(spans) == set(Pose.__dataclass_fields__)
+    for low, high, values in spans.values():
+        even = low + (high - low) * (np.arange(54) + 0.5) / 54
+        np.testing.assert_allclose(np.sort(values), even, atol=1e-9)
+
+
+def test_benchmark_pose_quantities_are_uncorrelated() -> None:
+    names = tuple(Pose.__dataclass_fields__)
+    table = np.array([[getattr(thing.pose, name) for name in names] for thing in BENCHMARK])
+    table = np.column_stack([np.arange(54), table])
+    assert np.abs(np.corrcoef(table.T) - np.eye(8)).max() < 0.25

@@ -1,0 +1,269 @@
+"""Sensor on a rig: model, gain, dead pixels, bias and texture (formulas: tests/laws/test_sensor.py)."""
+
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from nlos_calibration.rig import Occluder, load_rig
+from pydantic import ValidationError
+
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.placement import object_depth
+from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, cast
+from nlos_cam.render.renderer import MultiBounce, Rendering, render
+from nlos_cam.render.scene import Radiometry, Scene
+from nlos_cam.render.sensor.bias import EVEN, DepthBias, ripples, smooth_patches, texture
+from nlos_cam.render.sensor.effects import sensor_effects
+from nlos_cam.render.sensor.model import DEPTH_UNIT_M, STEADY_CELSIUS, SensorModel, WarmUp
+from nlos_cam.render.sensor.sensor import Echoes, Optics, Sensor, cell_of_pixels, compete
+
+RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
+QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
+NO_ECHO = MultiBounce(
+    np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32), np.full((64, 80), np.nan, np.float32)
+)
+
+
+def _generator(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module")
+def rendering() -> Rendering:
+    assert RIG.object_box is not None
+    return render(Scene(RIG, object_depth(3, RIG.object_box)[1]))
+
+
+def test_frame_holds_the_images_in_si_units(rendering: Rendering) -> None:
+    quiet = Sensor(RIG, QUIET).expose(rendering.multi, _generator())
+    frame = quiet.frame(RIG.pinhole)
+    np.testing.assert_array_equal(np.isnan(frame.depth_m), quiet.depth_z16 == 0)
+    np.testing.assert_allclose(np.nan_to_num(frame.depth_m), quiet.depth_z16 * DEPTH_UNIT_M, rtol=1e-6)
+    np.testing.assert_array_equal(frame.ir, quiet.ir)
+    np.testing.assert_array_equal(frame.confidence, quiet.confidence)
+
+
+@pytest.mark.parametrize("counts", [48.0, 100.0])
+def test_gain_puts_the_brightest_return_at_its_counts(counts: float) -> None:
+    model = QUIET.model_copy(update={"bare_wall_counts": counts})
+    for rig in (RIG, BARE):
+        assert Sensor(rig, model).expose(NO_ECHO, _generator()).ir.max() == counts
+
+
+@pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
+@pytest.mark.parametrize("pulse_ns", [0.0, 1.0])
+def test_gain_holds_for_any_pulse_and_radiometry(radiometry: Radiometry, pulse_ns: float) -> None:
+    scene = Scene(BARE, None, radiometry=radiometry, pulse_ns=pulse_ns)
+    model = QUIET.model_copy(update={"pulse_ns": pulse_ns})
+    images = Sensor(BARE, model, radiometry).expose(render(scene, "draft").multi, _generator())
+    assert images.ir.max() == pytest.approx(48, abs=2)
+
+
+def test_gain_does_not_depend_on_the_occluder() -> None:
+    near = RIG.model_copy(update={"occluder": Occluder(x_m=0.1, z_min_m=0.05)})
+    images, free = (Sensor(rig, QUIET).expose(NO_ECHO, _generator()) for rig in (near, BARE))
+    on_wall = cast(near, near.pinhole).on_wall.reshape(images.ir.shape)
+    assert 0 < on_wall.sum() < on_wall.size
+    np.testing.assert_array_equal(images.ir[on_wall], free.ir[on_wall])
+
+
+def test_dead_pixels_stay_from_frame_to_frame() -> None:
+    model = QUIET.model_copy(update={"dead_share": 0.05})
+    first, second = Sensor(BARE, model), Sensor(BARE, model)
+    dead = first.expose(NO_ECHO, _generator()).depth_z16 == 0
+    for sensor, seed in ((first, 1), (second, 2)):
+        np.testing.assert_array_equal(sensor.expose(NO_ECHO, _generator(seed)).depth_z16 == 0, dead)
+    whole = Sensor(BARE, QUIET).expose(NO_ECHO, _generator())
+    np.testing.assert_array_equal(first.expose(NO_ECHO, _generator()).ir, whole.ir)
+    alive = whole.depth_z16 > 0
+    assert (dead & alive).sum() / alive.sum() == pytest.approx(0.05, abs=0.003)
+
+
+def test_sensor_with_a_short_gate_gives_black_images() -> None:
+    device = BARE.device.model_copy(update={"gate_s": 0.1 / SPEED_OF_LIGHT_M_PER_S})
+    images = Sensor(BARE.model_copy(update={"device": device}), SensorModel()).expose(NO_ECHO, _generator())
+    assert not images.depth_z16.any()
+    assert not images.ir.any()
+    assert not images.confidence.any()
+
+
+def _finer(multi: MultiBounce, k: int) -> MultiBounce:
+    """The same echoes from k x k equal beams in each cell."""
+    maps = (np.repeat(np.repeat(m, k, 0), k, 1) for m in (multi.peak, multi.runner_up, multi.path_m))
+    return MultiBounce(*maps)
+
+
+@pytest.mark.parametrize("k", [2, 3, 8])
+def test_equal_beams_in_a_cell_are_one_beam(rendering: Rendering, k: int) -> None:
+    sensor = Sensor(RIG, SensorModel())
+    one, many = (sensor.expose(multi, _generator()) for multi in (rendering.multi, _finer(rendering.multi, k)))
+    for name in ("depth_z16", "ir", "confidence"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+
+
+@pytest.mark.parametrize("k", [1, 2, 5])
+def test_cell_of_pixels_takes_the_beam_at_the_pixel_center(k: int) -> None:
+    rows, columns = 64 * k, 80 * k
+    cell = cell_of_pixels((480, 640), (rows, columns)).reshape(480, 640)
+    row, column = np.divmod(cell, columns)
+    centre_row, centre_column = (np.arange(480) + 0.5) / 480, (np.arange(640) + 0.5) / 640
+    assert (np.abs(centre_row[:, None] - (row + 0.5) / rows) <= 0.5 / rows + 1e-12).all()
+    assert (np.abs(centre_column - (column + 0.5) / columns) <= 0.5 / columns + 1e-12).all()
+    np.testing.assert_array_equal(cell_of_pixels((rows, columns), (rows, columns)), np.arange(rows * columns))
+
+
+@pytest.mark.parametrize("shape", [(64, 81), (128, 80), (32, 40), (80, 64), (96, 120), (0, 0)])
+def test_sensor_refuses_maps_of_another_shape(shape: tuple[int, int]) -> None:
+    empty = np.zeros(shape, np.float32)
+    with pytest.raises(SceneError, match=re.escape(str(shape))):
+        Sensor(BARE, QUIET).expose(MultiBounce(empty, empty, empty), _generator())
+
+
+def test_included_direct_return_does_not_compete_again() -> None:
+    sensor = Sensor(BARE, QUIET)
+    faint = replace(NO_ECHO, peak=np.full((64, 80), 1e-9, np.float32), path_m=np.full((64, 80), 1.0, np.float32))
+    assert sensor.expose(faint, _generator()).ir.max() == 48
+    for echo in (NO_ECHO, faint):
+        assert not sensor.expose(replace(echo, direct_included=True), _generator()).ir.any()
+    strong = replace(faint, peak=np.full((64, 80), 1.0, np.float32))
+    apart, mixed = (sensor.expose(replace(strong, direct_included=mixed), _generator()) for mixed in (False, True))
+    np.testing.assert_array_equal(apart.depth_z16, mixed.depth_z16)
+    assert (mixed.confidence >= apart.confidence).all()
+
+
+def test_compete_takes_the_stronger_or_direct_return() -> None:
+    for own, peak, outcome in ((2.0, 2.0, (2.0, 0.25, 3.0, 2.0)), (0.125, 2.5, (2.5, 0.75, 4.0, 0.5))):
+        optics = Optics(*(np.array([x], np.float32) for x in (own, 0.25, 3.0, 1.0)), np.zeros(0, np.bool_), EVEN)
+        echoes = Echoes(*(np.array([0.0, x], np.float32) for x in (peak, 0.75, 0.5, 8.0)))
+        assert compete(optics, 0, echoes, 1) == outcome
+
+
+@pytest.mark.parametrize(
+    ("field", "low", "high"),
+    [
+        *[(name, 0.0, 1.0) for name in ("wall_texture", "range_noise_per_m", "ripple_m", "patch_drift_m")],
+        *[(name, -1.0, 1.0) for name in ("range_offset_m", "drift_m_per_celsius")],
+        *[(name, 0.0, 255.0) for name in ("read_noise_counts", "shot_noise")],
+        ("pulse_ns", 0.0, 100.0),
+        ("ambient_counts", 0.0, 254.9),
+        ("range_noise_m", 0.0, 10.0),
+        ("dead_share", 0.0, 0.99),
+        ("bare_wall_counts", 1e-9, 1e6),
+    ],
+)
+def test_sensor_model_refuses_values_out_of_range_by_field(field: str, low: float, high: float) -> None:
+    for value in (low, high):
+        assert getattr(SensorModel.model_validate({field: value}), field) == value
+    for value in (low - 1e-8, 1.02 * high, float("nan"), float("inf")):
+        with pytest.raises(ValidationError, match=field):
+            SensorModel.model_validate({field: value})
+
+
+def test_sensor_model_has_no_pulse_bias_or_warm_up_by_default() -> None:
+    bias = dict.fromkeys(("range_offset_m", "ripple_m", "patch_drift_m", "drift_m_per_celsius"), 0.0)
+    assert SensorModel() == SensorModel(pulse_ns=0, wall_texture=0, ambient_counts=0, warm_up=None, **bias)
+    assert SensorModel().celsius_at(0) == SensorModel().celsius_at(1e6) == STEADY_CELSIUS
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("from_celsius", 45.0),
+        ("from_celsius", -1.0),
+        ("to_celsius", 101.0),
+        ("to_celsius", float("nan")),
+        ("time_constant_s", 0.0),
+        ("time_constant_s", float("inf")),
+        ("time_constant_min", 1.0),
+    ],
+)
+def test_warm_up_refuses_bad_values_by_field(field: str, value: float) -> None:
+    fields = {"from_celsius": 25.0, "to_celsius": 45.0, "time_constant_s": 600.0}
+    with pytest.raises(ValidationError, match=field):
+        SensorModel.model_validate({"warm_up": fields | {field: value}})
+
+
+@given(st.floats(0, 1e5), st.floats(0, 1e5))
+def test_celsius_at_approaches_the_end_of_the_warm_up(one_s: float, other_s: float) -> None:
+    model = SensorModel(warm_up=WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600))
+    earlier, later = (model.celsius_at(seconds) for seconds in sorted((one_s, other_s)))
+    assert 25 <= earlier <= later <= 45
+    # the remaining difference shrinks to 1/e in each time constant
+    assert 45 - model.celsius_at(one_s + 600) == pytest.approx((45 - model.celsius_at(one_s)) / 2.718281828, abs=1e-6)
+
+
+SHAPE = 120, 160
+WARM_UP = WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600)
+
+
+def _bias_m(celsius: float | None, **fields: float | WarmUp) -> np.ndarray:
+    model = SensorModel.model_validate(fields)
+    return DepthBias(SHAPE, model, sensor_effects(model)).at_m(celsius)
+
+
+def test_bias_is_empty_by_default_and_drifts_from_the_warm_device() -> None:
+    for celsius in (None, 0.0, 100.0):
+        assert _bias_m(celsius).size == _bias_m(celsius, warm_up=WARM_UP).size == 0
+    for celsius, shift_m in ((45.0, 0.0), (None, 0.0), (35.0, -0.002), (25.0, -0.004)):
+        drift_m = _bias_m(celsius, drift_m_per_celsius=0.0002, warm_up=WARM_UP)
+        np.testing.assert_allclose(drift_m, shift_m, rtol=1e-6)
+
+
+def test_ripples_are_a_wave_with_five_periods_of_any_direction() -> None:
+    wave_m = _bias_m(None, ripple_m=0.002).reshape(SHAPE)
+    assert np.abs(wave_m).max() == pytest.approx(0.002, rel=0.01)
+    assert abs(wave_m.mean()) < 0.1 * 0.002
+    power = np.abs(np.fft.rfft2(wave_m)) ** 2
+    rows, columns = np.divmod(int(power.argmax()), power.shape[1])
+    periods = np.hypot(min(rows, SHAPE[0] - rows) * SHAPE[1] / SHAPE[0], columns)
+    assert periods == pytest.approx(5.0, abs=1.0)
+    waves = [ripples(SHAPE, 4.0, np.random.default_rng(seed)) for seed in range(8)]
+    alike = np.corrcoef([wave.ravel() for wave in waves]) - np.eye(8)
+    assert np.abs(alike).max() < 0.9
+
+
+def test_patches_are_smooth_and_of_unit_spread() -> None:
+    pattern = smooth_patches(SHAPE, np.random.default_rng(0))
+    assert pattern.std() == pytest.approx(1.0)
+    assert np.abs(np.diff(pattern)).max() < 0.5
+    few, many = (smooth_patches(SHAPE, np.random.default_rng(0), across) for across in (4, 24))
+    assert np.diff(few).std() < np.diff(many).std() / 2
+
+
+def test_patch_drift_grows_in_place_as_the_device_warms() -> None:
+    cold, half, warm = (_bias_m(celsius, patch_drift_m=0.001, warm_up=WARM_UP) for celsius in (25.0, 35.0, 45.0))
+    assert not cold.any()
+    assert warm.std() == pytest.approx(0.001, rel=1e-4)
+    assert warm.mean() == pytest.approx(0.0, abs=1e-7)  # a shift of the whole view is the drift
+    np.testing.assert_allclose(half, warm / 2, rtol=1e-5)
+    np.testing.assert_array_equal(_bias_m(None, patch_drift_m=0.001), warm)
+
+
+WALL = 240, 320
+
+
+@pytest.mark.parametrize("strength", [0.01, 0.2, 1.0])
+def test_texture_has_mean_1_and_its_strength_as_log_spread(strength: float) -> None:
+    factor = texture(WALL, strength)
+    assert factor.shape == (WALL[0] * WALL[1],)
+    assert factor.min() > 0
+    assert factor.mean() == pytest.approx(1, rel=1e-5)
+    assert np.log(factor).std() == pytest.approx(strength, rel=1e-4)
+    np.testing.assert_array_equal(texture(WALL, strength), factor)
+    half = np.log(texture(WALL, strength / 2))
+    np.testing.assert_allclose(2 * np.ptp(half), np.ptp(np.log(factor)), rtol=1e-4)
+    assert texture(WALL, 0.0).size == 0
+
+
+def test_texture_has_stains_and_grain_of_a_cell() -> None:
+    pattern = np.log(texture(WALL, 0.2)).reshape(WALL)
+    stains = cv2.GaussianBlur(pattern, (0, 0), 8)
+    assert 0.3 < (stains.std() / pattern.std()) ** 2 < 0.7
+    grain, cell = pattern - stains, WALL[1] // 80
+    near, far = (np.corrcoef(grain[:, :-by].ravel(), grain[:, by:].ravel())[0, 1] for by in (1, 2 * cell))
+    assert near > 0.8  # no finer than a pixel
+    assert abs(far) < 0.2

@@ -1,0 +1,165 @@
+"""First and last leg: where beams land and what returns directly, and the cells of the relay wall."""
+
+import numpy as np
+import pytest
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.rig import Extent, LidarPose, Occluder, Rig, load_rig
+
+from nlos_cam.render.geometry import (
+    NO_OCCLUDER,
+    SPEED_OF_LIGHT_M_PER_S,
+    behind,
+    cast,
+    gate_bins,
+    occluder_edge,
+    relay_cells,
+)
+
+BARE, PAPER = load_rig("bare-wall"), load_rig("paper-rig")
+
+
+def _cells(rig: Rig) -> Intrinsics:
+    return rig.pinhole.scaled(80, 64)
+
+
+def _lidar(**pose: float) -> Rig:
+    return BARE.model_copy(update={"lidar": LidarPose.model_validate({"distance_m": 0.2, "yaw_deg": 45.0} | pose)})
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 15.0, 45.0, -45.0])
+@pytest.mark.parametrize("pitch_deg", [0.0, 10.0])
+def test_beams_land_on_the_wall_along_the_rays_of_their_pixels(yaw_deg: float, pitch_deg: float) -> None:
+    rig = _lidar(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
+    beams = cast(rig, _cells(rig))
+    np.testing.assert_allclose(beams.foot_m[beams.on_wall, 2], 0, atol=1e-12)
+    pose = rig.wall_from_lidar
+    back = (beams.foot_m[beams.on_wall] - pose[:3, 3]) @ pose[:3, :3]
+    rays = _cells(rig).rays().reshape(-1, 3)[beams.on_wall]
+    np.testing.assert_allclose(back / back[:, 2:], rays, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(back, axis=1), beams.length_m[beams.on_wall])
+    np.testing.assert_allclose(back[:, 2] / np.linalg.norm(back, axis=1), beams.cos_axis[beams.on_wall])
+
+
+def test_level_lidar_sees_its_foot_in_the_middle() -> None:
+    rig = _lidar(yaw_deg=0.0)
+    beams = cast(rig, rig.pinhole.scaled(81, 65))
+    foot = beams.foot_m.reshape(65, 81, 3)
+    np.testing.assert_allclose(foot[32, 40], 0, atol=1e-9)
+    assert beams.direct.argmax() == 32 * 81 + 40
+    assert (np.diff(foot[:, :, 0], axis=1) > 0).all()
+    assert (np.diff(foot[:, :, 1], axis=0) < 0).all()
+
+
+def test_direct_return_scales_with_distance_and_receiver_cell() -> None:
+    near, far = (cast(_lidar(distance_m=d), _cells(BARE)) for d in (0.15, 0.3))
+    both = near.on_wall & far.on_wall
+    np.testing.assert_allclose(far.length_m[both], 2 * near.length_m[both])
+    np.testing.assert_allclose(far.direct[both], near.direct[both] / 4)
+    device = BARE.device.model_copy(update={"receiver_cell_m2": 3e-4})
+    beams = cast(BARE, _cells(BARE))
+    np.testing.assert_allclose(cast(BARE.model_copy(update={"device": device}), _cells(BARE)).direct, 3 * beams.direct)
+    fine, coarse = cast(BARE, BARE.pinhole.scaled(243, 195)), cast(BARE, BARE.pinhole.scaled(81, 65))
+    np.testing.assert_allclose(fine.direct.reshape(195, 243)[1::3, 1::3].ravel(), coarse.direct, rtol=1e-9)
+
+
+@pytest.mark.parametrize("yaw_deg", [75.0, 89.0])
+def test_beams_beside_the_wall_have_no_length_and_no_return(yaw_deg: float) -> None:
+    rig = _lidar(yaw_deg=yaw_deg)
+    beams = cast(rig, _cells(rig))
+    lost = np.isnan(beams.length_m)
+    assert lost.any()
+    assert not beams.on_wall[lost].any()
+    assert (beams.direct[lost] == 0).all()
+    assert np.isfinite(beams.direct).all()
+
+
+def test_beams_end_at_the_wall_edge_and_at_the_occluder() -> None:
+    small = BARE.model_copy(update={"wall": Extent(x_min_m=0, x_max_m=0.3, y_min_m=-0.1, y_max_m=0.1)})
+    beams = cast(small, _cells(small))
+    feet = beams.foot_m[beams.on_wall]
+    assert (np.abs(feet - (0.15, 0, 0)) <= (0.15, 0.1, 1e-9)).all()
+    assert np.isnan(beams.length_m[~beams.on_wall]).all()
+    beams, free = cast(PAPER, _cells(PAPER)), cast(BARE, _cells(BARE))
+    stopped = np.isfinite(beams.length_m) & ~beams.on_wall
+    assert stopped.any()
+    np.testing.assert_allclose(beams.foot_m[stopped, 0], 0.2)
+    assert (beams.foot_m[stopped, 2] >= 0.1).all()
+    reached = beams.on_wall
+    np.testing.assert_allclose(beams.length_m[reached], free.length_m[reached])
+    degrees = np.degrees(np.arctan2(beams.foot_m[stopped, 0], 0.2 - beams.foot_m[stopped, 2]))
+    assert degrees.min() > 63
+
+
+def test_direct_return_after_the_gate_is_not_received() -> None:
+    gate_m = 0.8
+    device = BARE.device.model_copy(update={"gate_s": gate_m / SPEED_OF_LIGHT_M_PER_S})
+    beams = cast(BARE.model_copy(update={"device": device}), _cells(BARE))
+    late = 2 * beams.length_m >= gate_m
+    assert 0 < late.sum() < late.size
+    assert (beams.direct[late] == 0).all()
+    assert (beams.direct[~late] > 0).all()
+
+
+def test_beams_met_takes_the_place_of_the_wall() -> None:
+    beams = cast(BARE, _cells(BARE))
+    met = beams.met(BARE, np.array([7]), np.array([0.1]), np.array([0.5]), np.array([0.25]), 2 * np.pi)
+    assert not met.on_wall[7]
+    np.testing.assert_allclose(met.foot_m[7], beams.lidar_m + 0.1 * beams.direction[7])
+    assert met.direct[7] == pytest.approx(0.25 * 0.5 * 1e-4 / (2 * np.pi * 0.01), rel=0.02)
+    others = np.arange(5120) != 7
+    np.testing.assert_array_equal(met.direct[others], beams.direct[others])
+
+
+@pytest.mark.parametrize(("gate_m", "bins"), [(0.999, 100), (1.001, 101), (1e-6, 1)])
+def test_gate_bins_begin_inside_the_gate(gate_m: float, bins: int) -> None:
+    device = BARE.device.model_copy(update={"gate_s": gate_m / SPEED_OF_LIGHT_M_PER_S})
+    assert gate_bins(device) == bins
+
+
+def test_cast_is_cached_and_read_only() -> None:
+    beams = cast(PAPER, _cells(PAPER))
+    assert cast(PAPER, _cells(PAPER)) is beams
+    with pytest.raises(ValueError, match="read-only"):
+        beams.direct[0] = 1
+
+
+LIDAR_M = np.array([0.0, 0.0, 0.2])
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(80, 64), (40, 32), (1, 1), (7, 3)])
+def test_relay_cells_cover_the_wall_exactly(columns: int, rows: int) -> None:
+    relay, wall = relay_cells(BARE, LIDAR_M, columns, rows), BARE.relay
+    assert len(relay.x_m) == len(relay.y_m) == len(relay.length_m) == columns * rows
+    area = (wall.x_max_m - wall.x_min_m) * (wall.y_max_m - wall.y_min_m)
+    assert relay.cell_m2 * columns * rows == pytest.approx(area)
+    assert relay.x_m.mean() == pytest.approx((wall.x_min_m + wall.x_max_m) / 2)
+    assert relay.y_m.mean() == pytest.approx((wall.y_min_m + wall.y_max_m) / 2)
+    assert len(set(zip(relay.x_m, relay.y_m, strict=True))) == columns * rows
+    assert relay.diagonal_m**2 >= 2 * relay.cell_m2 - 1e-15
+
+
+def test_relay_cells_and_points_behind_the_edge_are_hidden() -> None:
+    """From (0, 0.2) over the edge at (0.2, 0.1) the line of sight meets the wall at x = 0.4."""
+    relay = relay_cells(PAPER, LIDAR_M, 80, 64)
+    assert occluder_edge(PAPER) == (0.2, 0.1)
+    hidden = relay.behind(occluder_edge(PAPER), LIDAR_M)
+    np.testing.assert_array_equal(hidden, relay.x_m > 0.4)
+    kept = relay.kept(~hidden)
+    assert len(kept.x_m) == len(kept.y_m) == len(kept.cos_lidar) == 64 * 64
+    assert (kept.cell_m2, kept.diagonal_m) == (relay.cell_m2, relay.diagonal_m)
+    x, z = np.array([0.4, 0.4, 0.1, 0.0]), np.array([0.3, -0.1, 0.3, 0.3])
+    np.testing.assert_array_equal(behind((0.2, 0.1), x, z, LIDAR_M), [True, False, False, False])
+
+
+def test_relay_cells_are_hidden_by_a_low_occluder_only() -> None:
+    def seen(z_min_m: float) -> np.ndarray:
+        rig = BARE.model_copy(update={"occluder": Occluder(x_m=0.2, z_min_m=z_min_m)})
+        relay = relay_cells(rig, LIDAR_M, 80, 64)
+        return relay.kept(~relay.behind(occluder_edge(rig), LIDAR_M)).x_m
+
+    assert len(seen(0.25)) == 80 * 64
+    assert seen(1e-6).max() < 0.2
+    assert occluder_edge(BARE) == NO_OCCLUDER
+    assert not behind(NO_OCCLUDER, np.linspace(-5, 5, 11), np.zeros(11), LIDAR_M).any()
+    behind_lidar = BARE.model_copy(update={"occluder": Occluder(x_m=-3.0, z_min_m=0.05)})
+    np.testing.assert_array_equal(cast(behind_lidar, _cells(BARE)).direct, cast(BARE, _cells(BARE)).direct)

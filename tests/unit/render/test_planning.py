@@ -1,0 +1,260 @@
+"""Accuracy, scene facts and the plan of effects (two-sided laws: tests/laws/test_effects.py)."""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.placement import object_depth
+from nlos_cam.render.accuracy import MAX_BEAMS_PER_CELL, MAX_RELAY_CELLS, STOPS, Accuracy, accuracy_named
+from nlos_cam.render.effects import EFFECTS, decide, included
+from nlos_cam.render.energy_survey import CAUTION, EnergySurvey
+from nlos_cam.render.geometry import NO_OCCLUDER, SPEED_OF_LIGHT_M_PER_S
+from nlos_cam.render.job import TransportJob
+from nlos_cam.render.material import Surface, phong
+from nlos_cam.render.planning import Prepared, plan
+from nlos_cam.render.scene import Radiometry, Scene
+from nlos_cam.render.scene_facts import SceneFacts
+
+RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
+
+
+def _called_for(scene: Scene, stop: str = "standard") -> set[str]:
+    return {effect.name for effect in plan(SceneFacts(scene, STOPS[stop])) if effect.included}
+
+
+def _plate(slope: float = 0.0) -> np.ndarray:
+    depth = np.full((16, 16), np.nan, np.float32)
+    depth[4:12, 2:14] = 0.25 + slope * 0.25 / 16 * np.arange(12)
+    return depth
+
+
+EMPTY = np.full((8, 8), np.nan, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("scene", "effects"),
+    [
+        (Scene(RIG, object_depth(3, object_box(RIG))[1]), {"three-bounce", "occluder", "self-occlusion", "tilt"}),
+        (Scene(BARE), set()),
+        (Scene(RIG), {"occluder"}),
+        (Scene(RIG, EMPTY), {"occluder"}),
+        (Scene(RIG, _plate()), {"three-bounce", "occluder"}),
+    ],
+    ids=["paper", "bare wall", "no object", "empty object", "level plate"],
+)
+def test_plan_calls_for_the_effects_of_the_scene(scene: Scene, effects: set[str]) -> None:
+    assert _called_for(scene) == {"direct"} | effects
+
+
+def test_plan_calls_for_nothing_within_a_short_gate() -> None:
+    device = RIG.device.model_copy(update={"gate_s": 0.1 / SPEED_OF_LIGHT_M_PER_S})
+    assert _called_for(Scene(RIG.model_copy(update={"device": device}), _plate())) <= {"occluder"}
+
+
+def test_plan_calls_for_a_small_tilt_on_a_shiny_surface() -> None:
+    """A lobe turns by twice the tilt, which the change of the cosines does not show."""
+    gentle = _plate(1e-3)
+    assert "tilt" not in _called_for(Scene(RIG, gentle), "draft")
+    shiny = Surface(1.0, phong(0.1, 0.9, 2000))
+    assert _called_for(Scene(RIG, gentle, shiny), "draft") >= {"tilt", "brdf"}
+
+
+@pytest.mark.parametrize("specular", [0.01, 0.1, 0.5])
+def test_plan_bounds_the_error_of_the_mean_brdf(specular: float) -> None:
+    verdicts = plan(SceneFacts(Scene(RIG, _plate(), Surface(1.0, phong(1 - specular, specular, 4))), STOPS["standard"]))
+    low, high = 1 - specular, 1 - specular + 3 * specular
+    bound = next(effect.bound for effect in verdicts if effect.name == "brdf")
+    assert bound == pytest.approx(min((high - low) / 2 / low, 1))
+    assert tuple(effect.name for effect in verdicts) == EFFECTS
+
+
+PREPARE_RIG = load_rig("paper-rig")
+COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
+DEPTH = (0.25 + 0.01 * np.arange(8) * np.ones((8, 1))).astype(np.float32)
+SCENE = Scene(PREPARE_RIG, DEPTH, Surface(np.array([0.9, 0.6, 0.3]), phong(0.5, 0.5, 3)))
+
+
+def _without(*names: str) -> Prepared:
+    return Prepared.of(SCENE, COARSE, set(EFFECTS) - set(names))
+
+
+def _job(ready: Prepared) -> TransportJob:
+    job = ready.job()
+    assert job is not None
+    return job
+
+
+def test_prepared_holds_every_effect_and_drops_those_left_out() -> None:
+    whole = _job(_without())
+    assert _without().channels == 3
+    assert whole.more_bounces
+    assert whole.field.shades
+    assert whole.brdf is SCENE.surface.brdf
+    assert whole.patches.beta.max() > 1
+    assert whole.edge_m == (0.2, 0.1)
+    assert whole.relay.x_m.max() < 0.4
+    assert not _without("direct").beams.direct.any()
+    assert _without("three-bounce").job() is None
+    assert _without("colour").channels == 1
+    assert _job(_without("tilt")).patches.beta.max() == 1
+    assert not _job(_without("self-occlusion")).field.shades
+    open_job, short, dull = (_job(_without(name)) for name in ("occluder", "inter-reflection", "brdf"))
+    assert open_job.edge_m == NO_OCCLUDER
+    assert len(open_job.relay.x_m) == 48
+    assert len(open_job.foot_m) > len(whole.foot_m)
+    assert not short.more_bounces
+    assert short.bins < whole.bins
+    assert dull.brdf is None
+    assert dull.patches.albedo.mean() == pytest.approx(0.6 * (0.5 + 0.5 + 0.5 * 2.5) / 2)  # the middle of its range
+
+
+def test_prepared_refuses_histograms_that_do_not_fit() -> None:
+    device = PREPARE_RIG.device.model_copy(update={"bin_m": 1e-6})
+    scene = Scene(PREPARE_RIG.model_copy(update={"device": device}), DEPTH)
+    with pytest.raises(SceneError, match="GiB"):
+        Prepared.of(scene, COARSE, "auto").job()
+
+
+@pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
+def test_job_weights_are_the_factors_of_s2(radiometry: Radiometry) -> None:
+    job = _job(Prepared.of(Scene(PREPARE_RIG, DEPTH, Surface(0.5), radiometry), COARSE, "auto"))
+    relay, solid = job.relay, np.pi if radiometry == "lambertian" else 2 * np.pi
+    np.testing.assert_allclose(job.strength, 0.5 * job.patches.beta * job.patches.cell_m2)
+    far = relay.length_m > job.near_m
+    expected = relay.cell_m2 / (solid**2 * relay.length_m**2)
+    if radiometry == "lambertian":
+        expected = expected * job.receiver_cell_m2 * relay.cos_lidar
+        np.testing.assert_allclose(job.beam_weight, 1 / solid)
+    else:
+        np.testing.assert_allclose(job.beam_weight, job.cos_incidence / solid)
+    np.testing.assert_allclose(job.relay_weight[far], expected[far])
+    assert (job.relay_weight <= expected * (1 + 1e-12)).all()
+
+
+bounds = st.lists(st.floats(0, 1), min_size=len(EFFECTS), max_size=len(EFFECTS))
+
+
+def _findings(values: list[float]) -> list[tuple[str, float, str]]:
+    return [(name, bound, f"because of {name}") for name, bound in zip(EFFECTS, values, strict=True)]
+
+
+@settings(deadline=None, derandomize=True)
+@given(values=bounds, tolerance=st.floats(0, 1))
+def test_decide_leaves_out_bounds_up_to_the_tolerance(values: list[float], tolerance: float) -> None:
+    plan = decide(_findings(values), tolerance)
+    assert tuple(effect.name for effect in plan) == EFFECTS
+    out, kept = ([e.bound for e in plan if e.included == wanted] for wanted in (False, True))
+    assert sum(sorted(out)) <= tolerance
+    assert not kept or sum(sorted(out)) + min(kept) > tolerance
+    assert max(out, default=0) <= min(kept, default=1)
+
+
+@pytest.mark.parametrize("asked", [["tilt", "direct"], ("direct", "tilt"), {"tilt", "direct"}])
+def test_decide_includes_exactly_the_named_effects(asked: Collection[str]) -> None:
+    plan = decide(_findings([0.5] * len(EFFECTS)), 0.0, asked)
+    assert {effect.name for effect in plan if effect.included} == {"direct", "tilt"}
+    assert included(plan, "tilt")
+    assert not included(plan, "occluder")
+    assert all(e.reason.endswith(f"because of {e.name}") for e in plan)
+
+
+def test_decide_takes_names_and_leaves_out_zero_bounds() -> None:
+    assert {e.name for e in decide(_findings([1.0] * len(EFFECTS)), 0.0, "pulse") if e.included} == {"pulse"}
+    assert not any(effect.included for effect in decide(_findings([1.0] * len(EFFECTS)), 0.0, []))
+    with pytest.raises(SceneError, match="fog"):
+        decide(_findings([0.0] * len(EFFECTS)), 0.0, ["direct", "fog"])
+    plan = decide(_findings([0.0] * 5 + [1e-12] * 5), 0.0)
+    assert [effect.included for effect in plan] == [False] * 5 + [True] * 5
+
+
+def test_accuracy_named_finds_stops_in_order_and_keeps_settings() -> None:
+    assert all(stop.name == name and accuracy_named(name) is stop for name, stop in STOPS.items())
+    own = Accuracy("own", sub_bins=2)
+    assert accuracy_named(own) is own
+    tolerances = [stop.tolerance for stop in STOPS.values()]
+    assert tolerances == sorted(tolerances, reverse=True)
+    assert tolerances[-1] == 0
+    assert [name for name, stop in STOPS.items() if stop.sub_bins == 0] == ["reference"]
+    with pytest.raises(SceneError, match="best"):
+        accuracy_named("best")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *[("relay_columns", 0), ("relay_rows", MAX_RELAY_CELLS + 1), ("object_stride", 0), ("sectors", 0)],
+        *[("beams_per_cell", MAX_BEAMS_PER_CELL + 1), ("scatter_error", 0.0)],
+        *[("tolerance", value) for value in (-1e-9, float("nan"))],
+        *[("sub_bins", value) for value in (3, 128, -1)],
+    ],
+)
+def test_accuracy_refuses_values_out_of_range_by_field(field: str, value: float) -> None:
+    with pytest.raises(SceneError, match=rf"{field}.*{value}"):
+        replace(STOPS["standard"], **{field: value})
+
+
+ENERGY_SURVEY_RIG = load_rig("paper-rig")
+
+
+def test_survey_share_is_cautious_and_at_most_1() -> None:
+    two = np.ones(2)
+    found = EnergySurvey(two, two, 0 * two, 0 * two, 0 * two, 0 * two, 1.0)
+    assert found.share(np.array([0.1, 0.0])) == pytest.approx(CAUTION * 0.05)
+    assert found.share(np.array([5.0, 0.0])) == 1
+    assert found.tilt == found.occluder == 0
+    dark = EnergySurvey(0 * two, two, two, two, two, two, 1.0)
+    assert dark.share(two) == 1
+    assert dark.share(0 * two) == 0
+    uneven = EnergySurvey(two, two, 0 * two, 0 * two, 0 * two, 0 * two, 4.0)
+    assert uneven.share(np.array([0.1, 0.0])) == pytest.approx(4 * found.share(np.array([0.1, 0.0])))
+
+
+@pytest.mark.parametrize("z_m", [0.0, 1e-9])
+def test_survey_bounds_the_energy_of_a_patch_on_the_wall(z_m: float) -> None:
+    """A patch on the wall must not outweigh all others, whose bounds would then be too small."""
+    depth = np.full((8, 8), 0.2, np.float32)
+    depth[3, 3] = z_m
+    light = SceneFacts(Scene(ENERGY_SURVEY_RIG, depth, jump_m=0.5), COARSE).light
+    assert light is not None
+    assert np.isfinite(light.energy).all()
+    assert light.energy.max() < 1e3 * np.median(light.energy)
+
+
+SCENE_FACTS_RIG = load_rig("paper-rig")
+LEVEL = np.full((8, 8), 0.25, np.float32)
+
+
+@pytest.mark.parametrize(("cells", "stride", "blocks"), [(8, 2, 4), (8, 1, 8), (7, 2, 7), (8, 4, 2)])
+def test_stage_takes_blocks_where_the_stride_divides_the_grid(cells: int, stride: int, blocks: int) -> None:
+    scene = Scene(SCENE_FACTS_RIG, LEVEL[:cells, :cells], Surface(np.linspace(0, 1, cells**2).reshape(cells, cells)))
+    stage = SceneFacts(scene, replace(COARSE, object_stride=stride))
+    assert stage.depth_m.shape == stage.albedo.shape == (blocks, blocks)
+    assert stage.patches is not None
+    assert len(stage.patches.beta) == blocks**2
+    assert stage.albedo.mean() == pytest.approx(0.5)
+
+
+def test_stage_has_no_patches_of_empty_boxes_or_beyond_the_gate() -> None:
+    for depth in (None, np.full((8, 8), np.nan, np.float32)):
+        stage = SceneFacts(Scene(SCENE_FACTS_RIG, depth), COARSE)
+        assert stage.patches is stage.light is stage.sight is None
+        assert stage.more_bounces == 0
+    device = SCENE_FACTS_RIG.device.model_copy(update={"gate_s": 0.4999 / SPEED_OF_LIGHT_M_PER_S})
+    assert SceneFacts(Scene(SCENE_FACTS_RIG.model_copy(update={"device": device}), LEVEL), COARSE).patches is None
+    assert SceneFacts(Scene(SCENE_FACTS_RIG, LEVEL), COARSE).patches is not None
+
+
+def test_stage_of_a_coarse_stop_has_fewer_equally_bright_patches() -> None:
+    scene = Scene(SCENE_FACTS_RIG, LEVEL)
+    few, many = (SceneFacts(scene, STOPS[stop]).light for stop in ("draft", "standard"))
+    assert few is not None
+    assert many is not None
+    assert len(few.energy) == len(many.energy) // 4
+    assert few.taken.sum() == pytest.approx(many.taken.sum(), rel=0.05)

@@ -1,0 +1,227 @@
+"""Renderings, echoes, the rolling scan, BRDF tables and the numba backend (laws: tests/laws)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.render.accuracy import STOPS, Accuracy
+from nlos_cam.render.backend_numba import LANES, tables
+from nlos_cam.render.brdf_table import MAX_NODES, node_count, nodes, scattered, scattering
+from nlos_cam.render.echoes import MultiBounce, add_direct, compete, nothing, strongest
+from nlos_cam.render.effects import Effect
+from nlos_cam.render.geometry import Beams, cast
+from nlos_cam.render.job import TransportJob
+from nlos_cam.render.material import Brdf, Surface, phong
+from nlos_cam.render.planning import Prepared
+from nlos_cam.render.renderer import render, transient
+from nlos_cam.render.scanning import render_scan, scan_effect, slices
+from nlos_cam.render.scene import Scene
+
+RIG = load_rig("paper-rig")
+COARSE = Accuracy("coarse", relay_columns=4, relay_rows=3)
+DEPTH = np.full((4, 4), 0.25, np.float32)
+
+
+def test_rendering_has_maps_of_cells_and_echoes_of_beams() -> None:
+    for beams in (1, 2):
+        rendering = render(Scene(RIG, DEPTH), replace(COARSE, beams_per_cell=beams))
+        for image in (rendering.depth_m, rendering.intensity, rendering.margin):
+            assert image.shape == (64, 80)
+            assert image.dtype == np.float32
+        assert rendering.multi.peak.shape == (64 * beams, 80 * beams)
+        assert rendering.colour is None
+        assert transient(Scene(RIG, DEPTH), replace(COARSE, beams_per_cell=beams)).shape[:2] == (64 * beams, 80 * beams)
+
+
+def test_cell_takes_the_median_depth_of_its_beams() -> None:
+    rendering = render(Scene(RIG), replace(COARSE, beams_per_cell=2))
+    every = render(Scene(RIG), COARSE)
+    both = np.isfinite(rendering.depth_m) & np.isfinite(every.depth_m)
+    assert both.mean() > 0.5
+    assert np.median(np.abs(rendering.depth_m - every.depth_m)[both]) < 1e-3
+
+
+def test_color_is_the_winning_echo_in_each_channel() -> None:
+    albedo = np.array([1.0, 0.5, 0.0])
+    rendering = render(Scene(RIG, DEPTH, Surface(albedo)), COARSE)
+    assert rendering.colour is not None
+    wins = rendering.multi.peak == rendering.intensity
+    assert wins.any()
+    assert not wins.all()
+    np.testing.assert_allclose(
+        rendering.colour[wins], rendering.intensity[wins, None] * albedo / albedo.mean(), rtol=1e-5, atol=1e-30
+    )
+    np.testing.assert_allclose(rendering.colour[~wins], np.repeat(rendering.intensity[~wins, None], 3, 1), rtol=1e-6)
+
+
+BIN_M = 0.01
+
+
+def _beams(direct: list[float], length_m: float = 0.5) -> Beams:
+    n = len(direct)
+    every = np.full(n, length_m)
+    foot = np.zeros((n, 3))
+    lit = np.ones(n, np.bool_)
+    return Beams((1, n), foot, foot, every, every, np.full(n, 0.5), lit, np.array(direct), np.zeros(3))
+
+
+def _multi(peak: list[float], runner_up: list[float], path_m: float = 2.0) -> MultiBounce:
+    paths = np.full(len(peak), path_m, np.float32)
+    return MultiBounce(np.array(peak, np.float32), np.array(runner_up, np.float32), paths).of((1, len(peak)))
+
+
+@settings(deadline=None, derandomize=True)
+@given(arrays(np.float32, (5, 9), elements=st.sampled_from([0.0, 1e-6, 0.25, 0.5, 1.0])))
+def test_strongest_finds_the_two_highest_bins(histogram: np.ndarray) -> None:
+    found = strongest(histogram, BIN_M)
+    ordered = np.sort(histogram, axis=1)
+    np.testing.assert_array_equal(found.peak, ordered[:, -1])
+    np.testing.assert_array_equal(found.runner_up, ordered[:, -2])
+    expected = np.where(found.peak > 0, (histogram.argmax(1) + 0.5) * BIN_M, np.nan)  # the first of equals
+    np.testing.assert_allclose(found.path_m, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("direct", "multi", "depth_m", "intensity", "margin"),
+    [
+        ([0.4, 0.1], _multi([0.2, 0.2], [0.1, 0.15]), [0.25, 0.5], [0.4, 0.2], [0.5, 0.25]),
+        ([0.25], _multi([0.25], [0.0]), [0.25], [0.25], [0.0]),  # a tie goes to the direct return
+        ([0.0, 0.1], nothing(2).of((1, 2)), [np.nan, 0.25], [0.0, 0.1], [0.0, 1.0]),
+        ([0.4], replace(_multi([0.2], [0.05]), direct_included=True), [0.5], [0.2], [0.75]),  # counted once
+    ],
+    ids=["stronger", "tie", "nothing", "included"],
+)
+def test_compete_takes_the_stronger_return(
+    direct: list[float], multi: MultiBounce, depth_m: list[float], intensity: list[float], margin: list[float]
+) -> None:
+    for found, expected in zip(compete(_beams(direct), multi), (depth_m, intensity, margin), strict=True):
+        np.testing.assert_allclose(found[0], expected, rtol=1e-6)
+
+
+def test_add_direct_adds_in_the_bin_of_the_path() -> None:
+    beams = cast(RIG, RIG.pinhole.scaled(80, 64))
+    whole = add_direct(np.zeros((5120, 3), np.float32), beams, BIN_M)
+    returned = beams.direct > 0
+    np.testing.assert_allclose(whole.sum(1), beams.direct, rtol=1e-6)
+    np.testing.assert_array_equal(whole.argmax(1)[returned], np.floor(2 * beams.length_m[returned] / BIN_M))
+
+
+def _plate(share: float) -> Scene:
+    """A plate that comes 4 cm nearer to the wall during a scan."""
+    depth = np.full((16, 16), np.nan, np.float32)
+    depth[4:12, 4:12] = 0.3 - 0.04 * share
+    return Scene(RIG, depth)
+
+
+def _still(_share: float) -> Scene:
+    return _plate(0.0)
+
+
+def test_scan_of_a_still_scene_is_one_rendering() -> None:
+    assert not scan_effect(_still).included
+    assert scan_effect(_still).bound == 0
+    bare = Scene(load_rig("bare-wall"))
+    assert not scan_effect(lambda _share: bare).included
+    scan, instant = render_scan(_still), render(_still(0.0))
+    np.testing.assert_array_equal(scan.depth_m, instant.depth_m)
+    np.testing.assert_array_equal(scan.multi.peak, instant.multi.peak)
+    assert scan.plan[-1].name == "scan-time"
+
+
+def test_scan_effect_is_called_for_by_motion_above_the_tolerance() -> None:
+    verdict = scan_effect(_plate)
+    assert verdict.included
+    scan, instant = render_scan(_plate).multi.peak, render(_plate(0.0)).multi.peak
+    change = np.abs(scan - instant).sum() / scan.sum()
+    assert STOPS["standard"].tolerance < change <= verdict.bound
+    hardly = scan_effect(lambda share: _plate(share * 1e-4), "draft")
+    assert 0 < hardly.bound < STOPS["draft"].tolerance
+    assert not hardly.included
+
+
+@pytest.mark.slow
+def test_scan_sees_the_top_first_and_the_bottom_last() -> None:
+    scan = render_scan(_plate).multi.peak
+    start, end = render(_plate(0.0)).multi.peak, render(_plate(1.0)).multi.peak
+    count = slices(scan_effect(_plate), STOPS["standard"])
+    assert count >= 2
+    for rows, near, far in ((slice(0, 8), start, end), (slice(56, 64), end, start)):
+        assert np.abs(scan[rows] - near[rows]).sum() < 0.5 * np.abs(scan[rows] - far[rows]).sum()
+
+
+@pytest.mark.slow
+def test_scan_slice_is_the_rendering_of_its_instant() -> None:
+    scan, count = render_scan(_plate), slices(scan_effect(_plate), STOPS["standard"])
+    rows = np.array_split(np.arange(64), count)[0]
+    instant = render(_plate(float(rows.mean() + 0.5) / 64))
+    np.testing.assert_array_equal(scan.depth_m[rows], instant.depth_m[rows])
+    assert scan.depth_m.shape == (64, 80)
+
+
+@pytest.mark.parametrize(("bound", "count"), [(0.01, 2), (0.1, 5), (1.0, 50)])
+def test_slices_grow_with_the_motion(bound: float, count: int) -> None:
+    assert slices(Effect("scan-time", included=True, reason="", bound=bound), STOPS["standard"]) == count
+    assert slices(Effect("scan-time", included=False, reason="", bound=bound), STOPS["standard"]) == 1
+
+
+BRDF = phong(0.4, 0.6, 10)
+
+
+@pytest.fixture(scope="module")
+def job() -> TransportJob:
+    depth = np.random.default_rng(0).uniform(0.1, 0.3, (4, 4)).astype(np.float32)
+    job = Prepared.of(Scene(load_rig("paper-rig"), depth, Surface(1.0, BRDF), jump_m=0.5), COARSE, "auto").job()
+    assert job is not None
+    return job
+
+
+@pytest.mark.slow
+def test_scattering_compiled_and_plain_agree_leg_by_leg(job: TransportJob) -> None:
+    patches, relay, foot = job.patches, job.relay, job.foot_m[1000]
+    table = scattering(BRDF)(foot, patches.point_m, patches.normal, relay.x_m, relay.y_m)
+    out = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1)
+    for s in range(len(patches.beta)):
+        same = (np.broadcast_to(column, out.shape) for column in (foot, patches.point_m[s], patches.normal[s]))
+        np.testing.assert_allclose(table[s], scattered(BRDF, *same, out), rtol=1e-9)
+    assert table.min() >= 0.4
+    assert table.max() > 0.5
+
+
+def test_nodes_interpolate_every_beam_exactly(job: TransportJob) -> None:
+    made = list(nodes(job, BRDF))
+    share = np.stack([part for _, part in made])
+    feet = np.stack([foot for foot, _ in made])
+    np.testing.assert_allclose(share.sum(0), 1)
+    np.testing.assert_allclose(share.T @ feet, job.foot_m, atol=1e-9)
+
+
+def test_nodes_do_not_depend_on_the_rendered_beams(job: TransportJob) -> None:
+    few = job.some(np.array([5, 900]))
+    whole = {tuple(foot): share[[5, 900]] for foot, share in nodes(job, BRDF)}
+    for foot, share in nodes(few, BRDF):
+        np.testing.assert_array_equal(whole[tuple(foot)], share)
+
+
+def test_node_count_grows_as_the_error_shrinks(job: TransportJob) -> None:
+    def count(error: float, brdf: Brdf = BRDF) -> int:
+        return node_count(replace(job, accuracy=replace(COARSE, scatter_error=error)), brdf)
+
+    assert count(0.5) == 4
+    assert 4 < count(5e-3) <= count(1e-4) <= MAX_NODES
+    assert count(1e-4, phong(0.5, 0.0, 10)) == 4
+
+
+@pytest.mark.parametrize("per_bin", [1, 4, 8])
+def test_tables_are_the_histogram_at_each_sub_bin_shift(per_bin: int) -> None:
+    width = 2 * LANES
+    fine = np.zeros((3, width * per_bin), np.float32)
+    fine[:, : (width - 1) * per_bin] = np.random.default_rng(0).random((3, (width - 1) * per_bin))
+    table = tables(fine, per_bin)
+    for shift in range(per_bin):
+        later = np.roll(fine, shift, axis=1).reshape(3, width, per_bin).sum(-1)
+        np.testing.assert_allclose(table[:, shift], later, rtol=1e-5, atol=1e-6)

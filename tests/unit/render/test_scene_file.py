@@ -1,0 +1,281 @@
+"""Scene files: round trips, motion, meshes, faults, and errors that name the field."""
+
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+import trimesh
+from nlos_calibration.rig import dump_toml, load_rig
+from pydantic import ValidationError
+
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.meshes import read_mesh
+from nlos_cam.render.scene_file import (
+    Fault,
+    HiddenObject,
+    Motion,
+    SceneFile,
+    bare_wall_scene,
+    load_scene,
+    one_wrap,
+    paper_scene,
+)
+from nlos_cam.render.sensor.model import SensorModel
+
+CUP = """
+name = "cup"
+rig = "paper-rig"
+
+[object]
+category = "cup"
+seed = 3
+size_m = 0.15
+
+[motion]
+poses = 8
+sway_x_m = 0.03
+turn_deg = 20.0
+"""
+
+
+def _load(folder: Path, text: str) -> SceneFile:
+    path = folder / "scene.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_scene(path)
+
+
+def test_load_scene_reads_object_rig_and_faults(tmp_path: Path) -> None:
+    scene = _load(tmp_path, CUP)
+    assert scene.hidden == HiddenObject(category="cup", seed=3, size_m=0.15)
+    assert scene.rig == load_rig("paper-rig")
+    assert scene.poses == 8
+    assert scene.sensor == SensorModel()
+    scene = _load(tmp_path, CUP)
+    faulty = _load(tmp_path, CUP + '[[faults]]\nkind = "stall"\nat_frame = 30\nframes = 9\n')
+    assert (scene.faults, faulty.faults) == ((), (Fault(kind="stall", at_frame=30, frames=9),))
+    assert faulty.checksum == scene.checksum
+
+
+@pytest.mark.parametrize("make", [paper_scene, bare_wall_scene], ids=["paper", "bare wall"])
+@pytest.mark.parametrize("by_alias", [True, False])
+def test_scene_survives_a_file(tmp_path: Path, make: Callable[[], SceneFile], by_alias: bool) -> None:
+    scene = make()
+    text = tomli_w.dumps(scene.model_dump(mode="json", by_alias=by_alias, exclude_none=True))
+    assert ("object" in tomllib.loads(text)) == (by_alias and scene.hidden is not None)
+    again = _load(tmp_path, text)
+    assert again == scene
+    assert again.checksum == scene.checksum
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        *[
+            ("size_m = 0.15", f"{field} = {value}", rf"object\.{field}.*{value}")
+            for field, value in (("size_m", "nan"), ("tilt_x_deg", "inf"), ("x_m", "-inf"), ("front_m", "-0.01"))
+        ],
+        ("size_m = 0.15", "front_m = 0.4", r"front_m.*0\.4 m"),
+        ("size_m = 0.15", "x_m = 0.5", "cup.*x_m"),
+        ("seed = 3", "sede = 3", r"object\.sede"),
+        ('rig = "paper-rig"', 'rig = "none"', "rig"),
+        ('rig = "paper-rig"', "", "rig"),
+        ('name = "cup"', "", "name"),
+        ('category = "cup"', 'category = "teapot"', "category.*teapot"),
+        ('category = "cup"', "", "object.*category"),
+        ('category = "cup"', 'category = "cup"\nup = "z"', "object: up"),
+        ('category = "cup"', 'file = "none.stl"', r"object\.file.*none\.stl.*No such file"),
+        ('category = "cup"', 'file = "map.npy"', r"object\.file.*map\.npy"),
+        ('category = "cup"', "file = 3", r"object\.file.*3"),
+        *[
+            ("sway_x_m = 0.03", f"{field} = {value}", rf"motion\.{field}")
+            for field, value in (("poses", 0), ("spin", 1), ("sway_x_m", "nan"), ("approach_m", -1))
+        ],
+        ("[motion]", '[[faults]]\nat_frame = 1\nkind = "explode"\n[motion]', r"faults\.0\."),
+        (CUP, "name = ", r"scene\.toml"),
+        (CUP, "", r"scene\.toml"),
+    ],
+)
+def test_load_scene_names_what_is_wrong(tmp_path: Path, old: str, new: str, named: str) -> None:
+    with pytest.raises(SceneError, match=named) as caught:
+        _load(tmp_path, CUP.replace(old, new).replace("poses = 8\n", ""))
+    assert "\n" not in str(caught.value)
+
+
+def test_load_scene_names_a_missing_and_an_undecodable_file(tmp_path: Path) -> None:
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
+    for name in ("none.toml", "bytes.toml"):
+        with pytest.raises(SceneError, match=name):
+            load_scene(tmp_path / name)
+
+
+def test_checksum_ignores_name_and_sensor_except_the_pulse() -> None:
+    scene = paper_scene()
+    same = scene.model_copy(update={"name": "other", "sensor": SensorModel(shot_noise=0)})
+    assert same.checksum == scene.checksum
+    assert scene.hidden is not None
+    others = [
+        scene.model_copy(update={"motion": Motion(poses=91)}),
+        scene.model_copy(update={"hidden": scene.hidden.model_copy(update={"x_m": 0.001})}),
+        scene.model_copy(update={"rig": load_rig("bare-wall")}),
+    ]
+    assert len({scene.checksum, *(other.checksum for other in others)}) == 4
+    plain = paper_scene()
+    wide = plain.model_copy(update={"sensor": SensorModel(pulse_ns=1.0)})
+    assert wide.checksum != plain.checksum
+    assert (wide.scene_at(0).pulse_ns, plain.scene_at(0).pulse_ns) == (1.0, 0.0)
+
+
+def test_material_and_radiometry_reach_the_scene(tmp_path: Path) -> None:
+    text = CUP.replace("[object]", 'radiometry = "lambertian"\njump_m = 0.05\n[object]')
+    text = text.replace("[motion]", '[object.material]\nkind = "phong"\nalbedo = 0.5\n[motion]')
+    scene, plain = _load(tmp_path, text), _load(tmp_path, CUP)
+    at = scene.scene_at(0)
+    assert (at.radiometry, at.jump_m, float(np.asarray(at.surface.albedo))) == ("lambertian", 0.05, 0.5)
+    assert at.surface.brdf is not None
+    assert scene.checksum != plain.checksum
+    assert plain.scene_at(0).surface.brdf is None
+
+
+def test_paper_scene_moves_between_frames_and_is_not_trained_on() -> None:
+    scene = paper_scene()
+    assert scene.hidden is not None
+    assert scene.hidden.seed >= 20_000_000
+    poses = [scene.pose_at(scene.hidden, number) for number in (3, 3.5, 4)]
+    assert poses[0].x_m < poses[1].x_m < poses[2].x_m
+
+
+def test_motion_is_a_closed_loop(tmp_path: Path) -> None:
+    scene = _load(tmp_path, CUP)
+    depths = [scene.scene_at(k).object_depth_m for k in range(9)]
+    np.testing.assert_array_equal(depths[0], depths[8])
+    assert not np.array_equal(depths[0], depths[2], equal_nan=True)
+    np.testing.assert_array_equal(scene.scene_at(2).object_depth_m, depths[2])
+
+
+def test_paper_scene_stays_in_its_box() -> None:
+    scene = paper_scene()
+    assert scene.rig.object_box is not None
+    edges = [
+        np.isfinite(np.concatenate([d[0], d[-1], d[:, 0], d[:, -1]])).any()
+        for k in range(0, scene.poses, 3)
+        if (d := scene.scene_at(k).object_depth_m) is not None
+    ]
+    assert len(edges) == 30
+    assert not any(edges)
+
+
+def test_scene_has_one_pose_without_an_object_and_needs_a_box() -> None:
+    scene = bare_wall_scene()
+    assert scene.poses == 1
+    assert scene.scene_at(5).object_depth_m is None
+    still = scene.model_copy(update={"motion": Motion(poses=90)})
+    assert still.poses == 1
+    scene = SceneFile(name="wrong", rig=load_rig("bare-wall"), hidden=HiddenObject(category="cup"))
+    with pytest.raises(SceneError, match=r"object_box.*cup"):
+        scene.scene_at(0)
+
+
+def test_rig_path_is_absolute_or_relative_to_the_scene(tmp_path: Path) -> None:
+    (tmp_path / "bench.toml").write_text(dump_toml(load_rig("paper-rig").model_copy(update={"name": "bench"})))
+    for path in ("bench.toml", str(tmp_path / "bench.toml")):
+        assert _load(tmp_path, f'name = "mine"\nrig = "{path}"\n').rig.name == "bench"
+
+
+def test_scene_may_show_its_object_in_part_of_the_loop(tmp_path: Path) -> None:
+    scene = _load(tmp_path, CUP.replace("size_m = 0.15", "x_m = 0.25").replace("sway_x_m = 0.03", "sway_x_m = 0.2"))
+    assert [scene.shows_at(0), scene.shows_at(6)] == [False, True]
+
+
+WEDGE = CUP.replace('category = "cup"\nseed = 3', 'file = "things/wedge.stl"')
+
+
+def _wedge(folder: Path, height: float = 0.6) -> Path:
+    (folder / "things").mkdir(exist_ok=True)
+    corners = [(0, 0, 0), (1, 0, 0), (0, height, 0), (0, 0, 0.4)]
+    solid = trimesh.Trimesh(corners, [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], process=False)
+    solid.export(folder / "things" / "wedge.stl")
+    return folder / "things" / "wedge.stl"
+
+
+def test_mesh_path_is_relative_to_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = _wedge(tmp_path)
+    monkeypatch.chdir(tmp_path.parent)
+    scene = _load(tmp_path, WEDGE)
+    assert scene.hidden is not None
+    assert scene.hidden.file == read_mesh(path)
+    assert scene.shows_at(0)
+
+
+def test_scene_with_a_mesh_survives_a_file_in_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _wedge(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    scene = _load(Path(), WEDGE.replace("[motion]", 'up = "z"\n\n[motion]'))
+    (tmp_path / "elsewhere").mkdir()
+    again = _load(tmp_path / "elsewhere", dump_toml(scene))
+    assert again == scene
+    assert again.checksum == scene.checksum
+
+
+def test_mesh_moves_as_a_category_does(tmp_path: Path) -> None:
+    """The mesh of a category, read from a file, moves the same up to single precision."""
+    cup = _load(tmp_path, CUP)
+    assert cup.hidden is not None
+    triangles = cup.hidden.triangles
+    mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False)
+    mesh.export(tmp_path / "cup.stl")
+    read = _load(tmp_path, CUP.replace('category = "cup"\nseed = 3', 'file = "cup.stl"'))
+    for number in range(cup.poses):
+        depths = [np.nan_to_num(s.scene_at(number).object_depth_m, nan=1.0) for s in (cup, read)]
+        assert (np.abs(depths[0] - depths[1]) > 1e-5).sum() <= 3
+
+
+def test_checksum_holds_content_and_axes_of_a_mesh_not_its_path(tmp_path: Path) -> None:
+    path = _wedge(tmp_path)
+    first = _load(tmp_path, WEDGE).checksum
+    assert _load(tmp_path, WEDGE.replace('wedge.stl"', 'wedge.stl"\nup = "z"')).checksum != first
+    assert _load(tmp_path, CUP).checksum != first
+    path.rename(tmp_path / "moved.stl")
+    assert _load(tmp_path, WEDGE.replace("things/wedge", "moved")).checksum == first
+    _wedge(tmp_path, height=0.61)
+    assert _load(tmp_path, WEDGE).checksum != first
+
+
+def test_scene_keeps_the_mesh_it_was_loaded_with(tmp_path: Path) -> None:
+    """A mesh edited during rendering must not enter the cache under the checksum of the old one."""
+    _wedge(tmp_path)
+    scene = _load(tmp_path, WEDGE)
+    before, depth = scene.checksum, scene.scene_at(1).object_depth_m
+    _wedge(tmp_path, height=0.3)
+    assert scene.checksum == before
+    np.testing.assert_array_equal(scene.scene_at(1).object_depth_m, depth)
+
+
+@pytest.mark.parametrize(
+    ("fields", "word"),
+    [
+        ({"kind": "explode"}, "stall"),
+        ({"at_frame": -1}, "at_frame"),
+        ({"frames": 0}, "frames"),
+        ({"seconds": 3}, "seconds"),
+        ({"stream": "depth"}, "stall"),
+        ({"kind": "drops", "stream": "color"}, "infrared"),
+        ({"kind": "clock_wrap", "frames": 2}, "clock_wrap"),
+    ],
+)
+def test_fault_refuses_fields_that_make_no_sense(fields: dict[str, Any], word: str) -> None:
+    with pytest.raises(ValidationError, match=word):
+        Fault.model_validate({"kind": "stall", "at_frame": 0} | fields)
+    wraps = tuple(Fault(kind="clock_wrap", at_frame=frame) for frame in (1, 9))
+    assert one_wrap(wraps[:1]) == wraps[:1]
+    with pytest.raises(ValidationError, match="clock_wrap"):
+        SceneFile.model_validate({**dict(bare_wall_scene()), "faults": wraps})
+
+
+@pytest.mark.parametrize(("kind", "frames"), [("stall", [5, 6, 7]), ("out_of_order", [5, 6, 7, 8, 9, 10])])
+def test_fault_lasts_from_its_frame_on(kind: Any, frames: list[int]) -> None:
+    fault = Fault(kind=kind, at_frame=5, frames=3)
+    assert [frame for frame in range(20) if fault.befalls(frame)] == frames

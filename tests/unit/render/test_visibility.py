@@ -1,0 +1,227 @@
+"""Visibility: self-occlusion, line of sight from the lidar, and form factors of inter-reflection."""
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import ObjectBox, load_rig
+
+from nlos_cam.errors import SceneError
+from nlos_cam.objects.depth_map import cell_centres_m, object_box
+from nlos_cam.objects.placement import object_depth
+from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.render.interreflection import (
+    WALL_CELLS,
+    form_factor,
+    patch_to_patch,
+    wall_cell_m2,
+    wall_cells,
+    wall_factors,
+)
+from nlos_cam.render.job import TransportJob
+from nlos_cam.render.line_of_sight import first_hits
+from nlos_cam.render.material import Surface
+from nlos_cam.render.planning import Prepared
+from nlos_cam.render.renderer import three_bounce
+from nlos_cam.render.scene import Scene
+from nlos_cam.render.scene_facts import SceneFacts
+from nlos_cam.render.visibility import FACES, HeightField, blocked, height_field, horizon_table, visible
+from nlos_cam.render.visibility import segment_blocked as between
+
+RIG = load_rig("paper-rig")
+BOX = object_box(RIG)
+X_M, Y_M = cell_centres_m(BOX)
+ROW = 32
+
+
+def _field(depth: np.ndarray, *, shades: bool = True) -> HeightField:
+    return height_field(depth, BOX, shades=shades)
+
+
+def _ridge(front_m: float = 0.15) -> np.ndarray:
+    """A surface at 0.35 m with a ridge of one column at `front_m`."""
+    depth = np.full((64, 64), 0.35)
+    depth[:, 40] = front_m
+    return depth
+
+
+def _seen(field: HeightField, column: int, x: float, y: float, row: int = ROW) -> bool:
+    point = np.array([X_M[column], Y_M[row], field.depth_m[row, column]])
+    return visible(field, row, column, point, x, y)
+
+
+def test_ridge_shades_up_to_the_line_over_its_top() -> None:
+    """By similar triangles the line over the top of the ridge, less the bias, meets the wall at `reach`."""
+    field = _field(_ridge())
+    reach = (X_M[40] - X_M[10]) * 0.35 / (0.35 - 0.15 - 0.25 * field.pitch_x_m)
+    assert _seen(field, 10, X_M[10] + 0.999 * reach, Y_M[ROW])
+    assert not _seen(field, 10, X_M[10] + 1.001 * reach, Y_M[ROW])
+    assert _seen(_field(_ridge(), shades=False), 10, X_M[10] + 1.001 * reach, Y_M[ROW])
+    for x, y in ((X_M[10] - 2, Y_M[ROW]), (X_M[10], Y_M[ROW] + 2), (X_M[10], Y_M[ROW])):
+        assert _seen(field, 10, x, y)  # other directions
+    for angle in np.linspace(0, 2 * np.pi, 33):  # from the ridge itself
+        assert _seen(field, 40, X_M[40] + 3 * np.cos(angle), Y_M[ROW] + 3 * np.sin(angle))
+
+
+@pytest.mark.parametrize("slope", [0.0, 1.0, -1.0])
+def test_plane_does_not_shade_its_lit_side(slope: float) -> None:
+    columns, rows = np.meshgrid(X_M - X_M[32], Y_M - Y_M[32])
+    field = _field(0.4 + slope * (columns + 0.5 * rows))
+    for row, column in [(0, 0), (32, 32), (63, 10)]:
+        for angle in np.linspace(0, 2 * np.pi, 33):
+            dx, dy = np.cos(angle), np.sin(angle)
+            lit = slope * (dx + 0.5 * dy) * 10 + field.depth_m[row, column] > 0
+            assert _seen(field, column, X_M[column] + 10 * dx, Y_M[row] + 10 * dy, row) or not lit
+
+
+def test_background_neither_shades_nor_ends_the_walk() -> None:
+    depth, far = _ridge(), X_M[10] + 3
+    depth[:, 11:40] = np.nan
+    assert not _seen(_field(depth), 10, far, Y_M[ROW])
+    depth[:, 40] = np.nan
+    assert _seen(_field(depth), 10, far, Y_M[ROW])
+
+
+def test_segment_is_blocked_by_what_stands_between() -> None:
+    field = _field(_ridge())
+    assert between(field, ROW, 10, 0.35, ROW, 60, 0.35)
+    assert not between(field, ROW, 10, 0.35, ROW, 30, 0.35)
+    assert not between(field, ROW, 10, 0.35, 10, 10, 0.35)
+    assert not between(field, ROW, 10, 0.35, ROW, 40, 0.15)
+    for one, other in ((10, 60), (60, 10), (10, 39)):
+        assert between(field, ROW, one, 0.35, 40, other, 0.35) == between(field, 40, other, 0.35, ROW, one, 0.35)
+
+
+@pytest.mark.parametrize("sectors", [1, 8, 13])
+@pytest.mark.parametrize("seed", [0, 5])
+def test_horizon_table_bounds_the_walk_on_every_leg(seed: int, sectors: int) -> None:
+    field = _field(object_depth(seed, BOX)[1])
+    rows, columns = np.nonzero(~np.isnan(field.depth_m))
+    rows, columns = rows[::40], columns[::40]
+    z = field.depth_m[rows, columns]
+    low, high = horizon_table(field, rows, columns, z, np.full(len(rows), 400.0), sectors)
+    assert low.shape == high.shape == (len(rows), FACES * sectors)
+    generator, sure = np.random.default_rng(seed), 0
+    for s, row in enumerate(rows):
+        for u, v in generator.uniform(-300, 300, (60, 2)):
+            along = abs(u) >= abs(v)
+            major, minor = (u, v) if along else (v, u)
+            face = (0 if along else 2) + (0 if major >= 0 else 1)
+            k = face * sectors + min(int((minor / abs(major) + 1) * sectors / 2), sectors - 1)
+            shaded = blocked(field, row, columns[s], z[s], u, v)
+            if z[s] >= abs(major) * high[s, k]:
+                assert not shaded
+                sure += 1
+            elif z[s] < abs(major) * low[s, k]:
+                assert shaded
+                sure += 1
+    assert sure > 0
+
+
+PAPER = load_rig("paper-rig")
+OPEN = load_rig("bare-wall").model_copy(update={"object_box": PAPER.object_box})
+COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
+UNIT_BOX = ObjectBox(x_min_m=0, x_max_m=1, y_min_m=0, y_max_m=1, z_near_m=0.1, z_far_m=1)
+
+
+def _hit(depth: np.ndarray, start: list[float], towards: list[float]) -> tuple[float, float, int, int]:
+    ray = np.array(towards) - start
+    length = float(np.linalg.norm(ray))
+    slope = np.zeros((2, *depth.shape))
+    found = first_hits(
+        height_field(depth, UNIT_BOX, shades=True), slope, np.array(start), ray[None] / length, np.array([length])
+    )
+    return float(found[0][0]) / length, float(found[1][0]), int(found[2][0]), int(found[3][0])
+
+
+def test_first_hits_meet_a_column_by_its_front_or_side() -> None:
+    depth = np.full((4, 4), np.nan)
+    depth[1, 2] = 0.5  # x in 0.5 to 0.75, y in 0.5 to 0.75
+    share, cosine, row, column = _hit(depth, [0.6, 0.6, 0.0], [0.6, 0.6, 1.0])
+    assert (share, cosine, row, column) == pytest.approx((0.5, 1.0, 1, 2))
+    share, cosine, row, column = _hit(depth, [0.0, 0.6, 0.8], [1.0, 0.6, 0.8])
+    assert (share, cosine, row, column) == pytest.approx((0.5, 1.0, 1, 2))
+    assert _hit(depth, [0.0, 0.6, 0.3], [1.0, 0.6, 0.3])[0] == np.inf  # between the object and the wall
+    assert _hit(depth, [0.0, 0.2, 0.8], [1.0, 0.2, 0.8])[0] == np.inf  # past it
+    assert _hit(depth, [0.0, 0.6, 0.8], [0.4, 0.6, 0.8])[0] == np.inf  # not so far
+
+
+def test_sight_is_empty_in_the_paper_rig_and_refused_inside() -> None:
+    assert SceneFacts(Scene(PAPER, np.full((8, 8), 0.12, np.float32)), COARSE).sight is None
+    box = ObjectBox(x_min_m=-0.1, x_max_m=0.1, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.05, z_far_m=0.4)
+    around = OPEN.model_copy(update={"object_box": box})
+    with pytest.raises(SceneError, match=r"0\.2 m"):
+        _ = SceneFacts(Scene(around, np.full((8, 8), 0.1, np.float32)), COARSE).sight
+
+
+def test_sight_stops_beams_and_hides_relay_cells() -> None:
+    depth = np.full((8, 8), 0.06, np.float32)
+    stage = SceneFacts(Scene(OPEN, depth, Surface(0.5)), COARSE)
+    sight, beams = stage.sight, stage.beams()
+    assert sight is not None
+    assert sight.beam.size
+    assert sight.hidden.any()
+    free = np.nan_to_num(beams.length_m[sight.beam], nan=np.inf)
+    assert (sight.length_m < free).all()
+    point = beams.lidar_m + sight.length_m[:, None] * beams.direction[sight.beam]
+    assert (point[:, 2] >= 0.06 - 1e-9).all()
+    assert (stage.relay.x_m[sight.hidden] > 0.3).all()
+    ready = Prepared.of(stage.scene, COARSE, "auto")
+    np.testing.assert_allclose(ready.beams.length_m[sight.beam], sight.length_m)
+    assert not ready.beams.on_wall[sight.beam].any()
+    assert len(ready.relay.x_m) == (~sight.hidden).sum()
+    white = Prepared.of(Scene(OPEN, depth), COARSE, "auto").beams.direct[sight.beam]
+    np.testing.assert_allclose(ready.beams.direct[sight.beam], 0.5 * white)
+
+
+UP, DOWN = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def job() -> TransportJob:
+    at = np.linspace(-1, 1, 6)
+    depth = (0.2 - 0.06 * (at[:, None] ** 2 + at**2)).astype(np.float32)
+    scene = Scene(RIG, depth, radiometry="lambertian", jump_m=0.5)
+    job = Prepared.of(scene, Accuracy("coarse", 8, 6), ["three-bounce", "tilt", "inter-reflection"]).job()
+    assert job is not None
+    return job
+
+
+@pytest.mark.parametrize("lambertian", [True, False])
+def test_form_factor_of_two_squares_follows_s2(lambertian: bool) -> None:
+    a, b = np.zeros(3), np.array([0.3, 0.0, 0.4])
+    found = form_factor(a, UP, b, DOWN, 1e-4, 1.0, 0.1, lambertian)
+    expected = 1e-4 * 0.8 / 0.25 / ((np.pi / 0.8) if lambertian else 2 * np.pi)
+    assert found == pytest.approx(expected)
+    for back in ((a, DOWN, b, DOWN), (a, UP, b, UP)):
+        assert form_factor(*back, 1e-4, 1.0, 0.1, lambertian) == 0
+
+
+def test_patch_to_patch_is_reciprocal_and_loses_energy(job: TransportJob) -> None:
+    p = job.patches
+    surface = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
+    table = patch_to_patch(*surface, job.field, 1e-9, True)  # beyond near contact
+    assert (table > 0).any()
+    assert not np.diag(table).any()
+    given = table / job.strength
+    np.testing.assert_allclose(given, given.T, atol=1e-9 * given.max())
+    near = patch_to_patch(*surface, job.field, job.near_m, True)
+    assert near.sum(1).max() <= 1
+
+
+def test_wall_factors_sum_to_at_most_1(job: TransportJob) -> None:
+    cells = wall_cells(job)
+    assert len(cells) == WALL_CELLS**2
+    extent = np.ptp(cells[:, :2], axis=0) * WALL_CELLS / (WALL_CELLS - 1)
+    assert wall_cell_m2(job) * len(cells) == pytest.approx(extent.prod())
+    there, back = wall_factors(job, cells)
+    assert 0.5 < there.sum(1).max() <= 1
+    assert back.sum(0).max() <= 1
+
+
+SOME = np.arange(5120)[::151]
+MORE = ["three-bounce", "occluder", "tilt", "self-occlusion", "inter-reflection"]
+
+
+def test_brute_force_refuses_too_many_interreflections() -> None:
+    scene = Scene(RIG, np.full((32, 32), 0.2, np.float32), radiometry="lambertian")
+    with pytest.raises(SceneError, match="inter-reflection"):
+        three_bounce(scene, Accuracy("own", 3, 3, sub_bins=0), effects=MORE, chosen=SOME)
