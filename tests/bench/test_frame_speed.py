@@ -46,7 +46,9 @@ def bench(seen: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Calibr
 
 @pytest.mark.bench
 @pytest.mark.parametrize("part", ["maps", "bench", "both", "both, 100 averaged"])
-def test_a_frame(benchmark: BenchmarkFixture, seen: list[Frame], bench: CalibratedRig, part: str) -> None:
+def test_frame_up_to_its_difference_maps(
+    benchmark: BenchmarkFixture, seen: list[Frame], bench: CalibratedRig, part: str
+) -> None:
     turn, mean = iter(range(10**9)), MapMean(100 if "averaged" in part else 1)
     maps = [maps_from_frame(frame) for frame in seen]
 

@@ -9,7 +9,7 @@ from nlos_cam.render.scene_file import paper_scene
 
 @pytest.mark.bench
 @pytest.mark.parametrize("stop", ["draft", "standard", "fine"])
-def test_a_stop_of_the_dial(benchmark: BenchmarkFixture, stop: str) -> None:
+def test_render_at_an_accuracy(benchmark: BenchmarkFixture, stop: str) -> None:
     scene = paper_scene().scene_at(0)
     render(scene, stop)  # compiles
     rendering = benchmark(render, scene, stop)

@@ -1,145 +1,58 @@
-"""Each panel of the view in a headless Chromium, which is shown moments that were made up, one change at a time."""
+"""The view's page in a headless Chromium, with made-up moments."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from browser_page import Feed, Page, Pixels, Region, share_changed, share_like, share_unlike
-from made_up_moments import NOTHING, RIG, bump, full_moment
+from browser_page import DEADLINE_S, Page
+from made_up_moments import RIG, full_moment
 from measured_walls import exact_wall
 
 from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.view.images import LOOKS
 from nlos_cam.view.rrd_file import RrdFile
-from nlos_cam.view.viewer import Moment
 from nlos_cam.view.web import RecordedView, WebViewer
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(6 * DEADLINE_S)]
 
-PAGE_RGB = (13, 16, 17)
-BANNER: Region = slice(2, 90), slice(2, 740)
-RECONSTRUCTION: Region = slice(125, 475), slice(5, 370)
-UNCERTAINTY: Region = slice(125, 475), slice(378, 740)
-BENCH: Region = slice(35, 475), slice(755, 1275)
-TRUTH: Region = slice(512, 795), slice(5, 240)
-DEPTH: Region = slice(512, 795), slice(248, 575)
-LIGHT: Region = slice(512, 795), slice(584, 910)
-PLOTS: Region = slice(512, 795), slice(920, 1275)
-TIME: Region = slice(772, 800), slice(0, 1280)
-SLIDER_PX = 300, 1050
-"""From where to where a recording's time is dragged; its ends are a little beyond."""
-LEAST = 0.01
-"""The share of a panel that another moment changes."""
-SCENE = full_moment(0, size=(96, 128))
+VIEWS = {"Truth (simulated)", "Verdict", "Bench", "Depth"}
+PATHS = {"verdict", "reconstruction", "uncertainty", "truth", "latency", "drops", "physics/score", "bench/hidden"}
+WALL_PATHS = {"calibration", "lidar/difference", "bench/measured/footprint", "wall/residual"}
+LEFT_PX, RIGHT_PX, SLIDER_PX = 300, 1050, 786
+"""Left and right end of a recording's time on the page, and their distance from its top."""
 
 
-def still(number: int) -> Moment:
-    """A scene in which nothing moves but time."""
-    frame = replace(SCENE.frame, frame_number=number, timestamp_s=number / 4)
-    return replace(SCENE, frame=frame, published_s=number / 4)
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_page_shows_every_view_and_each_new_moment(browser: Any, calibrated: bool) -> None:
+    paths = {f"/{path}" for path in PATHS | (WALL_PATHS if calibrated else set())}
+    with WebViewer(RIG, exact_wall() if calibrated else None) as viewer:
+        for first in (0, 10):  # the page is opened again
+            viewer.show(full_moment(first))
+            page = Page(browser, viewer.address or "")
+            page.wait_until(lambda page=page: paths <= set(page.frames()), "all of a moment has arrived")
+            page.wait_until(lambda page=page: set(page.views()) >= VIEWS, "the layout is there")
+            last = first + 5
+            viewer.show(full_moment(last, Verdict.OUTSIDE))
+            for path in ("/verdict", "/reconstruction", "/latency"):
+                arrived = lambda page=page, path=path, last=last: page.frames()[path] == last  # noqa: E731
+                page.wait_until(arrived, f"the next moment's {path}")
+            assert not page.has_panicked()
+            page.close()
 
 
-def changed(**fields: Any) -> Moment:
-    return replace(SCENE, **fields)
-
-
-def seen(**fields: Any) -> Moment:
-    return replace(SCENE, frame=replace(SCENE.frame, **fields))
-
-
-CELLS = np.full((64, 64), 0.001, np.float32)
-CHANGES: dict[str, tuple[Moment, list[Region]]] = {
-    "verdict": (changed(verdict=Verdict.OUTSIDE), [BANNER, RECONSTRUCTION, BENCH]),
-    "hidden": (
-        changed(reconstruction=replace(SCENE.reconstruction, depth_m=bump(20))),
-        [RECONSTRUCTION, UNCERTAINTY, BENCH],
-    ),
-    "uncertainty": (changed(reconstruction=replace(SCENE.reconstruction, uncertainty_m=CELLS)), [UNCERTAINTY]),
-    "truth": (seen(truth_depth_m=NOTHING), [TRUTH]),
-    "depth": (seen(depth_m=SCENE.frame.depth_m[::-1] * np.float32(0.4)), [DEPTH]),
-    "infrared": (seen(ir=SCENE.frame.ir + 150), [LIGHT]),
-    "latency": (changed(latency_s=0.2), [PLOTS]),
-}
-
-
-def is_drawn(image: Pixels) -> bool:
-    """Whether every panel shows something."""
-    lit = (RECONSTRUCTION, UNCERTAINTY, BENCH, TRUTH, DEPTH, LIGHT, PLOTS)
-    green = share_like(image[BANNER], LOOKS[Verdict.SEEN].rgb) > 0.01
-    return green and all(share_unlike(image[region], PAGE_RGB) > 0.005 for region in lit)
-
-
-def differs(before: Pixels, regions: list[Region], now: Pixels) -> bool:
-    """Whether all of these look different."""
-    return all(share_changed(before, now, region) > LEAST / 4 for region in regions)
-
-
-def is_alike(before: Pixels, regions: list[Region], now: Pixels) -> bool:
-    """Whether none of these look different."""
-    return not any(differs(before, [region], now) for region in regions)
-
-
-def at(moment: Moment, number: int) -> Moment:
-    frame = replace(moment.frame, frame_number=number, timestamp_s=number / 4)
-    return replace(moment, frame=frame, published_s=number / 4)
-
-
-def test_each_panel_changes_with_its_part_of_a_moment_and_a_page_opened_again_shows_it_all(browser: Any) -> None:
-    with WebViewer(RIG) as viewer, Feed(viewer, still) as feed:
-        page = Page(browser, viewer.address or "")
-        before = page.until(is_drawn, "every panel is drawn")
-        for what, (moment, regions) in CHANGES.items():
-            feed.make = partial(at, moment)
-            page.until(partial(differs, before, regions), f"{what} is seen")
-            feed.make = still
-            if PLOTS not in regions:  # which remember
-                page.until(partial(is_alike, before, regions), "it is as before")
-        for panel, tabs in ((DEPTH, 2), (LIGHT, 2), (PLOTS, 4)):
-            for tab in range(1, tabs):
-                page.open_tab(tab, panel, before)
-                page.until(partial(differs, before, [panel]), f"tab {tab} is open")
-        page.close()
-        page = Page(browser, viewer.address or "")
-        page.until(is_drawn, "every panel is drawn again")
-        page.close()
-
-
-def test_the_calibrated_view_shows_what_changed_and_the_calibration(browser: Any) -> None:
-    with WebViewer(RIG, exact_wall()) as viewer, Feed(viewer, still) as feed:
-        page = Page(browser, viewer.address or "")
-        before = page.until(is_drawn, "every panel is drawn")
-        wide = np.full((64, 80), -0.02, np.float32)
-        nearer = replace(SCENE, difference=replace(SCENE.difference, depth_m=wide), warnings=("the lidar has moved",))
-        feed.make = lambda number: at(nearer, number)
-        page.until(
-            lambda now: share_changed(before, now, LIGHT) > 0.2 and share_changed(before, now, PLOTS) > 0.002,
-            "the change and the warning",
-        )
-        closed = before
-        for tab in (1, 2, 3):
-            before = page.look()
-            page.open_tab(tab, BENCH, closed)
-            page.until(
-                lambda now, before=before: share_changed(before, now, BENCH) > 0.05, f"picture {tab} of the wall"
-            )
-        page.close()
-
-
-def test_a_saved_view_is_gone_through_by_its_time(browser: Any, tmp_path: Path) -> None:
-    """Ten minutes, of which the second half is doubted: playing alone would take five to get there."""
+def test_page_of_a_saved_view_goes_to_the_time_that_is_clicked(browser: Any, tmp_path: Path) -> None:
     with RrdFile(tmp_path / "view.rrd", RIG, keeps_all=True) as saved:
         for number in range(60):
-            verdict = Verdict.SEEN if number < 30 else Verdict.OUTSIDE
-            saved.show(replace(full_moment(number, verdict), published_s=10.0 * number))
+            saved.show(replace(full_moment(number), published_s=10.0 * number))
     with RecordedView(tmp_path / "view.rrd") as view:
         page = Page(browser, view.address or "")
-        page.until(lambda now: share_like(now[BANNER], LOOKS[Verdict.SEEN].rgb) > 0.01, "the beginning")
-        assert share_unlike(page.look()[TIME], PAGE_RGB) > 0.005, "the panel of time is there"
-        start, stop = SLIDER_PX
-        for share, verdict in ((0.9, Verdict.OUTSIDE), (0.2, Verdict.SEEN)):
-            page.click(start + share * (stop - start), 786)
-            page.until(lambda now, verdict=verdict: share_like(now[BANNER], LOOKS[verdict].rgb) > 0.01, f"{verdict}")
+        page.wait_until(lambda: page.frames().get("/reconstruction") == 59, "the whole recording")
+        page.wait_until(lambda: set(page.views()) >= VIEWS, "the layout is there")
+        for low_s, share, high_s in ((450.0, 0.9, 590.0), (50.0, 0.2, 200.0)):
+
+            def is_there(low_s: float = low_s, share: float = share, high_s: float = high_s) -> bool:
+                page.page.mouse.click(LEFT_PX + share * (RIGHT_PX - LEFT_PX), SLIDER_PX)
+                return low_s < page.cursor_s() < high_s
+
+            page.wait_until(is_there, f"a time after {low_s} s is shown")
         page.close()

@@ -1,4 +1,4 @@
-"""Some live runs interrupted at random moments; tools/robustness/interrupt_live.py does the same fifty times."""
+"""Live runs interrupted at random moments; tools/interrupt_live.py does the same fifty times."""
 
 import importlib
 from pathlib import Path
@@ -8,10 +8,11 @@ import pytest
 
 pytestmark = [
     pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="lists processes as Linux does"),
+    pytest.mark.slow,
     pytest.mark.timeout(900),
 ]
 EARLY_S, LATE_S = 0.5, 8.0
-"""After its code began: while it starts, and mostly while it runs."""
+"""Seconds after its code began: while it starts, and mostly while it runs."""
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +31,7 @@ def tool() -> ModuleType:
         ("unplugged, then ctrl-c", LATE_S, False),
     ],
 )
-def test_nothing_is_left_and_nothing_is_half_written(
+def test_interrupted_live_leaves_no_process_or_partial_file(
     tool: ModuleType, tmp_path: Path, kind: str, after_s: float, view: bool
 ) -> None:
     outcome = tool.interrupt(tool.Plan(0, kind, after_s, 5, view), tmp_path)

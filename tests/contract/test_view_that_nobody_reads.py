@@ -1,7 +1,7 @@
-"""The live loop with a browser that asks for the stream and then takes nothing of it: frames go on meanwhile."""
+"""The live loop with a browser that asks for the stream and then reads nothing of it."""
 
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from threading import Event
 from typing import Any
 from urllib.parse import urlsplit
@@ -9,12 +9,12 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
+from small_frames import FrameCamera, sheet_network
 
 from nlos_cam.frames import Frame
 from nlos_cam.live.loop import run_live
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import Pipeline
-from nlos_cam.view import web
 from nlos_cam.view.server import Send
 from nlos_cam.view.web import WebViewer
 
@@ -25,7 +25,7 @@ PATIENCE = 100_000
 
 
 class Noted(WebViewer):
-    """Counts the pieces of its streams that a browser was given, and those that it took."""
+    """Viewer that counts the pieces of its streams that a browser was given, and those that it took."""
 
     given = taken = 0
 
@@ -38,21 +38,14 @@ class Noted(WebViewer):
         super()._stream(noting)
 
 
-class Camera:
-    """Gives frames of noise until a browser has kept a piece of the stream waiting for so many of them."""
+class Camera(FrameCamera):
+    """Camera of noise that ends once a browser has kept a piece of the stream waiting for MEANWHILE frames."""
 
-    uri, intrinsics, incomplete, dropped = "fake", RIG.pinhole, 0, 0
+    intrinsics = RIG.pinhole
 
     def __init__(self, viewer: Noted) -> None:
-        self.counts: Any = {}
-        self._viewer = viewer
-        self.kept_waiting = 0
-
-    def telemetry(self, _: str = "") -> Mapping[str, float]:
-        return {}
-
-    def __exit__(self, *_: object) -> None:
-        pass
+        super().__init__(None)
+        self._viewer, self.kept_waiting = viewer, 0
 
     def __iter__(self) -> Iterator[Frame]:
         generator, waited_for = np.random.default_rng(0), -1
@@ -67,17 +60,17 @@ class Camera:
             yield Frame(noise_m, ir, ir, number / 1000, number, RIG.pinhole)
 
 
-def test_the_loop_never_waits_for_a_browser_that_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web, "page_assets", dict)
-    monkeypatch.setattr(web, "DRAW_PERIOD_S", 0.0)
+@pytest.mark.slow
+def test_live_loop_never_waits_for_a_browser_that_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.view.web.page_assets", dict)
+    monkeypatch.setattr("nlos_cam.view.web.DRAW_PERIOD_S", 0.0)
     with Noted(RIG) as viewer, socket.socket() as deaf:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         place = urlsplit(viewer.address or "")
         deaf.connect((place.hostname, place.port))
         deaf.sendall(b"GET /live.rrd HTTP/1.0\r\nHost: localhost\r\n\r\n")
         camera: Any = Camera(viewer)
-        method = Pipeline(CalibratedRig(RIG), lambda *_: np.full((1, 64, 64), 0.5, np.float32))
-        report = run_live(camera, method, viewer, stop=Event(), recorded=True)
+        report = run_live(camera, Pipeline(CalibratedRig(RIG), sheet_network), viewer, stop=Event(), recorded=True)
     assert camera.kept_waiting == MEANWHILE
     assert report.frames > MEANWHILE
     assert report.dropped == 0

@@ -1,12 +1,11 @@
 """Moments of a run that never was, with everything in them that a view can show."""
 
-from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from nlos_calibration.rig import load_rig
+from small_frames import FrameCamera
 
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.objects.depth_map import object_box
@@ -58,23 +57,12 @@ def full_moment(number: int, verdict: Verdict = Verdict.SEEN, size: tuple[int, i
     )
 
 
-class Recorded:
-    """A recording of so many frames of theirs."""
+class Recorded(FrameCamera):
+    """Recording of `count` frames of full moments, at 41 degrees."""
 
     def __init__(self, count: int) -> None:
-        self.uri, self.rig, self.identity = "bag:fake.bag", None, {"serial": ""}
-        self.intrinsics, self.incomplete, self.dropped = full_moment(0).frame.intrinsics, 0, 0
-        self.counts: Counter[str] = Counter()
-        self._count = count
+        super().__init__(count, make=lambda number: full_moment(number).frame)
+        self.intrinsics = full_moment(0).frame.intrinsics
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (full_moment(number).frame for number in range(self._count))
-
-    def telemetry(self, *_: str) -> dict[str, float]:
+    def telemetry(self, _: str = "") -> dict[str, float]:
         return {"ldd_temperature": 41.0}

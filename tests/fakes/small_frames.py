@@ -1,0 +1,59 @@
+"""Small frames, a camera that yields them and a network that sees the same in all of them."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from threading import Event
+from typing import Self
+
+import numpy as np
+from fake_wall import SERIAL, SMALL
+
+from nlos_cam.frames import Frame
+from nlos_cam.reconstruct.network import Reconstruction
+
+NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})
+
+
+def sheet_network(*_: np.ndarray) -> np.ndarray:
+    """Reconstruct a flat sheet from any maps."""
+    return np.full((1, 64, 64), 0.5, np.float32)
+
+
+def small_frame(number: int, offset_s: float = 0.0) -> Frame:
+    """Make frame `number` of 30 a second, at constant depth; its timestamp starts at `offset_s`."""
+    depth_m, ir = np.full((64, 80), 0.3, np.float32), np.full((64, 80), 9, np.uint8)
+    return Frame(depth_m, ir, ir, offset_s + number / 30, number, SMALL)
+
+
+class FrameCamera:
+    """Camera of `count` frames (None: no end); calls `on_frame` before each, and sets `closed` when it is closed."""
+
+    intrinsics, rig, incomplete, dropped = SMALL, None, 0, 0
+
+    def __init__(
+        self,
+        count: int | None,
+        on_frame: Callable[[int], object] = lambda _: None,
+        *,
+        make: Callable[[int], Frame] = small_frame,
+        uri: str = "bag:fake.bag",
+    ) -> None:
+        self.uri, self.identity, self.counts = uri, {"serial": SERIAL}, Counter[str]()
+        self.closed = Event()
+        self._count, self._on_frame, self._make = count, on_frame, make
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.closed.set()
+
+    def telemetry(self, _: str = "") -> Mapping[str, float]:
+        return {}
+
+    def __iter__(self) -> Iterator[Frame]:
+        number = 0
+        while self._count is None or number < self._count:
+            self._on_frame(number)
+            yield self._make(number)
+            number += 1

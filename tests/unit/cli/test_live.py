@@ -1,0 +1,284 @@
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_doubter import FakeDoubter
+from fake_wall import RIG, WallCamera, bare_wall, wall_frame, write_wall
+from small_frames import FrameCamera, small_frame
+
+from nlos_cam.cli.live import told as summary_of
+from nlos_cam.cli.main import main
+from nlos_cam.live.statistics import RunReport
+from nlos_cam.reconstruct.verdict import Verdict
+
+TIMES = {"p50": 1.04, "p95": 2.0, "p99": 3.06}
+RECORDED, REPLAY = ["live", "--camera", "bag:fake", "--no-view"], ["replay", "run.bag", "--out", "out"]
+WALLED = [*REPLAY, "--overwrite", "--wall"]
+
+
+class FakeNetwork:
+    """Network that shows a sheet, and keeps the depth maps that it is given."""
+
+    runtime = "nothing at all"
+
+    def __init__(self) -> None:
+        self.given: list[np.ndarray] = []
+        self.record = SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
+
+    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+        assert depth_m.shape == intensity.shape == (len(depth_m), 64, 80)
+        self.given.extend(depth_m)
+        return np.full((len(depth_m), 64, 64), 0.5, np.float32)
+
+
+class Opened:
+    """How cameras were opened: `camera`, or one of `count` frames that calls `on_frame` before each."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, dict[str, Any]]] = []
+        self.on_frame: Callable[[int], object] = lambda _: None
+        self.on_open: Callable[[], None] = lambda: None
+        self.count: int | None = 20
+        self.camera: WallCamera | None = None
+        self.network, self.doubter = FakeNetwork(), FakeDoubter()
+
+    def __call__(self, uri: str, **options: Any) -> FrameCamera | WallCamera:
+        self.calls.append((uri, options))
+        self.on_open()
+        made: Any = {"uri": uri, "make": lambda number: replace(small_frame(number), timestamp_s=number / 1000)}
+        return self.camera or FrameCamera(self.count, self.on_frame, **made)
+
+    def interrupt_at(self, number: int) -> None:
+        """Press Ctrl-C at frame `number` of a camera that has no end."""
+        self.count = None
+        self.on_frame = lambda wanted: wanted == number and os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Opened]:
+    opened = Opened()
+    monkeypatch.setattr("nlos_cam.cli.live.open_camera", opened)
+    monkeypatch.setattr("nlos_cam.cli.live.load_networks", lambda *_: opened.network)
+    monkeypatch.setattr("nlos_cam.cli.live.load_doubt", lambda *_: opened.doubter)
+    monkeypatch.setattr("nlos_cam.live.replay.draw_sheet", lambda path, *_: path.touch())  # takes a second
+    monkeypatch.chdir(tmp_path)
+    before = signal.getsignal(signal.SIGINT)
+    yield opened
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+@pytest.fixture
+def walled(opened: Opened, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Opened:
+    """A camera on a measured wall, wall.toml, that is moved for a while."""
+    monkeypatch.setattr("nlos_cam.reconstruct.pipeline.os.cpu_count", lambda: 1)  # the network is given maps in order
+    write_wall(tmp_path / "wall.toml", bare_wall())
+    opened.camera, opened.doubter = WallCamera(100, moved=range(30, 60)), None
+    return opened
+
+
+Run = Callable[..., tuple[int, dict[str, Any], str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Exit code of a command with --json, the object that ends stdout, and stderr on one line."""
+
+    def run(*arguments: str) -> tuple[int, dict[str, Any], str]:
+        capsys.readouterr()
+        code = main([*arguments, "--json"])
+        captured = capsys.readouterr()
+        lines = captured.out.splitlines() or ["{}"]
+        return code, json.loads(lines[-1]), captured.err.replace("\n", " ")
+
+    return run
+
+
+@pytest.mark.usefixtures("opened")
+def test_live_json_has_the_fields_that_scripts_depend_on(run: Run) -> None:
+    code, report, _ = run(*RECORDED)
+    assert code == 0
+    fields = ("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings")
+    assert set(report) == {*fields, "stages_percentiles_ms", "verdicts", "stalled_s"}
+    assert (report["frames"], report["dropped"]) == (20, 0)
+    assert report["verdicts"] == {Verdict.SEEN.value: 20}
+    assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
+    assert set(report["stages_ms"]) == {"delivery", "wait", "queue", "maps", "bench", "network", "doubt", "view"}
+
+
+def test_live_does_not_wait_for_a_live_camera(opened: Opened, run: Run) -> None:
+    code, report, _ = run("live", "--camera", "sim", "--no-view")
+    assert (code, report["frames"] + report["dropped"]) == (0, 20)
+    assert [uri for uri, _ in opened.calls] == ["sim"]
+
+
+def test_interrupted_live_reports_and_exits_130(opened: Opened, run: Run) -> None:
+    opened.interrupt_at(10)
+    code, report, _ = run(*RECORDED)
+    assert code == 130
+    assert "frames" in report
+
+
+def test_live_ends_after_its_seconds(opened: Opened, run: Run) -> None:
+    opened.on_frame = lambda number: threading.Event().wait(0.05 if number else 0.0)
+    code, report, _ = run("live", "--camera", "sim", "--no-view", "--seconds", "0.2")
+    assert code == 0
+    assert report["frames"] < 20
+
+
+@pytest.mark.usefixtures("opened")
+def test_live_prints_the_address_of_its_view(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+    monkeypatch.setattr("nlos_cam.view.web.page_assets", dict)
+    code, _, printed = run("live", "--camera", "bag:fake")
+    assert code == 0
+    assert "http://127.0.0.1:" in printed
+
+
+def test_live_record_overwrites_only_when_asked(opened: Opened, tmp_path: Path, run: Run) -> None:
+    bag = tmp_path / "run.bag"
+    arguments = ["live", "--camera", "sim", "--no-view", "--record", str(bag)]
+    assert run(*arguments)[0] == 0
+    assert opened.calls[-1][1]["recording"].path == bag
+    bag.write_text("mine")
+    code, refused, _ = run(*arguments)
+    assert (code, refused["error"]["type"]) == (1, "OutputExistsError")
+    assert run(*arguments, "--overwrite")[0] == 0
+
+
+@pytest.mark.usefixtures("opened")
+def test_replay_on_a_wall_notes_that_the_rig_differs(tmp_path: Path, run: Run) -> None:
+    write_wall(tmp_path / "wall.toml")
+    code, _, printed = run(*WALLED, "wall.toml")
+    assert code == 0
+    assert "rig of the networks" in printed
+    with np.load(tmp_path / "out" / "reconstruction.npz") as file:
+        assert str(file["rig_name"]) == "measured"
+    code, refused, _ = run(*WALLED, "none.toml")
+    assert (code, refused["error"]["type"]) == (4, "RecordFileError")
+
+
+def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) -> None:
+    code, report, printed = run(*REPLAY)
+    assert code == 0
+    assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts"}
+    assert (report["frames"], report["out"]) == (20, "out")
+    assert "another" not in printed
+    assert opened.calls == [("bag:run.bag", {"reader": "plain"})]
+    assert run(*REPLAY)[0] == 1
+    assert run(*REPLAY, "--overwrite")[0] == 0
+
+
+def test_interrupted_replay_keeps_its_results(opened: Opened, run: Run) -> None:
+    opened.interrupt_at(10)
+    code, report, _ = run(*REPLAY)
+    assert code == 130
+    with np.load("out/reconstruction.npz") as file:
+        assert len(file["depth_m"]) == report["frames"]
+
+
+def test_replay_uses_the_reader_that_is_asked_for(opened: Opened) -> None:
+    assert main([*REPLAY, "--reader", "sdk"]) == 0
+    assert opened.calls == [("bag:run.bag", {"reader": "sdk"})]
+    assert main(["replay", "run.bag", "--reader", "quick"]) == 2
+
+
+@pytest.mark.usefixtures("opened")
+@pytest.mark.parametrize("option", ["--record", "--log", "--save-view"])
+def test_live_refuses_outputs_with_another_suffix(option: str) -> None:
+    assert main([*RECORDED, option, "run.txt"]) == 2
+
+
+@pytest.mark.usefixtures("opened")
+def test_live_log_has_a_line_for_each_frame(run: Run) -> None:
+    arguments = [*RECORDED, "--log", "log.csv"]
+    code, report, _ = run(*arguments)
+    assert code == 0
+    header, *lines = Path("log.csv").read_text(encoding="utf-8").splitlines()
+    assert [int(line.split(",")[0]) for line in lines] == list(range(report["frames"]))
+    assert {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"} <= set(header.split(","))
+    assert run(*arguments)[0] == 1
+
+
+@pytest.mark.parametrize("command", [("live", "--no-view", "--camera", "sim"), ("replay", "a.bag")])
+def test_interrupt_while_a_camera_opens_begins_no_run(opened: Opened, run: Run, command: tuple[str, ...]) -> None:
+    def swallow() -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    opened.on_open = swallow
+    assert run(*command)[:2] == (130, {})
+
+
+def test_live_budget_reports_whether_it_was_kept(opened: Opened, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.cli.live.loader", lambda _: lambda _: opened.network)
+    arguments = [*RECORDED, "--budget-ms", "100000"]
+    code, report, printed = run(*arguments)
+    assert code == 0
+    assert report["budget"]["kept"]
+    assert "100000 ms" in printed
+    assert main([*arguments, "--average", "4"]) == 2
+    assert len(opened.calls) == 1
+
+
+@pytest.mark.usefixtures("walled")
+@pytest.mark.parametrize("command", [["live", "--camera", "sim", "--no-view"], REPLAY])
+def test_command_prints_begin_and_end_of_a_warning_once(
+    run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    monkeypatch.setattr("nlos_cam.live.frame_queue.QUEUE_FRAMES", 1000)
+    code, report, printed = run(*command, "--wall", "wall.toml")
+    assert code == 0
+    [(warning, frames)] = report["warnings"].items()
+    assert 0 < frames < 100
+    assert printed.count("drifted") == 2
+    assert printed.count(warning) >= 1
+
+
+@pytest.mark.usefixtures("walled")
+@pytest.mark.slow
+def test_live_summary_counts_frames_and_warnings(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["live", "--camera", "bag:a.bag", "--no-view", "--wall", "wall.toml"]) == 0
+    printed = capsys.readouterr().out
+    assert "100 frames" in printed
+    assert "drifted" in printed
+
+
+def test_average_is_over_as_many_frames_as_asked(walled: Opened) -> None:
+    walled.camera = WallCamera(26)
+    assert main([*WALLED, "wall.toml", "--average", "20"]) == 0
+    mean_m = np.mean([wall_frame(number).depth_m for number in range(6, 26)], axis=0)
+    np.testing.assert_allclose(walled.network.given[25], mean_m, atol=1e-6)  # NaN where NaN
+    assert main([*WALLED, "wall.toml", "--average", "0"]) == 2
+
+
+def test_weights_of_difference_maps_need_a_wall(walled: Opened, run: Run) -> None:
+    walled.camera, walled.network.record.input = WallCamera(21), "difference maps"
+    assert run(*WALLED, "wall.toml")[0] == 0
+    assert abs(np.nanmean(walled.network.given[20])) < 1e-3
+    code, refused, _ = run("live", "--camera", "sim", "--no-view")
+    assert code == 1
+    assert "--wall" in refused["error"]["message"]
+
+
+def report(**others: object) -> RunReport:
+    stages = {"wait": TIMES, "delivery": TIMES, "network": TIMES}
+    given = {"stages_percentiles_ms": stages, **others}
+    return RunReport(10, 29.97, 2, {"p50": 9.0, "p95": 14.0, "p99": 21.0}, {}, {}, {}, **given)  # type: ignore[arg-type]
+
+
+def test_summary_names_stages_verdicts_and_stalls_if_any() -> None:
+    more = report(verdicts={"object seen": 7, "nothing there": 3}, stalled_s=1.25)
+    plain, full = (summary_of(each).splitlines() for each in (report(), more))
+    assert (len(plain), len(full)) == (3, 5)
+    for text in ("7 object seen", "3 nothing there", "1.2 s"):
+        assert any(text in line for line in full)
+    [line] = [line for line in plain if line.startswith("stages")]
+    assert line.index("delivery 1.0 3.1") < line.index("network 1.0 3.1") < line.index("wait 1.0 3.1")

@@ -1,0 +1,279 @@
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from itertools import count as count_up
+from itertools import pairwise
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_wall import SMALL, WallCamera, measured_wall
+from nlos_calibration.rig import load_rig
+from small_frames import FrameCamera, sheet_network, small_frame
+
+from nlos_cam.errors import CameraLostError, SceneError
+from nlos_cam.frames import Frame
+from nlos_cam.live.loop import in_words, paced, run_live, warm_up, watched
+from nlos_cam.live.statistics import OUTSIDE_LATENCY, STALLED, RunReport
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import Pipeline
+from nlos_cam.reconstruct.verdict import Verdict, frame_issues
+from nlos_cam.view.viewer import Moment, NullViewer
+
+RIG = load_rig("paper-rig")
+PERIOD_S = 1 / 30
+
+
+def pipeline(network: Callable[..., np.ndarray] = sheet_network) -> Pipeline:
+    return Pipeline(CalibratedRig(RIG), network)
+
+
+def test_paced_yields_frames_at_their_timestamps() -> None:
+    waits_s, now_s = [], [100.0]
+
+    class Waits(Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            waits_s.append(timeout)
+            now_s[0] += timeout or 0.0
+            return self.is_set()
+
+    stop, given = Waits(), []
+    for each in paced(map(small_frame, (0, 1, 4, 2)), stop, lambda: now_s[0]):
+        given.append(each.frame_number)
+        now_s[0] += 0.01
+    assert given == [0, 1, 4, 2]
+    assert waits_s == pytest.approx([0.0, PERIOD_S - 0.01, 3 * PERIOD_S - 0.01, 0.0])
+    stop.set()
+    assert list(paced([small_frame(0)], stop, lambda: 0.0)) == []
+
+
+class ListViewer(NullViewer):
+    def __init__(self) -> None:
+        self.moments: list[Moment] = []
+
+    def show(self, moment: Moment) -> None:
+        self.moments.append(moment)
+
+
+class Lockstep(ListViewer):
+    """Viewer, camera and clock in one step: a frame arrives 5 ms after its timestamp, once the last was shown."""
+
+    def __init__(self, count: int, offset_s: float) -> None:
+        super().__init__()
+        self._now_s, self._shown = 0.0, threading.Semaphore(1)
+        self.camera = FrameCamera(count, self._on_frame, make=lambda number: small_frame(number, offset_s))
+
+    def _on_frame(self, number: int) -> None:
+        while not self._shown.acquire(timeout=0.05) and not self.camera.closed.is_set():
+            pass
+        self._now_s = number * PERIOD_S + 0.005
+
+    def clock(self) -> float:
+        return self._now_s
+
+    def show(self, moment: Moment) -> None:
+        super().show(moment)
+        self._shown.release()
+
+
+@pytest.mark.parametrize(("offset_s", "delivery_ms"), [(0.0, 5.0), (1e6, 0.0), (-1e6, 0.0)])
+def test_run_live_reports_latency_on_any_clock(offset_s: float, delivery_ms: float) -> None:
+    lockstep = Lockstep(31, offset_s)
+    report = run_live(lockstep.camera, pipeline(), lockstep, stop=Event(), clock=lockstep.clock)
+    assert report.frames == len(lockstep.moments) == 31
+    assert report.dropped == 0
+    assert set(report.stages_ms) == {"delivery", "wait", "queue", "maps", "bench", "network", "view"}
+    assert set(report.latency_ms) == {"p50", "p95", "p99"}
+    assert report.latency_ms["p50"] <= report.latency_ms["p95"] <= report.latency_ms["p99"]
+    assert {name: times["p50"] for name, times in report.stages_percentiles_ms.items()} == report.stages_ms
+    assert report.stages_ms["delivery"] == pytest.approx(delivery_ms, abs=1.0)
+    assert report.latency_ms["p50"] == pytest.approx(delivery_ms, abs=1.0)
+    assert report.fps == pytest.approx(30.0, rel=0.04)
+    for moment in lockstep.moments[-5:]:  # once the fastest delivery is known
+        parts_s = sum(seconds for stage, seconds in moment.stages_s.items() if stage not in OUTSIDE_LATENCY)
+        assert 0.0 <= parts_s <= moment.latency_s + 1e-6
+
+
+def test_run_live_shows_every_recorded_frame_in_order() -> None:
+    viewer = ListViewer()
+    run_live(FrameCamera(20), pipeline(), viewer, stop=Event(), recorded=True)
+    assert [moment.frame.frame_number for moment in viewer.moments] == list(range(20))
+    assert all(moment.latency_s >= 0.0 for moment in viewer.moments)
+
+
+def test_run_live_ends_after_the_given_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.live.frame_queue.LET_GO_AFTER_S", 0.01)
+    lockstep = Lockstep(1000, 0.0)
+    report = run_live(lockstep.camera, pipeline(), lockstep, stop=Event(), seconds=1.0, clock=lockstep.clock)
+    assert report.frames == pytest.approx(31, abs=2)
+
+
+def test_warm_up_runs_the_pipeline_without_taking_a_frame() -> None:
+    shapes: list[tuple[int, ...]] = []
+    warm_up(FrameCamera(0), pipeline(lambda depth_m, _: shapes.append(depth_m.shape) or sheet_network()))
+    assert shapes == [(1, 64, 80)]
+
+
+def test_run_live_warns_while_the_lidar_is_moved(tmp_path: Path) -> None:
+    begins, viewer, clock = list[tuple[str, bool]](), ListViewer(), count_up(1.0)
+    camera, method = (
+        WallCamera(150, moved=range(30, 80)),
+        Pipeline(CalibratedRig(RIG, measured_wall(tmp_path)), sheet_network),
+    )
+    run: Any = {"stop": Event(), "recorded": True, "clock": lambda: next(clock)}  # the recording is never ahead of it
+    report = run_live(camera, method, viewer, **run, on_warning=lambda *about: begins.append(about))
+    [(warning, frames)] = report.warnings.items()
+    assert [each for _, each in begins] == [True, False]
+    assert begins[1][0] == warning
+    warned = [moment.frame.frame_number for moment in viewer.moments if moment.warnings]
+    assert len(warned) == frames
+    assert warned[0] in range(30, 80)
+    assert warned[-1] in range(79, 150)
+
+
+def test_run_live_counts_and_survives_failed_frames(caplog: pytest.LogCaptureFixture) -> None:
+    viewer, logged, calls = ListViewer(), list[Moment](), count_up()
+
+    def failing(*_: np.ndarray) -> np.ndarray:
+        if next(calls) in {3, 4}:
+            raise ZeroDivisionError("an odd frame")
+        return sheet_network()
+
+    report = run_live(FrameCamera(10), pipeline(failing), viewer, stop=Event(), recorded=True, on_moment=logged.append)
+    assert [moment.frame.frame_number for moment in viewer.moments] == [0, 1, 2, 5, 6, 7, 8, 9]
+    assert [moment.dropped for moment in viewer.moments] == [0, 0, 0, 2, 2, 2, 2, 2]
+    assert logged == viewer.moments
+    assert (report.counts, report.dropped) == ({"failed": 2}, 2)
+    assert "frame 3 " in caplog.text
+    assert "ZeroDivisionError: an odd frame" in caplog.text
+
+
+def test_run_live_ends_at_once_on_an_error_of_the_set_up() -> None:
+    bare = Pipeline(CalibratedRig(load_rig("bare-wall")), sheet_network)
+    with pytest.raises(SceneError, match="object_box"):
+        run_live(FrameCamera(9), bare, ListViewer(), stop=Event(), recorded=True)
+
+
+def test_run_live_reports_before_it_raises_the_cameras_error() -> None:
+    def fail_at_two(number: int) -> None:
+        if number == 2:
+            raise CameraLostError("unplugged")
+
+    camera, reports = FrameCamera(None, fail_at_two), list[RunReport]()
+    camera.counts = Counter(restarted=3)
+    with pytest.raises(CameraLostError, match="unplugged"):
+        run_live(camera, pipeline(), NullViewer(), stop=Event(), recorded=True, on_error=reports.append)
+    [report] = reports
+    assert (report.frames, report.counts) == (2, {"restarted": 3})
+
+
+def test_run_live_ends_in_time_without_further_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.live.frame_queue.LET_GO_AFTER_S", 0.01)
+    shown, now_s, viewer = Event(), [0.0], ListViewer()
+    viewer.show = lambda _: shown.set()  # type: ignore[method-assign]
+
+    def on_frame(number: int) -> None:
+        if number == 5:
+            assert shown.wait(60.0)
+            now_s.append(1000.0)
+            assert camera.closed.wait(60.0)
+
+    camera = FrameCamera(None, on_frame)
+    report = run_live(camera, pipeline(), viewer, stop=Event(), seconds=500.0, clock=lambda: now_s[-1])
+    assert camera.closed.is_set()
+    assert report.frames <= 5
+
+
+class Stalling(ListViewer):
+    """Viewer and camera that yields nothing between frames 4 and 5 until the stall was shown twice; 40 degrees warm.
+
+    The clock goes on by 0.3 s whenever it is read during the stall.
+    """
+
+    uri, intrinsics, incomplete, dropped, counts = "fake", SMALL, 0, 0, Counter[str]()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now_s, self.stalling = 100.0, False
+        self._shown, self._shown_twice = Event(), Event()
+
+    def __iter__(self) -> Iterator[Frame]:
+        for number in range(10):
+            if number == 5:
+                assert self._shown.wait(60.0)
+                self.stalling = True
+                assert self._shown_twice.wait(60.0)
+                self.stalling = False
+            yield small_frame(number, 100.0)
+
+    def telemetry(self, _: str = "") -> Mapping[str, float]:
+        return {"ldd_temperature": 40.0}
+
+    def clock(self) -> float:
+        self.now_s += 0.3 if self.stalling else 0.0
+        return self.now_s
+
+    def show(self, moment: Moment) -> None:
+        super().show(moment)
+        if moment.frame.frame_number == 4:
+            self._shown.set()
+        if sum(moment.verdict is Verdict.STALLED for moment in self.moments) == 2:
+            self._shown_twice.set()
+
+
+def test_run_live_shows_a_stall_with_the_last_moment() -> None:
+    camera, begins = Stalling(), list[tuple[str, bool]]()
+    run: Any = {"stop": Event(), "recorded": True, "clock": camera.clock}
+    report = run_live(camera, pipeline(), camera, **run, on_warning=lambda *about: begins.append(about))
+    frames = [moment.frame.frame_number for moment in camera.moments if moment.verdict is not Verdict.STALLED]
+    assert frames == list(range(10))
+    again = [moment for moment in camera.moments if moment.verdict is Verdict.STALLED]
+    assert len(again) >= 2
+    assert {moment.frame.frame_number for moment in again} == {4}
+    assert all(later.latency_s > before.latency_s for before, later in pairwise(again))
+    assert begins == [(STALLED, True), (STALLED, False)]
+    assert (report.frames, report.counts, report.verdicts) == (10, {"stalls": 1}, {})
+    assert report.stalled_s >= 1.0
+    assert {moment.celsius["ldd_temperature"] for moment in camera.moments} == {40.0}
+
+
+PIXELS = 80 * 64
+
+
+def frame_with(with_depth: int, at_255: int = 0) -> Frame:
+    """Frame in which this many pixels have a depth, and this many are saturated."""
+    depth_m, ir = np.full(PIXELS, np.nan, np.float32), np.full(PIXELS, 254, np.uint8)
+    depth_m[:with_depth], ir[:at_255] = 0.3, 255
+    shape = 64, 80
+    return Frame(depth_m.reshape(shape), ir.reshape(shape), ir.reshape(shape), 0.0, 0, SMALL)
+
+
+@pytest.mark.parametrize(
+    ("depths", "saturated", "names"),
+    [
+        (PIXELS, 0, []),
+        (PIXELS // 2 + 1, 0, []),
+        (PIXELS // 2, 0, ["half_invalid"]),
+        (1, 0, ["half_invalid"]),
+        (0, 0, ["blank"]),
+        (PIXELS, PIXELS // 1000, []),
+        (PIXELS, PIXELS // 1000 + 1, ["saturated"]),
+        (0, PIXELS, ["blank", "saturated"]),
+    ],
+)
+def test_amiss_names_what_is_wrong_with_a_frame(depths: int, saturated: int, names: list[str]) -> None:
+    assert frame_issues(frame_with(depths, saturated)) == names
+
+
+def test_watched_counts_frames_and_passes_them_on() -> None:
+    frames, seen = [frame_with(0), frame_with(PIXELS), frame_with(0, PIXELS), frame_with(9)], Counter[str]()
+    given = list(watched(frames, seen))
+    assert all(one is other for one, other in zip(frames, given, strict=True))
+    assert seen == {"blank": 2, "saturated": 1, "half_invalid": 1}
+
+
+def test_in_words_lists_counts() -> None:
+    assert in_words({"out_of_order": 3, "blank": 1}) == "3 out of order, 1 blank"
+    assert not in_words({})

@@ -1,0 +1,148 @@
+import gc
+import os
+import sys
+import weakref
+from pathlib import Path
+from threading import Event, Thread
+
+import pytest
+
+from nlos_cam.live.realtime import (
+    DRAWING,
+    LOOP,
+    ORDINARY,
+    SWITCH_S,
+    TASKS,
+    after_the_loop,
+    as_any_other,
+    precedence,
+    undisturbed,
+)
+
+OTHER, ROUND_ROBIN = 0, 2
+
+
+class System:
+    """Linux's schedules by thread: `missing` has ended, and real-time priority needs `may`."""
+
+    def __init__(self, tasks: Path, *names: str) -> None:
+        self.tasks, self.may, self.missing = tasks, True, ""
+        self.schedules = dict.fromkeys(names, (OTHER, ORDINARY))
+        for name in names:
+            (tasks / name).mkdir(parents=True)
+
+    def sched_setscheduler(self, task: int, policy: int, param: int) -> None:
+        if not self.may and policy:
+            raise PermissionError
+        if str(task) == self.missing:
+            raise ProcessLookupError
+        self.schedules[str(task)] = policy, param
+
+    def sched_getscheduler(self, task: int) -> int:
+        return self.schedules[str(task)][0]
+
+
+@pytest.fixture
+def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> System:
+    system = System(tmp_path / "task", "0", "7", "8")
+    monkeypatch.setattr("nlos_cam.live.realtime.TASKS", system.tasks)
+    for name, value in (("SCHED_RR", ROUND_ROBIN), ("SCHED_OTHER", OTHER), ("sched_param", int)):
+        monkeypatch.setattr(os, name, value, raising=False)
+    for name in ("sched_setscheduler", "sched_getscheduler"):
+        monkeypatch.setattr(os, name, getattr(system, name), raising=False)
+    return system
+
+
+def test_precedence_holds_for_all_threads_until_it_is_left(system: System) -> None:
+    def fail() -> None:
+        with precedence() as allowed:
+            assert allowed
+            assert set(system.schedules.values()) == {(ROUND_ROBIN, LOOP)}
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
+
+
+def test_precedence_changes_nothing_where_not_possible(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    system.may = False
+    with precedence() as allowed:
+        assert not allowed
+    monkeypatch.setattr("nlos_cam.live.realtime.TASKS", system.tasks / "none")
+    with precedence() as allowed:
+        assert not allowed
+    after_the_loop()
+    as_any_other()
+    assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
+
+
+def test_precedence_passes_over_a_thread_that_ended(system: System) -> None:
+    system.missing = "7"
+    with precedence() as allowed:
+        assert allowed
+        assert system.schedules["8"] == (ROUND_ROBIN, LOOP)
+
+
+def test_drawing_goes_after_the_loop_and_before_the_rest(system: System) -> None:
+    after_the_loop()
+    assert system.schedules["0"] == (OTHER, ORDINARY)
+    with precedence():
+        after_the_loop()
+        assert system.schedules["0"] == (ROUND_ROBIN, DRAWING)
+        as_any_other()
+        assert system.schedules["0"] == (OTHER, ORDINARY)
+
+
+@pytest.mark.skipif(not TASKS.is_dir(), reason="this system has no /proc/self/task")
+def test_precedence_restores_the_threads_of_this_process() -> None:
+    ended, began, found = Event(), Event(), list[int]()
+
+    def work() -> None:
+        began.set()
+        ended.wait(60.0)
+        found.append(os.sched_getscheduler(0))
+
+    before = os.sched_getscheduler(0)
+    with precedence():
+        worker = Thread(target=work)
+        worker.start()
+        assert began.wait(60.0)
+    ended.set()
+    worker.join(60.0)
+    assert [os.sched_getscheduler(0), *found] == [before] * 2
+
+
+class Loop:
+    """Refers to itself: only the collector finds it."""
+
+    def __init__(self) -> None:
+        self.me = self
+
+
+def test_undisturbed_freezes_live_objects_and_collects_garbage() -> None:
+    earlier = weakref.ref(Loop())
+    with undisturbed():
+        assert earlier() is None
+        assert gc.get_freeze_count() > 1000
+        known = gc.get_freeze_count()
+        later = weakref.ref(Loop())
+        gc.collect()
+        assert later() is None
+        assert gc.get_freeze_count() == known
+    assert gc.get_freeze_count() < known
+
+
+def test_undisturbed_shortens_thread_turns_until_it_is_left() -> None:
+    before_s, within_s = sys.getswitchinterval(), 0.0
+
+    def fail() -> None:
+        nonlocal within_s
+        with undisturbed():
+            within_s = sys.getswitchinterval()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert within_s == pytest.approx(SWITCH_S, rel=0.01)
+    assert sys.getswitchinterval() == before_s

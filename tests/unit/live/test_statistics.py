@@ -1,0 +1,191 @@
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from small_frames import NOTHING, small_frame
+
+from nlos_cam.errors import NlosCamError, SceneError
+from nlos_cam.frames import maps_from_frame
+from nlos_cam.live.statistics import (
+    MAX_FAILED_IN_A_ROW,
+    STALLED,
+    STALLED_AFTER_S,
+    Held,
+    RunReport,
+    RunStatistics,
+    StageTimes,
+    StallWatch,
+    Warned,
+    percentiles_ms,
+)
+from nlos_cam.reconstruct.pipeline import FrameResult
+from nlos_cam.reconstruct.verdict import Verdict
+
+
+@pytest.fixture
+def begins() -> list[tuple[str, bool]]:
+    return []
+
+
+@pytest.fixture
+def watch(begins: list[tuple[str, bool]]) -> StallWatch:
+    return StallWatch(lambda *about: begins.append(about))
+
+
+def step_of(number: int, *warnings: str, **others: Any) -> FrameResult:
+    frame = small_frame(number)
+    given: dict[str, Any] = {"published_s": 0.0, "stages_s": {}, "warnings": warnings, **others}
+    return FrameResult(frame, maps_from_frame(frame), NOTHING, **given)
+
+
+def reported(tally: RunStatistics, dropped_loop: int = 0, offset_s: float = 0.0, **camera: Any) -> RunReport:
+    seen_through: Any = SimpleNamespace(**{"incomplete": 0, "dropped": 0, "counts": Counter[str](), **camera})
+    reader: Any = SimpleNamespace(dropped=list(range(dropped_loop)), offset_s=offset_s)
+    return tally.report(seen_through, reader)
+
+
+def tally_of(ages_s: list[float]) -> RunStatistics:
+    """Tally of 30 frames a second, each published this long after its timestamp."""
+    tally = RunStatistics()
+    for number, age_s in enumerate(ages_s):
+        stages_s = {"wait": 0.001, "network": 0.01 * (number + 1)}
+        tally.add(step_of(number, published_s=number / 30 + age_s, stages_s=stages_s), view_s=0.002)
+    return tally
+
+
+def test_report_of_a_run_without_frames_is_zero() -> None:
+    report = reported(RunStatistics())
+    assert (report.frames, report.fps, report.dropped, report.stages_ms, report.counts) == (0, 0.0, 0, {}, {})
+    assert set(report.latency_ms.values()) == {0.0}
+    assert RunStatistics().lasted_s(1e9) == 0.0
+
+
+def test_report_gives_rate_latency_and_stages_of_the_frames() -> None:
+    report = reported(tally_of([0.005] * 31), offset_s=0.002)
+    assert report.frames == 31
+    assert report.fps == pytest.approx(30.0)
+    assert report.latency_ms == pytest.approx({"p50": 3.0, "p95": 3.0, "p99": 3.0}, abs=1e-6)
+    assert report.stages_ms == pytest.approx({"wait": 1.0, "network": 160.0, "view": 2.0})
+    assert tally_of([0.5, 0.1]).lasted_s(4.5) == pytest.approx(4.0), "from the first result"
+
+
+def test_report_counts_frames_by_verdict_and_warning() -> None:
+    tally, passed = RunStatistics(), [Verdict.SEEN, None, Verdict.NOTHING, Verdict.SEEN, Verdict.WALL_MOVED]
+    for number, verdict in enumerate(passed):
+        tally.add(step_of(number, *["hot"] * (number > 2), verdict=verdict), view_s=0.0)
+    report = reported(tally)
+    assert report.verdicts == {"object seen": 2, "nothing there": 1, "wall moved": 1}
+    assert list(report.verdicts) == [verdict.value for verdict in Verdict if verdict in passed]
+    assert report.warnings == {"hot": 2}
+
+
+def test_report_gives_delivery_of_steps_with_an_arrival() -> None:
+    tally = RunStatistics()
+    for number in range(9):
+        times = {"published_s": number / 30 + 0.012, "arrived_s": number / 30 + 0.007}
+        tally.add(step_of(number, **times), view_s=0.0)
+    report = reported(tally, offset_s=0.005)
+    assert report.stages_percentiles_ms["delivery"] == pytest.approx({"p50": 2.0, "p95": 2.0, "p99": 2.0}, abs=1e-6)
+    assert report.latency_ms["p99"] == pytest.approx(7.0, abs=1e-6)
+    assert "delivery" not in reported(tally_of([0.1])).stages_ms
+
+
+def test_report_counts_findings_and_lost_frames() -> None:
+    tally = RunStatistics()
+    tally.seen.update(["blank", "blank"])
+    tally.fail(small_frame(1), ZeroDivisionError("odd"), 1)
+    report = reported(tally, 4, incomplete=2, dropped=3, counts=Counter(duplicate=1, stalled=0))
+    lost = {"incomplete": 2, "dropped_camera": 3, "dropped_loop": 4, "failed": 1}
+    assert report.counts == {"duplicate": 1, **lost, "blank": 2}
+    assert report.dropped == 2 + 3 + 4 + 1
+
+
+def test_tally_raises_after_many_failures_in_a_row() -> None:
+    tally = RunStatistics()
+    for in_a_row in range(1, MAX_FAILED_IN_A_ROW):
+        tally.fail(small_frame(in_a_row), ZeroDivisionError("an odd frame"), in_a_row)
+    with pytest.raises(NlosCamError, match=f"{MAX_FAILED_IN_A_ROW} .*ZeroDivisionError: an odd frame"):
+        tally.fail(small_frame(99), ZeroDivisionError("an odd frame"), MAX_FAILED_IN_A_ROW)
+    assert tally.failed == MAX_FAILED_IN_A_ROW
+    with pytest.raises(SceneError, match="no object_box"):
+        tally.fail(small_frame(1), SceneError("no object_box"), 1)
+
+
+def test_warned_reports_begin_end_and_frames_of_a_warning(begins: list[tuple[str, bool]]) -> None:
+    found = Warned(lambda *about: begins.append(about))
+    for step in (step_of(7), step_of(8, "hot"), step_of(9, "hot", "moved"), step_of(11, "moved"), step_of(12)):
+        found.add(step)
+    assert begins == [("hot", True), ("moved", True), ("hot", False), ("moved", False)]
+    assert found.held == [Held("hot", 2, 8, 9), Held("moved", 2, 9, 11)]
+    found.add(step_of(20, "hot"))
+    assert begins[-1] == ("hot", True)
+    assert found.held[0] == Held("hot", 3, 8, 20)
+
+
+def test_warned_ignores_figures_in_a_warning(begins: list[tuple[str, bool]]) -> None:
+    found = Warned(lambda *about: begins.append(about))
+    for step in (step_of(1, "46.5 degrees"), step_of(2, "48 degrees"), step_of(3, "48 degrees", "48 mm"), step_of(4)):
+        found.add(step)
+    assert begins == [("46.5 degrees", True), ("48 mm", True), ("48 degrees", False), ("48 mm", False)]
+    assert found.frames() == {"48 degrees": 3, "48 mm": 1}
+
+
+@given(st.lists(st.floats(0.0, 10.0), max_size=50))
+def test_percentiles_rise_and_lie_among_the_times(seconds: list[float]) -> None:
+    found = percentiles_ms(np.array(seconds))
+    assert 0.0 <= found["p50"] <= found["p95"] <= found["p99"]
+    assert found["p99"] <= 1e3 * max(seconds, default=0.0) * (1 + 1e-12)
+
+
+def test_stage_times_replace_the_oldest_in_constant_memory() -> None:
+    times = StageTimes(remembered=10)
+    for number in range(35):
+        times.add({"maps": float(number)})
+        assert times._columns["maps"].size == 10
+    assert sorted(times.of("maps")) == [float(number) for number in range(25, 35)]
+
+
+def test_stage_times_hold_stages_that_only_some_frames_have() -> None:
+    times = StageTimes()
+    for stages_s in ({"maps": 1.0}, {"maps": 2.0, "doubt": 5.0}, {"doubt": 6.0}, {"latency": 1.7e9 + 0.0123}):
+        times.add(stages_s)
+    assert times.stages == ["maps", "doubt", "latency"]
+    assert (sorted(times.of("maps")), sorted(times.of("doubt"))) == ([1.0, 2.0], [5.0, 6.0])
+    assert times.of("latency")[0] - 1.7e9 == pytest.approx(0.0123, abs=1e-6)
+    assert times.of("unheard of").size == 0
+
+
+JUST_BEFORE_S = 0.999 * STALLED_AFTER_S
+
+
+def test_stall_watch_reports_a_stall_once_until_a_frame_comes(
+    watch: StallWatch, begins: list[tuple[str, bool]]
+) -> None:
+    assert not watch.look(1000.0, None), "no frame has come yet"
+    assert not watch.look(10.0 + JUST_BEFORE_S, 10.0)
+    shown = [time_s for time_s in (10.5, 10.6, 10.9, 11.0, 11.4, 11.6) if watch.look(time_s, 10.0)]
+    assert shown == [10.5, 11.0, 11.6]
+    watch.came(10.0)
+    assert begins == [(STALLED, True)], "a frame from before the stall does not end it"
+    watch.came(12.0)
+    watch.came(12.1)
+    assert begins == [(STALLED, True), (STALLED, False)]
+    assert (watch.stalls, watch.stalled_s) == (1, 2.0)
+
+
+def test_stall_watch_counts_a_stall_that_lasts_to_the_end(watch: StallWatch, begins: list[tuple[str, bool]]) -> None:
+    for start_s in (0.0, 10.0):
+        assert watch.look(start_s + 1.0, start_s)
+        watch.came(start_s + 2.0)
+    watch.look(21.0, 20.0)
+    assert not watch.look(21.6, 21.5), "a frame without a result ends a stall too"
+    watch.look(24.0, 23.0)
+    watch.close(25.0)
+    watch.close(99.0)
+    assert [each for _, each in begins] == [True, False, True, False, True, False, True]
+    assert watch.stalls == 4
+    assert watch.stalled_s == pytest.approx(2.0 + 2.0 + 1.5 + 2.0)

@@ -1,0 +1,279 @@
+import logging
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from fake_wall import WallCamera
+from nlos_calibration.arrays import Float32
+from nlos_calibration.rig import load_rig
+from small_frames import sheet_network
+
+from nlos_cam.frames import LidarMaps
+from nlos_cam.live.loop import run_live
+from nlos_cam.live.replay import REPORT, RESULT, replay_recording
+from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects.placement import object_depth
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.physics_check import (
+    EveryFrames,
+    Expected,
+    NullPhysicsCheck,
+    check,
+    explanation,
+    failure,
+    fitted_gain,
+    log_warning,
+    mean_cost,
+)
+from nlos_cam.reconstruct.pipeline import Pipeline
+from nlos_cam.render.renderer import render
+from nlos_cam.render.scene import Scene
+from nlos_cam.view.viewer import Moment, NullViewer
+
+SHAPE = 64, 80
+GAIN = 1e5
+RIGHT = np.broadcast_to(np.arange(80) >= 40, SHAPE)
+WALL_M = np.broadcast_to(np.linspace(0.2, 0.6, 80), SHAPE)
+
+
+def expected_object(echo_m: float = 0.5, strength: float = 4.0) -> Expected:
+    """A wall; on the right half an object's echo, so many times as strong as the wall's own return."""
+    direct = np.full(SHAPE, 3e-4)
+    echo = np.where(RIGHT, strength * direct, 0.0)
+    return Expected(WALL_M, direct, np.where(echo > 0, echo_m + np.zeros(SHAPE), np.nan), echo)
+
+
+def maps_of(expected: Expected, *, noise_m: float = 0.0, albedo: float = 1.0, gain: float = GAIN) -> LidarMaps:
+    depth_m, intensity = expected.seen(albedo, gain)
+    noise = np.random.default_rng(0).normal(0, 1, SHAPE).astype(np.float32)
+    return LidarMaps(depth_m + np.float32(noise_m) * noise, intensity, np.isfinite(depth_m))
+
+
+def score(seen: LidarMaps, expected: Expected) -> float:
+    return explanation(seen, expected, expected.bare).score
+
+
+def test_score_of_expected_maps_is_zero_and_noise_hardly_matters() -> None:
+    assert score(maps_of(expected_object()), expected_object()) == pytest.approx(0.0, abs=1e-6)
+    assert score(maps_of(expected_object(), noise_m=1e-4), expected_object()) < 0.1
+
+
+def test_score_of_the_bare_bench_for_an_object_is_one() -> None:
+    assert score(maps_of(expected_object()), expected_object().bare) == 1.0
+
+
+def test_score_rises_with_the_distance_from_the_object() -> None:
+    seen = maps_of(expected_object(0.5))
+    scores = [score(seen, expected_object(0.5 + off_m)) for off_m in (0.0, 0.005, 0.01, 0.03, 0.1)]
+    assert scores == sorted(scores)
+    assert scores[1] < scores[2] < scores[3] < scores[4]
+    assert scores[-1] > 0.9
+
+
+def test_score_of_an_object_for_a_bare_bench_is_above_one() -> None:
+    seen = maps_of(expected_object().bare, noise_m=1e-4)
+    assert score(seen, expected_object().bare) < 0.05
+    assert score(seen, expected_object(strength=20.0)) > 1.0
+
+
+def test_score_is_independent_of_the_gain() -> None:
+    seen = maps_of(expected_object(0.51), noise_m=1e-4)
+    dimmed = replace(seen, intensity=seen.intensity * np.float32(0.25))
+    assert score(dimmed, expected_object()) == pytest.approx(score(seen, expected_object()), rel=1e-5)
+    assert fitted_gain(dimmed, expected_object().bare) == pytest.approx(0.25 * GAIN, rel=1e-5)
+
+
+def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
+    seen = maps_of(expected_object(strength=40.0), gain=1e4)
+    assert fitted_gain(seen, expected_object().bare) == pytest.approx(1e4, rel=1e-5)
+    far = replace(seen, depth_m=seen.depth_m + np.float32(0.2))
+    assert fitted_gain(far, expected_object().bare) > 1e4
+    assert fitted_gain(replace(seen, valid=np.zeros(SHAPE, np.bool_)), expected_object().bare) == 1.0
+
+
+@pytest.mark.parametrize("albedo", [0.75, 1.0, (4 / 3) ** 0.5])
+def test_explanation_fits_the_albedo(albedo: float) -> None:
+    best = explanation(maps_of(expected_object(), albedo=albedo), expected_object(), expected_object().bare)
+    assert best.albedo == pytest.approx(albedo, rel=1e-6)
+    assert best.score == pytest.approx(0.0, abs=1e-6)
+
+
+def test_mean_cost_lets_nearly_equal_echoes_swap() -> None:
+    close, clear = (
+        mean_cost(maps_of(expected_object().bare), expected_object(strength=by), GAIN, 1.0) for by in (1.1, 10.0)
+    )
+    assert close < 0.05
+    assert clear > 0.4
+
+
+def test_mean_cost_counts_cells_that_wrongly_return_or_do_not() -> None:
+    wall = expected_object().bare
+    half = replace(wall, direct=np.where(RIGHT, 0.0, wall.direct), direct_m=np.where(RIGHT, np.nan, wall.direct_m))
+    assert mean_cost(maps_of(wall), half, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
+    assert mean_cost(maps_of(half), wall, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
+    assert mean_cost(maps_of(half), half, GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_score_of_no_returns_is_zero_if_none_are_expected() -> None:
+    nothing = Expected(np.full(SHAPE, np.nan), np.zeros(SHAPE), np.full(SHAPE, np.nan), np.zeros(SHAPE))
+    assert score(maps_of(nothing), nothing) == 0.0
+    assert score(maps_of(nothing), expected_object()) == pytest.approx(1.0)
+
+
+def test_mean_cost_lets_full_scale_hide_more_light_only() -> None:
+    bright = maps_of(expected_object(strength=1000.0))
+    assert bright.intensity.max() == 255
+    assert mean_cost(bright, expected_object(strength=1000.0), GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
+    dim = mean_cost(bright, expected_object(strength=1.5), GAIN, 1.0)
+    assert dim > 0.1
+
+
+RIG = load_rig("paper-rig")
+EMPTY = np.full((64, 64), np.nan, np.float32)
+SEEDS = range(20_000_100, 20_000_104)
+
+
+@cache
+def hidden(seed: int) -> Float32:
+    return object_depth(seed, object_box(RIG))[1]
+
+
+@cache
+def seen(seed: int | None, noise: int = 0) -> LidarMaps:
+    """What a lidar gives of an object, or of the bare bench, with the noise of the 60 pixels that make a cell."""
+    rendering = render(Scene(RIG, None if seed is None else hidden(seed)), "standard")
+    generator = np.random.default_rng(noise)
+    depth_m = rendering.depth_m + generator.normal(0, 1e-4, (64, 80)).astype(np.float32)
+    counts = rendering.intensity * 1.25e5 + generator.normal(0, 0.2, (64, 80)).astype(np.float32)
+    return LidarMaps(depth_m, np.maximum(counts, 0), np.isfinite(depth_m))
+
+
+@pytest.mark.slow
+def test_check_scores_the_true_object_best() -> None:
+    for seed in SEEDS:
+        scores = {other: check(seen(seed), hidden(other), RIG, accuracy="draft").score for other in SEEDS}
+        assert min(scores, key=lambda other: scores[other]) == seed
+        assert scores[seed] < 0.5 * min(score for other, score in scores.items() if other != seed)
+
+
+def test_check_explains_the_true_object_to_within_noise() -> None:
+    found = check(seen(SEEDS[0]), hidden(SEEDS[0]), RIG)
+    assert found.score < 0.05
+    assert np.nanquantile(np.abs(found.residual_depth_m), 0.95) < 2e-3
+    assert np.nanquantile(np.abs(found.residual_intensity), 0.95) < 3
+    assert found.residual_depth_m.dtype == found.residual_intensity.dtype == np.float32
+
+
+def test_check_renders_nothing_as_the_bare_bench() -> None:
+    assert check(seen(None), EMPTY, RIG).score < 0.05
+    assert check(seen(None), hidden(SEEDS[0]), RIG).score > 1.0
+    assert check(seen(SEEDS[0]), EMPTY, RIG).score == 1.0
+
+
+def test_check_works_on_a_rig_without_object_box() -> None:
+    bare = load_rig("bare-wall")
+    rendering = render(Scene(bare))
+    maps = LidarMaps(rendering.depth_m, rendering.intensity * np.float32(1e5), np.isfinite(rendering.depth_m))
+    assert check(maps, None, bare).score < 1e-3
+    assert check(maps, hidden(SEEDS[0]), bare).score < 1e-3
+
+
+def test_check_of_maps_without_returns_has_no_residual_depth() -> None:
+    nan_m, dark = np.full((64, 80), np.nan, np.float32), np.zeros((64, 80), np.float32)
+    found = check(LidarMaps(nan_m, dark, dark > 0), EMPTY, RIG)
+    assert found.score == 1.0
+    assert np.isnan(found.residual_depth_m).all()
+
+
+def test_check_is_timed_with_the_given_clock() -> None:
+    assert check(seen(None), EMPTY, RIG, clock=iter([5.0, 7.5]).__next__).seconds == 2.5
+
+
+def test_every_frames_check_is_independent_of_earlier_frames() -> None:
+    forwards, backwards = {}, {}
+    for found, order in ((forwards, SEEDS), (backwards, SEEDS[::-1])):
+        checks = EveryFrames(RIG, every=1, accuracy="draft")
+        for seed in order:
+            checks.offer(seed, seen(seed), hidden(SEEDS[0]))
+            found[seed] = checks.newest
+    for seed in SEEDS:
+        assert (forwards[seed].frame_number, forwards[seed].score) == (seed, backwards[seed].score)
+        np.testing.assert_array_equal(forwards[seed].residual_depth_m, backwards[seed].residual_depth_m)
+
+
+def test_every_frames_checks_each_third_frame() -> None:
+    numbers = []
+    with EveryFrames(RIG, every=3) as checks:
+        for number in range(8):
+            checks.offer(number, seen(None), EMPTY)
+            numbers.append(checks.newest.frame_number if checks.newest else None)
+    assert numbers == [0, 0, 0, 3, 3, 3, 6, 6]
+
+
+def test_every_frames_reports_a_failed_check_once() -> None:
+    errors, behind_the_wall = [], np.full((64, 64), -1.0, np.float32)
+    checks = EveryFrames(RIG, every=1, on_error=errors.append)
+    for number, depth_m in enumerate([behind_the_wall, behind_the_wall, EMPTY]):
+        checks.offer(number, seen(None), depth_m)
+    assert len(errors) == 1
+    assert "frame 0" in errors[0]
+    assert checks.newest is not None
+    assert checks.newest.frame_number == 2
+
+
+@pytest.mark.slow
+def test_replay_writes_reproducible_checks(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        processing = Pipeline(CalibratedRig(RIG), sheet_network, checks=EveryFrames(RIG, every=3, accuracy="draft"))
+        replay_recording(WallCamera(4), processing, tmp_path / name, stop=Event())
+    for file in (RESULT, REPORT):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    with np.load(tmp_path / "a" / RESULT) as result:
+        assert result["check_frame_number"].tolist() == [0, 3]
+        assert result["check_score"].shape == (2,)
+        assert (result["check_score"] > 0.5).all()
+    assert "check of 2 frames" in (tmp_path / "a" / REPORT).read_text()
+
+
+def test_replay_without_checks_writes_none(tmp_path: Path) -> None:
+    replay_recording(WallCamera(2), Pipeline(CalibratedRig(RIG), sheet_network), tmp_path / "out", stop=Event())
+    with np.load(tmp_path / "out" / RESULT) as result:
+        assert result["check_score"].size == result["check_frame_number"].size == 0
+    assert "physics" not in (tmp_path / "out" / REPORT).read_text()
+
+
+def test_check_renders_the_bare_bench_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    check(seen(None), EMPTY, RIG)
+    monkeypatch.setattr("nlos_cam.reconstruct.physics_check.render", lambda *_: pytest.fail("rendered again"))
+    check(seen(None), EMPTY, RIG)
+
+
+def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
+    shown = list[int]()
+
+    class Noting(NullViewer):
+        def show(self, moment: Moment) -> None:
+            assert moment.check is not None
+            shown.append(moment.check.frame_number)
+
+    processing = Pipeline(CalibratedRig(RIG), sheet_network, checks=EveryFrames(RIG, every=2, accuracy="draft"))
+    run_live(WallCamera(5, period_s=0.0), processing, Noting(), stop=Event(), recorded=True)
+    assert shown == [0, 0, 2, 2, 4]
+
+
+def test_no_checks_never_yields_a_check() -> None:
+    nothing = np.zeros((64, 80), np.float32)
+    with NullPhysicsCheck() as checks:
+        checks.offer(1, LidarMaps(nothing, nothing, nothing > 0), nothing[:, :64])
+        assert checks.newest is None
+
+
+def test_failure_is_logged_with_its_frame(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        log_warning(failure(7, "SceneError: 100 % wrong"))
+    (message,) = caplog.messages
+    assert "frame 7" in message
+    assert "SceneError: 100 % wrong" in message

@@ -1,0 +1,231 @@
+import time
+from dataclasses import replace
+from itertools import count as count_up
+from pathlib import Path
+from threading import Event
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_doubter import FakeDoubter
+from fake_wall import RIG, WallCamera, measured_wall, wall_frame
+from nlos_calibration.errors import CalibrationError
+from small_frames import sheet_network
+
+from nlos_cam.frames import maps_from_frame
+from nlos_cam.live.frame_queue import FrameReader
+from nlos_cam.live.loop import FRAMES_TOGETHER, MAX_BATCHES_AHEAD, iterate_batched, iterate_results, with_telemetry
+from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
+from nlos_cam.reconstruct.network import Clock
+from nlos_cam.reconstruct.physics_check import EveryFrames, PhysicsCheckResult
+from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline, load_networks, misfits, set_up, signs_of
+from nlos_cam.reconstruct.verdict import FrameConditions, Verdict
+
+
+def all_steps(
+    processing: Pipeline, camera: WallCamera, clock: Clock = lambda: 0.0, *, ahead: bool = False
+) -> list[FrameResult]:
+    """Results of a camera's frames: one by one, or `ahead` in batches."""
+    frames, thermometer = with_telemetry(camera, camera)
+    with FrameReader(frames, keeps_all=True, stop=Event(), clock=lambda: 0.0) as reader, processing.checks:
+        if ahead:
+            return list(iterate_batched(reader, processing, clock, thermometer))
+        return list(iterate_results(reader, processing, clock, thermometer=thermometer))
+
+
+@pytest.fixture
+def walled(tmp_path: Path) -> CalibratedRig:
+    return CalibratedRig(RIG, measured_wall(tmp_path))
+
+
+class Noting:
+    """Network that keeps the depth maps that it is given, one by one."""
+
+    def __init__(self) -> None:
+        self.given = list[np.ndarray]()
+
+    def __call__(self, depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+        self.given.append(depth_m[0])
+        return sheet_network()
+
+
+def test_steps_time_every_stage_with_the_given_clock() -> None:
+    ticks = iter(range(10_000))
+    done = all_steps(Pipeline(CalibratedRig(RIG), sheet_network), WallCamera(3), lambda: float(next(ticks)))
+    assert [step.frame.frame_number for step in done] == [0, 1, 2]
+    for step in done:
+        stages_s = dict(step.stages_s)
+        assert stages_s.pop("queue") > (step.arrived_s or 0.0) == 0.0
+        assert stages_s == {"wait": 1.0, "maps": 1.0, "bench": 1.0, "network": 1.0}
+
+
+def test_pipeline_feeds_the_mean_of_raw_or_difference_maps(walled: CalibratedRig) -> None:
+    noting = Noting()
+    for eats_difference in (False, True):
+        done = all_steps(Pipeline(walled, noting, eats_difference=eats_difference, average=4), WallCamera(6))
+    mean_m = np.mean([wall_frame(number).depth_m for number in range(2, 6)], axis=0)
+    np.testing.assert_allclose(noting.given[5], mean_m, atol=1e-6)
+    np.testing.assert_allclose(noting.given[11], mean_m - walled.reference.map_depth_m, atol=1e-6)
+    assert done[5].frame.frame_number == 5
+    np.testing.assert_array_equal(done[5].difference.depth_m, noting.given[11])
+    with pytest.raises(CalibrationError, match="--wall"):
+        Pipeline(CalibratedRig(RIG), sheet_network, eats_difference=True)
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 0.0045])
+def test_pipeline_adds_the_measured_offset_to_raw_maps(walled: CalibratedRig, offset_m: float) -> None:
+    noting, record = Noting(), walled.measured.record.model_copy(update={"range_offset_m": offset_m})
+    bench = CalibratedRig(RIG, replace(walled.measured, record=record))
+    (step,) = all_steps(Pipeline(bench, noting), WallCamera(1))
+    np.testing.assert_array_equal(noting.given[0], step.maps.depth_m + np.float32(offset_m))
+
+
+def test_pipeline_watches_drift_in_the_frame_not_the_mean(walled: CalibratedRig) -> None:
+    done = all_steps(Pipeline(walled, sheet_network, average=1000), WallCamera(100, moved=range(50, 100)))
+    assert not any(step.warnings for step in done[:50])
+    assert done[-1].warnings
+
+
+def test_telemetry_is_read_periodically_with_or_without_wall(walled: CalibratedRig) -> None:
+    for bench in (CalibratedRig(RIG), walled):
+        camera = WallCamera(25, celsius=80.0, period_s=1.0)
+        done = all_steps(Pipeline(bench, sheet_network), camera)
+        assert camera.asked == 3
+        assert all(bool(step.warnings) == (bench is walled) for step in done), "too hot from the first frame on"
+
+
+CALLS = count_up()
+
+
+def looking(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+    """Show the maps; every other call takes longer, so that calls side by side end out of order."""
+    time.sleep(0.02 * (next(CALLS) % 2 == 0))
+    return np.clip(np.nan_to_num(depth_m[:, :, :64]) + 0.5, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("count", [0, 1, FRAMES_TOGETHER, FRAMES_TOGETHER * (MAX_BATCHES_AHEAD + 3) + 3])
+def test_steps_ahead_equal_steps_in_turn(tmp_path: Path, count: int) -> None:
+    done: list[list[FrameResult]] = []
+    for ahead in (False, True):
+        bench, checks = CalibratedRig(RIG, measured_wall(tmp_path)), EveryFrames(RIG, every=5, accuracy="draft")
+        processing = Pipeline(bench, looking, average=3, doubter=FakeDoubter(), checks=checks)
+        done.append(all_steps(processing, WallCamera(count, moved=range(count // 2)), ahead=ahead))
+    assert [step.frame.frame_number for step in done[1]] == list(range(count))
+    for one, other in zip(*done, strict=True):
+        assert (one.verdict, one.warnings, one.arrived_s) == (other.verdict, other.warnings, other.arrived_s)
+        assert (one.check.frame_number, one.check.score) == (other.check.frame_number, other.check.score)
+        for name in ("maps", "reconstruction", "difference"):
+            np.testing.assert_array_equal(getattr(one, name).depth_m, getattr(other, name).depth_m)
+
+
+def test_steps_ahead_share_the_network_time_of_a_batch() -> None:
+    ticks = iter(range(10_000))
+    done = all_steps(Pipeline(CalibratedRig(RIG), sheet_network), WallCamera(4), lambda: float(next(ticks)), ahead=True)
+    assert len(done) == FRAMES_TOGETHER == 4
+    (share_s,) = {step.stages_s["network"] for step in done}
+    assert share_s in {ticks / 4 for ticks in range(1, 100)}
+
+
+@pytest.mark.parametrize(("ahead", "count"), [(False, 12), (True, 40)])
+def test_steps_raise_the_error_of_a_frame(ahead: bool, count: int) -> None:
+    odd_m = maps_from_frame(wall_frame(9)).depth_m
+
+    def failing(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+        if any(np.array_equal(one_m, odd_m, equal_nan=True) for one_m in depth_m):
+            raise ZeroDivisionError("an odd frame")
+        return sheet_network()
+
+    with pytest.raises(ZeroDivisionError, match="an odd frame"):
+        all_steps(Pipeline(CalibratedRig(RIG), failing), WallCamera(count), ahead=ahead)
+
+
+@pytest.mark.parametrize(("nothing", "verdict"), [(0.9, Verdict.NOTHING), (0.0, Verdict.SEEN)])
+def test_step_shows_what_its_verdict_says(nothing: float, verdict: Verdict) -> None:
+    doubter = FakeDoubter(lambda *_: (nothing, 0.0))
+    for step in all_steps(Pipeline(CalibratedRig(RIG), sheet_network, doubter=doubter), WallCamera(3)):
+        assert step.verdict == verdict
+        assert step.reconstruction.shows == (verdict is Verdict.SEEN)
+        assert step.reconstruction.uncertainty_m is not None
+
+
+def test_doubt_network_is_given_the_input_of_the_network(walled: CalibratedRig) -> None:
+    noting, doubter = Noting(), FakeDoubter()
+    all_steps(Pipeline(walled, noting, eats_difference=True, average=3, doubter=doubter), WallCamera(4))
+    for asked, given in zip(doubter.asked, noting.given, strict=True):
+        np.testing.assert_array_equal(asked[0][0], given)
+
+
+def test_moved_lidar_overrules_the_networks_verdict(walled: CalibratedRig) -> None:
+    doubter = FakeDoubter(lambda *_: (0.0, 0.9))
+    done = all_steps(Pipeline(walled, sheet_network, doubter=doubter), WallCamera(100, moved=range(50, 100)))
+    assert {step.verdict for step in done[:50]} == {Verdict.OUTSIDE}
+    assert done[-1].verdict == Verdict.WALL_MOVED
+
+
+@pytest.mark.parametrize(
+    ("change", "signs"),
+    [
+        ({}, FrameConditions()),
+        ({"depth_m": np.full((64, 80), np.nan, np.float32)}, FrameConditions(invalid=True)),
+        (
+            {"depth_m": np.where(np.arange(80) < 40, np.float32(0.3), np.nan) * np.ones((64, 1))},
+            FrameConditions(invalid=True),
+        ),
+        ({"ir": np.full((64, 80), 255, np.uint8)}, FrameConditions(saturated=True)),
+    ],
+)
+def test_signs_of_names_what_is_wrong_with_a_frame(change: dict[str, np.ndarray], signs: FrameConditions) -> None:
+    whole = replace(wall_frame(0), depth_m=np.full((64, 80), 0.3, np.float32))
+    assert signs_of(replace(whole, **change), BenchObservation(None, ()), None) == signs
+    check = PhysicsCheckResult(
+        0, np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32), score=1.0, seconds=0.0
+    )
+    assert signs_of(replace(whole, **change), BenchObservation(None, ()), check) == replace(signs, check=check)
+
+
+DOUBTER: Any = object()
+
+
+def trained(rig_name: str = RIG.name, rig_checksum: str = RIG.checksum, eats: str = "raw maps") -> Any:
+    return SimpleNamespace(rig_name=rig_name, rig_checksum=rig_checksum, input=eats)
+
+
+def test_misfits_name_what_differs_from_the_training_rig() -> None:
+    farther = RIG.model_copy(update={"lidar": RIG.lidar.model_copy(update={"distance_m": 0.3})})
+    assert misfits(CalibratedRig(RIG), trained(), DOUBTER) == []
+    (note,) = misfits(CalibratedRig(farther), trained(), DOUBTER)
+    assert "100 mm" in note
+    (note,) = misfits(CalibratedRig(RIG), trained(), None)
+    assert "uncertainty" in note
+
+
+@pytest.mark.parametrize(("checksum", "notes"), [(RIG.checksum, 0), ("0" * 12, 1)])
+def test_misfits_know_an_unnamed_rig_by_its_checksum(checksum: str, notes: int) -> None:
+    assert len(misfits(CalibratedRig(RIG), trained("a rig of somebody else's", checksum), DOUBTER)) == notes
+
+
+def test_misfits_name_a_wall_without_reference(walled: CalibratedRig) -> None:
+    bare = CalibratedRig(RIG, replace(walled.measured, reference=None))
+    more = set(misfits(bare, trained(), DOUBTER)) - set(misfits(walled, trained(), DOUBTER))
+    assert ["reference" in note for note in more] == [True]
+
+
+@pytest.mark.parametrize("eats", ["raw maps", "difference maps"])
+def test_set_up_feeds_the_networks_their_kind_of_maps(walled: CalibratedRig, eats: str) -> None:
+    network = Noting()
+    network.record = trained(eats=eats)
+    processing: Any = set_up(walled, network, average=7)
+    done = all_steps(processing, WallCamera(1))
+    assert processing.network is network
+    fed = {"raw maps": done[0].maps, "difference maps": done[0].difference}[eats]
+    np.testing.assert_array_equal(network.given[0], fed.depth_m)
+    assert len(processing._mean._last) == 7
+
+
+def test_load_networks_exports_into_the_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[Any] = []
+    monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
+    monkeypatch.setattr("nlos_cam.reconstruct.pipeline.load_reconstructor", lambda *given: asked.append(given) or np)
+    assert load_networks(Path("mine")) is np
+    assert asked == [(Path("mine"), tmp_path / "onnx")]

@@ -1,0 +1,195 @@
+import re
+import socket
+from contextlib import closing
+from http.client import HTTPException
+from urllib.parse import urlsplit
+
+import pytest
+from view_streams import ASSETS, EVERYWHERE, Streams, ask
+
+from nlos_cam.errors import NlosCamError
+from nlos_cam.view.assets import LOOPBACK
+from nlos_cam.view.server import ViewServer, address_of, exposed, is_loopback, names_of, resolved
+
+
+def test_server_sends_whole_files_and_forbids_other_origins(server: ViewServer) -> None:
+    for path, (kind, content) in ASSETS.items():
+        with closing(ask(server.address, path + "?renderer=webgl")) as answer:
+            assert answer.status == 200
+            assert answer.headers["Content-Type"] == kind
+            assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
+            assert answer.read() == content
+        with closing(ask(server.address, path, method="HEAD")) as answer:
+            assert answer.status == 200
+            assert int(answer.headers["Content-Length"]) == len(content)
+            assert answer.read() == b""
+
+
+def test_server_closes_connections_beyond_its_limit(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.view.server.MAX_CONNECTIONS", 1)
+    server = ViewServer(ASSETS, streams, 0)
+    with closing(ask(server.address, "/live.rrd")) as first:
+        with pytest.raises((HTTPException, OSError)):
+            ask(server.address, "/")
+        assert first.read(2000) == b"x" * 2000
+        streams.end.set()
+    server.close()
+
+
+def test_closing_server_cuts_browsers_that_do_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.view.server.CLOSE_AFTER_S", 0.01)
+    server = ViewServer(ASSETS, lambda send: [send(bytes(1 << 20)) for _ in range(1000)] and None, 0)
+    place = urlsplit(server.address)
+    with socket.create_connection((place.hostname, place.port)) as silent, socket.socket() as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.connect((place.hostname, place.port))
+        deaf.sendall(b"GET /live.rrd HTTP/1.0\r\nHost: localhost\r\n\r\n")
+        assert deaf.recv(12) == b"HTTP/1.0 200"
+        server.close()
+        assert silent.recv(1) == b""
+
+
+def test_server_replaces_a_busy_port_unless_it_is_exact(server: ViewServer, streams: Streams) -> None:
+    busy = urlsplit(server.address).port or 0
+    with pytest.raises(NlosCamError, match=rf"http://127.0.0.1:{busy}/ .* --view-port"):
+        ViewServer(ASSETS, streams, busy, exact=True)
+    other = ViewServer(ASSETS, streams, busy)
+    try:
+        assert other.address != server.address
+        with closing(ask(other.address, "/")) as answer:
+            assert answer.status == 200
+    finally:
+        other.close()
+
+
+def test_server_on_all_addresses_refuses_other_names(streams: Streams) -> None:
+    everywhere = ViewServer(ASSETS, streams, 0, host=EVERYWHERE)
+    try:
+        assert urlsplit(everywhere.address).hostname == LOOPBACK
+        for host, status in (("192.168.3.4:9090", 200), ("evil.example", 403)):
+            with closing(ask(everywhere.address, "/", host=host)) as answer:
+                assert answer.status == status
+    finally:
+        everywhere.close()
+
+
+def test_server_refuses_hosts_that_are_not_this_machine(streams: Streams) -> None:
+    with pytest.raises(NlosCamError, match=r"http://192.0.2.1:0/"):
+        ViewServer(ASSETS, streams, 0, host="192.0.2.1")
+    for host in ("no such host", "." * 300):
+        with pytest.raises(NlosCamError, match=re.escape(host)):
+            resolved(host)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [("GET", "/../secret", 404), *((method, "/", 501) for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS"))],
+)
+def test_server_refuses_other_paths_and_methods(server: ViewServer, method: str, path: str, status: int) -> None:
+    with closing(ask(server.address, path, method=method)) as answer:
+        assert answer.status == status
+
+
+def test_server_listens_on_the_loopback_only(server: ViewServer) -> None:
+    assert urlsplit(server.address).hostname == server._server.server_address[0] == LOOPBACK
+
+
+def test_stream_lasts_until_it_is_ended(server: ViewServer, streams: Streams) -> None:
+    with closing(ask(server.address, "/live.rrd")) as answer:
+        assert answer.read(5000) == b"x" * 5000
+        streams.end.set()
+        assert set(answer.read()) <= {ord("x")}
+    assert streams.error is None
+
+
+def test_stream_ends_when_its_browser_leaves(server: ViewServer, streams: Streams) -> None:
+    with closing(ask(server.address, "/live.rrd")) as answer:
+        answer.read(10)
+    assert streams.ended.wait(60.0)
+    assert isinstance(streams.error, OSError)
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        *((host, 403) for host in ("evil.example", "evil.example:9090", "127.0.0.1.evil.example", "10.1.2.3", "")),
+        *((host, 200) for host in ("127.0.0.1", "localhost:80", "LOCALHOST:8000", "[::1]:9090")),
+    ],
+)
+@pytest.mark.parametrize("path", ["/", "/file.wasm"])
+def test_server_answers_to_loopback_names_only(server: ViewServer, host: str, path: str, status: int) -> None:
+    with closing(ask(server.address, path, host=host)) as answer:
+        assert answer.status == status
+        assert (answer.read() == ASSETS[path][1]) == (status == 200)
+    if status == 403:
+        with closing(ask(server.address, "/live.rrd", host=host)) as answer:
+            assert answer.status == status
+
+
+def test_server_limits_streams_and_reuses_their_room(streams: Streams) -> None:
+    server = ViewServer(ASSETS, streams, 0, most_streams=2)
+    watching = [ask(server.address, "/live.rrd") for _ in range(2)]
+    with closing(ask(server.address, "/live.rrd")) as refused:
+        assert refused.status == 503
+        assert b"2 browsers" in refused.read()
+    with closing(ask(server.address, "/")) as page:
+        assert page.status == 200
+    streams.end.set()
+    for answer in watching:
+        answer.read()
+        answer.close()
+    streams.end.clear()
+    status = 503
+    while status != 200:  # a stream's thread ends after the browser has seen its end
+        with closing(ask(server.address, "/live.rrd")) as again:
+            status = again.status
+    streams.end.set()
+    server.close()
+
+
+@pytest.mark.parametrize(
+    ("asked", "address", "known", "unknown"),
+    [
+        (
+            *("127.0.0.1", "127.0.0.1", ["localhost:9090", "127.0.0.1", "[::1]:80"]),
+            ["bench.example", "10.0.0.1", socket.gethostname() + ".evil.example", ""],
+        ),
+        (
+            *("bench.lan", "192.0.2.7"),
+            ["BENCH.lan:9090", "192.0.2.7:9090", "[fe80::1]:1", "localhost", socket.gethostname()],
+            ["evil.example", "bench.lan.evil.example", ""],
+        ),
+    ],
+)
+def test_names_of_a_host_are_this_machines(asked: str, address: str, known: list[str], unknown: list[str]) -> None:
+    is_known = names_of(asked, address)
+    assert all(map(is_known, known))
+    assert not any(map(is_known, unknown))
+
+
+@pytest.mark.parametrize(("host", "loopback"), [("127.0.0.1", True), ("localhost", True), (EVERYWHERE, False)])
+def test_resolved_host_is_the_loopback_or_not(host: str, loopback: bool) -> None:
+    family, address = resolved(host)
+    assert family in {socket.AF_INET, socket.AF_INET6}
+    assert is_loopback(address) == loopback
+
+
+@pytest.mark.parametrize(
+    ("host", "address"),
+    [
+        ("127.0.0.1", "http://127.0.0.1:7/"),
+        (EVERYWHERE, "http://127.0.0.1:7/"),
+        ("::", "http://[::1]:7/"),
+        ("::1", "http://[::1]:7/"),
+    ],
+)
+def test_address_of_a_host_can_be_opened_on_this_machine(host: str, address: str) -> None:
+    assert address_of(host, 7) == address
+
+
+def test_exposed_warns_of_hosts_that_others_can_reach() -> None:
+    assert exposed("127.0.0.1", 9090) == exposed("localhost", 9090) == ""
+    assert "9090" in exposed(EVERYWHERE, 9090)
+    note = exposed("192.0.2.7", 8000)
+    assert all(text in note for text in ("192.0.2.7", "8000", "password"))
+    assert "\n" not in note
