@@ -2,15 +2,19 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: live test check docs
+.PHONY: live test test-all check docs
 
 live: .venv/.live
 	$(BIN)/nlos-cam live --camera sim
 
-# Laws and unit tests in two processes; what measures time, has processes of its own or draws in a browser, alone.
+# The quick tests, in two processes: to be run before every commit.
 test: .venv/.test
-	$(BIN)/python -m pytest tests/bench tests/browser tests/contract tests/hardware
-	$(BIN)/python -m pytest -n 2 --dist loadfile tests/laws tests/unit
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not bench and not slow' tests/laws tests/unit tests/contract
+
+# All tests, quick and slow; tests that draw in a browser run last, alone.
+test-all: .venv/.test
+	$(BIN)/python -m pytest -n 2 --dist loadfile tests/laws tests/unit tests/contract tests/bench tests/hardware
+	$(BIN)/python -m pytest tests/browser
 
 check: .venv/.test
 	$(BIN)/python tools/checks/check.py

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 from browser_page import needs_browser
-from headless_chromium import CHROMIUM, SOFTWARE_GL
+from screenshots import CHROMIUM, SOFTWARE_GL
 
 
 @pytest.fixture(scope="session")

@@ -9,8 +9,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from headless_chromium import CHROMIUM
 from rerun.chunk import RrdReader
+from screenshots import CHROMIUM
 
 SIZE = {"width": 1280, "height": 800}
 DEADLINE_S = 900.0

@@ -9,6 +9,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event
@@ -162,6 +163,10 @@ class Unhurried:
         return {name: celsius for name, celsius in self._world.celsius(self._number).items() if name.endswith(ending)}
 
 
+def _advance(update: Callable[[int, int], None], done: Iterator[int], total: int) -> None:
+    update(next(done), total)
+
+
 def replays(out: Path) -> None:
     """Draw a still of each scene, and the video of one."""
     for name, scene in SCENES.items():
@@ -173,14 +178,8 @@ def replays(out: Path) -> None:
         looks, camera = Looks(bench, stills=2, video=name == FILMED), Unhurried(world, frames)
         with TemporaryDirectory() as folder, tracked(f"reconstructing {name}") as update:
             made, done = Path(folder) / "replay", iter(range(1, frames + 1))
-            replay_recording(
-                camera,
-                processing,
-                made,
-                stop=Event(),
-                on_frame=lambda: update(next(done), frames),
-                looks=looks,  # noqa: B023
-            )
+            advance = partial(_advance, update, done, frames)
+            replay_recording(camera, processing, made, stop=Event(), on_frame=advance, looks=looks)
             shutil.copyfile(max(made.glob("still-*.png")), out / f"gallery-{name}.png")
             if looks.video:
                 shutil.copyfile(made / VIDEO, out / VIDEO)

@@ -8,15 +8,15 @@ from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint
 from nlos_models import runs as train_start
 from nlos_models.checkpoint import CheckpointRecord, save_pipeline, save_vae
+from nlos_models.errors import OutputExistsError, TrainingError
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import Recipe
-from nlos_models.runs import TrainingRun, compressor_start, job_of, transfer_start, vae_start
+from nlos_models.runs import TrainingRun, compressor_start, transfer_start, vae_start
 from safetensors.torch import load_file, save_file
 from small_maps import SmallCompressor, SmallVae, use_small_networks
 from small_run import small_recipe
 
 from nlos_cam.cli.train import RunOptions
-from nlos_cam.errors import OutputExistsError, SceneError
 
 RIG = load_rig("paper-rig")
 NAMED = (RIG.name, RIG.checksum)
@@ -67,7 +67,7 @@ def _start(recipe: Recipe, weights: Path) -> object:
     if recipe.task == "vae":
         return vae_start(recipe, weights)
     if recipe.task == "transfer":
-        return transfer_start(recipe, weights, partial=False)
+        return transfer_start(recipe, weights, partial=False, on_report=print)
     return compressor_start(recipe, weights, weights)
 
 
@@ -80,7 +80,7 @@ def _start(recipe: Recipe, weights: Path) -> object:
     ],
 )
 def test_start_refuses_weights_of_other_kind(weights: Path, recipe: Recipe, changes: dict, words: str) -> None:
-    with pytest.raises(SceneError, match=words):
+    with pytest.raises(TrainingError, match=words):
         _start(recipe.model_copy(update=changes), weights)
 
 
@@ -88,26 +88,27 @@ def test_start_refuses_color_weights_for_depth(weights: Path) -> None:
     record = CheckpointRecord.of([small_recipe(colour=True)], NAMED).model_dump_json()
     (weights / "checkpoint.json").write_text(record, encoding="utf-8")
     for recipe in (AGAIN, JOINT, TRANSFER):
-        with pytest.raises(SceneError, match="simulation only"):
+        with pytest.raises(TrainingError, match="simulation only"):
             _start(recipe, weights)
 
 
 def test_joint_start_needs_encoder_for_latent_loss(weights: Path) -> None:
     (weights / "encoder.safetensors").unlink()
-    with pytest.raises(SceneError, match="encoder"):
+    with pytest.raises(TrainingError, match="encoder"):
         _start(JOINT, weights)
     _start(JOINT.model_copy(update=IMAGES_ALONE), weights)
 
 
-def test_partial_start_fills_missing_tensors_by_seed(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_partial_start_fills_missing_tensors_by_seed(weights: Path) -> None:
     tensors, messages = load_file(weights / "compressor.safetensors"), list[str]()
     missing = tensors.pop("classifier.1.weight")
     save_file({**tensors, "more": missing}, weights / "compressor.safetensors")
-    monkeypatch.setattr(train_start, "say", messages.append)
     rows: list[torch.Tensor] = []
     for seed in (3, 3, 4):
         torch.rand(1)
-        pipeline, runs = transfer_start(small_recipe(task="transfer", seed=seed), weights, partial=True)
+        pipeline, runs = transfer_start(
+            small_recipe(task="transfer", seed=seed), weights, partial=True, on_report=print
+        )
         rows.append(pipeline.compressor.get_parameter("classifier.1.weight").detach())
         assert runs == [VAE, TWO]
         assert all(word in messages[-1] for word in ("more", "classifier.1.weight"))
@@ -116,7 +117,8 @@ def test_partial_start_fills_missing_tensors_by_seed(weights: Path, monkeypatch:
 
 
 def _job(out: Path, *runs: Recipe, starts: tuple[Path | None, ...] = ()) -> TrainingRun:
-    return job_of(RunOptions(Path("r.toml"), out, tensorboard=True), runs[-1], RIG, list(runs[:-1]), "origin", *starts)
+    options = RunOptions(Path("r.toml"), out, tensorboard=True)
+    return options.training(runs[-1], RIG, list(runs[:-1]), "origin", *starts)
 
 
 def test_job_records_run_after_earlier_ones(tmp_path: Path) -> None:
@@ -130,7 +132,7 @@ def test_job_records_run_after_earlier_ones(tmp_path: Path) -> None:
 @pytest.mark.parametrize("runs", [(VAE,), (OTHER_VAE,), (OTHER_VAE, VAE)])
 def test_job_does_not_overwrite_weights_of_another_run(tmp_path: Path, runs: tuple[Recipe, ...]) -> None:
     out = tmp_path / "run"
-    record = _job(out, VAE, OTHER_VAE).made({"held_out_loss": 1.5})
+    record = _job(out, VAE, OTHER_VAE).with_figures({"held_out_loss": 1.5})
     out.mkdir()
     (out / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
     _job(out, VAE, OTHER_VAE)  # the same run may be repeated
