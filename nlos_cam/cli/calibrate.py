@@ -228,8 +228,9 @@ TOLD = {
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add the commands."""
     app.command()(calibrate)
+    app.command()(board)
 
 
 def calibrate(
@@ -338,11 +339,6 @@ def _record(
 
 SheetOut = Annotated[Path | None, typer.Option("--out", help="The PDF to write.")]
 OnSheet = Annotated[Paper, typer.Option("--paper", help="What it will be printed on.")]
-
-
-def register_board(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(board)
 
 
 def board(out: SheetOut = None, paper: OnSheet = "a4", overwrite: Overwrite = False, json: Json = False) -> None:

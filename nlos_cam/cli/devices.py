@@ -22,8 +22,9 @@ SEEN = {True: "yes", False: "[red]no[/]", None: ""}
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add the commands."""
     app.command()(devices)
+    app.command()(doctor)
 
 
 def devices(json: Json = False) -> None:
@@ -111,11 +112,6 @@ def _format_device(facts: Facts) -> str:
 
 COLOURS = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
 WriteUdev = Annotated[Path | None, typer.Option("--write-udev", help="Write the udev rules for the L515 to this file.")]
-
-
-def register_doctor(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(doctor)
 
 
 def doctor(write_udev: WriteUdev = None, overwrite: Overwrite = False, json: Json = False) -> None:

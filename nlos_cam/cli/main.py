@@ -14,12 +14,12 @@ from nlos_cam.errors import DiskFullError, NlosCamError
 
 COMMANDS = {
     "devices": "devices",
-    "doctor": "doctor",
+    "doctor": "devices",
     "capture": "capture",
     "repair": "recordings",
     "export": "recordings",
     "calibrate": "calibrate",
-    "board": "board",
+    "board": "calibrate",
     "live": "live",
     "replay": "live",
     "view": "view",
