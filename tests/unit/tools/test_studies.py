@@ -100,48 +100,6 @@ def test_wall_study_calls_no_wrong_wall_good(tool: Tool, run: Read, monkeypatch:
 
 
 @pytest.mark.slow
-def test_occluder_study_finds_sheets_in_view(tool: Tool, run: Read, monkeypatch: pytest.MonkeyPatch) -> None:
-    few = tool("occluder").settings()[::97]
-    monkeypatch.setattr(tool("occluder"), "settings", lambda: few)
-    table = run("occluder", "occluder_study")
-    in_view, _, edge_hidden, out_of_view = table["what there is to see"]
-    assert in_view["found"] > 0.8
-    assert in_view["x_mm"]["p95"] < 0.5
-    assert out_of_view["found"] == edge_hidden["found"] == 0.0
-
-
-@pytest.mark.slow
-def test_board_study_measures_every_group(tool: Tool, run: Read, monkeypatch: pytest.MonkeyPatch) -> None:
-    board = tool("board")
-    few = {"DISTANCES_M": (0.2,), "FACING_DEG": (45.0,), "SPOTS_MM": (1.0,), "COUNTS": (48.0,), "FRAMES": 2}
-    for name, value in (few | {"TO_FILL_A4": {30.0: board.TO_FILL_A4[30.0]}}).items():
-        monkeypatch.setattr(board, name, value)
-    table = run("board", "board_study", "--scale", 0.003)
-    assert (table["grid_told"]["found"], len(table["grid"])) == (1.0, 1)
-    assert table["squares_by_spot_mm"]["30"]["1"]["found"] == 1.0
-    assert table["random_benches_and_bows_by_sigma_px"]["0.05"]["measured"] > 0
-
-
-@pytest.mark.slow
-def test_drift_study_reports_turns_and_no_rest(tool: Tool, run: Read, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tool("drift"), "look_ms", lambda: 1.0)
-    table = run("drift", "drift_study", "--every", 301)
-    assert table["at_rest"][0]["warned_per_10000"] == 0.0
-    turned = [one for one in table["knocks"] if "yaw" in one["name"]]
-    assert sum(one["told"] for one in turned) == sum(one["tried"] for one in turned) > 0
-
-
-def test_drift_estimates_count_within_their_uncertainty(tool: Tool) -> None:
-    drift = SimpleNamespace(distance_m=0.0023, distance_std_m=1e-4, yaw_deg=0.0, yaw_std_deg=0.02, uniform=False)
-    drift.pitch_deg, drift.pitch_std_deg, drift.range_m, drift.range_std_m = 0.0, 0.02, 0.0016, 1e-4
-    shift = tool("drift").Shift
-    assert shift(0.002).inside(drift) == pytest.approx(2 / 3)
-    assert shift(range_m=0.0015).inside(drift) == 0.0
-    drift.uniform = True
-    assert shift(range_m=0.0015).inside(drift) == 1.0
-
-
-@pytest.mark.slow
 def test_renderer_study_fits_lines_and_refines(
     tool: Tool, harness: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
