@@ -1,71 +1,71 @@
-"""Every error that nlos-cam raises on purpose, as one tree.
+"""Tree of the errors that nlos-cam raises on purpose, with exit codes and an example message of each.
 
-    NlosCamError                     exit 1   root; one clear line: what, the value, what to do
+    NlosCamError                     exit 1   root; one clear line: what was wrong, the value, what to do
     ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be rendered
-    ├── BudgetError (ValueError)     exit 1   a delay that no setting keeps on this machine
-    ├── OutputExistsError (FileExistsError)  exit 1   --out is there and --overwrite was not given
-    ├── DiskFullError (OSError)      exit 1   too little room for what is to be written, or none left
+    ├── BudgetError (ValueError)     exit 1   a latency budget that no setting meets on this machine
+    ├── OutputExistsError (FileExistsError)  exit 1   --out exists and --overwrite was not given
+    ├── DiskFullError (OSError)      exit 1   too little disk space for the output, or none left
     ├── FolderBusyError (BlockingIOError)  exit 1   another process writes to the folder
-    ├── WorkersLostError (ChildProcessError)  exit 1   workers that cannot be had, or that die again and again
-    ├── CameraError (OSError)        exit 3   a device that is missing or does not do as asked
+    ├── WorkersLostError (ChildProcessError)  exit 1   worker processes that cannot start, or that keep dying
+    ├── CameraError (OSError)        exit 3   a device that is missing or does not respond as it should
     │   ├── CameraNotFoundError      exit 3   no such device
-    │   └── CameraLostError          exit 3   it was there, and vanished or fell silent
+    │   └── CameraLostError          exit 3   a device that vanished or went silent while in use
     └── RecordingError (OSError)     exit 4   a recording, dataset or record that cannot be read
-        └── StreamMissingError       exit 4   it can be read, but a stream we need is not in it
+        └── StreamMissingError       exit 4   a readable recording without a stream that is needed
 
 `nlos_calibration.errors` and `nlos_models.errors` hold their packages' roots; the command line catches all three.
 """
 
 
 class NlosCamError(Exception):
-    """Root of the errors that nlos-cam foresaw."""
+    """Root of nlos-cam's own errors: "sim cannot be recorded: give a live camera (l515, sim)"."""
 
     exit_code = 1
 
 
 class SceneError(NlosCamError, ValueError):
-    """A scene, an object or an accuracy that cannot be rendered."""
+    """Scene, object or accuracy that cannot be rendered: "no object 'cupp': did you mean 'cup'?"."""
 
 
 class BudgetError(NlosCamError, ValueError):
-    """A delay that no setting keeps on this machine."""
+    """Latency budget that no setting meets on this machine: "--budget-ms 5: the fastest setting takes 9.1 ms"."""
 
 
 class OutputExistsError(NlosCamError, FileExistsError):
-    """An output path that exists, and that nobody asked to overwrite."""
+    """Output path that exists: "run.bag exists: choose another name, or add --overwrite to replace it"."""
 
 
 class DiskFullError(NlosCamError, OSError):
-    """A disk with too little room for what is to be written, or with none left."""
+    """Disk with too little free space: "run.json cannot be written (No space left on device): free some space"."""
 
 
 class FolderBusyError(NlosCamError, BlockingIOError):
-    """A folder that another process writes to."""
+    """Folder that another process writes to: "data is being written by another build: wait until it has ended"."""
 
 
 class WorkersLostError(NlosCamError, ChildProcessError):
-    """Workers that cannot be had, or that die again and again."""
+    """Worker processes that cannot start, or keep dying: "a worker exited (code -9) before producing objects"."""
 
 
 class CameraError(NlosCamError, OSError):
-    """A camera that does not do what was asked of it."""
+    """Camera that does not respond as it should: "l515 does not start (busy): close other programs that use it"."""
 
     exit_code = 3
 
 
 class CameraNotFoundError(CameraError):
-    """No camera answers to this name."""
+    """Camera that is not connected: "no L515 found (librealsense sees no device): check the USB 3 cable and port"."""
 
 
 class CameraLostError(CameraError):
-    """A camera that was there and vanished, or fell silent."""
+    """Camera that vanished or went silent while in use: "l515 did not stop within 5 s: replug it"."""
 
 
 class RecordingError(NlosCamError, OSError):
-    """A recording, dataset or record that cannot be read."""
+    """Recording, dataset or record that cannot be read: "run.bag is damaged (no index): run `nlos-cam repair`"."""
 
     exit_code = 4
 
 
 class StreamMissingError(RecordingError):
-    """A recording that lacks a stream the reconstruction needs."""
+    """Recording without a stream that is needed: "run.bag has no infrared stream (it has color, depth)"."""

@@ -1,11 +1,8 @@
-"""Results, a file or a folder: written under another name, and renamed when whole.
-
-Where what can be made again is kept.
-"""
+"""Atomic writes of results, and the location of the cache directory."""
 
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,39 +10,50 @@ from pathlib import Path
 from nlos_cam.errors import OutputExistsError
 
 
-@contextmanager
-def atomic_directory(out: Path) -> Generator[Path]:
-    """A folder to write in, beside `out`; its contents replace those of the same names in `out` at the end.
-
-    After an error it is removed. Raises OutputExistsError where `out` is a file.
-    """
-    if out.exists() and not out.is_dir():
-        raise OutputExistsError(f"{out} is a file: choose a folder's name for --out")
-    part = Path(tempfile.mkdtemp(".part", f".{out.name}.", out.parent))  # a process that died may have had our number
-    try:
-        yield part
-        out.mkdir(exist_ok=True)
-        for made in part.iterdir():
-            if made.is_dir():
-                shutil.rmtree(out / made.name, ignore_errors=True)
-            made.replace(out / made.name)
-    finally:
-        shutil.rmtree(part)
+def _unfinished(path: Path) -> Path:
+    """Return a name beside `path` that no other process or container uses, unlike a process id."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
 
 
 @contextmanager
 def atomic_file(path: Path) -> Generator[Path]:
-    """A file to write beside `path`, which it replaces at the end; after an error it is removed."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    """Yield a path to write to; on success flush that file to disk and rename it to `path`, else delete it.
+
+    Readers see the old file or the whole new one, also after a power cut or a full disk.
+    """
+    part = _unfinished(path)
     try:
         yield part
+        with part.open("r+b") as file:
+            os.fsync(file.fileno())
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
 
 
+@contextmanager
+def atomic_directory(out: Path) -> Generator[Path]:
+    """Yield an empty directory beside `out`; on success move its entries into `out`, and delete it in any case.
+
+    Entries of `out` with the same names are replaced, others stay. Raises OutputExistsError where `out` is a file.
+    """
+    if out.exists() and not out.is_dir():
+        raise OutputExistsError(f"{out} is a file, but --out must be a directory: choose another name")
+    part = _unfinished(out)
+    part.mkdir()
+    try:
+        yield part
+        out.mkdir(exist_ok=True)
+        for entry in part.iterdir():
+            if entry.is_dir():
+                shutil.rmtree(out / entry.name, ignore_errors=True)
+            entry.replace(out / entry.name)
+    finally:
+        shutil.rmtree(part)
+
+
 def cache_folder() -> Path:
-    """NLOS_CAM_CACHE, or nlos-cam's place in the user's cache folder."""
+    """Return NLOS_CAM_CACHE, or "nlos-cam" in the user's cache directory."""
     if chosen := os.environ.get("NLOS_CAM_CACHE"):
         return Path(chosen)
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "nlos-cam"

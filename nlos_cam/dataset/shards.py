@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from nlos_cam.dataset.plan import SCENE_COLUMNS, DatasetPlan
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
+from nlos_cam.files import atomic_file
 
-SHARDS, PARTS = "shard-*.h5", "shard-*.part"
+SHARDS, PARTS = "shard-*.h5", "*shard-*.part"
 FIRST_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category")
 """Those of every shard; scene came with the checksums."""
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -105,21 +106,15 @@ def store(path: Path, samples: Samples, provenance: str, command: str) -> None:
 
     Raises DiskFullError where it does not fit; what was there stays.
     """
-    part = path.with_suffix(".part")
     try:
-        with part.open("wb") as file:
-            file.write(_as_bytes(samples, provenance, command))
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        with atomic_file(path) as part:
+            part.write_bytes(_as_bytes(samples, provenance, command))
     except OSError as error:
         if error.errno in NO_ROOM:
             raise DiskFullError(
                 f"no room for {path} ({error.strerror}): what was made so far is kept; make room and build again"
             ) from error
         raise
-    finally:  # after Ctrl-C, too
-        part.unlink(missing_ok=True)
 
 
 def _as_bytes(samples: Samples, provenance: str, command: str) -> bytes:

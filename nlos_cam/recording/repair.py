@@ -1,6 +1,5 @@
 """Rebuilding a killed, cut or damaged recording: every whole chunk of it, with a new index, in a new file."""
 
-import os
 import re
 import shutil
 from collections import Counter
@@ -11,6 +10,7 @@ from typing import BinaryIO
 
 from nlos_cam.camera import FORMATS
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
+from nlos_cam.files import atomic_file
 from nlos_cam.recording.rosbag import (
     ENTRY_BYTES,
     FILE_HEADER_BYTES,
@@ -132,21 +132,11 @@ def _frames(chunks: list[Chunk], connections: Mapping[int, Connection]) -> dict[
 
 
 def _write(path: Path, out: Path, scan: Scan, report: OnProgress) -> None:
-    """Write beside `out`, and rename: whatever interrupts leaves no half of a file under its name."""
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    """Write the repaired bag to `out`, atomically."""
     try:
         _check_space(out, scan)
-        with path.open("rb") as source:
-            target = part.open("xb")  # so that what is removed below is ours
-            try:
-                with target:
-                    _Writer(source, target, scan, report).write()
-                    target.flush()
-                    os.fsync(target.fileno())
-                part.replace(out)
-            except BaseException:
-                part.unlink(missing_ok=True)
-                raise
+        with path.open("rb") as source, atomic_file(out) as part, part.open("wb") as target:
+            _Writer(source, target, scan, report).write()
     except OSError as error:
         if isinstance(error, NlosCamError):
             raise

@@ -1,7 +1,6 @@
 """The record beside a recording, F.json beside F.bag: device, settings, temperatures, calibration, label, summary."""
 
 import hashlib
-import os
 import platform
 from collections.abc import Mapping
 from contextlib import suppress
@@ -17,6 +16,7 @@ from pydantic import AwareDatetime, Field, ValidationError
 
 from nlos_cam.camera import Camera
 from nlos_cam.errors import DiskFullError, RecordingError
+from nlos_cam.files import atomic_file
 from nlos_cam.frames import Frame
 from nlos_cam.recording.playback import Verified
 from nlos_cam.recording.quality import Quality
@@ -202,13 +202,8 @@ class SidecarFile:
         self._write()
 
     def _write(self) -> None:
-        part = self.path.with_name(f"{self.path.name}.part")
         try:
-            with part.open("w", encoding="utf-8") as file:
-                file.write(self._sidecar.model_dump_json(indent=2) + "\n")
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(self.path)
+            with atomic_file(self.path) as part:
+                part.write_text(self._sidecar.model_dump_json(indent=2) + "\n", encoding="utf-8")
         except OSError as error:
-            part.unlink(missing_ok=True)
             raise DiskFullError(f"{self.path} cannot be written ({error.strerror}): free some space") from error

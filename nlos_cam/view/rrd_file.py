@@ -1,14 +1,14 @@
 """A viewer that writes what a browser would see to a file (.rrd), to be looked at later, from beginning to end."""
 
-from collections import deque
 from datetime import timedelta
 from pathlib import Path
-from threading import Condition, Thread
+from threading import Thread
 from typing import Self
 
 import rerun as rr
 from nlos_calibration import MeasuredWall, Rig
 
+from nlos_cam.threads import BoundedQueue
 from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.viewer import Moment
 
@@ -42,9 +42,7 @@ class RrdFile:
         self.full = False
         """Whether the file has ended before the run."""
         self._path, self._rig, self._measured, self._keeps_all = path, rig, measured, keeps_all
-        self._queue: deque[Moment] = deque()
-        self._changed = Condition()
-        self._ended = False
+        self._queue = BoundedQueue[Moment](QUEUE_MOMENTS)
         self._due_s = float("-inf")
         self._error: Exception | None = None
         self._thread = Thread(target=self._write, name="saved view")
@@ -55,9 +53,7 @@ class RrdFile:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with self._changed:
-            self._ended = True
-            self._changed.notify_all()
+        self._queue.finish()
         self._thread.join()
         if self._error:
             raise self._error
@@ -67,20 +63,13 @@ class RrdFile:
         if self.full or moment.published_s < self._due_s:
             return
         self._due_s = moment.published_s + PERIOD_S - SLACK_S
-        with self._changed:
-            while self._keeps_all and len(self._queue) == QUEUE_MOMENTS and self._thread.is_alive():
-                self._changed.wait(BATCH_S)
-            if len(self._queue) == QUEUE_MOMENTS:
-                self.left_out += 1
-                return
-            self._queue.append(moment)
-            self._changed.notify_all()
-
-    def _next(self) -> Moment | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._queue or self._ended)
-            self._changed.notify_all()
-            return self._queue.popleft() if self._queue else None
+        wait_s = BATCH_S if self._keeps_all else 0.0
+        while not (has_room := self._queue.wait_for_room(wait_s)) and self._keeps_all and self._thread.is_alive():
+            pass
+        if has_room:
+            self._queue.put(moment)
+        else:
+            self.left_out += 1
 
     def _write(self) -> None:
         try:
@@ -93,7 +82,7 @@ class RrdFile:
         recording.save(self._path)
         try:
             drawing: Drawing | None = None
-            while (moment := self._next()) is not None:
+            while (moment := self._queue.take()) is not None:
                 if self.full:
                     continue
                 drawing = drawing or Drawing(recording, self._rig, moment, self._measured, saved=True)

@@ -13,10 +13,11 @@ from typing import BinaryIO, Self
 from nlos_calibration import MeasuredWall, Rig
 
 from nlos_cam.errors import RecordingError
+from nlos_cam.threads import LatestValue
 from nlos_cam.view.assets import LOOPBACK, page_assets
 from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.server import Send, ViewServer
-from nlos_cam.view.viewer import Latest, Moment
+from nlos_cam.view.viewer import Moment
 
 PREFERRED_PORT = 9090
 DRAW_PERIOD_S = 1 / 12
@@ -49,7 +50,7 @@ class WebViewer:
         self.address: str | None = None
         self._host, self._port = host, port
         self._rig, self._measured, self._clock = rig, measured, clock
-        self._moments = Latest[Moment]()
+        self._moments = LatestValue[Moment]()
         self._closed = Event()
 
     def __enter__(self) -> Self:
