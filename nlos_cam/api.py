@@ -29,17 +29,17 @@ from nlos_cam.camera import Camera, OnProgress, open_camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live import FrameReader, RunStatistics, iterate_results, warm_up, with_telemetry
-from nlos_cam.objects import cell_centres_m, object_box
+from nlos_cam.objects import cell_centers_m, object_box
 from nlos_cam.reconstruct import (
     Clock,
     FrameResult,
     Pipeline,
     Verdict,
-    load_doubt,
+    build_pipeline,
+    compatibility_warnings,
     load_networks,
-    misfits,
+    load_uncertainty,
     open_bench,
-    set_up,
 )
 
 
@@ -78,7 +78,7 @@ class Glimpse:
     @property
     def points_m(self) -> Float32:
         """(n, 3): the hidden surface's points in the wall frame, x along the wall, y up, z into the room."""
-        x_m, y_m = np.meshgrid(*cell_centres_m(self.box))
+        x_m, y_m = np.meshgrid(*cell_centers_m(self.box))
         points_m = np.stack([x_m, y_m, self.depth_m], -1).astype(np.float32)
         return points_m[np.isfinite(self.depth_m)]
 
@@ -117,12 +117,12 @@ class Stream:
     """
 
     def __init__(
-        self, camera: Camera, processing: Pipeline, *, keeps_all: bool, notes: tuple[str, ...] = (), clock: Clock
+        self, camera: Camera, processing: Pipeline, *, lossless: bool, notes: tuple[str, ...] = (), clock: Clock
     ) -> None:
         self.camera = camera
         self.notes = notes
         """What does not fit between the networks and this bench: believe less where there is any."""
-        self._processing, self._keeps_all, self._clock = processing, keeps_all, clock
+        self._processing, self._keeps_all, self._clock = processing, lossless, clock
         self._box = object_box(self.rig)
         self._tally, self._inside = RunStatistics(), ExitStack()
         self._reader: FrameReader | None = None
@@ -145,7 +145,7 @@ class Stream:
         def leave() -> None:
             camera.__exit__(None, None, None)
 
-        reader = FrameReader(frames, keeps_all=self._keeps_all, stop=Event(), clock=self._clock, let_go=leave)
+        reader = FrameReader(frames, lossless=self._keeps_all, stop=Event(), clock=self._clock, let_go=leave)
         self._reader = self._inside.enter_context(reader)
         self._steps = iterate_results(reader, self._processing, self._clock, self._tally.fail, thermometer)
         return self
@@ -184,8 +184,8 @@ def open_stream(
     camera = open_camera(uri, on_progress=on_progress)
     bench = open_bench(Path(wall) if wall else None, camera)
     folder = Path(weights) if weights else None
-    network, doubter = load_networks(folder), load_doubt(folder)
-    processing = set_up(bench, network, average, doubter=doubter)
+    network, doubter = load_networks(folder), load_uncertainty(folder)
+    processing = build_pipeline(bench, network, average, uncertainty_model=doubter)
     warm_up(camera, processing)
-    notes = tuple(misfits(bench, network.record, doubter))
-    return Stream(camera, processing, keeps_all=uri.startswith("bag:"), notes=notes, clock=clock)
+    notes = tuple(compatibility_warnings(bench, network.record, doubter))
+    return Stream(camera, processing, lossless=uri.startswith("bag:"), notes=notes, clock=clock)

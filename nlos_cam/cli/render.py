@@ -18,18 +18,7 @@ from pydantic import ValidationError
 from rich.table import Table
 
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, stderr
-from nlos_cam.errors import SceneError
-from nlos_cam.objects import (
-    CATEGORIES,
-    DEPTH_MAP_SUFFIX,
-    MESH_SUFFIXES,
-    Up,
-    fit,
-    nothing_to_see,
-    object_box,
-    read_depth_map,
-    read_mesh,
-)
+from nlos_cam.objects import CATEGORIES, OBJECT_FILES, Up, load_object, object_box, object_kind
 from nlos_cam.render import (
     EFFECTS,
     Accuracy,
@@ -117,16 +106,13 @@ def accuracy_of(
     return choose(scene, max_error, max_seconds, effects, backend).accuracy
 
 
-_KINDS = f"a mesh ({', '.join(MESH_SUFFIXES)}), a {DEPTH_MAP_SUFFIX} depth map (n, n) in metres"
-
-
 def _option(field: str, told: str) -> Any:
     """An option of the same name as a field of HiddenObject: None where it is not given."""
     default = HiddenObject.model_fields[field].default
     return typer.Option(f"--{field.replace('_', '-')}", help=told, show_default=str(default))
 
 
-Object = Annotated[str, typer.Argument(metavar="OBJECT", help=f"A category's name, {_KINDS}.")]
+Object = Annotated[str, typer.Argument(metavar="OBJECT", help=f"A category's name, {OBJECT_FILES}.")]
 Seed = Annotated[int | None, _option("seed", "Which variation of a category.")]
 UpAxis = Annotated[Up | None, _option("up", "What points up in a mesh's file; -z (z up: its +y) faces the wall.")]
 Size = Annotated[float | None, _option("size_m", "Larger of its extents along x and y, once turned. It scales a mesh.")]
@@ -139,53 +125,28 @@ Front = Annotated[float | None, _option("front_m", "From the box to its nearest 
 
 
 def hidden_depth(hidden: str, rig: Rig, options: dict[str, Any]) -> Float32:
-    """The depth map (n, n) over the rig's object box of what OBJECT names; `options` are fields of HiddenObject.
+    """Return the depth map (n, n) of OBJECT over the rig's object box; `options` are fields of HiddenObject, or None.
 
-    Says on stderr what the box cuts off or flattens. Raises SceneError for an object that cannot be, and
-    typer.BadParameter for options (those that are not None) that do not go with it or are out of their range.
+    Prints on stderr how the box changes it. Raises SceneError for an object that cannot be loaded or placed, and
+    typer.BadParameter for options that do not apply to it or are out of range.
     """
-    given = {name: value for name, value in options.items() if value is not None}
-    if hidden in CATEGORIES:
-        _refuse(given, {"up"}, f"{hidden} is a category, which stands with y up")
-        return _placed({"category": hidden, **given}, rig)
-    suffix = Path(hidden).suffix.lower()
-    if suffix == DEPTH_MAP_SUFFIX:
-        _refuse(given, set(given), f"{hidden} is a depth map, which is placed already")
-        return _depth_map(Path(hidden))
-    if suffix in MESH_SUFFIXES:
-        _refuse(given, {"seed"}, f"{hidden} is a mesh, which has no variations")
-        return _placed({"file": read_mesh(Path(hidden)), **given}, rig)
-    raise SceneError(f"no object {hidden!r}: give {_KINDS}, or one of {', '.join(CATEGORIES)}")
-
-
-def _refuse(given: dict[str, Any], pointless: set[str], why: str) -> None:
-    if extra := [f"--{name.replace('_', '-')}" for name in given if name in pointless]:
-        raise typer.BadParameter(f"{why}: leave out {', '.join(extra)}")
-
-
-def _depth_map(path: Path) -> Float32:
-    depth_m = read_depth_map(path)
-    if np.isnan(depth_m).all():
-        say(f"{path} is an empty object (all of it is NaN): it hides nothing")
-    return depth_m
-
-
-def _placed(fields: dict[str, Any], rig: Rig) -> Float32:
-    try:
-        thing = HiddenObject(**fields)
-    except ValidationError as error:
-        raise typer.BadParameter(first_problem(error)) from error
-    box, scene = object_box(rig), SceneFile(name=thing.label, rig=rig, object=thing)
-    depth_m = scene.scene_at(0).object_depth_m
-    if depth_m is None or np.isnan(depth_m).all():
-        raise nothing_to_see(thing.label, box)
-    taken = fit(thing.triangles, scene.pose_at(thing, 0), box)
-    if taken.outside:
-        say(f"{thing.label}: {taken.outside:.0%} of its silhouette is outside the object box, and cut off")
-    if taken.depth_m > taken.room_m:
-        depths = f"{taken.depth_m:.3g} m deep, flattened to the {taken.room_m:.3g} m that the object box has for it"
-        say(f"{thing.label}: {depths}")
-    return depth_m
+    given, kind = {name: value for name, value in options.items() if value is not None}, object_kind(hidden)
+    unused = {"category": {"up"}, "mesh": {"seed"}, "depth map": set(given)}[kind]
+    if extra := [f"--{name.replace('_', '-')}" for name in given if name in unused]:
+        raise typer.BadParameter(f"{hidden} is a {kind}, to which {', '.join(extra)} does not apply: drop it")
+    if kind == "depth map":
+        loaded = load_object(hidden, object_box(rig))
+    else:
+        up: Up = given.pop("up", "y")
+        try:
+            rest = HiddenObject(category=next(iter(CATEGORIES)), **given)  # only checks the ranges of scene files
+        except ValidationError as error:
+            raise typer.BadParameter(first_problem(error)) from error
+        pose = SceneFile(name=hidden, rig=rig).pose_at(rest, 0)
+        loaded = load_object(hidden, object_box(rig), pose, seed=rest.seed, up=up)
+    for warning in loaded.warnings:
+        say(warning)
+    return loaded.depth_m
 
 
 def register(app: typer.Typer) -> None:
@@ -258,8 +219,8 @@ def _save(path: Path, scene: Scene, depth_m: Float32, rendering: Rendering) -> N
         "rig_checksum": np.array(scene.rig.checksum),
         "radiometry": np.array(scene.radiometry),
     }
-    if rendering.colour is not None:
-        arrays["colour"] = rendering.colour
+    if rendering.color is not None:
+        arrays["colour"] = rendering.color
     np.savez_compressed(path, allow_pickle=False, **arrays)
 
 

@@ -11,7 +11,7 @@ from nlos_models import SIMULATION_ONLY, SMALLER_IS_BETTER, MapSet, brightness, 
 
 from nlos_cam.dataset import sense_colour
 from nlos_cam.evaluate.metrics import advantage, over_objects, plain
-from nlos_cam.objects import TEXTURES, image_from_albedo, painted
+from nlos_cam.objects import TEXTURES, image_from_albedo, paint
 from nlos_cam.render import Scene, Sensor, SensorModel, Surface
 
 ROWS = ("truth", "reconstruction", "difference")
@@ -26,7 +26,7 @@ def painted_maps(
     """The maps of objects (64, 64), each painted by a seed of its own, with the sensor's noise; and their images."""
     sensor, maps, images = Sensor(rig, SensorModel()), list[tuple[Float32, Float32]](), list[Float32]()
     for seed, depth_m in enumerate(depths_m, first_seed):
-        albedo = painted(seed, depth_m, [*TEXTURES]).albedo
+        albedo = paint(seed, depth_m, [*TEXTURES]).albedo
         seen = sense_colour(Scene(rig, depth_m, Surface(albedo)), sensor, seed, accuracy)
         maps.append((seen.depth_m, seen.intensity))
         images.append(image_from_albedo(albedo, depth_m))

@@ -2,40 +2,45 @@ __all__ = [
     "CATEGORIES",
     "DEPTH_MAP_SUFFIX",
     "MESH_SUFFIXES",
-    "OF_EACH",
+    "OBJECTS_PER_CATEGORY",
+    "OBJECT_FILES",
     "TEXTURES",
+    "BenchmarkObject",
     "Coat",
-    "FixedObject",
     "MeshFile",
     "Pose",
     "Up",
     "benchmark_objects",
+    "box_width_m",
     "category_triangles",
-    "cell_centres_m",
+    "cell_centers_m",
     "depth_from_image",
-    "fit",
+    "find_category",
     "folder_objects",
     "image_from_albedo",
     "image_from_depth",
+    "invisible_object_error",
+    "load_object",
     "mesh_depth",
-    "nothing_to_see",
     "object_box",
     "object_depth",
     "object_depths",
+    "object_kind",
     "orthographic_depth",
-    "painted",
+    "paint",
     "panel",
     "place",
     "post",
     "random_pose",
     "read_depth_map",
     "read_mesh",
-    "upright",
+    "turn_upright",
 ]
 
-from .benchmark import OF_EACH, FixedObject, benchmark_objects
-from .depth_map import cell_centres_m, depth_from_image, image_from_depth, object_box, orthographic_depth
-from .generators import CATEGORIES
+from .benchmark import OBJECTS_PER_CATEGORY, BenchmarkObject, benchmark_objects
+from .depth_map import cell_centers_m, depth_from_image, image_from_depth, object_box, orthographic_depth
+from .generators import CATEGORIES, find_category
+from .loading import OBJECT_FILES, load_object, object_kind
 from .meshes import (
     DEPTH_MAP_SUFFIX,
     MESH_SUFFIXES,
@@ -45,13 +50,13 @@ from .meshes import (
     mesh_depth,
     read_depth_map,
     read_mesh,
-    upright,
+    turn_upright,
 )
 from .placement import (
     Pose,
+    box_width_m,
     category_triangles,
-    fit,
-    nothing_to_see,
+    invisible_object_error,
     object_depth,
     object_depths,
     panel,
@@ -59,4 +64,4 @@ from .placement import (
     post,
     random_pose,
 )
-from .textures import TEXTURES, Coat, image_from_albedo, painted
+from .textures import TEXTURES, Coat, image_from_albedo, paint

@@ -1,28 +1,18 @@
-"""Generators of what stands in a room: computer, cupboard, oven, soundbox, table.
+"""Generators of the 18 object categories of SI 1 of the paper, and the ranges of their settings.
 
-The settings of a category's generator: what training draws, and what only the test set has.
-
-Each setting is a proportion with a range. Some have an interval held out of it (or beside it): no seed draws a value in
-there, and the test set takes all of its values for that setting from there.
-
-Generators of what is lived in: birdhouse, tower.
-
-Generators of small things of the house: baskets, bell, bowl, cup, hat, lamp.
-
-Generators of what drives, sails and flies: airplane, boat, car, motorcycle, rocket.
-
-The table of the 18 kinds of things of SI 1: each a generator with its settings.
-
-A person names each from its picture. A generator builds the thing as it stands (y up), in units of its own size, with
-the side worth seeing towards the wall (z negative).
+A generator builds a recognisable object as it stands (y up), in units of its own size, with its telling side towards
+the wall (-z). Each setting is a proportion with a range; some have a held-out interval, which no training seed draws
+and from which the benchmark takes its values.
 """
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 import numpy as np
 from nlos_calibration.arrays import Float64
 
+from nlos_cam.errors import SceneError
 from nlos_cam.objects.primitives import (
     arch,
     at,
@@ -44,15 +34,15 @@ from nlos_cam.objects.primitives import (
 
 @dataclass(frozen=True)
 class Setting:
-    """One proportion of a thing, in units of the thing's own size, degrees or a count (its whole part)."""
+    """Range of one proportion of an object, in units of its size, in degrees, or a count (the whole part)."""
 
     low: float
     high: float
     held_out: tuple[float, float] | None = None
-    """An open interval within the range, or beside it, that training never draws from."""
+    """Open interval, within the range or beside it, that training never draws from."""
 
     @property
-    def trained(self) -> list[tuple[float, float]]:
+    def training_intervals(self) -> list[tuple[float, float]]:
         """The closed intervals that training draws from."""
         if self.held_out is None:
             return [(self.low, self.high)]
@@ -60,45 +50,45 @@ class Setting:
         pieces = (self.low, min(self.high, gap_low)), (max(self.low, gap_high), self.high)
         return [(low, high) for low, high in pieces if low < high]
 
-    def drawn(self, unit: float) -> float:
-        """The value at a share `unit` in [0, 1] of all that training draws from."""
-        pieces = self.trained
+    def draw(self, unit: float) -> float:
+        """Return the value at `unit` in [0, 1] of the training intervals, joined end to end."""
+        pieces = self.training_intervals
         value = pieces[0][0] + sum(high - low for low, high in pieces) * unit
         if len(pieces) == 1 or value <= pieces[0][1]:
             return value
         return max(pieces[1][0], value + (pieces[1][0] - pieces[0][1]))
 
-    def kept(self, unit: float) -> float:
-        """The value at a share `unit` in ]0, 1[ of what the test set has: the held-out interval, if there is one."""
+    def draw_held_out(self, unit: float) -> float:
+        """Return the value at `unit` in ]0, 1[ of the held-out interval, or of the whole range if there is none."""
         if self.held_out is None:
-            return self.drawn(unit)
+            return self.draw(unit)
         low, high = self.held_out
         return low + (high - low) * unit
 
 
 @dataclass(frozen=True)
 class Category:
-    """A kind of thing: how it is made of its settings, in the order in which a seed decides them."""
+    """Object category: its generator, and its settings in the order in which a seed draws them."""
 
     make: Callable[..., Float64]
     settings: Mapping[str, Setting]
 
     @property
     def name(self) -> str:
-        """What a person calls it."""
+        """The generator's name, an everyday word."""
         return self.make.__name__
 
-    def drawn(self, units: Iterable[float]) -> dict[str, float]:
-        """Settings for training from numbers in [0, 1], one for each."""
-        return {name: s.drawn(unit) for (name, s), unit in zip(self.settings.items(), units, strict=True)}
+    def draw(self, units: Iterable[float]) -> dict[str, float]:
+        """Return training settings from numbers in [0, 1], one for each."""
+        return {name: s.draw(unit) for (name, s), unit in zip(self.settings.items(), units, strict=True)}
 
-    def kept(self, units: Iterable[float]) -> dict[str, float]:
-        """Settings for the test set from numbers in ]0, 1[, one for each."""
-        return {name: s.kept(unit) for (name, s), unit in zip(self.settings.items(), units, strict=True)}
+    def draw_held_out(self, units: Iterable[float]) -> dict[str, float]:
+        """Return benchmark settings from numbers in ]0, 1[, one for each."""
+        return {name: s.draw_held_out(unit) for (name, s), unit in zip(self.settings.items(), units, strict=True)}
 
 
 def category(**settings: Setting) -> Callable[[Callable[..., Float64]], Category]:
-    """A decorator that makes a category of a function of its settings; the category has the function's name."""
+    """Return a decorator that makes a category from a generator function and the ranges of its arguments."""
     return lambda make: Category(make, settings)
 
 
@@ -113,7 +103,7 @@ SIDES = (-1, 1)
     tip=Setting(14, 30),
 )
 def computer(width: float, height: float, neck: float, reach: float, tip: float) -> Float64:
-    """A screen set into its frame, on neck and foot, with the keyboard before it."""
+    """Build a screen set into its frame, on a neck and a foot, with a keyboard in front."""
     foot = -height / 2 - neck
     screen = joined(frame(width, height, 0.07, 0.18), at(box(width - 0.1, height - 0.1, 0.04), z=0.06))
     stand = joined(at(box(0.16, neck, 0.08), y=foot + neck / 2), at(box(0.4, 0.04, 0.26), y=foot))
@@ -130,7 +120,7 @@ def computer(width: float, height: float, neck: float, reach: float, tip: float)
     tip=Setting(-5, 15),
 )
 def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float) -> Float64:
-    """Two doors on short legs: one is shut, with its knob; the other stands open and shows the shelves."""
+    """Build a cupboard on short legs: one door is shut, the other stands open and shows the shelves."""
     leaf, rows = width / 2 - 0.02, int(shelves)
     case = joined(frame(width, 0.9, 0.05, depth), at(box(width, 0.9, 0.03), z=depth / 2))
     boards = [at(box(width - 0.04, 0.04, depth * 0.85), y=0.9 * (k / rows - 0.5), z=0.03) for k in range(1, rows)]
@@ -151,7 +141,7 @@ def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float
     tip=Setting(18, 36),
 )
 def oven(width: float, depth: float, window: float, knobs: float, tip: float) -> Float64:
-    """A cooker seen a little from above: hob with rings, knobs, a handle, and the door's window set in."""
+    """Build a cooker seen a little from above: hob with rings, knobs, handle, door with a recessed window."""
     front, count = -depth / 2, int(knobs)
     door = at(frame(width, 0.6, (0.6 - window) / 2, 0.14), y=-0.2, z=front + 0.07)
     body = joined(at(box(width, 0.6, depth - 0.14), y=-0.2, z=0.07), at(box(width, 0.26, depth), y=0.23))
@@ -172,14 +162,14 @@ def oven(width: float, depth: float, window: float, knobs: float, tip: float) ->
     tweeter=Setting(0.2, 0.28),
 )
 def soundbox(width: float, depth: float, woofer: float, tweeter: float) -> Float64:
-    """A loudspeaker: a tall box, a large cone below and a small one above, each with its rim and its cap."""
+    """Build a loudspeaker: a tall box with a large cone below and a small one above."""
     low, high = _speaker(width, 0.6, woofer * width), _speaker(width, 0.4, tweeter * width)
     fronts = joined(at(low, y=-0.2), at(high, y=0.3))
     return joined(at(fronts, z=-depth / 2), at(box(width, 1.0, depth - 0.28), z=0.14))
 
 
 def _speaker(width: float, height: float, radius: float) -> Float64:
-    """A front plate facing the wall at z = 0, with a cone of some radius sunk into it."""
+    """Return a front plate at z = 0, facing the wall, with a sunk cone, its rim and its cap."""
     cone = turned(lathe([(radius, 0.0), (radius * 0.4, -0.25), (0, -0.25)]), (1, 0, 0), -90)
     cap = at(knob(radius * 0.4, 0.1), z=0.25)
     return joined(at(pierced(width, height, radius, 0.28), z=0.14), ring(radius, 0.03), cone, cap)
@@ -193,7 +183,7 @@ def _speaker(width: float, height: float, radius: float) -> Float64:
     tip=Setting(15, 40),
 )
 def table(width: float, depth: float, leg: float, height: float, tip: float) -> Float64:
-    """A table seen a little from above: top and four legs."""
+    """Build a table seen a little from above: top and four legs."""
     legs = [
         at(box(leg, height, leg), s * (width - leg) / 2, -height / 2, z * (depth - leg) / 2)
         for s in SIDES
@@ -210,7 +200,7 @@ def table(width: float, depth: float, leg: float, height: float, tip: float) -> 
     hole=Setting(0.09, 0.14),
 )
 def birdhouse(width: float, height: float, depth: float, gable: float, hole: float) -> Float64:
-    """A box with a gable roof, a round hole with its rim, and a perch under it."""
+    """Build a box with a gable roof, a round hole with a rim, and a perch below it."""
     eaves, front, sunk = height / 2 - 0.1, -depth / 2, 0.2
     house = at(box(width, height, depth - sunk), 0, -0.1, sunk / 2)
     face = at(pierced(width, height, hole, sunk), 0, -0.1, front + sunk / 2)
@@ -226,7 +216,7 @@ def birdhouse(width: float, height: float, depth: float, gable: float, hole: flo
     turn=Setting(0.0, 1.0),
 )
 def tower(radius: float, flare: float, turn: float) -> Float64:
-    """A round tower with battlements."""
+    """Build a round tower with battlements."""
     head = radius * flare
     merlon = 0.45 * head
     shaft = lathe([(0, 0.35), (head, 0.35), (head, 0.22), (radius, 0.14), (radius * 1.1, -0.5), (0, -0.5)])
@@ -243,7 +233,7 @@ def tower(radius: float, flare: float, turn: float) -> Float64:
     tip=Setting(10, 30),
 )
 def baskets(bottom: float, height: float, handle: float, ribs: float, tip: float) -> Float64:
-    """A round basket with woven rows, tipped so that its hollow shows, and a tall handle over it."""
+    """Build a round woven basket, tipped so that its hollow shows, with a tall handle."""
     rows = 2 * int(ribs) + 1
     top, low = 0.44, -height
     weave = [
@@ -260,7 +250,7 @@ def baskets(bottom: float, height: float, handle: float, ribs: float, tip: float
     waist=Setting(0.2, 0.28, held_out=(0.23, 0.255)),
 )
 def bell(rim: float, waist: float) -> Float64:
-    """A bell with a flared rim, a crown and a clapper."""
+    """Build a bell with a flared rim, a crown and a clapper."""
     crown = [(0, 0.34), (waist * 0.7, 0.32), (waist, 0.2)]
     shell = lathe([*crown, (waist * 1.1, -0.1), (rim * 0.8, -0.28), (rim, -0.4), (0, -0.4)])
     return joined(shell, at(ring(0.1, 0.045), 0, 0.42), at(knob(0.09, 0.09), 0, -0.44))
@@ -272,7 +262,7 @@ def bell(rim: float, waist: float) -> Float64:
     tip=Setting(20, 42),
 )
 def bowl(depth: float, foot: float, tip: float) -> Float64:
-    """Tipped towards the wall, so that its hollow shows above its side and foot."""
+    """Build a bowl tipped towards the wall, so that its hollow shows above its side and foot."""
     base = [(0, -depth - 0.06), (foot, -depth - 0.06), (foot, -depth)]
     outer = [*base, (0.38, -depth * 0.5), (0.47, -depth * 0.15), (0.5, 0)]
     inner = [(0.44, 0), (0.33, -depth * 0.5), (0.14, -depth * 0.85), (0, -depth * 0.85)]
@@ -287,7 +277,7 @@ def bowl(depth: float, foot: float, tip: float) -> Float64:
     tip=Setting(5, 28),
 )
 def cup(radius: float, taper: float, height: float, handle: float, tip: float) -> Float64:
-    """A mug with its handle to one side."""
+    """Build a mug with its handle to one side."""
     wall = [(0, -height / 2), (radius * taper, -height / 2), (radius, height / 2), (radius - 0.06, height / 2)]
     body = lathe([*wall, (radius * taper - 0.06, 0.08 - height / 2), (0, 0.08 - height / 2)])
     return tipped(joined(body, at(ring(height * handle, 0.055), radius * 0.95)), tip)
@@ -299,7 +289,7 @@ def cup(radius: float, taper: float, height: float, handle: float, tip: float) -
     tip=Setting(8, 38),
 )
 def hat(crown: float, height: float, tip: float) -> Float64:
-    """A brimmed hat with its band, a little tipped."""
+    """Build a brimmed hat with its band, a little tipped."""
     top = [(0, height - 0.03), (crown * 0.6, height), (crown * 0.85, height), (crown, height * 0.85)]
     band = [(crown * 1.06, 0.2), (crown * 1.2, 0.2), (crown * 1.24, 0.06)]
     return tipped(lathe([*top, *band, (0.42, 0.02), (0.5, 0.05), (0.5, 0.0), (0, -0.04)]), tip)
@@ -312,7 +302,7 @@ def hat(crown: float, height: float, tip: float) -> Float64:
     foot=Setting(0.2, 0.3),
 )
 def lamp(top: float, bottom: float, shade: float, foot: float) -> Float64:
-    """A table lamp: foot, stem, shade."""
+    """Build a table lamp: foot, stem, shade."""
     hood = lathe([(0, 0.5), (top, 0.5), (bottom, 0.5 - shade), (0, 0.5 - shade)])
     stem = at(box(0.08, 0.6, 0.08), 0, -0.15)
     return joined(hood, stem, lathe([(0, -0.4), (foot, -0.42), (0.3, -0.5), (0, -0.5)]))
@@ -326,7 +316,7 @@ def lamp(top: float, bottom: float, shade: float, foot: float) -> Float64:
     tail=Setting(0.16, 0.24),
 )
 def airplane(body: float, span: float, chord: float, sweep: float, tail: float) -> Float64:
-    """Seen from above: fuselage, swept wings, tailplane, fin. Frozen: the default scene's picture is one of them."""
+    """Build an airplane seen from above. Keep it as it is: the default scene shows one."""
     fuselage = ellipsoid(body, 0.5, body)
     wings = [
         slab([(0, 0.1), (0, 0.1 - chord), (s * span, -0.05 - sweep), (s * span, 0.05 - sweep)], 0.05) for s in SIDES
@@ -343,7 +333,7 @@ def airplane(body: float, span: float, chord: float, sweep: float, tail: float) 
     lag=Setting(0.12, 0.3),
 )
 def boat(beam: float, sail: float, lead: float, lag: float) -> Float64:
-    """From the side: hull, mast and two triangular sails."""
+    """Build a boat from the side: hull, mast and two triangular sails."""
     hull = slab([(-0.48, -0.2), (0.5, -0.2), (0.3, -0.45), (-0.32, -0.45)], 2 * beam)
     mast = at(box(0.06, sail + 0.1, 0.06), 0, sail / 2 - 0.22)
     jib = slab([(0.0, sail - 0.2), (0.0, -0.12), (lead, -0.12)], 0.06)
@@ -359,7 +349,7 @@ def boat(beam: float, sail: float, lead: float, lag: float) -> Float64:
     cabin=Setting(0.2, 0.26),
 )
 def car(height: float, wheel: float, width: float, front: float, back: float, cabin: float) -> Float64:
-    """From the side: body, a cabin with windows set in, two wheels."""
+    """Build a car from the side: body, cabin with recessed windows, two wheels."""
     body = slab([(-0.5, -0.08), (-0.5, 0.04), (0.44, 0.04), (0.5, -0.02), (0.5, -0.08)], 2 * width)
     sill = at(box(1.0, height - 0.06, 2 * width), 0, -0.08 - (height - 0.06) / 2)
     top, lean = 0.04 + cabin, 0.12
@@ -385,7 +375,7 @@ def car(height: float, wheel: float, width: float, front: float, back: float, ca
     tank=Setting(0.12, 0.17),
 )
 def motorcycle(wheel: float, tyre: float, base: float, rake: float, bars: float, tank: float) -> Float64:
-    """From the side: two open wheels, a slanted fork up to the handlebar, tank, seat, engine and exhaust."""
+    """Build a motorcycle from the side: two open wheels, slanted fork, tank, seat, engine and exhaust."""
     axle, head = -0.22, base - rake
     wheels = [at(joined(ring(wheel, tyre), disc(0.05, 0.14)), s * base, axle) for s in SIDES]
     guards = [at(arch(wheel + 0.05, 0.03, 150), s * base, axle) * (1, 1, 2) for s in SIDES]
@@ -406,7 +396,7 @@ def motorcycle(wheel: float, tyre: float, base: float, rake: float, bars: float,
     fin=Setting(0.14, 0.22),
 )
 def rocket(radius: float, nose: float, fin: float) -> Float64:
-    """Nose cone, body with a porthole, and fins."""
+    """Build a rocket: nose cone, body with a porthole, fins."""
     tip = [(0, 0.5), (radius * 0.6, 0.5 - nose * 0.5), (radius, 0.5 - nose)]
     body = lathe([*tip, (radius, -0.4), (radius * 0.6, -0.5), (0, -0.5)])
     root = radius * 0.8
@@ -418,12 +408,24 @@ def rocket(radius: float, nose: float, fin: float) -> Float64:
     return joined(body, *fins, porthole, at(box(0.06, 0.3, fin), 0, -0.33, -radius))
 
 
-_VEHICLES = airplane, boat, car, motorcycle, rocket
-_HOUSEHOLD = baskets, bell, bowl, cup, hat, lamp
-_FURNITURE = computer, cupboard, oven, soundbox, table
-_BUILDINGS = birdhouse, tower
-
 CATEGORIES: dict[str, Category] = {
-    kind.name: kind for kind in sorted((*_VEHICLES, *_HOUSEHOLD, *_FURNITURE, *_BUILDINGS), key=lambda kind: kind.name)
+    kind.name: kind
+    for kind in (
+        *(airplane, baskets, bell, birdhouse, boat, bowl, car, computer, cup),
+        *(cupboard, hat, lamp, motorcycle, oven, rocket, soundbox, table, tower),
+    )
 }
-"""By name, in the order of the alphabet: a seed picks the same thing everywhere."""
+"""By name, in alphabetical order: a seed picks by position."""
+
+
+def find_category(name: str) -> Category:
+    """Return a category by name. Raises SceneError, with the nearest name, where there is none."""
+    if name in CATEGORIES:
+        return CATEGORIES[name]
+    raise SceneError(f"no object category {name!r}.{suggest_category(name)} Choose from {', '.join(CATEGORIES)}")
+
+
+def suggest_category(name: str) -> str:
+    """Return " Did you mean ...?" with the category nearest to a name, empty where none is near."""
+    nearest = get_close_matches(name, CATEGORIES, 1)
+    return f" Did you mean {nearest[0]!r}?" if nearest else ""

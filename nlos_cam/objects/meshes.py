@@ -1,8 +1,6 @@
-"""Hidden objects from files: triangle meshes (.obj, .stl, .ply) and depth maps (.npy).
+"""Files of hidden objects: triangle meshes (.obj, .stl, .ply), folders of meshes, and depth maps (.npy).
 
-Mesh files made plain enough for a parser that has none of its optional packages.
-
-Hidden objects from a folder of meshes: which files it holds, and one of them at a random pose for each seed.
+Mesh files are simplified before trimesh parses them, so that none of its optional packages is needed.
 """
 
 import hashlib
@@ -28,7 +26,7 @@ from nlos_cam.objects.depth_map import orthographic_depth
 from nlos_cam.objects.placement import place, random_pose
 
 _PLAIN = bytes(range(128)).replace(b"\t", b" ") + b"?" * 128
-"""Tabs as blanks; letters of other alphabets, which only names and comments hold, as "?"."""
+"""Translation of bytes: tab to blank, non-ASCII (only in names and comments) to "?"."""
 _COMMENT = re.compile(rb"#[^\n]*")
 _RELATIVE = re.compile(rb" -(\d+)")
 _RELATIVE_FACE = re.compile(rb"^f [^\n]*-", re.MULTILINE)
@@ -36,12 +34,14 @@ _VERTEX_0 = re.compile(rb"^f[^\n]* 0+(?!\d)", re.MULTILINE)
 
 
 def plain(content: bytes, suffix: str) -> bytes:
-    """The content of a .obj, .stl or .ply file with the same triangles.
+    """Return a simpler .obj, .stl or .ply file with the same triangles.
 
-    Raises ValueError where a parser would go astray: binary of the wrong length, a face of vertex 0.
+    Raises ValueError where a parser would misread it: a binary of the wrong length, a face of vertex 0.
     """
     if suffix == ".ply":
-        content = _without_edges(content)
+        # As wireframe, edges would need scipy: rename them in the header.
+        header, end, body = content.partition(b"end_header")
+        content = header.replace(b"element edge ", b"element wire ") + end + body
     if b"\0" in content:
         return _checked_binary(content, suffix)
     text = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").translate(_PLAIN)
@@ -57,71 +57,65 @@ def _checked_binary(content: bytes, suffix: str) -> bytes:
     return content
 
 
-def _without_edges(content: bytes) -> bytes:
-    """A .ply file whose edges go by another name: as wireframe they would ask for scipy."""
-    header, end, body = content.partition(b"end_header")
-    return header.replace(b"element edge ", b"element wire ") + end + body
-
-
 def _plain_obj(text: bytes) -> bytes:
     text = _COMMENT.sub(b"", text.replace(b"\\\n", b" "))
     if _RELATIVE_FACE.search(text):
-        text = _absolute(text)
+        text = _with_absolute_indices(text)
     if _VERTEX_0.search(text):
         raise ValueError("a face names vertex 0, but vertices count from 1")
     return text
 
 
-def _absolute(text: bytes) -> bytes:
-    """A .obj text whose faces name no vertex by how far back it stands (-1 is the latest)."""
-    seen, lines = 0, text.split(b"\n")
+def _with_absolute_indices(text: bytes) -> bytes:
+    """Return a .obj text with absolute vertex numbers in place of relative ones (-1 is the latest vertex)."""
+    vertices, lines = 0, text.split(b"\n")
     for k, line in enumerate(lines):
         if line.startswith(b"v "):
-            seen += 1
+            vertices += 1
         elif line.startswith(b"f "):
-            lines[k] = _RELATIVE.sub(partial(_number, seen), line)
+            lines[k] = _RELATIVE.sub(partial(_absolute_index, vertices), line)
     return b"\n".join(lines)
 
 
-def _number(seen: int, back: re.Match[bytes]) -> bytes:
-    return b" %d" % max(seen + 1 - int(back[1]), 0)  # before the first: 0, which is refused
+def _absolute_index(vertices: int, relative: re.Match[bytes]) -> bytes:
+    return b" %d" % max(vertices + 1 - int(relative[1]), 0)  # before the first vertex: 0, which is refused
 
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply")
 DEPTH_MAP_SUFFIX = ".npy"
 MAX_FACES = 2_000_000
-"""So many are read in 2 s (binary .stl) to 16 s (.ply as text) and placed in 4 s, on two busy cores."""
+"""Read in 2 s (binary .stl) to 16 s (text .ply) and placed in 4 s, on two busy cores."""
 MAX_BYTES = 2**28
-"""A quarter of a gibibyte: as text, .stl takes 300 bytes a face, and four times that in memory while it is read."""
-LARGEST = 1e30
-"""Of a vertex's coordinates, in whatever unit: their squares stay finite."""
-_FEWER = "reduce the mesh, or save it as binary"
+"""256 MiB: a text .stl takes 300 bytes per face, and four times as much memory while it is parsed."""
+MAX_COORDINATE = 1e30
+"""Limit of a vertex's coordinates, in any unit: their squares stay finite."""
+_REDUCE = "reduce the mesh, or save it as binary"
 MIN_CELLS, MAX_CELLS = 8, 256
-DEEPEST_M = 10.0
-"""No bench is deeper; a depth map in millimetres is."""
+MAX_DEPTH_M = 10.0
+"""Larger than any bench, smaller than a depth map given in millimetres."""
 
 Up = Literal["y", "z"]
 
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh as its file had it when it was read: what becomes of the file later changes nothing."""
+    """Mesh read from a file; later changes of the file do not affect it."""
 
     path: Path
     sha256: str
-    """Of the content."""
+    """Of the file's content."""
     triangles: Float64 = field(repr=False, compare=False)
-    """(n, 3, 3), in the file's unit and axes; parts joined."""
+    """(n, 3, 3), in the file's unit and axes; all parts joined."""
 
 
 def read_mesh(path: Path) -> MeshFile:
-    """A mesh with all its parts. Raises SceneError for a file without one, or with one that nobody could place."""
+    """Return a mesh with all its parts. Raises SceneError for a file without a mesh that can be placed."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise SceneError(f"{path} is no mesh: give a file that ends in {', '.join(MESH_SUFFIXES)}")
+        raise SceneError(f"{path} is not a mesh: give a file that ends in {', '.join(MESH_SUFFIXES)}")
     with _readable(path, f"{suffix} file", "export it again, as triangles"):
         if (size := path.stat().st_size) > MAX_BYTES:
-            raise SceneError(f"{path} has {size / 2**20:.0f} MiB: at most {MAX_BYTES >> 20} are read; {_FEWER}")
+            raise SceneError(f"{path} has {size / 2**20:.0f} MiB, the limit is {MAX_BYTES >> 20} MiB: {_REDUCE}")
         content = path.read_bytes()
         parts = _parts(content, suffix)
         triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
@@ -130,39 +124,39 @@ def read_mesh(path: Path) -> MeshFile:
     return MeshFile(path, hashlib.sha256(content).hexdigest(), triangles)
 
 
-def upright(triangles: Float64, up: Up) -> Float64:
-    """Triangles (n, 3, 3) turned so that the axis `up` of their file is y, and the side that faces the wall is -z.
+def turn_upright(triangles: Float64, up: Up) -> Float64:
+    """Return triangles (n, 3, 3) turned so that the axis `up` of their file becomes y.
 
-    With z up, as CAD and Blender have it, that side is the file's +y: what an export with y up turns into -z too.
+    With z up, as in CAD and Blender, the file's +y turns towards the wall (-z), as in an export with y up.
     """
     return triangles if up == "y" else triangles[..., [0, 2, 1]] * (1, 1, -1)
 
 
 def read_depth_map(path: Path) -> Float32:
-    """A depth map (n, n) in metres over the object box, NaN for background, from real numbers of any type.
+    """Return a depth map (n, n) in metres over the object box, NaN for background, from numbers of any real type.
 
-    Raises SceneError where it is no such map.
+    Raises SceneError where the file holds anything else.
     """
     with _readable(path, "depth map", "save one with numpy.save(file, depth_m)"):
-        stored = np.lib.format.open_memmap(path, mode="r")  # no pickles; a header that claims too much costs nothing
+        stored = np.lib.format.open_memmap(path, mode="r")  # no pickles; a huge shape in the header costs nothing
     if stored.dtype.kind not in "fiu":
         raise SceneError(f"{path} holds {stored.dtype} values: a depth map holds real numbers, in metres")
     if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or not MIN_CELLS <= len(stored) <= MAX_CELLS:
         size = f"(n, n) with n from {MIN_CELLS} to {MAX_CELLS}"
         raise SceneError(f"{path} has shape {stored.shape}: a depth map has shape {size}")
     surface = stored[~np.isnan(stored)]
-    if surface.size and not (surface.min() >= 0 and surface.max() <= DEEPEST_M):
+    if surface.size and not (surface.min() >= 0 and surface.max() <= MAX_DEPTH_M):
         worst = surface.min() if surface.min() < 0 else surface.max()
         raise SceneError(
             f"{path} has a depth of {worst:g} m: depths are in metres from the wall into the room, "
-            f"0 to {DEEPEST_M:g} (negative is behind the wall), NaN for background"
+            f"0 to {MAX_DEPTH_M:g} (negative is behind the wall), NaN for background"
         )
     return np.array(stored, np.float32)
 
 
 @contextmanager
 def _readable(path: Path, kind: str, advice: str) -> Generator[None]:
-    """Whatever a missing or damaged file makes a parser raise, as one SceneError."""
+    """Raise any error of a parser on a missing or damaged file as one SceneError."""
     try:
         yield
     except SceneError:
@@ -171,12 +165,12 @@ def _readable(path: Path, kind: str, advice: str) -> Generator[None]:
         raise SceneError(f"{path} cannot be read as a {kind}: {error.strerror or error}") from error
     except Exception as error:
         detail = " ".join(f"{type(error).__name__}: {error}".split())
-        raise SceneError(f"{path} is damaged or no {kind} ({detail:.120}): {advice}") from error
+        raise SceneError(f"{path} is damaged or not a {kind} ({detail:.120}): {advice}") from error
 
 
 @contextmanager
 def _strict() -> Generator[None]:
-    """Numbers that cannot be read are an error, and trimesh keeps its log to itself."""
+    """Turn warnings of unreadable numbers into errors, and silence the log of trimesh."""
     log = logging.getLogger("trimesh")
     level = log.level
     log.setLevel(logging.CRITICAL + 1)
@@ -190,7 +184,7 @@ def _strict() -> Generator[None]:
 
 
 def _parts(content: bytes, suffix: str) -> list[trimesh.Trimesh]:
-    """Every mesh in a file, just as it is written. A stream has no folder to look for materials and textures in."""
+    """Return every mesh in a file, unprocessed. From a stream, trimesh cannot search for materials and textures."""
     with _strict():
         stream = BytesIO(plain(content, suffix))
         scene = trimesh.load_scene(stream, suffix[1:], process=False, fix_texture=False)
@@ -205,13 +199,13 @@ def _triangles(part: trimesh.Trimesh) -> Float64:
 
 
 def _problem(triangles: Float64) -> str:
-    """Why nobody could place triangles (n, 3, 3); empty where one can."""
+    """Return the reason why triangles (n, 3, 3) cannot be placed; empty where they can."""
     if not len(triangles):
         return "has no faces: it is empty, cut short or a point cloud; export a mesh of triangles"
     if len(triangles) > MAX_FACES:
-        return f"has {len(triangles)} faces: at most {MAX_FACES} are rendered; {_FEWER}"
-    if not np.abs(triangles).max() <= LARGEST:  # false for NaN too
-        return f"has a vertex that is NaN, infinite or beyond {LARGEST:g}: repair or export it again"
+        return f"has {len(triangles)} faces, the limit is {MAX_FACES}: {_REDUCE}"
+    if not np.abs(triangles).max() <= MAX_COORDINATE:  # false for NaN too
+        return f"has a vertex that is NaN, infinite or beyond {MAX_COORDINATE:g}: repair or export it again"
     extent = np.ptp(triangles.reshape(-1, 3), axis=0).max()
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     if not np.abs(normals).max() > 1e-12 * extent**2:
@@ -220,25 +214,23 @@ def _problem(triangles: Float64) -> str:
 
 
 POSES = 20
-"""Poses that a mesh is tried at before it counts as one that shows nothing: a sheet may be seen edge on."""
+"""Poses to try before a mesh counts as invisible: a sheet may be edge on in one of them."""
 Mesh = TypeVar("Mesh")
 
 
 def folder_objects(folder: Path) -> list[Path]:
-    """The meshes (.obj, .stl, .ply) of a folder and its subfolders, sorted by their place in it.
+    """Return the meshes (.obj, .stl, .ply) of a folder and its subfolders, sorted by relative path.
 
-    What starts with a dot is passed over, as other programs hide their own files so. Raises SceneError where the folder
-    cannot be looked through, or holds none.
+    Files and folders that start with a dot are skipped. Raises SceneError where there is no such folder, or no mesh.
     """
     if not folder.is_dir():
         raise SceneError(f"no folder {folder}: give one that holds meshes ({', '.join(MESH_SUFFIXES)})")
     found = [path for path in folder.rglob("*") if path.suffix.lower() in MESH_SUFFIXES and path.is_file()]
     meshes = {path.relative_to(folder).parts: path for path in found}
-    seen = [meshes[parts] for parts in sorted(meshes) if not any(part.startswith(".") for part in parts)]
-    if not seen:
-        endings = ", ".join(MESH_SUFFIXES)
-        raise SceneError(f"no meshes in {folder}: neither it nor its subfolders hold a file that ends in {endings}")
-    return seen
+    visible = [meshes[parts] for parts in sorted(meshes) if not any(part.startswith(".") for part in parts)]
+    if not visible:
+        raise SceneError(f"no meshes in {folder} and its subfolders: add files that end in {', '.join(MESH_SUFFIXES)}")
+    return visible
 
 
 def mesh_depth(
@@ -249,20 +241,20 @@ def mesh_depth(
     *,
     read: Callable[[Mesh], MeshFile],
 ) -> tuple[Mesh, Float32]:
-    """One of the meshes and its depth map (64, 64) in metres, NaN background; the seed picks it and its pose.
+    """Return one of the meshes and its depth map (64, 64) in metres, NaN background; the seed picks mesh and pose.
 
-    It is placed as procedural objects are, whatever the unit of its file; where a pose shows no surface, at the next.
-    Only the mesh that is picked is read. Raises SceneError, which names the file, for one that shows none at all.
+    Poses are those of procedural objects, up to POSES of them until one shows a surface. Only the picked mesh is read.
+    Raises SceneError, with the file's name, where none does.
     """
     generator = np.random.default_rng([seed, OBJECT_PIXELS])
     picked = meshes[int(generator.integers(len(meshes)))]
     mesh = read(picked)
-    triangles = upright(mesh.triangles, up)
+    triangles = turn_upright(mesh.triangles, up)
     for _ in range(POSES):
         depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
         if not np.isnan(depth_m).all():
             return picked, depth_m
     raise SceneError(
-        f"{mesh.path} shows no surface from any of {POSES} poses: it is thinner than a cell of the depth map; take it "
-        "out of the folder, or make it thicker"
+        f"{mesh.path} shows no surface in any of {POSES} poses (thinner than a depth-map cell): make it thicker, "
+        "or remove it from the folder"
     )

@@ -1,4 +1,4 @@
-"""The few solids that objects are made of, as triangles (n, 3, 3); y is up, the wall looks along +z."""
+"""Primitive solids of the object generators, as triangles (n, 3, 3): y is up, the wall lies towards -z."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -10,75 +10,76 @@ from numpy.typing import NDArray
 from trimesh import transformations
 
 SECTIONS = 28
+"""Facets of a full turn."""
 
 Point = tuple[float, float]
 
 
 def at(triangles: Float64, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float64:
-    """The solid moved by (x, y, z)."""
+    """Return the solid moved by (x, y, z)."""
     return triangles + np.array([x, y, z])
 
 
 def turned(triangles: Float64, axis: Sequence[float], angle_deg: float) -> Float64:
-    """The solid turned about an axis through the origin."""
+    """Return the solid turned about an axis through the origin."""
     turn = np.asarray(transformations.rotation_matrix(np.radians(angle_deg), axis))
     return triangles @ turn[:3, :3].T
 
 
 def tipped(triangles: Float64, angle_deg: float) -> Float64:
-    """The solid with its top tipped towards the wall, as if seen from above by so much."""
+    """Return the solid with its top tipped towards the wall, as if seen from above by that angle."""
     return turned(triangles, (1, 0, 0), -angle_deg)
 
 
 def joined(*parts: Float64) -> Float64:
-    """One solid of several; inner faces stay, since only the front is ever seen."""
+    """Return several solids as one; inner faces stay, since only the front shows."""
     return np.concatenate(parts)
 
 
 def box(width: float, height: float, depth: float) -> Float64:
-    """A box centred on the origin."""
+    """Return a box centred on the origin."""
     return _unit_box() * (width, height, depth)
 
 
 def ellipsoid(rx: float, ry: float, rz: float) -> Float64:
-    """An ellipsoid centred on the origin."""
+    """Return an ellipsoid centred on the origin."""
     return _unit_sphere(3) * (rx, ry, rz)
 
 
 def knob(radius: float, reach: float) -> Float64:
-    """A small round thing centred on the origin that reaches so far towards the wall: a quarter as fine as others."""
+    """Return an ellipsoid of half-depth `reach` along z, with a quarter of the faces of `ellipsoid`."""
     return _unit_sphere(2) * (radius, radius, reach)
 
 
 def lathe(profile: Sequence[Point]) -> Float64:
-    """The solid that a profile of (radius, height) sweeps about the y axis."""
+    """Return the solid that a profile of (radius, height) sweeps about the y axis."""
     angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)[:, None]
     radius, height = np.asarray(profile, float).T
-    return _quilt(np.stack(np.broadcast_arrays(radius * np.cos(angle), height, radius * np.sin(angle)), axis=-1))
+    return _grid_surface(np.stack(np.broadcast_arrays(radius * np.cos(angle), height, radius * np.sin(angle)), axis=-1))
 
 
 def disc(radius: float, thickness: float) -> Float64:
-    """A disc centred on the origin that faces the wall."""
+    """Return a disc centred on the origin that faces the wall."""
     half = thickness / 2
     return turned(lathe([(0, -half), (radius, -half), (radius, half), (0, half)]), (1, 0, 0), -90)
 
 
 def ring(radius: float, tube: float) -> Float64:
-    """A torus in the x-y plane."""
+    """Return a torus in the x-y plane."""
     return arch(radius, tube, 360)
 
 
 def arch(radius: float, tube: float, angle_deg: float = 180.0) -> Float64:
-    """The part of a torus in the x-y plane from the +x axis on, counter-clockwise seen with y up."""
+    """Return part of a torus in the x-y plane, from the +x axis on, counter-clockwise with y up."""
     along = np.linspace(0, np.radians(angle_deg), SECTIONS + 1)[:, None]
     around = np.linspace(0, 2 * np.pi, 13)
     distance = radius + tube * np.cos(around)
     points = distance * np.cos(along), distance * np.sin(along), tube * np.sin(around)
-    return _quilt(np.stack(np.broadcast_arrays(*points), axis=-1))
+    return _grid_surface(np.stack(np.broadcast_arrays(*points), axis=-1))
 
 
 def slab(corners: Sequence[Point], thickness: float) -> Float64:
-    """A convex polygon of (x, y) corners in the x-y plane, given a thickness along z."""
+    """Return a convex polygon of (x, y) corners with a thickness along z."""
     outline: NDArray[np.float64] = np.asarray(corners, float)
     n = len(outline)
     front = np.column_stack([outline, np.full(n, -thickness / 2)])
@@ -90,7 +91,7 @@ def slab(corners: Sequence[Point], thickness: float) -> Float64:
 
 
 def bar(start: Point, end: Point, width: float, thickness: float) -> Float64:
-    """A straight bar in the x-y plane from one point to another."""
+    """Return a straight bar in the x-y plane from one point to another."""
     (x0, y0), (x1, y1) = start, end
     share = width / 2 / np.hypot(x1 - x0, y1 - y0)
     u, v = (y0 - y1) * share, (x1 - x0) * share
@@ -98,20 +99,21 @@ def bar(start: Point, end: Point, width: float, thickness: float) -> Float64:
 
 
 def pierced(width: float, height: float, hole: float, thickness: float) -> Float64:
-    """A plate centred on the origin that faces the wall, with a round hole of radius `hole` in its middle."""
+    """Return a plate centred on the origin that faces the wall, with a hole of radius `hole` in its middle."""
+    # Rays from the centre hit the plate's rectangle where max(|x| / (width / 2), |y| / (height / 2)) is 1.
     angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     edge = circle / np.abs(circle / (width / 2, height / 2)).max(axis=1, keepdims=True)
     corners = np.array([[x, y] for x in (-1, 1) for y in (-1, 1)]) * (width / 2, height / 2)
-    for corner in corners:  # the nearest ray runs into the corner, or the plate would lack it
+    for corner in corners:  # snap the nearest ray to the corner, which would otherwise be cut off
         edge[np.linalg.norm(edge - corner, axis=1).argmin()] = corner
     loops = [(hole * circle, -1), (edge, -1), (edge, 1), (hole * circle, 1), (hole * circle, -1)]
     rings = [np.column_stack([loop, np.full(len(loop), side * thickness / 2)]) for loop, side in loops]
-    return _quilt(np.stack(rings, axis=1))
+    return _grid_surface(np.stack(rings, axis=1))
 
 
 def frame(width: float, height: float, border: float, thickness: float) -> Float64:
-    """A rectangular frame centred on the origin that faces the wall: its border lies within the width and height."""
+    """Return a rectangular frame centred on the origin that faces the wall; its border lies inside."""
     rail, post = box(width, border, thickness), box(border, height, thickness)
     up, aside = (height - border) / 2, (width - border) / 2
     return joined(at(rail, y=up), at(rail, y=-up), at(post, aside), at(post, -aside))
@@ -127,7 +129,7 @@ def _unit_sphere(subdivisions: int) -> Float64:
     return np.asarray(trimesh.creation.icosphere(subdivisions).triangles, np.float64)
 
 
-def _quilt(points: NDArray[np.float64]) -> Float64:
-    """The surface through a grid of points (rows, columns, 3): two triangles for every four neighbours."""
+def _grid_surface(points: NDArray[np.float64]) -> Float64:
+    """Return the surface through a grid of points (rows, columns, 3): two triangles per grid cell."""
     a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
     return np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(-1, 3, 3)

@@ -7,7 +7,7 @@ from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
-from nlos_cam.objects import cell_centres_m
+from nlos_cam.objects import cell_centers_m
 
 JUMP_M = 0.02
 """Neighbours further apart in depth than this are not one surface: beta (S3) must not join them by a curtain."""
@@ -61,7 +61,7 @@ def slope_along(depth: Float64, axis: int, pitch_m: float, jump_m: float = JUMP_
 
 def make_patches(depth: Float64, box: ObjectBox, albedo: Float64, jump_m: float = JUMP_M) -> Patches:
     """The patches of a depth map (rows, columns), NaN for background, with the albedo (rows, columns) of its cells."""
-    x_m, y_m = cell_centres_m(box, len(depth))
+    x_m, y_m = cell_centers_m(box, len(depth))
     pitch_x, pitch_y = cell_pitch_m(box, depth.shape)
     row, column = np.nonzero(~np.isnan(depth))
     slope_x = slope_along(depth, 1, pitch_x, jump_m)[row, column]

@@ -35,12 +35,12 @@ from nlos_cam.objects import (
     Pose,
     Up,
     category_triangles,
-    nothing_to_see,
+    invisible_object_error,
     object_box,
     orthographic_depth,
     place,
     read_mesh,
-    upright,
+    turn_upright,
 )
 from nlos_cam.render.material import Material
 from nlos_cam.render.patches import JUMP_M
@@ -122,7 +122,7 @@ class HiddenObject(Record):
     @property
     def triangles(self) -> Float64:
         """(n, 3, 3), before it is placed: y up, -z towards the wall."""
-        return upright(self.file.triangles, self.up) if self.file else category_triangles(self.label, self.seed)
+        return turn_upright(self.file.triangles, self.up) if self.file else category_triangles(self.label, self.seed)
 
 
 class Motion(Record):
@@ -299,7 +299,7 @@ def load_scene(path: Path) -> SceneFile:
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise SceneError(f"{path} cannot be read as a scene: {error}") from error
     if scene.hidden and not any(scene.shows_at(number) for number in range(scene.poses)):
-        raise nothing_to_see(scene.hidden.label, object_box(scene.rig))
+        raise invisible_object_error(scene.hidden.label, object_box(scene.rig))
     return scene
 
 

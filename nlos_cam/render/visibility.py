@@ -15,7 +15,7 @@ from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
-from nlos_cam.objects import cell_centres_m
+from nlos_cam.objects import cell_centers_m
 from nlos_cam.render.patches import cell_pitch_m
 
 FACES = 4
@@ -49,7 +49,7 @@ class HeightField(NamedTuple):
 
 def height_field(depth_m: NDArray[np.floating], box: ObjectBox, *, shades: bool) -> HeightField:
     """Lay out a depth map (n, n) over its box."""
-    x_m, y_m = cell_centres_m(box, len(depth_m))
+    x_m, y_m = cell_centers_m(box, len(depth_m))
     rows, columns = np.nonzero(~np.isnan(depth_m))
     nearest = float(np.nanmin(depth_m)) if rows.size else np.inf
     ends = (int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max())) if rows.size else (0, 0, 0, 0)

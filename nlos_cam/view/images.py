@@ -14,7 +14,7 @@ from nlos_calibration.arrays import Float32, UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from nlos_cam.objects import cell_centres_m, image_from_depth
+from nlos_cam.objects import cell_centers_m, image_from_depth
 from nlos_cam.reconstruct import Verdict
 
 BACKGROUND_RGB = (13, 16, 17)
@@ -161,7 +161,7 @@ class Surface:
 
 def surface(depth_m: Float32, box: ObjectBox) -> Surface:
     """The mesh of a hidden depth map (64, 64): squares whose corners are surface and do not jump."""
-    x_m, y_m = np.meshgrid(*cell_centres_m(box, len(depth_m)))
+    x_m, y_m = np.meshgrid(*cell_centers_m(box, len(depth_m)))
     points = np.stack([x_m, y_m, depth_m], axis=-1).astype(np.float32)
     corners = np.stack([depth_m[:-1, :-1], depth_m[:-1, 1:], depth_m[1:, :-1], depth_m[1:, 1:]])
     whole = np.ptp(corners, axis=0) < JUMP_M  # false where a corner is NaN

@@ -9,7 +9,7 @@ import torch
 from nlos_calibration.rig import Occluder, Rig, load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.depth_map import cell_centres_m, object_box
+from nlos_cam.objects.depth_map import cell_centers_m, object_box
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.effects import EFFECTS
@@ -78,7 +78,7 @@ SCENES = {
     "no occluder": Scene(RIG.model_copy(update={"occluder": None}), _object()),
     "tilted plane": Scene(RIG, _plane()),
     "occluder in front": Scene(_occluder(0.43), _plane()),
-    "occluder on a column": Scene(_occluder(float(cell_centres_m(object_box(RIG), 32)[0][9])), _plane()),
+    "occluder on a column": Scene(_occluder(float(cell_centers_m(object_box(RIG), 32)[0][9])), _plane()),
     "near contact": Scene(RIG, _near()),
     "near contact, lambertian": Scene(RIG, _near(), radiometry="lambertian"),
     "coloured": Scene(RIG, _object(), Surface(np.array([0.9, 0.5, 0.1]))),
@@ -134,8 +134,8 @@ def test_batch_renders_each_scene_as_alone(backend: str) -> None:
     for scene, rendering in zip(scenes, together, strict=True):
         alone = render(scene, SMALL, backend=backend)
         np.testing.assert_allclose(rendering.multi.peak, alone.multi.peak, rtol=1e-5)
-        np.testing.assert_array_equal(rendering.colour is None, alone.colour is None)
-    assert together[2].colour is not None
+        np.testing.assert_array_equal(rendering.color is None, alone.color is None)
+    assert together[2].color is not None
 
 
 def test_render_refuses_unknown_backends() -> None:

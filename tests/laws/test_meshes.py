@@ -12,9 +12,9 @@ from nlos_calibration.rig import ObjectBox, load_rig
 from trimesh.exchange.ply import export_ply
 from trimesh.transformations import rotation_matrix
 
-from nlos_cam.objects.depth_map import cell_centres_m, orthographic_depth
+from nlos_cam.objects.depth_map import cell_centers_m, orthographic_depth
 from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.meshes import read_mesh, upright
+from nlos_cam.objects.meshes import read_mesh, turn_upright
 from nlos_cam.objects.placement import Pose, category_triangles, object_depth, place
 
 PAPER = load_rig("paper-rig").object_box
@@ -103,14 +103,14 @@ def test_mesh_with_z_up_equals_the_same_with_y_up(tmp_path: Path) -> None:
     z_up = triangles @ rotation_matrix(np.pi / 2, (1, 0, 0))[:3, :3].T
     (tmp_path / "thing.stl").write_bytes(EXPORTS["binary.stl"](_mesh(z_up)))
     read = read_mesh(tmp_path / "thing.stl").triangles
-    _assert_same(_depth(upright(read, "z")), _depth(triangles))
-    assert not np.allclose(_depth(upright(read, "y")), _depth(triangles), atol=1e-3, equal_nan=True)
+    _assert_same(_depth(turn_upright(read, "z")), _depth(triangles))
+    assert not np.allclose(_depth(turn_upright(read, "y")), _depth(triangles), atol=1e-3, equal_nan=True)
 
 
 def _plates(depth_m: np.ndarray) -> Triangles:
     """A level plate over each cell of a depth map that is surface."""
     pixels = len(depth_m)
-    x, y = cell_centres_m(BOX, pixels)
+    x, y = cell_centers_m(BOX, pixels)
     half_x, half_y = (x[1] - x[0]) / 2, (y[0] - y[1]) / 2
     row, column = np.nonzero(~np.isnan(depth_m))
     signs = np.array([[(-1, -1), (1, -1), (1, 1)], [(-1, -1), (1, 1), (-1, 1)]])
@@ -123,7 +123,7 @@ def _plates(depth_m: np.ndarray) -> Triangles:
 
 def _sheet(depth_m: np.ndarray) -> Triangles:
     """The surface through the centres of the cells: two triangles for every four neighbours that are surface."""
-    x, y = np.meshgrid(*cell_centres_m(BOX, len(depth_m)))
+    x, y = np.meshgrid(*cell_centers_m(BOX, len(depth_m)))
     point = np.stack([x, y, depth_m], axis=-1)
     a, b, c, d = point[:-1, :-1], point[:-1, 1:], point[1:, 1:], point[1:, :-1]
     both = np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2).reshape(-1, 3, 3)

@@ -154,7 +154,7 @@ def straight_view() -> Callable[..., Float32]:
     box = object_box(load_rig("paper-rig"))
 
     def view(kind: Category, **changed: float) -> Float32:
-        settings = kind.drawn([0.5] * len(kind.settings)) | changed
+        settings = kind.draw([0.5] * len(kind.settings)) | changed
         return orthographic_depth(place(kind.make(**settings), Pose(size_m=0.24, front_m=0.0), box), box)
 
     return view

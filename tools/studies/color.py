@@ -23,7 +23,7 @@ from nlos_cam.cli.common import PAPER_RIG, tracked
 from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, open_dataset
 from nlos_cam.evaluate import draw_colour_sheet, figures_of_colour, painted_maps
-from nlos_cam.objects import OF_EACH, benchmark_objects, object_box
+from nlos_cam.objects import OBJECTS_PER_CATEGORY, benchmark_objects, object_box
 
 RECIPES = Path(__file__).parents[2] / "models" / "recipes"
 
@@ -52,7 +52,7 @@ def judge_all(out: Path, accuracy: str) -> dict[str, Any]:
     truth = maps.image.astype(np.float32)
     image, alone = run(load_pipeline(out / "compressor")[0], maps), rebuilt(load_vae(out / "vae")[0], maps.image)
     for name, made in (("sheet", image), ("sheet-vae", alone)):
-        draw_colour_sheet(out / f"{name}.png", made[::OF_EACH], truth[::OF_EACH])
+        draw_colour_sheet(out / f"{name}.png", made[::OBJECTS_PER_CATEGORY], truth[::OBJECTS_PER_CATEGORY])
     training = open_dataset(out / "train", colour=True).column("image")
     return figures_of_colour(image, truth, {"vae_alone": alone}, training)
 

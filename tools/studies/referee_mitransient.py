@@ -20,7 +20,7 @@ from nlos_calibration import Extent, LidarPose, ObjectBox, Rig
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
-from nlos_cam.objects import cell_centres_m
+from nlos_cam.objects import cell_centers_m
 from nlos_cam.render import Radiometry, Scene
 
 SLOPE_X, SLOPE_Y = 0.3, 0.2
@@ -74,7 +74,7 @@ STEP = (*PLATE, Face(0.3, 0.35, -0.05, 0.05, 0.18))
 
 def depth_map(faces: tuple[Face, ...], cells: int) -> NDArray[np.float32]:
     """Return the depth (cells, cells) of the face nearest to the wall; NaN for none."""
-    x, y = np.meshgrid(*cell_centres_m(BOX, cells))
+    x, y = np.meshgrid(*cell_centers_m(BOX, cells))
     depths = [np.where(face.covers(x, y), face.depth_m(x, y), np.nan) for face in faces]
     return np.fmin.reduce(depths).astype(np.float32)
 
@@ -149,13 +149,13 @@ def sample(job: Job, feet_m: Float64, seeds: NDArray[np.uint32]) -> Estimate:
     """Sample the histograms of the beams with spots at `feet_m` (beams, 3), one run for each seed (beams, runs)."""
     mitsuba = load()
     scene, mean, error, seconds = mitsuba.load_dict(_scene(mitsuba, job)), [], [], []
-    for foot_m, own in zip(feet_m, seeds.tolist(), strict=True):
-        _point_laser(mitsuba, scene, foot_m)
-        _run(scene, job, foot_m, 0)  # compiles
+    for laser_spot_m, own in zip(feet_m, seeds.tolist(), strict=True):
+        _point_laser(mitsuba, scene, laser_spot_m)
+        _run(scene, job, laser_spot_m, 0)  # compiles
         runs = []
         for seed in own:
             started = time.process_time()
-            runs.append(_run(scene, job, foot_m, seed))
+            runs.append(_run(scene, job, laser_spot_m, seed))
             seconds.append(time.process_time() - started)
         mean.append(np.mean(runs, axis=0))
         error.append(np.std(runs, axis=0, ddof=1) / np.sqrt(len(own)))
@@ -201,14 +201,14 @@ def _scene(mitsuba: ModuleType, job: Job) -> dict[str, Any]:
     return scene
 
 
-def _point_laser(mitsuba: ModuleType, scene: Any, foot_m: Float64) -> None:
+def _point_laser(mitsuba: ModuleType, scene: Any, laser_spot_m: Float64) -> None:
     from mitransient.nlos import focus_emitter_at_relay_wall_3dpoint
 
     wall = next(shape for shape in scene.shapes() if shape.sensor() is not None)
-    focus_emitter_at_relay_wall_3dpoint(mitsuba.Point3f(_units(foot_m)), wall, scene.emitters()[0])
+    focus_emitter_at_relay_wall_3dpoint(mitsuba.Point3f(_units(laser_spot_m)), wall, scene.emitters()[0])
 
 
-def _run(scene: Any, job: Job, foot_m: Float64, seed: int) -> Float64:
+def _run(scene: Any, job: Job, laser_spot_m: Float64, seed: int) -> Float64:
     """Return one run's histogram (bins,): pixels summed with their cell's area and the receiver's solid angle."""
     _, transient = scene.integrator().render(scene, scene.sensors()[0], seed=seed, spp=job.samples)
     radiance = np.array(transient, dtype=np.float64)[..., 0]  # (rows, columns, bins)
@@ -218,6 +218,6 @@ def _run(scene: Any, job: Job, foot_m: Float64, seed: int) -> Float64:
     squared = (x - lidar[0]) ** 2 + (y - lidar[1]) ** 2 + lidar[2] ** 2
     solid_angle = RIG.device.receiver_cell_m2 * lidar[2] / squared**1.5
     cell_units = 4 * HALF_M.prod() / (job.columns * job.rows) * UNITS_PER_M**2
-    to_foot = np.linalg.norm(foot_m - lidar)
+    to_foot = np.linalg.norm(laser_spot_m - lidar)
     power = lidar[2] / to_foot**3 / UNITS_PER_M**2  # on a square unit about the foot, of intensity 1
     return (radiance * solid_angle[..., None]).sum((0, 1)) * cell_units / power

@@ -16,8 +16,8 @@ import numpy as np
 from nlos_cam.camera import FRAMES_PER_S, Recording, SimulatedCamera, World
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
-from nlos_cam.objects import CATEGORIES, FixedObject, benchmark_objects, object_box
-from nlos_cam.recording import CaptureSession, CaptureTarget, load_sidecar, settle, sidecar_path, verify
+from nlos_cam.objects import CATEGORIES, BenchmarkObject, benchmark_objects, object_box
+from nlos_cam.recording import CaptureSession, CaptureTarget, load_sidecar, finalize, sidecar_path, verify
 from nlos_cam.render import Scene, SceneFile, SensedImages, load_scene, render
 
 SCENE = Path(__file__).parents[2] / "examples" / "bench.toml"
@@ -62,7 +62,7 @@ class Later(World):
 class Take:
     """Recording to be made: object, file, and frames since the device was switched on."""
 
-    thing: FixedObject
+    thing: BenchmarkObject
     path: Path
     since: int
 
@@ -83,7 +83,7 @@ class Take:
             return False
 
 
-def part_of(thing: FixedObject) -> str:
+def part_of(thing: BenchmarkObject) -> str:
     """Return the part of an object."""
     if thing.number == HELD_OUT_NUMBER:
         return HELD_OUT
@@ -91,7 +91,7 @@ def part_of(thing: FixedObject) -> str:
     return VALIDATION if looked_at and thing.number == VALIDATION_NUMBER else ADAPTATION
 
 
-def takes(things: Sequence[FixedObject], folder: Path) -> list[Take]:
+def takes(things: Sequence[BenchmarkObject], folder: Path) -> list[Take]:
     """Return one take of each object, in order: F/adaptation/cup-1.bag, F/held-out/cup-3.bag, ..."""
     apart = round(BETWEEN_S * FRAMES_PER_S)
     return [Take(thing, folder / part_of(thing) / f"{thing.name}.bag", k * apart) for k, thing in enumerate(things)]
@@ -110,13 +110,13 @@ def record(take: Take, scene: SceneFile, frames: int) -> None:
     )
     job = CaptureTarget(take.path, take.thing.name)
     for made in CaptureSession(camera, recording, [job]).record(Event(), lambda _: None):
-        settled = settle(made, verify)
+        settled = finalize(made, verify)
         if settled.error:
             raise settled.error
 
 
 def record_all(
-    scene: SceneFile, things: Sequence[FixedObject], folder: Path, frames: int, on_progress: Callable[[int, int], None]
+    scene: SceneFile, things: Sequence[BenchmarkObject], folder: Path, frames: int, on_progress: Callable[[int, int], None]
 ) -> Iterator[Path]:
     """Make the missing recordings in order; yield each when it exists."""
     for done, take in enumerate(every := takes(things, folder)):

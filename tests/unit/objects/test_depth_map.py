@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from nlos_calibration.rig import ObjectBox, load_rig
 
 from nlos_cam.objects.depth_map import (
-    cell_centres_m,
+    cell_centers_m,
     depth_from_image,
     image_from_depth,
     orthographic_depth,
@@ -18,7 +18,7 @@ from nlos_cam.objects.depth_map import (
 )
 
 BOX = ObjectBox(x_min_m=0.0, x_max_m=0.64, y_min_m=-0.32, y_max_m=0.32, z_near_m=0.1, z_far_m=0.6)
-X, Y = np.meshgrid(*cell_centres_m(BOX))
+X, Y = np.meshgrid(*cell_centers_m(BOX))
 
 
 def _quad(z: tuple[float, float, float, float], low: float = -1.0, high: float = 1.0) -> np.ndarray:
@@ -128,7 +128,7 @@ def test_image_survives_the_depth_map_and_back_in_float16() -> None:
 
 
 def test_cell_centers_grow_with_wall_x_and_against_wall_y() -> None:
-    x_m, y_m = cell_centres_m(PAPER)
+    x_m, y_m = cell_centers_m(PAPER)
     pitch = (PAPER.x_max_m - PAPER.x_min_m) / 64
     np.testing.assert_allclose(np.diff(x_m), pitch)
     np.testing.assert_allclose(np.diff(y_m), -pitch)

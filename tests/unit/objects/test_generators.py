@@ -242,10 +242,10 @@ def test_category_settings_all_change_the_depth_map(category: str) -> None:
     """No setting changes only a part that is hidden behind another."""
     kind, pose = CATEGORIES[category], random_pose(np.random.default_rng(4), BOX)
     pose, middle = replace(pose, size_m=0.2, x_m=0, y_m=0), [0.5] * len(kind.settings)
-    picture = orthographic_depth(place(kind.make(**kind.drawn(middle)), pose, BOX), BOX)
+    picture = orthographic_depth(place(kind.make(**kind.draw(middle)), pose, BOX), BOX)
     for n in range(len(middle)):
         units = [*middle[:n], 0.95, *middle[n + 1 :]]
-        other = orthographic_depth(place(kind.make(**kind.drawn(units)), pose, BOX), BOX)
+        other = orthographic_depth(place(kind.make(**kind.draw(units)), pose, BOX), BOX)
         assert not np.allclose(other, picture, atol=1e-4, equal_nan=True), list(kind.settings)[n]
 
 
@@ -283,8 +283,8 @@ def _settings(draw: st.DrawFn) -> Setting:
 @settings(deadline=None)
 @given(_settings(), UNIT)
 def test_setting_never_draws_held_out_values(setting: Setting, unit: float) -> None:
-    value = setting.drawn(unit)
-    assert any(low - 1e-12 <= value <= high + 1e-12 for low, high in setting.trained)
+    value = setting.draw(unit)
+    assert any(low - 1e-12 <= value <= high + 1e-12 for low, high in setting.training_intervals)
     if setting.held_out and setting.low < setting.held_out[0] and setting.held_out[1] < setting.high:
         low, high = setting.held_out
         assert not low < value < high
@@ -295,7 +295,7 @@ def test_category_setting_steps_over_its_held_out_interval(name: str) -> None:
     """A seed reaches a setting only through one number in [0, 1], in which it is monotonic: true of every seed."""
     setting = SETTINGS[name]
     low, high = setting.held_out or (np.inf, np.inf)
-    drawn = [setting.drawn(unit) for unit in np.linspace(0, 1, 501)]
+    drawn = [setting.draw(unit) for unit in np.linspace(0, 1, 501)]
     below = [k for k, value in enumerate(drawn) if value <= low]
     above = [k for k, value in enumerate(drawn) if value >= high]
     assert drawn == sorted(drawn)
@@ -303,18 +303,18 @@ def test_category_setting_steps_over_its_held_out_interval(name: str) -> None:
     if below and above:  # bisect to the very numbers where it steps over what is held out
         under, over = below[-1] / 500, above[0] / 500
         while under < (middle := (under + over) / 2) < over:
-            under, over = (middle, over) if setting.drawn(middle) <= low else (under, middle)
-        assert setting.drawn(under) <= low < high <= setting.drawn(over)
+            under, over = (middle, over) if setting.draw(middle) <= low else (under, middle)
+        assert setting.draw(under) <= low < high <= setting.draw(over)
 
 
 @settings(max_examples=50, deadline=None)
 @given(_settings())
 def test_setting_draws_grow_evenly_from_end_to_end(setting: Setting) -> None:
-    lows, highs = zip(*setting.trained, strict=True)
-    assert setting.drawn(0) == pytest.approx(min(lows), abs=1e-9)
-    assert setting.drawn(1) == pytest.approx(max(highs), abs=1e-9)
-    total = sum(high - low for low, high in setting.trained)
-    steps = np.diff([setting.drawn(u) for u in np.linspace(0, 1, 20)])
+    lows, highs = zip(*setting.training_intervals, strict=True)
+    assert setting.draw(0) == pytest.approx(min(lows), abs=1e-9)
+    assert setting.draw(1) == pytest.approx(max(highs), abs=1e-9)
+    total = sum(high - low for low, high in setting.training_intervals)
+    steps = np.diff([setting.draw(u) for u in np.linspace(0, 1, 20)])
     assert (steps >= -1e-12).all()
     assert np.sort(steps)[:-1] == pytest.approx(total / 19, abs=1e-9), "all but the step over the gap"
 
@@ -323,7 +323,7 @@ def test_setting_draws_grow_evenly_from_end_to_end(setting: Setting) -> None:
 @given(st.tuples(ENDS, ENDS), st.integers(0, 2**32))
 def test_setting_without_a_gap_draws_what_numpy_draws(ends: tuple[float, float], seed: int) -> None:
     low, high = sorted(ends)
-    drawn = Setting(low, high).drawn(np.random.default_rng(seed).random())
+    drawn = Setting(low, high).draw(np.random.default_rng(seed).random())
     assert drawn == np.random.default_rng(seed).uniform(low, high)
 
 
@@ -333,18 +333,18 @@ def test_category_holds_out_enough_and_trains_on_most(kind: Category) -> None:
     assert len(held) >= 2
     for setting in held.values():
         low, high = setting.held_out or (0, 0)
-        trained = sum(b - a for a, b in setting.trained)
+        trained = sum(b - a for a, b in setting.training_intervals)
         assert 0.1 < (high - low) / trained < 0.5
         assert all(
-            not a < u < b for a, b in setting.trained for u in (np.nextafter(low, high), np.nextafter(high, low))
+            not a < u < b for a, b in setting.training_intervals for u in (np.nextafter(low, high), np.nextafter(high, low))
         )
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(0.01, 0.99))
 def test_setting_kept_lies_in_the_held_out_interval(unit: float) -> None:
-    assert 1 < Setting(0, 4, (1, 2)).kept(unit) < 2
-    assert Setting(0, 4).kept(unit) == Setting(0, 4).drawn(unit) == 4 * unit
+    assert 1 < Setting(0, 4, (1, 2)).draw_held_out(unit) < 2
+    assert Setting(0, 4).draw_held_out(unit) == Setting(0, 4).draw(unit) == 4 * unit
 
 
 def test_category_decorator_keeps_name_and_setting_order() -> None:
@@ -353,8 +353,8 @@ def test_category_decorator_keeps_name_and_setting_order() -> None:
         return box(width, height, 1)
 
     assert crate.name == "crate"
-    assert crate.drawn([0.5, 1.0]) == {"width": 1.5, "height": 5}
-    assert crate.kept([0.5, 0.5]) == {"width": 1.5, "height": 3.75}
-    assert np.ptp(crate.make(**crate.drawn([0.5, 1.0]))[..., 1]) == 5
+    assert crate.draw([0.5, 1.0]) == {"width": 1.5, "height": 5}
+    assert crate.draw_held_out([0.5, 0.5]) == {"width": 1.5, "height": 3.75}
+    assert np.ptp(crate.make(**crate.draw([0.5, 1.0]))[..., 1]) == 5
     with pytest.raises(ValueError, match="shorter"):
-        crate.drawn([0.5])
+        crate.draw([0.5])

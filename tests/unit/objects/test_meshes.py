@@ -63,7 +63,7 @@ blocked = {"PIL", "networkx", "scipy", "lxml", "charset_normalizer", "chardet", 
 find = PathFinder.find_spec
 PathFinder.find_spec = lambda name, *rest: None if name.split(".")[0] in blocked else find(name, *rest)
 from pathlib import Path
-from nlos_cam.objects.files import read_mesh
+from nlos_cam.objects.meshes import read_mesh
 print(*(len(read_mesh(Path(name)).triangles) for name in sys.argv[1:]))
 assert not blocked & set(sys.modules)
 """

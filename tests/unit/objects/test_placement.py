@@ -7,22 +7,22 @@ from nlos_calibration.rig import ObjectBox, load_rig
 
 from nlos_cam.dataset.build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.benchmark import FixedObject, benchmark_objects
+from nlos_cam.objects.benchmark import BenchmarkObject, benchmark_objects
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import (
     POSE_UNITS,
     Pose,
     category_triangles,
-    fit,
+    fit_in_box,
     object_depth,
     object_depths,
     panel,
     place,
-    pose_from,
+    pose_from_units,
     post,
     random_pose,
-    with_background,
+    add_background,
 )
 
 BOX = object_box(load_rig("paper-rig"))
@@ -47,13 +47,13 @@ def test_place_gives_size_offset_front_and_turn_of_the_pose() -> None:
 
 
 def test_deep_mesh_is_flattened_and_fit_reports_it() -> None:
-    inside, beside = fit(CUP, Pose(size_m=0.2), BOX), fit(CUP, Pose(size_m=0.2, x_m=0.25), BOX)
+    inside, beside = fit_in_box(CUP, Pose(size_m=0.2), BOX), fit_in_box(CUP, Pose(size_m=0.2, x_m=0.25), BOX)
     assert inside.outside == 0
     assert beside.outside == 1
     assert inside.depth_m == pytest.approx(np.ptp(_points(Pose(size_m=0.2))[:, 2]))
     assert inside.room_m == pytest.approx(BOX.z_far_m - BOX.z_near_m - Pose().front_m)
     shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
-    flattened = fit(CUP, Pose(size_m=0.2), shallow)
+    flattened = fit_in_box(CUP, Pose(size_m=0.2), shallow)
     assert flattened.depth_m == inside.depth_m > flattened.room_m == pytest.approx(0.03)
     shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
     deep, flat = _points(Pose()), _points(Pose(), shallow)
@@ -109,7 +109,7 @@ def test_backgrounds_come_at_their_share_behind_the_same_objects() -> None:
 
 
 def test_pose_from_reaches_both_ends_of_training_in_the_box() -> None:
-    least, most = pose_from([0.0] * POSE_UNITS, BOX), pose_from([1.0] * POSE_UNITS, BOX)
+    least, most = pose_from_units([0.0] * POSE_UNITS, BOX), pose_from_units([1.0] * POSE_UNITS, BOX)
     assert (least.size_m, most.size_m) == (pytest.approx(0.55 * 0.25), pytest.approx(0.9 * 0.25))
     assert (least.turn_z_rad, most.turn_z_rad) == (pytest.approx(-np.radians(35)), pytest.approx(np.radians(35)))
     assert (least.front_m, most.front_m) == (0, pytest.approx(0.35 * 0.28))
@@ -121,7 +121,7 @@ def test_pose_from_reaches_both_ends_of_training_in_the_box() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_random_pose_is_pose_from_seven_random_numbers(seed: int) -> None:
     units = np.random.default_rng(seed).random(POSE_UNITS).tolist()
-    assert random_pose(np.random.default_rng(seed), BOX) == pose_from(units, BOX)
+    assert random_pose(np.random.default_rng(seed), BOX) == pose_from_units(units, BOX)
 
 
 OBJECTS = [object_depth(seed, BOX)[1] for seed in range(20)]
@@ -134,7 +134,7 @@ def _generator(seed: int) -> np.random.Generator:
 @pytest.mark.parametrize("seed", range(20))
 def test_background_leaves_the_object_and_stays_in_the_box(seed: int) -> None:
     thing = OBJECTS[seed]
-    depth = with_background(thing, BOX, _generator(seed))
+    depth = add_background(thing, BOX, _generator(seed))
     surface = ~np.isnan(thing)
     np.testing.assert_array_equal(depth[surface], thing[surface])
     added = depth[~surface & ~np.isnan(depth)]
@@ -145,7 +145,7 @@ def test_background_leaves_the_object_and_stays_in_the_box(seed: int) -> None:
 
 
 def test_background_is_a_post_or_a_panel() -> None:
-    shares = [np.isfinite(with_background(OBJECTS[0], BOX, _generator(seed))).mean() for seed in range(20)]
+    shares = [np.isfinite(add_background(OBJECTS[0], BOX, _generator(seed))).mean() for seed in range(20)]
     assert min(shares) < np.isfinite(OBJECTS[0]).mean() + 0.1
     assert max(shares) > 0.4
 
@@ -190,7 +190,7 @@ def test_benchmark_is_bit_identical_each_time() -> None:
 
 
 @pytest.mark.parametrize("thing", BENCHMARK, ids=lambda thing: thing.name)
-def test_benchmark_object_takes_held_out_settings(thing: FixedObject) -> None:
+def test_benchmark_object_takes_held_out_settings(thing: BenchmarkObject) -> None:
     """No seed reaches these intervals (test_generators.py)."""
     kind = CATEGORIES[thing.category]
     assert list(thing.settings) == list(kind.settings)

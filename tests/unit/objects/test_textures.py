@@ -8,7 +8,7 @@ from nlos_models.pipeline import KEPT_SHARE
 
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
+from nlos_cam.objects.textures import TEXTURES, image_from_albedo, paint
 from nlos_cam.render.material import Surface
 
 BOX = object_box(load_rig("paper-rig"))
@@ -16,13 +16,13 @@ BOX = object_box(load_rig("paper-rig"))
 
 def test_painted_depends_on_the_seed_and_draws_every_texture() -> None:
     depth_m = object_depth(5, BOX)[1]
-    one, again, other = (painted(seed, depth_m, [*TEXTURES]) for seed in (5, 5, 6))
+    one, again, other = (paint(seed, depth_m, [*TEXTURES]) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one.albedo, again.albedo)
     assert one.texture == again.texture
     assert not np.array_equal(one.albedo, other.albedo)
-    assert painted(5, depth_m, ["stripes"]).texture == "stripes"
+    assert paint(5, depth_m, ["stripes"]).texture == "stripes"
     depth_m = object_depth(1, BOX)[1]
-    assert {painted(seed, depth_m, [*TEXTURES]).texture for seed in range(40)} == set(TEXTURES)
+    assert {paint(seed, depth_m, [*TEXTURES]).texture for seed in range(40)} == set(TEXTURES)
 
 
 @pytest.mark.parametrize("name", TEXTURES)
@@ -51,7 +51,7 @@ def test_textures_have_the_colors_of_their_names() -> None:
 
 def test_image_is_the_albedo_on_the_surface_and_0_beside_it() -> None:
     depth_m = object_depth(2, BOX)[1]
-    albedo = painted(2, depth_m, [*TEXTURES]).albedo
+    albedo = paint(2, depth_m, [*TEXTURES]).albedo
     image, hidden = image_from_albedo(albedo, depth_m), np.isnan(depth_m)
     assert image.shape == (3, 64, 64)
     black = image_from_albedo(np.zeros((64, 64, 3)), np.full((64, 64), 0.2))

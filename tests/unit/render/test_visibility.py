@@ -5,7 +5,7 @@ import pytest
 from nlos_calibration.rig import ObjectBox, load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.depth_map import cell_centres_m, object_box
+from nlos_cam.objects.depth_map import cell_centers_m, object_box
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.interreflection import (
@@ -19,7 +19,7 @@ from nlos_cam.render.interreflection import (
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.line_of_sight import first_hits
 from nlos_cam.render.material import Surface
-from nlos_cam.render.planning import Prepared
+from nlos_cam.render.planning import prepare
 from nlos_cam.render.renderer import three_bounce
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_facts import SceneFacts
@@ -28,7 +28,7 @@ from nlos_cam.render.visibility import segment_blocked as between
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
-X_M, Y_M = cell_centres_m(BOX)
+X_M, Y_M = cell_centers_m(BOX)
 ROW = 32
 
 
@@ -145,17 +145,17 @@ def test_first_hits_meet_a_column_by_its_front_or_side() -> None:
 
 
 def test_sight_is_empty_in_the_paper_rig_and_refused_inside() -> None:
-    assert SceneFacts(Scene(PAPER, np.full((8, 8), 0.12, np.float32)), COARSE).sight is None
+    assert SceneFacts(Scene(PAPER, np.full((8, 8), 0.12, np.float32)), COARSE).line_of_sight is None
     box = ObjectBox(x_min_m=-0.1, x_max_m=0.1, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.05, z_far_m=0.4)
     around = OPEN.model_copy(update={"object_box": box})
     with pytest.raises(SceneError, match=r"0\.2 m"):
-        _ = SceneFacts(Scene(around, np.full((8, 8), 0.1, np.float32)), COARSE).sight
+        _ = SceneFacts(Scene(around, np.full((8, 8), 0.1, np.float32)), COARSE).line_of_sight
 
 
 def test_sight_stops_beams_and_hides_relay_cells() -> None:
     depth = np.full((8, 8), 0.06, np.float32)
     stage = SceneFacts(Scene(OPEN, depth, Surface(0.5)), COARSE)
-    sight, beams = stage.sight, stage.beams()
+    sight, beams = stage.line_of_sight, stage.beams()
     assert sight is not None
     assert sight.beam.size
     assert sight.hidden.any()
@@ -164,11 +164,12 @@ def test_sight_stops_beams_and_hides_relay_cells() -> None:
     point = beams.lidar_m + sight.length_m[:, None] * beams.direction[sight.beam]
     assert (point[:, 2] >= 0.06 - 1e-9).all()
     assert (stage.relay.x_m[sight.hidden] > 0.3).all()
-    ready = Prepared.of(stage.scene, COARSE, "auto")
+    ready = prepare(stage.scene, COARSE, "auto")
     np.testing.assert_allclose(ready.beams.length_m[sight.beam], sight.length_m)
     assert not ready.beams.on_wall[sight.beam].any()
-    assert len(ready.relay.x_m) == (~sight.hidden).sum()
-    white = Prepared.of(Scene(OPEN, depth), COARSE, "auto").beams.direct[sight.beam]
+    assert ready.job is not None
+    assert len(ready.job.relay.x_m) == (~sight.hidden).sum()
+    white = prepare(Scene(OPEN, depth), COARSE, "auto").beams.direct[sight.beam]
     np.testing.assert_allclose(ready.beams.direct[sight.beam], 0.5 * white)
 
 
@@ -180,7 +181,7 @@ def job() -> TransportJob:
     at = np.linspace(-1, 1, 6)
     depth = (0.2 - 0.06 * (at[:, None] ** 2 + at**2)).astype(np.float32)
     scene = Scene(RIG, depth, radiometry="lambertian", jump_m=0.5)
-    job = Prepared.of(scene, Accuracy("coarse", 8, 6), ["three-bounce", "tilt", "inter-reflection"]).job()
+    job = prepare(scene, Accuracy("coarse", 8, 6), ["three-bounce", "tilt", "inter-reflection"]).job
     assert job is not None
     return job
 

@@ -11,7 +11,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset.labelled import read_labelled
-from nlos_cam.objects.benchmark import FixedObject
+from nlos_cam.objects.benchmark import BenchmarkObject
 from nlos_cam.objects.benchmark import benchmark_objects as fixed_set
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.recording.sidecar import load_sidecar
@@ -27,7 +27,7 @@ def bench(tool: Callable[[str], ModuleType]) -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def things() -> list[FixedObject]:
+def things() -> list[BenchmarkObject]:
     return fixed_set(object_box(load_rig("paper-rig")))
 
 
@@ -55,7 +55,7 @@ def rendered(bench: ModuleType, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def test_no_object_is_in_two_parts_and_every_category_is_held_out_and_adapted_to(
-    bench: ModuleType, things: list[FixedObject]
+    bench: ModuleType, things: list[BenchmarkObject]
 ) -> None:
     made = bench.takes(things, Path("F"))
     assert Counter(take.path.parent.name for take in made) == {"adaptation": 30, "validation": 6, "held-out": 18}
@@ -67,7 +67,7 @@ def test_no_object_is_in_two_parts_and_every_category_is_held_out_and_adapted_to
 
 @pytest.mark.slow
 def test_a_recording_is_of_its_object_on_the_bench_and_labelled(
-    bench: ModuleType, things: list[FixedObject], scene: SceneFile, rendered: list[Any], tmp_path: Path
+    bench: ModuleType, things: list[BenchmarkObject], scene: SceneFile, rendered: list[Any], tmp_path: Path
 ) -> None:
     paths = list(bench.record_all(scene, things[:2], tmp_path, 3, lambda *_: None))
     assert [path.name for path in paths] == ["airplane-1.bag", "airplane-2.bag"]
