@@ -1,4 +1,4 @@
-"""What every command shares: where output goes, how a result or an error is told, what is never overwritten."""
+"""Shared parts of the commands: output paths, results on stdout, progress and messages on stderr, signals."""
 
 import json as json_module
 import os
@@ -26,25 +26,25 @@ from rich.table import Table
 
 from nlos_cam.errors import OutputExistsError
 
-Json = Annotated[bool, typer.Option("--json", help="End stdout with one JSON object; progress goes to stderr.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what --out names, if it exists.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Overwrite the output if it exists.")]
 
 PAPER_RIG = "paper-rig"
 INTERRUPTED = 130
-"""The exit code after Ctrl-C or a request to terminate."""
+"""Exit code after Ctrl-C or SIGTERM."""
 
 stderr = Console(stderr=True, highlight=False)
 
 
 def say(text: str, *, marked: bool = False) -> None:
-    """Tell the person at the terminal, never on stdout, which belongs to results; `marked` with Rich's markup."""
+    """Print a message to stderr (stdout is for results); `marked`: with Rich's markup."""
     stderr.print(text, soft_wrap=True, markup=marked)
 
 
 def finish(result: dict[str, Any], *, as_json: bool, text: str, note: str = "", marked: bool = False) -> None:
-    """End a command: one JSON object on stdout, or a sentence for a person, `marked` where it has Rich's markup.
+    """Print a command's result to stdout: one JSON object or a text; a note is added to either.
 
-    A note is in either.
+    `marked`: the text has Rich's markup.
     """
     if note:
         result, text = {**result, "note": note}, f"{text} ({note})"
@@ -55,13 +55,13 @@ def finish(result: dict[str, Any], *, as_json: bool, text: str, note: str = "", 
 
 
 def show(table: Table) -> None:
-    """A table on stdout, for a person."""
+    """Print a table to stdout."""
     Console(highlight=False).print(table)
 
 
 @contextmanager
 def progress(*others: ProgressColumn) -> Generator[Progress]:
-    """A progress bar on stderr, with further columns."""
+    """Show a progress bar on stderr, with further columns."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *others, TimeElapsedColumn()
     with Progress(*columns, TimeRemainingColumn(), console=stderr, transient=True) as bar:
         yield bar
@@ -69,7 +69,7 @@ def progress(*others: ProgressColumn) -> Generator[Progress]:
 
 @contextmanager
 def tracked(description: str) -> Generator[Callable[[int, int], None]]:
-    """A progress bar as a function of what is done and how much there is in all."""
+    """Show a progress bar; yield the function that takes (done, total)."""
     with progress() as bar:
         task = bar.add_task(description, total=None)
 
@@ -81,7 +81,7 @@ def tracked(description: str) -> Generator[Callable[[int, int], None]]:
 
 @contextmanager
 def stop_on_signals() -> Generator[Event]:
-    """An event that Ctrl-C or a request to terminate sets while the block lasts: the loop ends, results are told."""
+    """Yield an event that Ctrl-C or SIGTERM sets within the block, so that the loop ends and results are printed."""
     stop = Event()
     with _on_signals(stop.set):
         yield stop
@@ -89,24 +89,24 @@ def stop_on_signals() -> Generator[Event]:
 
 @contextmanager
 def interrupted_by_signals() -> Generator[None]:
-    """Ctrl-C or a request to terminate raises KeyboardInterrupt in the block, also where a shell had them ignored.
+    """Raise KeyboardInterrupt in the block on Ctrl-C or SIGTERM, also where a shell had them ignored.
 
-    And where the block ends after one: a library may have swallowed it, or made another error of it.
+    It is raised at the end of the block too: a library may have swallowed it or turned it into another error.
     """
-    came = Event()
+    interrupted = Event()
 
     def interrupt() -> None:
-        came.set()
+        interrupted.set()
         raise KeyboardInterrupt
 
     with _on_signals(interrupt):
         try:
             yield
         except Exception as error:
-            if came.is_set():
+            if interrupted.is_set():
                 raise KeyboardInterrupt from error
             raise
-    if came.is_set():
+    if interrupted.is_set():
         raise KeyboardInterrupt
 
 
@@ -125,15 +125,16 @@ def _on_signals(act: Callable[[], None]) -> Generator[None]:
 
 
 def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) -> Path:
-    """Where to write: `out`, or a dated name in the current folder; no suffix means a folder, which may be there empty.
+    """Return the output path: `out`, or a dated name in the current folder.
 
-    Raises OutputExistsError where that would replace something and `overwrite` was not given, or cannot be written.
+    Without a suffix the output is a folder, which may exist if it is empty. Raises OutputExistsError if something would
+    be replaced without `overwrite`, or if the path cannot be written.
     """
     path = out or Path(f"{stem}-{datetime.now().astimezone():%Y%m%d-%H%M%S}{suffix}")
     if suffix and path.is_dir():
         raise OutputExistsError(f"{path} is a folder: name a {suffix} file in it")
     if not suffix and path.exists() and not path.is_dir():
-        raise OutputExistsError(f"{path} is a file, and a folder is what is written: choose another name")
+        raise OutputExistsError(f"{path} is a file, but --out must be a folder: choose another name")
     if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
         raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
     if not path.parent.is_dir():

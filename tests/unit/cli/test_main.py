@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,13 @@ import pytest
 import typer
 from nlos_calibration.errors import CalibrationError, RecordFileError, WallRefusedError
 from nlos_models.errors import CheckpointError, ModelError, RecipeError
+from typer.main import get_command
 
 from nlos_cam import errors
 from nlos_cam.cli import main as module
 from nlos_cam.cli.common import Json, finish, output_path, say
 from nlos_cam.cli.main import COMMANDS, build_app, main, run
+from nlos_cam.cli.plain_help import plain_help, range_text
 
 CODES = {
     1: (errors.SceneError, errors.OutputExistsError, WallRefusedError, CalibrationError, ModelError),
@@ -123,9 +126,9 @@ def test_ctrl_c_exits_with_130_even_if_a_library_catches_it(does: Does, capsys: 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal here")
 def test_ctrl_c_while_loading_exits_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(_: str) -> Callable[..., int]:
+    def interrupted(_: str) -> typer.Typer:
         os.kill(os.getpid(), signal.SIGINT)
-        return lambda *_, **__: 0
+        return build_app("devices")
 
     monkeypatch.setattr(module, "build_app", interrupted)
     assert main(["live"]) == 130
@@ -176,10 +179,44 @@ def test_command_table_names_the_right_module(command: str) -> None:
     assert names <= {name for name, _ in leaves(build_app())}
 
 
-def test_devices_command_does_not_import_torch() -> None:
-    program = "import sys; from nlos_cam.cli.main import build_app; build_app('devices'); print('torch' in sys.modules)"
+@pytest.mark.parametrize("arguments", [[], ["-h"], ["--help"]])
+def test_help_page_groups_commands_and_imports_none(arguments: list[str]) -> None:
+    program = f"import sys; from nlos_cam.cli.main import main; rc = main({arguments}); print(rc, *sys.modules)"
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
-    assert ended.stdout == "False\n"
+    page, _, last = ended.stdout.rstrip().rpartition("\n")
+    assert all(group in page for group in {row.group for row in COMMANDS.values()})
+    assert last.split()[0] == "0"
+    assert not {"torch", "numba", "cv2", "rerun", "numpy"} & {*last.split()}
+
+
+@pytest.mark.parametrize("option", ["--version", "-V"])
+def test_version_is_that_of_the_package(capsys: Capsys, option: str) -> None:
+    assert main([option]) == 0
+    assert capsys.readouterr().out == f"nlos-cam {version('nlos-cam')}\n"
+
+
+def test_option_help_has_placeholders_and_ranges_in_words(capsys: Capsys) -> None:
+    tree = get_command(build_app("capture"))
+    plain_help(tree)
+    options = {parameter.name: parameter for parameter in tree.commands["capture"].params}  # type: ignore[attr-defined]
+    assert (options["seconds"].metavar, options["takes"].metavar, options["overwrite"].metavar) == ("SECONDS", "N", "")
+    assert options["takes"].help.endswith("(1 to 9999).")
+    assert main(["capture", "--help"]) == 0
+    assert not {"<bool>", "<=", ">="} & {*capsys.readouterr().out.replace("[", " ").split()}
+
+
+@pytest.mark.parametrize(
+    ("bounds", "text"),
+    [
+        ((1, 65535), "1 to 65535"),
+        ((0.1, None), "at least 0.1"),
+        ((1 / 30, 1e9), ""),
+        ((0, None), ""),
+        ((None, 5), "at most 5"),
+    ],
+)
+def test_range_in_words_leaves_out_bounds_against_nonsense(bounds: tuple[Any, Any], text: str) -> None:
+    assert range_text(*bounds) == text
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

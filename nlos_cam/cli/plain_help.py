@@ -1,0 +1,68 @@
+"""Help pages with real placeholders (FILE, SECONDS) and ranges in words, for a typer command tree."""
+
+from collections.abc import Iterable
+from typing import Any
+
+PLACEHOLDERS = {
+    "seconds": "SECONDS",
+    "view_port": "PORT",
+    "view_host": "HOST",
+    "camera": "CAMERA",
+    "seed": "SEED",
+    "rig": "RIG",
+    "rig_name": "RIG",
+    "ray": "ADDRESS",
+    "out": "PATH",
+}
+"""Placeholder of an option by its parameter; others follow from the suffix or the type."""
+SUFFIXES = {"_ms": "MS", "_m": "METRES", "_mm": "MM", "_deg": "DEGREES", "_ns": "NS"}
+TYPES = {"path": "PATH", "int": "N", "float": "X", "str": "TEXT", "range": "N"}
+HUGE, TINY = 1e6, 0.05
+"""Bounds beyond these only guard against nonsense: they are left out of the help."""
+
+
+def plain_help(command: Any) -> None:
+    """Set placeholders and range texts of a command's options, and of its subcommands'."""
+    for parameter in command.params:
+        _describe(parameter)
+    help_option = command.get_help_option
+
+    def flag_only(context: Any) -> Any:
+        option = help_option(context)
+        option.metavar = ""
+        return option
+
+    command.get_help_option = flag_only
+    children: Iterable[Any] = getattr(command, "commands", {}).values()
+    for child in children:
+        plain_help(child)
+
+
+def _describe(parameter: Any) -> None:
+    low, high = getattr(parameter, "min", None), getattr(parameter, "max", None)
+    if text := range_text(low, high):
+        parameter.help = f"{(parameter.help or '').removesuffix('.')} ({text})."
+    parameter._get_number_range_help_str = lambda: None  # noqa: SLF001  typer has no public way to leave "[x>=0.1]" out
+    if parameter.param_type_name == "option" and parameter.metavar is None:
+        parameter.metavar = "" if getattr(parameter, "is_flag", False) else placeholder(parameter)
+
+
+def placeholder(parameter: Any) -> str | None:
+    """Return an option's placeholder; None where its type names the choices."""
+    if parameter.type_descriptor.is_choice:
+        return None
+    name = str(parameter.name)
+    suffix = next((unit for end, unit in SUFFIXES.items() if name.endswith(end)), None)
+    kind = parameter.type_descriptor.path_type if parameter.type_descriptor.is_path else parameter.bare_type()
+    return PLACEHOLDERS.get(name) or suffix or TYPES.get(str(kind).split(" ")[-1], str(kind).upper())
+
+
+def range_text(low: float | None, high: float | None) -> str:
+    """Return a range in words, "1 to 65535" or "at least 0.1"; empty where only nonsense is excluded."""
+    shows_low = low is not None and not 0 < low < TINY
+    shows_high = high is not None and high < HUGE
+    if shows_low and shows_high:
+        return f"{low:g} to {high:g}"
+    if shows_high:
+        return f"at most {high:g}"
+    return f"at least {low:g}" if shows_low and low else ""
