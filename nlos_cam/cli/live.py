@@ -52,30 +52,30 @@ from nlos_cam.live import (
     SHIPPED,
     SUFFIXES,
     BackgroundPhysicsCheck,
-    Choice,
+    BudgetChoice,
     FrameLog,
     Looks,
     RunReport,
-    in_words,
+    available_options,
+    choose_within_budget,
+    describe_counts,
     loader,
-    options_here,
-    precedence,
+    low_latency_interpreter,
+    realtime_priority,
     replay_recording,
     run_live,
     timer,
-    undisturbed,
     warm_up,
-    within_budget,
 )
 from nlos_cam.reconstruct import (
     CalibratedRig,
     PhysicsCheck,
     Pipeline,
-    load_doubt,
+    build_pipeline,
+    compatibility_warnings,
     load_networks,
-    misfits,
+    load_uncertainty,
     open_bench,
-    set_up,
 )
 from nlos_cam.view import Moment
 
@@ -95,7 +95,7 @@ def told(report: RunReport) -> str:
     ]
     if report.verdicts:
         lines.append(f"verdicts {', '.join(f'{count} {verdict}' for verdict, count in report.verdicts.items())}")
-    if seen := in_words(report.counts):
+    if seen := describe_counts(report.counts):
         lines.append(f"seen     {seen}")
     if report.stalled_s:
         lines.append(f"stalled  {report.stalled_s:.1f} s without a frame")
@@ -218,10 +218,10 @@ def live(
     viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, kept.view)
     with (
         stop_on_signals() as stop,
-        precedence(),
+        realtime_priority(),
         viewer,
         kept.logging() as on_moment,
-        undisturbed(),
+        low_latency_interpreter(),
         opened as source,
     ):
         tell_of_view(viewer, host=view_host, port=view_port, open_it=open_view)
@@ -261,10 +261,10 @@ def replay_bag(
     with interrupted_by_signals():
         opened = open_camera(f"bag:{bag}", reader=reader)
         bench = open_bench(wall, opened)
-        from nlos_cam.reconstruct import EveryFrames  # the renderer takes a second to import
+        from nlos_cam.reconstruct import PeriodicPhysicsCheck  # the renderer takes a second to import
 
-        checks = EveryFrames(bench.rig, on_error=_warn_once)
-        processing = _processing(bench, load_networks(weights), load_doubt(weights), average, checks)
+        checks = PeriodicPhysicsCheck(bench.rig, on_error=_warn_once)
+        processing = _processing(bench, load_networks(weights), load_uncertainty(weights), average, checks)
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
         report = replay_recording(
@@ -282,7 +282,7 @@ def replay_bag(
         raise typer.Exit(INTERRUPTED)
 
 
-def _finish_live(report: RunReport, choice: Choice | None, *, as_json: bool) -> None:
+def _finish_live(report: RunReport, choice: BudgetChoice | None, *, as_json: bool) -> None:
     """What the run did, and what became of its budget."""
     budget = {"budget": choice.outcome(report)} if choice else {}
     text = [told(report), *([choice.outcome_told(report)] if choice else [])]
@@ -297,17 +297,17 @@ def _chosen(
     budget_ms: float | None,
     tradeoff: Path | None,
     checks: PhysicsCheck,
-) -> tuple[Pipeline, Choice | None]:
+) -> tuple[Pipeline, BudgetChoice | None]:
     """What is made of frames: as is usual, or within a budget, which then was chosen so."""
     if budget_ms is None:
-        return _processing(bench, load_networks(weights), load_doubt(weights), average, checks), None
-    options = options_here(tradeoff, weights)
-    doubter = load_doubt(weights)
-    making = partial(set_up, bench, doubter=doubter)  # takes as long whatever it watches
-    network, choice = within_budget(budget_ms, options, making, loader(weights, runtimes), timer(camera))
+        return _processing(bench, load_networks(weights), load_uncertainty(weights), average, checks), None
+    options = available_options(tradeoff, weights)
+    doubter = load_uncertainty(weights)
+    making = partial(build_pipeline, bench, uncertainty_model=doubter)  # takes as long whatever it watches
+    network, choice = choose_within_budget(budget_ms, options, making, loader(weights, runtimes), timer(camera))
     say(choice.told())
     if choice.option.weights != SHIPPED:
-        doubter = load_doubt(Path(choice.option.weights))
+        doubter = load_uncertainty(Path(choice.option.weights))
     return _processing(bench, network, doubter, choice.option.frames, checks), choice
 
 
@@ -319,8 +319,8 @@ def _processing(
     bench: CalibratedRig, network: Reconstructor, doubter: UncertaintyModel | None, average: int, checks: PhysicsCheck
 ) -> Pipeline:
     """What is made of frames; says what the networks are, and whether they were trained for this rig."""
-    processing = set_up(bench, network, average, doubter=doubter, checks=checks)
+    processing = build_pipeline(bench, network, average, uncertainty_model=doubter, checks=checks)
     say(f"networks: {network.runtime}, trained for rig {network.record.rig_name}")
-    for note in misfits(bench, network.record, doubter):
+    for note in compatibility_warnings(bench, network.record, doubter):
         say(f"note: {note}")
     return processing

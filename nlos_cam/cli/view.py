@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import typer
 
 from nlos_cam.cli.common import INTERRUPTED, Json, finish, interrupted_by_signals, say, stop_on_signals
-from nlos_cam.live import after_the_loop
+from nlos_cam.live import yield_to_loop
 from nlos_cam.reconstruct import CalibratedRig
 from nlos_cam.view import LOOPBACK, NullViewer, Viewer, Viewers, exposed
 
@@ -37,7 +37,7 @@ def viewer_of(bench: CalibratedRig, *, no_view: bool, host: str | None = None, p
         return NullViewer()
     from nlos_cam.view import WebViewer
 
-    return WebViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port, on_stream_thread=after_the_loop)
+    return WebViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port, on_stream_thread=yield_to_loop)
 
 
 class Addressed(Protocol):

@@ -30,7 +30,7 @@ from nlos_cam.objects import (
     MESH_SUFFIXES,
     benchmark_objects,
     image_from_depth,
-    nothing_to_see,
+    invisible_object_error,
     object_box,
     read_depth_map,
 )
@@ -96,7 +96,7 @@ def _placed(path: Path, name: str, rig: Rig) -> Float32:
     thing = _hidden(path, name)
     depth_m = SceneFile(name=thing.label, rig=rig, object=thing).scene_at(0).object_depth_m
     if depth_m is None or np.isnan(depth_m).all():
-        raise nothing_to_see(thing.label, object_box(rig))
+        raise invisible_object_error(thing.label, object_box(rig))
     return depth_m
 
 
@@ -211,7 +211,7 @@ def _read(path: Path, objects_of: Callable[[Rig], Mapping[str, Float32]], wall: 
         bench = _bench(path, sidecar, wall, camera)
         truth_m = truth_depth_m(path, sidecar.label, bench.rig, objects_of(bench.rig))
         taken = (maps_from_frame(frame) for number, frame in enumerate(camera) if number in chosen)
-        maps = [bench.corrected(some) for some in taken if some.valid.any()]
+        maps = [bench.correct_range(some) for some in taken if some.valid.any()]
     if not maps:
         raise RecordingError(f"{path} holds no frame with a return in it: look at it with `nlos-cam replay`")
     return _Recorded(path, sidecar.label, maps, truth_m, bench.rig)

@@ -5,33 +5,33 @@ __all__ = [
     "SUFFIXES",
     "VIDEO",
     "BackgroundPhysicsCheck",
-    "Choice",
+    "BudgetChoice",
     "FrameLog",
     "FrameReader",
     "Looks",
     "RunReport",
     "RunStatistics",
-    "after_the_loop",
-    "in_words",
+    "available_options",
+    "choose_within_budget",
+    "describe_counts",
     "iterate_results",
     "loader",
-    "options_here",
-    "precedence",
+    "low_latency_interpreter",
+    "realtime_priority",
     "replay_recording",
     "run_live",
     "timer",
-    "undisturbed",
     "warm_up",
     "with_telemetry",
-    "within_budget",
+    "yield_to_loop",
 ]
 
-from .budget import SHIPPED, Choice, loader, options_here, timer, within_budget
+from .budget import SHIPPED, BudgetChoice, available_options, choose_within_budget, loader, timer
 from .frame_log import SUFFIXES, FrameLog
 from .frame_queue import FrameReader
-from .loop import in_words, iterate_results, run_live, warm_up, with_telemetry
+from .loop import describe_counts, iterate_results, run_live, warm_up, with_telemetry
 from .physics_check_process import BackgroundPhysicsCheck
-from .realtime import after_the_loop, precedence, undisturbed
+from .realtime import low_latency_interpreter, realtime_priority, yield_to_loop
 from .replay import REPORT, replay_recording
 from .replay_media import VIDEO, Looks
 from .statistics import OUTSIDE_LATENCY, RunReport, RunStatistics

@@ -105,7 +105,7 @@ def load_tradeoff(path: Path) -> list[Option]:
         ) from error
 
 
-def in_pace(options: Sequence[Option], machine: Machine) -> list[Option]:
+def keeping_pace(options: Sequence[Option], machine: Machine) -> list[Option]:
     """Those that leave time between frames; the quickest alone where none does."""
     kept = [option for option in options if machine.busy_ms(option) <= BUSY_SHARE * PERIOD_MS]
     return kept or [min(options, key=lambda option: (machine.busy_ms(option), option.frames))]
@@ -116,7 +116,7 @@ def choose(options: Sequence[Option], machine: Machine, budget_ms: float) -> Opt
 
     Raises BudgetError where none does.
     """
-    paced = in_pace(options, machine)
+    paced = keeping_pace(options, machine)
     kept = [option for option in paced if machine.expected_ms(option) <= budget_ms]
     if not kept:
         least = min(paced, key=machine.expected_ms)
@@ -141,7 +141,7 @@ Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
-class Choice:
+class BudgetChoice:
     """What was chosen, and why."""
 
     budget_ms: float
@@ -183,13 +183,13 @@ class Timed:
     rest_ms: float
 
 
-def within_budget(
+def choose_within_budget(
     budget_ms: float,
     options: Sequence[Option],
     make: Make,
     load: Callable[[Option], Reconstructor],
     measure: Callable[[Pipeline], Timed],
-) -> tuple[Reconstructor, Choice]:
+) -> tuple[Reconstructor, BudgetChoice]:
     """The networks of the setting that keeps the budget: chosen by the table, and then tried.
 
     The table is scaled by its quickest setting of one thread and frame. One that turns out slower than expected is
@@ -212,7 +212,7 @@ def within_budget(
         timed = measure(make(network, option.frames))
         expected_ms = HANDOVER_MS + timed.network_ms + timed.rest_ms + option.averaging_ms
         if expected_ms <= budget_ms:
-            return network, Choice(budget_ms, option, expected_ms, best)
+            return network, BudgetChoice(budget_ms, option, expected_ms, best)
         tried_ms.append(expected_ms)
         left.remove(option)
     raise BudgetError(
@@ -221,7 +221,7 @@ def within_budget(
     )
 
 
-def options_here(tradeoff: Path | None, weights: Path | None) -> list[Option]:
+def available_options(tradeoff: Path | None, weights: Path | None) -> list[Option]:
     """The measured settings that can run on this machine. Raises RecordingError, and BudgetError where none can."""
     options = load_tradeoff(tradeoff or weights or shipped_folder())
     processors = os.cpu_count() or 1

@@ -1,18 +1,18 @@
 """A thread that reads a camera's frames into a bounded queue, so that a slow loop never holds up a camera."""
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from threading import Condition, Event, Thread
+from threading import Event, Thread
 from types import TracebackType
 from typing import Self
 
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
 from nlos_cam.reconstruct import Arrival, Clock
+from nlos_cam.threads import BoundedQueue
 
 QUEUE_FRAMES = 3
-LET_GO_AFTER_S = 1.0
+ABANDON_AFTER_S = 1.0
 """What still reads after this is waiting for a camera."""
 JOIN_TIMEOUT_S = 10.0
 POLL_S = 0.1
@@ -24,7 +24,7 @@ SAME_CLOCK_S = 10.0
 class FrameReader:
     """A thread that reads frames into a queue of three while entered.
 
-    When the queue is full it drops the oldest frame and counts it by number, or, if it `keeps_all`, waits. Iterating
+    When the queue is full it drops the oldest frame and counts it by number, or, if it `lossless`, waits. Iterating
     ends where the frames end, when `stop` is set, or when it is `enough`, also while no frame comes; their source's
     exception is raised to whoever iterates, whose `on_wait` is called ten times a second while no frame comes. On
     leaving, a source that keeps the thread waiting is told to `let_go`.
@@ -34,7 +34,7 @@ class FrameReader:
         self,
         frames: Iterable[Frame],
         *,
-        keeps_all: bool,
+        lossless: bool,
         stop: Event,
         clock: Clock = time.time,
         enough: Callable[[], bool] = lambda: False,
@@ -46,13 +46,9 @@ class FrameReader:
         self.newest_s: float | None = None
         """When the newest frame arrived; None before the first."""
         self._least_delay_s = float("inf")
-        self._frames, self._keeps_all, self._clock = frames, keeps_all, clock
+        self._frames, self._keeps_all, self._clock = frames, lossless, clock
         self._stop, self._enough, self._let_go, self._on_wait = stop, enough, let_go, on_wait
-        self._left = False
-        self._queue: deque[Arrival] = deque()
-        self._changed = Condition()
-        self._ended = False
-        self._error: BaseException | None = None
+        self._queue = BoundedQueue[Arrival](QUEUE_FRAMES)
         self._thread = Thread(target=self._read, name="frame reader", daemon=True)
 
     def __enter__(self) -> Self:
@@ -65,10 +61,8 @@ class FrameReader:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        with self._changed:
-            self._left = True
-            self._changed.notify_all()
-        self._thread.join(LET_GO_AFTER_S)
+        self._queue.finish()
+        self._thread.join(ABANDON_AFTER_S)
         if self._thread.is_alive():
             self._let_go()
             self._thread.join(JOIN_TIMEOUT_S)
@@ -76,24 +70,16 @@ class FrameReader:
             raise CameraLostError(f"the camera did not stop within {JOIN_TIMEOUT_S:.0f} s: replug it")
 
     def __iter__(self) -> Iterator[Arrival]:
-        while (arrival := self._next()) is not None:
-            yield arrival
-
-    def _next(self) -> Arrival | None:
-        while True:
-            with self._changed:
-                if not (self._queue or self._ended or self._is_done):
-                    self._changed.wait(POLL_S)
-                if self._is_done:
-                    return None
-                if self._queue:
-                    self._changed.notify_all()
-                    return self._queue.popleft()
-                if self._error is not None:
-                    raise self._error
-                if self._ended:
-                    return None
-            self._on_wait()
+        while not self._is_done:
+            has_item = self._queue.wait_for_item(POLL_S)
+            if self._is_done:
+                return
+            if not has_item:
+                self._on_wait()
+            elif (arrival := self._queue.take()) is not None:
+                yield arrival
+            else:
+                return
 
     def _read(self) -> None:
         try:
@@ -101,24 +87,19 @@ class FrameReader:
                 if not self._put(Arrival(frame, self._clock())):
                     return
         except BaseException as error:  # noqa: BLE001  whatever it was, the consumer raises it
-            self._error = error
+            self._queue.finish(error)
         finally:
-            with self._changed:
-                self._ended = True
-                self._changed.notify_all()
+            self._queue.finish()
 
     def _put(self, arrival: Arrival) -> bool:
-        """Queue a frame; False if nobody wants more."""
-        with self._changed:
-            while self._keeps_all and len(self._queue) == QUEUE_FRAMES and not self._unwanted:
-                self._changed.wait(POLL_S)
-            if len(self._queue) == QUEUE_FRAMES:
-                self.dropped.append(self._queue.popleft().frame.frame_number)
-            self._queue.append(arrival)
-            self.newest_s = arrival.arrived_s
-            self._least_delay_s = min(self._least_delay_s, arrival.arrived_s - arrival.frame.timestamp_s)
-            self._changed.notify_all()
-            return not self._unwanted
+        """Queue a frame; return False once no more are wanted."""
+        while self._keeps_all and not self._queue.wait_for_room(POLL_S) and not self._stop.is_set():
+            pass
+        self.newest_s = arrival.arrived_s
+        self._least_delay_s = min(self._least_delay_s, arrival.arrived_s - arrival.frame.timestamp_s)
+        if (dropped := self._queue.put(arrival)) is not None:
+            self.dropped.append(dropped.frame.frame_number)
+        return not (self._queue.finished or self._stop.is_set())
 
     @property
     def offset_s(self) -> float:
@@ -128,7 +109,3 @@ class FrameReader:
     @property
     def _is_done(self) -> bool:
         return self._stop.is_set() or self._enough()
-
-    @property
-    def _unwanted(self) -> bool:
-        return self._left or self._stop.is_set()

@@ -18,7 +18,7 @@ import numpy as np
 from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.statistics import DELIVERY, OnWarning, RunReport, RunStatistics, say_nothing
+from nlos_cam.live.statistics import DELIVERY, OnWarning, RunReport, RunStatistics, ignore
 from nlos_cam.live.telemetry import Telemetry, telemetry_of
 from nlos_cam.reconstruct import (
     Arrival,
@@ -34,7 +34,7 @@ from nlos_cam.reconstruct import (
 from nlos_cam.view import Moment, Viewer
 
 
-class Moments:
+class LiveDisplay:
     """Makes moments of steps, and shows them; the last one again while the camera stalls."""
 
     def __init__(
@@ -83,7 +83,7 @@ class Moments:
         return now_s - frame.timestamp_s - self._reader.offset_s
 
 
-def in_words(counts: Mapping[str, int]) -> str:
+def describe_counts(counts: Mapping[str, int]) -> str:
     """Counts by name as a person reads them; empty where there are none."""
     return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
 
@@ -106,7 +106,9 @@ def warm_up(camera: Camera, processing: Pipeline, clock: Clock = time.perf_count
     shape = camera.intrinsics.height, camera.intrinsics.width
     dark, flat = np.zeros(shape, np.uint8), np.full(shape, USUAL_DEPTH_M, np.float32)
     frame = Frame(flat, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics)
-    made = reconstruct(maps_from_frame(frame), processing.bench.rig, processing.network, clock, processing.doubter)
+    made = reconstruct(
+        maps_from_frame(frame), processing.bench.rig, processing.network, clock, processing.uncertainty_model
+    )
     return made.timings_s
 
 
@@ -120,7 +122,7 @@ def run_live(
     recorded: bool = False,
     clock: Clock = time.time,
     on_error: Callable[[RunReport], None] = lambda _: None,
-    on_warning: OnWarning = say_nothing,
+    on_warning: OnWarning = ignore,
     on_moment: Callable[[Moment], None] = lambda _: None,
 ) -> RunReport:
     """Reconstruct an entered camera's frames and show them, until it ends, `stop` is set, or `seconds` have passed.
@@ -149,9 +151,9 @@ def run_live(
         return tally.report(camera, reader)
 
     reader = FrameReader(
-        frames, keeps_all=recorded, stop=stop, clock=clock, enough=enough, let_go=leave, on_wait=look_up
+        frames, lossless=recorded, stop=stop, clock=clock, enough=enough, let_go=leave, on_wait=look_up
     )
-    moments = Moments(viewer, lambda: sum(tally.lost(camera, reader).values()), reader, thermometer, clock)
+    moments = LiveDisplay(viewer, lambda: sum(tally.lost(camera, reader).values()), reader, thermometer, clock)
     try:
         with reader, processing.checks:
             for step in iterate_results(reader, processing, clock, tally.fail, thermometer):
@@ -209,7 +211,7 @@ def iterate_results(
     for arrival in reader:
         try:
             _follow(thermometer, arrival, processing)
-            step = processing.step(arrival, clock, start_s)
+            step = processing.process(arrival, clock, start_s)
         except Exception as error:  # noqa: BLE001  whatever an odd frame leads to, who called decides
             in_a_row += 1
             on_failure(arrival.frame, error, in_a_row)
@@ -243,7 +245,7 @@ def _batches(
     together, start_s = list[PreparedFrame](), clock()
     for arrival in reader:
         _follow(thermometer, arrival, processing)
-        together.append(processing.see(arrival, clock, start_s))
+        together.append(processing.prepare(arrival, clock, start_s))
         if len(together) == FRAMES_TOGETHER:
             yield together
             together = []
@@ -263,4 +265,4 @@ def _finished(
 def _follow(thermometer: Telemetry | None, arrival: Arrival, processing: Pipeline) -> None:
     """Have the bench follow the lidar's temperature."""
     if thermometer and (celsius := thermometer.at(arrival.frame)):
-        processing.bench.look_at(celsius)
+        processing.bench.update_temperatures(celsius)

@@ -14,16 +14,17 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from queue import SimpleQueue
-from threading import Condition, Thread
+from threading import Thread
 from typing import IO, Any, Self
 
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
 
 from nlos_cam.frames import LidarMaps
-from nlos_cam.live.realtime import as_any_other
-from nlos_cam.reconstruct import Clock, PhysicsCheckResult, failure, log_warning
+from nlos_cam.live.realtime import drop_realtime_priority
+from nlos_cam.reconstruct import Clock, PhysicsCheckResult, describe_failure, log_warning
 from nlos_cam.render import Stop
+from nlos_cam.threads import BoundedQueue
 
 PERIOD_S = 1.0
 WORKER = sys.executable, "-m", "nlos_cam.live.physics_check_process"
@@ -54,8 +55,7 @@ class BackgroundPhysicsCheck:
         self._about, self._period_s, self._clock = (rig, accuracy), period_s, clock
         self._on_error, self._said, self._command = on_error, False, command
         self._due_s = -float("inf")
-        self._next: tuple[int, LidarMaps, Float32] | None = None
-        self._changed, self._ended = Condition(), False
+        self._queue = BoundedQueue[tuple[int, LidarMaps, Float32]](1)
         self.process: subprocess.Popen[bytes] | None = None
         """None where it could not be started."""
         self._thread = Thread(target=self._run, name="physics check", daemon=True)
@@ -70,9 +70,7 @@ class BackgroundPhysicsCheck:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with self._changed:
-            self._ended = True
-            self._changed.notify_all()
+        self._queue.close()
         if self.process:
             _end(self.process)
             self._thread.join(END_WITHIN_S)
@@ -82,22 +80,17 @@ class BackgroundPhysicsCheck:
         if (now_s := self._clock()) < self._due_s:
             return
         self._due_s = now_s + self._period_s
-        with self._changed:
-            if self._ended:
-                return
-            self.dropped += self._next is not None
-            self._next = frame_number, maps, depth_m
-            self._changed.notify_all()
+        self.dropped += self._queue.put((frame_number, maps, depth_m)) is not None
 
     @property
     def waits(self) -> bool:
         """Whether a frame waits to be checked."""
-        return self._next is not None
+        return len(self._queue) > 0
 
     @property
     def over(self) -> bool:
         """Whether nothing will be checked any more."""
-        return self._ended
+        return self._queue.closed
 
     def _run(self) -> None:
         if (process := self.process) is None:
@@ -112,32 +105,23 @@ class BackgroundPhysicsCheck:
     def _over(self, why: str) -> None:
         """There are no more checks, and never again a frame that waits for one."""
         self._say(f"no more physics checks: {why}")
-        with self._changed:
-            self._ended, self._next = True, None
+        self._queue.close()
 
     def _ask(self, process: subprocess.Popen[bytes]) -> None:
         asked, told = process.stdin, process.stdout
         if asked is None or told is None:
             return
         _send(asked, self._about)
-        while (frame := self._taken()) is not None:
+        while (frame := self._queue.take()) is not None:
             _send(asked, frame)
             answer = pickle.load(told)  # noqa: S301  of our own process, through a pipe that nobody else has
             if isinstance(answer, PhysicsCheckResult):
                 self.newest = answer
             else:
-                self._say(failure(frame[0], str(answer)))
-
-    def _taken(self) -> tuple[int, LidarMaps, Float32] | None:
-        """The frame that is next, once there is one; None when it is over."""
-        with self._changed:
-            while self._next is None and not self._ended:
-                self._changed.wait()
-            frame, self._next = self._next, None
-            return None if self._ended else frame
+                self._say(describe_failure(frame[0], str(answer)))
 
     def _say(self, text: str) -> None:
-        if not (self._said or self._ended):
+        if not (self._said or self._queue.closed):
             self._said = True
             self._on_error(text)
 
@@ -177,12 +161,12 @@ def serve(asked: IO[bytes], told: IO[bytes], leave: Callable[[], None]) -> None:
     questions: SimpleQueue[Any] = SimpleQueue()
     Thread(target=_listen, args=(asked, questions, leave), daemon=True).start()
     rig, accuracy = questions.get()
-    from nlos_cam.reconstruct import check  # takes a second to import: stdin is listened to meanwhile
+    from nlos_cam.reconstruct import check_reconstruction  # takes a second to import: stdin is listened to meanwhile
 
     while (question := questions.get()) is not None:
         frame_number, maps, depth_m = question
         try:
-            answer: object = check(maps, depth_m, rig, frame_number=frame_number, accuracy=accuracy)
+            answer: object = check_reconstruction(maps, depth_m, rig, frame_number=frame_number, accuracy=accuracy)
         except Exception as error:  # noqa: BLE001  whatever it was, it is told, and the next frame is looked at
             answer = f"{type(error).__name__}: {error}"
         with suppress(BrokenPipeError):
@@ -201,7 +185,7 @@ def _listen(asked: IO[bytes], questions: SimpleQueue[Any], leave: Callable[[], N
 
 def main() -> None:
     """Work for the parent, as little urgent as can be."""
-    as_any_other()
+    drop_realtime_priority()
     if hasattr(os, "nice"):
         os.nice(LOWEST_PRIORITY)
     told, sys.stdout = sys.stdout.buffer, sys.stderr  # what anybody prints is no answer

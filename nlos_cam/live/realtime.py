@@ -19,7 +19,7 @@ TASKS = Path("/proc/self/task")
 
 
 @contextmanager
-def precedence() -> Generator[bool]:
+def realtime_priority() -> Generator[bool]:
     """Meanwhile all threads of this process, and those that they start, go before ordinary ones; whether they may."""
     allowed = _all_threads(LOOP)
     try:
@@ -29,14 +29,14 @@ def precedence() -> Generator[bool]:
             _all_threads(ORDINARY)
 
 
-def after_the_loop() -> None:
-    """From now on the calling thread goes after the loop, if that has precedence, and before ordinary ones."""
+def yield_to_loop() -> None:
+    """From now on the calling thread goes after the loop, if that has realtime_priority, and before ordinary ones."""
     if _has_schedules() and os.sched_getscheduler(0) == os.SCHED_RR:
         _schedule(0, DRAWING)
 
 
-def as_any_other() -> None:
-    """From now on the calling process, which a loop with precedence may have started, goes like an ordinary one."""
+def drop_realtime_priority() -> None:
+    """From now on the calling process, which a loop with realtime_priority may have started, goes like an ordinary one."""
     if _has_schedules():
         _schedule(0, ORDINARY)
 
@@ -70,7 +70,7 @@ turn could hold a frame up for half of its period."""
 
 
 @contextmanager
-def undisturbed() -> Generator[None]:
+def low_latency_interpreter() -> Generator[None]:
     """Meanwhile what is alive now is not looked through for garbage, and threads take shorter turns.
 
     A collection over the modules and networks of a live run takes 0.2 s: six frames. What comes later is still

@@ -19,9 +19,9 @@ from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.loop import in_words, iterate_batched, with_telemetry
+from nlos_cam.live.loop import describe_counts, iterate_batched, with_telemetry
 from nlos_cam.live.replay_media import Looks, Samples, draw_sheet
-from nlos_cam.live.statistics import OnWarning, Warned, frames_by_verdict, say_nothing
+from nlos_cam.live.statistics import OnWarning, WarningLog, frames_by_verdict, ignore
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import UNEXPLAINED, CalibratedRig, Clock, FrameResult, Pipeline, Verdict
 
@@ -73,7 +73,7 @@ class _Results:
         self.verdicts: Counter[Verdict] = Counter()
         self.checks: dict[int, float] = {}
         """Scores by the number of the frame that was checked."""
-        self.samples, self.warned = Samples(SHEET_FRAMES), Warned(on_warning)
+        self.samples, self.warned = Samples(SHEET_FRAMES), WarningLog(on_warning)
 
     def add(self, step: FrameResult) -> None:
         depth_m = step.reconstruction.depth_m
@@ -102,7 +102,7 @@ def replay_recording(
     *,
     stop: Event,
     on_frame: Callable[[], None] = lambda: None,
-    on_warning: OnWarning = say_nothing,
+    on_warning: OnWarning = ignore,
     looks: Looks | None = None,
     clock: Clock = time.time,
 ) -> ReplayReport:
@@ -117,7 +117,7 @@ def replay_recording(
         results = _Results(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
         looking = files.enter_context((looks or Looks(bench)).into(part))
         frames, thermometer = with_telemetry(camera, camera)
-        with FrameReader(frames, keeps_all=True, stop=stop, clock=clock) as reader, processing.checks:
+        with FrameReader(frames, lossless=True, stop=stop, clock=clock) as reader, processing.checks:
             for step in iterate_batched(reader, processing, clock, thermometer):
                 results.add(step)
                 looking.add(step, thermometer.celsius)
@@ -178,7 +178,7 @@ def _report(camera: Camera, bench: CalibratedRig, results: _Results, *, stopped:
         "",
         f"- frames: {frames}, numbers {results.numbers[0]} to {results.numbers[-1]}, {times_s[-1] - times_s[0]:.2f} s",
         f"- skipped: {camera.incomplete} without all streams, {camera.dropped} that the recording lacks",
-        f"- seen: {in_words(camera.counts) or 'nothing odd'}",
+        f"- seen: {describe_counts(camera.counts) or 'nothing odd'}",
         f"- frames with a hidden surface: {results.with_surface} ({results.with_surface / frames:.0%})",
         f"- rig: {rig.name} {rig.checksum}, {rig.lidar.distance_m:.3f} m to the wall, {rig.facing_deg:.1f} degrees",
         f"- maps: {MAP_ROWS} x {MAP_COLUMNS}; hidden depth: {OBJECT_PIXELS} x {OBJECT_PIXELS} in `{RESULT}`",
@@ -201,7 +201,7 @@ def _checks_told(scores: Mapping[int, float]) -> list[str]:
     return [f"- physics check of {len(scores)} frames: {told}, {flagged} at {UNEXPLAINED:g} or more"]
 
 
-def _bench_told(bench: CalibratedRig, warned: Warned) -> list[str]:
+def _bench_told(bench: CalibratedRig, warned: WarningLog) -> list[str]:
     lines: list[str] = []
     if bench.reference:
         lines.append(f"- difference from the bare wall, the mean of {bench.reference.frames} frames: in `{DIFFERENCE}`")

@@ -124,13 +124,13 @@ OnWarning = Callable[[str, bool], None]
 """Called with a warning, and whether it begins (or ends)."""
 
 
-def say_nothing(warning: str, begins: bool) -> None:
+def ignore(warning: str, begins: bool) -> None:
     """Nobody listens to warnings as they come."""
     del warning, begins
 
 
 @dataclass
-class Held:
+class WarningSpan:
     """The frames that a warning held for."""
 
     text: str
@@ -141,11 +141,11 @@ class Held:
     """Frame numbers; it may have ended and begun again between."""
 
 
-class Warned:
+class WarningLog:
     """Which warnings held for which frames; tells when one begins and when it ends, not when its figures change."""
 
-    def __init__(self, on_warning: OnWarning = say_nothing) -> None:
-        self._held: dict[str, Held] = {}
+    def __init__(self, on_warning: OnWarning = ignore) -> None:
+        self._held: dict[str, WarningSpan] = {}
         self._on_warning, self._now = on_warning, set[str]()
 
     def add(self, step: FrameResult) -> None:
@@ -158,12 +158,12 @@ class Warned:
     def _note(self, warning: str, number: int) -> str:
         """Count a frame for a warning; what it is about."""
         subject = FIGURES.sub("", warning)
-        held = self._held.setdefault(subject, Held(warning, 0, number, number))
+        held = self._held.setdefault(subject, WarningSpan(warning, 0, number, number))
         held.text, held.frames, held.last = warning, held.frames + 1, number
         return subject
 
     @property
-    def held(self) -> list[Held]:
+    def held(self) -> list[WarningSpan]:
         """Each warning, in the order in which they first began."""
         return list(self._held.values())
 
@@ -201,8 +201,8 @@ class RunReport:
 class RunStatistics:
     """Collects what RunReport tells, in memory that does not grow with the frames."""
 
-    def __init__(self, on_warning: OnWarning = say_nothing) -> None:
-        self.warned = Warned(on_warning)
+    def __init__(self, on_warning: OnWarning = ignore) -> None:
+        self.warned = WarningLog(on_warning)
         self.stall = StallWatch(on_warning)
         self.frames = 0
         self.failed = 0

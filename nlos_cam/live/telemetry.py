@@ -8,7 +8,7 @@ from pathlib import Path
 from nlos_cam.camera import Camera
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording import LOOK_S, load_sidecar, sidecar_path
+from nlos_cam.recording import TEMPERATURE_INTERVAL_S, load_sidecar, sidecar_path
 
 RECORDED = "bag:"
 Celsius = Mapping[str, float]
@@ -23,7 +23,7 @@ class Telemetry:
     reconstructs them. The thread that starts and stops a device anew is the one that asks.
     """
 
-    def __init__(self, read: Callable[[float], Celsius], every_s: float = LOOK_S) -> None:
+    def __init__(self, read: Callable[[float], Celsius], every_s: float = TEMPERATURE_INTERVAL_S) -> None:
         self._read, self._every_s = read, every_s
         self._readings: deque[tuple[int, Celsius]] = deque()
         self.celsius: Celsius = {}

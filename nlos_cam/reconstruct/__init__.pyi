@@ -3,9 +3,9 @@ __all__ = [
     "Arrival",
     "CalibratedRig",
     "Clock",
-    "EveryFrames",
     "FrameConditions",
     "FrameResult",
+    "PeriodicPhysicsCheck",
     "PhysicsCheck",
     "PhysicsCheckResult",
     "Pipeline",
@@ -13,32 +13,40 @@ __all__ = [
     "Reconstruction",
     "Verdict",
     "VerdictFilter",
-    "check",
+    "build_pipeline",
     "check_intrinsics",
-    "failure",
+    "check_reconstruction",
+    "compatibility_warnings",
+    "describe_failure",
     "frame_issues",
-    "limits_of",
-    "load_doubt",
     "load_networks",
+    "load_uncertainty",
     "log_warning",
-    "misfits",
     "open_bench",
     "reconstruct",
-    "set_up",
+    "verdict_limits",
 ]
 
 from .bench import CalibratedRig, check_intrinsics, open_bench
 from .network import Clock, Reconstruction, reconstruct
-from .physics_check import UNEXPLAINED, EveryFrames, PhysicsCheck, PhysicsCheckResult, check, failure, log_warning
+from .physics_check import (
+    UNEXPLAINED,
+    PeriodicPhysicsCheck,
+    PhysicsCheck,
+    PhysicsCheckResult,
+    check_reconstruction,
+    describe_failure,
+    log_warning,
+)
 from .pipeline import (
     Arrival,
     FrameResult,
     Pipeline,
     PreparedFrame,
-    limits_of,
-    load_doubt,
+    build_pipeline,
+    compatibility_warnings,
     load_networks,
-    misfits,
-    set_up,
+    load_uncertainty,
+    verdict_limits,
 )
 from .verdict import FrameConditions, Verdict, VerdictFilter, frame_issues

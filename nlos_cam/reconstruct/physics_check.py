@@ -1,21 +1,17 @@
-"""A reconstruction rendered again, and held against what the lidar saw: what is found, and who looks.
+"""Physics check: a reconstruction rendered again and compared with the lidar's maps.
 
-How far the echoes that a renderer expects explain the maps that a lidar gave: arrays in, a score out.
-
-Each cell tells one echo of two, the strongest (S5): the bare wall's own, or that of three bounces. Where both are about
-as strong, a small error of the object swaps them and moves the depth by decimetres. So both are held against what was
-seen, and the one that explains it better counts. With r = seen less expected and s a tolerance that holds the noise:
+Each cell returns one of two echoes, the stronger one (S5): that of the bare wall, or that of three bounces. If both are
+about as strong, a small error of the object swaps them and changes the depth by decimetres. So the measurement is
+compared with both, and the one that explains it better counts. With r = measured less expected and s a tolerance that
+covers the noise:
 
     h = (depth r / s)^2 + (log intensity r / s)^2 + (log of how much the other echo is stronger / s)^2
-    cost = h / (1 + h)                          0 explained, 1 not at all; and the mean of it over the cells
-    score = (cost - NOISE_COST) / (cost of the bare bench - NOISE_COST), the one above at least 0, the one below at
+    cost = h / (1 + h)                          0 explained, 1 not at all; averaged over the cells
+    score = (cost - NOISE_COST) / (cost of the bare bench - NOISE_COST), the numerator at least 0, the denominator at
             least MIN_UNEXPLAINED
 
-Two things are not known beforehand and fitted: the device's gain, from the cells that show the bare wall, and the
-object's albedo, to within a factor of MAX_ALBEDO, as the one of the least cost. A wider range of albedos would explain
-any object that is not there as a dark one.
-
-The physics check itself: a reconstruction rendered again, through the expected sensor, against the lidar's maps.
+Two unknowns are fitted: the device's gain, from the cells that show the bare wall, and the object's albedo, to within a
+factor of MAX_ALBEDO, as the one of least cost. A wider range of albedos would explain any missing object as a dark one.
 """
 
 import logging
@@ -34,42 +30,41 @@ from nlos_cam.reconstruct.network import Clock
 from nlos_cam.render import Rendering, Scene, SensorModel, Stop, cast, render
 
 UNEXPLAINED = 0.91
-"""The score from which on what is shown does not explain the maps: 1 % of the 300 new objects that it was chosen on
+"""Score from which on the reconstruction does not explain the maps: 1 % of the 300 new objects that it was chosen on
 reach it (docs/physics-check.md)."""
 
 log = logging.getLogger(__name__)
 
 
 def log_warning(text: str) -> None:
-    """Tell of a check that failed where nobody else is told."""
+    """Log a failed check; the default of `on_error`."""
     log.warning("%s", text)
 
 
-def failure(frame_number: int, what: str) -> str:
-    """A check that failed, in a line."""
-    return f"the physics check of frame {frame_number} failed ({what}): frames go on without"
+def describe_failure(frame_number: int, reason: str) -> str:
+    """Return one line on a failed check."""
+    return f"the physics check of frame {frame_number} failed ({reason}): the run continues without it"
 
 
 @dataclass(frozen=True)
 class PhysicsCheckResult:
-    """What one frame's check found."""
+    """Residuals and score of one frame's check."""
 
     frame_number: int
     residual_depth_m: Float32
-    """(64, 80): seen less rendered; NaN where either has no return."""
+    """(64, 80): measured less rendered; NaN where either has no return."""
     residual_intensity: Float32
-    """(64, 80): seen less rendered, in IR counts."""
+    """(64, 80): measured less rendered, in IR counts."""
     score: float
-    """0 where the maps are explained to within the sensor's noise; 1 where they are explained no better than by nothing
-    at all hidden; more where worse."""
+    """0 if the maps are explained to within noise, 1 if no better than by an empty bench, more if worse."""
     seconds: float
-    """How long it took."""
+    """Duration of the check."""
     albedo: float = 1.0
-    """Of the object, against what the networks were trained on: the one that explains the maps best."""
+    """Albedo of the object that explains the maps best, relative to the training set's."""
 
 
 class PhysicsCheck(Protocol):
-    """PhysicsCheck some of the frames that it is shown, beside the loop or in its midst, while it is entered."""
+    """Check of some of the frames offered to it, in the loop's thread or beside it, while entered."""
 
     newest: PhysicsCheckResult | None
     """None until there is one."""
@@ -79,12 +74,12 @@ class PhysicsCheck(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
-        """Show it a frame's maps and the hidden depth (64, 64) made of them."""
+        """Offer a frame's maps and the hidden depth (64, 64) reconstructed from them."""
         ...
 
 
 class NullPhysicsCheck:
-    """For loops that nothing is checked of."""
+    """Physics check that does nothing."""
 
     newest: PhysicsCheckResult | None = None
 
@@ -99,39 +94,39 @@ class NullPhysicsCheck:
 
 
 WALL_TOLERANCE_M = 0.003
-"""Of the bare wall's depth: what a bench's record leaves."""
+"""Tolerance of the bare wall's depth: the error of a bench's record."""
 ECHO_TOLERANCE_M = 0.01
-"""Of a three-bounce echo's depth: two bins, and the least that reconstructions err by."""
+"""Tolerance of a three-bounce echo's depth: two bins, and the smallest error of reconstructions."""
 LOG_TOLERANCE = 0.6
-"""Of an intensity's logarithm, a factor of 1.8: what distance and slope of a reconstruction err by."""
+"""Tolerance of an intensity's logarithm, a factor of 1.8: errors of a reconstruction's distance and slope."""
 MAX_ALBEDO, ALBEDOS = 4 / 3, 5
 NOISE_COST = 0.006
-"""What the sensor's noise, and cells of many pixels, leave of a bare bench that is explained."""
+"""Cost of an explained bare bench: the sensor's noise, and cells of many pixels."""
 MIN_UNEXPLAINED = 0.02
-"""With less than this left by a bare bench nothing is to be explained. Objects leave 0.14 or more."""
-FEWEST_BARE = 50
-"""Cells that show the bare wall, for them to tell the gain."""
+"""Smallest denominator of the score, for benches without an object; objects cost a bare bench 0.14 or more."""
+MIN_BARE_CELLS = 50
+"""Cells showing the bare wall that are needed to fit the gain to them alone."""
 NOISE = SensorModel()
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What would come back from each cell (64, 80): depths along the optical axis, intensities in units of I0."""
+    """Two expected echoes of each cell (64, 80): depths along the optical axis, intensities in units of I0."""
 
     direct_m: Float64
-    """NaN where nothing returns."""
+    """NaN where there is no return."""
     direct: Float64
     echo_m: Float64
-    """Of three bounces; NaN where there is none."""
+    """Depth of the three-bounce echo; NaN where there is none."""
     echo: Float64
 
     @property
     def bare(self) -> "Expected":
-        """The same without three bounces."""
+        """The same without three-bounce echoes."""
         return Expected(self.direct_m, self.direct, np.full_like(self.echo_m, np.nan), np.zeros_like(self.echo))
 
-    def seen(self, albedo: float, gain: float) -> tuple[Float32, Float32]:
-        """Depth, NaN where there is no return, and intensity in counts, as a lidar without noise would give them."""
+    def noiseless_maps(self, albedo: float, gain: float) -> tuple[Float32, Float32]:
+        """Return depth (NaN where there is no return) and intensity in counts, as measured without noise."""
         wins = albedo * self.echo > self.direct
         intensity = np.where(wins, albedo * self.echo, self.direct)
         depth_m = np.where(intensity > 0, np.where(wins, self.echo_m, self.direct_m), np.nan)
@@ -140,7 +135,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class Explanation:
-    """How the maps are explained best."""
+    """Best fit of the expected echoes to the maps."""
 
     score: float
     albedo: float
@@ -148,71 +143,70 @@ class Explanation:
     """Counts for an intensity of I0."""
 
 
-def explanation(seen: LidarMaps, expected: Expected, bare: Expected) -> Explanation:
-    """The best explanation of maps by an object, against that of the bare bench."""
-    gain = fitted_gain(seen, bare)
+def explain(maps: LidarMaps, expected: Expected, bare: Expected) -> Explanation:
+    """Return the best explanation of maps by an object, scored against that of the bare bench."""
+    gain = fit_gain(maps, bare)
     albedos = np.geomspace(1 / MAX_ALBEDO, MAX_ALBEDO, ALBEDOS) if (expected.echo > 0).any() else np.ones(1)
-    costs = [mean_cost(seen, expected, gain, albedo) for albedo in albedos]
+    costs = [mean_cost(maps, expected, gain, albedo) for albedo in albedos]
     best = int(np.argmin(costs))
-    unexplained = max(mean_cost(seen, bare, gain, 1.0) - NOISE_COST, MIN_UNEXPLAINED)
+    unexplained = max(mean_cost(maps, bare, gain, 1.0) - NOISE_COST, MIN_UNEXPLAINED)
     return Explanation(max(costs[best] - NOISE_COST, 0.0) / unexplained, float(albedos[best]), gain)
 
 
-def fitted_gain(seen: LidarMaps, bare: Expected) -> float:
-    """Counts for an intensity of I0, by the median of the cells that show the bare wall; of all, if these are few."""
-    told = seen.valid & (seen.intensity > 0) & (bare.direct > 0)
-    shows_wall = told & (np.abs(seen.depth_m - bare.direct_m) < 3 * WALL_TOLERANCE_M)
-    some = shows_wall if shows_wall.sum() >= FEWEST_BARE else told
-    return float(np.median(seen.intensity[some] / bare.direct[some])) if some.any() else 1.0
+def fit_gain(maps: LidarMaps, bare: Expected) -> float:
+    """Return the counts for an intensity of I0: the median of the cells that show the bare wall, of all if too few."""
+    lit = maps.valid & (maps.intensity > 0) & (bare.direct > 0)
+    shows_wall = lit & (np.abs(maps.depth_m - bare.direct_m) < 3 * WALL_TOLERANCE_M)
+    cells = shows_wall if shows_wall.sum() >= MIN_BARE_CELLS else lit
+    return float(np.median(maps.intensity[cells] / bare.direct[cells])) if cells.any() else 1.0
 
 
-def mean_cost(seen: LidarMaps, expected: Expected, gain: float, albedo: float) -> float:
-    """The mean, over cells that return or should, of how far they are not explained: 0 to 1."""
+def mean_cost(maps: LidarMaps, expected: Expected, gain: float, albedo: float) -> float:
+    """Return the mean cost, 0 to 1, over the cells with a measured or expected return."""
     echo = albedo * expected.echo
-    should = (expected.direct > 0) | (echo > 0)
-    seen_m, light = np.where(seen.valid, seen.depth_m, np.nan).astype(np.float64), _light(seen, gain)
+    measured_m = np.where(maps.valid, maps.depth_m, np.nan).astype(np.float64)
+    light = _log(maps.intensity.astype(np.float64) / gain)  # in units of I0
     counts_of_i0 = NOISE.bare_wall_counts / max(float(expected.direct.max()), 1e-12)
-    lead, most = _log(echo) - _log(expected.direct), np.log(SATURATED / gain)
-    wall = _distance((seen_m - expected.direct_m) / WALL_TOLERANCE_M, light, expected.direct, counts_of_i0, lead, most)
-    bounced = _distance((seen_m - expected.echo_m) / ECHO_TOLERANCE_M, light, echo, counts_of_i0, -lead, most)
-    nearer = np.minimum(wall, bounced)
-    cost = np.where(np.isfinite(nearer), nearer / (1 + np.where(np.isfinite(nearer), nearer, 0)), 1.0)
-    counts = seen.valid | should
-    return float(cost[counts].mean()) if counts.any() else 0.0
+    lead, full_scale = _log(echo) - _log(expected.direct), np.log(SATURATED / gain)
+    off_wall, off_echo = measured_m - expected.direct_m, measured_m - expected.echo_m
+    wall = _misfit(off_wall / WALL_TOLERANCE_M, light, expected.direct, counts_of_i0, lead, full_scale)
+    bounced = _misfit(off_echo / ECHO_TOLERANCE_M, light, echo, counts_of_i0, -lead, full_scale)
+    h = np.minimum(wall, bounced)
+    # h / (1 + h) tends to 1 for h -> infinity, but inf / inf is NaN
+    cost = np.where(np.isfinite(h), h / (1 + np.where(np.isfinite(h), h, 0)), 1.0)
+    counted = maps.valid | (expected.direct > 0) | (echo > 0)
+    return float(cost[counted].mean()) if counted.any() else 0.0
 
 
-def _distance(
-    off: Float64, light: Float64, expected: Float64, counts_of_i0: float, lead: Float64, most: float
+def _misfit(
+    off: Float64, light: Float64, expected: Float64, counts_of_i0: float, lead: Float64, full_scale: float
 ) -> Float64:
-    """What `h` is of one of the two echoes; infinite where it is none, or nothing was seen.
+    """Return `h` of one of the two echoes; infinite where there is none, or nothing was measured.
 
-    `off` is the depth's part of it, `lead` the log of how much the other is stronger; from a log light of `most` on the
-    lidar is saturated, and what was there may have been stronger.
+    `off` is the depth term's r / s, `light` the log of the measured intensity, `lead` the log of how much the other
+    echo is stronger.
     """
     counts = counts_of_i0 * expected
     with np.errstate(divide="ignore", invalid="ignore"):
-        spread2 = LOG_TOLERANCE**2 + (NOISE.read_noise_counts**2 + NOISE.shot_noise**2 * counts) / counts**2
-        apart = light - _log(expected)
-        apart = np.where(light >= most, np.maximum(apart, 0), apart)
-        h = off**2 + apart**2 / spread2 + (np.maximum(lead, 0) / LOG_TOLERANCE) ** 2
+        # d(log n) = dn / n, so noise of variance read^2 + shot^2 n has variance (read^2 + shot^2 n) / n^2 in log n
+        variance = LOG_TOLERANCE**2 + (NOISE.read_noise_counts**2 + NOISE.shot_noise**2 * counts) / counts**2
+        log_ratio = light - _log(expected)
+        # a saturated cell measures a lower limit of its light: only too little expected light is a misfit
+        log_ratio = np.where(light >= full_scale, np.maximum(log_ratio, 0), log_ratio)
+        h = off**2 + log_ratio**2 / variance + (np.maximum(lead, 0) / LOG_TOLERANCE) ** 2
     return np.where((expected > 0) & np.isfinite(h), h, np.inf)
 
 
-def _light(seen: LidarMaps, gain: float) -> Float64:
-    """The logarithm of what was seen, in units of I0."""
-    return _log(seen.intensity.astype(np.float64) / gain)
-
-
 def _log(intensity: Float64) -> Float64:
-    """The logarithm; of nothing, that of next to nothing."""
+    """Return the natural logarithm, finite at zero."""
     return np.log(np.maximum(intensity, 1e-12))
 
 
 CHECKED_FRAMES = 30
-"""Of a replay, every so many frames are checked: about once a second."""
+"""Frames from one check to the next in a replay: about a second."""
 
 
-def check(
+def check_reconstruction(
     maps: LidarMaps,
     depth_m: Float32 | None,
     rig: Rig,
@@ -221,30 +215,30 @@ def check(
     accuracy: Stop = "standard",
     clock: Clock = time.perf_counter,
 ) -> PhysicsCheckResult:
-    """Render a hidden depth (64, 64) again, and hold what a lidar would see of it against the maps that it gave.
+    """Render a hidden depth (64, 64) and compare the echoes with the lidar's maps.
 
-    Without any surface, and on a rig without an object box, the bare bench is held against them. The depth of the maps
-    is that of the rig: what the lidar is known to lack was added (`Bench.corrected`).
+    Without a surface or an object box the bare bench is compared. The maps' depths include the range offset
+    (`CalibratedRig.correct_range`).
     """
     start_s = clock()
     bare = _bare(rig)  # pyright: ignore[reportArgumentType]  frozen, so hashable
-    hides = depth_m is not None and rig.object_box is not None and bool(np.isfinite(depth_m).any())
-    expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare) if hides else bare
-    best = explanation(maps, expected, bare)
-    rendered_m, rendered = expected.seen(best.albedo, best.gain)
-    seen_m = np.where(maps.valid, maps.depth_m, np.float32(np.nan))
-    residuals = seen_m - rendered_m, maps.intensity - rendered
+    has_object = depth_m is not None and rig.object_box is not None and bool(np.isfinite(depth_m).any())
+    expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare) if has_object else bare
+    best = explain(maps, expected, bare)
+    rendered_m, rendered = expected.noiseless_maps(best.albedo, best.gain)
+    measured_m = np.where(maps.valid, maps.depth_m, np.float32(np.nan))
+    residuals = measured_m - rendered_m, maps.intensity - rendered
     return PhysicsCheckResult(frame_number, *residuals, best.score, clock() - start_s, best.albedo)
 
 
 @lru_cache(maxsize=4)
 def _bare(rig: Rig) -> Expected:
-    """What comes back with nothing hidden."""
+    """Return the echoes of the empty bench."""
     return _expected(render(Scene(rig)), rig, None)
 
 
 def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected:
-    """Both echoes of each cell; where three bounces won, the direct one is the bare bench's."""
+    """Return both echoes of each cell; where three bounces won, the direct echo is the bare bench's."""
     cos_axis = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).cos_axis.reshape(MAP_ROWS, MAP_COLUMNS)
     echo, echo_m = rendering.multi.peak.astype(np.float64), rendering.multi.path_m / 2 * cos_axis
     direct, direct_m = rendering.intensity.astype(np.float64), rendering.depth_m.astype(np.float64)
@@ -254,10 +248,10 @@ def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected
     return Expected(np.where(bounced, bare.direct_m, direct_m), np.where(bounced, bare.direct, direct), echo_m, echo)
 
 
-class EveryFrames:
-    """PhysicsCheck every so many frames on the spot: of the same frames always the same ones, to the bit.
+class PeriodicPhysicsCheck:
+    """Physics check of the first of every `every` frames, in the caller's thread: reproducible to the bit.
 
-    `on_error` hears of the first check that fails.
+    Calls `on_error` for the first check that fails.
     """
 
     def __init__(
@@ -271,7 +265,7 @@ class EveryFrames:
         self.newest: PhysicsCheckResult | None = None
         self._rig, self._every, self._offered = rig, every, 0
         self._accuracy: Stop = accuracy
-        self._on_error, self._said = on_error, False
+        self._on_error, self._failed = on_error, False
 
     def __enter__(self) -> Self:
         return self
@@ -280,13 +274,15 @@ class EveryFrames:
         pass
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
-        """PhysicsCheckResult this frame if it is one of those."""
+        """Check this frame if it is the first of its group."""
         self._offered += 1
         if (self._offered - 1) % self._every:
             return
         try:
-            self.newest = check(maps, depth_m, self._rig, frame_number=frame_number, accuracy=self._accuracy)
-        except Exception as error:  # noqa: BLE001  whatever it was, frames go on without
-            if not self._said:
-                self._on_error(failure(frame_number, f"{type(error).__name__}: {error}"))
-            self._said = True
+            self.newest = check_reconstruction(
+                maps, depth_m, self._rig, frame_number=frame_number, accuracy=self._accuracy
+            )
+        except Exception as error:  # noqa: BLE001  whatever it was, the run continues without this check
+            if not self._failed:
+                self._on_error(describe_failure(frame_number, f"{type(error).__name__}: {error}"))
+            self._failed = True

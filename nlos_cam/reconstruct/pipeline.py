@@ -1,6 +1,6 @@
-"""What is made of each frame of a camera: maps, their difference from the bare wall, warnings, the hidden depth.
+"""Per-frame reconstruction pipeline: maps, difference maps, hidden depth, verdict.
 
-From a bench and networks to what is made of frames, and in words what does not fit between the two.
+Built from a rig and networks, whose mismatches it lists.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ from nlos_cam.reconstruct.verdict import FrameConditions, Verdict, VerdictFilter
 
 @dataclass(frozen=True)
 class Arrival:
-    """A frame, and when the reader had it."""
+    """Frame with the time at which the reader received it."""
 
     frame: Frame
     arrived_s: float
@@ -29,44 +29,45 @@ class Arrival:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """One frame's way through the loop."""
+    """Frame with its maps, reconstruction, verdict and timings."""
 
     frame: Frame
     maps: LidarMaps
     reconstruction: Reconstruction
     published_s: float
     stages_s: Mapping[str, float]
+    """Seconds by stage."""
     difference: LidarMaps | None = None
-    """The maps less the bare wall's; None without a reference."""
+    """Maps less those of the bare wall; None without a reference."""
     warnings: tuple[str, ...] = ()
     verdict: Verdict | None = None
-    """None from networks that do not tell."""
+    """None without an uncertainty model, unless the lidar moved or is saturated."""
     check: PhysicsCheckResult | None = None
-    """The newest physics check, of this frame or an earlier one."""
+    """Newest physics check, of this frame or an earlier one."""
     arrived_s: float | None = None
-    """When the loop's reader had the frame."""
+    """Time at which the reader received the frame."""
 
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame, and what the networks eat of it."""
+    """Frame with the maps that go into the networks."""
 
     arrival: Arrival
     maps: LidarMaps
-    look: BenchObservation
+    observation: BenchObservation
     corrected: LidarMaps
-    """Raw maps with the range that the lidar is known to lack added."""
-    eaten: LidarMaps
+    """Raw maps with the measured range offset of the lidar added."""
+    network_input: LidarMaps
     stages_s: Mapping[str, float]
 
 
 class Pipeline:
-    """What is made of a camera's frames, in their order: maps, their difference from the bare wall, the hidden depth.
+    """Per-frame reconstruction: frame -> maps -> difference maps -> networks -> uncertainty -> verdict.
 
-    Maps are the mean over the last `average` frames. With a doubt network each reconstruction has an uncertainty and a
-    verdict, and shows nothing where nothing is hidden. The newest of the `checks`, which whoever goes over the frames
-    enters, goes along with each. Raises CalibrationError where the networks eat difference maps and there is no bare
-    wall to form them from.
+    Maps are the mean of the last `average` frames. An uncertainty model adds expected errors and a verdict, and removes
+    the surface where nothing is hidden. Stateful (running mean, drift, smoothed verdict): give `prepare` and `finish`
+    the frames in order, from one thread; `reconstruct` keeps no state. The caller enters `checks`. Raises
+    CalibrationError if the networks need difference maps and the bench has no reference.
     """
 
     def __init__(
@@ -74,115 +75,131 @@ class Pipeline:
         bench: CalibratedRig,
         network: Network,
         *,
-        eats_difference: bool = False,
+        uses_difference: bool = False,
         average: int = 1,
-        doubter: UncertaintyModel | None = None,
+        uncertainty_model: UncertaintyModel | None = None,
         checks: PhysicsCheck | None = None,
     ) -> None:
-        if eats_difference and bench.reference is None:
+        if uses_difference and bench.reference is None:
             raise CalibrationError(
-                "these weights eat difference maps: give --wall with a reference (calibrate the wall again)"
+                "these weights expect difference maps: give --wall with a reference (calibrate the wall again)"
             )
-        self.bench, self.network, self.doubter = bench, network, doubter
-        self._judge = VerdictFilter(limits_of(doubter) if doubter else None)
+        self.bench, self.network, self.uncertainty_model = bench, network, uncertainty_model
         self.checks = checks or NullPhysicsCheck()
-        self._eats_difference, self._mean = eats_difference, MapMean(average)
+        self._verdicts = VerdictFilter(verdict_limits(uncertainty_model) if uncertainty_model else None)
+        self._uses_difference, self._mean = uses_difference, MapMean(average)
 
-    def step(self, arrival: Arrival, clock: Clock, start_s: float) -> FrameResult:
-        """All of it, for one frame that is waited for since `start_s`."""
-        seen = self.see(arrival, clock, start_s)
-        (made,) = self.reconstruct([seen], clock)
-        return self.finish(seen, made, clock)
+    def process(self, arrival: Arrival, clock: Clock, start_s: float) -> FrameResult:
+        """Return the result of one frame; `start_s` is when the loop began to wait for it."""
+        prepared = self.prepare(arrival, clock, start_s)
+        (reconstruction,) = self.reconstruct([prepared], clock)
+        return self.finish(prepared, reconstruction, clock)
 
-    def see(self, arrival: Arrival, clock: Clock, start_s: float) -> PreparedFrame:
-        """What the lidar saw, up to what the networks eat; frames in their order."""
-        got_s = clock()
+    def prepare(self, arrival: Arrival, clock: Clock, start_s: float) -> PreparedFrame:
+        """Return the maps of a frame as the networks need them; call in frame order."""
+        taken_s = clock()
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
         maps = self._mean.add(maps)
-        look = self.bench.look(arrival.frame, maps)
-        looked_s = clock()
-        stages_s = {"wait": got_s - start_s, "queue": got_s - arrival.arrived_s}
-        stages_s |= {"maps": mapped_s - got_s, "bench": looked_s - mapped_s}
-        corrected = self.bench.corrected(maps)
-        eaten = look.difference if self._eats_difference and look.difference else corrected
-        return PreparedFrame(arrival, maps, look, corrected, eaten, stages_s)
+        observation = self.bench.observe(arrival.frame, maps)
+        observed_s = clock()
+        stages_s = {"wait": taken_s - start_s, "queue": taken_s - arrival.arrived_s}
+        stages_s |= {"maps": mapped_s - taken_s, "bench": observed_s - mapped_s}
+        corrected = self.bench.correct_range(maps)
+        network_input = observation.difference if self._uses_difference and observation.difference else corrected
+        return PreparedFrame(arrival, maps, observation, corrected, network_input, stages_s)
 
-    def reconstruct(self, several: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
-        """What the networks make of each, and of no other frame: what it takes does not change, nor is it changed."""
-        eaten = [seen.eaten for seen in several]
-        return reconstruct_all(eaten, self.bench.rig, self.network, clock, self.doubter)
+    def reconstruct(self, frames: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
+        """Return the reconstruction of each frame; reads and changes no state, so any thread may call it."""
+        maps = [frame.network_input for frame in frames]
+        return reconstruct_all(maps, self.bench.rig, self.network, clock, self.uncertainty_model)
 
-    def finish(self, seen: PreparedFrame, made: Reconstruction, clock: Clock) -> FrameResult:
-        """What is shown of it, and what is said; frames in their order."""
-        frame, look = seen.arrival.frame, seen.look
-        shown, verdict = self._judge.look(made, signs_of(frame, look, self.checks.newest))
-        self.checks.offer(frame.frame_number, seen.corrected, shown.depth_m)
-        stages_s = {**seen.stages_s, **made.timings_s}
-        told = shown, clock(), stages_s, look.difference, look.warnings, verdict
-        return FrameResult(frame, seen.maps, *told, check=self.checks.newest, arrived_s=seen.arrival.arrived_s)
-
-
-def limits_of(doubter: UncertaintyModel) -> VerdictLimits:
-    """The limits that a doubt network was calibrated with."""
-    return VerdictLimits(doubter.record.nothing_above, doubter.record.outside_above, UNEXPLAINED)
-
-
-def signs_of(frame: Frame, look: BenchObservation, check: PhysicsCheckResult | None) -> FrameConditions:
-    """What is amiss with a frame itself, with its bench, and with what was made of the last frame that was checked."""
-    names = frame_issues(frame)
-    invalid = "blank" in names or "half_invalid" in names
-    return FrameConditions("saturated" in names, invalid, look.moved, check)
+    def finish(self, prepared: PreparedFrame, reconstruction: Reconstruction, clock: Clock) -> FrameResult:
+        """Return the result of a frame with its verdict, and offer it to the physics check; call in frame order."""
+        frame, observation = prepared.arrival.frame, prepared.observation
+        conditions = frame_conditions(frame, observation, self.checks.newest)
+        shown, verdict = self._verdicts.decide(reconstruction, conditions)
+        self.checks.offer(frame.frame_number, prepared.corrected, shown.depth_m)
+        return FrameResult(
+            frame,
+            prepared.maps,
+            shown,
+            published_s=clock(),
+            stages_s={**prepared.stages_s, **reconstruction.timings_s},
+            difference=observation.difference,
+            warnings=observation.warnings,
+            verdict=verdict,
+            check=self.checks.newest,
+            arrived_s=prepared.arrival.arrived_s,
+        )
 
 
-NO_DOUBT = "these weights have no doubt network (`train doubt`): no uncertainty is told, and no verdict"
+def verdict_limits(uncertainty_model: UncertaintyModel) -> VerdictLimits:
+    """Return the probabilities and the physics-check score above which verdicts change."""
+    record = uncertainty_model.record
+    return VerdictLimits(record.nothing_above, record.outside_above, UNEXPLAINED)
+
+
+def frame_conditions(frame: Frame, observation: BenchObservation, check: PhysicsCheckResult | None) -> FrameConditions:
+    """Return the conditions of a frame that affect its verdict; `check` is the newest physics check."""
+    issues = frame_issues(frame)
+    invalid = "blank" in issues or "half_invalid" in issues
+    return FrameConditions("saturated" in issues, invalid, observation.moved, check)
 
 
 def load_networks(weights: Path | None = None) -> Reconstructor:
-    """The shipped weights, or a checkpoint folder's, exported once into the cache folder. Raises CheckpointError."""
+    """Load the shipped networks, or those of a folder, exported to the cache once. Raises CheckpointError."""
     return load_reconstructor(weights, cache_folder() / "onnx")
 
 
-def load_doubt(weights: Path | None = None) -> UncertaintyModel | None:
-    """The doubt network beside the shipped weights, or a folder's; None where there is none."""
+def load_uncertainty(weights: Path | None = None) -> UncertaintyModel | None:
+    """Load the uncertainty model ("doubt network") beside the shipped weights, or of a folder; None without one."""
     return load_uncertainty_model(weights, cache_folder() / "onnx")
 
 
-def set_up(
+def build_pipeline(
     bench: CalibratedRig,
     network: Reconstructor,
     average: int = 1,
     *,
-    doubter: UncertaintyModel | None = None,
+    uncertainty_model: UncertaintyModel | None = None,
     checks: PhysicsCheck | None = None,
 ) -> Pipeline:
-    """What these networks make of frames of this bench: raw maps or difference maps, as the networks eat."""
-    eats_difference = network.record.input == "difference maps"
-    return Pipeline(bench, network, eats_difference=eats_difference, average=average, doubter=doubter, checks=checks)
-
-
-def misfits(bench: CalibratedRig, trained: CheckpointRecord, doubter: UncertaintyModel | None) -> list[str]:
-    """What a person should know of networks on this bench before believing them; empty where all fits."""
-    return [*_of_rig(bench.rig, trained), *_of_reference(bench), *([] if doubter else [NO_DOUBT])]
-
-
-def _of_rig(rig: Rig, trained: CheckpointRecord) -> list[str]:
-    """How the bench differs from the one that the networks were trained for."""
-    try:
-        theirs = load_rig(trained.rig_name)
-    except RecordFileError:  # trained for a rig of a file that is not here
-        theirs = None
-    if theirs is None or theirs.checksum != trained.rig_checksum:
-        unlike = trained.rig_checksum != rig.checksum
-        return [f"the networks were trained for another rig than {rig.name}: what they show is off"] if unlike else []
-    difference = rig_difference(rig, theirs)
-    return (
-        [f"unlike the rig of the networks, this one has {'; '.join(difference)}: they err more"] if difference else []
+    """Build a pipeline with raw or difference maps, depending on the networks' input."""
+    return Pipeline(
+        bench,
+        network,
+        uses_difference=network.record.input == "difference maps",
+        average=average,
+        uncertainty_model=uncertainty_model,
+        checks=checks,
     )
 
 
-def _of_reference(bench: CalibratedRig) -> list[str]:
-    if not bench.measured or bench.reference:
-        return []
-    told = "no difference maps are formed, and a lidar that moves is not noticed: calibrate the wall again"
-    return [f"this wall's record has no reference: {told}"]
+def compatibility_warnings(
+    bench: CalibratedRig, trained: CheckpointRecord, uncertainty_model: UncertaintyModel | None
+) -> list[str]:
+    """Return the mismatches between networks and bench, one sentence each; empty if all fits."""
+    warnings = _rig_warnings(bench.rig, trained)
+    if bench.measured and not bench.reference:
+        warnings.append(
+            "this wall record has no reference: no difference maps, and a moved lidar goes unnoticed; calibrate the "
+            "wall again"
+        )
+    if not uncertainty_model:
+        warnings.append("these weights have no uncertainty model (`train doubt`): no uncertainty and no verdict")
+    return warnings
+
+
+def _rig_warnings(rig: Rig, trained: CheckpointRecord) -> list[str]:
+    try:
+        training_rig = load_rig(trained.rig_name)
+    except RecordFileError:  # trained for the rig of a file on another machine
+        training_rig = None
+    if training_rig is None or training_rig.checksum != trained.rig_checksum:
+        if trained.rig_checksum == rig.checksum:
+            return []
+        return [f"the networks were trained for another rig than {rig.name}: expect larger errors"]
+    if difference := rig_difference(rig, training_rig):
+        return [f"this rig differs from the training rig ({'; '.join(difference)}): expect larger errors"]
+    return []

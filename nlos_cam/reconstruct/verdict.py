@@ -1,4 +1,4 @@
-"""What may be believed of a frame's reconstruction, in plain words, and by which rule it is said."""
+"""Verdict on a frame's reconstruction: one of six, with the rules that decide it."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -11,17 +11,16 @@ from nlos_cam.reconstruct.network import Reconstruction
 from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
 
 STEADY_FRAMES = 5
-"""Doubt about the range is averaged over so many frames (0.17 s), so that the verdict does not flicker."""
+"""Frames (0.17 s) over which the out-of-distribution probability is averaged, so that the verdict does not flicker."""
 
 
 class Verdict(StrEnum):
-    """One of six for each frame; where several hold, the one that comes last here is told.
+    """Reliability of one frame's reconstruction; if several verdicts hold, the last of them in this order is given.
 
-    SEEN: something is there, like what the networks were trained on. NOTHING: the maps are those of the bench without
-    anything hidden; no surface is shown, whatever is told. OUTSIDE: what is there is shown, but not to be believed: it
-    is unlike the training set, or rendered again it does not explain the maps, or there is no surface to show, or half
-    of the frame is missing. SATURATED, WALL_MOVED: of what the lidar saw, whatever was made of it. STALLED: the frame
-    is old.
+    SEEN: there is an object like those of the training set. NOTHING: the bench is empty; no surface is shown. OUTSIDE:
+    the shape is shown but not reliable, because it is out of distribution (OOD), or the physics check does not explain
+    the maps by it, or there is no surface, or half of the frame has no depth. SATURATED, WALL_MOVED: the lidar's data
+    are not usable, whatever was reconstructed. STALLED: no newer frame has come.
     """
 
     SEEN = "object seen"
@@ -34,17 +33,19 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class VerdictLimits:
-    """From which probabilities on it is told; they come with a doubt network."""
+    """Smallest values at which a verdict is given; calibrated with the uncertainty model."""
 
     nothing: float
+    """Probability that nothing is hidden."""
     outside: float
+    """Probability of an object out of distribution."""
     unexplained: float = float("inf")
-    """Of the physics check's score: from there on the maps are not explained by what is shown."""
+    """Score of the physics check."""
 
 
 @dataclass(frozen=True)
 class FrameConditions:
-    """What else is known of a frame."""
+    """Conditions of frame and bench that affect the verdict."""
 
     saturated: bool = False
     invalid: bool = False
@@ -54,39 +55,43 @@ class FrameConditions:
 
 
 class VerdictFilter:
-    """Passes a verdict on each frame, in their order.
+    """Decision of each frame's verdict. Stateful: give it the frames in order, from one thread.
 
-    Whether nothing is there is a matter of the frame alone: a shown object is gone with the first frame without it.
+    The out-of-distribution probability is averaged over frames. That nothing is hidden is decided for each frame alone,
+    so an object that leaves disappears with the first frame without it. Without `limits` (no uncertainty model) only
+    the conditions of lidar and bench are considered.
     """
 
     def __init__(self, limits: VerdictLimits | None) -> None:
-        """None, where there is no doubt network: then only what the lidar saw is judged."""
         self._limits = limits
         self._outside: deque[float] = deque(maxlen=STEADY_FRAMES)
 
-    def look(self, found: Reconstruction, signs: FrameConditions) -> tuple[Reconstruction, Verdict | None]:
-        """The reconstruction as it is to be shown, and the verdict; None where there is no telling."""
-        told = Verdict.WALL_MOVED if signs.moved else Verdict.SATURATED if signs.saturated else None
-        if (limits := self._limits) is None or (doubt := found.doubt) is None:
-            return found, told
+    def decide(
+        self, reconstruction: Reconstruction, conditions: FrameConditions
+    ) -> tuple[Reconstruction, Verdict | None]:
+        """Return the reconstruction to show, without surface if nothing is hidden, and the verdict."""
+        of_lidar = Verdict.WALL_MOVED if conditions.moved else Verdict.SATURATED if conditions.saturated else None
+        if (limits := self._limits) is None or (doubt := reconstruction.doubt) is None:
+            return reconstruction, of_lidar
         if doubt.nothing >= limits.nothing:
             self._outside.clear()
-            return found.hidden, told or (Verdict.OUTSIDE if signs.invalid else Verdict.NOTHING)
+            verdict = Verdict.OUTSIDE if conditions.invalid else Verdict.NOTHING
+            return reconstruction.without_surface, of_lidar or verdict
         self._outside.append(doubt.outside)
         unlike = sum(self._outside) / len(self._outside) >= limits.outside
-        unexplained = signs.check is not None and signs.check.score >= limits.unexplained
-        outside = unlike or unexplained or signs.invalid or not found.shows
-        return found, told or (Verdict.OUTSIDE if outside else Verdict.SEEN)
+        unexplained = conditions.check is not None and conditions.check.score >= limits.unexplained
+        outside = unlike or unexplained or conditions.invalid or not reconstruction.has_surface
+        return reconstruction, of_lidar or (Verdict.OUTSIDE if outside else Verdict.SEEN)
 
 
 def frame_issues(frame: Frame) -> list[str]:
-    """By name: blank (no depth at all), else half_invalid (for half the pixels or more); and saturated."""
-    pixels, with_depth = frame.depth_m.size, np.count_nonzero(frame.depth_m > 0)  # NaN is not
-    names: list[str] = []
+    """Return the issues of a frame: blank (no depth at all) or half_invalid (none in half of the pixels); saturated."""
+    with_depth = np.count_nonzero(frame.depth_m > 0)  # NaN compares false
+    issues: list[str] = []
     if with_depth == 0:
-        names.append("blank")
-    elif 2 * with_depth <= pixels:
-        names.append("half_invalid")
+        issues.append("blank")
+    elif 2 * with_depth <= frame.depth_m.size:
+        issues.append("half_invalid")
     if saturated_share(frame.ir) > MAX_SATURATED:
-        names.append("saturated")
-    return names
+        issues.append("saturated")
+    return issues

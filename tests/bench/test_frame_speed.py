@@ -56,6 +56,6 @@ def test_frame_up_to_its_difference_maps(
         k = next(turn) % FRAMES
         if part == "maps":
             return maps_from_frame(seen[k])
-        return bench.look(seen[k], maps[k] if part == "bench" else mean.add(maps_from_frame(seen[k]))).difference
+        return bench.observe(seen[k], maps[k] if part == "bench" else mean.add(maps_from_frame(seen[k]))).difference
 
     assert benchmark(go) is not None

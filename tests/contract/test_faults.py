@@ -205,7 +205,7 @@ def test_device_that_stays_away_ends_the_run_with_its_counts(
 
 @pytest.mark.slow
 def test_stopping_ends_a_wait_for_a_lost_device(camera: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_queue, "LET_GO_AFTER_S", 0.01)
+    monkeypatch.setattr(frame_queue, "ABANDON_AFTER_S", 0.01)
     gone = camera(fault("unplug", FOREVER))
     gone.silence_s, gone.replug_s = 0.05, float("inf")
     stop = Event()

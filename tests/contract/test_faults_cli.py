@@ -42,7 +42,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(commands, "open_camera", opened)
     monkeypatch.setattr(commands, "load_networks", lambda *_: FakeNetwork())
-    monkeypatch.setattr(commands, "load_doubt", lambda *_: None)
+    monkeypatch.setattr(commands, "load_uncertainty", lambda *_: None)
 
 
 def run(folder: Path, faults: list[dict[str, Any]], *options: str) -> int:

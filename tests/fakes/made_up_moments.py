@@ -9,7 +9,7 @@ from small_frames import FrameCamera
 
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.reconstruct.network import Reconstruction, pose_of
+from nlos_cam.reconstruct.network import Reconstruction, box_pose
 from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.viewer import Moment
@@ -34,7 +34,7 @@ def moment(
     ir = np.full(size, 40, np.uint8)
     frame = Frame(depth_m, ir, ir % 16, number / 30, number, RIG.pinhole.scaled(size[1], size[0]))
     hidden = SHEET if hidden_m is None else hidden_m
-    made = Reconstruction(hidden, pose_of(object_box(RIG)), None, {})
+    made = Reconstruction(hidden, box_pose(object_box(RIG)), None, {})
     return replace(Moment(frame, made, number / 30, 0.02), **fields)
 
 

@@ -31,7 +31,7 @@ def processing() -> Pipeline:
     cache = cache_folder() / "onnx"
     doubter = load_uncertainty_model(None, cache)
     assert doubter is not None
-    return Pipeline(CalibratedRig(RIG), load_reconstructor(None, cache), doubter=doubter)
+    return Pipeline(CalibratedRig(RIG), load_reconstructor(None, cache), uncertainty_model=doubter)
 
 
 def frames_of(sight: Stimulus, count: int, seed: int) -> list[Frame]:
@@ -42,7 +42,7 @@ def frames_of(sight: Stimulus, count: int, seed: int) -> list[Frame]:
 
 
 def steps_of(processing: Pipeline, frames: Sequence[Frame]) -> list[FrameResult]:
-    return [processing.step(Arrival(frame, 0.0), lambda: 0.0, 0.0) for frame in frames]
+    return [processing.process(Arrival(frame, 0.0), lambda: 0.0, 0.0) for frame in frames]
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -50,7 +50,7 @@ def test_empty_bench_never_shows_an_object(processing: Pipeline, seed: int) -> N
     bench = varied_empty(RIG, SensorModel(), np.random.default_rng([seed, 77]))
     for step in steps_of(processing, frames_of(Stimulus(*bench), 3, seed)):
         assert step.verdict == Verdict.NOTHING
-        assert not step.reconstruction.shows
+        assert not step.reconstruction.has_surface
 
 
 def test_known_objects_are_seen_with_honest_expected_errors(processing: Pipeline) -> None:
@@ -92,5 +92,5 @@ def test_plain_outliers_are_reported_as_unusual(processing: Pipeline, name: str)
 def test_object_shows_in_its_first_frame_and_not_after(processing: Pipeline) -> None:
     sight = ordinary(np.random.default_rng(5), Stimulus(RIG, SensorModel()))
     with_it, without = frames_of(sight, 1, 0), frames_of(Stimulus(RIG, SensorModel()), 1, 0)
-    shown = [step.reconstruction.shows for step in steps_of(processing, [*without, *with_it, *without])]
+    shown = [step.reconstruction.has_surface for step in steps_of(processing, [*without, *with_it, *without])]
     assert shown == [False, True, False]

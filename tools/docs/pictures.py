@@ -37,7 +37,7 @@ from nlos_cam.objects import (
     place,
     random_pose,
 )
-from nlos_cam.reconstruct import CalibratedRig, load_doubt, load_networks, set_up
+from nlos_cam.reconstruct import CalibratedRig, build_pipeline, load_networks, load_uncertainty
 
 ROOT = Path(__file__).parents[2]
 WORST, NEAR_M, FAR_M = 6, 0.16, 0.24
@@ -174,7 +174,7 @@ def replays(out: Path) -> None:
         with tracked(f"rendering {name}") as on_progress:
             world = open_world(str(ROOT / scene) if scene else "", on_progress)
         bench = CalibratedRig(world.rig if world.rig.object_box else load_rig("paper-rig"))
-        processing = set_up(bench, load_networks(), doubter=load_doubt())
+        processing = build_pipeline(bench, load_networks(), uncertainty_model=load_uncertainty())
         looks, camera = Looks(bench, stills=2, video=name == FILMED), Unhurried(world, frames)
         with TemporaryDirectory() as folder, tracked(f"reconstructing {name}") as update:
             made, done = Path(folder) / "replay", iter(range(1, frames + 1))

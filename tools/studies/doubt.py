@@ -28,7 +28,7 @@ from nlos_cam.evaluate import echoes_of, rig_of, sense, truth_of
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, depth_from_image, object_box
-from nlos_cam.reconstruct import FrameConditions, Reconstruction, Verdict, VerdictFilter, limits_of, reconstruct
+from nlos_cam.reconstruct import FrameConditions, Reconstruction, Verdict, VerdictFilter, reconstruct, verdict_limits
 from nlos_cam.render import SensorModel
 
 BINS = 10
@@ -52,15 +52,15 @@ class Pipeline:
     """Pipeline of `live` for single frames, without a memory."""
 
     def __init__(self, rig: Rig, network: Reconstructor, doubter: UncertaintyModel) -> None:
-        self.rig, self.limits = rig, limits_of(doubter)
+        self.rig, self.limits = rig, verdict_limits(doubter)
         self._network, self._doubter = network, doubter
 
     def answer(self, depth_m: NDArray[np.float32], intensity: NDArray[np.float32]) -> Answer:
         """Return the answer to maps (64, 80)."""
         maps = LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
-        found = reconstruct(maps, self.rig, self._network, doubter=self._doubter)
-        shown, verdict = VerdictFilter(self.limits).look(found, FrameConditions())
-        return Answer(found, verdict, shown.shows)
+        found = reconstruct(maps, self.rig, self._network, uncertainty_model=self._doubter)
+        shown, verdict = VerdictFilter(self.limits).decide(found, FrameConditions())
+        return Answer(found, verdict, shown.has_surface)
 
 
 def verdicts_of(answers: Sequence[Answer]) -> dict[str, int]:

@@ -24,7 +24,7 @@ from nlos_cam.evaluate import seeded_objects, sense
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, depth_from_image, object_box
-from nlos_cam.reconstruct import UNEXPLAINED, check
+from nlos_cam.reconstruct import UNEXPLAINED, check_reconstruction
 from nlos_cam.render import Scene, Stop, render
 
 RIG = load_rig("paper-rig")
@@ -65,7 +65,7 @@ class Study:
 
 def scores(pairs: Iterable[tuple[LidarMaps, Float32]], accuracy: Any = "standard") -> Float64:
     """Return the score of each hidden depth with its maps."""
-    return np.array([check(maps, depth_m, RIG, accuracy=accuracy).score for maps, depth_m in pairs])
+    return np.array([check_reconstruction(maps, depth_m, RIG, accuracy=accuracy).score for maps, depth_m in pairs])
 
 
 def populations(

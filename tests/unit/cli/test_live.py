@@ -68,7 +68,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Opened]:
     opened = Opened()
     monkeypatch.setattr("nlos_cam.cli.live.open_camera", opened)
     monkeypatch.setattr("nlos_cam.cli.live.load_networks", lambda *_: opened.network)
-    monkeypatch.setattr("nlos_cam.cli.live.load_doubt", lambda *_: opened.doubter)
+    monkeypatch.setattr("nlos_cam.cli.live.load_uncertainty", lambda *_: opened.doubter)
     monkeypatch.setattr("nlos_cam.live.replay.draw_sheet", lambda path, *_: path.touch())  # takes a second
     monkeypatch.chdir(tmp_path)
     before = signal.getsignal(signal.SIGINT)

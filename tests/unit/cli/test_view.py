@@ -83,7 +83,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     network.record = record
     monkeypatch.setattr("nlos_cam.cli.live.open_camera", lambda *_, **__: Recorded(12))
     monkeypatch.setattr("nlos_cam.cli.live.load_networks", lambda *_: network)
-    monkeypatch.setattr("nlos_cam.cli.live.load_doubt", lambda *_: None)
+    monkeypatch.setattr("nlos_cam.cli.live.load_uncertainty", lambda *_: None)
     monkeypatch.chdir(tmp_path)
 
 

@@ -20,16 +20,16 @@ from nlos_cam.live.budget import (
     HANDOVER_MS,
     PERIOD_MS,
     SHIPPED,
-    Choice,
+    BudgetChoice,
     Machine,
     Option,
     Timed,
+    available_options,
     choose,
-    in_pace,
+    choose_within_budget,
+    keeping_pace,
     load_tradeoff,
-    options_here,
     timer,
-    within_budget,
 )
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import Pipeline
@@ -61,7 +61,7 @@ def test_choose_takes_the_most_accurate_setting_in_budget(
     options: list[Option], slower: float, budget_ms: float
 ) -> None:
     machine = Machine(slower, 1.0)
-    kept = [one for one in in_pace(options, machine) if machine.expected_ms(one) <= budget_ms]
+    kept = [one for one in keeping_pace(options, machine) if machine.expected_ms(one) <= budget_ms]
     if not kept:
         with pytest.raises(BudgetError, match=r"the least is \d"):
             choose(options, machine, budget_ms)
@@ -73,7 +73,7 @@ def test_choose_takes_the_most_accurate_setting_in_budget(
 
 @given(some_options, st.floats(1.0, 500.0), st.floats(1.0, 10.0))
 def test_choose_is_no_less_accurate_with_a_larger_budget(options: list[Option], budget_ms: float, more: float) -> None:
-    least_ms = min(map(AS_MEASURED.expected_ms, in_pace(options, AS_MEASURED)))
+    least_ms = min(map(AS_MEASURED.expected_ms, keeping_pace(options, AS_MEASURED)))
     assert choose(options, AS_MEASURED, least_ms) in options
     if budget_ms >= least_ms:
         tight, wide = (choose(options, AS_MEASURED, limit) for limit in (budget_ms, more * budget_ms))
@@ -131,8 +131,8 @@ ALL = [GOOD, QUICK, MEAN]
 
 def chosen(
     budget_ms: float, slower: float = 1.0, surprises: dict[str, float] | None = None
-) -> tuple[Choice, list[str]]:
-    """Choice on a machine `slower` than the table's, where some settings take longer still, and what was loaded."""
+) -> tuple[BudgetChoice, list[str]]:
+    """BudgetChoice on a machine `slower` than the table's, where some settings take longer still, and what was loaded."""
     loaded: list[str] = []
 
     def load(wanted: Option) -> Any:
@@ -143,7 +143,7 @@ def chosen(
         late_ms = (surprises or {}).get(made.runtime, 0.0) if len(loaded) > 1 else 0.0
         return Timed(slower * made.milliseconds_p90 + late_ms, 1.0)
 
-    _, choice = within_budget(budget_ms, ALL, lambda network, _: network, load, measure)  # type: ignore[arg-type]
+    _, choice = choose_within_budget(budget_ms, ALL, lambda network, _: network, load, measure)  # type: ignore[arg-type]
     return choice, loaded
 
 
@@ -177,7 +177,7 @@ def test_choice_names_its_error_and_averaging() -> None:
 @pytest.mark.parametrize(("p95_ms", "kept"), [(9.9, True), (10.1, False)])
 def test_outcome_counts_averaging_towards_the_delay(p95_ms: float, kept: bool) -> None:
     report: Any = SimpleNamespace(latency_ms={"p95": p95_ms})
-    choice = Choice(60.0, MEAN, 55.0, MEAN)
+    choice = BudgetChoice(60.0, MEAN, 55.0, MEAN)
     outcome = choice.outcome(report)
     assert (outcome["kept"], outcome["p95_ms"]) == (kept, pytest.approx(p95_ms + 50.0))
     assert ("NOT" in choice.outcome_told(report)) != kept
@@ -191,10 +191,10 @@ def test_options_here_leaves_out_what_cannot_run(monkeypatch: pytest.MonkeyPatch
     ]
     monkeypatch.setattr("nlos_cam.cli.live.load_tradeoff", lambda _: [*elsewhere, *ALL])
     monkeypatch.setattr("nlos_cam.cli.live.torch.cuda.is_available", lambda: False)
-    assert options_here(None, None) == ALL
+    assert available_options(None, None) == ALL
     monkeypatch.setattr("nlos_cam.cli.live.load_tradeoff", lambda _: elsewhere)
     with pytest.raises(BudgetError):
-        options_here(Path("other"), None)
+        available_options(Path("other"), None)
 
 
 def test_timer_measures_late_calls_without_the_first() -> None:

@@ -20,19 +20,19 @@ def numbers_of(reader: FrameReader) -> list[int]:
 
 
 def test_full_queue_drops_the_oldest_frames() -> None:
-    with FrameReader(FrameCamera(10), keeps_all=False, stop=Event()) as reader:
+    with FrameReader(FrameCamera(10), lossless=False, stop=Event()) as reader:
         wait_for_end(reader)
         assert numbers_of(reader) == [7, 8, 9]
     assert reader.dropped == list(range(10 - QUEUE_FRAMES))
 
 
-@pytest.mark.parametrize("keeps_all", [True, False])
-def test_reader_yields_or_counts_every_frame(keeps_all: bool) -> None:
-    with FrameReader(FrameCamera(200), keeps_all=keeps_all, stop=Event()) as reader:
+@pytest.mark.parametrize("lossless", [True, False])
+def test_reader_yields_or_counts_every_frame(lossless: bool) -> None:
+    with FrameReader(FrameCamera(200), lossless=lossless, stop=Event()) as reader:
         numbers = numbers_of(reader)
     assert sorted(numbers + reader.dropped) == list(range(200))
     assert numbers == sorted(numbers)
-    assert not (keeps_all and reader.dropped)
+    assert not (lossless and reader.dropped)
 
 
 def test_reader_raises_the_cameras_error_after_its_frames() -> None:
@@ -43,7 +43,7 @@ def test_reader_raises_the_cameras_error_after_its_frames() -> None:
     seen = []
     with (
         pytest.raises(CameraLostError, match="unplugged"),
-        FrameReader(FrameCamera(None, fail_at_two), keeps_all=True, stop=Event()) as reader,
+        FrameReader(FrameCamera(None, fail_at_two), lossless=True, stop=Event()) as reader,
     ):
         seen.extend(arrival.frame.frame_number for arrival in reader)
     assert seen == [0, 1]
@@ -51,26 +51,26 @@ def test_reader_raises_the_cameras_error_after_its_frames() -> None:
 
 def test_reader_ends_with_the_stop_event_or_when_left() -> None:
     stop = Event()
-    with FrameReader(FrameCamera(None), keeps_all=True, stop=stop) as reader:
+    with FrameReader(FrameCamera(None), lossless=True, stop=stop) as reader:
         for arrival in reader:
             if arrival.frame.frame_number == 5:
                 stop.set()
     assert not reader._thread.is_alive()
-    with FrameReader(FrameCamera(None), keeps_all=True, stop=Event()) as reader:
+    with FrameReader(FrameCamera(None), lossless=True, stop=Event()) as reader:
         next(iter(reader))
     assert not reader._thread.is_alive()
 
 
 def test_reader_closes_or_reports_a_source_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.live.frame_queue.LET_GO_AFTER_S", 0.01)
+    monkeypatch.setattr("nlos_cam.live.frame_queue.ABANDON_AFTER_S", 0.01)
     release = Event()
     source = FrameCamera(None, lambda _: release.wait(60.0))
-    with FrameReader(source, keeps_all=True, stop=Event(), let_go=release.set) as reader:
+    with FrameReader(source, lossless=True, stop=Event(), let_go=release.set) as reader:
         pass
     assert not reader._thread.is_alive()
     monkeypatch.setattr("nlos_cam.live.frame_queue.JOIN_TIMEOUT_S", 0.05)
     release.clear()
-    with pytest.raises(CameraLostError), FrameReader(source, keeps_all=True, stop=Event()) as reader:
+    with pytest.raises(CameraLostError), FrameReader(source, lossless=True, stop=Event()) as reader:
         pass
     release.set()
     wait_for_end(reader)
@@ -79,7 +79,7 @@ def test_reader_closes_or_reports_a_source_that_hangs(monkeypatch: pytest.Monkey
 def test_reader_can_end_while_no_frame_arrives() -> None:
     release, asked = Event(), count_up()
     source = FrameCamera(None, lambda _: release.wait(60.0))
-    run: Any = {"keeps_all": True, "stop": Event(), "enough": lambda: next(asked) > 2, "let_go": release.set}
+    run: Any = {"lossless": True, "stop": Event(), "enough": lambda: next(asked) > 2, "let_go": release.set}
     with FrameReader(source, **run) as reader:
         assert list(reader) == []
         release.set()
@@ -93,8 +93,8 @@ def test_reader_calls_on_wait_while_no_frame_arrives() -> None:
         release.set()
 
     source = FrameCamera(4, lambda number: number == 3 and release.wait(60.0))
-    with FrameReader(source, keeps_all=True, stop=Event(), clock=lambda: 7.0, on_wait=on_wait) as reader:
+    with FrameReader(source, lossless=True, stop=Event(), clock=lambda: 7.0, on_wait=on_wait) as reader:
         assert numbers_of(reader) == [0, 1, 2, 3]
     assert waits
     assert waits[-1] == 7.0
-    assert FrameReader([], keeps_all=True, stop=Event()).newest_s is None
+    assert FrameReader([], lossless=True, stop=Event()).newest_s is None

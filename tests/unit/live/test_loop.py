@@ -15,7 +15,7 @@ from small_frames import FrameCamera, sheet_network, small_frame
 
 from nlos_cam.errors import CameraLostError, SceneError
 from nlos_cam.frames import Frame
-from nlos_cam.live.loop import in_words, paced, run_live, warm_up, watched
+from nlos_cam.live.loop import describe_counts, paced, run_live, warm_up, watched
 from nlos_cam.live.statistics import OUTSIDE_LATENCY, STALLED, RunReport
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import Pipeline
@@ -104,7 +104,7 @@ def test_run_live_shows_every_recorded_frame_in_order() -> None:
 
 
 def test_run_live_ends_after_the_given_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.live.frame_queue.LET_GO_AFTER_S", 0.01)
+    monkeypatch.setattr("nlos_cam.live.frame_queue.ABANDON_AFTER_S", 0.01)
     lockstep = Lockstep(1000, 0.0)
     report = run_live(lockstep.camera, pipeline(), lockstep, stop=Event(), seconds=1.0, clock=lockstep.clock)
     assert report.frames == pytest.approx(31, abs=2)
@@ -170,7 +170,7 @@ def test_run_live_reports_before_it_raises_the_cameras_error() -> None:
 
 
 def test_run_live_ends_in_time_without_further_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.live.frame_queue.LET_GO_AFTER_S", 0.01)
+    monkeypatch.setattr("nlos_cam.live.frame_queue.ABANDON_AFTER_S", 0.01)
     shown, now_s, viewer = Event(), [0.0], ListViewer()
     viewer.show = lambda _: shown.set()  # type: ignore[method-assign]
 
@@ -275,5 +275,5 @@ def test_watched_counts_frames_and_passes_them_on() -> None:
 
 
 def test_in_words_lists_counts() -> None:
-    assert in_words({"out_of_order": 3, "blank": 1}) == "3 out of order, 1 blank"
-    assert not in_words({})
+    assert describe_counts({"out_of_order": 3, "blank": 1}) == "3 out of order, 1 blank"
+    assert not describe_counts({})

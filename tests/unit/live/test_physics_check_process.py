@@ -15,7 +15,7 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live.physics_check_process import BackgroundPhysicsCheck, main, serve
-from nlos_cam.reconstruct.physics_check import check
+from nlos_cam.reconstruct.physics_check import check_reconstruction
 
 RIG = load_rig("bare-wall")
 NOTHING = np.full((64, 64), np.nan, np.float32)
@@ -63,7 +63,7 @@ def test_background_check_equals_a_check_in_this_process() -> None:
     assert not errors
     assert checks.newest is not None
     assert checks.newest.frame_number == 5
-    assert checks.newest.score == check(DARK, NOTHING, RIG, accuracy="draft").score
+    assert checks.newest.score == check_reconstruction(DARK, NOTHING, RIG, accuracy="draft").score
     assert checks.process.returncode is not None
 
 
@@ -158,7 +158,7 @@ def answers(*frames: object, end: bytes = b"") -> list[Any]:
 def test_worker_answers_each_frame_in_order() -> None:
     found = answers((4, DARK, NOTHING), (9, DARK, NOTHING))
     assert [each.frame_number for each in found] == [4, 9]
-    assert found[0].score == check(DARK, NOTHING, RIG, accuracy="draft").score
+    assert found[0].score == check_reconstruction(DARK, NOTHING, RIG, accuracy="draft").score
 
 
 def test_worker_names_the_error_of_a_frame_and_goes_on() -> None:

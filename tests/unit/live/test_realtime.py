@@ -13,10 +13,10 @@ from nlos_cam.live.realtime import (
     ORDINARY,
     SWITCH_S,
     TASKS,
-    after_the_loop,
-    as_any_other,
-    precedence,
-    undisturbed,
+    drop_realtime_priority,
+    low_latency_interpreter,
+    realtime_priority,
+    yield_to_loop,
 )
 
 OTHER, ROUND_ROBIN = 0, 2
@@ -55,7 +55,7 @@ def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> System:
 
 def test_precedence_holds_for_all_threads_until_it_is_left(system: System) -> None:
     def fail() -> None:
-        with precedence() as allowed:
+        with realtime_priority() as allowed:
             assert allowed
             assert set(system.schedules.values()) == {(ROUND_ROBIN, LOOP)}
             raise ZeroDivisionError
@@ -67,30 +67,30 @@ def test_precedence_holds_for_all_threads_until_it_is_left(system: System) -> No
 
 def test_precedence_changes_nothing_where_not_possible(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     system.may = False
-    with precedence() as allowed:
+    with realtime_priority() as allowed:
         assert not allowed
     monkeypatch.setattr("nlos_cam.live.realtime.TASKS", system.tasks / "none")
-    with precedence() as allowed:
+    with realtime_priority() as allowed:
         assert not allowed
-    after_the_loop()
-    as_any_other()
+    yield_to_loop()
+    drop_realtime_priority()
     assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
 
 
 def test_precedence_passes_over_a_thread_that_ended(system: System) -> None:
     system.missing = "7"
-    with precedence() as allowed:
+    with realtime_priority() as allowed:
         assert allowed
         assert system.schedules["8"] == (ROUND_ROBIN, LOOP)
 
 
 def test_drawing_goes_after_the_loop_and_before_the_rest(system: System) -> None:
-    after_the_loop()
+    yield_to_loop()
     assert system.schedules["0"] == (OTHER, ORDINARY)
-    with precedence():
-        after_the_loop()
+    with realtime_priority():
+        yield_to_loop()
         assert system.schedules["0"] == (ROUND_ROBIN, DRAWING)
-        as_any_other()
+        drop_realtime_priority()
         assert system.schedules["0"] == (OTHER, ORDINARY)
 
 
@@ -104,7 +104,7 @@ def test_precedence_restores_the_threads_of_this_process() -> None:
         found.append(os.sched_getscheduler(0))
 
     before = os.sched_getscheduler(0)
-    with precedence():
+    with realtime_priority():
         worker = Thread(target=work)
         worker.start()
         assert began.wait(60.0)
@@ -122,7 +122,7 @@ class Loop:
 
 def test_undisturbed_freezes_live_objects_and_collects_garbage() -> None:
     earlier = weakref.ref(Loop())
-    with undisturbed():
+    with low_latency_interpreter():
         assert earlier() is None
         assert gc.get_freeze_count() > 1000
         known = gc.get_freeze_count()
@@ -138,7 +138,7 @@ def test_undisturbed_shortens_thread_turns_until_it_is_left() -> None:
 
     def fail() -> None:
         nonlocal within_s
-        with undisturbed():
+        with low_latency_interpreter():
             within_s = sys.getswitchinterval()
             raise ZeroDivisionError
 

@@ -75,7 +75,7 @@ def test_replay_writes_every_frame_with_number_time_and_place(tmp_path: Path) ->
 def test_replay_writes_uncertainty_and_verdict_of_each_frame(tmp_path: Path) -> None:
     says = iter([(0.0, 0.0), (0.9, 0.0), (0.0, 0.9)])
     doubter = FakeDoubter(lambda *_: next(says), error_v=0.1)
-    replayed(tmp_path / "out", 3, pipeline=Pipeline(CalibratedRig(RIG), network, doubter=doubter))
+    replayed(tmp_path / "out", 3, pipeline=Pipeline(CalibratedRig(RIG), network, uncertainty_model=doubter))
     with np.load(tmp_path / "out" / RESULT) as file:
         assert file["verdict"].tolist() == ["object seen", "nothing there", "outside the trained range"]
         assert np.isfinite(file["depth_m"]).any((1, 2)).tolist() == [True, False, True]

@@ -14,12 +14,12 @@ from nlos_cam.live.statistics import (
     MAX_FAILED_IN_A_ROW,
     STALLED,
     STALLED_AFTER_S,
-    Held,
     RunReport,
     RunStatistics,
     StageTimes,
     StallWatch,
-    Warned,
+    WarningLog,
+    WarningSpan,
     percentiles_ms,
 )
 from nlos_cam.reconstruct.pipeline import FrameResult
@@ -116,18 +116,18 @@ def test_tally_raises_after_many_failures_in_a_row() -> None:
 
 
 def test_warned_reports_begin_end_and_frames_of_a_warning(begins: list[tuple[str, bool]]) -> None:
-    found = Warned(lambda *about: begins.append(about))
+    found = WarningLog(lambda *about: begins.append(about))
     for step in (step_of(7), step_of(8, "hot"), step_of(9, "hot", "moved"), step_of(11, "moved"), step_of(12)):
         found.add(step)
     assert begins == [("hot", True), ("moved", True), ("hot", False), ("moved", False)]
-    assert found.held == [Held("hot", 2, 8, 9), Held("moved", 2, 9, 11)]
+    assert found.held == [WarningSpan("hot", 2, 8, 9), WarningSpan("moved", 2, 9, 11)]
     found.add(step_of(20, "hot"))
     assert begins[-1] == ("hot", True)
-    assert found.held[0] == Held("hot", 3, 8, 20)
+    assert found.held[0] == WarningSpan("hot", 3, 8, 20)
 
 
 def test_warned_ignores_figures_in_a_warning(begins: list[tuple[str, bool]]) -> None:
-    found = Warned(lambda *about: begins.append(about))
+    found = WarningLog(lambda *about: begins.append(about))
     for step in (step_of(1, "46.5 degrees"), step_of(2, "48 degrees"), step_of(3, "48 degrees", "48 mm"), step_of(4)):
         found.add(step)
     assert begins == [("46.5 degrees", True), ("48 mm", True), ("48 degrees", False), ("48 mm", False)]

@@ -10,7 +10,7 @@ from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig, difference_of, open_bench
+from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig, open_bench, subtract_reference
 
 
 def camera(intrinsics: Intrinsics = SMALL, **others: Any) -> Any:
@@ -29,7 +29,7 @@ def bench(tmp_path: Path) -> CalibratedRig:
 
 def observe(bench: CalibratedRig, number: int = 0, nearer_m: float = 0.0) -> BenchObservation:
     frame = wall_frame(number, nearer_m)
-    return bench.look(frame, maps_from_frame(frame))
+    return bench.observe(frame, maps_from_frame(frame))
 
 
 def test_open_bench_prefers_camera_rig_with_object_box() -> None:
@@ -37,7 +37,7 @@ def test_open_bench_prefers_camera_rig_with_object_box() -> None:
     assert open_bench(None, camera(rig=own)).rig is own
     assert open_bench(None, camera(rig=load_rig("bare-wall"))).rig == RIG
     bench = open_bench(None, camera(Intrinsics(320, 240, 1.0, 1.0, 0.0, 0.0)))
-    bench.look_at({"ldd_temperature": 90.0})
+    bench.update_temperatures({"ldd_temperature": 90.0})
     look = observe(bench)
     assert bench.rig == RIG
     assert (look.difference, look.warnings, bench.reference) == (None, (), None)
@@ -76,7 +76,7 @@ def test_difference_is_valid_where_maps_and_reference_are() -> None:
     depth_m = reference.map_depth_m + added_m
     depth_m[:, 3] = np.nan
     maps = LidarMaps(depth_m, reference.map_intensity + added, ~np.isnan(depth_m))
-    found = difference_of(maps, reference)
+    found = subtract_reference(maps, reference)
     np.testing.assert_array_equal(found.valid, maps.valid & np.isfinite(reference.map_depth_m))
     assert not found.valid[:, 3].any()
     assert not found.valid.all(axis=0)[79]  # the wall as far as 0.6 m is all that the reference has
@@ -101,7 +101,7 @@ def test_bench_warns_of_drift_and_of_a_moved_lidar(
 
 def test_bench_warns_of_a_much_hotter_lidar(bench: CalibratedRig) -> None:
     for celsius, warned in ((41.0, False), (75.0, True)):
-        bench.look_at({"ldd_temperature": celsius})
+        bench.update_temperatures({"ldd_temperature": celsius})
         assert [bool(observe(bench, number + 500).warnings) for number in range(40)][-1] == warned
 
 

@@ -8,7 +8,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_map import depth_from_image, image_from_depth, object_box
-from nlos_cam.reconstruct.network import doubt_of, pose_of, reconstruct
+from nlos_cam.reconstruct.network import box_pose, estimate_doubt, reconstruct
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -52,7 +52,7 @@ def test_reconstruct_gives_the_network_a_batch_of_one() -> None:
 
 
 def test_pose_of_box_stands_on_the_wall_before_its_middle() -> None:
-    pose = pose_of(BOX)
+    pose = box_pose(BOX)
     np.testing.assert_allclose(pose @ [0, 0, 0, 1], [0.45, 0.0, 0.0, 1.0])
     np.testing.assert_array_equal(pose[:3, :3], np.eye(3))
 
@@ -77,17 +77,17 @@ def test_reconstruct_with_doubt_adds_uncertainty_and_a_stage() -> None:
 def test_reconstruct_without_returns_still_asks_for_doubt() -> None:
     doubter, blank = FakeDoubter(), np.full((64, 80), np.nan, np.float32)
     maps = LidarMaps(blank, np.zeros((64, 80), np.float32), ~np.isnan(blank))
-    found = reconstruct(maps, RIG, lambda *_: np.ones((1, 64, 64), np.float32), doubter=doubter)
-    assert not found.shows
+    found = reconstruct(maps, RIG, lambda *_: np.ones((1, 64, 64), np.float32), uncertainty_model=doubter)
+    assert not found.has_surface
     assert found.uncertainty_m is not None
     assert not doubter.asked[0][2].any()
 
 
 def test_hidden_reconstruction_keeps_uncertainty_and_doubt() -> None:
-    found = reconstruct(some_maps(), RIG, half, doubter=FakeDoubter())
-    assert found.shows
-    assert not found.hidden.shows
-    assert (found.hidden.uncertainty_m, found.hidden.doubt) == (found.uncertainty_m, found.doubt)
+    found = reconstruct(some_maps(), RIG, half, uncertainty_model=FakeDoubter())
+    assert found.has_surface
+    assert not found.without_surface.has_surface
+    assert (found.without_surface.uncertainty_m, found.without_surface.doubt) == (found.uncertainty_m, found.doubt)
 
 
 def test_reconstruct_refuses_a_rig_without_object_box() -> None:
@@ -96,6 +96,6 @@ def test_reconstruct_refuses_a_rig_without_object_box() -> None:
 
 
 def test_doubt_converts_an_image_error_to_metres() -> None:
-    doubt = doubt_of(FakeDoubter(error_v=0.1), some_maps(), half()[0], BOX)
+    doubt = estimate_doubt(FakeDoubter(error_v=0.1), some_maps(), half()[0], BOX)
     apart_m = depth_from_image(half()[0], BOX) - depth_from_image(half()[0] + np.float32(0.1), BOX)
     np.testing.assert_allclose(doubt.error_m, apart_m, rtol=1e-5)

@@ -18,13 +18,13 @@ from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.physics_check import (
-    EveryFrames,
     Expected,
     NullPhysicsCheck,
-    check,
-    explanation,
-    failure,
-    fitted_gain,
+    PeriodicPhysicsCheck,
+    check_reconstruction,
+    describe_failure,
+    explain,
+    fit_gain,
     log_warning,
     mean_cost,
 )
@@ -47,13 +47,13 @@ def expected_object(echo_m: float = 0.5, strength: float = 4.0) -> Expected:
 
 
 def maps_of(expected: Expected, *, noise_m: float = 0.0, albedo: float = 1.0, gain: float = GAIN) -> LidarMaps:
-    depth_m, intensity = expected.seen(albedo, gain)
+    depth_m, intensity = expected.noiseless_maps(albedo, gain)
     noise = np.random.default_rng(0).normal(0, 1, SHAPE).astype(np.float32)
     return LidarMaps(depth_m + np.float32(noise_m) * noise, intensity, np.isfinite(depth_m))
 
 
 def score(seen: LidarMaps, expected: Expected) -> float:
-    return explanation(seen, expected, expected.bare).score
+    return explain(seen, expected, expected.bare).score
 
 
 def test_score_of_expected_maps_is_zero_and_noise_hardly_matters() -> None:
@@ -83,20 +83,20 @@ def test_score_is_independent_of_the_gain() -> None:
     seen = maps_of(expected_object(0.51), noise_m=1e-4)
     dimmed = replace(seen, intensity=seen.intensity * np.float32(0.25))
     assert score(dimmed, expected_object()) == pytest.approx(score(seen, expected_object()), rel=1e-5)
-    assert fitted_gain(dimmed, expected_object().bare) == pytest.approx(0.25 * GAIN, rel=1e-5)
+    assert fit_gain(dimmed, expected_object().bare) == pytest.approx(0.25 * GAIN, rel=1e-5)
 
 
 def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
     seen = maps_of(expected_object(strength=40.0), gain=1e4)
-    assert fitted_gain(seen, expected_object().bare) == pytest.approx(1e4, rel=1e-5)
+    assert fit_gain(seen, expected_object().bare) == pytest.approx(1e4, rel=1e-5)
     far = replace(seen, depth_m=seen.depth_m + np.float32(0.2))
-    assert fitted_gain(far, expected_object().bare) > 1e4
-    assert fitted_gain(replace(seen, valid=np.zeros(SHAPE, np.bool_)), expected_object().bare) == 1.0
+    assert fit_gain(far, expected_object().bare) > 1e4
+    assert fit_gain(replace(seen, valid=np.zeros(SHAPE, np.bool_)), expected_object().bare) == 1.0
 
 
 @pytest.mark.parametrize("albedo", [0.75, 1.0, (4 / 3) ** 0.5])
 def test_explanation_fits_the_albedo(albedo: float) -> None:
-    best = explanation(maps_of(expected_object(), albedo=albedo), expected_object(), expected_object().bare)
+    best = explain(maps_of(expected_object(), albedo=albedo), expected_object(), expected_object().bare)
     assert best.albedo == pytest.approx(albedo, rel=1e-6)
     assert best.score == pytest.approx(0.0, abs=1e-6)
 
@@ -154,13 +154,15 @@ def seen(seed: int | None, noise: int = 0) -> LidarMaps:
 @pytest.mark.slow
 def test_check_scores_the_true_object_best() -> None:
     for seed in SEEDS:
-        scores = {other: check(seen(seed), hidden(other), RIG, accuracy="draft").score for other in SEEDS}
+        scores = {
+            other: check_reconstruction(seen(seed), hidden(other), RIG, accuracy="draft").score for other in SEEDS
+        }
         assert min(scores, key=lambda other: scores[other]) == seed
         assert scores[seed] < 0.5 * min(score for other, score in scores.items() if other != seed)
 
 
 def test_check_explains_the_true_object_to_within_noise() -> None:
-    found = check(seen(SEEDS[0]), hidden(SEEDS[0]), RIG)
+    found = check_reconstruction(seen(SEEDS[0]), hidden(SEEDS[0]), RIG)
     assert found.score < 0.05
     assert np.nanquantile(np.abs(found.residual_depth_m), 0.95) < 2e-3
     assert np.nanquantile(np.abs(found.residual_intensity), 0.95) < 3
@@ -168,34 +170,34 @@ def test_check_explains_the_true_object_to_within_noise() -> None:
 
 
 def test_check_renders_nothing_as_the_bare_bench() -> None:
-    assert check(seen(None), EMPTY, RIG).score < 0.05
-    assert check(seen(None), hidden(SEEDS[0]), RIG).score > 1.0
-    assert check(seen(SEEDS[0]), EMPTY, RIG).score == 1.0
+    assert check_reconstruction(seen(None), EMPTY, RIG).score < 0.05
+    assert check_reconstruction(seen(None), hidden(SEEDS[0]), RIG).score > 1.0
+    assert check_reconstruction(seen(SEEDS[0]), EMPTY, RIG).score == 1.0
 
 
 def test_check_works_on_a_rig_without_object_box() -> None:
     bare = load_rig("bare-wall")
     rendering = render(Scene(bare))
     maps = LidarMaps(rendering.depth_m, rendering.intensity * np.float32(1e5), np.isfinite(rendering.depth_m))
-    assert check(maps, None, bare).score < 1e-3
-    assert check(maps, hidden(SEEDS[0]), bare).score < 1e-3
+    assert check_reconstruction(maps, None, bare).score < 1e-3
+    assert check_reconstruction(maps, hidden(SEEDS[0]), bare).score < 1e-3
 
 
 def test_check_of_maps_without_returns_has_no_residual_depth() -> None:
     nan_m, dark = np.full((64, 80), np.nan, np.float32), np.zeros((64, 80), np.float32)
-    found = check(LidarMaps(nan_m, dark, dark > 0), EMPTY, RIG)
+    found = check_reconstruction(LidarMaps(nan_m, dark, dark > 0), EMPTY, RIG)
     assert found.score == 1.0
     assert np.isnan(found.residual_depth_m).all()
 
 
 def test_check_is_timed_with_the_given_clock() -> None:
-    assert check(seen(None), EMPTY, RIG, clock=iter([5.0, 7.5]).__next__).seconds == 2.5
+    assert check_reconstruction(seen(None), EMPTY, RIG, clock=iter([5.0, 7.5]).__next__).seconds == 2.5
 
 
 def test_every_frames_check_is_independent_of_earlier_frames() -> None:
     forwards, backwards = {}, {}
     for found, order in ((forwards, SEEDS), (backwards, SEEDS[::-1])):
-        checks = EveryFrames(RIG, every=1, accuracy="draft")
+        checks = PeriodicPhysicsCheck(RIG, every=1, accuracy="draft")
         for seed in order:
             checks.offer(seed, seen(seed), hidden(SEEDS[0]))
             found[seed] = checks.newest
@@ -206,7 +208,7 @@ def test_every_frames_check_is_independent_of_earlier_frames() -> None:
 
 def test_every_frames_checks_each_third_frame() -> None:
     numbers = []
-    with EveryFrames(RIG, every=3) as checks:
+    with PeriodicPhysicsCheck(RIG, every=3) as checks:
         for number in range(8):
             checks.offer(number, seen(None), EMPTY)
             numbers.append(checks.newest.frame_number if checks.newest else None)
@@ -215,7 +217,7 @@ def test_every_frames_checks_each_third_frame() -> None:
 
 def test_every_frames_reports_a_failed_check_once() -> None:
     errors, behind_the_wall = [], np.full((64, 64), -1.0, np.float32)
-    checks = EveryFrames(RIG, every=1, on_error=errors.append)
+    checks = PeriodicPhysicsCheck(RIG, every=1, on_error=errors.append)
     for number, depth_m in enumerate([behind_the_wall, behind_the_wall, EMPTY]):
         checks.offer(number, seen(None), depth_m)
     assert len(errors) == 1
@@ -227,7 +229,9 @@ def test_every_frames_reports_a_failed_check_once() -> None:
 @pytest.mark.slow
 def test_replay_writes_reproducible_checks(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        processing = Pipeline(CalibratedRig(RIG), sheet_network, checks=EveryFrames(RIG, every=3, accuracy="draft"))
+        processing = Pipeline(
+            CalibratedRig(RIG), sheet_network, checks=PeriodicPhysicsCheck(RIG, every=3, accuracy="draft")
+        )
         replay_recording(WallCamera(4), processing, tmp_path / name, stop=Event())
     for file in (RESULT, REPORT):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
@@ -246,9 +250,9 @@ def test_replay_without_checks_writes_none(tmp_path: Path) -> None:
 
 
 def test_check_renders_the_bare_bench_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    check(seen(None), EMPTY, RIG)
+    check_reconstruction(seen(None), EMPTY, RIG)
     monkeypatch.setattr("nlos_cam.reconstruct.physics_check.render", lambda *_: pytest.fail("rendered again"))
-    check(seen(None), EMPTY, RIG)
+    check_reconstruction(seen(None), EMPTY, RIG)
 
 
 def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
@@ -259,7 +263,9 @@ def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
             assert moment.check is not None
             shown.append(moment.check.frame_number)
 
-    processing = Pipeline(CalibratedRig(RIG), sheet_network, checks=EveryFrames(RIG, every=2, accuracy="draft"))
+    processing = Pipeline(
+        CalibratedRig(RIG), sheet_network, checks=PeriodicPhysicsCheck(RIG, every=2, accuracy="draft")
+    )
     run_live(WallCamera(5, period_s=0.0), processing, Noting(), stop=Event(), recorded=True)
     assert shown == [0, 0, 2, 2, 4]
 
@@ -273,7 +279,7 @@ def test_no_checks_never_yields_a_check() -> None:
 
 def test_failure_is_logged_with_its_frame(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
-        log_warning(failure(7, "SceneError: 100 % wrong"))
+        log_warning(describe_failure(7, "SceneError: 100 % wrong"))
     (message,) = caplog.messages
     assert "frame 7" in message
     assert "SceneError: 100 % wrong" in message

@@ -18,8 +18,15 @@ from nlos_cam.live.frame_queue import FrameReader
 from nlos_cam.live.loop import FRAMES_TOGETHER, MAX_BATCHES_AHEAD, iterate_batched, iterate_results, with_telemetry
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.network import Clock
-from nlos_cam.reconstruct.physics_check import EveryFrames, PhysicsCheckResult
-from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline, load_networks, misfits, set_up, signs_of
+from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
+from nlos_cam.reconstruct.pipeline import (
+    FrameResult,
+    Pipeline,
+    build_pipeline,
+    compatibility_warnings,
+    frame_conditions,
+    load_networks,
+)
 from nlos_cam.reconstruct.verdict import FrameConditions, Verdict
 
 
@@ -28,7 +35,7 @@ def all_steps(
 ) -> list[FrameResult]:
     """Results of a camera's frames: one by one, or `ahead` in batches."""
     frames, thermometer = with_telemetry(camera, camera)
-    with FrameReader(frames, keeps_all=True, stop=Event(), clock=lambda: 0.0) as reader, processing.checks:
+    with FrameReader(frames, lossless=True, stop=Event(), clock=lambda: 0.0) as reader, processing.checks:
         if ahead:
             return list(iterate_batched(reader, processing, clock, thermometer))
         return list(iterate_results(reader, processing, clock, thermometer=thermometer))
@@ -62,15 +69,15 @@ def test_steps_time_every_stage_with_the_given_clock() -> None:
 
 def test_pipeline_feeds_the_mean_of_raw_or_difference_maps(walled: CalibratedRig) -> None:
     noting = Noting()
-    for eats_difference in (False, True):
-        done = all_steps(Pipeline(walled, noting, eats_difference=eats_difference, average=4), WallCamera(6))
+    for uses_difference in (False, True):
+        done = all_steps(Pipeline(walled, noting, uses_difference=uses_difference, average=4), WallCamera(6))
     mean_m = np.mean([wall_frame(number).depth_m for number in range(2, 6)], axis=0)
     np.testing.assert_allclose(noting.given[5], mean_m, atol=1e-6)
     np.testing.assert_allclose(noting.given[11], mean_m - walled.reference.map_depth_m, atol=1e-6)
     assert done[5].frame.frame_number == 5
     np.testing.assert_array_equal(done[5].difference.depth_m, noting.given[11])
     with pytest.raises(CalibrationError, match="--wall"):
-        Pipeline(CalibratedRig(RIG), sheet_network, eats_difference=True)
+        Pipeline(CalibratedRig(RIG), sheet_network, uses_difference=True)
 
 
 @pytest.mark.parametrize("offset_m", [0.0, 0.0045])
@@ -108,8 +115,11 @@ def looking(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
 def test_steps_ahead_equal_steps_in_turn(tmp_path: Path, count: int) -> None:
     done: list[list[FrameResult]] = []
     for ahead in (False, True):
-        bench, checks = CalibratedRig(RIG, measured_wall(tmp_path)), EveryFrames(RIG, every=5, accuracy="draft")
-        processing = Pipeline(bench, looking, average=3, doubter=FakeDoubter(), checks=checks)
+        bench, checks = (
+            CalibratedRig(RIG, measured_wall(tmp_path)),
+            PeriodicPhysicsCheck(RIG, every=5, accuracy="draft"),
+        )
+        processing = Pipeline(bench, looking, average=3, uncertainty_model=FakeDoubter(), checks=checks)
         done.append(all_steps(processing, WallCamera(count, moved=range(count // 2)), ahead=ahead))
     assert [step.frame.frame_number for step in done[1]] == list(range(count))
     for one, other in zip(*done, strict=True):
@@ -143,22 +153,22 @@ def test_steps_raise_the_error_of_a_frame(ahead: bool, count: int) -> None:
 @pytest.mark.parametrize(("nothing", "verdict"), [(0.9, Verdict.NOTHING), (0.0, Verdict.SEEN)])
 def test_step_shows_what_its_verdict_says(nothing: float, verdict: Verdict) -> None:
     doubter = FakeDoubter(lambda *_: (nothing, 0.0))
-    for step in all_steps(Pipeline(CalibratedRig(RIG), sheet_network, doubter=doubter), WallCamera(3)):
+    for step in all_steps(Pipeline(CalibratedRig(RIG), sheet_network, uncertainty_model=doubter), WallCamera(3)):
         assert step.verdict == verdict
-        assert step.reconstruction.shows == (verdict is Verdict.SEEN)
+        assert step.reconstruction.has_surface == (verdict is Verdict.SEEN)
         assert step.reconstruction.uncertainty_m is not None
 
 
 def test_doubt_network_is_given_the_input_of_the_network(walled: CalibratedRig) -> None:
     noting, doubter = Noting(), FakeDoubter()
-    all_steps(Pipeline(walled, noting, eats_difference=True, average=3, doubter=doubter), WallCamera(4))
+    all_steps(Pipeline(walled, noting, uses_difference=True, average=3, uncertainty_model=doubter), WallCamera(4))
     for asked, given in zip(doubter.asked, noting.given, strict=True):
         np.testing.assert_array_equal(asked[0][0], given)
 
 
 def test_moved_lidar_overrules_the_networks_verdict(walled: CalibratedRig) -> None:
     doubter = FakeDoubter(lambda *_: (0.0, 0.9))
-    done = all_steps(Pipeline(walled, sheet_network, doubter=doubter), WallCamera(100, moved=range(50, 100)))
+    done = all_steps(Pipeline(walled, sheet_network, uncertainty_model=doubter), WallCamera(100, moved=range(50, 100)))
     assert {step.verdict for step in done[:50]} == {Verdict.OUTSIDE}
     assert done[-1].verdict == Verdict.WALL_MOVED
 
@@ -177,11 +187,11 @@ def test_moved_lidar_overrules_the_networks_verdict(walled: CalibratedRig) -> No
 )
 def test_signs_of_names_what_is_wrong_with_a_frame(change: dict[str, np.ndarray], signs: FrameConditions) -> None:
     whole = replace(wall_frame(0), depth_m=np.full((64, 80), 0.3, np.float32))
-    assert signs_of(replace(whole, **change), BenchObservation(None, ()), None) == signs
+    assert frame_conditions(replace(whole, **change), BenchObservation(None, ()), None) == signs
     check = PhysicsCheckResult(
         0, np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32), score=1.0, seconds=0.0
     )
-    assert signs_of(replace(whole, **change), BenchObservation(None, ()), check) == replace(signs, check=check)
+    assert frame_conditions(replace(whole, **change), BenchObservation(None, ()), check) == replace(signs, check=check)
 
 
 DOUBTER: Any = object()
@@ -193,21 +203,25 @@ def trained(rig_name: str = RIG.name, rig_checksum: str = RIG.checksum, eats: st
 
 def test_misfits_name_what_differs_from_the_training_rig() -> None:
     farther = RIG.model_copy(update={"lidar": RIG.lidar.model_copy(update={"distance_m": 0.3})})
-    assert misfits(CalibratedRig(RIG), trained(), DOUBTER) == []
-    (note,) = misfits(CalibratedRig(farther), trained(), DOUBTER)
+    assert compatibility_warnings(CalibratedRig(RIG), trained(), DOUBTER) == []
+    (note,) = compatibility_warnings(CalibratedRig(farther), trained(), DOUBTER)
     assert "100 mm" in note
-    (note,) = misfits(CalibratedRig(RIG), trained(), None)
+    (note,) = compatibility_warnings(CalibratedRig(RIG), trained(), None)
     assert "uncertainty" in note
 
 
 @pytest.mark.parametrize(("checksum", "notes"), [(RIG.checksum, 0), ("0" * 12, 1)])
 def test_misfits_know_an_unnamed_rig_by_its_checksum(checksum: str, notes: int) -> None:
-    assert len(misfits(CalibratedRig(RIG), trained("a rig of somebody else's", checksum), DOUBTER)) == notes
+    assert (
+        len(compatibility_warnings(CalibratedRig(RIG), trained("a rig of somebody else's", checksum), DOUBTER)) == notes
+    )
 
 
 def test_misfits_name_a_wall_without_reference(walled: CalibratedRig) -> None:
     bare = CalibratedRig(RIG, replace(walled.measured, reference=None))
-    more = set(misfits(bare, trained(), DOUBTER)) - set(misfits(walled, trained(), DOUBTER))
+    more = set(compatibility_warnings(bare, trained(), DOUBTER)) - set(
+        compatibility_warnings(walled, trained(), DOUBTER)
+    )
     assert ["reference" in note for note in more] == [True]
 
 
@@ -215,7 +229,7 @@ def test_misfits_name_a_wall_without_reference(walled: CalibratedRig) -> None:
 def test_set_up_feeds_the_networks_their_kind_of_maps(walled: CalibratedRig, eats: str) -> None:
     network = Noting()
     network.record = trained(eats=eats)
-    processing: Any = set_up(walled, network, average=7)
+    processing: Any = build_pipeline(walled, network, average=7)
     done = all_steps(processing, WallCamera(1))
     assert processing.network is network
     fed = {"raw maps": done[0].maps, "difference maps": done[0].difference}[eats]
