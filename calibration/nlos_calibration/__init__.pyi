@@ -46,7 +46,8 @@ __all__ = [
     "WallByBoard",
     "WallFit",
     "WallRecord",
-    "depth_lacks_m",
+    "board_agreement",
+    "depth_offset_m",
     "depth_noise_m",
     "dump_toml",
     "facing_angle_rad",
@@ -71,11 +72,15 @@ __all__ = [
     "save_reference",
     "settings_changed",
     "wall_depth",
+    "wall_facts",
     "wall_from_plane",
     "wall_from_zero",
     "wall_points_m",
+    "wall_summary",
     "wall_with_board",
     "watched_pixels",
+    "with_degrees",
+    "with_mm",
     "with_occluder",
 ]
 
@@ -105,6 +110,7 @@ from .rig import (
     load_rig,
 )
 from .rig_check import GAP_RANGE_M, MAP_SHAPE, footprint, lidar_sees, on_plane, rig_difference
+from .summary import board_agreement, wall_facts, wall_summary, with_degrees, with_mm
 from .wall import (
     DISTANCE_RANGE_M,
     FACING_RANGE_DEG,
@@ -120,7 +126,7 @@ from .wall import (
 from .wall_record import (
     MeasuredWall,
     WallRecord,
-    depth_lacks_m,
+    depth_offset_m,
     load_measured,
     load_wall,
     new_wall_record,

@@ -1,6 +1,6 @@
-"""Whether pose, range, settings or temperature have left the bare wall's reference, told while frames come.
+"""Drift check: comparison of live frames with the bare wall's reference in pose, range, settings and temperature.
 
-What a second of frames says of the wall together: by how much it has left the reference, and how surely.
+The changes of single frames (`wall_tracker`) are combined over a second into a median with its uncertainty.
 """
 
 from collections.abc import Mapping
@@ -12,39 +12,40 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.errors import CalibrationError
 from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.noise import SCATTER_PER_MEDIAN, with_uncertainty
 from nlos_calibration.reference import BareWall
 from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall_tracker import WallObservation, WallTrack
 
 WINDOW_FRAMES, MIN_FRAMES = 30, 15
-"""What is told is the median over the first, of at least so many that showed the wall."""
+"""Frames that medians are taken over, and number of these that must show the wall."""
 UNIFORM_MISFIT = 3.0
-"""In one frame. The plane's two parameters more take up a sum of squares of 2 that is noise."""
+"""Largest misfit of a constant change of range, per frame: by noise, the plane's two further parameters absorb a sum of
+squares of 2."""
 CARRIED_OVER = 1.25
-"""A fit that begins where the last one ended is not independent of it: by so much the median is less sure than the
-spread says, as simulated."""
+"""Factor on the median's uncertainty, from simulation: each fit begins at the previous one and depends on it."""
 SHARP_TOLERANCES = 0.5
 
 
 @dataclass(frozen=True)
 class Drift:
-    """By how much the wall has left the reference over the last second; *_std are standard uncertainties."""
+    """Change of the wall against the reference over the last second; *_std are standard uncertainties."""
 
     distance_m: float
     """Positive is farther."""
     yaw_deg: float
     pitch_deg: float
     range_m: float
-    """The change of every depth that explains it instead; positive is longer."""
+    """Alternative explanation: one constant change of every depth; positive is longer."""
     distance_std_m: float
     yaw_std_deg: float
     pitch_std_deg: float
     range_std_m: float
     uniform: bool
-    """Whether `range_m` explains the depths as well as a lidar that moved does."""
+    """True if `range_m` explains the depths as well as a moved lidar does."""
 
     def tolerances(self, sigmas: float = 0.0) -> float:
-        """How many tolerances it is off at the least, allowing for so many standard uncertainties."""
+        """Return the drift in tolerances, less `sigmas` standard uncertainties."""
         if self.uniform:
             return (abs(self.range_m) - sigmas * self.range_std_m) / TOLERANCE_M
         return max(
@@ -55,69 +56,67 @@ class Drift:
 
     @property
     def sharp(self) -> bool:
-        """Whether the wall was seen well enough to tell a lidar that moves by a few tolerances."""
+        """True if the uncertainties are small enough to detect a lidar that moves by a few tolerances."""
         turn_std_deg = max(self.yaw_std_deg, self.pitch_std_deg)
         return max(self.distance_std_m / TOLERANCE_M, turn_std_deg / TOLERANCE_DEG) <= SHARP_TOLERANCES
 
     def apart(self, other: "Drift") -> bool:
-        """Whether another drift is of another kind, or by more than a tolerance another."""
+        """Return True if two drifts differ in kind, or by more than a tolerance."""
         if self.uniform or other.uniform:
             return self.uniform != other.uniform or abs(self.range_m - other.range_m) > TOLERANCE_M
         turn_deg = hypot(self.yaw_deg - other.yaw_deg, self.pitch_deg - other.pitch_deg)
         return abs(self.distance_m - other.distance_m) > TOLERANCE_M or turn_deg > TOLERANCE_DEG
 
     def __str__(self) -> str:
-        """One line: what drifted, by how much, what to do."""
+        """Return one line: the kind of drift, its amount, the remedy."""
         if self.uniform:
             return (
                 "the range has drifted (or the lidar has moved straight back or forth): depths of the wall are "
                 f"{_amount(self.range_m, self.range_std_m, 'longer', 'shorter')} than in the calibration: let the "
                 "lidar warm up, then calibrate the wall again"
             )
-        turn_deg, turn_std_deg = hypot(self.yaw_deg, self.pitch_deg), max(self.yaw_std_deg, self.pitch_std_deg)
+        turn = with_uncertainty(hypot(self.yaw_deg, self.pitch_deg), max(self.yaw_std_deg, self.pitch_std_deg), "°")
         return (
             f"the lidar has moved: the wall is {_amount(self.distance_m, self.distance_std_m, 'farther', 'nearer')} "
-            f"and turned by {turn_deg:.2f} +- {turn_std_deg:.2f} degrees from the calibration: calibrate the wall again"
+            f"and turned by {turn} against the calibration: calibrate the wall again"
         )
 
 
 def _amount(change_m: float, std_m: float, more: str, less: str) -> str:
-    return f"{abs(change_m) * 1e3:.2f} +- {std_m * 1e3:.2f} mm {more if change_m > 0 else less}"
+    return f"{with_uncertainty(abs(change_m) * 1e3, std_m * 1e3, 'mm')} {more if change_m > 0 else less}"
 
 
 class DriftWindow:
-    """The last frames of a WallTrack. Time is counted in frames, 30 in a second."""
+    """Ring buffer of the last WINDOW_FRAMES observations of a WallTrack. One thread."""
 
     def __init__(self, reference_frames: int) -> None:
         self._reference_frames, self._frames = reference_frames, 0
-        self._sights = np.full((WINDOW_FRAMES, len(WallObservation._fields)), np.nan)
+        self._observations = np.full((WINDOW_FRAMES, len(WallObservation._fields)), np.nan)
         self._shares = np.zeros(WINDOW_FRAMES)
 
-    def add(self, sight: WallObservation | None, share: float) -> None:
-        """Take in what a frame said, and the share of the watched pixels that showed the wall."""
+    def add(self, observation: WallObservation | None, share: float) -> None:
+        """Add a frame's observation, and the share of the watched pixels that showed the wall."""
         place = self._frames % WINDOW_FRAMES
-        self._sights[place] = np.nan if sight is None else sight
+        self._observations[place] = np.nan if observation is None else observation
         self._shares[place] = share
         self._frames += 1
 
     @property
     def share(self) -> float:
-        """Of the watched pixels, those that showed the wall; 0 before the first frame."""
+        """Mean share of the watched pixels that showed the wall; 0 before the first frame."""
         return float(self._shares.sum()) / max(min(self._frames, WINDOW_FRAMES), 1)
 
     def drift(self) -> Drift | None:
-        """The medians of the frames that show the wall; None for too few.
-
-        The spread over the frames holds what noise and passing objects do. A median's uncertainty is sqrt(pi / 2) times
-        a mean's, and the reference was taken with the same noise.
-        """
-        seen = self._sights[~np.isnan(self._sights[:, 0])]
-        if len(seen) < MIN_FRAMES:
+        """Return the medians over the frames that show the wall, and their uncertainty; None for too few frames."""
+        valid = self._observations[~np.isnan(self._observations[:, 0])]
+        if len(valid) < MIN_FRAMES:
             return None
-        middle = len(seen) // 2
-        median = np.sort(seen, axis=0)[middle]
-        off = np.abs(seen - median)
-        spread = 1.4826 * np.sort(off, axis=0)[middle]
+        # The spread over the frames contains noise and passing objects. The median of n frames has the variance
+        # (pi / 2) spread^2 / n; the reference, a mean over its frames with the same noise, adds spread^2 / frames.
+        middle = len(valid) // 2
+        median = np.sort(valid, axis=0)[middle]
+        off = np.abs(valid - median)
+        spread = SCATTER_PER_MEDIAN * np.sort(off, axis=0)[middle]
         agreeing = np.maximum((off <= 3.0 * spread).sum(axis=0), 1)  # just after a knock, half of them
         share = np.pi / 2 / agreeing + 1 / max(self._reference_frames, 1)
         *stds, _ = (CARRIED_OVER * spread * np.sqrt(share)).tolist()
@@ -126,59 +125,62 @@ class DriftWindow:
 
 
 SURE_SIGMAS = 4.0
-"""A drift is told that is beyond a tolerance by so many standard uncertainties."""
+"""Standard uncertainties by which a drift must exceed a tolerance to be reported."""
 ENDS_AT = 0.7
-"""What is told stays told until it is below this share of what it took, so that it does not flicker."""
+"""A reported drift ends below this share of the limit that it began at: hysteresis against flicker."""
 MAX_RANGE_DRIFT_M = 0.005
-"""What a temperature may do to the range, by the data sheet's accuracy; beyond it the lidar has moved straight back or
-forth."""
+"""Largest change of range by temperature, from the data sheet's accuracy; beyond it the lidar has moved straight back
+or forth."""
 BLIND_FRAMES, BLIND_ENDS = 300, 10
-"""So many frames without a pose are told (10 s; objects pass by); each frame with one counts for so many."""
+"""Frames without a pose until a warning (10 s, since objects pass by), and frames that one with a pose takes back."""
 MIN_PIXELS = 30
-"""To watch; with fewer the pose is not looked after."""
+"""Watched pixels needed to track the pose."""
 TOLERANCE_C = 5.0
-"""Nobody has published how the range of an L515 moves with its temperatures, so this is a guess: warming up shows, a
-room's ups and downs do not. What the range then does is told from the depth itself."""
+"""Nobody has published how the range of an L515 moves with its temperatures, so this is a guess between warming up and
+a room's fluctuations. The resulting change of range is measured from the depth itself."""
 ABSOLUTE_ZERO_C = -273.15
-"""What is below is no temperature: an L515 says -9999 until it has measured the photodiode's."""
+"""Lower readings are invalid: an L515 reports -9999 until it has measured the photodiode's temperature."""
 HOST_OPTIONS = frozenset({"error_polling_enabled", "frames_queue_size", "global_time_enabled", "host_performance"})
-"""How the host is served; nothing of it is in the depth."""
+"""Options of the host's software, without effect on the depth."""
 MEASURED = "_temperature", "noise_estimation"
-"""Endings of the options that are measurements."""
+"""Endings of options that are measurements."""
 ALIKE = 1e-5
-"""Relative: a device keeps its settings as single floats."""
+"""Relative tolerance: a device stores its settings as single floats."""
 
 
 def settings_changed(reference: BareWall, settings: Mapping[str, float]) -> tuple[str, ...]:
-    """The options that are not as they were at the bare wall, with both values.
+    """Return the settings that differ from those of the bare wall, with both values.
 
-    Measurements are no settings, and an option that only one of both tells of is no change.
+    Measurements, options of the host and options that only one of both has are ignored.
     """
     then = {name: value for name, value in reference.settings.items() if name in settings}
     changed = [name for name, value in then.items() if not isclose(value, settings[name], rel_tol=ALIKE)]
-    told = sorted(name for name in changed if not name.endswith(MEASURED) and name not in HOST_OPTIONS)
-    return tuple(f"{name} was {then[name]:g} and is {settings[name]:g}" for name in told)
+    names = sorted(name for name in changed if not name.endswith(MEASURED) and name not in HOST_OPTIONS)
+    return tuple(f"{name} was {then[name]:g} and is {settings[name]:g}" for name in names)
 
 
 def _check_size(shape: tuple[int, ...], then: Intrinsics) -> None:
     if shape != (then.height, then.width):
         size = " x ".join(str(pixels) for pixels in reversed(shape))
         raise CalibrationError(
-            f"a frame of {size} pixels cannot be held against a bare wall of {then.width} x {then.height}: open the "
-            "camera at that size, or calibrate the wall again",
+            f"a frame of {size} pixels does not match the bare wall of {then.width} x {then.height}: open the camera "
+            "at that size, or calibrate the wall again",
         )
 
 
 class DriftCheck:
-    """Holds the frames of a stream against the bare wall's reference. Time is counted in frames, 30 in a second."""
+    """Comparison of a stream's frames with the bare wall's reference, with warnings that do not flicker.
+
+    Stateful, one thread: feed frames in order. Time is counted in frames, 30 per second.
+    """
 
     def __init__(self, reference: BareWall, wall_from_lidar: Float64) -> None:
         self.drift: Drift | None = None
-        """Over the last second; None while too few frames show the wall."""
+        """Drift over the last second; None while too few frames show the wall."""
         self._reference = reference
         self._track, self._window = WallTrack(reference, wall_from_lidar), DriftWindow(reference.frames)
         self._watches = len(self._track.pixels) >= MIN_PIXELS
-        self._told: Drift | None = None
+        self._reported: Drift | None = None
         self._blind, self._blindness = 0, ""
         self._settings: Mapping[str, float] = {}
         self._about_settings: tuple[str, ...] = ()
@@ -186,21 +188,18 @@ class DriftCheck:
 
     @property
     def wall_share(self) -> float:
-        """Of the pixels that are watched, those that showed the wall over the last second."""
+        """Share of the watched pixels that showed the wall over the last second."""
         return self._window.share
 
     @property
     def moved(self) -> bool:
-        """Whether it is told that the lidar has moved, or no longer sees the wall; a range that drifts a little is not.
-
-        As with `warnings`, the answer does not flicker.
-        """
-        if (told := self._told) is None:
+        """True while a warning says that the lidar has moved or no longer sees the wall; False for a small range drift."""
+        if (drift := self._reported) is None:
             return bool(self._blindness)
-        return not told.uniform or abs(told.range_m) > MAX_RANGE_DRIFT_M
+        return not drift.uniform or abs(drift.range_m) > MAX_RANGE_DRIFT_M
 
-    def look(self, depth_m: Float32, settings: Mapping[str, float]) -> None:
-        """Take a frame (height, width) in, NaN where there is no return, and the settings it was taken with.
+    def observe(self, depth_m: Float32, settings: Mapping[str, float]) -> None:
+        """Add a frame (height, width), NaN where there is no return, and the settings that it was taken with.
 
         Raises CalibrationError for a frame of another size.
         """
@@ -211,61 +210,59 @@ class DriftCheck:
         if self._watches:
             self._window.add(self._track.follow(depth_m), self._track.share)
             self.drift = self._window.drift()
-            self._tell_drift()
-            self._tell_blindness()
+            self._update_reported()
+            self._update_blindness()
 
-    def look_at(self, celsius: Mapping[str, float]) -> None:
-        """Take a reading of the device's temperatures in, by the SDK's name; what is not named stays as it was."""
+    def update_temperatures(self, celsius: Mapping[str, float]) -> None:
+        """Add a reading of the device's temperatures by the SDK's name; the others keep their last value."""
         for name, now_c in celsius.items():
             if name in self._reference.celsius and now_c > ABSOLUTE_ZERO_C:
                 self._about_celsius[name] = self._about_temperature(name, now_c)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to tell now, a line each; they stay as they are while nothing changes. Empty while all is well."""
-        lines = [str(self._told) if self._told else "", self._blindness, self._about_temperatures()]
+        """Current warnings, a line each, constant while nothing changes; empty while all is well."""
+        lines = [str(self._reported) if self._reported else "", self._blindness]
+        if off := [line for line in self._about_celsius.values() if line]:  # one device: the first stands for all
+            lines.append(off[0] + (f" ({len(off) - 1} more of its temperatures are off)" if len(off) > 1 else ""))
         if self._about_settings:
             changes = ", ".join(self._about_settings)
             lines.append(f"settings have changed since the wall was measured: {changes}: calibrate the wall again")
         if not self._watches:
             lines.append(
-                f"the bare wall's reference has {len(self._track.pixels)} good pixels to watch, {MIN_PIXELS} needed: a "
-                "lidar that moves would not be noticed: calibrate the wall again"
+                f"the bare-wall reference has {len(self._track.pixels)} good pixels to watch, {MIN_PIXELS} needed: a "
+                "move of the lidar would not be noticed: calibrate the wall again"
             )
         return tuple(line for line in lines if line)
 
-    def _tell_drift(self) -> None:
-        """Begin, renew or end what is told of the pose; while the wall is hidden, what was told stays."""
+    def _update_reported(self) -> None:
+        """Begin, renew or end the reported drift; while the wall is hidden, it stays as it is."""
         if self.drift is None:
             return
-        if self._told is None:
-            self._told = self.drift if self.drift.tolerances(SURE_SIGMAS) > 1.0 else None
+        if self._reported is None:
+            self._reported = self.drift if self.drift.tolerances(SURE_SIGMAS) > 1.0 else None
         elif self.drift.tolerances() < ENDS_AT:
-            self._told = None
-        elif self._told.apart(self.drift):
-            self._told = self.drift
+            self._reported = None
+        elif self._reported.apart(self.drift):
+            self._reported = self.drift
 
-    def _tell_blindness(self) -> None:
-        sees = self.drift is not None and self.drift.sharp
-        self._blind = max(self._blind - BLIND_ENDS, 0) if sees else min(self._blind + 1, BLIND_FRAMES)
+    def _update_blindness(self) -> None:
+        """Begin or end the warning that too little of the wall is in view."""
+        sharp = self.drift is not None and self.drift.sharp
+        self._blind = max(self._blind - BLIND_ENDS, 0) if sharp else min(self._blind + 1, BLIND_FRAMES)
         if self._blind == 0:
             self._blindness = ""
         elif self._blind == BLIND_FRAMES and not self._blindness:
             self._blindness = (
-                f"{self.wall_share:.0%} of the wall is seen where it was calibrated, too little to notice a lidar that "
-                "moves: look once with nothing hidden; if this stays, it has moved far: calibrate the wall again"
+                f"only {self.wall_share:.0%} of the wall is where it was calibrated, too little to notice a move of "
+                "the lidar: remove the hidden object for a moment; if this warning stays, calibrate the wall again"
             )
 
-    def _about_temperatures(self) -> str:
-        """Of several that are off, the first: they are of one device."""
-        told = [line for line in self._about_celsius.values() if line]
-        others = f" ({len(told) - 1} more of its temperatures are off)" if len(told) > 1 else ""
-        return told[0] + others if told else ""
-
     def _about_temperature(self, name: str, now_c: float) -> str:
+        """Return a warning for a temperature beyond the tolerance; empty within it."""
         then_c, span_c = self._reference.celsius[name], self._reference.celsius_span.get(name, 0.0)
-        least_c = max(TOLERANCE_C, span_c) * (ENDS_AT if self._about_celsius.get(name) else 1.0)
-        if abs(now_c - then_c) <= least_c:
+        limit_c = max(TOLERANCE_C, span_c) * (ENDS_AT if self._about_celsius.get(name) else 1.0)
+        if abs(now_c - then_c) <= limit_c:
             return ""
-        about = f"{name} is {now_c:.0f} degrees C and was {then_c:.0f} when the wall was measured: "
+        about = f"{name} is {now_c:.0f} °C and was {then_c:.0f} °C when the wall was measured: "
         return about + ("let the lidar warm up" if now_c < then_c else "calibrate the wall again")

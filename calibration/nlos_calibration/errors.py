@@ -1,32 +1,32 @@
 """Errors of the calibration package.
 
 CalibrationError (ValueError)    exit 1   root
-├── WallRefusedError             exit 1   what the lidar saw is not a bare wall we can trust
-├── BoardRefusedError            exit 1   there is no board in the image whose plane we can trust
-├── OccluderRefusedError         exit 1   there is no occluder in the view whose place we can trust
-└── RecordFileError              exit 4   a rig or wall record that cannot be read
+├── WallRefusedError             exit 1   "only 31.0% of the depth lies on one plane (50% needed), ..."
+├── BoardRefusedError            exit 1   "4 corners of a board of 6 x 9 squares of 30 mm are seen, 8 needed: ..."
+├── OccluderRefusedError         exit 1   "the occluder touches the wall (gap 1.2 mm, known to 2.0 mm): ..."
+└── RecordFileError              exit 4   "wall.toml is not a wall record: frames: ... (got 0)"
 """
 
 
 class CalibrationError(ValueError):
-    """Root of the errors that the calibration foresaw."""
+    """Root of the errors that calibration raises on purpose."""
 
     exit_code = 1
 
 
 class WallRefusedError(CalibrationError):
-    """What the lidar saw is not a bare wall that can be trusted; the message says why."""
+    """The depth is not that of one bare, flat wall; the message gives the reason and the remedy."""
 
 
 class BoardRefusedError(CalibrationError):
-    """There is no board in the image whose plane can be trusted; the message says why."""
+    """The image shows no board whose plane can be trusted; the message gives the reason and the remedy."""
 
 
 class OccluderRefusedError(CalibrationError):
-    """There is no occluder in the view whose place can be trusted; the message says why."""
+    """The depth shows no occluder whose position can be trusted; the message gives the reason and the remedy."""
 
 
 class RecordFileError(CalibrationError):
-    """A rig or wall record that cannot be read."""
+    """A rig or wall record cannot be read."""
 
     exit_code = 4

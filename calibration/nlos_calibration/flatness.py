@@ -1,8 +1,7 @@
-"""Is it one flat wall? Whether a part of the view tells of another plane than the whole.
+"""Tests of a plane fit's residuals: bends of the wall, range offset and ripples of the lidar.
 
-A bend, a curve, a step or an offset of the range does that, and no small residual excuses it.
-
-What neighbouring residuals of a plane have in common: ripples and drift of the lidar, and what they cost.
+A bend, a curve, a step or a range offset makes a part of the view show another plane than the whole, however small the
+residuals. Ripples correlate neighbouring residuals, which widens the covariance.
 """
 
 from dataclasses import dataclass
@@ -11,55 +10,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_calibration.arrays import Float64
+from nlos_calibration.geometry import plane_from_slopes, plane_gradients, propagated_std
 from nlos_calibration.plane import PlaneFit
 
 SURE_SIGMAS = 3.0
 HALVES_POINTS = 60_000
-"""Enough to compare halves by."""
+"""Number of inliers that halves are compared by."""
 MAX_OFFSET_M = 0.02
-"""More than this is no constant of the device."""
+"""A larger offset is no constant of the device."""
 
 
 @dataclass(frozen=True)
 class Flatness:
-    """How far the depth is from one flat wall."""
+    """Deviation of the depth from one flat wall."""
 
     bend_m: float
     bend_deg: float
-    """The most by which distance and normal of a half of the view differ from the whole's."""
+    """Largest difference in distance and normal between half of the view and the whole."""
     bend_std_m: float
     bend_std_deg: float
-    """What noise alone makes of that."""
+    """Standard uncertainty of that difference by noise alone."""
     offset_m: float
-    """What to add to every depth so that the halves agree best."""
+    """Constant to add to every depth so that the halves agree best."""
     offset_bend_m: float
     offset_bend_deg: float
-    """The bend that is left then."""
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """The normal equations of a part of the view: of slopes (3) and of a constant added to the depth (1)."""
-
-    matrix: Float64
-    """(4, 4)."""
-    right: Float64
-    """(4,)."""
-
-    def step(self, offset_m: float = 0.0) -> Float64:
-        """By how much the slopes (3,) of this part alone differ, once `offset_m` is added to every depth."""
-        # an offset to be added is an error to be subtracted: the fourth unknown is its negative
-        step = np.linalg.lstsq(self.matrix[:3, :3], self.right[:3] + offset_m * self.matrix[:3, 3])[0]
-        return step.astype(np.float64)
+    """Bend that remains after adding the offset."""
 
 
 def flatness(plane: PlaneFit, rays: Float64) -> Flatness:
-    """Judge the residuals of `plane`, fitted to depth along `rays` (height, width, 3)."""
-    halves, whole, chi2 = _halves(plane, rays.reshape(-1, 3))
-    offset_m = _offset_m(whole, chi2)
-    bend_m, bend_deg = _bend(plane, [half.step() for half in halves])
-    left_m, left_deg = _bend(plane, [half.step(offset_m) for half in halves], whole.step(offset_m))
-    stds = [_std(plane, chi2 * np.linalg.pinv(half.matrix[:3, :3]).astype(np.float64)) for half in halves]
+    """Compare planes through halves of the view with `plane`, fitted to depth along `rays` (height, width, 3)."""
+    # Every half is four adjacent eighths, so that each of four cuts gives two. A fold or step along a cut leaves both
+    # of its halves flat but different from the whole; one across it leaves both as tilted as the whole, and another
+    # cut finds it. Normal equations add, so eighths suffice.
+    matrices, rights, chi2 = _eighths(plane, rays.reshape(-1, 3))
+    whole = matrices.sum(axis=0), rights.sum(axis=0)
+    near = [(np.arange(4) + first) % 8 for first in range(8)]
+    halves = [(matrices[some].sum(axis=0), rights[some].sum(axis=0)) for some in near]
+    offset_m = _offset_m(*whole, chi2)
+    bend_m, bend_deg = _bend(plane, [_step(*half) for half in halves], np.zeros(3))
+    left_m, left_deg = _bend(plane, [_step(*half, offset_m) for half in halves], _step(*whole, offset_m))
+    stds = [_std(plane, chi2 * np.linalg.pinv(matrix[:3, :3]).astype(np.float64)) for matrix, _ in halves]
     return Flatness(
         bend_m=bend_m,
         bend_deg=bend_deg,
@@ -71,83 +61,70 @@ def flatness(plane: PlaneFit, rays: Float64) -> Flatness:
     )
 
 
-def _halves(plane: PlaneFit, rays: Float64) -> tuple[list[_Sums], _Sums, float]:
-    """Eight halves of some inliers, of four ways to cut; all of these; their mean square in standard deviations.
-
-    A step along a cut leaves both of its halves flat; a step across it leaves both as tilted as the whole.
-    """
+def _eighths(plane: PlaneFit, rays: Float64) -> tuple[Float64, Float64, float]:
+    """Return normal equations of eight sectors, (8, 4, 4) and (8, 4), and the mean square residual in sigmas."""
     some = np.flatnonzero(plane.inliers)
     some = some[:: max(len(some) // HALVES_POINTS, 1)]
-    seen, weight = rays[some], 1.0 / plane.sigmas_m[some]
+    inliers, weight = rays[some], 1.0 / plane.sigmas_m[some]
     sigmas = plane.errors_m[some] * weight
-    predicted_m = 1.0 / (seen @ plane.slopes)
-    rows = np.column_stack([seen * (-(predicted_m**2) * weight)[:, np.newaxis], weight])
-    x, y = (seen[:, :2] - np.median(seen[:, :2], axis=0)).T
+    predicted_m = 1.0 / (inliers @ plane.slopes)
+    # unknowns: change of the slopes, d p_z = -p_z^2 r (`plane`), and a constant error of every depth, d p_z = 1
+    rows = np.column_stack([inliers * (-(predicted_m**2) * weight)[:, np.newaxis], weight])
+    x, y = (inliers[:, :2] - np.median(inliers[:, :2], axis=0)).T
     eighth = np.floor(np.arctan2(y, x) * 4.0 / np.pi).astype(np.int64) % 8
-    eighths = [_sums(rows, sigmas, eighth == one) for one in range(8)]
-    halves = [_total([eighths[(one + more) % 8] for more in range(4)]) for one in range(8)]
-    return halves, _total(eighths), float(sigmas @ sigmas) / max(len(sigmas) - 3, 1)
+    parts = [(rows[eighth == one], sigmas[eighth == one]) for one in range(8)]
+    matrices, rights = np.stack([part.T @ part for part, _ in parts]), np.stack([part.T @ b for part, b in parts])
+    return matrices, rights, float(sigmas @ sigmas) / max(len(sigmas) - 3, 1)
 
 
-def _total(parts: list[_Sums]) -> _Sums:
-    return _Sums(
-        sum((part.matrix for part in parts), np.zeros((4, 4))), sum((part.right for part in parts), np.zeros(4))
-    )
+def _step(matrix: Float64, right: Float64, offset_m: float = 0.0) -> Float64:
+    """Return the slopes (3,) of a part of the view alone less the whole's, once `offset_m` is added to every depth."""
+    # adding the offset raises every residual by it, and so the right-hand side by the offset times the fourth column
+    return np.linalg.lstsq(matrix[:3, :3], right[:3] + offset_m * matrix[:3, 3])[0].astype(np.float64)
 
 
-def _sums(rows: Float64, sigmas: Float64, part: NDArray[np.bool_]) -> _Sums:
-    rows = rows[part]
-    return _Sums(rows.T @ rows, rows.T @ sigmas[part])
-
-
-def _bend(plane: PlaneFit, steps: list[Float64], whole: Float64 | None = None) -> tuple[float, float]:
-    """The most by which distance (m) and normal (degrees) change by any of the steps (3,), beyond the whole's."""
-    distance_m, normal = _plane(plane.slopes + (np.zeros(3) if whole is None else whole))
-    parts = [_plane(plane.slopes + step) for step in steps]
-    turns = [np.arctan2(np.linalg.norm(np.cross(turned, normal)), turned @ normal) for _, turned in parts]
-    return max(abs(far_m - distance_m) for far_m, _ in parts), float(np.degrees(max(turns)))
-
-
-def _plane(slopes: Float64) -> tuple[float, Float64]:
-    distance_m = 1.0 / float(np.linalg.norm(slopes))
-    return distance_m, -slopes * distance_m
+def _bend(plane: PlaneFit, steps: list[Float64], whole: Float64) -> tuple[float, float]:
+    """Return the largest change of distance (m) and normal (degrees) by any of the steps (3,), beyond the whole's."""
+    normal, distance_m = plane_from_slopes(plane.slopes + whole)
+    parts = [plane_from_slopes(plane.slopes + step) for step in steps]
+    turns = [np.arctan2(np.linalg.norm(np.cross(turned, normal)), turned @ normal) for turned, _ in parts]
+    return max(abs(far_m - distance_m) for _, far_m in parts), float(np.degrees(max(turns)))
 
 
 def _std(plane: PlaneFit, covariance: Float64) -> tuple[float, float]:
-    """Of distance (m) and of the normal's turn, whichever way (degrees)."""
-    along = plane.distance_m**2 * plane.normal
-    across = plane.distance_m * (np.eye(3) - np.outer(plane.normal, plane.normal))
+    """Return the standard uncertainty of distance (m) and of the normal in its least certain direction (degrees)."""
+    along, across = plane_gradients(plane.normal, plane.distance_m)
     turn = np.linalg.eigvalsh(across @ covariance @ across.T)[-1]
-    return float(np.sqrt(along @ covariance @ along)), float(np.degrees(np.sqrt(max(turn, 0.0))))
+    return propagated_std(along, covariance), float(np.degrees(np.sqrt(max(turn, 0.0))))
 
 
-def _offset_m(whole: _Sums, chi2: float) -> float:
-    """The constant to add to every depth that leaves the least residuals of a plane; 0 where none is plausible."""
-    offset_m = -float(np.linalg.lstsq(whole.matrix, whole.right)[0][3])
-    std_m = float(np.sqrt(chi2 * np.linalg.pinv(whole.matrix)[3, 3]))
+def _offset_m(matrix: Float64, right: Float64, chi2: float) -> float:
+    """Return the constant to add to every depth for the smallest residuals of a plane; 0 where none is plausible."""
+    offset_m = -float(np.linalg.lstsq(matrix, right)[0][3])  # the fourth unknown is the error, the offset removes it
+    std_m = float(np.sqrt(chi2 * np.linalg.pinv(matrix)[3, 3]))
     return offset_m if SURE_SIGMAS * std_m < abs(offset_m) <= MAX_OFFSET_M else 0.0
 
 
 BLOCKS_ACROSS = 40
-"""The finest blocks: fine enough for ripples of half a degree, coarse enough to average noise."""
+"""Number of the finest blocks across the view: they resolve ripples of half a degree and average noise."""
 COARSER = (1, 2, 4, 8)
-"""Blocks of blocks: ripples may be wide."""
+"""Sizes of the larger blocks, in finest blocks: ripples may be wide."""
 
 
 @dataclass(frozen=True)
 class Ripples:
-    """How alike neighbouring residuals are."""
+    """Correlation of neighbouring residuals."""
 
     rms_m: float
-    """Normal to the wall, of what blocks of pixels deviate by beyond their noise."""
+    """RMS deviation of blocks of pixels beyond their noise, normal to the wall."""
     correlation: float
-    """By how much the mean square of block means exceeds that of independent residuals; 1 where it surely does not."""
+    """Mean square of block means over that of independent residuals; 1 where it is not surely more."""
     covariance: Float64
-    """(3, 3) of the plane's slopes, with that in it."""
+    """(3, 3) of the plane's slopes, ripples included."""
 
 
 def ripples(plane: PlaneFit, rays: Float64) -> Ripples:
-    """Judge the residuals of `plane`, fitted to depth along `rays` (height, width, 3)."""
+    """Measure the correlation of the residuals of `plane`, fitted to depth along `rays` (height, width, 3)."""
     shape = rays.shape[:2]
     size = max(2, shape[1] // BLOCKS_ACROSS)
     across = np.where(plane.inliers, plane.distance_m * (rays.reshape(-1, 3) @ plane.slopes), 0.0)
@@ -164,7 +141,8 @@ def ripples(plane: PlaneFit, rays: Float64) -> Ripples:
 
 
 def _beyond_noise_m(count: Float64, within: Float64, normal_m: Float64, variance_m2: Float64, size: int) -> float:
-    """RMS of block means beyond their noise, which is judged by the scatter within blocks."""
+    """Return the RMS of block means beyond their noise, which is estimated from the scatter within blocks."""
+    # analysis of variance: E[mean^2] = ripple^2 + noise sum(sigma^2) / n^2, with the noise scale from within blocks
     full = count >= size**2 / 2
     if not full.any():
         return 0.0
@@ -174,10 +152,9 @@ def _beyond_noise_m(count: Float64, within: Float64, normal_m: Float64, variance
 
 
 def _correlation(count: Float64, total: Float64, chi2: float) -> tuple[float, int]:
-    """The mean square of block means over what it would be if residuals were independent, and the size of the blocks.
-
-    Of blocks of several sizes the largest: the mean over a patch as wide as a ripple varies most. 1 if it is not sure.
-    """
+    """Return the largest growth of block sums over independent residuals, and its block size; 1 if not significant."""
+    # The sum of n independent residuals has the mean square n chi2, so sum(totals^2) / sum(counts) / chi2 is 1 up to
+    # sqrt(2 / blocks). The growth is largest for blocks as wide as a ripple: hence several sizes.
     found = 1.0, 1
     for size in COARSER:
         counts, totals = block_sums(count, size), block_sums(total, size)
@@ -189,7 +166,7 @@ def _correlation(count: Float64, total: Float64, chi2: float) -> tuple[float, in
 
 
 def _pulls(plane: PlaneFit, rays: Float64, weighted: Float64, size: int) -> Float64:
-    """How each block (n, 3) pulls at the slopes: the sums of the least squares' gradient over it."""
+    """Return each block's sum (n, 3) of the least-squares gradient with respect to the slopes."""
     slopewise = rays.reshape(-1, 3) @ plane.slopes
     predicted_m = np.divide(1.0, slopewise, out=np.zeros_like(slopewise), where=plane.inliers)
     strength = -(predicted_m**2 * weighted).reshape(rays.shape[:2])
@@ -197,14 +174,18 @@ def _pulls(plane: PlaneFit, rays: Float64, weighted: Float64, size: int) -> Floa
 
 
 def _clustered(plane: PlaneFit, pulls: Float64) -> Float64:
-    """The covariance if blocks, not pixels, are independent (Liang and Zeger): each block tells its own spread."""
+    """Return the covariance (3, 3) for independent blocks of correlated pixels (Liang and Zeger, 1986)."""
+    # Sandwich estimator: (J'J)^-1 sum(g g') (J'J)^-1 over the blocks' gradients g, corrected for three fitted
+    # parameters. The fit's covariance is chi^2 (J'J)^-1, hence the division.
     bread = plane.covariance / plane.noise_scale**2
     blocks = int(pulls.any(axis=1).sum())
     return bread @ (pulls.T @ pulls) @ bread * blocks / max(blocks - 3, 1)
 
 
 def _greater(one: Float64, other: Float64) -> Float64:
-    """The covariance that is the greater of two in every direction: where both are diagonal, entry by entry."""
+    """Return a covariance that is at least as large as either of two in every direction."""
+    # With one = L L' and L^-1 other L^-T = V D V', the basis L V makes one the identity and other the diagonal D at
+    # once; the larger entry of each pair bounds both.
     root = np.linalg.cholesky(one)
     inner = np.linalg.solve(root, np.linalg.solve(root, other).T)
     values, vectors = np.linalg.eigh((inner + inner.T) / 2.0)
@@ -213,6 +194,6 @@ def _greater(one: Float64, other: Float64) -> Float64:
 
 
 def block_sums(values: NDArray[np.generic], size: int) -> Float64:
-    """The sums over blocks of `size` x `size`."""
+    """Return the sums over blocks of `size` x `size`, incomplete ones at the far edges included."""
     rows, columns = (np.arange(0, length, size) for length in values.shape)
     return np.add.reduceat(np.add.reduceat(values.astype(np.float64), rows, axis=0), columns, axis=1)

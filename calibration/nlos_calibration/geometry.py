@@ -1,13 +1,13 @@
-"""The wall frame, the lidar frame, and the pose between them.
+"""Wall frame, lidar frame, the pose between them, and pinhole rays of the lidar.
 
 Wall frame: origin at the foot of the perpendicular from the lidar to the wall, z into the room, x = the lidar's x axis
-projected on the wall, y = z cross x. Lidar frame: x right, y down, z along the optical axis. A wall plane seen by the
-lidar (unit normal towards the lidar, distance) is therefore a whole pose.
-
-Pinhole projection of the lidar: pixels to rays and back (no distortion: the L515's depth model has none).
+projected on the wall, y = z cross x. Lidar frame: x right, y down, z along the optical axis. A wall plane in the lidar
+frame (unit normal towards the lidar, distance) therefore defines a complete pose.
+The pinhole has no distortion: the L515's depth model has none.
 """
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 
@@ -15,24 +15,43 @@ from nlos_calibration.arrays import Float64
 
 
 def normal_from_angles(yaw_rad: float, pitch_rad: float) -> Float64:
-    """The wall's normal (3,) in the lidar frame; positive yaw turns the axis towards wall +x, positive pitch up."""
+    """Return the wall's normal (3,) in the lidar frame; positive yaw turns the axis to wall +x, positive pitch up."""
     return np.array(
         [np.sin(yaw_rad) * np.cos(pitch_rad), -np.sin(pitch_rad), -np.cos(yaw_rad) * np.cos(pitch_rad)],
     )
 
 
 def angles_from_normal(normal_lidar: Float64) -> tuple[float, float]:
-    """(yaw_rad, pitch_rad) of a wall whose unit normal in the lidar frame is `normal_lidar` (3,)."""
+    """Return (yaw_rad, pitch_rad) of a wall with the unit normal `normal_lidar` (3,) in the lidar frame."""
     x, y, z = normal_lidar
     return float(np.arctan2(x, -z)), float(np.arcsin(np.clip(-y, -1.0, 1.0)))
 
 
-def wall_from_plane(normal_lidar: Float64, distance_m: float) -> Float64:
-    """The pose wall_from_lidar (4, 4) for a plane normal . p + distance_m = 0, the normal (3,) towards the lidar.
+def plane_from_slopes(slopes: Float64) -> tuple[Float64, float]:
+    """Return (normal (3,), distance_m) of the plane with `slopes` (3,) = -normal / distance_m."""
+    distance_m = 1.0 / float(np.linalg.norm(slopes))
+    return -slopes * distance_m, distance_m
 
-    The rows of the rotation are the wall's axes seen from the lidar: z = normal, x = the lidar's x made orthogonal to
-    it, y = z cross x. Raises ValueError where the lidar's x axis is the normal itself, which leaves x undefined.
+
+def plane_gradients(normal: Float64, distance_m: float) -> tuple[Float64, Float64]:
+    """Return the derivatives of a plane's distance (3,) and normal (3, 3) with respect to its slopes."""
+    # distance = 1 / |s|, so its gradient is -s / |s|^3 = distance^2 normal: only a change along the normal moves it;
+    # normal = -s / |s|, so it turns by -distance times the part of the change across the normal
+    return distance_m**2 * normal, -distance_m * (np.eye(3) - np.outer(normal, normal))
+
+
+def propagated_std(gradient: Float64, covariance: Float64) -> float:
+    """Return sqrt(g' C g), to first order the standard uncertainty of a quantity with gradient g (n,)."""
+    return sqrt(max(float(gradient @ covariance @ gradient), 0.0))
+
+
+def wall_from_plane(normal_lidar: Float64, distance_m: float) -> Float64:
+    """Return the pose wall_from_lidar (4, 4) of a plane normal . p + distance_m = 0, the normal (3,) to the lidar.
+
+    Raises ValueError where the lidar's x axis is the normal itself, which leaves the wall's x undefined.
     """
+    # The rows of the rotation are the wall's axes in the lidar frame: z = normal, x = the lidar's x without its
+    # component along z (one Gram-Schmidt step), y = z cross x. The lidar is at wall (0, 0, distance).
     z_axis = normal_lidar / np.linalg.norm(normal_lidar)
     x_axis = np.array([1.0, 0.0, 0.0]) - z_axis[0] * z_axis
     if np.linalg.norm(x_axis) < 1e-9:
@@ -46,13 +65,13 @@ def wall_from_plane(normal_lidar: Float64, distance_m: float) -> Float64:
 
 
 def facing_angle_rad(wall_from_lidar: Float64) -> float:
-    """The angle between the optical axis and the wall's normal, from the pose (4, 4)."""
+    """Return the angle between the optical axis and the wall's normal, from the pose (4, 4)."""
     return float(np.arccos(np.clip(-wall_from_lidar[2, 2], -1.0, 1.0)))
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole intrinsics in pixels, as librealsense gives them: (ppx, ppy) in pixel centres, x right, y down."""
+    """Pinhole intrinsics in pixels, as in librealsense: (ppx, ppy) in pixel centres, x right, y down."""
 
     width: int
     height: int
@@ -62,18 +81,19 @@ class Intrinsics:
     ppy: float
 
     def scaled(self, width: int, height: int) -> "Intrinsics":
-        """The same field of view at another resolution; pixel (0, 0) is centred on (0, 0), so edges are at -0.5."""
+        """Return the intrinsics of the same field of view at another resolution."""
+        # pixel (0, 0) is centred on (0, 0), so the image's edge, which must stay, is at -0.5
         sx, sy = width / self.width, height / self.height
         ppx, ppy = (self.ppx + 0.5) * sx - 0.5, (self.ppy + 0.5) * sy - 0.5
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, ppx, ppy)
 
     @property
     def matrix(self) -> Float64:
-        """The same for OpenCV: (3, 3)."""
+        """OpenCV's camera matrix (3, 3)."""
         return np.array([[self.fx, 0.0, self.ppx], [0.0, self.fy, self.ppy], [0.0, 0.0, 1.0]])
 
     def rays(self) -> Float64:
-        """Rays (height, width, 3) in the lidar frame with unit z: a point is depth_m * ray."""
+        """Return rays (height, width, 3) in the lidar frame with unit z: a point is depth_m * ray."""
         x = (np.arange(self.width) - self.ppx) / self.fx
         y = (np.arange(self.height) - self.ppy) / self.fy
         grid_x, grid_y = np.meshgrid(x, y)

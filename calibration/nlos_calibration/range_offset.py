@@ -1,14 +1,14 @@
-"""What the lidar's depth lacks against a distance measured by hand, and what that does to the pose.
+"""Range offset of the lidar from a distance measured by tape, and its effect on the pose.
 
 Sign: true depth = the lidar's depth + offset_m, along the optical axis; the truth counts from the front glass. The tape
-goes from the point of the glass on the optical axis to the wall, along the wall's normal. The data sheet says that
-4.5 mm lie between the glass and the zero of depth, and its readers disagree about the sign: so it is measured.
+goes from the point of the glass on the optical axis to the wall, along the wall's normal. The data sheet puts 4.5 mm
+between the glass and the zero of depth, and its readers disagree about the sign: so it is measured.
 
-Two causes look alike where the wall is faced squarely, and are told apart by how flat an oblique wall looks:
-origin: the beams meet in the zero of depth, which lies offset_m before the glass. The wall is flat as it is seen; the
-    pose's origin moves along the optical axis, and the distance by offset_m x cos(facing).
+Two causes look alike where the wall is faced squarely; on an oblique wall the flatter one is right:
+origin: the beams meet in the zero of depth, which lies offset_m before the glass. The measured wall is flat; the pose's
+    origin moves along the optical axis, and the distance by offset_m x cos(facing).
 depth: the beams meet in the glass, and every depth is too short by offset_m. That bends and turns an oblique wall
-    (by 0.2 degrees at 45 degrees and 4.5 mm); corrected depths are fitted anew.
+    (by 0.2 degrees at 45 degrees and 4.5 mm); the corrected depths are fitted again.
 """
 
 from collections.abc import Callable
@@ -20,30 +20,30 @@ from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.wall import WallFit
 
 TAPE_STD_M = 0.0005
-"""Standard uncertainty of a distance read by eye."""
+"""Standard uncertainty of a tape read by eye."""
 MAX_OFFSET_M = 0.03
-"""More is a misreading."""
+"""A larger offset is a misreading."""
 AGREED_M, MAX_STEPS = 1e-6, 8
 
 Cause = Literal["origin", "depth"]
 FitWith = Callable[[float, float], WallFit]
-"""The wall with (depth_offset_m added to each depth, the pose's origin origin_m behind the zero of depth)."""
+"""Fit of the wall with (offset_m added to each depth, the pose's origin origin_m behind the zero of depth)."""
 
 
 @dataclass(frozen=True)
 class TapedWall:
-    """A wall whose distance was measured by hand, and what that says about the lidar."""
+    """A wall at the distance measured by tape, and the lidar's offset that follows from it."""
 
     fit: WallFit
-    """Its distance is the tape's, and so is that uncertainty."""
+    """Wall with the tape's distance and the tape's uncertainty."""
     offset_m: float
-    """To be added to the lidar's depth."""
+    """Length to add to the lidar's depth."""
     offset_std_m: float
     cause: Cause
 
 
 def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
-    """The offset with which the wall is at `tape_m`, as the cause that lets the wall look flatter.
+    """Find the offset that puts the wall at `tape_m`, with the cause that makes the wall flatter.
 
     Raises CalibrationError where tape and lidar cannot both be right.
     """
@@ -52,8 +52,9 @@ def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
     origin_m = (tape_m - plain.distance_m) / axis_share
     if abs(origin_m) > MAX_OFFSET_M:
         raise CalibrationError(
-            f"the tape says {tape_m:.4f} m and the lidar {plain.distance_m:.4f} m: no offset of the lidar is "
-            f"{abs(origin_m) * 1e3:.0f} mm; measure from the front glass to the wall, along the wall's normal",
+            f"the tape reads {tape_m * 1e3:.1f} mm and the lidar {plain.distance_m * 1e3:.1f} mm, an offset of "
+            f"{abs(origin_m) * 1e3:.0f} mm ({MAX_OFFSET_M * 1e3:.0f} mm allowed): measure from the front glass to the "
+            "wall, along the wall's normal",
         )
     moved = _taped(fit_with(0.0, origin_m), origin_m, axis_share, "origin")
     corrected = _corrected(fit_with, plain, origin_m, tape_m)
@@ -61,7 +62,7 @@ def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
 
 
 def _corrected(fit_with: FitWith, plain: WallFit, offset_m: float, tape_m: float) -> TapedWall | None:
-    """The wall with all depths corrected, by secants; None where no correction leaves a wall at `tape_m`."""
+    """Solve distance(offset) = tape_m by the secant method; None where no correction leaves a wall there."""
     before, step_m = plain, offset_m
     for _ in range(MAX_STEPS):
         try:
@@ -79,6 +80,7 @@ def _corrected(fit_with: FitWith, plain: WallFit, offset_m: float, tape_m: float
 
 
 def _taped(fit: WallFit, offset_m: float, effect: float, cause: Cause) -> TapedWall:
-    """`effect` is by how much the distance changes with the offset."""
+    """Return the result; `effect` is the change of distance per change of offset."""
+    # offset = (tape - distance) / effect, so the two independent uncertainties add in squares and divide by the effect
     std_m = hypot(TAPE_STD_M, fit.distance_std_m) / effect
     return TapedWall(replace(fit, distance_std_m=TAPE_STD_M), offset_m, std_m, cause)

@@ -1,4 +1,4 @@
-"""The bare wall as the lidar sees it: mean and spread of every pixel and map cell over many frames, and their file."""
+"""Bare-wall reference: mean and spread of every pixel and map cell over many frames, and the file that holds them."""
 
 import hashlib
 import json
@@ -11,25 +11,26 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos_calibration.arrays import Float32, Float64
+from nlos_calibration.arrays import Float32, Float64, Mask, UInt8
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.noise import DepthMean
 from nlos_calibration.rig_check import MAP_SHAPE
 
 FULL_SCALE = 255
-"""IR counts that say no more than that there was too much light."""
+"""IR counts of a saturated pixel."""
 
 
 class Moments:
-    """Streaming mean and spread of arrays of one shape; NaN is no sample."""
+    """Streaming mean and standard deviation of arrays of one shape, ignoring NaN. One thread."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self.count = np.zeros(shape, np.int64)
         self._mean, self._squares = np.zeros(shape), np.zeros(shape)
 
     def add(self, values: NDArray[Any]) -> None:
-        """Take one array of the shape in (Welford's update: no cancellation, whatever the offset)."""
+        """Add one array of the shape."""
+        # Welford's update (1962): the sum of squares grows by (x - old mean) (x - new mean), free of cancellation
         known = np.isfinite(values)
         self.count += known
         off = np.where(known, values - self._mean, 0.0)
@@ -37,31 +38,31 @@ class Moments:
         self._squares += off * np.where(known, values - self._mean, 0.0)
 
     def mean(self) -> Float64:
-        """NaN where there was no sample."""
+        """Return the mean; NaN without a sample."""
         return np.where(self.count > 0, self._mean, np.nan)
 
     def spread(self) -> Float64:
-        """The standard deviation of a sample; NaN where there are fewer than two."""
+        """Return the standard deviation of a sample; NaN with fewer than two."""
         return np.sqrt(self._squares / np.where(self.count > 1, self.count - 1.0, np.nan))
 
 
 @dataclass(frozen=True, eq=False)
 class BareWall:
-    """What the lidar gives of a bench with nothing hidden: the reference that difference maps are formed from."""
+    """Statistics of the lidar's frames with nothing hidden: the reference that difference maps are formed from."""
 
     depth_m: Float32
     """(height, width); the mean, NaN where fewer than half of the frames had a return."""
     depth_std_m: Float32
-    """(height, width); of one sample, as all *_std are; NaN where there are fewer than two."""
+    """(height, width); of one sample, like all *_std; NaN where there are fewer than two."""
     ir: Float32
     """(height, width); in counts."""
     ir_std: Float32
     saturated: Float32
     """(height, width); share of the frames in which the IR was at its full scale."""
-    inliers: NDArray[np.bool_]
-    """(height, width); the pixels that the wall's plane rests on."""
+    inliers: Mask
+    """(height, width); pixels of the wall's plane fit."""
     map_depth_m: Float32
-    """(64, 80); of the maps, as all map_*; NaN where no frame had a return in the cell."""
+    """(64, 80), like all map_*; NaN where no frame had a return in the cell."""
     map_depth_std_m: Float32
     map_intensity: Float32
     """NaN, like the depth, where no frame had a return."""
@@ -70,11 +71,11 @@ class BareWall:
     intrinsics: Intrinsics
     serial: str = ""
     settings: Mapping[str, float] = field(default_factory=dict[str, float])
-    """The device's options as read back when streaming began."""
+    """Device options as read back when streaming began."""
     celsius: Mapping[str, float] = field(default_factory=dict[str, float])
-    """Mean temperatures by the SDK's name; empty where the device tells none."""
+    """Mean temperatures by the SDK's name; empty where the device reports none."""
     celsius_span: Mapping[str, float] = field(default_factory=dict[str, float])
-    """By how much each rose or fell meanwhile."""
+    """Maximum less minimum of each temperature during the measurement."""
 
 
 ARRAYS = [known.name for known in fields(BareWall)][:10]
@@ -82,45 +83,40 @@ FACTS = [known.name for known in fields(BareWall)][10:]
 
 
 class BareWallStatistics:
-    """Collects a BareWall from frames; holds maps of sums, not the frames."""
+    """Collector of a BareWall from frames. Holds maps of sums, not the frames; one thread."""
 
     def __init__(self, intrinsics: Intrinsics) -> None:
         shape = intrinsics.height, intrinsics.width
         self.depth = DepthMean(*shape)
-        """What the wall's plane is fitted to."""
+        """Mean depth, which the wall's plane is fitted to."""
         self._intrinsics = intrinsics
         self._ir, self._saturated = Moments(shape), np.zeros(shape)
         self._map_depth, self._map_intensity = Moments(MAP_SHAPE), Moments(MAP_SHAPE)
-        self._celsius: list[Mapping[str, float]] = []
+        self._celsius: dict[str, list[float]] = {}
 
-    def add(self, depth_m: Float32, ir: NDArray[np.uint8], map_depth_m: Float32, map_intensity: Float32) -> None:
-        """Take one frame (height, width) and its maps (64, 80) in."""
+    def add(self, depth_m: Float32, ir: UInt8, map_depth_m: Float32, map_intensity: Float32) -> None:
+        """Add one frame (height, width) and its maps (64, 80)."""
         self.depth.add(depth_m)
         self._ir.add(ir)
         self._saturated += ir == FULL_SCALE
         self._map_depth.add(map_depth_m)
         self._map_intensity.add(np.where(np.isfinite(map_depth_m), map_intensity, np.nan))
 
-    def look_at(self, celsius: Mapping[str, float]) -> None:
-        """Take one reading of the device's temperatures in; an empty one says nothing."""
-        if celsius:
-            self._celsius.append(dict(celsius))
+    def add_temperatures(self, celsius: Mapping[str, float]) -> None:
+        """Add one reading of the device's temperatures, by the SDK's name; may be empty."""
+        for name, value in celsius.items():
+            self._celsius.setdefault(name, []).append(value)
 
     def ir_mean(self) -> Float64:
-        """(height, width), in counts; NaN before the first frame."""
+        """Return the mean infrared (height, width) in counts; NaN before the first frame."""
         return self._ir.mean()
 
     def celsius(self) -> dict[str, float]:
-        """The mean of each thermometer's readings."""
-        return {name: float(np.mean(values)) for name, values in self._series().items()}
+        """Return the mean of each thermometer's readings."""
+        return {name: float(np.mean(values)) for name, values in sorted(self._celsius.items())}
 
-    def _series(self) -> dict[str, list[float]]:
-        names = sorted(set[str]().union(*self._celsius))
-        return {name: [look[name] for look in self._celsius if name in look] for name in names}
-
-    def reference(self, inliers: NDArray[np.bool_], *, serial: str, settings: Mapping[str, float]) -> BareWall:
-        """What was collected, with the pixels that the wall's plane rests on."""
-        series = self._series()
+    def reference(self, inliers: Mask, *, serial: str, settings: Mapping[str, float]) -> BareWall:
+        """Return the statistics so far; `inliers` (height, width) are the pixels of the wall's plane fit."""
         statistics = {
             "depth_m": self.depth.mean_m(),
             "depth_std_m": self.depth.spread_m(),
@@ -140,7 +136,7 @@ class BareWallStatistics:
             serial=serial,
             settings=dict(settings),
             celsius=self.celsius(),
-            celsius_span={name: max(values) - min(values) for name, values in series.items()},
+            celsius_span={name: max(values) - min(values) for name, values in sorted(self._celsius.items())},
         )
 
 
@@ -154,19 +150,18 @@ def save_reference(path: Path, wall: BareWall) -> str:
 
 
 def load_reference(path: Path, sha256: str) -> BareWall:
-    """The reference that a record names. Raises RecordFileError where it is gone, damaged, or not that record's."""
+    """Read the reference that a record names. Raises RecordFileError if it is missing, damaged or another record's."""
     advice = "calibrate the wall again"
     try:
-        found = hashlib.sha256(path.read_bytes()).hexdigest()
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise RecordFileError(
-            f"the bare wall's reference {path} cannot be read ({error.strerror}): keep it beside its record, or "
-            f"{advice}",
+            f"cannot read the bare-wall reference {path} ({error.strerror}): keep it beside its record, or {advice}",
         ) from error
-    if found != sha256:
+    if digest != sha256:
         raise RecordFileError(
-            f"{path} is not the reference that the record was written with (SHA-256 {found[:12]}, not {sha256[:12]}): "
-            f"put back the file that was beside it, or {advice}"
+            f"{path} is not the reference that the record was written with (SHA-256 {digest[:12]}, not {sha256[:12]}): "
+            f"restore the original file, or {advice}"
         )
     try:
         with np.load(path) as file:
@@ -174,4 +169,4 @@ def load_reference(path: Path, sha256: str) -> BareWall:
             arrays = {name: file[name] for name in ARRAYS}
         return BareWall(**arrays, **(facts | {"intrinsics": Intrinsics(**facts["intrinsics"])}))
     except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
-        raise RecordFileError(f"{path} is no reference of a bare wall ({error}): {advice}") from error
+        raise RecordFileError(f"{path} is not a bare-wall reference ({error}): {advice}") from error

@@ -1,4 +1,4 @@
-"""A rig: lidar pose and intrinsics, wall, occluder, object box, device constants. One validated TOML record."""
+"""Rig record: lidar pose and intrinsics, wall, occluder, object box and device constants, as validated TOML."""
 
 import hashlib
 import tomllib
@@ -23,7 +23,7 @@ R = TypeVar("R", bound=BaseModel)
 
 
 class Record(BaseModel):
-    """A frozen record that refuses fields it does not know."""
+    """Frozen record that rejects unknown fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -44,7 +44,7 @@ class Extent(Record):
 
 
 class ObjectBox(Extent):
-    """The box that hidden objects live in: an extent, and the depths that v = 1 (near) and v = 0.1 (far) mean."""
+    """Box that holds the hidden object: an extent, and the depths of v = 1 (near) and v = 0.1 (far)."""
 
     z_near_m: Positive
     z_far_m: Positive
@@ -57,29 +57,29 @@ class ObjectBox(Extent):
 
 
 class Occluder(Record):
-    """The half plane x = x_m, z >= z_min_m, endless in y, that hides the object from the lidar."""
+    """Half plane x = x_m, z >= z_min_m, endless in y, that hides the object from the lidar."""
 
     x_m: Finite
     z_min_m: Positive
 
 
 class OccluderRecord(Record):
-    """The occluder as it was found, or as somebody says it stands; `rig.occluder` is its half plane."""
+    """The occluder as detected or as entered by hand; `rig.occluder` is its half plane."""
 
     source: Literal["detected", "entered"]
     x_m: Finite
-    """Wall x of its edge."""
+    """Wall x of the edge."""
     gap_m: Positive
-    """Between its edge and the wall: the aperture."""
+    """Distance from the edge to the wall: the aperture."""
     x_std_m: NotNegative | None = None
-    """None, as gap_std_m and tilt_deg, where it was entered."""
+    """None, like gap_std_m and tilt_deg, if entered by hand."""
     gap_std_m: NotNegative | None = None
     tilt_deg: Finite | None = None
-    """Of its sheet against the plane x = x_m, about wall y; positive leans away from the lidar's foot."""
+    """Tilt of the sheet against the plane x = x_m, about wall y; positive leans away from the lidar."""
 
 
 class LidarPose(Record):
-    """The lidar's pose in the wall frame. Its three numbers are all that the frame's definition leaves free."""
+    """The lidar's pose in the wall frame: the three numbers that the frame's definition leaves free."""
 
     distance_m: Positive
     yaw_deg: Annotated[float, Field(gt=-90, lt=90)]
@@ -100,18 +100,18 @@ class PinholeRecord(Record):
 
 
 class DeviceConstants(Record):
-    """What the device adds to the geometry."""
+    """Constants of the device beside its geometry."""
 
     receiver_cell_m2: Positive = 1e-4
-    """S_unit_wall of S1, a constant of the device and not of any grid."""
+    """S_unit_wall of S1, a constant of the device, independent of any grid."""
     bin_m: Positive = 0.01
     """Width of a path-length bin (S4)."""
     gate_s: Positive = 100e-9
-    """Echoes later than this are not received (S5)."""
+    """Latest echo that is received (S5)."""
 
 
 class Rig(Record):
-    """Everything about the bench but the hidden object."""
+    """The whole set-up except the hidden object."""
 
     name: str
     lidar: LidarPose
@@ -119,42 +119,42 @@ class Rig(Record):
     wall: Extent
     """The physical wall: beams that miss it give no return."""
     relay: Extent
-    """The part of the wall that third bounces are collected from: the sum of S2 runs over it."""
+    """Part of the wall that third bounces are collected from: the sum of S2 runs over it."""
     occluder: Occluder | None = None
     object_box: ObjectBox | None = None
     device: DeviceConstants = DeviceConstants()
 
     @property
     def wall_from_lidar(self) -> NDArray[np.float64]:
-        """The pose (4, 4)."""
+        """Pose (4, 4) of the lidar in the wall frame."""
         normal = normal_from_angles(radians(self.lidar.yaw_deg), radians(self.lidar.pitch_deg))
         return wall_from_plane(normal, self.lidar.distance_m)
 
     @property
     def facing_deg(self) -> float:
-        """The angle between the optical axis and the wall's normal."""
+        """Angle between the optical axis and the wall's normal."""
         return degrees(facing_angle_rad(self.wall_from_lidar))
 
     @property
     def pinhole(self) -> Intrinsics:
-        """The intrinsics of the depth stream."""
+        """Intrinsics of the depth stream."""
         return Intrinsics(**self.intrinsics.model_dump())
 
     @property
     def checksum(self) -> str:
-        """Twelve hexadecimal digits that change with any field: what datasets and weights are tied to."""
+        """Twelve hexadecimal digits that change with any field; datasets and weights store them."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:12]
 
 
 def first_problem(error: ValidationError) -> str:
-    """The first problem of a validation as one line: the field, what is wrong, the value."""
+    """Return the first problem of a validation as one line: field, problem, value."""
     problem = error.errors()[0]
     field = ".".join(str(part) for part in problem["loc"]) or "record"
     return f"{field}: {problem['msg']} (got {problem['input']!r:.80})"
 
 
 def load_rig(name_or_path: str | Path) -> Rig:
-    """A packaged rig by name (`paper-rig`, `bare-wall`), or a rig from a TOML file.
+    """Load a packaged rig by name (`paper-rig`, `bare-wall`), or a rig from a TOML file.
 
     Raises RecordFileError where it cannot be read.
     """
@@ -163,18 +163,20 @@ def load_rig(name_or_path: str | Path) -> Rig:
     return read_record(source, Rig, "rig", "give a packaged name (paper-rig) or a file")
 
 
-def read_record(source: Traversable, model: type[R], what: str, advice: str) -> R:
-    """A validated record from a TOML file. Raises RecordFileError, with `advice` where there is no such file."""
+def read_record(source: Traversable, model: type[R], kind: str, advice: str) -> R:
+    """Read a validated record from a TOML file. Raises RecordFileError, with `advice` if there is no such file."""
     try:
         return model.model_validate(tomllib.loads(source.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
-        raise RecordFileError(f"no {what} {source}: {advice}") from error
+        raise RecordFileError(f"no {kind} {source}: {advice}") from error
     except ValidationError as error:
-        raise RecordFileError(f"{source} is not a {what}: {first_problem(error)}") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise RecordFileError(f"{source} cannot be read as TOML: {error}") from error
+        raise RecordFileError(f"{source} is not a {kind}: {first_problem(error)}") from error
+    except UnicodeDecodeError as error:
+        raise RecordFileError(f"{source} is a binary file, not a TOML {kind}: {advice}") from error
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise RecordFileError(f"{source} cannot be read as TOML ({error}): {advice}") from error
 
 
 def dump_toml(record: BaseModel) -> str:
-    """Any record as TOML text; fields that are None are left out, since TOML has no null."""
+    """Return a record as TOML text; fields that are None are omitted, since TOML has no null."""
     return tomli_w.dumps(record.model_dump(mode="json", exclude_none=True))

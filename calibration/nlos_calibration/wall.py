@@ -1,8 +1,7 @@
-"""The bare wall from the mean of depth frames: a plane, a pose, their uncertainty, a verdict; or a refusal.
+"""Wall measurement from the mean of depth frames: plane, pose, uncertainty and a verdict; or a refusal with its reason.
 
-From distance, angle and flatness to a verdict, with what to move and by how much; or a refusal.
-
-What a plane's slopes say about distance and angles, and how surely: first-order propagation of their covariance.
+Uncertainties of distance and angles are propagated to first order from the covariance of the plane's slopes. The
+verdict compares distance, angle and flatness with the paper's ranges, and advises by how much to move.
 """
 
 from dataclasses import dataclass, field, replace
@@ -12,24 +11,31 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos_calibration.arrays import Float64
+from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.flatness import SURE_SIGMAS, Flatness, block_sums, flatness, ripples
-from nlos_calibration.geometry import Intrinsics, angles_from_normal, wall_from_plane
+from nlos_calibration.geometry import (
+    Intrinsics,
+    angles_from_normal,
+    plane_from_slopes,
+    plane_gradients,
+    propagated_std,
+    wall_from_plane,
+)
 from nlos_calibration.noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
 from nlos_calibration.plane import GATE_SIGMAS, fit_depth, plane_depth_m
 
 Verdict = Literal["good", "out of range", "doubtful"]
-"""Doubtful: the plane itself may be off by more than `TOLERANCE_M` or `TOLERANCE_DEG`, and the depth cannot tell."""
+"""Doubtful: the plane may be off by more than `TOLERANCE_M` or `TOLERANCE_DEG`, and the depth alone cannot decide."""
 
 DISTANCE_RANGE_M, FACING_RANGE_DEG = (0.15, 0.30), (15.0, 75.0)
 """The paper's ranges (SI 1)."""
 TOLERANCE_M, TOLERANCE_DEG = 0.001, 0.2
-"""What the measurement may err by: a wall on the edge of a range is in it, a bend that shifts it by less is none."""
+"""Tolerated error: a wall on the edge of a range is inside, a smaller shift by a bend is ignored."""
 DOUBTED_TOLERANCES, REFUSED_TOLERANCES = 0.7, 5.0
-"""A wall is refused whose halves differ from the whole by this much: 5 mm or 1 degree (a bend of 2 degrees). Less could
-also be ripples of the lidar, 1 or 2 mm high and as wide as half the view: those are told, not refused. It is doubted
-from somewhat less than a tolerance on, since a half that bends itself says too little."""
+"""Difference between half of the view and the whole, in tolerances. From the second on (5 mm or 1 degree, a bend of 2
+degrees) the wall is refused; less could also be ripples of the lidar, 1 or 2 mm high and half a view wide, which are
+only reported. Doubt begins below one tolerance, since a half that bends itself shows too little."""
 DOUBTED_RIPPLE_M, MAX_RIPPLE_M = 0.0009, 0.002
 """RMS normal to the wall. The L515's ripples are a millimetre or two high; two panes 2 mm apart are 1 mm off a plane
 between them."""
@@ -37,22 +43,22 @@ WARN_RIPPLE_M, WARN_NOISE_SCALE = 0.0003, 2.0
 
 
 def check_flat(flat: Flatness, ripple_m: float) -> None:
-    """Refuse a wall that surely bends, curves or steps, unless an offset of the lidar's range explains it."""
+    """Refuse a wall that surely bends, curves or steps, unless a range offset of the lidar explains it."""
     sure_m, sure_deg = flat.bend_m - SURE_SIGMAS * flat.bend_std_m, flat.bend_deg - SURE_SIGMAS * flat.bend_std_deg
     if _tolerances(sure_m, sure_deg) > REFUSED_TOLERANCES and not _explained_by_offset(flat):
         raise WallRefusedError(
             f"the wall is not one flat wall: half of the view differs from the whole by {_amounts(flat)}, as of a "
-            "bend, a curve or a step; take a flat wall, or move so that only one is in view",
+            "bend, a curve or a step; use a flat wall, or move so that only one is in view",
         )
     if ripple_m > MAX_RIPPLE_M:
         raise WallRefusedError(
             f"the wall is not flat: parts are {ripple_m * 1e3:.1f} mm RMS off the plane, {MAX_RIPPLE_M * 1e3:.1f} "
-            "mm allowed; take a flat, matt wall and let the lidar warm up",
+            "mm allowed; use a flat, matt wall and let the lidar warm up",
         )
 
 
 def judge(distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float) -> tuple[Verdict, str]:
-    """The verdict, and one sentence: what it rests on, or what to do."""
+    """Return the verdict, and one sentence with its reason or the remedy."""
     doubts = _doubts(flat, ripple_m)
     if not doubts:
         return range_verdict(distance_m, facing_deg)
@@ -60,20 +66,20 @@ def judge(distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float)
 
 
 def range_verdict(distance_m: float, facing_deg: float) -> tuple[Verdict, str]:
-    """The verdict on a plane that is not in doubt."""
+    """Return verdict and reason for a plane that is not in doubt."""
     if problems := out_of_range(distance_m, facing_deg):
         return "out of range", "; ".join(problems)
     return "good", "distance and angle are inside the paper's ranges"
 
 
 def warnings(ripple_m: float, noise_scale: float) -> tuple[str, ...]:
-    """What does not change the verdict but should be known."""
-    told: list[str] = []
+    """Return remarks on ripples and noise that leave the verdict unchanged."""
+    lines: list[str] = []
     if ripple_m > WARN_RIPPLE_M:
-        told.append(f"the depth has ripples of {ripple_m * 1e3:.1f} mm RMS: the uncertainties allow for them")
+        lines.append(f"the depth has ripples of {ripple_m * 1e3:.1f} mm RMS: the uncertainties include them")
     if noise_scale > WARN_NOISE_SCALE:
-        told.append(f"depth is {noise_scale:.1f} times as noisy as the lidar's should be: warm it up, dim the light")
-    return tuple(told)
+        lines.append(f"depth is {noise_scale:.1f} times as noisy as nominal: let the lidar warm up, dim the light")
+    return tuple(lines)
 
 
 def _tolerances(bend_m: float, bend_deg: float) -> float:
@@ -89,46 +95,45 @@ def _amounts(flat: Flatness) -> str:
 
 
 def _doubts(flat: Flatness, ripple_m: float) -> list[str]:
-    """Why the plane may be another than the wall's."""
+    """Return the reason why the fitted plane may not be the wall's; empty if there is none."""
     bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTED_TOLERANCES
     if bent and _explained_by_offset(flat):
-        why = f"the depths look as if {flat.offset_m * 1e3:+.1f} mm were missing from each (or the wall is curved): "
+        why = f"a range offset of {flat.offset_m * 1e3:+.1f} mm would make the wall flat (or the wall is curved): "
         return [why + "measure the distance with a tape and give it with --tape-m"]
     if ripple_m > DOUBTED_RIPPLE_M:
         why = f"parts of the wall are {ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the lidar, or a wall "
-        return [why + "that is not flat; take a flat, matt wall and let the lidar warm up"]
+        return [why + "that is not flat; use a flat, matt wall and let the lidar warm up"]
     if not bent:
         return []
     if flat.bend_m <= SURE_SIGMAS * flat.bend_std_m and flat.bend_deg <= SURE_SIGMAS * flat.bend_std_deg:
         return [f"noise leaves {_amounts(flat)} between half of the view and the whole: average more frames"]
     why = f"half of the view differs from the whole by {_amounts(flat)}: a bent wall, or ripples of the lidar; "
-    return [why + "take a flat wall and let the lidar warm up"]
+    return [why + "use a flat wall and let the lidar warm up"]
 
 
 def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
-    """What is out of the paper's ranges, each with what to do."""
+    """Return a line for each of distance and angle that is outside the paper's ranges, with the move that cures it."""
     problems: list[str] = []
     low, high = DISTANCE_RANGE_M
     if not low - TOLERANCE_M <= distance_m <= high + TOLERANCE_M:
-        away = at_least(100.0 * (low - distance_m)), "back"
-        move = away if distance_m < low else (at_least(100.0 * (distance_m - high)), "closer")
+        excess_m, way = (low - distance_m, "back") if distance_m < low else (distance_m - high, "closer")
         problems.append(
-            f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar {move[0]} cm {move[1]}"
+            f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar {at_least(100.0 * excess_m)} cm "
+            f"{way}"
         )
     low, high = FACING_RANGE_DEG
     if not low - TOLERANCE_DEG <= facing_deg <= high + TOLERANCE_DEG:
-        aside = at_least(low - facing_deg), "aside"
-        turn = aside if facing_deg < low else (at_least(facing_deg - high), "towards the wall")
-        plural = "" if turn[0] == 1 else "s"
+        excess, way = (low - facing_deg, "aside") if facing_deg < low else (facing_deg - high, "towards the wall")
+        turn = at_least(excess)
         problems.append(
-            f"{facing_deg:.1f} degrees is outside {low:.0f} to {high:.0f}: turn the lidar {turn[0]} degree{plural} "
-            f"{turn[1]}",
+            f"{facing_deg:.1f} degrees is outside {low:.0f} to {high:.0f}: turn the lidar {turn} "
+            f"degree{'s' * (turn != 1)} {way}",
         )
     return problems
 
 
 def at_least(amount: float) -> int:
-    """The whole number that suffices; what lies a thousandth above one does not ask for the next."""
+    """Return the smallest whole number from 1 on that suffices, to a thousandth."""
     return max(ceil(amount - 1e-3), 1)
 
 
@@ -151,12 +156,12 @@ class WallMeasures:
 
 
 def measures_of(slopes: Float64, covariance: Float64) -> WallMeasures:
-    """Distance and angles of `slopes` (3,) = -normal / distance_m, uncertain by `covariance` (3, 3)."""
-    distance_m = 1.0 / float(np.linalg.norm(slopes))
-    normal = -slopes * distance_m
-    # a change of the slopes moves the distance along the normal and turns the normal across it
-    along, across = distance_m**2 * normal, -distance_m * (np.eye(3) - np.outer(normal, normal))
+    """Return distance and angles of `slopes` (3,) = -normal / distance_m with covariance (3, 3)."""
+    normal, distance_m = plane_from_slopes(slopes)
+    along, across = plane_gradients(normal, distance_m)
     turn = across @ covariance @ across.T
+    # yaw = atan2(x, -z) has the gradient (-z, 0, x) / (x^2 + z^2) over the normal, pitch = asin(-y) that of
+    # -y / sqrt(1 - y^2) = -y / sqrt(x^2 + z^2)
     x, z = normal[0], normal[2]
     level = x**2 + z**2
     yaw_rad, pitch_rad = angles_from_normal(normal)
@@ -165,80 +170,75 @@ def measures_of(slopes: Float64, covariance: Float64) -> WallMeasures:
         yaw_deg=degrees(yaw_rad),
         pitch_deg=degrees(pitch_rad),
         facing_deg=degrees(_facing_rad(normal)),
-        distance_std_m=_std(along, covariance),
-        yaw_std_deg=degrees(_std(np.array([-z, 0.0, x]) / level, turn)),
-        pitch_std_deg=degrees(_std(np.array([0.0, -1.0, 0.0]) / sqrt(level), turn)),
+        distance_std_m=propagated_std(along, covariance),
+        yaw_std_deg=degrees(propagated_std(np.array([-z, 0.0, x]) / level, turn)),
+        pitch_std_deg=degrees(propagated_std(np.array([0.0, -1.0, 0.0]) / sqrt(level), turn)),
         facing_std_deg=degrees(_facing_std_rad(normal, turn)),
     )
 
 
 def _facing_rad(normal: Float64) -> float:
-    """By the tangent: the cosine says nothing about small angles."""
+    """Return the facing angle by its tangent, which unlike the cosine resolves small angles."""
     return float(np.arctan2(np.hypot(normal[0], normal[1]), -normal[2]))
 
 
 def _facing_std_rad(normal: Float64, turn: Float64) -> float:
-    """How surely the facing angle f is known.
-
-    Turns towards the axis change it one for one. Turns aside by s change it to sqrt(f^2 + s^2): nothing while s is
-    small against f, s itself where the wall is faced squarely, s^2 / sqrt(f^2 + s^2) in between. There f is measured
-    too large by s: the least f that s allows is taken.
-    """
+    """Return the standard uncertainty of the facing angle, `turn` (3, 3) being the normal's covariance."""
+    # A turn towards the axis changes the facing angle f one for one. A turn aside by s changes it to sqrt(f^2 + s^2):
+    # by nothing while s << f, by s itself at f = 0, with the standard deviation s^2 / sqrt(f^2 + s^2) in between.
+    # There f is measured too large by about s, so the smallest f that s allows is used.
     facing_rad, sideways = _facing_rad(normal), float(np.hypot(normal[0], normal[1]))
     x, y = normal[:2] / sideways if sideways > 0.0 else (1.0, 0.0)
     towards = np.array([x * -normal[2], y * -normal[2], sideways])
     aside = np.array([-y, x, 0.0])
     variance = float(aside @ turn @ aside)
-    least_rad = max(facing_rad - 2.0 * sqrt(max(variance, 0.0)), 0.0)
-    second_order = variance**2 / (variance + least_rad**2) if variance > 0.0 else 0.0
+    smallest_rad = max(facing_rad - 2.0 * sqrt(max(variance, 0.0)), 0.0)
+    second_order = variance**2 / (variance + smallest_rad**2) if variance > 0.0 else 0.0
     return sqrt(float(towards @ turn @ towards) + second_order)
-
-
-def _std(gradient: Float64, covariance: Float64) -> float:
-    return sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 
 
 MIN_VALID_SHARE = 0.05
 STUCK_SHARE = 0.5
-"""Of depths that are one and the same: noise spreads those of a true wall, even one that is faced squarely."""
+"""Share of identical depths of a stuck lidar: noise spreads those of a true wall, even one that is faced squarely."""
 BLOCK_PIXELS, SEEN_IN_BLOCK, STRAY_IN_BLOCK = 4, 0.75, 0.875
 MAX_STRAY_SHARE = 0.05
-"""Scattered outliers are noise; blocks that stray as one are another surface or another path. At 40 % of scattered
-outliers a full block strays by chance once in 8,000, and one in which nothing else is seen counts once in 200."""
+"""Scattered outliers are noise; blocks that stray together are another surface or another light path. At 40 % of
+scattered outliers a full block strays by chance once in 8,000, and one where the wall itself gives no return once in
+200."""
 
 
 @dataclass(frozen=True)
 class WallFit(WallMeasures):
-    """Where the wall is, how surely, how well the depth says so, and whether the paper's method works from there.
+    """Measured wall: pose, uncertainty, quality of the depth, and whether the paper's method works from there.
 
-    The standard uncertainties (*_std) allow for noise and for ripples that show in the residuals. They do not know of
-    what every depth has in common: that is `range_offset`'s.
+    The standard uncertainties (*_std) include noise and ripples visible in the residuals, but no error that all depths
+    share: for that see `range_offset`.
     """
 
     wall_from_lidar: Float64
     """(4, 4)."""
     covariance: Float64 = field(repr=False)
-    """(3, 3) of -normal / distance, as seen from the zero of depth."""
+    """(3, 3) of -normal / distance, with the distance from the zero of depth."""
     residual_m: float
     """RMS distance of the inliers from the plane."""
     noise_scale: float
-    """The noise of a depth sample over the lidar's nominal: by its spread over frames; of one frame by residuals."""
+    """Noise of a depth sample over nominal: from the spread over frames; for one frame from the residuals."""
     inlier_fraction: float
-    inliers: NDArray[np.bool_] = field(repr=False)
-    """(height, width); which pixels the plane rests on."""
+    inliers: Mask = field(repr=False)
+    """(height, width); pixels of the plane fit."""
     ripple_m: float
-    """RMS of the deviation of parts of the wall from the plane, beyond noise."""
+    """RMS deviation of parts of the wall from the plane, beyond noise."""
     bend_m: float
     bend_deg: float
-    """By how much a plane through half of the view differs from that through the whole."""
+    """Largest difference between planes through half of the view and through the whole."""
     verdict: Verdict
     advice: str
-    """One sentence: what the verdict rests on, or what to do."""
+    """One sentence: the reason for the verdict, or the remedy."""
     warnings: tuple[str, ...]
 
 
 def wall_depth(wall_from_lidar: Float64, intrinsics: Intrinsics) -> Float64:
-    """The depth (height, width) that a bare, endless wall gives; inf where a beam never meets it."""
+    """Return the depth (height, width) in metres of a bare, endless wall; inf where a beam never meets it."""
     away = -(intrinsics.rays() @ wall_from_lidar[2, :3])
     depth_m = np.full(away.shape, np.inf)
     return np.divide(wall_from_lidar[2, 3], away, out=depth_m, where=away > 0.0)
@@ -251,9 +251,9 @@ def fit_wall(
     noise: MeanNoise | None = None,
     origin_m: float = 0.0,
 ) -> WallFit:
-    """Measure the wall from a mean depth map (height, width); NaN, infinite or not positive is no return.
+    """Measure the wall from a mean depth map (height, width); NaN, infinite and non-positive depths are no return.
 
-    `noise` is that of the flattened map (`DepthMean.noise`), of one frame where it is not given. The pose is of a point
+    `noise` is that of the flattened map (`DepthMean.noise`), by default of one frame. The pose is that of a point
     `origin_m` behind the zero of depth on the optical axis (`range_offset`). Raises WallRefusedError where the depth is
     not that of one bare, flat wall.
     """
@@ -288,7 +288,7 @@ def fit_wall(
 
 
 def _check_depth(depth_m: Float64) -> None:
-    """Refuse a map that is nearly empty, or that says the same everywhere."""
+    """Raise WallRefusedError for a map that is nearly empty or constant."""
     valid_m = depth_m[np.isfinite(depth_m)]
     share = len(valid_m) / depth_m.size
     if share < MIN_VALID_SHARE:
@@ -300,25 +300,25 @@ def _check_depth(depth_m: Float64) -> None:
     if times.max() >= STUCK_SHARE * len(some_m):
         raise WallRefusedError(
             f"{times.max() / len(some_m):.0%} of the view reads {values_m[times.argmax()]:.5f} m, as if the lidar were "
-            "stuck: start it again",
+            "stuck: restart it",
         )
 
 
 def _check_one_surface(depth_m: Float64, expected_m: Float64) -> None:
-    """Refuse a map in which blocks of pixels stray from the wall together (NaN in `depth_m` is neither)."""
+    """Raise WallRefusedError for a map in which blocks of pixels stray from the wall together; NaN is ignored."""
     gate_m = GATE_SIGMAS * depth_noise_m(depth_m)
     valid = np.isfinite(depth_m)
     behind = valid & (depth_m - expected_m > gate_m)
     before = valid & (expected_m - depth_m > gate_m)
-    seen, behind_seen, before_seen = (block_sums(mask, BLOCK_PIXELS) for mask in (valid, behind, before))
-    blocks = seen >= SEEN_IN_BLOCK * BLOCK_PIXELS**2
+    returns, returns_behind, returns_before = (block_sums(mask, BLOCK_PIXELS) for mask in (valid, behind, before))
+    blocks = returns >= SEEN_IN_BLOCK * BLOCK_PIXELS**2
     total = max(int(blocks.sum()), 1)
-    stray = blocks & (behind_seen + before_seen >= STRAY_IN_BLOCK * seen)
+    stray = blocks & (returns_behind + returns_before >= STRAY_IN_BLOCK * returns)
     if stray.sum() <= MAX_STRAY_SHARE * total:
         return
-    far = (stray & (behind_seen >= before_seen)).sum() / total
+    far = (stray & (returns_behind >= returns_before)).sum() / total
     near = stray.sum() / total - far
     raise WallRefusedError(
-        f"the depth is not a bare wall's: {far:.0%} of the view is behind the wall's plane (light that went by way of "
-        f"a hidden object?), {near:.0%} in front of it (an occluder?): take away whatever stands before the wall",
+        f"this does not look like a bare wall: {far:.0%} of the view is behind the wall's plane (light by way of a "
+        f"hidden object?), {near:.0%} in front of it (an occluder?): remove everything in front of the wall",
     )

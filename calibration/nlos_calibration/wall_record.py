@@ -208,10 +208,10 @@ def points_m(record: WallRecord, depth_m: Float64, intrinsics: Intrinsics) -> Fl
     The lidar's range offset is allowed for as it is in the record's pose.
     """
     pose = wall_from_zero(record)
-    return ((depth_m[..., np.newaxis] + depth_lacks_m(record)) * intrinsics.rays()) @ pose[:3, :3].T + pose[:3, 3]
+    return ((depth_m[..., np.newaxis] + depth_offset_m(record)) * intrinsics.rays()) @ pose[:3, :3].T + pose[:3, 3]
 
 
-def depth_lacks_m(record: WallRecord) -> float:
+def depth_offset_m(record: WallRecord) -> float:
     """What is to be added to each depth before it is a point: the range offset, where depth is its cause."""
     return record.range_offset_m if record.range_offset_cause == "depth" else 0.0
 
@@ -219,5 +219,5 @@ def depth_lacks_m(record: WallRecord) -> float:
 def wall_from_zero(record: WallRecord) -> Float64:
     """The pose (4, 4) of where the beams meet: the lidar's, but that an offset of the origin is before the glass."""
     pose = np.array(record.wall_from_lidar)
-    pose[:3, 3] += (record.range_offset_m - depth_lacks_m(record)) * pose[:3, 2]
+    pose[:3, 3] += (record.range_offset_m - depth_offset_m(record)) * pose[:3, 2]
     return pose

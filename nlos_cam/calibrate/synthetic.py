@@ -417,7 +417,7 @@ class WallStream:
     def look(self, depth_m: Float64) -> None:
         """Take in a frame of these depths of the watched pixels (N,), which gets its noise here."""
         self._frame.ravel()[self.pixels] = sensed(depth_m, self._generator)
-        self.check.look(self._frame, {})
+        self.check.observe(self._frame, {})
         self.frames += 1
 
 

@@ -54,13 +54,13 @@ class CalibratedRig:
     def update_temperatures(self, celsius: Mapping[str, float]) -> None:
         """Pass one reading of the device's temperatures to the drift check."""
         if self._drift:
-            self._drift.look_at(celsius)
+            self._drift.update_temperatures(celsius)
 
     def observe(self, frame: Frame, maps: LidarMaps) -> BenchObservation:
         """Return the difference of the maps, which may be a mean over frames, and the drift up to this frame."""
         if self.reference is None or self._drift is None:
             return BenchObservation(None, self.notes)
-        self._drift.look(frame.depth_m, frame.settings)
+        self._drift.observe(frame.depth_m, frame.settings)
         difference = self._subtract_drift(subtract_reference(maps, self.reference))
         return BenchObservation(difference, self.notes + self._drift.warnings, self._drift.moved)
 

@@ -51,7 +51,7 @@ def bare_wall(frames: int = 20) -> BareWall:
         frame = wall_frame(number)
         maps = maps_from_frame(frame)
         statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
-    statistics.look_at({"ldd_temperature": 40.0})
+    statistics.add_temperatures({"ldd_temperature": 40.0})
     return statistics.reference(FIT.inliers, serial=SERIAL, settings={"laser_power": 40.0})
 
 

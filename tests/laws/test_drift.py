@@ -155,7 +155,7 @@ def test_drift_check_measures_whole_frames_with_holes() -> None:
     depth_m[:, 200:400] = np.nan
     for number in range(40):
         frame = sensed(depth_m, generator) if number % 4 else np.full_like(depth_m, np.nan)
-        check.look(frame.astype(np.float32), {})
+        check.observe(frame.astype(np.float32), {})
     assert check.drift is not None
     assert abs(check.drift.distance_m - 0.002) < SIGMAS * check.drift.distance_std_m < TOLERANCE_M
     (line,) = check.warnings

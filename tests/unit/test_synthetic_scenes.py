@@ -87,7 +87,7 @@ def test_the_scenes_rays_are_the_renderers(yaw_deg: float, pitch_deg: float, x_m
     beams = cast(rig, SMALL_PAPER)
     seen = View(rig.wall_from_lidar, SMALL_PAPER)
     depth_m = bench(seen, Sheet(x_m, gap_m)).ravel()
-    met = np.isfinite(beams.length_m) & (beams.foot_m[:, 0] < 2.0) & (np.abs(beams.foot_m[:, 1]) < 1.5)
+    met = np.isfinite(beams.length_m) & (beams.laser_spot_m[:, 0] < 2.0) & (np.abs(beams.laser_spot_m[:, 1]) < 1.5)
     np.testing.assert_allclose(depth_m[met], (beams.length_m * beams.cos_axis)[met], rtol=1e-9)
     assert (~beams.on_wall & met).any()
 

@@ -59,58 +59,58 @@ def test_settings_changed_names_settings_only(wall: BareWall, change: dict[str, 
 
 def test_drift_check_warns_of_a_changed_setting(wall: BareWall, check: DriftCheck) -> None:
     settings = dict(SETTINGS)
-    check.look(wall.depth_m, settings)
+    check.observe(wall.depth_m, settings)
     assert check.warnings == ()
     settings["laser_power"] = 40.0  # in place
-    check.look(wall.depth_m, settings)
+    check.observe(wall.depth_m, settings)
     (line,) = check.warnings
     for part in ("laser_power", "60", "40"):
         assert part in line
-    check.look(wall.depth_m, SETTINGS)
+    check.observe(wall.depth_m, SETTINGS)
     assert check.warnings == ()
 
 
 def test_drift_check_warns_of_a_temperature_beyond_tolerance(check: DriftCheck) -> None:
-    check.look_at({"ldd_temperature": 40.0 + TOLERANCE_C, "apd_temperature": 30.0})
+    check.update_temperatures({"ldd_temperature": 40.0 + TOLERANCE_C, "apd_temperature": 30.0})
     assert check.warnings == ()
-    check.look_at({"ldd_temperature": 41.0 + TOLERANCE_C})
+    check.update_temperatures({"ldd_temperature": 41.0 + TOLERANCE_C})
     (line,) = check.warnings
     for part in ("ldd_temperature", "46", "40"):
         assert part in line
-    check.look_at({"ldd_temperature": 30.0})
+    check.update_temperatures({"ldd_temperature": 30.0})
     assert "warm" in check.warnings[0]
 
 
 def test_drift_check_allows_for_the_references_own_span(check: DriftCheck) -> None:
-    check.look_at({"apd_temperature": 37.0})
+    check.update_temperatures({"apd_temperature": 37.0})
     assert check.warnings == ()
-    check.look_at({"apd_temperature": 39.0})
+    check.update_temperatures({"apd_temperature": 39.0})
     assert len(check.warnings) == 1
 
 
 def test_drift_check_temperature_warning_does_not_flicker(check: DriftCheck) -> None:
     for over_c in (0.5, -0.5) * 5:
-        check.look_at({"ldd_temperature": 40.0 + TOLERANCE_C + over_c})
+        check.update_temperatures({"ldd_temperature": 40.0 + TOLERANCE_C + over_c})
         assert len(check.warnings) == 1
-    check.look_at({"ldd_temperature": 40.0})
+    check.update_temperatures({"ldd_temperature": 40.0})
     assert check.warnings == ()
 
 
 def test_drift_check_counts_further_temperatures(check: DriftCheck) -> None:
-    check.look_at({"ldd_temperature": 80.0, "apd_temperature": 80.0})
+    check.update_temperatures({"ldd_temperature": 80.0, "apd_temperature": 80.0})
     (warning,) = check.warnings
     assert "ldd_temperature" in warning
     assert "1 more" in warning
 
 
 def test_drift_check_ignores_unknown_temperatures(check: DriftCheck) -> None:
-    check.look_at({"apd_temperature": -9999.0, "another_temperature": 99.0, "ldd_temperature": float("nan")})
+    check.update_temperatures({"apd_temperature": -9999.0, "another_temperature": 99.0, "ldd_temperature": float("nan")})
     assert check.warnings == ()
 
 
 def test_drift_check_refuses_a_frame_of_another_size(check: DriftCheck) -> None:
     with pytest.raises(CalibrationError, match=r"64 x 48 .* 32 x 24"):
-        check.look(np.zeros((48, 64), np.float32), {})
+        check.observe(np.zeros((48, 64), np.float32), {})
 
 
 @pytest.mark.parametrize("left", [0, MIN_PIXELS - 1])
@@ -119,7 +119,7 @@ def test_drift_check_warns_of_too_few_good_pixels(wall: BareWall, left: int) -> 
     inliers.flat[np.flatnonzero(wall.inliers)[:left]] = True
     check = DriftCheck(replace(wall, inliers=inliers), wall_from_lidar(POSE))
     for _ in range(40):
-        check.look(wall.depth_m, {})
+        check.observe(wall.depth_m, {})
     (line,) = check.warnings
     assert str(MIN_PIXELS) in line
     assert (check.drift, check.wall_share) == (None, 0.0)
@@ -184,6 +184,6 @@ def test_drift_is_measured_in_tolerances(drift: Drift, tolerances: float) -> Non
 
 def test_drift_text_holds_amounts_and_uncertainties() -> None:
     moved = str(replace(STILL, distance_m=0.0018, distance_std_m=0.0002, yaw_deg=-0.3, pitch_deg=0.4))
-    assert "1.80 +- 0.20 mm" in moved
-    assert "0.50 +- 0.01 degrees" in moved
-    assert "1.30 +- 0.01 mm" in str(replace(STILL, range_m=-0.0013, uniform=True))
+    assert "1.8 ± 0.2 mm" in moved
+    assert "0.50 ± 0.01°" in moved
+    assert "1.30 ± 0.01 mm" in str(replace(STILL, range_m=-0.0013, uniform=True))

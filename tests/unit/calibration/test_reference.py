@@ -23,8 +23,8 @@ def wall() -> BareWall:
         ir[0, 0], depth_m[0, 1] = 255, np.nan
         statistics.add(depth_m, ir, np.full(CELLS, 0.2, np.float32), np.full(CELLS, 45, np.float32))
     for celsius in (30.0, 32.0):
-        statistics.look_at({"ldd_temperature": celsius})
-    statistics.look_at({})
+        statistics.add_temperatures({"ldd_temperature": celsius})
+    statistics.add_temperatures({})
     return statistics.reference(np.ones(SHAPE, np.bool_), serial="f1", settings={"laser_power": 40.0})
 
 
