@@ -1,4 +1,4 @@
-"""How a laser is turned down until its returns do not saturate: the rule, without the device."""
+"""Rule for lowering a laser's power until its returns do not saturate, apart from the device."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -11,47 +11,47 @@ STRIDES = 10
 
 @dataclass(frozen=True)
 class PowerLimits:
-    """What an option of the device can be set to."""
+    """Range of an option of the device."""
 
-    least: float
-    most: float
+    min: float
+    max: float
     step: float
     """Above 0."""
 
     def nearest(self, value: float) -> float:
-        """The allowed value that is nearest."""
-        steps = round((min(max(value, self.least), self.most) - self.least) / self.step)
-        return min(self.least + steps * self.step, self.most)
+        """Return the nearest allowed value."""
+        steps = round((min(max(value, self.min), self.max) - self.min) / self.step)
+        return min(self.min + steps * self.step, self.max)
 
 
 @dataclass(frozen=True)
 class Settled:
-    """Where turning down ended."""
+    """Power at which lowering ended."""
 
     power: float
     saturated: float | None
-    """Share of infrared pixels at that power; None where no frame came to look at."""
+    """Share of saturated infrared pixels at that power; None where no frame came."""
 
 
 def weaker(power: float, limits: PowerLimits) -> Iterator[float]:
-    """Every power to try below this one, down to the weakest that is no darkness: 0 turns the laser off."""
-    weakest = limits.least if limits.least > 0 else limits.least + limits.step
-    stride = max(1, round((limits.most - limits.least) / STRIDES / limits.step)) * limits.step
+    """Yield the powers to try below this one, down to the weakest but 0, which turns the laser off."""
+    weakest = limits.min if limits.min > 0 else limits.min + limits.step
+    stride = max(1, round((limits.max - limits.min) / STRIDES / limits.step)) * limits.step
     while power > weakest:
         power = max(weakest, power - stride)
         yield power
 
 
 def turn_down(
-    power: float, limits: PowerLimits, look: Callable[[], float | None], put: Callable[[float], bool]
+    power: float, limits: PowerLimits, measure: Callable[[], float | None], put: Callable[[float], bool]
 ) -> Settled:
-    """Turn down while too much saturates, no further than that takes.
+    """Lower the power while more than MAX_SATURATED saturates, and no further.
 
-    `look` gives the share that saturates now, None where it cannot see; `put` sets a power, and whether it took.
+    `measure` returns the share that saturates now, None without frames; `put` sets a power and returns True if it held.
     """
-    saturated = look()
+    saturated = measure()
     for lower in weaker(power, limits):
         if saturated is None or saturated <= MAX_SATURATED or not put(lower):
             break
-        power, saturated = lower, look()
+        power, saturated = lower, measure()
     return Settled(power, saturated)

@@ -1,7 +1,4 @@
-"""The seam that every camera is seen through. Everything above it is ignorant of librealsense.
-
-Time as an argument.
-"""
+"""Protocols that every camera and its clock fulfil; nothing above them knows librealsense."""
 
 import time
 from collections import Counter
@@ -15,24 +12,24 @@ from nlos_cam.frames import Frame
 
 
 class Camera(Protocol):
-    """A source of Frames in SI units. Entering starts it; leaving stops it, whatever happened inside.
+    """Source of Frames in SI units, started on entering and stopped on leaving, whatever happened inside.
 
-    Leaving ends an iteration, by whichever thread; doing so again does nothing. Iterating yields frames until the
-    source ends: a recording's end is a normal end, a live camera goes on. Frames that lack a stream are counted in
-    `incomplete` and skipped; frame numbers that never came are counted in `dropped`. Numbers and timestamps rise
-    together, 30 a second, also over an outage after which the device counts anew: its numbers count as dropped.
+    Any thread may leave, which ends an iteration; leaving again has no effect. Iterating yields frames until the source
+    ends: a recording's end is a normal end, a live camera goes on. Frames without all streams are counted in
+    `incomplete` and skipped; missing frame numbers are counted in `dropped`. Numbers and timestamps rise together, 30 a
+    second, also over an outage after which the device restarts its count: the outage's numbers count as dropped.
     """
 
     uri: str
     intrinsics: Intrinsics
     rig: Rig | None
-    """The bench, where the camera knows it (a simulated one does)."""
+    """Rig geometry, where the camera knows it (a simulated one does)."""
     identity: Mapping[str, str]
-    """Of the device: name, serial, firmware, usb_type; without what it does not tell."""
+    """Name, serial, firmware and usb_type of the device, as far as it reports them."""
     incomplete: int
     dropped: int
     counts: Counter[str]
-    """What else befell it, by name, never zero: restarted, reset, replugged, and what `Pairing.counts` tells."""
+    """Other events by name, never zero: restarted, reset, replugged, and those of `FrameSynchronizer.counts`."""
 
     def __enter__(self) -> Self: ...
 
@@ -41,27 +38,27 @@ class Camera(Protocol):
     def __iter__(self) -> Iterator[Frame]: ...
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
-        """The options that can be read now, temperatures among them, by the SDK's name; empty where there are none.
+        """Return the options that can be read now, temperatures among them, by the SDK's name; empty without any.
 
-        Each costs a real device a command on its link: ask for what is needed by the `ending` of its name.
+        Each costs a real device a command on its link: limit them by the `ending` of their names.
         """
         ...
 
 
 class Clock(Protocol):
-    """What time it is, and waiting."""
+    """Time source that can also wait."""
 
     def now(self) -> float:
-        """Seconds since 1970; never goes back."""
+        """Return seconds since 1970; never goes back."""
         ...
 
     def wait(self, stop: Event, seconds: float) -> bool:
-        """Wait that long, or until `stop` is set; whether it is."""
+        """Wait for this time, or until `stop` is set; return True if it is."""
         ...
 
 
 class WallClock:
-    """The host's time of day when made, kept steady from then on."""
+    """The host's time of day at construction, advanced by its monotonic clock."""
 
     def __init__(self) -> None:
         self._zero_s = time.time() - time.monotonic()

@@ -1,14 +1,10 @@
-"""One run of a device's three streams through the SDK's sensor API, the same for every backend.
+"""One run of a device's three streams through the SDK's sensor API, for every backend, and its queue of sets."""
 
-The bounded queue between the SDK's threads, which deliver samples, and whoever iterates over a camera.
-"""
-
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from math import inf
-from threading import Condition
 from typing import Any
 
 from nlos_calibration import Intrinsics
@@ -29,16 +25,17 @@ from nlos_cam.camera.streams import (
 )
 from nlos_cam.camera.timestamps import ClockUnwrap
 from nlos_cam.frames import Frame
+from nlos_cam.threads import BoundedQueue
 
 CAPACITY = 8
 """Sets: a quarter of a second, and 10 MB at 640 x 480."""
 
 
 class SampleQueue:
-    """Pairs what the SDK's threads put, and keeps the sets until they are taken.
+    """Queue of paired samples between the SDK's threads, which `put`, and the thread that iterates over a camera.
 
-    A full inbox drops its oldest set and counts it, so that a live device never waits; a `lossless` one makes the SDK
-    wait, which holds up a recording's playback.
+    When full it drops and counts the oldest set, so that a live device never waits; a `lossless` one makes the SDK
+    wait, which pauses the playback of a recording. `on_set` is called on an SDK thread with every set.
     """
 
     def __init__(self, *, lossless: bool, on_set: Callable[[FrameSet], None] | None = None) -> None:
@@ -47,99 +44,78 @@ class SampleQueue:
         self._lossless, self._on_set = lossless, on_set
         self._pairing = FrameSynchronizer()
         self._evicted = 0
-        self._sets: deque[FrameSet] = deque()
-        self._changed = Condition()
-        self.closed = False
-        self._finished = False
-        self._failure: Exception | None = None
+        self._sets = BoundedQueue[FrameSet](CAPACITY)
 
     @property
     def incomplete(self) -> int:
-        """Sets that lacked a stream."""
+        """Sets without all streams."""
         return self._pairing.incomplete
 
     @property
     def dropped(self) -> int:
-        """Sets that never came, or that nobody took in time."""
+        """Sets that never came, or were not taken in time."""
         return self._pairing.dropped + self._evicted
 
     @property
     def counts(self) -> Counter[str]:
-        """What else the pairing saw, by name."""
-        with self._changed:
+        """Other events of the pairing, by name."""
+        with self._sets.changed:
             return Counter(self._pairing.counts)
 
     @property
+    def closed(self) -> bool:
+        """True once the consumer has left."""
+        return self._sets.closed
+
+    @property
     def ended(self) -> bool:
-        """Whether nothing is left to take, and nothing will come."""
-        return (self._finished or self.closed) and not self._sets
+        """True once no set is left and none will come."""
+        return self._sets.ended
 
     def expect(self, shape: tuple[int, int]) -> None:
-        """Take only samples of this shape (rows, columns) for good ones."""
+        """Reject samples of any other shape (rows, columns)."""
         self._pairing.shape = shape
 
     def put(self, sample: Sample) -> None:
-        """Take a sample from an SDK thread."""
-        with self._changed:
-            self._changed.wait_for(self._has_room)
-            if self.closed or self._finished:
+        """Pair a sample, on an SDK thread."""
+        with self._sets.changed:
+            if self._lossless:
+                self._sets.wait_for_room()
+            if self._sets.closed or self._sets.finished:
                 return
             self.arrived[sample.stream] += 1
             complete = self._pairing.add(sample)
             if complete is None:
                 return
-            self._sets.append(complete)
-            if len(self._sets) > CAPACITY and not self._lossless:
-                self._sets.popleft()
-                self._evicted += 1
-            self._changed.notify_all()
+            self._evicted += self._sets.put(complete) is not None
         if self._on_set:
             self._on_set(complete)
 
-    def _has_room(self) -> bool:
-        return not self._lossless or len(self._sets) < CAPACITY or self._finished or self.closed
-
     def take(self, timeout_s: float) -> FrameSet | None:
-        """The oldest set; None when none came in time or `ended`. Raises what `fail` was given."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._sets or self._finished or self.closed, timeout_s)
-            if self._sets:
-                self._changed.notify_all()
-                return self._sets.popleft()
-            if self._failure and not self.closed:
-                raise self._failure
-            return None
+        """Return the oldest set; None after the timeout or once `ended`. Raises the error given to `finish`."""
+        return self._sets.take(timeout_s)
 
-    def finish(self) -> None:
-        """Nothing more will come; what is here can still be taken."""
-        with self._changed:
-            self._finished = True
-            if self._lossless:  # a live device is left in the middle of a set; a recording's end is the end
+    def finish(self, error: Exception | None = None) -> None:
+        """Accept no more samples, optionally because of an error; sets that wait can still be taken."""
+        with self._sets.changed:
+            self._sets.finish(error)
+            if self._lossless:  # half a set is a loss at a recording's end, but normal when a live device is left
                 self._pairing.finish()
-            self._changed.notify_all()
-
-    def fail(self, error: Exception) -> None:
-        """Nothing more will come, because of this error."""
-        self._failure = error
-        self.finish()
 
     def close(self) -> None:
-        """Nobody will take any more: let go of everybody who waits."""
-        with self._changed:
-            self.closed = True
-            self._sets.clear()
-            self._changed.notify_all()
+        """Discard all sets and wake every thread that waits."""
+        self._sets.close()
 
 
 Size = tuple[int, int]
 """Width and height in pixels."""
 NOT_YET = -9999.0
-"""A temperature that the firmware has not measured yet: the photodiode's, until 5 s after the start."""
+"""Reading of a temperature not measured yet: the photodiode's, until 5 s after the start."""
 BOUNDARY_WAIT_S = 0.2
 
 
 def find_streams(device: Any, size: Size | None = None) -> tuple[Any, dict[str, Any]]:
-    """The sensor that offers most of the needed streams, and their profiles; at `size` and 30 frames/s, if given."""
+    """Return the sensor with most of the needed streams, and their profiles; at `size` and 30 frames/s, if given."""
     best: tuple[Any, dict[str, Any]] = (None, {})
     for sensor in device.query_sensors():
         profiles = [profile for profile in sensor.get_stream_profiles() if is_needed(profile)]
@@ -154,7 +130,7 @@ def _has(profile: Any, size: Size) -> bool:
 
 
 def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
-    """Every option with such a name that the sensor lets be read, by the SDK's name; empty when it is gone."""
+    """Return every readable option whose name ends so, by the SDK's name; empty when the sensor is gone."""
     settings: dict[str, float] = {}
     for option in sensor.get_supported_options():
         if not option.name.endswith(ending):
@@ -169,12 +145,15 @@ def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
 def _depth_unit_m(sensor: Any) -> float:
     settings = read_settings(sensor)
     if "depth_units" not in settings:
-        raise RuntimeError("it does not tell its depth unit")
+        raise RuntimeError("it does not report its depth unit")
     return settings["depth_units"]
 
 
 class Session:
-    """Three streams of one sensor, delivered to an inbox from `start` to `stop`. Errors are the SDK's RuntimeError."""
+    """Three streams of one sensor, delivered to an inbox between `start` and `stop`, both called by the owner.
+
+    Samples come on the SDK's threads. Errors are the SDK's RuntimeError.
+    """
 
     def __init__(self, sensor: Any, profiles: Mapping[str, Any], inbox: SampleQueue) -> None:
         self.inbox = inbox
@@ -186,16 +165,16 @@ class Session:
         self._unit_m = _depth_unit_m(sensor)
         self._clocks = {stream: ClockUnwrap() for stream in profiles}
         self._preview = SampleQueue(lossless=False)
-        """Of frames from before the settings hold."""
+        """Frames from before the settings hold."""
         self._listening = False
         self._previewed_s = -inf
-        """When the newest sample was taken that came before the settings held."""
+        """Timestamp of the newest sample from before the settings held."""
         self._held_back = 0
 
     def start(self, prepare: Callable[[Any], None] | None = None, ready: Callable[[], None] | None = None) -> None:
-        """Let frames come, once `prepare` has had the running sensor; from `ready` on, none is lost.
+        """Start the sensor, set it up with `prepare`, call `ready`, and deliver every frame from then on.
 
-        Raises RuntimeError when the device vanishes meanwhile.
+        Raises RuntimeError when the device vanishes during this.
         """
         self._sensor.open(self._profiles)
         self._listening = prepare is None  # a recording's first frame comes while `start` still runs
@@ -206,20 +185,20 @@ class Session:
         if not self.settings:
             raise RuntimeError("it vanished while it was set up")
         if self._preview.arrived:
-            self.look(BOUNDARY_WAIT_S)  # else the first set of a recording would lack what came before this
+            self.look(BOUNDARY_WAIT_S)  # else the first set of a recording would miss streams that came before
         if ready:
             ready()
         self._listening = True
         self._preview.close()
 
     def look(self, timeout_s: float) -> FrameSet | None:
-        """While the sensor is prepared, the next set that comes; None when none does, or `end_wait` was called."""
+        """Return the next set to come while the sensor is prepared; None after the timeout or `end_wait`."""
         while self._preview.take(0.0):
             pass
         return self._preview.take(timeout_s)
 
     def end_wait(self) -> None:
-        """Let go of whoever looks, from any thread."""
+        """End `look`, from any thread."""
         self._preview.close()
 
     def _on_frame(self, frame: Any) -> None:
@@ -228,9 +207,9 @@ class Session:
         inbox.put(sample)
 
     def _is_heard(self, sample: Sample) -> bool:
-        """Whether it is delivered: not one of a set that had begun before, which would lack what came until then.
+        """Return False for samples of a set that began before the settings held, which would be incomplete.
 
-        No more than that set is held back, so that a clock which stands still silences nothing.
+        At most one set is held back, so that a device whose clock stands still is not silenced.
         """
         if not self._listening:
             self._previewed_s = max(self._previewed_s, sample.timestamp_s)
@@ -240,13 +219,13 @@ class Session:
         return not began_before or self._held_back >= len(FORMATS)
 
     def _unwrapped(self, sample: Sample, domain: str) -> Sample:
-        """A sample on a clock that goes on: the device's own wraps every 71.6 minutes, for each stream by itself."""
+        """Return a sample on a clock that does not wrap: the device's wraps, for each stream by itself."""
         if domain != "hardware_clock":
             return sample
         return replace(sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s))
 
     def telemetry(self, ending: str = "") -> dict[str, float]:
-        """The options as they read now; empty when the device is gone, or the session has stopped."""
+        """Return the options as they read now; empty when the device is gone or the session has stopped."""
         sensor = self._sensor
         try:
             return read_settings(sensor, ending) if sensor else {}
@@ -254,15 +233,15 @@ class Session:
             return {}
 
     def stop(self) -> None:
-        """Stop and close the sensor, and let go of it."""
+        """Stop, close and release the sensor."""
         self.end_wait()
         self.inbox.close()  # first: the SDK waits for its callbacks, and a callback may wait for room
         for end in (self._sensor.stop, self._sensor.close):
-            with suppress(RuntimeError):  # a device that vanished, or never started, is stopped already
+            with suppress(RuntimeError):  # a device that vanished or never started is already stopped
                 end()
         self._sensor = None
         self._profiles.clear()
 
     def frame(self, found: FrameSet, truth_depth_m: Float32 | None = None) -> Frame:
-        """A set in SI units."""
+        """Return a set in SI units."""
         return frame_in_si(found, self._unit_m, self.intrinsics, self.settings, truth_depth_m)

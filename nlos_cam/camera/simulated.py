@@ -211,7 +211,7 @@ class SimulatedCamera(LiveCamera):
         try:
             self._deliver(first)
         except Exception as error:  # noqa: BLE001  whatever it is, it is for the consumer's thread
-            inbox.fail(error)
+            inbox.finish(error)
 
     def _deliver(self, instant: int) -> None:
         """Expose each instant ahead, and hand over what the device makes of it when it is due."""

@@ -35,14 +35,14 @@ class Wall:
 @pytest.mark.parametrize("limits", RANGES)
 @pytest.mark.parametrize("part", [0.0, 0.15, 0.5, 0.77, 1.0, 2.0])
 def test_turn_down_falls_above_darkness_as_far_as_needed(limits: PowerLimits, part: float) -> None:
-    threshold = limits.least + part * (limits.most - limits.least)
-    wall = Wall(limits.most, threshold)
-    settled = turn_down(limits.most, limits, wall.look, wall.put)
-    tried = [limits.most, *wall.put_values]
+    threshold = limits.min + part * (limits.max - limits.min)
+    wall = Wall(limits.max, threshold)
+    settled = turn_down(limits.max, limits, wall.look, wall.put)
+    tried = [limits.max, *wall.put_values]
     assert settled.power == tried[-1] == wall.power
     assert len(tried) <= STRIDES + 2
     assert all(lower < higher for higher, lower in pairwise(tried))
-    assert min(tried) >= max(limits.least, min(limits.step, limits.most))
+    assert min(tried) >= max(limits.min, min(limits.step, limits.max))
     assert min(tried) > 0
     assert all(power > threshold for power in tried[:-1])
     if settled.power > threshold:

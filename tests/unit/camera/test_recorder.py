@@ -324,7 +324,7 @@ def test_can_grow_finds_a_limit_and_changes_nothing(tmp_path: Path) -> None:
     assert path.read_bytes() == b"precious"
     pytest.importorskip("resource")
     program = (
-        "import pathlib, resource, sys\nfrom nlos_cam.camera.disk import can_grow\n"
+        "import pathlib, resource, sys\nfrom nlos_cam.camera.recorder import can_grow\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))\n"
         "path = pathlib.Path(sys.argv[1])\nprint(can_grow(path, 4000), can_grow(path, 6000))"
     )

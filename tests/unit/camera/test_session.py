@@ -87,7 +87,7 @@ def test_finish_counts_half_a_set_of_a_recording(lossless: bool) -> None:
 def test_failure_is_raised_after_the_sets_before_it() -> None:
     inbox = SampleQueue(lossless=False)
     put(inbox, range(1))
-    inbox.fail(ZeroDivisionError("far away"))
+    inbox.finish(ZeroDivisionError("far away"))
     assert inbox.take(0.0) is not None
     with pytest.raises(ZeroDivisionError, match="far away"):
         inbox.take(0.0)

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.camera.streams import (
+    CONSISTENT_SETS,
     FORMATS,
     FRAMES_PER_S,
     LATE_NUMBERS,
     MAX_GAP,
-    TELLING,
     WAITING_SETS,
     FrameSet,
     FrameSynchronizer,
@@ -225,7 +225,7 @@ def counted_apart(instants: range, lost: dict[str, int]) -> Iterator[Sample]:
 def test_pairing_realigns_a_stream_that_lost_a_frame(stream: str, instant: int) -> None:
     pairing = FrameSynchronizer()
     found = [one for sample in counted_apart(range(60), {stream: instant}) if (one := pairing.add(sample))]
-    assert len(found) == 60 - 1 - TELLING
+    assert len(found) == 60 - 1 - CONSISTENT_SETS
     assert pairing.incomplete == 60 - len(found)
     assert pairing.counts == {}
     numbers, times_s = (np.array([getattr(one, name) for one in found]) for name in ("number", "timestamp_s"))
@@ -235,7 +235,7 @@ def test_pairing_realigns_a_stream_that_lost_a_frame(stream: str, instant: int) 
 def test_pairing_realigns_two_streams() -> None:
     pairing, lost = FrameSynchronizer(), {"infrared": 0, "confidence": 30}
     found = [one for sample in counted_apart(range(90), lost) if (one := pairing.add(sample))]
-    assert len(found) >= 90 - 2 * (2 + TELLING)
+    assert len(found) >= 90 - 2 * (2 + CONSISTENT_SETS)
     assert found[-1].timestamp_s == 89 / FRAMES_PER_S
 
 
@@ -247,7 +247,7 @@ def test_alignment_shifts_numbers_only_after_repeated_lags() -> None:
     sample = Sample("infrared", 7, 1.0, PIXELS)
     assert alignment.add(sample) is sample
     alignment = StreamOffsets(FRAMES_PER_S)
-    for _ in range(TELLING + 1):
+    for _ in range(CONSISTENT_SETS + 1):
         alignment.note({"depth": 1.0, "infrared": 1.0 + 2 / FRAMES_PER_S})
     assert alignment.add(sample).number == 9
     assert alignment.add(Sample("depth", 7, 1.0, PIXELS)).number == 7
