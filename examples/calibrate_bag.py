@@ -6,19 +6,19 @@ from pathlib import Path
 
 from nlos_calibration import new_wall_record
 
-from nlos_cam.calibrate import WallFiles, by_depth, look, written
+from nlos_cam.calibrate import WallFiles, collect_statistics, measure_by_depth, write_record
 from nlos_cam.camera import open_camera
 
 
 def main(bag: Path, out: Path) -> None:
     """Fit the wall over 60 frames, say where it is and how surely, and write record, reference and report."""
     with open_camera(f"bag:{bag}") as camera:
-        seen = look(camera, 60)
-    fit, facts = by_depth(seen)
+        seen = collect_statistics(camera, 60)
+    fit, facts = measure_by_depth(seen)
     about = {"camera": seen.camera, "frames": seen.statistics.depth.frames}
     today, others = datetime.now().astimezone().date(), seen.facts() | facts
     record = new_wall_record(fit, seen.intrinsics, **about, created=today, others=others)
-    written(WallFiles.beside(out, overwrite=False), record, seen.reference(fit.inliers))
+    write_record(WallFiles.beside(out, overwrite=False), record, seen.reference(fit.inliers))
     print(f"{1e3 * record.distance_m:.1f} mm to the wall, {record.facing_deg:.2f} degrees: {record.verdict}")
 
 

@@ -1,7 +1,7 @@
 __all__ = [
     "PINHOLE",
     "CaptureStatistics",
-    "Glance",
+    "FrameFit",
     "Hide",
     "Light",
     "Placed",
@@ -14,19 +14,19 @@ __all__ = [
     "bench",
     "bent",
     "both",
-    "by_board",
-    "by_depth",
-    "by_occluder",
+    "capture_color_view",
     "clean_view",
+    "collect_statistics",
     "corners_px",
     "curved",
     "detours",
+    "fit_frame",
     "frames_of",
-    "glance",
     "in_the_middle",
-    "look",
-    "look_in_colour",
     "looked_at",
+    "measure_by_board",
+    "measure_by_depth",
+    "measure_occluder",
     "patch",
     "patchy",
     "rippled",
@@ -37,14 +37,22 @@ __all__ = [
     "wall_from_lidar",
     "window",
     "with_outliers",
-    "write_sheet",
-    "written",
+    "write_board_pdf",
+    "write_record",
 ]
 
-from .board_pdf import write_sheet
-from .color_view import look_in_colour
-from .files import WallFiles, written
-from .measure import CaptureStatistics, Glance, by_board, by_depth, by_occluder, glance, look
+from .board_pdf import write_board_pdf
+from .color_view import capture_color_view
+from .files import WallFiles, write_record
+from .measure import (
+    CaptureStatistics,
+    FrameFit,
+    collect_statistics,
+    fit_frame,
+    measure_by_board,
+    measure_by_depth,
+    measure_occluder,
+)
 from .synthetic import (
     PINHOLE,
     Hide,

@@ -1,4 +1,4 @@
-"""The sheet that `nlos-cam board` prints: the board's pattern to exact scale, a bar to check it by, and advice."""
+"""Printable ChArUco board of `nlos-cam board`: the pattern to exact scale, a scale bar, and printing advice."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from nlos_calibration import BOARDS, PAPER_MM, Board, Paper
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,8 +22,8 @@ Rectangle = tuple[float, float, float, float]
 """Left, top, width, height in mm from the sheet's upper left corner."""
 
 
-def sheet_figure(paper: Paper) -> "Figure":
-    """The sheet as a figure of the paper's size, whose coordinates are millimetres from its upper left corner."""
+def board_figure(paper: Paper) -> "Figure":
+    """Return the sheet as a figure of the paper's size; coordinates are millimetres from its upper left corner."""
     from matplotlib.figure import Figure
 
     board, (width_mm, height_mm) = BOARDS[paper], PAPER_MM[paper]
@@ -32,28 +31,26 @@ def sheet_figure(paper: Paper) -> "Figure":
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0.0, width_mm), ylim=(height_mm, 0.0))
     axes.axis("off")
-    # one path for all, so that no hairline shows where two cells meet
+    # one path for all cells: separate ones would show hairlines where they meet
     axes.add_patch(_patch(list(black_cells(board, *pattern_origin_mm(paper)))))
     axes.add_patch(_patch(bar_mm(paper)))
-    middle_mm = width_mm / 2.0
-    axes.text(
-        middle_mm, height_mm - TEXT_ABOVE_EDGE_MM, _text(board, paper), size=TEXT_POINTS, ha="center", va="bottom"
-    )
+    text_mm = width_mm / 2.0, height_mm - TEXT_ABOVE_EDGE_MM
+    axes.text(*text_mm, _text(board, paper), size=TEXT_POINTS, ha="center", va="bottom")
     return figure
 
 
-def write_sheet(path: Path, paper: Paper) -> None:
+def write_board_pdf(path: Path, paper: Paper) -> None:
     """Write the sheet as a PDF page of the paper's size."""
-    sheet_figure(paper).savefig(path, format="pdf", metadata={"Title": f"nlos-cam board, {paper}"})
+    board_figure(paper).savefig(path, format="pdf", metadata={"Title": f"nlos-cam board, {paper}"})
 
 
 def pattern_origin_mm(paper: Paper) -> tuple[float, float]:
-    """Where the pattern's upper left corner is."""
+    """Return the pattern's upper left corner (x, y) in mm."""
     return (PAPER_MM[paper][0] - BOARDS[paper].size_mm[0]) / 2.0, TOP_MM
 
 
 def bar_mm(paper: Paper) -> list[Rectangle]:
-    """The bar of 100 mm between the outer edges of its ticks."""
+    """Return the scale bar and its ticks: 100 mm between the ticks' outer edges."""
     width_mm, height_mm = PAPER_MM[paper]
     left_mm, line_mm = (width_mm - BAR_MM) / 2.0, height_mm - BAR_ABOVE_EDGE_MM
     tick_mm = line_mm - TICK_MM / 2.0
@@ -65,23 +62,17 @@ def bar_mm(paper: Paper) -> list[Rectangle]:
 
 
 def black_cells(board: Board, left_mm: float, top_mm: float) -> Iterator[Rectangle]:
-    """All that is black of a pattern whose upper left corner is at (left_mm, top_mm): squares, and cells of markers."""
+    """Yield the black squares and marker cells of a pattern whose upper left corner is at (left_mm, top_mm)."""
     side_mm = board.square_mm
     for row in range(board.squares_y):
         for column in range(row % 2, board.squares_x, 2):
             yield left_mm + column * side_mm, top_mm + row * side_mm, side_mm, side_mm
-    markers = zip(board.opencv_board.getIds(), board.opencv_board.getObjPoints(), strict=True)
-    for marker, corners_m in markers:
-        cells = _marker_cells(board, int(marker))
+    size = board.opencv_dictionary.markerSize + 2  # with the marker's black border; one pixel for each cell
+    for marker, corners_m in zip(board.opencv_board.getIds(), board.opencv_board.getObjPoints(), strict=True):
+        cells = np.asarray(cv2.aruco.generateImageMarker(board.opencv_dictionary, int(marker), size))
         cell_mm, (x_mm, y_mm) = board.marker_mm / len(cells), np.asarray(corners_m)[0, :2] * 1e3
         for row, column in np.argwhere(cells == 0):
             yield left_mm + float(x_mm) + column * cell_mm, top_mm + float(y_mm) + row * cell_mm, cell_mm, cell_mm
-
-
-def _marker_cells(board: Board, marker: int) -> NDArray[np.uint8]:
-    """A marker with its black border, one pixel for each cell."""
-    size = board.opencv_dictionary.markerSize + 2
-    return np.asarray(cv2.aruco.generateImageMarker(board.opencv_dictionary, marker, size), np.uint8)
 
 
 def _patch(rectangles: list[Rectangle]) -> "PathPatch":

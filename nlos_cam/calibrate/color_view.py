@@ -1,8 +1,7 @@
-"""A look through the colour camera beside the lidar: the mean grey image, its lens, and where it is seen from.
+"""Color view of the board: mean gray image of the color camera beside the lidar, its lens and its pose.
 
-Done by itself, before the lidar runs: a board is looked for on a wall that stands still, so nothing is to be paired,
-and the link has room for the depth. No real L515 was seen: what is held here against librealsense is a software
-device with its streams, and a D435's recording.
+It is captured before the lidar runs: the wall stands still, so no frames are paired, and later the link has room for
+the depth. Not tried on a physical L515: checked against a software device and a D435's recording.
 """
 
 from collections.abc import Callable, Mapping
@@ -37,17 +36,18 @@ from nlos_cam.errors import (
     RecordingError,
     StreamMissingError,
 )
-from nlos_cam.recording import BagFile
+from nlos_cam.recording import BagReader
 
-COLOUR, FORMAT = "color", "rgb8"
-"""The SDK's names of the stream, and of the format that a live camera is asked for."""
-WIDEST = 1280
-"""A wider image shows the corners no better: they are found between pixels."""
-SETTLES = 30
+COLOR_STREAM, COLOR_FORMAT = "color", "rgb8"
+"""The SDK's name of the stream, and the format requested from a live camera."""
+WANTED = COLOR_STREAM, COLOR_FORMAT, FRAMES_PER_S
+MAX_WIDTH_PX = 1280
+"""A wider image does not improve the corners, which are found with subpixel accuracy."""
+SETTLING_FRAMES = 30
 """Frames until the automatic exposure has settled."""
 SILENCE_S = 5.0
-WAITING = 8
-GREY: Mapping[str, Callable[[NDArray[Any]], Any]] = {
+QUEUE_FRAMES = 8
+TO_GRAY: Mapping[str, Callable[[NDArray[Any]], Any]] = {
     "rgb8": lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY),
     "bgr8": lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY),
     "rgba8": lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_RGBA2GRAY),
@@ -55,19 +55,17 @@ GREY: Mapping[str, Callable[[NDArray[Any]], Any]] = {
     "yuyv": lambda pixels: (pixels & 0xFF).astype(np.uint8),
     "uyvy": lambda pixels: (pixels >> 8).astype(np.uint8),
 }
-"""What makes grey (height, width), in 8 bits, of the pixels of a format."""
+"""Conversion of each pixel format to gray (height, width), 8 bits."""
 
 
 @dataclass(frozen=True)
-class _Look:
-    """How a live camera is looked through."""
-
+class _LiveOptions:
     frames: int
     on_frame: Callable[[], None]
     silence_s: float
 
 
-def look_in_colour(
+def capture_color_view(
     uri: str,
     frames: int,
     *,
@@ -75,115 +73,118 @@ def look_in_colour(
     sdk: Any = None,
     silence_s: float = SILENCE_S,
 ) -> BoardView:
-    """What the colour camera of a recording or a live L515 sees, over at most `frames` frames.
+    """Return the mean gray view over at most `frames` frames of the color camera of a recording or a live L515.
 
-    Of a recording those are the last, when the exposure has settled; of a live camera those after SETTLES others, and
-    it is free again afterwards. Raises StreamMissingError and RecordingError for a recording, CameraNotFoundError,
-    CameraLostError and CameraError for a live one or one without colour, NlosCamError for a lens of another model.
+    A recording's last frames are used, when the exposure has settled; a live camera's frames after SETTLING_FRAMES,
+    and the camera is released. Raises StreamMissingError and RecordingError for a recording, CameraNotFoundError,
+    CameraLostError and CameraError for a live camera or one without color, NlosCamError for another lens model.
     """
     scheme, _, rest = uri.partition(":")
     if scheme == "bag" and rest:
         return _recorded(Path(rest), frames, on_frame)
     if scheme == "l515":
-        return _live(uri, rest, sdk or load_sdk(), _Look(frames, on_frame, silence_s))
+        return _live(uri, rest, sdk or load_sdk(), _LiveOptions(frames, on_frame, silence_s))
     if scheme == "sim":
-        raise CameraError(f"{uri}: the simulated lidar has no colour camera: look in infrared")
+        raise CameraError(f"{uri}: the simulated lidar has no colour camera: use --board-in infrared")
     raise CameraNotFoundError(f"no camera is called {uri!r}: use {NAMES}")
 
 
 def _recorded(path: Path, frames: int, on_frame: Callable[[], None]) -> BoardView:
-    bag = BagFile(path)
-    if missing := [stream for stream in ("depth", COLOUR) if stream not in bag.streams]:
+    bag = BagReader(path)
+    if missing := [stream for stream in ("depth", COLOR_STREAM) if stream not in bag.streams]:
         raise StreamMissingError(
             f"{path} has no {' and no '.join(missing)} stream (it has {', '.join(sorted(bag.streams))}): record colour "
-            "beside depth, e.g. with realsense-viewer, or look in infrared"
+            "beside depth, e.g. with realsense-viewer, or use --board-in infrared"
         )
-    info = bag.streams[COLOUR]
-    lens, pose = _lens(f"{path}", *bag.lens(COLOUR)), bag.pose("depth", COLOUR)
+    info = bag.streams[COLOR_STREAM]
+    lens, pose = _lens(f"{path}", *bag.lens(COLOR_STREAM)), bag.pose("depth", COLOR_STREAM)
     mean = Moments(shape := (info.intrinsics.height, info.intrinsics.width))
     for index in range(max(info.frames - frames, 0), info.frames):
-        pixels = bag.sample(COLOUR, index).pixels
-        if info.format not in GREY or pixels.shape[:2] != shape:
+        pixels = bag.sample(COLOR_STREAM, index).pixels
+        if info.format not in TO_GRAY or pixels.shape[:2] != shape:
             size = f"{pixels.shape[1]} x {pixels.shape[0]} {info.format}"
-            raise RecordingError(f"{path} has colour images of {size}, which we cannot use: look in infrared")
-        mean.add(GREY[info.format](pixels))
+            raise RecordingError(f"{path} has unsupported colour images ({size}): use --board-in infrared")
+        mean.add(TO_GRAY[info.format](pixels))
         on_frame()
     return BoardView(mean.mean(), info.intrinsics, lens, pose, "colour", CameraErrors())
 
 
-def _live(uri: str, serial: str, sdk: Any, look: _Look) -> BoardView:
+def _live(uri: str, serial: str, sdk: Any, options: _LiveOptions) -> BoardView:
     device, _ = find_l515(sdk, shared_context(sdk), serial)
     try:
-        sensor, profile = _colour_of(device)
+        sensor, profile = _color_profile(device)
         depth = find_streams(device)[1].get("depth")
         if profile is None or depth is None:
-            raise CameraError(f"{uri} offers no colour beside its depth, at {FRAMES_PER_S} frames/s: look in infrared")
+            raise CameraError(
+                f"{uri} offers no colour beside its depth at {FRAMES_PER_S} frames/s: use --board-in infrared"
+            )
         model = profile.as_video_stream_profile().get_intrinsics()
         lens = _lens(uri, model.model.name, np.array(model.coeffs))
         pose = _pose(profile.get_extrinsics_to(depth))
-        image = _mean_of(uri, sensor, profile, look)
+        image = _mean_of(uri, sensor, profile, options)
     except RuntimeError as error:
         raise CameraError(
-            f"{uri} cannot be looked through in colour ({error}): close what else uses it, or replug it"
+            f"cannot open the colour camera of {uri} ({error}): close other programs that use it, or replug it"
         ) from error
     return BoardView(image, intrinsics_of(profile), lens, pose, "colour", CameraErrors())
 
 
-def _colour_of(device: Any) -> tuple[Any, Any]:
-    """The colour sensor and its widest profile, up to WIDEST; None where there is none."""
+def _color_profile(device: Any) -> tuple[Any, Any]:
+    """Return the color sensor and its widest profile, up to MAX_WIDTH_PX; None, None without one."""
     best: tuple[int, Any, Any] = (0, None, None)
     for sensor in device.query_sensors():
         for profile in sensor.get_stream_profiles():
-            named = stream_name(profile), profile.format().name, profile.fps()
-            width = profile.as_video_stream_profile().width() if named == (COLOUR, FORMAT, FRAMES_PER_S) else 0
-            if best[0] < width <= WIDEST:
+            if (stream_name(profile), profile.format().name, profile.fps()) != WANTED:
+                continue
+            width = profile.as_video_stream_profile().width()
+            if best[0] < width <= MAX_WIDTH_PX:
                 best = width, sensor, profile
     return best[1:]
 
 
 def _lens(where: str, model: str, coefficients: Float64) -> Float64:
-    """The coefficients as OpenCV has them, of a lens that we can undo. Raises NlosCamError for another."""
+    """Return the lens coefficients in OpenCV's order. Raises NlosCamError for an unsupported model."""
     if not coefficients.any():
         return np.zeros(5)
     if model != "brown_conrady" or coefficients.shape != (5,) or not np.isfinite(coefficients).all():
         raise NlosCamError(
-            f"{where}: the colour camera's lens is told as {model} {coefficients.tolist()}, which we cannot undo: "
-            "look in infrared"
+            f"{where}: unsupported distortion model for the colour stream: {model} {coefficients.tolist()}; "
+            "use --board-in infrared"
         )
     return coefficients.astype(np.float64)
 
 
 def _pose(extrinsics: Any) -> Float64:
-    """(4, 4) from the SDK's, whose rotation is in columns."""
+    """Return the pose (4, 4) from the SDK's extrinsics, whose rotation is stored by columns."""
     pose = np.eye(4)
     pose[:3, :3] = np.reshape(extrinsics.rotation, (3, 3)).T
     pose[:3, 3] = extrinsics.translation
     return pose
 
 
-def _mean_of(uri: str, sensor: Any, profile: Any, look: _Look) -> Float64:
-    """The mean grey image of a sensor, which runs only meanwhile."""
+def _mean_of(uri: str, sensor: Any, profile: Any, options: _LiveOptions) -> Float64:
+    """Return the mean gray image (height, width) of a sensor; it streams only during the call."""
     size = intrinsics_of(profile)
-    mean, waiting = Moments((size.height, size.width)), Queue[NDArray[Any]](maxsize=WAITING)
+    mean, queue = Moments((size.height, size.width)), Queue[NDArray[Any]](maxsize=QUEUE_FRAMES)
 
     def keep(frame: Any) -> None:
-        with suppress(Full):  # the SDK must not wait, and of a scene that stands still another frame will do
-            waiting.put_nowait(sample_from_sdk(frame).pixels)
+        with suppress(Full):  # never block the SDK: the scene stands still, so a later frame is as good
+            queue.put_nowait(sample_from_sdk(frame).pixels)
 
     sensor.open([profile])
     try:
         sensor.start(keep)
-        for index in range(SETTLES + look.frames):
-            pixels = waiting.get(timeout=look.silence_s)
-            if index >= SETTLES:
-                mean.add(GREY[FORMAT](pixels))
-                look.on_frame()
+        for index in range(SETTLING_FRAMES + options.frames):
+            pixels = queue.get(timeout=options.silence_s)
+            if index >= SETTLING_FRAMES:
+                mean.add(TO_GRAY[COLOR_FORMAT](pixels))
+                options.on_frame()
     except Empty:
         raise CameraLostError(
-            f"{uri} gave no colour frame for {look.silence_s:g} s: replug it, close other programs"
+            f"{uri} gave no colour frame for {options.silence_s:g} s: replug it, close other programs"
         ) from None
     finally:
         for end in (sensor.stop, sensor.close):
-            with suppress(RuntimeError):  # a device that vanished, or never started, is stopped already
+            with suppress(RuntimeError):  # unplugged, or never started
                 end()
     return mean.mean()

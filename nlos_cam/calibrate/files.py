@@ -1,4 +1,4 @@
-"""What `calibrate` leaves on disk: the record, the bare wall's reference beside it, and a report."""
+"""Files that `calibrate` writes: the record, the bare wall's reference and the report."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -6,14 +6,14 @@ from pathlib import Path
 
 from nlos_calibration import BareWall, MeasuredWall, WallRecord, dump_toml, save_reference
 
-from nlos_cam.calibrate.report import report
+from nlos_cam.calibrate.report import report_html
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import atomic_file
 
 
 @dataclass(frozen=True)
 class WallFiles:
-    """Three files of one name."""
+    """Paths of the three files, which differ in their suffix only."""
 
     record: Path
     reference: Path
@@ -21,27 +21,27 @@ class WallFiles:
 
     @classmethod
     def beside(cls, record: Path, *, overwrite: bool) -> "WallFiles":
-        """Those of a record. Raises OutputExistsError where one would be replaced and `overwrite` was not given."""
+        """Return the paths for a record. Raises OutputExistsError for an existing file without `overwrite`."""
         files = cls(record, record.with_suffix(".npz"), record.with_suffix(".html"))
         if record in (files.reference, files.report):
-            raise OutputExistsError(f"{record} would be overwritten by what is written beside it: name it wall.toml")
+            raise OutputExistsError(f"{record} would be overwritten by the reference or the report: name it wall.toml")
         for path in (files.reference, files.report):
             if path.is_dir() or (path.exists() and not overwrite):
                 raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
         return files
 
 
-def written(files: WallFiles, record: WallRecord, reference: BareWall | None) -> WallRecord:
-    """Write all there is; returns the record, which names its reference.
+def write_record(files: WallFiles, record: WallRecord, reference: BareWall | None) -> WallRecord:
+    """Write the three files and return the record, which names its reference.
 
-    Each is whole before one takes its place, so that what ends this early leaves earlier ones that belong together.
+    They replace earlier ones only when all are complete, so an interrupted run leaves the earlier set whole.
     """
-    with ExitStack() as whole:
-        part = whole.enter_context(atomic_file(files.record))
+    with ExitStack() as parts:
+        record_part = parts.enter_context(atomic_file(files.record))
         if reference is not None:
-            digest = save_reference(whole.enter_context(atomic_file(files.reference)), reference)
+            digest = save_reference(parts.enter_context(atomic_file(files.reference)), reference)
             record = record.model_copy(update={"reference": files.reference.name, "reference_sha256": digest})
-        told = whole.enter_context(atomic_file(files.report))
-        told.write_text(report(MeasuredWall(record, reference), files.record.name), encoding="utf-8")
-        part.write_text(dump_toml(record), encoding="utf-8")
+        html = report_html(MeasuredWall(record, reference), files.record.name)
+        parts.enter_context(atomic_file(files.report)).write_text(html, encoding="utf-8")
+        record_part.write_text(dump_toml(record), encoding="utf-8")
     return record

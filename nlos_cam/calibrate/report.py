@@ -1,9 +1,4 @@
-"""The report beside a wall's record: one HTML file that says whether the bench is right, and what to move if not.
-
-The pieces of HTML that the report on a measured wall is made of: the page, tables, lists, a bar with a marker.
-
-The words of the report on a measured wall as HTML: verdict, ranges, measures, board, device, files, use.
-"""
+"""Report on a measured wall: one HTML file with verdict, ranges, pictures, quantities, device and use."""
 
 import base64
 import shlex
@@ -15,12 +10,14 @@ from nlos_calibration import (
     DISTANCE_RANGE_M,
     FACING_RANGE_DEG,
     GAP_RANGE_M,
-    INTERVAL_STDS,
     TOLERANCE_DEG,
     TOLERANCE_M,
-    BoardRecord,
     MeasuredWall,
     WallRecord,
+    board_agreement,
+    wall_facts,
+    with_degrees,
+    with_mm,
 )
 
 from nlos_cam.calibrate.report_drawings import bench_picture, footprint_picture
@@ -62,15 +59,40 @@ PAGE = Template("""<!DOCTYPE html>
 <main>$body</main></body>
 </html>
 """)
+VERDICTS = {
+    "good": "✔ Good: the bench can be used",
+    "out of range": "✘ Out of range: the wall is measured, but the bench has to be moved",
+    "doubtful": "? Doubtful: the wall may be elsewhere than measured",
+}
+"""Words and a sign beside the color, for readers who cannot tell the colors apart."""
+NO_MAPS = Picture("Maps of the wall", "This record names no reference of the bare wall: there are no maps to draw.")
 
 
-def page(title: str, under: str, parts: Iterable[str]) -> str:
-    """A whole document, which needs nothing but itself; title and what is under it are text, the parts HTML."""
-    return PAGE.substitute(title=escape(title), under=escape(under), style=STYLE, body="\n".join(parts))
+def report_html(wall: MeasuredWall, record_file: str) -> str:
+    """Return the report on a wall whose record is called `record_file`: HTML that needs no other file, no network."""
+    record = wall.record
+    maps = [NO_MAPS] if wall.reference is None else wall_maps(record, wall.reference)
+    subtitle = f"{record.created}, {record.camera}, {record.frames} frames of the bare wall"
+    parts = [
+        banner(record),
+        ranges(record),
+        _figure(bench_picture(record)),
+        measures(record),
+        board(record),
+        _figure(footprint_picture(record)),
+        *map(_figure, maps),
+        device(wall),
+        usage(record, record_file),
+    ]
+    return page(f"The bench as measured: {record_file}", subtitle, parts)
 
 
-def pictured(picture: Picture) -> str:
-    """A picture with its title and caption; the caption alone where there is nothing to draw."""
+def page(title: str, subtitle: str, parts: Iterable[str]) -> str:
+    """Return a self-contained document; title and subtitle are text, the parts HTML."""
+    return PAGE.substitute(title=escape(title), under=escape(subtitle), style=STYLE, body="\n".join(parts))
+
+
+def _figure(picture: Picture) -> str:
     title, caption = escape(picture.title), escape(picture.caption)
     if picture.png is None:
         return f"<section><h2>{title}</h2><p>{caption}</p></section>"
@@ -79,14 +101,13 @@ def pictured(picture: Picture) -> str:
     return f"<figure><h2>{title}</h2>{image}<figcaption>{caption}</figcaption></figure>"
 
 
-def table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...]) -> str:
-    """Rows of text, of which the first cell names the row."""
+def _table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...]) -> str:
+    """Return rows of text as a table; the first cell names the row."""
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     return f"<table class='numbers'><thead><tr>{top}</tr></thead><tbody>{''.join(map(_row, rows))}</tbody></table>"
 
 
-def pairs(facts: Mapping[str, str]) -> str:
-    """Names and values."""
+def _pairs(facts: Mapping[str, str]) -> str:
     return f"<table><tbody>{''.join(map(_row, facts.items()))}</tbody></table>"
 
 
@@ -95,55 +116,40 @@ def _row(cells: tuple[str, ...]) -> str:
     return f"<tr><th>{name}</th>{''.join(f'<td>{cell}</td>' for cell in others)}</tr>"
 
 
-def bullets(name: str, items: Iterable[str], of_class: str = "") -> str:
-    """A list of sentences under a name; empty where there are none."""
-    told = "".join(f"<li>{escape(item)}</li>" for item in items)
-    return f"<section class='{of_class}'><h3>{escape(name)}</h3><ul>{told}</ul></section>" if told else ""
+def _bullets(name: str, items: Iterable[str], css_class: str = "") -> str:
+    """Return a list of sentences under a heading; empty where there are none."""
+    entries = "".join(f"<li>{escape(item)}</li>" for item in items)
+    return f"<section class='{css_class}'><h3>{escape(name)}</h3><ul>{entries}</ul></section>" if entries else ""
 
 
-def range_bar(name: str, value: float, allowed: tuple[float, float], tolerance: float, unit: str, most: float) -> str:
-    """A range as a bar, with a marker where the value is; beyond the scale the marker stands at its end."""
+def range_bar(name: str, value: float, allowed: tuple[float, float], tolerance: float, unit: str, end: float) -> str:
+    """Return a bar from 0 to `end` with the allowed range and a marker at the value, or at the bar's nearer end."""
     low, high = allowed
     inside = low - tolerance <= value <= high + tolerance
-    left, right, at = (_place(each, most) for each in (low, high, min(max(value, 0.0), most)))
-    colour, state = ("inside", "inside") if inside else ("outside", "too small" if value < low else "too large")
-    told = f"{name}: {value:.1f} {unit}, {state} ({low:.0f} to {high:.0f} {unit})"
+    left, right, at = (BAR_MARGIN + BAR_WIDTH * each / end for each in (low, high, min(max(value, 0.0), end)))
+    marker, state = ("inside", "inside") if inside else ("outside", "too small" if value < low else "too large")
+    label = escape(f"{name}: {value:.1f} {unit}, {state} ({low:.0f} to {high:.0f} {unit})")
     ends = "".join(
         f"<text x='{x:.0f}' y='46' text-anchor='middle'>{each:.0f} {unit}</text>"
         for x, each in ((left, low), (right, high))
     )
     return (
-        f"<p class='bar'><b>{escape(told)}</b></p><svg viewBox='0 0 680 52' role='img' aria-label='{escape(told)}'>"
+        f"<p class='bar'><b>{label}</b></p><svg viewBox='0 0 680 52' role='img' aria-label='{label}'>"
         f"<rect x='{BAR_MARGIN:.0f}' y='14' width='{BAR_WIDTH:.0f}' height='14' rx='7' class='rail'/>"
         f"<rect x='{left:.1f}' y='14' width='{right - left:.1f}' height='14' class='allowed'/>{ends}"
-        f"<path d='M {at:.1f} 28 l -9 -24 h 18 z' class='{colour}'/></svg>"
+        f"<path d='M {at:.1f} 28 l -9 -24 h 18 z' class='{marker}'/></svg>"
     )
 
 
-def _place(value: float, most: float) -> float:
-    return BAR_MARGIN + BAR_WIDTH * value / most
-
-
-VERDICTS = {
-    "good": "✔ Good: the bench can be used",
-    "out of range": "✘ Out of range: the wall is measured, but the bench has to be moved",
-    "doubtful": "? Doubtful: the wall may be elsewhere than measured",
-}
-"""Words and a sign beside the colour, for those who do not see it."""
-MIN_REPORTED = 0.001
-Row = tuple[str, str, str]
-"""What, how much, what that means."""
-
-
-def verdict(record: WallRecord) -> str:
-    """The banner: the verdict, the advice, and the warnings."""
+def banner(record: WallRecord) -> str:
+    """Return verdict, advice and warnings."""
     name = record.verdict.replace(" ", "-")
-    banner = f"<p class='word'>{VERDICTS[record.verdict]}</p><p>{escape(record.advice)}</p>"
-    return f"<section class='verdict {name}'>{banner}</section>{bullets('Note', record.warnings, 'warnings')}"
+    text = f"<p class='word'>{VERDICTS[record.verdict]}</p><p>{escape(record.advice)}</p>"
+    return f"<section class='verdict {name}'>{text}</section>{_bullets('Note', record.warnings, 'warnings')}"
 
 
 def ranges(record: WallRecord) -> str:
-    """Where this bench lies in the paper's ranges, as bars."""
+    """Return bars that show this bench within the paper's ranges."""
     bars = [
         _bar_in_cm("distance", record.distance_m, DISTANCE_RANGE_M, 45.0),
         range_bar("facing angle", record.facing_deg, FACING_RANGE_DEG, TOLERANCE_DEG, "degrees", 90.0),
@@ -153,114 +159,56 @@ def ranges(record: WallRecord) -> str:
     return f"<section><h2>Where the bench is in the paper's ranges</h2>{''.join(bars)}</section>"
 
 
-def _bar_in_cm(name: str, value_m: float, allowed_m: tuple[float, float], most_cm: float) -> str:
+def _bar_in_cm(name: str, value_m: float, allowed_m: tuple[float, float], end_cm: float) -> str:
     low_cm, high_cm = (100.0 * end for end in allowed_m)
-    return range_bar(name, 100.0 * value_m, (low_cm, high_cm), 100.0 * TOLERANCE_M, "cm", most_cm)
+    return range_bar(name, 100.0 * value_m, (low_cm, high_cm), 100.0 * TOLERANCE_M, "cm", end_cm)
 
 
 def measures(record: WallRecord) -> str:
-    """What was measured, with the half width of each 95 % interval."""
-    rows = [*_pose_rows(record), *_offset_rows(record), *_occluder_rows(record), *_quality_rows(record)]
-    if record.footprint_share is not None:
-        rows.append(("view on the wall", f"{record.footprint_share:.1%}", "share of the map's 64 x 80 cells"))
-    return f"<section><h2>What was measured</h2>{table(rows, ('', 'measured (± 95 %)', 'meaning'))}</section>"
-
-
-def _pose_rows(record: WallRecord) -> list[Row]:
-    yaw, pitch = _degrees(record.yaw_deg, record.yaw_std_deg), _degrees(record.pitch_deg, record.pitch_std_deg)
-    return [
-        ("distance", _metres(record.distance_m, record.distance_std_m), "from the lidar to the wall, along its normal"),
-        ("facing angle", _degrees(record.facing_deg, record.facing_std_deg), "between optical axis and wall's normal"),
-        ("yaw", yaw, "to the side; positive turns the axis towards the object (+x)"),
-        ("pitch", pitch, "positive looks up"),
-    ]
-
-
-def _offset_rows(record: WallRecord) -> list[Row]:
-    if record.range_offset_std_m is None:
-        return [("range offset", "not measured", "give the distance by tape with --tape-m")]
-    amount = f"{1e3 * record.range_offset_m:+z.2f} mm{_plus_minus(record.range_offset_std_m, 'mm', 1e3)}"
-    causes = {"origin": "the beams' origin lies so far before the glass", "depth": "each depth lacks it"}
-    meaning = causes.get(record.range_offset_cause or "", "to be added to the lidar's depth")
-    return [("range offset", amount, f"{meaning}; it is in the distance")]
-
-
-def _occluder_rows(record: WallRecord) -> list[Row]:
-    if record.occluder is None:
-        return []
-    found = record.occluder
-    edge, gap = _metres(found.x_m, found.x_std_m), _metres(found.gap_m, found.gap_std_m)
-    rows = [
-        (f"occluder's edge ({found.source})", edge, "along the wall from the lidar's foot"),
-        (f"occluder's gap ({found.source})", gap, "between its edge and the wall"),
-    ]
-    leans = "against the wall's normal; positive leans away from the lidar's foot"
-    return rows if found.tilt_deg is None else [*rows, ("occluder's tilt", f"{found.tilt_deg:+z.2f}°", leans)]
-
-
-def _quality_rows(record: WallRecord) -> list[Row]:
-    if record.residual_m is None:
-        return [("depth", "refused", "the plane is the board's alone: the depth says nothing about the wall")]
-    measured: list[tuple[str, float | None, str, float, str]] = [
-        ("residual", record.residual_m, "{:.2f} mm RMS", 1e3, "distance of the pixels used from the plane"),
-        ("on the plane", record.inlier_fraction, "{:.1f} %", 100.0, "of the pixels with depth; the rest is left out"),
-        ("noise", record.noise_scale, "{:.2f} times nominal", 1.0, "of one depth sample; 1 is as it should be"),
-        ("ripples", record.ripple_m, "{:.2f} mm RMS", 1e3, "of parts of the wall off the plane, beyond noise"),
-        ("bend", record.bend_m, "{:.2f} mm", 1e3, "between planes through half of the view and through all of it"),
-        ("bend", record.bend_deg, "{:.2f} degrees", 1.0, "the same as an angle"),
-    ]
-    return [(name, form.format(scale * at), what) for name, at, form, scale, what in measured if at is not None]
+    """Return the measured quantities with the half width of each 95 % interval."""
+    hint = "" if record.range_offset_std_m is not None else "<p>Range offset not measured: give --tape-m.</p>"
+    rows = _table(wall_facts(record), ("", "measured (± 95 %)", "meaning"))
+    return f"<section><h2>What was measured</h2>{rows}{hint}</section>"
 
 
 def board(record: WallRecord) -> str:
-    """What the printed board said, beside what the record says; empty where none was asked for."""
+    """Return the measurement by the printed board beside the record's; empty without a board."""
     found = record.board
     if found is None:
         return ""
-    both = [
-        ("distance", (found.distance_m, found.distance_std_m), (record.distance_m, record.distance_std_m)),
-        ("facing angle", (found.facing_deg, found.facing_std_deg), (record.facing_deg, record.facing_std_deg)),
-        ("yaw", (found.yaw_deg, found.yaw_std_deg), (record.yaw_deg, record.yaw_std_deg)),
-        ("pitch", (found.pitch_deg, found.pitch_std_deg), (record.pitch_deg, record.pitch_std_deg)),
+    rows = [
+        (
+            "distance",
+            with_mm(found.distance_m, found.distance_std_m),
+            with_mm(record.distance_m, record.distance_std_m),
+        ),
+        *(
+            (name, *(with_degrees(getattr(by, f"{key}_deg"), getattr(by, f"{key}_std_deg")) for by in (found, record)))
+            for name, key in (("facing angle", "facing"), ("yaw", "yaw"), ("pitch", "pitch"))
+        ),
     ]
-
-    def told(name: str, value: float, std: float | None) -> str:
-        return _metres(value, std) if name == "distance" else _degrees(value, std)
-
-    rows = [(name, told(name, *by), told(name, *ours)) for name, by, ours in both]
     used = {"both": "depth and board together", "depth": "the depth alone", "board": "the board alone"}[found.used]
-    compared = table(rows, ("", "by the board (± 95 %)", "in the record"))
-    print_of = f"{found.printed.squares_x} x {found.printed.squares_y} squares of {found.printed.square_mm:.2f} mm"
+    printed = f"{found.printed.squares_x} x {found.printed.squares_y} squares of {found.printed.square_mm:.2f} mm"
     facts = (
-        f"{_disagreement(found)} The record's plane is of {used}. {found.corners} corners of {print_of} "
+        f"{board_agreement(found)} The record's plane is of {used}. {found.corners} corners of {printed} "
         f"({'measured on the print' if found.measured else 'as drawn, not measured on the print'}), "
         f"{found.residual_px:.2f} pixels RMS off; stretched by {100.0 * found.stretch:+z.2f} %, "
         f"bowed by {1e3 * found.bow_m:+z.2f} mm."
     )
-    causes = bullets("What may lie behind it", found.causes)
+    compared = _table(rows, ("", "by the board (± 95 %)", "in the record"))
+    causes = _bullets("Possible causes", found.causes)
     return f"<section><h2>By a printed board</h2>{compared}<p>{escape(facts)}</p>{causes}</section>"
 
 
-def _disagreement(found: BoardRecord) -> str:
-    if found.disagreement_m is None or found.disagreement_deg is None or found.disagreement_sigmas is None:
-        return f"The depth was refused: {found.depth_refused}."
-    return (
-        f"The board's plane is {1e3 * found.disagreement_m:+z.2f} mm and {found.disagreement_deg:.3f}° from the "
-        f"depth's: {found.disagreement_sigmas:.1f} standard deviations."
-    )
-
-
 def device(wall: MeasuredWall) -> str:
-    """The camera, its settings and temperatures."""
+    """Return the camera, its settings and temperatures."""
     record, reference = wall.record, wall.reference
     pinhole = record.rig.pinhole
     span = reference.celsius_span if reference is not None else {}
     facts = {
-        "date": f"{record.created}",
         "camera": record.camera,
         "serial": record.serial or "not known",
         "firmware": record.firmware or "not known",
-        "frames averaged": f"{record.frames}",
         "depth image": f"{pinhole.width} x {pinhole.height} pixels",
     }
     celsius = {
@@ -269,57 +217,17 @@ def device(wall: MeasuredWall) -> str:
     }
     settings = {name: f"{value:g}" for name, value in record.settings.items()}
     parts = [("Device", facts), ("Temperatures", celsius), ("Settings", settings)]
-    tables = "".join(f"<div><h3>{name}</h3>{pairs(what)}</div>" for name, what in parts if what)
+    tables = "".join(f"<div><h3>{name}</h3>{_pairs(values)}</div>" for name, values in parts if values)
     return f"<section><h2>What it was measured with</h2><div class='columns'>{tables}</div></section>"
 
 
-def files(record: WallRecord, record_file: str) -> str:
-    """Which files belong together, and how they are used."""
+def usage(record: WallRecord, record_file: str) -> str:
+    """Return the files that belong together, and the commands that use them."""
     facts = {"record": record_file, "rig's checksum": record.rig.checksum}
     if record.reference:
         facts |= {"bare wall's reference": record.reference, "its SHA-256": record.reference_sha256}
     name, kind = shlex.quote(record_file), record.camera.split(":", maxsplit=1)[0]
     camera = {"sim": "sim", "bag": "l515"}.get(kind, shlex.quote(record.camera))
     commands = f"nlos-cam live --camera {camera} --wall {name}\nnlos-cam render cup --rig {name}"
-    use = "Keep the files together. The first command shows what is hidden, live; the second renders for this bench."
-    return f"<section><h2>Files and use</h2>{pairs(facts)}<p>{use}</p><pre>{escape(commands)}</pre></section>"
-
-
-def _plus_minus(std: float | None, unit: str, scale: float = 1.0) -> str:
-    """The half width of the 95 % interval; nothing where it is not known."""
-    if std is None:
-        return ""
-    half = INTERVAL_STDS * scale * std
-    return (f" ± {half:.2g} {unit}" if half >= MIN_REPORTED else f" ± less than {MIN_REPORTED} {unit}").replace(
-        " °", "°"
-    )
-
-
-def _metres(value_m: float, std_m: float | None) -> str:
-    return f"{value_m:.4f} m{_plus_minus(std_m, 'mm', 1e3)}"
-
-
-def _degrees(value_deg: float, std_deg: float | None) -> str:
-    return f"{value_deg:z.2f}°{_plus_minus(std_deg, '°')}"
-
-
-NO_MAPS = Picture("Maps of the wall", "This record names no reference of the bare wall: there are no maps to draw.")
-
-
-def report(wall: MeasuredWall, record_file: str) -> str:
-    """The report on a wall whose record is called `record_file`, as HTML that needs no other file and no network."""
-    record = wall.record
-    maps = [NO_MAPS] if wall.reference is None else wall_maps(record, wall.reference)
-    under = f"{record.created}, {record.camera}, {record.frames} frames of the bare wall"
-    parts = [
-        verdict(record),
-        ranges(record),
-        pictured(bench_picture(record)),
-        measures(record),
-        board(record),
-        pictured(footprint_picture(record)),
-        *map(pictured, maps),
-        device(wall),
-        files(record, record_file),
-    ]
-    return page(f"The bench as measured: {record_file}", under, parts)
+    use = "Keep the files together. The first command shows the hidden object live; the second renders for this bench."
+    return f"<section><h2>Files and use</h2>{_pairs(facts)}<p>{use}</p><pre>{escape(commands)}</pre></section>"

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlos_cam.calibrate.color_view import look_in_colour
+from nlos_cam.calibrate.color_view import capture_color_view
 from nlos_cam.camera import Camera, Recording, open_camera
 from nlos_cam.camera.l515 import NEAR_WALL, L515Camera, list_devices
 from nlos_cam.recording.playback import ReplayCamera, verify
@@ -75,7 +75,7 @@ def test_wall_is_near_and_unsaturated(camera: Camera) -> None:
 
 
 def test_color_is_captured_before_depth_and_leaves_it_alone(camera: Camera) -> None:
-    view = look_in_colour(camera.uri, 10)
+    view = capture_color_view(camera.uri, 10)
     assert view.image.shape == (view.intrinsics.height, view.intrinsics.width)
     assert 5.0 < view.image.mean() < 250.0
     assert view.distortion.any()

@@ -13,7 +13,7 @@ from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall
 from software_colour import SoftwareColour, record_with_colour
 
-from nlos_cam.calibrate.color_view import look_in_colour
+from nlos_cam.calibrate.color_view import capture_color_view
 from nlos_cam.calibrate.synthetic import View, at_near_edge, frame_of
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.sdk import load_sdk
@@ -38,7 +38,7 @@ def recorded(path: Path, frames: int = 4) -> Path:
 def test_board_in_a_recordings_colour_gives_the_lidars_wall(tmp_path: Path) -> None:
     """From a .bag by librealsense's recorder to the wall, by pixels, lens and pose; beside depth and alone."""
     uri = f"bag:{recorded(tmp_path / 'board.bag')}"
-    view = look_in_colour(uri, 30)
+    view = capture_color_view(uri, 30)
     with open_camera(uri) as camera:
         mean = DepthMean(camera.intrinsics.height, camera.intrinsics.width)
         for frame in camera:

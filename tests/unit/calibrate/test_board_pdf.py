@@ -7,7 +7,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from nlos_calibration.board import BOARDS, PAPER_MM, Board, Paper
 
-from nlos_cam.calibrate.board_pdf import BAR_MM, bar_mm, black_cells, pattern_origin_mm, sheet_figure, write_sheet
+from nlos_cam.calibrate.board_pdf import BAR_MM, bar_mm, black_cells, board_figure, pattern_origin_mm, write_board_pdf
 
 DPI = 254
 PIXELS_PER_MM = DPI / 25.4
@@ -16,7 +16,7 @@ PIXELS_PER_MM = DPI / 25.4
 @pytest.fixture(scope="module", params=list(BOARDS))
 def page(request: pytest.FixtureRequest) -> tuple[Paper, np.ndarray]:
     """A sheet as printed, at ten dots per millimetre."""
-    figure = sheet_figure(request.param)
+    figure = board_figure(request.param)
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -64,7 +64,7 @@ def test_black_cells_are_those_that_opencv_draws() -> None:
 
 @pytest.mark.parametrize("paper", list(BOARDS))
 def test_write_sheet_makes_a_vector_page_of_the_paper(tmp_path: Path, paper: Paper) -> None:
-    write_sheet(tmp_path / "board.pdf", paper)
+    write_board_pdf(tmp_path / "board.pdf", paper)
     content = (tmp_path / "board.pdf").read_bytes()
     assert content.startswith(b"%PDF-")
     (box,) = re.findall(rb"/MediaBox \[([^\]]*)\]", content)

@@ -14,7 +14,7 @@ from nlos_calibration.board_wall import BoardView, CameraErrors, undistorted
 from nlos_calibration.geometry import Intrinsics
 from software_colour import SoftwareColour, record_with_colour
 
-from nlos_cam.calibrate.color_view import GREY, SETTLES, look_in_colour
+from nlos_cam.calibrate.color_view import SETTLING_FRAMES, TO_GRAY, capture_color_view
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.errors import (
@@ -25,7 +25,7 @@ from nlos_cam.errors import (
     RecordingError,
     StreamMissingError,
 )
-from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.bag_reader import BagReader
 from nlos_cam.render.sensor.sensor import SensedImages
 
 SMALL = Intrinsics(64, 48, 60.0, 61.0, 33.0, 22.0)
@@ -81,14 +81,14 @@ def recorded(path: Path, greys: list[int], form: str = "rgb8") -> Path:
 
 def test_look_in_colour_averages_the_last_frames(tmp_path: Path) -> None:
     path, told = recorded(tmp_path / "a.bag", [0, 10, 20, 40]), list[int]()
-    view = look_in_colour(f"bag:{path}", 2, on_frame=lambda: told.append(1))
+    view = capture_color_view(f"bag:{path}", 2, on_frame=lambda: told.append(1))
     np.testing.assert_array_equal(view.image, np.full((24, 32), 30.0))
     assert len(told) == 2
-    np.testing.assert_array_equal(look_in_colour(f"bag:{path}", 99).image, np.full((24, 32), 17.5))
+    np.testing.assert_array_equal(capture_color_view(f"bag:{path}", 99).image, np.full((24, 32), 17.5))
 
 
 def assert_same_as_the_sdk(path: Path) -> None:
-    view = look_in_colour(f"bag:{path}", 1)
+    view = capture_color_view(f"bag:{path}", 1)
     sensors = load_sdk().context().load_device(str(path)).as_playback().query_sensors()
     profiles = {profile.stream_type().name: profile for s in sensors for profile in s.get_stream_profiles()}
     told = profiles["color"].as_video_stream_profile().get_intrinsics()
@@ -106,8 +106,8 @@ def test_look_in_colour_reads_lens_and_pose_like_the_sdk(tmp_path: Path) -> None
 
 def test_look_in_colour_reads_a_real_recording_like_the_sdk(real_bag: Path) -> None:
     assert_same_as_the_sdk(real_bag)
-    rgb = BagFile(real_bag).sample("color", 0).pixels
-    grey = look_in_colour(f"bag:{real_bag}", 1).image
+    rgb = BagReader(real_bag).sample("color", 0).pixels
+    grey = capture_color_view(f"bag:{real_bag}", 1).image
     np.testing.assert_allclose(grey, rgb @ [0.299, 0.587, 0.114], atol=1.0)
 
 
@@ -125,9 +125,9 @@ def test_undistorted_inverts_the_sdks_lens() -> None:
     assert np.abs(seen - straight).max() > 1.0
 
 
-@pytest.mark.parametrize("form", GREY)
+@pytest.mark.parametrize("form", TO_GRAY)
 def test_look_in_colour_makes_every_format_grey(tmp_path: Path, form: str) -> None:
-    image = look_in_colour(f"bag:{recorded(tmp_path / 'a.bag', [77], form)}", 1).image
+    image = capture_color_view(f"bag:{recorded(tmp_path / 'a.bag', [77], form)}", 1).image
     np.testing.assert_array_equal(image, np.full((24, 32), 77.0))
 
 
@@ -135,9 +135,9 @@ def test_grey_weighs_each_channel_by_its_luminance() -> None:
     pixel = np.array([[[200, 100, 50, 255]]], np.uint8)
     expected = 0.299 * 200 + 0.587 * 100 + 0.114 * 50
     for form, order in {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2, 3], "bgra8": [2, 1, 0, 3]}.items():
-        assert GREY[form](np.ascontiguousarray(pixel[..., order]))[0, 0] == pytest.approx(expected, abs=0.6)
+        assert TO_GRAY[form](np.ascontiguousarray(pixel[..., order]))[0, 0] == pytest.approx(expected, abs=0.6)
     luma = np.array([[91, 7]], np.uint8).view("<u2")
-    assert (GREY["yuyv"](luma)[0, 0], GREY["uyvy"](luma)[0, 0]) == (91, 7)
+    assert (TO_GRAY["yuyv"](luma)[0, 0], TO_GRAY["uyvy"](luma)[0, 0]) == (91, 7)
 
 
 def test_look_in_colour_refuses_unusable_recordings(noise_bag: Path, rewritten: Any, tmp_path: Path) -> None:
@@ -150,20 +150,20 @@ def test_look_in_colour_refuses_unusable_recordings(noise_bag: Path, rewritten: 
         return [(time_ns, raw)]
 
     with pytest.raises(StreamMissingError, match=r"noise\.bag.*color"):
-        look_in_colour(f"bag:{noise_bag}", 5)
+        capture_color_view(f"bag:{noise_bag}", 5)
     source = recorded(tmp_path / "a.bag", [5])
     path = rewritten(lambda topic, time, raw: [] if "Color_0/tf" in topic else [(time, raw)], source=source)
     with pytest.raises(RecordingError, match="color"):
-        look_in_colour(f"bag:{path}", 1)
+        capture_color_view(f"bag:{path}", 1)
     path.unlink()
     with pytest.raises(RecordingError, match="16 x 48 rgb8"):
-        look_in_colour(f"bag:{rewritten(narrower, source=source)}", 1)
+        capture_color_view(f"bag:{rewritten(narrower, source=source)}", 1)
 
 
 @pytest.mark.parametrize("uri", ["sim", "sim:bare-wall", "bag:", "kinect", "l515:x"])
 def test_look_in_colour_refuses_a_camera_that_is_not_there(uri: str) -> None:
     with pytest.raises(CameraError if uri.startswith("sim") else CameraNotFoundError, match=uri.removeprefix("l515:")):
-        look_in_colour(uri, 5, sdk=FakeSdk(fake()))
+        capture_color_view(uri, 5, sdk=FakeSdk(fake()))
 
 
 def fake(brightness: Callable[[int], int] = lambda _: 100, **how: Any) -> FakeLidar:
@@ -173,8 +173,8 @@ def fake(brightness: Callable[[int], int] = lambda _: 100, **how: Any) -> FakeLi
 
 
 def test_look_in_colour_waits_for_a_live_cameras_exposure() -> None:
-    lidar = fake(lambda number: 100 if number >= SETTLES else 200)
-    view = look_in_colour("l515", 3, sdk=FakeSdk(lidar))
+    lidar = fake(lambda number: 100 if number >= SETTLING_FRAMES else 200)
+    view = capture_color_view("l515", 3, sdk=FakeSdk(lidar))
     np.testing.assert_array_equal(view.image, np.full((720, 1280), 100.0))
     np.testing.assert_array_equal(view.distortion, LENS)
     np.testing.assert_allclose(view.lidar_from_camera, LIDAR_FROM_COLOUR, atol=1e-12)
@@ -182,34 +182,34 @@ def test_look_in_colour_waits_for_a_live_cameras_exposure() -> None:
 
 
 def test_look_in_colour_on_usb_2_takes_the_size_offered() -> None:
-    view = look_in_colour("l515:f0246262", 1, sdk=FakeSdk(fake(usb="2.1")))
+    view = capture_color_view("l515:f0246262", 1, sdk=FakeSdk(fake(usb="2.1")))
     assert (view.intrinsics.width, view.intrinsics.height) == (640, 480)
 
 
 def test_look_in_colour_refuses_no_colour_and_unknown_lenses() -> None:
     with pytest.raises(CameraError, match="colour"):
-        look_in_colour("l515", 1, sdk=FakeSdk(FakeLidar()))
+        capture_color_view("l515", 1, sdk=FakeSdk(FakeLidar()))
     lidar = fake()
     lidar.lens_model = "inverse_brown_conrady"
     with pytest.raises(NlosCamError, match="inverse_brown_conrady"):
-        look_in_colour("l515", 2, sdk=FakeSdk(lidar))
+        capture_color_view("l515", 2, sdk=FakeSdk(lidar))
 
 
 def test_look_in_colour_closes_a_camera_that_fails() -> None:
-    silent, busy = fake(runs=(SETTLES + 1,)), fake()
+    silent, busy = fake(runs=(SETTLING_FRAMES + 1,)), fake()
     with pytest.raises(CameraLostError, match=r"0\.2 s"):
-        look_in_colour("l515", 2, sdk=FakeSdk(silent), silence_s=0.2)
+        capture_color_view("l515", 2, sdk=FakeSdk(silent), silence_s=0.2)
     assert silent.did[-2:] == ["stop", "close"]
     busy.start_error = RuntimeError("busy")
     with pytest.raises(CameraError, match="busy"):
-        look_in_colour("l515", 2, sdk=FakeSdk(busy))
+        capture_color_view("l515", 2, sdk=FakeSdk(busy))
     assert busy.did[-1] == "close"
 
 
 def test_look_in_colour_works_on_librealsense_itself() -> None:
     desk = Desk()
     try:
-        view = look_in_colour("l515", FRAMES, sdk=desk, on_frame=desk.on_frame)
+        view = capture_color_view("l515", FRAMES, sdk=desk, on_frame=desk.on_frame)
     finally:
         desk.end()
     np.testing.assert_array_equal(view.image, np.full((48, 64), 90.0))

@@ -8,8 +8,8 @@ from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.reference import BareWall, BareWallStatistics
 from nlos_calibration.wall_record import MeasuredWall, load_measured
 
-from nlos_cam.calibrate.files import WallFiles, written
-from nlos_cam.calibrate.report import report
+from nlos_cam.calibrate.files import WallFiles, write_record
+from nlos_cam.calibrate.report import report_html
 from nlos_cam.errors import OutputExistsError
 
 
@@ -31,12 +31,12 @@ def files(tmp_path: Path) -> WallFiles:
 def test_written_wall_files_belong_together(
     files: WallFiles, measured: Callable[..., MeasuredWall], wall: BareWall, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    record = written(files, measured().record, wall)
+    record = write_record(files, measured().record, wall)
     loaded = load_measured(files.record)
     assert loaded.record == record
     assert loaded.reference is not None
     np.testing.assert_array_equal(loaded.reference.depth_m, wall.depth_m)
-    assert files.report.read_text(encoding="utf-8") == report(loaded, "wall.toml")
+    assert files.report.read_text(encoding="utf-8") == report_html(loaded, "wall.toml")
     before = {path.name: path.read_bytes() for path in files.record.parent.iterdir()}
     assert set(before) == {"wall.toml", "wall.npz", "wall.html"}
 
@@ -45,12 +45,12 @@ def test_written_wall_files_belong_together(
 
     monkeypatch.setattr("nlos_cam.calibrate.files.report", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        written(files, record, replace(wall, depth_m=wall.depth_m + np.float32(0.1)))
+        write_record(files, record, replace(wall, depth_m=wall.depth_m + np.float32(0.1)))
     assert {path.name: path.read_bytes() for path in files.record.parent.iterdir()} == before
 
 
 def test_written_wall_without_a_reference_names_none(files: WallFiles, measured: Callable[..., MeasuredWall]) -> None:
-    assert written(files, measured().record, None).reference == ""
+    assert write_record(files, measured().record, None).reference == ""
     assert not files.reference.exists()
     assert load_measured(files.record).reference is None
 

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from measured_walls import BOARD
+from nlos_calibration.summary import wall_facts
 from nlos_calibration.wall_record import MeasuredWall, OccluderRecord, WallRecord
 
-from nlos_cam.calibrate import report as text
-from nlos_cam.calibrate.report import page, range_bar, report
+from nlos_cam.calibrate import report
 
 Measured = Callable[..., MeasuredWall]
 VOID = {"meta", "img", "rect", "path"}
@@ -20,7 +20,7 @@ PNG = "data:image/png;base64,"
 
 
 class Reader(HTMLParser):
-    """Reader of what a browser finds: text, pictures, and what it would fetch or run."""
+    """Reader of a page as a browser: its text, its pictures, and everything it would fetch or run."""
 
     def __init__(self, page: str) -> None:
         super().__init__(convert_charrefs=True)
@@ -48,7 +48,7 @@ class Reader(HTMLParser):
 
 def read(wall: MeasuredWall, record_file: str = "wall.toml") -> Reader:
     """Read the report, which must be well-formed and self-contained."""
-    page = report(wall, record_file)
+    page = report.report_html(wall, record_file)
     found = Reader(page)
     assert found.open == []
     assert found.fetched == []
@@ -109,18 +109,18 @@ def test_report_of_noise_stays_small(measured: Measured) -> None:
         ir=noise.uniform(0.0, 255.0, shape).astype(np.float32),
         saturated=noise.uniform(0.0, 1.0, shape).astype(np.float32),
     )
-    assert len(report(MeasuredWall(wall.record, loud), "wall.toml")) < 1_500_000
+    assert len(report.report_html(MeasuredWall(wall.record, loud), "wall.toml")) < 1_500_000
 
 
 def test_report_page_may_hold_dollars_and_braces() -> None:
-    made = page("$title", "{under}", ["<p>$body ${style}</p>"])
+    html = report.page("$title", "{under}", ["<p>$body ${style}</p>"])
     for part in ("<title>$title</title>", "{under}", "<p>$body ${style}</p>"):
-        assert part in made
+        assert part in html
 
 
 def marker_and_range(value: float) -> tuple[float, float, float]:
     """Return the places of the marker and of both ends of the range from 15 to 30."""
-    drawn = range_bar("distance", value, (15.0, 30.0), 0.1, "cm", 45.0)
+    drawn = report.range_bar("distance", value, (15.0, 30.0), 0.1, "cm", 45.0)
     marker = re.search(r"M ([\d.]+) ", drawn)
     allowed = re.search(r"x='([\d.]+)' y='14' width='([\d.]+)' height='14' class='allowed'", drawn)
     assert marker is not None
@@ -142,68 +142,56 @@ def test_range_bar_marker_is_where_the_value_is() -> None:
     ("value", "drawn"), [(14.85, "outside"), (14.95, "inside"), (30.05, "inside"), (31.0, "outside")]
 )
 def test_range_bar_shows_whether_the_value_is_inside(value: float, drawn: str) -> None:
-    made = range_bar("distance", value, (15.0, 30.0), 0.1, "cm", 45.0)
-    assert f"{value:.1f} cm" in made
-    assert f"class='{drawn}'" in made
+    html = report.range_bar("distance", value, (15.0, 30.0), 0.1, "cm", 45.0)
+    assert f"{value:.1f} cm" in html
+    assert f"class='{drawn}'" in html
 
 
 @pytest.mark.parametrize("verdict", ["good", "out of range", "doubtful"])
 def test_report_banner_holds_verdict_advice_and_warnings(measured: Measured, verdict: str) -> None:
-    told = {"verdict": verdict, "advice": "move <4 cm> back", "warnings": ("ripples & noise", "cold")}
-    banner = text.verdict(recorded(measured, **told))
+    fields = {"verdict": verdict, "advice": "move <4 cm> back", "warnings": ("ripples & noise", "cold")}
+    banner = report.banner(recorded(measured, **fields))
     assert f"class='verdict {verdict.replace(' ', '-')}'" in banner
     for sentence in (verdict, "move <4 cm> back", "ripples & noise", "cold"):
         assert sentence in unescape(banner).lower()
 
 
-def test_report_bars_are_of_what_is_known(measured: Measured) -> None:
+def test_report_bars_are_of_measured_quantities(measured: Measured) -> None:
     record = measured(0.35, 80.0, 0.0).record
-    bars = text.ranges(record)
+    bars = report.ranges(record)
     assert "35.0 cm" in bars
     assert "80.0 degrees" in bars
     assert "gap" not in bars
     wide = OccluderRecord(source="entered", x_m=0.2, gap_m=0.25)
-    assert "25.0 cm" in text.ranges(record.model_copy(update={"occluder": wide}))
+    assert "25.0 cm" in report.ranges(record.model_copy(update={"occluder": wide}))
 
 
-def test_report_measures_have_their_uncertainty(measured: Measured) -> None:
-    stds = {"distance_std_m": 0.001, "facing_std_deg": 0.1, "yaw_std_deg": 0.2, "pitch_std_deg": 1e-6}
-    record = measured(0.2, 40.0, -3.0).record.model_copy(update=stds)
-    told = text.measures(record)
-    for words in ("0.2000 m ± 2 mm", "40.09° ± 0.2°", "40.00° ± 0.39°", "-3.00° ± ", "0.001°"):
-        assert words in told
-    assert "occluder" not in told
-    assert "0.2000 m</td>" in text.measures(record.model_copy(update={"distance_std_m": None}))
-
-
-def test_report_measures_hold_offset_occluder_and_footprint(measured: Measured) -> None:
-    found = OccluderRecord(source="detected", x_m=0.21, gap_m=0.09, x_std_m=0.001, gap_std_m=0.001, tilt_deg=-1.5)
-    told = {"range_offset_m": -0.0045, "range_offset_std_m": 0.0005, "range_offset_cause": "depth"}
-    made = unescape(text.measures(recorded(measured, **told, occluder=found, footprint_share=0.875)))
-    for words in ("-4.50 mm ± 0.98 mm", "0.2100 m ± 2 mm", "0.0900 m ± 2 mm", "-1.50°", "87.5%"):
-        assert words in made
-    refused = text.measures(recorded(measured, residual_m=None))
-    assert "refused" in refused
-    assert "ripples" not in refused
+def test_report_measures_are_the_summarys_rows(measured: Measured) -> None:
+    record = recorded(measured, footprint_share=0.875)
+    html = unescape(report.measures(record))
+    for cell in (cell for row in wall_facts(record) for cell in row):
+        assert cell in html
+    assert "--tape-m" in html
+    assert "--tape-m" not in report.measures(record.model_copy(update={"range_offset_std_m": 0.001}))
 
 
 def test_report_compares_the_board_with_the_record(measured: Measured) -> None:
-    assert not text.board(measured().record)
-    made = unescape(text.board(recorded(measured, board=BOARD)))
-    for words in ("0.2034 m ± 0.98 mm", "0.2000 m", "+3.40 mm", "0.117°", "6.5", "at 97 %"):
-        assert words in made
+    assert not report.board(measured().record)
+    html = unescape(report.board(recorded(measured, board=BOARD)))
+    for words in ("203.4 ± 1.0 mm", "200.", "40.10 ± 0.04°", "+3.40 mm", "0.117°", "6.5", "at 97 %"):
+        assert words in html
     alone = {"used": "board", "disagreement_m": None, "depth_refused": "a <mirror>"}
-    assert "a <mirror>" in unescape(text.board(recorded(measured, board=BOARD.model_copy(update=alone))))
+    assert "a <mirror>" in unescape(report.board(recorded(measured, board=BOARD.model_copy(update=alone))))
 
 
 def test_report_device_has_temperatures_and_settings(measured: Measured) -> None:
     device = {"serial": "f0246262", "firmware": "1.5.8.1", "settings": {"laser_power": 80.0}}
     wall = measured(**device, temperatures_c={"LLD": 41.26})
     assert wall.reference is not None
-    made = text.device(MeasuredWall(wall.record, replace(wall.reference, celsius_span={"LLD": 1.5})))
-    for words in ("f0246262", "1.5.8.1", "laser_power", "80", "41.3 °C", "1.5", "2026-01-31", "64 x 48"):
-        assert words in made
-    assert "°C" not in text.device(MeasuredWall(measured().record, None))
+    html = report.device(MeasuredWall(wall.record, replace(wall.reference, celsius_span={"LLD": 1.5})))
+    for words in ("f0246262", "1.5.8.1", "laser_power", "80", "41.3 °C", "1.5", "64 x 48"):
+        assert words in html
+    assert "°C" not in report.device(MeasuredWall(measured().record, None))
 
 
 @pytest.mark.parametrize(
@@ -216,6 +204,6 @@ def test_report_device_has_temperatures_and_settings(measured: Measured) -> None
 )
 def test_report_commands_can_be_pasted(measured: Measured, camera: str, record_file: str, live: str) -> None:
     record = measured(reference="wall.npz", reference_sha256="ab" * 32).record.model_copy(update={"camera": camera})
-    made = unescape(text.files(record, record_file))
-    assert f"nlos-cam {live}\n" in made
-    assert all(words in made for words in ("render cup --rig", "wall.npz", "ab" * 32, record.rig.checksum))
+    html = unescape(report.usage(record, record_file))
+    assert f"nlos-cam {live}\n" in html
+    assert all(words in html for words in ("render cup --rig", "wall.npz", "ab" * 32, record.rig.checksum))

@@ -19,12 +19,12 @@ from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import load_measured, load_wall
 from rich.console import Console
 
-from nlos_cam.calibrate.measure import Glance, glance
+from nlos_cam.calibrate.measure import FrameFit, fit_frame
 from nlos_cam.calibrate.synthetic import View, at_near_edge, clean_view, frames_of
 from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.cli import calibrate
-from nlos_cam.cli.calibrate import EVERY, gauge, panel, until_enter, watch
+from nlos_cam.cli.calibrate import EVERY, gauge, panel, until_enter, watch_wall
 from nlos_cam.cli.main import main
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.frames import Frame
@@ -83,10 +83,10 @@ def call(monkeypatch: pytest.MonkeyPatch, out: Path) -> Call:
             return opened[0]
 
         monkeypatch.setattr("nlos_cam.cli.calibrate.open_camera", open_fake)
-        monkeypatch.setattr("nlos_cam.calibrate.files.report", lambda *_: "")  # it takes a second to draw
+        monkeypatch.setattr("nlos_cam.calibrate.files.report_html", lambda *_: "")  # it takes a second to draw
         app = typer.Typer()
         calibrate.register(app)
-        app([*arguments, "--out", str(out)], standalone_mode=False)
+        app(["calibrate", *arguments, "--out", str(out)], standalone_mode=False)
         return opened[0] if opened else None
 
     return run
@@ -122,9 +122,9 @@ def test_calibrate_writes_device_and_reference(call: Call, out: Path, capsys: py
     assert (reference.frames, reference.settings) == (10, {"laser_power": 80.0})
     np.testing.assert_allclose(reference.depth_m, camera.depth_m, rtol=1e-6)
     assert reference.inliers.mean() == pytest.approx(record.inlier_fraction)
-    told = capsys.readouterr().out
-    for part in ("0.2000 m ± ", "45.00 ± ", "mm RMS", "good", "wall.toml"):
-        assert part in told
+    shown = capsys.readouterr().out
+    for part in ("200.00 ± 0.0", "45.00", " mm RMS", "Verdict: good", "wall.npz", "open wall.html"):
+        assert part in shown
 
 
 def test_calibrate_takes_frames_of_a_recording(call: Call, out: Path) -> None:
@@ -138,9 +138,9 @@ def test_calibrate_writes_an_entered_occluder(call: Call, out: Path, capsys: pyt
     record = load_wall(out)
     assert record.rig.occluder == Occluder(x_m=0.25, z_min_m=0.08)
     assert record.occluder == OccluderRecord(source="entered", x_m=0.25, gap_m=0.08)
-    told = capsys.readouterr().out
-    for part in ("0.250 m", "0.080 m", "entered"):
-        assert part in told
+    shown = capsys.readouterr().out
+    for part in ("250.0 mm", "80.0 mm", "entered"):
+        assert part in shown
 
 
 @pytest.mark.slow
@@ -150,11 +150,11 @@ def test_calibrate_finds_the_occluder_on_a_simulated_bench(tmp_path: Path, capsy
     assert main(["calibrate", *WALL, "--frames", "20", "--out", str(wall)]) == 0
     run = ["calibrate", "--occluder", str(wall), "--camera", f"sim:{scene}", "--frames", "20", "--out", str(bench)]
     assert main([*run, "--json"]) == 0
-    told = json_of(capsys)
-    assert told["occluder"]["source"] == "detected"
-    assert (told["occluder"]["x_m"], told["occluder"]["gap_m"]) == pytest.approx((0.2, 0.1), abs=0.001)
+    result = json_of(capsys)
+    assert result["occluder"]["source"] == "detected"
+    assert (result["occluder"]["x_m"], result["occluder"]["gap_m"]) == pytest.approx((0.2, 0.1), abs=0.001)
     before, after = load_measured(wall), load_measured(bench)
-    assert (after.record.distance_m, told["reference"]) == (before.record.distance_m, "bench.npz")
+    assert (after.record.distance_m, result["reference"]) == (before.record.distance_m, "bench.npz")
     assert after.reference is not None
     assert after.reference.inliers.mean() < 0.8
     assert main(run) == 1
@@ -166,7 +166,7 @@ def test_calibrate_measures_after_watching(
 ) -> None:
     monkeypatch.setattr("sys.stdin", StringIO("\n"))
     call("--wall", "--watch", "--camera", "sim")
-    assert "0.2000 m" in capsys.readouterr().err
+    assert "200.0 mm" in capsys.readouterr().err
     assert load_wall(out).frames == 10
 
 
@@ -190,7 +190,7 @@ def test_calibrate_writes_a_wall_out_of_range(call: Call, out: Path, capsys: pyt
     [
         (WALL, {"patch": 1.5}, WallRefusedError, r"\d+%"),
         (WALL, {"frames": 0}, WallRefusedError, "sim:bare-wall"),
-        ((*WALL, "--tape-m", "0.3"), {}, CalibrationError, r"0\.3000 m.*0\.2000 m"),
+        ((*WALL, "--tape-m", "0.3"), {}, CalibrationError, r"300\.0 mm.*200\.0 mm"),
     ],
     ids=["patch", "no frames", "tape"],
 )
@@ -309,9 +309,9 @@ def test_calibrate_board_uses_depth_and_board(record: Record, capsys: pytest.Cap
     assert board["distance_m"] == pytest.approx(0.2, abs=3 * board["distance_std_m"])
     assert abs(board["disagreement_m"]) < 0.002
     assert main(["calibrate", "--wall", "--board", "--bag", str(bag), "--out", str(bag.with_name("w.toml"))]) == 0
-    told = capsys.readouterr().out
-    for part in ("board", f"{board['corners']} corners", "both"):
-        assert part in told
+    shown = capsys.readouterr().out
+    for part in ("printed board", f"{board['corners']} corners", "used: both"):
+        assert part in shown
 
 
 @pytest.mark.slow
@@ -342,17 +342,17 @@ def frames(count: int) -> Iterator[Frame]:
         yield Frame(DEPTH_M.astype(np.float32), counts, counts, number / 30, number, INTRINSICS)
 
 
-def shown(seen: Glance) -> str:
+def shown(seen: FrameFit) -> str:
     text = StringIO()
     Console(file=text, width=140).print(panel(seen))
     return text.getvalue()
 
 
 def test_watch_panel_shows_measures_or_the_refusal() -> None:
-    text = shown(glance(next(frames(1))))
-    for part in ("0.2000 m", "45.00 deg", "good", "●"):
+    text = shown(fit_frame(next(frames(1))))
+    for part in ("200.0 mm", "45.00°", "good", "●"):
         assert part in text
-    text = shown(Glance(None, "the wall [so to say] is not flat", 0.25))
+    text = shown(FrameFit(None, "the wall [so to say] is not flat", 0.25))
     assert "the wall [so to say] is not flat" in text
     assert "25.0%" in text
 
@@ -365,11 +365,11 @@ def test_watch_ends_with_the_camera_or_on_request() -> None:
         return len(asked) == 2 * EVERY
 
     camera: Any = frames(100)
-    last = watch(camera, stop)
+    last = watch_wall(camera, stop)
     assert last is not None
     assert last.fit is not None
     assert len(asked) == 2 * EVERY
-    assert watch(frames(0), lambda: False) is None  # type: ignore[arg-type]
+    assert watch_wall(frames(0), lambda: False) is None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("typed", ["\n", ""])
@@ -397,11 +397,11 @@ def test_board_json_is_the_board_that_was_printed(out: Path, capsys: pytest.Capt
         assert Board.model_validate(result) == board
 
 
-def test_board_tells_how_to_print_it(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_board_prints_how_to_print_it(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["board", "--out", str(out)]) == 0
-    told = capsys.readouterr().out
+    shown = capsys.readouterr().out
     for part in ("6 x 9", "30 mm", "a4", "100 %", "wall.toml"):
-        assert part in told
+        assert part in shown
 
 
 def test_board_keeps_an_existing_file_unless_asked(out: Path) -> None:

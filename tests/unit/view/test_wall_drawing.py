@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from measured_walls import BOARD, HEIGHT, WIDTH, exact_wall
+from measured_walls import HEIGHT, WIDTH, exact_wall
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.reference import BareWall
-from nlos_calibration.rig import OccluderRecord
 from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.view.images import BACKGROUND_RGB, SATURATED_RGB
@@ -32,7 +31,6 @@ PATHS = {
     f"bench/measured/{name}"
     for name in ("footprint", "distance", "distance/end", "axis", "axis/end", "frame", "points")
 }
-RECORD = exact_wall().record.model_copy(update={"reference": "wall.npz", "reference_sha256": "0" * 64})
 
 
 def reference_of(wall: MeasuredWall) -> BareWall:
@@ -99,8 +97,8 @@ def test_wall_outline_is_closed_finite_and_on_the_wall() -> None:
 def test_bench_drawings_label_distance_and_angle() -> None:
     drawings = dict(bench_drawings(exact_wall()))
     assert set(drawings) == PATHS
-    assert drawings["bench/measured/distance/end"].labels.as_arrow_array().to_pylist() == ["0.2000 m"]
-    assert drawings["bench/measured/axis/end"].labels.as_arrow_array().to_pylist() == ["45.0 degrees"]
+    assert drawings["bench/measured/distance/end"].labels.as_arrow_array().to_pylist() == ["200.0 mm"]
+    assert drawings["bench/measured/axis/end"].labels.as_arrow_array().to_pylist() == ["45.0°"]
     np.testing.assert_allclose(points(drawings["bench/measured/distance/end"]), [[0.0, 0.0, 0.0]], atol=1e-6)
     np.testing.assert_allclose(points(drawings["bench/measured/axis/end"]), [[0.2, 0.0, 0.0]], atol=1e-6)
 
@@ -164,60 +162,14 @@ def test_wall_names_state_their_scales() -> None:
     assert wall_names(exact_wall(), None).difference == ""
 
 
-def row(text: str, name: str) -> str:
-    (found,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
-    return found.split("|")[2].strip()
-
-
-def text_with(**fields: Any) -> str:
-    return calibration_text(RECORD.model_copy(update=fields))
-
-
-def test_calibration_text_holds_measures_with_intervals() -> None:
-    text = calibration_text(RECORD)
-    assert text.startswith("**GOOD**")
-    assert row(text, "distance") == "0.2000 m ± 0.20 mm"
-    assert row(text, "facing") == "45.00° ± 0.020°"
-    assert row(text, "yaw") == "+45.00° ± 0.020°"
-    assert row(text, "pitch") == "+0.00° ± 0.039°"
-    assert row(text, "temperature") == "41.7 °C"
-    assert row(text, "date") == "2026-11-22, 30 frames"
-    assert row(text_with(facing_std_deg=1e-7), "facing") == "45.00° ± 0.001°"
-    assert not any(word in text_with(temperatures_c={}) for word in ("temperature", "offset", "Board", "Note"))
-
-
-def test_calibration_text_shows_warnings_instead_of_all_well() -> None:
-    calm, alarmed = calibration_text(RECORD), calibration_text(RECORD, ["the lidar has moved", "it is warm"])
+def test_calibration_text_shows_warnings_before_the_summary() -> None:
+    record = exact_wall().record.model_copy(update={"reference": "wall.npz", "reference_sha256": "0" * 64})
+    calm, alarmed = calibration_text(record), calibration_text(record, ["the lidar has moved", "it is warm"])
     assert ALL_IS_WELL in calm
     assert "WARNING" not in calm
     assert ALL_IS_WELL not in alarmed
     assert "> - the lidar has moved\n> - it is warm" in alarmed
     assert alarmed.index("it is warm") < alarmed.index("| distance |")  # visible without scrolling
-    unwatched = text_with(reference="", reference_sha256="")
+    unwatched = calibration_text(exact_wall().record)
     assert NOT_WATCHED in unwatched
     assert ALL_IS_WELL not in unwatched
-
-
-def test_calibration_text_holds_offset_board_and_notes() -> None:
-    offset = {"range_offset_m": -0.0045, "range_offset_std_m": 0.0005, "range_offset_cause": "depth"}
-    text = text_with(**offset, board=BOARD, warnings=("it has ripples",))
-    assert row(text, "offset of depth") == "-4.5 mm ± 0.98 mm"
-    for words in ("+3.40 mm", "0.12°", "6.5 sigma", "used: depth", "Note: it has ripples"):
-        assert words in text
-    alone = {"disagreement_m": None, "disagreement_deg": None, "disagreement_sigmas": None, "used": "board"}
-    assert "24 corners" in text_with(board=BOARD.model_copy(update=alone))
-
-
-def test_calibration_text_holds_occluder_and_temperatures() -> None:
-    occluder = OccluderRecord(source="entered", x_m=0.21, gap_m=0.09)
-    text = text_with(occluder=occluder, temperatures_c={"ldd_temperature": 40.0, "apd_temperature": 35.5})
-    assert row(text, "occluder") == "0.210 m, gap 0.090 m"
-    assert row(text, "temperature") == "35.5 to 40.0 °C"
-    assert "occluder" not in calibration_text(RECORD)
-
-
-@pytest.mark.parametrize(
-    "stds", [{}, dict.fromkeys(("distance_std_m", "facing_std_deg", "yaw_std_deg", "pitch_std_deg"))]
-)
-def test_calibration_text_of_a_version_1_record_has_no_interval(stds: dict[str, None]) -> None:
-    assert ("±" in row(text_with(**stds), "distance")) == (not stds)

@@ -1,0 +1,117 @@
+"""Summary of a wall record for readers: quantities with 95 % intervals, as rows and as Markdown.
+
+The report (HTML), the live view (Markdown) and the terminal all render these rows.
+"""
+
+from math import floor, log10
+
+from nlos_calibration.board_wall import BoardRecord
+from nlos_calibration.wall import INTERVAL_STDS
+from nlos_calibration.wall_record import WallRecord
+
+Row = tuple[str, str, str]
+"""Quantity, value with its unit, meaning."""
+MAX_DECIMALS_MM, MAX_DECIMALS_DEG = 2, 3
+"""Finest digits printed, however small the interval: an interval below one unit of them is printed as one unit."""
+
+
+def wall_facts(record: WallRecord) -> list[Row]:
+    """Return the measured quantities of a record; those that were not measured are left out."""
+    rows = [
+        ("distance", with_mm(record.distance_m, record.distance_std_m), "from the lidar to the wall, along its normal"),
+        (
+            "facing angle",
+            with_degrees(record.facing_deg, record.facing_std_deg),
+            "between optical axis and wall's normal",
+        ),
+        (
+            "yaw",
+            with_degrees(record.yaw_deg, record.yaw_std_deg, "+"),
+            "positive turns the axis towards the object (+x)",
+        ),
+        ("pitch", with_degrees(record.pitch_deg, record.pitch_std_deg, "+"), "positive points up"),
+    ]
+    if record.range_offset_std_m is not None:
+        causes = {"origin": "the beams start this far in front of the glass", "depth": "each depth is short by this"}
+        meaning = causes.get(record.range_offset_cause or "", "added to the lidar's depth")
+        offset = with_mm(record.range_offset_m, record.range_offset_std_m, "+")
+        rows.append(("range offset", offset, f"{meaning}; included in the distance"))
+    if found := record.occluder:
+        edge, gap = with_mm(found.x_m, found.x_std_m), with_mm(found.gap_m, found.gap_std_m)
+        rows.append((f"occluder's edge ({found.source})", edge, "along the wall from the lidar's foot"))
+        rows.append((f"occluder's gap ({found.source})", gap, "between its edge and the wall"))
+        if found.tilt_deg is not None:
+            leaning = "against the wall's normal; positive leans away from the lidar's foot"
+            rows.append(("occluder's tilt", with_degrees(found.tilt_deg, None, "+"), leaning))
+    if record.board:
+        rows.append(_board_row(record.board))
+    rows += _depth_rows(record)
+    if record.footprint_share is not None:
+        rows.append(("view on the wall", f"{record.footprint_share:.1%}", "of the map's 64 x 80 cells"))
+    rows.append(("measured on", f"{record.created}", f"{record.frames} frames averaged"))
+    if celsius := record.temperatures_c.values():
+        span = dict.fromkeys(f"{value:.1f}" for value in (min(celsius), max(celsius)))
+        rows.append(("temperature", f"{' to '.join(span)} °C", "of the camera"))
+    return rows
+
+
+def wall_summary(record: WallRecord, status: str = "") -> str:
+    """Return a record as Markdown: verdict and advice, the `status` of now, a table of quantities, warnings."""
+    rows = [f"| {name} | {value} |" for name, value, _ in wall_facts(record)]
+    table = "\n".join(["| quantity | value (± 95 %) |", "|---|---|", *rows])
+    notes = [f"Note: {warning}" for warning in record.warnings]
+    return "\n\n".join(filter(None, [f"**{record.verdict.upper()}**: {record.advice}", status, table, *notes]))
+
+
+def board_agreement(board: BoardRecord) -> str:
+    """Return how far the plane of a printed board is from the plane of the depth."""
+    if board.disagreement_m is None or board.disagreement_deg is None or board.disagreement_sigmas is None:
+        return f"The depth was refused: {board.depth_refused}."
+    return (
+        f"The board's plane is {1e3 * board.disagreement_m:+z.2f} mm and {board.disagreement_deg:.3f}° from the "
+        f"depth's: {board.disagreement_sigmas:.1f} standard deviations."
+    )
+
+
+def with_mm(value_m: float, std_m: float | None, sign: str = "") -> str:
+    """Return a length in metres as millimetres with its 95 % interval: "200.00 ± 0.01 mm"."""
+    return f"{_with_interval(1e3 * value_m, None if std_m is None else 1e3 * std_m, MAX_DECIMALS_MM, sign)} mm"
+
+
+def with_degrees(value_deg: float, std_deg: float | None, sign: str = "") -> str:
+    """Return an angle with its 95 % interval: "45.000 ± 0.001°"."""
+    return f"{_with_interval(value_deg, std_deg, MAX_DECIMALS_DEG, sign)}°"
+
+
+def _with_interval(value: float, std: float | None, max_decimals: int, sign: str) -> str:
+    """Return a value and the half width of its 95 % interval, with the digits that the interval justifies.
+
+    Without a standard uncertainty (records of version 1, what was entered by hand) the value stands alone.
+    """
+    if std is None:
+        return f"{value:{sign}z.{max_decimals - 1}f}"
+    half = max(INTERVAL_STDS * std, 10.0**-max_decimals)
+    # one significant digit of the half width, two where it begins with 1: none after the point from 2 to 20, one from
+    # 0.2 to 2, ...
+    decimals = min(max(-floor(log10(half / 2.0)), 0), max_decimals)
+    return f"{value:{sign}z.{decimals}f} ± {half:.{decimals}f}"
+
+
+def _board_row(board: BoardRecord) -> Row:
+    plane = with_mm(board.distance_m, board.distance_std_m), with_degrees(board.facing_deg, board.facing_std_deg)
+    return "printed board", ", ".join(plane), f"{board.corners} corners; used: {board.used}. {board_agreement(board)}"
+
+
+def _depth_rows(record: WallRecord) -> list[Row]:
+    """Return how well the depth fits the plane."""
+    if record.residual_m is None:
+        return [("depth", "refused", "the plane is the board's alone")]
+    measured: list[tuple[str, float | None, str, float, str]] = [
+        ("residual", record.residual_m, "{:.2f} mm RMS", 1e3, "distance of the pixels used from the plane"),
+        ("on the plane", record.inlier_fraction, "{:.1f} %", 100.0, "of the pixels with depth; the rest is left out"),
+        ("noise", record.noise_scale, "{:.2f} times nominal", 1.0, "of one depth sample"),
+        ("ripples", record.ripple_m, "{:.2f} mm RMS", 1e3, "of parts of the wall off the plane, beyond noise"),
+        ("bend", record.bend_m, "{:.2f} mm", 1e3, "between planes through half of the view and through all of it"),
+        ("bend", record.bend_deg, "{:.2f}°", 1.0, "the same as an angle"),
+    ]
+    return [(name, form.format(scale * at), what) for name, at, form, scale, what in measured if at is not None]

@@ -1,0 +1,90 @@
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from measured_walls import BOARD, exact_wall
+from nlos_calibration.rig import OccluderRecord
+from nlos_calibration.summary import wall_facts, wall_summary, with_degrees, with_mm
+from nlos_calibration.wall import INTERVAL_STDS
+
+RECORD = exact_wall().record
+OFFSET = {"range_offset_m": -0.0045, "range_offset_std_m": 0.0005, "range_offset_cause": "depth"}
+
+
+def values(**fields: Any) -> dict[str, str]:
+    return {name: value for name, value, _ in wall_facts(RECORD.model_copy(update=fields))}
+
+
+@pytest.mark.parametrize(
+    ("std_m", "text"),
+    [
+        *((1e-9, "200.00 ± 0.01 mm"), (0.0, "200.00 ± 0.01 mm"), (1e-4, "200.00 ± 0.20 mm"), (5e-4, "200.0 ± 1.0 mm")),
+        *((0.0016, "200 ± 3 mm"), (0.008, "200 ± 16 mm"), (None, "200.0 mm")),
+    ],
+)
+def test_length_has_the_digits_of_its_interval(std_m: float | None, text: str) -> None:
+    assert with_mm(0.2, std_m) == text
+
+
+@given(st.floats(1e-3, 30.0), st.floats(-90.0, 90.0))
+def test_interval_is_printed_within_a_tenth_of_a_digit(std_deg: float, value_deg: float) -> None:
+    value, half = with_degrees(value_deg, std_deg, "+").removesuffix("°").split(" ± ")
+    assert float(half) == pytest.approx(INTERVAL_STDS * std_deg, rel=0.26)
+    assert float(value) == pytest.approx(value_deg, abs=0.51 * float(half))
+    assert len(value.partition(".")[2]) == len(half.partition(".")[2])
+
+
+def test_facts_hold_quantities_with_intervals() -> None:
+    facts = values()
+    assert facts["distance"] == "200.00 ± 0.20 mm"
+    assert facts["facing angle"] == "45.000 ± 0.020°"
+    assert facts["yaw"] == "+45.000 ± 0.020°"
+    assert facts["pitch"] == "+0.00 ± 0.04°"
+    assert facts["measured on"] == "2026-11-22"
+    assert facts["temperature"] == "41.7 °C"
+    assert values(facing_std_deg=None)["facing angle"] == "45.00°"
+    for name in ("range offset", "printed board", "view on the wall", "occluder's tilt"):
+        assert name not in facts
+    assert "temperature" not in values(temperatures_c={})
+
+
+def test_facts_hold_offset_board_occluder_and_footprint() -> None:
+    found = OccluderRecord(source="detected", x_m=0.21, gap_m=0.09, x_std_m=0.001, gap_std_m=0.001, tilt_deg=-1.5)
+    warm = {"ldd_temperature": 40.0, "apd_temperature": 35.5}
+    facts = values(**OFFSET, occluder=found, board=BOARD, footprint_share=0.875, temperatures_c=warm)
+    assert facts["range offset"] == "-4.5 ± 1.0 mm"
+    assert (facts["occluder's edge (detected)"], facts["occluder's gap (detected)"]) == (
+        "210.0 ± 2.0 mm",
+        "90.0 ± 2.0 mm",
+    )
+    assert facts["occluder's tilt"] == "-1.50°"
+    assert facts["printed board"] == "203.4 ± 1.0 mm, 40.10 ± 0.04°"
+    assert facts["view on the wall"] == "87.5%"
+    assert facts["temperature"] == "35.5 to 40.0 °C"
+    entered = OccluderRecord(source="entered", x_m=0.21, gap_m=0.09)
+    assert values(occluder=entered)["occluder's gap (entered)"] == "90.0 mm"
+
+
+def test_facts_of_refused_depth_have_no_residual() -> None:
+    assert values()["depth"] == "refused"
+    assert values(residual_m=0.0001)["residual"] == "0.10 mm RMS"
+
+
+@pytest.mark.parametrize(
+    ("apart", "words"), [({}, "+3.40 mm and 0.117°"), ({"disagreement_m": None}, "refused: mirror")]
+)
+def test_facts_compare_board_with_depth(apart: dict[str, Any], words: str) -> None:
+    board = BOARD.model_copy(update={"depth_refused": "mirror", **apart})
+    [meaning] = [row[2] for row in wall_facts(RECORD.model_copy(update={"board": board})) if row[0] == "printed board"]
+    assert words in meaning
+    assert "24 corners; used: depth" in meaning
+
+
+def test_summary_holds_verdict_status_table_and_notes() -> None:
+    text = wall_summary(RECORD.model_copy(update={"warnings": ("it has ripples",)}), "all is well")
+    assert text.startswith("**GOOD**: ")
+    assert (
+        text.index("all is well") < text.index("| distance | 200.00 ± 0.20 mm |") < text.index("Note: it has ripples")
+    )
+    assert "Note" not in wall_summary(RECORD)
