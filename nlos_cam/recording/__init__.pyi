@@ -1,33 +1,33 @@
 __all__ = [
-    "LOOK_S",
-    "BagFile",
+    "TEMPERATURE_INTERVAL_S",
+    "BagReader",
     "CaptureResult",
     "CaptureSession",
     "CaptureTarget",
-    "Exported",
+    "ExportOptions",
+    "ExportResult",
     "Format",
-    "Repaired",
+    "RepairResult",
     "ReplayCamera",
     "SdkReplayCamera",
     "Sidecar",
     "State",
     "Summary",
-    "Verified",
-    "Wanted",
+    "VerifyResult",
     "export_recording",
+    "finalize",
+    "load_measured_wall",
     "load_sidecar",
     "open_lidar_bag",
     "repair_recording",
-    "settle",
     "sidecar_path",
     "verify",
-    "wall_of",
 ]
 
-from .bag_reader import BagFile
-from .capture import CaptureResult, CaptureSession, CaptureTarget, settle
-from .export import Exported, Format, Wanted, export_recording
-from .playback import ReplayCamera, Verified, open_lidar_bag, verify
-from .repair import Repaired, repair_recording
+from .bag_reader import BagReader
+from .capture import CaptureResult, CaptureSession, CaptureTarget, finalize
+from .export import ExportOptions, ExportResult, Format, export_recording
+from .playback import ReplayCamera, VerifyResult, open_lidar_bag, verify
+from .repair import RepairResult, repair_recording
 from .sdk_playback import SdkReplayCamera
-from .sidecar import LOOK_S, Sidecar, State, Summary, load_sidecar, sidecar_path, wall_of
+from .sidecar import TEMPERATURE_INTERVAL_S, Sidecar, State, Summary, load_measured_wall, load_sidecar, sidecar_path

@@ -1,87 +1,76 @@
-"""A librealsense recording, read without librealsense: streams, frames in order or by index, options, metadata.
-
-The options of a recorded sensor: which values were in force when.
-"""
+"""Reader of librealsense recordings without librealsense: streams, frames by index, options, metadata."""
 
 import re
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Iterator, Mapping
+from bz2 import BZ2Decompressor
+from collections import defaultdict
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from heapq import merge
+from io import BufferedReader, BytesIO, FileIO
 from itertools import count, repeat
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import numpy as np
+from lz4.frame import LZ4FrameDecompressor
 from nlos_calibration import Intrinsics
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float64
+from rosbags.rosbag1 import Reader
+from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
-from nlos_cam.camera import Sample
+from nlos_cam.camera import Sample, repair_command
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording import bag_container
-from nlos_cam.recording.bag_container import ENCODINGS, BagContainer, Entry, FrameMetadata, sdk_name
-
-
-class RecordedOptions:
-    """The options of one sensor, from the messages that told of them."""
-
-    def __init__(self, container: BagContainer, topics: Mapping[str, str]) -> None:
-        """`topics`: of each option's value, with the option's name."""
-        self._container = container
-        self._names = {topic: sdk_name(name) for topic, name in topics.items()}
-        self._changes: list[tuple[Entry, str]] = sorted(
-            (entry, topic) for topic in topics for entry in container.entries[topic]
-        )
-        self._done = 0
-        """Changes that are in `_values`."""
-        self._values: dict[str, float] = {}
-
-    def at(self, time_ns: int) -> Mapping[str, float]:
-        """The values in force, by the SDK's names; the same object until one changes."""
-        done = bisect_right(self._changes, time_ns, key=lambda change: change[0].time_ns)
-        if done != self._done:
-            ahead = done > self._done
-            latest = {topic: entry for entry, topic in self._changes[self._done if ahead else 0 : done]}
-            read = {self._names[topic]: self._value(topic, entry) for topic, entry in latest.items()}
-            self._values, self._done = self._values | read if ahead else read, done
-        return self._values
-
-    def _value(self, topic: str, entry: Entry) -> float:
-        return float(self._container.read(topic, entry).data)
-
+from nlos_cam.recording import bag_messages
+from nlos_cam.recording.bag_messages import ENCODINGS, FrameMetadata, sdk_name
+from nlos_cam.recording.rosbag import CHUNK_LIMIT, MAGIC
 
 DEVICE = "/device_0"
 STREAM = re.compile(DEVICE + r"/sensor_(\d+)/(\w+)_(\d+)(?=/image/data$)")
 OPTION = re.compile(DEVICE + r"/sensor_(\d+)/option/(.+)/value")
 STATIC_NS = 1
-"""When librealsense says that what was so from the beginning was recorded."""
+"""The time that librealsense gives to values in force when the recording began."""
+MAX_CHUNK_BYTES = CHUNK_LIMIT
+"""Bound on a chunk's size; librealsense begins a new chunk after 768 kB."""
+DECOMPRESSORS = {"lz4": LZ4FrameDecompressor, "bz2": BZ2Decompressor}
+
+
+class Entry(NamedTuple):
+    """Position of a message in the file; entries sort by time, then by position."""
+
+    time_ns: int
+    """On the recorder's clock, which starts at 0."""
+    chunk_pos: int
+    offset: int
+    connection: int
 
 
 @dataclass(frozen=True)
 class StreamInfo:
-    """One stream of a recording."""
+    """Stream of a recording."""
 
     name: str
     """The SDK's, with the index where that is not 0: depth, infrared, confidence, color, infrared_1."""
     topic: str
     sensor: int
     encoding: str
-    """As the file has it: mono16, 8UC1, mono8, rgb8, ..."""
+    """As the file spells it: mono16, 8UC1, mono8, rgb8, ..."""
     frames_per_s: int
     intrinsics: Intrinsics
     frames: int
-    """How many the index lists."""
+    """Number of frames in the index."""
 
     @property
     def format(self) -> str:
-        """The SDK's name of the encoding: z16, y8, raw8, rgb8, ...; empty where we cannot read it."""
+        """The SDK's name of the encoding: z16, y8, raw8, rgb8, ...; empty for one that we cannot read."""
         return ENCODINGS[self.encoding].sdk_format if self.encoding in ENCODINGS else ""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A frame's place among all frames of a recording."""
+    """Position of a frame in the order of recording."""
 
     stream: str
     index: int
@@ -90,140 +79,289 @@ class Place:
     """When it was recorded, on the recorder's clock, which starts at 0."""
 
 
-class BagFile:
-    """A recording. Opening reads its index; frames are read when asked for, and no file stays open in between.
+class BagReader:
+    """Recording of any RealSense camera; frames are read on request.
 
-    Numbers and timestamps are as librealsense's playback gives them. Raises RecordingError, on opening and from every
-    method, with the place of the damage.
+    Opening reads the index into memory. One chunk is cached and no file stays open, so there is nothing to close; for
+    one thread at a time. Numbers and timestamps equal those of librealsense's playback. Opening and every method raise
+    RecordingError, with the place of the damage.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._container = BagContainer(path)
-        self._entries = self._container.entries
-        self._options: dict[int, RecordedOptions] = {}
+        self.entries: dict[str, list[Entry]] = {}
+        """Messages of each topic, in order of time."""
+        self.types: dict[str, str] = {}
+        """Message type of each topic, in rosbags' spelling."""
+        self.end_ns = 0
+        """Time of the last message, on the recorder's clock."""
+        self._chunk_pos, self._chunk = -1, b""
+        self._options: dict[int, _SensorOptions] = {}
+        _check_start(path)
+        with raise_as_recording_error(path, "is cut short or damaged"):
+            self._read_index()
         self.device: Mapping[str, str] = self._key_values(f"{DEVICE}/info")
         """By the SDK's names: name, serial_number, firmware_version, product_line, ..."""
-        found = [match for topic, entries in self._entries.items() if entries and (match := STREAM.match(topic))]
-        infos = [self._stream_info(*match.groups(), topic=match[0]) for match in found]
+        matches = [match for topic, entries in self.entries.items() if entries and (match := STREAM.match(topic))]
+        infos = [self._stream_info(*match.groups(), topic=match[0]) for match in matches]
         self.streams: Mapping[str, StreamInfo] = {info.name: info for info in infos}
-        """Those that have frames, by name."""
+        """Streams with at least one frame, by name."""
+
+    def _read_index(self) -> None:
+        found: dict[str, list[Entry]] = defaultdict(list)
+        with Reader(cast("Any", _BoundedPath(self.path))) as reader:
+            for connection in reader.connections:
+                index = reader.indexes.pop(connection.id)  # half a million tuples for ten minutes: keep one copy
+                found[connection.topic].extend(Entry(*place, connection.id) for place in index)
+                self.types[connection.topic] = connection.msgtype
+        if not found:
+            raise ValueError("its index is empty")
+        self.entries = {topic: sorted(entries) for topic, entries in found.items()}
+        self.end_ns = max((entries[-1].time_ns for entries in self.entries.values() if entries), default=0)
 
     def _stream_info(self, sensor: str, kind: str, index: str, topic: str) -> StreamInfo:
         info, camera = self._first(f"{topic}/info"), self._first(f"{topic}/info/camera_info")
-        name = sdk_name(kind if index == "0" else f"{kind}_{index}")
-        frames = len(self._entries[f"{topic}/image/data"])
-        return StreamInfo(
-            name, topic, int(sensor), info.encoding, info.fps, bag_container.intrinsics_of(camera), frames
-        )
+        name, frames = sdk_name(kind if index == "0" else f"{kind}_{index}"), len(self.entries[f"{topic}/image/data"])
+        pinhole = bag_messages.intrinsics_of(camera)
+        return StreamInfo(name, topic, int(sensor), info.encoding, info.fps, pinhole, frames)
 
     def _first(self, topic: str) -> Any:
-        entries = self._entries.get(topic)
-        if not entries:
-            raise self._container.damage(f"it has no {topic}")
-        return self._container.read(topic, entries[0])
+        if entries := self.entries.get(topic):
+            return self.read(topic, entries[0])
+        raise RecordingError(f"{self.path} is damaged (it has no {topic}): {repair_advice(self.path)}")
 
     def _key_values(self, topic: str) -> dict[str, str]:
-        pairs = [self._container.read(topic, entry) for entry in self._entries.get(topic, ())]
+        pairs = [self.read(topic, entry) for entry in self.entries.get(topic, ())]
         return {sdk_name(pair.key): pair.value for pair in pairs}
 
-    @property
-    def end_ns(self) -> int:
-        """When the last message was recorded, on the recorder's clock."""
-        return self._container.end_ns
-
     def check(self) -> None:
-        """Read everything, also what there is no method for. Raises RecordingError at the first damage."""
+        """Read every message, in the order of the file. Raises RecordingError at the first damage."""
         images = {f"{info.topic}/image/data": info for info in self.streams.values() if info.format}
-        for topic, entry, message in self._container.everything():
-            if topic in images:
-                self._pixels(message, images[topic], entry)
+        messages = [(entry, topic) for topic, entries in self.entries.items() for entry in entries]
+        for entry, topic in sorted(messages, key=lambda message: (message[0].chunk_pos, message[0].offset)):
+            with self._locate(entry):
+                raw = self.raw(entry)
+                if not bag_messages.is_known(self.types[topic]):
+                    continue
+                message = bag_messages.parse(raw, self.types[topic])
+                if topic in images:
+                    bag_messages.pixels(message, images[topic].encoding, images[topic].intrinsics)
 
-    def _pixels(self, image: Any, info: StreamInfo, entry: Entry) -> NDArray[Any]:
-        with self._container.told_at(entry):
-            return bag_container.pixels(image, info.encoding, info.intrinsics)
+    def read(self, topic: str, entry: Entry) -> Any:
+        """Return a message as rosbags deserialises it."""
+        with self._locate(entry):
+            return bag_messages.parse(self.raw(entry), self.types[topic])
+
+    def _locate(self, entry: Entry) -> AbstractContextManager[None]:
+        """Raise any exception within the block as a RecordingError that names this place in the recording."""
+        place = f"{entry.time_ns / 1e9:.1f} s into its {self.end_ns / 1e9:.1f} s, at byte {entry.chunk_pos}"
+        return raise_as_recording_error(self.path, f"is damaged {place}")
+
+    def raw(self, entry: Entry) -> memoryview:
+        """Return a message's bytes. Damage can raise almost any exception."""
+        if entry.chunk_pos != self._chunk_pos:
+            self._chunk, self._chunk_pos = self._read_chunk(entry.chunk_pos), entry.chunk_pos
+        stream = BytesIO(self._chunk)
+        stream.seek(entry.offset)
+        header = Header.read(stream, RecordType.MSGDATA)
+        if (header.get_time("time"), header.get_uint32("conn")) != (entry.time_ns, entry.connection):
+            raise ValueError("the index leads to another message")
+        size = read_uint32(stream)
+        data = memoryview(self._chunk)[stream.tell() : stream.tell() + size]
+        if len(data) != size:
+            raise ValueError(f"a message of {size} bytes has {len(data)}")
+        return data
+
+    def _read_chunk(self, position: int) -> bytes:
+        with _BoundedFile(self.path) as file:
+            file.seek(position)
+            header = Header.read(file, RecordType.CHUNK)
+            packed = file.read(read_uint32(file))
+        return _unpack(packed, header.get_string("compression"), header.get_uint32("size"))
 
     def sensor_name(self, stream: str) -> str:
-        """What the sensor of a stream is called; empty where that is not recorded."""
+        """Return the name of a stream's sensor; empty where not recorded."""
         return self._key_values(f"{DEVICE}/sensor_{self.streams[stream].sensor}/info").get("name", "")
 
     def order(self, streams: Iterable[str]) -> Iterator[Place]:
-        """Where the frames of these streams are, in the order in which they were recorded."""
+        """Yield the places of all frames of these streams, in the order of recording."""
         each = [zip(self._frames(stream), repeat(stream), count()) for stream in streams]
         return (Place(stream, index, entry.time_ns) for entry, stream, index in merge(*each))
 
     def _frames(self, stream: str) -> list[Entry]:
-        return self._entries[f"{self.streams[stream].topic}/image/data"]
+        return self.entries[f"{self.streams[stream].topic}/image/data"]
 
     def samples(self, streams: Iterable[str]) -> Iterator[Sample]:
-        """The frames of these streams, in the order in which they were recorded."""
+        """Yield all frames of these streams, in the order of recording."""
         return (self.sample(place.stream, place.index) for place in self.order(streams))
 
     def sample(self, stream: str, index: int) -> Sample:
-        """A frame by its place in its stream. Raises IndexError where there is none."""
+        """Return a frame by its index in its stream. Raises IndexError beyond the last."""
         info, entry = self.streams[stream], self._frames(stream)[index]
         if not info.format:
-            raise RecordingError(
-                f"{self.path}: its {stream} stream is encoded as {info.encoding}, which we cannot read"
-            )
-        image = self._container.read(f"{info.topic}/image/data", entry)
-        return Sample(stream, image.header.seq, bag_container.timestamp_s(image), self._pixels(image, info, entry))
+            raise RecordingError(f"{self.path}: unsupported encoding of the {stream} stream: {info.encoding}")
+        image = self.read(f"{info.topic}/image/data", entry)
+        with self._locate(entry):
+            pixels = bag_messages.pixels(image, info.encoding, info.intrinsics)
+        return Sample(stream, image.header.seq, bag_messages.timestamp_s(image), pixels)
 
     def metadata(self, stream: str, index: int) -> FrameMetadata:
-        """What is told of that frame besides its image."""
-        time_ns, topic = self._frames(stream)[index].time_ns, f"{self.streams[stream].topic}/image/metadata"
-        entries = self._entries.get(topic, [])
-        first, end = (side(entries, time_ns, key=_time_ns) for side in (bisect_left, bisect_right))
-        pairs = [self._container.read(topic, entry) for entry in entries[first:end]]
-        with self._container.told_at(self._frames(stream)[index]):
-            return bag_container.metadata(pairs)
+        """Return the metadata of a frame by its index in its stream."""
+        frame, topic = self._frames(stream)[index], f"{self.streams[stream].topic}/image/metadata"
+        entries = self.entries.get(topic, [])
+        first, end = (side(entries, frame.time_ns, key=lambda e: e.time_ns) for side in (bisect_left, bisect_right))
+        pairs = [self.read(topic, entry) for entry in entries[first:end]]
+        with self._locate(frame):
+            return bag_messages.metadata(pairs)
 
     def settings(self, time_ns: int = STATIC_NS, stream: str = "depth") -> Mapping[str, float]:
-        """The options of the stream's sensor in force at a time, by the SDK's names: from the first to `end_ns`.
+        """Return the options in force at a time, by the SDK's names, of the sensor of a stream.
 
-        The same object is given until one of them changes.
+        Returns the same mapping until one of them changes.
         """
         sensor = self.streams[stream].sensor
         if sensor not in self._options:
-            found = [match for topic in self._entries if (match := OPTION.fullmatch(topic))]
-            names = {match[0]: match[2] for match in found if int(match[1]) == sensor}
-            self._options[sensor] = RecordedOptions(self._container, names)
+            matches = [match for topic in self.entries if (match := OPTION.fullmatch(topic))]
+            names = {match[0]: sdk_name(match[2]) for match in matches if int(match[1]) == sensor}
+            self._options[sensor] = _SensorOptions(self, names)
         return self._options[sensor].at(time_ns)
 
-    def lens(self, stream: str) -> tuple[str, NDArray[np.float64]]:
-        """The distortion model of a stream, by the SDK's name, and its coefficients."""
-        return bag_container.lens_of(self._first(f"{self.streams[stream].topic}/info/camera_info"))
+    def lens(self, stream: str) -> tuple[str, Float64]:
+        """Return the distortion model of a stream, by the SDK's name, and its coefficients."""
+        return bag_messages.lens_of(self._first(f"{self.streams[stream].topic}/info/camera_info"))
 
-    def pose(self, stream: str, other: str) -> NDArray[np.float64]:
-        """Where another stream's camera is in the frame of a stream's: stream_from_other (4, 4).
+    def pose(self, stream: str, other: str) -> Float64:
+        """Return stream_from_other (4, 4): the pose of another stream's camera in the frame of this stream's.
 
-        Raises RecordingError where the recording does not tell.
+        Raises RecordingError where the recording holds no common reference of the two.
         """
         mine, others = self._poses(stream), self._poses(other)
         if not (groups := mine.keys() & others.keys()):
-            raise RecordingError(f"{self.path} does not tell where {other} is seen from, against {stream}")
+            raise RecordingError(f"{self.path} has no extrinsics between {stream} and {other}")
         group = min(groups)
         return mine[group] @ np.linalg.inv(others[group])
 
-    def _poses(self, stream: str) -> dict[str, NDArray[np.float64]]:
-        """stream_from_reference (4, 4) by group: streams of one group have one reference."""
-        start, poses = f"{self.streams[stream].topic}/tf/", dict[str, NDArray[np.float64]]()
-        for topic, entries in self._entries.items():
+    def _poses(self, stream: str) -> dict[str, Float64]:
+        """Return stream_from_reference (4, 4) by group; the streams of a group share one reference."""
+        start, poses = f"{self.streams[stream].topic}/tf/", dict[str, Float64]()
+        for topic, entries in self.entries.items():
             if topic.startswith(start) and entries:
-                with self._container.told_at(entries[0]):
-                    poses[topic.removeprefix(start)] = bag_container.pose_of(self._container.read(topic, entries[0]))
+                with self._locate(entries[0]):
+                    poses[topic.removeprefix(start)] = bag_messages.pose_of(self.read(topic, entries[0]))
         return poses
 
     def depth_unit_m(self) -> float:
-        """Metres per depth count. Raises RecordingError where the recording does not tell."""
+        """Return metres per depth count. Raises RecordingError where no positive unit is recorded."""
         info, entry = self.streams["depth"], self._frames("depth")[0]
-        with self._container.told_at(entry):
-            tail = bag_container.depth_unit_m(self._container.raw(entry))
-        unit_m = self.settings().get("depth_units", tail)
+        with self._locate(entry):
+            after_image = bag_messages.depth_unit_m(self.raw(entry))
+        unit_m = self.settings().get("depth_units", after_image)
         if unit_m is None or not 0 < unit_m < inf:
-            raise RecordingError(f"{self.path}: {info.topic} does not tell its depth unit ({unit_m}): record it again")
+            raise RecordingError(f"{self.path}: {info.topic} has no valid depth unit ({unit_m}): record it again")
         return unit_m
 
 
-def _time_ns(entry: Entry) -> int:
-    return entry.time_ns
+class _SensorOptions:
+    """Options of one sensor over time, from the messages that record their changes; caches the last values."""
+
+    def __init__(self, bag: BagReader, names: Mapping[str, str]) -> None:
+        """Take the options' names by the topics of their values."""
+        self._bag, self._names = bag, names
+        self._changes = sorted((entry, topic) for topic in names for entry in bag.entries[topic])
+        self._applied = 0
+        """Number of changes in `_values`."""
+        self._values: dict[str, float] = {}
+
+    def at(self, time_ns: int) -> Mapping[str, float]:
+        """Return the values in force at a time; the same mapping until one of them changes."""
+        due = bisect_right(self._changes, time_ns, key=lambda change: change[0].time_ns)
+        if due != self._applied:
+            ahead = due > self._applied
+            latest = {topic: entry for entry, topic in self._changes[self._applied if ahead else 0 : due]}
+            read = {self._names[topic]: float(self._bag.read(topic, entry).data) for topic, entry in latest.items()}
+            self._values, self._applied = self._values | read if ahead else read, due
+        return self._values
+
+
+class _BoundedFile(BufferedReader):
+    """File that returns at most its own size in total and a chunk at once, so that absurd lengths read short."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(FileIO(path))
+        self._left = path.stat().st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        wanted = self._left if size is None or size < 0 else size
+        data = super().read(min(wanted, self._left, MAX_CHUNK_BYTES))
+        self._left -= len(data)
+        return data
+
+
+class _BoundedPath:
+    """Path for rosbags' Reader that opens a `_BoundedFile`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def exists(self) -> bool:
+        return True
+
+    def open(self, mode: str) -> _BoundedFile:
+        del mode
+        return _BoundedFile(self._path)
+
+
+def _unpack(packed: bytes, compression: str, size: int) -> bytes:
+    """Return a chunk's content. Raises ValueError where that has another size than declared, or an absurd one."""
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk of {size} bytes")
+    if compression == "none":
+        content, whole = packed, True
+    else:
+        decompressor = DECOMPRESSORS[compression]()
+        content = cast("bytes", decompressor.decompress(packed, size + 1))  # one more: reach the checksum at the end
+        whole = decompressor.eof
+    if len(content) != size or not whole:
+        raise ValueError(f"a chunk of {size} bytes has {len(content)}")
+    return content
+
+
+def _check_start(path: Path) -> None:
+    """Raise RecordingError for a path that is not a .bag, before rosbags reports it less clearly."""
+    if not path.exists():
+        raise RecordingError(f"{path} does not exist: give the path of a .bag recording")
+    if not path.is_file():  # opening a pipe would wait for a writer
+        kind = "a directory" if path.is_dir() else "not a file"
+        raise RecordingError(f"{path} is {kind}: give the path of a .bag recording")
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(MAGIC))
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    if not start:
+        raise RecordingError(f"{path} is empty: record it again")
+    if start != MAGIC:
+        raise RecordingError(f"{path} is not a .bag recording (it starts with {start!r}): give one made by `capture`")
+
+
+@contextmanager
+def raise_as_recording_error(path: Path, problem: str) -> Generator[None]:
+    """Raise any exception within the block as a RecordingError of one line, with the command that repairs."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except Exception as error:  # damaged bytes make the libraries raise almost anything
+        if isinstance(error, OSError) and error.strerror:
+            raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+        detail = " ".join(str(error).split()) or "its parts contradict each other"
+        if "not indexed" in detail:
+            problem, detail = "was never closed", "the capture was killed, so it has no index"
+        elif "index looks damaged" in detail:
+            detail = "its index cannot be read"
+        raise RecordingError(f"{path} {problem} ({detail}): {repair_advice(path)}") from error
+
+
+def repair_advice(path: Path) -> str:
+    """Return the advice for a recording that cannot be read to its end."""
+    return f"`{repair_command(path)}` recovers the undamaged part"

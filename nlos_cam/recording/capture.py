@@ -1,4 +1,4 @@
-"""CaptureSession: one recording after another of a camera that stays on, each with its sidecar, read back and summed up."""
+"""Takes of one running camera, each recorded with its sidecar and then verified."""
 
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -12,18 +12,14 @@ from nlos_calibration import Rig
 from nlos_cam.camera import RESERVE_BYTES, Camera, Recording
 from nlos_cam.errors import CameraError, DiskFullError, NlosCamError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.playback import Verified
+from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality, QualityMeter
 from nlos_cam.recording.sidecar import SidecarFile, State, Summary, WallFile, sidecar_path, summary_of
-
-Wall = tuple[Rig, WallFile]
-OnSets = Callable[[int], None]
-"""Called with the sets recorded so far."""
 
 
 @dataclass(frozen=True)
 class CaptureTarget:
-    """A take to be made."""
+    """File and label of a take to be recorded."""
 
     path: Path
     label: str | None = None
@@ -31,56 +27,63 @@ class CaptureTarget:
 
 @dataclass(frozen=True)
 class CaptureResult:
-    """A take that was made."""
+    """Outcome of a take."""
 
-    job: CaptureTarget
+    target: CaptureTarget
     state: State
     sets: int
-    """That came while it recorded."""
+    """Complete sets of the three streams that came while it recorded."""
     quality: Quality
     sidecar: SidecarFile
     error: NlosCamError | None = None
-    """Why it ended, where that is neither its limit nor whoever watched."""
-    cut_in: bool = False
-    """Begun while the device ran: in a device of several threads, the first set may have been on its way."""
+    """Reason for its end, other than its limit or the user."""
+    follows_another: bool = False
+    """Whether the device ran when it began: with several device threads, the first set may be in part before it."""
     events: Counter[str] = field(default_factory=Counter[str])
-    found: Verified | None = None
-    """What the file holds, once it was read back."""
-
+    verified: VerifyResult | None = None
+    """Contents of the file, once verified."""
     closed: bool = True
-    """Whether its file has its index; only then can it be read back."""
+    """Whether the file has its index, without which it cannot be read."""
 
     @property
     def summary(self) -> Summary:
-        return summary_of(self.found, self.quality, self.events)
+        return summary_of(self.verified, self.quality, self.events)
 
 
 class CaptureSession:
-    """Records `jobs` one after another while a camera runs, which was opened with `recording`: the first of them."""
+    """Recorder of takes one after another while a camera runs, from one thread.
+
+    Takes a camera that was opened with `recording`, the first of the `targets`; `record` enters and leaves it.
+    """
 
     def __init__(
-        self, camera: Camera, recording: Recording, jobs: Sequence[CaptureTarget], *, wall: Wall | None = None
+        self,
+        camera: Camera,
+        recording: Recording,
+        targets: Sequence[CaptureTarget],
+        *,
+        wall: tuple[Rig, WallFile] | None = None,
     ) -> None:
-        self.jobs = jobs
+        self.targets = targets
         self._camera, self._recording, self._wall = camera, recording, wall
 
-    def record(self, stop: Event, on_sets: OnSets) -> Generator[CaptureResult]:
-        """Each take when it is closed; the camera runs on meanwhile, and is left before the last one is yielded.
+    def record(self, stop: Event, on_sets: Callable[[int], None]) -> Generator[CaptureResult]:
+        """Yield each take when its file is closed; the camera is left before the last one, and runs on before others.
 
-        A take that was ended before its limit is the last. Raises CameraError where the camera does not start.
+        `on_sets` gets the number of sets recorded so far. A take that ends before its limit is the last. Raises
+        CameraError where the camera does not start.
         """
         take: CaptureResult | None = None
         try:
             with ExitStack() as entered:
                 frames = self._enter(entered)
-                for number, job in enumerate(self.jobs):
+                for number, target in enumerate(self.targets):
                     if take:
                         self._recording.close()
                         yield take
                         take = None
-                        self._recording.next_take(job.path, last=job is self.jobs[-1])
-                    take = self._take(job, frames, stop, on_sets)
-                    take = replace(take, cut_in=number > 0)
+                        self._recording.next_take(target.path, last=target is self.targets[-1])
+                    take = replace(self._take(target, frames, stop, on_sets), follows_another=number > 0)
                     if take.state != "complete":
                         break
         except DiskFullError as error:
@@ -88,7 +91,7 @@ class CaptureSession:
                 raise
             take = replace(take, state="disk full", error=error, closed=False)
         if take:
-            yield replace(take, sets=self._recording.sets)  # with the one that was in flight when it ended
+            yield replace(take, sets=self._recording.sets)  # with the set that was in flight at its end
 
     def _enter(self, entered: ExitStack) -> Iterator[Frame]:
         try:
@@ -98,8 +101,10 @@ class CaptureSession:
                 self._recording.path.unlink(missing_ok=True)
             raise
 
-    def _take(self, job: CaptureTarget, frames: Iterator[Frame], stop: Event, on_sets: OnSets) -> CaptureResult:
-        sidecar = SidecarFile(sidecar_path(job.path), self._camera, label=job.label, wall=self._wall)
+    def _take(
+        self, target: CaptureTarget, frames: Iterator[Frame], stop: Event, on_sets: Callable[[int], None]
+    ) -> CaptureResult:
+        sidecar = SidecarFile(sidecar_path(target.path), self._camera, label=target.label, wall=self._wall)
         meter = QualityMeter()
         state: State = "complete"
         error: NlosCamError | None = None
@@ -114,12 +119,16 @@ class CaptureSession:
         except CameraError as lost:
             state, error = "lost", lost
         if self._recording.disk_full:
-            state, error = "disk full", _short_of_space(job.path)
+            state = "disk full"
+            error = DiskFullError(
+                f"less than {RESERVE_BYTES / 1e6:.0f} MB were left for {target.path}: free some, or choose an --out on "
+                "another disk"
+            )
         events = Counter(self._camera.counts)
-        return CaptureResult(job, state, self._recording.sets, meter.quality(), sidecar, error, events=events)
+        return CaptureResult(target, state, self._recording.sets, meter.quality(), sidecar, error, events=events)
 
     def _recorded(self, frames: Iterator[Frame]) -> Iterator[Frame]:
-        """The frames that are in the take, until it is done."""
+        """Yield the frames that belong to the take, until it ends."""
         for frame in frames:
             if self._recording.covers(frame.timestamp_s):
                 yield frame
@@ -127,41 +136,36 @@ class CaptureSession:
                 return
 
 
-def _short_of_space(path: Path) -> DiskFullError:
-    left_mb = RESERVE_BYTES / 1e6
-    return DiskFullError(f"less than {left_mb:.0f} MB were left for {path}: free some, or name a --out on another disk")
+def finalize(take: CaptureResult, read_back: Callable[[Path], VerifyResult | None]) -> CaptureResult:
+    """Verify a closed take with `read_back`, and write its outcome into the sidecar; delete one without any frame.
 
-
-def settle(take: CaptureResult, read_back: Callable[[Path], Verified | None]) -> CaptureResult:
-    """Read a closed take back, unless that is impossible, and write into its sidecar how it ended.
-
-    `read_back` gives None when it was interrupted. What holds no frame at all is removed.
+    `read_back` returns None when interrupted.
     """
     if take.sets == 0:
-        for path in (take.job.path, take.sidecar.path):
+        for path in (take.target.path, take.sidecar.path):
             path.unlink(missing_ok=True)
         return take
-    settled = _read_back(take, read_back) if take.closed else take
+    final = _verify(take, read_back) if take.closed else take
     try:
-        settled.sidecar.finish(settled.state, settled.summary)
+        final.sidecar.finish(final.state, final.summary)
     except DiskFullError as error:
-        return replace(settled, error=settled.error or error)
-    return settled
+        return replace(final, error=final.error or error)
+    return final
 
 
-def _read_back(take: CaptureResult, read_back: Callable[[Path], Verified | None]) -> CaptureResult:
+def _verify(take: CaptureResult, read_back: Callable[[Path], VerifyResult | None]) -> CaptureResult:
     try:
-        found = read_back(take.job.path)
+        found = read_back(take.target.path)
     except RecordingError as error:
         return replace(take, state="damaged", error=error)
     if found is None:
         return replace(take, state="interrupted")
-    # without metadata, a reader learns anew which frames belong together: some are there, and in no set
-    held = max(found.frames, min(found.streams.values(), default=0))
-    if held < take.sets - take.cut_in:
+    # Without metadata a reader pairs the streams differently, so that some recorded frames are in no set.
+    recorded = max(found.frames, min(found.streams.values(), default=0))
+    if recorded < take.sets - take.follows_another:
         error = RecordingError(
-            f"{take.job.path} holds {found.frames} of the {take.sets} frames that came: check the disk's free space "
+            f"{take.target.path} holds {found.frames} of the {take.sets} frames that came: check the disk's free space "
             "and speed, and record again"
         )
-        return replace(take, state="damaged", error=error, found=found)
-    return replace(take, found=found)
+        return replace(take, state="damaged", error=error, verified=found)
+    return replace(take, verified=found)

@@ -1,7 +1,4 @@
-"""A recording as files that other programs read: PNG or NPZ per stream, timestamps, intrinsics, point clouds.
-
-The files of an export: a PNG per frame with a table, one NPZ per stream, a point cloud per set.
-"""
+"""Export of a recording to files of other programs: PNG or NPZ per stream, timestamps, intrinsics, point clouds."""
 
 import csv
 import json
@@ -17,20 +14,20 @@ from typing import IO, Any, Literal, Protocol
 import cv2
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float64
 
 from nlos_cam.camera import FORMATS, FrameSet, FrameSynchronizer, Sample
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import atomic_directory
-from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.bag_reader import BagReader
 
 POINTS = "points"
 TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA}
-"""What a PNG wants of encodings that OpenCV does not write as they are; a .npz keeps every stream's own bytes."""
+"""Conversions to OpenCV's order of channels for PNG; a .npz keeps every stream's own."""
 
 
 class Sink(Protocol):
-    """Where the frames of one stream go."""
+    """Writer of the frames of one stream, or of point clouds."""
 
     def add(self, sample: Sample) -> None: ...
 
@@ -40,7 +37,7 @@ class Sink(Protocol):
 
 
 class PngSink:
-    """One PNG a frame, named by its number (16 bit for depth, in the stream's own units), and a table of timestamps."""
+    """Writer of one PNG per frame, named by its number (16 bit depth in raw units), and a table of timestamps."""
 
     def __init__(self, folder: Path, stream: str, encoding: str) -> None:
         self._folder, self._encoding = folder / stream, encoding
@@ -48,18 +45,18 @@ class PngSink:
         self._table = (folder / f"{stream}.csv").open("w", newline="", encoding="utf-8")
         self._rows = csv.writer(self._table)
         self._rows.writerow(["file", "frame_number", "timestamp_s"])
-        self._seen: Counter[int] = Counter()
+        self._repeats: Counter[int] = Counter()
 
     def add(self, sample: Sample) -> None:
-        """Raises NlosCamError where the picture cannot be written."""
-        self._seen[sample.number] += 1
-        again = f"-{self._seen[sample.number]}" if self._seen[sample.number] > 1 else ""
-        path = self._folder / f"{sample.number:06d}{again}.png"
+        """Write a frame. Raises NlosCamError for an encoding that PNG does not have."""
+        self._repeats[sample.number] += 1
+        suffix = f"-{self._repeats[sample.number]}" if self._repeats[sample.number] > 1 else ""
+        path = self._folder / f"{sample.number:06d}{suffix}.png"
         code = TO_BGR.get(self._encoding)
         pixels = sample.pixels if code is None else cv2.cvtColor(sample.pixels, code)
         done, png = cv2.imencode(".png", pixels)
         if not done:
-            raise NlosCamError(f"frame {sample.number} of {sample.stream} ({self._encoding}) makes no PNG: use npz")
+            raise NlosCamError(f"{sample.stream} ({self._encoding}) cannot be written as PNG: use --format npz")
         path.write_bytes(png.tobytes())
         self._rows.writerow([f"{self._folder.name}/{path.name}", sample.number, f"{sample.timestamp_s:.6f}"])
 
@@ -68,7 +65,10 @@ class PngSink:
 
 
 class NpzSink:
-    """All frames of a stream in one .npz: pixels (N, height, width), frame_number, timestamp_s (N,)."""
+    """Writer of one .npz with all frames of a stream: pixels (N, height, width), frame_number (N,), timestamp_s (N,).
+
+    Collects pixels in a temporary file, not in memory.
+    """
 
     def __init__(self, folder: Path, stream: str, constants: dict[str, Any]) -> None:
         self._path, self._constants = folder / f"{stream}.npz", constants
@@ -79,12 +79,12 @@ class NpzSink:
         self._timestamps_s: list[float] = []
 
     def add(self, sample: Sample) -> None:
-        """Raises RecordingError where a frame is of another size than those before it."""
+        """Take a frame. Raises RecordingError for one of another size than those before it."""
         self._shape, self._type = self._shape or sample.pixels.shape, sample.pixels.dtype
         if sample.pixels.shape != self._shape:
             raise RecordingError(
-                f"frame {sample.number} of {sample.stream} is {sample.pixels.shape}, those before are {self._shape}: "
-                "export as png"
+                f"frame {sample.number} of {sample.stream} has shape {sample.pixels.shape}, those before have "
+                f"{self._shape}: use --format png"
             )
         self._pixels.write(np.ascontiguousarray(sample.pixels).tobytes())
         self._numbers.append(sample.number)
@@ -106,33 +106,33 @@ class NpzSink:
 
 
 class PointSink:
-    """One binary PLY for each whole set, or the first `most`; grey by infrared.
+    """Writer of one binary PLY per complete set of streams, at most `limit`, gray by infrared.
 
-    Metres in the lidar frame: x right, y down, z ahead.
+    Points in metres in the lidar frame: x right, y down, z forward.
     """
 
-    def __init__(self, folder: Path, rays: NDArray[np.float64], unit_m: float, most: int | None = None) -> None:
-        self._folder, self._rays, self._unit_m, self._most = folder / POINTS, rays, unit_m, most
+    def __init__(self, folder: Path, rays: Float64, unit_m: float, limit: int | None = None) -> None:
+        self._folder, self._rays, self._unit_m, self._limit = folder / POINTS, rays, unit_m, limit
         self._folder.mkdir()
         self._pairing = FrameSynchronizer(rays.shape[:2])
         self.written = 0
 
     def add(self, sample: Sample) -> None:
-        if self.written == self._most or sample.stream not in FORMATS:
+        if self.written == self._limit or sample.stream not in FORMATS:
             return
         if found := self._pairing.add(sample):
             self._write(found)
 
     def _write(self, found: FrameSet) -> None:
-        seen = found.depth_z16 > 0
-        points_m = self._rays[seen] * (found.depth_z16[seen] * self._unit_m)[:, np.newaxis]
-        grey = np.repeat(found.ir[seen][:, np.newaxis], 3, axis=1)
-        cloud: Any = trimesh.PointCloud(points_m, colors=grey)
+        valid = found.depth_z16 > 0
+        points_m = self._rays[valid] * (found.depth_z16[valid] * self._unit_m)[:, np.newaxis]
+        gray = np.repeat(found.ir[valid][:, np.newaxis], 3, axis=1)
+        cloud: Any = trimesh.PointCloud(points_m, colors=gray)
         (self._folder / f"{found.number:06d}.ply").write_bytes(cloud.export(file_type="ply"))
         self.written += 1
 
     def close(self) -> None:
-        """Every cloud is a file of its own."""
+        """Do nothing: each cloud is a file of its own."""
 
 
 Format = Literal["png", "npz"]
@@ -140,93 +140,82 @@ INFO = "export.json"
 
 
 @dataclass(frozen=True)
-class Exported:
-    """What an export wrote."""
+class ExportResult:
+    """Files written by an export."""
 
     frames: dict[str, int]
-    """By stream; and under `points`, point clouds."""
+    """By stream; `points` counts point clouds."""
     out: str
     damage: str = ""
-    """Why it ends before the recording does; empty if it does not."""
+    """Error that ended it before the end of the recording; empty if none did."""
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What is wanted of a recording."""
+class ExportOptions:
+    """Selection of frames, and their file format."""
 
     format: Format = "png"
     points: bool = False
-    """A point cloud for each whole set of depth, infrared and confidence; else for the first, if all is exported."""
+    """A point cloud for each complete set; otherwise one for the first, when all streams are exported."""
     streams: Collection[str] = ()
-    """By name; none means all."""
+    """By name; empty for all."""
     every: int = 1
-    """Only frames whose number this divides."""
+    """Only frames whose number is divisible by this."""
 
 
 def export_recording(
-    bag: BagFile,
+    bag: BagReader,
     out: Path,
-    wanted: Wanted,
+    options: ExportOptions,
     *,
     stop: Event,
     on_frame: Callable[[], None] = lambda: None,
-) -> Exported:
-    """Write what is `wanted` of a recording into the folder `out`.
+) -> ExportResult:
+    """Write the selected frames of a recording into the directory `out`.
 
-    Setting `stop` ends it early and keeps what is done, and so does damage within the recording. Raises
-    RecordingError for streams that the recording lacks.
+    Setting `stop` ends it early and keeps the frames so far, and so does damage within the recording. Raises
+    RecordingError for streams that the recording does not have.
     """
-    streams = _streams(bag, wanted)
+    streams = _streams(bag, options)
     written: Counter[str] = Counter(dict.fromkeys(streams, 0))
     damage = ""
     with atomic_directory(out) as part:
-        (part / INFO).write_text(json.dumps(_info(bag, wanted), indent=1) + "\n", encoding="utf-8")
+        (part / INFO).write_text(json.dumps(_info(bag, options), indent=1) + "\n", encoding="utf-8")
         with ExitStack() as closing:
-            sinks = {stream: _sink(bag, stream, part, wanted.format) for stream in streams}
-            points = _points(bag, wanted, part)
+            sinks = {stream: _sink(bag, stream, part, options.format) for stream in streams}
+            points = _points(bag, options, part)
             for sink in [*sinks.values(), *([points] if points else [])]:
                 closing.callback(sink.close)
             try:
-                _pour(bag, wanted, sinks, points, written, stop, on_frame)
+                for sample in bag.samples({*sinks, *(FORMATS if points else ())}):
+                    if stop.is_set():
+                        break
+                    on_frame()
+                    if sample.number % options.every:
+                        continue
+                    if sample.stream in sinks:
+                        sinks[sample.stream].add(sample)
+                        written[sample.stream] += 1
+                    if points:
+                        points.add(sample)
             except RecordingError as error:
                 damage = str(error)
     if points:
         written[POINTS] = points.written
-    return Exported(dict(written), str(out), damage)
+    return ExportResult(dict(written), str(out), damage)
 
 
-def _pour(
-    bag: BagFile,
-    wanted: Wanted,
-    sinks: dict[str, Sink],
-    points: PointSink | None,
-    written: Counter[str],
-    stop: Event,
-    on_frame: Callable[[], None],
-) -> None:
-    needed = {*sinks, *(FORMATS if points else ())}
-    for sample in bag.samples(needed):
-        if stop.is_set():
-            return
-        on_frame()
-        if sample.stream in sinks and sample.number % wanted.every == 0:
-            sinks[sample.stream].add(sample)
-            written[sample.stream] += 1
-        if points and sample.number % wanted.every == 0:
-            points.add(sample)
-
-
-def _streams(bag: BagFile, wanted: Wanted) -> list[str]:
-    """The streams to write. Raises RecordingError for one that is not there."""
+def _streams(bag: BagReader, options: ExportOptions) -> list[str]:
+    """Return the streams to write. Raises RecordingError for one that the recording does not have."""
     present = [name for name, info in bag.streams.items() if info.format]
-    if missing := sorted(set(wanted.streams) - set(present)):
+    if missing := sorted(set(options.streams) - set(present)):
         raise RecordingError(f"{bag.path} has no {' and no '.join(missing)} stream: it has {', '.join(present)}")
-    if wanted.points and (missing := [stream for stream in FORMATS if stream not in present]):
+    if options.points and (missing := [stream for stream in FORMATS if stream not in present]):
         raise RecordingError(f"{bag.path} has no {' and no '.join(missing)} stream: point clouds need all three")
-    return [name for name in present if not wanted.streams or name in wanted.streams]
+    return [name for name in present if not options.streams or name in options.streams]
 
 
-def _sink(bag: BagFile, stream: str, folder: Path, form: Format) -> Sink:
+def _sink(bag: BagReader, stream: str, folder: Path, form: Format) -> Sink:
     info = bag.streams[stream]
     if form == "png":
         return PngSink(folder, stream, info.format)
@@ -235,16 +224,16 @@ def _sink(bag: BagFile, stream: str, folder: Path, form: Format) -> Sink:
     return NpzSink(folder, stream, {**pinhole, **unit, "encoding": np.array(info.format)})
 
 
-def _points(bag: BagFile, wanted: Wanted, folder: Path) -> PointSink | None:
+def _points(bag: BagReader, options: ExportOptions, folder: Path) -> PointSink | None:
     has_sets = all(stream in bag.streams and bag.streams[stream].format for stream in FORMATS)
-    if not wanted.points and (wanted.streams or not has_sets):
+    if not options.points and (options.streams or not has_sets):
         return None
-    most = None if wanted.points else 1
-    return PointSink(folder, bag.streams["depth"].intrinsics.rays(), bag.depth_unit_m(), most)
+    limit = None if options.points else 1
+    return PointSink(folder, bag.streams["depth"].intrinsics.rays(), bag.depth_unit_m(), limit)
 
 
-def _info(bag: BagFile, wanted: Wanted) -> dict[str, Any]:
-    """What holds for the whole recording: the device, its settings, each stream's intrinsics."""
+def _info(bag: BagReader, options: ExportOptions) -> dict[str, Any]:
+    """Return facts of the whole recording for JSON: device, settings, intrinsics by stream, and its sidecar."""
     streams = {
         name: {
             "format": info.format,
@@ -260,14 +249,15 @@ def _info(bag: BagFile, wanted: Wanted) -> dict[str, Any]:
         "recording": bag.path.name,
         "device": dict(bag.device),
         **unit,
-        "every": wanted.every,
+        "every": options.every,
         "streams": streams,
-    } | {"capture": _noted(bag.path.with_suffix(".json"))}
+        "capture": _read_json(bag.path.with_suffix(".json")),
+    }
 
 
-def _noted(beside: Path) -> Any:
-    """What `capture` noted of the recording in the file beside it; None where that is not there, or something else."""
+def _read_json(path: Path) -> Any:
+    """Return a file's JSON; None where there is none."""
     try:
-        return json.loads(beside.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None

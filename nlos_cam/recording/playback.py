@@ -1,4 +1,4 @@
-"""A recording as a camera: complete, in order, the same each time, as fast as it is read; without librealsense."""
+"""Playback of a recording as a camera, without librealsense; and verification of recordings."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -11,7 +11,7 @@ from nlos_calibration import Intrinsics, Rig
 from nlos_cam.camera import FORMATS, ClockUnwrap, FrameSynchronizer, frame_in_si
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.bag_reader import BagReader
 
 IDENTITY = {
     "name": "name",
@@ -19,14 +19,15 @@ IDENTITY = {
     "firmware": "firmware_version",
     "usb_type": "usb_type_descriptor",
 }
-"""What a camera tells of itself, by our name and by the SDK's."""
+"""The SDK's names of the device's properties, by ours."""
 
 
 class ReplayCamera:
-    """The frames of a .bag. Iterating starts at the first frame each time, and never drops one.
+    """Camera that plays a .bag as fast as it is read, from the first frame at each iteration, without drops.
 
-    A frame's settings are those in force when it was recorded. Raises RecordingError for a file that cannot be read, or
-    where it cannot be read on; StreamMissingError for one that lacks a stream.
+    No thread and no open file, so leaving the context only ends iterations. A frame's settings are those in force when
+    it was recorded. Raises RecordingError for a file that cannot be read, or at the damage; StreamMissingError without
+    depth, infrared or confidence.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,7 +44,7 @@ class ReplayCamera:
         self._settings: Mapping[str, float] = {}
         self._entered = False
         self._iterations = 0
-        """Begun so far: only the last goes on."""
+        """Started so far; all but the last have ended."""
 
     def __enter__(self) -> Self:
         self._entered = True
@@ -75,7 +76,7 @@ class ReplayCamera:
                 self._count(pairing)
                 self._settings = self._bag.settings(place.time_ns)
                 yield frame_in_si(found, self._unit_m, self.intrinsics, self._settings)
-            if iteration != self._iterations:  # it was left, or begun anew
+            if iteration != self._iterations:  # the context was left, or another iteration started
                 return
         self._end(pairing)
 
@@ -90,9 +91,9 @@ class ReplayCamera:
         return {name: value for name, value in self._settings.items() if name.endswith(ending)}
 
 
-def open_lidar_bag(path: Path) -> BagFile:
-    """A recording with the three streams that are needed. Raises StreamMissingError for another, RecordingError."""
-    bag = BagFile(path)
+def open_lidar_bag(path: Path) -> BagReader:
+    """Open a recording of an L515. Raises StreamMissingError without one of its three streams, RecordingError."""
+    bag = BagReader(path)
     if not bag.streams:
         raise RecordingError(f"{path} holds no frames: record it again")
     present = {name: info.format for name, info in bag.streams.items()}
@@ -104,37 +105,37 @@ def open_lidar_bag(path: Path) -> BagFile:
     return bag
 
 
-def identity_of(bag: BagFile) -> dict[str, str]:
-    """What a camera tells of itself, from a recording of it."""
+def identity_of(bag: BagReader) -> dict[str, str]:
+    """Return name, serial, firmware and usb_type of the recorded device, as far as recorded."""
     return {ours: bag.device[theirs] for ours, theirs in IDENTITY.items() if theirs in bag.device}
 
 
-def device_clock(bag: BagFile) -> Callable[[float], float]:
-    """What makes one clock of a recording's timestamps, taken in order: a device's own counter wraps."""
+def device_clock(bag: BagReader) -> Callable[[float], float]:
+    """Return a function that makes timestamps in order monotonic: the counter of a device's clock wraps."""
     wraps = bag.metadata("depth", 0).domain == "hardware_clock"
     return ClockUnwrap().add if wraps else float
 
 
 @dataclass(frozen=True)
-class Verified:
-    """What a recording holds, read back from the file."""
+class VerifyResult:
+    """Contents of a recording that was read from end to end."""
 
     frames: int
-    """Complete sets."""
+    """Complete sets of the three streams."""
     dropped: int
-    """Numbers between the first and the last set that are not in the file, or lack a stream."""
+    """Frame numbers between the first and the last set that are missing, or lack a stream."""
     seconds: float
     """From the first set to the last."""
     streams: dict[str, int]
     """Frames of each stream."""
 
 
-def verify(path: Path, on_frame: Callable[[], None] = lambda: None) -> Verified:
-    """Read a recording from end to end. Raises RecordingError where it cannot be."""
+def verify(path: Path, on_frame: Callable[[], None] = lambda: None) -> VerifyResult:
+    """Read a recording from end to end and return its contents. Raises RecordingError at damage."""
     frames, first_s, last_s = 0, 0.0, 0.0
     with ReplayCamera(path) as camera:
         for frame in camera:
             first_s, last_s = first_s if frames else frame.timestamp_s, frame.timestamp_s
             frames += 1
             on_frame()
-        return Verified(frames, camera.dropped + camera.incomplete, last_s - first_s, dict(camera.arrived))
+        return VerifyResult(frames, camera.dropped + camera.incomplete, last_s - first_s, dict(camera.arrived))

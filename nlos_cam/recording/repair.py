@@ -1,4 +1,4 @@
-"""Rebuilding a killed, cut or damaged recording: every whole chunk of it, with a new index, in a new file."""
+"""Repair of a killed, cut or damaged recording: its undamaged chunks with a new index, in a new file."""
 
 import re
 import shutil
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
-from nlos_cam.camera import FORMATS
+from nlos_cam.camera import FORMATS, OnProgress
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
 from nlos_cam.files import atomic_file
 from nlos_cam.recording.rosbag import (
@@ -22,35 +22,35 @@ from nlos_cam.recording.rosbag import (
     pack_file_header,
     pack_index,
 )
-from nlos_cam.recording.salvage import Chunk, Damage, OnProgress, Scan, scan_bag, unreported
+from nlos_cam.recording.salvage import Chunk, Damage, Scan, ignore_progress, scan_bag
 
 FRAMES_TOPIC = re.compile(r"/([A-Za-z]+)_\d+/image/data$")
 VERSION_TOPIC = "/file_version"
-"""The first of what describes the device; librealsense plays nothing without."""
+"""First message of the device's description; librealsense plays no file without it."""
 RECORD_BYTES = 128
-"""More than a record takes besides its data, where that is an index or a chunk."""
+"""Bound on an index or chunk record without its data."""
 
 
 @dataclass(frozen=True)
-class Repaired:
-    """What a repair found, and what of it is in the new file."""
+class RepairResult:
+    """Contents of a repaired recording, and the damage of the original."""
 
     recovered_frames: dict[str, int]
-    """Of depth, infrared and confidence, and of every other stream of images there is."""
+    """Of depth, infrared and confidence, and of any other stream of images."""
     chunks: int
     damages: list[Damage]
     """In the order of the file."""
     out: Path
 
 
-def repair_recording(path: Path, out: Path, report: OnProgress = unreported) -> Repaired:
-    """Write what is whole in the recording `path` to `out`, which is replaced; `path` is only read.
+def repair_recording(path: Path, out: Path, report: OnProgress = ignore_progress) -> RepairResult:
+    """Write the undamaged part of the recording `path` to `out`, replacing it atomically; `path` is only read.
 
-    `out` appears when all of it is written. Raises RecordingError where nothing can be recovered, OutputExistsError if
-    both are one file, NlosCamError where `out` cannot be written.
+    Raises RecordingError where nothing can be recovered, OutputExistsError if both are the same file, NlosCamError
+    where `out` cannot be written.
     """
-    if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for
-        raise RecordingError(f"{path} is no file: give the path of a .bag recording")
+    if path.exists() and not (path.is_file() or path.is_dir()):  # opening a pipe would wait for a writer
+        raise RecordingError(f"{path} is not a file: give the path of a .bag recording")
     try:
         same = out.exists() and out.samefile(path)
         scan = None if same else scan_bag(path, lambda done, total: report(done, 2 * total))
@@ -62,50 +62,49 @@ def repair_recording(path: Path, out: Path, report: OnProgress = unreported) -> 
     if not any(_holds_frames(chunk) for chunk in chunks):
         raise RecordingError(f"{path} has nothing to recover: {_why_nothing(scan)}")
     _write(path, out, replace(scan, chunks=chunks), report)
-    return Repaired(_frames(chunks, scan.connections), len(chunks), damages, out)
+    return RepairResult(_count_frames(chunks, scan.connections), len(chunks), damages, out)
 
 
 def _readable(scan: Scan) -> tuple[list[Chunk], list[Damage]]:
-    """The chunks, with an index of the messages that something describes, and of each frame once; what is damaged."""
-    found = _Index(scan.connections)
-    chunks = [chunk for chunk in (found.narrow(chunk) for chunk in scan.chunks) if chunk.index]
-    damages = [*scan.damages, *found.damages.values()]
+    """Return the chunks, with each described message and each frame once in their indexes, and all damage."""
+    described = _IndexFilter(scan.connections)
+    chunks = [chunk for chunk in map(described.narrow, scan.chunks) if chunk.index]
+    damages = [*scan.damages, *described.damages.values()]
     if VERSION_TOPIC not in {scan.connections[number].topic.lower() for chunk in chunks for number in chunk.index}:
-        damages.append(Damage(0, 0, "what describes the streams is lost: librealsense will not play this"))
+        damages.append(Damage(0, 0, "stream descriptions missing: librealsense cannot play this"))
     return chunks, sorted(damages, key=lambda damage: damage.position)
 
 
-class _Index:
-    """Narrows the indexes of chunks, one after the other, to what can be read."""
+class _IndexFilter:
+    """Filter of chunk indexes: drops messages without a description, and repeated frames. Feed chunks in order."""
 
     def __init__(self, connections: Mapping[int, Connection]) -> None:
         self.damages: dict[int, Damage] = {}
-        """By connection."""
+        """The first of each connection."""
         self._connections = connections
-        self._taken = set[tuple[int, bytes]]()
+        self._frames = set[tuple[int, bytes]]()
 
     def narrow(self, chunk: Chunk) -> Chunk:
-        index = {number: self._once(chunk.at, number, entries) for number, entries in chunk.index.items()}
+        """Return a chunk with the readable part of its index."""
+        index = {number: self._filter(chunk.at, number, entries) for number, entries in chunk.index.items()}
         return replace(chunk, index={number: entries for number, entries in index.items() if entries})
 
-    def _once(self, at: int, number: int, entries: bytes) -> bytes:
+    def _filter(self, at: int, number: int, entries: bytes) -> bytes:
         if number not in self._connections:
-            self._note(at, number, "nothing tells what it is")
+            self.damages.setdefault(number, Damage(at, 0, f"connection {number} without a description"))
             return b""
         if not FRAMES_TOPIC.search(self._connections[number].topic):
             return entries
         new: list[bytes] = []
         for start in range(0, len(entries), ENTRY_BYTES):
             frame = number, entries[start : start + 8]
-            if frame not in self._taken:
-                self._taken.add(frame)
+            if frame not in self._frames:
+                self._frames.add(frame)
                 new.append(entries[start : start + ENTRY_BYTES])
         if len(new) * ENTRY_BYTES < len(entries):
-            self._note(at, number, "some of its frames are there twice, and taken once")
+            why = f"frames of connection {number} that are there twice (used once)"
+            self.damages.setdefault(number, Damage(at, 0, why))
         return b"".join(new)
-
-    def _note(self, at: int, number: int, why: str) -> None:
-        self.damages.setdefault(number, Damage(at, 0, f"connection {number}: {why}"))
 
 
 def _holds_frames(chunk: Chunk) -> bool:
@@ -116,13 +115,13 @@ def _why_nothing(scan: Scan) -> str:
     if not scan.bytes:
         return "it is empty"
     if not scan.chunks:
-        return f"none of its {scan.bytes} bytes are a whole piece of a recording"
+        return f"its {scan.bytes} bytes hold no complete chunk of a recording"
     if any(_holds_frames(chunk) for chunk in scan.chunks):
-        return "nothing that is left of it tells what its messages are"
+        return "the descriptions of its messages are lost"
     return "it ends before the first frame"
 
 
-def _frames(chunks: list[Chunk], connections: Mapping[int, Connection]) -> dict[str, int]:
+def _count_frames(chunks: list[Chunk], connections: Mapping[int, Connection]) -> dict[str, int]:
     frames = Counter(dict.fromkeys(FORMATS, 0))
     for chunk in chunks:
         for number, entries in chunk.index.items():
@@ -132,7 +131,6 @@ def _frames(chunks: list[Chunk], connections: Mapping[int, Connection]) -> dict[
 
 
 def _write(path: Path, out: Path, scan: Scan, report: OnProgress) -> None:
-    """Write the repaired bag to `out`, atomically."""
     try:
         _check_space(out, scan)
         with path.open("rb") as source, atomic_file(out) as part, part.open("wb") as target:
@@ -148,16 +146,17 @@ def _check_space(out: Path, scan: Scan) -> None:
     needed = scan.bytes + index + RECORD_BYTES * len(scan.chunks) + 2 * FILE_HEADER_BYTES
     free = shutil.disk_usage(out.parent).free
     if free < needed:
-        raise NlosCamError(f"{out} needs {needed >> 20} MB, and {free >> 20} MB are free: choose another --out")
+        raise NlosCamError(f"{out} needs {needed >> 20} MB, but {free >> 20} MB are free: choose another --out")
 
 
 class _Writer:
-    """Writes a bag of given chunks and connections."""
+    """Writer of a bag from the chunks and connections of a scan; the data of whole chunks are copied unchanged."""
 
     def __init__(self, source: BinaryIO, target: BinaryIO, scan: Scan, report: OnProgress) -> None:
         self._source, self._target, self._scan, self._report = source, target, scan, report
 
     def write(self) -> None:
+        """Write the whole file."""
         self._write_header(0)
         infos = [self._write_chunk(chunk) for chunk in self._scan.chunks]
         index_at = self._target.tell()
@@ -171,20 +170,17 @@ class _Writer:
         self._target.write(MAGIC + pack_file_header(len(self._scan.connections), len(self._scan.chunks), index_at))
 
     def _write_chunk(self, chunk: Chunk) -> bytes:
-        """Write a chunk and its index; what the file's index says of it."""
+        """Write a chunk and its index; return its chunk info for the end of the file."""
         at = self._target.tell()
         self._target.write(pack_chunk_head(chunk.compression, chunk.size, chunk.data_bytes))
-        if chunk.content is None:
-            self._copy(chunk)
-        else:
-            self._target.write(chunk.content)
+        self._target.write(self._data(chunk) if chunk.content is None else chunk.content)
         self._target.writelines(pack_index(number, entries) for number, entries in chunk.index.items())
         self._report(min(2 * self._scan.bytes, self._scan.bytes + self._target.tell()), 2 * self._scan.bytes)
         return pack_chunk_info(at, chunk.index)
 
-    def _copy(self, chunk: Chunk) -> None:
+    def _data(self, chunk: Chunk) -> bytes:
         self._source.seek(chunk.data_at)
         data = self._source.read(chunk.data_bytes)
         if len(data) < chunk.data_bytes:
-            raise RecordingError(f"{self._source.name} changed while it was read: repair it when it is written")
-        self._target.write(data)
+            raise RecordingError(f"{self._source.name} shrank during the repair: repair it after writing has ended")
+        return data

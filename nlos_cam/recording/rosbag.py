@@ -1,9 +1,7 @@
-"""The records of a ROS bag (format 2.0): read with every length checked against what is there, and written.
+"""Records of a ROS bag (format 2.0): reading with every length checked, packing, and the contents of a chunk.
 
-A record is a header of named fields and data, each behind its length (wiki.ros.org/Bags/Format/2.0). Numbers are
-little-endian. A chunk's data are records too, packed as its compression says.
-
-The connections and messages in a chunk of a bag, unpacked: where they lie, and up to where they are whole.
+A record is a header of named fields and data, each after its length (wiki.ros.org/Bags/Format/2.0). Numbers are
+little-endian. The data of a chunk are records too, compressed as its header says.
 """
 
 import re
@@ -15,34 +13,34 @@ from enum import Enum, IntEnum
 
 MAGIC = b"#ROSBAG V2.0\n"
 HEADER_LIMIT = 1 << 16
-"""Bytes of fields; real ones have some hundred."""
+"""Bound on the bytes of a header; real ones have some hundred."""
 CHUNK_LIMIT = 64 << 20
-"""Bytes of a chunk, unpacked; librealsense closes a chunk after 768 KiB and the image that passes that."""
+"""Bound on the bytes of an unpacked chunk; librealsense closes one after 768 KiB and the image that exceeds that."""
 FILE_HEADER_BYTES = 4096
 """Fields and padding of a file's first record."""
 ENTRY_BYTES = 12
-"""An index's entry: a message's time (4 bytes of seconds, 4 of nanoseconds) and its offset in its chunk's content."""
+"""Index entry: a message's time (4 bytes of seconds, 4 of nanoseconds) and its offset in the unpacked chunk."""
 SET_UP_TIME = struct.pack("<II", 0, 1)
-"""What librealsense stamps on all that describes the device: before any frame."""
+"""The time that librealsense gives to all that describes the device, before any frame."""
 
 Read = Callable[[int, int], bytes]
-"""Called with where and how many; gives as many bytes as are there."""
+"""Returns up to that many bytes (second argument) from that offset (first), fewer at the end."""
 Fields = Mapping[str, bytes]
 
 
 class BagFormatError(ValueError):
-    """Bytes that are not the record they should be; never leaves the package."""
+    """Bytes that are not the expected record; never leaves the package."""
 
 
 class BagCutError(BagFormatError):
-    """A record that the file's end cuts off."""
+    """A record that extends beyond the end of the file."""
 
 
-CUT = "the file ends within it"
+CUT = "file truncated"
 
 
 class Op(IntEnum):
-    """What a record is."""
+    """Kind of a record."""
 
     MESSAGE = 2
     FILE_HEADER = 3
@@ -54,7 +52,7 @@ class Op(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class BagRecord:
-    """A record's fields, and where its data lies; whether all of it is there, is for the reader to check."""
+    """Fields of a record, and the place of its data, which may extend beyond the end of the file."""
 
     op: Op
     fields: Fields
@@ -63,44 +61,48 @@ class BagRecord:
 
     @property
     def end(self) -> int:
-        """Where the next record starts."""
+        """Offset of the next record."""
         return self.data_at + self.data_bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A topic, the number that messages call it by, and its description word for word."""
+    """Topic, the number by which messages refer to it, and its description, verbatim."""
 
     number: int
     topic: str
     kind: str
-    """The messages' type, as package/Name."""
+    """Type of the messages, as package/Name."""
     md5sum: bytes
     """Of the type's definition."""
     record: bytes
 
     def is_like(self, other: "Connection") -> bool:
-        """Whether a message of the one can be read as one of the other."""
+        """Return whether both have the same topic and message type."""
         return (self.topic, self.kind, self.md5sum) == (other.topic, other.kind, other.md5sum)
 
 
 def read_record(read: Read, at: int) -> BagRecord:
-    """The record at that place. Raises BagFormatError where there is none."""
+    """Return the record at an offset. Raises BagFormatError where there is none."""
     head = read(at, 4)
     if len(head) < 4:
         raise BagCutError(CUT)
     header_bytes = _number(head, 4)
     if header_bytes > HEADER_LIMIT:
-        raise BagFormatError(f"a record's header claims {header_bytes} bytes")
+        raise BagFormatError(f"implausible record header of {header_bytes} bytes")
     header = read(at + 4, header_bytes + 4)
     if len(header) < header_bytes + 4:
         raise BagCutError(CUT)
     fields = parse_fields(header[:header_bytes])
-    return BagRecord(_op(fields), fields, at + 8 + header_bytes, _number(header[header_bytes:], 4))
+    try:
+        op = Op(number(fields, "op", 1))
+    except ValueError as error:
+        raise BagFormatError("record of unknown kind") from error
+    return BagRecord(op, fields, at + 8 + header_bytes, _number(header[header_bytes:], 4))
 
 
 def parse_fields(header: bytes) -> dict[str, bytes]:
-    """The fields of a header. Raises BagFormatError where they do not fill it exactly."""
+    """Return the fields of a header. Raises BagFormatError where they do not fill it exactly."""
     fields: dict[str, bytes] = {}
     at = 0
     while at < len(header):
@@ -108,96 +110,89 @@ def parse_fields(header: bytes) -> dict[str, bytes]:
         at = start + _number(header[at:start], 4)
         name, equals, value = header[start:at].partition(b"=")
         if at > len(header) or not equals or not name.isascii():
-            raise BagFormatError("a header's field is damaged")
+            raise BagFormatError("damaged field of a record header")
         fields[name.decode()] = value
     return fields
-
-
-def _op(fields: Fields) -> Op:
-    try:
-        return Op(_number(_field(fields, "op"), 1))
-    except ValueError as error:
-        raise BagFormatError("a record is of no known kind") from error
 
 
 def _field(fields: Fields, name: str) -> bytes:
     try:
         return fields[name]
     except KeyError:
-        raise BagFormatError(f"a record lacks its field {name!r}") from None
+        raise BagFormatError(f"record without its field {name!r}") from None
 
 
 def _number(value: bytes, size: int) -> int:
     if len(value) != size:
-        raise BagFormatError(f"a number of {size} bytes has {len(value)}")
+        raise BagFormatError(f"number of {len(value)} bytes in place of {size}")
     return int.from_bytes(value, "little")
 
 
 def number(fields: Fields, name: str, size: int = 4) -> int:
-    """A field as an unsigned number of that many bytes. Raises BagFormatError where it is none."""
+    """Return a field as an unsigned number of `size` bytes. Raises BagFormatError for another size."""
     return _number(_field(fields, name), size)
 
 
 def text(fields: Fields, name: str) -> str:
-    """A field as text. Raises BagFormatError where it is none."""
+    """Return a field as text. Raises BagFormatError where it is not UTF-8."""
     try:
         return _field(fields, name).decode()
     except UnicodeDecodeError as error:
-        raise BagFormatError(f"a record's field {name!r} is not text") from error
+        raise BagFormatError(f"record whose field {name!r} is not text") from error
 
 
 def message_key(record: BagRecord) -> tuple[int, bytes]:
-    """A message's connection number and time (8 bytes: seconds, nanoseconds). Raises BagFormatError."""
+    """Return a message's connection number and time (8 bytes: seconds, nanoseconds). Raises BagFormatError."""
     time = _field(record.fields, "time")
     if len(time) != len(SET_UP_TIME):
-        raise BagFormatError("a message's time is damaged")
+        raise BagFormatError("message with a damaged time")
     return number(record.fields, "conn"), time
 
 
 def read_connection(read: Read, record: BagRecord) -> Connection:
-    """What a connection record says. Raises BagFormatError where any reader of bags would stumble over it."""
+    """Return a connection record's content. Raises BagFormatError for one that readers of bags would refuse."""
     if record.data_bytes > HEADER_LIMIT:
-        raise BagFormatError(f"the description of a connection claims {record.data_bytes} bytes")
+        raise BagFormatError(f"implausible connection of {record.data_bytes} bytes")
     data = read(record.data_at, record.data_bytes)
     if len(data) < record.data_bytes:
         raise BagCutError(CUT)
-    described = parse_fields(data)
-    for name in described:
-        text(described, name)
-    topic, kind = text(record.fields, "topic"), text(described, "type")
+    description = parse_fields(data)
+    for name in description:
+        text(description, name)
+    topic, kind = text(record.fields, "topic"), text(description, "type")
     if not topic.isprintable() or not topic.startswith("/") or not re.fullmatch(r"\w+/\w+", kind):
-        raise BagFormatError("the description of a connection is damaged")
-    _field(described, "message_definition")
-    written = pack_record(record.fields, data)
-    return Connection(number(record.fields, "conn"), topic, kind, _field(described, "md5sum"), written)
+        raise BagFormatError("damaged description of a connection")
+    _field(description, "message_definition")
+    packed = pack_record(record.fields, data)
+    return Connection(number(record.fields, "conn"), topic, kind, _field(description, "md5sum"), packed)
 
 
 def check_bookkeeping(read: Read, record: BagRecord) -> None:
-    """Raise BagFormatError for a file header, index or chunk info whose length cannot be right."""
+    """Raise BagFormatError for a file header, index or chunk info of an impossible length."""
     if record.op is Op.INDEX and record.data_bytes != ENTRY_BYTES * number(record.fields, "count"):
-        raise BagFormatError("an index's length does not fit its entries")
+        raise BagFormatError("index whose length contradicts its number of entries")
     if record.op is Op.CHUNK_INFO and record.data_bytes != 8 * number(record.fields, "count"):
-        raise BagFormatError("a chunk info's length does not fit its entries")
+        raise BagFormatError("chunk info whose length contradicts its number of entries")
     if record.op is Op.FILE_HEADER and record.data_bytes > HEADER_LIMIT:
-        raise BagFormatError(f"the file's header claims {record.data_bytes} bytes")
+        raise BagFormatError(f"implausible file header of {record.data_bytes} bytes")
     if record.op is Op.FILE_HEADER and read(record.data_at, record.data_bytes).strip(b" \0"):
-        raise BagFormatError("the file's header is damaged")
+        raise BagFormatError("damaged file header")
 
 
 def pack_record(fields: Fields, data: bytes) -> bytes:
-    """A whole record."""
+    """Return the bytes of a record."""
     return pack_head(fields, len(data)) + data
 
 
 def pack_head(fields: Fields, data_bytes: int) -> bytes:
-    """A record up to its data."""
+    """Return the bytes of a record up to its data."""
     named = [name.encode() + b"=" + value for name, value in fields.items()]
     header = b"".join(len(field).to_bytes(4, "little") + field for field in named)
     return len(header).to_bytes(4, "little") + header + data_bytes.to_bytes(4, "little")
 
 
 def pack_file_header(connections: int, chunks: int, index_at: int) -> bytes:
-    """A file's first record, padded so that it can be written again in place."""
+    """Return the first record of a file, padded to a fixed length so that it can be overwritten in place."""
     fields = {
         "chunk_count": chunks.to_bytes(4, "little"),
         "conn_count": connections.to_bytes(4, "little"),
@@ -209,7 +204,7 @@ def pack_file_header(connections: int, chunks: int, index_at: int) -> bytes:
 
 
 def pack_chunk_head(compression: str, size: int, data_bytes: int) -> bytes:
-    """A chunk up to its data; `size` is that of its content, unpacked."""
+    """Return a chunk up to its data; `size` counts the unpacked bytes."""
     fields = {
         "compression": compression.encode(),
         "op": bytes([Op.CHUNK]),
@@ -219,7 +214,7 @@ def pack_chunk_head(compression: str, size: int, data_bytes: int) -> bytes:
 
 
 def pack_index(connection: int, entries: bytes) -> bytes:
-    """Where one connection's messages lie in a chunk, ENTRY_BYTES for each."""
+    """Return the index of one connection's messages in a chunk, from entries of ENTRY_BYTES."""
     fields = {
         "conn": connection.to_bytes(4, "little"),
         "count": (len(entries) // ENTRY_BYTES).to_bytes(4, "little"),
@@ -230,7 +225,7 @@ def pack_index(connection: int, entries: bytes) -> bytes:
 
 
 def pack_chunk_info(chunk_at: int, index: Mapping[int, bytes]) -> bytes:
-    """What a chunk holds: how many messages of each connection, from when to when; `index` has their entries."""
+    """Return the summary of a chunk: message counts by connection, and the time span, from its index entries."""
     ends = [(entries[:8], entries[-ENTRY_BYTES:-4]) for entries in index.values()]
     times = [struct.unpack("<II", time) for pair in ends for time in pair]
     counts = [struct.pack("<II", connection, len(entries) // ENTRY_BYTES) for connection, entries in index.items()]
@@ -246,7 +241,7 @@ def pack_chunk_info(chunk_at: int, index: Mapping[int, bytes]) -> bytes:
 
 
 class Ending(Enum):
-    """How a chunk's data ends."""
+    """Condition of a chunk's data at its end."""
 
     WHOLE = "whole"
     CUT = "cut off"
@@ -255,21 +250,22 @@ class Ending(Enum):
 
 @dataclass(frozen=True)
 class Content:
-    """The records in a chunk, as far as they can be read."""
+    """Readable records of a chunk."""
 
     connections: dict[int, Connection]
     index: dict[int, bytes]
-    """Of each connection, its entries as in an index record, sorted by time."""
+    """Entries of each connection as in an index record, sorted by time."""
     bytes: int
-    """Up to here all is whole."""
+    """Length of the undamaged part."""
     ending: Ending
     why: str
-    """What is wrong with the bytes after that; empty if nothing is."""
+    """Damage after that; empty if there is none."""
 
 
 def read_content(read: Read, at: int, end: int, expected_bytes: int) -> Content:
-    """The connections and messages from `at` on: to `expected_bytes` further, if a record ends there, else to where
-    something else comes, at most to `end`.
+    """Return the connections and messages from `at` on.
+
+    They end after `expected_bytes`, if a record ends there, else at the first record of another kind, at most at `end`.
     """
     connections: dict[int, Connection] = {}
     entries: dict[int, list[bytes]] = {}
@@ -287,12 +283,13 @@ def read_content(read: Read, at: int, end: int, expected_bytes: int) -> Content:
         ending, why = Ending.CUT, str(error)
     except BagFormatError as error:
         ending, why = Ending.BROKEN, str(error)
-    index = {connection: b"".join(sorted(found, key=_time)) for connection, found in sorted(entries.items())}
+    by_time = {number: sorted(found, key=lambda e: struct.unpack_from("<II", e)) for number, found in entries.items()}
+    index = {number: b"".join(by_time[number]) for number in sorted(by_time)}
     return Content(connections, index, reached - at, ending, why)
 
 
 def _records(read: Read, at: int, end: int, expected_bytes: int) -> Iterator[tuple[int, BagRecord]]:
-    """Messages and connections, and where each starts. Raises BagFormatError where neither comes."""
+    """Yield messages and connections with their offsets. Raises BagFormatError where neither follows."""
     expected_end = at + expected_bytes
     while at != expected_end and read(at, 1):
         record = read_record(read, at)
@@ -301,13 +298,13 @@ def _records(read: Read, at: int, end: int, expected_bytes: int) -> Iterator[tup
         if not read(record.end - 1, 1):
             raise BagCutError(CUT)
         if record.end > end:
-            raise BagFormatError(f"it holds more than {CHUNK_LIMIT >> 20} MiB")
+            raise BagFormatError(f"chunk of more than {CHUNK_LIMIT >> 20} MiB")
         yield at, record
         at = record.end
 
 
 def _confirmed(records: Iterator[tuple[int, BagRecord]]) -> Iterator[tuple[int, BagRecord]]:
-    """All but the one before damage: its length may be what is wrong."""
+    """Yield all records but the last one before damage: its length may be the damaged part."""
     last: tuple[int, BagRecord] | None = None
     try:
         for found in records:
@@ -322,13 +319,8 @@ def _confirmed(records: Iterator[tuple[int, BagRecord]]) -> Iterator[tuple[int, 
         yield last
 
 
-def _time(entry: bytes) -> tuple[int, int]:
-    seconds, nanoseconds = struct.unpack_from("<II", entry)
-    return seconds, nanoseconds
-
-
 def set_up_records(read: Read) -> Iterator[tuple[int, BagRecord]]:
-    """What describes the device, and the connections, and where each starts; as far as records are whole."""
+    """Yield the records that describe the device, and connections, with their offsets, up to the first damage."""
     with suppress(BagFormatError):
         for start, record in _records(read, 0, CHUNK_LIMIT, CHUNK_LIMIT):
             if record.op is Op.CONNECTION or message_key(record)[1] == SET_UP_TIME:
@@ -336,5 +328,5 @@ def set_up_records(read: Read) -> Iterator[tuple[int, BagRecord]]:
 
 
 def reader(content: bytes) -> Read:
-    """Read from memory."""
+    """Return a Read of bytes in memory."""
     return lambda at, count: content[at : at + count]

@@ -1,10 +1,6 @@
-"""A bag read chunk by chunk without its index: what is whole, what is damaged and where, and on after damage.
-
-One chunk of a bag: whether it is whole, what is in it, and what of a broken one can still be had.
-"""
+"""Scan of a bag without its index: undamaged chunks, places of damage, and parts of broken chunks."""
 
 import re
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +8,7 @@ from typing import BinaryIO
 
 from lz4.frame import LZ4FrameDecompressor
 
+from nlos_cam.camera import OnProgress
 from nlos_cam.recording.rosbag import (
     CHUNK_LIMIT,
     CUT,
@@ -39,7 +36,7 @@ LZ4_TAIL_BYTES = 8
 
 @dataclass(frozen=True)
 class Chunk:
-    """A chunk that can be written anew: its data as it lies in the file, or what was unpacked of it."""
+    """Chunk that can be written again, from its data in the file or from its unpacked content."""
 
     at: int
     compression: str
@@ -48,27 +45,28 @@ class Chunk:
     data_at: int
     data_bytes: int
     content: bytes | None
-    """In place of the data in the file, where that is cut."""
+    """Replaces the data in the file where that is cut off."""
     index: dict[int, bytes]
 
 
 @dataclass(frozen=True)
 class Examined:
-    """What became of a chunk."""
+    """Result of checking one chunk."""
 
     chunk: Chunk | None
+    """None where nothing of it can be used."""
     connections: dict[int, Connection]
     end: int
-    """Where to read on."""
+    """Offset at which reading continues."""
     ending: Ending
     why: str
-    """What is wrong with it; empty if nothing is."""
+    """Damage; empty if there is none."""
 
 
 def find_chunk(read: Read, at: int) -> BagRecord | None:
-    """The chunk that begins there, or the data of one that lost its header; None where neither does.
+    """Return the chunk at an offset, or the data of one without its header; None at another record.
 
-    Raises BagFormatError where no record begins either.
+    Raises BagFormatError where no record begins.
     """
     if read(at, len(LZ4_MAGIC)) == LZ4_MAGIC:
         return BagRecord(Op.CHUNK, {"compression": b"lz4"}, at, 0)
@@ -79,7 +77,7 @@ def find_chunk(read: Read, at: int) -> BagRecord | None:
 
 
 def is_headless(chunk: BagRecord) -> bool:
-    """Whether `find_chunk` found data without its header."""
+    """Return whether `find_chunk` found data without a header."""
     return "size" not in chunk.fields
 
 
@@ -90,16 +88,16 @@ def _is_message(read: Read, at: int) -> bool:
 
 
 def examine(read: Read, at: int, record: BagRecord, file_end: int) -> Examined:
-    """Unpack and check the chunk that `record`, which starts at `at`, says is there.
+    """Unpack and check a chunk, given its record at `at`.
 
-    Its lengths are not believed: lz4 data says itself where it ends, other data ends where messages do.
+    The lengths in its header are not trusted: lz4 data mark their own end, other data end with the last message.
     """
     compression = record.fields.get("compression")
     if compression == b"lz4":
         return _examine_lz4(read, at, record, file_end)
     if compression == b"none":
         return _examine_plain(read, at, record)
-    return Examined(None, {}, record.data_at, Ending.BROKEN, "its compression is neither lz4 nor none")
+    return Examined(None, {}, record.data_at, Ending.BROKEN, "unknown compression, neither lz4 nor none")
 
 
 def _examine_plain(read: Read, at: int, record: BagRecord) -> Examined:
@@ -111,7 +109,8 @@ def _examine_plain(read: Read, at: int, record: BagRecord) -> Examined:
 
 
 def _examine_lz4(read: Read, at: int, record: BagRecord, file_end: int) -> Examined:
-    unpacked, end, ending, why = unpack(read, record.data_at, file_end, _piece_bytes(record))
+    piece_bytes = min(max(record.data_bytes, MIN_PIECE_BYTES), MAX_PIECE_BYTES)  # a whole chunk, if its length is sane
+    unpacked, end, ending, why = unpack(read, record.data_at, file_end, piece_bytes)
     if ending is Ending.BROKEN:
         return Examined(None, {}, record.data_at, ending, why)
     found = read_content(reader(unpacked), 0, len(unpacked), len(unpacked))
@@ -125,25 +124,20 @@ def _examine_lz4(read: Read, at: int, record: BagRecord, file_end: int) -> Exami
     return Examined(chunk if found.index else None, found.connections, end, ending, why)
 
 
-def _piece_bytes(record: BagRecord) -> int:
-    """All of a chunk at once, if its length is sensible."""
-    return min(max(record.data_bytes, MIN_PIECE_BYTES), MAX_PIECE_BYTES)
-
-
 def _wrong_lengths(record: BagRecord, end: int, size: int) -> str:
     if is_headless(record):
         return ""  # the damage is before it
     if record.data_bytes == 0:
-        return "it was never finished"
+        return "unfinished chunk"
     if record.end != end or record.fields["size"] != size.to_bytes(4, "little"):
-        return "it has another length than it says"
+        return "wrong length in the chunk header"
     return ""
 
 
 def unpack(read: Read, at: int, end: int, piece_bytes: int) -> tuple[bytes, int, Ending, str]:
-    """The content of the lz4 frame at `at`, where the frame ends, how, and what is wrong with it.
+    """Return the content of the lz4 frame at `at`, the offset of its end, its condition there, and the damage.
 
-    Reads `piece_bytes` at a time; never unpacks more than CHUNK_LIMIT, whatever the data claims.
+    Reads `piece_bytes` at a time and never unpacks more than CHUNK_LIMIT.
     """
     decoder, parts, room, limit = LZ4FrameDecompressor(), list[bytes](), CHUNK_LIMIT, at + 2 * CHUNK_LIMIT
     while not decoder.eof:
@@ -153,17 +147,17 @@ def unpack(read: Read, at: int, end: int, piece_bytes: int) -> tuple[bytes, int,
         try:
             parts.append(decoder.decompress(piece, min(room + 1, MAX_PIECE_BYTES)))
         except RuntimeError:
-            return b"".join(parts), at, Ending.BROKEN, "its data is damaged"
+            return b"".join(parts), at, Ending.BROKEN, "damaged data of a chunk"
         at, room = at + len(piece), room - len(parts[-1])
         if room < 0 or at > limit:
-            return b"", at, Ending.BROKEN, f"it holds more than {CHUNK_LIMIT >> 20} MiB"
+            return b"", at, Ending.BROKEN, f"chunk of more than {CHUNK_LIMIT >> 20} MiB"
     return b"".join(parts), at - len(decoder.unused_data or b""), Ending.WHOLE, ""
 
 
 def salvage_set_up(read: Read, at: int, record: BagRecord, file_end: int) -> tuple[Chunk | None, dict[int, Connection]]:
-    """What describes the device and its streams, out of a broken lz4 chunk, as far as its checksum can be passed over.
+    """Return the descriptions of device and streams, and connections, from a broken lz4 chunk, without its checksum.
 
-    Not one frame can be read without it, and a recording holds it once. It may be wrong, where frames are not taken.
+    A recording holds them once and no frame can be read without them; unlike frames, they are used unverified.
     """
     end = min(record.end, file_end) - LZ4_TAIL_BYTES
     unpacked = reader(unpack(read, record.data_at, end, MIN_PIECE_BYTES)[0])
@@ -174,54 +168,53 @@ def salvage_set_up(read: Read, at: int, record: BagRecord, file_end: int) -> tup
 
 
 WINDOW_BYTES = 1 << 20
-LONGEST_START_BYTES = 32
-"""From a record's first byte to the end of what RECORD_START finds in it, at most."""
+MAX_START_BYTES = 32
+"""Bound on the bytes from the first of a record to the end of its match of RECORD_START."""
 RECORD_START = re.compile(rb"\x00\x00\x00(?:compression|conn|op|chunk_pos|chunk_count)=|" + re.escape(LZ4_MAGIC))
-"""A record's first field, behind the first byte of its length; or a packed chunk's data."""
+"""First field of a record, after the first byte of its length; or the data of an lz4 chunk."""
 BEFORE_FIELD_BYTES = 5
-"""From where a record begins to what RECORD_START finds."""
+"""Bytes from the start of a record to its match of RECORD_START."""
 COMPRESSIONS = (b"lz4", b"none")
 COMPRESSION = re.compile(rb"\x00\x00\x00compression=(lz4|none)")
-OnProgress = Callable[[int, int], None]
-"""Called with bytes done and bytes in all."""
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A place that is not as it should be."""
+    """Damaged place of a file."""
 
     position: int
     bytes: int
-    """That could not be used."""
+    """Bytes lost."""
     why: str
 
 
 @dataclass(frozen=True)
 class Scan:
-    """What is in a bag."""
+    """Contents of a bag, read without its index."""
 
     bytes: int
+    """Size of the file."""
     chunks: list[Chunk]
     connections: dict[int, Connection]
     damages: list[Damage]
 
 
-def unreported(done: int, total: int) -> None:
-    """Tell nobody."""
+def ignore_progress(done: int, total: int) -> None:
+    """Do nothing."""
     del done, total
 
 
-def scan_bag(path: Path, report: OnProgress = unreported) -> Scan:
-    """Read a bag from end to end, a chunk at a time. Raises OSError where the file cannot be read."""
+def scan_bag(path: Path, report: OnProgress = ignore_progress) -> Scan:
+    """Read a bag from end to end, one chunk at a time; report bytes. Raises OSError where it cannot be read."""
     with path.open("rb") as file:
-        walk = _Walk(file, report)
-        walk.run()
-    # what a chunk says of a connection counts more than what the file's end says: it is checked
-    return Scan(walk.end, walk.chunks, walk.trailing | walk.connections, walk.damages)
+        scanner = _Scanner(file, report)
+        scanner.run()
+    # connections in chunks are checked, so they take precedence over those at the end of the file
+    return Scan(scanner.end, scanner.chunks, scanner.trailing | scanner.connections, scanner.damages)
 
 
-class _Walk:
-    """Goes from record to record, and after damage on to the next that makes sense."""
+class _Scanner:
+    """Pass over a file from record to record, and after damage to the next plausible one."""
 
     def __init__(self, file: BinaryIO, report: OnProgress) -> None:
         self._file, self._report = file, report
@@ -229,21 +222,22 @@ class _Walk:
         self.chunks: list[Chunk] = []
         self.connections: dict[int, Connection] = {}
         self.trailing: dict[int, Connection] = {}
+        """Connections at the end of the file."""
         self.damages: list[Damage] = []
-        self._seen = set[tuple[tuple[int, bytes], ...]]()
-        self._set_up = False
+        self._indexes = set[tuple[tuple[int, bytes], ...]]()
+        self._has_set_up = False
         self._is_plain = self._first_chunk_is_plain()
 
     def read(self, at: int, count: int) -> bytes:
-        """As many of these bytes as are there."""
+        """Return up to `count` bytes from an offset, fewer at the end of the file."""
         self._file.seek(at)
         return self._file.read(max(0, min(count, self.end - at)))
 
     def run(self) -> None:
-        """Walk to the file's end."""
+        """Scan to the end of the file."""
         at = len(MAGIC)
         if self.read(0, at) != MAGIC:
-            at = self._lose(0, "it does not begin as a recording does", search_at=0)
+            at = self._skip(0, "no signature of a .bag", search_at=0)
         while at < self.end:
             at = self._step(at)
             self._report(at, self.end)
@@ -255,17 +249,17 @@ class _Walk:
             record = read_record(self.read, at)
             self._take_other(record)
         except BagFormatError as error:
-            return self._lose(at, str(error), search_at=at + 1)
+            return self._skip(at, str(error), search_at=at + 1)
         return record.end
 
     def _take_other(self, record: BagRecord) -> None:
-        """Note a connection, pass over the index. Raises BagFormatError where that is damaged."""
+        """Note a connection, pass over index records. Raises BagFormatError where they are damaged."""
         if record.op is Op.CONNECTION:
             found = read_connection(self.read, record)
             self.trailing.setdefault(found.number, found)
         check_bookkeeping(self.read, record)
         if record.end > self.end:
-            raise BagFormatError("the file ends within its index")
+            raise BagFormatError("file truncated within its index")
 
     def _take_chunk(self, at: int, record: BagRecord) -> int:
         found = examine(self.read, at, record, self.end)
@@ -275,63 +269,63 @@ class _Walk:
             return found.end
         resumed = self._search(found.end + 1)
         if found.chunk is None:
-            self._lose_chunk(at, record, resumed, found.why)
+            self._drop_chunk(at, record, resumed, found.why)
         elif found.chunk.content is None or resumed == self.end:
             self._take(found)
             lost_at = at if found.chunk.content else found.end
-            self.damages.append(Damage(lost_at, resumed - lost_at, f"{found.why}: what is whole in it is kept"))
+            self.damages.append(Damage(lost_at, resumed - lost_at, f"{found.why} (undamaged messages recovered)"))
         else:
-            self._lose_chunk(at, record, resumed, "its data is damaged")
+            self._drop_chunk(at, record, resumed, "damaged data of a chunk")
         return resumed
 
     def _take(self, found: Examined) -> bool:
-        """Keep a chunk, unless it contradicts others or is there already."""
+        """Add a chunk; return False for one that contradicts others or repeats one."""
         if (chunk := found.chunk) is None:
             self.connections |= found.connections
             return True
         why = ""
         if any(n in self.connections and not self.connections[n].is_like(c) for n, c in found.connections.items()):
-            why = "it calls other topics by the same numbers"
-        elif (content := tuple(chunk.index.items())) in self._seen:
-            why = "it is in the file twice"
+            why = "chunk of another recording, with other topics"
+        elif (index := tuple(chunk.index.items())) in self._indexes:
+            why = "chunk that is in the file twice"
         else:
-            self._seen.add(content)
+            self._indexes.add(index)
             self.connections |= found.connections
-            self._keep(chunk)
+            self._add(chunk)
         if why:
             self.damages.append(Damage(chunk.at, found.end - chunk.at, why))
         return not why
 
-    def _keep(self, chunk: Chunk) -> None:
+    def _add(self, chunk: Chunk) -> None:
         self.chunks.append(chunk)
-        self._set_up |= any(entries.startswith(SET_UP_TIME) for entries in chunk.index.values())
+        self._has_set_up |= any(entries.startswith(SET_UP_TIME) for entries in chunk.index.values())
 
-    def _lose_chunk(self, at: int, record: BagRecord, resumed: int, why: str) -> None:
-        if not self._set_up and record.fields.get("compression") == b"lz4":
+    def _drop_chunk(self, at: int, record: BagRecord, resumed: int, why: str) -> None:
+        if not self._has_set_up and record.fields.get("compression") == b"lz4":
             chunk, connections = salvage_set_up(self.read, at, record, self.end)
             self.trailing = connections | self.trailing
             if chunk:
-                self._keep(chunk)
-                why += "; it describes the streams: that is kept, unchecked"
+                self._add(chunk)
+                why += " (stream descriptions recovered, unverified)"
         self.damages.append(Damage(at, resumed - at, why))
 
-    def _lose(self, at: int, why: str, search_at: int) -> int:
+    def _skip(self, at: int, why: str, search_at: int) -> int:
         resumed = self._search(search_at)
         self.damages.append(Damage(at, resumed - at, why))
         return resumed
 
     def _search(self, at: int) -> int:
-        """Where the next record that makes sense begins, or the file's end."""
+        """Return the offset of the next plausible record, or the end of the file."""
         for window_at in range(at, self.end, WINDOW_BYTES):
             self._report(window_at, self.end)
-            for match in RECORD_START.finditer(self.read(window_at, WINDOW_BYTES + LONGEST_START_BYTES)):
+            for match in RECORD_START.finditer(self.read(window_at, WINDOW_BYTES + MAX_START_BYTES)):
                 before = 0 if match[0] == LZ4_MAGIC else BEFORE_FIELD_BYTES
                 start = window_at + match.start() - before
-                if start >= at and self._makes_sense(start):
+                if start >= at and self._is_plausible(start):
                     return start
         return self.end
 
-    def _makes_sense(self, at: int) -> bool:
+    def _is_plausible(self, at: int) -> bool:
         with suppress(BagFormatError):
             if (chunk := self._find_chunk(at)) is None:
                 record = read_record(self.read, at)
@@ -345,18 +339,18 @@ class _Walk:
         return False
 
     def _is_at_end(self, at: int) -> bool:
-        """Whether this may follow a connection of the file's end; in a chunk, a message does."""
+        """Return whether a connection before this offset is one of the file's end; in a chunk, a message follows."""
         return at == self.end or read_record(self.read, at).op in {Op.CONNECTION, Op.CHUNK_INFO}
 
     def _find_chunk(self, at: int) -> BagRecord | None:
-        """As `find_chunk`. Messages that show in packed data are no chunk, though: half of them is elsewhere."""
+        """Return `find_chunk`, except messages visible in lz4 data: parts of those are stored elsewhere."""
         chunk = find_chunk(self.read, at)
         if chunk and is_headless(chunk) and chunk.fields["compression"] == b"none" and not self._is_plain:
-            raise BagFormatError("a message is outside of any chunk")
+            raise BagFormatError("message outside of any chunk")
         return chunk
 
     def _first_chunk_is_plain(self) -> bool:
         for window_at in range(0, self.end, WINDOW_BYTES):
-            if found := COMPRESSION.search(self.read(window_at, WINDOW_BYTES + LONGEST_START_BYTES)):
+            if found := COMPRESSION.search(self.read(window_at, WINDOW_BYTES + MAX_START_BYTES)):
                 return found[1] == b"none"
         return False

@@ -1,4 +1,4 @@
-"""A recording as a camera, played back by librealsense: the second reader, that ours is checked against."""
+"""Playback of a recording by librealsense (`--reader sdk`), with the same results as the built-in reader."""
 
 import atexit
 import gc
@@ -12,21 +12,21 @@ from nlos_calibration import Intrinsics, Rig
 from nlos_cam.camera import FORMATS, FrameSet, SampleQueue, Session, find_streams, load_sdk
 from nlos_cam.errors import CameraError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.bag_container import advice, told
+from nlos_cam.recording.bag_reader import raise_as_recording_error, repair_advice
 from nlos_cam.recording.playback import identity_of, open_lidar_bag
 from nlos_cam.recording.salvage import scan_bag
 
 POLL_S = 0.05
 START_TIMEOUT_S = 30.0
-"""Before its first frame, a playback that has not begun looks like one that has ended."""
+"""Before its first frame, a playback that has not begun has the same status as one that has ended."""
 
 
 class SdkReplayCamera:
-    """The frames of a .bag through librealsense. Iterating starts at the first; none is dropped, since the SDK waits.
+    """Camera that plays a .bag through librealsense, from the first frame at each iteration, without drops.
 
-    The file is read by us first, since some damaged ones crash the SDK, or hang it; where its playback ends is held
-    against the index. A frame's settings are those with which the recording began. Raises what ReplayCamera raises, but
-    on opening, and CameraError where there is no SDK.
+    Use it as a context manager, which stops the SDK's threads; iterate in one thread. A frame's settings are those with
+    which the recording began. Since damaged files can crash or hang the SDK, opening reads every byte with the built-in
+    reader first. Raises what ReplayCamera raises, but on opening, and CameraError without the SDK.
     """
 
     def __init__(self, path: Path) -> None:
@@ -44,9 +44,9 @@ class SdkReplayCamera:
         self.intrinsics: Intrinsics = self._open()[1].intrinsics
 
     def _check_all(self) -> None:
-        """Raise RecordingError for any damage, in what we read of a recording and in what only the SDK does."""
+        """Raise RecordingError for damage, also in parts of the file that only the SDK reads."""
         self._bag.check()
-        with told(self._path, "is damaged"):
+        with raise_as_recording_error(self._path, "is damaged"):
             if damages := scan_bag(self._path).damages:
                 raise ValueError(f"at byte {damages[0].position}: {damages[0].why}")
 
@@ -57,22 +57,19 @@ class SdkReplayCamera:
             return playback, Session(*find_streams(playback), SampleQueue(lossless=True))
         except RuntimeError as error:
             raise self._damaged(f"is cut short or damaged ({error})") from error
-        except KeyError as error:  # it takes a damaged description for one of another stream
+        except KeyError as error:  # it can take a damaged description for one of another stream
             raise self._damaged(f"is damaged (librealsense finds no {error} in it)") from error
 
-    def _damaged(self, what: str) -> RecordingError:
-        return RecordingError(f"{self._path} {what}: {advice(self._path)}")
+    def _damaged(self, problem: str) -> RecordingError:
+        return RecordingError(f"{self._path} {problem}: {repair_advice(self._path)}")
 
     def __enter__(self) -> Self:
         self._entered = True
-        atexit.register(self._leave)  # for a program that ends without leaving: the SDK's threads would crash it
+        atexit.register(self.__exit__)  # a program that ends inside the block would crash in the SDK's threads
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._leave()
-
-    def _leave(self) -> None:
-        atexit.unregister(self._leave)
+        atexit.unregister(self.__exit__)
         self._entered = False
         self._stop()
 
@@ -93,16 +90,16 @@ class SdkReplayCamera:
             self._count(session.inbox)
             yield session.frame(found)
         self._count(session.inbox)
-        if not session.inbox.closed:  # else it was left early
+        if not session.inbox.closed:  # else the caller left early
             self._check_end(playback.get_position() / 1e9)
 
     def _check_end(self, reached_s: float) -> None:
-        """The SDK ends quietly where it cannot read on. Raises RecordingError where the index lists more."""
+        """Raise RecordingError where fewer frames came than the index lists: the SDK ends silently at damage."""
         for stream in FORMATS:
             listed, came = self._bag.streams[stream].frames, self.arrived[stream]
             if came < listed:
                 raise self._damaged(
-                    f"is damaged {reached_s:.1f} s into its {self._bag.end_ns / 1e9:.1f} s: the SDK's playback gave "
+                    f"is damaged {reached_s:.1f} s into its {self._bag.end_ns / 1e9:.1f} s: librealsense played "
                     f"{came} of {listed} {stream} frames"
                 )
 
@@ -117,7 +114,7 @@ class SdkReplayCamera:
         waited_s = 0.0
         while (found := inbox.take(POLL_S)) is None and not inbox.ended:
             waited_s += POLL_S
-            # asked, and not called back: a callback from a thread that ends may find the interpreter waiting for it
+            # polled: a callback from one of the SDK's ending threads could deadlock with the interpreter
             stopped = playback.current_status() == self._sdk.playback_status.stopped
             if stopped and inbox.arrived.total() > 0:
                 inbox.finish()

@@ -1,4 +1,4 @@
-"""The record beside a recording, F.json beside F.bag: device, settings, temperatures, calibration, label, summary."""
+"""Sidecar of a recording, F.json beside F.bag: device, settings, temperatures, calibration, label, summary."""
 
 import hashlib
 import platform
@@ -18,53 +18,52 @@ from nlos_cam.camera import Camera
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import Frame
-from nlos_cam.recording.playback import Verified
+from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality
 
 State = Literal["recording", "complete", "interrupted", "lost", "disk full", "damaged"]
-"""While it records, or after it was killed: recording. Ended by Ctrl-C: interrupted. The camera vanished: lost.
-
-damaged: the file holds less than came.
+"""recording: in progress, or killed. interrupted: by Ctrl-C. lost: the camera vanished. damaged: the file holds fewer
+frames than came.
 """
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]
 PACKAGES = ("nlos-cam", "pyrealsense2")
-LOOK_S = 10.0
-"""Temperatures are looked at, and the file is written anew, about so often."""
-MAX_LOOKS = 1000
-"""Beyond so many, every other one is forgotten, and only every other one is kept from then on."""
+TEMPERATURE_INTERVAL_S = 10.0
+"""Seconds between temperature readings, each of which rewrites the file."""
+MAX_TEMPERATURES = 1000
+"""Bound on the readings in the file; beyond it every other one is dropped, and the interval doubles."""
 
 
 class Temperatures(Record):
-    """One look at the device's thermometers."""
+    """Reading of the device's thermometers."""
 
     time_s: Finite
-    """Since the first frame, by the device's clock."""
+    """Since the first frame, on the device's clock."""
     celsius: dict[str, Finite]
     """By the SDK's name of the option."""
 
 
 class WallFile(Record):
-    """The wall record that `--wall` named."""
+    """Wall record given with `--wall`."""
 
     path: str
     sha256: str
 
 
 class Summary(Record):
-    """What the file holds, read back, and how good the frames were."""
+    """Verified contents of the file, and quality of the frames."""
 
     frames: Count | None = None
-    """Complete sets in the file; None where it was not read back."""
+    """Complete sets in the file; None where not verified."""
     dropped: Count | None = None
     seconds: Finite | None = None
     frames_per_s: Finite | None = None
     streams: dict[str, Count]
     """Frames of each stream in the file."""
     events: dict[str, int]
-    """What befell the camera, by name, as it counts."""
+    """Faults of the camera, counted by name."""
     frames_seen: Count = 0
-    """By those figures that follow."""
+    """Frames behind the quality figures that follow."""
     saturated_share: Share | None = None
     invalid_share: Share | None = None
     confidence_mean: Annotated[float, Field(ge=0, le=15)] | None = None
@@ -73,7 +72,7 @@ class Summary(Record):
 
 
 class Sidecar(Record):
-    """All that is known of a recording beside its frames."""
+    """Content of a sidecar file."""
 
     schema_version: Literal[1] = 1
     label: str | None
@@ -83,27 +82,27 @@ class Sidecar(Record):
     started: AwareDatetime
     """UTC."""
     device: dict[str, str]
-    """name, serial, firmware, usb_type, where the device tells them."""
+    """name, serial, firmware, usb_type, as far as the device reports them."""
     versions: dict[str, str]
     intrinsics: PinholeRecord
     """Of the depth stream; infrared and confidence share it."""
     rig: Rig | None = None
-    """The bench: measured, with `wall`, or known to a simulated camera."""
+    """Measured with `wall`, or known for a simulated camera."""
     wall: WallFile | None = None
     settings: dict[str, Finite]
-    """Every option of the depth sensor, as read back when the recording began."""
+    """All options of the depth sensor at the start of the recording, as read from the device."""
     temperatures: list[Temperatures]
     summary: Summary | None = None
     """None until the recording has ended."""
 
 
 def sidecar_path(recording: Path) -> Path:
-    """F.json of F.bag."""
+    """Return F.json for F.bag."""
     return recording.with_suffix(".json")
 
 
 def load_sidecar(path: Path) -> Sidecar:
-    """Read a sidecar. Raises RecordingError, with the first problem, where it is not one."""
+    """Read a sidecar. Raises RecordingError, with the first problem, for any other file."""
     try:
         return Sidecar.model_validate_json(path.read_bytes(), strict=True)
     except FileNotFoundError as error:
@@ -115,21 +114,21 @@ def load_sidecar(path: Path) -> Sidecar:
 
 
 def versions() -> dict[str, str]:
-    """Of this program, librealsense's wheel and Python; and the kind of machine."""
+    """Return the versions of this program, librealsense's Python package and Python, and the platform."""
     found = {"python": platform.python_version(), "platform": f"{platform.system().lower()} {platform.machine()}"}
     for package in PACKAGES:
-        with suppress(PackageNotFoundError):  # librealsense has no wheel for every machine
+        with suppress(PackageNotFoundError):  # librealsense has no package for some machines
             found[package] = version(package)
     return found
 
 
-def wall_of(path: Path) -> tuple[Rig, WallFile]:
-    """The measured rig, and which file it is from. Raises RecordFileError where it is no wall record."""
+def load_measured_wall(path: Path) -> tuple[Rig, WallFile]:
+    """Return the rig of a wall record, and its path and checksum. Raises RecordFileError for any other file."""
     return load_wall(path).rig, WallFile(path=str(path), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
 
 
-def summary_of(found: Verified | None, quality: Quality, events: Mapping[str, int]) -> Summary:
-    """The summary of a recording that was read back, or was not."""
+def summary_of(found: VerifyResult | None, quality: Quality, events: Mapping[str, int]) -> Summary:
+    """Return the summary of a recording; None where it was not verified."""
     figures: dict[str, Any] = asdict(quality) | {"events": dict(events), "streams": {}}
     if found:
         figures |= asdict(found)
@@ -138,14 +137,14 @@ def summary_of(found: Verified | None, quality: Quality, events: Mapping[str, in
 
 
 def _finite(values: Mapping[str, float]) -> dict[str, float]:
-    """JSON has no other numbers."""
+    """Return the finite values: JSON has no others."""
     return {name: value for name, value in values.items() if isfinite(value)}
 
 
 class SidecarFile:
-    """A sidecar as a recording goes on, and its file, which is whole at any time.
+    """Sidecar during a recording; its file is replaced atomically at each update. For one thread; `finish` ends it.
 
-    Raises DiskFullError on making and on finishing it, where it cannot be written.
+    Creating and finishing it raise DiskFullError where it cannot be written.
     """
 
     def __init__(
@@ -159,7 +158,7 @@ class SidecarFile:
     ) -> None:
         self.path = path
         self._first_s: float | None = None
-        self._looked_s, self._every_s = float("-inf"), LOOK_S
+        self._read_s, self._every_s = float("-inf"), TEMPERATURE_INTERVAL_S
         self._camera = camera
         self._sidecar = Sidecar(
             label=label,
@@ -177,27 +176,27 @@ class SidecarFile:
         self._write()
 
     def on_frame(self, frame: Frame) -> None:
-        """Take note of the settings, and of temperatures from time to time."""
+        """Record the settings of the first frame, and the temperatures every TEMPERATURE_INTERVAL_S."""
         if self._first_s is None:
             self._first_s = frame.timestamp_s
             self._sidecar = self._sidecar.model_copy(update={"settings": _finite(frame.settings)})
-        if frame.timestamp_s - self._looked_s >= self._every_s:
-            self._looked_s = frame.timestamp_s
-            self._look(frame.timestamp_s - self._first_s)
-            with suppress(DiskFullError):  # the recording's own end tells
+        if frame.timestamp_s - self._read_s >= self._every_s:
+            self._read_s = frame.timestamp_s
+            self._read_temperatures(frame.timestamp_s - self._first_s)
+            with suppress(DiskFullError):  # the end of the recording raises it
                 self._write()
 
-    def _look(self, time_s: float) -> None:
+    def _read_temperatures(self, time_s: float) -> None:
         celsius = _finite(self._camera.telemetry("_temperature"))
         if not celsius:
             return
         series = [*self._sidecar.temperatures, Temperatures(time_s=time_s, celsius=celsius)]
-        if len(series) > MAX_LOOKS:
+        if len(series) > MAX_TEMPERATURES:
             series, self._every_s = series[::2], 2 * self._every_s
         self._sidecar = self._sidecar.model_copy(update={"temperatures": series})
 
     def finish(self, state: State, summary: Summary) -> None:
-        """Write how it ended."""
+        """Write the final state and summary."""
         self._sidecar = self._sidecar.model_copy(update={"state": state, "summary": summary})
         self._write()
 

@@ -27,7 +27,7 @@ from rosbags.rosbag1 import Reader
 
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.evaluate import machine
-from nlos_cam.recording import BagFile, ReplayCamera, Wanted, export_recording, repair_recording
+from nlos_cam.recording import BagReader, ReplayCamera, ExportOptions, export_recording, repair_recording
 
 DOCS = Path(__file__).parents[2] / "docs"
 MEMORY_BYTES = 1 << 30
@@ -69,7 +69,7 @@ def replay_all(path: Path, _: Path) -> None:
 
 def export_all(path: Path, folder: Path) -> None:
     """Export, and check that the reported number of files was written."""
-    made = export_recording(BagFile(path), folder / "export", Wanted(points=True), stop=Event())
+    made = export_recording(BagReader(path), folder / "export", ExportOptions(points=True), stop=Event())
     for stream, count in made.frames.items():
         if len(list((folder / "export" / stream).iterdir())) != count:
             raise AssertionError(f"reported {count} {stream}, and wrote others")

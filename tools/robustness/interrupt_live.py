@@ -24,7 +24,7 @@ from live_process import LiveProcess
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
 from nlos_cam.evaluate import machine
-from nlos_cam.recording import BagFile, repair_recording
+from nlos_cam.recording import BagReader, repair_recording
 
 DOCS = Path(__file__).parents[2] / "docs"
 KINDS = "ctrl-c", "terminate", "viewer killed", "unplugged a while", "unplugged, then ctrl-c", "unplugged for good"
@@ -155,7 +155,7 @@ def files_of(folder: Path) -> tuple[int, list[str]]:
 def _frames_in(bag: Path) -> int:
     """Count the frames of the shortest stream. Raises RecordingError where it can be neither read nor repaired."""
     try:
-        streams = BagFile(bag).streams
+        streams = BagReader(bag).streams
     except RecordingError:
         fixed = bag.with_name("repaired.bag")
         recovered = repair_recording(bag, fixed).recovered_frames

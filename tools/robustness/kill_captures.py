@@ -25,7 +25,7 @@ from processes import PROGRAM
 from nlos_cam.camera import open_world
 from nlos_cam.errors import RecordingError
 from nlos_cam.evaluate import machine
-from nlos_cam.recording import BagFile, SdkReplayCamera, repair_recording
+from nlos_cam.recording import BagReader, SdkReplayCamera, repair_recording
 from nlos_cam.render import SensedImages
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -113,7 +113,7 @@ def frames_in(chunks: list[bytes]) -> dict[str, int]:
 
 def played(path: Path, world: World) -> tuple[dict[str, int], int]:
     """Count the frames that librealsense plays, and the sets that differ from the world's images."""
-    in_file = {name: info.frames for name, info in BagFile(path).streams.items()}
+    in_file = {name: info.frames for name, info in BagReader(path).streams.items()}
     if missing := set(STREAMS) - set(in_file):  # killed before the first set was whole: there is nothing to pair
         return in_file | dict.fromkeys(missing, 0), 0
     wrong = 0
