@@ -1,7 +1,4 @@
-"""`nlos-cam devices`: which cameras there are, as librealsense and as USB see them.
-
-`nlos-cam doctor`: why a camera is not found, and exactly what to do.
-"""
+"""`nlos-cam devices` lists the cameras that librealsense and USB see; `nlos-cam doctor` explains why one is missing."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,11 +11,11 @@ from rich.table import Table
 
 from nlos_cam.camera import SIMULATED, DeviceInfo
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, show
-from nlos_cam.doctor import Check, Facts, Pair, UsbDevice, diagnose, gather, install, rules
+from nlos_cam.doctor import Check, Facts, Pair, UsbDevice, diagnose, gather_facts, install_command, rules_text
 from nlos_cam.errors import NlosCamError
 
-SEEN = {True: "yes", False: "[red]no[/]", None: ""}
-"""A camera seen, not seen, and not looked for."""
+VISIBLE = {True: "yes", False: "[red]no[/]", None: ""}
+"""Cell for a camera that is listed, not listed, and not searched for."""
 
 
 def register(app: typer.Typer) -> None:
@@ -28,11 +25,11 @@ def register(app: typer.Typer) -> None:
 
 
 def devices(json: Json = False) -> None:
-    """List the cameras that librealsense and USB see, side by side, and the simulated ones that can be asked for."""
-    facts = gather()
+    """List the cameras that librealsense and USB see, side by side, and the simulated cameras."""
+    facts = gather_facts()
     if not json:
         show(_table(facts))
-    finish(_result(facts), as_json=json, text=_format_device(facts), marked=True)
+    finish(_result(facts), as_json=json, text=_device_notes(facts), marked=True)
 
 
 def _result(facts: Facts) -> dict[str, Any]:
@@ -66,14 +63,14 @@ def _usb_seen(facts: Facts, pair: Pair) -> bool | None:
 
 
 def _sdk_seen(facts: Facts, device: UsbDevice) -> bool | None:
-    """Only of the L515's family is it known which device of the SDK is which on USB."""
+    """Return whether the SDK lists a USB device; None if unknown: only cameras of the L515's family are paired."""
     if facts.sdk.error:
         return None
     return next((pair.sdk is not None for pair in facts.pairs if pair.usb is device), None)
 
 
 def _uri(info: DeviceInfo | None) -> str:
-    """What `--camera` takes for it; empty for a device that is no L515."""
+    """Return the value of `--camera` for a device; empty if it is not an L515."""
     return f"l515:{info.serial}" if info and "L515" in info.name else ""
 
 
@@ -82,67 +79,71 @@ def _table(facts: Facts) -> Table:
     for pair in facts.pairs:
         table.add_row(*_row(facts, pair))
     for device in facts.usb.of_kind("recovery") + facts.usb.of_kind("other"):
-        table.add_row("", escape(device.meaning), escape(device.serial), device.firmware, device.link, "", SEEN[True])
+        table.add_row(
+            "", escape(device.meaning), escape(device.serial), device.firmware, device.link, "", VISIBLE[True]
+        )
     for info in facts.sdk.devices:
         if info not in facts.sdk.lidars:
-            table.add_row("", *map(escape, (info.name, info.serial, info.firmware, info.usb_type)), SEEN[True], "")
+            table.add_row("", *map(escape, (info.name, info.serial, info.firmware, info.usb_type)), VISIBLE[True], "")
     for uri, name in SIMULATED.items():
         table.add_row(uri, escape(name))
     return table
 
 
 def _row(facts: Facts, pair: Pair) -> list[str]:
-    seen = SEEN[None if facts.sdk.error else pair.sdk is not None], SEEN[_usb_seen(facts, pair)]
-    return [_uri(pair.sdk), *map(escape, (pair.name, pair.serial, pair.firmware, pair.link)), *seen]
+    visible = VISIBLE[None if facts.sdk.error else pair.sdk is not None], VISIBLE[_usb_seen(facts, pair)]
+    return [_uri(pair.sdk), *map(escape, (pair.name, pair.serial, pair.firmware, pair.link)), *visible]
 
 
-def _format_device(facts: Facts) -> str:
-    """What is missing, and where to ask why."""
-    told: list[str] = []
+def _device_notes(facts: Facts) -> str:
+    """Return the errors and the missing cameras, with the command that explains them."""
+    notes: list[str] = []
     if error := facts.sdk.error:
-        told.append(f"[yellow]librealsense cannot be asked:[/] {escape(error)}")
+        notes.append(f"[yellow]Cannot query librealsense:[/] {escape(error)}")
     if facts.usb.error:
-        told.append(f"[yellow]USB cannot be looked at:[/] {escape(facts.usb.error)}")
+        notes.append(f"[yellow]Cannot list USB devices:[/] {escape(facts.usb.error)}")
     if not facts.pairs:
-        told.append("no L515 is seen, neither by librealsense nor on USB; the simulated cameras need none")
-    if told or any(pair.usb is None or pair.sdk is None for pair in facts.pairs):
-        told.append("`nlos-cam doctor` says why, and what to do")
-    return "\n".join(told) or "librealsense and USB see the same"
+        notes.append("No L515 found by librealsense or on USB; the simulated cameras work without one")
+    if notes or any(pair.usb is None or pair.sdk is None for pair in facts.pairs):
+        notes.append("Run `nlos-cam doctor` for the cause and the fix")
+    return "\n".join(notes) or "librealsense and USB list the same cameras"
 
 
-COLOURS = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
+COLORS = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
 WriteUdev = Annotated[Path | None, typer.Option("--write-udev", help="Write the udev rules for the L515 to this file.")]
 
 
 def doctor(write_udev: WriteUdev = None, overwrite: Overwrite = False, json: Json = False) -> None:
-    """Check everything between a camera and this program, and say what to do; exit code 0 whatever is found."""
+    """Check everything between a camera and this program, and print fixes; the exit code is 0 even if checks fail."""
     if write_udev is not None:
         _write(output_path(write_udev, "", ".rules", overwrite=overwrite))
-    checks = diagnose(gather())
+    checks = diagnose(gather_facts())
     if not json:
         show(_checks_table(checks))
     failures = sum(check.status == "failed" for check in checks)
     result = {"checks": [asdict(check) for check in checks], "ok": not failures}
-    finish(result, as_json=json, text=_format_check(checks, failures), marked=True)
+    finish(result, as_json=json, text=_fixes(checks, failures), marked=True)
 
 
 def _write(path: Path) -> None:
     try:
-        path.write_text(rules(), encoding="utf-8")
+        path.write_text(rules_text(), encoding="utf-8")
     except OSError as error:
-        raise NlosCamError(f"{path} cannot be written ({error.strerror}): write it here, then install it") from error
-    say(f"wrote {path!s}; to put it in force, run, and plug the camera in again:\n  {install(str(path))}")
+        raise NlosCamError(
+            f"cannot write {path} ({error.strerror}): write it to this folder, then install it"
+        ) from error
+    say(f"Wrote {path}. To install it, run this, then plug the camera in again:\n  {install_command(str(path))}")
 
 
 def _checks_table(checks: Sequence[Check]) -> Table:
-    table = Table("", "check", "what was seen", box=None, pad_edge=False)
+    table = Table("", "check", "finding", box=None, pad_edge=False)
     for check in checks:
-        table.add_row(f"[{COLOURS[check.status]}]{check.status}[/]", check.name, escape(check.detail))
+        table.add_row(f"[{COLORS[check.status]}]{check.status}[/]", check.name, escape(check.detail))
     return table
 
 
-def _format_check(checks: Sequence[Check], failures: int) -> str:
-    """The fixes, each on a line that can be copied, and the sum."""
+def _fixes(checks: Sequence[Check], failures: int) -> str:
+    """Return the fixes, each on a line that can be copied, and the number of failures."""
     fixes = [f"[bold]{check.name}[/]: {escape(check.fix)}" for check in checks if check.fix]
-    told = f"{failures} of {len(checks)} checks failed" if failures else "nothing failed"
-    return "\n".join(["", *(["what to do, from the top:", *fixes, ""] if fixes else []), told])
+    total = f"{failures} of {len(checks)} checks failed" if failures else "All checks passed"
+    return "\n".join(["", *(["Fixes, in this order:", *fixes, ""] if fixes else []), total])

@@ -4,12 +4,12 @@ __all__ = [
     "Pair",
     "UsbDevice",
     "diagnose",
-    "gather",
-    "install",
-    "rules",
+    "gather_facts",
+    "install_command",
+    "rules_text",
 ]
 
 from .diagnosis import diagnose
-from .facts import Check, Facts, Pair, gather
-from .udev import install, rules
+from .facts import Check, Facts, Pair, gather_facts
+from .udev import install_command, rules_text
 from .usb import UsbDevice

@@ -1,8 +1,6 @@
-"""Checks of what Linux puts between a camera and librealsense: containers, rules, permissions, drivers, other users.
+"""Checks of everything between a camera and this program: Linux, librealsense and Python, USB, firmware.
 
-Checks of what is installed: Python, the system, librealsense and libusb.
-
-Checks of the camera itself: is it on USB, in its normal mode, on a fast link, with a firmware that is known.
+Each check answers one question about the facts with a finding: status, detail and, unless all is well, a fix.
 """
 
 import re
@@ -21,21 +19,21 @@ NO_CAMERA_IN_KERNEL = "the kernel sees no L515"
 HID_MODULES = ("hid_sensor_hub", "hid_sensor_accel_3d", "hid_sensor_gyro_3d")
 HID_OPTIONS = "CONFIG_HID_SENSOR_HUB, CONFIG_HID_SENSOR_ACCEL_3D and CONFIG_HID_SENSOR_GYRO_3D"
 MIN_SENSORS = 2
-"""librealsense on Linux leaves out an L515 of which it does not see accelerometer and gyroscope."""
+"""Accelerometer and gyroscope: without both, librealsense on Linux does not list an L515."""
 JOIN = "`sudo usermod -aG plugdev,video $USER`, and log in again"
-PASSERS_BY = {"pipewire", "wireplumber"}
+DESKTOP_SERVICES = {"pipewire", "wireplumber"}
 """Desktop services that keep a camera's node open without streaming."""
 
 
 def _not_here(facts: Facts) -> str:
-    """Why a question about a camera on Linux does not arise; empty if it does."""
+    """Return why a check of a camera on Linux does not apply; empty if it does."""
     if facts.host.platform.system != "linux":
         return NOT_LINUX
     return "" if facts.host.cameras else NO_CAMERA_IN_KERNEL
 
 
 def container(facts: Facts) -> Finding:
-    """Whether this is a container, and the camera is passed into it."""
+    """Check that the camera is passed into the container, if this is one."""
     host = facts.host
     if host.platform.system != "linux":
         return skipped(NOT_LINUX)
@@ -43,24 +41,24 @@ def container(facts: Facts) -> Finding:
         return ok("not in a container")
     if host.cameras and not facts.usb.of_kind("camera") + facts.usb.of_kind("recovery"):
         return failed(
-            f"this is a container ({host.container}), and the host's L515 is not passed into it", CONTAINER_FIX
+            f"running in a container ({host.container}); the host's L515 is not passed into it", CONTAINER_FIX
         )
     if facts.pairs and not any(node.error for node in host.nodes):
         return ok(f"in a container ({host.container}) that shows the camera")
     return warning(
-        f"this is a container ({host.container}): a camera of the host shows only if it is passed", CONTAINER_FIX
+        f"running in a container ({host.container}): a camera of the host shows only if it is passed in", CONTAINER_FIX
     )
 
 
 def udev_rules(facts: Facts) -> Finding:
-    """Whether rules give this user access to an L515 once it is plugged in."""
+    """Check that udev rules give this user access to an L515."""
     host = facts.host
     if host.platform.system != "linux":
         return skipped(NOT_LINUX)
     if host.rules:
         return ok(f"rules in {', '.join(host.rules)}")
     if host.container:
-        return skipped("in a container the host's rules count")
+        return skipped("in a container the host's rules apply")
     if host.platform.is_root:
         return warning("no udev rules for the L515: only root can open it", WRITE_AND_INSTALL)
     if host.nodes and not any(node.error for node in host.nodes):
@@ -69,12 +67,12 @@ def udev_rules(facts: Facts) -> Finding:
 
 
 def permissions(facts: Facts) -> Finding:
-    """Whether every node of the camera opens."""
+    """Check that every device node of the camera opens."""
     host = facts.host
     if host.platform.system != "linux":
         return skipped(NOT_LINUX)
     shut = [f"{node.path} ({node.error})" for node in host.nodes if node.error]
-    if not host.cameras:  # no /sys here, so libusb is the only witness
+    if not host.cameras:  # no /sys here: libusb alone reports permissions
         shut = [f"{device.label} ({device.error})" for device in facts.usb.devices if device.denied]
     if shut:
         return failed(f"cannot open {', '.join(shut)}", _permission_fix(host))
@@ -91,7 +89,7 @@ def _permission_fix(host: Host) -> str:
 
 
 def video_driver(facts: Facts) -> Finding:
-    """Whether uvcvideo has made video nodes of the camera."""
+    """Check that uvcvideo has created the camera's video nodes."""
     if reason := _not_here(facts):
         return skipped(reason)
     cameras = [camera for camera in facts.host.cameras if LIDARS[camera.product_id][0] == "camera"]
@@ -99,13 +97,11 @@ def video_driver(facts: Facts) -> Finding:
         state = facts.host.modules.get("uvcvideo", "unknown")
         fix = "install a kernel with CONFIG_USB_VIDEO_CLASS" if state == "missing" else "sudo modprobe uvcvideo"
         return failed(f"the L515 at {', '.join(bare)} has no /dev/video* (uvcvideo: {state})", fix)
-    return ok(
-        ", ".join(node for camera in cameras for node in camera.video_nodes) or "in recovery mode: none is needed"
-    )
+    return ok(", ".join(node for camera in cameras for node in camera.video_nodes) or "none is needed in recovery mode")
 
 
 def hid_sensors(facts: Facts) -> Finding:
-    """Whether the kernel shows the motion sensors, without which librealsense silently leaves the camera out."""
+    """Check that the kernel shows the motion sensors: without them librealsense does not list the camera."""
     if facts.host.platform.system != "linux":
         return skipped(NOT_LINUX)
     cameras = [camera for camera in facts.host.cameras if camera.product_id == L515]
@@ -122,7 +118,7 @@ def _without_sensors(facts: Facts, camera: KernelCamera) -> Finding:
     drivers = ", ".join(camera.hid_devices) or "no HID device"
     detail = (
         f"the L515 at {camera.port} shows fewer than {MIN_SENSORS} motion sensors ({seen}; {drivers}): librealsense "
-        "then leaves it out without a word"
+        "then does not list it"
     )
     return failed(detail, _sensor_fix(facts, camera))
 
@@ -131,37 +127,39 @@ def _sensor_fix(facts: Facts, camera: KernelCamera) -> str:
     host = facts.host
     offers = next((device.interfaces for device in facts.usb.devices if device.port == camera.port), ())
     if offers and "hid" not in offers:
-        return "it offers no HID interface: unplug it, wait 5 s, plug it in again; if it stays so, update its firmware"
+        return (
+            "it has no HID interface: unplug it, wait 5 s, plug it in again; if that does not help, update its firmware"
+        )
     if host.container and not host.has_iio:
         return f"{CONTAINER_FIX}: this one hides /sys/bus/iio"
     if missing := [name for name in HID_MODULES if host.modules.get(name) == "missing"]:
         return (
-            f"this kernel has no {', '.join(missing)} (JetPack 6 is built so): install one with {HID_OPTIONS}, or "
+            f"this kernel has no {', '.join(missing)} (as on JetPack 6): install one with {HID_OPTIONS}, or "
             "try librealsense 2.54.2 built with -DFORCE_RSUSB_BACKEND=ON, which reads USB without it"
         )
     return f"sudo modprobe -a {' '.join(HID_MODULES)}; then unplug the camera and plug it in again"
 
 
 def in_use(facts: Facts) -> Finding:
-    """Whether another process holds the camera: librealsense gives it to one at a time."""
+    """Check that no other process has the camera open: librealsense serves one process at a time."""
     if reason := _not_here(facts):
         return skipped(reason)
     held = {f"{one.name} (pid {one.pid})": one for one in facts.host.holders}
     closed = facts.host.closed_processes
-    blind = f"; {closed} processes of others do not show: sudo sees them" if closed else ""
+    blind = f"; {closed} processes of other users could not be checked: try sudo" if closed else ""
     if not held:
         return ok(f"no other process has it open{blind}")
     pids = " ".join(str(pid) for pid in sorted({one.pid for one in held.values()}))
-    if {one.name for one in held.values()} <= PASSERS_BY:
+    if {one.name for one in held.values()} <= DESKTOP_SERVICES:
         return warning(
-            f"{', '.join(held)} has it open; it may only watch{blind}",
+            f"{', '.join(held)} has it open, perhaps without streaming{blind}",
             "if streaming fails: systemctl --user stop wireplumber pipewire",
         )
     return failed(f"{', '.join(held)} has it open{blind}", f"close that program, or `kill {pids}`")
 
 
 def metadata(facts: Facts) -> Finding:
-    """Where the frames' numbers and times come from; both ways work here."""
+    """Report the source of the frames' numbers and times; both sources work."""
     on = facts.host.platform.system
     if on == "linux" and facts.host.patched_uvc:
         return ok("uvcvideo is librealsense's: frames carry the camera's clock and number")
@@ -178,12 +176,12 @@ def metadata(facts: Facts) -> Finding:
 MACOS_WHEEL = "pyrealsense2-macosx==2.54.2"
 FROM_SOURCE = "build librealsense 2.54.2 from source with -DBUILD_PYTHON_BINDINGS=ON"
 NEWEST_PYTHON = {"linux x86_64": (3, 11), "windows amd64": (3, 11), "darwin": (3, 12)}
-"""The last Python that a wheel with the L515's driver exists for; macOS has a community's."""
+"""Newest Python with a wheel that has the L515's driver; the one for macOS is by the community."""
 TESTED = (2, 54, 2)
 REMOVED = (2, 55)
-"""librealsense from here on does not know the L515, and says nothing of it."""
+"""First librealsense without the L515's driver; it reports no error."""
 SYSTEM_LIBRARIES = {"libusb-1.0": "libusb-1.0-0", "libudev": "libudev1", "libstdc++": "libstdc++6"}
-"""Shared libraries that the Linux wheel asks for, and the Debian packages that bring them."""
+"""Shared libraries that the Linux wheel loads, and the Debian packages that provide them."""
 VC_RUNTIME = "install Microsoft's Visual C++ runtime: https://aka.ms/vs/17/release/vc_redist.x64.exe"
 
 
@@ -191,13 +189,13 @@ def _wheel(on: str) -> str:
     return MACOS_WHEEL if on == "darwin" else WHEEL
 
 
-def numbers(version: str) -> tuple[int, ...]:
-    """A version as numbers: 01.05.08.01 is (1, 5, 8, 1)."""
+def version_numbers(version: str) -> tuple[int, ...]:
+    """Return a version as numbers: (1, 5, 8, 1) for 01.05.08.01."""
     return tuple(int(part) for part in re.findall(r"\d+", version))
 
 
 def python(facts: Facts) -> Finding:
-    """Whether librealsense has a wheel for this Python on this system."""
+    """Check that librealsense has a wheel for this Python on this system."""
     on = facts.host.platform
     here = f"Python {on.python[0]}.{on.python[1]} on {on.system} {on.machine}"
     if not facts.sdk.load_error:
@@ -212,14 +210,14 @@ def python(facts: Facts) -> Finding:
     if on.python > newest:
         last = f"{newest[0]}.{newest[1]}"
         return failed(
-            f"{here}: the last librealsense that knows the L515 has wheels up to Python {last}",
+            f"{here}: the last librealsense that supports the L515 has wheels up to Python {last}",
             f"use Python {last} (`python{last} -m venv .venv`), or {FROM_SOURCE}",
         )
     return ok(f"{here}: a wheel of librealsense exists")
 
 
 def system(facts: Facts) -> Finding:
-    """Whether a camera can be used on this operating system."""
+    """Check that a camera can be used on this operating system."""
     if facts.host.platform.system == "darwin":
         return _macos(facts)
     if facts.host.is_wsl:
@@ -228,18 +226,17 @@ def system(facts: Facts) -> Finding:
 
 
 def _macos(facts: Facts) -> Finding:
-    tell = warning if facts.sdk.lidars else failed
-    return tell(
-        "macOS: simulation and recordings only; since macOS 12 librealsense reaches a camera as root at most, and "
-        "often not even then",
-        "use the camera on Linux or Windows; to try it here all the same: "
-        f"`pip install {MACOS_WHEEL}`, and run with sudo",
+    finding = warning if facts.sdk.lidars else failed
+    return finding(
+        "macOS: simulation and recordings only; since macOS 12 librealsense needs root to reach a camera, and "
+        "often fails even then",
+        f"use the camera on Linux or Windows; to try it here anyway: `pip install {MACOS_WHEEL}`, and run with sudo",
     )
 
 
 def _wsl(facts: Facts) -> Finding:
-    tell = warning if facts.pairs else failed
-    return tell(
+    finding = warning if facts.pairs else failed
+    return finding(
         "WSL: a virtual machine that sees only the USB devices handed to it, with a kernel that may lack uvcvideo and "
         "the HID sensors",
         "run nlos-cam on Windows itself; or, in PowerShell as administrator: `usbipd list`, "
@@ -248,16 +245,16 @@ def _wsl(facts: Facts) -> Finding:
 
 
 def sdk(facts: Facts) -> Finding:
-    """Whether librealsense can be loaded and asked."""
+    """Check that librealsense can be loaded and queried."""
     if error := facts.sdk.load_error:
         return failed(error, _load_fix(error, facts.host.platform.system))
     if error := facts.sdk.query_error:
-        return failed(f"librealsense is there, but cannot list devices: {error}", _query_fix(error))
+        return failed(f"librealsense is loaded, but cannot list devices: {error}", _query_fix(error))
     return ok(f"librealsense {facts.sdk.version or 'of unknown version'} is loaded")
 
 
 def _load_fix(error: str, on: str) -> str:
-    """What to install, by what the loader missed."""
+    """Return what to install for an error of the loader."""
     if "DLL" in error:
         return VC_RUNTIME
     if "GLIBC" in error:
@@ -271,44 +268,44 @@ def _load_fix(error: str, on: str) -> str:
 
 
 def _query_fix(error: str) -> str:
-    if "attribute" in error:  # a folder or file called pyrealsense2 stands before the wheel
+    if "attribute" in error:  # a folder or file called pyrealsense2 shadows the wheel
         return f"remove any folder or file of your own called pyrealsense2; `pip install --force-reinstall {WHEEL}`"
     return "unplug the camera, wait 5 s, plug it in again; close realsense-viewer and whatever else uses it"
 
 
 def sdk_version(facts: Facts) -> Finding:
-    """Whether this librealsense still has the L515's driver: it was removed in 2.55, without a word."""
+    """Check that this librealsense has the L515's driver, which was removed in 2.55."""
     if not facts.sdk.packages:
-        return skipped("no package of librealsense is installed that would tell its version")
-    newest = max(facts.sdk.packages, key=lambda package: numbers(package[1]))[1]
+        return skipped("no package of librealsense is installed, so its version is unknown")
+    newest = max(facts.sdk.packages, key=lambda package: version_numbers(package[1]))[1]
     fix = f"pip install {_wheel(facts.host.platform.system)}"
-    if numbers(newest)[:2] >= REMOVED:
+    if version_numbers(newest)[:2] >= REMOVED:
         return failed(
-            f"librealsense {newest} has no driver for the L515 (the last that has is 2.54.2): it reports no device",
+            f"librealsense {newest} has no driver for the L515 (the last with it is 2.54.2): it reports no device",
             fix,
         )
-    if numbers(newest)[:3] != TESTED:
-        return warning(f"librealsense {newest} knows the L515, but only 2.54.2 is tested", fix)
-    return ok(f"librealsense {newest} knows the L515")
+    if version_numbers(newest)[:3] != TESTED:
+        return warning(f"librealsense {newest} supports the L515, but only 2.54.2 is tested", fix)
+    return ok(f"librealsense {newest} supports the L515")
 
 
 def sdk_alone(facts: Facts) -> Finding:
-    """Whether a second librealsense overwrites the first: their packages share one folder."""
-    told = ", ".join(f"{name} {version}" for name, version in facts.sdk.packages)
+    """Check that only one package of librealsense is installed: they share one folder."""
+    packages = ", ".join(f"{name} {version}" for name, version in facts.sdk.packages)
     if len(facts.sdk.packages) > 1:
         names = " ".join(name for name, _ in facts.sdk.packages)
         return failed(
-            f"{told} are installed into one folder, and overwrite each other",
+            f"{packages} are installed into one folder, and overwrite each other",
             f"pip uninstall -y {names} && pip install {_wheel(facts.host.platform.system)}",
         )
-    return ok(f"only {told}") if told else skipped("no package of librealsense is installed")
+    return ok(f"only {packages}") if packages else skipped("no package of librealsense is installed")
 
 
 def libusb(facts: Facts) -> Finding:
-    """Whether the devices on USB can be listed without librealsense."""
+    """Check that USB devices can be listed without librealsense."""
     if facts.usb.error:
         return failed(
-            f"USB cannot be looked at: {facts.usb.error}",
+            f"cannot list USB devices: {facts.usb.error}",
             "pip install pyusb libusb-package"
             + (", or `sudo apt install libusb-1.0-0`" if facts.host.platform.system == "linux" else ""),
         )
@@ -325,9 +322,9 @@ FLASH = (
 
 
 def usb_camera(facts: Facts) -> Finding:
-    """Whether an L515 is on the bus, in whatever mode."""
+    """Check that an L515 is on USB, in any mode."""
     if facts.usb.error:
-        return skipped("USB cannot be looked at: see libusb")
+        return skipped("cannot list USB devices: see libusb")
     here = facts.usb.of_kind("camera") + facts.usb.of_kind("recovery")
     if here:
         return ok(", ".join(f"{device.label} ({device.id}, {device.link})" for device in here))
@@ -353,8 +350,8 @@ def _absent(facts: Facts) -> Finding:
         "--camera sim"
     )
     if others := facts.usb.of_kind("other"):
-        told = ", ".join(f"{device.label} ({device.id})" for device in others)
-        return failed(f"no L515 on USB, but another RealSense: {told}", f"only an L515 will do: {plug}")
+        found = ", ".join(f"{device.label} ({device.id})" for device in others)
+        return failed(f"no L515 on USB, but another RealSense: {found}", f"an L515 is required: {plug}")
     if not facts.usb.total:
         return failed(
             "nothing is plugged in: USB shows no device at all", f"{plug}; in a virtual machine, pass USB to it"
@@ -363,11 +360,11 @@ def _absent(facts: Facts) -> Finding:
 
 
 def recovery(facts: Facts) -> Finding:
-    """Whether a camera waits for firmware instead of giving frames."""
+    """Check that no camera is in recovery mode, waiting for firmware."""
     if stuck := facts.usb.of_kind("recovery"):
         return failed(
             ", ".join(f"{device.label} ({device.id})" for device in stuck)
-            + ": it waits for firmware, and gives no frames",
+            + ": it waits for firmware and delivers no frames",
             "unplug it, wait 5 s, plug it into a USB 3 port; if it comes back like this: `rs-fw-update -r -f "
             "Signed_Image_UVC_1_5_8_1.bin` of librealsense 2.54.2, or its realsense-viewer",
         )
@@ -375,29 +372,28 @@ def recovery(facts: Facts) -> Finding:
 
 
 def link(facts: Facts) -> Finding:
-    """Whether every camera is on USB 3."""
+    """Check that every camera is on USB 3."""
     if not facts.pairs:
         return skipped(NO_CAMERA)
     if slow := [pair for pair in facts.pairs if pair.is_slow]:
         return warning(
             f"{', '.join(pair.label for pair in slow)} is on USB 2: depth, infrared and confidence come at 320 x 240 "
             "and 30 frames/s only, without max-usable-range and IR reflectivity",
-            "turn the USB-C plug round and push it in whole; use a USB 3 cable and a USB 3 port, without a hub; a "
+            "turn the USB-C plug round and push it in fully; use a USB 3 cable and a USB 3 port, without a hub; a "
             "camera that stays on USB 2 with every cable and port is defective",
         )
     return ok(", ".join(f"{pair.label}: {pair.link}" for pair in facts.pairs))
 
 
 def firmware(facts: Facts) -> Finding:
-    """Whether every camera's firmware is accepted by librealsense 2.54.2, and the one it asks for."""
-    told = {pair.label: pair.firmware for pair in facts.pairs}
-    known = {label: version for label, version in told.items() if version}
+    """Check that librealsense 2.54.2 accepts the firmware of every camera and recommends no newer one."""
+    known = {pair.label: pair.firmware for pair in facts.pairs if pair.firmware}
     if not known:
-        return skipped("no camera tells its firmware" if told else NO_CAMERA)
+        return skipped("no camera reports its firmware" if facts.pairs else NO_CAMERA)
     detail = ", ".join(f"{label}: {version}" for label, version in known.items())
-    oldest = min(map(numbers, known.values()))
+    oldest = min(map(version_numbers, known.values()))
     if oldest < MIN_FIRMWARE[: len(oldest)]:
-        return failed(f"{detail}; librealsense takes 1.5.1.3 and later", f"update to 1.5.8.1 {FLASH}")
+        return failed(f"{detail}; librealsense accepts 1.5.1.3 and later", f"update to 1.5.8.1 {FLASH}")
     if oldest < BEST_FIRMWARE[: len(oldest)]:
-        return warning(f"{detail}; librealsense asks for 1.5.8.1", f"update to 1.5.8.1 {FLASH}")
+        return warning(f"{detail}; librealsense recommends 1.5.8.1", f"update to 1.5.8.1 {FLASH}")
     return ok(detail)

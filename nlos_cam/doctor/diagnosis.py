@@ -1,4 +1,4 @@
-"""The diagnosis: every check in order, and the reason why USB and librealsense differ."""
+"""Diagnosis: every check in order, and the cause if USB shows a camera that librealsense does not."""
 
 from collections.abc import Callable
 
@@ -6,8 +6,8 @@ from nlos_cam.doctor import checks
 from nlos_cam.doctor.facts import Check, Facts, Finding, failed, ok, skipped, warning
 
 REPLUG = (
-    "unplug the camera, wait 5 s, plug it straight into a USB 3 port and run this again; if it stays, run with "
-    "LRS_LOG_LEVEL=DEBUG in the environment and look for `partial enum`"
+    "unplug the camera, wait 5 s, plug it straight into a USB 3 port and run this again; if that does not help, run "
+    "with LRS_LOG_LEVEL=DEBUG in the environment and look for `partial enum`"
 )
 REPLUG_WINDOWS = (
     "in the Device Manager uninstall every RealSense device together with its driver, unplug the camera and plug it in "
@@ -24,33 +24,33 @@ CAUSES: dict[str, Callable[[Facts], Finding]] = {
     "in-use": checks.in_use,
     "firmware": checks.firmware,
 }
-"""What can hide from librealsense a camera that USB shows, the likeliest first."""
+"""Checks whose failure can hide a camera from librealsense that USB shows, the likeliest cause first."""
 
 
 def sdk_camera(facts: Facts) -> Finding:
-    """Whether librealsense sees the cameras that USB shows, and if not, why."""
+    """Check that librealsense sees the cameras that USB shows; if not, name the causes."""
     if facts.sdk.error:
-        return skipped("librealsense cannot be asked: see sdk")
+        return skipped("librealsense cannot be queried: see sdk")
     hidden = [pair.label for pair in facts.pairs if not pair.sdk]
     if hidden:
         return _hidden(facts, ", ".join(hidden))
     if not facts.pairs:
         return skipped(checks.NO_CAMERA)
-    told = ", ".join(f"l515:{pair.sdk.serial}" for pair in facts.pairs if pair.sdk)
+    visible = ", ".join(f"l515:{pair.sdk.serial}" for pair in facts.pairs if pair.sdk)
     if facts.usb.error or all(pair.usb for pair in facts.pairs):
-        return ok(f"librealsense sees {told}")
-    return warning(f"librealsense sees {told}, USB not all of it", checks.CONTAINER_FIX)
+        return ok(f"librealsense sees {visible}")
+    return warning(f"librealsense sees {visible}, USB not all of them", checks.CONTAINER_FIX)
 
 
-def _hidden(facts: Facts, told: str) -> Finding:
-    """Failed, for the first cause that was found."""
+def _hidden(facts: Facts, cameras: str) -> Finding:
+    """Return a failure with every cause found, and the fix of the likeliest."""
     found = {name: check(facts) for name, check in CAUSES.items()}
     causes = {name: finding for name, finding in found.items() if finding.status == "failed"}
     if not causes:
         fix = REPLUG_WINDOWS if facts.host.platform.system == "windows" else REPLUG
-        return failed(f"USB shows {told}, librealsense does not, and nothing here says why", fix)
+        return failed(f"USB shows {cameras}, librealsense does not; no check found the cause", fix)
     reasons = "; ".join(f"{name}: {finding.detail}" for name, finding in causes.items())
-    return failed(f"USB shows {told}, librealsense does not: {reasons}", next(iter(causes.values())).fix)
+    return failed(f"USB shows {cameras}, librealsense does not: {reasons}", next(iter(causes.values())).fix)
 
 
 CHECKS: dict[str, Callable[[Facts], Finding]] = {
@@ -73,9 +73,9 @@ CHECKS: dict[str, Callable[[Facts], Finding]] = {
     "firmware": checks.firmware,
     "metadata": checks.metadata,
 }
-"""Every check by its name, in the order in which they are told."""
+"""Every check by its name, in the order of the output."""
 
 
 def diagnose(facts: Facts) -> list[Check]:
-    """Every check's outcome; none is left out."""
+    """Return the outcome of every check, in order."""
     return [Check(name, **vars(check(facts))) for name, check in CHECKS.items()]

@@ -1,7 +1,4 @@
-"""What a diagnosis rests on: the host, what USB shows, what librealsense shows, and which of them are the same.
-
-What a check finds: a status, what was seen, and what to do about it.
-"""
+"""Facts for a diagnosis: the host, cameras seen by USB and by librealsense, and their pairing; findings of checks."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -10,82 +7,82 @@ from typing import Any, Literal
 
 from nlos_cam.camera import DeviceInfo, connected, load_sdk, shared_context
 from nlos_cam.doctor.host import Host, read_host
-from nlos_cam.doctor.usb import UsbDevice, UsbScan, scan, sdk_serial
+from nlos_cam.doctor.usb import UsbDevice, UsbScan, scan_usb, sdk_serial
 from nlos_cam.errors import CameraError
 
 LIDAR_NAMES = ("L515", "L500")
-"""What the SDK calls a camera of this family; in recovery mode it is an L51X."""
+"""The SDK's names of this family; in recovery mode a camera is called L51X."""
 
 
 @dataclass(frozen=True)
 class Sdk:
-    """librealsense, as far as it can be had."""
+    """librealsense: its packages, errors, and the devices it lists."""
 
     packages: tuple[tuple[str, str], ...] = ()
-    """The installed distributions that bring it: name and version."""
+    """Installed distributions of it: name and version."""
     load_error: str = ""
-    """Why it cannot be loaded; empty if it was."""
+    """Why it cannot be loaded; empty otherwise."""
     query_error: str = ""
-    """Why it cannot list devices; empty if it did."""
+    """Why it cannot list devices; empty otherwise."""
     devices: tuple[DeviceInfo, ...] = ()
 
     @property
     def error(self) -> str:
-        """Why it cannot be asked for its devices; empty if it was."""
+        """Error of loading or of listing devices; empty without one."""
         return self.load_error or self.query_error
 
     @property
     def version(self) -> str:
-        """Of the only one that is installed; empty where that is not known."""
+        """Version of the only installed package; empty with none or several."""
         return self.packages[0][1] if len(self.packages) == 1 else ""
 
     @property
     def lidars(self) -> list[DeviceInfo]:
-        """The cameras of the L515's family that it sees."""
+        """Cameras of the L515's family."""
         return [info for info in self.devices if any(name in info.name for name in LIDAR_NAMES)]
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One camera of the L515's family, as USB and as the SDK see it; None where one does not."""
+    """Camera of the L515's family as listed by USB and by the SDK; None where one of them does not list it."""
 
     usb: UsbDevice | None
     sdk: DeviceInfo | None
 
     @property
     def label(self) -> str:
-        """What to call it in a sentence."""
+        """Name for messages."""
         return self.usb.label if self.usb else f"{self.name} {self.serial}".strip()
 
     @property
     def name(self) -> str:
-        """The SDK's, or what its id on USB stands for."""
+        """Product name by the SDK, or else by its USB id."""
         return self.sdk.name if self.sdk else self.usb.meaning if self.usb else ""
 
     @property
     def serial(self) -> str:
-        """As the SDK writes it; empty where it was not to be had."""
+        """Serial number as the SDK writes it; empty if unknown."""
         return self.sdk.serial if self.sdk else self.usb.serial if self.usb else ""
 
     @property
     def firmware(self) -> str:
-        """Four numbers from the SDK, or three of them from USB."""
+        """Firmware: four numbers from the SDK, or three of them from USB."""
         return (self.sdk and self.sdk.firmware) or (self.usb.firmware if self.usb else "")
 
     @property
     def link(self) -> str:
-        """The speed of the link in words, or the version of USB."""
+        """Speed of the link, or version of USB."""
         return self.usb.link if self.usb else f"USB {self.sdk.usb_type}" if self.sdk else ""
 
     @property
     def is_slow(self) -> bool:
-        """Whether the link is USB 2 or less."""
+        """True for a link of USB 2 or less."""
         return self.usb.is_slow if self.usb else bool(self.sdk and self.sdk.usb_type.startswith("2"))
 
 
 @dataclass(frozen=True)
 class Facts:
-    """The three views of one moment."""
+    """Facts of one moment: host, USB and SDK."""
 
     host: Host
     usb: UsbScan
@@ -93,41 +90,41 @@ class Facts:
 
     @property
     def pairs(self) -> list[Pair]:
-        """Every camera of the family that anybody sees, without those in recovery mode."""
-        return pair(self.usb.of_kind("camera"), self.sdk.lidars)
+        """Every camera of the family that USB or the SDK lists, without those in recovery mode."""
+        return match_devices(self.usb.of_kind("camera"), self.sdk.lidars)
 
 
-def gather() -> Facts:
-    """Look at this machine; never raises."""
-    return Facts(read_host(), scan(), look_at_sdk())  # the SDK last: it opens nodes of its own
+def gather_facts() -> Facts:
+    """Return the facts of this machine; never raises."""
+    return Facts(read_host(), scan_usb(), query_sdk())  # the SDK last: it opens nodes of its own
 
 
-def look_at_sdk(
+def query_sdk(
     load: Callable[[], Any] = load_sdk, installed: Callable[[], Iterable[Any]] = metadata.distributions
 ) -> Sdk:
-    """Load librealsense and ask it for its devices; never raises."""
+    """Load librealsense and list its devices; never raises."""
     names = {(str(one.name), str(one.version)) for one in installed()}
     packages = tuple(sorted(pair for pair in names if pair[0].lower().startswith("pyrealsense2")))
     try:
         sdk = load()
     except CameraError as error:
-        return Sdk(packages, load_error=str(error.__cause__ or error))  # the cause alone: what to do is told beside it
+        return Sdk(packages, load_error=str(error.__cause__ or error))  # the cause alone: the check adds the fix
     try:
         return Sdk(packages, devices=tuple(info for _, info in connected(sdk, shared_context(sdk))))
-    except (CameraError, RuntimeError, AttributeError) as error:  # AttributeError: a folder of its name, not the wheel
+    except (CameraError, RuntimeError, AttributeError) as error:  # AttributeError: a folder shadows the wheel
         return Sdk(packages, query_error=str(error))
 
 
-def pair(usb: Sequence[UsbDevice], sdk: Sequence[DeviceInfo]) -> list[Pair]:
-    """Match by serial number, and what has none by being the only ones left over on both sides."""
+def match_devices(usb: Sequence[UsbDevice], sdk: Sequence[DeviceInfo]) -> list[Pair]:
+    """Pair cameras by serial number; those without one in order, if as many are left over on both sides."""
     known = {device.serial: device for device in usb if device.serial}
-    seen = {sdk_serial(info.serial): info for info in sdk}
-    matched = [Pair(device, seen.get(serial)) for serial, device in known.items()]
-    unread = [device for device in usb if not device.serial]
-    strange = [info for serial, info in seen.items() if serial not in known]
-    if len(unread) == len(strange):
-        return matched + [Pair(device, info) for device, info in zip(unread, strange, strict=True)]
-    return matched + [Pair(device, None) for device in unread] + [Pair(None, info) for info in strange]
+    listed = {sdk_serial(info.serial): info for info in sdk}
+    matched = [Pair(device, listed.get(serial)) for serial, device in known.items()]
+    nameless = [device for device in usb if not device.serial]
+    unmatched = [info for serial, info in listed.items() if serial not in known]
+    if len(nameless) == len(unmatched):
+        return matched + [Pair(device, info) for device, info in zip(nameless, unmatched, strict=True)]
+    return matched + [Pair(device, None) for device in nameless] + [Pair(None, info) for info in unmatched]
 
 
 Status = Literal["ok", "warning", "failed", "skipped"]
@@ -135,7 +132,7 @@ Status = Literal["ok", "warning", "failed", "skipped"]
 
 @dataclass(frozen=True)
 class Finding:
-    """The outcome of one question; a warning or a failure always says what to do."""
+    """Outcome of one check; a warning or a failure always has a fix."""
 
     status: Status
     detail: str
@@ -144,7 +141,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Check:
-    """A finding under the name of its question; names and fields are fixed: scripts depend on them."""
+    """Finding with the name of its check; names and fields are fixed: scripts depend on them."""
 
     name: str
     status: Status
@@ -153,20 +150,20 @@ class Check:
 
 
 def ok(detail: str) -> Finding:
-    """All is well: what was seen."""
+    """Return a success."""
     return Finding("ok", detail)
 
 
 def skipped(reason: str) -> Finding:
-    """The question does not arise here: why."""
+    """Return the reason why a check does not apply."""
     return Finding("skipped", reason)
 
 
 def warning(detail: str, fix: str) -> Finding:
-    """It works, but not as well as it could."""
+    """Return a problem that a camera works with."""
     return Finding("warning", detail, fix)
 
 
 def failed(detail: str, fix: str) -> Finding:
-    """A camera will not work like this."""
+    """Return a problem that keeps a camera from working."""
     return Finding("failed", detail, fix)

@@ -1,9 +1,4 @@
-"""Product ids under which the L515's family and other RealSense cameras are met on USB.
-
-What Linux's kernel shows of a plugged-in L515 in its file systems, and who has it open.
-
-What this host is to a camera: system, container, kernel modules, udev rules, and nodes that open or do not.
-"""
+"""Facts about this host: USB product ids, cameras the kernel has enumerated, modules, udev rules, device nodes."""
 
 import os
 import platform
@@ -25,7 +20,7 @@ LIDARS: dict[int, tuple[Kind, str]] = {
     0x0B55: ("recovery", "L515 in recovery mode"),
     0x0ADC: ("recovery", "RealSense in recovery mode on USB 2 (an early L515, or a D400)"),
 }
-"""The L515's family: what each is, and what to call it."""
+"""The L515's family by product id: kind and name."""
 OTHERS = {
     0x0AA5: "SR300",
     0x0AD1: "D400",
@@ -40,57 +35,57 @@ OTHERS = {
     0x0B5B: "D405",
     0x0B5C: "D455",
 }
-"""Other RealSense cameras that are likely to be met, so that they can be named."""
+"""Names of other common RealSense cameras by product id."""
 
 
 @dataclass(frozen=True)
 class KernelCamera:
-    """A camera of the L515's family, as the kernel sees it: the path of a node is that on the running system."""
+    """Camera of the L515's family as the kernel has enumerated it; nodes are paths on the running system."""
 
     port: str
     product_id: int
     serial: str
     usb_node: str
     video_nodes: tuple[str, ...]
-    """Of the driver uvcvideo."""
+    """Nodes of the driver uvcvideo."""
     hid_devices: tuple[str, ...]
-    """Each with the driver that has it."""
+    """Each with its driver."""
     hid_sensors: tuple[str, ...]
-    """Names of its industrial-I/O devices: what the SDK counts before it believes in an L515."""
+    """Names of its industrial-I/O devices: the SDK requires them to list an L515."""
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """Everything that has to be opened to stream."""
+        """Every node that has to be opened to stream."""
         return (self.usb_node, *self.video_nodes)
 
 
 @dataclass(frozen=True)
 class Holder:
-    """A process that has a node open."""
+    """Process that has a device node open."""
 
     pid: int
     name: str
     node: str
 
 
-def text(path: Path) -> str:
-    """A small file's content; empty where it cannot be read."""
+def read_text(path: Path) -> str:
+    """Return a small file's content, stripped; empty if it cannot be read."""
     try:
         return path.read_text(encoding="utf-8", errors="replace").strip()
     except (OSError, ValueError):
         return ""
 
 
-def entries(folder: Path) -> list[Path]:
-    """What a folder holds, in order; nothing where it cannot be listed."""
+def list_folder(folder: Path) -> list[Path]:
+    """Return a folder's entries in order; none if it cannot be listed."""
     try:
         return sorted(folder.iterdir())
     except (OSError, ValueError):
         return []
 
 
-def is_there(path: Path) -> bool:
-    """Whether there is such a file or folder, as far as we may know."""
+def path_exists(path: Path) -> bool:
+    """Return True for a file or folder that exists and may be accessed."""
     try:
         return path.exists()
     except OSError:
@@ -98,8 +93,8 @@ def is_there(path: Path) -> bool:
 
 
 def kernel_cameras(root: Path = Path("/")) -> tuple[KernelCamera, ...]:
-    """Every camera of the family that the kernel has enumerated; `root` holds `sys`."""
-    devices = entries(root / "sys/bus/usb/devices")
+    """Return the cameras of the family that the kernel has enumerated; `root` holds `sys`."""
+    devices = list_folder(root / "sys/bus/usb/devices")
     return tuple(_camera(root / "sys", device) for device in devices if _is_lidar(device))
 
 
@@ -109,50 +104,50 @@ def _is_lidar(device: Path) -> bool:
 
 def _hex(path: Path) -> int:
     try:
-        return int(text(path), 16)
+        return int(read_text(path), 16)
     except ValueError:
         return 0
 
 
 def _camera(sys: Path, device: Path) -> KernelCamera:
-    bus, address = (text(device / name).zfill(3) for name in ("busnum", "devnum"))
+    bus, address = (read_text(device / name).zfill(3) for name in ("busnum", "devnum"))
     return KernelCamera(
         port=device.name,
         product_id=_hex(device / "idProduct"),
-        serial=text(device / "serial"),
+        serial=read_text(device / "serial"),
         usb_node=f"/dev/bus/usb/{bus}/{address}",
         video_nodes=tuple(f"/dev/{found.name}" for found in _below(device, sys / "class/video4linux")),
         hid_devices=tuple(f"{found.name} ({_driver(found)})" for found in _below(device, sys / "bus/hid/devices")),
-        hid_sensors=tuple(text(found / "name") or found.name for found in _below(device, sys / "bus/iio/devices")),
+        hid_sensors=tuple(read_text(found / "name") or found.name for found in _below(device, sys / "bus/iio/devices")),
     )
 
 
 def _below(device: Path, folder: Path) -> list[Path]:
-    """Those links of a folder that lead to something that is part of the device."""
+    """Return the links of a folder whose targets lie below the device."""
     whole = os.path.realpath(device) + os.sep
-    return [found for found in entries(folder) if os.path.realpath(found).startswith(whole)]
+    return [found for found in list_folder(folder) if os.path.realpath(found).startswith(whole)]
 
 
 def _driver(device: Path) -> str:
     driver = device / "driver"
-    return Path(os.path.realpath(driver)).name if is_there(driver) else "no driver"
+    return Path(os.path.realpath(driver)).name if path_exists(driver) else "no driver"
 
 
-def holders(nodes: Collection[str], root: Path = Path("/")) -> tuple[list[Holder], int]:
-    """Other processes that have one of the nodes open, and how many processes would not be looked into."""
+def find_holders(nodes: Collection[str], root: Path = Path("/")) -> tuple[list[Holder], int]:
+    """Return other processes that have one of the nodes open, and the number of processes that deny access."""
     found: set[Holder] = set()
     closed = 0
-    for process in entries(root / "proc"):
+    for process in list_folder(root / "proc"):
         if not process.name.isdecimal() or int(process.name) == os.getpid():
             continue
         try:
             targets = {_target(link) for link in (process / "fd").iterdir()}
-        except FileNotFoundError:  # it has ended meanwhile
+        except FileNotFoundError:  # the process has ended
             continue
         except OSError:
             closed += 1
             continue
-        found |= {Holder(int(process.name), text(process / "comm"), node) for node in targets & set(nodes)}
+        found |= {Holder(int(process.name), read_text(process / "comm"), node) for node in targets & set(nodes)}
     return sorted(found, key=lambda one: (one.pid, one.node)), closed
 
 
@@ -172,12 +167,12 @@ CONTAINERS = {
     "containerd": "containerd",
     "lxc": "lxc",
 }
-"""Words in the control groups of a container's first process, and what they tell."""
+"""Container type by a word in the control groups of its first process."""
 
 
 @dataclass(frozen=True)
 class Platform:
-    """The interpreter and the system that it runs on."""
+    """Python interpreter and operating system."""
 
     system: str
     """linux, darwin or windows."""
@@ -191,7 +186,7 @@ class Platform:
 
 @dataclass(frozen=True)
 class Node:
-    """A device file that a camera needs, and why it does not open; empty if it does."""
+    """Device file of a camera, and the error of opening it; empty without one."""
 
     path: str
     error: str = ""
@@ -199,28 +194,28 @@ class Node:
 
 @dataclass(frozen=True)
 class Host:
-    """The facts; everything but `platform` is empty where the system is not Linux."""
+    """Facts about this host; all but `platform` are empty on systems other than Linux."""
 
     platform: Platform
     container: str = ""
-    """What kind of container this is; empty outside one."""
+    """Type of the container; empty outside one."""
     is_wsl: bool = False
     modules: Mapping[str, str] = field(default_factory=dict[str, str])
-    """Each of MODULES: loaded, built in, available, or missing; unknown where the kernel's list is not to be seen."""
+    """Each of MODULES: loaded, built in, available or missing; unknown without the kernel's lists."""
     has_iio: bool = False
     patched_uvc: bool = False
-    """Whether uvcvideo is librealsense's, which passes on the frames' metadata."""
+    """True for librealsense's uvcvideo, which passes on the frames' metadata."""
     cameras: tuple[KernelCamera, ...] = ()
     rules: tuple[str, ...] = ()
-    """Files of udev rules that speak of the L515."""
+    """Files of udev rules that name the L515."""
     nodes: tuple[Node, ...] = ()
     holders: tuple[Holder, ...] = ()
     closed_processes: int = 0
-    """Processes of others, whose open files are not shown to this user."""
+    """Number of processes whose open files this user may not read."""
 
 
 def this_platform() -> Platform:
-    """The platform of this process."""
+    """Return the platform of this process."""
     return Platform(
         system=platform.system().lower(),
         machine=platform.machine().lower(),
@@ -246,20 +241,20 @@ def open_node(path: str) -> None:
 
 
 def read_host(root: Path = Path("/"), on: Platform | None = None, opening: Callable[[str], None] = open_node) -> Host:
-    """Look around; never raises. `root` holds the system's `sys`, `proc`, `etc`, ..."""
+    """Return the facts about this host; never raises. `root` holds the system's `sys`, `proc`, `etc`, ..."""
     on = on or this_platform()
     if on.system != "linux":
         return Host(on)
     cameras = kernel_cameras(root)
     nodes = [node for camera in cameras for node in camera.nodes]
-    holding, closed = holders(nodes, root) if nodes else ([], 0)
+    holding, closed = find_holders(nodes, root) if nodes else ([], 0)
     return Host(
         platform=on,
         container=_container(root),
-        is_wsl="microsoft" in text(root / "proc/version").lower(),
+        is_wsl="microsoft" in read_text(root / "proc/version").lower(),
         modules=_modules(root),
-        has_iio=is_there(root / "sys/bus/iio"),
-        patched_uvc="realsense" in text(root / "sys/module/uvcvideo/version"),
+        has_iio=path_exists(root / "sys/bus/iio"),
+        patched_uvc="realsense" in read_text(root / "sys/module/uvcvideo/version"),
         cameras=cameras,
         rules=_rules(root),
         nodes=tuple(_node(path, opening) for path in nodes),
@@ -269,39 +264,39 @@ def read_host(root: Path = Path("/"), on: Platform | None = None, opening: Calla
 
 
 def _container(root: Path) -> str:
-    if is_there(root / ".dockerenv"):
+    if path_exists(root / ".dockerenv"):
         return "docker"
-    if is_there(root / "run/.containerenv"):
+    if path_exists(root / "run/.containerenv"):
         return "podman"
-    environment = text(root / "proc/1/environ").split("\0")
+    environment = read_text(root / "proc/1/environ").split("\0")
     named = [value for name, _, value in (entry.partition("=") for entry in environment) if name == "container"]
-    groups = text(root / "proc/1/cgroup")
-    named += [text(root / "run/systemd/container"), *(name for word, name in CONTAINERS.items() if word in groups)]
+    groups = read_text(root / "proc/1/cgroup")
+    named += [read_text(root / "run/systemd/container"), *(name for word, name in CONTAINERS.items() if word in groups)]
     return next((name for name in named if name), "")
 
 
 def _modules(root: Path) -> dict[str, str]:
-    loaded = {line.split(" ")[0] for line in text(root / "proc/modules").splitlines()}
-    folder = root / "lib/modules" / (text(root / "proc/sys/kernel/osrelease") or "unknown")
-    lists = {"built in": text(folder / "modules.builtin"), "available": text(folder / "modules.dep")}
+    loaded = {line.split(" ")[0] for line in read_text(root / "proc/modules").splitlines()}
+    folder = root / "lib/modules" / (read_text(root / "proc/sys/kernel/osrelease") or "unknown")
+    lists = {"built in": read_text(folder / "modules.builtin"), "available": read_text(folder / "modules.dep")}
     return {name: _state(name, loaded, lists, root / "sys/module" / name) for name in MODULES}
 
 
 def _state(name: str, loaded: set[str], lists: Mapping[str, str], shown: Path) -> str:
-    """A module's file may be spelled with hyphens where its name has underscores, and be compressed."""
-    if name in loaded or is_there(shown):
+    """Return a module's state. Its file may have hyphens for underscores in its name, and be compressed."""
+    if name in loaded or path_exists(shown):
         return "loaded"
     files = (f"/{name}.ko", f"/{name.replace('_', '-')}.ko")
-    told = next((state for state, listed in lists.items() if any(file in listed for file in files)), "")
-    return told or ("missing" if any(lists.values()) else "unknown")
+    found = next((state for state, listed in lists.items() if any(file in listed for file in files)), "")
+    return found or ("missing" if any(lists.values()) else "unknown")
 
 
 def _rules(root: Path) -> tuple[str, ...]:
     files = {
         os.path.realpath(file): file
         for folder in RULE_FOLDERS
-        for file in entries(root / folder)
-        if file.suffix == ".rules" and "0b64" in text(file).lower()
+        for file in list_folder(root / folder)
+        if file.suffix == ".rules" and "0b64" in read_text(file).lower()
     }
     return tuple(f"/{file.relative_to(root)}" for file in files.values())
 

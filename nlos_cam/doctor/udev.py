@@ -1,4 +1,4 @@
-"""The udev rules that let every user of a Linux machine open an L515, which librealsense's wheel does not install."""
+"""udev rules that let every user of a Linux machine open an L515; librealsense's wheel does not install them."""
 
 from shlex import quote
 
@@ -10,7 +10,7 @@ HEAD = """\
 #   {reload}
 """
 MOTION = """\
-# The motion sensors: without them the SDK leaves the whole camera out.
+# The motion sensors: without them the SDK does not list the camera.
 KERNEL=="iio*", {match}, MODE:="0777", GROUP:="plugdev", RUN+="/bin/sh -c 'chmod -R 0777 /sys/%p'"
 DRIVER=="hid_sensor*", {match}, RUN+="/bin/sh -c 'chmod -R 0777 /sys/%p && chmod 0777 /dev/%k'"
 """
@@ -18,17 +18,17 @@ FILE_NAME = "99-l515.rules"
 RELOAD = "sudo udevadm control --reload-rules && sudo udevadm trigger"
 
 
-def install(written: str) -> str:
-    """What to run once the rules are in that file."""
-    return f"sudo install -m 644 {quote(written)} /etc/udev/rules.d/{FILE_NAME} && {RELOAD}"
+def install_command(path: str) -> str:
+    """Return the shell command that installs the rules from a file."""
+    return f"sudo install -m 644 {quote(path)} /etc/udev/rules.d/{FILE_NAME} && {RELOAD}"
 
 
-WRITE_AND_INSTALL = f"nlos-cam doctor --write-udev {FILE_NAME} && {install(FILE_NAME)}"
-"""What to run to have the rules in force for a camera that is plugged in after it."""
+WRITE_AND_INSTALL = f"nlos-cam doctor --write-udev {FILE_NAME} && {install_command(FILE_NAME)}"
+"""Shell command that writes and installs the rules; they apply to a camera plugged in afterwards."""
 
 
-def rules() -> str:
-    """The file: access to the camera's USB and video nodes, and to its motion sensors."""
+def rules_text() -> str:
+    """Return the rules file: access to the camera's USB and video nodes and its motion sensors."""
     access = [f"# {name}\n{_usb_rule(product_id)}\n" for product_id, (_, name) in LIDARS.items()]
     return "\n".join([HEAD.format(name=FILE_NAME, reload=RELOAD), *access, MOTION.format(match=_match(L515))])
 

@@ -1,11 +1,11 @@
-"""What USB itself shows of the L515 and its relatives, asked through libusb; no interface is claimed."""
+"""RealSense cameras on USB, read through libusb without claiming an interface."""
 
 import errno
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nlos_cam.doctor.host import INTEL, LIDARS, OTHERS, Kind, text
+from nlos_cam.doctor.host import INTEL, LIDARS, OTHERS, Kind, read_text
 
 SPEEDS = {
     1: "1.5 Mbit/s (USB 1)",
@@ -15,14 +15,14 @@ SPEEDS = {
     5: "10 Gbit/s (USB 3)",
     6: "20 Gbit/s (USB 3)",
 }
-"""libusb's codes of the speed that a link came up with."""
+"""Link speed by libusb's code."""
 SUPER_SPEED = 4
 CLASSES = {0x03: "hid", 0x0E: "video", 0xFE: "dfu", 0xFF: "vendor"}
 
 
 @dataclass(frozen=True)
 class UsbDevice:
-    """A RealSense camera on the bus; a text is empty where the device or the system does not tell it."""
+    """RealSense camera on USB; unknown texts are empty."""
 
     product_id: int
     kind: Kind
@@ -30,63 +30,63 @@ class UsbDevice:
     bus: int | None
     address: int | None
     port: str
-    """Bus and ports from the root down, as Linux writes them: 2-1.4."""
+    """Bus and ports as Linux writes them: 2-1.4."""
     bcd_usb: int
     speed: int | None
     """libusb's code."""
     firmware: str
     serial: str
-    """As the SDK writes it: lower case, without leading zeros."""
+    """As `sdk_serial` writes it."""
     product: str
     interfaces: tuple[str, ...]
-    """The classes of its interfaces: video, vendor, hid, dfu, or a number."""
+    """Classes: video, vendor, hid, dfu, or a number."""
     error: str = ""
-    """Why the device could not be asked for its strings."""
+    """Why the device's strings could not be read."""
     denied: bool = False
-    """Whether that was for lack of permission."""
+    """True if that was for lack of permission."""
 
     @property
     def id(self) -> str:
-        """Vendor and product, as `lsusb` writes them."""
+        """Vendor and product id, as `lsusb` writes them."""
         return f"{INTEL:04x}:{self.product_id:04x}"
 
     @property
     def usb_type(self) -> str:
-        """The version of USB that it speaks on this link, as the SDK writes it: 3.2, 2.1."""
+        """Version of USB on this link, as the SDK writes it: 3.2, 2.1."""
         return f"{self.bcd_usb >> 8:x}.{self.bcd_usb >> 4 & 0xF:x}"
 
     @property
     def link(self) -> str:
-        """The speed of the link in words."""
+        """Speed of the link."""
         return SPEEDS.get(self.speed or 0, f"USB {self.usb_type}, speed unknown")
 
     @property
     def is_slow(self) -> bool:
-        """Whether the link is USB 2 or less."""
+        """True for a link of USB 2 or less."""
         return (self.speed or 0) < SUPER_SPEED if self.speed in SPEEDS else self.bcd_usb < 0x0300
 
     @property
     def label(self) -> str:
-        """What to call it in a sentence: L515 f0246262 at 2-1."""
+        """Name for messages: L515 f0246262 at 2-1."""
         place = f"at {self.port}" if self.port else ""
         return " ".join(part for part in (self.meaning, self.serial, place) if part)
 
 
 @dataclass(frozen=True)
 class UsbScan:
-    """The RealSense cameras on the bus, how many devices there are in all, and why there is no knowing."""
+    """RealSense cameras on USB, the number of all devices, and the error of listing them."""
 
     devices: tuple[UsbDevice, ...] = ()
     total: int = 0
     error: str = ""
 
     def of_kind(self, kind: Kind) -> list[UsbDevice]:
-        """Those that are cameras, in recovery mode, or something else."""
+        """Return the devices of one kind."""
         return [device for device in self.devices if device.kind == kind]
 
 
-def scan(backend: Any = None, root: Path = Path("/")) -> UsbScan:
-    """Look at every device on the bus; never raises. `root` holds the `sys` that tells what a device will not."""
+def scan_usb(backend: Any = None, root: Path = Path("/")) -> UsbScan:
+    """Return the RealSense cameras on USB; never raises. `root` holds `sys`, read where a device denies access."""
     try:
         import libusb_package
         import usb.core
@@ -96,14 +96,14 @@ def scan(backend: Any = None, root: Path = Path("/")) -> UsbScan:
     except (ImportError, OSError, ValueError, NotImplementedError) as error:  # no pyusb, no libusb, no USB
         return UsbScan(error=str(error) or type(error).__name__)
     known = [device for device in found if device.idVendor == INTEL and device.idProduct in {*LIDARS, *OTHERS}]
-    return UsbScan(tuple(_described(device, root) for device in known), len(found))
+    return UsbScan(tuple(_describe(device, root) for device in known), len(found))
 
 
-def _described(device: Any, root: Path) -> UsbDevice:
+def _describe(device: Any, root: Path) -> UsbDevice:
     kind, meaning = LIDARS.get(device.idProduct) or ("other", f"RealSense {OTHERS[device.idProduct]}")
     port = _port(device)
     serial, product, error = _strings(device)
-    told = root / "sys/bus/usb/devices" / port
+    kernel = root / "sys/bus/usb/devices" / port
     return UsbDevice(
         product_id=device.idProduct,
         kind=kind,
@@ -114,8 +114,8 @@ def _described(device: Any, root: Path) -> UsbDevice:
         bcd_usb=device.bcdUSB,
         speed=device.speed,
         firmware=firmware_of(device.bcdDevice) if device.idProduct in LIDARS else "",
-        serial=sdk_serial(serial or text(told / "serial")) if port else sdk_serial(serial),
-        product=product or (text(told / "product") if port else ""),
+        serial=sdk_serial(serial or read_text(kernel / "serial")) if port else sdk_serial(serial),
+        product=product or (read_text(kernel / "product") if port else ""),
         interfaces=_interfaces(device),
         error=str(error) if error else "",
         denied=isinstance(error, OSError) and error.errno in {errno.EACCES, errno.EPERM},
@@ -123,12 +123,12 @@ def _described(device: Any, root: Path) -> UsbDevice:
 
 
 def _port(device: Any) -> str:
-    """Where it is plugged in; empty for a device that hangs on no port."""
+    """Return bus and ports, as 2-1.4; empty for a device without a port."""
     return f"{device.bus}-{'.'.join(map(str, device.port_numbers))}" if device.port_numbers else ""
 
 
 def _strings(device: Any) -> tuple[str, str, Exception | None]:
-    """Serial number, product, and what stood in the way: permission, a driver of Windows, a device that left."""
+    """Return serial number, product, and the error of reading them: permission, driver on Windows, unplugged."""
     import usb.util
 
     try:
@@ -145,7 +145,7 @@ def _strings(device: Any) -> tuple[str, str, Exception | None]:
 
 
 def _interfaces(device: Any) -> tuple[str, ...]:
-    """The classes of every interface; none where the system keeps the description to itself."""
+    """Return the classes of all interfaces; none where the system does not provide the description."""
     try:
         codes = {interface.bInterfaceClass for configuration in device for interface in configuration}
     except (OSError, NotImplementedError):
@@ -154,15 +154,15 @@ def _interfaces(device: Any) -> tuple[str, ...]:
 
 
 def firmware_of(bcd_device: int) -> str:
-    """The firmware that an L515's release number stands for; empty for a number of another form.
+    """Return the firmware version encoded in an L515's USB release number; empty for another form.
 
     Major, a zero, minor and patch, a hexadecimal digit each: 0x1058 is 1.5.8. Inferred from three units (0x1058,
-    0x1052, 0x1041), none of which showed what the second digit is for; the fourth part of a version is not in it.
+    0x1052, 0x1041), where the second digit was always 0; the fourth part of a version is not encoded.
     """
     major, second, minor, patch = (bcd_device >> shift & 0xF for shift in (12, 8, 4, 0))
     return "" if second or major == 0 or max(major, minor, patch) > 9 else f"{major}.{minor}.{patch}"
 
 
 def sdk_serial(serial: str) -> str:
-    """A serial number as the SDK writes it, so that both can be compared."""
+    """Return a serial number as the SDK writes it: lower case, without leading zeros."""
     return serial.strip().lower().lstrip("0")

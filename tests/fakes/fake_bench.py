@@ -12,9 +12,9 @@ from fake_lidar import FakeLidar
 from usb.backend import IBackend
 
 from nlos_cam.doctor import Check, Facts, diagnose
-from nlos_cam.doctor.facts import look_at_sdk
+from nlos_cam.doctor.facts import query_sdk
 from nlos_cam.doctor.host import Platform, read_host
-from nlos_cam.doctor.usb import scan
+from nlos_cam.doctor.usb import scan_usb
 from nlos_cam.errors import CameraError
 
 L515_CLASSES = (0x0E, 0x0E, 0xFF, 0x03)
@@ -232,7 +232,7 @@ class Bench:
     def facts(self) -> Facts:
         host = read_host(self.linux.root, self.platform, self.open_node)
         packages = [SimpleNamespace(name=name, version=version) for name, version in self.installed.items()]
-        return Facts(host, scan(self.usb, self.linux.root), look_at_sdk(self.load_sdk, lambda: packages))
+        return Facts(host, scan_usb(self.usb, self.linux.root), query_sdk(self.load_sdk, lambda: packages))
 
     def checks(self) -> dict[str, Check]:
         return {check.name: check for check in diagnose(self.facts())}

@@ -10,7 +10,7 @@ from fake_bench import Bench
 from nlos_cam.cli import devices
 from nlos_cam.cli.main import main
 from nlos_cam.doctor.diagnosis import CHECKS
-from nlos_cam.doctor.udev import rules
+from nlos_cam.doctor.udev import rules_text
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -23,7 +23,7 @@ def bench(tmp_path: Path) -> Bench:
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], bench: Any) -> Run:
     """Run the command on the bench; returns exit code, stdout and stderr."""
-    monkeypatch.setattr(devices, "gather", bench.facts)
+    monkeypatch.setattr(devices, "gather_facts", bench.facts)
     monkeypatch.setenv("COLUMNS", "160")
 
     def act(*arguments: str) -> tuple[int, str, str]:
@@ -62,7 +62,7 @@ def test_doctor_prints_checks_and_each_fix_on_a_line(run: Run, bench: Bench) -> 
 def test_doctor_writes_udev_rules_and_how_to_install_them(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "99-l515.rules"
     code, out, err = run("--write-udev", str(path), "--json")
-    assert (code, path.read_text(encoding="utf-8")) == (0, rules())
+    assert (code, path.read_text(encoding="utf-8")) == (0, rules_text())
     assert f"sudo install -m 644 {path} /etc/udev/rules.d/" in err.replace("\n", "")
     assert json.loads(out.splitlines()[-1])["ok"]
     path.write_text("mine", encoding="utf-8")
@@ -70,7 +70,7 @@ def test_doctor_writes_udev_rules_and_how_to_install_them(run: Run, tmp_path: Pa
     assert (code, path.read_text(encoding="utf-8")) == (1, "mine")
     assert "--overwrite" in err
     assert run("--write-udev", str(path), "--overwrite")[0] == 0
-    assert path.read_text(encoding="utf-8") == rules()
+    assert path.read_text(encoding="utf-8") == rules_text()
 
 
 def test_doctor_reports_rules_that_cannot_be_written(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

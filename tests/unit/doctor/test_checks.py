@@ -13,7 +13,7 @@ import pytest
 import usb.core
 
 from nlos_cam.camera.sdk import WHEEL
-from nlos_cam.doctor.checks import numbers
+from nlos_cam.doctor.checks import version_numbers
 from nlos_cam.doctor.diagnosis import REPLUG
 
 DENIED = usb.core.USBError("Access denied (insufficient permissions)", -3, 13)
@@ -227,7 +227,7 @@ def test_sdk_without_the_l515_is_why_it_is_not_seen(bench: Any, version: str) ->
     ],
 )
 def test_firmware_is_judged_by_sdk_or_usb(bench: Any, firmware: str | int, status: str) -> None:
-    """USB has three of its four numbers, and not of every firmware."""
+    """USB has three of its four version_numbers, and not of every firmware."""
     if isinstance(firmware, str):
         bench.show(firmware_version=firmware)
     else:
@@ -252,4 +252,4 @@ def test_older_of_two_firmwares_counts(bench: Any, device: Any, fake_l515: Any) 
     ("text", "version"), [("01.05.08.01", (1, 5, 8, 1)), ("2.54.2.5684", (2, 54, 2, 5684)), ("", ())]
 )
 def test_versions_are_numbers(text: str, version: tuple[int, ...]) -> None:
-    assert numbers(text) == version
+    assert version_numbers(text) == version

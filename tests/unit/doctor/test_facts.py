@@ -4,7 +4,7 @@ from unittest.mock import Mock
 import pytest
 
 from nlos_cam.camera.l515 import DeviceInfo
-from nlos_cam.doctor.facts import Pair, gather, look_at_sdk, pair
+from nlos_cam.doctor.facts import Pair, gather_facts, match_devices, query_sdk
 from nlos_cam.errors import CameraError
 
 
@@ -17,7 +17,7 @@ def serials(pairs: list[Pair]) -> list[tuple[str | None, str | None]]:
 
 
 def test_gather_asks_this_machine() -> None:
-    facts = gather()
+    facts = gather_facts()
     assert facts.sdk.load_error == ""
     assert ("pyrealsense2", facts.sdk.version) in facts.sdk.packages
 
@@ -39,7 +39,7 @@ def test_failed_import_keeps_the_cause_without_advice(bench: Any) -> None:
     sdk = bench.facts().sdk
     assert sdk.load_error == sdk.error == "No module named 'pyrealsense2'"
     assert sdk.devices == ()
-    assert look_at_sdk(Mock(side_effect=CameraError("no such luck")), list).load_error == "no such luck"
+    assert query_sdk(Mock(side_effect=CameraError("no such luck")), list).load_error == "no such luck"
 
 
 def test_sdk_that_cannot_list_devices_keeps_the_error(bench: Any) -> None:
@@ -53,12 +53,12 @@ def test_sdk_that_cannot_list_devices_keeps_the_error(bench: Any) -> None:
 
 def test_pair_matches_serials_whatever_their_zeros(bench: Any, device: Any) -> None:
     usb = bench.facts().usb.of_kind("camera")
-    assert serials(pair(usb, [])) == [("f0246262", None)]
-    assert serials(pair([], [info("f9")])) == [(None, "f9")]
-    assert serials(pair(usb, [info("f9")])) == [("f0246262", None), (None, "f9")]
+    assert serials(match_devices(usb, [])) == [("f0246262", None)]
+    assert serials(match_devices([], [info("f9")])) == [(None, "f9")]
+    assert serials(match_devices(usb, [info("f9")])) == [("f0246262", None), (None, "f9")]
     bench.usb.devices = [device(serial="00000000F1"), device(serial="00000000F2", address=4)]
     usb = bench.facts().usb.of_kind("camera")
-    assert serials(pair(usb, [info("f2"), info("00000000f1")])) == [("f1", "00000000f1"), ("f2", "f2")]
+    assert serials(match_devices(usb, [info("f2"), info("00000000f1")])) == [("f1", "00000000f1"), ("f2", "f2")]
     bench.put_on_usb(0x0B55)
     assert [one.usb for one in bench.facts().pairs] == [None]  # one in recovery mode is no camera
 
@@ -71,7 +71,7 @@ def test_pair_gives_the_last_device_to_a_camera_without_serial(
     bench: Any, device: Any, there: list[str], matched: list[tuple[str | None, str | None]]
 ) -> None:
     bench.usb.devices = [device(serial="", port_numbers=None)]
-    assert serials(pair(bench.facts().usb.of_kind("camera"), [info(serial) for serial in there])) == matched
+    assert serials(match_devices(bench.facts().usb.of_kind("camera"), [info(serial) for serial in there])) == matched
 
 
 def test_pair_prefers_what_the_sdk_reports(bench: Any) -> None:

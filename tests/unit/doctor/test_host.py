@@ -15,13 +15,13 @@ from nlos_cam.doctor.host import (
     Holder,
     Host,
     Platform,
-    entries,
-    holders,
-    is_there,
+    find_holders,
     kernel_cameras,
+    list_folder,
     open_node,
+    path_exists,
     read_host,
-    text,
+    read_text,
     this_platform,
 )
 
@@ -154,20 +154,20 @@ def test_kernel_cameras_hold_what_hangs_on_each_port(bench: Any, tmp_path: Path)
 
 def test_odd_files_are_empty_and_odd_folders_hold_nothing(tmp_path: Path) -> None:
     assert kernel_cameras(tmp_path) == ()
-    assert holders(["/dev/video0"], tmp_path) == ([], 0)
+    assert find_holders(["/dev/video0"], tmp_path) == ([], 0)
     (tmp_path / "binary").write_bytes(b"\xff\xfe 1 ")
-    assert text(tmp_path / "binary").endswith("1")
-    assert text(tmp_path) == text(tmp_path / "absent") == text(Path("nul\0byte")) == ""
-    assert entries(tmp_path / "binary") == entries(tmp_path / "absent") == []
+    assert read_text(tmp_path / "binary").endswith("1")
+    assert read_text(tmp_path) == read_text(tmp_path / "absent") == read_text(Path("nul\0byte")) == ""
+    assert list_folder(tmp_path / "binary") == list_folder(tmp_path / "absent") == []
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    assert not is_there(tmp_path / "loop")
+    assert not path_exists(tmp_path / "loop")
 
 
 def test_process_that_holds_a_node_is_named(bench: Any, tmp_path: Path) -> None:
     bench.linux.process(41, "realsense-viewer", "/dev/null", "/dev/video30", "/dev/video31")
     bench.linux.process(42, "bash", "/dev/tty")
     bench.linux.write(*UNLISTED)
-    found, closed = holders(["/dev/video30", "/dev/bus/usb/002/003"], tmp_path)
+    found, closed = find_holders(["/dev/video30", "/dev/bus/usb/002/003"], tmp_path)
     assert (found, closed) == ([Holder(41, "realsense-viewer", "/dev/video30")], 1)
 
 
@@ -178,8 +178,8 @@ def test_real_process_that_has_a_file_open_is_found(tmp_path: Path) -> None:
         assert other.stdout
         other.stdout.readline()
         with held.open():  # ours is left out
-            found, _ = holders([str(held)])
+            found, _ = find_holders([str(held)])
         other.communicate(b"")
     assert [(one.pid, one.node) for one in found] == [(other.pid, str(held))]
     assert found[0].name.startswith("python")
-    assert holders([str(held)])[0] == []
+    assert find_holders([str(held)])[0] == []

@@ -3,13 +3,13 @@ import re
 import pytest
 
 from nlos_cam.doctor.host import LIDARS, OTHERS
-from nlos_cam.doctor.udev import FILE_NAME, RELOAD, WRITE_AND_INSTALL, install, rules
+from nlos_cam.doctor.udev import FILE_NAME, RELOAD, WRITE_AND_INSTALL, install_command, rules_text
 
 CLAUSE = re.compile(r'[A-Z]+(\{\w+\})?(==|:=|\+=)"[^"]*"')
 
 
 def lines() -> list[str]:
-    return [line for line in rules().splitlines() if line and not line.startswith("#")]
+    return [line for line in rules_text().splitlines() if line and not line.startswith("#")]
 
 
 @pytest.mark.parametrize("product_id", LIDARS)
@@ -31,5 +31,5 @@ def test_rules_open_motion_sensors_and_are_well_formed() -> None:
 def test_commands_name_the_file_and_reload() -> None:
     assert f"--write-udev {FILE_NAME}" in WRITE_AND_INSTALL
     assert WRITE_AND_INSTALL.endswith(RELOAD)
-    assert "'my rules'" in install("my rules")
-    assert install("a").index("install") < install("a").index("udevadm")
+    assert "'my rules'" in install_command("my rules")
+    assert install_command("a").index("install") < install_command("a").index("udevadm")

@@ -13,7 +13,7 @@ import usb.core
 import usb.util
 from usb.backend.libusb1 import _LibUSB
 
-from nlos_cam.doctor.usb import SPEEDS, SUPER_SPEED, UsbDevice, firmware_of, scan, sdk_serial
+from nlos_cam.doctor.usb import SPEEDS, SUPER_SPEED, UsbDevice, firmware_of, scan_usb, sdk_serial
 
 Make = Callable[..., SimpleNamespace]
 Scan = Callable[..., list[UsbDevice]]
@@ -25,7 +25,7 @@ def seen(bench: Any, tmp_path: Path) -> Scan:
 
     def look(*devices: SimpleNamespace) -> list[UsbDevice]:
         bench.usb.devices = list(devices)
-        found = scan(bench.usb, tmp_path)
+        found = scan_usb(bench.usb, tmp_path)
         assert found.total == len(devices)
         return list(found.devices)
 
@@ -111,25 +111,25 @@ def test_broken_string_is_an_error_of_the_device(seen: Scan, device: Make) -> No
 
 def test_scan_closes_every_device_and_claims_none(bench: Any, tmp_path: Path, device: Make) -> None:
     bench.usb.devices = [device(), device(0x0B07, address=4)]
-    assert len(scan(bench.usb, tmp_path).devices) == 2
+    assert len(scan_usb(bench.usb, tmp_path).devices) == 2
     assert (bench.usb.open_handles, bench.usb.meddled) == (0, [])
     bench.usb.fails = usb.core.USBError("Input/Output Error", -1, 5)
-    assert "Input/Output Error" in scan(bench.usb, tmp_path).error
+    assert "Input/Output Error" in scan_usb(bench.usb, tmp_path).error
 
 
 def test_scan_reports_a_missing_libusb_or_package(monkeypatch: pytest.MonkeyPatch) -> None:
     for package in ("usb.core", "libusb_package"):
         with monkeypatch.context() as patch:
             patch.setitem(sys.modules, package, None)
-            assert package in scan().error
+            assert package in scan_usb().error
     monkeypatch.setattr("libusb_package.get_libusb1_backend", lambda: None)
     for name in ("libusb1", "libusb0", "openusb"):
         monkeypatch.setattr(f"usb.backend.{name}.get_backend", lambda: None)
-    assert scan().error == "No backend available"
+    assert scan_usb().error == "No backend available"
 
 
 def test_scan_of_the_real_bus_has_no_error() -> None:
-    found = scan()
+    found = scan_usb()
     assert found.error == ""
     assert len(found.devices) <= found.total
 
