@@ -1,4 +1,4 @@
-"""Faults of a simulated device: what it delivers of each instant of the world, instead of one good frame."""
+"""Faults of a simulated device: the frames that it delivers of each instant, instead of one good one."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,16 +12,16 @@ from nlos_cam.render import Fault, FaultKind, SensedImages
 
 @dataclass(frozen=True)
 class Delivery:
-    """One frame that a device hands over."""
+    """Frame that a device delivers."""
 
     instant: int
-    """Of the world, 30 a second."""
+    """Index of the world's instant, 30 a second."""
     number: int
-    """As the device counts."""
+    """Number by the device's own count."""
     timestamp_s: float
     images: SensedImages
     streams: tuple[str, ...] = tuple(FORMATS)
-    """Those that it comes on."""
+    """Streams that deliver it."""
 
 
 def _black(images: SensedImages) -> SensedImages:
@@ -42,20 +42,20 @@ def _half_size(images: SensedImages) -> SensedImages:
     return SensedImages(images.depth_z16[::2, ::2], images.ir[::2, ::2], images.confidence[::2, ::2])
 
 
-SPOILED: dict[FaultKind, Callable[[SensedImages], SensedImages]] = {
+IMAGE_FAULTS: dict[FaultKind, Callable[[SensedImages], SensedImages]] = {
     "all_zero": _black,
     "saturated": _saturated,
     "half_invalid": _half_invalid,
     "wrong_size": _half_size,
 }
-"""The faults that change the images."""
+"""Changes to the images, by kind of fault."""
 
 
 class FaultyDevice:
-    """What a device hands over, instant by instant, once `faults` have acted; without any, each instant as it is.
+    """Device with `faults`, which delivers frames instant by instant; without faults, one good frame of each.
 
-    It numbers frames from 0 at the instant that it is plugged in, leaving out those that it does not count. Once
-    unplugged it stays so: what is plugged in again is another one.
+    Stateful: deliver instants in rising order, from one thread. Frames are numbered from 0 at the instant of plugging
+    in, without those that it does not count. Once unplugged it stays so: plugging in again makes another one.
     """
 
     def __init__(self, faults: Sequence[Fault] = (), plugged_in_at: int = 0) -> None:
@@ -64,53 +64,53 @@ class FaultyDevice:
         self._held: list[Delivery] = []
         wraps = [fault.at_frame for fault in faults if fault.kind == "clock_wrap"]
         self.has_own_clock = bool(wraps)
-        """Whether its timestamps are not the host's time: they begin at 0 with it, but for the first, which wraps."""
+        """True if timestamps are on its own clock: 0 when plugged in, except for the first device, which wraps."""
         self._clock_from = plugged_in_at or sum(wraps)
         self.has_other_size = any(fault.kind == "wrong_size" for fault in faults)
 
-    def is_there(self, instant: int) -> bool:
-        """Whether it is still plugged in, and never was unplugged."""
+    def is_connected(self, instant: int) -> bool:
+        """Return True unless it has been unplugged."""
         unplugs = [fault for fault in self._faults if fault.kind == "unplug"]
         return not any(fault.at_frame <= instant and fault.until_frame > self._plugged_in_at for fault in unplugs)
 
     def is_gone(self, instant: int) -> bool:
-        """Whether nothing is plugged in, neither this device nor another in its place."""
-        return self._befallen(instant, "unplug")
+        """Return True while neither this device nor a successor is plugged in."""
+        return self._has_fault(instant, "unplug")
 
     def unplug(self, instant: int, instants: int) -> None:
-        """Unplug it for so long."""
+        """Unplug it for this number of instants."""
         self._faults = (*self._faults, Fault(kind="unplug", at_frame=instant, frames=instants))
 
-    def hand_over(self, instant: int, due_s: float, images: SensedImages) -> list[Delivery]:
-        """The frames of one instant, in the order in which they come; instants rise from call to call."""
+    def deliver(self, instant: int, due_s: float, images: SensedImages) -> list[Delivery]:
+        """Return the frames that come at one instant, in order of arrival."""
         late, self._held = self._held, []
-        if not self.is_there(instant):
+        if not self.is_connected(instant):
             return []
-        if self._befallen(instant, "stall"):
+        if self._has_fault(instant, "stall"):
             self._counted_from += 1
             return late
-        taken = Delivery(instant, instant - self._counted_from, self._timestamp_s(instant, due_s), images)
-        handed = [] if self._befallen(instant, "drops") else [self._spoil(taken, instant)]
+        frame = Delivery(instant, instant - self._counted_from, self._timestamp_s(instant, due_s), images)
+        frames = [] if self._has_fault(instant, "drops") else [self._apply(frame, instant)]
         if self._is_held(instant):
-            self._held = handed
+            self._held = frames
             return late
-        return [*handed * (2 if self._befallen(instant, "duplicate") else 1), *late]
+        return [*frames * (2 if self._has_fault(instant, "duplicate") else 1), *late]
 
     def _timestamp_s(self, instant: int, due_s: float) -> float:
         return (instant - self._clock_from) / FRAMES_PER_S % WRAP_PERIOD_S if self.has_own_clock else due_s
 
-    def _spoil(self, delivery: Delivery, instant: int) -> Delivery:
+    def _apply(self, delivery: Delivery, instant: int) -> Delivery:
         images = delivery.images
         for fault in self._faults:
-            if fault.befalls(instant) and (change := SPOILED.get(fault.kind)):
+            if fault.befalls(instant) and (change := IMAGE_FAULTS.get(fault.kind)):
                 images = change(images)
-        streams = tuple(stream for stream in delivery.streams if not self._befallen(instant, "drops", stream))
+        streams = tuple(stream for stream in delivery.streams if not self._has_fault(instant, "drops", stream))
         return replace(delivery, images=images, streams=streams)
 
     def _is_held(self, instant: int) -> bool:
-        """Whether the next frame comes before it."""
+        """Return True if the next frame is delivered before it."""
         swaps = [fault for fault in self._faults if fault.kind == "out_of_order" and fault.befalls(instant)]
         return any((instant - fault.at_frame) % 2 == 0 for fault in swaps)
 
-    def _befallen(self, instant: int, kind: FaultKind, stream: str | None = None) -> bool:
+    def _has_fault(self, instant: int, kind: FaultKind, stream: str | None = None) -> bool:
         return any(fault.kind == kind and fault.stream == stream and fault.befalls(instant) for fault in self._faults)

@@ -1,7 +1,4 @@
-"""A real Intel RealSense L515.
-
-Setting a running sensor's options within their ranges, and reading back what became of it.
-"""
+"""Camera that is a real Intel RealSense L515, and its options."""
 
 import logging
 from collections.abc import Mapping
@@ -25,21 +22,21 @@ NOT_OFFERED = "not offered by this firmware"
 
 
 class Options:
-    """A sensor's options, by the SDK's names. What the SDK refuses becomes a note, never an exception."""
+    """Options of a running sensor, by the SDK's names; the SDK's refusals are returned as notes, not raised."""
 
     def __init__(self, sensor: Any, sdk: Any) -> None:
         self._sensor, self._sdk = sensor, sdk
 
     def limits(self, name: str) -> PowerLimits | None:
-        """The range that the firmware tells; None where it tells none."""
+        """Return the range that the firmware reports; None where it reports none."""
         try:
-            told = self._sensor.get_option_range(self._option(name))
+            limits = self._sensor.get_option_range(self._option(name))
         except RuntimeError:
             return None
-        return PowerLimits(told.min, told.max, told.step if told.step > 0 else 1.0)
+        return PowerLimits(limits.min, limits.max, limits.step if limits.step > 0 else 1.0)
 
     def get(self, name: str) -> float | None:
-        """The value now; None where it cannot be read."""
+        """Return the present value; None where it cannot be read."""
         option = self._option(name)
         try:
             return float(self._sensor.get_option(option)) if self._sensor.supports(option) else None
@@ -47,7 +44,7 @@ class Options:
             return None
 
     def put(self, name: str, wanted: float) -> str:
-        """Set an option as near as its range allows; what is not as wanted then, empty where all is."""
+        """Set an option to the nearest allowed value, and return the `difference` or why it failed."""
         option = self._option(name)
         if not self._sensor.supports(option):
             return NOT_OFFERED
@@ -60,14 +57,14 @@ class Options:
         return self.difference(name, wanted)
 
     def difference(self, name: str, wanted: float) -> str:
-        """How the value now differs from what is wanted; empty where it does not."""
+        """Describe how the present value differs from the wanted one; empty where it does not."""
         found = self.get(name)
         if found is None:
             return "cannot be read back"
-        return "" if abs(found - wanted) <= TOLERANCE else f"{wanted:g} was wanted, {found:g} is read back"
+        return "" if abs(found - wanted) <= TOLERANCE else f"{wanted:g} was requested, {found:g} is read back"
 
     def put_all(self, wanted: Mapping[str, float]) -> dict[str, str]:
-        """Set options in order; what is not as wanted then, by name."""
+        """Set options in order, and return the differences by name."""
         notes = {name: self.put(name, value) for name, value in wanted.items()}
         return {name: note for name, note in notes.items() if note}
 
@@ -78,9 +75,9 @@ class Options:
 USB3_SIZE: Size = (640, 480)
 USB2_SIZE: Size = (320, 240)
 PRESET = {"global_time_enabled": 1.0, "visual_preset": 5.0}
-"""Timestamps of the host, and short range, whose lower gain does not saturate so near."""
+"""Timestamps on the host's clock, and short range, whose lower gain does not saturate near a wall."""
 MODES_OFF = ("alternate_ir", "enable_ir_reflectivity", "enable_max_usable_range")
-"""Where the firmware has them: IR would mean something else than intensity, and the preset be set to maximum range."""
+"""Modes in which IR is not intensity, or which set the preset to maximum range; not in every firmware."""
 NEAR_WALL = {
     "min_distance": 0.0,
     "confidence_threshold": 1.0,
@@ -89,12 +86,12 @@ NEAR_WALL = {
     "post_processing_sharpening": 0.0,
     "invalidation_bypass": 0.0,
 }
-"""For a wall at 0.15 to 0.30 m, on top of the short-range preset: starting values, to be tuned on a bench."""
+"""Options for a wall at 0.15 to 0.30 m, after the short-range preset: starting values, to be tuned on a bench."""
 PRESET_SETTLES_S = 0.5
 LASER_POWER = "laser_power"
-UNDER_WAY = 3
-"""Sets that may have been taken before the last change."""
-LOOKED_AT = 3
+SETS_IN_FLIGHT = 3
+"""Sets that may have been exposed before the last change."""
+SETS_MEASURED = 3
 LOOK_TIMEOUT_S = 0.5
 
 log = logging.getLogger(__name__)
@@ -102,7 +99,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """What the SDK tells of a connected device; empty where it does not."""
+    """Identity of a connected device; fields that the SDK does not report are empty."""
 
     name: str
     serial: str
@@ -112,12 +109,12 @@ class DeviceInfo:
 
 @cache
 def shared_context(sdk: Any) -> Any:
-    """The one context of this process, for discovery and streaming: two of them fight over a device."""
+    """Return this process's one context, for discovery and streaming: two of them compete for a device."""
     return sdk.context()
 
 
 def connected(sdk: Any, context: Any) -> list[tuple[Any, DeviceInfo]]:
-    """Every device that the SDK sees, but for those that it fails on. Raises CameraError where it fails on all."""
+    """Return every device that the SDK can open. Raises CameraError where it fails on all."""
     found: list[tuple[Any, DeviceInfo]] = []
     failure: RuntimeError | None = None
     try:
@@ -137,30 +134,26 @@ def connected(sdk: Any, context: Any) -> list[tuple[Any, DeviceInfo]]:
 
 
 def _info(device: Any, sdk: Any) -> DeviceInfo:
-    keys = ("name", "serial_number", "firmware_version", "usb_type_descriptor")
-    return DeviceInfo(*(_told(device, getattr(sdk.camera_info, key)) for key in keys))
-
-
-def _told(device: Any, key: Any) -> str:
-    return device.get_info(key) if device.supports(key) else ""
+    names = ("name", "serial_number", "firmware_version", "usb_type_descriptor")
+    keys = [getattr(sdk.camera_info, name) for name in names]
+    return DeviceInfo(*(device.get_info(key) if device.supports(key) else "" for key in keys))
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Every device that the SDK sees now."""
+    """Return every connected device."""
     sdk = load_sdk()
     return [info for _, info in connected(sdk, shared_context(sdk))]
 
 
 class L515Camera(LiveCamera):
-    """An L515 by serial number, or the only one; 640 x 480 at 30 frames/s, 320 x 240 on USB 2.
+    """L515 by serial number, or the only one; 640 x 480 at 30 frames/s, 320 x 240 on USB 2.
 
-    Once it runs, its options are set for a near wall and its laser is turned down until its returns do not saturate;
-    frames come, and a recording begins, when that is done. What the options read then is in `Frame.settings`. Raises
-    CameraNotFoundError.
+    After the start it sets the options for a near wall and lowers the laser power until returns do not saturate; then
+    frames are delivered and recorded. `Frame.settings` holds the options as read back. Raises CameraNotFoundError.
     """
 
     differences: Mapping[str, str]
-    """Options that are not as wanted, and how."""
+    """Options that differ from the wanted values, and how."""
 
     def __init__(
         self,
@@ -181,13 +174,13 @@ class L515Camera(LiveCamera):
         super().__init__(uri, device, size, sdk, recording, clock)
         self.identity: Mapping[str, str] = {key: value for key, value in asdict(info).items() if value}
 
-    def _begin_anew(self) -> None:
-        super()._begin_anew()
+    def _clear_state(self) -> None:
+        super()._clear_state()
         self._laser_power: float | None = None
-        """As it was found, for when the device comes back."""
+        """The power that did not saturate, for when the device comes back."""
 
     def _prepare(self, sensor: Any) -> None:
-        """Preset first, since it changes the others; after start, since starting resets it."""
+        """Set the preset first, since it changes other options, and after the start, which resets it."""
         options = Options(sensor, self._sdk)
         off = {name: 0.0 for name in MODES_OFF if options.get(name) not in {None, 0.0}}
         differences = self._put(options, off | PRESET) | self._put(options, NEAR_WALL)
@@ -198,44 +191,41 @@ class L515Camera(LiveCamera):
         self._turn_down(options)
 
     def _put(self, options: Options, wanted: Mapping[str, float]) -> dict[str, str]:
-        """Set options, twice where they do not hold once the device has settled; how they differ from `wanted` then."""
+        """Set options, again where they did not hold after settling, and return the differences by name."""
         missing = {name: note for name, note in options.put_all(wanted).items() if note == NOT_OFFERED}
-        self._settle()
+        self._clock.wait(self._left, PRESET_SETTLES_S)
         again = {name: value for name, value in wanted.items() if options.difference(name, value)}
         return missing | options.put_all({name: value for name, value in again.items() if name not in missing})
 
-    def _settle(self) -> None:
-        self._clock.wait(self._left, PRESET_SETTLES_S)
-
     def _turn_down(self, options: Options) -> None:
-        """Turn the laser down until its returns do not saturate, from where it was if the device came back."""
+        """Lower the laser power until returns do not saturate, from its last power if the device came back."""
         limits, preset = options.limits(LASER_POWER), options.get(LASER_POWER)
         if limits is None or preset is None:
             return
         power = preset if self._laser_power is None else self._laser_power
         if power != preset:
             options.put(LASER_POWER, power)
-        settled = turn_down(power, limits, self._saturated, lambda lower: not options.put(LASER_POWER, lower))
+        settled = turn_down(power, limits, self._saturated_share, lambda lower: not options.put(LASER_POWER, lower))
         self._laser_power = settled.power
         if settled.power < power:
-            log.warning("%s: laser power %g saturated: turned down to %g", self.uri, power, settled.power)
+            log.warning("%s: laser power lowered from %g to %g: returns saturated", self.uri, power, settled.power)
         if (settled.saturated or 0.0) > MAX_SATURATED:
             log.warning(
-                "%s: %.1f %% of the infrared image is saturated at laser power %g: go farther from the wall, or tilt "
+                "%s: %.1f %% of the infrared image is saturated at laser power %g: move away from the wall, or tilt "
                 "the camera by 5 to 15 degrees",
                 self.uri,
                 100 * (settled.saturated or 0.0),
                 settled.power,
             )
 
-    def _saturated(self) -> float | None:
-        """The share of saturated pixels now; None where no frames come."""
+    def _saturated_share(self) -> float | None:
+        """Return the share of saturated pixels now; None where no frames come."""
         shares: list[float] = []
-        for index in range(UNDER_WAY + LOOKED_AT):
+        for index in range(SETS_IN_FLIGHT + SETS_MEASURED):
             found = self._session.look(LOOK_TIMEOUT_S) if self._session else None
             if found is None:
                 return None
-            shares += [saturated_share(found.ir)] if index >= UNDER_WAY else []
+            shares += [saturated_share(found.ir)] if index >= SETS_IN_FLIGHT else []
         return sum(shares) / len(shares)
 
     def _is_connected(self) -> bool:
@@ -249,17 +239,17 @@ class L515Camera(LiveCamera):
         self._device.hardware_reset()
 
     def _begin(self, inbox: SampleQueue) -> None:
-        """It runs already."""
+        """Do nothing: the device runs already."""
 
     def _end(self) -> None:
-        """It needs nothing."""
+        """Do nothing."""
 
     def _truth_depth_m(self, number: int) -> Float32 | None:  # noqa: ARG002  a real device does not know
         return None
 
 
 def find_l515(sdk: Any, context: Any, serial: str) -> tuple[Any, DeviceInfo]:
-    """The one L515 that is meant, by serial number, or the only one. Raises CameraNotFoundError with what to check."""
+    """Return the L515 with this serial number, or the only one. Raises CameraNotFoundError with advice."""
     there = connected(sdk, context)
     lidars = [(device, info) for device, info in there if "L515" in info.name]
     chosen = [(device, info) for device, info in lidars if serial in {"", info.serial}]
@@ -267,10 +257,10 @@ def find_l515(sdk: Any, context: Any, serial: str) -> tuple[Any, DeviceInfo]:
         return chosen[0]
     if chosen:
         names = ", ".join(f"l515:{info.serial}" for _, info in chosen)
-        raise CameraNotFoundError(f"{len(chosen)} L515s are connected: say which ({names})")
-    seen = ", ".join(f"{info.name} {info.serial}".strip() for _, info in there) or "no device"
+        raise CameraNotFoundError(f"{len(chosen)} L515s are connected: choose one ({names})")
+    present = ", ".join(f"{info.name} {info.serial}".strip() for _, info in there) or "no device"
     wanted = f"L515 with serial {serial}" if serial else "L515"
     raise CameraNotFoundError(
-        f"no {wanted} found (librealsense sees {seen}): check the USB 3 cable and port, and run `nlos-cam doctor`, "
-        "which says what else may hide it; without a camera, use --camera sim"
+        f"no {wanted} found (librealsense sees {present}): check the USB 3 cable and port, and run `nlos-cam doctor`, "
+        "which checks driver and permissions; without a camera, use --camera sim"
     )

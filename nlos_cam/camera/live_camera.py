@@ -1,10 +1,10 @@
-"""What the simulated camera and a real one share: everything but where the device comes from."""
+"""Base of the live cameras, simulated and real: everything but the source of the device."""
 
 import atexit
 import logging
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from threading import Event, RLock
 from typing import Any, Self
 
@@ -24,12 +24,12 @@ log = logging.getLogger(__name__)
 
 
 class LiveCamera(ABC):
-    """A device that delivers frames from entering to leaving, recorded meanwhile if a `Recording` is given.
+    """Device that delivers frames from entering to leaving, and records them if a `Recording` is given.
 
-    Iterating goes on until the camera is left, by whichever thread, or the recording is full. When no whole set comes
-    for `silence_s`, `Recovery` makes the device deliver again, and `Continuity` numbers what follows; a recording ends
-    there, whole, since the device's numbers begin anew. Raises CameraLostError where nothing helps, or at once where
-    the recording that ends is not `optional`.
+    Iterating goes on until any thread leaves the camera, or the recording is full. When no whole set comes for
+    `silence_s`, `Recovery` restarts the device and `Continuity` renumbers its frames; a recording is closed there,
+    whole, since the device restarts its numbers. Raises CameraLostError where recovery fails, or at once where that
+    recording is not `optional`.
     """
 
     intrinsics: Intrinsics
@@ -43,18 +43,18 @@ class LiveCamera(ABC):
         self.counts: Counter[str] = Counter()
         self.silence_s = 5.0
         self.replug_s = 60.0
-        """How long a device that was unplugged is waited for."""
+        """Time to wait for a device that was unplugged."""
         self._device, self._size, self._sdk, self._recording = device, size, sdk, recording
         self._clock: Clock = clock or WallClock()
         self._session: Session | None = None
         self._changing = RLock()
-        """Held while streams start or stop: one thread iterates, and another may leave."""
+        """Held while streams start or stop: one thread iterates, another may leave."""
         self._entered = False
-        self._begin_anew()
-        self._cured(self._start)
+        self._clear_state()
+        self._start_cured()
 
-    def _begin_anew(self) -> None:
-        """Nothing was seen yet."""
+    def _clear_state(self) -> None:
+        """Reset counts and state to those of a camera not yet entered."""
         self.incomplete = self.dropped = 0
         self.counts.clear()
         self._past_incomplete = self._past_dropped = 0
@@ -62,34 +62,34 @@ class LiveCamera(ABC):
         self._continuity = Continuity()
         self._left = Event()
         self._recovery: Recovery | None = None
-        """Of the silence under way, and only then: it and the camera refer to each other, which frees a device late."""
+        """Set only during a silence: it and the camera refer to each other, which would free a device late."""
 
     @abstractmethod
     def _prepare(self, sensor: Any) -> None:
-        """Set up the sensor, which runs; no frame is delivered or recorded before this is done."""
+        """Set up the running sensor; frames are delivered and recorded only after this."""
 
     @abstractmethod
     def _begin(self, inbox: SampleQueue) -> None:
-        """Frames may come now."""
+        """Note that frames may be delivered from now on."""
 
     @abstractmethod
     def _end(self) -> None:
-        """No more frames are wanted."""
+        """Note that no more frames are wanted."""
 
     def _is_connected(self) -> bool:
-        """Whether the device is still there."""
+        """Return True while the device is connected."""
         return True
 
     def _reconnect(self) -> Any | None:
-        """The device anew, when it is there or has come back; None while it is not."""
+        """Return a handle of the device; None while it is not connected."""
         return self._device
 
-    def _reset(self) -> None:  # noqa: B027  a device that cannot be reset is only restarted
-        """Make the device start afresh, as by unplugging it; it vanishes and comes back."""
+    def _reset(self) -> None:  # noqa: B027  a device without a reset is only restarted
+        """Reset the device, as by unplugging it: it vanishes and comes back."""
 
     @abstractmethod
     def _truth_depth_m(self, number: int) -> Float32 | None:
-        """The hidden depth at a frame, by the device's own number, where it is known."""
+        """Return the hidden depth at a frame, by the device's own number, if known."""
 
     def _new_session(self) -> Session:
         try:
@@ -101,10 +101,10 @@ class LiveCamera(ABC):
         width, height = self._size
         raise CameraError(f"{self.uri} offers no {' and no '.join(missing)} at {width} x {height}, 30 frames/s")
 
-    def _cured(self, start: Callable[[], None]) -> None:
-        """Start; where the device has lost its calibration, once more after a reset."""
+    def _start_cured(self) -> None:
+        """Start; if the device lost its calibration, once more after a reset."""
         try:
-            start()
+            self._start()
         except (RuntimeError, CameraError) as error:
             if NO_INTRINSICS not in str(error) or not self._new_recovery().reset():
                 raise
@@ -114,21 +114,21 @@ class LiveCamera(ABC):
         return Recovery(self.uri, hooks, self._clock, self._left, self.counts)
 
     def __enter__(self) -> Self:
-        self._begin_anew()
+        self._clear_state()
         self._entered = True
         try:
-            self._cured(self._start)
+            self._start_cured()
         except RuntimeError as error:
             self._abandon()
-            raise CameraError(f"{self.uri} does not start ({error}): close what else uses it, or replug it") from error
+            raise CameraError(f"{self.uri} does not start ({error}): close other programs, or replug it") from error
         except BaseException:
             self._abandon()
             raise
-        atexit.register(self._leave)  # for a program that ends without leaving: the SDK's threads would crash it
+        atexit.register(self._leave)  # the SDK's threads would crash a program that ends without leaving
         return self
 
     def _start(self, device: Any | None = None) -> None:
-        """Start the streams, of another device if given; before entering, only check that they could be."""
+        """Start the streams, of another device if given; before entering, only check that they exist."""
         with self._changing:
             self._device = device or self._device
             session = self._new_session()
@@ -144,16 +144,16 @@ class LiveCamera(ABC):
                 raise
 
     def _record(self) -> None:
-        """The settings hold: the SDK's recorder takes to a sensor that runs."""
+        """Start recording, once the settings hold: the SDK's recorder can join a running sensor."""
         if self._recording:
-            # never paused meanwhile: the SDK then stamps frames out of order when it resumes
+            # not paused before: the SDK then stamps frames out of order when it resumes
             self._recording.begin(self._device, self._sdk)
 
     def __exit__(self, *_: object) -> None:
         self._leave()
 
     def _leave(self) -> None:
-        """Stop, and end an iteration under way; again does nothing."""
+        """Stop, and end an iteration in another thread; without effect if repeated."""
         atexit.unregister(self._leave)
         self._left.set()
         if session := self._session:
@@ -170,7 +170,7 @@ class LiveCamera(ABC):
             self._stop()
 
     def _stop(self) -> None:
-        """Stop the streams, which may be started again; what was counted stays so."""
+        """Stop the streams, which may be started again, and keep the counts."""
         with self._changing:
             self._end()
             if self._session:
@@ -181,9 +181,9 @@ class LiveCamera(ABC):
                 self._recording.close()
 
     def _count_session(self, inbox: SampleQueue) -> None:
-        told = self.incomplete + self.dropped
+        before = self.incomplete + self.dropped
         self._count(inbox)
-        self._continuity.restart(counted=self.incomplete + self.dropped - told)
+        self._continuity.restart(counted=self.incomplete + self.dropped - before)
         self._past_incomplete += inbox.incomplete
         self._past_dropped += inbox.dropped
         self._past_counts += inbox.counts
@@ -200,13 +200,13 @@ class LiveCamera(ABC):
         left = self._left
         while not left.is_set() and (session := self._session):
             if found := session.inbox.take(self.silence_s):
-                yield self._passed_on(session, found)
+                yield self._next_frame(session, found)
             elif session.inbox.ended:
                 break
             else:
                 self._recover(session.inbox)
 
-    def _passed_on(self, session: Session, found: FrameSet) -> Frame:
+    def _next_frame(self, session: Session, found: FrameSet) -> Frame:
         self._recovery = None
         frame = session.frame(found, self._truth_depth_m(found.number))
         frame = self._continuity.add(frame, self._clock.now())
@@ -222,7 +222,7 @@ class LiveCamera(ABC):
         self._recovery.recover(silence, self.replug_s)
 
     def _end_recording(self, silence: str) -> None:
-        """Close a recording that holds something; one that does not begins anew with the streams."""
+        """Close a recording that holds frames; an empty one starts again with the streams."""
         recording = self._recording
         if not recording or not recording.sets:
             return
@@ -230,8 +230,8 @@ class LiveCamera(ABC):
         self._stop()
         self._recording = None
         if not recording.optional:
-            raise CameraLostError(f"{silence}: the recording ends there, whole; replug the camera and record again")
-        log.warning("%s: the recording ends there, whole, after %d frames", silence, recording.sets)
+            raise CameraLostError(f"{silence}: the recording is closed, and whole; replug the camera and record again")
+        log.warning("%s: the recording is closed, whole, after %d frames", silence, recording.sets)
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
         return session.telemetry(ending) if (session := self._session) else {}

@@ -1,9 +1,4 @@
-"""Recording a live camera to .bag, until it is full, or the disk is: one take, or several in a row.
-
-Room on the disk that a recording is written to: what it may need, what is free, whether a file can still grow.
-
-librealsense's recorder of one device to one .bag, paused and closed so that a full disk cannot end the program.
-"""
+"""Recording of a live camera to .bag files, in one take or several, up to a length or until the disk is full."""
 
 import ctypes
 import gc
@@ -23,49 +18,48 @@ from nlos_cam.camera.streams import BYTES_PER_PIXEL, FRAMES_PER_S, SAME_INSTANT_
 from nlos_cam.errors import DiskFullError, RecordingError
 
 RESERVE_BYTES = 200_000_000
-"""A recording stops before less than this is free: five seconds of 640 x 480, and what its index takes."""
+"""Disk space that a recording leaves free: five seconds of 640 x 480, and its index."""
 CHUNK_BYTES = 4_000_000
-"""More than a recording keeps back before it writes: librealsense writes in pieces of 0.75 MB."""
+"""Upper bound of what the SDK has buffered; it writes in chunks of 0.75 MB."""
 INDEX_SHARE = 1e-3
-"""Of a recording's size: more than its index at the end takes."""
+"""Upper bound of the index at the end, as a share of the recording."""
 
 
 def bytes_per_frame(intrinsics: Intrinsics) -> int:
-    """The most that a frame of three streams takes: librealsense compresses, but by how much is not known ahead."""
+    """Return the uncompressed size of a frame of three streams; the compression is not known in advance."""
     return intrinsics.width * intrinsics.height * sum(BYTES_PER_PIXEL.values())
 
 
 def free_bytes(path: Path) -> int:
-    """What is free on the disk of `path`, a file that may not exist yet in a folder that does."""
+    """Return the free space of the disk of `path`, a file that need not exist in a folder that does."""
     return shutil.disk_usage(path.absolute().parent).free
 
 
 def recording_s(intrinsics: Intrinsics, free: int) -> float:
-    """How long a recording lasts, at least, until only the reserve is left."""
+    """Return the shortest time in s until a recording leaves only the reserve."""
     return max(0, free - RESERVE_BYTES) / (bytes_per_frame(intrinsics) * FRAMES_PER_S)
 
 
 def check_room(path: Path, intrinsics: Intrinsics, frames: int, free: int) -> None:
-    """Raise DiskFullError where so many frames may not fit, and leave the reserve."""
+    """Raise DiskFullError unless this number of frames fits and leaves the reserve."""
     needed = frames * bytes_per_frame(intrinsics)
     if free < needed + RESERVE_BYTES:
         size = f"{intrinsics.width} x {intrinsics.height}"
         raise DiskFullError(
-            f"{path}: {frames} frames of {size} may need {needed / 1e9:.2f} GB (uncompressed; how far they compress is "
-            f"not known ahead) beside {RESERVE_BYTES / 1e9:.1f} GB that stay free, and {free / 1e9:.2f} GB are free: "
-            "make room, record less, or name a --out on another disk"
+            f"{path}: {frames} frames of {size} need up to {needed / 1e9:.2f} GB, {RESERVE_BYTES / 1e9:.1f} GB must "
+            f"stay free, and {free / 1e9:.2f} GB are free: free space, record less, or choose --out on another disk"
         )
 
 
 def closing_bytes(path: Path) -> int:
-    """More than closing a recording adds to it."""
+    """Return an upper bound of the bytes that closing a recording adds to it."""
     return CHUNK_BYTES + int(path.stat().st_size * INDEX_SHARE)
 
 
 def can_grow(path: Path, by_bytes: int) -> bool:
-    """Whether a file can, tried on the file itself: a quota or a size limit shows nowhere else.
+    """Return True if a file can grow, by trying: quotas and size limits show nowhere else.
 
-    It has its old length afterwards. Nobody may write to it meanwhile.
+    It has its old length afterwards. Nothing else may write to it during the call.
     """
     length = path.stat().st_size
     try:
@@ -82,18 +76,18 @@ def can_grow(path: Path, by_bytes: int) -> bool:
 
 
 STILL_S = 5.0
-"""A file that has not grown for so long while frames came is not written any more."""
+"""Time without growth, while frames come, after which the SDK has failed to write."""
 FLUSH_S = 9.0
 """A pause that took longer gave up (after 10 s) before everything was written."""
-FLUSHES = 30
-"""Pauses until a disk is taken for one that takes nothing any more (5 minutes)."""
+MAX_FLUSHES = 30
+"""Pauses, of 10 s each, until the disk counts as unable to write."""
 
 
 class SdkRecorder:
-    """Records what `device` delivers from now on. Raises RecordingError where nothing can be written.
+    """librealsense's recorder of one device to one .bag, from construction to `close`.
 
-    librealsense's recorder goes on quietly when it cannot write. It would tell in a notification, but whoever listens
-    to those from Python locks up when a device is stopped or vanishes in the middle of one: the file is watched.
+    The SDK's recorder ignores failed writes. Listening to its notifications from Python deadlocks when a device stops
+    or vanishes during one, so `watch` checks the file instead. Raises RecordingError where nothing can be written.
     """
 
     def __init__(
@@ -106,7 +100,7 @@ class SdkRecorder:
     ) -> None:
         self.path = path
         self.failure: str | None = None
-        """Why it could not write."""
+        """Reason of a failed write."""
         self._now, self._grew_s, self._bytes = now, now(), 0
         try:
             path.unlink(missing_ok=True)
@@ -115,20 +109,20 @@ class SdkRecorder:
             raise RecordingError(f"{path} cannot be written ({error}): choose another --out") from error
 
     def watch(self) -> None:
-        """Look whether the file grows, about once a second, while frames come."""
+        """Check that the file grows; call about once a second while frames come."""
         if (size := self.path.stat().st_size) != self._bytes:
             self._bytes, self._grew_s = size, self._now()
         elif self._now() - self._grew_s > STILL_S:
-            self.failure = f"nothing was written for {STILL_S:.0f} s"
+            self.failure = f"nothing written for {STILL_S:.0f} s"
 
     def pause(self) -> None:
-        """Record nothing more. What came is written before this returns, if the disk takes it."""
+        """Stop recording. Frames so far are written before this returns, if the disk has room."""
         self._recorder.pause()
 
     def close(self) -> None:
-        """Write the index and close the file: the SDK does when nothing refers to its recorder any more.
+        """Write the index and close the file, which the SDK does on deleting its recorder.
 
-        Raises DiskFullError where it cannot be written: the SDK would end the program if it tried.
+        Raises DiskFullError where there is no room for it: the SDK would abort the program.
         """
         self._flush()
         if self.failure is None and not can_grow(self.path, closing_bytes(self.path)):
@@ -139,34 +133,35 @@ class SdkRecorder:
         gc.collect()
 
     def _flush(self) -> None:
-        for _ in range(FLUSHES):
+        for _ in range(MAX_FLUSHES):
             start_s = self._now()
             self.pause()
             if self.failure or self._now() - start_s < FLUSH_S:
                 return
-        self.failure = "the disk takes nothing any more"
+        self.failure = "the disk no longer accepts data"
 
     def _abandon(self) -> None:
-        """Leave the file as it is. Raises DiskFullError."""
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recorder))  # not even the program's end destroys it
+        """Raise DiskFullError, and leave the file as it is."""
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recorder))  # never deleted, not even at exit
         self._recorder = None
         raise DiskFullError(
-            f"{self.path} could not be written to its end ({self.failure}): free some space, and get back what is "
-            f"there with `{repair_command(self.path)}`"
+            f"{self.path} could not be completed ({self.failure}): free some space, and recover its frames with "
+            f"`{repair_command(self.path)}`"
         )
 
 
 BOUNDARY_WAIT_S = 1.0
-"""How long to wait for the set in flight, so that no stream has one frame more than another."""
+"""Time to wait for the set in flight, so that no stream has one frame more than another."""
 
 log = logging.getLogger(__name__)
 
 
 class Recording:
-    """A recording to be made: where to, and when it is full (never, unless `frames` or `seconds` says).
+    """Recording of a camera to `path`, up to a number of `frames` or `seconds`, if given.
 
-    Give it to `open_camera`; the camera begins it on entering and closes it on leaving. One that is not the `last`
-    take leaves the camera running when it is full, and `next_take` records on.
+    Give it to `open_camera`: the camera begins it on entering and closes it on leaving. One that is not the `last` take
+    leaves the camera running when it is full, until `next_take`. `add` is called on an SDK thread, the rest by the
+    thread that iterates over the camera.
     """
 
     def __init__(
@@ -181,13 +176,13 @@ class Recording:
     ) -> None:
         self.path = path
         self.optional = optional
-        """Whether a camera goes on without it when it ends early: the device fell silent, or the disk is full."""
+        """True if the camera goes on without it when it ends early, by a silent device or a full disk."""
         self.sets = 0
-        """Complete sets of streams in this take so far, from the first that a reader of the camera sees."""
+        """Complete sets in this take so far, from the first that the camera yields."""
         self.begun = False
-        """Whether the file is this take's, and not what it may replace."""
+        """True once the file is this take's, and no longer the one it replaces."""
         self.disk_full = False
-        """Whether it stopped because little was left on the disk."""
+        """True if it stopped for want of disk space."""
         self._frames, self._seconds, self._last, self._free = frames, seconds, last, free
         self._before_s, self._first_s, self._last_s = float("-inf"), 0.0, 0.0
         self._stopping, self._paused = Event(), Event()
@@ -196,16 +191,13 @@ class Recording:
         self._recorder: SdkRecorder | None = None
 
     def begin(self, device: Any, sdk: Any) -> None:
-        """Wrap `device`: what its sensors deliver is recorded.
-
-        Raises RecordingError where nothing can be written.
-        """
+        """Record the device's streams. Raises RecordingError where nothing can be written."""
         self._source = device, sdk
         self._recorder = SdkRecorder(self.path, device, sdk)
         self.begun = True
 
     def next_take(self, path: Path, *, last: bool) -> None:
-        """Record on to `path`, from the next set, after this take was closed: device and settings stay as they are.
+        """Record to `path` from the next set on, with the same device and settings, after this take was closed.
 
         Raises RecordingError where nothing can be written.
         """
@@ -223,7 +215,7 @@ class Recording:
             self._changed.set()
 
     def add(self, found: FrameSet) -> bool:
-        """Note a set as it passes, on an SDK thread; True when nothing more is recorded, in this take or a next."""
+        """Count a passing set, on an SDK thread; return True once no more is recorded, in this or a later take."""
         if self._changing.is_set():
             self._before_s = found.timestamp_s
             self._at_boundary.set()
@@ -237,12 +229,12 @@ class Recording:
         self._first_s = found.timestamp_s if self.sets == 0 else self._first_s
         self._last_s = found.timestamp_s
         self.sets += 1
-        self.disk_full = self.sets % FRAMES_PER_S == 1 and self._is_disk_full(recorder)  # looked at once a second
+        self.disk_full = self.sets % FRAMES_PER_S == 1 and self._is_disk_full(recorder)  # checked once a second
         if self.disk_full or self._is_full(found.timestamp_s) or self._stopping.is_set():
-            recorder.pause()  # queued behind the frames seen so far: none of them is lost
+            recorder.pause()  # queued behind the frames so far: none of them is lost
             self._paused.set()
         if self.disk_full and self.optional:
-            log.warning("%s: the disk is full, and the recording ends after %d frames", self.path, self.sets)
+            log.warning("%s: disk full, the recording ends after %d frames", self.path, self.sets)
 
     def _is_disk_full(self, recorder: SdkRecorder) -> bool:
         recorder.watch()
@@ -256,22 +248,22 @@ class Recording:
 
     @property
     def done(self) -> bool:
-        """Whether nothing more is recorded in this take."""
+        """True once no more is recorded in this take."""
         return self._paused.is_set()
 
     def covers(self, timestamp_s: float) -> bool:
-        """Whether a frame that a reader got now is in this take: some may have waited for their reader since before."""
+        """Return True if a frame is in this take: those yielded now may have queued since before it."""
         return self._before_s < timestamp_s and (not self.done or timestamp_s <= self._last_s)
 
     def stop(self) -> None:
-        """Record until the set in flight is whole, and no further; the device still runs."""
+        """Stop after the set in flight; the device still runs."""
         self._stopping.set()
         if self._recorder and not self._paused.wait(BOUNDARY_WAIT_S):
             self._recorder.pause()
             self._paused.set()
 
     def close(self) -> None:
-        """Write the index and close the file. Raises DiskFullError where that cannot be; an optional one warns."""
+        """Write the index and close the file. Raises DiskFullError without room; if optional, warns instead."""
         recorder, self._recorder = self._recorder, None
         try:
             if recorder:
@@ -283,5 +275,5 @@ class Recording:
 
 
 def repair_command(path: Path) -> str:
-    """What to type to have a recording repaired, into the current folder."""
+    """Return the command that repairs a recording into the current folder."""
     return f"nlos-cam repair {quote(str(path))} --out {quote(f'{path.stem}-repaired.bag')}"

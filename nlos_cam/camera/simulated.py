@@ -1,7 +1,4 @@
-"""The simulated L515: a rendered world with a thin device in front of it.
-
-A lidar that librealsense takes for a device, and that delivers what is pushed into it.
-"""
+"""Simulated L515: a rendered world behind a software device of librealsense."""
 
 from collections.abc import Collection, Mapping, Sequence
 from threading import Event, Thread
@@ -28,11 +25,11 @@ SENSOR_NAME = "L500 Depth Sensor"
 
 
 class SoftwareLidar:
-    """An `rs.software_device` with the L515's depth sensor: same sensor name, streams, formats and depth unit.
+    """`rs.software_device` with the L515's depth sensor, which delivers the images pushed into it.
 
-    It streams at one size; one that `has_other_size` can also be made to deliver frames of half the rows and columns.
-    Its timestamps are the host's time, unless it `has_own_clock`. Its options are its depth unit and the temperatures
-    `celsius`, by the SDK's names, which stay as they are given.
+    It has the L515's sensor name, streams, formats and depth unit, and streams at one size; with `has_other_size` also
+    at half the rows and columns. Timestamps are host time, or the device's with `has_own_clock`. Its options are the
+    depth unit and the temperatures `celsius`, by the SDK's names, which stay constant.
     """
 
     def __init__(
@@ -63,23 +60,23 @@ class SoftwareLidar:
         self._register_extrinsics()
 
     def _add(self, stream: str, size: Intrinsics) -> Any:
-        made = self._sdk.video_stream()
-        made.type, made.index, made.uid = getattr(self._sdk.stream, stream), 0, len(self._profiles)
-        made.width, made.height, made.fps = size.width, size.height, FRAMES_PER_S
-        made.bpp, made.fmt = BYTES_PER_PIXEL[stream], getattr(self._sdk.format, FORMATS[stream])
-        made.intrinsics = self._sdk_intrinsics(size)
-        is_default = made.uid < len(FORMATS)
-        return self._sdk.video_stream_profile(self._sensor.add_video_stream(made, is_default))
+        video = self._sdk.video_stream()
+        video.type, video.index, video.uid = getattr(self._sdk.stream, stream), 0, len(self._profiles)
+        video.width, video.height, video.fps = size.width, size.height, FRAMES_PER_S
+        video.bpp, video.fmt = BYTES_PER_PIXEL[stream], getattr(self._sdk.format, FORMATS[stream])
+        video.intrinsics = self._sdk_intrinsics(size)
+        is_default = video.uid < len(FORMATS)
+        return self._sdk.video_stream_profile(self._sensor.add_video_stream(video, is_default))
 
-    def _sdk_intrinsics(self, mine: Intrinsics) -> Any:
-        made = self._sdk.intrinsics()
-        made.width, made.height = mine.width, mine.height
-        made.fx, made.fy, made.ppx, made.ppy = mine.fx, mine.fy, mine.ppx, mine.ppy
-        made.model, made.coeffs = self._sdk.distortion.none, [0.0] * 5
-        return made
+    def _sdk_intrinsics(self, pinhole: Intrinsics) -> Any:
+        lens = self._sdk.intrinsics()
+        lens.width, lens.height = pinhole.width, pinhole.height
+        lens.fx, lens.fy, lens.ppx, lens.ppy = pinhole.fx, pinhole.fy, pinhole.ppx, pinhole.ppy
+        lens.model, lens.coeffs = self._sdk.distortion.none, [0.0] * 5
+        return lens
 
     def _register_extrinsics(self) -> None:
-        """All streams are seen from one place; without saying so, playback fails."""
+        """Declare that all streams share one origin; without it, playback fails."""
         same = self._sdk.extrinsics()
         same.rotation, same.translation = np.eye(3).ravel().tolist(), [0.0] * 3
         for one in self._profiles.values():
@@ -90,40 +87,40 @@ class SoftwareLidar:
     def push(
         self, number: int, timestamp_s: float, images: SensedImages, streams: Collection[str] = tuple(FORMATS)
     ) -> None:
-        """Deliver one instant on its streams, at the size of its images; only while the sensor streams."""
+        """Deliver one instant on `streams`, at the size of its images; only while the sensor streams."""
         pixels = {"depth": images.depth_z16, "infrared": images.ir, "confidence": images.confidence << 4}
         for (stream, shape), profile in self._profiles.items():
             if stream in streams and shape == images.ir.shape:
                 self._push(profile, stream, number, timestamp_s, pixels[stream])
 
     def _push(self, profile: Any, stream: str, number: int, timestamp_s: float, pixels: NDArray[Any]) -> None:
-        frame = self._sdk.software_video_frame()  # a new one each time: a pushed frame belongs to the SDK
+        frame = self._sdk.software_video_frame()  # a new one each time: the SDK owns a pushed frame
         frame.pixels, frame.bpp = np.ascontiguousarray(pixels), BYTES_PER_PIXEL[stream]
         frame.stride = pixels.shape[1] * BYTES_PER_PIXEL[stream]
         frame.timestamp, frame.frame_number = timestamp_s * 1e3, number
-        frame.domain, frame.profile = self._domain, profile  # of its size: the SDK reads as many pixels as that says
+        frame.domain, frame.profile = self._domain, profile  # of its size: the SDK reads that number of pixels
         self._sensor.on_video_frame(frame)
 
 
-MAX_LATENESS = FRAMES_PER_S
-"""Frames that a world may deliver late, when the machine is busy; beyond that it drops numbers."""
+MAX_LATE_FRAMES = FRAMES_PER_S
+"""Lateness in frames, on a busy machine, beyond which the world drops numbers."""
 JOIN_TIMEOUT_S = 5.0
 RESET_INSTANTS = FRAMES_PER_S
-"""How long a device that is reset is gone."""
+"""Instants for which a device that is reset is disconnected."""
 EXPOSED_AHEAD_S = 0.5 / FRAMES_PER_S
-"""A frame is exposed from so long before it is due, or as much longer as exposing takes: a real device needs no
-processor for it, and the one that was delivered last is being reconstructed before then."""
-REMEMBERED = 1000
-"""Frames of which the instant is known, for their truth; a reader is never as late as that."""
+"""Least time before a frame is due at which its exposure is computed: late, since a real device needs no processor for
+it and the last frame is still being reconstructed, and twice the time of the last exposure if that is longer."""
+MAX_TRUTHS = 1000
+"""Frames whose instant is remembered for their ground truth; no reader is that late."""
 
 
 class SimulatedCamera(LiveCamera):
-    """A world seen through librealsense's software device, 30 frames/s, with the `faults` that it is given.
+    """Camera on a world through librealsense's software device, at 30 frames/s, with the given `faults`.
 
-    The world begins when the camera is entered, and goes on whatever befalls the device. The device does not model:
-    the seconds that a start takes, options and presets (it tells its depth unit and its temperatures), other
-    resolutions, the colour camera and the motion sensors, per-frame metadata, clock drift and jitter, and no fault that
-    it is not given; one that is unplugged does not cool. The world's docstrings say what the images do not model.
+    A thread of its own delivers frames while entered; the world goes on through faults of the device. Not modeled: the
+    seconds that a start takes, options and presets beyond depth unit and temperatures, other resolutions, the color
+    camera and motion sensors, per-frame metadata, clock drift and jitter, faults that are not given, and the cooling of
+    an unplugged device. `World` and `Sensor` say what the images do not model.
     """
 
     def __init__(
@@ -136,7 +133,7 @@ class SimulatedCamera(LiveCamera):
         faults: Sequence[Fault] = (),
     ) -> None:
         self._world, self._clock, self._faults = world, clock or WallClock(), tuple(faults)
-        world.images(0)  # compiles, which would make the first frames late
+        world.images(0)  # compile now: it would delay the first frames
         self._stopping = Event()
         self._thread: Thread | None = None
         self._start_s: float | None = None
@@ -162,7 +159,7 @@ class SimulatedCamera(LiveCamera):
         )
 
     def _prepare(self, sensor: Any) -> None:
-        """Nothing to set."""
+        """Do nothing: there is nothing to set."""
 
     def _begin(self, inbox: SampleQueue) -> None:
         first = self._instant() + 1 if self._start_s is not None else 0
@@ -181,15 +178,15 @@ class SimulatedCamera(LiveCamera):
         self._thread = None
 
     def _instant(self) -> int:
-        """The world's instant that is now."""
+        """Return the index of the world's present instant."""
         return int((self._clock.now() - self._start_s) * FRAMES_PER_S) if self._start_s is not None else 0
 
     def _is_connected(self) -> bool:
-        return self._model.is_there(self._instant())
+        return self._model.is_connected(self._instant())
 
     def _reconnect(self) -> Any | None:
         instant = self._instant()
-        if not self._model.is_there(instant):
+        if not self._model.is_connected(instant):
             if self._model.is_gone(instant):
                 return None
             self._plug_in(instant)
@@ -203,34 +200,34 @@ class SimulatedCamera(LiveCamera):
         return None if instant is None else self._world.truth_depth_m(instant)
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
-        """What the device tells, its temperatures those of the world's instant: the SDK keeps the first."""
-        told, celsius = super().telemetry(ending), self._world.celsius(self._instant())
-        return {name: celsius.get(name, value) for name, value in told.items()}
+        """Return the options with the temperatures of the present instant; the SDK's own stay constant."""
+        options, celsius = super().telemetry(ending), self._world.celsius(self._instant())
+        return {name: celsius.get(name, value) for name, value in options.items()}
 
     def _run(self, inbox: SampleQueue, first: int) -> None:
         try:
             self._deliver(first)
-        except Exception as error:  # noqa: BLE001  whatever it is, it is for the consumer's thread
+        except Exception as error:  # noqa: BLE001  any error is raised in the consumer's thread
             inbox.finish(error)
 
     def _deliver(self, instant: int) -> None:
-        """Expose each instant ahead, and hand over what the device makes of it when it is due."""
+        """Expose each instant ahead of time, and deliver the device's frames when it is due."""
         start_s, ahead_s = self._start_s or 0.0, EXPOSED_AHEAD_S
         while True:
             due_s = start_s + instant / FRAMES_PER_S
             if self._clock.wait(self._stopping, due_s - ahead_s - self._clock.now()):
                 return
-            begun_s, images = self._clock.now(), self._world.images(instant)
-            ahead_s = max(EXPOSED_AHEAD_S, 2 * (self._clock.now() - begun_s))
+            exposure_s, images = self._clock.now(), self._world.images(instant)
+            ahead_s = max(EXPOSED_AHEAD_S, 2 * (self._clock.now() - exposure_s))
             if self._clock.wait(self._stopping, due_s - self._clock.now()):
                 return
-            for delivery in self._model.hand_over(instant, due_s, images):
+            for delivery in self._model.deliver(instant, due_s, images):
                 self._push(delivery)
             late = int((self._clock.now() - start_s) * FRAMES_PER_S) - instant
-            instant += max(1, late - MAX_LATENESS)
+            instant += max(1, late - MAX_LATE_FRAMES)
 
     def _push(self, delivery: Delivery) -> None:
         self._instants[delivery.number] = delivery.instant
-        if len(self._instants) > REMEMBERED:
+        if len(self._instants) > MAX_TRUTHS:
             del self._instants[next(iter(self._instants))]
         self._lidar.push(delivery.number, delivery.timestamp_s, delivery.images, delivery.streams)

@@ -1,6 +1,6 @@
-"""The world that a simulated camera sees: a scene's loop of poses, rendered ahead and cached; the sensor is live."""
+"""World of a simulated camera: a scene's loop of poses, pre-rendered and cached; the sensor model runs live."""
 
-import os
+import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from zipfile import BadZipFile
@@ -10,7 +10,7 @@ from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
 
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.files import cache_folder
+from nlos_cam.files import atomic_file, cache_folder
 from nlos_cam.render import (
     MultiBounce,
     SceneFile,
@@ -23,9 +23,11 @@ from nlos_cam.render import (
 )
 
 Loop = tuple[list[MultiBounce], list[Float32]]
-"""Echoes of each frame, and hidden depth in the middle of its scan."""
+"""Echoes of each frame, and hidden depth at the middle of its scan."""
+MAPS = "peak", "runner_up", "path_m"
+"""Maps of a frame's echoes, in the order of `MultiBounce`."""
 OnProgress = Callable[[int, int], None]
-"""Called with poses done and poses in all."""
+"""Called with the poses rendered so far and in all."""
 CELSIUS_ABOVE = {
     "ldd_temperature": 0.0,
     "mc_temperature": -3.0,
@@ -33,11 +35,14 @@ CELSIUS_ABOVE = {
     "apd_temperature": -5.0,
     "humidity_temperature": -8.0,
 }
-"""Against the laser driver's, whose temperature is the sensor's. The names are the SDK's; the figures are chosen."""
+"""Offsets from the sensor's temperature, which is the laser driver's; names from the SDK, values assumed."""
+
+
+log = logging.getLogger(__name__)
 
 
 class World:
-    """A loop of instants. Frame numbers beyond the loop start it again, with other noise; the device warms on."""
+    """Loop of instants that repeats with new noise, while the device keeps warming."""
 
     def __init__(self, scene: SceneFile, echoes: list[MultiBounce], truths: list[Float32 | None]) -> None:
         self.scene = scene
@@ -46,54 +51,56 @@ class World:
 
     @property
     def rig(self) -> Rig:
-        """The rig whose lidar sees this world."""
+        """Rig with the lidar in this world."""
         return self.scene.rig
 
     def images(self, number: int) -> SensedImages:
-        """What the device delivers as frame `number`; the same number gives the same bits."""
+        """Return the images of frame `number`, the same bits each time."""
         generator = np.random.default_rng([number, len(self._echoes)])
         echoes = self._echoes[number % len(self._echoes)]
         return self._sensor.expose(echoes, generator, celsius=self._celsius(number))
 
     def celsius(self, number: int) -> Mapping[str, float]:
-        """The device's temperatures at frame `number`, by the names of the options that tell them.
+        """Return the device's temperatures at frame `number`, by the names of their options.
 
-        All warm as one body: they differ by what is always the same, and none comes later than the others.
+        Not modeled: heat flow. All differ by constants from the sensor's.
         """
         return {name: self._celsius(number) + above for name, above in CELSIUS_ABOVE.items()}
 
     def _celsius(self, number: int) -> float:
-        """The sensor's own; it was started at frame 0."""
+        """Return the sensor's temperature; it was started at frame 0."""
         return self.scene.sensor.celsius_at(number / FRAMES_PER_S)
 
     def truth_depth_m(self, number: int) -> Float32 | None:
-        """The hidden depth (64, 64) at frame `number`; None where nothing is hidden."""
+        """Return the hidden depth (64, 64) at frame `number`; None without a hidden object."""
         return self._truths[number % len(self._truths)]
 
 
 def open_world(name: str, on_progress: OnProgress | None = None) -> World:
-    """The world of a scene: "" the paper's rig with a moving object, "bare-wall", or a scene.toml's path.
+    """Return the world of a scene: "" for the paper's rig with a moving object, "bare-wall", or a scene.toml's path.
 
-    Renders the loop ahead on first use and keeps it in the cache folder. Raises SceneError for a scene that cannot be.
+    Pre-renders the loop on first use and stores it in the cache folder. Raises SceneError for an invalid scene.
     """
     scene = {"": paper_scene, "bare-wall": bare_wall_scene}.get(name, lambda: load_scene(Path(name)))()
     cached = cache_folder() / "worlds" / f"{scene.checksum}.npz"
     if (loop := _load(cached)) is None:
         loop = _render_loop(scene, on_progress)
-        _store(cached, *loop)
+        try:
+            _store(cached, *loop)
+        except OSError as error:
+            log.warning(
+                "%s cannot be written (%s): continuing without a cache; set NLOS_CAM_CACHE", cached, error.strerror
+            )
     echoes, truths = loop
     return World(scene, echoes, list(truths) if scene.hidden else [None])
 
 
 def _load(path: Path) -> Loop | None:
-    """A cached loop; None where there is none, or it is damaged and must be rendered anew."""
+    """Return a cached loop; None where it is missing or damaged."""
     try:
         with np.load(path) as file:
-            maps, mixed = (
-                zip(file["peak"], file["runner_up"], file["path_m"], strict=True),
-                bool(file["direct_included"]),
-            )
-            return [MultiBounce(*of_pose, mixed) for of_pose in maps], list(file["truth_m"])
+            poses, mixed = zip(*(file[name] for name in MAPS), strict=True), bool(file["direct_included"])
+            return [MultiBounce(*pose, mixed) for pose in poses], list(file["truth_m"])
     except (OSError, ValueError, EOFError, KeyError, BadZipFile):
         return None
 
@@ -112,13 +119,6 @@ def _render_loop(scene: SceneFile, on_progress: OnProgress | None) -> Loop:
 
 def _store(path: Path, echoes: list[MultiBounce], truths: list[Float32]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
-    np.savez_compressed(
-        part,
-        peak=np.stack([echo.peak for echo in echoes]),
-        runner_up=np.stack([echo.runner_up for echo in echoes]),
-        path_m=np.stack([echo.path_m for echo in echoes]),
-        direct_included=echoes[0].direct_included,
-        truth_m=np.stack(truths),
-    )
-    part.replace(path)
+    maps = {name: np.stack([getattr(echo, name) for echo in echoes]) for name in MAPS}
+    with atomic_file(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **maps, direct_included=echoes[0].direct_included, truth_m=np.stack(truths))

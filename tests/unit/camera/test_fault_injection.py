@@ -26,7 +26,7 @@ def images(instant: int) -> SensedImages:
 def handed(*faults: Fault, until: int = 12, plugged_in_at: int = 0) -> list[Delivery]:
     device, came = FaultyDevice(faults, plugged_in_at), list[Delivery]()
     for instant in range(plugged_in_at, until):
-        came += device.hand_over(instant, START_S + instant / 30, images(instant))
+        came += device.deliver(instant, START_S + instant / 30, images(instant))
     return came
 
 
@@ -45,7 +45,7 @@ def same(one: SensedImages, other: SensedImages) -> bool:
 @given(st.integers(0, 1000))
 def test_device_without_faults_changes_nothing(instant: int) -> None:
     seen = images(instant)
-    [delivery] = FaultyDevice().hand_over(instant, START_S, seen)
+    [delivery] = FaultyDevice().deliver(instant, START_S, seen)
     assert delivery.images is seen
     assert (delivery.number, delivery.instant, delivery.timestamp_s) == (instant, instant, START_S)
     assert delivery.streams == tuple(FORMATS)
@@ -102,7 +102,7 @@ def test_unplugged_device_stays_away_and_counts_from_0() -> None:
     fault, by_hand = Fault(kind="unplug", at_frame=3, frames=4), FaultyDevice()
     by_hand.unplug(3, 4)
     for device in (FaultyDevice([fault]), by_hand):
-        assert [instant for instant in range(12) if device.is_there(instant)] == [0, 1, 2]
+        assert [instant for instant in range(12) if device.is_connected(instant)] == [0, 1, 2]
         assert [instant for instant in range(12) if device.is_gone(instant)] == [3, 4, 5, 6]
     assert instants(handed(fault)) == [0, 1, 2]
     again = handed(fault, plugged_in_at=7)

@@ -152,7 +152,7 @@ def test_laser_is_turned_down_until_little_saturates(
     if found > 1.0:
         assert np.count_nonzero(frame.ir == 255) <= 0.001 * frame.ir.size  # none from before it was found
     assert ("laser power 1:" in caplog.text) == ("2.0 %" in caplog.text) == (found == 1.0)  # with advice
-    assert ("turned down" in caplog.text) == (found < 93.0)
+    assert ("lowered" in caplog.text) == (found < 93.0)
 
 
 def test_laser_power_is_kept_when_a_device_comes_back(fake_camera: Make) -> None:

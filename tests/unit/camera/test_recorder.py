@@ -11,7 +11,7 @@ from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.camera.recorder import (
     FLUSH_S,
-    FLUSHES,
+    MAX_FLUSHES,
     RESERVE_BYTES,
     STILL_S,
     Recording,
@@ -220,13 +220,13 @@ def test_recorder_reports_a_place_that_cannot_be_written(tmp_path: Path) -> None
         SdkRecorder(tmp_path / "no folder" / "a.bag", "device", SimpleNamespace(recorder=FakeRecorder))
 
 
-@pytest.mark.parametrize(("slow", "pauses"), [(0, 1), (3, 4), (10**6, FLUSHES)])
+@pytest.mark.parametrize(("slow", "pauses"), [(0, 1), (3, 4), (10**6, MAX_FLUSHES)])
 def test_recorder_pauses_again_while_a_disk_is_behind(
     made: SdkRecorder, clock: FakeTime, slow: int, pauses: int
 ) -> None:
     fake = made._recorder
     fake.on_pause = lambda: clock.pass_by(FLUSH_S + 1 if fake.pauses <= slow else 1.0)
-    if pauses == FLUSHES:
+    if pauses == MAX_FLUSHES:
         with pytest.raises(DiskFullError, match=r"a\.bag"):
             made.close()
     else:

@@ -11,7 +11,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import read_settings
-from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MAX_LATENESS, SimulatedCamera, SoftwareLidar
+from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MAX_LATE_FRAMES, SimulatedCamera, SoftwareLidar
 from nlos_cam.camera.streams import intrinsics_of, is_needed, stream_name
 from nlos_cam.recording.playback import ReplayCamera
 
@@ -106,9 +106,9 @@ def test_failing_world_fails_its_reader(noise_world: Any, hurried_clock: Any) ->
 
 
 def test_late_world_catches_up_or_drops_numbers(noise_world: Any, tmp_path: Path) -> None:
-    assert numbers_recorded(tmp_path / "late.bag", noise_world(), 0.9 * MAX_LATENESS / 30, 40) == list(range(40))
-    gaps = np.diff(numbers_recorded(tmp_path / "very late.bag", noise_world(), 3 * MAX_LATENESS / 30, 10)) - 1
-    assert gaps.max() == pytest.approx(2 * MAX_LATENESS, abs=3)
+    assert numbers_recorded(tmp_path / "late.bag", noise_world(), 0.9 * MAX_LATE_FRAMES / 30, 40) == list(range(40))
+    gaps = np.diff(numbers_recorded(tmp_path / "very late.bag", noise_world(), 3 * MAX_LATE_FRAMES / 30, 10)) - 1
+    assert gaps.max() == pytest.approx(2 * MAX_LATE_FRAMES, abs=3)
     assert np.count_nonzero(gaps) == 1
 
 
