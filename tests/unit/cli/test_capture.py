@@ -14,11 +14,11 @@ import typer
 from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.cli import capture
-from nlos_cam.cli.capture import ending, result, told
+from nlos_cam.cli.capture import final_error, format_take, result_of
 from nlos_cam.cli.main import main
 from nlos_cam.errors import CameraLostError, CameraNotFoundError, DiskFullError, NlosCamError, OutputExistsError
 from nlos_cam.recording.capture import CaptureResult, CaptureTarget
-from nlos_cam.recording.playback import Verified, verify
+from nlos_cam.recording.playback import VerifyResult, verify
 from nlos_cam.recording.quality import Quality
 from nlos_cam.recording.sidecar import load_sidecar
 
@@ -29,15 +29,13 @@ app = typer.Typer()
 capture.register(app)
 sys.exit(app(sys.argv[1:], standalone_mode=False) or 0)
 """
-
-
 Run = Callable[..., dict[str, Any]]
 
 
 def app() -> typer.Typer:
-    made = typer.Typer()
-    capture.register(made)
-    return made
+    found = typer.Typer()
+    capture.register(found)
+    return found
 
 
 @pytest.fixture
@@ -161,26 +159,26 @@ def test_capture_checks_disk_space_before_writing(
     assert run("--takes", "2", "--frames", "5", "--out", out)["frames"] == 10
 
 
-def test_capture_without_a_limit_reports_remaining_minutes(
+def test_capture_without_a_limit_reports_remaining_time(
     run: Run, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch, lines: list[str]
 ) -> None:
     beside = SimpleNamespace(path=tmp_path / "a.json")
     ended = CaptureResult(CaptureTarget(Path(out)), "interrupted", 0, Quality(), beside)  # before the first frame
     monkeypatch.setattr(capture, "free_bytes", lambda _: 200_000_000 + 64 * 48 * 4 * 30 * 90)
-    monkeypatch.setattr(capture.Takes, "record", lambda *_: (one for one in [ended]))
+    monkeypatch.setattr(capture.CaptureSession, "record", lambda *_: (one for one in [ended]))
     assert run("--out", out)["exit"] == 130
-    assert "1.5 minutes" in lines[0]
+    assert "at least 90 s" in lines[0]
 
 
 def test_capture_reports_damage_and_gaps(
     run: Run, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch, lines: list[str]
 ) -> None:
-    monkeypatch.setattr(capture, "verify", lambda *_, **__: Verified(3, 0, 0.1, {}))
+    monkeypatch.setattr(capture, "verify", lambda *_, **__: VerifyResult(3, 0, 0.1, {}))
     found = run("--frames", "5", "--out", out)
     assert (found["exit"], found["state"], found["error"]["type"]) == (4, "damaged", "RecordingError")
     assert "3 of the 5" in lines[-1]
     lines.clear()
-    monkeypatch.setattr(capture, "verify", lambda *_, **__: Verified(5, 2, 0.1, {}))
+    monkeypatch.setattr(capture, "verify", lambda *_, **__: VerifyResult(5, 2, 0.1, {}))
     assert run("--frames", "5", "--out", str(tmp_path / "b.bag"))["dropped"] == 2
     assert "2 frames" in lines[0]
 
@@ -188,7 +186,7 @@ def test_capture_reports_damage_and_gaps(
 def test_capture_interrupted_while_reading_back_loses_nothing(
     run: Run, out: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(path: Path, on_frame: Callable[[], None]) -> Verified:
+    def interrupted(path: Path, on_frame: Callable[[], None]) -> VerifyResult:
         return verify(path, lambda: (on_frame(), signal.raise_signal(signal.SIGINT))[0])
 
     monkeypatch.setattr(capture, "verify", interrupted)
@@ -243,12 +241,12 @@ def take(path: str, **changes: Any) -> CaptureResult:
     """Make a take of 30 frames in a file of 3 MB."""
     Path(path).write_bytes(bytes(3_000_000))
     values = {"state": "complete", "sets": 30, "quality": Quality(30, 0.001, 0.25, 9.0, 1.234, 0.1)}
-    values |= {"job": CaptureTarget(Path(path)), "found": Verified(30, 1, 1.00049, STREAMS)}
+    values |= {"target": CaptureTarget(Path(path)), "verified": VerifyResult(30, 1, 1.00049, STREAMS)}
     return CaptureResult(**values | {"sidecar": SimpleNamespace(path=Path("a.json"))} | changes)
 
 
 def test_result_holds_the_fields_of_one_take(out: str) -> None:
-    assert result([take(out, job=CaptureTarget(Path(out), "a cup"))], several=False) == {
+    assert result_of([take(out, target=CaptureTarget(Path(out), "a cup"))], several=False) == {
         "frames": 30,
         "dropped": 1,
         "seconds": 1.0,
@@ -264,36 +262,35 @@ def test_result_holds_the_fields_of_one_take(out: str) -> None:
 
 
 def test_result_of_several_takes_has_totals(out: str) -> None:
-    found = result([take(out), take(out)], several=True)
+    found = result_of([take(out), take(out)], several=True)
     assert [one["frames"] for one in found["takes"]] == [30, 30]
     assert (found["frames"], found["dropped"], found["seconds"]) == (60, 2, 2.0)
-    assert "error" not in found["takes"][0]
-    assert result([take(out, found=None)], several=True)["frames"] == 0
-    assert result([take(out, found=None)], several=False)["seconds"] is None  # not read back
-    assert "label" not in found["takes"][0]
+    assert not {"error", "label"} & found["takes"][0].keys()
+    assert result_of([take(out, verified=None)], several=True)["frames"] == 0
+    assert result_of([take(out, verified=None)], several=False)["seconds"] is None
 
 
-def test_error_of_a_take_says_what_is_kept(out: str) -> None:
+def test_error_of_a_take_says_what_is_saved(out: str) -> None:
     lost = take(out, state="lost", error=LOST)
-    error = result([lost], several=False)["error"]
-    assert error["type"] == "CameraLostError"
-    assert isinstance(ending(lost), CameraLostError)
-    assert error["message"] == str(ending(lost))
+    error = result_of([lost], several=False)["error"]
+    assert (error["type"], error["message"]) == ("CameraLostError", str(final_error(lost)))
+    assert isinstance(final_error(lost), CameraLostError)
     assert all(word in error["message"] for word in ("l515 vanished: replug it", "30 frames", out))
-    assert "frames" not in str(ending(take(out, state="lost", sets=0, found=None, error=LOST)))
-    full = take(out, state="disk full", found=None, closed=False, error=DiskFullError("repair it"))
-    assert str(ending(full)) == "repair it"
-    assert ending(take(out, state="interrupted")) is None
+    assert "frames" not in str(final_error(take(out, state="lost", sets=0, verified=None, error=LOST)))
+    full = take(out, state="disk full", verified=None, closed=False, error=DiskFullError("repair it"))
+    assert str(final_error(full)) == "repair it"
+    assert final_error(take(out, state="interrupted")) is None
 
 
-def test_lines_for_a_person_hold_the_figures(out: str) -> None:
-    text = told(take(out))
-    for word in ("30 frames", "1.0 s", "3 MB", "0.10%", "25.0%", "1.23 mm", out):
+def test_lines_at_the_terminal_hold_the_figures(out: str) -> None:
+    text = format_take(take(out))
+    for word in ("30 frames", "1.0 s", "3 MB", "verified", "0.10 %", "25.0 %", "1.23 mm", out):
         assert word in text
-    assert "unknown" in told(take(out, quality=Quality(1, 0.0, 0.0)))
-    for changes in ({}, {"found": None}):
-        assert told(take(out, state="interrupted", **changes)).startswith("interrupted: 30 frames")
-    assert told(take(out, state="lost", sets=0, found=None)).startswith("lost")
+    assert "unknown" in format_take(take(out, quality=Quality(1, 0.0, 0.0)))
+    assert "verified" not in format_take(take(out, state="damaged"))
+    for changes in ({}, {"verified": None}):
+        assert format_take(take(out, state="interrupted", **changes)).startswith("Interrupted. Recorded 30 frames")
+    assert format_take(take(out, state="lost", sets=0, verified=None)).startswith("Camera lost before")
 
 
 @pytest.mark.parametrize("takes", [1, 3])
@@ -305,8 +302,8 @@ def test_capture_interrupted_before_start_has_the_same_fields(
     folder = tmp_path / "empty"
     folder.mkdir()
     assert main(["capture", "--camera", "sim", "--out", str(folder / "a.bag"), "--json", *several]) == 130
-    made = json.loads(capsys.readouterr().out)
-    assert set(made) == set(result([take(str(tmp_path / "b.bag"))], several=takes > 1))
-    one = made["takes"][0] if takes > 1 else made
-    assert (one["frames"], one["state"], made["frames"]) == (0, "interrupted", 0)
+    found = json.loads(capsys.readouterr().out)
+    assert set(found) == set(result_of([take(str(tmp_path / "b.bag"))], several=takes > 1))
+    one = found["takes"][0] if takes > 1 else found
+    assert (one["frames"], one["state"], found["frames"]) == (0, "interrupted", 0)
     assert list(folder.iterdir()) == []

@@ -53,10 +53,9 @@ def test_repair_prints_what_was_recovered_and_lost(
     shown = capsys.readouterr().out
     assert " 0 bytes" not in shown
     assert str(tmp_path / "b.bag") in shown
-    lines = len(shown.splitlines())
-    monkeypatch.setattr(recordings, "MAX_TOLD", 1)  # many damages in few lines
+    monkeypatch.setattr(recordings, "MAX_REPORTED", 1)  # much damage in few lines
     recordings.repair_bag(tmp_path / "bad.bag", tmp_path / "c.bag")
-    assert 1 < len(capsys.readouterr().out.splitlines()) < lines
+    assert 1 < len(capsys.readouterr().out.splitlines()) < len(shown.splitlines())
 
 
 def test_repair_without_frames_is_exit_code_4(run: Run, tmp_path: Path) -> None:
@@ -88,7 +87,7 @@ def test_repair_overwrites_with_the_option_but_not_its_input(
 def test_repair_interrupted_is_exit_code_130_without_output(
     run: Run, noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    repair = recordings.repair
+    repair = recordings.repair_recording
 
     def interrupted(path: Path, out: Path, report: Callable[[int, int], None]) -> Any:
         def once_half_way(done: int, total: int) -> None:
@@ -98,7 +97,7 @@ def test_repair_interrupted_is_exit_code_130_without_output(
 
         return repair(path, out, once_half_way)
 
-    monkeypatch.setattr(recordings, "repair", interrupted)
+    monkeypatch.setattr(recordings, "repair_recording", interrupted)
     code, _, _ = run(noise_bags["plain"], "--out", tmp_path / "a.bag")
     assert code == 130
     assert list(tmp_path.iterdir()) == []

@@ -10,19 +10,86 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rosbags.rosbag1 import Reader
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording.bag_container import MAX_BYTES, BagContainer
-from nlos_cam.recording.bag_reader import BagFile, RecordedOptions
+from nlos_cam.recording.bag_reader import MAX_CHUNK_BYTES, BagReader
 from nlos_cam.recording.playback import verify
 
-
 @pytest.fixture(params=["noise_bag", "noise_bag_uncompressed", "real_bag"])
-def bag(request: pytest.FixtureRequest) -> BagFile:
-    return BagFile(request.getfixturevalue(request.param))
+def bag(request: pytest.FixtureRequest) -> BagReader:
+    return BagReader(request.getfixturevalue(request.param))
 
 
-def test_frames_come_in_recorded_order_and_by_index(bag: BagFile) -> None:
+def contents(bag: BagReader) -> dict[str, list[tuple[int, bytes]]]:
+    """Read every message by topic."""
+    return {
+        topic: [(entry.time_ns, bytes(bag.raw(entry))) for entry in entries] for topic, entries in bag.entries.items()
+    }
+
+
+def changed(source: Path, target: Path, edit: Callable[[bytes], bytes]) -> Path:
+    target.write_bytes(edit(source.read_bytes()))
+    return target
+
+
+def version_of(bag: BagReader) -> Any:
+    return bag.read("/file_version", bag.entries["/file_version"][0])
+
+
+def test_reader_reads_the_messages_that_rosbags_reads(bag: BagReader) -> None:
+    expected: dict[str, list[tuple[int, bytes]]] = {}
+    with Reader(bag.path) as reader:
+        for connection, time_ns, raw in reader.messages():
+            expected.setdefault(connection.topic, []).append((time_ns, bytes(raw)))
+    assert contents(bag) == expected
+    assert bag.end_ns == max(messages[-1][0] for messages in expected.values())
+
+
+@pytest.mark.parametrize("compression", ["LZ4", "BZ2"])
+def test_reader_reads_each_compression(noise_bag: Path, rewritten: Any, compression: str) -> None:
+    path = rewritten(lambda _, time_ns, raw: [(time_ns, raw)], compression=compression)
+    assert contents(BagReader(path)) == contents(BagReader(noise_bag))
+
+
+def test_reader_unpacks_no_more_than_its_bound(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.recording.bag_reader.MAX_CHUNK_BYTES", 10_000)
+    with pytest.raises(RecordingError, match="chunk"):
+        BagReader(noise_bag)
+
+
+def test_damage_is_reported_with_its_place_and_the_repair(noise_bag: Path, tmp_path: Path) -> None:
+    where = noise_bag.read_bytes().index(b"compression=lz4") + 1000
+    path = changed(noise_bag, tmp_path / "damaged.bag", lambda old: old[:where] + bytes(100) + old[where + 100 :])
+    position = BagReader(noise_bag).entries["/file_version"][0].chunk_pos
+    with pytest.raises(RecordingError, match=rf"0\.0 s .* byte {position}") as raised:
+        BagReader(path)
+    assert f"`nlos-cam repair {path} --out damaged-repaired.bag`" in str(raised.value)
+
+
+def test_reader_refuses_a_wrong_or_empty_index(noise_bag: Path, tmp_path: Path) -> None:
+    bag = BagReader(noise_bag)
+    one, other = (bag.entries[f"/device_0/sensor_0/{name}_0/image/data"][0] for name in ("Depth", "Infrared"))
+    with pytest.raises(RecordingError, match="index"):
+        bag.read("/file_version", one._replace(offset=other.offset))
+    none = re.compile(rb"(?s)(chunk_count=).{4}")
+    path = changed(noise_bag, tmp_path / "nothing.bag", lambda old: none.sub(rb"\1" + bytes(4), old, count=1))
+    with pytest.raises(RecordingError, match=r"nothing\.bag"):
+        BagReader(path)
+
+
+def test_reader_keeps_no_file_open_and_reports_its_loss(noise_bag: Path, tmp_path: Path) -> None:
+    path = changed(noise_bag, tmp_path / "gone.bag", bytes)
+    bag = BagReader(path)
+    if (open_files := Path("/proc/self/fd")).is_dir():  # only Linux lists the open files of a process
+        assert path not in {each.readlink() for each in open_files.iterdir() if each.is_symlink()}
+    path.unlink()
+    bag._chunk_pos = -1
+    with pytest.raises(RecordingError, match="No such file"):
+        version_of(bag)
+
+
+def test_frames_come_in_recorded_order_and_by_index(bag: BagReader) -> None:
     bag.check()
     places = list(bag.order(bag.streams))
     assert all(one.time_ns <= other.time_ns for one, other in pairwise(places))
@@ -36,7 +103,7 @@ def test_frames_come_in_recorded_order_and_by_index(bag: BagFile) -> None:
 
 
 def test_sample_owns_its_pixels_and_ends_at_the_last(noise_bag: Path) -> None:
-    bag = BagFile(noise_bag)
+    bag = BagReader(noise_bag)
     bag.sample("depth", 0).pixels[:] = 0
     assert bag.sample("depth", 0).pixels.any()
     with pytest.raises(IndexError):
@@ -57,23 +124,23 @@ def with_unit(*, option: bool, tail_m: float | None) -> Callable[[str, int, byte
 @pytest.mark.parametrize(("option", "tail_m"), [(True, None), (True, 0.5), (False, 0.00025)])
 def test_depth_unit_is_an_option_or_follows_the_images(rewritten: Any, option: bool, tail_m: float | None) -> None:
     path = rewritten(with_unit(option=option, tail_m=tail_m))
-    assert BagFile(path).depth_unit_m() == pytest.approx(0.00025)
+    assert BagReader(path).depth_unit_m() == pytest.approx(0.00025)
 
 
 @pytest.mark.parametrize("tail_m", [None, 0.0, -1.0, float("nan"), float("inf")])
 def test_bag_without_a_depth_unit_is_an_error(rewritten: Any, tail_m: float | None) -> None:
     with pytest.raises(RecordingError, match="depth unit"):
-        BagFile(rewritten(with_unit(option=False, tail_m=tail_m))).depth_unit_m()
+        BagReader(rewritten(with_unit(option=False, tail_m=tail_m))).depth_unit_m()
 
 
 def test_bag_without_intrinsics_is_an_error(rewritten: Any) -> None:
     path = rewritten(lambda topic, time_ns, raw: [] if topic.endswith("camera_info") else [(time_ns, raw)])
     with pytest.raises(RecordingError, match="camera_info"):
-        BagFile(path)
+        BagReader(path)
 
 
 def test_unknown_encoding_is_an_error_when_read(rewritten: Any) -> None:
-    bag = BagFile(rewritten(lambda _, time_ns, raw: [(time_ns, raw.replace(b"8UC1", b"Y10B"))]))
+    bag = BagReader(rewritten(lambda _, time_ns, raw: [(time_ns, raw.replace(b"8UC1", b"Y10B"))]))
     assert not bag.streams["infrared"].format
     assert bag.sample("depth", 0).number == 0
     with pytest.raises(RecordingError, match="Y10B"):
@@ -82,20 +149,20 @@ def test_unknown_encoding_is_an_error_when_read(rewritten: Any) -> None:
 
 def test_streams_of_one_kind_differ_by_their_index(noise_bag_uncompressed: Path, tmp_path: Path) -> None:
     path = tmp_path / "stereo.bag"
-    path.write_bytes(noise_bag_uncompressed.read_bytes().replace(b"Infrared_0", b"Infrared_2"))
-    assert set(BagFile(path).streams) == {"depth", "infrared_2", "confidence"}
-    assert BagFile(path).sample("infrared_2", 19).number == 19
+    bag = BagReader(changed(noise_bag_uncompressed, path, lambda old: old.replace(b"Infrared_0", b"Infrared_2")))
+    assert set(bag.streams) == {"depth", "infrared_2", "confidence"}
+    assert bag.sample("infrared_2", 19).number == 19
 
 
 @pytest.mark.parametrize("topic", ["/sensor_0/info", "/Depth_Units/description", "/Infrared_0/tf/1", "/image/data"])
 def test_check_finds_damage_in_any_message(noise_bag_uncompressed: Path, tmp_path: Path, topic: str) -> None:
-    bag, path = BagContainer(noise_bag_uncompressed), tmp_path / "damaged.bag"
+    bag = BagReader(noise_bag_uncompressed)
     name = next(name for name in bag.entries if name.endswith(topic))
     content, message = noise_bag_uncompressed.read_bytes(), bytes(bag.raw(bag.entries[name][-1]))
     where = content.rindex(message) - 4  # its length
-    path.write_bytes(content[:where] + b"\xff\xff" + content[where + 2 :])
+    path = changed(bag.path, tmp_path / "damaged.bag", lambda old: old[:where] + b"\xff\xff" + old[where + 2 :])
     with pytest.raises(RecordingError, match=r"damaged\.bag"):
-        BagFile(path).check()
+        BagReader(path).check()
 
 
 def test_check_finds_an_image_smaller_than_its_header(rewritten: Any) -> None:
@@ -104,49 +171,48 @@ def test_check_finds_an_image_smaller_than_its_header(rewritten: Any) -> None:
         return [(time_ns, doubled if topic.endswith("Depth_0/image/data") else raw)]
 
     with pytest.raises(RecordingError, match="128 x 48"):
-        BagFile(rewritten(wider)).check()
+        BagReader(rewritten(wider)).check()
+
+
+def test_check_passes_over_unknown_types(noise_bag_uncompressed: Path, tmp_path: Path) -> None:
+    old, new = b"geometry_msgs/Transform", b"realsense_msgs/Transfor"
+    path = changed(noise_bag_uncompressed, tmp_path / "other.bag", lambda content: content.replace(old, new))
+    BagReader(path).check()
 
 
 OPTION = "/device_0/sensor_0/option/Frames_Queue_Size/value"
-UNIT = "/device_0/sensor_0/option/Depth_Units/value"
 CHANGES = {10_000_000: 3.0, 20_000_000: 5.0, 30_000_000: 4.0}
 
 
-def test_options_at_a_time_are_those_last_set(rewritten: Any) -> None:
+def test_settings_at_a_time_are_those_last_set(rewritten: Any) -> None:
     def edit(topic: str, time_ns: int, raw: bytes) -> Iterable[tuple[int, bytes]]:
         yield time_ns, raw
         for later_ns, value in CHANGES.items() if topic == OPTION else ():
             yield later_ns, struct.pack("<f", value)
 
-    bag = BagContainer(rewritten(edit))
-
-    def options() -> RecordedOptions:
-        return RecordedOptions(bag, {OPTION: "Frames_Queue_Size", UNIT: "Depth_Units"})
-
-    found = options()
+    path = rewritten(edit)
+    bag = BagReader(path)
     for time_ns, value in {1: 0.0, 9_999_999: 0.0, **CHANGES, 10**12: 4.0}.items():
-        assert found.at(time_ns)["frames_queue_size"] == value
-        assert found.at(time_ns)["depth_units"] == pytest.approx(0.00025)
+        assert bag.settings(time_ns)["frames_queue_size"] == value
+        assert bag.settings(time_ns)["depth_units"] == pytest.approx(0.00025)
     for time_ns in (10**12, 1, 25_000_000, 15_000_000, 35_000_000, 0):  # in any order
-        assert found.at(time_ns) == options().at(time_ns)
-    assert options().at(0) == {}
-    before = found.at(11_000_000)
-    assert found.at(12_000_000) is before
-    assert found.at(21_000_000) is not before
+        assert bag.settings(time_ns) == BagReader(path).settings(time_ns)
+    assert bag.settings(0) == {}
+    before = bag.settings(11_000_000)
+    assert bag.settings(12_000_000) is before
+    assert bag.settings(21_000_000) is not before
     assert before["frames_queue_size"] == 3.0
 
 
 ABSURD = b"\xff\xff\xff\xff"
-
-
 SIZES = (b"size=", b"count=", b"chunk_count=", b"conn_count=", b"index_pos=", b"chunk_pos=")
-"""Fields that say how much to read, or where."""
+"""Fields with a number of bytes to read, or an offset."""
 
 
 def read_all(path: Path) -> None:
     """Read everything in a recording. Raises RecordingError."""
     verify(path)
-    bag = BagFile(path)
+    bag = BagReader(path)
     for place in bag.order(bag.streams):
         bag.sample(place.stream, place.index)
         bag.metadata(place.stream, place.index)
@@ -184,4 +250,4 @@ def test_reader_does_not_allocate_an_absurd_size(
             read_all(path)
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        assert peak < 2 * MAX_BYTES
+        assert peak < 2 * MAX_CHUNK_BYTES

@@ -9,8 +9,8 @@ import pytest
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.errors import CameraLostError, DiskFullError, RecordingError
-from nlos_cam.recording.capture import CaptureResult, CaptureSession, CaptureTarget, settle
-from nlos_cam.recording.playback import Verified, verify
+from nlos_cam.recording.capture import CaptureResult, CaptureSession, CaptureTarget, finalize
+from nlos_cam.recording.playback import VerifyResult, verify
 from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
 
 Run = Callable[..., list[CaptureResult]]
@@ -33,21 +33,21 @@ def world(noise_world: Any) -> Any:
 
 @pytest.fixture
 def run(world: Any, hurried_clock: Any, tmp_path: Path) -> Run:
-    """Record takes of a NoiseWorld and settle each; stop, as by Ctrl-C, after `stop_at` sets."""
+    """Record takes of a NoiseWorld and finalize each; stop, as by Ctrl-C, after `stop_at` sets."""
 
     def call(
-        count: int = 1, stop_at: int | None = None, read_back: Callable[[Path], Verified | None] = verify, **limits: Any
+        count: int = 1, stop_at: int | None = None, read_back: Callable[[Path], VerifyResult | None] = verify, **limits: Any
     ) -> list[CaptureResult]:
-        jobs = [CaptureTarget(tmp_path / f"{number}.bag", label=f"object {number}") for number in range(count)]
-        recording, stop = Recording(jobs[0].path, last=count == 1, **limits), Event()
+        targets = [CaptureTarget(tmp_path / f"{number}.bag", label=f"object {number}") for number in range(count)]
+        recording, stop = Recording(targets[0].path, last=count == 1, **limits), Event()
         camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
 
         def on_sets(sets: int) -> None:
             if stop_at is not None and sets >= stop_at:
                 stop.set()
 
-        with closing(CaptureSession(camera, recording, jobs).record(stop, on_sets)) as takes:
-            return [settle(take, read_back) for take in takes]
+        with closing(CaptureSession(camera, recording, targets).record(stop, on_sets)) as takes:
+            return [finalize(take, read_back) for take in takes]
 
     return call
 
@@ -59,8 +59,8 @@ def saved_state(take: CaptureResult) -> str:
 def test_take_holds_what_came_and_its_sidecar_agrees(run: Run, noise_world: Any) -> None:
     (take,) = run(frames=5)
     assert (take.state, take.sets, take.error) == ("complete", 5, None)
-    assert take.found == verify(take.job.path)
-    found = load_sidecar(sidecar_path(take.job.path))
+    assert take.verified == verify(take.target.path)
+    found = load_sidecar(sidecar_path(take.target.path))
     assert (found.state, found.label, found.camera) == ("complete", "object 0", "sim")
     assert found.summary == take.summary
     assert found.summary
@@ -76,7 +76,7 @@ def test_take_holds_what_came_and_its_sidecar_agrees(run: Run, noise_world: Any)
 def test_takes_have_own_files_and_follow_each_other(run: Run, tmp_path: Path) -> None:
     there: list[list[str]] = []
 
-    def read_back(path: Path) -> Verified:
+    def read_back(path: Path) -> VerifyResult:
         there.append(sorted(entry.name for entry in tmp_path.glob("*.bag")))
         return verify(path)
 
@@ -84,23 +84,23 @@ def test_takes_have_own_files_and_follow_each_other(run: Run, tmp_path: Path) ->
     assert there == [["0.bag"], ["0.bag", "1.bag"], ["0.bag", "1.bag", "2.bag"]]
     assert [take.state for take in takes] == ["complete"] * 3
     for number, take in enumerate(takes):
-        assert verify(take.job.path).streams == dict.fromkeys(("depth", "infrared", "confidence"), 6)
-        assert load_sidecar(sidecar_path(take.job.path)).label == f"object {number}"
+        assert verify(take.target.path).streams == dict.fromkeys(("depth", "infrared", "confidence"), 6)
+        assert load_sidecar(sidecar_path(take.target.path)).label == f"object {number}"
         assert take.quality.frames_seen <= 6
 
 
 def test_interrupted_take_keeps_frames_and_is_the_last(run: Run, tmp_path: Path) -> None:
     (take,) = run(count=3, frames=500, stop_at=7)
     assert take.state == saved_state(take) == "interrupted"
-    assert take.found
-    assert take.found.frames == take.sets >= 7
+    assert take.verified
+    assert take.verified.frames == take.sets >= 7
     assert not (tmp_path / "1.bag").exists()
 
 
 def test_take_interrupted_while_read_back_is_kept(run: Run) -> None:
     (take,) = run(frames=4, read_back=lambda _: None)
-    assert (take.state, saved_state(take), take.found, take.error) == ("interrupted", "interrupted", None, None)
-    assert verify(take.job.path).frames == 4
+    assert (take.state, saved_state(take), take.verified, take.error) == ("interrupted", "interrupted", None, None)
+    assert verify(take.target.path).frames == 4
 
 
 def test_take_of_a_vanishing_camera_is_whole(run: Run, world: Any) -> None:
@@ -108,16 +108,16 @@ def test_take_of_a_vanishing_camera_is_whole(run: Run, world: Any) -> None:
     (take,) = run(count=2, frames=500)
     assert (take.state, saved_state(take), take.sets) == ("lost", "lost", 8)
     assert isinstance(take.error, CameraLostError)
-    assert take.found
-    assert take.found.frames == 8
+    assert take.verified
+    assert take.verified.frames == 8
 
 
 def test_take_without_a_frame_leaves_no_file(world: Any, tmp_path: Path, hurried_clock: Any) -> None:
-    recording, jobs = Recording(tmp_path / "0.bag"), [CaptureTarget(tmp_path / "0.bag")]
+    recording, targets = Recording(tmp_path / "0.bag"), [CaptureTarget(tmp_path / "0.bag")]
     camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
     world.vanishes_at = 0
-    (take,) = [settle(one, verify) for one in CaptureSession(camera, recording, jobs).record(Event(), print)]
-    assert (take.state, take.sets, take.found) == ("lost", 0, None)
+    (take,) = [finalize(one, verify) for one in CaptureSession(camera, recording, targets).record(Event(), print)]
+    assert (take.state, take.sets, take.verified) == ("lost", 0, None)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -139,8 +139,8 @@ def test_take_ends_whole_where_disk_space_is_low(run: Run) -> None:
     assert (take.state, saved_state(take), take.sets) == ("disk full", "disk full", 1)
     assert isinstance(take.error, DiskFullError)
     assert "200 MB" in str(take.error)
-    assert take.found
-    assert take.found.frames == 1
+    assert take.verified
+    assert take.verified.frames == 1
 
 
 @pytest.mark.parametrize("indexed", [True, False])
@@ -153,7 +153,7 @@ def test_sidecar_that_cannot_be_written_hides_no_other_error(
     monkeypatch.setattr("nlos_cam.recording.sidecar.SidecarFile.finish", full)
     monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: indexed)
     (take,) = run(frames=4)
-    assert (take.found is not None) == indexed
+    assert (take.verified is not None) == indexed
     assert ("0.json" if indexed else "nlos-cam repair") in str(take.error)
 
 
@@ -163,7 +163,7 @@ def test_take_whose_file_cannot_be_closed_is_not_read_back(
 ) -> None:
     monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: False)
     (take,) = run(count=count, frames=4, read_back=lambda _: pytest.fail("it has no index"))
-    assert (take.state, saved_state(take), take.closed, take.found) == ("disk full", "disk full", False, None)
+    assert (take.state, saved_state(take), take.closed, take.verified) == ("disk full", "disk full", False, None)
     assert "nlos-cam repair" in str(take.error)
     summary = load_sidecar(take.sidecar.path).summary
     assert summary
@@ -172,33 +172,33 @@ def test_take_whose_file_cannot_be_closed_is_not_read_back(
 
 @pytest.mark.slow
 def test_take_with_missing_frames_in_its_file_is_damaged(run: Run) -> None:
-    (take,) = run(frames=5, read_back=lambda _: Verified(3, 0, 0.1, {}))
+    (take,) = run(frames=5, read_back=lambda _: VerifyResult(3, 0, 0.1, {}))
     assert (take.state, saved_state(take)) == ("damaged", "damaged")
     assert "3 of the 5" in str(take.error)
     whole, short = ({"depth": 5, "infrared": 5, "confidence": count} for count in (5, 4))
     for streams, state in ((whole, "complete"), (short, "damaged")):  # frames that are in no set are no damage
-        (take,) = run(frames=5, read_back=lambda _, streams=streams: Verified(2, 3, 0.1, streams))
+        (take,) = run(frames=5, read_back=lambda _, streams=streams: VerifyResult(2, 3, 0.1, streams))
         assert take.state == state
-    takes = run(count=2, frames=5, read_back=lambda _: Verified(4, 0, 0.1, {}))
+    takes = run(count=2, frames=5, read_back=lambda _: VerifyResult(4, 0, 0.1, {}))
     assert [take.state for take in takes] == ["damaged", "complete"]  # a first set may have been on its way
 
 
 def test_take_that_cannot_be_read_back_is_damaged(run: Run) -> None:
-    def read_back(path: Path) -> Verified:
+    def read_back(path: Path) -> VerifyResult:
         raise RecordingError(f"{path} is cut short")
 
     (take,) = run(frames=5, read_back=read_back)
-    assert (take.state, str(take.error)) == ("damaged", f"{take.job.path} is cut short")
+    assert (take.state, str(take.error)) == ("damaged", f"{take.target.path} is cut short")
 
 
 def test_closing_between_takes_stops_the_camera(world: Any, hurried_clock: Any, tmp_path: Path) -> None:
-    jobs = [CaptureTarget(tmp_path / "0.bag"), CaptureTarget(tmp_path / "1.bag")]
-    recording = Recording(jobs[0].path, frames=3, last=False)
+    targets = [CaptureTarget(tmp_path / "0.bag"), CaptureTarget(tmp_path / "1.bag")]
+    recording = Recording(targets[0].path, frames=3, last=False)
     camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
-    takes = CaptureSession(camera, recording, jobs).record(Event(), print)
+    takes = CaptureSession(camera, recording, targets).record(Event(), print)
     next(takes)
     assert camera._thread
     takes.close()
     assert camera._thread is None
-    assert verify(jobs[0].path).frames == 3
-    assert not jobs[1].path.exists()
+    assert verify(targets[0].path).frames == 3
+    assert not targets[1].path.exists()

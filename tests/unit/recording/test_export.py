@@ -12,18 +12,18 @@ import trimesh
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording.bag_reader import BagFile
-from nlos_cam.recording.export import INFO, Exported, Wanted, export_recording
+from nlos_cam.recording.bag_reader import BagReader
+from nlos_cam.recording.export import INFO, ExportResult, ExportOptions, export_recording
 
 FRAMES = 20
 
 
-def exported(bag: Path, out: Path, stop: Event | None = None, **wanted: Any) -> Exported:
-    return export_recording(BagFile(bag), out, Wanted(**wanted), stop=stop or Event())
+def exported(bag: Path, out: Path, stop: Event | None = None, **wanted: Any) -> ExportResult:
+    return export_recording(BagReader(bag), out, ExportOptions(**wanted), stop=stop or Event())
 
 
 def samples(bag: Path, stream: str) -> list[Any]:
-    return list(BagFile(bag).samples([stream]))
+    return list(BagReader(bag).samples([stream]))
 
 
 def rows(out: Path, stream: str) -> list[dict[str, str]]:
@@ -96,7 +96,7 @@ def test_export_that_is_stopped_keeps_written_frames(noise_bag: Path, tmp_path: 
         if len(seen) == 6:
             stop.set()
 
-    made = export_recording(BagFile(noise_bag), tmp_path / "out", Wanted(format="npz"), stop=stop, on_frame=after_six)
+    made = export_recording(BagReader(noise_bag), tmp_path / "out", ExportOptions(format="npz"), stop=stop, on_frame=after_six)
     assert made.frames == {"depth": 2, "infrared": 2, "confidence": 2, "points": 1}
     with np.load(tmp_path / "out" / "depth.npz") as found:
         assert found["pixels"].shape == (2, 48, 64)

@@ -11,7 +11,7 @@ from rosbags.rosbag1 import Reader
 
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
 from nlos_cam.recording.playback import verify
-from nlos_cam.recording.repair import Repaired, repair_recording
+from nlos_cam.recording.repair import RepairResult, repair_recording
 from nlos_cam.recording.sdk_playback import SdkReplayCamera
 
 ALL = {"depth": 40, "infrared": 40, "confidence": 40}
@@ -22,13 +22,13 @@ def bag(request: pytest.FixtureRequest, noise_bags: dict[str, Path]) -> Path:
     return noise_bags[request.param]
 
 
-def repaired(tmp_path: Path, content: bytes) -> Repaired:
+def repaired(tmp_path: Path, content: bytes) -> RepairResult:
     path = tmp_path / "bad.bag"
     path.write_bytes(content)
     return repair_recording(path, tmp_path / "good.bag")
 
 
-def whys(found: Repaired) -> str:
+def whys(found: RepairResult) -> str:
     return "; ".join(damage.why for damage in found.damages)
 
 

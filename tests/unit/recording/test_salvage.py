@@ -90,8 +90,7 @@ def test_unpack_refuses_a_bomb(monkeypatch: pytest.MonkeyPatch) -> None:
     content, read_bytes, ending, why = unpack(reader(bomb), 0, len(bomb), 1 << 16)
     assert (content, ending, "64 MiB" in why) == (b"", Ending.BROKEN, True)
     assert read_bytes < len(bomb) / 3
-    for module in ("bag_chunk", "bag_content"):
-        monkeypatch.setattr(f"nlos_cam.camera.{module}.CHUNK_LIMIT", len(CONTENT) - 1)
+    monkeypatch.setattr("nlos_cam.recording.salvage.CHUNK_LIMIT", len(CONTENT) - 1)
     assert examined(DATA["lz4"])[0].chunk is None
     assert examined(CONTENT, "none")[0].ending == Ending.BROKEN
 

@@ -18,7 +18,7 @@ from nlos_cam.camera.session import SampleQueue, read_settings
 from nlos_cam.camera.streams import intrinsics_of, sample_from_sdk
 from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.errors import RecordingError, StreamMissingError
-from nlos_cam.recording.bag_reader import BagFile
+from nlos_cam.recording.bag_reader import BagReader
 from nlos_cam.recording.playback import ReplayCamera
 from nlos_cam.recording.sdk_playback import SdkReplayCamera
 
@@ -143,7 +143,7 @@ class SdkPlayback:
 
 @pytest.mark.parametrize("kind", ["noise_bag", "noise_bag_uncompressed", "real_bag"])
 def test_bag_file_agrees_with_librealsense(kind: str, request: pytest.FixtureRequest) -> None:
-    bag = BagFile(request.getfixturevalue(kind))
+    bag = BagReader(request.getfixturevalue(kind))
     played = SdkPlayback(bag.path)
     assert set(bag.streams) == set(played.samples)
     for stream, info in bag.streams.items():
@@ -169,7 +169,7 @@ def test_bag_file_agrees_with_librealsense(kind: str, request: pytest.FixtureReq
 
 @pytest.mark.parametrize("kind", ["noise_bag", "real_bag"])
 def test_lenses_and_poses_agree_with_librealsense(kind: str, request: pytest.FixtureRequest) -> None:
-    bag = BagFile(request.getfixturevalue(kind))
+    bag = BagReader(request.getfixturevalue(kind))
     sensors = load_sdk().context().load_device(str(bag.path)).as_playback().query_sensors()
     cameras = {profile.stream_type().name: profile for one in sensors for profile in one.get_stream_profiles()}
     for stream, camera in cameras.items():

@@ -16,9 +16,9 @@ from nlos_calibration.wall_record import WallRecord
 
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.playback import Verified
+from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality
-from nlos_cam.recording.sidecar import LOOK_S, SidecarFile, load_sidecar, sidecar_path, summary_of, versions, wall_of
+from nlos_cam.recording.sidecar import TEMPERATURE_INTERVAL_S, SidecarFile, load_sidecar, sidecar_path, summary_of, versions, load_measured_wall
 
 PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
 
@@ -32,7 +32,7 @@ WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 SEEN = Quality(9, 0.25, 0.5, 7.0, 1.5, 0.1)
 
 
-READ = Verified(frames=9, dropped=2, seconds=0.5, streams={"depth": 9, "infrared": 9, "confidence": 9})
+READ = VerifyResult(frames=9, dropped=2, seconds=0.5, streams={"depth": 9, "infrared": 9, "confidence": 9})
 
 
 @dataclass
@@ -85,7 +85,7 @@ def test_sidecar_samples_temperatures_over_device_time(path: Path) -> None:
     for number in range(900):
         sidecar.on_frame(frame(1e9 + number / 30))
     series = load_sidecar(path).temperatures
-    assert [look.time_s for look in series] == pytest.approx([0.0, LOOK_S, 2 * LOOK_S], abs=0.05)
+    assert [look.time_s for look in series] == pytest.approx([0.0, TEMPERATURE_INTERVAL_S, 2 * TEMPERATURE_INTERVAL_S], abs=0.05)
     celsius = [look.celsius["ldd_temperature"] for look in series]
     assert celsius == sorted(celsius)
     assert set(series[0].celsius) == {"ldd_temperature"}
@@ -96,10 +96,10 @@ def test_sidecar_samples_temperatures_over_device_time(path: Path) -> None:
 
 
 def test_sidecar_thins_a_long_series_evenly(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.recording.sidecar.MAX_LOOKS", 10)
+    monkeypatch.setattr("nlos_cam.recording.sidecar.MAX_TEMPERATURES", 10)
     sidecar = SidecarFile(path, Warm())
     for number in range(100):
-        sidecar.on_frame(frame(number * LOOK_S))
+        sidecar.on_frame(frame(number * TEMPERATURE_INTERVAL_S))
     times = [look.time_s for look in load_sidecar(path).temperatures]
     assert 5 <= len(times) <= 10
     assert times[0] == 0.0
@@ -123,7 +123,7 @@ def test_summary_writes_unknown_values_as_null(path: Path) -> None:
     summary = json.loads(path.read_text())["summary"]
     assert summary["frames"] is summary["temporal_noise_mm"] is summary["saturated_share"] is None
     assert load_sidecar(path).summary == summary_of(None, Quality(), {})
-    assert summary_of(Verified(1, 0, 0.0, {"depth": 1}), Quality(), {}).frames_per_s is None
+    assert summary_of(VerifyResult(1, 0, 0.0, {"depth": 1}), Quality(), {}).frames_per_s is None
 
 
 def test_sidecar_stays_whole_on_a_full_disk(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,14 +159,14 @@ def test_sidecar_prefers_the_rig_of_a_measured_wall(path: Path, tmp_path: Path) 
     wall_toml.write_text(dump_toml(record))
     SidecarFile(path, Warm(rig=bench))
     assert load_sidecar(path).rig == bench
-    measured, wall = wall_of(wall_toml)
+    measured, wall = load_measured_wall(wall_toml)
     SidecarFile(path, Warm(rig=bench), wall=(measured, wall))
     found = load_sidecar(path)
     assert found.rig == measured == rig != bench
     assert found.wall
     assert found.wall.sha256 == hashlib.sha256(wall_toml.read_bytes()).hexdigest()
     with pytest.raises(RecordFileError):
-        wall_of(tmp_path / "none.toml")
+        load_measured_wall(tmp_path / "none.toml")
 
 
 def test_versions_name_the_program_and_no_machine() -> None:
