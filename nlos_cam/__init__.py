@@ -4,13 +4,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from nlos_cam.api import Glimpse, Stream
-    from nlos_cam.api import open_stream as open  # noqa: A004  as gzip.open: always called by its module's name
+    from nlos_cam.api import open_stream as open  # noqa: A004  as gzip.open: always called as nlos_cam.open
 
 __version__ = "0.1.0"
 __all__ = ["Glimpse", "Stream", "__version__", "open"]
 
 LATE = {"Glimpse": "Glimpse", "Stream": "Stream", "open": "open_stream"}
-"""Each name, and what it is called in `nlos_cam.api`, which is imported when one of them is first asked for."""
+"""Public names and their names in `nlos_cam.api`, which is imported on first use."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,7 +1,4 @@
-"""What a camera yields (Frame) and what the networks eat (LidarMaps), both in SI units.
-
-The running mean of maps over the last frames, per cell over those in which it was valid.
-"""
+"""Frames of a camera, the maps that the networks take as input, and running means of maps, all in SI units."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,50 +13,61 @@ from numpy.typing import NDArray
 MAP_ROWS, MAP_COLUMNS = 64, 80
 OBJECT_PIXELS = 64
 WINNER_SPREAD_M = 0.01
-"""Samples of a cell this close to its median depth count towards its intensity: a plain mean would mix winners."""
+"""Distance from a cell's median depth within which samples count towards its intensity: they are of one echo."""
+SATURATED = 255
+"""Full scale of the IR's 8 bits, in counts."""
+MAX_SATURATED = 0.001
+"""Share of saturated infrared pixels above which depth is unreliable: the L515 under-estimates it there."""
 
 Real = float | np.float32
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One synchronised frame of a lidar: depth, infrared and confidence of one instant."""
+    """Depth, infrared and confidence images of one instant."""
 
     depth_m: Float32
     """(height, width); distance along the optical axis, NaN where there is no return."""
     ir: NDArray[np.uint8]
-    """(height, width); intensity of the return, 255 is saturated."""
+    """(height, width); intensity of the return, in counts; 255 is saturated."""
     confidence: NDArray[np.uint8]
     """(height, width); 0 (low) to 15 (high)."""
     timestamp_s: float
     frame_number: int
     intrinsics: Intrinsics
     settings: Mapping[str, float] = field(default_factory=dict[str, float])
-    """The device's options as read back when streaming began."""
+    """The device's options as read back at the start of streaming."""
     truth_depth_m: Float32 | None = None
-    """(64, 64) hidden depth over the object box, where the camera knows it (a simulated one does)."""
+    """(64, 64) hidden depth over the object box, if known (as by a simulated camera)."""
 
 
 @dataclass(frozen=True)
 class LidarMaps:
-    """A frame reduced to the (64, 80) cells that the networks eat; row 0 on top, column 79 far from the foot."""
+    """Frame reduced to the (64, 80) cells of the networks' input; row 0 on top, column 79 far from the foot."""
 
     depth_m: Float32
-    """(64, 80); NaN where a cell has no valid sample."""
+    """(64, 80); median of the valid samples, NaN without any."""
     intensity: Float32
-    """(64, 80); in IR counts, 0 where a cell has no valid sample."""
+    """(64, 80); in IR counts, 0 without valid samples."""
     valid: NDArray[np.bool_]
-    """(64, 80)."""
+    """(64, 80); True where a cell has a valid sample."""
 
 
+def saturated_share(ir: NDArray[np.uint8]) -> float:
+    """Return the share of saturated pixels in an infrared image."""
+    return float(np.count_nonzero(ir == SATURATED)) / ir.size
+
+
+# Depths are compared by their bits as int32: IEEE 754 orders positive floats as their bits, and integers vectorise.
+# Zero has bits 0, negative depths negative bits, infinity INFINITE_BITS, and NaN is beyond either end.
 NO_SAMPLE = np.int32(0x7FFFFFFF)
-"""Depth is compared by its bits: those of positive floats are ordered as the floats are, and this is beyond them."""
+"""Bits above those of any valid depth, which sort invalid samples last."""
 INFINITE_BITS = np.int32(0x7F800000)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _gather(depth_bits: Int32, ir: NDArray[np.uint8], bits: Int32, counts: NDArray[np.uint8]) -> np.int32:
-    """Copy one cell's samples side by side; how many of them are a return (not NaN, 0, negative or infinite)."""
+    """Copy one cell's samples to `bits` and `counts`; return how many are valid (not NaN, 0, negative or infinite)."""
     valid, k = np.int32(0), 0
     for r in range(depth_bits.shape[0]):
         for c in range(depth_bits.shape[1]):
@@ -73,7 +81,10 @@ def _gather(depth_bits: Int32, ir: NDArray[np.uint8], bits: Int32, counts: NDArr
 
 @numba.njit(cache=True, error_model="numpy")
 def _two_from(bits: Int32, rank: np.int32) -> tuple[np.int32, np.int32]:
-    """The bits of the samples of that rank (0 is the smallest) and the next, by bisection between samples."""
+    """Return the bits of the samples of this rank (0 is the smallest) and the next one."""
+    # Bisection between the smallest and the largest valid sample, without sorting: count the samples up to the middle.
+    # More than `rank` of them: the wanted one is among them, at most the largest of those (`below`). Otherwise it is at
+    # least the smallest above the middle (`above`). Both bounds are samples, so low meets high at the wanted one.
     low, high = NO_SAMPLE, np.int32(0)
     for i in range(bits.size):
         low = min(low, bits[i])
@@ -90,6 +101,7 @@ def _two_from(bits: Int32, rank: np.int32) -> tuple[np.int32, np.int32]:
             high = below
         else:
             low = above
+    # The next in rank is the same value where it repeats beyond the rank, else the smallest above it.
     up_to, above = np.int32(0), NO_SAMPLE
     for i in range(bits.size):
         is_below = bits[i] <= low
@@ -100,7 +112,7 @@ def _two_from(bits: Int32, rank: np.int32) -> tuple[np.int32, np.int32]:
 
 @numba.njit(cache=True, error_model="numpy")
 def _mean_near(bits: Int32, depth_m: Float32, counts: NDArray[np.uint8], median_m: Real, spread_m: Real) -> np.floating:
-    """The mean count of the samples within `spread_m` of the median; NaN if there are none."""
+    """Return the mean count of the samples within `spread_m` of the median; NaN without any."""
     total, near = np.int32(0), np.int32(0)
     for i in range(bits.size):
         is_near = (bits[i] != NO_SAMPLE) & (abs(depth_m[i] - median_m) <= spread_m)
@@ -109,17 +121,18 @@ def _mean_near(bits: Int32, depth_m: Float32, counts: NDArray[np.uint8], median_
     return np.float32(total) / np.float32(near)
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)  # meanwhile another thread may take the next frame
+@numba.njit(cache=True, error_model="numpy", nogil=True)  # so that another thread can read the next frame
 def _reduce_cells(
     depth_bits: Int32,
     ir: NDArray[np.uint8],
     row_edges: NDArray[np.int64],
     column_edges: NDArray[np.int64],
-    most: int,
+    max_samples: int,
 ) -> tuple[Float32, Float32]:
+    """Return depth and intensity of every cell, NaN and 0 without valid samples."""
     rows, columns = row_edges.size - 1, column_edges.size - 1
     depth, intensity = np.full((rows, columns), np.nan, np.float32), np.zeros((rows, columns), np.float32)
-    bits, middle, counts = np.empty(most, np.int32), np.empty(2, np.int32), np.empty(most, np.uint8)
+    bits, middle, counts = np.empty(max_samples, np.int32), np.empty(2, np.int32), np.empty(max_samples, np.uint8)
     samples_m, middle_m = bits.view(np.float32), middle.view(np.float32)
     for i in range(rows):
         top, bottom = row_edges[i], row_edges[i + 1]
@@ -132,55 +145,46 @@ def _reduce_cells(
             middle[0], middle[1] = _two_from(bits[:n], (valid - np.int32(1)) >> 1)
             depth[i, j] = middle_m[0] if valid % 2 else (middle_m[0] + middle_m[1]) / np.float32(2.0)
             mean = _mean_near(bits[:n], samples_m[:n], counts[:n], depth[i, j], np.float32(WINNER_SPREAD_M))
-            # the two middle samples may lie far apart, and none near their mean
+            # the two middle samples may be of two echoes, with no sample near their mean: take all valid ones then
             intensity[i, j] = mean if mean == mean else _mean_near(bits[:n], samples_m[:n], counts[:n], 0.0, np.inf)  # noqa: PLR0124  NaN
     return depth, intensity
 
 
 def _edges(pixels: int, cells: int) -> NDArray[np.int64]:
-    """The first pixel of each cell, and one past the last: a pixel belongs to the cell that holds its centre."""
+    """Return the first pixel of each cell, and one past the last: a pixel belongs to the cell that holds its center."""
+    # Pixel p has its center at (p + 1/2) cells / pixels, so cell k begins with the least p >= k pixels / cells - 1/2.
     return np.ceil(np.arange(cells + 1) * pixels / cells - 0.5).astype(np.int64).clip(0, pixels)
 
 
 def maps_from_frame(frame: Frame) -> LidarMaps:
-    """Reduce the full field of a frame to the (64, 80) cells: median depth, mean intensity near that median."""
+    """Reduce the full field of a frame to (64, 80) cells: median depth, and mean intensity near that median."""
     height, width = frame.depth_m.shape
-    most = ceil(height / MAP_ROWS + 1) * ceil(width / MAP_COLUMNS + 1)
+    max_samples = ceil(height / MAP_ROWS + 1) * ceil(width / MAP_COLUMNS + 1)
     edges = _edges(height, MAP_ROWS), _edges(width, MAP_COLUMNS)
-    depth, intensity = _reduce_cells(frame.depth_m.view(np.int32), frame.ir, *edges, most)
+    depth, intensity = _reduce_cells(frame.depth_m.view(np.int32), frame.ir, *edges, max_samples)
     return LidarMaps(depth, intensity, ~np.isnan(depth))
 
 
-MAX_SATURATED = 0.001
-"""Share of infrared pixels; the L515 under-estimates depth where they are."""
-
-
-def saturated_share(ir: NDArray[np.uint8]) -> float:
-    """Of the pixels of an infrared image, the share that is saturated."""
-    return float(np.count_nonzero(ir == SATURATED)) / ir.size
-
-
-SATURATED = 255
-"""The full scale of the IR's 8 bits, in counts."""
-
-
 class MapMean:
-    """The mean of the last maps, as many as are given, in the same time however many; NaN depth is no sample.
+    """Running mean of the last `frames` maps, per cell over those in which it was valid, in constant time per frame.
 
-    Sums in float64 are of float32 depths, which are exact while the depths lie between 2^-15 m and 2^15 m over the
-    number of frames: what is taken off is what was added, and no error accumulates.
+    Stateful: feed maps in order, from one thread.
     """
+
+    # A running sum adds the new value and subtracts the old one, without error as long as sums fit the 53 bits of
+    # float64: float32 depths of at least 2^-15 m, of 24 bits each, are multiples of 2^-38 m, and sums of such multiples
+    # are exact below 2^15 m.
 
     def __init__(self, frames: int) -> None:
         shape = MAP_ROWS, MAP_COLUMNS
         self._last = np.zeros((frames, 2, *shape), np.float32)
-        """Depth and intensity, 0 where there was none."""
+        """Depth and intensity of each frame, 0 where invalid."""
         self._valid = np.zeros((frames, *shape), np.bool_)
         self._sums, self._count = np.zeros((2, *shape)), np.zeros(shape, np.int64)
         self._next = 0
 
     def add(self, maps: LidarMaps) -> LidarMaps:
-        """Take the maps of a frame in, let go of those that have become too old, and return the mean."""
+        """Add the maps of a frame, drop the oldest beyond `frames`, and return the mean."""
         if len(self._last) == 1:
             return maps
         last, valid = self._last[self._next], self._valid[self._next]
@@ -191,6 +195,7 @@ class MapMean:
         self._sums += last
         self._count += valid
         self._next = (self._next + 1) % len(self._last)
-        seen = self._count > 0
+        has_samples = self._count > 0
         depth_m, intensity = (self._sums / np.maximum(self._count, 1)).astype(np.float32)
-        return LidarMaps(np.where(seen, depth_m, np.float32(np.nan)), np.where(seen, intensity, np.float32(0.0)), seen)
+        depth_m[~has_samples], intensity[~has_samples] = np.nan, 0.0
+        return LidarMaps(depth_m, intensity, has_samples)
