@@ -1,10 +1,9 @@
-import os
 from pathlib import Path
 
 import pytest
 
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.files import atomic_directory, cache_folder
+from nlos_cam.files import atomic_directory, atomic_file, cache_folder
 
 
 @pytest.mark.parametrize(
@@ -28,17 +27,41 @@ def test_cache_folder_is_chosen_by_variables(
     assert not cache_folder().exists()
 
 
-def test_folder_appears_when_it_is_whole(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    with atomic_directory(out) as part:
-        (part / "inner").mkdir()
-        (part / "inner" / "a.txt").write_text("a")
-        assert not out.exists()
-    assert (out / "inner" / "a.txt").read_text() == "a"
+def test_atomic_file_appears_when_it_is_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, synced = tmp_path / "out.txt", list[int]()
+    out.write_text("old")
+    monkeypatch.setattr("nlos_cam.files.os.fsync", synced.append)
+    with atomic_file(out) as part, atomic_file(out) as other:  # two writers do not meet
+        part.write_text("new")
+        other.write_text("other")
+        assert out.read_text() == "old"
+    assert out.read_text() == "new"
+    assert len(synced) == 2
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_contents_of_the_same_names_are_replaced(tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
+def test_atomic_writes_leave_nothing_after_an_error(tmp_path: Path, error: type[BaseException]) -> None:
+    with pytest.raises(error), atomic_directory(tmp_path / "folder") as folder, atomic_file(tmp_path / "file") as file:
+        (folder / "a.txt").write_text("a")
+        file.write_text("b")
+        raise error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_atomic_directory_appears_when_it_is_whole(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with atomic_directory(out) as part, atomic_directory(out) as other:
+        (part / "inner").mkdir()
+        (part / "inner" / "a.txt").write_text("a")
+        (other / "b.txt").write_text("b")
+        assert not out.exists()
+    assert (out / "inner" / "a.txt").read_text() == "a"
+    assert (out / "b.txt").read_text() == "b"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_atomic_directory_replaces_entries_of_the_same_name(tmp_path: Path) -> None:
     (tmp_path / "inner").mkdir()
     (tmp_path / "inner" / "old.txt").write_text("old")
     (tmp_path / "mine.txt").write_text("mine")
@@ -49,23 +72,8 @@ def test_contents_of_the_same_names_are_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
-def test_folder_is_not_left_after_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), atomic_directory(tmp_path / "out") as part:
-        _ = (part / "a.txt").write_text("a") // 0
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_file_of_that_name_is_not_replaced(tmp_path: Path) -> None:
+def test_atomic_directory_refuses_to_replace_a_file(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("precious")
     with pytest.raises(OutputExistsError, match="out"), atomic_directory(tmp_path / "out"):
         pass
     assert (tmp_path / "out").read_text() == "precious"
-
-
-def test_part_of_a_killed_process_is_no_obstacle(tmp_path: Path) -> None:
-    """In containers every process may have the same number."""
-    (tmp_path / f".out.{os.getpid()}.part").mkdir()
-    with atomic_directory(tmp_path / "out") as part, atomic_directory(tmp_path / "out") as other:
-        (part / "a.txt").write_text("a")
-        (other / "b.txt").write_text("b")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.txt", "b.txt"]
