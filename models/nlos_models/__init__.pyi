@@ -1,7 +1,6 @@
 __all__ = [
     "BACKGROUND_BELOW_V",
     "BLACK_V",
-    "DOUBT_RECORD",
     "MIN_V",
     "SIMULATION_ONLY",
     "SMALLER_IS_BETTER",
@@ -10,18 +9,17 @@ __all__ = [
     "CheckpointRecord",
     "DoubtRecord",
     "DoubtSet",
-    "Figures",
     "InMemory",
     "MapBatch",
     "MapSet",
     "MapSource",
-    "OnStep",
     "OnnxReconstructor",
     "Preprocess",
     "Recipe",
     "Reconstructor",
     "Running",
     "Sample",
+    "Scores",
     "TorchReconstructor",
     "TrainingRun",
     "UncertaintyModel",
@@ -30,18 +28,15 @@ __all__ = [
     "as_batch",
     "brightness",
     "channel_statistics",
-    "check_run_folder",
-    "checksum_of_watched",
-    "colour_metrics",
+    "color_metrics",
     "compressor_start",
     "cut_silhouette",
     "digest_of",
-    "exported",
+    "export_once",
     "first_of",
     "foreground_rmse_mm",
     "latent_error",
-    "launched",
-    "less_bare_wall",
+    "launch",
     "lift_edges",
     "load_encoder",
     "load_pipeline",
@@ -50,12 +45,13 @@ __all__ = [
     "load_record",
     "load_uncertainty_model",
     "load_vae",
-    "new_record",
     "open_fabric",
     "parts_of",
-    "quantise",
-    "rebuilt",
-    "refuse_colour",
+    "quantize",
+    "rebuild",
+    "record_doubt_run",
+    "record_run",
+    "refuse_color",
     "run",
     "run_compressor",
     "run_doubt",
@@ -64,25 +60,26 @@ __all__ = [
     "shipped_folder",
     "silhouette_iou",
     "split_and_stack",
+    "subtract_bare_wall",
     "surface",
     "transfer_start",
     "vae_start",
 ]
 
 from .checkpoint import CheckpointRecord, load_encoder, load_pipeline, load_record, load_vae, shipped_folder
-from .data import InMemory, MapBatch, MapSet, MapSource, as_batch, first_of, less_bare_wall
-from .distributed import Accelerator, launched, open_fabric
-from .doubt_checkpoint import DOUBT_RECORD, DoubtRecord, UncertaintyModel, checksum_of_watched, load_uncertainty_model
+from .data import InMemory, MapBatch, MapSet, MapSource, as_batch, first_of, subtract_bare_wall
+from .distributed import Accelerator, launch, open_fabric
+from .doubt_checkpoint import DoubtRecord, UncertaintyModel, load_uncertainty_model
 from .doubt_training import DoubtSet
 from .inference import (
     OnnxReconstructor,
     Reconstructor,
     Sample,
     TorchReconstructor,
-    exported,
+    export_once,
     load_reconstructor,
-    quantise,
-    refuse_colour,
+    quantize,
+    refuse_color,
 )
 from .losses import latent_error
 from .metrics import (
@@ -93,7 +90,7 @@ from .metrics import (
     accuracy_mean_abs,
     accuracy_within_2_percent,
     brightness,
-    colour_metrics,
+    color_metrics,
     foreground_rmse_mm,
     silhouette_iou,
     surface,
@@ -101,11 +98,10 @@ from .metrics import (
 from .pipeline import SMALLEST_SPREAD, Preprocess, channel_statistics, cut_silhouette, lift_edges, split_and_stack
 from .recipe import SIMULATION_ONLY, Recipe, load_recipe
 from .runs import (
-    Figures,
     TrainingRun,
-    check_run_folder,
     compressor_start,
-    new_record,
+    record_doubt_run,
+    record_run,
     run_compressor,
     run_doubt,
     run_transfer,
@@ -113,5 +109,5 @@ from .runs import (
     transfer_start,
     vae_start,
 )
-from .tasks import parts_of, rebuilt, run
-from .train import OnStep, Running, digest_of
+from .tasks import parts_of, rebuild, run
+from .train import Running, Scores, digest_of

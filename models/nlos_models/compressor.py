@@ -1,10 +1,9 @@
-"""The compressor: MobileNetV2 with 4 input channels and 256 outputs (SI 4, Table S2; 2,552,096 parameters).
+"""Compressors from maps to latents (SI 4): MobileNetV2 for depth, ResNet50 for color.
 
-The colour compressor: ResNet50 with 8 input channels and 512 outputs (SI 4; 24,572,800 parameters).
-
-Bottlenecks 3-4-6-3 as published (He et al., "Deep Residual Learning for Image Recognition", 2015, table 1), with the
-stride in the 3 x 3 convolution, as it is commonly built: the parameters are the same. SI's 24,557,120 is the count for
-3 inputs.
+MobileNetV2 has 4 input channels and 256 outputs (Table S2; 2,552,096 parameters). ResNet50 has 8 input channels and 512
+outputs (24,572,800 parameters; SI's 24,557,120 is the count for 3 inputs), with bottlenecks 3-4-6-3 (He et al., "Deep
+Residual Learning for Image Recognition", 2015, table 1) and the stride in the 3 x 3 convolution, as is common; the
+number of parameters is the same.
 """
 
 import torch
@@ -18,14 +17,14 @@ DROPOUT = 0.5
 
 
 def conv_norm(channels_in: int, channels_out: int, kernel: int, stride: int = 1, groups: int = 1) -> list[nn.Module]:
-    """A convolution that keeps the size but for its stride, and its batch norm."""
+    """Return a padded convolution and its batch norm; only the stride changes the image's size."""
     padding = kernel // 2
     conv = nn.Conv2d(channels_in, channels_out, kernel, stride, padding, groups=groups, bias=False)
     return [conv, nn.BatchNorm2d(channels_out)]
 
 
 class InvertedResidual(nn.Module):
-    """Expand, filter each channel, project; added to its input where the shapes allow."""
+    """Residual block: expand, filter each channel, project; its input is added where the shapes agree."""
 
     def __init__(self, channels_in: int, channels_out: int, stride: int, expansion: int) -> None:
         super().__init__()
@@ -36,20 +35,20 @@ class InvertedResidual(nn.Module):
         self.residual = stride == 1 and channels_in == channels_out
 
     def forward(self, x: Tensor) -> Tensor:
-        """(n, in, h, w) to (n, out, h / stride, w / stride)."""
+        """Map (n, in, h, w) to (n, out, h / stride, w / stride)."""
         return x + self.layers(x) if self.residual else self.layers(x)
 
 
-def thinned(channels: int, width: float) -> int:
-    """So many of a layer's channels as a network of this width has: MobileNetV2's rule, in eights."""
+def _scale_channels(channels: int, width: float) -> int:
+    """Return the channels of a layer in a network of this width: a multiple of 8, by MobileNetV2's rule."""
     return max(8, int(channels * width + 4) // 8 * 8)
 
 
 def _features(width: float) -> nn.Sequential:
-    channels = thinned(STEM, width)
+    channels = _scale_channels(STEM, width)
     layers: list[nn.Module] = [*conv_norm(INPUT_CHANNELS, channels, 3, stride=2), nn.ReLU6()]
     for expansion, full, repeats, stride in STAGES:
-        out = thinned(full, width)
+        out = _scale_channels(full, width)
         for repeat in range(repeats):
             layers.append(InvertedResidual(channels, out, stride if repeat == 0 else 1, expansion))
             channels = out
@@ -57,7 +56,7 @@ def _features(width: float) -> nn.Sequential:
 
 
 class Compressor(nn.Module):
-    """Split-and-stack maps (n, 4, 100, 100) to latents (n, 256); of another width, all but the last layer is so."""
+    """MobileNetV2 from stacked maps (n, 4, 100, 100) to latents (n, 256); `width` scales all layers but the last."""
 
     def __init__(self, dropout: float = DROPOUT, width: float = 1.0) -> None:
         super().__init__()
@@ -65,20 +64,20 @@ class Compressor(nn.Module):
         self.classifier = nn.Sequential(nn.Dropout(dropout), nn.Linear(HEAD, OUTPUTS))
 
     def forward(self, stacked: Tensor) -> Tensor:
-        """(n, 4, 100, 100) to (n, 256)."""
+        """Map (n, 4, 100, 100) to (n, 256)."""
         return self.classifier(self.features(stacked).mean((2, 3)))
 
 
 COLOR_INPUT_CHANNELS, COLOR_OUTPUTS = 8, 512
 COLOR_STEM = 64
 COLOR_STAGES = ((64, 3, 1), (128, 4, 2), (256, 6, 2), (512, 3, 2))
-"""Channels within, repeats, stride of the first."""
+"""Inner channels, repeats, stride of the first."""
 WIDENED = 4
-"""A bottleneck gives this many times its channels within."""
+"""Output channels of a bottleneck per inner channel."""
 
 
 class Bottleneck(nn.Module):
-    """Narrow, filter, widen; added to its input, which is projected where the shapes differ."""
+    """Residual block: narrow, filter, widen; its input is added, projected where the shapes differ."""
 
     def __init__(self, channels_in: int, within: int, stride: int) -> None:
         super().__init__()
@@ -94,7 +93,7 @@ class Bottleneck(nn.Module):
         self.shortcut = nn.Identity() if same else nn.Sequential(*conv_norm(channels_in, out, 1, stride))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(n, in, h, w) to (n, 4 within, h / stride, w / stride)."""
+        """Map (n, in, h, w) to (n, 4 within, h / stride, w / stride)."""
         return torch.relu(self.main(x) + self.shortcut(x))
 
 
@@ -109,7 +108,7 @@ def _color_features(channels: int) -> nn.Sequential:
 
 
 class ResNet50(nn.Module):
-    """Stacked maps (n, channels, 100, 100) to latents (n, outputs)."""
+    """ResNet50 from stacked maps (n, channels, 100, 100) to latents (n, outputs)."""
 
     def __init__(
         self, channels: int = COLOR_INPUT_CHANNELS, outputs: int = COLOR_OUTPUTS, dropout: float = 0.0
@@ -119,5 +118,5 @@ class ResNet50(nn.Module):
         self.classifier = nn.Sequential(nn.Dropout(dropout), nn.Linear(WIDENED * COLOR_STAGES[-1][0], outputs))
 
     def forward(self, stacked: Tensor) -> Tensor:
-        """(n, channels, 100, 100) to (n, outputs)."""
+        """Map (n, channels, 100, 100) to (n, outputs)."""
         return self.classifier(self.features(stacked).mean((2, 3)))

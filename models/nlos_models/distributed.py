@@ -1,4 +1,4 @@
-"""One training run on one device or on several processes: who starts them, and what is whose."""
+"""Devices and processes of a training run: launch, errors across processes, seeds and shares of a batch."""
 
 import multiprocessing
 from collections.abc import Callable
@@ -16,50 +16,51 @@ from nlos_models.recipe import Recipe
 
 Accelerator = Literal["auto", "cpu", "cuda"]
 Loss = Callable[[Any, float], Tensor]
-"""Of a batch, when such a share of the run's steps is done."""
+"""Loss of a batch, given the share of the run's steps that is done."""
 
 
 class LossStep(nn.Module):
-    """A loss as a module's forward: what several processes need, to average the gradients behind it."""
+    """Loss in the place of a module's forward pass, so that several processes average the gradients behind it."""
 
     def __init__(self, module: nn.Module, loss: Loss) -> None:
         super().__init__()
         self.module, self._loss = module, loss
 
     def forward(self, batch: Any, done: float) -> Tensor:
-        """The loss of one batch, when such a share of the run's steps is done."""
+        """Return the loss of one batch, given the share of the run's steps that is done."""
         return self._loss(batch, done)
 
 
 def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: int = 1) -> Fabric:
-    """A fabric on one device, or on several processes: one for each GPU, or on a CPU.
+    """Return a fabric of `devices` processes, one per GPU or all on the CPU.
 
-    Raises TrainingError where there are not so many GPUs, RecipeError where they cannot share a batch evenly.
+    Raises TrainingError where there are fewer GPUs, RecipeError where the processes cannot share a batch evenly.
     """
     if recipe.batch % devices:
-        raise RecipeError(f"a batch of {recipe.batch} is not shared by {devices} processes evenly: change one of them")
+        raise RecipeError(f"a batch of {recipe.batch} cannot be shared evenly by {devices} processes: change either")
     if accelerator == "auto":
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
-    there = torch.cuda.device_count()
-    if accelerator == "cuda" and devices > there:
-        raise TrainingError(f"{devices} GPUs asked for, {there} there: choose fewer --devices, or --accelerator cpu")
+    gpus = torch.cuda.device_count()
+    if accelerator == "cuda" and devices > gpus:
+        requested = f"{devices} GPU{'s' if devices > 1 else ''} requested, {gpus or 'none'} available"
+        raise TrainingError(f"{requested}: choose fewer --devices, or --accelerator cpu")
     strategy = "ddp_spawn" if devices > 1 else "auto"
     return Fabric(accelerator=accelerator, devices=devices, strategy=strategy, precision=recipe.precision)
 
 
-def launched(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
-    """What `work(fabric, *arguments)` returns in the leading process.
+def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
+    """Run `work(fabric, *arguments)` in every process and return the leading one's result.
 
-    With several processes all of that must be picklable. An error that one of them foresaw comes out as its own;
-    an interruption is passed on to all, waited for, and raised as KeyboardInterrupt.
+    With several processes, work, arguments and result have to be picklable. Errors of this package are raised as they
+    are; an interruption is passed on to all processes, waited for, and raised as KeyboardInterrupt.
     """
     if fabric.world_size == 1:
         return work(fabric, *arguments)
     try:
-        result = fabric.launch(partial(_guarded, work=work, arguments=arguments))
+        result = fabric.launch(partial(_return_errors, work=work, arguments=arguments))
     except (ProcessRaisedException, ProcessExitedException) as error:
-        last = str(error).strip().splitlines()[-1]
-        raise TrainingError(f"a training process ended early ({last}): train again, it goes on") from error
+        last_line = str(error).strip().splitlines()[-1]
+        raise TrainingError(f"a training process ended early ({last_line}): repeat the command to resume") from error
     except KeyboardInterrupt:
         _end_all()
         raise
@@ -68,8 +69,8 @@ def launched(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
     return result
 
 
-def _guarded(fabric: Fabric, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """Runs in each process; what is raised there would reach no one but as a traceback's text."""
+def _return_errors(fabric: Fabric, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """Run in each process; return expected errors, since raised ones reach the parent only as a traceback's text."""
     try:
         return work(fabric, *arguments)
     except (ValueError, OSError, KeyboardInterrupt) as error:
@@ -79,7 +80,7 @@ def _guarded(fabric: Fabric, work: Callable[..., Any], arguments: tuple[Any, ...
 
 
 def _end_all() -> None:
-    """Ask the processes to save and end, and wait until they did."""
+    """Ask the processes to save and end, and wait for them."""
     children = multiprocessing.active_children()
     for child in children:
         child.terminate()
@@ -88,12 +89,12 @@ def _end_all() -> None:
 
 
 def seed_of(*parts: int) -> int:
-    """A seed of its own for every tuple of numbers; their count goes in, as numpy ignores zeros at the end."""
+    """Return a seed for a tuple of numbers; their count goes in too, since numpy ignores zeros at the end."""
     return int(np.random.SeedSequence([*parts, len(parts)]).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def share_of(batch: Any, rank: int, world: int) -> Any:
-    """The part of a batch (a tensor, or a tuple of them) that is this process's."""
+    """Return the share of a batch (a tensor, or a tuple of them) that belongs to process `rank` of `world`."""
     if world == 1:
         return batch
     if isinstance(batch, Tensor):

@@ -1,7 +1,7 @@
-"""The doubt network: maps and what was made of them in; how far that may be believed out (about 200,000 parameters).
+"""Uncertainty ("doubt") network: maps and the image reconstructed from them in, expected error and verdicts out.
 
-Our own, not the paper's. It sees where the maps leave the bare wall's, which it has learnt, coarsely and finely, and
-the image that the networks that it watches made; the two meet at 8 x 8.
+Our own, not the paper's; about 200,000 parameters. Its inputs are the maps' differences from the bare wall's, at a
+coarse and at a fine scale, and the image; the two branches meet at 8 x 8.
 """
 
 from typing import NamedTuple
@@ -15,22 +15,22 @@ from nlos_models.compressor import conv_norm
 MAP_SHAPE = (64, 80)
 DEPTH_SCALES_M = (0.1, 0.005)
 INTENSITY_SCALES = (10.0, 1.0)
-"""By which what differs from the bare wall is told: coarsely, for what is hidden, and finely, for whether it is."""
+"""Scales of the differences from the bare wall: coarse for the hidden object, fine for the question if there is one."""
 MIN_ERROR_V, MAX_ERROR_V = 1e-3, 1.0
-"""Between which an expected error lies."""
+"""Range of an expected error."""
 
 
 class DoubtOutput(NamedTuple):
-    """What the network says, as it is trained: logits, and the logarithm of a scale."""
+    """Raw outputs for training: logits, and the logarithm of a scale."""
 
     nothing: Tensor
-    """(n,)."""
+    """(n,): logit that nothing is hidden."""
     outside: Tensor
-    """(n,)."""
+    """(n,): logit that the sample is out of distribution."""
     log_error: Tensor
-    """(n, 64, 64); of the expected absolute error in v, were there a surface."""
+    """(n, 64, 64): logarithm of the expected absolute error in v, given a surface."""
     surface: Tensor
-    """(n, 64, 64); that there is a surface."""
+    """(n, 64, 64): logit that there is a surface."""
 
 
 def _down(channels_in: int, channels_out: int, stride: int = 2) -> nn.Sequential:
@@ -38,7 +38,7 @@ def _down(channels_in: int, channels_out: int, stride: int = 2) -> nn.Sequential
 
 
 class _Up(nn.Module):
-    """Narrow, double the size, join with what was there on the way down."""
+    """Upsampling block: narrow, double the size, join with the features of that size on the way down."""
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class _Up(nn.Module):
 
 
 class DoubtNetwork(nn.Module):
-    """Maps (n, 64, 80) and images (n, 64, 64) to doubt."""
+    """Uncertainty network of maps (n, 64, 80) and images (n, 64, 64)."""
 
     bare_depth_m: Tensor
     bare_intensity: Tensor
@@ -68,35 +68,35 @@ class DoubtNetwork(nn.Module):
         self.frame = nn.Sequential(nn.Linear(256, 64), nn.ReLU(), nn.Dropout(0.2), nn.Linear(64, 2))
 
     def learn_bare(self, depth_m: Tensor, intensity: Tensor) -> None:
-        """Take the bare wall from maps (n, 64, 80) of benches with nothing hidden: each cell's median."""
+        """Set the bare wall to each cell's median over maps (n, 64, 80) of benches with nothing hidden."""
         self.bare_depth_m.copy_(torch.nan_to_num(depth_m.nanmedian(0).values))
         self.bare_intensity.copy_(intensity.median(0).values)
 
     def features(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Where maps leave the bare wall's (n, 5, 64, 80), each from -1 to 1, and which cells have no return."""
-        gone = torch.isnan(depth_m)
-        beyond_m = torch.where(gone, 0.0, depth_m - self.bare_depth_m)
-        brighter = torch.where(gone, 0.0, intensity - self.bare_intensity)
-        told = [torch.tanh(beyond_m / scale) for scale in DEPTH_SCALES_M]
-        told += [torch.tanh(brighter / scale) for scale in INTENSITY_SCALES]
-        return torch.stack([*told, gone.to(depth_m.dtype)], 1)
+        """Return (n, 5, 64, 80): differences from the bare wall, each from -1 to 1, and 1 for cells without return."""
+        invalid = torch.isnan(depth_m)
+        farther_m = torch.where(invalid, 0.0, depth_m - self.bare_depth_m)
+        brighter = torch.where(invalid, 0.0, intensity - self.bare_intensity)
+        features = [torch.tanh(farther_m / scale) for scale in DEPTH_SCALES_M]
+        features += [torch.tanh(brighter / scale) for scale in INTENSITY_SCALES]
+        return torch.stack([*features, invalid.to(depth_m.dtype)], 1)
 
     def forward(self, depth_m: Tensor, intensity: Tensor, image: Tensor) -> DoubtOutput:
-        """Maps (n, 64, 80), NaN depth where there is no return, and images (n, 64, 64) in [0, 1]."""
-        seen = self.maps(self.features(depth_m, intensity))
+        """Return the raw outputs for maps (n, 64, 80) with NaN for no return and images (n, 64, 64) in [0, 1]."""
+        from_maps = self.maps(self.features(depth_m, intensity))
         levels = [image[:, None]]
         for down in self.image:
             levels.append(down(levels[-1]))
-        met = self.meet(torch.cat([functional.interpolate(seen, (8, 8), mode="bilinear"), levels[3]], 1))
-        fine = self.ups[1](self.ups[0](met, levels[2]), levels[1])
-        both = self.pixels(torch.cat([functional.interpolate(fine, scale_factor=2.0), levels[0]], 1))
-        pooled = [part for of in (seen, met) for part in (of.mean((2, 3)), of.amax((2, 3)))]
+        joint = self.meet(torch.cat([functional.interpolate(from_maps, (8, 8), mode="bilinear"), levels[3]], 1))
+        fine = self.ups[1](self.ups[0](joint, levels[2]), levels[1])
+        pixels = self.pixels(torch.cat([functional.interpolate(fine, scale_factor=2.0), levels[0]], 1))
+        pooled = [part for x in (from_maps, joint) for part in (x.mean((2, 3)), x.amax((2, 3)))]
         logits = self.frame(torch.cat(pooled, 1))
-        return DoubtOutput(logits[:, 0], logits[:, 1], both[:, 0] - 3.0, both[:, 1])
+        return DoubtOutput(logits[:, 0], logits[:, 1], pixels[:, 0] - 3.0, pixels[:, 1])
 
 
-class Told(nn.Module):
-    """The network as it is used: probabilities and an expected error, calibrated."""
+class CalibratedDoubt(nn.Module):
+    """Uncertainty network with its calibration: probabilities, and an expected error in v."""
 
     temperature: Tensor
     error_scale: Tensor
@@ -108,8 +108,8 @@ class Told(nn.Module):
         self.register_buffer("error_scale", torch.tensor(error_scale))
 
     def forward(self, depth_m: Tensor, intensity: Tensor, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Probabilities of nothing and of outside (n,); expected error in v, probability of surface (n, 64, 64)."""
-        said = self.network(depth_m, intensity, image)
-        nothing, outside = said.nothing / self.temperature[0], said.outside / self.temperature[1]
-        error_v = (self.error_scale * said.log_error.exp()).clamp(MIN_ERROR_V, MAX_ERROR_V)
-        return torch.sigmoid(nothing), torch.sigmoid(outside), error_v, torch.sigmoid(said.surface)
+        """Return the four arrays of `doubt_checkpoint.UncertaintyEstimate`."""
+        raw = self.network(depth_m, intensity, image)
+        nothing, outside = raw.nothing / self.temperature[0], raw.outside / self.temperature[1]
+        error_v = (self.error_scale * raw.log_error.exp()).clamp(MIN_ERROR_V, MAX_ERROR_V)
+        return torch.sigmoid(nothing), torch.sigmoid(outside), error_v, torch.sigmoid(raw.surface)

@@ -1,13 +1,11 @@
-"""Inference: maps in, images out; ONNX Runtime on a CPU, torch on a GPU.
-
-An exported pipeline with its weights, and with samples its activations too, in 8-bit integers (ONNX Runtime).
-"""
+"""Inference from maps to images: ONNX Runtime on a CPU, torch on a GPU, and quantisation to 8-bit integers."""
 
 import hashlib
 import logging
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,18 +24,18 @@ OPSET = 18
 
 
 class Reconstructor(Protocol):
-    """A trained pipeline, ready to run."""
+    """Trained pipeline that is ready to run."""
 
     record: CheckpointRecord
     runtime: str
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
-        """Maps (n, 64, 80), NaN depth where there is no return, to images (n, 64, 64) in [0, 1]."""
+        """Return the images (n, 64, 64) in [0, 1] of maps (n, 64, 80) with NaN depth where there is no return."""
         ...
 
 
 class TorchReconstructor:
-    """The pipeline as torch runs it; in float32 the definition that the others are held against."""
+    """Pipeline in torch; in float32 it is the reference for the others."""
 
     def __init__(
         self, pipeline: RemappingNetwork, record: CheckpointRecord, device: str, dtype: torch.dtype = torch.float32
@@ -53,7 +51,7 @@ class TorchReconstructor:
 
 
 class OnnxReconstructor:
-    """The pipeline exported to ONNX and run by ONNX Runtime: about five times faster than torch at batch 1."""
+    """Pipeline in ONNX Runtime on the CPU, about five times faster than torch there for one frame."""
 
     def __init__(self, model: Path, record: CheckpointRecord, threads: int = 1) -> None:
         self.record, self.runtime = record, "ONNX Runtime on cpu"
@@ -65,7 +63,7 @@ class OnnxReconstructor:
 
 
 def open_session(model: Path, threads: int = 1) -> Any:
-    """An ONNX file ready to run on the CPU."""
+    """Open an ONNX file in ONNX Runtime on the CPU."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -75,29 +73,29 @@ def open_session(model: Path, threads: int = 1) -> Any:
 
 
 def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
-    """The shipped weights (None), or a checkpoint folder's, on the best device at hand.
+    """Load a checkpoint folder's weights (None: the shipped ones) on a GPU if there is one, else in ONNX Runtime.
 
-    The ONNX file is exported once into the folder `cache`, named by a checksum of weights and code.
-    Raises CheckpointError where the weights cannot be read, or are for colour.
+    The ONNX file is exported once into the folder `cache`, named by a checksum of weights and code. Raises
+    CheckpointError where the weights cannot be read or are for color.
     """
     pipeline, record = load_pipeline(folder)
-    refuse_colour(record, folder)
+    refuse_color(record, folder)
     if torch.cuda.is_available():
         return TorchReconstructor(pipeline, record, "cuda")
-    return OnnxReconstructor(exported(pipeline, cache), record)
+    return OnnxReconstructor(export_once(pipeline, cache), record)
 
 
-def refuse_colour(record: CheckpointRecord, folder: Path | None) -> None:
-    """Raise CheckpointError for weights of full colour: what runs here, and is exported, reconstructs depth."""
-    if record.colour:
+def refuse_color(record: CheckpointRecord, folder: Path | None) -> None:
+    """Raise CheckpointError for color weights: exports and runtimes are for depth."""
+    if record.color:
         raise CheckpointError(
-            f"{folder} holds weights for full colour ({SIMULATION_ONLY}): name weights for depth; "
-            "tools/colour_demo.py judges these"
+            f"{folder} holds weights for full color ({SIMULATION_ONLY}): name weights for depth, or evaluate these "
+            "with tools/studies/color.py"
         )
 
 
-def exported(pipeline: RemappingNetwork, cache: Path) -> Path:
-    """The pipeline's ONNX file in the folder `cache`, written unless it is there."""
+def export_once(pipeline: RemappingNetwork, cache: Path) -> Path:
+    """Return the pipeline's ONNX file in the folder `cache`; write it where it is missing."""
     model = cache / f"{checksum_of(pipeline)}.onnx"
     if not model.exists():
         export_onnx(pipeline, model)
@@ -105,23 +103,19 @@ def exported(pipeline: RemappingNetwork, cache: Path) -> Path:
 
 
 def export_onnx(pipeline: RemappingNetwork, path: Path) -> None:
-    """Write the whole pipeline, preprocessing included, as one ONNX file with a free batch size.
-
-    Raises ModelError for one of full colour.
-    """
+    """Write the pipeline, preprocessing included, as an ONNX file for any batch size. Raises ModelError for color."""
     if pipeline.intensities > 1:
-        raise ModelError(f"networks of full colour ({SIMULATION_ONLY}) are not exported: use them in torch")
+        raise ModelError(f"color networks ({SIMULATION_ONLY}) cannot be exported: use them in torch")
     write_onnx(pipeline, path, {"depth_m": MAP_SHAPE, "intensity": MAP_SHAPE}, ["image"])
 
 
 def write_onnx(network: nn.Module, path: Path, inputs: Mapping[str, tuple[int, int]], outputs: list[str]) -> None:
-    """Write a network of inputs (n, rows, columns), by name, as one ONNX file with a free n."""
+    """Write a network as an ONNX file for any batch size n; inputs are (n, *shape) by name."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.onnx")
     for noisy in ("onnxscript", "torch.onnx"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter warns of its own internals
+        warnings.simplefilter("ignore")  # the exporter warns about its own internals
         program = torch.onnx.export(
             network.eval(),
             tuple(torch.ones(2, *shape) for shape in inputs.values()),
@@ -134,15 +128,23 @@ def write_onnx(network: nn.Module, path: Path, inputs: Mapping[str, tuple[int, i
         )
     if program is None:
         raise ModelError("torch's exporter returned no ONNX program: install a torch between 2.6 and 2.13")
-    try:
+    with _replaced(path) as part:
         program.save(part, external_data=False)
+
+
+@contextmanager
+def _replaced(path: Path) -> Generator[Path]:
+    """Yield a temporary path of this process, renamed to `path` if the block succeeds, else deleted."""
+    part = path.with_name(f"{path.stem}.{os.getpid()}.part.onnx")
+    try:
+        yield part
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
 
 
 def checksum_of(network: nn.Module) -> str:
-    """Of all that decides what an exported network computes: exporter, weights, and this package's own code."""
+    """Return a checksum of all that an exported network depends on: exporter, weights and this package's code."""
     digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
@@ -153,39 +155,36 @@ def checksum_of(network: nn.Module) -> str:
 
 Sample = tuple[Float32, Float32]
 """Depth and intensity maps, each (n, 64, 80)."""
+QUANTIZED = ["Conv", "MatMul", "Gemm"]
+"""Operators with nearly all of the work; the rest is preprocessing, activations and the silhouette."""
 
-QUANTISED = ("Conv", "MatMul", "Gemm")
-"""Nearly all of the work; what is left over is the preprocessing, activations and the silhouette."""
 
+def quantize(model: Path, path: Path, samples: Iterable[Sample] | None = None) -> None:
+    """Write `model` with 8-bit weights; given samples, also with 8-bit activations, whose ranges come from them.
 
-def quantise(model: Path, path: Path, samples: Iterable[Sample] | None = None) -> None:
-    """Write `model` with 8-bit weights; with samples, from which their ranges are learnt, with 8-bit activations too.
-
-    Raises ModelError where ONNX Runtime cannot, with its reason.
+    Raises ModelError where ONNX Runtime fails.
     """
     import onnx
     from onnxruntime import quantization
 
     plain = onnx.load(model)
-    del plain.graph.value_info[:]  # the exporter's shapes; the quantiser turns a Gemm about and trips over them
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.onnx")
-    logging.getLogger().addFilter(_no_advice)  # it advises, through the root logger, to prepare the model first
+    del plain.graph.value_info[:]  # shapes from the exporter; they are wrong after the quantizer transposes a Gemm
+    logging.getLogger().addFilter(_is_no_advice)  # advice to preprocess the model, sent through the root logger
     try:
-        if samples is None:
-            quantization.quantize_dynamic(plain, part, op_types_to_quantize=list(QUANTISED))
-        else:
-            quantization.quantize_static(
-                plain, part, _reader(samples), op_types_to_quantize=list(QUANTISED), per_channel=True
-            )
-        part.replace(path)
+        with _replaced(path) as part:
+            if samples is None:
+                quantization.quantize_dynamic(plain, part, op_types_to_quantize=QUANTIZED)
+            else:
+                quantization.quantize_static(
+                    plain, part, _reader(samples), op_types_to_quantize=QUANTIZED, per_channel=True
+                )
     except (RuntimeError, ValueError, OSError) as error:
-        raise ModelError(f"{model} cannot be made 8-bit: {error}; use it as it is") from error
+        raise ModelError(f"{model} cannot be quantised to 8 bits ({error}): use it as it is") from error
     finally:
-        part.unlink(missing_ok=True)
-        logging.getLogger().removeFilter(_no_advice)
+        logging.getLogger().removeFilter(_is_no_advice)
 
 
-def _no_advice(record: logging.LogRecord) -> bool:
+def _is_no_advice(record: logging.LogRecord) -> bool:
     return "pre-processing before quantization" not in record.getMessage()
 
 
@@ -193,7 +192,7 @@ def _reader(samples: Iterable[Sample]) -> Any:
     from onnxruntime.quantization import CalibrationDataReader
 
     class Reader(CalibrationDataReader):
-        """Samples one by one, None at the end."""
+        """Reader of samples, one at a time; None at the end."""
 
         def __init__(self) -> None:
             self._rest: Iterator[Sample] = iter(samples)

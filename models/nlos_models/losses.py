@@ -1,4 +1,4 @@
-"""The losses of the two steps. SI states neither reduction: pixels and latent entries are summed, samples averaged."""
+"""Losses of VAE and compressor. SI states no reduction: here pixels and latent entries are summed, samples averaged."""
 
 import torch
 from torch import Tensor
@@ -7,11 +7,12 @@ from nlos_models.recipe import ImageLoss
 
 
 def image_error(image: Tensor, truth: Tensor, surface_weight: float = 1.0, kind: ImageLoss = "squared") -> Tensor:
-    """Error of images (n, channels, 64, 64): summed over pixels and channels, averaged over the batch.
+    """Return the error of images (n, channels, 64, 64), summed over pixels and channels, averaged over the batch.
 
-    What is surface with probability p at v is, by squared error, best answered with w p v / (1 - p + w p), where w is
-    `surface_weight`: at 1 doubt of the outline is told as distance, above it less so. By absolute error it is best
-    answered with v where w p > 1 - p and with 0 elsewhere: doubt stays doubt.
+    Suppose that a pixel is a surface at v with probability p, else background (0), and that w is `surface_weight`. The
+    expected squared error p w (x - v)^2 + (1 - p) x^2 is least at x = w p v / (1 - p + w p): for w = 1 at p v, so that
+    an uncertain outline looks like a larger distance, less so for w > 1. The expected absolute error is least at x = v
+    where w p > 1 - p and at x = 0 elsewhere: the outline stays sharp.
     """
     truth = truth.float()
     off = image.float() - truth
@@ -20,20 +21,26 @@ def image_error(image: Tensor, truth: Tensor, surface_weight: float = 1.0, kind:
 
 
 def kl_divergence(mean: Tensor, log_variance: Tensor) -> Tensor:
-    """KL(q || N(0, 1)) of latents (n, latent): summed over entries, averaged over the batch."""
+    """Return KL(q || N(0, 1)) of latents (n, latent), summed over entries, averaged over the batch.
+
+    For q = N(m, s^2) each entry has (m^2 + s^2 - 1 - log s^2) / 2 (Kingma and Welling, 2013, appendix B).
+    """
     mean, log_variance = mean.float(), log_variance.float()
     return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()
 
 
 def variational_share(done: float, warm_up: float) -> float:
-    """How much of its noise and divergence a VAE has when such a share of its run is done: all, without a warm-up.
+    """Return the weight of a VAE's noise and divergence after a share `done` of its run: 1 without a warm-up.
 
-    With one it begins as a plain autoencoder, for that share of the run; both then rise evenly over as much again.
+    With one, the VAE is a plain autoencoder for that share of the run; over an equal share the weight then rises to 1.
     """
     return min(1.0, max(0.0, done / warm_up - 1)) if warm_up else 1.0
 
 
 def latent_error(latent: Tensor, mean: Tensor, log_variance: Tensor) -> Tensor:
-    """Squared error of latents (n, latent) in units of the encoder's own doubt, so that empty entries weigh little."""
+    """Return the squared error of latents (n, latent) in units of the encoder's variance, averaged over the batch.
+
+    Entries that the encoder leaves close to its prior have a variance near 1 and weigh little.
+    """
     weight = torch.exp(-log_variance.float()).clamp(max=100.0)
     return (weight * (latent.float() - mean.float()).square()).sum(1).mean()

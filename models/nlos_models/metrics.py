@@ -1,7 +1,4 @@
-"""Metrics by name (v in [0, 1], background where v < 0.05); one value per object.
-
-Metrics of colour images (n, 3, 64, 64) with v in [0, 1], black background; one value per object.
-"""
+"""Image metrics, one value per object: of depth images v in [0, 1] (background below 0.05) and of color images."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,31 +12,31 @@ MIN_V = 0.1
 
 
 def surface(image: Float32) -> NDArray[np.bool_]:
-    """Where an image (..., 64, 64) shows a surface."""
+    """Return the mask of an image's surface, (..., 64, 64)."""
     return image >= BACKGROUND_BELOW_V
 
 
 def accuracy_mean_abs(image: Float32, truth: Float32) -> Float64:
-    """1 - mean |v - v_true| over all pixels, (n,)."""
+    """Return 1 - mean |v - v_true| over all pixels, (n,)."""
     return 1.0 - np.abs(image.astype(np.float64) - truth).mean((-2, -1))
 
 
 def accuracy_within_2_percent(image: Float32, truth: Float32) -> Float64:
-    """Share of all pixels with |v - v_true| <= 0.02, (n,)."""
+    """Return the share of all pixels with |v - v_true| <= 0.02, (n,)."""
     return (np.abs(image - truth) <= CLOSE).mean((-2, -1))
 
 
 def silhouette_iou(image: Float32, truth: Float32) -> Float64:
-    """Intersection over union of the surface masks, (n,); 1 where both are empty."""
-    mine, its = surface(image), surface(truth)
-    union = (mine | its).sum((-2, -1))
-    return np.where(union > 0, (mine & its).sum((-2, -1)) / np.maximum(union, 1), 1.0)
+    """Return intersection over union of the surface masks, (n,); 1 where both are empty."""
+    found, true = surface(image), surface(truth)
+    union = (found | true).sum((-2, -1))
+    return np.where(union > 0, (found & true).sum((-2, -1)) / np.maximum(union, 1), 1.0)
 
 
 def foreground_rmse_mm(image: Float32, truth: Float32, mm_per_v: float) -> Float64:
-    """RMSE of depth over pixels that are surface in both, (n,); NaN where they share none.
+    """Return the RMSE of depth over pixels with a surface in both, (n,); NaN where they share none.
 
-    Depth is what `live` shows: a v between background's and MIN_V is at z_far.
+    Depth as `live` shows it: v from 0.05 to MIN_V is at z_far.
     """
     both = surface(image) & surface(truth)
     apart = np.maximum(image.astype(np.float64), MIN_V) - np.maximum(truth, MIN_V)
@@ -49,32 +46,32 @@ def foreground_rmse_mm(image: Float32, truth: Float32, mm_per_v: float) -> Float
 
 
 BLACK_V = 0.1
-"""v of a channel that a surface does not reflect at all; background is 0."""
+"""v of a surface's channel with an albedo of 0; background is 0."""
 SMALLER_IS_BETTER = frozenset({"root_mean_square_error", "colour_error"})
 
 
 def brightness(image: Float32) -> Float32:
-    """The brightest channel (..., 64, 64) of colour images (..., 3, 64, 64): it says where there is a surface."""
+    """Return the brightest channel (..., 64, 64) of color images (..., 3, 64, 64), which defines their surface."""
     return image.max(-3)
 
 
-def colour_silhouette_iou(image: Float32, truth: Float32) -> Float64:
-    """`silhouette_iou` of what is not black, (n,)."""
+def color_silhouette_iou(image: Float32, truth: Float32) -> Float64:
+    """Return `silhouette_iou` of the brightest channels, (n,)."""
     return silhouette_iou(brightness(image), brightness(truth))
 
 
-def colour_accuracy_mean_abs(image: Float32, truth: Float32) -> Float64:
-    """1 - mean |v - v_true| over all pixels and channels, (n,)."""
+def color_accuracy_mean_abs(image: Float32, truth: Float32) -> Float64:
+    """Return 1 - mean |v - v_true| over all pixels and channels, (n,)."""
     return accuracy_mean_abs(image, truth).mean(-1)
 
 
 def root_mean_square_error(image: Float32, truth: Float32) -> Float64:
-    """RMS of v - v_true over all pixels and channels, (n,): of all that is the same for every object, the mean wins."""
+    """Return the RMS of v - v_true over all pixels and channels, (n,); the mean object is its best constant answer."""
     return np.sqrt(np.square(image.astype(np.float64) - truth).mean((-3, -2, -1)))
 
 
-def colour_error(image: Float32, truth: Float32) -> Float64:
-    """Mean |albedo - its truth| over channels and pixels that are surface in both, (n,); NaN where they share none."""
+def color_error(image: Float32, truth: Float32) -> Float64:
+    """Return the mean |albedo error| over channels and pixels with surface in both, (n,); NaN where they share none."""
     both = surface(brightness(image)) & surface(brightness(truth))
     apart = np.abs(np.maximum(image, BLACK_V).astype(np.float64) - np.maximum(truth, BLACK_V)) / (1 - BLACK_V)
     count = both.sum((-2, -1))
@@ -82,11 +79,11 @@ def colour_error(image: Float32, truth: Float32) -> Float64:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def colour_metrics(image: Float32, truth: Float32) -> dict[str, Float64]:
-    """Every metric of colour by name, each (n,)."""
+def color_metrics(image: Float32, truth: Float32) -> dict[str, Float64]:
+    """Return every color metric by name, each (n,)."""
     return {
-        "silhouette_iou": colour_silhouette_iou(image, truth),
-        "accuracy_mean_abs": colour_accuracy_mean_abs(image, truth),
+        "silhouette_iou": color_silhouette_iou(image, truth),
+        "accuracy_mean_abs": color_accuracy_mean_abs(image, truth),
         "root_mean_square_error": root_mean_square_error(image, truth),
-        "colour_error": colour_error(image, truth),
+        "colour_error": color_error(image, truth),
     }

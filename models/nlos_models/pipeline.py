@@ -1,43 +1,36 @@
-"""Compressor and decoder as one network: lidar maps in, image of what is hidden out.
+"""Reconstruction network from lidar maps to hidden images: preprocessing, compressor, decoder, silhouette (SI 3, 4).
 
-Split-and-stack: (64, 80) lidar maps to the (4, 100, 100) that the compressor eats (SI 4).
-
-Channels: left depth, right depth, left intensity, right intensity; left = columns 0 to 39, nearer the lidar. In
-colour, which is simulation only, three intensities follow the depth: 8 channels.
-
-Where the surface ends, and how deep it is there: the last step from a decoded image to a hidden depth map.
-
-A network trained on squared error answers with the mean of what could be there: near a silhouette, a fraction of the
-surface's v. By the convention v < 0.05 nearly all of that would count as surface, and much too far away. So a pixel is
-kept only if it reaches KEPT_SHARE of the brightest about it, and what is kept is lifted to the surface's own v.
-
-The networks that a recipe asks for: of depth, or of full colour (SI 3 and 4), which is simulation only.
-
-A colour image (n, 3, 64, 64) holds the hidden object's albedo in red, green and blue: 0 for background, else from 0.1
+Split-and-stack cuts maps (64, 80) into four channels: left depth, right depth, left intensity, right intensity. Columns
+0 to 39 are left, nearer the lidar. In color, which is simulation only, three intensities follow the depth: 8 channels.
+A color image (n, 3, 64, 64) holds the hidden object's albedo in red, green and blue: 0 for background, else from 0.1
 (black) to 1 (white) in each channel.
+
+Silhouette: a network trained on squared error answers with the mean of all images that are possible, so that a pixel
+near the outline has a fraction of the surface's v. The convention v < 0.05 would count nearly all of them as surface,
+much too far away. So a pixel is kept only if it reaches KEPT_SHARE of the brightest pixel around it, and is then lifted
+to the surface's own v.
 """
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nlos_models.compressor import COLOR_OUTPUTS as COLOUR_LATENT
-from nlos_models.compressor import DROPOUT, Compressor, ResNet50
+from nlos_models.compressor import COLOR_OUTPUTS, DROPOUT, Compressor, ResNet50
 from nlos_models.metrics import MIN_V
 from nlos_models.vae import Decoder, ResVae
 
 RESIZED = 100
 SMALLEST_SPREAD = 1e-6
-"""A channel that never varies is divided by this, not by zero."""
+"""Divisor of a channel without variation."""
 
 
 def stacked_channels(intensities: int = 1) -> int:
-    """Left and right half of the depth and of each intensity."""
+    """Return the number of channels: left and right half of the depth and of each intensity."""
     return 2 * (1 + intensities)
 
 
 def split_and_stack(depth_m: Tensor, intensity: Tensor) -> Tensor:
-    """Depth (n, 64, 80), and intensity (n, 64, 80) or (n, k, 64, 80), to (n, 2 + 2 k, 64, 40): left, right in turn.
+    """Stack depth (n, 64, 80) and intensity (n, 64, 80) or (n, k, 64, 80) to (n, 2 + 2 k, 64, 40): left, right in turn.
 
     A cell without a return (NaN depth) is NaN in all of its channels.
     """
@@ -49,17 +42,17 @@ def split_and_stack(depth_m: Tensor, intensity: Tensor) -> Tensor:
 
 
 def channel_statistics(stacked: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation (channels,) of stacked maps (n, channels, 64, 40) over the cells with a return."""
+    """Return mean and standard deviation (channels,) of stacked maps (n, channels, 64, 40) over valid cells."""
     values = stacked.transpose(0, 1).flatten(1).double()
-    seen = ~torch.isnan(values)
-    count = seen.sum(1).clamp(min=1)
-    mean = torch.where(seen, values, 0.0).sum(1) / count
-    spread = torch.where(seen, values - mean[:, None], 0.0).square().sum(1) / count
+    valid = ~torch.isnan(values)
+    count = valid.sum(1).clamp(min=1)
+    mean = torch.where(valid, values, 0.0).sum(1) / count
+    spread = torch.where(valid, values - mean[:, None], 0.0).square().sum(1) / count
     return mean.float(), spread.sqrt().float()
 
 
 class Preprocess(nn.Module):
-    """Normalise per channel, add SI 4's noise to the left channels while training, resize to 100 x 100."""
+    """Preprocessing: normalise each channel, add SI 4's noise to the left ones in training, resize to 100 x 100."""
 
     mean: Tensor
     spread: Tensor
@@ -70,14 +63,14 @@ class Preprocess(nn.Module):
         self.register_buffer("mean", torch.zeros(stacked_channels(intensities)))
         self.register_buffer("spread", torch.ones(stacked_channels(intensities)))
 
-    def learn(self, stacked: Tensor) -> None:
-        """Take the statistics from training maps (n, channels, 64, 40)."""
+    def learn(self, stacked: Tensor, channels: slice = slice(None)) -> None:
+        """Set the statistics of all or some channels to those of stacked maps (n, channels, 64, 40)."""
         mean, spread = channel_statistics(stacked)
-        self.mean.copy_(mean)
-        self.spread.copy_(spread)
+        self.mean[channels] = mean[channels]
+        self.spread[channels] = spread[channels]
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Maps (n, 64, 80) to (n, channels, 100, 100); invalid cells take the channel's mean, which is 0 here."""
+        """Map maps (n, 64, 80) to (n, channels, 100, 100); invalid cells get the channel's mean (0, normalised)."""
         stacked = split_and_stack(depth_m, intensity)
         scale = self.spread.clamp(min=SMALLEST_SPREAD)
         normal = (stacked - self.mean[:, None, None]) / scale[:, None, None]
@@ -96,7 +89,7 @@ KEPT_SHARE = 0.4
 
 
 def cut_silhouette(image: Tensor) -> Tensor:
-    """Decoded images (n, channels, h, w) as hidden images: 0 for background; a pixel's brightest channel tells."""
+    """Set the background of decoded images (n, channels, h, w) to 0, judging each pixel by its brightest channel."""
     bright = image.amax(1, keepdim=True)
     brightest = functional.max_pool2d(bright, WINDOW, stride=1, padding=WINDOW // 2)
     kept = (bright >= KEPT_SHARE * brightest) & (bright >= MIN_V)
@@ -104,16 +97,16 @@ def cut_silhouette(image: Tensor) -> Tensor:
 
 
 def lift_edges(image: Tensor) -> Tensor:
-    """Raise decoded images (n, 1, h, w) to the smoothed brightest of their surroundings; nothing gets darker."""
+    """Raise decoded images (n, 1, h, w) to the smoothed maximum around each pixel; no pixel gets darker."""
     pad = LIFT_WINDOW // 2
     brightest = functional.max_pool2d(image, LIFT_WINDOW, stride=1, padding=pad)
     return torch.maximum(image, functional.avg_pool2d(brightest, LIFT_WINDOW, 1, pad, count_include_pad=False))
 
 
 class RemappingNetwork(nn.Module):
-    """Maps (n, 64, 80) to images (n, 64, 64) in [0, 1]: preprocessing, compressor, decoder, silhouette.
+    """Network from maps (n, 64, 80) to images (n, 64, 64) in [0, 1]: preprocessing, compressor, decoder, silhouette.
 
-    In colour (simulation only: the L515's laser is infrared) intensities (n, 3, 64, 80) to images (n, 3, 64, 64).
+    In color (simulation only: the L515's laser is infrared) intensities are (n, 3, 64, 80), images (n, 3, 64, 64).
     """
 
     def __init__(self, compressor: nn.Module, decoder: Decoder, left_noise: float = 0.2, intensities: int = 1) -> None:
@@ -124,11 +117,11 @@ class RemappingNetwork(nn.Module):
         self.decoder = decoder
 
     def latent(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Maps (n, 64, 80), NaN depth where there is no return, to latents (n, latent)."""
+        """Return the latents (n, latent) of maps (n, 64, 80) with NaN depth where there is no return."""
         return self.compressor(self.preprocess(depth_m, intensity))
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Maps to images; depth is lifted to its brightest about an edge, where colours would run into each other."""
+        """Return the images of maps; edges of depth are lifted, edges of color are not: colors would mix."""
         image = self.decoder(self.latent(depth_m, intensity))
         cut = cut_silhouette(image)
         if image.shape[1] > 1:
@@ -139,22 +132,22 @@ class RemappingNetwork(nn.Module):
 CHANNELS = 3
 
 
-def new_vae(*, colour: bool) -> ResVae:
-    """A new Res-VAE: of 64 x 64 with a latent of 256, or in colour of 64 x 64 x 3 with one of 512 (SI 3)."""
-    return ResVae(CHANNELS, COLOUR_LATENT) if colour else ResVae()
+def new_vae(*, color: bool) -> ResVae:
+    """Return an untrained Res-VAE for 64 x 64 images with a latent of 256, or for 64 x 64 x 3 with 512 (SI 3)."""
+    return ResVae(CHANNELS, COLOR_OUTPUTS) if color else ResVae()
 
 
 def new_pipeline(
     decoder: Decoder | None = None,
     *,
-    colour: bool,
+    color: bool,
     dropout: float = DROPOUT,
     left_noise: float = 0.2,
     width: float = 1.0,
 ) -> RemappingNetwork:
-    """A new compressor before a decoder, a new one unless given: MobileNetV2, or in colour ResNet50 (SI 4)."""
-    if not colour:
+    """Return an untrained compressor (MobileNetV2, for color ResNet50; SI 4) before a decoder (default: untrained)."""
+    if not color:
         return RemappingNetwork(Compressor(dropout, width), decoder or Decoder(), left_noise)
     return RemappingNetwork(
-        ResNet50(dropout=dropout), decoder or Decoder(CHANNELS, COLOUR_LATENT), left_noise, CHANNELS
+        ResNet50(dropout=dropout), decoder or Decoder(CHANNELS, COLOR_OUTPUTS), left_noise, CHANNELS
     )

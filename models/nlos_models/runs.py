@@ -1,4 +1,4 @@
-"""Training runs: starting weights, run folder and record, and one function per task that trains and saves."""
+"""Training runs: starting weights, output folder and record, and one function per task that trains and saves."""
 
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager
@@ -22,81 +22,93 @@ from nlos_models.checkpoint import (
     shipped_folder,
 )
 from nlos_models.data import MapSet, MapSource
-from nlos_models.doubt_checkpoint import DoubtRecord, save_doubt
-from nlos_models.doubt_training import DoubtSet, calibrated, train_doubt
+from nlos_models.doubt_checkpoint import DOUBT_RECORD, DoubtRecord, checksum_of_watched, save_doubt
+from nlos_models.doubt_training import DoubtSet, calibrate, train_doubt
 from nlos_models.errors import OutputExistsError, TrainingError
 from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
 from nlos_models.tasks import Start, figures_of, run, train_compressor, train_transfer, train_vae
-from nlos_models.train import OnStep, Running
+from nlos_models.train import Running, Scores
 from nlos_models.vae import Encoder, ResVae
-
-Figures = dict[str, float]
 
 
 @contextmanager
-def unwatched(fabric: Fabric, training: "TrainingRun", name: str) -> Generator[tuple[OnStep, Running]]:
-    """Run without progress, to its end."""
-    del name
-    yield lambda _done, _total: None, training.running(fabric)
+def unwatched(running: Running, recipe: Recipe, name: str) -> Generator[Running]:
+    """Run to the end without progress or interruption."""
+    del recipe, name
+    yield running
 
 
-Watch = Callable[[Fabric, "TrainingRun", str], AbstractContextManager[tuple[OnStep, Running]]]
-"""Opens progress and interruption for a run of this name, in each of its processes; has to be picklable."""
+Watch = Callable[[Running, Recipe, str], AbstractContextManager[Running]]
+"""Adds progress and interruption to a run, given its name; called in each process, so it has to be picklable."""
 
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """Everything that a task needs beside its data."""
+    """Parameters of a run besides its data and its starting weights."""
 
     recipe: Recipe
     out: Path
     record: CheckpointRecord
-    """Record of the weights to be made, still without figures."""
+    """Record of the weights that the run makes, without figures."""
+    origin: str = ""
+    """`digest_of` starting weights and data; see `Running`."""
     tensorboard: bool = False
     compiled: bool = False
-    origin: str = ""
-    """Digest of the starting weights and data; see `Running`."""
     watch: Watch = unwatched
 
-    def with_figures(self, figures: Figures) -> CheckpointRecord:
+    def watched(self, fabric: Fabric, name: str) -> AbstractContextManager[Running]:
+        """Open progress and interruption for a run of this name."""
+        running = Running(fabric, tensorboard=self.tensorboard, compiled=self.compiled, origin=self.origin)
+        return self.watch(running, self.recipe, name)
+
+    def with_figures(self, figures: Scores) -> CheckpointRecord:
         """Return the record with the held-out figures."""
         return self.record.model_copy(update={"figures": figures})
 
-    def running(self, fabric: Fabric) -> Running:
-        """Return how the run is run, without hooks."""
-        return Running(fabric, tensorboard=self.tensorboard, compiled=self.compiled, origin=self.origin)
 
+def record_run(
+    recipe: Recipe, out: Path, rig: tuple[str, str], before: list[Recipe], *starts: Path | None
+) -> CheckpointRecord:
+    """Return the record of the weights that a recipe makes after the runs `before`; `rig` is its (name, checksum).
 
-def new_record(recipe: Recipe, rig: tuple[str, str], before: list[Recipe]) -> CheckpointRecord:
-    """Return the record of the weights that a recipe makes after earlier runs; `rig` is its (name, checksum)."""
-    return CheckpointRecord.of([*before, recipe], rig, recipe.maps)
-
-
-def check_run_folder(out: Path, record: CheckpointRecord, *starts: Path | None) -> None:
-    """Raise OutputExistsError where a run into `out` would write over a file, its own start, or other weights."""
+    Raises OutputExistsError where the run would write over a file, over a folder that it starts from, or over other
+    weights.
+    """
+    record = CheckpointRecord.of([*before, recipe], rig, recipe.maps)
     if out.exists() and not out.is_dir():
-        raise OutputExistsError(f"{out} is a file, but --out must be a run's directory: choose another --out")
+        raise OutputExistsError(f"{out} is a file, but --out must be a directory: choose another --out")
     if out.resolve() in {start.resolve() for start in starts if start}:
         raise OutputExistsError(f"{out} holds the weights that this run starts from: choose another --out")
     if (out / RECORD).exists() and load_record(out).model_copy(update={"figures": {}}) != record:
         raise OutputExistsError(f"{out} holds weights from another run: choose another --out")
+    return record
 
 
-def run_vae(fabric: Fabric, training: TrainingRun, start: ResVae | None, images: Float16, held_out: Float16) -> Figures:
+def record_doubt_run(recipe: Recipe, out: Path, watched: Path, kinds: list[str]) -> DoubtRecord:
+    """Return the record of an uncertainty network that watches the weights in a folder and learns kinds of outliers.
+
+    Raises OutputExistsError where `out` is that folder or holds an uncertainty network.
+    """
+    if out.resolve() == watched.resolve() or (out / DOUBT_RECORD).exists():
+        raise OutputExistsError(f"{out} holds weights already: choose another --out")
+    return DoubtRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=kinds)
+
+
+def run_vae(fabric: Fabric, training: TrainingRun, start: ResVae | None, images: Float16, held_out: Float16) -> Scores:
     """Train a VAE and save it; return its held-out figures."""
-    with training.watch(fabric, training, "VAE") as (on_step, running):
-        vae, figures = train_vae(training.recipe, images, held_out, training.out, on_step, running, start)
+    with training.watched(fabric, "VAE") as running:
+        vae, figures = train_vae(training.recipe, images, held_out, training.out, running, start)
     if fabric.is_global_zero:
         save_vae(training.out, vae, training.with_figures(figures))
     return figures
 
 
-def run_compressor(fabric: Fabric, training: TrainingRun, start: Start, maps: MapSource, held_out: MapSet) -> Figures:
+def run_compressor(fabric: Fabric, training: TrainingRun, start: Start, maps: MapSource, held_out: MapSet) -> Scores:
     """Train a compressor and save it with its decoder; return its held-out figures."""
-    with training.watch(fabric, training, "compressor") as (on_step, running):
-        recipe = training.recipe
-        pipeline, figures = train_compressor(recipe, start, maps, held_out, training.out, on_step, running)
+    recipe = training.recipe
+    with training.watched(fabric, "compressor") as running:
+        pipeline, figures = train_compressor(recipe, start, maps, held_out, training.out, running)
     if fabric.is_global_zero:
         encoder = start.vae.encoder if start.vae and recipe.steps != "one" else None
         save_pipeline(training.out, pipeline, training.with_figures(figures), encoder)
@@ -110,78 +122,70 @@ def run_transfer(
     encoder: Encoder | None,
     maps: MapSource,
     held_out: MapSet,
-) -> dict[str, Figures]:
+) -> dict[str, Scores]:
     """Fine-tune weights on recordings and save them; return their held-out figures before and after."""
     before = figures_of(run(pipeline.to(fabric.device).eval(), held_out), held_out.image)
-    with training.watch(fabric, training, "transfer") as (on_step, running):
-        pipeline, after = train_transfer(
-            training.recipe, pipeline, encoder, maps, held_out, training.out, on_step, running
-        )
+    with training.watched(fabric, "transfer") as running:
+        pipeline, after = train_transfer(training.recipe, pipeline, encoder, maps, held_out, training.out, running)
     if fabric.is_global_zero:
         save_pipeline(training.out, pipeline, training.with_figures(after), encoder)
     return {"before": before, "after": after}
 
 
 def run_doubt(
-    fabric: Fabric,
-    training: TrainingRun,
-    about: DoubtRecord,
-    watched: Path,
-    samples: DoubtSet,
-    held_out: DoubtSet,
-) -> Figures:
+    fabric: Fabric, training: TrainingRun, about: DoubtRecord, watched: Path, samples: DoubtSet, held_out: DoubtSet
+) -> Scores:
     """Train, calibrate and save an uncertainty network beside the weights it watches; return its held-out figures."""
-    with training.watch(fabric, training, "doubt network") as (on_step, running):
-        network, figures = train_doubt(training.recipe, samples, held_out, training.out, on_step, running)
-    fitted = calibrated(network, held_out)
-    record = about.model_copy(update={**asdict(fitted), "figures": figures})
+    with training.watched(fabric, "uncertainty network") as running:
+        network, figures = train_doubt(training.recipe, samples, held_out, training.out, running)
+    fitted = calibrate(network, held_out)
     if fabric.is_global_zero:
+        record = about.model_copy(update={**asdict(fitted), "figures": figures})
         save_doubt(training.out, network, record, watched)
     return {**figures, "error_scale": fitted.error_scale, "outside_above": fitted.outside_above}
 
 
 def vae_start(recipe: Recipe, weights: Path | None) -> tuple[ResVae, list[Recipe]]:
-    """Load the VAE that a recipe starts from (the shipped one unless named) and the runs that made it."""
+    """Load the VAE that a recipe starts from (default: the shipped one) and the runs that made it."""
     _check_same_color(recipe, weights)
-    trained, record = load_vae(weights or shipped_folder())
-    return trained, record.vae_runs
+    vae, record = load_vae(weights or shipped_folder())
+    return vae, record.vae_runs
 
 
 def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | None) -> tuple[Start, list[Recipe]]:
-    """Load the networks that the recipe's steps start from, and the runs that made them; none for one step."""
+    """Load the networks that the recipe's steps start from and the runs that made them; none for steps = "one"."""
     if recipe.steps == "one":
         return Start(), []
     if recipe.steps == "two":
-        trained, vae_runs = vae_start(recipe, vae_folder)
+        vae, vae_runs = vae_start(recipe, vae_folder)
         if recipe.start == "scratch":
-            return Start(trained), vae_runs
+            return Start(vae), vae_runs
         pipeline, runs = _pipeline_start(recipe, weights)
-        return Start(trained, pipeline), [*(run for run in runs if run not in vae_runs), *vae_runs]
+        return Start(vae, pipeline), [*(run for run in runs if run not in vae_runs), *vae_runs]
     pipeline, runs = _pipeline_start(recipe, weights)
-    trained = new_vae(colour=recipe.colour)
+    vae = new_vae(color=recipe.colour)
     if encoder := load_encoder(weights):
-        trained.encoder = encoder
+        vae.encoder = encoder
     elif recipe.latent_weight:
         raise TrainingError(f"{weights} has no encoder to aim at: set latent_weight = 0 in the recipe")
-    trained.decoder = pipeline.decoder
-    return Start(trained, pipeline), runs
+    vae.decoder = pipeline.decoder
+    return Start(vae, pipeline), runs
 
 
 def transfer_start(
     recipe: Recipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
 ) -> tuple[RemappingNetwork, list[Recipe]]:
-    """Load the pipeline that a transfer starts from, and the runs that made it.
+    """Load the pipeline that a transfer starts from (default: the shipped one) and the runs that made it.
 
-    If `partial`, only matching layers are loaded, `on_report` is called with a summary of them, and the others are
-    initialised from the recipe's seed.
+    If `partial`, only matching layers of the compressor are loaded, `on_report` is called with a summary of them, and
+    the others are initialised from the recipe's seed.
     """
+    if not partial:
+        return _pipeline_start(recipe, weights)
     _check_fits(recipe, weights)
     torch.manual_seed(recipe.seed)
-    if partial:
-        pipeline, record, report = load_pipeline_partly(weights or shipped_folder())
-        on_report(f"compressor: {report}")
-    else:
-        pipeline, record = load_pipeline(weights)
+    pipeline, record, report = load_pipeline_partly(weights or shipped_folder())
+    on_report(f"compressor: {report}")
     return pipeline, record.runs
 
 
@@ -192,24 +196,21 @@ def _pipeline_start(recipe: Recipe, weights: Path | None) -> tuple[RemappingNetw
 
 
 def _check_fits(recipe: Recipe, folder: Path | None) -> None:
-    record = _check_same_color(recipe, folder)
+    """Raise TrainingError unless weights and recipe agree in color, maps and the compressor's width."""
+    record, wrong = _check_same_color(recipe, folder), ""
     if record.input != recipe.maps:
-        raise TrainingError(
-            f"weights expect {record.input} but the recipe uses {recipe.maps}: choose a matching pair of --weights and "
-            "--recipe"
-        )
-    if recipe.task == "compressor" and record.width != recipe.width:
-        raise TrainingError(
-            f"weights have width {record.width:g} but the recipe asks for {recipe.width:g}: choose a matching pair of "
-            "--weights and --recipe"
-        )
+        wrong = f"weights expect {record.input} but the recipe uses {recipe.maps}"
+    elif recipe.task == "compressor" and record.width != recipe.width:
+        wrong = f"weights have width {record.width:g} but the recipe asks for {recipe.width:g}"
+    if wrong:
+        raise TrainingError(f"{wrong}: choose a matching pair of --weights and --recipe")
 
 
 def _check_same_color(recipe: Recipe, folder: Path | None) -> CheckpointRecord:
     """Return the weights' record; raise TrainingError unless weights and recipe are both of depth or both in color."""
     record = load_record(folder or shipped_folder())
-    if record.colour != recipe.colour:
-        holds, wants = (f"colour ({SIMULATION_ONLY})" if one.colour else "depth" for one in (record, recipe))
+    if record.color != recipe.colour:
+        holds, wants = (f"color ({SIMULATION_ONLY})" if color else "depth" for color in (record.color, recipe.colour))
         raise TrainingError(
             f"{folder or 'the shipped folder'} holds weights for {holds} but the recipe is for {wants}: name others "
             "with --vae or --weights"

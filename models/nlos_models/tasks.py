@@ -1,12 +1,7 @@
-"""The two steps of the method as training tasks: first the VAE on images, then the compressor onto its latent.
-
-The second step of the method: maps onto a latent, and through a decoder; what training and transfer share.
-
-Transfer to a real bench (SI 4): all layers of the compressor for a few epochs, then its last classifier alone.
-"""
+"""Training tasks of the method: VAE on images, compressor onto the VAE's latent, and transfer to a bench (SI 3, 4)."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,66 +15,61 @@ from nlos_models.arrays import Float16, Float32
 from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapSet, MapSource, as_images, image_batches
 from nlos_models.errors import TrainingError
 from nlos_models.losses import image_error, kl_divergence, latent_error, variational_share
-from nlos_models.metrics import colour_error, colour_silhouette_iou, silhouette_iou
-from nlos_models.pipeline import (
-    RemappingNetwork,
-    channel_statistics,
-    cut_silhouette,
-    new_pipeline,
-    new_vae,
-    split_and_stack,
-)
+from nlos_models.metrics import color_error, color_silhouette_iou, silhouette_iou
+from nlos_models.pipeline import RemappingNetwork, cut_silhouette, new_pipeline, new_vae, split_and_stack
 from nlos_models.recipe import Recipe
-from nlos_models.train import OnStep, Running, fit
+from nlos_models.train import Running, Scores, fit
 from nlos_models.vae import Encoder, ResVae
 
 SCORING_BATCH = 100
+ALL_LAYERS, CLASSIFIER = "all-layers", "classifier"
+"""Folders of a transfer's two phases."""
+CHANNELS = {"own": slice(None), "own intensity": slice(2, None)}
+"""Channels that take the recordings' statistics: depth is in metres on every bench, intensity in a device's counts."""
 
 Module = TypeVar("Module", bound=nn.Module)
 
 
 @dataclass(frozen=True)
 class Remapping:
-    """A pipeline that learns from maps, by the latents of a frozen encoder, by images, or by both."""
+    """A pipeline with the maps that it is trained on, by the latents of a frozen encoder, by images, or by both."""
 
     pipeline: RemappingNetwork
     encoder: Encoder | None
-    """Of the VAE whose latent is aimed at; None where only images are."""
+    """Of the VAE whose latents are the targets; None for a loss of images alone."""
     source: MapSource
     held_out: MapSet
 
     def learn_statistics(self, channels: slice = slice(None)) -> None:
-        """Normalise maps, or some of the channels that they are split into, by those of the source."""
-        mean, spread = statistics_of(self.source)
-        self.pipeline.preprocess.mean[channels] = mean[channels]
-        self.pipeline.preprocess.spread[channels] = spread[channels]
+        """Normalise some or all channels of the split maps by the source's mean and spread."""
+        maps = self.source.first(STATISTICS_OBJECTS)
+        stacked = split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
+        self.pipeline.preprocess.learn(stacked, channels)
 
-    def fit(
-        self, recipe: Recipe, frozen: Iterable[nn.Module], folder: Path, on_step: OnStep, running: Running
-    ) -> dict[str, float]:
-        """Train all of the pipeline but its frozen parts; a second call resumes.
+    def fit(self, recipe: Recipe, frozen: Iterable[nn.Module], folder: Path, running: Running) -> Scores:
+        """Train all of the pipeline except its frozen parts; a second call resumes.
 
-        A frozen part keeps its weights, and its batch norms their statistics: it works as it will when in use.
+        Frozen parts keep their weights and run in eval mode, so that their batch norms keep their statistics too.
         """
-        still, fabric = list(frozen), running.on(recipe)
+        still, fabric = list(frozen), running.fabric_for(recipe)
         self.pipeline.requires_grad_(requires_grad=True)
         for part in still:
             part.requires_grad_(requires_grad=False)
         pipeline = in_channels_last(self.pipeline).to(fabric.device)
         targets = self._targets(recipe, fabric)
-        latent_of, decoded = running.quick(pipeline.latent), running.quick(pipeline.decoder)
+        encode, decode = running.maybe_compile(pipeline.latent), running.maybe_compile(pipeline.decoder)
 
         def loss(batch: MapBatch, _: float) -> Tensor:
             for part in still:
                 part.eval()
-            latent = latent_of(batch.depth_m, batch.intensity)
+            latent = encode(batch.depth_m, batch.intensity)
             value = torch.zeros((), device=latent.device)
             if targets:
                 straight, mirrored = (pair[batch.row] for pair in targets)
-                aim = torch.where(batch.mirrored[:, None, None], mirrored, straight)
-                value = value + recipe.latent_weight * latent_error(latent, *aim.unbind(1))
+                target = torch.where(batch.mirrored[:, None, None], mirrored, straight)
+                value = value + recipe.latent_weight * latent_error(latent, *target.unbind(1))
             if recipe.image_weight:
-                error = image_error(decoded(latent), batch.image, recipe.surface_weight, recipe.image_loss)
+                error = image_error(decode(latent), batch.image, recipe.surface_weight, recipe.image_loss)
                 value = value + recipe.image_weight * error
             return value
 
@@ -91,16 +81,15 @@ class Remapping:
             loss=loss,
             score=lambda: figures_of(run(pipeline, self.held_out), self.held_out.image),
             folder=folder,
-            on_step=on_step,
             running=running,
         )
 
     def _targets(self, recipe: Recipe, fabric: Fabric) -> list[Tensor]:
-        """The latents (n, 2, latent) of the images as they are, and of their mirrors; none where none are aimed at."""
+        """Return the latents (n, 2, latent) of the images and of their mirror images; none without a latent loss."""
         if not recipe.latent_weight:
             return []
         if self.encoder is None:
-            raise TrainingError("these weights have no encoder to aim at: set latent_weight = 0, or name a VAE's")
+            raise TrainingError("these weights have no encoder to aim at: set latent_weight = 0, or name a VAE (--vae)")
         encoder = in_channels_last(self.encoder).to(fabric.device).requires_grad_(requires_grad=False).eval()
         with fabric.autocast():
             return [
@@ -109,59 +98,53 @@ class Remapping:
 
 
 def in_channels_last(module: Module) -> Module:
-    """The module with its convolutions' weights laid out as CPUs and GPUs are fastest with."""
-    return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub lacks it)
+    """Return the module with its convolutions' weights in the layout that CPUs and GPUs run fastest."""
+    return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub omits it)
 
 
 def set_for_training(pipeline: RemappingNetwork, recipe: Recipe) -> None:
-    """Give a loaded pipeline the recipe's dropout and noise, which weights do not hold."""
+    """Give a loaded pipeline the recipe's dropout and noise, which checkpoints do not hold."""
     pipeline.preprocess.left_noise = recipe.left_noise
     for module in pipeline.compressor.modules():
         if isinstance(module, nn.Dropout):
             module.p = recipe.dropout
 
 
-def statistics_of(source: MapSource) -> tuple[Tensor, Tensor]:
-    """Mean and spread, each (channels,), of the channels that a source's maps are split into."""
-    maps = source.first(STATISTICS_OBJECTS)
-    return channel_statistics(split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)))
-
-
 @torch.inference_mode()
 def run(pipeline: RemappingNetwork, maps: MapSet) -> Float32:
-    """Images (n, 64, 64) that the pipeline makes of maps, in eval mode; in colour (n, 3, 64, 64)."""
+    """Return the images (n, 64, 64), in color (n, 3, 64, 64), that a pipeline in eval mode reconstructs from maps."""
     device = next(pipeline.parameters()).device
     pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
-    made = (pipeline(*(torch.from_numpy(part).to(device) for part in pair)) for pair in pairs)
-    return np.concatenate([images.float().cpu().numpy() for images in made])
+    parts = (pipeline(*(torch.from_numpy(part).to(device) for part in pair)) for pair in pairs)
+    return np.concatenate([images.float().cpu().numpy() for images in parts])
 
 
 @torch.no_grad()
 def latents_of(encoder: Encoder, images: Float16 | Float32) -> Tensor:
-    """Mean and log-variance (n, 2, latent) of images (n, 64, 64) or in colour, where the encoder is."""
+    """Return mean and log-variance (n, 2, latent) of images (n, 64, 64) or (n, 3, 64, 64), on the encoder's device."""
     device = next(encoder.parameters()).device
     parts = (as_images(part).to(device) for part in parts_of(images))
     return torch.cat([torch.stack(encoder(part), dim=1) for part in parts])
 
 
 def parts_of(arrays: NDArray[Any]) -> list[NDArray[Any]]:
-    """Arrays (n, ...) in parts that a network takes at once without learning from them."""
+    """Split arrays (n, ...) into batches for inference."""
     return [arrays[k : k + SCORING_BATCH] for k in range(0, len(arrays), SCORING_BATCH)]
 
 
-def figures_of(image: Float32, truth: Float16 | Float32) -> dict[str, float]:
-    """What a run is judged by: squared error, summed over pixels, and silhouette IoU, averaged over (n, 64, 64).
+def figures_of(image: Float32, truth: Float16 | Float32) -> Scores:
+    """Return the squared error, summed over pixels, and silhouette IoU, averaged over images (n, 64, 64).
 
-    Of images in colour (n, 3, 64, 64) also the error of colour: 1 where none shares a pixel with its truth.
+    For color images (n, 3, 64, 64) also the color error: 1 if no object shares a pixel with its ground truth.
     """
     truth = truth.astype(np.float32)
     error = float(np.square(image - truth).sum(tuple(range(1, truth.ndim))).mean())
     if truth.ndim == 3:
         return {"held_out_loss": error, "held_out_iou": float(np.mean(silhouette_iou(image, truth)))}
-    colour = colour_error(image, truth)
-    seen = colour[~np.isnan(colour)]
-    figures = {"held_out_loss": error, "held_out_iou": float(np.mean(colour_silhouette_iou(image, truth)))}
-    return {**figures, "held_out_colour_error": float(seen.mean()) if seen.size else 1.0}
+    color = color_error(image, truth)
+    shared = color[~np.isnan(color)]
+    figures = {"held_out_loss": error, "held_out_iou": float(np.mean(color_silhouette_iou(image, truth)))}
+    return {**figures, "held_out_colour_error": float(shared.mean()) if shared.size else 1.0}
 
 
 def train_vae(
@@ -169,17 +152,17 @@ def train_vae(
     images: Float16,
     held_out: Float16,
     folder: Path,
-    on_step: OnStep,
     running: Running | None = None,
     start: ResVae | None = None,
-) -> tuple[ResVae, dict[str, float]]:
-    """Train a Res-VAE on images (n, 64, 64), or in colour (n, 3, 64, 64), in [0, 1] (SI 3); a second call resumes.
+) -> tuple[ResVae, Scores]:
+    """Train a Res-VAE (SI 3), from `start` if given, on images (n, 64, 64) or (n, 3, 64, 64) in [0, 1].
 
-    It sets out from `start` if there is one. Returns the network in eval mode and its held-out figures.
+    A second call resumes. Returns the network in eval mode and its held-out figures.
     """
     torch.manual_seed(recipe.seed)
-    vae = in_channels_last(start or new_vae(colour=recipe.colour))
-    quick = (running or Running()).quick(vae)
+    running = running or Running()
+    vae = in_channels_last(start or new_vae(color=recipe.colour))
+    forward = running.maybe_compile(vae)
 
     def loss(image: Tensor, done: float) -> Tensor:
         if recipe.augmentation == "turns":
@@ -187,8 +170,8 @@ def train_vae(
         image = image.contiguous(memory_format=torch.channels_last)
         share = variational_share(done, recipe.latent_warm_up)
         noise = share * torch.randn(len(image), vae.latent, device=image.device)
-        rebuilt, mean, log_variance = quick(image, noise)
-        error = image_error(rebuilt, image, recipe.surface_weight, recipe.image_loss)
+        decoded, mean, log_variance = forward(image, noise)
+        error = image_error(decoded, image, recipe.surface_weight, recipe.image_loss)
         return error + share * recipe.kl_weight * kl_divergence(mean, log_variance)
 
     figures = fit(
@@ -197,9 +180,8 @@ def train_vae(
         steps_per_epoch=len(images) // recipe.batch,
         batches=lambda generator: image_batches(images, recipe.batch, generator),
         loss=loss,
-        score=lambda: figures_of(rebuilt(vae, held_out), held_out),
+        score=lambda: figures_of(rebuild(vae, held_out), held_out),
         folder=folder,
-        on_step=on_step,
         running=running,
     )
     return vae.cpu().eval(), figures
@@ -207,75 +189,63 @@ def train_vae(
 
 @dataclass(frozen=True)
 class Start:
-    """What a compressor's training sets out from."""
+    """Networks that a compressor's training starts from."""
 
     vae: ResVae | None = None
-    """Whose latent is aimed at, and whose decoder is used; None for steps "one"."""
+    """Source of the target latents and of the decoder; None for steps = "one"."""
     pipeline: RemappingNetwork | None = None
-    """Two-step weights, for steps "two-then-joint" (its decoder is the VAE's) or for a start from weights."""
+    """Two-step weights, for steps = "two-then-joint" (its decoder is the VAE's) or start = "weights"."""
 
 
 def train_compressor(
-    recipe: Recipe,
-    start: Start,
-    maps: MapSource,
-    held_out: MapSet,
-    folder: Path,
-    on_step: OnStep,
-    running: Running | None = None,
-) -> tuple[RemappingNetwork, dict[str, float]]:
-    """Train a compressor as the recipe's `steps` say (SI 4: onto the latent of a frozen VAE); a second call resumes.
+    recipe: Recipe, start: Start, maps: MapSource, held_out: MapSet, folder: Path, running: Running | None = None
+) -> tuple[RemappingNetwork, Scores]:
+    """Train a compressor by the recipe's `steps` (SI 4: onto the latent of a frozen VAE); a second call resumes.
 
-    Returns the network in eval mode and its held-out figures. Raises TrainingError where the start does not hold what
-    these steps need.
+    Returns the pipeline in eval mode and its held-out figures. Raises TrainingError where these steps need a network
+    that `start` does not hold.
     """
     torch.manual_seed(recipe.seed)
-    pipeline = _set_out(recipe, start)
+    pipeline = _starting_pipeline(recipe, start)
     remapping = Remapping(pipeline, start.vae.encoder if start.vae else None, maps, held_out)
     if recipe.steps != "two-then-joint":
         remapping.learn_statistics()
     frozen = [pipeline.decoder] if recipe.steps == "two" else []
-    figures = remapping.fit(recipe, frozen, folder, on_step, running or Running())
+    figures = remapping.fit(recipe, frozen, folder, running or Running())
     return pipeline.cpu().eval(), figures
 
 
-def _set_out(recipe: Recipe, start: Start) -> RemappingNetwork:
+def _starting_pipeline(recipe: Recipe, start: Start) -> RemappingNetwork:
     if recipe.steps == "one":
         return new_pipeline(
-            colour=recipe.colour, dropout=recipe.dropout, left_noise=recipe.left_noise, width=recipe.width
+            color=recipe.colour, dropout=recipe.dropout, left_noise=recipe.left_noise, width=recipe.width
         )
     if recipe.steps == "two-then-joint":
         if start.pipeline is None:
-            raise TrainingError("steps 'two-then-joint' go on from two-step weights: name them (--weights)")
-        set_for_training(start.pipeline, recipe)
-        return start.pipeline
-    if start.vae is None:
-        raise TrainingError("steps 'two' need a trained VAE: name one (--vae)")
-    pipeline = start.pipeline or new_pipeline(start.vae.decoder, colour=recipe.colour, width=recipe.width)
-    pipeline.decoder = start.vae.decoder
+            raise TrainingError("steps = 'two-then-joint' starts from two-step weights: name them (--weights)")
+        pipeline = start.pipeline
+    else:
+        if start.vae is None:
+            raise TrainingError("steps = 'two' needs a trained VAE: name one (--vae)")
+        pipeline = start.pipeline or new_pipeline(start.vae.decoder, color=recipe.colour, width=recipe.width)
+        pipeline.decoder = start.vae.decoder
     set_for_training(pipeline, recipe)
     return pipeline
 
 
 def turn_some(images: Tensor, quarters: Tensor) -> Tensor:
-    """Turn each of images (n, channels, 64, 64) by so many quarters (n,); with the mirror, SI 3's turns and flips."""
+    """Rotate images (n, channels, 64, 64) by quarter turns (n,); with the mirror, these are SI 3's turns and flips."""
     turned = torch.stack([images.rot90(k, (-2, -1)) for k in range(4)])
     return turned[quarters, torch.arange(len(images), device=images.device)]
 
 
 @torch.inference_mode()
-def rebuilt(vae: ResVae, images: Float16 | Float32) -> Float32:
-    """What a VAE alone makes of images (n, 64, 64) or (n, 3, 64, 64), cut as the pipeline cuts."""
+def rebuild(vae: ResVae, images: Float16 | Float32) -> Float32:
+    """Return images (n, 64, 64) or (n, 3, 64, 64) encoded and decoded by a VAE, with the pipeline's silhouette cut."""
     device = next(vae.parameters()).device
     means = (vae.encoder(as_images(part).to(device))[0] for part in parts_of(images))
-    made = np.concatenate([cut_silhouette(vae.decoder(mean)).float().cpu().numpy() for mean in means])
-    return made.reshape(images.shape)
-
-
-ALL_LAYERS, CLASSIFIER = "all-layers", "classifier"
-"""Each phase's folder in the run's."""
-CHANNELS = {"own": slice(None), "own intensity": slice(2, None)}
-"""Which channels take the recordings' statistics; depth is in metres on every bench, intensity in a device's counts."""
+    decoded = np.concatenate([cut_silhouette(vae.decoder(mean)).float().cpu().numpy() for mean in means])
+    return decoded.reshape(images.shape)
 
 
 def train_transfer(
@@ -285,13 +255,13 @@ def train_transfer(
     maps: MapSource,
     held_out: MapSet,
     folder: Path,
-    on_step: OnStep,
     running: Running | None = None,
-) -> tuple[RemappingNetwork, dict[str, float]]:
-    """Train synthetic weights on, in place, on recordings' maps; a second call resumes. The decoder stays as it is.
+) -> tuple[RemappingNetwork, Scores]:
+    """Fine-tune a pipeline in place on recordings' maps (SI 4); the decoder stays as it is. A second call resumes.
 
-    In the first phase batch norms go over to the recordings' statistics; in the second they are frozen with the
-    features, so that nothing but the classifier changes. Returns the network in eval mode and its held-out figures.
+    The first phase trains all layers of the compressor, and batch norms take the recordings' statistics; the second
+    freezes these with the features and trains the classifier alone. Returns the pipeline in eval mode and its held-out
+    figures.
     """
     torch.manual_seed(recipe.seed)
     running = running or Running()
@@ -302,9 +272,16 @@ def train_transfer(
     steps = len(maps.image) // recipe.batch
     before = recipe.all_layers_epochs * steps
     total = before + recipe.epochs * steps
+
+    def counting_from(first: int) -> Running:
+        def on_step(done: int, _: int) -> None:
+            running.on_step(first + done, total)
+
+        return replace(running, on_step=on_step)
+
     if recipe.all_layers_epochs:
         first = recipe.model_copy(update={"epochs": recipe.all_layers_epochs})
-        remapping.fit(first, [pipeline.decoder], folder / ALL_LAYERS, lambda done, _: on_step(done, total), running)
+        remapping.fit(first, [pipeline.decoder], folder / ALL_LAYERS, counting_from(0))
     frozen = [pipeline.decoder, pipeline.compressor.get_submodule("features")]
-    figures = remapping.fit(recipe, frozen, folder / CLASSIFIER, lambda done, _: on_step(before + done, total), running)
+    figures = remapping.fit(recipe, frozen, folder / CLASSIFIER, counting_from(before))
     return pipeline.cpu().eval(), figures

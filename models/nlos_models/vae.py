@@ -1,8 +1,8 @@
-"""Res-VAE: images (n, channels, 64, 64) in [0, 1] to a latent and back (SI 3, Table S1 and its mirror).
+"""Res-VAE between images (n, channels, 64, 64) in [0, 1] and latents (SI 3, Table S1).
 
-Depth has one channel and a latent of 256; colour, three and 512: then 512 channels enter Table S1. Chosen where
-the paper is silent: ReLU between convolutions, a sigmoid at the output, the encoder as the decoder's mirror (average
-pooling where that upsamples, 1 x 1 convolutions for mean and log-variance).
+Depth images have one channel and a latent of 256, color images three and 512; 512 channels then enter Table S1. Our
+choices where the paper is silent: ReLU between convolutions, a sigmoid at the output, and the encoder as the decoder's
+mirror (average pooling for upsampling, 1 x 1 convolutions for mean and log-variance).
 """
 
 import torch
@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 LATENT = 256
 UP_BLOCKS = ((256, 256, 512), (512, 256, 512), (512, 128, 256), (256, 64, 128), (128, 32, 64), (64, 16, 32))
-"""Table S1: channels in, within and out of each residual block; a latent of another size enters the first."""
+"""Table S1: input, inner and output channels of each residual block; the first takes the latent's size as input."""
 LOG_VARIANCE_LIMIT = 10.0
-"""exp() of what lies beyond overflows float16."""
+"""exp() of larger values overflows float16."""
 
 
 def _conv(channels_in: int, channels_out: int) -> nn.Conv2d:
@@ -25,7 +25,7 @@ def _up_blocks(latent: int) -> list[tuple[int, int, int]]:
 
 
 class ResBlock(nn.Module):
-    """Two convolutions beside a convolved shortcut, then a change of resolution by two."""
+    """Residual block: two convolutions beside a convolved shortcut, then a change of resolution by two."""
 
     def __init__(self, channels_in: int, within: int, channels_out: int, resample: nn.Module) -> None:
         super().__init__()
@@ -40,12 +40,12 @@ class ResBlock(nn.Module):
         self.resample = resample
 
     def forward(self, x: Tensor) -> Tensor:
-        """(n, in, h, w) to (n, out, h', w')."""
+        """Map (n, in, h, w) to (n, out, h', w')."""
         return self.resample(torch.relu(self.main(x) + self.shortcut(x)))
 
 
 class Decoder(nn.Module):
-    """Latents (n, latent) to images (n, channels, 64, 64) in [0, 1] (Table S1)."""
+    """Decoder from latents (n, latent) to images (n, channels, 64, 64) in [0, 1] (Table S1)."""
 
     def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
@@ -54,12 +54,12 @@ class Decoder(nn.Module):
         self.output = _conv(UP_BLOCKS[-1][-1], channels)
 
     def forward(self, latent: Tensor) -> Tensor:
-        """(n, latent) to (n, channels, 64, 64)."""
+        """Map (n, latent) to (n, channels, 64, 64)."""
         return torch.sigmoid(self.output(self.blocks(latent[:, :, None, None])))
 
 
 class Encoder(nn.Module):
-    """Images (n, channels, 64, 64) to the mean and log-variance, each (n, latent), of their latent."""
+    """Encoder from images (n, channels, 64, 64) to mean and log-variance, each (n, latent)."""
 
     def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
@@ -70,14 +70,14 @@ class Encoder(nn.Module):
         self.log_variance = nn.Conv2d(latent, latent, 1)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """(n, channels, 64, 64) to two (n, latent)."""
+        """Map (n, channels, 64, 64) to two (n, latent)."""
         features = self.blocks(torch.relu(self.input(image)))
         log_variance = self.log_variance(features).clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
         return self.mean(features).flatten(1), log_variance.flatten(1)
 
 
 class ResVae(nn.Module):
-    """Encoder, reparametrisation, decoder."""
+    """Variational autoencoder: encoder, reparametrisation, decoder."""
 
     def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
@@ -86,6 +86,6 @@ class ResVae(nn.Module):
         self.decoder = Decoder(channels, latent)
 
     def forward(self, image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Images (n, channels, 64, 64) and standard normal noise (n, latent) to image, mean and log-variance."""
+        """Map images (n, channels, 64, 64) and standard normal noise (n, latent) to image, mean and log-variance."""
         mean, log_variance = self.encoder(image)
         return self.decoder(mean + noise * torch.exp(0.5 * log_variance)), mean, log_variance

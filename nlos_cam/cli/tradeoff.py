@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 from nlos_calibration import rig_named
-from nlos_models import load_record, refuse_colour, shipped_folder
+from nlos_models import load_record, refuse_color, shipped_folder
 
 from nlos_cam.cli.common import INTERRUPTED, Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
 from nlos_cam.cli.render import hidden_depth
@@ -114,7 +114,7 @@ def _bench(folders: dict[str, Path | None], count: int | None) -> RuntimeBench:
     """
     records = {name: load_record(path or shipped_folder()) for name, path in folders.items()}
     for name, record in records.items():
-        refuse_colour(record, folders[name])
+        refuse_color(record, folders[name])
     rigs = {record.rig_name for record in records.values()}
     if len(rigs) > 1:
         raise SceneError(f"these weights are for different rigs ({', '.join(sorted(rigs))}): compare those of one rig")

@@ -1,9 +1,4 @@
-"""`train vae|compressor|transfer|doubt`: recipes to weights.
-
-The options that the three `train` commands share, each written once.
-
-`train doubt`: what a pipeline makes of ordinary objects, empty benches and outliers, to a network that doubts it.
-"""
+"""`train vae|compressor|transfer|doubt`: recipes to weights, with the options that these commands share."""
 
 import inspect
 from collections.abc import Callable, Generator
@@ -15,27 +10,24 @@ from typing import Annotated, Any
 
 import typer
 from lightning_fabric import Fabric
-from nlos_calibration import Rig, rig_named
+from nlos_calibration import rig_named
 from nlos_models import (
-    DOUBT_RECORD,
     SIMULATION_ONLY,
     Accelerator,
-    DoubtRecord,
-    Figures,
-    OnStep,
+    CheckpointRecord,
     Recipe,
     Running,
+    Scores,
     TrainingRun,
-    check_run_folder,
-    checksum_of_watched,
     compressor_start,
     digest_of,
-    launched,
+    launch,
     load_encoder,
     load_recipe,
     load_reconstructor,
-    new_record,
     open_fabric,
+    record_doubt_run,
+    record_run,
     run_compressor,
     run_doubt,
     run_transfer,
@@ -48,7 +40,7 @@ from nlos_models import (
 from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say, stop_on_signals, tracked
 from nlos_cam.dataset import (
     HELD_OUT_SEED,
-    TO_LEARN,
+    TRAINING_OUTLIERS,
     TRAINING_SEED,
     DatasetPlan,
     Objects,
@@ -58,133 +50,110 @@ from nlos_cam.dataset import (
     procedural_images,
     read_maps,
 )
-from nlos_cam.errors import OutputExistsError, SceneError
+from nlos_cam.errors import SceneError
 from nlos_cam.files import cache_folder
 from nlos_cam.objects import TEXTURES
 
+SAMPLES = "samples"
+"""Folder of rendered samples in the output folder of `train doubt`."""
+
 Budget = Annotated[float, typer.Option("--budget", min=1e-4, max=1.0, help="Share of the recipe's budget.")]
+Maps = Annotated[Path, typer.Option("--dataset", help="Training maps, from `dataset build` or `dataset label`.")]
+HeldOut = Annotated[Path, typer.Option("--held-out", help="Held-out maps, of other objects.")]
+Wall = Annotated[
+    Path | None, typer.Option("--wall", help="Bare wall for difference maps (wall.toml; default: rendered).")
+]
+Weights = Annotated[
+    Path | None, typer.Option("--weights", help="Weights that the run starts from (default: the shipped ones).")
+]
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What is run, where to, and how; each field is an option of every command."""
+    """Options that every `train` command has."""
 
-    recipe_file: Annotated[
-        Path, typer.Option("--recipe", help="A training recipe (models/recipes).", show_default=False)
+    recipe_file: Annotated[Path, typer.Option("--recipe", help="Training recipe (models/recipes).", show_default=False)]
+    out: Annotated[
+        Path, typer.Option("--out", help="Output folder: log, checkpoints, weights. An interrupted run resumes there.")
     ]
-    out: Annotated[Path, typer.Option("--out", help="The run's folder: log, checkpoints, weights. Resumes there.")]
-    objects: Annotated[int | None, typer.Option("--objects", min=2, help="Train on so many, not on the recipe's.")] = (
-        None
-    )
-    devices: Annotated[int, typer.Option("--devices", min=1, help="Processes: one for each GPU, or on the CPU.")] = 1
-    accelerator: Annotated[Accelerator, typer.Option("--accelerator", help="auto is a GPU if there is one.")] = "auto"
-    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Log for TensorBoard too, beside log.csv.")] = False
+    objects: Annotated[
+        int | None, typer.Option("--objects", min=2, help="Number of training objects (default: the recipe's).")
+    ] = None
+    devices: Annotated[
+        int, typer.Option("--devices", min=1, help="Number of processes, one per GPU or on the CPU.")
+    ] = 1
+    accelerator: Annotated[
+        Accelerator, typer.Option("--accelerator", help="Device; auto: a GPU if there is one, else the CPU.")
+    ] = "auto"
+    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also log for TensorBoard.")] = False
     compiled: Annotated[
-        bool, typer.Option("--compile", help="Networks through torch.compile: faster; needs a C++ compiler.")
+        bool, typer.Option("--compile", help="Run the networks through torch.compile; faster, needs a C++ compiler.")
     ] = False
     json: Json = False
 
     def recipe(self, task: str, budget: float = 1.0) -> Recipe:
-        """The recipe, at a share of its budget. Raises SceneError where it is another task's."""
+        """Return the recipe at a share of its budget. Raises SceneError where it is for another task."""
         recipe = load_recipe(self.recipe_file)
         if recipe.task != task:
-            told = f"{self.recipe_file} is a recipe for {recipe.task!r}, not {task!r}"
-            raise SceneError(f"{told}: choose another --recipe")
+            raise SceneError(
+                f"{self.recipe_file} is a recipe for {recipe.task!r}, not {task!r}: choose another --recipe"
+            )
         if self.objects is not None:
             recipe = recipe.of_objects(self.objects)
         return recipe.scaled(budget)
 
     def fabric(self, recipe: Recipe) -> Fabric:
-        """What the recipe is run on."""
+        """Open the devices that the recipe is run on."""
         return open_fabric(recipe, accelerator=self.accelerator, devices=self.devices)
 
-    def training(
-        self, recipe: Recipe, rig: Rig, before: list[Recipe], origin: str, *starts: Path | None
-    ) -> TrainingRun:
-        """Return the run of a recipe after earlier runs. Raises OutputExistsError where it would overwrite weights."""
-        record = new_record(recipe, (rig.name, rig.checksum), before)
-        check_run_folder(self.out, record, *starts)
-        return TrainingRun(recipe, self.out, record, self.tensorboard, self.compiled, origin, watched_run)
+    def training(self, recipe: Recipe, record: CheckpointRecord, origin: str) -> TrainingRun:
+        """Return a run with progress and interruption; `record` is that of its weights, `origin` a `digest_of`."""
+        return TrainingRun(recipe, self.out, record, origin, self.tensorboard, self.compiled, watched_run)
+
+    def finish(self, recipe: Recipe, figures: Scores, before: Scores | None = None) -> None:
+        """End a command with the figures of its weights, and of those that a transfer started from."""
+        result, text = {"out": str(self.out), **figures}, f"weights in {self.out}: {_values(figures)}"
+        if before is not None:
+            result, text = {**result, "before": before}, f"{text}; before: {_values(before)}"
+        finish(result, as_json=self.json, text=text, note=SIMULATION_ONLY if recipe.colour else "")
 
 
 @contextmanager
-def watched_run(fabric: Fabric, training: TrainingRun, name: str) -> Generator[tuple[OnStep, Running]]:
+def watched_run(running: Running, recipe: Recipe, name: str) -> Generator[Running]:
     """Show a run's progress, in the leading process; Ctrl-C or SIGTERM ends it after the current step, saved."""
     with progress() as bar, stop_on_signals() as stop:
-        title = f"training the {name}" + (f" in colour ({SIMULATION_ONLY})" if training.recipe.colour else "")
-        task = bar.add_task(title, total=None, visible=fabric.is_global_zero)
+        title = f"training the {name}" + (f" in color ({SIMULATION_ONLY})" if recipe.colour else "")
+        task = bar.add_task(title, total=None, visible=running.fabric is None or running.fabric.is_global_zero)
 
         def on_step(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        def on_epoch(row: Figures) -> None:
+        def on_epoch(row: Scores) -> None:
             text = f"epoch {row['epoch'] + 1:.0f} done, loss {row['loss']:.4g}, held out {row['held_out_loss']:.4g}"
             bar.update(task, description=f"{title}: {text}")
 
-        yield on_step, replace(training.running(fabric), stop=stop.is_set, tell=say, on_epoch=on_epoch)
+        yield replace(running, stop=stop.is_set, on_message=say, on_step=on_step, on_epoch=on_epoch)
 
 
 def refuse_ignored(why: str, given: dict[str, bool]) -> None:
-    """Raise SceneError for the first option that is given and would be ignored."""
+    """Raise SceneError for the first given option that would be ignored."""
     for option in (option for option, is_given in given.items() if is_given):
-        raise SceneError(f"{why}, so that {option} would do nothing: leave it out, or change the recipe")
+        raise SceneError(f"{why}, so {option} would have no effect: drop it, or change the recipe")
 
 
 def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """A command as typer wants it: the fields of RunOptions, spelt out, in the place of its parameter `run`."""
+    """Replace a command's parameter `run` by the fields of RunOptions, so that typer sees each as an option."""
     shared = inspect.signature(RunOptions).parameters
     own = [each for name, each in inspect.signature(command).parameters.items() if name != "run"]
 
     @wraps(command)
-    def spelt_out(**given: Any) -> None:
-        command(run=RunOptions(**{name: given.pop(name) for name in shared}), **given)
+    def expanded(**values: Any) -> None:
+        command(run=RunOptions(**{name: values.pop(name) for name in shared}), **values)
 
     every = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*shared.values(), *own)]
-    spelt_out.__annotations__ = {each.name: each.annotation for each in every}
-    spelt_out.__dict__["__signature__"] = inspect.Signature(every)
-    return spelt_out
-
-
-Maps = Annotated[Path, typer.Option("--dataset", help="Training maps, from `dataset build` or of recordings.")]
-
-
-HeldOut = Annotated[Path, typer.Option("--held-out", help="Maps to judge by, of other objects.")]
-
-
-SAMPLES = "samples"
-
-
-def doubt(
-    run: RunOptions,
-    data: Maps,
-    held_out_data: HeldOut,
-    weights: Annotated[
-        Path | None, typer.Option("--weights", help="Whose images are doubted; the shipped ones unless given.")
-    ] = None,
-) -> None:
-    """Train a doubt network on what trained weights make of maps; the run's folder is then a folder of weights."""
-    recipe, watched = run.recipe("doubt"), weights or shipped_folder()
-    fabric = run.fabric(recipe)
-    pipeline = load_reconstructor(weights, cache_folder() / "onnx")
-    training, judging = (open_dataset(folder) for folder in (data, held_out_data))
-    check_doubt_data(recipe, pipeline, training, judging)
-    about = DoubtRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=list(TO_LEARN))
-    if run.out.resolve() == watched.resolve() or (run.out / DOUBT_RECORD).exists():
-        raise OutputExistsError(f"{run.out} holds weights already: choose another --out")
-    with tracked("rendering empty benches and outliers") as on_progress:
-        sets = doubt_sets(recipe, pipeline, (training, judging), run.out / SAMPLES, on_progress)
-    job = TrainingRun(recipe, run.out, pipeline.record, run.tensorboard, run.compiled, about.watches, watched_run)
-    figures = launched(fabric, run_doubt, job, about, watched, *sets)
-    finish({"out": str(run.out), **figures}, as_json=run.json, text=f"weights with their doubt in {run.out}: {figures}")
-
-
-Wall = Annotated[
-    Path | None, typer.Option("--wall", help="The bare wall for difference maps (wall.toml); else it is rendered.")
-]
-Weights = Annotated[
-    Path | None,
-    typer.Option("--weights", help="Where a recipe that goes on from weights starts; the shipped ones unless given."),
-]
+    expanded.__annotations__ = {each.name: each.annotation for each in every}
+    expanded.__dict__["__signature__"] = inspect.Signature(every)
+    return expanded
 
 
 def register(app: typer.Typer) -> None:
@@ -199,7 +168,7 @@ def vae(
     run: RunOptions,
     weights: Weights = None,
     rig_name: Annotated[
-        str, typer.Option("--rig", help="In whose object box objects stand: a packaged rig's name, or its TOML file.")
+        str, typer.Option("--rig", help="Rig whose object box the objects stand in: a packaged rig, or a TOML file.")
     ] = PAPER_RIG,
     budget: Budget = 1.0,
 ) -> None:
@@ -208,43 +177,42 @@ def vae(
     refuse_ignored('the recipe has start = "scratch"', {"--weights": bool(weights) and recipe.start == "scratch"})
     fabric = run.fabric(recipe)
     start, runs = vae_start(recipe, weights) if recipe.start == "weights" else (None, [])
-    job = run.training(recipe, rig, runs, digest_of(start, rig.checksum), weights)
-    box = DatasetPlan(rig, 0).box
-    say(f"making {recipe.objects + recipe.held_out} objects")
-    kinds, besides = Objects.without(recipe.left_out).categories, recipe.backgrounds
+    record = record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+    job = run.training(recipe, record, digest_of(start, rig.checksum))
+    say(f"generating {recipe.objects + recipe.held_out} objects")
+    box, kinds = DatasetPlan(rig, 0).box, Objects.without(recipe.left_out).categories
     textures = tuple(TEXTURES) if recipe.colour else ()
     images, held_out = (
-        procedural_images(seed, count, box, kinds, backgrounds=besides, textures=textures)
+        procedural_images(seed, count, box, kinds, backgrounds=recipe.backgrounds, textures=textures)
         for seed, count in ((TRAINING_SEED, recipe.objects), (HELD_OUT_SEED, recipe.held_out))
     )
-    _tell(run, recipe, launched(fabric, run_vae, job, start, images, held_out))
+    run.finish(recipe, launch(fabric, run_vae, job, start, images, held_out))
 
 
 def compressor(
     run: RunOptions,
     data: Maps,
     held_out_data: HeldOut,
-    vae_folder: Annotated[
-        Path | None, typer.Option("--vae", help="A trained VAE; the shipped one unless given.")
-    ] = None,
+    vae_folder: Annotated[Path | None, typer.Option("--vae", help="Trained VAE (default: the shipped one).")] = None,
     weights: Weights = None,
     wall: Wall = None,
     stream: Annotated[
-        bool, typer.Option("--stream", help="Read the maps as they are needed: for more than memory holds.")
+        bool, typer.Option("--stream", help="Read maps from disk as needed, for datasets larger than memory.")
     ] = False,
     budget: Budget = 1.0,
 ) -> None:
     """Train a compressor onto the latent of a trained VAE (SI 4), or as the recipe's `steps` say."""
     recipe = run.recipe("compressor", budget)
-    goes_on = recipe.start == "weights" or recipe.steps == "two-then-joint"
-    refuse_ignored("the recipe starts from scratch", {"--weights": bool(weights) and not goes_on})
+    scratch = recipe.start != "weights" and recipe.steps != "two-then-joint"
+    refuse_ignored("the recipe starts from scratch", {"--weights": bool(weights) and scratch})
     refuse_ignored(f"the recipe has steps = {recipe.steps!r}", {"--vae": bool(vae_folder) and recipe.steps != "two"})
     fabric = run.fabric(recipe)
     start, runs = compressor_start(recipe, vae_folder, weights)
     maps = read_maps(recipe, data, held_out_data, wall, stream=stream)
-    origin = digest_of(start.vae, start.pipeline, maps.digest)
-    job = run.training(maps.told(recipe), maps.plan.rig, runs, origin, weights, vae_folder)
-    _tell(run, recipe, launched(fabric, run_compressor, job, start, maps.training, maps.held_out))
+    recipe, rig = maps.limit_recipe(recipe), maps.plan.rig
+    record = record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights, vae_folder)
+    job = run.training(recipe, record, digest_of(start.vae, start.pipeline, maps.digest))
+    run.finish(recipe, launch(fabric, run_compressor, job, start, maps.training, maps.held_out))
 
 
 def transfer(
@@ -253,23 +221,43 @@ def transfer(
     held_out_data: HeldOut,
     weights: Weights = None,
     partial: Annotated[
-        bool, typer.Option("--partial", help="Take what fits of a compressor that does not quite, and say what did.")
+        bool, typer.Option("--partial", help="Load matching layers only, and report which ones were loaded.")
     ] = False,
     wall: Wall = None,
 ) -> None:
-    """Train synthetic weights on, on a bench's recordings (SI 4): all layers, then the classifier alone."""
+    """Fine-tune synthetic weights on a bench's recordings (SI 4): all layers first, then the classifier alone."""
     recipe = run.recipe("transfer")
     fabric = run.fabric(recipe)
     pipeline, runs = transfer_start(recipe, weights, partial=partial, on_report=say)
     encoder = load_encoder(weights)
     maps = read_maps(recipe, data, held_out_data, wall)
-    origin = digest_of(pipeline, encoder, maps.digest)
-    job = run.training(maps.told(recipe), maps.plan.rig, runs, origin, weights)
-    figures = launched(fabric, run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
-    told = f"weights in {run.out}: {figures['after']}, from {figures['before']}"
-    finish({"out": str(run.out), **figures["after"], "before": figures["before"]}, as_json=run.json, text=told)
+    recipe, rig = maps.limit_recipe(recipe), maps.plan.rig
+    record = record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+    job = run.training(recipe, record, digest_of(pipeline, encoder, maps.digest))
+    figures = launch(fabric, run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
+    run.finish(recipe, figures["after"], figures["before"])
 
 
-def _tell(run: RunOptions, recipe: Recipe, figures: dict[str, float]) -> None:
-    note = SIMULATION_ONLY if recipe.colour else ""
-    finish({"out": str(run.out), **figures}, as_json=run.json, text=f"weights in {run.out}: {figures}", note=note)
+def doubt(
+    run: RunOptions,
+    data: Maps,
+    held_out_data: HeldOut,
+    weights: Annotated[
+        Path | None, typer.Option("--weights", help="Weights whose images are judged (default: the shipped ones).")
+    ] = None,
+) -> None:
+    """Train the uncertainty ("doubt") network of trained weights; --out then holds a copy of these weights too."""
+    recipe, watched = run.recipe("doubt"), weights or shipped_folder()
+    fabric = run.fabric(recipe)
+    pipeline = load_reconstructor(weights, cache_folder() / "onnx")
+    datasets = open_dataset(data), open_dataset(held_out_data)
+    check_doubt_data(recipe, pipeline, *datasets)
+    about = record_doubt_run(recipe, run.out, watched, list(TRAINING_OUTLIERS))
+    with tracked("rendering empty benches and outliers") as on_progress:
+        sets = doubt_sets(recipe, pipeline, datasets, run.out / SAMPLES, on_progress)
+    job = run.training(recipe, pipeline.record, about.watches)
+    run.finish(recipe, launch(fabric, run_doubt, job, about, watched, *sets))
+
+
+def _values(figures: Scores) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in figures.items())

@@ -121,4 +121,5 @@ def estimate_doubt(uncertainty_model: UncertaintyModel, maps: LidarMaps, image: 
     said = uncertainty_model(*(array[None] for array in (maps.depth_m, maps.intensity, image)))
     # v falls linearly from 1 at z_near to MIN_V at z_far, so an error of 1 in v is this many metres (depth_from_image)
     metres_per_v = (box.z_far_m - box.z_near_m) / (1 - MIN_V)
-    return Doubt(float(said.nothing[0]), float(said.outside[0]), said.error_v[0] * metres_per_v, said.surface[0])
+    error_m = said.error_v[0] * metres_per_v
+    return Doubt(float(said.p_empty[0]), float(said.p_out_of_distribution[0]), error_m, said.p_surface[0])

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from nlos_models.doubt_checkpoint import DoubtRecord, SaidOf
+from nlos_models.doubt_checkpoint import DoubtRecord, UncertaintyEstimate
 from nlos_models.recipe import Recipe
 
 RECIPE = Recipe(task="doubt", objects=8, outliers=4, empties=4, held_out=4, epochs=1, batch=4, learning_rate=1e-3)
@@ -17,7 +17,7 @@ class FakeDoubter:
         self.asked: list[tuple[np.ndarray, ...]] = []
         self._says, self._error_v = says, error_v
 
-    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray, image: np.ndarray) -> SaidOf:
+    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray, image: np.ndarray) -> UncertaintyEstimate:
         self.asked.append((depth_m, intensity, image))
         nothing, outside = (np.array([p], np.float32) for p in self._says(depth_m, intensity, image))
-        return SaidOf(nothing, outside, np.full_like(image, self._error_v), (image > 0).astype(np.float32))
+        return UncertaintyEstimate(nothing, outside, np.full_like(image, self._error_v), (image > 0).astype(np.float32))

@@ -98,8 +98,7 @@ class SmallRun:
             loss=self._loss,
             score=self.score,
             folder=self.folder,
-            on_step=on_step,
-            running=Running(**running),
+            running=Running(on_step=on_step, **running),
         )
 
     @property
@@ -153,17 +152,17 @@ def on_two(fabric: Fabric, folder: Path) -> dict[str, Any]:
     recipe = small_recipe(epochs=3, schedule="one-cycle")
     whole = SmallRun(recipe, folder / "whole", plain=True)
     figures = whole.go(fabric=fabric)
-    stopped, told = SmallRun(recipe, folder / "stopped", plain=True), list[str]()
+    stopped, messages = SmallRun(recipe, folder / "stopped", plain=True), list[str]()
     try:
-        stopped.go(fabric=fabric, stop=lambda: fabric.global_rank == 1, tell=told.append)
+        stopped.go(fabric=fabric, stop=lambda: fabric.global_rank == 1, on_message=messages.append)
     except KeyboardInterrupt:
-        told.append("interrupted")
+        messages.append("interrupted")
     again = SmallRun(recipe, folder / "stopped", plain=True)
     again.go(fabric=fabric)
     return {
         "figures": figures,
         "net": {name: tensor.tolist() for name, tensor in whole.net.state_dict().items()},
         "again": {name: tensor.tolist() for name, tensor in again.net.state_dict().items()},
-        "told": told,
+        "messages": messages,
         "scored": float(fabric.all_reduce(torch.tensor(float(whole.scored)), reduce_op="sum")),
     }

@@ -16,7 +16,7 @@ from nlos_models.tasks import run
 from small_run import log_rows
 
 from nlos_cam.cli.main import main
-from nlos_cam.dataset import build
+from nlos_cam.dataset import DatasetPlan, open_dataset
 from nlos_cam.dataset.samples import make_samples
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.errors import RecordingError
@@ -44,7 +44,7 @@ def folder(one_thread: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("color")
     for name, textures in (("data", tuple(TEXTURES)), ("depth", ())):
         for seed, of in ((40, name), (50, f"{name}-held-out")):
-            plan = build.DatasetPlan(load_rig("paper-rig"), seed, accuracy="draft", textures=textures)
+            plan = DatasetPlan(load_rig("paper-rig"), seed, accuracy="draft", textures=textures)
             (folder / of).mkdir()
             store(shard_path(folder / of, seed), make_samples(plan, range(seed, seed + 2)), plan.provenance, "")
     for name, text in RECIPES.items():
@@ -79,7 +79,7 @@ def test_color_training_notes_simulation_and_continues(go: Go, folder: Path, tmp
     code, answer = go("compressor", vae="vae")
     assert (code, answer["note"]) == (0, SIMULATION_ONLY)
     pipeline, record = load_pipeline(tmp_path / "out")
-    held_out = build.open_dataset(folder / "data-held-out", colour=True).arrays()
+    held_out = open_dataset(folder / "data-held-out", color=True).arrays()
     assert run(pipeline, held_out).shape == held_out.image.shape == (2, 3, 64, 64)
     encoder, vae = load_encoder(tmp_path / "out"), load_vae(folder / "vae")[0]
     assert encoder is not None
@@ -90,7 +90,7 @@ def test_color_training_notes_simulation_and_continues(go: Go, folder: Path, tmp
         assert float(log[-1]["loss"]) < float(log[0]["loss"])
     assert set(record.figures) == {"held_out_loss", "held_out_iou", "held_out_colour_error"}
     assert record.figures == {name: value for name, value in answer.items() if name not in {"out", "note"}}
-    assert (record.colour, record.note) == (True, SIMULATION_ONLY)
+    assert (record.color, record.note) == (True, SIMULATION_ONLY)
     assert record.vae_recipe == load_record(folder / "vae").vae_recipe
     assert go("compressor", vae="vae") == (code, answer)  # it had finished
     (tmp_path / "out").rename(folder / "first")
@@ -127,7 +127,7 @@ def test_train_refuses_mixture_of_depth_and_color(
     go: Go, folder: Path, tmp_path: Path, recipe: str, options: dict[str, str], code: int, word: str
 ) -> None:
     with pytest.raises(RecordingError, match="simulation only"):
-        build.read(folder / "data")
+        open_dataset(folder / "data")
     ended, answer = go(recipe, **options)
     assert (ended, word in answer["error"]["message"]) == (code, True), answer
     assert not (tmp_path / "out").exists()

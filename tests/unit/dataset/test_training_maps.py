@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from nlos_calibration.rig import load_rig
-from nlos_models.data import flip_some, less_bare_wall
+from nlos_models.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
 
@@ -111,7 +111,7 @@ def test_difference_maps_subtract_measured_or_rendered_wall(monkeypatch: pytest.
 def test_streamed_maps_equal_maps_in_memory() -> None:
     maps, generator = small_maps(8, 0), np.random.default_rng(0)
     bare = tuple(generator.random((64, 80), np.float32) for _ in range(2))
-    stream, whole = Streamed(SmallDataset(maps, PLAN), maps.image, bare), less_bare_wall(maps, *bare)
+    stream, whole = Streamed(SmallDataset(maps, PLAN), maps.image, bare), subtract_bare_wall(maps, *bare)
     batches, again = (list(stream.batches(4, torch.Generator().manual_seed(3))) for _ in "ab")
     for batch, same in zip(batches, again, strict=True):
         wanted = [torch.from_numpy(part)[batch.row] for part in (whole.depth_m, whole.intensity)]

@@ -107,7 +107,7 @@ def test_saved_pipeline_has_same_bytes_after_reload(saved: Path, tmp_path: Path)
 @pytest.mark.parametrize("color", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_vae_round_trip_keeps_weights_and_bytes(tmp_path: Path, color: bool) -> None:
     torch.manual_seed(0)
-    vae, saved = new_vae(colour=color), CheckpointRecord.of([small_recipe(colour=color)], RIG)
+    vae, saved = new_vae(color=color), CheckpointRecord.of([small_recipe(colour=color)], RIG)
     save_vae(tmp_path / "one", vae, saved)
     loaded, record = load_vae(tmp_path / "one")
     save_vae(tmp_path / "two", loaded, record)
@@ -117,7 +117,7 @@ def test_vae_round_trip_keeps_weights_and_bytes(tmp_path: Path, color: bool) -> 
     for name in ("encoder", "decoder"):
         first, second = ((tmp_path / n / f"{name}.safetensors").read_bytes() for n in ("one", "two"))
         assert first == second
-    save_vae(tmp_path / "two", new_vae(colour=not color), saved)
+    save_vae(tmp_path / "two", new_vae(color=not color), saved)
     with pytest.raises(CheckpointError, match="encoder"):
         load_vae(tmp_path / "two")
 
@@ -272,8 +272,8 @@ def test_record_in_color_notes_simulation_only() -> None:
     runs = [small_recipe(colour=True), small_recipe(task="compressor", colour=True)]
     for some in (runs[:1], runs[1:], runs):
         record = CheckpointRecord.of(some, RIG)
-        assert (record.colour, record.note) == (True, SIMULATION_ONLY)
+        assert (record.color, record.note) == (True, SIMULATION_ONLY)
         assert CheckpointRecord.model_validate_json(record.model_dump_json()) == record
         assert CheckpointRecord.model_validate(record.model_dump(exclude={"note"})) == record
     depth = CheckpointRecord.of([RUNS["v0"], RUNS["c0"]], RIG)
-    assert (depth.colour, depth.note) == (False, "")
+    assert (depth.color, depth.note) == (False, "")

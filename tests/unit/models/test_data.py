@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from nlos_models.data import InMemory, first_of, flip_some, image_batches, less_bare_wall, map_batches, shuffled
+from nlos_models.data import InMemory, first_of, flip_some, image_batches, map_batches, shuffled, subtract_bare_wall
 from small_maps import small_maps
 
 
@@ -69,7 +69,7 @@ def test_difference_maps_subtract_bare_wall_where_both_return() -> None:
     maps = small_maps(3, 0)
     depth, intensity = np.full((64, 80), 0.125, np.float32), np.full((64, 80), 4.0, np.float32)
     depth[30] = np.nan
-    difference = less_bare_wall(maps, depth, intensity)
+    difference = subtract_bare_wall(maps, depth, intensity)
     valid = ~np.isnan(maps.depth_m) & ~np.isnan(depth)
     assert 0 < valid.sum() < (~np.isnan(maps.depth_m)).sum()
     np.testing.assert_array_equal(~np.isnan(difference.depth_m), valid)

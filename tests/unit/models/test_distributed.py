@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from nlos_models.distributed import launched, open_fabric, seed_of, share_of
+from nlos_models.distributed import launch, open_fabric, seed_of, share_of
 from nlos_models.errors import RecipeError, TrainingError
 from small_run import SmallRun, on_two, small_recipe
 from torch import Tensor
@@ -40,7 +40,7 @@ def test_seed_of_depends_on_every_number_and_its_place() -> None:
 
 @pytest.mark.slow
 def test_two_processes_end_with_weights_of_one(tmp_path: Path) -> None:
-    made: dict[str, Any] = launched(open_fabric(small_recipe(), accelerator="cpu", devices=2), on_two, tmp_path)
+    made: dict[str, Any] = launch(open_fabric(small_recipe(), accelerator="cpu", devices=2), on_two, tmp_path)
     alone = SmallRun(small_recipe(epochs=3, schedule="one-cycle"), tmp_path / "alone", plain=True)
     figures = alone.go(fabric=open_fabric(small_recipe(), accelerator="cpu"))
     together = SmallRun(alone.recipe, tmp_path / "whole", plain=True)
@@ -50,9 +50,9 @@ def test_two_processes_end_with_weights_of_one(tmp_path: Path) -> None:
     for mine, its in zip(alone.log, together.log, strict=True):
         assert {k: float(v) for k, v in mine.items()} == pytest.approx({k: float(v) for k, v in its.items()}, rel=1e-4)
     assert made["scored"] == 3  # only the leading process evaluates
-    assert len(made["told"]) == 2
-    assert "step 4" in made["told"][0]
-    assert made["told"][1] == "interrupted"
+    assert len(made["messages"]) == 2
+    assert "step 4" in made["messages"][0]
+    assert made["messages"][1] == "interrupted"
     assert made["again"] == made["net"]
 
 
@@ -74,12 +74,12 @@ KILLED = ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7
         (KILLED, TrainingError),
     ],
 )
-def test_launched_raises_error_of_process(error: BaseException, raised: type[BaseException]) -> None:
+def test_launch_raises_error_of_process(error: BaseException, raised: type[BaseException]) -> None:
     def fail(_: Any) -> None:
         raise error
 
-    launch = fail if error is KILLED else lambda guarded: guarded(None)
+    start = fail if error is KILLED else lambda work: work(None)
     with pytest.raises(raised, match="SIGKILL" if error is KILLED else None):
-        launched(SimpleNamespace(world_size=2, launch=launch), fail)
+        launch(SimpleNamespace(world_size=2, launch=start), fail)
     alone = SimpleNamespace(world_size=1, launch=pytest.fail)
-    assert launched(alone, lambda its, a, b: (its is alone, a + b), 2, 3) == (True, 5)
+    assert launch(alone, lambda its, a, b: (its is alone, a + b), 2, 3) == (True, 5)

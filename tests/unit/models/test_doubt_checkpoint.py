@@ -14,7 +14,7 @@ from nlos_models.doubt_checkpoint import (
     load_uncertainty_model,
     save_doubt,
 )
-from nlos_models.doubt_network import Told
+from nlos_models.doubt_network import CalibratedDoubt
 from nlos_models.errors import CheckpointError
 from small_doubt import untrained_doubt, watched_weights
 
@@ -31,7 +31,7 @@ def record(tmp_path: Path, watched: Path) -> DoubtRecord:
     return untrained_doubt(tmp_path / "run", watched)
 
 
-def _load(folder: Path) -> tuple[Told, DoubtRecord]:
+def _load(folder: Path) -> tuple[CalibratedDoubt, DoubtRecord]:
     loaded = load_doubt(folder)
     assert loaded is not None
     return loaded

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from nlos_models.doubt_network import MAX_ERROR_V, MIN_ERROR_V, DoubtNetwork, Told
+from nlos_models.doubt_network import MAX_ERROR_V, MIN_ERROR_V, CalibratedDoubt, DoubtNetwork
 from small_maps import hard_maps
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -33,7 +33,7 @@ def test_cell_without_return_sets_its_own_feature_alone(network: DoubtNetwork) -
 @pytest.mark.parametrize("name", ["all zero", "saturated", "half invalid", "all invalid"])
 @pytest.mark.parametrize("v", [0.0, 1.0])
 def test_doubt_of_hard_maps_is_finite_and_in_range(network: DoubtNetwork, name: str, v: float) -> None:
-    calibrated = Told(network, (1.0, 2.0), 3.0).eval()
+    calibrated = CalibratedDoubt(network, (1.0, 2.0), 3.0).eval()
     nothing, outside, error_v, surface = calibrated(*hard_maps(name), torch.full((1, 64, 64), v))
     for probability in (nothing, outside, surface):
         assert bool(((probability >= 0) & (probability <= 1)).all())
@@ -44,7 +44,9 @@ def test_doubt_of_hard_maps_is_finite_and_in_range(network: DoubtNetwork, name: 
 
 def test_calibration_scales_error_and_divides_logits(network: DoubtNetwork) -> None:
     maps, image = hard_maps("saturated"), torch.full((1, 64, 64), 0.5)
-    plain, scaled = (Told(network, t, s).eval()(*maps, image) for t, s in (((1.0, 1.0), 1.0), ((2.0, 4.0), 1.5)))
+    plain, scaled = (
+        CalibratedDoubt(network, t, s).eval()(*maps, image) for t, s in (((1.0, 1.0), 1.0), ((2.0, 4.0), 1.5))
+    )
     torch.testing.assert_close(scaled[2], 1.5 * plain[2])
     for one, other, temperature in zip(plain[:2], scaled[:2], (2.0, 4.0), strict=True):
         torch.testing.assert_close(torch.logit(other) * temperature, torch.logit(one))

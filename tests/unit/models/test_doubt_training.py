@@ -1,6 +1,7 @@
 """Training of a doubt network on a small set, exact resuming, its loss, and the calibration of its outputs."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ from nlos_models.doubt_network import DoubtNetwork, DoubtOutput
 from nlos_models.doubt_training import (
     MAX_FALSE_ALARMS,
     as_doubt_batch,
-    calibrated,
+    calibrate,
     doubt_batches,
     doubt_loss,
     error_scale,
-    said_of,
+    predict,
     shared_errors,
     temperature,
     train_doubt,
@@ -30,9 +31,9 @@ QUICK = RECIPE.model_copy(
 Trained = tuple[DoubtNetwork, Path]
 
 
-def _train(folder: Path, steps: list[int], running: Running | None = None) -> DoubtNetwork:
+def _train(folder: Path, steps: list[int], **running: Any) -> DoubtNetwork:
     sets = small_doubt_set(128, 0), small_doubt_set(32, 1)
-    return train_doubt(QUICK, *sets, folder, lambda done, _: steps.append(done), running or Running())[0]
+    return train_doubt(QUICK, *sets, folder, Running(on_step=lambda done, _: steps.append(done), **running))[0]
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def _assert_same(one: DoubtNetwork, other: DoubtNetwork) -> None:
 @pytest.mark.slow
 def test_doubt_network_learns_empty_unusual_and_uncertain(trained: Trained) -> None:
     fresh = small_doubt_set(64, 2)
-    said = said_of(trained[0], fresh)
+    said = predict(trained[0], fresh)
     assert ((said.nothing.numpy() > 0) == fresh.nothing).mean() > 0.9
     there = ~fresh.nothing
     assert np.corrcoef(said.outside.numpy()[there], fresh.outside[there])[0, 1] > 0.8
@@ -60,7 +61,7 @@ def test_doubt_network_learns_empty_unusual_and_uncertain(trained: Trained) -> N
 def test_stopped_doubt_run_resumes_to_same_weights(trained: Trained, tmp_path: Path) -> None:
     steps = list[int]()
     with pytest.raises(KeyboardInterrupt):
-        _train(tmp_path, steps, Running(stop=lambda: len(steps) == 11))
+        _train(tmp_path, steps, stop=lambda: len(steps) == 11)
     _assert_same(_train(tmp_path, steps), trained[0])
     assert steps == list(range(1, 65))
 
@@ -68,7 +69,7 @@ def test_stopped_doubt_run_resumes_to_same_weights(trained: Trained, tmp_path: P
 @pytest.mark.slow
 def test_calibrated_limits_keep_their_false_alarm_rates(trained: Trained) -> None:
     some = small_doubt_set(200, 3)
-    fitted, said = calibrated(trained[0], some), said_of(trained[0], some)
+    fitted, said = calibrate(trained[0], some), predict(trained[0], some)
     nothing, outside = (
         torch.sigmoid(logits / t).numpy() for logits, t in zip(said[:2], fitted.temperatures, strict=True)
     )

@@ -11,7 +11,7 @@ from nlos_models import inference
 from nlos_models.checkpoint import CheckpointRecord, save_pipeline
 from nlos_models.compressor import Compressor
 from nlos_models.errors import ModelError
-from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, load_reconstructor, quantise
+from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, load_reconstructor, quantize
 from nlos_models.metrics import MIN_V
 from nlos_models.pipeline import RemappingNetwork, split_and_stack
 from nlos_models.vae import Decoder
@@ -122,7 +122,7 @@ def test_interrupted_export_leaves_no_file(
 def test_color_networks_are_not_exported(pipeline: RemappingNetwork, tmp_path: Path) -> None:
     color = RemappingNetwork(pipeline.compressor, Decoder(3, 512), intensities=3)
     with pytest.raises(ModelError, match="simulation only"):
-        inference.exported(color, tmp_path)
+        inference.export_once(color, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -174,9 +174,9 @@ def _answer(path: Path, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarra
 
 
 @pytest.mark.parametrize("static", [False, True])
-def test_quantised_network_is_nearly_exact_for_any_batch(tmp_path: Path, model: Path, static: bool) -> None:
+def test_quantized_network_is_nearly_exact_for_any_batch(tmp_path: Path, model: Path, static: bool) -> None:
     small = tmp_path / "small.onnx"
-    quantise(model, small, _samples(0) if static else None)
+    quantize(model, small, _samples(0) if static else None)
     weights = {tensor.name: tensor.data_type for tensor in onnx.load(small).graph.initializer}
     assert {TensorProto.INT8, TensorProto.UINT8} & set(weights.values())
     both = [np.concatenate(maps) for maps in zip(*_samples(1), strict=True)]
@@ -187,9 +187,9 @@ def test_quantised_network_is_nearly_exact_for_any_batch(tmp_path: Path, model: 
 
 
 def test_failed_quantisation_leaves_no_file(tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ModelError, match="8-bit"):
-        quantise(model, tmp_path / "small.onnx", [])
+    with pytest.raises(ModelError, match="8 bits"):
+        quantize(model, tmp_path / "small.onnx", [])
     monkeypatch.setattr(quantization, "quantize_dynamic", lambda _, path, **__: _interrupted(path))
     with pytest.raises(KeyboardInterrupt):
-        quantise(model, tmp_path / "small.onnx")
+        quantize(model, tmp_path / "small.onnx")
     assert not list(tmp_path.iterdir())

@@ -8,10 +8,10 @@ from nlos_models.metrics import (
     accuracy_mean_abs,
     accuracy_within_2_percent,
     brightness,
-    colour_accuracy_mean_abs,
-    colour_error,
-    colour_metrics,
-    colour_silhouette_iou,
+    color_accuracy_mean_abs,
+    color_error,
+    color_metrics,
+    color_silhouette_iou,
     foreground_rmse_mm,
     root_mean_square_error,
     silhouette_iou,
@@ -77,7 +77,7 @@ def test_metrics_return_one_value_per_object() -> None:
 
 def test_color_metrics_of_equal_images_are_perfect() -> None:
     truth = _colored((0.9, 0.2, 0.0))
-    assert {name: value.item() for name, value in colour_metrics(truth, truth).items()} == {
+    assert {name: value.item() for name, value in color_metrics(truth, truth).items()} == {
         "silhouette_iou": 1.0,
         "accuracy_mean_abs": 1.0,
         "root_mean_square_error": 0.0,
@@ -87,26 +87,26 @@ def test_color_metrics_of_equal_images_are_perfect() -> None:
 
 def test_wrong_color_is_no_error_of_silhouette() -> None:
     truth, image = _colored((0.9, 0.2, 0.1)), _colored((0.9, 0.5, 0.1))
-    assert colour_silhouette_iou(image, truth) == 1.0
-    assert colour_error(image, truth) == pytest.approx(0.3 / 3, rel=1e-5)
-    assert colour_accuracy_mean_abs(image, truth) == pytest.approx(1 - 0.25 * 0.9 * 0.3 / 3, rel=1e-5)
+    assert color_silhouette_iou(image, truth) == 1.0
+    assert color_error(image, truth) == pytest.approx(0.3 / 3, rel=1e-5)
+    assert color_accuracy_mean_abs(image, truth) == pytest.approx(1 - 0.25 * 0.9 * 0.3 / 3, rel=1e-5)
     assert root_mean_square_error(image, truth) == pytest.approx(np.sqrt(0.25 / 3) * 0.9 * 0.3, rel=1e-5)
 
 
 def test_wrong_silhouette_is_no_error_of_color() -> None:
     truth, image = _colored((0.9, 0.2, 0.1)), _colored((0.9, 0.2, 0.1), slice(16, 32))
-    assert colour_silhouette_iou(image, truth) == 0.5
-    assert colour_error(image, truth) == 0.0
-    assert np.isnan(colour_error(np.zeros_like(truth), truth)).all()
+    assert color_silhouette_iou(image, truth) == 0.5
+    assert color_error(image, truth) == 0.0
+    assert np.isnan(color_error(np.zeros_like(truth), truth)).all()
     black, below = _colored((0.9, 0.2, 0.0)), _colored((0.9, 0.2, 0.0))
     below[:, 2, 16:48, 16:48] = 0.03  # below black is black
-    assert colour_error(below, black) == 0.0
+    assert color_error(below, black) == 0.0
 
 
 def test_color_metrics_do_not_depend_on_channel_order() -> None:
     generator = np.random.default_rng(0)
     image, truth = generator.random((2, 4, 3, 64, 64), dtype=np.float32)
-    turned = colour_metrics(image[:, [2, 0, 1]], truth[:, [2, 0, 1]])
-    for name, value in colour_metrics(image, truth).items():
+    turned = color_metrics(image[:, [2, 0, 1]], truth[:, [2, 0, 1]])
+    for name, value in color_metrics(image, truth).items():
         np.testing.assert_allclose(value, turned[name], rtol=1e-12)
     np.testing.assert_array_equal(brightness(image), brightness(image[:, [2, 0, 1]]))

@@ -138,7 +138,7 @@ def test_preprocess_of_hard_maps_is_finite(name: str) -> None:
 @pytest.fixture(scope="module")
 def pipeline() -> RemappingNetwork:
     torch.manual_seed(0)
-    return new_pipeline(colour=False).eval()
+    return new_pipeline(color=False).eval()
 
 
 @torch.inference_mode()
@@ -154,7 +154,7 @@ def test_pipeline_makes_possible_image_of_hard_maps(pipeline: RemappingNetwork, 
 @pytest.mark.slow
 def test_color_pipeline_handles_hard_maps() -> None:
     torch.manual_seed(0)
-    pipeline = new_pipeline(colour=True)
+    pipeline = new_pipeline(color=True)
     for maps in (hard_maps(name, (CHANNELS,)) for name in HARD_MAPS):
         pipeline.preprocess.learn(split_and_stack(*maps))
         pipeline.train().zero_grad()
@@ -181,9 +181,9 @@ def test_pipeline_latent_depends_on_neither_batch_nor_layout(pipeline: Remapping
 @pytest.mark.parametrize(("color", "channels", "latent"), [(False, 4, 256), (True, 8, 512)])
 def test_new_pipeline_is_of_depth_or_color(color: bool, channels: int, latent: int) -> None:
     with torch.device("meta"):
-        vae = new_vae(colour=color)
-        made = new_pipeline(vae.decoder, colour=color, dropout=0.3, left_noise=0.1)
-        own = new_pipeline(colour=color)
+        vae = new_vae(color=color)
+        made = new_pipeline(vae.decoder, color=color, dropout=0.3, left_noise=0.1)
+        own = new_pipeline(color=color)
     assert made.decoder is vae.decoder
     assert own.decoder.state_dict().keys() == vae.decoder.state_dict().keys()
     assert vae.latent == latent

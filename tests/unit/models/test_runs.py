@@ -5,18 +5,16 @@ from pathlib import Path
 import pytest
 import torch
 from nlos_calibration.rig import load_rig
-from nlos_models import checkpoint
-from nlos_models import runs as train_start
+from nlos_models import checkpoint, runs
 from nlos_models.checkpoint import CheckpointRecord, save_pipeline, save_vae
 from nlos_models.errors import OutputExistsError, TrainingError
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import Recipe
-from nlos_models.runs import TrainingRun, compressor_start, transfer_start, vae_start
+from nlos_models.runs import compressor_start, record_doubt_run, record_run, transfer_start, vae_start
 from safetensors.torch import load_file, save_file
+from small_doubt import untrained_doubt, watched_weights
 from small_maps import SmallCompressor, SmallVae, use_small_networks
 from small_run import small_recipe
-
-from nlos_cam.cli.train import RunOptions
 
 RIG = load_rig("paper-rig")
 NAMED = (RIG.name, RIG.checksum)
@@ -29,7 +27,7 @@ IMAGES_ALONE = {"latent_weight": 0, "image_weight": 1.0}
 
 @pytest.fixture(autouse=True)
 def _small_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_small_networks(monkeypatch, checkpoint, train_start)
+    use_small_networks(monkeypatch, checkpoint, runs)
 
 
 @pytest.fixture
@@ -67,7 +65,7 @@ def _start(recipe: Recipe, weights: Path) -> object:
     if recipe.task == "vae":
         return vae_start(recipe, weights)
     if recipe.task == "transfer":
-        return transfer_start(recipe, weights, partial=False, on_report=print)
+        return transfer_start(recipe, weights, partial=False, on_report=pytest.fail)
     return compressor_start(recipe, weights, weights)
 
 
@@ -106,42 +104,45 @@ def test_partial_start_fills_missing_tensors_by_seed(weights: Path) -> None:
     rows: list[torch.Tensor] = []
     for seed in (3, 3, 4):
         torch.rand(1)
-        pipeline, runs = transfer_start(
-            small_recipe(task="transfer", seed=seed), weights, partial=True, on_report=print
-        )
+        recipe = small_recipe(task="transfer", seed=seed)
+        pipeline, earlier = transfer_start(recipe, weights, partial=True, on_report=messages.append)
         rows.append(pipeline.compressor.get_parameter("classifier.1.weight").detach())
-        assert runs == [VAE, TWO]
+        assert earlier == [VAE, TWO]
         assert all(word in messages[-1] for word in ("more", "classifier.1.weight"))
     assert torch.equal(rows[0], rows[1])
     assert not torch.equal(rows[0], rows[2])
 
 
-def _job(out: Path, *runs: Recipe, starts: tuple[Path | None, ...] = ()) -> TrainingRun:
-    options = RunOptions(Path("r.toml"), out, tensorboard=True)
-    return options.training(runs[-1], RIG, list(runs[:-1]), "origin", *starts)
+def _record(out: Path, *recipes: Recipe, starts: tuple[Path | None, ...] = ()) -> CheckpointRecord:
+    return record_run(recipes[-1], out, NAMED, list(recipes[:-1]), *starts)
 
 
-def test_job_records_run_after_earlier_ones(tmp_path: Path) -> None:
-    job = _job(tmp_path / "run", VAE, OTHER_VAE, starts=(None, tmp_path / "start"))
-    assert (job.record.vae_recipe, job.record.earlier) == (OTHER_VAE, [VAE])
-    assert (job.record.rig_name, job.record.rig_checksum) == NAMED
-    assert (job.recipe, job.out, job.origin) == (OTHER_VAE, tmp_path / "run", "origin")
-    assert (job.tensorboard, job.compiled) == (True, False)
+def test_record_run_names_recipe_rig_and_earlier_runs(tmp_path: Path) -> None:
+    record = _record(tmp_path / "run", VAE, OTHER_VAE, starts=(None, tmp_path / "start"))
+    assert (record.vae_recipe, record.earlier) == (OTHER_VAE, [VAE])
+    assert (record.rig_name, record.rig_checksum) == NAMED
 
 
-@pytest.mark.parametrize("runs", [(VAE,), (OTHER_VAE,), (OTHER_VAE, VAE)])
-def test_job_does_not_overwrite_weights_of_another_run(tmp_path: Path, runs: tuple[Recipe, ...]) -> None:
-    out = tmp_path / "run"
-    record = _job(out, VAE, OTHER_VAE).with_figures({"held_out_loss": 1.5})
-    out.mkdir()
-    (out / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
-    _job(out, VAE, OTHER_VAE)  # the same run may be repeated
+@pytest.mark.parametrize("recipes", [(VAE,), (OTHER_VAE,), (OTHER_VAE, VAE)])
+def test_record_run_refuses_weights_of_another_run(tmp_path: Path, recipes: tuple[Recipe, ...]) -> None:
+    record = _record(tmp_path, VAE, OTHER_VAE).model_copy(update={"figures": {"held_out_loss": 1.5}})
+    (tmp_path / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
+    _record(tmp_path, VAE, OTHER_VAE)  # the same run may be repeated
     with pytest.raises(OutputExistsError, match="--out"):
-        _job(out, *runs)
+        _record(tmp_path, *recipes)
 
 
-def test_job_refuses_file_and_folder_it_starts_from(tmp_path: Path) -> None:
+def test_record_run_refuses_file_and_folder_it_starts_from(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for name, starts in (("file", ()), ("run", (tmp_path / "x" / ".." / "run",))):
         with pytest.raises(OutputExistsError, match="--out"):
-            _job(tmp_path / name, VAE, starts=starts)
+            _record(tmp_path / name, VAE, starts=starts)
+
+
+def test_record_doubt_run_refuses_watched_folder_and_finished_run(tmp_path: Path) -> None:
+    watched = watched_weights(tmp_path / "watched")
+    known = untrained_doubt(tmp_path / "run", watched)
+    assert record_doubt_run(known.recipe, tmp_path / "new", watched, ["a"]).watches == known.watches
+    for out in (watched, tmp_path / "run"):
+        with pytest.raises(OutputExistsError, match="--out"):
+            record_doubt_run(known.recipe, out, watched, ["a"])

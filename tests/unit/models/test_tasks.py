@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import torch
 from nlos_models import tasks, train
-from nlos_models import tasks as remap
-from nlos_models import tasks as transfer
 from nlos_models.data import InMemory, map_batches
 from nlos_models.errors import TrainingError
 from nlos_models.pipeline import RemappingNetwork, channel_statistics, split_and_stack
@@ -26,7 +24,7 @@ from nlos_models.tasks import (
     train_vae,
     turn_some,
 )
-from nlos_models.train import OnStep, Running
+from nlos_models.train import Running, Scores
 from small_maps import SmallCompressor, SmallVae, small_images, small_maps, use_small_networks
 from small_run import Stopped, changed_tensors, log_rows, small_recipe, state_of, stop_halfway
 from torch import Tensor
@@ -36,7 +34,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 COUNT, BATCH = 16, 8
 STEPS = COUNT // BATCH
 CLASSIFIER_TENSORS = {"compressor.classifier.1.weight", "compressor.classifier.1.bias"}
-Figures = dict[str, float]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -56,27 +53,20 @@ def _recipe(task: str, **changes: object) -> Recipe:
     return small_recipe(task=task, **(facts | changes))
 
 
-def _ignore(done: int, total: int) -> None:
-    assert done <= total
-
-
 def _statistics(maps: object) -> tuple[Tensor, Tensor]:
     return channel_statistics(split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)))
 
 
-Trained = tuple[SmallVae, Figures, Path]
+Trained = tuple[SmallVae, Scores, Path]
 
 
-def _vae(
-    recipe: Recipe, folder: Path, on_step: OnStep = _ignore, running: Running | None = None, start: object = None
-) -> tuple[SmallVae, Figures]:
-    return train_vae(recipe, small_images(COUNT, 0), small_images(4, 1), folder, on_step, running, start)
+def _vae(recipe: Recipe, folder: Path, start: object = None, **running: object) -> tuple[SmallVae, Scores]:
+    return train_vae(recipe, small_images(COUNT, 0), small_images(4, 1), folder, Running(**running), start)
 
 
-def _compressor(
-    recipe: Recipe, start: Start, folder: Path, on_step: OnStep = _ignore, running: Running | None = None
-) -> tuple[RemappingNetwork, Figures]:
-    return train_compressor(recipe, start, InMemory(small_maps(COUNT, 0)), small_maps(4, 1), folder, on_step, running)
+def _compressor(recipe: Recipe, start: Start, folder: Path, **running: object) -> tuple[RemappingNetwork, Scores]:
+    maps = InMemory(small_maps(COUNT, 0)), small_maps(4, 1)
+    return train_compressor(recipe, start, *maps, folder, Running(**running))
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +86,7 @@ def test_vae_loss_falls_and_figures_are_of_last_epoch(trained: Trained) -> None:
 
 def test_resumed_vae_equals_uninterrupted(trained: Trained, tmp_path: Path) -> None:
     with pytest.raises(Stopped):
-        _vae(_recipe("vae"), tmp_path, stop_halfway)
+        _vae(_recipe("vae"), tmp_path, on_step=stop_halfway)
     torch.manual_seed(99)
     vae, figures = _vae(_recipe("vae"), tmp_path)
     assert not changed_tensors(vae.state_dict(), trained[0].state_dict())
@@ -109,7 +99,7 @@ def test_vae_warm_up_ignores_divergence_and_resumes(tmp_path: Path) -> None:
     for weight in (0.0, 5.0):
         recipe = _recipe("vae", latent_warm_up=0.5, kl_weight=weight, epochs=4)
         with pytest.raises(Stopped):
-            _vae(recipe, tmp_path / f"{weight}", stop_halfway)
+            _vae(recipe, tmp_path / f"{weight}", on_step=stop_halfway)
         _vae(recipe, tmp_path / f"{weight}")
         losses.append([row["loss"] for row in log_rows(tmp_path / f"{weight}")])
     without, with_it = losses
@@ -182,14 +172,12 @@ def test_compiled_networks_are_the_trained_ones(
     trained: Trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled: list[object] = []
-    monkeypatch.setattr(train, "compiled", lambda network: compiled.append(network) or network)
-    plain, quick = (
-        _vae(_recipe("vae", epochs=1), tmp_path / f"{on}", running=Running(compiled=on))[0] for on in (False, True)
-    )
+    monkeypatch.setattr(train, "compile_network", lambda network: compiled.append(network) or network)
+    plain, quick = (_vae(_recipe("vae", epochs=1), tmp_path / f"{on}", compiled=on)[0] for on in (False, True))
     assert compiled == [quick]
     assert not changed_tensors(plain.state_dict(), quick.state_dict())
     recipe = _recipe("compressor", epochs=1, image_weight=1.0)
-    made, _ = _compressor(recipe, Start(trained[0]), tmp_path / "c", running=Running(compiled=True))
+    made, _ = _compressor(recipe, Start(trained[0]), tmp_path / "c", compiled=True)
     assert compiled[1:] == [made.latent, made.decoder]
 
 
@@ -227,7 +215,7 @@ def test_vae_turns_images_only_by_recipe(
 
 @torch.no_grad()
 def test_latents_of_batches_equal_those_of_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remap, "SCORING_BATCH", 3)
+    monkeypatch.setattr(tasks, "SCORING_BATCH", 3)
     encoder, maps = SmallVae().eval().encoder, small_maps(8, 3)
     straight, mirrored = latents_of(encoder, maps.image), latents_of(encoder, maps.image[:, ::-1])
     for batch in map_batches(maps, 4, torch.Generator().manual_seed(0)):
@@ -239,7 +227,7 @@ def test_run_in_parts_equals_run_at_once(monkeypatch: pytest.MonkeyPatch) -> Non
     pipeline, maps = RemappingNetwork(SmallCompressor(), SmallVae().decoder).eval(), small_maps(5, 2)
     whole = run(pipeline, maps)
     assert whole.shape == (5, 64, 64)
-    monkeypatch.setattr(remap, "SCORING_BATCH", 2)
+    monkeypatch.setattr(tasks, "SCORING_BATCH", 2)
     np.testing.assert_allclose(run(pipeline, maps), whole, atol=1e-5)
 
 
@@ -263,8 +251,8 @@ def _first_loss(folder: Path, encoder: bool = True, **changes: float) -> float:
     still = {"objects": 8, "epochs": 1, "dropout": 0.0, "left_noise": 0.0, "schedule": "plateau"}
     recipe = _recipe("compressor").model_copy(update={**still, **changes})
     pipeline, source = RemappingNetwork(SmallCompressor(), vae.decoder), InMemory(small_maps(8, 0))
-    task, rows = Remapping(pipeline, vae.encoder if encoder else None, source, small_maps(4, 1)), list[Figures]()
-    task.fit(recipe, [vae.decoder], folder, _ignore, Running(on_epoch=rows.append))
+    task, rows = Remapping(pipeline, vae.encoder if encoder else None, source, small_maps(4, 1)), list[Scores]()
+    task.fit(recipe, [vae.decoder], folder, Running(on_epoch=rows.append))
     return rows[0]["loss"]
 
 
@@ -293,7 +281,7 @@ class Bench:
         self.pipeline.preprocess.mean.fill_(0.25)
         self.maps, self.held_out = small_maps(COUNT, 0), small_maps(4, 1)
 
-    def go(self, fail_at: int | None = None, **changes: object) -> Figures:
+    def go(self, fail_at: int | None = None, **changes: object) -> Scores:
         def on_step(done: int, total: int) -> None:
             self.steps.append((done, total))
             if done == fail_at:
@@ -302,7 +290,9 @@ class Bench:
         recipe = _recipe("transfer", **({"epochs": 3, "all_layers_epochs": 2, "image_weight": 1.0} | changes))
         recipe = recipe.model_copy(update={"schedule": "plateau"})
         source, encoder = InMemory(self.maps), self.vae.encoder
-        return train_transfer(recipe, self.pipeline, encoder, source, self.held_out, self.folder, on_step)[1]
+        return train_transfer(
+            recipe, self.pipeline, encoder, source, self.held_out, self.folder, Running(on_step=on_step)
+        )[1]
 
     @property
     def state(self) -> dict[str, Tensor]:
@@ -320,12 +310,12 @@ def test_transfer_second_phase_changes_classifier_alone(tmp_path: Path) -> None:
 
 def test_transfer_first_phase_changes_all_of_compressor_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path)
-    before, fit = bench.state, transfer.Remapping.fit
+    before, fit = bench.state, Remapping.fit
 
     def first_alone(self: Remapping, recipe: Recipe, frozen: list, folder: Path, *rest: object) -> object:
         return fit(self, recipe, frozen, folder, *rest) if folder.name == ALL_LAYERS else {}
 
-    monkeypatch.setattr(transfer.Remapping, "fit", first_alone)
+    monkeypatch.setattr(Remapping, "fit", first_alone)
     bench.go()
     ours = {name for name in before if name.startswith("compressor")}
     assert any("running_mean" in name for name in ours)
@@ -346,11 +336,11 @@ def test_transfer_second_phase_starts_from_best_epoch(tmp_path: Path, monkeypatc
     losses, found = iter([2.0, 1.0, 3.0, *[9.0] * 9]), list[dict[str, Tensor]]()
     bench = Bench(tmp_path)
 
-    def figures(*_: object) -> Figures:
+    def figures(*_: object) -> Scores:
         found.append(bench.state)
         return {"held_out_loss": next(losses)}
 
-    monkeypatch.setattr(remap, "figures_of", figures)
+    monkeypatch.setattr(tasks, "figures_of", figures)
     bench.go(all_layers_epochs=3, epochs=1, keep="best", dropout=0.0)
     after_best, last = (changed_tensors(found[k], bench.state) for k in (1, 2))
     assert after_best == CLASSIFIER_TENSORS

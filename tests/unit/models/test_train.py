@@ -22,10 +22,10 @@ from nlos_models.train import (
     LAST,
     LOG,
     PREVIOUS,
-    Board,
-    compiled,
-    compiling,
+    TensorBoardLog,
+    compile_network,
     digest_of,
+    explain_compile_errors,
     read_best,
     read_last,
     write_best,
@@ -94,7 +94,7 @@ def test_stopped_run_names_step_and_resumes_there(tmp_path: Path) -> None:
     whole, calls, messages = _trained(tmp_path / "whole"), count(1), list[str]()
     run = SmallRun(whole.recipe, tmp_path / "stopped")
     with pytest.raises(KeyboardInterrupt):
-        run.go(stop=lambda: next(calls) == STEPS + 2, tell=messages.append)
+        run.go(stop=lambda: next(calls) == STEPS + 2, on_message=messages.append)
     assert len(messages) == 1
     assert "epoch 1" in messages[0]
     assert "step 2" in messages[0]
@@ -308,7 +308,7 @@ def test_tensorboard_logs_figures_of_each_epoch(tmp_path: Path) -> None:
 def test_missing_tensorboard_names_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", None)
     with pytest.raises(TrainingError, match=r"nlos-cam\[train\]"):
-        Board(tmp_path, 0)
+        TensorBoardLog(tmp_path, 0)
 
 
 @pytest.fixture
@@ -337,7 +337,7 @@ class Noisy(nn.Module):
 @pytest.mark.usefixtures("compiler")
 def test_compiled_part_has_loss_and_gradients_of_plain_one() -> None:
     network, x, found = Noisy(), torch.rand(8, 3), []
-    for part in (network.noisy, compiled(network.noisy)):
+    for part in (network.noisy, compile_network(network.noisy)):
         network.zero_grad()
         torch.manual_seed(5)
         loss = part(x).square().sum()
@@ -357,11 +357,11 @@ def _no_gradients(_: Tensor) -> None:
 @pytest.mark.usefixtures("compiler")
 @pytest.mark.parametrize("network", [torch.compile(nn.Linear(3, 2), backend=_no_compiler), _no_gradients])
 def test_failed_compilation_is_one_line(network: nn.Module) -> None:
-    with pytest.raises(TrainingError, match=r"--compile .*No g\+\+") as caught, compiling():
+    with pytest.raises(TrainingError, match=r"--compile .*No g\+\+") as caught, explain_compile_errors():
         network(torch.rand(1, 3))
     assert "\n" not in str(caught.value)
 
 
 def test_error_of_network_is_not_blamed_on_compiler() -> None:
-    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"), compiling():
+    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"), explain_compile_errors():
         nn.Linear(3, 2)(torch.rand(1, 4))

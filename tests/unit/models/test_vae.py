@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from nlos_models.pipeline import CHANNELS, COLOUR_LATENT, new_vae
+from nlos_models.pipeline import CHANNELS, COLOR_OUTPUTS, new_vae
 from nlos_models.vae import LATENT, LOG_VARIANCE_LIMIT, Encoder, ResBlock, ResVae
 from torch import nn
 
@@ -42,8 +42,8 @@ def test_decoder_matches_table_s1(vae: ResVae) -> None:
 
 def test_color_vae_differs_in_outer_layers_alone() -> None:
     with torch.device("meta"):
-        vae = new_vae(colour=True)
-    assert (vae.latent, CHANNELS, COLOUR_LATENT) == (512, 3, 512)
+        vae = new_vae(color=True)
+    assert (vae.latent, CHANNELS, COLOR_OUTPUTS) == (512, 3, 512)
     counts = [sum(p.numel() for p in part.parameters()) for part in (vae.encoder, vae.decoder)]
     assert counts == [12_715_344, 12_188_083]
     blocks = tuple(_convolutions(block) for block in vae.decoder.blocks)
