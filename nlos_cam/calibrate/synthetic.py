@@ -1,17 +1,10 @@
-"""Walls as a lidar's depth maps, bare and otherwise, and frames of them by the sensor's noise model.
+"""Synthetic measurements for tests and studies: walls, occluders, printed boards, drifting streams, without a camera.
 
-A scene is a depth map (height, width) with the pose of the wall that holds most of the view. Walls that are not flat
-are given by how far they stand out from that wall, or by a second plane.
-
-A bench with its occluder as a lidar's depth map: rays cast on a wall and a sheet, and what else may stand there.
-
-A printed board on the wall as the lidar's infrared would see it: what tests and the study of the board look at.
-
-Modelled: perspective, each pixel's own area, the laser's spot, the falloff with distance and incidence, toner that
-still reflects, a print that is scaled and stretched, gain, saturation, shot and read noise, 8 bits. Not modelled:
-speckle, gloss, a mirror that does not scan evenly, paper that bows (of which the corners alone know).
-
-A measured bare wall and frames of it afterwards, without a camera; only watched pixels have depth, to be fast.
+A scene is a depth map (height, width) with the pose of the wall that fills most of the view. Walls that are not flat
+are given by their height above that plane, or by a second plane. The image of a board has perspective, pixel area,
+the laser's spot, falloff with distance and incidence, toner that reflects, a print that is scaled and stretched, gain,
+saturation, shot and read noise, 8 bits. Not modelled: speckle, gloss, a mirror that scans unevenly, bowed paper (only
+in `corners_px`).
 """
 
 from collections.abc import Callable
@@ -47,7 +40,7 @@ DEAD_SHARE = 0.03
 
 @dataclass(frozen=True)
 class View:
-    """A wall's pose and the lidar that looks at it."""
+    """Pose of a wall and the lidar that faces it."""
 
     pose: Float64
     """wall_from_lidar (4, 4)."""
@@ -63,72 +56,72 @@ class View:
         return float(np.degrees(facing_angle_rad(self.pose)))
 
     def on_wall(self) -> tuple[Float64, Float64]:
-        """Wall x and y (height, width) of what each pixel sees, far away where it sees no wall."""
+        """Return wall x and y (height, width) where each pixel's ray meets the wall; far away where it does not."""
         depth_m = np.minimum(self.depth_m, 50.0)
         points = (self.pinhole.rays() * depth_m[..., np.newaxis]) @ self.pose[:2, :3].T
         return points[..., 0], points[..., 1]
 
 
 def view(distance_m: float, yaw_deg: float, pitch_deg: float, pinhole: Intrinsics) -> View:
-    """A view of a wall."""
+    """Return the view of a wall at a distance and angles."""
     return View(wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m), pinhole)
 
 
-def along(seen: View, direction_rad: float) -> Float64:
-    """The wall coordinate (height, width) along a direction in the wall."""
+def wall_coordinate(seen: View, direction_rad: float) -> Float64:
+    """Return the wall coordinate (height, width) along a direction in the wall."""
     x, y = seen.on_wall()
     return x * np.cos(direction_rad) + y * np.sin(direction_rad)
 
 
 def bent(seen: View, bend_deg: float, share: float, direction_rad: float = 0.0) -> tuple[Float64, View]:
-    """A wall that turns by `bend_deg` along a line, beyond which `share` of the view lies.
+    """Return the depth of a wall that turns by `bend_deg` along a line, and the view of its larger part.
 
-    Returns the depth and the view of the wall that fills more of it. A positive bend turns away from the lidar.
+    `share` of the view lies beyond the line. A positive bend turns away from the lidar.
     """
-    s = along(seen, direction_rad)
+    s = wall_coordinate(seen, direction_rad)
     fold_m = float(np.quantile(s[seen.depth_m < LONGEST_DEPTH_M], 1.0 - share))
     across = np.cos(direction_rad) * seen.pose[0, :3] + np.sin(direction_rad) * seen.pose[1, :3]
     normal, bend = seen.pose[2, :3], np.radians(bend_deg)
     turned = np.cos(bend) * normal + np.sin(bend) * across
-    # a point of the fold: s across the wall from its foot, which lies distance along the normal behind the lidar
+    # a point of the fold, seen from the lidar: fold_m across the wall from the foot, which lies at -distance * normal;
+    # the turned plane goes through it, so its distance is -turned . point
     distance_m = -float(turned @ (fold_m * across - seen.pose[2, 3] * normal))
     if distance_m <= 0.0:
         raise ValueError(f"a bend of {bend_deg} degrees puts the lidar behind the wall")
     other = View(wall_from_plane(turned, distance_m), seen.pinhole)
-    # of two planes the one in front is seen where the wall bends towards the lidar, the one behind where it bends away
     depth_m = np.where(s > fold_m, other.depth_m, seen.depth_m)
     returned = (depth_m > 0.0) & (depth_m < LONGEST_DEPTH_M)
     return depth_m, other if (s > fold_m)[returned].mean() > 0.5 else seen
 
 
 def raised(seen: View, height_m: Float64) -> Float64:
-    """A wall that stands out (height, width) towards the lidar from the plane, as each pixel's own beam finds it."""
+    """Return the depth of a wall raised towards the lidar by `height_m` (height, width), along each pixel's ray."""
     return seen.depth_m * (1.0 - height_m / seen.pose[2, 3])
 
 
 def curved(seen: View, radius_m: float, direction_rad: float = 0.0) -> Float64:
-    """A cylinder that touches the plane in the middle of the view; positive radius bulges towards the lidar."""
-    s = along(seen, direction_rad)
+    """Return the depth of a cylinder that touches the plane mid-view; a positive radius bulges towards the lidar."""
+    s = wall_coordinate(seen, direction_rad)
     s = s - float(np.median(s))
-    reach_m = np.clip(s, -1.0, 1.0)  # parabola, cut where it would be steep
+    reach_m = np.clip(s, -1.0, 1.0)  # parabola, clipped where it would be steep
     return raised(seen, -(reach_m**2) / (2.0 * radius_m))
 
 
 def stepped(seen: View, height_m: float, share: float, direction_rad: float = 0.0) -> Float64:
-    """A wall of which `share` of the view stands out by a step."""
-    s = along(seen, direction_rad)
+    """Return the depth of a wall with a step: `share` of the view is raised."""
+    s = wall_coordinate(seen, direction_rad)
     edge_m = float(np.quantile(s[seen.depth_m < LONGEST_DEPTH_M], 1.0 - share))
     return raised(seen, np.where(s > edge_m, height_m, 0.0))
 
 
 def window(seen: View, gap_m: float, pane: int = 12) -> Float64:
-    """Panes as wide as their bars: half of the view lies `gap_m` behind the frame that holds them."""
+    """Return the depth of a window with bars as wide as its panes: half of the view lies `gap_m` behind the frame."""
     rows, columns = np.indices(seen.depth_m.shape)
     return raised(seen, np.where((columns // pane + rows // pane) % 2 == 0, 0.0, -gap_m))
 
 
 def patch(seen: View, share: float) -> NDArray[np.bool_]:
-    """A rectangle (height, width) in the middle of the view, that takes `share` of it."""
+    """Return a mask (height, width): a rectangle in the middle with `share` of the pixels."""
     rows, columns = np.indices(seen.depth_m.shape)
     tall, wide = (
         np.abs(at / size - 0.5) < np.sqrt(share) / 2.0 for at, size in zip((rows, columns), rows.shape, strict=True)
@@ -137,30 +130,30 @@ def patch(seen: View, share: float) -> NDArray[np.bool_]:
 
 
 def rippled(seen: View, amplitude_m: float, waves: float, generator: np.random.Generator) -> Float64:
-    """Depth with a wave of the lidar's own over the image, `waves` of them across it, any way."""
+    """Return depth with a sensor ripple: `waves` periods across the image, in a random direction."""
     return seen.depth_m + amplitude_m * ripples((seen.pinhole.height, seen.pinhole.width), waves, generator)
 
 
 def patchy(seen: View, rms_m: float, generator: np.random.Generator) -> Float64:
-    """Depth that drifts here this way and there that way."""
+    """Return depth with a smooth random error over the image."""
     return seen.depth_m + rms_m * smooth_patches((seen.pinhole.height, seen.pinhole.width), generator)
 
 
 def with_outliers(depth_m: Float64, share: float, generator: np.random.Generator) -> Float64:
-    """Depth of which `share` of the returns read anything from 5 cm to 2 m."""
+    """Return depth with `share` of the returns replaced by random values from 5 cm to 2 m."""
     stray = (generator.random(depth_m.shape) < share) & (depth_m < LONGEST_DEPTH_M)
     return np.where(stray, generator.uniform(0.05, 2.0, depth_m.shape), depth_m)
 
 
-def frame_of(depth_m: Float64, generator: np.random.Generator, noise: float = 1.0) -> NDArray[np.float32]:
-    """One frame as an L515 would give it: noise, steps of 0.25 mm, a limited range, dead pixels."""
-    seen_m = np.where((depth_m > 0.0) & (depth_m < LONGEST_DEPTH_M), depth_m, np.nan)
-    noisy_m = seen_m + noise * depth_noise_m(seen_m) * generator.standard_normal(seen_m.shape)
-    dead = generator.random(seen_m.shape) < DEAD_SHARE
+def depth_frame(depth_m: Float64, generator: np.random.Generator, noise: float = 1.0) -> NDArray[np.float32]:
+    """Return one frame with an L515's noise, steps of 0.25 mm, limited range and dead pixels."""
+    valid_m = np.where((depth_m > 0.0) & (depth_m < LONGEST_DEPTH_M), depth_m, np.nan)
+    noisy_m = valid_m + noise * depth_noise_m(valid_m) * generator.standard_normal(valid_m.shape)
+    dead = generator.random(valid_m.shape) < DEAD_SHARE
     return np.where(dead, np.nan, np.round(noisy_m / QUANTUM_M) * QUANTUM_M).astype(np.float32)
 
 
-def looked_at(
+def depth_statistics(
     depth_m: Float64,
     generator: np.random.Generator,
     *,
@@ -168,10 +161,10 @@ def looked_at(
     noise: float = 1.0,
     flicker: float = 0.0,
 ) -> DepthMean:
-    """The statistics of frames of `depth_m`; `flicker` is the share of samples that stray in each frame anew."""
+    """Return the statistics of frames of `depth_m`; `flicker` is the share of outliers, redrawn in each frame."""
     mean = DepthMean(*depth_m.shape)
     for _ in range(frames):
-        mean.add(frame_of(with_outliers(depth_m, flicker, generator), generator, noise))
+        mean.add(depth_frame(with_outliers(depth_m, flicker, generator), generator, noise))
     return mean
 
 
@@ -180,10 +173,10 @@ WALL_EXTENT_M = 2.0
 
 @dataclass(frozen=True)
 class Sheet:
-    """A flat occluder: the paper's, and how it may be set up badly."""
+    """Flat occluder: the paper's by default, with the errors of a bad set-up."""
 
     x_m: float = 0.2
-    """Of the edge at y = 0."""
+    """Place of the edge at y = 0."""
     gap_m: float = 0.1
     lean_deg: float = 0.0
     """About y; positive leans away from the lidar's foot."""
@@ -194,13 +187,13 @@ class Sheet:
     height_m: float = np.inf
     bottom_m: float = -np.inf
     top_m: float = np.inf
-    """The y that it ends at."""
+    """Range of y."""
 
 
-def bench(seen: View, sheet: Sheet | None, *, beams: int = 1) -> Float64:
-    """Depth (height, width) of wall and sheet, inf where a ray meets neither.
+def bench_depth(seen: View, occluding_sheet: Sheet | None, *, beams: int = 1) -> Float64:
+    """Return the depth (height, width) of wall and sheet, inf where a ray meets neither.
 
-    With more than one beam across a pixel it reads their mean: one on the edge flies between sheet and wall.
+    A pixel reads the mean of its `beams`, so on the edge it lies between sheet and wall (a flying pixel).
     """
     pinhole = seen.pinhole.scaled(seen.pinhole.width * beams, seen.pinhole.height)
     rays = pinhole.rays() @ seen.pose[:3, :3].T
@@ -208,26 +201,32 @@ def bench(seen: View, sheet: Sheet | None, *, beams: int = 1) -> Float64:
     with np.errstate(divide="ignore", invalid="ignore"):
         wall_m = np.where(rays[..., 2] < 0.0, -lidar[2] / rays[..., 2], np.inf)
         wall_m[wall_m * rays[..., 0] > WALL_EXTENT_M] = np.inf
-        depth_m = wall_m if sheet is None else np.minimum(wall_m, _sheet_depth(sheet, lidar, rays))
+        depth_m = wall_m if occluding_sheet is None else np.minimum(wall_m, _sheet_depth(occluding_sheet, lidar, rays))
     return depth_m.reshape(pinhole.height, seen.pinhole.width, beams).mean(axis=-1)
 
 
-def _sheet_depth(sheet: Sheet, lidar: Float64, rays: Float64) -> Float64:
-    """Along each ray, as far as it meets the sheet: normal . (p - edge) = 0."""
-    lean, twist = np.tan(np.radians([sheet.lean_deg, sheet.twist_deg]))
-    normal, edge = np.array([1.0, -twist, -lean]), np.array([sheet.x_m, 0.0, sheet.gap_m])
+def _sheet_depth(occluding_sheet: Sheet, lidar: Float64, rays: Float64) -> Float64:
+    """Return the depth along each ray to the sheet: t with normal . (lidar + t ray - edge) = 0; inf without a hit."""
+    lean, twist = np.tan(np.radians([occluding_sheet.lean_deg, occluding_sheet.twist_deg]))
+    normal, edge = np.array([1.0, -twist, -lean]), np.array([occluding_sheet.x_m, 0.0, occluding_sheet.gap_m])
     depth_m = (normal @ (edge - lidar)) / (rays @ normal)
     y, z = (lidar[axis] + depth_m * rays[..., axis] for axis in (1, 2))
-    above_m = z - sheet.gap_m - np.tan(np.radians(sheet.edge_deg)) * y
-    on = (above_m >= 0.0) & (above_m <= sheet.height_m) & (y >= sheet.bottom_m) & (y <= sheet.top_m)
+    above_m = z - occluding_sheet.gap_m - np.tan(np.radians(occluding_sheet.edge_deg)) * y
+    on = (
+        (above_m >= 0.0)
+        & (above_m <= occluding_sheet.height_m)
+        & (y >= occluding_sheet.bottom_m)
+        & (y <= occluding_sheet.top_m)
+    )
     return np.where((depth_m > 0.0) & on, depth_m, np.inf)
 
 
 def ball(seen: View, centre_m: tuple[float, float, float], radius_m: float) -> Float64:
-    """Depth (height, width) of a ball in the wall frame, inf beside it."""
+    """Return the depth (height, width) of a ball in the wall frame, inf beside it."""
     rays = seen.pinhole.rays() @ seen.pose[:3, :3].T
     towards = np.asarray(centre_m) - seen.pose[:3, 3]
     square, along = (rays**2).sum(axis=-1), rays @ towards
+    # |t ray - towards|^2 = radius^2, solved for the smaller t
     inside = along**2 - square * (towards @ towards - radius_m**2)
     return np.where((inside > 0.0) & (along > 0.0), (along - np.sqrt(np.maximum(inside, 0.0))) / square, np.inf)
 
@@ -235,60 +234,60 @@ def ball(seen: View, centre_m: tuple[float, float, float], radius_m: float) -> F
 TEXTURE_PER_SQUARE = 240
 SUPERSAMPLED = 4
 TONER = 0.08
-"""Albedo of the black squares, where the paper's is that of the wall."""
+"""Albedo of the black squares relative to the paper, which is as bright as the wall."""
 EDGE_PX = 8.0
 
 
 @dataclass(frozen=True)
-class Light:
-    """What happens to the light between wall and image."""
+class Illumination:
+    """Brightness, noise and laser spot of the infrared image."""
 
     brightest_counts: float = 48.0
-    """Of the bare wall."""
+    """Brightest counts of the bare wall."""
     read_noise_counts: float = 0.7
     shot_noise: float = 0.3
     spot_mm: float = 1.0
-    """Full width at half maximum of the laser's spot: not known of an L515, whose infrared is seen to be blurred."""
+    """Full width at half maximum of the laser's spot; assumed: no value is published for the L515."""
 
 
 @dataclass(frozen=True)
-class Placed:
-    """Where the pattern's middle is on the wall, how the sheet is turned, and what the printer did to it."""
+class Placement:
+    """Placement of a printed board on the wall: middle, rotation, and the printer's scale errors."""
 
     x_m: float
     y_m: float = 0.0
     turn_rad: float = 0.0
-    """Of the board's x axis from the wall's x axis to its y axis."""
+    """Rotation of the board's x axis from the wall's x axis to its y axis."""
     scale: float = 1.0
     stretch: float = 1.0
-    """Of width over height."""
+    """Ratio of width to height."""
 
     def wall_from_board(self, board: Board) -> Float64:
-        """Points (x, y, 1) of the drawing to points (x, y, z, 1) of the wall, as a matrix (4, 3)."""
+        """Return the matrix (4, 3) from points (x, y, 1) of the drawing to points (x, y, z, 1) of the wall."""
         cos, sin = np.cos(self.turn_rad), np.sin(self.turn_rad)
         turn = np.array([[cos, sin], [sin, -cos]]) * self.scale * np.sqrt([self.stretch, 1.0 / self.stretch])
         origin_m = np.array([self.x_m, self.y_m]) - turn @ board.size_mm * 0.5e-3
         return np.array([[*turn[0], origin_m[0]], [*turn[1], origin_m[1]], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def at_near_edge(board: Board, seen: View) -> Placed:
-    """An upright board that begins where the lidar's view of the wall begins, on the side where the wall is near."""
+def at_near_edge(board: Board, seen: View) -> Placement:
+    """Return an upright board at the edge of the lidar's view, on the side where the wall is near."""
     ray = np.array([(EDGE_PX - seen.pinhole.ppx) / seen.pinhole.fx, 0.0, 1.0])
     direction = seen.pose[:3, :3] @ ray
     edge_m = float(-direction[0] / direction[2] * seen.pose[2, 3])
-    return Placed(edge_m + board.size_mm[0] * 0.5e-3)
+    return Placement(edge_m + board.size_mm[0] * 0.5e-3)
 
 
-def in_the_middle(seen: View) -> Placed:
-    """An upright board where the optical axis meets the wall."""
+def at_optical_axis(seen: View) -> Placement:
+    """Return an upright board where the optical axis meets the wall."""
     axis = seen.pose[:3, 2]
-    return Placed(*(-axis[:2] / axis[2] * seen.pose[2, 3]))
+    return Placement(*(-axis[:2] / axis[2] * seen.pose[2, 3]))
 
 
-def corners_px(board: Board, seen: View, placed: Placed, bow_m: tuple[float, float] = (0.0, 0.0)) -> Float64:
-    """Where the chessboard corners (n, 2) truly are in the image, whether in it or not.
+def corners_px(board: Board, seen: View, placed: Placement, bow_m: tuple[float, float] = (0.0, 0.0)) -> Float64:
+    """Return the true places of the chessboard corners (n, 2) in pixels, also outside the image.
 
-    `bow_m` is how far the middle of the sheet stands off the wall, seen along its x and its y axis.
+    `bow_m` is the height of the sheet's middle above the wall, for a bow along its x and its y axis.
     """
     flat = np.column_stack([board.corners_m[:, :2], np.ones(len(board.corners_m))])
     wall_m = placed.wall_from_board(board) @ flat.T
@@ -298,25 +297,27 @@ def corners_px(board: Board, seen: View, placed: Placed, bow_m: tuple[float, flo
     return np.column_stack([lidar.fx * x_m / z_m + lidar.ppx, lidar.fy * y_m / z_m + lidar.ppy])
 
 
-def clean_view(board: Board, seen: View, placed: Placed, light: Light | None = None) -> Float64:
-    """The mean counts (height, width) before saturation, noise and rounding; the wall about the sheet is white."""
-    light = light or Light()
+def clean_infrared(board: Board, seen: View, placed: Placement, light: Illumination | None = None) -> Float64:
+    """Return the mean counts (height, width) before saturation, noise and rounding; the wall around is white."""
+    light = light or Illumination()
     rays, distance_m = seen.pinhole.rays(), float(seen.pose[2, 3])
     away = -(rays @ seen.pose[2, :3])
+    # irradiance cos(incidence) / length^2, where cos(incidence) = distance / length
     length_m = distance_m * np.linalg.norm(rays, axis=-1) / np.maximum(away, 1e-6)
-    falloff = np.where(away > 1e-6, distance_m / length_m**3, 0.0)  # cos(incidence) / length^2
+    falloff = np.where(away > 1e-6, distance_m / length_m**3, 0.0)
     counts = light.brightest_counts * falloff / falloff.max() * _albedo(board, seen, placed)
     if light.spot_mm <= 0.0:
         return counts
+    # 2.355 = 2 sqrt(2 ln 2): full width at half maximum over sigma
     sigma_px = light.spot_mm * 1e-3 / 2.355 / float(np.quantile(length_m, 0.25)) * seen.pinhole.fx
     return cv2.GaussianBlur(counts, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE).astype(np.float64)
 
 
-def frames_of(
-    clean: Float64, generator: np.random.Generator, count: int, light: Light | None = None
+def infrared_frames(
+    clean: Float64, generator: np.random.Generator, count: int, light: Illumination | None = None
 ) -> NDArray[np.uint8]:
-    """Frames (count, height, width) of what the lidar delivers of a view."""
-    light = light or Light()
+    """Return noisy, saturated infrared frames (count, height, width) of a view."""
+    light = light or Illumination()
     noise = generator.standard_normal((count, *clean.shape), np.float32)
     spread = np.sqrt(light.read_noise_counts**2 + light.shot_noise**2 * clean).astype(np.float32)
     return np.clip(np.rint(clean.astype(np.float32) + noise * spread), 0, 255).astype(np.uint8)
@@ -324,13 +325,13 @@ def frames_of(
 
 @lru_cache(maxsize=8)
 def _texture(board: Board) -> NDArray[np.float32]:
-    """The pattern's albedo, with a square of paper about it."""
+    """Return the pattern's albedo with a margin of one square of paper."""
     pattern = board.pattern(TEXTURE_PER_SQUARE).astype(np.float32) / 255.0
     return np.pad(TONER + (1.0 - TONER) * pattern, TEXTURE_PER_SQUARE, constant_values=1.0).astype(np.float32)
 
 
-def _albedo(board: Board, seen: View, placed: Placed) -> Float64:
-    """The albedo (height, width), averaged over each pixel's area."""
+def _albedo(board: Board, seen: View, placed: Placement) -> Float64:
+    """Return the albedo (height, width), averaged over each pixel's area."""
     fine = seen.pinhole.scaled(SUPERSAMPLED * seen.pinhole.width, SUPERSAMPLED * seen.pinhole.height)
     camera = np.array([[fine.fx, 0.0, fine.ppx], [0.0, fine.fy, fine.ppy], [0.0, 0.0, 1.0]])
     texel_m = board.square_mm * 1e-3 / TEXTURE_PER_SQUARE
@@ -344,9 +345,9 @@ def _albedo(board: Board, seen: View, placed: Placed) -> Float64:
     return cv2.resize(sharp, shape, interpolation=cv2.INTER_AREA).astype(np.float64)
 
 
-Hide = Callable[[Float64, int], Float64]
-"""From the depths of the watched pixels (N,) and a frame's number to what is seen of them."""
-Pose = tuple[float, float, float]
+DepthChange = Callable[[Float64, int], Float64]
+"""Change of the depths of the watched pixels (N,) in a frame, given its number."""
+WallPose = tuple[float, float, float]
 """Distance in metres, yaw and pitch in degrees."""
 
 PINHOLE = load_rig("bare-wall").pinhole
@@ -357,19 +358,19 @@ DEAD = 0.01
 """Share of the samples that give no depth."""
 
 
-def wall_from_lidar(pose: Pose) -> Float64:
+def wall_from_lidar(pose: WallPose) -> Float64:
     distance_m, yaw_deg, pitch_deg = pose
     return wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m)
 
 
-def sensed(depth_m: Float64, generator: np.random.Generator) -> Float64:
-    """One frame of `depth_m`: noise of 0.5 mm and 2 mm for each metre, steps of 0.25 mm, dead samples."""
+def noisy_depth(depth_m: Float64, generator: np.random.Generator) -> Float64:
+    """Return one frame of `depth_m`: noise of 0.5 mm plus 2 mm per metre, steps of 0.25 mm, dead samples."""
     noisy_m = depth_m + generator.standard_normal(depth_m.shape) * (0.0005 + 0.002 * depth_m)
     return np.where(generator.random(depth_m.shape) < DEAD, np.nan, np.round(noisy_m / 0.00025) * 0.00025)
 
 
-def measured(pose: Pose, intrinsics: Intrinsics, generator: np.random.Generator, **facts: Any) -> BareWall:
-    """The reference that `BareWallStatistics` would come to, drawn at once; `facts` replace fields."""
+def reference_of_wall(pose: WallPose, intrinsics: Intrinsics, generator: np.random.Generator, **facts: Any) -> BareWall:
+    """Return the reference that `BareWallStatistics` would yield, without its frames; `facts` replace fields."""
     depth_m = wall_depth(wall_from_lidar(pose), intrinsics)
     inliers = depth_m < WALL_ENDS_M
     depth_m[~inliers] = np.nan
@@ -384,47 +385,50 @@ def measured(pose: Pose, intrinsics: Intrinsics, generator: np.random.Generator,
 
 
 class WallStream:
-    """Frames of a wall, each looked at by `check`. The same seed gives the same bits."""
+    """Frames of a wall after its calibration, fed to a drift check. Stateful; deterministic for a seed.
 
-    def __init__(self, pose: Pose, intrinsics: Intrinsics = SMALL, seed: int = 0) -> None:
+    Only watched pixels have depth, to be fast.
+    """
+
+    def __init__(self, pose: WallPose, intrinsics: Intrinsics = SMALL, seed: int = 0) -> None:
         self.pose, self.intrinsics, self.frames = pose, intrinsics, 0
         self._generator = np.random.default_rng(seed)
-        self.reference = measured(pose, intrinsics, self._generator)
+        self.reference = reference_of_wall(pose, intrinsics, self._generator)
         self.check = DriftCheck(self.reference, wall_from_lidar(pose))
         self.pixels = watched_pixels(self.reference)
         rows, columns = np.divmod(self.pixels, intrinsics.width)
         self.places = np.stack([columns / intrinsics.width, rows / intrinsics.height], axis=1)
-        """(N, 2); of the watched pixels in the view, 0 to 1."""
+        """Places (N, 2) of the watched pixels in the view, 0 to 1."""
         self._frame = np.full((intrinsics.height, intrinsics.width), np.nan, np.float32)
 
-    def moved(self, distance_m: float = 0.0, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> Pose:
-        """The first pose, moved by so much."""
+    def moved(self, distance_m: float = 0.0, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> WallPose:
+        """Return the first pose plus a change."""
         return self.pose[0] + distance_m, self.pose[1] + yaw_deg, self.pose[2] + pitch_deg
 
-    def show(self, pose: Pose, count: int = 1, hide: Hide = lambda depth_m, _: depth_m) -> int | None:
-        """Look at `count` frames from a pose; after how many the first warning was there, None if there was none."""
-        depth_m, told = self.depth_from(pose), None
+    def show(self, pose: WallPose, count: int = 1, hide: DepthChange = lambda depth_m, _: depth_m) -> int | None:
+        """Feed `count` frames from a pose; return the number of the frame with the first warning, None without one."""
+        depth_m, first = self.depth_from(pose), None
         for number in range(1, count + 1):
             self.look(hide(depth_m, self.frames))
-            told = number if told is None and self.check.warnings else told
-        return told
+            first = number if first is None and self.check.warnings else first
+        return first
 
-    def depth_from(self, pose: Pose) -> Float64:
-        """Of the watched pixels (N,), without noise; NaN where a beam never meets the wall."""
+    def depth_from(self, pose: WallPose) -> Float64:
+        """Return the depth of the watched pixels (N,) without noise; NaN where a beam misses the wall."""
         depth_m = wall_depth(wall_from_lidar(pose), self.intrinsics).ravel()[self.pixels]
         return np.where(np.isfinite(depth_m), depth_m, np.nan)
 
     def look(self, depth_m: Float64) -> None:
-        """Take in a frame of these depths of the watched pixels (N,), which gets its noise here."""
-        self._frame.ravel()[self.pixels] = sensed(depth_m, self._generator)
+        """Feed one frame with these depths of the watched pixels (N,); noise is added here."""
+        self._frame.ravel()[self.pixels] = noisy_depth(depth_m, self._generator)
         self.check.observe(self._frame, {})
         self.frames += 1
 
 
-def detours(places: Float64, share: float, seed: int, *, beyond: bool = False) -> Hide:
-    """Light that went by way of an object that moves: a share of the pixels is 3 to 40 cm farther, smoothly.
+def multipath(places: Float64, share: float, seed: int, *, beyond: bool = False) -> DepthChange:
+    """Return multipath by a moving object: a share of the pixels reads 3 to 40 cm too far, smoothly.
 
-    They are here and there, or `beyond` a line that only sways.
+    The pixels form moving patches, or lie `beyond` a line that sways.
     """
     generator = np.random.default_rng(seed)
     waves = generator.uniform(1, 6, (4, 2)) * generator.choice([-1, 1], (4, 2))
@@ -440,13 +444,13 @@ def detours(places: Float64, share: float, seed: int, *, beyond: bool = False) -
     return hide
 
 
-def both(first: Hide, second: Hide) -> Hide:
-    """The second on top of the first."""
+def chained(first: DepthChange, second: DepthChange) -> DepthChange:
+    """Return both changes, the second applied to the result of the first."""
     return lambda depth_m, number: second(first(depth_m, number), number)
 
 
-def sheet(places: Float64, nearest: float) -> Hide:
-    """An occluder: from that place in the view on (0 to 1) the depth is shorter, by 5 to 50 cm, but never by half."""
+def occluding_sheet(places: Float64, nearest: float) -> DepthChange:
+    """Return an occluder from place `nearest` (0 to 1) of the view on: 5 to 50 cm shorter, by half at most."""
 
     def hide(depth_m: Float64, _: int) -> Float64:
         into = np.clip((places[:, 0] - nearest) / (1.0 - nearest), 0.0, 1.0)

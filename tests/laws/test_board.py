@@ -10,14 +10,14 @@ from nlos_calibration.board import BOARDS
 from nlos_calibration.board_pose import PrintErrors
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.calibrate.synthetic import Light, at_near_edge, view
+from nlos_cam.calibrate.synthetic import Illumination, at_near_edge, view
 
 PINHOLE, A4 = load_rig("bare-wall").pinhole, BOARDS["a4"]
 
 
 def bench(distance_m: float, yaw_deg: float, pitch_deg: float = 0.0, **light: float) -> Bench:
     seen = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
-    return Bench(A4, seen, at_near_edge(A4, seen), Light(**light))
+    return Bench(A4, seen, at_near_edge(A4, seen), Illumination(**light))
 
 
 def assert_measured(one: Bench, frames: int = 10, within_mm: float = 1.0, within_deg: float = 0.2) -> None:
@@ -54,7 +54,7 @@ def test_board_interval_holds_the_truth_as_often_as_stated() -> None:
     """Of 120 rendered benches, three quantities each: a share of 95 % is found between 91 and 99 % but once in 500."""
     generator = np.random.default_rng(5)
     measured, refused = board_trials.trials(
-        120, lambda: random_bench(A4, PINHOLE, generator, Light(), FLAT), lambda one: by_image(one, 4, generator)
+        120, lambda: random_bench(A4, PINHOLE, generator, Illumination(), FLAT), lambda one: by_image(one, 4, generator)
     )
     assert len(refused) <= 2
     assert 0.91 < summary(measured, refused)["in_95_percent_interval_pooled"] < 0.99
@@ -66,7 +66,7 @@ def test_board_interval_allows_for_bow_and_stretch(sigma_px: float) -> None:
     generator, printed = np.random.default_rng(6), PrintErrors()
     measured, refused = board_trials.trials(
         400,
-        lambda: random_bench(A4, PINHOLE, generator, Light(), printed),
+        lambda: random_bench(A4, PINHOLE, generator, Illumination(), printed),
         lambda one: by_corners(one, sigma_px, generator, printed),
     )
     assert len(refused) <= 4

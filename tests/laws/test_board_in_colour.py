@@ -14,7 +14,7 @@ from nlos_calibration.wall import WallFit, fit_wall
 from software_colour import SoftwareColour, record_with_colour
 
 from nlos_cam.calibrate.color_view import capture_color_view
-from nlos_cam.calibrate.synthetic import View, at_near_edge, frame_of
+from nlos_cam.calibrate.synthetic import View, at_near_edge, depth_frame
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
@@ -26,7 +26,7 @@ def recorded(path: Path, frames: int = 4) -> Path:
     rig, generator = load_rig("bare-wall"), np.random.default_rng(0)
     seen = View(rig.wall_from_lidar, rig.pinhole)
     bench = Bench(A4, seen, at_near_edge(A4, seen), ROOM)
-    depth_m = [np.nan_to_num(frame_of(seen.depth_m, generator)) for _ in range(frames)]
+    depth_m = [np.nan_to_num(depth_frame(seen.depth_m, generator)) for _ in range(frames)]
     dim = np.full(depth_m[0].shape, 15, np.uint8)
     images = [SensedImages(np.rint(each / DEPTH_UNIT_M).astype(np.uint16), dim, dim) for each in depth_m]
     grey = colour_frames(bench, as_told(), frames, generator)

@@ -6,7 +6,17 @@ from nlos_calibration.drift import BLIND_FRAMES, WINDOW_FRAMES, DriftCheck
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M, wall_depth
 
-from nlos_cam.calibrate.synthetic import PINHOLE, SMALL, Pose, WallStream, both, detours, sensed, sheet, wall_from_lidar
+from nlos_cam.calibrate.synthetic import (
+    PINHOLE,
+    SMALL,
+    WallPose,
+    WallStream,
+    chained,
+    multipath,
+    noisy_depth,
+    occluding_sheet,
+    wall_from_lidar,
+)
 
 POSES = [(0.2, 45.0, 0.0), (0.15, 15.0, 0.0), (0.3, 70.0, -8.0), (0.3, 15.0, 5.0), (0.2, -60.0, 10.0), (0.2, 0.0, 0.0)]
 SHIFTS = [(0.002, 0.0, 0.0), (-0.002, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5)]
@@ -16,7 +26,7 @@ poses = pytest.mark.parametrize("pose", POSES)
 shifts = pytest.mark.parametrize("shift", SHIFTS)
 
 
-def assert_right(stream: WallStream, shift: Pose) -> None:
+def assert_right(stream: WallStream, shift: WallPose) -> None:
     """Check that the drift is the lidar's move within its uncertainty, which must be small."""
     drift = stream.check.drift
     assert drift is not None
@@ -27,7 +37,7 @@ def assert_right(stream: WallStream, shift: Pose) -> None:
 
 @poses
 @pytest.mark.parametrize("intrinsics", [SMALL, PINHOLE], ids=["320", "640"])
-def test_drift_check_is_silent_at_noise_alone(pose: Pose, intrinsics: Intrinsics) -> None:
+def test_drift_check_is_silent_at_noise_alone(pose: WallPose, intrinsics: Intrinsics) -> None:
     stream = WallStream(pose, intrinsics)
     assert stream.show(pose, 500) is None
     assert_right(stream, (0.0, 0.0, 0.0))
@@ -36,39 +46,42 @@ def test_drift_check_is_silent_at_noise_alone(pose: Pose, intrinsics: Intrinsics
 
 @poses
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
-def test_drift_check_is_silent_at_objects_and_occluders(pose: Pose, share: float) -> None:
+def test_drift_check_is_silent_at_objects_and_occluders(pose: WallPose, share: float) -> None:
     stream = WallStream(pose, seed=1)
     for seed in range(3):
-        assert stream.show(pose, 100, detours(stream.places, share, seed)) is None
+        assert stream.show(pose, 100, multipath(stream.places, share, seed)) is None
     assert stream.check.wall_share == pytest.approx(1.0 - share, abs=0.05)
-    for hide in (sheet(stream.places, 0.4), both(detours(stream.places, 0.5, 4), sheet(stream.places, 0.7))):
+    for hide in (
+        occluding_sheet(stream.places, 0.4),
+        chained(multipath(stream.places, 0.5, 4), occluding_sheet(stream.places, 0.7)),
+    ):
         assert stream.show(pose, 100, hide) is None
 
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("pose", [POSES[0], (0.3, 75.0, -8.0)])
-def test_drift_check_is_silent_at_detours_beyond_the_wall(pose: Pose, seed: int) -> None:
+def test_drift_check_is_silent_at_detours_beyond_the_wall(pose: WallPose, seed: int) -> None:
     """At a grazing angle a detour of centimetres looks like a wall turned by a degree."""
     stream = WallStream(pose, seed=seed)
-    assert stream.show(pose, 200, detours(stream.places, 0.9, seed, beyond=True)) is None
+    assert stream.show(pose, 200, multipath(stream.places, 0.9, seed, beyond=True)) is None
     assert stream.check.wall_share == pytest.approx(0.1, abs=0.05)
 
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("pose", [POSES[0], (0.3, 65.0, -8.0)])
-def test_drift_check_is_silent_at_detours_across_the_wall(pose: Pose, seed: int) -> None:
+def test_drift_check_is_silent_at_detours_across_the_wall(pose: WallPose, seed: int) -> None:
     """Detours behind an occluder have any depth, also the wall's."""
     stream = WallStream(pose, seed=seed)
-    hide = both(sheet(stream.places, 0.3), detours(stream.places, 0.8, seed, beyond=seed % 2 == 0))
+    hide = chained(occluding_sheet(stream.places, 0.3), multipath(stream.places, 0.8, seed, beyond=seed % 2 == 0))
     assert stream.show(pose, 200, hide) is None
 
 
 @poses
 @shifts
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
-def test_drift_check_measures_a_knock_beside_an_object(pose: Pose, shift: Pose, share: float) -> None:
+def test_drift_check_measures_a_knock_beside_an_object(pose: WallPose, shift: WallPose, share: float) -> None:
     stream = WallStream(pose, seed=3)
-    hide = [detours(stream.places, share, 5)] if share else []
+    hide = [multipath(stream.places, share, 5)] if share else []
     assert stream.show(pose, 40, *hide) is None
     told = stream.show(stream.moved(*shift), TOLD_FRAMES, *hide)
     assert told is not None
@@ -78,16 +91,16 @@ def test_drift_check_measures_a_knock_beside_an_object(pose: Pose, shift: Pose, 
 
 @pytest.mark.parametrize("shift", [(0.01, 0.0, 0.0), (0.0, -5.0, 0.0), (0.03, 5.0, -3.0), (-0.02, -8.0, 2.0)])
 @pytest.mark.parametrize("pose", POSES[:2])
-def test_drift_check_measures_a_large_move_beside_both(pose: Pose, shift: Pose) -> None:
+def test_drift_check_measures_a_large_move_beside_both(pose: WallPose, shift: WallPose) -> None:
     stream = WallStream(pose, seed=4)
-    hide = both(detours(stream.places, 0.3, 6), sheet(stream.places, 0.8))
+    hide = chained(multipath(stream.places, 0.3, 6), occluding_sheet(stream.places, 0.8))
     assert stream.show(pose, 40, hide) is None
     assert stream.show(stream.moved(*shift), 3 * TOLD_FRAMES, hide) is not None
     assert_right(stream, shift)
 
 
 @poses
-def test_drift_check_warning_ends_when_the_lidar_is_back(pose: Pose) -> None:
+def test_drift_check_warning_ends_when_the_lidar_is_back(pose: WallPose) -> None:
     stream = WallStream(pose, seed=5)
     assert stream.show(stream.moved(0.002, 0.5, -0.5), TOLD_FRAMES) is not None
     stream.show(pose, WINDOW_FRAMES)
@@ -95,7 +108,7 @@ def test_drift_check_warning_ends_when_the_lidar_is_back(pose: Pose) -> None:
 
 
 @poses
-def test_drift_check_names_a_range_that_drifts(pose: Pose) -> None:
+def test_drift_check_names_a_range_that_drifts(pose: WallPose) -> None:
     stream = WallStream(pose, seed=6)
     assert stream.show(pose, 60, lambda depth_m, _: depth_m + 0.7 * TOLERANCE_M) is None
     stream.show(pose, 60, lambda depth_m, _: depth_m + 1.5 * TOLERANCE_M)
@@ -107,7 +120,7 @@ def test_drift_check_names_a_range_that_drifts(pose: Pose) -> None:
 
 
 @pytest.mark.parametrize("pose", POSES[:5])
-def test_drift_check_separates_a_move_from_a_range_drift(pose: Pose) -> None:
+def test_drift_check_separates_a_move_from_a_range_drift(pose: WallPose) -> None:
     """Not where the wall is faced squarely: both are the same there."""
     stream = WallStream(pose, seed=7)
     stream.show(stream.moved(0.002), TOLD_FRAMES)
@@ -132,7 +145,7 @@ def test_drift_check_warns_of_a_wall_out_of_view_until_back() -> None:
     assert stream.show(stream.pose, BLIND_FRAMES - 1, lambda depth_m, _: np.full_like(depth_m, np.nan)) is None
     assert stream.check.drift is None
     assert stream.check.wall_share == 0.0
-    assert stream.show(stream.pose, 60, detours(stream.places, 0.97, 1)) is not None
+    assert stream.show(stream.pose, 60, multipath(stream.places, 0.97, 1)) is not None
     (line,) = stream.check.warnings
     assert "%" in line
     stream.show(stream.pose, 2 * WINDOW_FRAMES)
@@ -154,7 +167,7 @@ def test_drift_check_measures_whole_frames_with_holes() -> None:
     depth_m = wall_depth(wall_from_lidar(stream.moved(0.002)), PINHOLE)
     depth_m[:, 200:400] = np.nan
     for number in range(40):
-        frame = sensed(depth_m, generator) if number % 4 else np.full_like(depth_m, np.nan)
+        frame = noisy_depth(depth_m, generator) if number % 4 else np.full_like(depth_m, np.nan)
         check.observe(frame.astype(np.float32), {})
     assert check.drift is not None
     assert abs(check.drift.distance_m - 0.002) < SIGMAS * check.drift.distance_std_m < TOLERANCE_M

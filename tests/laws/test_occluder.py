@@ -5,7 +5,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 from occluder_trials import BARELY, IN_VIEW, Setting, drawn, find_occluder, looked_at, sensed, trial
 
-from nlos_cam.calibrate.synthetic import bench
+from nlos_cam.calibrate.synthetic import bench_depth
 
 SENSOR = load_rig("paper-rig").pinhole.scaled(160, 120)
 LOOKS = {
@@ -54,7 +54,7 @@ def test_occluder_of_more_frames_has_a_surer_sheet_but_same_edge() -> None:
     def stds(frames: int) -> tuple[float, float]:
         generator = np.random.default_rng(4)
         seen, sheet = drawn(Setting(lean_deg=0.0), generator)
-        mean = looked_at(bench(seen, sheet), generator, frames=frames)
+        mean = looked_at(bench_depth(seen, sheet), generator, frames=frames)
         fit = find_occluder(mean.mean_m(), mean.noise(), seen.pinhole, seen.pose, generator)
         return fit.x_std_m, fit.gap_std_m
 

@@ -12,7 +12,7 @@ from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth
 from numpy.typing import NDArray
 
-from nlos_cam.calibrate.synthetic import View, looked_at, view
+from nlos_cam.calibrate.synthetic import View, depth_statistics, view
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 LONGEST_DEPTH_M = 4.0
@@ -24,7 +24,7 @@ few = settings(derandomize=True, deadline=None, max_examples=15)
 
 def measured(depth_m: Float64, seed: int = 0, frames: int = 8) -> WallFit:
     generator = np.random.default_rng(seed)
-    mean = looked_at(depth_m, generator, frames=frames, noise=1.0)
+    mean = depth_statistics(depth_m, generator, frames=frames, noise=1.0)
     return fit_wall(mean.mean_m(), PINHOLE, generator, mean.noise())
 
 

@@ -11,7 +11,7 @@ from nlos_cam.calibrate.synthetic import (
     View,
     bent,
     curved,
-    looked_at,
+    depth_statistics,
     patch,
     rippled,
     stepped,
@@ -31,7 +31,7 @@ def seen(request: pytest.FixtureRequest) -> View:
 
 def measured(depth_m: Float64, *, frames: int = 8, noise: float = 1.0) -> WallFit:
     generator = np.random.default_rng(0)
-    mean = looked_at(depth_m, generator, frames=frames, noise=noise)
+    mean = depth_statistics(depth_m, generator, frames=frames, noise=noise)
     return fit_wall(mean.mean_m(), PINHOLE, generator, mean.noise())
 
 

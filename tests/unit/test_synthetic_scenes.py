@@ -14,27 +14,27 @@ from nlos_cam.calibrate.synthetic import (
     REFERENCE_FRAMES,
     SMALL,
     TONER,
-    Light,
-    Placed,
-    Pose,
+    Illumination,
+    Placement,
     Sheet,
     View,
+    WallPose,
     WallStream,
     at_near_edge,
+    at_optical_axis,
     ball,
-    bench,
+    bench_depth,
     bent,
-    clean_view,
+    clean_infrared,
     corners_px,
     curved,
-    detours,
-    frames_of,
-    in_the_middle,
-    measured,
+    infrared_frames,
+    multipath,
+    noisy_depth,
+    occluding_sheet,
     patch,
+    reference_of_wall,
     rippled,
-    sensed,
-    sheet,
     stepped,
     view,
     wall_from_lidar,
@@ -46,7 +46,7 @@ RIG, PAPER = load_rig("bare-wall"), load_rig("paper-rig")
 PINHOLE, A4 = RIG.pinhole, BOARDS["a4"]
 SMALL_BARE, SMALL_PAPER = PINHOLE.scaled(80, 60), PAPER.pinhole.scaled(80, 60)
 TINY = SMALL.scaled(80, 60)
-POSE: Pose = (0.2, 30.0, 0.0)
+POSE: WallPose = (0.2, 30.0, 0.0)
 
 
 @pytest.mark.parametrize("bend_deg", [-20.0, -1.0, 1.0, 20.0])
@@ -86,7 +86,7 @@ def test_the_scenes_rays_are_the_renderers(yaw_deg: float, pitch_deg: float, x_m
     rig = PAPER.model_copy(update={"lidar": lidar, "occluder": Occluder(x_m=x_m, z_min_m=gap_m)})
     beams = cast(rig, SMALL_PAPER)
     seen = View(rig.wall_from_lidar, SMALL_PAPER)
-    depth_m = bench(seen, Sheet(x_m, gap_m)).ravel()
+    depth_m = bench_depth(seen, Sheet(x_m, gap_m)).ravel()
     met = np.isfinite(beams.length_m) & (beams.laser_spot_m[:, 0] < 2.0) & (np.abs(beams.laser_spot_m[:, 1]) < 1.5)
     np.testing.assert_allclose(depth_m[met], (beams.length_m * beams.cos_axis)[met], rtol=1e-9)
     assert (~beams.on_wall & met).any()
@@ -94,8 +94,8 @@ def test_the_scenes_rays_are_the_renderers(yaw_deg: float, pitch_deg: float, x_m
 
 def test_a_badly_set_sheet_is_where_it_says() -> None:
     seen = view(0.2, 45.0, 0.0, SMALL_PAPER)
-    sheet = Sheet(lean_deg=10.0, twist_deg=-5.0, edge_deg=4.0, height_m=0.05, bottom_m=-0.03, top_m=0.04)
-    depth_m, bare_m = bench(seen, sheet), bench(seen, None)
+    occluding_sheet = Sheet(lean_deg=10.0, twist_deg=-5.0, edge_deg=4.0, height_m=0.05, bottom_m=-0.03, top_m=0.04)
+    depth_m, bare_m = bench_depth(seen, occluding_sheet), bench_depth(seen, None)
     on = depth_m < bare_m
     x, y, z = (seen.pose[:3, 3] + (SMALL_PAPER.rays() * depth_m[..., np.newaxis])[on] @ seen.pose[:3, :3].T).T
     lean, twist, edge = np.tan(np.radians([10.0, -5.0, 4.0]))
@@ -109,8 +109,8 @@ def test_a_badly_set_sheet_is_where_it_says() -> None:
 
 def test_only_pixels_on_the_edge_mix() -> None:
     seen = view(0.2, 45.0, 0.0, SMALL_PAPER)
-    sheet = Sheet(gap_m=0.103)
-    sharp, mixed = bench(seen, sheet), bench(seen, sheet, beams=9)
+    occluding_sheet = Sheet(gap_m=0.103)
+    sharp, mixed = bench_depth(seen, occluding_sheet), bench_depth(seen, occluding_sheet, beams=9)
     off = np.abs(mixed - sharp) > 0.01
     assert off.sum(axis=1).max() == 1
     assert off.any()
@@ -127,9 +127,9 @@ def test_a_ball_is_round() -> None:
 
 def test_paper_and_toner_have_their_counts() -> None:
     """Without a spot: the falloff of a bare wall, its brightest pixel at the gain, toner at its albedo."""
-    seen, light = View(RIG.wall_from_lidar, PINHOLE), Light(spot_mm=0.0)
-    away, placed = Placed(50.0), at_near_edge(A4, seen)
-    bare, with_board = (clean_view(A4, seen, where, light) for where in (away, placed))
+    seen, light = View(RIG.wall_from_lidar, PINHOLE), Illumination(spot_mm=0.0)
+    away, placed = Placement(50.0), at_near_edge(A4, seen)
+    bare, with_board = (clean_infrared(A4, seen, where, light) for where in (away, placed))
     assert bare.max() == pytest.approx(48.0)
     points = seen.pinhole.rays() * seen.depth_m[..., np.newaxis]
     length_m = np.linalg.norm(points, axis=-1)
@@ -145,8 +145,8 @@ def test_paper_and_toner_have_their_counts() -> None:
 def test_corners_are_where_the_rendered_squares_meet(turn_rad: float) -> None:
     """About a true corner the pattern is the same after half a turn; about a point half a pixel off it is not."""
     seen = view(0.25, 20.0, 5.0, PINHOLE)
-    placed, sharp = replace(at_near_edge(A4, seen), turn_rad=turn_rad), Light(spot_mm=0.0)
-    albedo = clean_view(A4, seen, placed, sharp) / clean_view(A4, seen, Placed(50.0), sharp)
+    placed, sharp = replace(at_near_edge(A4, seen), turn_rad=turn_rad), Illumination(spot_mm=0.0)
+    albedo = clean_infrared(A4, seen, placed, sharp) / clean_infrared(A4, seen, Placement(50.0), sharp)
     true_px = corners_px(A4, seen, placed)
     true_px = true_px[((true_px > 8) & (true_px < np.array([631, 471]))).all(axis=1)]
     turn = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
@@ -165,7 +165,7 @@ def test_corners_are_where_the_rendered_squares_meet(turn_rad: float) -> None:
 
 
 def test_a_sheet_is_placed_where_it_is_said() -> None:
-    placed = Placed(0.2, 0.03, 0.0, scale=0.97, stretch=1.01)
+    placed = Placement(0.2, 0.03, 0.0, scale=0.97, stretch=1.01)
     middle = np.array([*(size * 0.5e-3 for size in A4.size_mm), 1.0])
     np.testing.assert_allclose(placed.wall_from_board(A4) @ middle, [0.2, 0.03, 0.0, 1.0], atol=1e-12)
     across, down = placed.wall_from_board(A4)[:2, 0], placed.wall_from_board(A4)[:2, 1]
@@ -178,24 +178,24 @@ def test_the_near_edge_is_in_view_and_the_middle_is_on_the_axis() -> None:
     seen = View(RIG.wall_from_lidar, PINHOLE)
     edge = corners_px(A4, seen, at_near_edge(A4, seen))
     assert 0.0 < edge[:, 0].min() < 100.0
-    placed = in_the_middle(seen)
+    placed = at_optical_axis(seen)
     np.testing.assert_allclose(corners_px(A4, seen, placed).mean(axis=0), [PINHOLE.ppx, PINHOLE.ppy], atol=60.0)
 
 
 def test_frames_have_the_lidars_noise_and_saturate() -> None:
     clean = np.full((40, 50), 25.0)
-    frames = frames_of(clean, np.random.default_rng(0), 50).astype(float)
+    frames = infrared_frames(clean, np.random.default_rng(0), 50).astype(float)
     assert frames.mean() == pytest.approx(25.0, abs=0.05)
     assert frames.std() == pytest.approx(np.sqrt(0.7**2 + 0.09 * 25.0 + 1.0 / 12.0), rel=0.02)
-    assert frames_of(np.full((2, 2), 400.0), np.random.default_rng(0), 1).max() == 255
+    assert infrared_frames(np.full((2, 2), 400.0), np.random.default_rng(0), 1).max() == 255
 
 
 def test_the_reference_is_as_one_from_frames() -> None:
     generator = np.random.default_rng(0)
-    drawn, collected = measured(POSE, TINY, generator), BareWallStatistics(TINY)
+    drawn, collected = reference_of_wall(POSE, TINY, generator), BareWallStatistics(TINY)
     truth_m, cells = wall_depth(wall_from_lidar(POSE), TINY), np.zeros((64, 80), np.float32)
     for _ in range(REFERENCE_FRAMES):
-        collected.add(sensed(truth_m, generator).astype(np.float32), np.full((60, 80), 40, np.uint8), cells, cells)
+        collected.add(noisy_depth(truth_m, generator).astype(np.float32), np.full((60, 80), 40, np.uint8), cells, cells)
     wall = collected.reference(drawn.inliers, serial="", settings={})
     for reference in (drawn, wall):
         pulls = (reference.depth_m - truth_m) / (0.0005 + 0.002 * truth_m) * np.sqrt(REFERENCE_FRAMES)
@@ -210,13 +210,13 @@ def test_the_reference_is_as_one_from_frames() -> None:
 def test_detours_are_longer_and_move_and_a_sheet_is_nearer() -> None:
     stream = WallStream(POSE, TINY)
     depth_m = np.full(len(stream.pixels), 0.3)
-    hide = detours(stream.places, 0.6, 1)
+    hide = multipath(stream.places, 0.6, 1)
     first, later = hide(depth_m, 0) - depth_m, hide(depth_m, 10) - depth_m
     assert (first > 0.0).mean() == pytest.approx(0.6, abs=0.01)
     assert first[first > 0.0].min() >= 0.03 - 1e-9
     assert first.max() <= 0.4 + 1e-9
     assert ((first > 0.0) != (later > 0.0)).any()
-    nearer = depth_m - sheet(stream.places, 0.5)(depth_m, 0)
+    nearer = depth_m - occluding_sheet(stream.places, 0.5)(depth_m, 0)
     assert (nearer > 0.0).mean() == pytest.approx(0.5, abs=0.05)
     assert nearer[nearer > 0.0].min() >= 0.05
 

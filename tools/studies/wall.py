@@ -36,7 +36,7 @@ from nlos_cam.calibrate import (
     View,
     bent,
     curved,
-    looked_at,
+    depth_statistics,
     patch,
     patchy,
     rippled,
@@ -167,7 +167,7 @@ def trial(setting: Setting, generator: Generator) -> harness.Record:
         depth_m, truth = SCENES[setting.scene](seen, generator)
         depth_m = with_outliers(depth_m, setting.outliers, generator)
         noise = 0.0 if setting.scene == "stuck" else setting.noise
-        mean = looked_at(depth_m, generator, frames=setting.frames, noise=noise, flicker=setting.flicker)
+        mean = depth_statistics(depth_m, generator, frames=setting.frames, noise=noise, flicker=setting.flicker)
     drawn = {"distance_m": float(seen.pose[2, 3]), "facing_deg": float(seen.facing_deg)}
     try:
         fit = fit_wall(mean.mean_m(), seen.pinhole, generator, mean.noise())
@@ -282,7 +282,7 @@ def cells(one: harness.Record) -> list[str]:
 def fit_milliseconds() -> float:
     """Return the shortest time of one fit of a 640 x 480 mean map."""
     pinhole, generator, times = BARE.pinhole, np.random.default_rng(0), list[float]()
-    mean = looked_at(view(0.2, 45.0, 0.0, pinhole).depth_m, generator, frames=8)
+    mean = depth_statistics(view(0.2, 45.0, 0.0, pinhole).depth_m, generator, frames=8)
     for _ in range(10):
         start = time.perf_counter()
         fit_wall(mean.mean_m(), pinhole, generator, mean.noise())

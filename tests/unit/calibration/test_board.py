@@ -9,7 +9,7 @@ from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.rig import dump_toml, load_rig
 from pydantic import ValidationError
 
-from nlos_cam.calibrate.synthetic import Light, View, at_near_edge, clean_view, corners_px, frames_of
+from nlos_cam.calibrate.synthetic import Illumination, View, at_near_edge, clean_infrared, corners_px, infrared_frames
 
 SMALL = {"squares_x": 4, "squares_y": 5, "square_mm": 20.0, "marker_mm": 15.0}
 A4 = BOARDS["a4"]
@@ -20,11 +20,11 @@ def of_bench(**light: float) -> tuple[Float64, Float64]:
     """A noiseless view at 0.2 m and 45 degrees, and where its corners are."""
     seen = View(load_rig("bare-wall").wall_from_lidar, PINHOLE)
     placed = at_near_edge(A4, seen)
-    return clean_view(A4, seen, placed, Light(**light)), corners_px(A4, seen, placed)
+    return clean_infrared(A4, seen, placed, Illumination(**light)), corners_px(A4, seen, placed)
 
 
 def mean_of(clean: Float64, frames: int = 30) -> Float64:
-    return frames_of(clean, np.random.default_rng(1), frames).mean(axis=0)
+    return infrared_frames(clean, np.random.default_rng(1), frames).mean(axis=0)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_find_corners_locates_them_at_any_brightness(counts: float | None, least
 
 
 def test_find_corners_needs_the_mean_of_dim_frames() -> None:
-    frames = frames_of(of_bench(brightest_counts=3.0)[0], np.random.default_rng(1), 60)
+    frames = infrared_frames(of_bench(brightest_counts=3.0)[0], np.random.default_rng(1), 60)
     with pytest.raises(BoardRefusedError):
         find_corners(frames[0], A4)
     assert len(find_corners(frames.mean(axis=0), A4).ids) >= 16

@@ -28,7 +28,15 @@ from nlos_calibration.geometry import normal_from_angles
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, WallMeasures, fit_wall, measures_of
 
-from nlos_cam.calibrate.synthetic import View, at_near_edge, clean_view, corners_px, frames_of, looked_at, view
+from nlos_cam.calibrate.synthetic import (
+    View,
+    at_near_edge,
+    clean_infrared,
+    corners_px,
+    depth_statistics,
+    infrared_frames,
+    view,
+)
 
 RIG = load_rig("bare-wall")
 PINHOLE, A4 = RIG.pinhole, BOARDS["a4"]
@@ -104,7 +112,7 @@ def infrared(scale: float = 1.0) -> BoardView:
     """The mean of 20 frames of a board of that scale on the wall of the rig."""
     seen = View(RIG.wall_from_lidar, PINHOLE)
     placed = replace(at_near_edge(A4, seen), scale=scale)
-    frames = frames_of(clean_view(A4, seen, placed), np.random.default_rng(0), 20)
+    frames = infrared_frames(clean_infrared(A4, seen, placed), np.random.default_rng(0), 20)
     return BoardView(frames.mean(axis=0), PINHOLE)
 
 
@@ -112,7 +120,7 @@ def infrared(scale: float = 1.0) -> BoardView:
 def depth() -> WallFit:
     """The wall of the rig by 20 frames of depth."""
     depth_m = View(RIG.wall_from_lidar, PINHOLE).depth_m
-    mean = looked_at(depth_m, np.random.default_rng(0), frames=20, noise=1.0)
+    mean = depth_statistics(depth_m, np.random.default_rng(0), frames=20, noise=1.0)
     return fit_wall(mean.mean_m(), PINHOLE, np.random.default_rng(0), mean.noise())
 
 

@@ -16,10 +16,10 @@ from nlos_calibration.errors import CalibrationError
 from nlos_calibration.reference import BareWall
 from nlos_calibration.wall_tracker import WallObservation
 
-from nlos_cam.calibrate.synthetic import SMALL, Pose, measured, wall_from_lidar
+from nlos_cam.calibrate.synthetic import SMALL, WallPose, reference_of_wall, wall_from_lidar
 
 TINY = SMALL.scaled(32, 24)
-POSE: Pose = (0.2, 45.0, 0.0)
+POSE: WallPose = (0.2, 45.0, 0.0)
 SETTINGS = {"laser_power": 60.0, "depth_units": 0.00025, "ldd_temperature": 31.0, "noise_estimation": 7.0}
 MANY = 10**6
 STILL = Drift(0.0, 0.0, 0.0, 0.0, 1e-5, 0.01, 0.01, 1e-5, uniform=False)
@@ -27,7 +27,7 @@ STILL = Drift(0.0, 0.0, 0.0, 0.0, 1e-5, 0.01, 0.01, 1e-5, uniform=False)
 
 @pytest.fixture
 def wall() -> BareWall:
-    return measured(
+    return reference_of_wall(
         POSE,
         TINY,
         np.random.default_rng(0),
@@ -104,7 +104,9 @@ def test_drift_check_counts_further_temperatures(check: DriftCheck) -> None:
 
 
 def test_drift_check_ignores_unknown_temperatures(check: DriftCheck) -> None:
-    check.update_temperatures({"apd_temperature": -9999.0, "another_temperature": 99.0, "ldd_temperature": float("nan")})
+    check.update_temperatures(
+        {"apd_temperature": -9999.0, "another_temperature": 99.0, "ldd_temperature": float("nan")}
+    )
     assert check.warnings == ()
 
 

@@ -6,7 +6,7 @@ from nlos_calibration.occluder import MAX_BEHIND, Edge, OccluderFit, find_edge, 
 from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
 
-from nlos_cam.calibrate.synthetic import Sheet, View, ball, bench, view
+from nlos_cam.calibrate.synthetic import Sheet, View, ball, bench_depth, view
 
 PAPER = load_rig("paper-rig")
 PINHOLE = PAPER.pinhole.scaled(160, 120)
@@ -35,7 +35,7 @@ def fitted(seen: View, depth_m: NDArray[np.float64], **stds: float) -> OccluderF
 
 def found(sheet: Sheet | None, yaw_deg: float = 45.0, **stds: float) -> OccluderFit:
     seen = view(0.2, yaw_deg, 0.0, PINHOLE)
-    return fitted(seen, noisy(bench(seen, sheet)), **stds)
+    return fitted(seen, noisy(bench_depth(seen, sheet)), **stds)
 
 
 def test_find_occluder_finds_the_papers_to_half_a_pixel() -> None:
@@ -68,15 +68,15 @@ def test_find_occluder_gap_is_not_biased_by_flying_pixels(seen: View) -> None:
     errors_m = []
     for step in np.linspace(0.0, 2.0, 9):
         gap_m = 0.1 + step * PIXEL_M
-        fit = fitted(seen, noisy(bench(seen, Sheet(gap_m=gap_m), beams=5)))
+        fit = fitted(seen, noisy(bench_depth(seen, Sheet(gap_m=gap_m), beams=5)))
         errors_m.append(fit.gap_m - gap_m)
         assert abs(errors_m[-1]) <= 1.96 * fit.gap_std_m
     assert abs(np.mean(errors_m)) < 0.35 * PIXEL_M
 
 
 def test_find_occluder_tolerates_an_object_in_some_beams_only(seen: View) -> None:
-    depth_m = bench(seen, Sheet())
-    on_wall = np.flatnonzero(depth_m == bench(seen, None))
+    depth_m = bench_depth(seen, Sheet())
+    on_wall = np.flatnonzero(depth_m == bench_depth(seen, None))
     some = depth_m.copy()
     some.flat[np.random.default_rng(0).choice(on_wall, depth_m.size // 5, replace=False)] += 0.15
     fit = fitted(seen, noisy(some))
@@ -89,7 +89,7 @@ def test_find_occluder_tolerates_an_object_in_some_beams_only(seen: View) -> Non
 
 def test_find_occluder_warns_of_a_finger_beside_the_sheet(seen: View) -> None:
     finger = ball(seen, (0.12, 0.02, 0.06), 0.015)
-    fit = fitted(seen, noisy(np.minimum(bench(seen, Sheet()), finger)))
+    fit = fitted(seen, noisy(np.minimum(bench_depth(seen, Sheet()), finger)))
     assert abs(fit.x_m - 0.2) < 1e-3
     assert len(fit.warnings) == 1
 
@@ -120,11 +120,11 @@ def test_find_occluder_refuses_a_sheet_it_cannot_trust(yaw_deg: float, sheet: Sh
 @pytest.mark.parametrize("centre_m", [(0.2, 0.02, 0.13), (0.1, 0.0, 0.1)])
 def test_find_occluder_refuses_a_fist(seen: View, centre_m: tuple[float, float, float]) -> None:
     with pytest.raises(OccluderRefusedError):
-        fitted(seen, noisy(np.minimum(bench(seen, None), ball(seen, centre_m, 0.045))))
+        fitted(seen, noisy(np.minimum(bench_depth(seen, None), ball(seen, centre_m, 0.045))))
 
 
 def test_find_occluder_refuses_a_box_beside_the_sheet(seen: View) -> None:
-    both = np.minimum(bench(seen, Sheet()), bench(seen, Sheet(0.08, 0.05, height_m=0.06)))
+    both = np.minimum(bench_depth(seen, Sheet()), bench_depth(seen, Sheet(0.08, 0.05, height_m=0.06)))
     with pytest.raises(OccluderRefusedError, match=r"\d+%"):
         fitted(seen, noisy(both))
 

@@ -6,14 +6,14 @@ from nlos_calibration.reference import BareWall
 from nlos_calibration.wall import measures_of, wall_depth
 from nlos_calibration.wall_tracker import GRID, WallTrack, noise_scale, watched_pixels
 
-from nlos_cam.calibrate.synthetic import SMALL, Pose, measured, wall_from_lidar
+from nlos_cam.calibrate.synthetic import SMALL, WallPose, reference_of_wall, wall_from_lidar
 
-POSE: Pose = (0.2, 45.0, -5.0)
+POSE: WallPose = (0.2, 45.0, -5.0)
 
 
 @pytest.fixture
 def wall() -> BareWall:
-    return measured(POSE, SMALL, np.random.default_rng(0))
+    return reference_of_wall(POSE, SMALL, np.random.default_rng(0))
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_noise_scale_is_that_of_the_reference(wall: BareWall) -> None:
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.001, 0.2, -0.2), (-0.004, 1.0, 2.0), (0.03, -6.0, 5.0)])
-def test_wall_track_finds_an_exact_pose_exactly(exact: BareWall, shift: Pose) -> None:
+def test_wall_track_finds_an_exact_pose_exactly(exact: BareWall, shift: WallPose) -> None:
     pose = wall_from_lidar((POSE[0] + shift[0], POSE[1] + shift[1], POSE[2] + shift[2]))
     track, frame, sight = WallTrack(exact, wall_from_lidar(POSE)), wall_depth(pose, SMALL).astype(np.float32), None
     for _ in range(60):

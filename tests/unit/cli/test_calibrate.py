@@ -20,7 +20,7 @@ from nlos_calibration.wall_record import load_measured, load_wall
 from rich.console import Console
 
 from nlos_cam.calibrate.measure import FrameFit, fit_frame
-from nlos_cam.calibrate.synthetic import View, at_near_edge, clean_view, frames_of
+from nlos_cam.calibrate.synthetic import View, at_near_edge, clean_infrared, infrared_frames
 from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.cli import calibrate
@@ -257,7 +257,7 @@ class BoardWorld:
 
     def __init__(self, scale: float, offset_m: float, step_m: float) -> None:
         seen = View(RIG.wall_from_lidar, RIG.pinhole)
-        self._clean = clean_view(A4, seen, replace(at_near_edge(A4, seen), scale=scale))
+        self._clean = clean_infrared(A4, seen, replace(at_near_edge(A4, seen), scale=scale))
         self._depth_m = np.where(seen.depth_m < 4.0, seen.depth_m - offset_m, 0.0)
         self._depth_m[:, :300] -= step_m
 
@@ -265,7 +265,7 @@ class BoardWorld:
         generator = np.random.default_rng(number)
         noise_m = generator.standard_normal(self._depth_m.shape) * (0.0005 + 0.002 * self._depth_m)
         depth = np.where(self._depth_m > 0.0, np.rint((self._depth_m + noise_m) / DEPTH_UNIT_M), 0.0)
-        ir = frames_of(self._clean, generator, 1)[0]
+        ir = infrared_frames(self._clean, generator, 1)[0]
         return SensedImages(depth.astype(np.uint16), ir, np.full(ir.shape, 15, np.uint8))
 
     def truth_depth_m(self, number: int) -> np.ndarray:
