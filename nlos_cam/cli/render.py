@@ -1,12 +1,7 @@
-"""`render`: one hidden object to the maps that the lidar would report, with numbers and a picture.
-
-How `render` renders: the options of surface, radiometry and accuracy, and the scene and setting that they make.
-
-OBJECT and the options that place it: what `render` hides, as the depth map that the wall sees.
-"""
+"""`render`: the maps that the lidar would report of one hidden object, as numbers and a picture."""
 
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,28 +32,31 @@ from nlos_cam.render import (
     sensor_effects,
 )
 
-Stop = Annotated[str | None, typer.Option("--accuracy", help="draft, standard (the default), fine or reference.")]
-MaxError = Annotated[
-    float | None, typer.Option("--max-error", help="Cheapest accuracy whose peak intensities are within this share.")
+Stop = Annotated[
+    str | None, typer.Option("--accuracy", help="draft, standard, fine or reference.", show_default="standard")
 ]
-MaxSeconds = Annotated[float | None, typer.Option("--max-seconds", help="Most accurate that takes no longer.")]
+MaxError = Annotated[
+    float | None, typer.Option("--max-error", help="Use the fastest accuracy with this relative peak error or less.")
+]
+MaxSeconds = Annotated[
+    float | None, typer.Option("--max-seconds", help="Use the best accuracy that renders within this many seconds.")
+]
 BeamsPerCell = Annotated[int | None, typer.Option("--beams-per-cell", help="Beams along each axis of a map cell.")]
 EffectNames = Annotated[
-    str, typer.Option("--effects", help=f"auto: what the scene calls for. Or exactly these: {', '.join(EFFECTS)}.")
+    str,
+    typer.Option("--effects", help=f"auto (those that matter in the scene), or a list from: {', '.join(EFFECTS)}."),
 ]
 Backend = Annotated[str, typer.Option("--backend", help="cpu, torch (on the CPU) or cuda.")]
 RadiometryName = Annotated[str | None, typer.Option("--radiometry", help="paper (S1 to S5) or lambertian.")]
 MaterialKind = Annotated[str | None, typer.Option("--material", help="lambertian, phong or retroreflective.")]
-Specular = Annotated[float | None, typer.Option("--specular", help="Share of the albedo that a lobe takes.")]
-Exponent = Annotated[float | None, typer.Option("--exponent", help="Of the lobe's cosine: the larger, the narrower.")]
-Albedo = Annotated[
-    str | None, typer.Option("--albedo", help="One number, or three with commas between: red,green,blue.")
-]
-PulseNs = Annotated[float | None, typer.Option("--pulse-ns", help="Full width of the laser's pulse at half height.")]
+Specular = Annotated[float | None, typer.Option("--specular", help="Share of the albedo in the specular lobe.")]
+Exponent = Annotated[float | None, typer.Option("--exponent", help="Exponent of the lobe; larger is narrower.")]
+Albedo = Annotated[str | None, typer.Option("--albedo", help="Albedo from 0 to 1: one number, or red,green,blue.")]
+PulseNs = Annotated[float | None, typer.Option("--pulse-ns", help="Full width of the pulse at half maximum, in ns.")]
 
 
 def scene_of(bare: Scene, material: dict[str, Any], options: dict[str, Any]) -> Scene:
-    """A scene with those of the options that were given (not None): fields of Material, and of Scene.
+    """Return a scene with the options that are not None: fields of Material, and of Scene.
 
     Raises typer.BadParameter or SceneError with the field, the value and the range.
     """
@@ -74,15 +72,16 @@ def scene_of(bare: Scene, material: dict[str, Any], options: dict[str, Any]) -> 
 
 
 def _numbers(text: str) -> float | tuple[float, ...]:
+    """Return one number, or those between commas."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError as error:
-        raise typer.BadParameter(f"albedo {text!r} is not a number, nor three with commas between") from error
+        raise typer.BadParameter(f"--albedo takes 1 number or 3 with commas between, got {text!r}") from error
     return values[0] if len(values) == 1 else values
 
 
 def effects_of(text: str) -> Effects:
-    """What `--effects` names."""
+    """Return the effects named by `--effects`."""
     return "auto" if text == "auto" else [name for name in text.split(",") if name]
 
 
@@ -95,33 +94,35 @@ def accuracy_of(
     effects: Effects,
     backend: str,
 ) -> Accuracy:
-    """The setting of a stop, or the one that keeps a bound. Raises typer.BadParameter where both are given."""
+    """Return the setting of a stop, or the one that keeps a bound. Raises typer.BadParameter for both."""
     if max_error is None and max_seconds is None:
         setting = accuracy_named(stop or "standard")
         return setting if beams_per_cell is None else replace(setting, beams_per_cell=beams_per_cell)
     if stop is not None or beams_per_cell is not None:
         raise typer.BadParameter(
-            "--max-error and --max-seconds choose the accuracy: leave out --accuracy and --beams-per-cell"
+            "--max-error and --max-seconds choose the accuracy: drop --accuracy and --beams-per-cell"
         )
     return choose(scene, max_error, max_seconds, effects, backend).accuracy
 
 
-def _option(field: str, told: str) -> Any:
-    """An option of the same name as a field of HiddenObject: None where it is not given."""
+def _option(field: str, text: str) -> Any:
+    """Return an option named like a field of HiddenObject: None unless set."""
     default = HiddenObject.model_fields[field].default
-    return typer.Option(f"--{field.replace('_', '-')}", help=told, show_default=str(default))
+    return typer.Option(f"--{field.replace('_', '-')}", help=text, show_default=str(default))
 
 
 Object = Annotated[str, typer.Argument(metavar="OBJECT", help=f"A category's name, {OBJECT_FILES}.")]
-Seed = Annotated[int | None, _option("seed", "Which variation of a category.")]
-UpAxis = Annotated[Up | None, _option("up", "What points up in a mesh's file; -z (z up: its +y) faces the wall.")]
-Size = Annotated[float | None, _option("size_m", "Larger of its extents along x and y, once turned. It scales a mesh.")]
-TiltX = Annotated[float | None, _option("tilt_x_deg", "Its angle about wall x, turned first.")]
-TiltY = Annotated[float | None, _option("tilt_y_deg", "Then about wall y (up): 180 turns its back to the wall.")]
-Turn = Annotated[float | None, _option("turn_deg", "Then about wall z.")]
-OffsetX = Annotated[float | None, _option("x_m", "Its middle from the box's middle, away from the lidar.")]
-OffsetY = Annotated[float | None, _option("y_m", "Its middle from the box's middle, up.")]
-Front = Annotated[float | None, _option("front_m", "From the box to its nearest point; too deep a thing is flattened.")]
+Seed = Annotated[int | None, _option("seed", "Number of the category's variation.")]
+UpAxis = Annotated[Up | None, _option("up", "Axis of a mesh that points up; its -z (z up: its +y) faces the wall.")]
+Size = Annotated[float | None, _option("size_m", "Size in meters: the larger extent along x and y after turning.")]
+TiltX = Annotated[float | None, _option("tilt_x_deg", "Rotation about the wall's x in degrees, applied first.")]
+TiltY = Annotated[float | None, _option("tilt_y_deg", "Then about the wall's y (up): at 180 its back faces the wall.")]
+Turn = Annotated[float | None, _option("turn_deg", "Then about the wall's z.")]
+OffsetX = Annotated[float | None, _option("x_m", "Offset from the box's middle in meters, away from the lidar.")]
+OffsetY = Annotated[float | None, _option("y_m", "Offset from the box's middle in meters, up.")]
+Front = Annotated[
+    float | None, _option("front_m", "Gap in meters from the box to the object; deep objects are flattened.")
+]
 
 
 def hidden_depth(hidden: str, rig: Rig, options: dict[str, Any]) -> Float32:
@@ -156,9 +157,11 @@ def register(app: typer.Typer) -> None:
 
 def command(
     hidden: Object,
-    out: Annotated[Path | None, typer.Option("--out", help="Maps (.npz); a picture goes beside them.")] = None,
-    scene: Annotated[Path | None, typer.Option("--scene", help="A scene.toml: its object gives way to OBJECT.")] = None,
-    rig: Annotated[str, typer.Option("--rig", help="A packaged rig's name, or a rig's TOML file.")] = "paper-rig",
+    out: Annotated[Path | None, typer.Option("--out", help="Output (.npz), with a picture (.png) beside it.")] = None,
+    scene: Annotated[
+        Path | None, typer.Option("--scene", help="A scene.toml, of which OBJECT replaces the object.")
+    ] = None,
+    rig: Annotated[str, typer.Option("--rig", help="Name of a packaged rig, or a rig's TOML file.")] = "paper-rig",
     accuracy: Stop = None,
     max_error: MaxError = None,
     max_seconds: MaxSeconds = None,
@@ -180,11 +183,13 @@ def command(
     beams_per_cell: BeamsPerCell = None,
     effects: EffectNames = "auto",
     backend: Backend = "cpu",
-    explain: Annotated[bool, typer.Option("--explain", help="Tell which effects the scene calls for.")] = False,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Print the included effects, with reasons and costs.")
+    ] = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Render what a lidar of highest-echo kind reports of a hidden object."""
+    """Render the maps that a lidar which reports its strongest echo gets of a hidden object."""
     path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
     file = load_scene(scene) if scene else None
     bare = file.bare if file else Scene(rig_named(rig))
@@ -195,18 +200,18 @@ def command(
     depth_m = hidden_depth(hidden, bare.rig, {"seed": seed, "up": up, **angles, **place})
     target, wanted = replace(bare, object_depth_m=depth_m), effects_of(effects)
     setting = accuracy_of(accuracy, max_error, max_seconds, beams_per_cell, target, wanted, backend)
-    started = time.perf_counter()
+    start_s = time.perf_counter()
     rendering = render(target, setting, wanted, backend)
-    seconds = time.perf_counter() - started
+    seconds = time.perf_counter() - start_s
     _save(path, target, depth_m, rendering)
     _draw(path.with_suffix(".png"), depth_m, rendering)
     sensor, measured = file.sensor if file else SensorModel(), explain and setting.sub_bins > 0
-    told = _effects(target, rendering, sensor, backend, measured=measured)
+    verdicts = _effects(target, rendering, sensor, backend, measured=measured)
     if explain:
-        stderr.print(_table(told))
+        stderr.print(_table(verdicts))
     facts = {"seconds": seconds, "accuracy": setting.name, "near_legs": rendering.near_legs}
-    text = f"rendered in {seconds:.2f} s at {setting.name!r}: {path}, picture {path.with_suffix('.png')}"
-    finish({**facts, "effects": told, "out": str(path)}, as_json=json, text=text)
+    text = f"Rendered at {setting.name!r} in {seconds:.2f} s: {path}, {path.with_suffix('.png')}"
+    finish({**facts, "effects": verdicts, "out": str(path)}, as_json=json, text=text)
 
 
 def _save(path: Path, scene: Scene, depth_m: Float32, rendering: Rendering) -> None:
@@ -227,18 +232,10 @@ def _save(path: Path, scene: Scene, depth_m: Float32, rendering: Rendering) -> N
 def _effects(
     scene: Scene, rendering: Rendering, sensor: SensorModel, backend: str, *, measured: bool
 ) -> list[dict[str, Any]]:
-    """The verdicts as facts; what each costs in seconds where that is to be measured, the sensor's own aside."""
+    """Return the verdicts as facts, with the seconds that each effect of the renderer costs if `measured`."""
     seconds = costs(scene, rendering.accuracy, rendering.plan, backend) if measured else {}
-    return [
-        {
-            "name": effect.name,
-            "included": effect.included,
-            "reason": effect.reason,
-            "bound": effect.bound,
-            "seconds": seconds.get(effect.name),
-        }
-        for effect in (*rendering.plan, *sensor_effects(sensor))
-    ]
+    effects = *rendering.plan, *sensor_effects(sensor)
+    return [{**asdict(effect), "seconds": seconds.get(effect.name)} for effect in effects]
 
 
 def _table(effects: list[dict[str, Any]]) -> Table:
@@ -254,7 +251,7 @@ def _draw(path: Path, depth_m: Float32, rendering: Rendering) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3), layout="constrained")
-    titles = "hidden depth (m)", "lidar depth (m)", "lidar intensity", "margin of the winner"
+    titles = "hidden depth (m)", "lidar depth (m)", "lidar intensity", "margin of the strongest echo"
     maps = depth_m, rendering.depth_m, rendering.intensity, rendering.margin
     for axis, title, image in zip(figure.subplots(1, 4), titles, maps, strict=True):
         figure.colorbar(axis.imshow(image, cmap="magma"), ax=axis)

@@ -1,18 +1,18 @@
 __all__ = [
     "EMPTY",
-    "FIRST_ARRAYS",
-    "FRAMES_EACH",
+    "FRAMES_PER_RECORDING",
+    "HELD_OUT_OUTLIERS",
     "HELD_OUT_SEED",
-    "IN_SHAPE",
     "ORDINARY",
-    "PARTS",
-    "SHARDS",
+    "PART_PATTERN",
+    "REQUIRED_ARRAYS",
+    "SHAPE_OUTLIERS",
+    "SHARD_PATTERN",
     "TEST_SEED",
-    "TO_JUDGE",
-    "TO_LEARN",
+    "TRAINING_OUTLIERS",
     "TRAINING_SEED",
     "BareMaps",
-    "Built",
+    "BuildReport",
     "Dataset",
     "DatasetPlan",
     "Objects",
@@ -20,30 +20,31 @@ __all__ = [
     "Stimulus",
     "build_dataset",
     "check_doubt_data",
-    "cluster",
     "doubt_sets",
+    "draw_outlier",
+    "label_recordings",
+    "list_recordings",
     "measured_bare_wall",
-    "objects_of",
+    "objects_from_folder",
     "open_dataset",
-    "outlier",
     "procedural_images",
+    "ray_farm",
     "read_labelled",
     "read_maps",
-    "recordings_in",
     "render_bare_wall",
     "samples_on_disk",
-    "sense_colour",
+    "sense_color",
     "sense_object",
     "write_shards",
 ]
 
-from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, Built, build_dataset
+from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
 from .doubt_samples import EMPTY, ORDINARY, check_doubt_data, doubt_sets, samples_on_disk
-from .labelled import FRAMES_EACH, read_labelled, recordings_in, write_shards
-from .outliers import IN_SHAPE, TO_JUDGE, TO_LEARN, Stimulus, outlier
+from .labelled import FRAMES_PER_RECORDING, label_recordings, list_recordings, read_labelled, write_shards
+from .outliers import HELD_OUT_OUTLIERS, SHAPE_OUTLIERS, TRAINING_OUTLIERS, Stimulus, draw_outlier
 from .plan import DatasetPlan, Objects, RigSpread
-from .ray_backend import cluster
+from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
-from .samples import objects_of, procedural_images, sense_colour, sense_object
-from .shards import FIRST_ARRAYS, PARTS, SHARDS
+from .samples import objects_from_folder, procedural_images, sense_color, sense_object
+from .shards import PART_PATTERN, REQUIRED_ARRAYS, SHARD_PATTERN
 from .training_maps import BareMaps, measured_bare_wall, read_maps, render_bare_wall

@@ -1,7 +1,7 @@
-"""What a doubt network learns from and is judged by: seeds to ordinary objects, empty benches and outliers, on disk."""
+"""Samples of the uncertainty network: ordinary objects, empty benches and outliers by seed, cached on disk."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from zlib import crc32
 
@@ -11,120 +11,116 @@ from nlos_calibration.arrays import Float32
 from nlos_models import DoubtSet, MapSet, Recipe, Reconstructor, first_of, parts_of
 from numpy.typing import NDArray
 
-from nlos_cam.dataset import build
-from nlos_cam.dataset.outliers import SLIGHT, TO_JUDGE, TO_LEARN, Stimulus, ordinary, outlier, varied, varied_empty
+from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
+from nlos_cam.dataset.outliers import (
+    HELD_OUT_OUTLIERS,
+    SLIGHT,
+    TRAINING_OUTLIERS,
+    Stimulus,
+    draw_outlier,
+    ordinary,
+    vary_bench,
+    vary_empty_bench,
+)
+from nlos_cam.dataset.reader import Dataset
+from nlos_cam.dataset.samples import OnProgress, cached_sensor, ignore
 from nlos_cam.errors import SceneError
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
-from nlos_cam.objects import image_from_depth, object_box
-from nlos_cam.render import Rendering, Sensor, SensorModel, render
+from nlos_cam.objects import image_from_depth
+from nlos_cam.render import Rendering, SensorModel, render
 
 EMPTY, ORDINARY = "empty", "ordinary"
 PIECE = 100
-"""Samples in a file: what a kill can cost."""
+"""Samples in a file; a killed build loses at most as many."""
 BESIDE_M = 0.01
-"""Depth this far from the bare wall's is that of what is hidden: the width of a path-length bin."""
-BENCH = 10
-"""Samples in a row that are of one bench, whose sensor is worked out once."""
+"""Depth differing from the bare wall's by more than this belongs to the object: the width of a path-length bin."""
+SEEDS_PER_BENCH = 10
+"""Consecutive seeds on the same bench, whose sensor is computed once."""
 VERSION = 2
-"""Raised with any change of what a seed makes."""
+"""Raise it when a seed makes another sample."""
 _STREAM = 5
-"""Keeps these random numbers apart from those of datasets."""
-
-OnProgress = Callable[[int, int], None]
+"""Seeds these random numbers apart from those of datasets."""
+KINDS = {ORDINARY: ordinary, **TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}
+MIN_CELLS = 8
+"""Training leaves out outliers that change fewer cells of the maps: they hardly differ from an empty bench."""
+HELD_OUT_SHARE = 0.15
+"""Held-out outliers and empty benches, relative to the number of training ones."""
 
 
 @dataclass(frozen=True)
 class DoubtSamples:
-    """Maps, and what was hidden."""
+    """Maps of hidden objects, with the truth."""
 
     depth_m: Float32
     """(n, 64, 80); NaN where there is no return."""
     intensity: Float32
     """(n, 64, 80)."""
     image: NDArray[np.float16]
-    """(n, 64, 64); the truth, 0 for background."""
+    """(n, 64, 64); image v of the truth, 0 for background."""
     cells: NDArray[np.int32]
-    """(n,); in how many cells of the maps what is hidden is the strongest return: in none it cannot be seen."""
+    """(n,); number of map cells whose strongest return is the object's: with none it is invisible."""
     kind: NDArray[np.str_]
-    """(n,); EMPTY, ORDINARY, or an outlier's."""
+    """(n,); EMPTY, ORDINARY, or a kind of outlier."""
 
     def __len__(self) -> int:
         return len(self.kind)
 
     def where(self, chosen: NDArray[np.bool_]) -> "DoubtSamples":
-        """Those that are chosen (n,)."""
+        """Return the samples of a mask (n,)."""
         return DoubtSamples(**{name: values[chosen] for name, values in vars(self).items()})
 
 
 def make_samples(
     kind: str, seeds: Sequence[int], rig: Rig, sensor: SensorModel, accuracy: str = "draft"
 ) -> DoubtSamples:
-    """Samples of one kind, the same bits for the same seeds: BENCH in a row are of one bench.
+    """Return samples of one kind, the same bits for the same seeds; SEEDS_PER_BENCH consecutive ones share a bench.
 
-    Ordinary objects, of which datasets have those on the given bench, are on benches that lie slightly off, outliers
-    on every second such; empty benches may lie widely off.
+    Datasets hold ordinary objects on the given bench. Here these are on benches that deviate slightly, outliers on
+    such benches and the given one in turn, and empty benches may deviate widely.
     """
-    sights = [_sight(kind, seed, rig, sensor) for seed in seeds]
-    rendered = [render(sight.scene, accuracy) for sight in sights]
+    stimuli = [_stimulus(kind, seed, rig, sensor) for seed in seeds]
+    renderings = [render(stimulus.scene, accuracy) for stimulus in stimuli]
     noises = [_generator(kind, seed, 2) for seed in seeds]
-    maps = [_sensed(*each) for each in zip(sights, rendered, noises, strict=True)]
+    maps = [_sense(*each) for each in zip(stimuli, renderings, noises, strict=True)]
     return DoubtSamples(
         np.stack([one.depth_m for one in maps]),
         np.stack([one.intensity for one in maps]),
-        np.stack([_truth(sight) for sight in sights]),
-        np.array([_cells(*each) for each in zip(sights, rendered, strict=True)], np.int32),
+        np.stack([_truth(stimulus) for stimulus in stimuli]),
+        np.array([_visible_cells(*each) for each in zip(stimuli, renderings, strict=True)], np.int32),
         np.array([kind] * len(seeds)),
     )
 
 
-def _generator(kind: str, seed: int, of: int) -> np.random.Generator:
-    """Other numbers for each kind: benches or noise that kinds share would tell outliers from ordinary objects."""
-    return np.random.default_rng([crc32(kind.encode()), seed, _STREAM, of])
+def _generator(kind: str, seed: int, stream: int) -> np.random.Generator:
+    """Return a generator that differs between kinds: shared benches or noise would give outliers away."""
+    return np.random.default_rng([crc32(kind.encode()), seed, _STREAM, stream])
 
 
-def _sensed(sight: Stimulus, rendered: Rendering, noise: np.random.Generator) -> LidarMaps:
-    sensor = _sensor(sight)
-    images = sensor.expose(rendered.multi, noise)
-    return maps_from_frame(images.frame(sensor.rig.pinhole))
-
-
-def _truth(sight: Stimulus) -> NDArray[np.float16]:
-    nothing = np.full((OBJECT_PIXELS, OBJECT_PIXELS), np.nan, np.float32)
-    hidden_m = nothing if sight.depth_m is None else sight.depth_m
-    return image_from_depth(hidden_m, object_box(sight.rig)).astype(np.float16)
-
-
-def _cells(sight: Stimulus, rendered: Rendering) -> int:
-    """In how many cells the depth is not the bare wall's."""
-    bare_m = render(replace(sight.scene, object_depth_m=None)).depth_m
-    return int(np.count_nonzero(np.abs(rendered.depth_m - bare_m) > BESIDE_M))
-
-
-def _sight(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Stimulus:
-    of_bench = _generator(kind, seed // BENCH, 0)
+def _stimulus(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Stimulus:
+    bench_generator = _generator(kind, seed // SEEDS_PER_BENCH, 0)
     if kind == EMPTY:
-        return Stimulus(*varied_empty(rig, sensor, of_bench))
-    slight = kind == ORDINARY or seed // BENCH % 2
-    bench = varied(rig, sensor, SLIGHT, of_bench) if slight else (rig, sensor)
-    return outlier(KINDS[kind], _generator(kind, seed, 1), Stimulus(*bench))
+        return Stimulus(*vary_empty_bench(rig, sensor, bench_generator))
+    slight = kind == ORDINARY or seed // SEEDS_PER_BENCH % 2
+    bench = vary_bench(rig, sensor, SLIGHT, bench_generator) if slight else (rig, sensor)
+    return draw_outlier(KINDS[kind], _generator(kind, seed, 1), Stimulus(*bench))
 
 
-KINDS = {ORDINARY: ordinary, **TO_LEARN, **TO_JUDGE}
+def _sense(stimulus: Stimulus, rendering: Rendering, noise: np.random.Generator) -> LidarMaps:
+    images = cached_sensor(stimulus.rig, stimulus.sensor).expose(rendering.multi, noise)
+    return maps_from_frame(images.frame(stimulus.rig.pinhole))
 
 
-class _Last:
-    """The sensor that was made last: benches come in rows."""
+def _truth(stimulus: Stimulus) -> NDArray[np.float16]:
+    empty = np.full((OBJECT_PIXELS, OBJECT_PIXELS), np.nan, np.float32)
+    depth_m = empty if stimulus.depth_m is None else stimulus.depth_m
+    return image_from_depth(depth_m, stimulus.box).astype(np.float16)
 
-    key: tuple[Rig, SensorModel] | None = None
-    sensor: Sensor | None = None
 
-
-def _sensor(sight: Stimulus) -> Sensor:
-    key = sight.rig, sight.sensor
-    if _Last.sensor is None or _Last.key != key:
-        _Last.key, _Last.sensor = key, Sensor(*key)
-    return _Last.sensor
+def _visible_cells(stimulus: Stimulus, rendering: Rendering) -> int:
+    """Return the number of cells whose depth differs from the bare wall's."""
+    bare_m = render(replace(stimulus.scene, object_depth_m=None)).depth_m
+    return int(np.count_nonzero(np.abs(rendering.depth_m - bare_m) > BESIDE_M))
 
 
 def samples_on_disk(
@@ -135,26 +131,22 @@ def samples_on_disk(
     sensor: SensorModel,
     *,
     accuracy: str = "draft",
-    on_progress: OnProgress = lambda _done, _total: None,
+    on_progress: OnProgress = ignore,
 ) -> DoubtSamples:
-    """So many samples of each kind; what the folder has of them is read, what it lacks is made and kept there."""
+    """Return `counts` samples of each kind; those missing in the folder are made and stored there."""
     folder.mkdir(parents=True, exist_ok=True)
     about = f"v{VERSION}-{rig.checksum}-{accuracy}"
     done, total, parts = 0, sum(counts.values()), list[DoubtSamples]()
     for kind, seeds in _pieces(counts, first_seed):
         path = folder / f"{about}-{kind.replace(' ', '_')}-{seeds.start}-{len(seeds)}.npz"
-        if (part := _read(path)) is None:
+        if not path.exists():
             part = make_samples(kind, seeds, rig, sensor, accuracy)
-            _write(path, part)
-        parts.append(part)
+            with atomic_file(path) as unfinished, unfinished.open("wb") as file:
+                np.savez(file, **vars(part))
+        with np.load(path) as file:
+            parts.append(DoubtSamples(**file))
         on_progress(done := done + len(seeds), total)
-    return joined(parts)
-
-
-def joined(parts: Sequence[DoubtSamples]) -> DoubtSamples:
-    """Samples one after the other."""
-    names = [one.name for one in fields(DoubtSamples)]
-    return DoubtSamples(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    return DoubtSamples(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
 
 
 def _pieces(counts: Mapping[str, int], first_seed: int) -> Iterator[tuple[str, range]]:
@@ -163,54 +155,30 @@ def _pieces(counts: Mapping[str, int], first_seed: int) -> Iterator[tuple[str, r
             yield kind, range(start, min(start + PIECE, first_seed + count))
 
 
-def _read(path: Path) -> DoubtSamples | None:
-    """The samples of a file; None where there is none."""
-    if not path.exists():
-        return None
-    with np.load(path) as file:
-        return DoubtSamples(**file)
-
-
-def _write(path: Path, samples: DoubtSamples) -> None:
-    with atomic_file(path) as part, part.open("wb") as file:
-        np.savez(file, **vars(samples))
-
-
-MIN_CELLS = 8
-"""An outlier that shows in fewer cells of the maps is not learnt from: it can hardly be told from nothing at all."""
-
-
-HELD_OUT_SHARE = 0.15
-"""Of outliers and empty benches, beside those that are learnt from."""
-
-
 def counts_of(recipe: Recipe) -> dict[str, int]:
-    """How many samples are rendered of each kind.
+    """Return the number of samples to render of each kind.
 
-    On benches that lie slightly off, as many ordinary objects as outliers: else what lies off would itself be a sign.
+    Benches that deviate slightly have as many ordinary objects as outliers, so that the deviation does not give
+    outliers away.
     """
-    of_each = dict.fromkeys(TO_LEARN, recipe.outliers)
-    return {EMPTY: recipe.empties, ORDINARY: sum(of_each.values()) // 2, **of_each}
+    per_kind = dict.fromkeys(TRAINING_OUTLIERS, recipe.outliers)
+    return {EMPTY: recipe.empties, ORDINARY: sum(per_kind.values()) // 2, **per_kind}
 
 
-def doubt_set(pipeline: Reconstructor, samples: DoubtSamples) -> DoubtSet:
-    """Samples beside what a pipeline makes of them."""
-    outside = (samples.kind != EMPTY) & (samples.kind != ORDINARY)
-    made = _images(pipeline, MapSet(samples.depth_m, samples.intensity, samples.image))
-    return DoubtSet(samples.depth_m, samples.intensity, made, samples.image, samples.kind == EMPTY, outside)
+def _doubt_set(pipeline: Reconstructor, ordinary_maps: MapSet, samples: DoubtSamples) -> DoubtSet:
+    """Return a dataset's maps of ordinary objects and the visible samples, with the pipeline's images of both."""
+    nothing = samples.kind == EMPTY
+    outside = ~nothing & (samples.kind != ORDINARY)
+    images = _images(pipeline, MapSet(samples.depth_m, samples.intensity, samples.image))
+    drawn = DoubtSet(samples.depth_m, samples.intensity, images, samples.image, nothing, outside)
+    drawn = drawn.where((samples.cells >= MIN_CELLS) | nothing)
+    depth_m, intensity, truth = ordinary_maps.depth_m, ordinary_maps.intensity, ordinary_maps.image.astype(np.float16)
+    no = np.zeros(len(truth), np.bool_)
+    usual = DoubtSet(depth_m, intensity, _images(pipeline, ordinary_maps), truth, no, no)
+    return DoubtSet(**{name: np.concatenate([values, vars(drawn)[name]]) for name, values in vars(usual).items()})
 
 
-def _whole_set(pipeline: Reconstructor, usual: MapSet, samples: DoubtSamples) -> DoubtSet:
-    """Ordinary maps of a dataset, and the samples that can be seen."""
-    made = doubt_set(pipeline, samples)
-    made = made.where((samples.cells >= MIN_CELLS) | made.nothing)
-    of_dataset, no = _images(pipeline, usual), np.zeros(len(usual.image), np.bool_)
-    ordinary = DoubtSet(usual.depth_m, usual.intensity, of_dataset, usual.image.astype(np.float16), no, no)
-    pairs = {name: (values, vars(made)[name]) for name, values in vars(ordinary).items()}
-    return DoubtSet(**{name: np.concatenate(pair) for name, pair in pairs.items()})
-
-
-def _images(pipeline: Reconstructor, maps: MapSet) -> np.ndarray:
+def _images(pipeline: Reconstructor, maps: MapSet) -> NDArray[np.float16]:
     pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
     return np.concatenate([pipeline(*pair) for pair in pairs]).astype(np.float16)
 
@@ -218,34 +186,36 @@ def _images(pipeline: Reconstructor, maps: MapSet) -> np.ndarray:
 def doubt_sets(
     recipe: Recipe,
     pipeline: Reconstructor,
-    datasets: tuple[build.Dataset, build.Dataset],
+    datasets: tuple[Dataset, Dataset],
     folder: Path,
-    on_progress: OnProgress = lambda _done, _total: None,
+    on_progress: OnProgress = ignore,
 ) -> list[DoubtSet]:
     """Return the training set and the held-out set of an uncertainty network; rendered samples are kept in `folder`."""
     counts = counts_of(recipe)
-    fewer = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
+    held_out_counts = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
     sets: list[DoubtSet] = []
-    for dataset, most, some, seed in zip(
-        datasets,
-        (recipe.objects, recipe.held_out),
-        (counts, fewer),
-        (build.TRAINING_SEED, build.HELD_OUT_SEED),
-        strict=True,
+    for dataset, objects, kinds, seed in (
+        (datasets[0], recipe.objects, counts, TRAINING_SEED),
+        (datasets[1], recipe.held_out, held_out_counts, HELD_OUT_SEED),
     ):
         plan = dataset.plan
         samples = samples_on_disk(
-            folder, some, seed, plan.rig, plan.sensor, accuracy=plan.accuracy, on_progress=on_progress
+            folder, kinds, seed, plan.rig, plan.sensor, accuracy=plan.accuracy, on_progress=on_progress
         )
-        sets.append(_whole_set(pipeline, first_of(dataset.arrays(), most), samples))
+        sets.append(_doubt_set(pipeline, first_of(dataset.arrays(), objects), samples))
     return sets
 
 
-def check_doubt_data(recipe: Recipe, pipeline: Reconstructor, training: build.Dataset, judging: build.Dataset) -> None:
+def check_doubt_data(recipe: Recipe, pipeline: Reconstructor, training: Dataset, held_out: Dataset) -> None:
+    """Raise SceneError where datasets, weights and recipe do not fit together."""
     if pipeline.record.input != "raw maps":
-        raise SceneError(f"these weights eat {pipeline.record.input}, and doubt is learnt of raw maps: name others")
-    if not training.plan.rig.checksum == judging.plan.rig.checksum == pipeline.record.rig_checksum:
-        raise SceneError("maps, held-out maps and weights are not all of one rig: name others, or build the maps again")
+        raise SceneError(
+            f"weights expect {pipeline.record.input}, but the uncertainty network needs raw maps: use others"
+        )
+    if not training.plan.rig.checksum == held_out.plan.rig.checksum == pipeline.record.rig_checksum:
+        raise SceneError(
+            "--dataset, --held-out and --weights are not all of one rig: use others, or build the maps again"
+        )
     if len(training) < recipe.objects:
-        told = f"the dataset holds {len(training)} objects, the recipe asks for {recipe.objects}"
-        raise SceneError(f"{told}: build that many, or give --objects")
+        count = f"--dataset holds {len(training)} objects, the recipe needs {recipe.objects}"
+        raise SceneError(f"{count}: build more, or lower --objects")

@@ -1,13 +1,7 @@
-"""What a lidar may be shown that no training object is: kinds of outliers, some to learn from, the others to judge by.
+"""Outliers: stimuli unlike the training objects, and variations of a bench, for the uncertainty network.
 
-Training's objects are whole, of one piece, of 55 to 90 % of the box, with their front in its nearest third, white and
-matt. A kind to judge by is never learnt from, so that what is unlike anything seen before is judged, too.
-
-What the lidar is shown, on which rig, by which sensor; and ordinary things, of which outliers are made.
-
-Benches near the one that networks were trained for: a lidar that stands a little off, other light, biased depth.
-
-Kinds of outliers that a doubt network learns from.
+Training objects are of one piece, 55 to 90 % of the box wide, in its nearest third, white and matt. Kinds of outliers
+are either in the training set or held out from it, so that the evaluation also covers kinds the network has not met.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,13 +12,14 @@ import cv2
 import numpy as np
 import trimesh
 from nlos_calibration import ObjectBox, Rig
-from nlos_calibration.arrays import Float32, Float64
+from nlos_calibration.arrays import Float32
 from trimesh.transformations import euler_matrix
 
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects import (
     CATEGORIES,
     Pose,
+    box_width_m,
     category_triangles,
     object_box,
     orthographic_depth,
@@ -40,57 +35,55 @@ Generator = np.random.Generator
 
 @dataclass(frozen=True)
 class Stimulus:
-    """What the lidar is shown, on which rig, and by which sensor it is seen."""
+    """Stimulus of the lidar: the hidden object and its surface, the rig, and the sensor."""
 
     rig: Rig
     sensor: SensorModel
     depth_m: Float32 | None = None
-    """(64, 64), NaN for background; None hides nothing."""
+    """(64, 64), NaN for background; None for an empty bench."""
     surface: Surface = field(default_factory=Surface)
 
     @property
+    def box(self) -> ObjectBox:
+        """The rig's object box."""
+        return object_box(self.rig)
+
+    @property
     def scene(self) -> Scene:
-        """What is rendered."""
+        """The scene to render."""
         return Scene(self.rig, self.depth_m, self.surface, pulse_ns=self.sensor.pulse_ns)
 
 
-Kind = Callable[[Generator, Stimulus], Stimulus]
-"""Makes an outlier of a sight that is ordinary, but for its object, which is still to come."""
+OutlierKind = Callable[[Generator, Stimulus], Stimulus]
+"""Makes an outlier from an ordinary stimulus that has no object yet."""
 
 
-def _triangles(generator: Generator) -> Float64:
-    return category_triangles(str(generator.choice(list(CATEGORIES))), int(generator.integers(2**31)))
-
-
-def placed(generator: Generator, box: ObjectBox, **pose: float) -> Float32:
-    """A thing of any category in a pose that is random but for what is given."""
+def draw_object(generator: Generator, box: ObjectBox, **pose: float) -> Float32:
+    """Return the depth map of an object of any category in a random pose, except for the given values."""
     drawn = replace(random_pose(generator, box), **pose)
-    return orthographic_depth(place(_triangles(generator), drawn, box), box)
-
-
-def width_m(box: ObjectBox) -> float:
-    return min(box.x_max_m - box.x_min_m, box.y_max_m - box.y_min_m)
+    category = str(generator.choice(list(CATEGORIES)))
+    return orthographic_depth(place(category_triangles(category, int(generator.integers(2**31))), drawn, box), box)
 
 
 def smooth_pattern(generator: Generator, across: int) -> Float32:
-    """A smooth random pattern (64, 64) from 0 to 1."""
+    """Return a smooth random pattern (64, 64) from 0 to 1."""
     coarse = generator.standard_normal((across, across)).astype(np.float32)
     pattern = cv2.resize(coarse, (OBJECT_PIXELS, OBJECT_PIXELS), interpolation=cv2.INTER_CUBIC)
     return ((pattern - pattern.min()) / np.ptp(pattern)).astype(np.float32)
 
 
-def ordinary(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing as training has them."""
-    return replace(sight, depth_m=placed(generator, object_box(sight.rig)))
+def ordinary(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object like those of the training set."""
+    return replace(stimulus, depth_m=draw_object(generator, stimulus.box))
 
 
-class Spread(NamedTuple):
-    """How far a bench may lie from the given one; each is drawn evenly up to it."""
+class BenchSpread(NamedTuple):
+    """Largest deviations of a bench from the given one; each is drawn uniformly."""
 
     place_m: float
     angle_deg: float
     gain: float
-    """Of the logarithm of the counts, to either side."""
+    """Of the logarithm of the counts, in either direction."""
     ambient_counts: float
     offset_m: float
     ripple_m: float
@@ -98,16 +91,16 @@ class Spread(NamedTuple):
     texture: float
 
 
-SLIGHT = Spread(0.0005, 0.1, 0.05, 10.0, 0.001, 0.0005, 0.0003, 0.03)
-"""What a good calibration leaves: objects look as they did."""
-WIDE = Spread(0.004, 0.6, 0.7, 60.0, 0.006, 0.003, 0.002, 0.2)
-"""What an empty bench may do without showing an object."""
-WITHOUT_OCCLUDER = 0.1
-"""Of wide benches, the share that has no occluder: a wall alone hides nothing."""
+SLIGHT = BenchSpread(0.0005, 0.1, 0.05, 10.0, 0.001, 0.0005, 0.0003, 0.03)
+"""Errors left by a good calibration, which do not change the look of objects."""
+WIDE = BenchSpread(0.004, 0.6, 0.7, 60.0, 0.006, 0.003, 0.002, 0.2)
+"""Deviations of an empty bench that must not look like an object."""
+NO_OCCLUDER_SHARE = 0.1
+"""Share of empty benches without an occluder: a bare wall."""
 
 
-def moved(rig: Rig, place_m: float, yaw_deg: float, pitch_deg: float) -> Rig:
-    """The rig with its lidar so much farther from the wall, and turned by so much."""
+def move_lidar(rig: Rig, place_m: float, yaw_deg: float, pitch_deg: float) -> Rig:
+    """Return the rig with its lidar `place_m` farther from the wall, and turned."""
     lidar = rig.lidar.model_copy(
         update={
             "distance_m": rig.lidar.distance_m + place_m,
@@ -118,8 +111,8 @@ def moved(rig: Rig, place_m: float, yaw_deg: float, pitch_deg: float) -> Rig:
     return rig.model_copy(update={"lidar": lidar})
 
 
-def varied(rig: Rig, sensor: SensorModel, spread: Spread, generator: Generator) -> tuple[Rig, SensorModel]:
-    """A bench near the given one."""
+def vary_bench(rig: Rig, sensor: SensorModel, spread: BenchSpread, generator: Generator) -> tuple[Rig, SensorModel]:
+    """Return a rig and a sensor near the given ones."""
     place, yaw, pitch, gain, offset = generator.uniform(-1, 1, 5).tolist()
     ambient, ripple, patch, texture = generator.uniform(0, 1, 4).tolist()
     changed = sensor.model_copy(
@@ -133,245 +126,231 @@ def varied(rig: Rig, sensor: SensorModel, spread: Spread, generator: Generator) 
         }
     )
     angles = yaw * spread.angle_deg, pitch * spread.angle_deg
-    return moved(rig, place * spread.place_m, *angles), changed
+    return move_lidar(rig, place * spread.place_m, *angles), changed
 
 
-def varied_empty(rig: Rig, sensor: SensorModel, generator: Generator) -> tuple[Rig, SensorModel]:
-    """A bench with nothing hidden: from the given one to one that lies widely off, and some without an occluder."""
+def vary_empty_bench(rig: Rig, sensor: SensorModel, generator: Generator) -> tuple[Rig, SensorModel]:
+    """Return the rig and the sensor of an empty bench: the given ones, wide deviations, some without an occluder."""
     share = float(generator.choice([0.0, generator.random(), 1.0]))
-    spread = Spread(*(share * most for most in WIDE))
-    bench, seen_by = varied(rig, sensor, spread, generator)
-    if generator.random() < WITHOUT_OCCLUDER:
+    spread = BenchSpread(*(share * limit for limit in WIDE))
+    bench, model = vary_bench(rig, sensor, spread, generator)
+    if generator.random() < NO_OCCLUDER_SHARE:
         bench = bench.model_copy(update={"occluder": None})
-    return bench, seen_by
+    return bench, model
 
 
-def small(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing of 15 to 35 % of the box."""
-    box = object_box(sight.rig)
-    size_m, (right, up) = width_m(box) * generator.uniform(0.15, 0.35), generator.uniform(-0.3, 0.3, 2) * width_m(box)
-    return replace(sight, depth_m=placed(generator, box, size_m=size_m, x_m=right, y_m=up))
+def small(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object of 15 to 35 % of the box."""
+    box = stimulus.box
+    size_m, (right, up) = (
+        box_width_m(box) * generator.uniform(0.15, 0.35),
+        generator.uniform(-0.3, 0.3, 2) * box_width_m(box),
+    )
+    return replace(stimulus, depth_m=draw_object(generator, box, size_m=size_m, x_m=right, y_m=up))
 
 
-def large(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing of 125 to 180 % of the box, whose sides are cut off."""
-    box = object_box(sight.rig)
-    return replace(sight, depth_m=placed(generator, box, size_m=width_m(box) * generator.uniform(1.25, 1.8)))
+def large(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object of 125 to 180 % of the box, whose sides are cut off."""
+    box = stimulus.box
+    return replace(
+        stimulus, depth_m=draw_object(generator, box, size_m=box_width_m(box) * generator.uniform(1.25, 1.8))
+    )
 
 
-def far(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing 0.12 to 0.35 m farther from the wall, most of it beyond the box."""
-    return replace(sight, depth_m=placed(generator, object_box(sight.rig)) + np.float32(generator.uniform(0.12, 0.35)))
+def far(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object 0.12 to 0.35 m farther from the wall, most of it behind the box."""
+    return replace(stimulus, depth_m=draw_object(generator, stimulus.box) + np.float32(generator.uniform(0.12, 0.35)))
 
 
-def near(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing that stands out of the box, 40 to 90 mm nearer to the wall."""
-    box = object_box(sight.rig)
-    depth_m = placed(generator, box, front_m=0.0) - np.float32(generator.uniform(0.04, 0.09))
-    return replace(sight, depth_m=depth_m)
+def near(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object that sticks out of the box, 40 to 90 mm nearer to the wall."""
+    depth_m = draw_object(generator, stimulus.box, front_m=0.0) - np.float32(generator.uniform(0.04, 0.09))
+    return replace(stimulus, depth_m=depth_m)
 
 
-def half_out(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing of ordinary size, 35 to 60 % of which lies beside the box."""
-    box = object_box(sight.rig)
+def half_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object of ordinary size, 35 to 60 % of which lies beside the box."""
+    box = stimulus.box
     pose = random_pose(generator, box)
-    out_m = (width_m(box) + pose.size_m) / 2 - pose.size_m * generator.uniform(0.4, 0.65)
+    out_m = (box_width_m(box) + pose.size_m) / 2 - pose.size_m * generator.uniform(0.4, 0.65)
     angle = np.radians(90) * int(generator.integers(4))
-    return replace(sight, depth_m=placed(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle)))
+    return replace(stimulus, depth_m=draw_object(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle)))
 
 
-def several(generator: Generator, sight: Stimulus) -> Stimulus:
-    """Two or three things apart from each other."""
-    box = object_box(sight.rig)
+def several(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add two or three separate objects."""
+    box = stimulus.box
     count, start = int(generator.integers(2, 4)), generator.uniform(0, 2 * np.pi)
     depths_m = list[Float32]()
     for k in range(count):
-        angle, reach_m = start + 2 * np.pi * k / count, 0.3 * width_m(box)
+        angle, reach_m = start + 2 * np.pi * k / count, 0.3 * box_width_m(box)
         x_m, y_m = reach_m * np.cos(angle), reach_m * np.sin(angle)
-        size_m = width_m(box) * generator.uniform(0.25, 0.4)
+        size_m = box_width_m(box) * generator.uniform(0.25, 0.4)
         front_m = generator.uniform(0, 0.6) * (box.z_far_m - box.z_near_m)
-        depths_m.append(placed(generator, box, size_m=size_m, x_m=x_m, y_m=y_m, front_m=front_m))
-    return replace(sight, depth_m=np.fmin.reduce(depths_m))
+        depths_m.append(draw_object(generator, box, size_m=size_m, x_m=x_m, y_m=y_m, front_m=front_m))
+    return replace(stimulus, depth_m=np.fmin.reduce(depths_m))
 
 
-def blobs(generator: Generator, sight: Stimulus) -> Stimulus:
-    """Smooth random shapes of smooth random depth."""
-    box = object_box(sight.rig)
+def blobs(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add smooth random shapes of smooth random depth."""
+    box = stimulus.box
     covered = smooth_pattern(generator, int(generator.integers(3, 9))) > generator.uniform(0.35, 0.75)
     share = smooth_pattern(generator, int(generator.integers(3, 9))) * generator.uniform(0.3, 1.0)
     depth_m = box.z_near_m + share * np.float32(box.z_far_m - box.z_near_m)
-    return replace(sight, depth_m=np.where(covered, depth_m, np.float32(np.nan)))
+    return replace(stimulus, depth_m=np.where(covered, depth_m, np.float32(np.nan)))
 
 
-def dim(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A grey or black thing: 5 to 40 % of a white one's light."""
-    return replace(ordinary(generator, sight), surface=Surface(float(generator.uniform(0.05, 0.4))))
+def dim(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add a grey or black object with an albedo of 0.05 to 0.4."""
+    return replace(ordinary(generator, stimulus), surface=Surface(float(generator.uniform(0.05, 0.4))))
 
 
-def posts(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing on a post, with another above it."""
-    depth_m = placed(generator, object_box(sight.rig))
+def posts(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object on a post, with another post above it."""
+    depth_m = draw_object(generator, stimulus.box)
     for _ in range(2):
         depth_m = np.where(np.isnan(depth_m), post(depth_m, generator), depth_m)[::-1]
-    return replace(sight, depth_m=np.ascontiguousarray(depth_m))
+    return replace(stimulus, depth_m=np.ascontiguousarray(depth_m))
 
 
-def tilted(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing tilted by 40 to 75 degrees, up or down and to a side."""
+def tilted(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object tilted by 40 to 75 degrees, up or down and to a side."""
     tilts = np.radians(generator.uniform(40, 75, 2)) * generator.choice([-1, 1], 2)
     pose = {"tilt_x_rad": float(tilts[0]), "tilt_y_rad": float(tilts[1])}
-    return replace(sight, depth_m=placed(generator, object_box(sight.rig), **pose))
+    return replace(stimulus, depth_m=draw_object(generator, stimulus.box, **pose))
 
 
-def plates(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A large slanted plate without any relief."""
-    box, steps = object_box(sight.rig), np.linspace(-0.5, 0.5, OBJECT_PIXELS)
+def plates(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add a large slanted plate without relief."""
+    box, steps = stimulus.box, np.linspace(-0.5, 0.5, OBJECT_PIXELS)
     x, y = np.meshgrid(steps, -steps)
     slope_x, slope_y = generator.uniform(-1, 1, 2)
-    depth_m = generator.uniform(box.z_near_m, 0.8 * box.z_far_m) + width_m(box) * (slope_x * x + slope_y * y)
+    depth_m = generator.uniform(box.z_near_m, 0.8 * box.z_far_m) + box_width_m(box) * (slope_x * x + slope_y * y)
     half_x, half_y = generator.uniform(0.3, 0.5, 2)
     covered = (abs(x) < half_x) & (abs(y) < half_y) & (depth_m > 0.5 * box.z_near_m)
-    return replace(sight, depth_m=np.where(covered, depth_m, np.nan).astype(np.float32))
+    return replace(stimulus, depth_m=np.where(covered, depth_m, np.nan).astype(np.float32))
 
 
-def other_rig(generator: Generator, sight: Stimulus) -> Stimulus:
-    """An ordinary thing seen by a lidar that stands 15 to 50 mm off, turned by 2 to 8 degrees."""
+def other_rig(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an ordinary object, and move the lidar by 15 to 50 mm and 2 to 8 degrees."""
     signs = generator.choice([-1, 1], 3)
     place_m, yaw, pitch = signs * generator.uniform([0.015, 2, 2], [0.05, 8, 8])
-    return replace(ordinary(generator, sight), rig=moved(sight.rig, place_m, yaw, pitch))
+    return replace(ordinary(generator, stimulus), rig=move_lidar(stimulus.rig, place_m, yaw, pitch))
 
 
-def other_sensor(generator: Generator, sight: Stimulus) -> Stimulus:
-    """An ordinary thing seen with a third to two thirds of the gain, or half as much again to three times it."""
+def other_sensor(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an ordinary object, and multiply the gain by 0.3 to 0.65 or 1.6 to 3."""
     gain = float(generator.choice([generator.uniform(0.3, 0.65), generator.uniform(1.6, 3.0)]))
-    sensor = sight.sensor.model_copy(update={"bare_wall_counts": sight.sensor.bare_wall_counts * gain})
-    return replace(ordinary(generator, sight), sensor=sensor)
+    sensor = stimulus.sensor.model_copy(update={"bare_wall_counts": stimulus.sensor.bare_wall_counts * gain})
+    return replace(ordinary(generator, stimulus), sensor=sensor)
 
 
-def warped(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing bent out of shape: every pixel is taken from up to a sixth of the box away, smoothly."""
-    whole_m, steps = placed(generator, object_box(sight.rig)), np.arange(OBJECT_PIXELS, dtype=np.float32)
+def warped(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add a warped object: every pixel is displaced by up to a sixth of the box, smoothly."""
+    whole_m, steps = draw_object(generator, stimulus.box), np.arange(OBJECT_PIXELS, dtype=np.float32)
     x, y = np.meshgrid(steps, steps)
     off = [(smooth_pattern(generator, 5) - np.float32(0.5)) * np.float32(OBJECT_PIXELS / 3) for _ in range(2)]
     bent = cv2.remap(whole_m, x + off[0], y + off[1], cv2.INTER_NEAREST, borderValue=float("nan"))
-    return replace(sight, depth_m=bent.astype(np.float32))
+    return replace(stimulus, depth_m=bent.astype(np.float32))
 
 
-def inside_out(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing whose far parts are near and whose near parts are far, and twice as deep."""
-    box = object_box(sight.rig)
-    whole_m = placed(generator, box)
+def inside_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object turned inside out: near parts become far ones, and relief doubles."""
+    box = stimulus.box
+    whole_m = draw_object(generator, box)
     depth_m = np.nanmin(whole_m) + 2 * (np.nanmax(whole_m) - whole_m)
-    return replace(sight, depth_m=np.minimum(depth_m, np.float32(1.5 * box.z_far_m)))
+    return replace(stimulus, depth_m=np.minimum(depth_m, np.float32(1.5 * box.z_far_m)))
 
 
-def cut_out(generator: Generator, sight: Stimulus) -> Stimulus:
-    """The silhouette of a thing, flat, with holes in it."""
-    whole_m = placed(generator, object_box(sight.rig))
+def cut_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add the flat silhouette of an object, with holes."""
+    whole_m = draw_object(generator, stimulus.box)
     holes = smooth_pattern(generator, int(generator.integers(4, 10))) > generator.uniform(0.45, 0.75)
     flat = np.where(holes | np.isnan(whole_m), np.nan, np.nanmedian(whole_m))
-    return replace(sight, depth_m=flat.astype(np.float32))
+    return replace(stimulus, depth_m=flat.astype(np.float32))
 
 
-def scrambled(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing cut into 3 x 3 or 4 x 4 tiles, which are shuffled."""
-    whole_m, n = placed(generator, object_box(sight.rig)), int(generator.choice([3, 4]))
+def scrambled(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object cut into 3 x 3 or 4 x 4 tiles, shuffled."""
+    whole_m, n = draw_object(generator, stimulus.box), int(generator.choice([3, 4]))
     side = OBJECT_PIXELS // n
     tiles = [whole_m[i * side : (i + 1) * side, j * side : (j + 1) * side] for i in range(n) for j in range(n)]
     order = generator.permutation(n * n)
     mixed_m = np.block([[tiles[order[i * n + j]] for j in range(n)] for i in range(n)])
     margin = OBJECT_PIXELS - n * side
-    return replace(sight, depth_m=np.pad(mixed_m, (0, margin), constant_values=np.nan).astype(np.float32))
+    return replace(stimulus, depth_m=np.pad(mixed_m, (0, margin), constant_values=np.nan).astype(np.float32))
 
 
-TO_LEARN: Mapping[str, Kind] = {
-    kind.__name__.replace("_", " "): kind
-    for kind in (
-        *(small, large, far, near, half_out, several, blobs, dim, posts, tilted, plates, other_rig, other_sensor),
-        *(warped, inside_out, cut_out, scrambled),
-    )
-}
-
-
-__all__ = ["IN_SHAPE", "TO_JUDGE", "TO_LEARN", "outlier"]
-
-LOBES = phong(0.1, 0.9, 80.0), retroreflective(0.1, 0.9, 80.0)
-"""Made once: each is compiled."""
+GLOSSY_LOBES = phong(0.1, 0.9, 80.0), retroreflective(0.1, 0.9, 80.0)
+"""Shared, since each is compiled."""
 MIN_PIXELS = 12
-"""An outlier of fewer pixels is made again: too little to be hidden."""
+"""Fewest pixels of an outlier."""
 
 
-def panels(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing before a panel that fills most of the box."""
-    box = object_box(sight.rig)
-    depth_m = placed(generator, box)
-    return replace(sight, depth_m=np.where(np.isnan(depth_m), panel(depth_m, box, generator), depth_m))
+def panels(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object in front of a panel that fills most of the box."""
+    box = stimulus.box
+    depth_m = draw_object(generator, box)
+    return replace(stimulus, depth_m=np.where(np.isnan(depth_m), panel(depth_m, box, generator), depth_m))
 
 
-def noise_sheet(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A sheet whose every pixel lies elsewhere in the box."""
-    box = object_box(sight.rig)
+def noise_sheet(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add a sheet of random depth in every pixel."""
+    box = stimulus.box
     depth_m = generator.uniform(box.z_near_m, box.z_far_m, (OBJECT_PIXELS, OBJECT_PIXELS))
     depth_m[generator.random(depth_m.shape) < generator.uniform(0, 0.5)] = np.nan
-    return replace(sight, depth_m=depth_m.astype(np.float32))
+    return replace(stimulus, depth_m=depth_m.astype(np.float32))
 
 
-def bars(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A cage: parallel bars, upright or lying, with gaps between them."""
-    box, period = object_box(sight.rig), int(generator.integers(10, 24))
+def bars(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add a cage of parallel bars, upright or lying."""
+    box, period = stimulus.box, int(generator.integers(10, 24))
     at = (np.arange(OBJECT_PIXELS) + int(generator.integers(period))) % period < max(2, period // 4)
     depth_m = np.where(at, generator.uniform(box.z_near_m, 0.7 * box.z_far_m), np.nan).astype(np.float32)
     sheet = np.ascontiguousarray(np.broadcast_to(depth_m, (OBJECT_PIXELS, OBJECT_PIXELS)))
-    return replace(sight, depth_m=sheet if generator.random() < 0.5 else np.ascontiguousarray(sheet.T))
+    return replace(stimulus, depth_m=sheet if generator.random() < 0.5 else np.ascontiguousarray(sheet.T))
 
 
-def rings(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A torus that is turned any way."""
-    box = object_box(sight.rig)
+def rings(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add a torus in any orientation."""
+    box = stimulus.box
     ring = trimesh.creation.torus(1.0, generator.uniform(0.15, 0.35), major_sections=32, minor_sections=16)
     turn = euler_matrix(*np.radians(generator.uniform(-60, 60, 3)))[:3, :3]
-    pose = Pose(size_m=width_m(box) * generator.uniform(0.55, 0.9), front_m=generator.uniform(0, 0.1))
-    return replace(sight, depth_m=orthographic_depth(place(np.asarray(ring.triangles) @ turn.T, pose, box), box))
+    pose = Pose(size_m=box_width_m(box) * generator.uniform(0.55, 0.9), front_m=generator.uniform(0, 0.1))
+    return replace(stimulus, depth_m=orthographic_depth(place(np.asarray(ring.triangles) @ turn.T, pose, box), box))
 
 
-def glossy(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A mirror-like thing, or one that sends light back to where it came from."""
-    return replace(ordinary(generator, sight), surface=Surface(1.0, LOBES[int(generator.integers(2))]))
+def glossy(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add a mirror-like or a retroreflective object."""
+    return replace(ordinary(generator, stimulus), surface=Surface(1.0, GLOSSY_LOBES[int(generator.integers(2))]))
 
 
-def two_tone(generator: Generator, sight: Stimulus) -> Stimulus:
-    """A thing of which one half is nearly black."""
-    seen = ordinary(generator, sight)
+def two_tone(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add an object with nearly black patches on about half of it."""
+    whole = ordinary(generator, stimulus)
     dark = smooth_pattern(generator, 3) > 0.5
-    return replace(seen, surface=Surface(np.where(dark, 0.05, 1.0)))
+    return replace(whole, surface=Surface(np.where(dark, 0.05, 1.0)))
 
 
-TO_JUDGE: Mapping[str, Kind] = {
-    kind.__name__.replace("_", " "): kind for kind in (panels, noise_sheet, bars, rings, glossy, two_tone)
-}
+def _by_name(*kinds: OutlierKind) -> Mapping[str, OutlierKind]:
+    return {kind.__name__.replace("_", " "): kind for kind in kinds}
 
-IN_SHAPE = frozenset(
-    (
-        "blobs",
-        "posts",
-        "plates",
-        "warped",
-        "inside out",
-        "cut out",
-        "scrambled",
-        "panels",
-        "noise sheet",
-        "bars",
-        "rings",
-    )
+
+TRAINING_OUTLIERS = _by_name(
+    *(small, large, far, near, half_out, several, blobs, dim, posts, tilted, plates, other_rig, other_sensor),
+    *(warped, inside_out, cut_out, scrambled),
 )
-"""Kinds that are unlike training in their shape alone. All others are out of its range: of size, place, tilt, number,
-light, rig or sensor."""
+HELD_OUT_OUTLIERS = _by_name(panels, noise_sheet, bars, rings, glossy, two_tone)
+SHAPE_OUTLIERS = frozenset(
+    _by_name(blobs, posts, plates, warped, inside_out, cut_out, scrambled, panels, noise_sheet, bars, rings)
+)
+"""Kinds with an unusual shape alone. All others are out of the training range in size, place, tilt, number, light, rig
+or sensor."""
 
 
-def outlier(kind: Kind, generator: Generator, sight: Stimulus) -> Stimulus:
-    """One outlier of a kind that shows some surface."""
+def draw_outlier(kind: OutlierKind, generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Return an outlier of a kind, drawn again until it has MIN_PIXELS of surface."""
     while True:
-        made = kind(generator, sight)
-        if made.depth_m is not None and np.isfinite(made.depth_m).sum() >= MIN_PIXELS:
-            return made
+        drawn = kind(generator, stimulus)
+        if drawn.depth_m is not None and np.isfinite(drawn.depth_m).sum() >= MIN_PIXELS:
+            return drawn

@@ -1,4 +1,4 @@
-"""What a dataset holds apart from how many: rig and how far it varies, sensor, surface, objects; kept as JSON."""
+"""Plan of a dataset: rig and its variation, sensor, surface and objects; stored as JSON in every shard."""
 
 import json
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from nlos_models import SIMULATION_ONLY
 from pydantic import TypeAdapter
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects import CATEGORIES, object_box
+from nlos_cam.objects import CATEGORIES, find_category, object_box
 from nlos_cam.render import JUMP_M, RENDERING_VERSION, Material, Radiometry, SceneFile, SensorModel
 
 OBJECTS_VERSION = 2
-"""Raised with any change of what a seed makes of its categories."""
+"""Raise it when a seed makes another object of the same categories."""
 FIRST_OBJECTS = {
     "version": 1,
     "categories": (
@@ -24,7 +24,7 @@ FIRST_OBJECTS = {
         *("cup", "hat", "lamp", "rocket", "table", "tower"),
     ),
 }
-"""Those of datasets from before their plan told."""
+"""Objects of datasets whose plan does not name any: they are from before it did."""
 SCENE_COLUMNS = (
     "lidar_distance_m",
     "lidar_yaw_deg",
@@ -33,39 +33,39 @@ SCENE_COLUMNS = (
     "occluder_gap_m",
     "bare_wall_counts",
 )
-"""What may differ from object to object; NaN where there is no occluder."""
+"""Values that differ between objects; NaN where there is no occluder."""
 _RIG_STREAM = 2
-"""Of an object's random numbers: its noise has stream 1."""
+"""Stream of an object's random numbers; its noise has stream 1."""
 
 
 class RigSpread(Record):
-    """How far the rig of each object lies from the plan's, at most: drawn evenly, by the object's seed."""
+    """Largest deviation of each object's rig from the plan's; drawn uniformly, by the object's seed."""
 
     place_m: NotNegative = 0.0
-    """Of the lidar's distance, the occluder's place and its gap."""
+    """Deviation of the lidar's distance, the occluder's x and its gap."""
     angle_deg: NotNegative = 0.0
-    """Of yaw and pitch."""
+    """Deviation of yaw and pitch."""
     gain_share: NotNegative = 0.0
-    """Of the counts of the brightest bare-wall return."""
+    """Relative deviation of the counts of the brightest bare-wall return."""
 
     def check(self, rig: Rig) -> None:
-        """Raise SceneError where a draw could leave what a rig can be."""
-        least_m = min(rig.lidar.distance_m, rig.occluder.z_min_m if rig.occluder else rig.lidar.distance_m)
-        if self.place_m >= least_m:
-            raise SceneError(f"a spread of {self.place_m * 1e3:g} mm reaches the wall: keep it below {least_m * 1e3:g}")
+        """Raise SceneError where a draw could be an impossible rig."""
+        limit_m = min(rig.lidar.distance_m, rig.occluder.z_min_m if rig.occluder else rig.lidar.distance_m)
+        if self.place_m >= limit_m:
+            raise SceneError(f"a spread of {self.place_m * 1e3:g} mm reaches the wall: keep it below {limit_m * 1e3:g}")
         box, occluder = object_box(rig), rig.occluder
         if occluder and occluder.x_m <= box.x_min_m < occluder.x_m + self.place_m:
-            free_mm = (box.x_min_m - occluder.x_m) * 1e3
+            free_mm = f"{(box.x_min_m - occluder.x_m) * 1e3:g} mm"
             raise SceneError(
-                f"a spread of {self.place_m * 1e3:g} mm moves the occluder into the object box: {free_mm:g} mm are free"
+                f"a spread of {self.place_m * 1e3:g} mm moves the occluder into the object box: keep it below {free_mm}"
             )
         if self.angle_deg + max(abs(rig.lidar.yaw_deg), abs(rig.lidar.pitch_deg)) >= 90:
             raise SceneError(f"a spread of {self.angle_deg:g} degrees turns the lidar away from the wall: lower it")
         if self.gain_share >= 1:
             raise SceneError(f"a gain spread of {self.gain_share:.0%} leaves no light: keep it below 100 %")
 
-    def drawn(self, rig: Rig, sensor: SensorModel, seed: int) -> tuple[Rig, SensorModel]:
-        """The rig and the sensor that one object is seen with; without a spread they are the given ones."""
+    def draw(self, rig: Rig, sensor: SensorModel, seed: int) -> tuple[Rig, SensorModel]:
+        """Return the rig and the sensor of one object; without a spread they are the given ones."""
         if self == RigSpread():
             return rig, sensor
         distance, yaw, pitch, place, gap, gain = np.random.default_rng([seed, _RIG_STREAM]).uniform(-1, 1, 6).tolist()
@@ -89,32 +89,30 @@ class RigSpread(Record):
 
 @dataclass(frozen=True)
 class Objects:
-    """What is hidden: procedural objects of some categories, or meshes of a folder, named by their content."""
+    """Hidden objects: procedural ones of some categories, or the meshes of a folder, identified by their content."""
 
     categories: tuple[str, ...] = tuple(CATEGORIES)
     """A seed picks by position."""
     meshes: tuple[tuple[str, str], ...] = ()
-    """(path in the folder, SHA-256), in order; with any of them there are no categories."""
+    """(path in the folder, SHA-256), in order; with meshes there are no categories."""
     backgrounds: float = 0.0
-    """Share of the procedural objects that have a post or a panel beside them."""
+    """Share of the procedural objects with a post or a panel beside them."""
     version: int = OBJECTS_VERSION
     folder: Path | None = field(default=None, compare=False)
-    """Where the meshes are on this machine."""
+    """Folder of the meshes on this machine."""
 
     @classmethod
     def without(cls, left_out: Sequence[str], backgrounds: float = 0.0) -> Self:
-        """Every category but these. Raises SceneError for one that is not known, or if none is left."""
-        for name in left_out:
-            if name not in CATEGORIES:
-                raise SceneError(f"no object category {name!r}: choose some of {', '.join(CATEGORIES)}")
-        if not (kept := tuple(name for name in CATEGORIES if name not in left_out)):
-            raise SceneError("every object category is left out: keep at least one")
-        return cls(kept, backgrounds=backgrounds)
+        """Return all categories but these. Raises SceneError for an unknown one, or if none is left."""
+        dropped = [find_category(name).name for name in left_out]
+        if not (categories := tuple(name for name in CATEGORIES if name not in dropped)):
+            raise SceneError("--without leaves no object category: keep at least one")
+        return cls(categories, backgrounds=backgrounds)
 
 
 @dataclass(frozen=True)
 class DatasetPlan:
-    """What a dataset holds, apart from how many."""
+    """Everything that decides the samples of a dataset, except their number."""
 
     rig: Rig
     first_seed: int
@@ -127,11 +125,11 @@ class DatasetPlan:
     material: Material = field(default_factory=Material)
     rendering_version: int = RENDERING_VERSION
     textures: tuple[str, ...] = ()
-    """What objects are painted with; with any of them the dataset is in colour, which is simulation only."""
+    """Textures of the objects; with any of them the dataset is in color, which is simulation only."""
 
     @classmethod
     def of_scene(cls, scene: SceneFile, first_seed: int, **others: Any) -> Self:
-        """A plan with a scene's rig, sensor, radiometry and its object's material; the object itself gives way."""
+        """Return a plan with the rig, sensor, radiometry and material of a scene, but not its object."""
         material = scene.hidden.material if scene.hidden else Material()
         return cls(
             scene.rig,
@@ -145,7 +143,7 @@ class DatasetPlan:
 
     @property
     def box(self) -> ObjectBox:
-        """The rig's object box; SceneError where it has none."""
+        """The rig's object box. Raises SceneError where it has none."""
         return object_box(self.rig)
 
     @property
@@ -155,42 +153,42 @@ class DatasetPlan:
         if self.textures:
             facts["note"] = SIMULATION_ONLY
         else:
-            del facts["textures"]  # older readers know none
+            del facts["textures"]  # older readers refuse unknown fields
         return json.dumps({**facts, "rig_checksum": self.rig.checksum})
 
     @classmethod
     def from_provenance(cls, text: str) -> "DatasetPlan":
-        """The plan that was written down; what an older nlos-cam did not know is at its default.
+        """Return a stored plan, with defaults for fields that are missing in older datasets.
 
-        Raises ValueError for what is no plan, or one that a newer nlos-cam wrote.
+        Raises ValueError for anything that is not a plan, or a plan of a newer nlos-cam.
         """
         facts: dict[str, Any] = json.loads(text)
         known = {"rig_checksum", "note", *(one.name for one in fields(cls))}
         if newer := sorted(set(facts) - known):
-            raise ValueError(f"its plan has {newer[0]!r}, which this nlos-cam does not know: update it")
+            raise ValueError(f"the plan has an unknown field {newer[0]!r}: update nlos-cam")
         facts.setdefault("objects", FIRST_OBJECTS)
         return _PLAN.validate_python(facts)
 
     def differences(self, other: "DatasetPlan") -> list[str]:
-        """In what the plans differ, by name; empty where they make the same bits."""
+        """Return the names of fields that differ; empty where both plans make the same bits."""
         names = [one.name for one in fields(self)]
         return [name.replace("_", " ") for name in names if getattr(self, name) != getattr(other, name)]
 
     def check(self) -> None:
-        """Raise SceneError where nothing could be made by this plan."""
+        """Raise SceneError where no sample can be made by this plan."""
         _ = self.box
         self.spread.check(self.rig)
         if self.textures and self.material.albedo != 1:
-            raise SceneError("the scene's object has an albedo, and in colour textures give each its own: leave it out")
+            raise SceneError("the scene's object has an albedo, but in color its albedo comes from textures: remove it")
         if np.ndim(self.material.albedo):
-            raise SceneError("the scene's object has three albedos, and datasets hold one intensity: give it one")
+            raise SceneError("the scene's object has three albedos, but datasets hold one intensity: give one albedo")
 
 
 _PLAN = TypeAdapter(DatasetPlan)
 
 
 def scene_row(rig: Rig, sensor: SensorModel) -> list[float]:
-    """SCENE_COLUMNS of one object."""
+    """Return SCENE_COLUMNS of one object."""
     nowhere = float("nan")
     occluder = (rig.occluder.x_m, rig.occluder.z_min_m) if rig.occluder else (nowhere, nowhere)
     return [rig.lidar.distance_m, rig.lidar.yaw_deg, rig.lidar.pitch_deg, *occluder, sensor.bare_wall_counts]

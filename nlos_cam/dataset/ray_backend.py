@@ -1,6 +1,6 @@
-"""Samples made by a Ray cluster: the same ones, by the workers of many machines; one that dies is replaced.
+"""Ray cluster as a farm: equal samples by the workers of many machines; a dead worker is replaced.
 
-Each machine needs this nlos-cam, and a folder of meshes at the same path. Shards are written by the one who asked.
+Each machine needs this version of nlos-cam, and a folder of meshes at the same path. The caller writes the shards.
 """
 
 from collections.abc import Generator, Sequence
@@ -8,20 +8,20 @@ from importlib.metadata import version
 from itertools import islice
 from typing import Any
 
-from nlos_cam.dataset.build import one_thread
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import Samples, make_samples
+from nlos_cam.dataset.worker import use_one_thread
 from nlos_cam.errors import NlosCamError, SceneError, WorkersLostError
 
-TRIES = 5
+MAX_RETRIES = 5
 """Deaths of its worker that a piece survives."""
 VERSION = version("nlos-cam")
-AHEAD = 3
-"""Pieces asked for at a time, for each processor of the cluster: what waits is little, and nobody waits."""
+PIECES_PER_CPU = 3
+"""Pieces submitted ahead for each processor of the cluster: no worker waits, and few results do."""
 
 
-def cluster(address: str) -> "RayFarm":
-    """The farm of a cluster by its address: `auto`, HOST:PORT, ray://HOST:PORT, or `local` for one of its own.
+def ray_farm(address: str) -> "RayFarm":
+    """Return the farm of a cluster by its address: `auto`, HOST:PORT, ray://HOST:PORT, or `local` to start one.
 
     Raises WorkersLostError where Ray is not installed.
     """
@@ -33,20 +33,20 @@ def cluster(address: str) -> "RayFarm":
 
 
 class RayFarm:
-    """A farm on a cluster; it is connected while samples are made."""
+    """Farm on a Ray cluster: it connects when samples are requested, and disconnects when the generator is closed."""
 
     def __init__(self, ray: Any, address: str) -> None:
         self._ray, self._address = ray, address
 
     def __call__(self, plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tuple[range, Samples]]:
-        """Make the samples of ranges of seeds, in any order. Raises WorkersLostError where nobody can."""
+        """Yield the samples of ranges of seeds, in any order. Raises WorkersLostError where the cluster fails."""
         if not pieces:
             return
         self._connect()
         try:
-            yield from self._made(plan, pieces)
+            yield from self._make(plan, pieces)
         except self._ray.exceptions.RayError as error:
-            raise _foreseen(error) from error
+            raise _cause(error) from error
         finally:
             self._ray.shutdown()
 
@@ -56,32 +56,32 @@ class RayFarm:
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise WorkersLostError(
                 f"no Ray cluster at {self._address!r} ({' '.join(str(error).split()):.120}): start one with "
-                "`ray start --head`, or leave out --ray"
+                "`ray start --head`, or omit --ray"
             ) from error
 
-    def _made(self, plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tuple[range, Samples]]:
-        ray, coming = self._ray, iter(pieces)
-        work = ray.remote(num_cpus=1, max_retries=TRIES)(make_piece)
-        ahead = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
-        waiting = {work.remote(plan, piece, VERSION): piece for piece in islice(coming, ahead)}
+    def _make(self, plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tuple[range, Samples]]:
+        ray, remaining = self._ray, iter(pieces)
+        work = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(make_piece)
+        ahead = PIECES_PER_CPU * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        waiting = {work.remote(plan, piece, VERSION): piece for piece in islice(remaining, ahead)}
         while waiting:
             (ready, *_), _ = ray.wait([*waiting], num_returns=1)
             yield waiting.pop(ready), ray.get(ready)
-            waiting |= {work.remote(plan, piece, VERSION): piece for piece in islice(coming, 1)}
+            waiting |= {work.remote(plan, piece, VERSION): piece for piece in islice(remaining, 1)}
 
 
 def make_piece(plan: DatasetPlan, piece: range, wanted: str) -> Samples:
-    """What a worker does. Raises SceneError where its machine has another nlos-cam than the one who asks."""
+    """Return samples, as a worker. Raises SceneError where this machine has another version than `wanted`."""
     if wanted != VERSION:
-        raise SceneError(f"a worker has nlos-cam {VERSION}, not {wanted}: install the same everywhere")
-    one_thread()
+        raise SceneError(f"a worker has nlos-cam {VERSION}, not {wanted}: install the same version on every machine")
+    use_one_thread()
     return make_samples(plan, piece)
 
 
-def _foreseen(error: Exception) -> NlosCamError:
-    """A worker's own error as it was, or that workers are lost."""
+def _cause(error: Exception) -> NlosCamError:
+    """Return a worker's own error, or WorkersLostError."""
     cause = getattr(error, "cause", None)
     if isinstance(cause, NlosCamError):
         return cause
     problem = " ".join(str(error).split())
-    return WorkersLostError(f"the Ray cluster gave up ({problem:.200}): finished shards are kept; build again")
+    return WorkersLostError(f"the Ray cluster failed ({problem:.200}): finished shards are kept; build again")

@@ -1,4 +1,4 @@
-"""A dataset to read: whole, or streamed in shuffled batches when it is larger than memory."""
+"""Reader of datasets: whole, or streamed in shuffled batches where they are larger than memory."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ from nlos_cam.errors import RecordingError, SceneError
 
 MAP_CHANNELS = ("depth_m", "intensity", "image")
 BUFFER = 40
-"""Shards that are shuffled together and kept in memory (twice as many while one batch spans two such sets)."""
+"""Shards that are shuffled together and kept in memory (twice as many while a batch spans two such blocks)."""
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """The shards of a folder, in the order of their seeds; nothing but their heads is in memory."""
+    """Dataset in a folder: the heads of its shards, in the order of their seeds. Arrays are read when requested."""
 
     folder: Path
     plan: DatasetPlan
@@ -32,26 +32,26 @@ class Dataset:
         return sum(len(shard.seeds) for shard in self.shards)
 
     def column(self, name: str) -> NDArray[Any]:
-        """Any array of all samples: seed (n,), category (n,), scene (n, 6), object_depth_m (n, 64, 64), or a map."""
+        """Return an array over all samples: seed, category (n,), scene (n, 6), object_depth_m (n, 64, 64) or a map."""
         return np.concatenate([read_arrays(shard, [name])[0] for shard in self.shards])
 
     def arrays(self) -> MapSet:
-        """All maps and images, in memory."""
+        """Read all maps and images."""
         return MapSet(*(np.concatenate(parts) for parts in zip(*map(_maps, self.shards), strict=True)))
 
     def chunks(self) -> Iterator[MapSet]:
-        """All maps and images in their order, a shard at a time: for what is worked out in one pass."""
+        """Yield all maps and images in order, one shard at a time."""
         for shard in self.shards:
             yield MapSet(*_maps(shard))
 
     def batches(self, seed: int, epoch: int, batch: int, *, rank: int = 0, world: int = 1) -> Iterator[MapBatch]:
-        """One epoch of batches, shuffled and mirrored at random, by seed and epoch alone; `row` counts in the dataset.
+        """Yield one epoch of batches, shuffled and mirrored at random, by seed and epoch alone; `row` is the dataset's.
 
-        Of `world` processes each gets its share of every batch: together they see the batches that one would. The
+        Each of `world` processes gets its share of every batch: together they see the batches of a single process. The
         last, smaller batch is left out. Raises SceneError where a batch cannot be shared evenly.
         """
         if batch % world or not 0 <= rank < world <= len(self):
-            raise SceneError(f"a batch of {batch} cannot be shared by {world} processes: make it a multiple of that")
+            raise SceneError(f"a batch of {batch} cannot be shared by {world} processes: use a multiple of {world}")
         generator = np.random.default_rng([seed, epoch])
         blocks = self._shuffled_blocks(generator)
         order = np.concatenate([rows for _, rows in blocks])
@@ -62,7 +62,7 @@ class Dataset:
             yield as_batch(window.take(rows), rows, mirrored[start : start + batch][rank::world])
 
     def _shuffled_blocks(self, generator: np.random.Generator) -> list[tuple[NDArray[np.int64], Int64]]:
-        """Shards in random order, BUFFER at a time, each with all their rows in random order."""
+        """Return blocks of BUFFER shards in random order, each with all its rows in random order."""
         rows_of = [np.arange(end - len(shard.seeds), end) for shard, end in zip(self.shards, self.ends, strict=True)]
         order = generator.permutation(len(self.shards))
         blocks = [order[k : k + BUFFER] for k in range(0, len(order), BUFFER)]
@@ -76,7 +76,7 @@ class Dataset:
 
 
 class _Window:
-    """The shards in memory: each is read once an epoch, and let go when its block is through."""
+    """Shards in memory during one epoch: each is read once, and dropped after the last batch of its block."""
 
     def __init__(self, dataset: Dataset, blocks: list[NDArray[np.int64]]) -> None:
         self._dataset, self._ends = dataset, dataset.ends
@@ -84,7 +84,7 @@ class _Window:
         self._held: dict[int, list[NDArray[Any]]] = {}
 
     def take(self, rows: Int64) -> MapSet:
-        """The maps and images of some rows, in their order."""
+        """Return the maps and images of some rows, in their order."""
         shards = np.searchsorted(self._ends, rows, side="right")
         wanted = [int(shard) for shard in np.unique(shards)]
         oldest = min((self._block[shard] for shard in wanted), default=0)
@@ -92,39 +92,33 @@ class _Window:
         for shard in wanted:
             if shard not in self._held:
                 self._held[shard] = _maps(self._dataset.shards[shard])
-        found = [np.empty((len(rows), *of.shape[1:]), of.dtype) for of in self._held[wanted[0]]]
+        arrays = [np.empty((len(rows), *of.shape[1:]), of.dtype) for of in self._held[wanted[0]]]
         for shard in wanted:
             here = shards == shard
             within = rows[here] - (self._ends[shard] - len(self._dataset.shards[shard].seeds))
-            for target, source in zip(found, self._held[shard], strict=True):
+            for target, source in zip(arrays, self._held[shard], strict=True):
                 target[here] = source[within]
-        return MapSet(*found)
+        return MapSet(*arrays)
 
 
-def open_dataset(folder: Path, *, colour: bool = False) -> Dataset:
-    """A folder's dataset, of depth or in colour.
+def open_dataset(folder: Path, *, color: bool = False) -> Dataset:
+    """Open a folder's dataset, of depth or in color.
 
-    Raises RecordingError where there is none, one of the other kind, or one whose shards do not belong together.
+    Raises RecordingError where there is none, one of the other kind, or shards of two datasets.
     """
     if not (shards := shards_of(folder)):
         raise RecordingError(f"no dataset in {folder}: it holds no shard-*.h5; make one with `nlos-cam dataset build`")
     plan = shards[0].plan
     for shard in shards[1:]:
         if shard.provenance != shards[0].provenance and shard.plan != plan:
-            raise RecordingError(
-                f"{shard.path} is of another dataset than {shards[0].path.name}: take one of them away"
-            )
-    if plan.textures and not colour:
-        raise RecordingError(f"{folder} holds a dataset in colour ({SIMULATION_ONLY}): name one of depth")
-    if colour and not plan.textures:
-        raise RecordingError(f"{folder} holds a dataset of depth: make one with `nlos-cam dataset build --colour`")
+            raise RecordingError(f"{shard.path} is of another dataset than {shards[0].path.name}: remove one of them")
+    if plan.textures and not color:
+        raise RecordingError(f"{folder} holds a dataset in color ({SIMULATION_ONLY}): give one of depth")
+    if color and not plan.textures:
+        raise RecordingError(
+            f"{folder} holds a dataset of depth: make one in color with `nlos-cam dataset build --colour`"
+        )
     return Dataset(folder, plan, tuple(shards))
-
-
-def read(folder: Path) -> tuple[MapSet, DatasetPlan]:
-    """All maps and images of a dataset, in the order of the seeds, and the plan they were built by."""
-    dataset = open_dataset(folder)
-    return dataset.arrays(), dataset.plan
 
 
 def _maps(shard: Shard) -> list[NDArray[Any]]:

@@ -1,6 +1,6 @@
-"""Seeds to samples: a hidden object, its rig, its rendering and its noise, each by the object's seed alone.
+"""Samples by seed: a hidden object, its rig, its rendering and its noise depend on the object's seed alone.
 
-Torch is not imported here: every worker would wait for it, and has no use for it.
+Torch must not be imported here: workers do not need it, and its import takes seconds.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,18 +26,21 @@ from nlos_cam.objects import (
     mesh_depth,
     object_depth,
     object_depths,
-    painted,
+    paint,
     read_mesh,
 )
 from nlos_cam.render import Radiometry, Scene, Sensor, SensorModel, Surface, render
 
 Samples = Mapping[str, NDArray[Any]]
-"""By name, one row for each object: depth_m and intensity (n, 64, 80), image and object_depth_m (n, 64, 64), seed (n,),
-scene (n, 6), category (n,). In colour intensity is (n, 3, 64, 80), image (n, 3, 64, 64), and there is texture (n,)."""
+"""Arrays with one row per object: depth_m and intensity (n, 64, 80), image and object_depth_m (n, 64, 64), seed (n,),
+scene (n, 6), category (n,). In color intensity is (n, 3, 64, 80), image (n, 3, 64, 64), and there is texture (n,)."""
+
+OnProgress = Callable[[int, int], None]
+"""Callback with the count of finished items, and of all."""
 
 
-def silent(*_: object) -> None:
-    """Tell nobody how far it is."""
+def ignore(*_: object) -> None:
+    """Do nothing: the default of callbacks."""
 
 
 def procedural_images(
@@ -49,9 +52,9 @@ def procedural_images(
     backgrounds: float = 0.0,
     textures: Sequence[str] = (),
 ) -> NDArray[np.float16]:
-    """Images (count, 64, 64) of random objects, without rendering: all that a VAE needs; see `object_depth`.
+    """Return images (count, 64, 64) of random objects without rendering, as a VAE needs them; see `object_depth`.
 
-    With textures, in colour: (count, 3, 64, 64).
+    With textures, they are in color: (count, 3, 64, 64).
     """
     seeds = range(first_seed, first_seed + count)
     depths = object_depths(seeds, box, categories, backgrounds=backgrounds)
@@ -60,73 +63,83 @@ def procedural_images(
 
 
 def sense_object(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard", exposure: int = 0) -> LidarMaps:
-    """The maps of one hidden object, rendered, through the sensor's chain and the same reduction as live frames."""
+    """Return the maps of one rendered scene, by the sensor model and the reduction of live frames."""
     echoes = render(scene, accuracy).multi
     images = sensor.expose(echoes, np.random.default_rng([seed, 1, exposure]))  # numpy: [seed, 1, 0] is [seed, 1]
     return maps_from_frame(images.frame(sensor.rig.pinhole))
 
 
-def sense_colour(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard") -> LidarMaps:
-    """The same of an object whose albedo has three channels: intensity is (3, 64, 80). Simulation only.
+def sense_color(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard") -> LidarMaps:
+    """Return the maps of a scene whose albedo has three channels; intensity is (3, 64, 80). Simulation only.
 
-    The lidar that this simulates has three lasers and one detector: each instant is exposed once in white (every laser
-    at a third of its power), which gives the depth, and once in red, green and blue, which give the intensities. Each
-    exposure is the whole device, with the same gain and noise of its own.
+    The simulated lidar has three lasers and one detector. It exposes each instant four times, each time with the same
+    gain and new noise: in white (each laser at a third of its power) for the depth, and in red, green and blue.
     """
     albedo = np.asarray(scene.surface.albedo)
     lights = (albedo.mean(-1), *np.moveaxis(albedo, -1, 0))
-    seen = (replace(scene, surface=Surface(light, scene.surface.brdf)) for light in lights)
-    white, *colours = (sense_object(one, sensor, seed, accuracy, exposure) for exposure, one in enumerate(seen))
-    return replace(white, intensity=np.stack([maps.intensity for maps in colours]))
+    scenes = (replace(scene, surface=Surface(light, scene.surface.brdf)) for light in lights)
+    white, *colors = (sense_object(one, sensor, seed, accuracy, exposure) for exposure, one in enumerate(scenes))
+    return replace(white, intensity=np.stack([maps.intensity for maps in colors]))
 
 
 def make_samples(plan: DatasetPlan, seeds: Sequence[int]) -> Samples:
-    """The samples of some seeds: the same bits wherever and in whatever order they are made."""
-    made = [hidden_object(plan.objects, seed, plan.box) for seed in seeds]
-    seen = [plan.spread.drawn(plan.rig, plan.sensor, seed) for seed in seeds]
-    coats = [_coat(seed, depth_m, plan.textures) for seed, (_, depth_m) in zip(seeds, made, strict=True)]
+    """Return the samples of some seeds, with the same bits on any machine and in any order."""
+    objects = [hidden_object(plan.objects, seed, plan.box) for seed in seeds]
+    rigs = [plan.spread.draw(plan.rig, plan.sensor, seed) for seed in seeds]
+    coats = [_coat(seed, depth_m, plan.textures) for seed, (_, depth_m) in zip(seeds, objects, strict=True)]
     maps = [
-        _sensed(plan, depth_m, coat, rig, model, seed)
-        for (_, depth_m), coat, (rig, model), seed in zip(made, coats, seen, seeds, strict=True)
+        _sense(plan, depth_m, coat, rig, model, seed)
+        for (_, depth_m), coat, (rig, model), seed in zip(objects, coats, rigs, seeds, strict=True)
     ]
-    images = [_image(depth, plan.box, coat) for (_, depth), coat in zip(made, coats, strict=True)]
+    images = [_image(depth, plan.box, coat) for (_, depth), coat in zip(objects, coats, strict=True)]
     textures = [coat.texture for coat in coats if coat]
     return {
         "depth_m": np.stack([m.depth_m for m in maps]),
         "intensity": np.stack([m.intensity for m in maps]),
         "image": np.stack(images).astype(np.float16),
-        "object_depth_m": np.stack([depth for _, depth in made]),
+        "object_depth_m": np.stack([depth for _, depth in objects]),
         "seed": np.asarray(seeds, np.int64),
-        "scene": np.array([scene_row(rig, model) for rig, model in seen]),
-        "category": np.array([category for category, _ in made], object),
+        "scene": np.array([scene_row(rig, model) for rig, model in rigs]),
+        "category": np.array([category for category, _ in objects], object),
         **({"texture": np.array(textures, object)} if textures else {}),
     }
 
 
 def _coat(seed: int, depth_m: Float32, textures: Sequence[str]) -> Coat | None:
-    return painted(seed, depth_m, textures) if textures else None
+    return paint(seed, depth_m, textures) if textures else None
 
 
 def _image(depth_m: Float32, box: ObjectBox, coat: Coat | None) -> Float32:
     return image_from_albedo(coat.albedo, depth_m) if coat else image_from_depth(depth_m, box)
 
 
-def _sensed(
+def _sense(
     plan: DatasetPlan, depth_m: Float32, coat: Coat | None, rig: Rig, model: SensorModel, seed: int
 ) -> LidarMaps:
-    scene, sensor = _scene(plan, depth_m, rig, model), _sensor_of(plan, rig, model)
+    scene = Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, model.pulse_ns)
+    sensor = cached_sensor(rig, model, plan.radiometry)
     if coat is None:
         return sense_object(scene, sensor, seed, plan.accuracy)
-    return sense_colour(replace(scene, surface=Surface(coat.albedo, plan.material.brdf)), sensor, seed, plan.accuracy)
+    return sense_color(replace(scene, surface=Surface(coat.albedo, plan.material.brdf)), sensor, seed, plan.accuracy)
 
 
-def joined(parts: Sequence[Samples]) -> Samples:
-    """Samples one after the other."""
+def cached_sensor(rig: Rig, model: SensorModel, radiometry: Radiometry = "paper") -> Sensor:
+    """Return a sensor, kept until one of another rig, model or radiometry is requested."""
+    return _sensor(rig, model, radiometry)  # pyright: ignore[reportArgumentType]  frozen, so hashable
+
+
+@lru_cache(maxsize=1)
+def _sensor(rig: Rig, model: SensorModel, radiometry: Radiometry) -> Sensor:
+    return Sensor(rig, model, radiometry)
+
+
+def join_samples(parts: Sequence[Samples]) -> Samples:
+    """Return several sets of samples as one."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Float32]:
-    """One random object: its category or its mesh's path, and its depth map (64, 64) in metres, NaN background."""
+    """Return one random object: its category or mesh path, and its depth map (64, 64) in metres, NaN background."""
     if not objects.meshes:
         return object_depth(seed, box, objects.categories, backgrounds=objects.backgrounds)
     if (folder := objects.folder) is None:
@@ -135,42 +148,23 @@ def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Flo
     return name, depth_m
 
 
-def objects_of(folder: Path, on_progress: Callable[[int, int], None] = silent) -> Objects:
-    """The meshes of a folder and its subfolders. Raises SceneError where there is none, or one that cannot be used.
-
-    It reads them all: `on_progress` hears how many are done, and how many there are.
-    """
-    found, meshes = folder_objects(folder), list[tuple[str, str]]()
-    for path in found:
-        meshes.append((_told(path.relative_to(folder)), read_mesh(path).sha256))
-        on_progress(len(meshes), len(found))
+def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objects:
+    """Read the meshes of a folder and its subfolders. Raises SceneError for none, or one that cannot be used."""
+    paths, meshes = folder_objects(folder), list[tuple[str, str]]()
+    for path in paths:
+        name = path.relative_to(folder).as_posix()
+        try:
+            name.encode()
+        except UnicodeEncodeError as error:  # a shard stores names as UTF-8
+            raise SceneError(f"the name of the mesh {name!a} is not UTF-8: rename it") from error
+        meshes.append((name, read_mesh(path).sha256))
+        on_progress(len(meshes), len(paths))
     return Objects((), tuple(meshes), folder=folder.resolve())
-
-
-def _told(path: Path) -> str:
-    """A mesh as shards tell it. Raises SceneError for a name that no shard can hold."""
-    try:
-        return path.as_posix().encode().decode()
-    except UnicodeEncodeError as error:
-        raise SceneError(f"the name of the mesh {path.as_posix()!a} is not UTF-8: rename it") from error
 
 
 @lru_cache(maxsize=16)
 def _unchanged(path: Path, sha256: str) -> MeshFile:
     mesh = read_mesh(path)
     if mesh.sha256 != sha256:
-        raise SceneError(f"{path} changed since the dataset was begun: put it back, or choose another --out")
+        raise SceneError(f"{path} changed since the dataset was started: restore it, or choose another --out")
     return mesh
-
-
-@lru_cache(maxsize=1)
-def _sensor(rig: Rig, model: SensorModel, radiometry: Radiometry) -> Sensor:
-    return Sensor(rig, model, radiometry)
-
-
-def _sensor_of(plan: DatasetPlan, rig: Rig, model: SensorModel) -> Sensor:
-    return _sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]  frozen, so hashable
-
-
-def _scene(plan: DatasetPlan, depth_m: Float32, rig: Rig, sensor: SensorModel) -> Scene:
-    return Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, sensor.pulse_ns)

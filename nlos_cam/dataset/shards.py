@@ -1,7 +1,4 @@
-"""A shard: some samples, their plan and the checksum of every array in one HDF5 file that is whole or not there.
-
-One builder to a folder: a lock that the system lets go of when its holder dies, and a note of who holds it.
-"""
+"""Shards of a dataset: HDF5 files of samples with their plan and checksums of all arrays, and the lock of a builder."""
 
 import errno
 import hashlib
@@ -26,25 +23,25 @@ from nlos_cam.dataset.samples import Samples
 from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
 from nlos_cam.files import atomic_file
 
-SHARDS, PARTS = "shard-*.h5", "*shard-*.part"
-FIRST_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category")
-"""Those of every shard; scene came with the checksums."""
+SHARD_PATTERN, PART_PATTERN = "shard-*.h5", "*shard-*.part"
+REQUIRED_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category")
+"""Arrays of every shard; newer ones, with checksums, also have scene."""
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-"""No space, a quota, a limit on the size of files."""
+"""No space left, a quota reached, or a limit on the size of files."""
 
 
 @dataclass(frozen=True)
 class Shard:
-    """A shard's head."""
+    """Head of a shard."""
 
     path: Path
     seeds: range
     provenance: str
-    """The plan it was made by, as JSON."""
+    """Its plan, as JSON."""
 
     @property
     def plan(self) -> DatasetPlan:
-        """The same. Raises RecordingError where this nlos-cam cannot read it."""
+        """The plan. Raises RecordingError where this nlos-cam cannot read it."""
         try:
             return DatasetPlan.from_provenance(self.provenance)
         except ValueError as error:
@@ -53,40 +50,36 @@ class Shard:
 
 
 def shard_path(folder: Path, first_seed: int) -> Path:
-    """Where the shard that begins with a seed is, or would be: names sort as seeds do."""
+    """Return the path of the shard that begins with a seed; names sort in the order of seeds."""
     return folder / f"shard-{first_seed:09d}.h5"
 
 
 def shards_of(folder: Path) -> list[Shard]:
-    """The heads of a folder's shards, in the order of their seeds. Raises RecordingError for one that is damaged."""
-    heads = sorted((head_of(path) for path in folder.glob(SHARDS)), key=lambda head: head.seeds.start)
+    """Return the heads of a folder's shards, in the order of their seeds. Raises RecordingError for a damaged one."""
+    heads = sorted((read_head(path) for path in folder.glob(SHARD_PATTERN)), key=lambda head: head.seeds.start)
     for one, following in pairwise(heads):
         if following.seeds.start < one.seeds.stop:
             raise RecordingError(
-                f"{following.path} holds objects that {one.path.name} holds too: they are of two datasets; delete one"
+                f"{following.path} and {one.path.name} hold the same objects: they belong to two datasets; delete one"
             )
     return heads
 
 
-def head_of(path: Path) -> Shard:
-    """What a shard says of itself. Raises RecordingError where it cannot be read."""
-    with opened(path) as file:
+def read_head(path: Path) -> Shard:
+    """Return the head of a shard. Raises RecordingError where it cannot be read."""
+    with open_shard(path) as file:
         plan, seeds = str(file.attrs["plan"]), _checked(path, "seed", file["seed"])
         if file.attrs.get("plan_sha256", "") not in {"", _digest(plan.encode())}:
-            raise _damaged(path, "its plan is not what was written")
-        if (
-            seeds.ndim != 1
-            or not len(seeds)
-            or (np.diff(seeds) != 1).any()
-            or shard_path(path.parent, seeds[0]) != path
-        ):
-            raise _damaged(path, "its seeds are not those of its name, one after the other")
+            raise _damaged(path, "the checksum of its plan differs")
+        consecutive = seeds.ndim == 1 and len(seeds) and (np.diff(seeds) == 1).all()
+        if not consecutive or shard_path(path.parent, seeds[0]) != path:
+            raise _damaged(path, "its seeds do not match its name, or are not consecutive")
         return Shard(path, range(int(seeds[0]), int(seeds[-1]) + 1), plan)
 
 
 def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
-    """Arrays of a shard, each checked against its checksum where it has one. Raises RecordingError if it differs."""
-    with opened(head.path) as file:
+    """Return arrays of a shard. Raises RecordingError where one differs from its checksum."""
+    with open_shard(head.path) as file:
         found = [_checked(head.path, name, file[name]) for name in names]
     for name, values in zip(names, found, strict=True):
         if len(values) != len(head.seeds):
@@ -94,10 +87,10 @@ def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
     return found
 
 
-def check_all(head: Shard) -> None:
-    """Read everything. Raises RecordingError where the shard is damaged."""
-    with opened(head.path) as file:
-        names = {*map(str, file), *FIRST_ARRAYS, *(["scene"] if "plan_sha256" in file.attrs else [])}
+def check_arrays(head: Shard) -> None:
+    """Read all arrays. Raises RecordingError where the shard is damaged."""
+    with open_shard(head.path) as file:
+        names = {*map(str, file), *REQUIRED_ARRAYS, *(["scene"] if "plan_sha256" in file.attrs else [])}
     read_arrays(head, sorted(names))
 
 
@@ -135,7 +128,7 @@ def _as_bytes(samples: Samples, provenance: str, command: str) -> bytes:
 
 
 def content_checksum(values: NDArray[Any]) -> str:
-    """SHA-256 of an array: of its type, its shape and its values."""
+    """Return the SHA-256 of an array's type, shape and values."""
     kind = f"{values.dtype.str} {values.shape} ".encode()
     content = "\0".join(values).encode() if values.dtype == object else np.ascontiguousarray(values).tobytes()
     return _digest(kind + content)
@@ -146,26 +139,33 @@ def _digest(content: bytes) -> str:
 
 
 @contextmanager
-def opened(path: Path) -> Generator[h5py.File]:
-    """A shard to read from. Raises RecordingError where it, or what is asked of it inside, cannot be read."""
+def open_shard(path: Path) -> Generator[h5py.File]:
+    """Open a shard. Raises RecordingError where it cannot be read, also within the block."""
     try:
         with h5py.File(path) as file:
             yield file
     except RecordingError:
         raise
-    except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:  # what damage makes
+    except (
+        OSError,
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+    ) as error:  # raised by h5py for damage
         raise _damaged(path, f"cannot be read as a shard: {' '.join(str(error).split())}") from error
 
 
 def _checked(path: Path, name: str, stored: Any) -> NDArray[Any]:
     values: NDArray[Any] = stored.asstr()[:] if h5py.check_string_dtype(stored.dtype) else stored[:]
     if stored.attrs.get("sha256", "") not in {"", content_checksum(values)}:
-        raise _damaged(path, f"{name} is not what was written")
+        raise _damaged(path, f"the checksum of {name} differs")
     return values
 
 
 def _damaged(path: Path, why: str) -> RecordingError:
-    return RecordingError(f"{path} is damaged ({why}): build again to make it anew, or delete it")
+    return RecordingError(f"{path} is damaged ({why}): build again to replace it, or delete it")
 
 
 LOCK, NOTE = ".build.lock", ".builder"
@@ -173,9 +173,10 @@ LOCK, NOTE = ".build.lock", ".builder"
 
 @contextmanager
 def only_builder(folder: Path) -> Generator[None]:
-    """Hold a folder's lock. Raises FolderBusyError, with the holder's process id, where another process has it.
+    """Hold a folder's lock, which the system releases when its holder dies.
 
-    Raises OutputExistsError where nothing may be written there.
+    Raises FolderBusyError, with the holder's process id, where another process has it, and OutputExistsError where the
+    folder cannot be written to.
     """
     lock, note = FileLock(folder / LOCK), folder / NOTE
     try:
@@ -189,7 +190,7 @@ def only_builder(folder: Path) -> Generator[None]:
             f"{folder} cannot be written to: choose another --out, or change its permissions"
         ) from error
     try:
-        with suppress(OSError):  # a full disk is told where it matters
+        with suppress(OSError):  # a full disk is reported when a shard is stored
             note.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
         yield
     finally:
@@ -200,5 +201,5 @@ def only_builder(folder: Path) -> Generator[None]:
 def _holder(note: Path) -> str:
     try:
         return note.read_text(encoding="utf-8") or "another process"
-    except OSError:  # it is just beginning, or ending
+    except OSError:  # the holder has just started, or just ended
         return "another process"

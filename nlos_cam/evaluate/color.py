@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float16, Float32
-from nlos_models import SIMULATION_ONLY, SMALLER_IS_BETTER, MapSet, brightness, colour_metrics, surface
+from nlos_models import SIMULATION_ONLY, SMALLER_IS_BETTER, MapSet, brightness, color_metrics, surface
 
-from nlos_cam.dataset import sense_colour
+from nlos_cam.dataset import sense_color
 from nlos_cam.evaluate.metrics import advantage, over_objects, plain
 from nlos_cam.objects import TEXTURES, image_from_albedo, paint
 from nlos_cam.render import Scene, Sensor, SensorModel, Surface
@@ -17,17 +17,17 @@ from nlos_cam.render import Scene, Sensor, SensorModel, Surface
 ROWS = ("truth", "reconstruction", "difference")
 
 Figure = dict[str, float | None]
-"""value, low and high: a mean over objects, and its bootstrap 95 % interval."""
+"""Mean over objects and its bootstrap 95 % interval: value, low, high."""
 
 
 def painted_maps(
     depths_m: Sequence[Float32], rig: Rig, first_seed: int, accuracy: str, on_progress: Callable[[int, int], None]
 ) -> MapSet:
-    """The maps of objects (64, 64), each painted by a seed of its own, with the sensor's noise; and their images."""
+    """Return noisy maps and true images of objects (64, 64), each painted from its own seed."""
     sensor, maps, images = Sensor(rig, SensorModel()), list[tuple[Float32, Float32]](), list[Float32]()
     for seed, depth_m in enumerate(depths_m, first_seed):
         albedo = paint(seed, depth_m, [*TEXTURES]).albedo
-        seen = sense_colour(Scene(rig, depth_m, Surface(albedo)), sensor, seed, accuracy)
+        seen = sense_color(Scene(rig, depth_m, Surface(albedo)), sensor, seed, accuracy)
         maps.append((seen.depth_m, seen.intensity))
         images.append(image_from_albedo(albedo, depth_m))
         on_progress(len(images), len(depths_m))
@@ -35,44 +35,44 @@ def painted_maps(
     return MapSet(depth, intensity, np.stack(images))
 
 
-def judge_colour(image: Float32, truth: Float32) -> dict[str, Figure]:
-    """Every metric of colour images (n, 3, 64, 64) against the truth."""
-    return plain(over_objects(colour_metrics(image, truth)))
+def color_figures(image: Float32, truth: Float32) -> dict[str, Figure]:
+    """Return every metric of color images (n, 3, 64, 64) against the truth."""
+    return plain(over_objects(color_metrics(image, truth)))
 
 
 def better_than(guess: Float32, image: Float32, truth: Float32) -> dict[str, Figure]:
-    """By how much images are better than a guess, object by object: positive is better, also where less is better."""
-    return plain(advantage(colour_metrics(image, truth), colour_metrics(guess, truth), SMALLER_IS_BETTER))
+    """Return the per-object advantage of images over a guess; positive is better for every metric."""
+    return plain(advantage(color_metrics(image, truth), color_metrics(guess, truth), SMALLER_IS_BETTER))
 
 
-def colour_guesses(image: Float32, training: Float16 | Float32) -> dict[str, Float32]:
-    """Images (n, 3, 64, 64) to beat: nothing, the mean training object, and our silhouettes in the mean colour."""
+def color_baselines(image: Float32, training: Float16 | Float32) -> dict[str, Float32]:
+    """Return baselines (n, 3, 64, 64): background, mean training object, our silhouettes in the mean color."""
     training = training.astype(np.float32)
-    seen, shown = surface(brightness(training)), surface(brightness(image))
-    colour = np.where(seen[:, None], training, 0.0).sum((0, 2, 3)) / max(int(seen.sum()), 1)
+    trained, ours = surface(brightness(training)), surface(brightness(image))
+    mean_color = np.where(trained[:, None], training, 0.0).sum((0, 2, 3)) / max(int(trained.sum()), 1)
     return {
         "all_background": np.zeros_like(image),
         "mean_object": np.broadcast_to(training.mean(0), image.shape).astype(np.float32),
-        "mean_colour": np.where(shown[:, None], colour[:, None, None], 0.0).astype(np.float32),
+        "mean_colour": np.where(ours[:, None], mean_color[:, None, None], 0.0).astype(np.float32),
     }
 
 
-def figures_of_colour(
+def figures_of_color(
     image: Float32, truth: Float32, others: Mapping[str, Float32], training: Float16 | Float32
 ) -> dict[str, Any]:
-    """All figures of images (n, 3, 64, 64), ready for JSON, beside those of others and of trivial guesses."""
-    guesses = colour_guesses(image, training)
+    """Return all figures of images (n, 3, 64, 64) with those of other answers and of the baselines, ready for JSON."""
+    guesses = color_baselines(image, training)
     return {
         "note": SIMULATION_ONLY,
         "objects": len(truth),
-        **judge_colour(image, truth),
-        "baselines": {name: judge_colour(guess, truth) for name, guess in {**others, **guesses}.items()},
+        **color_figures(image, truth),
+        "baselines": {name: color_figures(guess, truth) for name, guess in {**others, **guesses}.items()},
         "better_than": {name: better_than(guesses[name], image, truth) for name in ("mean_object", "mean_colour")},
     }
 
 
-def draw_colour_sheet(path: Path, image: Float32, truth: Float32) -> None:
-    """Truth, reconstruction and the size of their difference in each channel, object by object, in colour."""
+def draw_color_sheet(path: Path, image: Float32, truth: Float32) -> None:
+    """Draw truth, reconstruction and absolute difference per channel, in color."""
     from matplotlib.figure import Figure as Canvas
 
     count = len(truth)

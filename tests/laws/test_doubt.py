@@ -8,7 +8,7 @@ from nlos_calibration.rig import load_rig
 from nlos_models.doubt_checkpoint import load_uncertainty_model
 from nlos_models.inference import load_reconstructor
 
-from nlos_cam.dataset.outliers import TO_LEARN, Stimulus, ordinary, outlier, varied_empty
+from nlos_cam.dataset.outliers import TRAINING_OUTLIERS, Stimulus, draw_outlier, ordinary, vary_empty_bench
 from nlos_cam.evaluate.subjects import echoes_of, sense
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps
@@ -34,11 +34,11 @@ def processing() -> Pipeline:
     return Pipeline(CalibratedRig(RIG), load_reconstructor(None, cache), uncertainty_model=doubter)
 
 
-def frames_of(sight: Stimulus, count: int, seed: int) -> list[Frame]:
+def frames_of(stimulus: Stimulus, count: int, seed: int) -> list[Frame]:
     """Return frames of one scene with different noise."""
-    sensor, echoes = Sensor(sight.rig, sight.sensor), render(sight.scene, "draft").multi
+    sensor, echoes = Sensor(stimulus.rig, stimulus.sensor), render(stimulus.scene, "draft").multi
     noises = (np.random.default_rng([seed, number]) for number in range(count))
-    return [sensor.expose(echoes, noise).frame(sight.rig.pinhole) for noise in noises]
+    return [sensor.expose(echoes, noise).frame(stimulus.rig.pinhole) for noise in noises]
 
 
 def steps_of(processing: Pipeline, frames: Sequence[Frame]) -> list[FrameResult]:
@@ -47,7 +47,7 @@ def steps_of(processing: Pipeline, frames: Sequence[Frame]) -> list[FrameResult]
 
 @pytest.mark.parametrize("seed", range(10))
 def test_empty_bench_never_shows_an_object(processing: Pipeline, seed: int) -> None:
-    bench = varied_empty(RIG, SensorModel(), np.random.default_rng([seed, 77]))
+    bench = vary_empty_bench(RIG, SensorModel(), np.random.default_rng([seed, 77]))
     for step in steps_of(processing, frames_of(Stimulus(*bench), 3, seed)):
         assert step.verdict == Verdict.NOTHING
         assert not step.reconstruction.has_surface
@@ -84,13 +84,15 @@ def frame_of(maps: LidarMaps) -> Frame:
 def test_plain_outliers_are_reported_as_unusual(processing: Pipeline, name: str) -> None:
     verdicts = list[Verdict | None]()
     for seed in range(8):
-        sight = outlier(TO_LEARN[name], np.random.default_rng([seed, 78]), Stimulus(RIG, SensorModel()))
-        verdicts.append(steps_of(processing, frames_of(sight, 5, seed))[-1].verdict)
+        stimulus = draw_outlier(
+            TRAINING_OUTLIERS[name], np.random.default_rng([seed, 78]), Stimulus(RIG, SensorModel())
+        )
+        verdicts.append(steps_of(processing, frames_of(stimulus, 5, seed))[-1].verdict)
     assert verdicts.count(Verdict.OUTSIDE) + verdicts.count(Verdict.SATURATED) >= 6
 
 
 def test_object_shows_in_its_first_frame_and_not_after(processing: Pipeline) -> None:
-    sight = ordinary(np.random.default_rng(5), Stimulus(RIG, SensorModel()))
-    with_it, without = frames_of(sight, 1, 0), frames_of(Stimulus(RIG, SensorModel()), 1, 0)
+    stimulus = ordinary(np.random.default_rng(5), Stimulus(RIG, SensorModel()))
+    with_it, without = frames_of(stimulus, 1, 0), frames_of(Stimulus(RIG, SensorModel()), 1, 0)
     shown = [step.reconstruction.has_surface for step in steps_of(processing, [*without, *with_it, *without])]
     assert shown == [False, True, False]

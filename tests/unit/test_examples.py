@@ -15,9 +15,8 @@ from nlos_calibration.wall_record import load_measured
 from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.camera.simulated_world import open_world
-from nlos_cam.dataset import build
-from nlos_cam.dataset.build import DatasetPlan, Samples
-from nlos_cam.dataset.samples import make_samples
+from nlos_cam.dataset import DatasetPlan, build_dataset
+from nlos_cam.dataset.samples import Samples, make_samples
 from nlos_cam.render.scene_file import load_scene
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -110,7 +109,7 @@ def in_this_process(plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tup
 @pytest.mark.slow
 def test_own_training_reduces_the_loss(run: Run, folder: Path) -> None:
     plan = DatasetPlan(RIG, 0, accuracy="draft")
-    build(plan, 24, folder / "data", workers=1, on_progress=lambda *_: None, farm=in_this_process)
+    build_dataset(plan, 24, folder / "data", workers=1, on_progress=lambda *_: None, farm=in_this_process)
     losses = [float(line.split()[-1]) for line in run("own_training", "data", "3").splitlines()]
     assert len(losses) == 3
     assert losses[-1] < losses[0]

@@ -26,7 +26,7 @@ from nlos_cam.cli.common import tracked
 from nlos_cam.evaluate import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, Frame
-from nlos_cam.live import VIDEO, Looks, replay_recording
+from nlos_cam.live import VIDEO, ReplayMedia, replay_recording
 from nlos_cam.objects import (
     CATEGORIES,
     benchmark_objects,
@@ -108,7 +108,7 @@ def variations(category: str, box: ObjectBox) -> list[Float32]:
     return [image_from_depth(orthographic_depth(triangles, box), box) for triangles in placed]
 
 
-def fixed_objects(box: ObjectBox) -> dict[str, list[Float32]]:
+def benchmark_depths(box: ObjectBox) -> dict[str, list[Float32]]:
     """Return images of the test set by category."""
     objects = benchmark_objects(box)
     return {n: [image_from_depth(thing.depth_m, box) for thing in objects if thing.category == n] for n in CATEGORIES}
@@ -134,7 +134,7 @@ def objects(out: Path) -> None:
     """Draw the sheets of training's and of the test set's objects."""
     box = object_box(load_rig("paper-rig"))
     draw_sheet(out / "objects.png", {name: variations(name, box) for name in CATEGORIES})
-    draw_sheet(out / "test_objects.png", fixed_objects(box))
+    draw_sheet(out / "test_objects.png", benchmark_depths(box))
 
 
 class Unhurried:
@@ -175,13 +175,13 @@ def replays(out: Path) -> None:
             world = open_world(str(ROOT / scene) if scene else "", on_progress)
         bench = CalibratedRig(world.rig if world.rig.object_box else load_rig("paper-rig"))
         processing = build_pipeline(bench, load_networks(), uncertainty_model=load_uncertainty())
-        looks, camera = Looks(bench, stills=2, video=name == FILMED), Unhurried(world, frames)
+        media, camera = ReplayMedia(bench, stills=2, video=name == FILMED), Unhurried(world, frames)
         with TemporaryDirectory() as folder, tracked(f"reconstructing {name}") as update:
             made, done = Path(folder) / "replay", iter(range(1, frames + 1))
             advance = partial(_advance, update, done, frames)
-            replay_recording(camera, processing, made, stop=Event(), on_frame=advance, looks=looks)
+            replay_recording(camera, processing, made, stop=Event(), on_frame=advance, media=media)
             shutil.copyfile(max(made.glob("still-*.png")), out / f"gallery-{name}.png")
-            if looks.video:
+            if media.video:
                 shutil.copyfile(made / VIDEO, out / VIDEO)
     if (size := (out / VIDEO).stat().st_size) > MAX_BYTES:
         print(f"{VIDEO} has {size / 1e6:.1f} MB, and the docs have room for {MAX_BYTES / 1e6:.0f}: shorten it")

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from processes import children_of, runs
 
-from nlos_cam.dataset import FIRST_ARRAYS, PARTS, SHARDS, open_dataset
+from nlos_cam.dataset import PART_PATTERN, REQUIRED_ARRAYS, SHARD_PATTERN, open_dataset
 from nlos_cam.evaluate import machine
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -65,7 +65,7 @@ def kill(command: list[str], folder: Path, shards: int, then_s: float) -> Kill:
     killed = False
     before, started_s, workers = _shards(folder), time.monotonic(), list[int]()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        while process.poll() is None and len(list(folder.glob(SHARDS))) < shards:
+        while process.poll() is None and len(list(folder.glob(SHARD_PATTERN))) < shards:
             time.sleep(0.005)
         try:
             process.wait(then_s)
@@ -73,14 +73,14 @@ def kill(command: list[str], folder: Path, shards: int, then_s: float) -> Kill:
             workers = children_of(process.pid)
             process.kill()
             killed = True
-    after_s, parts = time.monotonic() - started_s, len(list(folder.glob(PARTS)))
+    after_s, parts = time.monotonic() - started_s, len(list(folder.glob(PART_PATTERN)))
     left, after = _still_running(workers), _shards(folder)
     lost = sum(after.get(name) != content for name, content in before.items())
     return Kill(after_s, len(before), len(after), parts, lost, left, killed)
 
 
 def _shards(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob(SHARDS)}
+    return {path.name: path.read_bytes() for path in folder.glob(SHARD_PATTERN)}
 
 
 def _still_running(processes: list[int]) -> int:
@@ -93,7 +93,7 @@ def _still_running(processes: list[int]) -> int:
 def differing(one: Path, other: Path) -> list[str]:
     """Return the arrays of two datasets that differ in any bit."""
     left, right = open_dataset(one), open_dataset(other)
-    return [name for name in (*FIRST_ARRAYS, "scene") if not _same(left.column(name), right.column(name))]
+    return [name for name in (*REQUIRED_ARRAYS, "scene") if not _same(left.column(name), right.column(name))]
 
 
 def _same(one: np.ndarray, other: np.ndarray) -> bool:

@@ -22,7 +22,16 @@ from nlos_models import Reconstructor, UncertaintyModel, load_reconstructor, loa
 from numpy.typing import NDArray
 
 from nlos_cam.cli.common import tracked
-from nlos_cam.dataset import EMPTY, IN_SHAPE, ORDINARY, TEST_SEED, TO_JUDGE, TO_LEARN, open_dataset, samples_on_disk
+from nlos_cam.dataset import (
+    EMPTY,
+    HELD_OUT_OUTLIERS,
+    ORDINARY,
+    SHAPE_OUTLIERS,
+    TEST_SEED,
+    TRAINING_OUTLIERS,
+    open_dataset,
+    samples_on_disk,
+)
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import echoes_of, rig_of, sense, truth_of
 from nlos_cam.files import cache_folder
@@ -150,7 +159,7 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
     usual = open_dataset(held_out).arrays()
     answers = [pipeline.answer(*pair) for pair in zip(usual.depth_m[start:], usual.intensity[start:], strict=True)]
     result["held_out_objects"] = of_objects(answers, usual.image[start:], rig)
-    for kind in (EMPTY, ORDINARY, *TO_LEARN, *TO_JUDGE):
+    for kind in (EMPTY, ORDINARY, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS):
         wanted = {kind: empty if kind == EMPTY else math.ceil(count * FEWER.get(kind, 1.0))}
         with tracked(f"rendering {kind}") as on_progress:
             made = samples_on_disk(
@@ -169,7 +178,7 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
         elif kind == ORDINARY:
             result["ordinary_on_slightly_other_benches"] = of_objects(answers, made.image, rig)
         else:
-            sort = "learnt" if kind in TO_LEARN else "never_learnt"
+            sort = "learnt" if kind in TRAINING_OUTLIERS else "never_learnt"
             result.setdefault(sort, {})[kind] = of_outliers(answers, made.cells)
     return result | flagged_by_sort(result["learnt"], result["never_learnt"])
 
@@ -180,9 +189,9 @@ def flagged_by_sort(learnt: Mapping[str, Any], never_learnt: Mapping[str, Any]) 
     sorts = {
         "learnt": learnt,
         "never_learnt": never_learnt,
-        "learnt_out_of_range": {name: kind for name, kind in learnt.items() if name not in IN_SHAPE},
-        "out_of_range": {name: kind for name, kind in both.items() if name not in IN_SHAPE},
-        "unlike_in_shape": {name: kind for name, kind in both.items() if name in IN_SHAPE},
+        "learnt_out_of_range": {name: kind for name, kind in learnt.items() if name not in SHAPE_OUTLIERS},
+        "out_of_range": {name: kind for name, kind in both.items() if name not in SHAPE_OUTLIERS},
+        "unlike_in_shape": {name: kind for name, kind in both.items() if name in SHAPE_OUTLIERS},
     }
     found = dict[str, Any]()
     for sort, kinds in sorts.items():

@@ -98,13 +98,13 @@ def populations(
 
 def outliers(each: int) -> dict[str, list[Any]]:
     """Return the same stimuli of every kind of outlier."""
-    from nlos_cam.dataset import TO_JUDGE, TO_LEARN, Stimulus, outlier
+    from nlos_cam.dataset import HELD_OUT_OUTLIERS, TRAINING_OUTLIERS, Stimulus, draw_outlier
     from nlos_cam.render import SensorModel
 
     plain = Stimulus(RIG, SensorModel())
-    kinds = {**TO_LEARN, **TO_JUDGE}
+    kinds = {**TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}
     return {
-        name: [outlier(kind, np.random.default_rng([which, number]), plain) for number in range(each)]
+        name: [draw_outlier(kind, np.random.default_rng([which, number]), plain) for number in range(each)]
         for which, (name, kind) in enumerate(kinds.items())
     }
 

@@ -27,7 +27,7 @@ from transfer_bench import ADAPTATION, FRAMES, HELD_OUT, VALIDATION, part_of
 
 from nlos_cam.cli.common import tracked
 from nlos_cam.cli.main import main as nlos_cam
-from nlos_cam.dataset import read_labelled, recordings_in, write_shards
+from nlos_cam.dataset import list_recordings, read_labelled, write_shards
 from nlos_cam.errors import NlosCamError
 from nlos_cam.evaluate import mm_per_v, over_objects, per_object, plain, reconstruct_all
 from nlos_cam.files import cache_folder
@@ -80,7 +80,8 @@ def on_paper_rig(on_progress: OnProgress) -> dict[str, MapSet]:
 
 def on_bench(folder: Path, on_progress: OnProgress) -> dict[str, MapSet]:
     """Read one frame of each recording of each folder."""
-    return {part: read_labelled(recordings_in(folder / part), frames=1, on_progress=on_progress).maps for part in PARTS}
+    found = {part: list_recordings(folder / part) for part in PARTS}
+    return {part: read_labelled(paths, frames=1, on_progress=on_progress).maps for part, paths in found.items()}
 
 
 def figures(asked: argparse.Namespace) -> None:
@@ -162,11 +163,11 @@ def curve(
 
     Points of an earlier call are read from `runs`.
     """
-    held_out = read_labelled(recordings_in(folder / HELD_OUT), frames=1).maps
+    held_out = read_labelled(list_recordings(folder / HELD_OUT), frames=1).maps
     validation = runs / "validation"
-    write_shards(read_labelled(recordings_in(folder / VALIDATION), frames=frames), validation)
+    write_shards(read_labelled(list_recordings(folder / VALIDATION), frames=frames), validation)
     yield Point("before", 0, _judged(before, held_out))
-    for count, chosen in nested(recordings_in(folder / ADAPTATION), counts).items():
+    for count, chosen in nested(list_recordings(folder / ADAPTATION), counts).items():
         data = runs / f"{count:02d}-recordings"
         labelled = read_labelled(chosen, frames=frames)
         write_shards(labelled, data)

@@ -18,9 +18,8 @@ from rich.progress import Progress
 
 from nlos_cam.cli.dataset import Rate
 from nlos_cam.cli.main import main
-from nlos_cam.dataset import build
-from nlos_cam.dataset.build import DatasetPlan, RigSpread, open_dataset, read
-from nlos_cam.dataset.shards import head_of
+from nlos_cam.dataset import DatasetPlan, RigSpread, build, open_dataset
+from nlos_cam.dataset.shards import read_head
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.textures import TEXTURES
 from nlos_cam.recording.playback import ReplayCamera
@@ -85,7 +84,7 @@ def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path) -> Non
 
 def test_build_in_color_is_noted_as_simulation_only(tmp_path: Path, built: Run) -> None:
     assert built(tmp_path, "--colour")["note"] == SIMULATION_ONLY
-    assert open_dataset(tmp_path, colour=True).plan.textures == tuple(TEXTURES)
+    assert open_dataset(tmp_path, color=True).plan.textures == tuple(TEXTURES)
     assert "textures" in built(tmp_path, code=4)["error"]["message"]
 
 
@@ -106,14 +105,14 @@ def test_build_reports_damaged_shard(tmp_path: Path, capsys: pytest.CaptureFixtu
     captured = capsys.readouterr()
     assert shard.name in captured.err
     assert json.loads(captured.out)["damaged"] == [str(shard)]
-    assert len(head_of(shard).seeds) == 4
+    assert len(read_head(shard).seeds) == 4
 
 
 def test_build_keeps_finished_shards_at_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(build, "SHARD", 2)
     monkeypatch.setattr(build, "processes", lambda _: FakeFarm(fails_after=1))
     assert _build(tmp_path) == 130
-    assert read(tmp_path)[0].image.tolist() == samples_of(range(2))["image"].tolist()
+    assert open_dataset(tmp_path).arrays().image.tolist() == samples_of(range(2))["image"].tolist()
 
 
 def test_build_hides_meshes_of_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -174,7 +173,7 @@ def label(recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 def test_label_makes_dataset_of_single_frames(label: Run, tmp_path: Path) -> None:
     result = label("--frames", "3")
-    maps, plan = read(out := tmp_path / "my data")
+    maps, plan = (data := open_dataset(out := tmp_path / "my data")).arrays(), data.plan
     assert len(maps.image) == result["samples"] == 6
     assert (result["recordings"], result["labels"], result["out"]) == (2, ["jug", "mug"], str(out))
     assert (result["rig_name"], result["rig_checksum"]) == (plan.rig.name, plan.rig.checksum)
@@ -186,11 +185,11 @@ def test_label_replaces_dataset_only_with_overwrite(label: Run, recordings: Path
     out = tmp_path / "my data"
     label("--frames", "2")
     assert label("--frames", "1", code=1)["error"]["type"] == "OutputExistsError"
-    assert len(read(out)[0].image) == 4
+    assert len(open_dataset(out).arrays().image) == 4
     label("--frames", "1", "--overwrite")
-    assert len(read(out)[0].image) == 2
+    assert len(open_dataset(out).arrays().image) == 2
     assert _command(out) == f"nlos-cam dataset label {recordings} --out '{out}' --frames 1 --overwrite"
     (recordings / "b.npy").unlink()
     error = label("--overwrite", code=4)["error"]
     assert (error["type"], "'jug'" in error["message"]) == ("RecordingError", True)
-    assert len(read(out)[0].image) == 2
+    assert len(open_dataset(out).arrays().image) == 2

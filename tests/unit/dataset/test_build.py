@@ -18,12 +18,11 @@ import pytest
 from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset import build
+from nlos_cam.dataset import BuildReport, DatasetPlan, build_dataset, open_dataset, worker
 from nlos_cam.dataset import build as dataset
-from nlos_cam.dataset import build as dataset_worker
-from nlos_cam.dataset.build import Built, DatasetPlan, open_dataset, processes
+from nlos_cam.dataset.build import processes
 from nlos_cam.dataset.samples import make_samples
-from nlos_cam.dataset.shards import LOCK, SHARDS, only_builder, store
+from nlos_cam.dataset.shards import LOCK, SHARD_PATTERN, only_builder, store
 from nlos_cam.errors import (
     DiskFullError,
     FolderBusyError,
@@ -39,7 +38,7 @@ BLAS = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 PARENT = """
 import multiprocessing, time
 from threading import Thread
-from nlos_cam.dataset_worker import end_with_parent
+from nlos_cam.dataset.worker import end_with_parent
 def wait(connection):
     Thread(target=end_with_parent, daemon=True).start()
     connection.send("ready")
@@ -63,9 +62,9 @@ def _small_shards() -> Iterator[None]:
         yield
 
 
-def _build(folder: Path, farm: Any = None, count: int = COUNT, **others: Any) -> Built:
+def _build(folder: Path, farm: Any = None, count: int = COUNT, **others: Any) -> BuildReport:
     options = {"workers": 1, "on_progress": lambda *_: None, "farm": farm or FakeFarm(), **others}
-    return build(options.pop("plan", PLAN), count, folder, **options)
+    return build_dataset(options.pop("plan", PLAN), count, folder, **options)
 
 
 def _bytes(folder: Path) -> Shards:
@@ -144,7 +143,7 @@ def test_build_replaces_only_damaged_shards_it_needs(
 ) -> None:
     told, path = list[str](), finished / name
     path.write_bytes(whole[name][: int(keep * len(whole[name]))])
-    built = _build(finished, count=count, tell=told.append)
+    built = _build(finished, count=count, on_warning=told.append)
     assert [str(path) in line for line in told] == [True]
     assert (built.made, built.damaged) == (made, (path,) if made else ())
     assert (_bytes(finished) == whole) == bool(made)
@@ -211,7 +210,7 @@ def test_build_keeps_shards_when_disk_is_full(tmp_path: Path, whole: Shards, mon
     with pytest.raises(DiskFullError):
         _build(tmp_path, farm)
     assert farm.closed
-    assert len(list(tmp_path.glob(SHARDS))) == 2
+    assert len(list(tmp_path.glob(SHARD_PATTERN))) == 2
     _build(tmp_path)
     assert _bytes(tmp_path) == whole
 
@@ -249,7 +248,7 @@ def test_processes_replace_killed_workers_or_give_up(
 
 @pytest.mark.slow
 def test_processes_make_the_samples_of_one_process(tmp_path: Path) -> None:
-    build(PLAN, 4, tmp_path, workers=2, on_progress=lambda *_: None)
+    build_dataset(PLAN, 4, tmp_path, workers=2, on_progress=lambda *_: None)
     for name, values in make_samples(PLAN, range(40, 44)).items():
         np.testing.assert_array_equal(open_dataset(tmp_path).column(name), values)
     assert not active_children()
@@ -266,12 +265,12 @@ def test_worker_ends_with_killed_parent() -> None:
 
 
 def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset_worker, "parent_process", lambda: None)
+    monkeypatch.setattr(worker, "parent_process", lambda: None)
     for name in BLAS:
         monkeypatch.setenv(name, "2")
     threads, handler = numba.get_num_threads(), signal.getsignal(signal.SIGINT)
     try:
-        dataset_worker.begin_worker()
+        worker.begin_worker()
         assert numba.get_num_threads() == 1
         assert {os.environ[name] for name in BLAS} == {"1"}
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
@@ -282,5 +281,5 @@ def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: pytest.Monkey
 
 def test_worker_module_does_not_import_numpy() -> None:
     """BLAS counts the processors when numpy is imported, which must happen after `begin_worker`."""
-    program = "import sys, nlos_cam.cli.main, nlos_cam.dataset_worker; raise SystemExit('numpy' in sys.modules)"
+    program = "import sys, nlos_cam.cli.main, nlos_cam.dataset.worker; raise SystemExit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -8,16 +8,16 @@ from nlos_calibration.rig import Rig, load_rig
 
 from nlos_cam.dataset import doubt_samples
 from nlos_cam.dataset.doubt_samples import (
-    BENCH,
     EMPTY,
     ORDINARY,
+    SEEDS_PER_BENCH,
     DoubtSamples,
     _generator,
-    _sight,
+    _stimulus,
     make_samples,
     samples_on_disk,
 )
-from nlos_cam.dataset.outliers import TO_JUDGE, TO_LEARN
+from nlos_cam.dataset.outliers import HELD_OUT_OUTLIERS, TRAINING_OUTLIERS
 from nlos_cam.render.sensor.model import SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
@@ -48,8 +48,8 @@ def test_sample_depends_on_its_seed_alone(some: dict[str, DoubtSamples]) -> None
 
 
 def test_ordinary_and_half_of_outlier_benches_lie_slightly_off() -> None:
-    seeds = 0, BENCH - 1, BENCH
-    ordinary, plates = ([_sight(kind, seed, RIG, SENSOR).rig for seed in seeds] for kind in (ORDINARY, "plates"))
+    seeds = 0, SEEDS_PER_BENCH - 1, SEEDS_PER_BENCH
+    ordinary, plates = ([_stimulus(kind, seed, RIG, SENSOR).rig for seed in seeds] for kind in (ORDINARY, "plates"))
     assert [rig == RIG for rig in plates] == [True, True, False]
     assert RIG not in ordinary
     assert ordinary[0] == ordinary[1] != ordinary[2]
@@ -57,12 +57,12 @@ def test_ordinary_and_half_of_outlier_benches_lie_slightly_off() -> None:
 
 def test_kinds_share_no_bench_and_no_noise() -> None:
     """A shared bench would let a network tell outliers from ordinary objects."""
-    kinds = [EMPTY, ORDINARY, *TO_LEARN, *TO_JUDGE]
+    kinds = [EMPTY, ORDINARY, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS]
     for of in range(3):
         assert len({_generator(kind, 3, of).bytes(8) for kind in kinds}) == len(kinds)
-    slight = [_sight(kind, BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)]
-    assert len({sight.rig.checksum for sight in slight}) == 3
-    assert len({sight.sensor.bare_wall_counts for sight in slight}) == 3
+    slight = [_stimulus(kind, SEEDS_PER_BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)]
+    assert len({stimulus.rig.checksum for stimulus in slight}) == 3
+    assert len({stimulus.sensor.bare_wall_counts for stimulus in slight}) == 3
 
 
 def test_samples_on_disk_makes_only_missing_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

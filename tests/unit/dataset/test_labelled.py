@@ -17,15 +17,15 @@ from nlos_models.data import MapSet
 
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.dataset import build
+from nlos_cam.dataset import DatasetPlan, build_dataset, open_dataset
 from nlos_cam.dataset import labelled as labelled_shards
-from nlos_cam.dataset.build import SHARD, DatasetPlan, open_dataset, read
+from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.labelled import (
     RECORDED,
     Labelled,
-    fixed_objects,
+    benchmark_depths,
+    list_recordings,
     read_labelled,
-    recordings_in,
     spread,
     truth_depth_m,
     write_shards,
@@ -34,7 +34,7 @@ from nlos_cam.dataset.shards import store
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError, SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects.benchmark import benchmark_objects as fixed_set
-from nlos_cam.objects.depth_map import cell_centres_m, image_from_depth, object_box
+from nlos_cam.objects.depth_map import cell_centers_m, image_from_depth, object_box
 from nlos_cam.recording.playback import ReplayCamera
 from nlos_cam.recording.sidecar import SidecarFile, WallFile, sidecar_path
 
@@ -163,10 +163,10 @@ def test_read_labelled_skips_frames_without_return(
 
 def test_recordings_in_lists_bags_by_name(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="capture --label"):
-        recordings_in(tmp_path)
+        list_recordings(tmp_path)
     for name in ("b.bag", "a.bag", "a.json"):
         (tmp_path / name).touch()
-    assert recordings_in(tmp_path) == [tmp_path / "a.bag", tmp_path / "b.bag"]
+    assert list_recordings(tmp_path) == [tmp_path / "a.bag", tmp_path / "b.bag"]
 
 
 def _truth(folder: Path, label: str = "mug", name: str = "F") -> np.ndarray:
@@ -183,7 +183,7 @@ def _write_ball(path: Path) -> None:
 
 def test_truth_of_label_is_its_test_object() -> None:
     assert _truth(Path("nowhere"), "cup-1") is CUP
-    objects = fixed_objects(BOX)
+    objects = benchmark_depths(BOX)
     assert list(objects) == [thing.name for thing in fixed_set(BOX)]
     np.testing.assert_array_equal(objects["cup-2"], next(o.depth_m for o in fixed_set(BOX) if o.name == "cup-2"))
 
@@ -201,7 +201,7 @@ def test_truth_of_mesh_stands_at_its_pose(tmp_path: Path, named: bool) -> None:
     _write_ball(tmp_path / ("print.stl" if named else "mug.stl"))
     file = 'file = "print.stl"\n' if named else ""
     _write_truth(tmp_path, f"{file}size_m = 0.1\nx_m = 0.05\ny_m = -0.03\nfront_m = 0.06\n")
-    depth_m, (x_m, y_m) = _truth(tmp_path), cell_centres_m(BOX)
+    depth_m, (x_m, y_m) = _truth(tmp_path), cell_centers_m(BOX)
     rows, columns = np.nonzero(~np.isnan(depth_m))
     assert x_m[columns].mean() == pytest.approx(0.45 + 0.05, abs=0.002)
     assert y_m[rows].mean() == pytest.approx(-0.03, abs=0.002)
@@ -264,13 +264,12 @@ def _samples(count: int) -> Labelled:
 def test_labelled_shards_are_read_as_written(tmp_path: Path, count: int) -> None:
     write_shards(_samples(SHARD + 5), tmp_path)  # a larger dataset, which the next replaces as a whole
     write_shards(samples := _samples(count), tmp_path)
-    maps, plan = read(tmp_path)
+    maps, plan = (data := open_dataset(tmp_path)).arrays(), data.plan
     for name in ("depth_m", "intensity", "image"):
         np.testing.assert_array_equal(getattr(maps, name), getattr(samples.maps, name))
-    kept = open_dataset(tmp_path)
-    assert tuple(kept.column("category")) == samples.label
-    np.testing.assert_array_equal(kept.column("object_depth_m"), samples.object_depth_m)
-    assert np.isnan(kept.column("scene")).any(axis=0).sum() == 1  # the gain is not known
+    assert tuple(data.column("category")) == samples.label
+    np.testing.assert_array_equal(data.column("object_depth_m"), samples.object_depth_m)
+    assert np.isnan(data.column("scene")).any(axis=0).sum() == 1  # the gain is not known
     assert (plan.rig, plan.accuracy) == (RIG, RECORDED)
 
 
@@ -295,4 +294,4 @@ def test_labelled_shards_survive_full_disk(tmp_path: Path, monkeypatch: pytest.M
 def test_build_refuses_to_extend_labelled_shards(tmp_path: Path) -> None:
     write_shards(_samples(4), tmp_path)
     with pytest.raises(RecordingError, match="--out"):
-        build(DatasetPlan(RIG, 0), 4, tmp_path, workers=1, on_progress=lambda *_: None)
+        build_dataset(DatasetPlan(RIG, 0), 4, tmp_path, workers=1, on_progress=lambda *_: None)

@@ -1,4 +1,4 @@
-"""Outliers lie outside the range of training objects by their own measure; varied rigs stay within their spread."""
+"""Outliers lie outside the range of training objects by their own measure; vary_bench rigs stay within their spread."""
 
 from collections.abc import Callable
 
@@ -7,19 +7,19 @@ import pytest
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset.outliers import (
-    IN_SHAPE,
+    HELD_OUT_OUTLIERS,
     MIN_PIXELS,
+    SHAPE_OUTLIERS,
     SLIGHT,
-    TO_JUDGE,
-    TO_LEARN,
+    TRAINING_OUTLIERS,
     WIDE,
-    Spread,
+    BenchSpread,
     Stimulus,
-    moved,
+    draw_outlier,
+    move_lidar,
     ordinary,
-    outlier,
-    varied,
-    varied_empty,
+    vary_bench,
+    vary_empty_bench,
 )
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.render.sensor.model import SensorModel
@@ -31,12 +31,12 @@ SEEDS = range(6)
 
 
 def made(name: str, seed: int) -> Stimulus:
-    return outlier({**TO_LEARN, **TO_JUDGE}[name], np.random.default_rng(seed), PLAIN)
+    return draw_outlier({**TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}[name], np.random.default_rng(seed), PLAIN)
 
 
-def depth_of(sight: Stimulus) -> np.ndarray:
-    assert sight.depth_m is not None
-    return sight.depth_m
+def depth_of(stimulus: Stimulus) -> np.ndarray:
+    assert stimulus.depth_m is not None
+    return stimulus.depth_m
 
 
 def width_m(depth_m: np.ndarray) -> float:
@@ -44,12 +44,12 @@ def width_m(depth_m: np.ndarray) -> float:
     return float(max(np.ptp(rows), np.ptp(columns)) + 1) * 0.25 / 64
 
 
-def touches_edge(sight: Stimulus) -> bool:
-    seen = np.isfinite(depth_of(sight))
+def touches_edge(stimulus: Stimulus) -> bool:
+    seen = np.isfinite(depth_of(stimulus))
     return bool(seen[[0, -1]].any() or seen[:, [0, -1]].any())
 
 
-@pytest.mark.parametrize("name", [*TO_LEARN, *TO_JUDGE])
+@pytest.mark.parametrize("name", [*TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS])
 def test_outlier_shows_surface_before_wall_and_repeats_by_seed(name: str) -> None:
     for seed in SEEDS:
         one, again = made(name, seed), made(name, seed)
@@ -61,11 +61,11 @@ def test_outlier_shows_surface_before_wall_and_repeats_by_seed(name: str) -> Non
 
 
 def test_outlier_kinds_to_learn_and_to_judge_differ() -> None:
-    assert not set(TO_LEARN) & set(TO_JUDGE)
-    for kinds in (TO_LEARN, TO_JUDGE):
-        assert set(kinds) & IN_SHAPE
-        assert set(kinds) - IN_SHAPE
-    assert {*TO_LEARN, *TO_JUDGE} > IN_SHAPE
+    assert not set(TRAINING_OUTLIERS) & set(HELD_OUT_OUTLIERS)
+    for kinds in (TRAINING_OUTLIERS, HELD_OUT_OUTLIERS):
+        assert set(kinds) & SHAPE_OUTLIERS
+        assert set(kinds) - SHAPE_OUTLIERS
+    assert {*TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS} > SHAPE_OUTLIERS
 
 
 OUTSIDE: dict[str, Callable[[Stimulus], bool]] = {
@@ -90,35 +90,35 @@ def test_outlier_is_outside_by_its_own_measure(name: str) -> None:
 
 def test_ordinary_object_is_no_outlier() -> None:
     for seed in SEEDS:
-        sight = ordinary(np.random.default_rng(seed), PLAIN)
-        assert (sight.rig, sight.sensor) == (RIG, SENSOR)
+        stimulus = ordinary(np.random.default_rng(seed), PLAIN)
+        assert (stimulus.rig, stimulus.sensor) == (RIG, SENSOR)
         for name in ("far", "near", "dim", "glossy", "other rig", "other sensor"):
-            assert not OUTSIDE[name](sight)
+            assert not OUTSIDE[name](stimulus)
 
 
 def test_outlier_without_surface_is_drawn_again() -> None:
     tries = list[int]()
 
-    def shy(generator: np.random.Generator, sight: Stimulus) -> Stimulus:
+    def shy(generator: np.random.Generator, stimulus: Stimulus) -> Stimulus:
         tries.append(1)
-        seen = ordinary(generator, sight)
-        return sight if len(tries) < 3 else seen
+        seen = ordinary(generator, stimulus)
+        return stimulus if len(tries) < 3 else seen
 
-    assert np.isfinite(depth_of(outlier(shy, np.random.default_rng(0), PLAIN))).any()
+    assert np.isfinite(depth_of(draw_outlier(shy, np.random.default_rng(0), PLAIN))).any()
     assert len(tries) == 3
 
 
 def test_moved_rig_differs_in_lidar_pose_alone() -> None:
-    other = moved(RIG, 0.01, 2.0, -3.0)
+    other = move_lidar(RIG, 0.01, 2.0, -3.0)
     assert other.lidar.distance_m == pytest.approx(RIG.lidar.distance_m + 0.01)
     assert other.facing_deg == pytest.approx(47.0, abs=0.2)
     assert other.model_copy(update={"lidar": RIG.lidar}) == RIG
 
 
-@pytest.mark.parametrize("spread", [Spread(*(0.0,) * len(SLIGHT)), SLIGHT, WIDE])
-def test_varied_rig_lies_within_its_spread(spread: Spread) -> None:
+@pytest.mark.parametrize("spread", [BenchSpread(*(0.0,) * len(SLIGHT)), SLIGHT, WIDE])
+def test_varied_rig_lies_within_its_spread(spread: BenchSpread) -> None:
     for seed in range(50):
-        rig, sensor = varied(RIG, SENSOR, spread, np.random.default_rng(seed))
+        rig, sensor = vary_bench(RIG, SENSOR, spread, np.random.default_rng(seed))
         assert abs(rig.lidar.distance_m - RIG.lidar.distance_m) <= spread.place_m
         assert max(abs(rig.lidar.yaw_deg - 45.0), abs(rig.lidar.pitch_deg)) <= spread.angle_deg
         assert abs(np.log(sensor.bare_wall_counts / SENSOR.bare_wall_counts)) <= spread.gain + 1e-9
@@ -128,7 +128,7 @@ def test_varied_rig_lies_within_its_spread(spread: Spread) -> None:
 
 
 def test_varied_empty_benches_are_plain_wide_or_without_occluder() -> None:
-    benches = [varied_empty(RIG, SENSOR, np.random.default_rng(seed)) for seed in range(200)]
+    benches = [vary_empty_bench(RIG, SENSOR, np.random.default_rng(seed)) for seed in range(200)]
     assert any(sensor == SENSOR for _, sensor in benches)
     assert any(abs(rig.lidar.distance_m - 0.2) > SLIGHT.place_m for rig, _ in benches)
     assert 5 < sum(rig.occluder is None for rig, _ in benches) < 50

@@ -94,7 +94,7 @@ def test_plan_of_scene_takes_all_but_the_object() -> None:
 
 
 def test_spread_draws_rigs_uniformly_within_bounds() -> None:
-    drawn = np.array([scene_row(*SPREAD.drawn(RIG, SENSOR, seed)) for seed in range(300)])
+    drawn = np.array([scene_row(*SPREAD.draw(RIG, SENSOR, seed)) for seed in range(300)])
     half = np.array([0.02, 5, 5, 0.02, 0.02, 0.3 * SENSOR.bare_wall_counts])
     share = (drawn - np.array(scene_row(RIG, SENSOR))) / half
     assert drawn.shape[1] == len(SCENE_COLUMNS)
@@ -105,10 +105,10 @@ def test_spread_draws_rigs_uniformly_within_bounds() -> None:
 
 
 def test_spread_draws_by_seed_and_none_keeps_the_rig() -> None:
-    assert SPREAD.drawn(RIG, SENSOR, 5) == SPREAD.drawn(RIG, SENSOR, 5)
-    assert SPREAD.drawn(RIG, SENSOR, 5) != SPREAD.drawn(RIG, SENSOR, 6)
-    assert RigSpread().drawn(RIG, SENSOR, 5) == (RIG, SENSOR)
-    rig, sensor = SPREAD.drawn(RIG.model_copy(update={"occluder": None}), SENSOR, 1)
+    assert SPREAD.draw(RIG, SENSOR, 5) == SPREAD.draw(RIG, SENSOR, 5)
+    assert SPREAD.draw(RIG, SENSOR, 5) != SPREAD.draw(RIG, SENSOR, 6)
+    assert RigSpread().draw(RIG, SENSOR, 5) == (RIG, SENSOR)
+    rig, sensor = SPREAD.draw(RIG.model_copy(update={"occluder": None}), SENSOR, 1)
     assert rig.occluder is None
     assert np.isnan(scene_row(rig, sensor)).tolist() == [False, False, False, True, True, False]
 

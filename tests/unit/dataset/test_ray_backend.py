@@ -16,7 +16,7 @@ from nlos_calibration.rig import load_rig
 import nlos_cam
 from nlos_cam.dataset import ray_backend
 from nlos_cam.dataset.plan import DatasetPlan
-from nlos_cam.dataset.ray_backend import AHEAD, RayFarm, make_piece
+from nlos_cam.dataset.ray_backend import PIECES_PER_CPU, RayFarm, make_piece
 from nlos_cam.errors import SceneError, WorkersLostError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0)
@@ -47,7 +47,7 @@ class FakeRay:
         return {"CPU": 2.0}
 
     def remote(self, **options: object) -> Callable[..., Any]:
-        assert options == {"num_cpus": 1, "max_retries": ray_backend.TRIES}
+        assert options == {"num_cpus": 1, "max_retries": ray_backend.MAX_RETRIES}
         return lambda work: SimpleNamespace(remote=lambda *arguments: (work, arguments))
 
     def wait(self, waiting: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
@@ -64,7 +64,7 @@ class FakeRay:
 @pytest.fixture(autouse=True)
 def _nothing_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_backend, "make_samples", lambda _, piece: samples_of(piece))
-    monkeypatch.setattr(ray_backend, "one_thread", lambda: None)
+    monkeypatch.setattr(ray_backend, "use_one_thread", lambda: None)
 
 
 def test_ray_farm_makes_every_piece_once_and_leaves_cluster() -> None:
@@ -73,7 +73,7 @@ def test_ray_farm_makes_every_piece_once_and_leaves_cluster() -> None:
     assert sorted(made, key=lambda piece: piece.start) == PIECES
     for piece, samples in made.items():
         np.testing.assert_array_equal(samples["depth_m"], samples_of(piece)["depth_m"])
-    assert ray.most_waiting == 2 * AHEAD
+    assert ray.most_waiting == 2 * PIECES_PER_CPU
     assert not ray.running
     making = RayFarm(ray, "auto")(PLAN, PIECES)
     next(making)

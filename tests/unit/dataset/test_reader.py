@@ -12,7 +12,7 @@ from nlos_models.data import MapBatch, MapSet
 
 from nlos_cam.dataset import reader
 from nlos_cam.dataset.plan import DatasetPlan
-from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _maps, _Window, open_dataset, read
+from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _maps, _Window, open_dataset
 from nlos_cam.dataset.shards import Shard, shard_path, store
 from nlos_cam.errors import RecordingError, SceneError
 
@@ -53,7 +53,7 @@ def _assert_as_stored(found: MapBatch) -> None:
 
 
 def test_dataset_is_read_as_stored(data: Dataset, folder: Path) -> None:
-    maps, plan = read(folder)
+    maps, plan = data.arrays(), data.plan
     assert (len(data), plan) == (COUNT, PLAN)
     for name in MAP_CHANNELS:
         np.testing.assert_array_equal(getattr(maps, name), samples_of(range(40, 40 + COUNT))[name])
@@ -145,7 +145,7 @@ def test_reader_names_damaged_shard(folder: Path, tmp_path: Path, way: str) -> N
 
 def test_reader_refuses_no_dataset_and_shards_of_two(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="nlos-cam dataset build"):
-        read(tmp_path)
+        open_dataset(tmp_path)
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     other = DatasetPlan(PLAN.rig, 40, accuracy="fine")
     store(shard_path(tmp_path, 90), samples_of(range(90, 92)), other.provenance, "")

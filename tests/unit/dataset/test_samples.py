@@ -17,11 +17,11 @@ from nlos_cam.dataset.plan import DatasetPlan, Objects, RigSpread, scene_row
 from nlos_cam.dataset.samples import (
     Samples,
     hidden_object,
-    joined,
+    join_samples,
     make_samples,
-    objects_of,
+    objects_from_folder,
     procedural_images,
-    sense_colour,
+    sense_color,
     sense_object,
 )
 from nlos_cam.errors import SceneError
@@ -29,7 +29,7 @@ from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_map import image_from_depth
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.objects.textures import TEXTURES, image_from_albedo, painted
+from nlos_cam.objects.textures import TEXTURES, image_from_albedo, paint
 from nlos_cam.render.material import Surface
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
@@ -68,7 +68,7 @@ def test_samples_are_rendered_and_sensed_objects_of_their_seeds(samples: Samples
 
 
 def test_samples_are_independent_of_pieces(samples: Samples) -> None:
-    pieces = joined([make_samples(PLAN, [0]), make_samples(PLAN, [1, 2])])
+    pieces = join_samples([make_samples(PLAN, [0]), make_samples(PLAN, [1, 2])])
     assert pieces.keys() == samples.keys()
     for name, values in pieces.items():
         assert values.dtype == samples[name].dtype
@@ -118,25 +118,25 @@ def meshes(tmp_path: Path) -> Path:
 
 def test_objects_of_hides_meshes_of_a_folder_by_seed(meshes: Path) -> None:
     seen: list[tuple[int, int]] = []
-    objects = objects_of(meshes, lambda *at: seen.append(at))
+    objects = objects_from_folder(meshes, lambda *at: seen.append(at))
     assert seen == [(1, 2), (2, 2)]
     assert [name for name, _ in objects.meshes] == ["cube.stl", "sub/ball.ply"]
     found = [hidden_object(objects, seed, BOX) for seed in range(12)]
     assert {name for name, _ in found} == {"cube.stl", "sub/ball.ply"}
-    np.testing.assert_array_equal(hidden_object(objects_of(meshes), 3, BOX)[1], found[3][1])
+    np.testing.assert_array_equal(hidden_object(objects_from_folder(meshes), 3, BOX)[1], found[3][1])
     assert make_samples(replace(PLAN, objects=objects), [0])["category"][0] == found[0][0]
 
 
 def test_meshes_are_identified_by_content_not_by_folder(meshes: Path) -> None:
-    before = objects_of(meshes)
+    before = objects_from_folder(meshes)
     moved = meshes.rename(meshes.with_name("moved"))
-    assert objects_of(moved) == before
+    assert objects_from_folder(moved) == before
     trimesh.creation.box((1, 2, 1)).export(moved / "cube.stl")
-    assert objects_of(moved) != before
+    assert objects_from_folder(moved) != before
     with pytest.raises(SceneError, match=r"cube\.stl"):
         hidden_object(replace(before, folder=moved, meshes=before.meshes[:1]), 0, BOX)
     with pytest.raises(SceneError, match=moved.parent.name):
-        objects_of(moved.parent / "none")
+        objects_from_folder(moved.parent / "none")
     with pytest.raises(SceneError, match="--objects"):
         hidden_object(replace(before, folder=None), 0, BOX)
 
@@ -145,17 +145,17 @@ def test_meshes_are_identified_by_content_not_by_folder(meshes: Path) -> None:
 def test_objects_of_refuses_mesh_name_that_is_not_utf8(meshes: Path) -> None:
     (meshes / "cube.stl").rename(meshes / os.fsdecode(b"caf\xe9.stl"))
     with pytest.raises(SceneError, match="UTF-8"):
-        objects_of(meshes)
+        objects_from_folder(meshes)
 
 
 @pytest.mark.slow
 def test_samples_module_does_not_import_torch() -> None:
-    program = "import sys, nlos_cam.dataset_samples; raise SystemExit('torch' in sys.modules)"
+    program = "import sys, nlos_cam.dataset.samples; raise SystemExit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
 def _sensed(depth_m: Float32, albedo: Float32, sensor: Sensor, seed: int = 0) -> LidarMaps:
-    return sense_colour(Scene(RIG, depth_m, Surface(albedo)), sensor, seed, "draft")
+    return sense_color(Scene(RIG, depth_m, Surface(albedo)), sensor, seed, "draft")
 
 
 @pytest.mark.slow
@@ -213,14 +213,14 @@ def test_color_samples_are_painted_depth_samples_on_drawn_rig() -> None:
     for name in ("object_depth_m", "seed", "scene", "category"):
         np.testing.assert_array_equal(made[name], plain[name])
     depth_m = hidden_object(plan.objects, 41, plan.box)[1]
-    coat = painted(41, depth_m, plan.textures)
+    coat = paint(41, depth_m, plan.textures)
     assert made["texture"][0] == coat.texture
     np.testing.assert_array_equal(made["image"][0], image_from_albedo(coat.albedo, depth_m).astype(np.float16))
     np.testing.assert_array_equal(made["image"], procedural_images(41, 1, plan.box, textures=plan.textures))
-    rig, model = plan.spread.drawn(plan.rig, plan.sensor, 41)
+    rig, model = plan.spread.draw(plan.rig, plan.sensor, 41)
     np.testing.assert_array_equal(made["scene"][0], scene_row(rig, model))
     sensor = Sensor(rig, model)
-    in_color = sense_colour(Scene(rig, depth_m, Surface(coat.albedo)), sensor, 41, "draft")
+    in_color = sense_color(Scene(rig, depth_m, Surface(coat.albedo)), sensor, 41, "draft")
     for samples, maps in ((made, in_color), (plain, sense_object(Scene(rig, depth_m), sensor, 41, "draft"))):
         np.testing.assert_array_equal(samples["depth_m"][0], maps.depth_m)
         np.testing.assert_array_equal(samples["intensity"][0], maps.intensity)

@@ -19,10 +19,10 @@ from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.shards import (
     LOCK,
     NOTE,
-    check_all,
-    head_of,
+    check_arrays,
     only_builder,
     read_arrays,
+    read_head,
     shard_path,
     shards_of,
     store,
@@ -49,14 +49,14 @@ def _stored(folder: Path, seeds: range = SEEDS) -> Path:
 
 def _is_damaged(path: Path) -> bool:
     try:
-        check_all(head_of(path))
+        check_arrays(read_head(path))
     except RecordingError as error:
         return str(error).startswith(f"{path} is damaged")
     return False
 
 
 def _assert_as_stored(path: Path) -> None:
-    head, samples = head_of(path), samples_of(SEEDS)
+    head, samples = read_head(path), samples_of(SEEDS)
     assert (head.seeds, head.plan) == (SEEDS, PLAN)
     for values, found in zip(samples.values(), read_arrays(head, list(samples)), strict=True):
         assert found.dtype == values.dtype
@@ -65,7 +65,7 @@ def _assert_as_stored(path: Path) -> None:
 
 def test_shard_is_read_as_stored_and_describes_itself(tmp_path: Path) -> None:
     _assert_as_stored(path := _stored(tmp_path))
-    check_all(head_of(path))
+    check_arrays(read_head(path))
     assert [path.name for path in tmp_path.iterdir()] == ["shard-000000040.h5"]
     with h5py.File(path) as file:
         facts = dict(file.attrs)
@@ -119,7 +119,7 @@ def test_shard_without_checksums_of_older_version_is_read(tmp_path: Path) -> Non
         del file["scene"]
         for stored in file.values():
             del stored.attrs["sha256"]
-    check_all(head := head_of(path))
+    check_arrays(head := read_head(path))
     np.testing.assert_array_equal(read_arrays(head, ["image"])[0], samples_of(SEEDS)["image"])
 
 

@@ -12,15 +12,15 @@ from nlos_models.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
 
-from nlos_cam.dataset import build, training_maps
-from nlos_cam.dataset.training_maps import Streamed, TrainingMaps, measured_bare_wall, read_maps, render_bare_wall
+from nlos_cam.dataset import DatasetPlan, RigSpread, training_maps
+from nlos_cam.dataset.training_maps import MapSplit, Streamed, measured_bare_wall, read_maps, render_bare_wall
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.sensor.sensor import Sensor
 
-PLAN = build.DatasetPlan(load_rig("paper-rig"), 0)
+PLAN = DatasetPlan(load_rig("paper-rig"), 0)
 OTHER = replace(PLAN, rig=PLAN.rig.model_copy(update={"name": "other"}))
 RECIPE = small_recipe(task="compressor", objects=4, held_out=2)
 WALL = Path("wall.toml")
@@ -28,16 +28,16 @@ WALL = Path("wall.toml")
 
 @pytest.fixture(autouse=True)
 def _datasets(monkeypatch: pytest.MonkeyPatch) -> None:
-    def opened(of: Path, *, colour: bool) -> SmallDataset:
-        assert not colour
+    def opened(of: Path, *, color: bool) -> SmallDataset:
+        assert not color
         return SmallDataset(small_maps(6, len(of.name)), OTHER if "rig" in of.name else PLAN)
 
-    monkeypatch.setattr(build, "open_dataset", opened)
+    monkeypatch.setattr(training_maps, "open_dataset", opened)
 
 
 def _read(
     data: str = "data", other: str = "other", wall: Path | None = None, *, stream: bool = False, **changes: object
-) -> TrainingMaps:
+) -> MapSplit:
     return read_maps(RECIPE.model_copy(update=changes), Path(data), Path(other), wall, stream=stream)
 
 
@@ -45,8 +45,8 @@ def test_read_maps_takes_first_objects_of_recipe() -> None:
     maps = _read()
     np.testing.assert_array_equal(maps.training.image, small_maps(6, 4).image[:4])
     np.testing.assert_array_equal(maps.held_out.image, small_maps(6, 5).image[:2])
-    assert maps.told(RECIPE) == RECIPE
-    assert _read(held_out=400).told(RECIPE).held_out == 6  # all that there are
+    assert maps.limit_recipe(RECIPE) == RECIPE
+    assert _read(held_out=400).limit_recipe(RECIPE).held_out == 6  # all that there are
 
 
 def test_digest_depends_on_objects_and_rig() -> None:
@@ -83,7 +83,7 @@ def test_rendered_bare_wall_cancels_a_frame_of_bare_wall() -> None:
 
 def test_render_bare_wall_refuses_varying_rigs() -> None:
     with pytest.raises(SceneError, match="--wall"):
-        render_bare_wall(replace(PLAN, spread=build.RigSpread(place_m=0.01)))
+        render_bare_wall(replace(PLAN, spread=RigSpread(place_m=0.01)))
 
 
 def test_measured_bare_wall_is_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:

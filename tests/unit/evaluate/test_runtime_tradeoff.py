@@ -11,7 +11,7 @@ import pytest
 import torch
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset.build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
+from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.evaluate import runtime_tradeoff
 from nlos_cam.evaluate.metrics import Interval
 from nlos_cam.evaluate.runtime_tradeoff import (

@@ -4,7 +4,7 @@ import numpy as np
 from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset.build import DatasetPlan
+from nlos_cam.dataset import DatasetPlan
 from nlos_cam.dataset.samples import make_samples
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")

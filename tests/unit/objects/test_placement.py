@@ -5,7 +5,7 @@ import pytest
 from nlos_calibration.arrays import Float32
 from nlos_calibration.rig import ObjectBox, load_rig
 
-from nlos_cam.dataset.build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
+from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.benchmark import BenchmarkObject, benchmark_objects
 from nlos_cam.objects.depth_map import object_box
@@ -13,6 +13,7 @@ from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import (
     POSE_UNITS,
     Pose,
+    add_background,
     category_triangles,
     fit_in_box,
     object_depth,
@@ -22,7 +23,6 @@ from nlos_cam.objects.placement import (
     pose_from_units,
     post,
     random_pose,
-    add_background,
 )
 
 BOX = object_box(load_rig("paper-rig"))

@@ -12,7 +12,7 @@ import pytest
 from fake_farm import samples_of
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset.build import DatasetPlan
+from nlos_cam.dataset import DatasetPlan
 from nlos_cam.dataset.shards import shard_path, store
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0)
