@@ -6,14 +6,12 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from typing import Any
 
-from nlos_calibration.arrays import Float32
-
 from nlos_cam.camera.laser_power import PowerLimits, turn_down
 from nlos_cam.camera.live_camera import LiveCamera
 from nlos_cam.camera.protocol import Clock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import SampleQueue, Size
+from nlos_cam.camera.session import Size
 from nlos_cam.errors import CameraError, CameraNotFoundError
 from nlos_cam.frames import MAX_SATURATED, saturated_share
 
@@ -139,12 +137,6 @@ def _info(device: Any, sdk: Any) -> DeviceInfo:
     return DeviceInfo(*(device.get_info(key) if device.supports(key) else "" for key in keys))
 
 
-def list_devices() -> list[DeviceInfo]:
-    """Return every connected device."""
-    sdk = load_sdk()
-    return [info for _, info in connected(sdk, shared_context(sdk))]
-
-
 class L515Camera(LiveCamera):
     """L515 by serial number, or the only one; 640 x 480 at 30 frames/s, 320 x 240 on USB 2.
 
@@ -237,15 +229,6 @@ class L515Camera(LiveCamera):
 
     def _reset(self) -> None:
         self._device.hardware_reset()
-
-    def _begin(self, inbox: SampleQueue) -> None:
-        """Do nothing: the device runs already."""
-
-    def _end(self) -> None:
-        """Do nothing."""
-
-    def _truth_depth_m(self, number: int) -> Float32 | None:  # noqa: ARG002  a real device does not know
-        return None
 
 
 def find_l515(sdk: Any, context: Any, serial: str) -> tuple[Any, DeviceInfo]:

@@ -2,7 +2,6 @@
 
 import atexit
 import logging
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from threading import Event, RLock
@@ -23,13 +22,13 @@ from nlos_cam.frames import Frame
 log = logging.getLogger(__name__)
 
 
-class LiveCamera(ABC):
+class LiveCamera:
     """Device that delivers frames from entering to leaving, and records them if a `Recording` is given.
 
     Iterating goes on until any thread leaves the camera, or the recording is full. When no whole set comes for
     `silence_s`, `Recovery` restarts the device and `Continuity` renumbers its frames; a recording is closed there,
     whole, since the device restarts its numbers. Raises CameraLostError where recovery fails, or at once where that
-    recording is not `optional`.
+    recording is not `optional`. Subclasses override the methods that their device needs.
     """
 
     intrinsics: Intrinsics
@@ -64,15 +63,12 @@ class LiveCamera(ABC):
         self._recovery: Recovery | None = None
         """Set only during a silence: it and the camera refer to each other, which would free a device late."""
 
-    @abstractmethod
     def _prepare(self, sensor: Any) -> None:
         """Set up the running sensor; frames are delivered and recorded only after this."""
 
-    @abstractmethod
     def _begin(self, inbox: SampleQueue) -> None:
         """Note that frames may be delivered from now on."""
 
-    @abstractmethod
     def _end(self) -> None:
         """Note that no more frames are wanted."""
 
@@ -84,12 +80,12 @@ class LiveCamera(ABC):
         """Return a handle of the device; None while it is not connected."""
         return self._device
 
-    def _reset(self) -> None:  # noqa: B027  a device without a reset is only restarted
+    def _reset(self) -> None:
         """Reset the device, as by unplugging it: it vanishes and comes back."""
 
-    @abstractmethod
-    def _truth_depth_m(self, number: int) -> Float32 | None:
+    def _truth_depth_m(self, number: int) -> Float32 | None:  # noqa: ARG002  a real device does not know
         """Return the hidden depth at a frame, by the device's own number, if known."""
+        return None
 
     def _new_session(self) -> Session:
         try:
@@ -200,18 +196,15 @@ class LiveCamera(ABC):
         left = self._left
         while not left.is_set() and (session := self._session):
             if found := session.inbox.take(self.silence_s):
-                yield self._next_frame(session, found)
+                self._recovery = None
+                frame = session.frame(found, self._truth_depth_m(found.number))
+                frame = self._continuity.add(frame, self._clock.now())
+                self._count(session.inbox)
+                yield frame
             elif session.inbox.ended:
                 break
             else:
                 self._recover(session.inbox)
-
-    def _next_frame(self, session: Session, found: FrameSet) -> Frame:
-        self._recovery = None
-        frame = session.frame(found, self._truth_depth_m(found.number))
-        frame = self._continuity.add(frame, self._clock.now())
-        self._count(session.inbox)
-        return frame
 
     def _recover(self, inbox: SampleQueue) -> None:
         arrived = self._arrived + inbox.arrived

@@ -51,11 +51,6 @@ def check_room(path: Path, intrinsics: Intrinsics, frames: int, free: int) -> No
         )
 
 
-def closing_bytes(path: Path) -> int:
-    """Return an upper bound of the bytes that closing a recording adds to it."""
-    return CHUNK_BYTES + int(path.stat().st_size * INDEX_SHARE)
-
-
 def can_grow(path: Path, by_bytes: int) -> bool:
     """Return True if a file can grow, by trying: quotas and size limits show nowhere else.
 
@@ -125,7 +120,8 @@ class SdkRecorder:
         Raises DiskFullError where there is no room for it: the SDK would abort the program.
         """
         self._flush()
-        if self.failure is None and not can_grow(self.path, closing_bytes(self.path)):
+        closing_bytes = CHUNK_BYTES + int(self.path.stat().st_size * INDEX_SHARE)
+        if self.failure is None and not can_grow(self.path, closing_bytes):
             self.failure = "no room for its index"
         if self.failure:
             self._abandon()

@@ -43,26 +43,18 @@ def open_camera(
     """
     scheme, _, rest = uri.partition(":")
     if scheme == "bag" and rest:
-        return _replay(uri, Path(rest), recording, reader)
+        if recording:
+            raise NlosCamError(f"{uri} is already a recording: copy the file, or give a live camera (l515, sim)")
+        module, name = REPLAY_BACKENDS[reader]
+        return getattr(import_module(module), name)(Path(rest))
     if scheme == "sim":
-        return _simulated(uri, rest, on_progress, recording)
+        from nlos_cam.camera.simulated import SimulatedCamera
+        from nlos_cam.camera.simulated_world import open_world
+
+        world = open_world(rest, on_progress)
+        return SimulatedCamera(uri, world, recording=recording, faults=world.scene.faults)
     if scheme == "l515":
         from nlos_cam.camera.l515 import L515Camera
 
         return L515Camera(uri, rest, recording=recording)
     raise CameraNotFoundError(f"no camera is called {uri!r}: use {NAMES}")
-
-
-def _replay(uri: str, path: Path, recording: "Recording | None", reader: Reader) -> Camera:
-    if recording:
-        raise NlosCamError(f"{uri} is already a recording: copy the file, or give a live camera (l515, sim)")
-    module, name = REPLAY_BACKENDS[reader]
-    return getattr(import_module(module), name)(path)
-
-
-def _simulated(uri: str, name: str, on_progress: OnProgress | None, recording: "Recording | None") -> Camera:
-    from nlos_cam.camera.simulated import SimulatedCamera
-    from nlos_cam.camera.simulated_world import open_world
-
-    world = open_world(name, on_progress)
-    return SimulatedCamera(uri, world, recording=recording, faults=world.scene.faults)

@@ -142,13 +142,6 @@ def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
     return {name: value for name, value in settings.items() if value != NOT_YET}
 
 
-def _depth_unit_m(sensor: Any) -> float:
-    settings = read_settings(sensor)
-    if "depth_units" not in settings:
-        raise RuntimeError("it does not report its depth unit")
-    return settings["depth_units"]
-
-
 class Session:
     """Three streams of one sensor, delivered to an inbox between `start` and `stop`, both called by the owner.
 
@@ -162,7 +155,9 @@ class Session:
         inbox.expect((self.intrinsics.height, self.intrinsics.width))
         self._sensor: Any = sensor
         self._profiles = list(profiles.values())
-        self._unit_m = _depth_unit_m(sensor)
+        if (unit_m := read_settings(sensor).get("depth_units")) is None:
+            raise RuntimeError("it does not report its depth unit")
+        self._unit_m = unit_m
         self._clocks = {stream: ClockUnwrap() for stream in profiles}
         self._preview = SampleQueue(lossless=False)
         """Frames from before the settings hold."""
@@ -202,7 +197,9 @@ class Session:
         self._preview.close()
 
     def _on_frame(self, frame: Any) -> None:
-        sample = self._unwrapped(sample_from_sdk(frame), frame.get_frame_timestamp_domain().name)
+        sample = sample_from_sdk(frame)
+        if frame.get_frame_timestamp_domain().name == "hardware_clock":  # it wraps, for each stream by itself
+            sample = replace(sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s))
         inbox = self.inbox if self._is_heard(sample) else self._preview
         inbox.put(sample)
 
@@ -217,12 +214,6 @@ class Session:
         began_before = abs(sample.timestamp_s - self._previewed_s) <= SAME_INSTANT_S
         self._held_back += began_before
         return not began_before or self._held_back >= len(FORMATS)
-
-    def _unwrapped(self, sample: Sample, domain: str) -> Sample:
-        """Return a sample on a clock that does not wrap: the device's wraps, for each stream by itself."""
-        if domain != "hardware_clock":
-            return sample
-        return replace(sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s))
 
     def telemetry(self, ending: str = "") -> dict[str, float]:
         """Return the options as they read now; empty when the device is gone or the session has stopped."""

@@ -120,7 +120,7 @@ class SimulatedCamera(LiveCamera):
     A thread of its own delivers frames while entered; the world goes on through faults of the device. Not modeled: the
     seconds that a start takes, options and presets beyond depth unit and temperatures, other resolutions, the color
     camera and motion sensors, per-frame metadata, clock drift and jitter, faults that are not given, and the cooling of
-    an unplugged device. `World` and `Sensor` say what the images do not model.
+    an unplugged device. For the images, see `World` and `Sensor`.
     """
 
     def __init__(
@@ -157,9 +157,6 @@ class SimulatedCamera(LiveCamera):
         self._lidar = SoftwareLidar(
             pinhole, load_sdk(), celsius=celsius, has_other_size=other_size, has_own_clock=own_clock
         )
-
-    def _prepare(self, sensor: Any) -> None:
-        """Do nothing: there is nothing to set."""
 
     def _begin(self, inbox: SampleQueue) -> None:
         first = self._instant() + 1 if self._start_s is not None else 0

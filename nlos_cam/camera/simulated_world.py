@@ -24,8 +24,6 @@ from nlos_cam.render import (
 
 Loop = tuple[list[MultiBounce], list[Float32]]
 """Echoes of each frame, and hidden depth at the middle of its scan."""
-MAPS = "peak", "runner_up", "path_m"
-"""Maps of a frame's echoes, in the order of `MultiBounce`."""
 OnProgress = Callable[[int, int], None]
 """Called with the poses rendered so far and in all."""
 CELSIUS_ABOVE = {
@@ -99,7 +97,8 @@ def _load(path: Path) -> Loop | None:
     """Return a cached loop; None where it is missing or damaged."""
     try:
         with np.load(path) as file:
-            poses, mixed = zip(*(file[name] for name in MAPS), strict=True), bool(file["direct_included"])
+            poses = zip(file["peak"], file["runner_up"], file["path_m"], strict=True)
+            mixed = bool(file["direct_included"])
             return [MultiBounce(*pose, mixed) for pose in poses], list(file["truth_m"])
     except (OSError, ValueError, EOFError, KeyError, BadZipFile):
         return None
@@ -119,6 +118,12 @@ def _render_loop(scene: SceneFile, on_progress: OnProgress | None) -> Loop:
 
 def _store(path: Path, echoes: list[MultiBounce], truths: list[Float32]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    maps = {name: np.stack([getattr(echo, name) for echo in echoes]) for name in MAPS}
     with atomic_file(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, **maps, direct_included=echoes[0].direct_included, truth_m=np.stack(truths))
+        np.savez_compressed(
+            file,
+            peak=np.stack([echo.peak for echo in echoes]),
+            runner_up=np.stack([echo.runner_up for echo in echoes]),
+            path_m=np.stack([echo.path_m for echo in echoes]),
+            direct_included=echoes[0].direct_included,
+            truth_m=np.stack(truths),
+        )
