@@ -47,6 +47,7 @@ ENDINGS: dict[State, str] = {
     "damaged": "File damaged. ",
 }
 NOTHING = "nothing was recorded"
+PRE_RENDERING = "Pre-rendering the simulated scene (first run only, about 90 s)"
 
 
 def result_of(takes: Sequence[CaptureResult], *, several: bool) -> dict[str, Any]:
@@ -158,10 +159,7 @@ def capture(
     measured = load_measured_wall(wall) if wall else None
     recording = Recording(targets[0].path, frames=frames, seconds=seconds, last=takes == 1)
     try:
-        with (
-            interrupted_by_signals(),
-            tracked("Pre-rendering the simulated scene (first run only, about 90 s)") as on_progress,
-        ):
+        with interrupted_by_signals(), tracked(PRE_RENDERING) as on_progress:
             source = open_camera(camera, on_progress=on_progress, recording=recording)
     except KeyboardInterrupt:
         result, text = empty_result(targets[0], several=takes > 1), f"Interrupted before the first frame; {NOTHING}"

@@ -17,14 +17,7 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording import (
-    BagReader,
-    ExportOptions,
-    Format,
-    RepairResult,
-    export_recording,
-    repair_recording,
-)
+from nlos_cam.recording import BagReader, ExportOptions, Format, RepairResult, export_recording, repair_recording
 
 DamagedBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="Recording that was killed, cut short or damaged.")]
 NewBag = Annotated[Path | None, typer.Option("--out", help="Recording to write (.bag).")]

@@ -32,8 +32,6 @@ STREAM = re.compile(DEVICE + r"/sensor_(\d+)/(\w+)_(\d+)(?=/image/data$)")
 OPTION = re.compile(DEVICE + r"/sensor_(\d+)/option/(.+)/value")
 STATIC_NS = 1
 """The time that librealsense gives to values in force when the recording began."""
-MAX_CHUNK_BYTES = CHUNK_LIMIT
-"""Bound on a chunk's size; librealsense begins a new chunk after 768 kB."""
 DECOMPRESSORS = {"lz4": LZ4FrameDecompressor, "bz2": BZ2Decompressor}
 
 
@@ -179,10 +177,6 @@ class BagReader:
             packed = file.read(read_uint32(file))
         return _unpack(packed, header.get_string("compression"), header.get_uint32("size"))
 
-    def sensor_name(self, stream: str) -> str:
-        """Return the name of a stream's sensor; empty where not recorded."""
-        return self._key_values(f"{DEVICE}/sensor_{self.streams[stream].sensor}/info").get("name", "")
-
     def order(self, streams: Iterable[str]) -> Iterator[Place]:
         """Yield the places of all frames of these streams, in the order of recording."""
         each = [zip(self._frames(stream), repeat(stream), count()) for stream in streams]
@@ -292,7 +286,7 @@ class _BoundedFile(BufferedReader):
 
     def read(self, size: int | None = -1, /) -> bytes:
         wanted = self._left if size is None or size < 0 else size
-        data = super().read(min(wanted, self._left, MAX_CHUNK_BYTES))
+        data = super().read(min(wanted, self._left, CHUNK_LIMIT))
         self._left -= len(data)
         return data
 
@@ -313,7 +307,7 @@ class _BoundedPath:
 
 def _unpack(packed: bytes, compression: str, size: int) -> bytes:
     """Return a chunk's content. Raises ValueError where that has another size than declared, or an absurd one."""
-    if size > MAX_CHUNK_BYTES:
+    if size > CHUNK_LIMIT:
         raise ValueError(f"a chunk of {size} bytes")
     if compression == "none":
         content, whole = packed, True
@@ -328,16 +322,11 @@ def _unpack(packed: bytes, compression: str, size: int) -> bytes:
 
 def _check_start(path: Path) -> None:
     """Raise RecordingError for a path that is not a .bag, before rosbags reports it less clearly."""
-    if not path.exists():
-        raise RecordingError(f"{path} does not exist: give the path of a .bag recording")
     if not path.is_file():  # opening a pipe would wait for a writer
-        kind = "a directory" if path.is_dir() else "not a file"
-        raise RecordingError(f"{path} is {kind}: give the path of a .bag recording")
-    try:
-        with path.open("rb") as file:
-            start = file.read(len(MAGIC))
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+        problem = "is a directory" if path.is_dir() else "is not a file" if path.exists() else "does not exist"
+        raise RecordingError(f"{path} {problem}: give the path of a .bag recording")
+    with raise_as_recording_error(path, "cannot be read"), path.open("rb") as file:
+        start = file.read(len(MAGIC))
     if not start:
         raise RecordingError(f"{path} is empty: record it again")
     if start != MAGIC:

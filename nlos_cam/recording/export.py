@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Event
-from typing import IO, Any, Literal, Protocol
+from typing import IO, Any, Literal
 
 import cv2
 import numpy as np
@@ -24,16 +24,6 @@ from nlos_cam.recording.bag_reader import BagReader
 POINTS = "points"
 TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA}
 """Conversions to OpenCV's order of channels for PNG; a .npz keeps every stream's own."""
-
-
-class Sink(Protocol):
-    """Writer of the frames of one stream, or of point clouds."""
-
-    def add(self, sample: Sample) -> None: ...
-
-    def close(self) -> None:
-        """Finish the files."""
-        ...
 
 
 class PngSink:
@@ -215,7 +205,7 @@ def _streams(bag: BagReader, options: ExportOptions) -> list[str]:
     return [name for name in present if not options.streams or name in options.streams]
 
 
-def _sink(bag: BagReader, stream: str, folder: Path, form: Format) -> Sink:
+def _sink(bag: BagReader, stream: str, folder: Path, form: Format) -> PngSink | NpzSink:
     info = bag.streams[stream]
     if form == "png":
         return PngSink(folder, stream, info.format)

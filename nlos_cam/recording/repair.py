@@ -22,7 +22,7 @@ from nlos_cam.recording.rosbag import (
     pack_file_header,
     pack_index,
 )
-from nlos_cam.recording.salvage import Chunk, Damage, Scan, ignore_progress, scan_bag
+from nlos_cam.recording.salvage import Chunk, Damage, Scan, scan_bag
 
 FRAMES_TOPIC = re.compile(r"/([A-Za-z]+)_\d+/image/data$")
 VERSION_TOPIC = "/file_version"
@@ -43,7 +43,7 @@ class RepairResult:
     out: Path
 
 
-def repair_recording(path: Path, out: Path, report: OnProgress = ignore_progress) -> RepairResult:
+def repair_recording(path: Path, out: Path, report: OnProgress = lambda _done, _total: None) -> RepairResult:
     """Write the undamaged part of the recording `path` to `out`, replacing it atomically; `path` is only read.
 
     Raises RecordingError where nothing can be recovered, OutputExistsError if both are the same file, NlosCamError

@@ -174,7 +174,6 @@ RECORD_START = re.compile(rb"\x00\x00\x00(?:compression|conn|op|chunk_pos|chunk_
 """First field of a record, after the first byte of its length; or the data of an lz4 chunk."""
 BEFORE_FIELD_BYTES = 5
 """Bytes from the start of a record to its match of RECORD_START."""
-COMPRESSIONS = (b"lz4", b"none")
 COMPRESSION = re.compile(rb"\x00\x00\x00compression=(lz4|none)")
 
 
@@ -199,12 +198,7 @@ class Scan:
     damages: list[Damage]
 
 
-def ignore_progress(done: int, total: int) -> None:
-    """Do nothing."""
-    del done, total
-
-
-def scan_bag(path: Path, report: OnProgress = ignore_progress) -> Scan:
+def scan_bag(path: Path, report: OnProgress = lambda _done, _total: None) -> Scan:
     """Read a bag from end to end, one chunk at a time; report bytes. Raises OSError where it cannot be read."""
     with path.open("rb") as file:
         scanner = _Scanner(file, report)
@@ -335,7 +329,7 @@ class _Scanner:
                 return True
             if is_headless(chunk):
                 return examine(self.read, at, chunk, self.end).chunk is not None
-            return chunk.fields.get("compression") in COMPRESSIONS
+            return chunk.fields.get("compression") in {b"lz4", b"none"}
         return False
 
     def _is_at_end(self, at: int) -> bool:

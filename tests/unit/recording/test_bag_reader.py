@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording.bag_reader import MAX_CHUNK_BYTES, BagReader
+from nlos_cam.recording.bag_reader import BagReader
 from nlos_cam.recording.playback import verify
+from nlos_cam.recording.rosbag import CHUNK_LIMIT
 
 @pytest.fixture(params=["noise_bag", "noise_bag_uncompressed", "real_bag"])
 def bag(request: pytest.FixtureRequest) -> BagReader:
@@ -53,7 +54,7 @@ def test_reader_reads_each_compression(noise_bag: Path, rewritten: Any, compress
 
 
 def test_reader_unpacks_no_more_than_its_bound(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.recording.bag_reader.MAX_CHUNK_BYTES", 10_000)
+    monkeypatch.setattr("nlos_cam.recording.bag_reader.CHUNK_LIMIT", 10_000)
     with pytest.raises(RecordingError, match="chunk"):
         BagReader(noise_bag)
 
@@ -250,4 +251,4 @@ def test_reader_does_not_allocate_an_absurd_size(
             read_all(path)
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        assert peak < 2 * MAX_CHUNK_BYTES
+        assert peak < 2 * CHUNK_LIMIT
