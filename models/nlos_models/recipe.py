@@ -105,6 +105,10 @@ class Recipe(BaseModel):
             raise ValueError("outliers and empties are for an uncertainty network (task = 'doubt'): set both, or none")
         return self
 
+    def trains_like(self, other: Self) -> bool:
+        """Return True where two recipes differ in the wording of their deviations alone."""
+        return self.model_copy(update={"deviations": other.deviations}) == other
+
     def scaled(self, share: float) -> Self:
         """Return the recipe at a share of its budget (objects x epochs): fewer epochs, and objects below one epoch.
 

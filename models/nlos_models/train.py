@@ -374,7 +374,7 @@ class _Run:
         state = read_last(self.folder, self.report)
         if state is None:
             return
-        if Recipe.model_validate_json(state["recipe"]) != self.recipe:
+        if not self.recipe.trains_like(Recipe.model_validate_json(state["recipe"])):
             raise RecipeError(f"{self.folder} holds a run of another recipe: choose another --out")
         if state.get("origin", self._running.origin) != self._running.origin:  # states of old runs have no origin
             raise RecipeError(f"{self.folder} holds a run from other weights or objects: choose another --out")

@@ -144,6 +144,9 @@ def test_finished_run_returns_figures_without_training(tmp_path: Path) -> None:
 def test_run_of_other_recipe_or_origin_is_refused(tmp_path: Path) -> None:
     run = SmallRun(small_recipe(epochs=1), tmp_path)
     run.go(origin="these weights")
+    reworded = SmallRun(small_recipe(epochs=1, deviations=["other words"]), tmp_path)
+    reworded.go(origin="these weights")
+    assert not reworded.steps
     with pytest.raises(RecipeError, match="recipe"):
         _trained(tmp_path, learning_rate=0.5)
     with pytest.raises(RecipeError, match="weights"):
