@@ -1,16 +1,16 @@
-"""nlos-cam from Python: open a camera, loop over its frames, and have what is hidden, in metres.
+"""Python API: open a camera, iterate over its frames, and get the hidden surface in metres.
 
-`import nlos_cam` is all that it takes, and costs nothing: what a camera needs is imported when it is opened.
+`import nlos_cam` is enough, and cheap: the rest is imported when a camera is opened.
 
     >>> import nlos_cam
     >>> with nlos_cam.open("bag:run.bag") as stream:
-    ...     for seen in stream:
-    ...         print(seen.frame_number, seen.depth_m.shape, seen.points_m.shape[1])
+    ...     for glimpse in stream:
+    ...         print(glimpse.frame_number, glimpse.depth_m.shape, glimpse.points_m.shape[1])
     0 (64, 64) 3
     1 (64, 64) 3
     2 (64, 64) 3
 
-A live camera (`l515`, `sim`) goes on until the loop is left.
+A live camera (`l515`, `sim`) runs until the loop is left.
 """
 
 import time
@@ -45,12 +45,12 @@ from nlos_cam.reconstruct import (
 
 @dataclass(frozen=True)
 class Glimpse:
-    """What one frame tells of the hidden object."""
+    """Result of one frame: the hidden surface with its uncertainty and verdict."""
 
     step: FrameResult
-    """The frame's whole way: the frame itself, the reconstruction with its pose, timings, the physics check."""
+    """Everything else about the frame: the frame itself, the reconstruction's pose, timings, the physics check."""
     box: ObjectBox
-    """Where on the bench the object is looked for, in the wall frame."""
+    """Box in which objects are reconstructed, in the wall frame."""
 
     @property
     def depth_m(self) -> Float32:
@@ -62,98 +62,99 @@ class Glimpse:
 
     @property
     def uncertainty_m(self) -> Float32 | None:
-        """(64, 64): by how much `depth_m` may be off; None from networks that do not tell."""
+        """(64, 64): expected absolute error of `depth_m`; None without an uncertainty model."""
         return self.step.reconstruction.uncertainty_m
 
     @property
     def verdict(self) -> Verdict | None:
-        """What may be believed of the frame, in plain words; None from networks that do not tell."""
+        """Reliability of the reconstruction, such as "object seen"; None without an uncertainty model."""
         return self.step.verdict
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the person at the bench should know now, such as that the lidar has moved."""
+        """Warnings that hold now, such as that the lidar has moved."""
         return self.step.warnings
 
     @property
     def points_m(self) -> Float32:
-        """(n, 3): the hidden surface's points in the wall frame, x along the wall, y up, z into the room."""
+        """(n, 3): points of the hidden surface in the wall frame, x along the wall, y up, z into the room."""
         x_m, y_m = np.meshgrid(*cell_centers_m(self.box))
         points_m = np.stack([x_m, y_m, self.depth_m], -1).astype(np.float32)
         return points_m[np.isfinite(self.depth_m)]
 
     @property
     def maps(self) -> LidarMaps:
-        """What the lidar saw, in (64, 80) cells."""
+        """Lidar maps of (64, 80) cells."""
         return self.step.maps
 
     @property
     def difference(self) -> LidarMaps | None:
-        """The maps less the bare wall's; None without a wall record that has a reference."""
+        """Maps less those of the bare wall; None without a wall record that has a reference."""
         return self.step.difference
 
     @property
     def timestamp_s(self) -> float:
-        """When the frame was taken, by the camera's clock."""
+        """Time of the frame by the camera's clock."""
         return self.step.frame.timestamp_s
 
     @property
     def frame_number(self) -> int:
-        """As the camera counts."""
+        """Number of the frame, counted by the camera."""
         return self.step.frame.frame_number
 
     @property
     def truth_depth_m(self) -> Float32 | None:
-        """`depth_m` as it should be, where the camera knows it (a simulated one does)."""
+        """Ground truth of `depth_m` from a simulated camera; else None."""
         return self.step.frame.truth_depth_m
 
 
 class Stream:
-    """A camera's frames and what each tells. Entering starts the camera; leaving stops it, whatever happened inside.
+    """Frames of a camera with their results. Entering starts the camera; leaving stops it, also after an error.
 
-    Iterate while it is entered; leaving a loop and beginning another goes on with the frames that come next. A live
-    camera does not wait: of frames that come faster than they are taken, the oldest are dropped, and counted. A
-    recording waits, and loses none. Raises what the camera raises.
+    Iterate from one thread while entered; a second loop continues with the next frames. A live camera does not wait: if
+    frames come faster than they are taken, the oldest are dropped and counted. A recording waits and loses none. Raises
+    the camera's errors.
     """
 
     def __init__(
-        self, camera: Camera, processing: Pipeline, *, lossless: bool, notes: tuple[str, ...] = (), clock: Clock
+        self, camera: Camera, pipeline: Pipeline, *, lossless: bool, notes: tuple[str, ...] = (), clock: Clock
     ) -> None:
         self.camera = camera
         self.notes = notes
-        """What does not fit between the networks and this bench: believe less where there is any."""
-        self._processing, self._keeps_all, self._clock = processing, lossless, clock
+        """Mismatches between networks and bench: expect larger errors if there are any."""
+        self._pipeline, self._lossless, self._clock = pipeline, lossless, clock
         self._box = object_box(self.rig)
-        self._tally, self._inside = RunStatistics(), ExitStack()
+        self._statistics, self._entered = RunStatistics(), ExitStack()
         self._reader: FrameReader | None = None
 
     @property
     def rig(self) -> Rig:
-        """The bench: of the wall record, else the camera's own, else the paper's."""
-        return self._processing.bench.rig
+        """Rig of the wall record; without one, the camera's own, else the paper's."""
+        return self._pipeline.bench.rig
 
     @property
     def dropped(self) -> int:
-        """Frames that came to no result up to now, whoever lost them."""
-        in_loop = len(self._reader.dropped) if self._reader else 0
-        return self.camera.incomplete + self.camera.dropped + in_loop + self._tally.failed
+        """Frames without a result up to now, for any reason."""
+        return sum(self._statistics.lost(self.camera, self._reader).values()) if self._reader else 0
 
     def __enter__(self) -> Self:
-        camera = self._inside.enter_context(self.camera)
-        frames, thermometer = with_telemetry(camera, camera)
-
-        def leave() -> None:
-            camera.__exit__(None, None, None)
-
-        reader = FrameReader(frames, lossless=self._keeps_all, stop=Event(), clock=self._clock, let_go=leave)
-        self._reader = self._inside.enter_context(reader)
-        self._steps = iterate_results(reader, self._processing, self._clock, self._tally.fail, thermometer)
+        camera = self._entered.enter_context(self.camera)
+        frames, telemetry = with_telemetry(camera)
+        reader = FrameReader(
+            frames,
+            lossless=self._lossless,
+            stop=Event(),
+            clock=self._clock,
+            abandon_source=lambda: camera.__exit__(None, None, None),
+        )
+        self._reader = self._entered.enter_context(reader)
+        self._results = iterate_results(reader, self._pipeline, self._clock, self._statistics.fail, telemetry)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._inside.__exit__(kind, error, trace)
+        self._entered.__exit__(kind, error, trace)
 
     def __iter__(self) -> Self:
         return self
@@ -161,7 +162,7 @@ class Stream:
     def __next__(self) -> Glimpse:
         if self._reader is None:
             raise NlosCamError("the camera has not been started: loop inside `with nlos_cam.open(...) as stream:`")
-        return Glimpse(next(self._steps), self._box)
+        return Glimpse(next(self._results), self._box)
 
 
 def open_stream(
@@ -173,19 +174,19 @@ def open_stream(
     on_progress: OnProgress | None = None,
     clock: Clock = time.time,
 ) -> Stream:
-    """The camera of that name with the networks before it, found and loaded but not started; call it `nlos_cam.open`.
+    """Open a camera and load the networks, without starting the camera yet; call it as `nlos_cam.open`.
 
     `uri` is `l515`, `l515:SERIAL`, `sim`, `sim:bare-wall`, `sim:scene.toml` or `bag:run.bag`; `wall` a record of
     `calibrate --wall`, `weights` a folder of other weights than the shipped ones; maps are the mean of the last
-    `average` frames. `on_progress` hears how far a simulated world is rendered ahead, which takes seconds the first
-    time. Raises the errors of `nlos_cam.errors`; RecordFileError and CalibrationError for the wall, CheckpointError for
+    `average` frames. `on_progress` is called while a simulated scene is pre-rendered, which takes time on its first
+    run. Raises the errors of `nlos_cam.errors`; RecordFileError and CalibrationError for the wall, CheckpointError for
     the weights.
     """
     camera = open_camera(uri, on_progress=on_progress)
     bench = open_bench(Path(wall) if wall else None, camera)
     folder = Path(weights) if weights else None
-    network, doubter = load_networks(folder), load_uncertainty(folder)
-    processing = build_pipeline(bench, network, average, uncertainty_model=doubter)
-    warm_up(camera, processing)
-    notes = tuple(compatibility_warnings(bench, network.record, doubter))
-    return Stream(camera, processing, lossless=uri.startswith("bag:"), notes=notes, clock=clock)
+    network, uncertainty_model = load_networks(folder), load_uncertainty(folder)
+    pipeline = build_pipeline(bench, network, average, uncertainty_model=uncertainty_model)
+    warm_up(camera, pipeline)
+    notes = tuple(compatibility_warnings(bench, network.record, uncertainty_model))
+    return Stream(camera, pipeline, lossless=uri.startswith("bag:"), notes=notes, clock=clock)

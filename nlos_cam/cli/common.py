@@ -68,13 +68,13 @@ def progress(*others: ProgressColumn) -> Generator[Progress]:
 
 
 @contextmanager
-def tracked(description: str) -> Generator[Callable[[int, int], None]]:
-    """Show a progress bar; yield the function that takes (done, total)."""
+def tracked(description: str, *, at_once: bool = True) -> Generator[Callable[[int, int], None]]:
+    """Show a progress bar, `at_once` or from the first step; yield the function that takes (done, total)."""
     with progress() as bar:
-        task = bar.add_task(description, total=None)
+        task = bar.add_task(description, total=None, visible=at_once)
 
         def update(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
+            bar.update(task, completed=done, total=total, visible=True)
 
         yield update
 

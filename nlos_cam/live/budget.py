@@ -1,10 +1,10 @@
-"""Which of the measured ways to reconstruct keeps a budget of delay on this machine, and what that costs.
+"""Latency budget (`--budget-ms`): the most accurate measured setting that meets it on this machine.
 
-    expected delay = hand-over + all but the network, here + network's 90 % in the table x how much slower this machine
-                     is + (n - 1) / 2 frame periods
+    expected latency = hand-over + all but the networks, here + networks' 90th percentile in the table x how much slower
+                       this machine is + (n - 1) / 2 frame periods
 
-The last is what a mean over n frames adds: its middle is so much older than its newest frame. Accuracy is what was
-measured on objects that stand still; what moves also smears.
+The last term is the age of a mean over n frames: its frames are 0 to n - 1 periods older than the newest, on average
+(n - 1) / 2. The table's accuracy was measured with objects at rest; moving ones blur as well.
 """
 
 import os
@@ -26,26 +26,33 @@ from nlos_cam.files import cache_folder
 from nlos_cam.live.loop import warm_up
 from nlos_cam.live.statistics import RunReport
 from nlos_cam.objects import object_box
-from nlos_cam.reconstruct import Pipeline
+from nlos_cam.reconstruct import Clock, Pipeline
 
 TRADEOFF = "tradeoff.json"
-"""What `tradeoff reconstruct` writes; one lies beside the shipped weights."""
+"""Table written by `tradeoff reconstruct`; one is beside the shipped weights."""
 SHIPPED = "shipped"
 PERIOD_MS = 1000 / FRAMES_PER_S
 HANDOVER_MS = 2.4
-"""From a frame's timestamp until it is its turn: 95 % of both stages in docs/live.json."""
+"""From a frame's timestamp to its processing: 95th percentile of delivery and queue in docs/live.json."""
 BUSY_SHARE = 0.5
-"""Of each frame's period: the rest is for the camera, the view and whatever else runs."""
+"""Share of each frame period for processing: the rest is for camera, view and other programs."""
+CALLS, LATE_PERCENT = 30, 95
+"""Calls timed on this machine, and the percentile taken of them."""
+
+BuildPipeline = Callable[[Reconstructor, int], Pipeline]
+"""Networks and number of averaged frames to a pipeline."""
+Runtimes = Callable[[Path | None, Rig, ObjectBox, Path], Mapping[str, Callable[[int], Reconstructor]]]
+"""Weights, rig, object box and cache folder to loaders by runtime, which take a number of threads."""
 
 
-class Figure(BaseModel):
-    """A metric's estimate."""
+class Metric(BaseModel):
+    """Estimate of a metric."""
 
     value: float | None
 
 
-class Option(BaseModel):
-    """One measured setting of a trade-off."""
+class Setting(BaseModel):
+    """Measured setting of a trade-off table: weights, runtime, threads, averaged frames."""
 
     name: str
     weights: str
@@ -53,217 +60,198 @@ class Option(BaseModel):
     runtime: str
     threads: int = Field(ge=1)
     frames: int = Field(ge=1)
-    """Averaged."""
+    """Number of averaged frames."""
     milliseconds: float = Field(gt=0)
     milliseconds_p90: float = Field(gt=0)
-    foreground_rmse_mm: Figure
+    foreground_rmse_mm: Metric
 
     @property
     def rmse_mm(self) -> float:
-        """Infinite where no surface was found at all."""
+        """Infinite if no surface was found at all."""
         value = self.foreground_rmse_mm.value
         return float("inf") if value is None else value
 
     @property
     def averaging_ms(self) -> float:
-        """The delay that the mean over its frames adds."""
+        """Latency added by averaging."""
         return (self.frames - 1) / 2 * PERIOD_MS
 
 
 class _Table(BaseModel):
-    settings: list[Option] = Field(min_length=1)
+    settings: list[Setting] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds per frame on this machine, late in their distribution."""
+
+    network_ms: float
+    rest_ms: float
+    """All but the networks."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What was measured of this machine."""
+    """Speed of this machine."""
 
     slower: float
-    """How many times longer a network takes at its 90 % than in the table."""
+    """Networks' time here over their 90th percentile in the table."""
     rest_ms: float
-    """All that is done to a frame but the network."""
 
-    def busy_ms(self, option: Option) -> float:
-        """What a frame costs."""
-        return self.rest_ms + self.slower * option.milliseconds_p90
+    def busy_ms(self, setting: Setting) -> float:
+        """Return the processing time of a frame."""
+        return self.rest_ms + self.slower * setting.milliseconds_p90
 
-    def expected_ms(self, option: Option) -> float:
-        """The delay of what is shown."""
-        return HANDOVER_MS + self.busy_ms(option) + option.averaging_ms
-
-
-def load_tradeoff(path: Path) -> list[Option]:
-    """The settings of a table that `tradeoff reconstruct` wrote. Raises RecordingError."""
-    file = path / TRADEOFF if path.is_dir() else path
-    try:
-        return _Table.model_validate_json(file.read_text(encoding="utf-8")).settings
-    except (OSError, UnicodeDecodeError, ValidationError) as error:
-        what = error.strerror if isinstance(error, OSError) else "no table of settings"
-        raise RecordingError(
-            f"{file} cannot be read ({what}): measure these weights with `nlos-cam tradeoff reconstruct --out DIR`, "
-            "and give --tradeoff DIR"
-        ) from error
-
-
-def keeping_pace(options: Sequence[Option], machine: Machine) -> list[Option]:
-    """Those that leave time between frames; the quickest alone where none does."""
-    kept = [option for option in options if machine.busy_ms(option) <= BUSY_SHARE * PERIOD_MS]
-    return kept or [min(options, key=lambda option: (machine.busy_ms(option), option.frames))]
-
-
-def choose(options: Sequence[Option], machine: Machine, budget_ms: float) -> Option:
-    """The most accurate that keeps budget and pace; of those alike, that of the fewest threads, then the quickest.
-
-    Raises BudgetError where none does.
-    """
-    paced = keeping_pace(options, machine)
-    kept = [option for option in paced if machine.expected_ms(option) <= budget_ms]
-    if not kept:
-        least = min(paced, key=machine.expected_ms)
-        raise BudgetError(
-            f"no setting keeps a delay of {budget_ms:g} ms on this machine: the least is "
-            f"{machine.expected_ms(least):.1f} ms ({least.name}); give a larger --budget-ms"
-        )
-    return min(kept, key=lambda option: (round(option.rmse_mm, 2), option.threads, machine.expected_ms(option)))
-
-
-CALLS = 30
-
-
-LATE_PERCENT = 95
-
-
-Make = Callable[[Reconstructor, int], Pipeline]
-"""What is made of frames, by a network and the mean over so many frames."""
-
-
-Clock = Callable[[], float]
+    def expected_ms(self, setting: Setting) -> float:
+        """Return the latency."""
+        return HANDOVER_MS + self.busy_ms(setting) + setting.averaging_ms
 
 
 @dataclass(frozen=True)
 class BudgetChoice:
-    """What was chosen, and why."""
+    """Setting chosen for a latency budget, with its latency measured here."""
 
     budget_ms: float
-    option: Option
+    setting: Setting
     expected_ms: float
-    best: Option
-    """The most accurate of all that were measured, however late."""
+    best: Setting
+    """The most accurate of all measured settings, at any latency."""
 
-    def told(self) -> str:
-        """In one line."""
-        option, loss_mm = self.option, self.option.rmse_mm - self.best.rmse_mm
-        averaged = f", the mean of {option.frames} frames ({option.averaging_ms:.0f} ms)" if option.frames > 1 else ""
-        cost = f"{loss_mm:.1f} mm more than the best, {self.best.name}" if loss_mm > 0 else "the best there is"
+    def describe(self) -> str:
+        """Return the choice and its cost in accuracy in one line."""
+        setting, loss_mm = self.setting, self.setting.rmse_mm - self.best.rmse_mm
+        threads = f"{setting.threads} thread{'s' if setting.threads > 1 else ''}"
+        mean = f", mean of {setting.frames} frames ({setting.averaging_ms:.0f} ms)" if setting.frames > 1 else ""
+        cost = f"{loss_mm:.1f} mm above the best, {self.best.name}" if loss_mm > 0 else "the best of all settings"
         return (
-            f"budget {self.budget_ms:g} ms: {option.runtime} on {option.threads} "
-            f"thread{'s' if option.threads > 1 else ''}{averaged}; {self.expected_ms:.1f} ms expected at p95; "
-            f"RMSE {option.rmse_mm:.1f} mm, {cost}"
+            f"Budget {self.budget_ms:g} ms: {setting.runtime} on {threads}{mean}; expected p95 {self.expected_ms:.1f} "
+            f"ms; RMSE {setting.rmse_mm:.1f} mm, {cost}"
         )
 
     def outcome(self, report: RunReport) -> dict[str, Any]:
-        """What became of it in a run, ready for JSON; the delay of averaging counts."""
-        p95_ms = report.latency_ms["p95"] + self.option.averaging_ms
-        option = self.option.model_dump(include={"name", "weights", "runtime", "threads", "frames"})
-        figures = {"expected_ms": self.expected_ms, "rmse_mm": self.option.rmse_mm, "best_rmse_mm": self.best.rmse_mm}
-        return {"ms": self.budget_ms, **option, **figures, "p95_ms": p95_ms, "kept": p95_ms <= self.budget_ms}
+        """Return the choice and its result in a run, ready for JSON; `p95_ms` includes averaging."""
+        p95_ms = report.latency_ms["p95"] + self.setting.averaging_ms
+        setting = self.setting.model_dump(include={"name", "weights", "runtime", "threads", "frames"})
+        figures = {"expected_ms": self.expected_ms, "rmse_mm": self.setting.rmse_mm, "best_rmse_mm": self.best.rmse_mm}
+        return {"ms": self.budget_ms, **setting, **figures, "p95_ms": p95_ms, "kept": p95_ms <= self.budget_ms}
 
-    def outcome_told(self, report: RunReport) -> str:
-        """The same in a line."""
+    def describe_outcome(self, report: RunReport) -> str:
+        """Return whether a run met the budget in one line."""
         outcome = self.outcome(report)
-        kept = "kept" if outcome["kept"] else "NOT kept"
-        return f"budget   {self.budget_ms:g} ms {kept}: p95 {outcome['p95_ms']:.1f} ms"
+        return f"Budget {self.budget_ms:g} ms {'' if outcome['kept'] else 'NOT '}met: p95 {outcome['p95_ms']:.1f} ms"
 
 
-@dataclass(frozen=True)
-class Timed:
-    """One setting's times here, late in their distribution."""
+def load_tradeoff(path: Path) -> list[Setting]:
+    """Load the settings of a table, given as a file or its folder. Raises RecordingError."""
+    file = path / TRADEOFF if path.is_dir() else path
+    try:
+        return _Table.model_validate_json(file.read_text(encoding="utf-8")).settings
+    except (OSError, UnicodeDecodeError, ValidationError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a table of settings"
+        raise RecordingError(
+            f"cannot read {file} ({reason}): measure these weights with `nlos-cam tradeoff reconstruct --out DIR`, "
+            "and give --tradeoff DIR"
+        ) from error
 
-    network_ms: float
-    rest_ms: float
+
+def available_settings(tradeoff: Path | None, weights: Path | None) -> list[Setting]:
+    """Return the measured settings that this machine can run. Raises RecordingError, and BudgetError without any."""
+    processors = os.cpu_count() or 1
+    available = [
+        setting
+        for setting in load_tradeoff(tradeoff or weights or shipped_folder())
+        if setting.threads <= processors
+        and ("cuda" not in setting.runtime or torch.cuda.is_available())
+        and (setting.weights == SHIPPED or Path(setting.weights).is_dir())
+    ]
+    if not any(setting.frames == 1 for setting in available):
+        raise BudgetError("this machine can run no setting of the trade-off: measure with `tradeoff reconstruct`")
+    return available
+
+
+def keeping_pace(settings: Sequence[Setting], machine: Machine) -> list[Setting]:
+    """Return the settings that leave time between frames; the quickest alone if none does."""
+    quick = [setting for setting in settings if machine.busy_ms(setting) <= BUSY_SHARE * PERIOD_MS]
+    return quick or [min(settings, key=lambda setting: (machine.busy_ms(setting), setting.frames))]
+
+
+def choose(settings: Sequence[Setting], machine: Machine, budget_ms: float) -> Setting:
+    """Return the most accurate setting that keeps pace and meets the budget. Raises BudgetError without any.
+
+    Among equally accurate ones, that of the fewest threads, then the quickest.
+    """
+    paced = keeping_pace(settings, machine)
+    within = [setting for setting in paced if machine.expected_ms(setting) <= budget_ms]
+    if not within:
+        quickest = min(paced, key=machine.expected_ms)
+        raise BudgetError(
+            f"no setting meets a latency budget of {budget_ms:g} ms on this machine: the least is "
+            f"{machine.expected_ms(quickest):.1f} ms ({quickest.name}); give a larger --budget-ms"
+        )
+    return min(within, key=lambda setting: (round(setting.rmse_mm, 2), setting.threads, machine.expected_ms(setting)))
 
 
 def choose_within_budget(
     budget_ms: float,
-    options: Sequence[Option],
-    make: Make,
-    load: Callable[[Option], Reconstructor],
-    measure: Callable[[Pipeline], Timed],
+    settings: Sequence[Setting],
+    build: BuildPipeline,
+    load: Callable[[Setting], Reconstructor],
+    measure: Callable[[Pipeline], Timing],
 ) -> tuple[Reconstructor, BudgetChoice]:
-    """The networks of the setting that keeps the budget: chosen by the table, and then tried.
+    """Return the networks of the setting that meets the budget: chosen from the table, then timed here.
 
-    The table is scaled by its quickest setting of one thread and frame. One that turns out slower than expected is
-    given up for the next best. Raises BudgetError where none is left.
+    The table is scaled by its quickest setting with one frame and the fewest threads. A setting that is slower than
+    expected is replaced by the next best. Raises BudgetError if none is left.
     """
-    singles = (option for option in options if option.frames == 1)
-    anchor = min(singles, key=lambda option: (option.threads, option.milliseconds))
-    timed = measure(make(load(anchor), 1))
-    machine = Machine(timed.network_ms / anchor.milliseconds_p90, timed.rest_ms)
-    best, left = min(options, key=lambda option: option.rmse_mm), list(options)
+    singles = (setting for setting in settings if setting.frames == 1)
+    anchor = min(singles, key=lambda setting: (setting.threads, setting.milliseconds))
+    timing = measure(build(load(anchor), 1))
+    machine = Machine(timing.network_ms / anchor.milliseconds_p90, timing.rest_ms)
+    best, left = min(settings, key=lambda setting: setting.rmse_mm), list(settings)
     tried_ms: list[float] = []
     while left:
         try:
-            option = choose(left, machine, budget_ms)
+            setting = choose(left, machine, budget_ms)
         except BudgetError:
             if not tried_ms:
                 raise
             break
-        network = load(option)
-        timed = measure(make(network, option.frames))
-        expected_ms = HANDOVER_MS + timed.network_ms + timed.rest_ms + option.averaging_ms
+        network = load(setting)
+        timing = measure(build(network, setting.frames))
+        expected_ms = HANDOVER_MS + timing.network_ms + timing.rest_ms + setting.averaging_ms
         if expected_ms <= budget_ms:
-            return network, BudgetChoice(budget_ms, option, expected_ms, best)
+            return network, BudgetChoice(budget_ms, setting, expected_ms, best)
         tried_ms.append(expected_ms)
-        left.remove(option)
+        left.remove(setting)
     raise BudgetError(
-        f"no setting kept {budget_ms:g} ms when it was tried: the least was {min(tried_ms):.1f} ms; close what else "
-        "runs, or give a larger --budget-ms"
+        f"no setting met {budget_ms:g} ms when timed on this machine: the least was {min(tried_ms):.1f} ms; close "
+        "other programs, or give a larger --budget-ms"
     )
 
 
-def available_options(tradeoff: Path | None, weights: Path | None) -> list[Option]:
-    """The measured settings that can run on this machine. Raises RecordingError, and BudgetError where none can."""
-    options = load_tradeoff(tradeoff or weights or shipped_folder())
-    processors = os.cpu_count() or 1
-    here = [
-        option
-        for option in options
-        if option.threads <= processors
-        and ("cuda" not in option.runtime or torch.cuda.is_available())
-        and (option.weights == SHIPPED or Path(option.weights).is_dir())
-    ]
-    if not any(option.frames == 1 for option in here):
-        raise BudgetError("no setting of this trade-off runs on this machine: measure with `tradeoff reconstruct`")
-    return here
+def setting_loader(weights: Path | None, runtimes: Runtimes) -> Callable[[Setting], Reconstructor]:
+    """Return a function that loads a setting's networks; `weights` replace those that the table calls shipped."""
 
-
-Runtimes = Callable[[Path | None, Rig, ObjectBox, Path], Mapping[str, Callable[[int], Reconstructor]]]
-"""Weights, rig, object box and cache folder to networks by runtime and number of threads."""
-
-
-def loader(weights: Path | None, runtimes: Runtimes) -> Callable[[Option], Reconstructor]:
-    """Return a function that loads the networks of an option; `weights` are those that its table calls shipped."""
-
-    def load(option: Option) -> Reconstructor:
-        folder = weights if option.weights == SHIPPED else Path(option.weights)
+    def load(setting: Setting) -> Reconstructor:
+        folder = weights if setting.weights == SHIPPED else Path(setting.weights)
         rig = rig_named(load_record(folder or shipped_folder()).rig_name)
-        if option.runtime.startswith("torch"):
-            torch.set_num_threads(option.threads)
-        return runtimes(folder, rig, object_box(rig), cache_folder() / "onnx")[option.runtime](option.threads)
+        if setting.runtime.startswith("torch"):
+            torch.set_num_threads(setting.threads)
+        return runtimes(folder, rig, object_box(rig), cache_folder() / "onnx")[setting.runtime](setting.threads)
 
     return load
 
 
-def timer(camera: Camera, clock: Clock = time.perf_counter) -> Callable[[Pipeline], Timed]:
-    """Measures what is made of frames on this machine, as it is now; a first call, which allocates, is not counted."""
+def pipeline_timer(camera: Camera, clock: Clock = time.perf_counter) -> Callable[[Pipeline], Timing]:
+    """Return a function that times a pipeline on this machine, without its first call, which allocates."""
 
-    def measure(processing: Pipeline) -> Timed:
-        warm_up(camera, processing)
+    def measure(pipeline: Pipeline) -> Timing:
+        warm_up(camera, pipeline)
         network_s, rest_s = np.empty(CALLS), np.empty(CALLS)
         for call in range(CALLS):
             start_s = clock()
-            network_s[call] = warm_up(camera, processing, clock)["network"]
+            network_s[call] = warm_up(camera, pipeline, clock)["network"]
             rest_s[call] = clock() - start_s - network_s[call]
-        return Timed(*(1e3 * float(np.percentile(each, LATE_PERCENT)) for each in (network_s, rest_s)))
+        return Timing(*(1e3 * float(np.percentile(each, LATE_PERCENT)) for each in (network_s, rest_s)))
 
     return measure

@@ -1,4 +1,4 @@
-"""A log of a live run: one line for each frame, written as they come."""
+"""Log of a live run, one line per frame."""
 
 import csv
 import json
@@ -8,15 +8,15 @@ from typing import IO, Any, Self
 
 from nlos_cam.view import Moment
 
-SUFFIXES = ".csv", ".jsonl"
-FLUSHED_EVERY_S = 1.0
-"""So much is lost at most where the process is killed."""
+LOG_SUFFIXES = ".csv", ".jsonl"
+FLUSH_INTERVAL_S = 1.0
+"""Longest part of the log that is lost if the process is killed."""
 
 log = logging.getLogger(__name__)
 
 
-def line_of(moment: Moment) -> dict[str, Any]:
-    """What a line tells of a moment; milliseconds, and None for what is not known."""
+def log_line(moment: Moment) -> dict[str, Any]:
+    """Return the fields of a moment's line; None for unknown values."""
     return {
         "frame_number": moment.frame.frame_number,
         "timestamp_s": round(moment.frame.timestamp_s, 6),
@@ -31,10 +31,10 @@ def line_of(moment: Moment) -> dict[str, Any]:
 
 
 class FrameLog:
-    """A file of lines while entered: .csv with a header, or one JSON object a line (.jsonl).
+    """Log file, open while entered: .csv with a header, or one JSON object per line (.jsonl). Used by one thread.
 
-    The columns of a .csv are those of its first line. A disk that takes no more ends the log, with a warning, not the
-    run. Raises OSError on entering where the file cannot be opened.
+    The columns of a .csv are those of its first line. A write error ends the log with a warning, not the run. Raises
+    OSError on entering if the file cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,12 +57,12 @@ class FrameLog:
             log.warning("%s: the log's end is lost (%s)", self._path, error.strerror)
 
     def add(self, moment: Moment) -> None:
-        """Write one line."""
+        """Write one line; flushed once a second."""
         if self._file is None:
             return
         try:
-            self._write(self._file, line_of(moment))
-            if moment.published_s - self._flushed_s >= FLUSHED_EVERY_S:
+            self._write(self._file, log_line(moment))
+            if moment.published_s - self._flushed_s >= FLUSH_INTERVAL_S:
                 self._file.flush()
                 self._flushed_s = moment.published_s
         except OSError as error:

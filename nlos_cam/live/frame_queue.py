@@ -1,4 +1,4 @@
-"""A thread that reads a camera's frames into a bounded queue, so that a slow loop never holds up a camera."""
+"""Reader thread between a camera and the loop, so that a slow loop never blocks the camera."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -13,21 +13,25 @@ from nlos_cam.threads import BoundedQueue
 
 QUEUE_FRAMES = 3
 ABANDON_AFTER_S = 1.0
-"""What still reads after this is waiting for a camera."""
+"""A thread still alive after this waits for its camera."""
 JOIN_TIMEOUT_S = 10.0
 POLL_S = 0.1
-"""How often a wait looks up, so that a signal is answered."""
+"""Interval at which a wait checks for signals."""
 SAME_CLOCK_S = 10.0
 """Timestamps this close to the host's time of day are host time; others have a zero of their own."""
 
 
-class FrameReader:
-    """A thread that reads frames into a queue of three while entered.
+def ignore(*_: object) -> None:
+    """Do nothing: the default of callbacks."""
 
-    When the queue is full it drops the oldest frame and counts it by number, or, if it `lossless`, waits. Iterating
-    ends where the frames end, when `stop` is set, or when it is `enough`, also while no frame comes; their source's
-    exception is raised to whoever iterates, whose `on_wait` is called ten times a second while no frame comes. On
-    leaving, a source that keeps the thread waiting is told to `let_go`.
+
+class FrameReader:
+    """Thread that reads frames into a bounded queue while entered; iterate from one other thread.
+
+    A full queue drops its oldest frame and records its number, or, if `lossless`, blocks the camera. Iteration ends
+    with the frames, once `stop` is set, or once `should_stop` returns True, and raises the exception of the frames'
+    source. While no frame comes, it calls `on_idle` every POLL_S. Leaving calls `abandon_source` if the thread has not
+    ended after ABANDON_AFTER_S, and raises CameraLostError if that does not end it.
     """
 
     def __init__(
@@ -37,17 +41,18 @@ class FrameReader:
         lossless: bool,
         stop: Event,
         clock: Clock = time.time,
-        enough: Callable[[], bool] = lambda: False,
-        let_go: Callable[[], None] = lambda: None,
-        on_wait: Callable[[], None] = lambda: None,
+        should_stop: Callable[[], bool] = lambda: False,
+        abandon_source: Callable[[], None] = ignore,
+        on_idle: Callable[[], None] = ignore,
     ) -> None:
         self.dropped: list[int] = []
         """Frame numbers."""
         self.newest_s: float | None = None
-        """When the newest frame arrived; None before the first."""
-        self._least_delay_s = float("inf")
-        self._frames, self._keeps_all, self._clock = frames, lossless, clock
-        self._stop, self._enough, self._let_go, self._on_wait = stop, enough, let_go, on_wait
+        """Arrival of the newest frame; None before the first."""
+        self._shortest_delay_s = float("inf")
+        self._frames, self._lossless, self._clock = frames, lossless, clock
+        self._stop, self._should_stop = stop, should_stop
+        self._abandon_source, self._on_idle = abandon_source, on_idle
         self._queue = BoundedQueue[Arrival](QUEUE_FRAMES)
         self._thread = Thread(target=self._read, name="frame reader", daemon=True)
 
@@ -56,15 +61,12 @@ class FrameReader:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._queue.finish()
         self._thread.join(ABANDON_AFTER_S)
         if self._thread.is_alive():
-            self._let_go()
+            self._abandon_source()
             self._thread.join(JOIN_TIMEOUT_S)
         if self._thread.is_alive() and error is None:
             raise CameraLostError(f"the camera did not stop within {JOIN_TIMEOUT_S:.0f} s: replug it")
@@ -75,7 +77,7 @@ class FrameReader:
             if self._is_done:
                 return
             if not has_item:
-                self._on_wait()
+                self._on_idle()
             elif (arrival := self._queue.take()) is not None:
                 yield arrival
             else:
@@ -93,19 +95,19 @@ class FrameReader:
 
     def _put(self, arrival: Arrival) -> bool:
         """Queue a frame; return False once no more are wanted."""
-        while self._keeps_all and not self._queue.wait_for_room(POLL_S) and not self._stop.is_set():
+        while self._lossless and not self._queue.wait_for_room(POLL_S) and not self._stop.is_set():
             pass
         self.newest_s = arrival.arrived_s
-        self._least_delay_s = min(self._least_delay_s, arrival.arrived_s - arrival.frame.timestamp_s)
+        self._shortest_delay_s = min(self._shortest_delay_s, arrival.arrived_s - arrival.frame.timestamp_s)
         if (dropped := self._queue.put(arrival)) is not None:
             self.dropped.append(dropped.frame.frame_number)
         return not (self._queue.finished or self._stop.is_set())
 
     @property
     def offset_s(self) -> float:
-        """What makes host time of a timestamp: 0 if it is that already, else such that the fastest delivery took 0."""
-        return 0.0 if abs(self._least_delay_s) < SAME_CLOCK_S else self._least_delay_s
+        """Host time less timestamp: 0 if timestamps are host time, else such that the fastest delivery took 0 s."""
+        return 0.0 if abs(self._shortest_delay_s) < SAME_CLOCK_S else self._shortest_delay_s
 
     @property
     def _is_done(self) -> bool:
-        return self._stop.is_set() or self._enough()
+        return self._stop.is_set() or self._should_stop()

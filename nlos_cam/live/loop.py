@@ -1,9 +1,4 @@
-"""The streaming loop: each frame's way from a camera to a reconstruction and to a viewer, timed.
-
-What the loop shows: a moment of each step, and the last one again while the camera stalls.
-
-What can be seen to be amiss with a frame: blank, half invalid, saturated.
-"""
+"""Live loop: a camera's frames through the pipeline to a viewer, with statistics and stall display."""
 
 import os
 import time
@@ -17,9 +12,9 @@ import numpy as np
 
 from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame, maps_from_frame
-from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.statistics import DELIVERY, OnWarning, RunReport, RunStatistics, ignore
-from nlos_cam.live.telemetry import Telemetry, telemetry_of
+from nlos_cam.live.frame_queue import FrameReader, ignore
+from nlos_cam.live.statistics import DELIVERY, OnWarning, RunReport, RunStatistics
+from nlos_cam.live.telemetry import Telemetry, with_telemetry
 from nlos_cam.reconstruct import (
     Arrival,
     Clock,
@@ -33,141 +28,72 @@ from nlos_cam.reconstruct import (
 )
 from nlos_cam.view import Moment, Viewer
 
+USUAL_DEPTH_M = 0.3
+BATCH_FRAMES = 4
+"""Frames per batch of the networks in a replay: two thirds of the time per frame."""
+MAX_BATCHES_AHEAD = 2
+"""Batches in the networks while earlier ones are finished: about the duration of a physics check."""
+
+OnFailure = Callable[[Frame, Exception, int], None]
+"""Called with a frame that failed, its error, and the number of failures in a row; raises to end the run."""
+
 
 class LiveDisplay:
-    """Makes moments of steps, and shows them; the last one again while the camera stalls."""
+    """Display of results as moments, and of the last one again while the camera stalls. Used by the loop's thread."""
 
     def __init__(
-        self,
-        viewer: Viewer,
-        dropped: Callable[[], int],
-        reader: FrameReader,
-        thermometer: Telemetry,
-        clock: Clock,
+        self, viewer: Viewer, count_dropped: Callable[[], int], reader: FrameReader, telemetry: Telemetry, clock: Clock
     ) -> None:
-        self._viewer, self._dropped, self._reader = viewer, dropped, reader
-        self._thermometer, self._clock = thermometer, clock
+        self._viewer, self._count_dropped, self._reader = viewer, count_dropped, reader
+        self._telemetry, self._clock = telemetry, clock
         self._last: Moment | None = None
 
-    def show(self, step: FrameResult) -> Moment:
-        """Of one step, as it is shown."""
-        stages_s = {**self._delivery_s(step), **step.stages_s}
+    def show(self, result: FrameResult) -> Moment:
+        """Show a result, and return its moment."""
+        frame = result.frame
+        delivery = {} if result.arrived_s is None else {DELIVERY: self._age_s(frame, result.arrived_s)}
         self._last = moment = Moment(
-            step.frame,
-            step.reconstruction,
-            step.published_s,
-            self._age_s(step.frame, step.published_s),
-            step.difference,
-            step.warnings,
-            step.verdict,
-            step.check,
-            stages_s,
-            self._dropped(),
-            self._thermometer.celsius,
+            frame,
+            result.reconstruction,
+            published_s=result.published_s,
+            latency_s=self._age_s(frame, result.published_s),
+            difference=result.difference,
+            warnings=result.warnings,
+            verdict=result.verdict,
+            check=result.check,
+            stages_s={**delivery, **result.stages_s},
+            dropped=self._count_dropped(),
+            celsius=self._telemetry.celsius,
         )
         self._viewer.show(moment)
         return moment
 
-    def stalled(self) -> None:
-        """Show the last moment again, as old as it is; none, where there was none."""
+    def show_stall(self) -> None:
+        """Show the last moment again, if any, with its present age."""
         if self._last is not None:
             now_s = self._clock()
-            age_s, verdict = self._age_s(self._last.frame, now_s), Verdict.STALLED
-            again = replace(self._last, published_s=now_s, latency_s=age_s, verdict=verdict, dropped=self._dropped())
-            self._viewer.show(again)
-
-    def _delivery_s(self, step: FrameResult) -> dict[str, float]:
-        return {} if step.arrived_s is None else {DELIVERY: self._age_s(step.frame, step.arrived_s)}
+            age_s, dropped = self._age_s(self._last.frame, now_s), self._count_dropped()
+            stalled = Verdict.STALLED
+            self._viewer.show(replace(self._last, published_s=now_s, latency_s=age_s, verdict=stalled, dropped=dropped))
 
     def _age_s(self, frame: Frame, now_s: float) -> float:
         return now_s - frame.timestamp_s - self._reader.offset_s
 
 
 def describe_counts(counts: Mapping[str, int]) -> str:
-    """Counts by name as a person reads them; empty where there are none."""
+    """Return counts by name as text, "3 out of order, 1 blank"; empty if there are none."""
     return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
 
 
-def watched(frames: Iterable[Frame], seen: Counter[str]) -> Iterator[Frame]:
-    """The same frames; what is amiss with them is counted in `seen`."""
+def count_issues(frames: Iterable[Frame], counts: Counter[str]) -> Iterator[Frame]:
+    """Yield the same frames, and add their issues to `counts`."""
     for frame in frames:
-        seen.update(frame_issues(frame))
+        counts.update(frame_issues(frame))
         yield frame
 
 
-USUAL_DEPTH_M = 0.3
-
-
-def warm_up(camera: Camera, processing: Pipeline, clock: Clock = time.perf_counter) -> Mapping[str, float]:
-    """Reconstruct a frame that is all the same, before the camera is entered; seconds by stage.
-
-    What is compiled or allocated on first use would otherwise hold up the first frame, and drop those after it.
-    """
-    shape = camera.intrinsics.height, camera.intrinsics.width
-    dark, flat = np.zeros(shape, np.uint8), np.full(shape, USUAL_DEPTH_M, np.float32)
-    frame = Frame(flat, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics)
-    made = reconstruct(
-        maps_from_frame(frame), processing.bench.rig, processing.network, clock, processing.uncertainty_model
-    )
-    return made.timings_s
-
-
-def run_live(
-    camera: Camera,
-    processing: Pipeline,
-    viewer: Viewer,
-    *,
-    stop: Event,
-    seconds: float | None = None,
-    recorded: bool = False,
-    clock: Clock = time.time,
-    on_error: Callable[[RunReport], None] = lambda _: None,
-    on_warning: OnWarning = ignore,
-    on_moment: Callable[[Moment], None] = lambda _: None,
-) -> RunReport:
-    """Reconstruct an entered camera's frames and show them, until it ends, `stop` is set, or `seconds` have passed.
-
-    One that is `recorded` loses no frame and is shown at the speed it was recorded. A camera that keeps the loop's end
-    waiting is left. A frame that comes to no result is counted. While none comes, the last is shown again, as stalled.
-    `on_warning` hears when a warning begins and ends, `on_moment` of each frame's result once it is shown.
-    Raises what the camera raises, and NlosCamError where none comes to a result, once `on_error` has had the report.
-    """
-    tally = RunStatistics(on_warning)
-    frames, thermometer = with_telemetry(camera, camera)
-    frames = watched(paced(frames, stop, clock) if recorded else frames, tally.seen)
-
-    def enough() -> bool:
-        return seconds is not None and tally.lasted_s(clock()) >= seconds
-
-    def leave() -> None:
-        camera.__exit__(None, None, None)
-
-    def look_up() -> None:
-        if tally.stall.look(clock(), reader.newest_s):
-            moments.stalled()
-
-    def report() -> RunReport:
-        tally.stall.close(clock())
-        return tally.report(camera, reader)
-
-    reader = FrameReader(
-        frames, lossless=recorded, stop=stop, clock=clock, enough=enough, let_go=leave, on_wait=look_up
-    )
-    moments = LiveDisplay(viewer, lambda: sum(tally.lost(camera, reader).values()), reader, thermometer, clock)
-    try:
-        with reader, processing.checks:
-            for step in iterate_results(reader, processing, clock, tally.fail, thermometer):
-                moment = moments.show(step)
-                tally.add(step, clock() - step.published_s)
-                on_moment(moment)
-    except Exception:
-        on_error(report())
-        raise
-    return report()
-
-
-def paced(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]:
-    """Frames no sooner, after the first, than their timestamps say."""
+def pace(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]:
+    """Yield recorded frames at the intervals of their timestamps, or later."""
     offset_s: float | None = None
     for frame in frames:
         offset_s = clock() - frame.timestamp_s if offset_s is None else offset_s
@@ -176,93 +102,140 @@ def paced(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]
         yield frame
 
 
-FRAMES_TOGETHER = 4
-"""Where nobody waits for them, the networks take so many frames at once: two thirds of the time for each."""
+def warm_up(camera: Camera, pipeline: Pipeline, clock: Clock = time.perf_counter) -> Mapping[str, float]:
+    """Reconstruct a flat frame before the camera is entered, and return its seconds by stage.
+
+    Compiling and allocating on first use would delay the first frame, and drop those after it.
+    """
+    shape = camera.intrinsics.height, camera.intrinsics.width
+    dark, flat = np.zeros(shape, np.uint8), np.full(shape, USUAL_DEPTH_M, np.float32)
+    maps = maps_from_frame(Frame(flat, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics))
+    return reconstruct(maps, pipeline.bench.rig, pipeline.network, clock, pipeline.uncertainty_model).timings_s
 
 
-MAX_BATCHES_AHEAD = 2
-"""So many times as many are worked on while others are judged: for about as long as a physics check takes."""
+def run_live(
+    camera: Camera,
+    pipeline: Pipeline,
+    viewer: Viewer,
+    *,
+    stop: Event,
+    seconds: float | None = None,
+    recorded: bool = False,
+    clock: Clock = time.time,
+    on_error: Callable[[RunReport], None] = ignore,
+    on_warning: OnWarning = ignore,
+    on_moment: Callable[[Moment], None] = ignore,
+) -> RunReport:
+    """Reconstruct and show an entered camera's frames until it ends, `stop` is set, or `seconds` have passed.
+
+    A `recorded` camera loses no frame and is shown at the speed of its recording. If the camera does not stop in time,
+    its context is closed from here. Frames that fail are counted. While no frame comes, the last one is shown again, as
+    stalled. `on_warning` is called when a warning begins and ends, `on_moment` for each result shown. Raises the
+    camera's errors, and NlosCamError if frame after frame fails, after `on_error` has received the report.
+    """
+    statistics = RunStatistics(on_warning)
+    frames, telemetry = with_telemetry(camera)
+    frames = count_issues(pace(frames, stop, clock) if recorded else frames, statistics.issues)
+
+    def should_stop() -> bool:
+        return seconds is not None and statistics.duration_s(clock()) >= seconds
+
+    def on_idle() -> None:
+        if statistics.stall.update(clock(), reader.newest_s):
+            display.show_stall()
+
+    def report() -> RunReport:
+        statistics.stall.close(clock())
+        return statistics.report(camera, reader)
+
+    reader = FrameReader(
+        frames,
+        lossless=recorded,
+        stop=stop,
+        clock=clock,
+        should_stop=should_stop,
+        abandon_source=lambda: camera.__exit__(None, None, None),
+        on_idle=on_idle,
+    )
+    display = LiveDisplay(viewer, lambda: sum(statistics.lost(camera, reader).values()), reader, telemetry, clock)
+    try:
+        with reader, pipeline.checks:
+            for result in iterate_results(reader, pipeline, clock, statistics.fail, telemetry):
+                moment = display.show(result)
+                statistics.add(result, clock() - result.published_s)
+                on_moment(moment)
+    except Exception:
+        on_error(report())
+        raise
+    return report()
 
 
-OnFailure = Callable[[Frame, Exception, int], None]
-"""Called with a frame that came to no result, why, and how many have in a row; raises to end there."""
-
-
-def _refuse(frame: Frame, error: Exception, in_a_row: int) -> None:
+def _raise_error(frame: Frame, error: Exception, in_a_row: int) -> None:
     del frame, in_a_row
     raise error
 
 
-def with_telemetry(frames: Iterable[Frame], camera: Camera) -> tuple[Iterable[Frame], Telemetry]:
-    """The same frames, and the camera's thermometer, read as they pass."""
-    thermometer = telemetry_of(camera)
-    return thermometer.watch(frames), thermometer
-
-
 def iterate_results(
     reader: FrameReader,
-    processing: Pipeline,
+    pipeline: Pipeline,
     clock: Clock = time.time,
-    on_failure: OnFailure = _refuse,
-    thermometer: Telemetry | None = None,
+    on_failure: OnFailure = _raise_error,
+    telemetry: Telemetry | None = None,
 ) -> Generator[FrameResult]:
-    """Reconstruct every frame that the reader gives, in order."""
+    """Yield the result of every frame of an entered reader, in order."""
     start_s, in_a_row = clock(), 0
     for arrival in reader:
         try:
-            _follow(thermometer, arrival, processing)
-            step = processing.process(arrival, clock, start_s)
-        except Exception as error:  # noqa: BLE001  whatever an odd frame leads to, who called decides
+            _update_temperatures(telemetry, arrival, pipeline)
+            result = pipeline.process(arrival, clock, start_s)
+        except Exception as error:  # noqa: BLE001  whatever an odd frame leads to, the caller decides
             in_a_row += 1
             on_failure(arrival.frame, error, in_a_row)
         else:
             in_a_row = 0
-            yield step
+            yield result
         start_s = clock()
 
 
 def iterate_batched(
-    reader: FrameReader, processing: Pipeline, clock: Clock = time.time, thermometer: Telemetry | None = None
+    reader: FrameReader, pipeline: Pipeline, clock: Clock = time.time, telemetry: Telemetry | None = None
 ) -> Generator[FrameResult]:
-    """The same steps in the same order, for frames that nobody waits for: the networks take several at once.
+    """Yield the same results in the same order, with several frames per call of the networks: for replays.
 
-    Which ones does not depend on how fast they come, so the same frames give the same bits. What one leads to ends it.
+    Batches do not depend on timing, so the same frames give the same bits. The first error ends the iteration.
     """
     ahead = deque[tuple[Sequence[PreparedFrame], Future[list[Reconstruction]]]]()
+
+    def finish_oldest() -> Generator[FrameResult]:
+        batch, reconstructions = ahead.popleft()
+        for prepared, reconstruction in zip(batch, reconstructions.result(), strict=True):
+            yield pipeline.finish(prepared, reconstruction, clock)
+
     with ThreadPoolExecutor(os.cpu_count(), "networks") as threads:
-        for together in _batches(reader, processing, clock, thermometer):
-            ahead.append((together, threads.submit(processing.reconstruct, together, clock)))
+        for batch in _batches(reader, pipeline, clock, telemetry):
+            ahead.append((batch, threads.submit(pipeline.reconstruct, batch, clock)))
             if len(ahead) > MAX_BATCHES_AHEAD:
-                yield from _finished(*ahead.popleft(), processing, clock)
-        for lot in ahead:
-            yield from _finished(*lot, processing, clock)
+                yield from finish_oldest()
+        while ahead:
+            yield from finish_oldest()
 
 
 def _batches(
-    reader: FrameReader, processing: Pipeline, clock: Clock, thermometer: Telemetry | None
+    reader: FrameReader, pipeline: Pipeline, clock: Clock, telemetry: Telemetry | None
 ) -> Generator[Sequence[PreparedFrame]]:
-    """What the lidar saw, FRAMES_TOGETHER at a time; fewer at the end."""
-    together, start_s = list[PreparedFrame](), clock()
+    """Yield the prepared frames, BATCH_FRAMES at a time; fewer at the end."""
+    batch, start_s = list[PreparedFrame](), clock()
     for arrival in reader:
-        _follow(thermometer, arrival, processing)
-        together.append(processing.prepare(arrival, clock, start_s))
-        if len(together) == FRAMES_TOGETHER:
-            yield together
-            together = []
+        _update_temperatures(telemetry, arrival, pipeline)
+        batch.append(pipeline.prepare(arrival, clock, start_s))
+        if len(batch) == BATCH_FRAMES:
+            yield batch
+            batch = []
         start_s = clock()
-    if together:
-        yield together
+    if batch:
+        yield batch
 
 
-def _finished(
-    together: Sequence[PreparedFrame], making: Future[list[Reconstruction]], processing: Pipeline, clock: Clock
-) -> Generator[FrameResult]:
-    """The steps of frames taken together, once they are made."""
-    for seen, made in zip(together, making.result(), strict=True):
-        yield processing.finish(seen, made, clock)
-
-
-def _follow(thermometer: Telemetry | None, arrival: Arrival, processing: Pipeline) -> None:
-    """Have the bench follow the lidar's temperature."""
-    if thermometer and (celsius := thermometer.at(arrival.frame)):
-        processing.bench.update_temperatures(celsius)
+def _update_temperatures(telemetry: Telemetry | None, arrival: Arrival, pipeline: Pipeline) -> None:
+    if telemetry and (celsius := telemetry.at(arrival.frame)):
+        pipeline.bench.update_temperatures(celsius)

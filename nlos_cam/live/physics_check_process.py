@@ -1,9 +1,8 @@
-"""Physics checks beside a streaming loop, in a process of little urgency that never holds the loop up.
+"""Physics checks in a separate process of low priority, which never delays the live loop.
 
-The process of physics checks, `python -m nlos_cam.physics_check_worker`: asked by stdin, told by stdout.
-
-It takes rig and accuracy first, then one frame after another, each as a pickle, and answers each with a Check, or with
-a text where that failed. It ends with its stdin, in the midst of a check too: however its parent ends, it does.
+`python -m nlos_cam.live.physics_check_process` is that process. It reads rig and accuracy from stdin, then frames, each
+as a pickle, and answers each with a PhysicsCheckResult, or with a text if the check failed. It exits as soon as stdin
+closes, even during a check, so it never outlives its parent.
 """
 
 import os
@@ -29,14 +28,17 @@ from nlos_cam.threads import BoundedQueue
 PERIOD_S = 1.0
 WORKER = sys.executable, "-m", "nlos_cam.live.physics_check_process"
 END_WITHIN_S = 2.0
-"""What has not ended by then is killed."""
+"""A process that has not ended by then is killed."""
+LOWEST_PRIORITY = 19
+"""`nice` of the process: it gets the processor time that the loop leaves."""
 
 
 class BackgroundPhysicsCheck:
-    """Checks the newest frame about once a period, in a process of its own while entered.
+    """Physics check of the newest frame about once a period, in a process of its own while entered.
 
-    `offer` returns at once. What is due while another is worked on waits, one frame at most: a newer one takes its
-    place. Where checks fail, or the process ends, `on_error` hears of the first time, and the loop goes on.
+    `offer`, for one thread, returns at once: a frame that is due while another is checked waits, until a newer one
+    replaces it. A thread talks to the process. `on_error` is called for the first failed check, or if the process ends;
+    the loop continues without.
     """
 
     def __init__(
@@ -51,21 +53,21 @@ class BackgroundPhysicsCheck:
     ) -> None:
         self.newest: PhysicsCheckResult | None = None
         self.dropped = 0
-        """Frames that were due, and that a newer one took the place of."""
-        self._about, self._period_s, self._clock = (rig, accuracy), period_s, clock
-        self._on_error, self._said, self._command = on_error, False, command
+        """Due frames that a newer one replaced."""
+        self._setup, self._period_s, self._clock = (rig, accuracy), period_s, clock
+        self._on_error, self._reported, self._command = on_error, False, command
         self._due_s = -float("inf")
         self._queue = BoundedQueue[tuple[int, LidarMaps, Float32]](1)
         self.process: subprocess.Popen[bytes] | None = None
-        """None where it could not be started."""
-        self._thread = Thread(target=self._run, name="physics check", daemon=True)
+        """None if it could not be started."""
 
     def __enter__(self) -> Self:
         try:
-            self.process = _started(self._command)
+            self.process = _start(self._command)
         except OSError as error:
-            self._over(f"their process cannot be started ({error.strerror})")
+            self._give_up(f"cannot start their process ({error.strerror})")
         else:
+            self._thread = Thread(target=self._run, args=(self.process,), name="physics check", daemon=True)
             self._thread.start()
         return self
 
@@ -76,7 +78,7 @@ class BackgroundPhysicsCheck:
             self._thread.join(END_WITHIN_S)
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
-        """Have this frame checked if one is due."""
+        """Have this frame checked if a check is due."""
         if (now_s := self._clock()) < self._due_s:
             return
         self._due_s = now_s + self._period_s
@@ -84,50 +86,47 @@ class BackgroundPhysicsCheck:
 
     @property
     def waits(self) -> bool:
-        """Whether a frame waits to be checked."""
+        """Whether a frame waits for its check."""
         return len(self._queue) > 0
 
     @property
-    def over(self) -> bool:
-        """Whether nothing will be checked any more."""
+    def ended(self) -> bool:
+        """Whether there will be no more checks."""
         return self._queue.closed
 
-    def _run(self) -> None:
-        if (process := self.process) is None:
-            return
-        with suppress(OSError), process:  # closing a pipe that nobody reads any more is one
+    def _run(self, process: subprocess.Popen[bytes]) -> None:
+        with suppress(OSError), process:  # closing a broken pipe raises
             try:
                 self._ask(process)
             except (OSError, EOFError, pickle.PickleError):
                 _end(process)
-                self._over(f"their process ended ({process.returncode})")
-
-    def _over(self, why: str) -> None:
-        """There are no more checks, and never again a frame that waits for one."""
-        self._say(f"no more physics checks: {why}")
-        self._queue.close()
+                self._give_up(f"their process ended ({process.returncode})")
 
     def _ask(self, process: subprocess.Popen[bytes]) -> None:
-        asked, told = process.stdin, process.stdout
-        if asked is None or told is None:
+        to_worker, from_worker = process.stdin, process.stdout
+        if to_worker is None or from_worker is None:
             return
-        _send(asked, self._about)
+        _send(to_worker, self._setup)
         while (frame := self._queue.take()) is not None:
-            _send(asked, frame)
-            answer = pickle.load(told)  # noqa: S301  of our own process, through a pipe that nobody else has
+            _send(to_worker, frame)
+            answer = pickle.load(from_worker)  # noqa: S301  from our own process, through a private pipe
             if isinstance(answer, PhysicsCheckResult):
                 self.newest = answer
             else:
-                self._say(describe_failure(frame[0], str(answer)))
+                self._report(describe_failure(frame[0], str(answer)))
 
-    def _say(self, text: str) -> None:
-        if not (self._said or self._queue.closed):
-            self._said = True
+    def _give_up(self, reason: str) -> None:
+        self._report(f"no more physics checks: {reason}")
+        self._queue.close()
+
+    def _report(self, text: str) -> None:
+        if not (self._reported or self.ended):
+            self._reported = True
             self._on_error(text)
 
 
-def _started(command: Sequence[str]) -> subprocess.Popen[bytes]:
-    """The process, on one core, where a Ctrl-C at the terminal does not reach it, with the modules that we see."""
+def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:
+    """Start the process with one thread and our import path, in a group that Ctrl-C at the terminal does not reach."""
     one_thread = {f"{name}_NUM_THREADS": "1" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
     path = os.pathsep.join(entry for entry in sys.path if entry)
     group, flags = 0, 0
@@ -137,13 +136,13 @@ def _started(command: Sequence[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen([*command], stdin=pipe, stdout=pipe, env=env, process_group=group, creationflags=flags)
 
 
-def _send(to: IO[bytes], what: object) -> None:
-    pickle.dump(what, to)
-    to.flush()
+def _send(pipe: IO[bytes], message: object) -> None:
+    pickle.dump(message, pipe)
+    pipe.flush()
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Have it end, and wait until it has."""
+    """Terminate the process and wait for it; kill it after END_WITHIN_S."""
     process.terminate()
     try:
         process.wait(END_WITHIN_S)
@@ -152,44 +151,39 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-LOWEST_PRIORITY = 19
-"""`nice` of the process: it gets what the loop leaves."""
+def serve(from_parent: IO[bytes], to_parent: IO[bytes], leave: Callable[[], None]) -> None:
+    """Answer every frame until there are no more; calls `leave` then, even during a check."""
+    messages: SimpleQueue[Any] = SimpleQueue()
+    Thread(target=_listen, args=(from_parent, messages, leave), daemon=True).start()
+    rig, accuracy = messages.get()
+    from nlos_cam.reconstruct import check_reconstruction  # takes a second, during which stdin is already watched
 
-
-def serve(asked: IO[bytes], told: IO[bytes], leave: Callable[[], None]) -> None:
-    """Answer every question until there are no more; then `leave` is called, while one may be worked on."""
-    questions: SimpleQueue[Any] = SimpleQueue()
-    Thread(target=_listen, args=(asked, questions, leave), daemon=True).start()
-    rig, accuracy = questions.get()
-    from nlos_cam.reconstruct import check_reconstruction  # takes a second to import: stdin is listened to meanwhile
-
-    while (question := questions.get()) is not None:
-        frame_number, maps, depth_m = question
+    while (message := messages.get()) is not None:
+        frame_number, maps, depth_m = message
         try:
             answer: object = check_reconstruction(maps, depth_m, rig, frame_number=frame_number, accuracy=accuracy)
-        except Exception as error:  # noqa: BLE001  whatever it was, it is told, and the next frame is looked at
+        except Exception as error:  # noqa: BLE001  whatever it was, it is reported, and the next frame is checked
             answer = f"{type(error).__name__}: {error}"
         with suppress(BrokenPipeError):
-            pickle.dump(answer, told)
-            told.flush()
+            _send(to_parent, answer)
 
 
-def _listen(asked: IO[bytes], questions: SimpleQueue[Any], leave: Callable[[], None]) -> None:
+def _listen(from_parent: IO[bytes], messages: SimpleQueue[Any], leave: Callable[[], None]) -> None:
     try:
         while True:
-            questions.put(pickle.load(asked))  # noqa: S301  of our own parent, through a pipe that nobody else has
+            messages.put(pickle.load(from_parent))  # noqa: S301  from our own parent, through a private pipe
     except (EOFError, OSError, pickle.UnpicklingError):
-        questions.put(None)
+        messages.put(None)
         leave()
 
 
 def main() -> None:
-    """Work for the parent, as little urgent as can be."""
+    """Serve the parent at the lowest priority."""
     drop_realtime_priority()
     if hasattr(os, "nice"):
         os.nice(LOWEST_PRIORITY)
-    told, sys.stdout = sys.stdout.buffer, sys.stderr  # what anybody prints is no answer
-    serve(sys.stdin.buffer, told, leave=lambda: os._exit(0))
+    answers, sys.stdout = sys.stdout.buffer, sys.stderr  # keeps prints out of the answers
+    serve(sys.stdin.buffer, answers, leave=lambda: os._exit(0))
 
 
 if __name__ == "__main__":

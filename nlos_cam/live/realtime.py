@@ -1,9 +1,7 @@
-"""The live loop before whatever else runs, where the system lets it: a busy browser cannot hold it up.
+"""Scheduling of the live loop: real-time priority, and an interpreter without long pauses.
 
-Linux has this for root, for whom has CAP_SYS_NICE, and for users with an `rtprio` limit (ulimit -r). Elsewhere
-nothing changes, and nothing is said: the loop keeps its pace as long as there is a processor for it.
-
-A process set up for a loop that must not be held up by its own runtime.
+Linux grants real-time priority to root, to processes with CAP_SYS_NICE, and to users with an `rtprio` limit (ulimit
+-r). Elsewhere nothing changes: the loop keeps its pace as long as it has a processor.
 """
 
 import gc
@@ -14,13 +12,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 LOOP, DRAWING, ORDINARY = 2, 1, 0
-"""Real-time priorities, the lowest two: the loop goes before drawing, both before what has none."""
+"""Real-time priorities, the lowest two: the loop before drawing, both before ordinary threads (0: none)."""
 TASKS = Path("/proc/self/task")
+SWITCH_S = 0.001
+"""Interval at which threads hand over the interpreter: at Python's 5 ms, three threads that each took their turn could
+delay a frame by half of its period."""
 
 
 @contextmanager
 def realtime_priority() -> Generator[bool]:
-    """Meanwhile all threads of this process, and those that they start, go before ordinary ones; whether they may."""
+    """Give all threads of this process, and those that they start, real-time priority; yield whether that worked."""
     allowed = _all_threads(LOOP)
     try:
         yield allowed
@@ -30,13 +31,13 @@ def realtime_priority() -> Generator[bool]:
 
 
 def yield_to_loop() -> None:
-    """From now on the calling thread goes after the loop, if that has realtime_priority, and before ordinary ones."""
+    """Schedule the calling thread after the loop, if that has real-time priority, and before ordinary threads."""
     if _has_schedules() and os.sched_getscheduler(0) == os.SCHED_RR:
         _schedule(0, DRAWING)
 
 
 def drop_realtime_priority() -> None:
-    """From now on the calling process, which a loop with realtime_priority may have started, goes like an ordinary one."""
+    """Schedule the calling process as an ordinary one, also if a loop with real-time priority started it."""
     if _has_schedules():
         _schedule(0, ORDINARY)
 
@@ -46,13 +47,13 @@ def _has_schedules() -> bool:
 
 
 def _all_threads(priority: int) -> bool:
-    """False where that is not allowed."""
+    """Set the priority of all threads; return False if that is not permitted."""
     if not _has_schedules():
         return False
     for task in TASKS.iterdir():
         try:
             _schedule(int(task.name), priority)
-        except ProcessLookupError:  # it ended meanwhile
+        except ProcessLookupError:  # the thread has ended since
             continue
         except PermissionError:
             return False
@@ -64,17 +65,12 @@ def _schedule(task: int, priority: int) -> None:
     os.sched_setscheduler(task, policy, os.sched_param(priority))
 
 
-SWITCH_S = 0.001
-"""How long a thread may keep the interpreter while others want it: at Python's 5 ms, three threads that each took their
-turn could hold a frame up for half of its period."""
-
-
 @contextmanager
 def low_latency_interpreter() -> Generator[None]:
-    """Meanwhile what is alive now is not looked through for garbage, and threads take shorter turns.
+    """Exempt the objects alive now from garbage collection, and shorten the threads' turns.
 
-    A collection over the modules and networks of a live run takes 0.2 s: six frames. What comes later is still
-    collected, so memory stays flat. Entering collects once: enter before the camera runs.
+    A collection over the modules and networks of a live run takes 0.2 s: six frames. Later objects are still collected,
+    so memory stays flat. Entering collects once: enter before the camera runs.
     """
     before_s = sys.getswitchinterval()
     gc.collect()

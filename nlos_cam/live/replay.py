@@ -1,4 +1,4 @@
-"""A whole recording to files: every frame's hidden depth, its difference maps, a contact sheet and a short report."""
+"""Replay of a whole recording to files: hidden depth, difference maps, contact sheet, media and a report."""
 
 import time
 from collections import Counter
@@ -18,10 +18,11 @@ from nlos_cam.camera import Camera
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.loop import describe_counts, iterate_batched, with_telemetry
-from nlos_cam.live.replay_media import Looks, Samples, draw_sheet
-from nlos_cam.live.statistics import OnWarning, WarningLog, frames_by_verdict, ignore
+from nlos_cam.live.frame_queue import FrameReader, ignore
+from nlos_cam.live.loop import describe_counts, iterate_batched
+from nlos_cam.live.replay_media import FrameSampler, ReplayMedia, draw_contact_sheet
+from nlos_cam.live.statistics import OnWarning, WarningLog, frames_by_verdict
+from nlos_cam.live.telemetry import with_telemetry
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import UNEXPLAINED, CalibratedRig, Clock, FrameResult, Pipeline, Verdict
 
@@ -31,20 +32,20 @@ SHEET_FRAMES = 6
 
 @dataclass(frozen=True)
 class ReplayReport:
-    """What a replay did."""
+    """Summary of a replay."""
 
     frames: int
     seconds: float
-    """How long the replay took."""
+    """Duration of the replay itself."""
     out: str
     warnings: Mapping[str, int] = field(default_factory=dict[str, int])
-    """Of the bench, and the frames that each held for."""
+    """Number of frames by warning of the bench."""
     verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
-    """By verdict, the frames that it was passed on; empty from networks that pass none."""
+    """Number of frames by verdict; empty without an uncertainty model."""
 
 
 class _Stack:
-    """Arrays of one shape that go to a file as they come, so that an hour of them fits into memory."""
+    """Arrays of one shape, written to a file one by one, so that an hour of them fits into memory."""
 
     def __init__(self, file: IO[bytes], *shape: int) -> None:
         self._file, self._shape, self._count = file, shape, 0
@@ -54,106 +55,107 @@ class _Stack:
         self._count += 1
 
     def all(self) -> NDArray[np.float32]:
-        """(count, *shape), mapped from the file."""
+        """Return (count, *shape), mapped from the file."""
         self._file.flush()
         return np.memmap(self._file, np.float32, "r", shape=(self._count, *self._shape))
 
 
 class _Results:
-    """What is collected from the steps; `new_file` gives what the arrays go to."""
+    """Collector of the frames' results; `new_file` opens a file for arrays."""
 
     def __init__(self, new_file: Callable[[], IO[bytes]], on_warning: OnWarning) -> None:
-        self.hidden_m = _Stack(new_file(), OBJECT_PIXELS, OBJECT_PIXELS)
+        self.hidden_m, self.uncertainty_m = (_Stack(new_file(), OBJECT_PIXELS, OBJECT_PIXELS) for _ in range(2))
         self.difference_m, self.difference_intensity = (_Stack(new_file(), MAP_ROWS, MAP_COLUMNS) for _ in range(2))
         self.timestamps_s: list[float] = []
         self.numbers: list[int] = []
-        self.uncertainty_m = _Stack(new_file(), OBJECT_PIXELS, OBJECT_PIXELS)
-        self.told: list[str] = []
+        self.verdict_of_frame: list[str] = []
         self.with_surface = 0
         self.verdicts: Counter[Verdict] = Counter()
         self.checks: dict[int, float] = {}
-        """Scores by the number of the frame that was checked."""
-        self.samples, self.warned = Samples(SHEET_FRAMES), WarningLog(on_warning)
+        """Scores by number of the checked frame."""
+        self.samples, self.warnings = FrameSampler(SHEET_FRAMES), WarningLog(on_warning)
 
-    def add(self, step: FrameResult) -> None:
-        depth_m = step.reconstruction.depth_m
+    def add(self, result: FrameResult) -> None:
+        reconstruction = result.reconstruction
+        depth_m, uncertainty_m = reconstruction.depth_m, reconstruction.uncertainty_m
         self.hidden_m.add(depth_m)
-        uncertainty_m = step.reconstruction.uncertainty_m
         self.uncertainty_m.add(np.full_like(depth_m, np.nan) if uncertainty_m is None else uncertainty_m)
-        self.told.append(step.verdict or "")
-        if step.difference:
-            self.difference_m.add(step.difference.depth_m)
-            self.difference_intensity.add(step.difference.intensity)
-        self.timestamps_s.append(step.frame.timestamp_s)
-        self.numbers.append(step.frame.frame_number)
-        self.with_surface += bool(np.isfinite(depth_m).any())
-        if step.check:
-            self.checks[step.check.frame_number] = step.check.score
-        self.samples.add(step)
-        self.warned.add(step)
-        if step.verdict:
-            self.verdicts[step.verdict] += 1
+        if result.difference:
+            self.difference_m.add(result.difference.depth_m)
+            self.difference_intensity.add(result.difference.intensity)
+        self.timestamps_s.append(result.frame.timestamp_s)
+        self.numbers.append(result.frame.frame_number)
+        self.verdict_of_frame.append(result.verdict or "")
+        self.with_surface += reconstruction.has_surface
+        if result.check:
+            self.checks[result.check.frame_number] = result.check.score
+        self.samples.add(result)
+        self.warnings.add(result)
+        if result.verdict:
+            self.verdicts[result.verdict] += 1
 
 
 def replay_recording(
     camera: Camera,
-    processing: Pipeline,
+    pipeline: Pipeline,
     out: Path,
     *,
     stop: Event,
-    on_frame: Callable[[], None] = lambda: None,
+    on_frame: Callable[[], None] = ignore,
     on_warning: OnWarning = ignore,
-    looks: Looks | None = None,
+    media: ReplayMedia | None = None,
     clock: Clock = time.time,
 ) -> ReplayReport:
-    """Reconstruct every frame of an entered recording into the folder `out`; its files of the same names are replaced.
+    """Reconstruct every frame of an entered recording into the folder `out`; files of the same names are replaced.
 
-    Difference maps are written where the bench has a reference; those of an earlier replay go. Setting `stop` ends it
-    early and keeps what is done. Raises RecordingError for a recording without a whole frame, and what the camera
-    raises.
+    Difference maps are written if the bench has a reference; else those of an earlier replay are removed. Setting
+    `stop` ends the replay early and keeps its results. Raises RecordingError for a recording without a complete frame,
+    and the camera's errors.
     """
-    start_s, bench = clock(), processing.bench
+    start_s, bench = clock(), pipeline.bench
+    media = media or ReplayMedia(bench)
     with atomic_directory(out) as part, ExitStack() as files:
         results = _Results(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
-        looking = files.enter_context((looks or Looks(bench)).into(part))
-        frames, thermometer = with_telemetry(camera, camera)
-        with FrameReader(frames, lossless=True, stop=stop, clock=clock) as reader, processing.checks:
-            for step in iterate_batched(reader, processing, clock, thermometer):
-                results.add(step)
-                looking.add(step, thermometer.celsius)
+        files.enter_context(media.into(part))
+        frames, telemetry = with_telemetry(camera)
+        with FrameReader(frames, lossless=True, stop=stop, clock=clock) as reader, pipeline.checks:
+            for result in iterate_batched(reader, pipeline, clock, telemetry):
+                results.add(result)
+                media.add(result, telemetry.celsius)
                 on_frame()
         if not results.numbers:
-            raise RecordingError(f"{camera.uri} holds no frame with depth, infrared and confidence: record it again")
-        np.savez_compressed(part / RESULT, **_of_frames(results, bench.rig), **_hidden(results, bench.rig))
+            raise RecordingError(f"{camera.uri} has no frame with depth, infrared and confidence: record it again")
+        frame_fields = {
+            "timestamp_s": np.array(results.timestamps_s),
+            "frame_number": np.array(results.numbers, np.int64),
+            "rig_name": bench.rig.name,
+            "rig_checksum": bench.rig.checksum,
+        }
+        np.savez_compressed(part / RESULT, **frame_fields, **_hidden_fields(results, bench.rig))
         if bench.reference:
-            np.savez_compressed(part / DIFFERENCE, **_of_frames(results, bench.rig), **_difference(results, bench))
-        draw_sheet(part / SHEET, results.samples.chosen())
+            np.savez_compressed(part / DIFFERENCE, **frame_fields, **_difference_fields(results, bench))
+        draw_contact_sheet(part / SHEET, results.samples.results())
         (part / REPORT).write_text(_report(camera, bench, results, stopped=stop.is_set()), encoding="utf-8")
     if not bench.reference:
         (out / DIFFERENCE).unlink(missing_ok=True)
-    looking.forget_others(out)
-    told = results.warned.frames(), frames_by_verdict(results.verdicts)
-    return ReplayReport(len(results.numbers), clock() - start_s, str(out), *told)
+    media.remove_stale(out)
+    return ReplayReport(
+        len(results.numbers),
+        clock() - start_s,
+        str(out),
+        warnings=results.warnings.frames,
+        verdicts=frames_by_verdict(results.verdicts),
+    )
 
 
-def _of_frames(results: _Results, rig: Rig) -> dict[str, Any]:
-    """Which frames a file's arrays are of, and by which rig."""
-    return {
-        "timestamp_s": np.array(results.timestamps_s),
-        "frame_number": np.array(results.numbers, np.int64),
-        "rig_name": rig.name,
-        "rig_checksum": rig.checksum,
-    }
-
-
-def _hidden(results: _Results, rig: Rig) -> dict[str, Any]:
+def _hidden_fields(results: _Results, rig: Rig) -> dict[str, Any]:
     box = object_box(rig)
     pitch_x_m = (box.x_max_m - box.x_min_m) / OBJECT_PIXELS
     pitch_y_m = (box.y_max_m - box.y_min_m) / OBJECT_PIXELS
     return {
         "depth_m": results.hidden_m.all(),
         "uncertainty_m": results.uncertainty_m.all(),
-        "verdict": np.array(results.told, np.str_),
+        "verdict": np.array(results.verdict_of_frame, np.str_),
         "origin_m": np.array([box.x_min_m + pitch_x_m / 2, box.y_max_m - pitch_y_m / 2]),  # wall (x, y) of pixel (0, 0)
         "pitch_m": np.array([pitch_x_m, -pitch_y_m]),  # wall (x, y) from one column, one row to the next
         "z_near_m": box.z_near_m,
@@ -163,7 +165,7 @@ def _hidden(results: _Results, rig: Rig) -> dict[str, Any]:
     }
 
 
-def _difference(results: _Results, bench: CalibratedRig) -> dict[str, Any]:
+def _difference_fields(results: _Results, bench: CalibratedRig) -> dict[str, Any]:
     return {
         "depth_m": results.difference_m.all(),
         "intensity": results.difference_intensity.all(),
@@ -172,38 +174,30 @@ def _difference(results: _Results, bench: CalibratedRig) -> dict[str, Any]:
 
 
 def _report(camera: Camera, bench: CalibratedRig, results: _Results, *, stopped: bool) -> str:
+    """Return the report as Markdown."""
     frames, times_s, rig = len(results.numbers), results.timestamps_s, bench.rig
-    lines = [
-        f"# Replay of {camera.uri}",
-        "",
+    lines = [f"# Replay of {camera.uri}", ""]
+    if stopped:
+        lines += ["**Interrupted: only the frames up to then are included.**", ""]
+    lines += [
         f"- frames: {frames}, numbers {results.numbers[0]} to {results.numbers[-1]}, {times_s[-1] - times_s[0]:.2f} s",
-        f"- skipped: {camera.incomplete} without all streams, {camera.dropped} that the recording lacks",
-        f"- seen: {describe_counts(camera.counts) or 'nothing odd'}",
+        f"- skipped: {camera.incomplete} without all streams, {camera.dropped} missing from the recording",
+        f"- irregular messages: {describe_counts(camera.counts) or 'none'}",
         f"- frames with a hidden surface: {results.with_surface} ({results.with_surface / frames:.0%})",
         f"- rig: {rig.name} {rig.checksum}, {rig.lidar.distance_m:.3f} m to the wall, {rig.facing_deg:.1f} degrees",
         f"- maps: {MAP_ROWS} x {MAP_COLUMNS}; hidden depth: {OBJECT_PIXELS} x {OBJECT_PIXELS} in `{RESULT}`",
-        *(f"- verdict, {frames} frames: {verdict}" for verdict, frames in frames_by_verdict(results.verdicts).items()),
-        *_checks_told(results.checks),
-        *_bench_told(bench, results.warned),
-        "",
-        f"![some frames]({SHEET})",
     ]
-    if stopped:
-        lines.insert(2, "**Interrupted: the frames below are those done until then.**\n")
-    return "\n".join(lines) + "\n"
-
-
-def _checks_told(scores: Mapping[int, float]) -> list[str]:
-    if not scores:
-        return []
-    flagged = sum(score >= UNEXPLAINED for score in scores.values())
-    told = f"score {np.median(list(scores.values())):.2f} (median; 0 explains what the lidar saw, 1 explains nothing)"
-    return [f"- physics check of {len(scores)} frames: {told}, {flagged} at {UNEXPLAINED:g} or more"]
-
-
-def _bench_told(bench: CalibratedRig, warned: WarningLog) -> list[str]:
-    lines: list[str] = []
+    lines += [f"- verdict, {count} frames: {verdict}" for verdict, count in frames_by_verdict(results.verdicts).items()]
+    if scores := list(results.checks.values()):
+        unexplained = sum(score >= UNEXPLAINED for score in scores)
+        lines.append(
+            f"- physics check of {len(scores)} frames: median score {np.median(scores):.2f} (0: the reconstruction "
+            f"explains the maps, 1: no better than an empty bench), {unexplained} at {UNEXPLAINED:g} or more"
+        )
     if bench.reference:
         lines.append(f"- difference from the bare wall, the mean of {bench.reference.frames} frames: in `{DIFFERENCE}`")
-    told = (f"{held.frames} frames from {held.first} to {held.last}: {held.text}" for held in warned.held)
-    return lines + [f"- warning, {each}" for each in told]
+    lines += [
+        f"- warning, {each.frames} frames from {each.first} to {each.last}: {each.text}"
+        for each in results.warnings.spans
+    ]
+    return "\n".join([*lines, "", f"![some frames]({SHEET})", ""])

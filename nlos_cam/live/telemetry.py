@@ -1,4 +1,4 @@
-"""The temperatures of a camera from time to time, told with the frames they belong to."""
+"""Temperatures of a camera or a recording, read periodically and matched to frames."""
 
 import logging
 from collections import deque
@@ -17,20 +17,20 @@ log = logging.getLogger(__name__)
 
 
 class Telemetry:
-    """Reads temperatures, by `read` of the seconds since the first frame, in the thread that reads the frames.
+    """Periodic reader of temperatures; `read` takes the seconds since the first frame.
 
-    Asking a real device takes time on its link: it is done every `every_s` of the frames' time, and not by who
-    reconstructs them. The thread that starts and stops a device anew is the one that asks.
+    `watch` reads every `every_s` of the frames' time, in the thread that reads the frames: a real device needs time to
+    answer, and only the thread that restarts a device may ask it. `at` may be called from another thread.
     """
 
     def __init__(self, read: Callable[[float], Celsius], every_s: float = TEMPERATURE_INTERVAL_S) -> None:
         self._read, self._every_s = read, every_s
         self._readings: deque[tuple[int, Celsius]] = deque()
         self.celsius: Celsius = {}
-        """The last reading that `at` gave."""
+        """Last reading that `at` returned."""
 
     def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The same frames."""
+        """Yield the same frames, and read when due."""
         first_s, due_s = None, float("-inf")
         for frame in frames:
             if frame.timestamp_s >= due_s:
@@ -41,7 +41,7 @@ class Telemetry:
             yield frame
 
     def at(self, frame: Frame) -> Celsius | None:
-        """The last reading up to this frame, once; None if there is no new one. May be called by another thread."""
+        """Return the last reading up to this frame, once; None if there is no new one."""
         newest: Celsius | None = None
         while self._readings and self._readings[0][0] <= frame.frame_number:
             newest = self.celsius = self._readings.popleft()[1]
@@ -49,7 +49,7 @@ class Telemetry:
 
 
 def telemetry_of(camera: Camera) -> Telemetry:
-    """Of a device, or of the sidecar that lies beside a recording."""
+    """Return the telemetry of a device, or of a recording's sidecar if it has one."""
     path = sidecar_path(Path(camera.uri.removeprefix(RECORDED)))
     if not camera.uri.startswith(RECORDED) or not path.is_file():
         return Telemetry(lambda _: camera.telemetry("_temperature"))
@@ -58,8 +58,10 @@ def telemetry_of(camera: Camera) -> Telemetry:
     except RecordingError as error:
         log.warning("no temperatures: %s", error)
         series = []
+    return Telemetry(lambda time_s: next((each.celsius for each in reversed(series) if each.time_s <= time_s), {}))
 
-    def recorded(time_s: float) -> Celsius:
-        return next((look.celsius for look in reversed(series) if look.time_s <= time_s), {})
 
-    return Telemetry(recorded)
+def with_telemetry(camera: Camera) -> tuple[Iterator[Frame], Telemetry]:
+    """Return the camera's frames and its telemetry, which is read as they pass."""
+    telemetry = telemetry_of(camera)
+    return telemetry.watch(camera), telemetry

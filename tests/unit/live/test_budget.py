@@ -22,14 +22,14 @@ from nlos_cam.live.budget import (
     SHIPPED,
     BudgetChoice,
     Machine,
-    Option,
-    Timed,
-    available_options,
+    Setting,
+    Timing,
+    available_settings,
     choose,
     choose_within_budget,
     keeping_pace,
     load_tradeoff,
-    timer,
+    pipeline_timer,
 )
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import Pipeline
@@ -37,15 +37,15 @@ from nlos_cam.reconstruct.pipeline import Pipeline
 AS_MEASURED = Machine(slower=1.0, rest_ms=1.0)
 
 
-def option(rmse_mm: float | None, ms: float, frames: int = 1, threads: int = 1, **others: Any) -> Option:
+def setting(rmse_mm: float | None, ms: float, frames: int = 1, threads: int = 1, **others: Any) -> Setting:
     fixed: dict[str, Any] = {"name": f"{rmse_mm} mm, {ms} ms", "weights": SHIPPED, "runtime": "any"}
     times = {"milliseconds": ms, "milliseconds_p90": ms, "threads": threads, "frames": frames}
-    return Option.model_validate({**fixed, **times, "foreground_rmse_mm": {"value": rmse_mm}, **others})
+    return Setting.model_validate({**fixed, **times, "foreground_rmse_mm": {"value": rmse_mm}, **others})
 
 
-some_options = st.lists(
+some_settings = st.lists(
     st.builds(
-        option,
+        setting,
         st.one_of(st.none(), st.floats(1.0, 99.0)),
         st.floats(0.5, 60.0),
         st.integers(1, 16),
@@ -56,58 +56,58 @@ some_options = st.lists(
 )
 
 
-@given(some_options, st.floats(0.2, 20.0), st.floats(1.0, 500.0))
+@given(some_settings, st.floats(0.2, 20.0), st.floats(1.0, 500.0))
 def test_choose_takes_the_most_accurate_setting_in_budget(
-    options: list[Option], slower: float, budget_ms: float
+    settings: list[Setting], slower: float, budget_ms: float
 ) -> None:
     machine = Machine(slower, 1.0)
-    kept = [one for one in keeping_pace(options, machine) if machine.expected_ms(one) <= budget_ms]
+    kept = [one for one in keeping_pace(settings, machine) if machine.expected_ms(one) <= budget_ms]
     if not kept:
         with pytest.raises(BudgetError, match=r"the least is \d"):
-            choose(options, machine, budget_ms)
+            choose(settings, machine, budget_ms)
         return
-    chosen = choose(options, machine, budget_ms)
+    chosen = choose(settings, machine, budget_ms)
     assert machine.expected_ms(chosen) <= budget_ms
     assert chosen.rmse_mm <= min(one.rmse_mm for one in kept) + 0.01
 
 
-@given(some_options, st.floats(1.0, 500.0), st.floats(1.0, 10.0))
-def test_choose_is_no_less_accurate_with_a_larger_budget(options: list[Option], budget_ms: float, more: float) -> None:
-    least_ms = min(map(AS_MEASURED.expected_ms, keeping_pace(options, AS_MEASURED)))
-    assert choose(options, AS_MEASURED, least_ms) in options
+@given(some_settings, st.floats(1.0, 500.0), st.floats(1.0, 10.0))
+def test_choose_is_no_less_accurate_with_a_larger_budget(settings: list[Setting], budget_ms: float, more: float) -> None:
+    least_ms = min(map(AS_MEASURED.expected_ms, keeping_pace(settings, AS_MEASURED)))
+    assert choose(settings, AS_MEASURED, least_ms) in settings
     if budget_ms >= least_ms:
-        tight, wide = (choose(options, AS_MEASURED, limit) for limit in (budget_ms, more * budget_ms))
+        tight, wide = (choose(settings, AS_MEASURED, limit) for limit in (budget_ms, more * budget_ms))
         assert wide.rmse_mm <= tight.rmse_mm + 0.01
 
 
 def test_averaging_delays_by_half_of_its_frames() -> None:
-    assert option(1.0, 1.0).averaging_ms == 0.0
-    assert option(1.0, 1.0, frames=4).averaging_ms == pytest.approx(1.5 * PERIOD_MS)
-    assert AS_MEASURED.expected_ms(option(1.0, 5.0, frames=3)) == pytest.approx(HANDOVER_MS + 1.0 + 5.0 + PERIOD_MS)
+    assert setting(1.0, 1.0).averaging_ms == 0.0
+    assert setting(1.0, 1.0, frames=4).averaging_ms == pytest.approx(1.5 * PERIOD_MS)
+    assert AS_MEASURED.expected_ms(setting(1.0, 5.0, frames=3)) == pytest.approx(HANDOVER_MS + 1.0 + 5.0 + PERIOD_MS)
 
 
 def test_choose_leaves_out_settings_that_cannot_keep_pace() -> None:
-    quick, slow = option(20.0, 4.0), option(10.0, BUSY_SHARE * PERIOD_MS)
+    quick, slow = setting(20.0, 4.0), setting(10.0, BUSY_SHARE * PERIOD_MS)
     assert choose([slow, quick], AS_MEASURED, 1e6) == quick
-    assert choose([slow, option(20.0, 99.0)], AS_MEASURED, 1e6) == slow
+    assert choose([slow, setting(20.0, 99.0)], AS_MEASURED, 1e6) == slow
 
 
 def test_choose_takes_a_quicker_setting_on_a_slower_machine() -> None:
-    options = [option(10.0, 12.0), option(20.0, 2.0)]
-    assert choose(options, AS_MEASURED, 20.0).rmse_mm == 10.0
-    assert choose(options, Machine(slower=3.0, rest_ms=1.0), 20.0).rmse_mm == 20.0
+    settings = [setting(10.0, 12.0), setting(20.0, 2.0)]
+    assert choose(settings, AS_MEASURED, 20.0).rmse_mm == 10.0
+    assert choose(settings, Machine(slower=3.0, rest_ms=1.0), 20.0).rmse_mm == 20.0
 
 
 def test_choose_prefers_fewer_threads_at_equal_accuracy() -> None:
-    one, two = option(20.0, 6.0), option(20.0, 3.0, threads=2)
+    one, two = setting(20.0, 6.0), setting(20.0, 3.0, threads=2)
     assert choose([two, one], AS_MEASURED, 20.0) == one
     assert choose([two, one], AS_MEASURED, 8.0) == two
 
 
 def test_shipped_weights_have_a_tradeoff_table() -> None:
-    options = load_tradeoff(shipped_folder())
-    assert {one.frames for one in options} > {1}
-    assert choose(options, Machine(1.0, 2.0), 50.0).rmse_mm <= 1.2 * min(one.rmse_mm for one in options)
+    settings = load_tradeoff(shipped_folder())
+    assert {one.frames for one in settings} > {1}
+    assert choose(settings, Machine(1.0, 2.0), 50.0).rmse_mm <= 1.2 * min(one.rmse_mm for one in settings)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"[]", b'{"settings": []}', b'{"settings": [{"name": "x"}]}', b"\xff"])
@@ -120,12 +120,12 @@ def test_load_tradeoff_refuses_other_files(tmp_path: Path, content: bytes | None
 
 def test_load_tradeoff_takes_a_folder_or_a_file(tmp_path: Path) -> None:
     file = tmp_path / "tradeoff.json"
-    file.write_text(json.dumps({"settings": [option(3.0, 2.0).model_dump()], "machine": "any"}))
-    assert load_tradeoff(tmp_path) == load_tradeoff(file) == [option(3.0, 2.0)]
+    file.write_text(json.dumps({"settings": [setting(3.0, 2.0).model_dump()], "machine": "any"}))
+    assert load_tradeoff(tmp_path) == load_tradeoff(file) == [setting(3.0, 2.0)]
 
 
-QUICK, GOOD = option(20.0, 2.0, runtime="quick"), option(15.0, 8.0, runtime="good")
-MEAN = option(12.0, 2.0, frames=4, runtime="mean")
+QUICK, GOOD = setting(20.0, 2.0, runtime="quick"), setting(15.0, 8.0, runtime="good")
+MEAN = setting(12.0, 2.0, frames=4, runtime="mean")
 ALL = [GOOD, QUICK, MEAN]
 
 
@@ -135,13 +135,13 @@ def chosen(
     """BudgetChoice on a machine `slower` than the table's, where some settings take longer still, and what was loaded."""
     loaded: list[str] = []
 
-    def load(wanted: Option) -> Any:
+    def load(wanted: Setting) -> Any:
         loaded.append(wanted.runtime)
         return wanted
 
-    def measure(made: Any) -> Timed:
+    def measure(made: Any) -> Timing:
         late_ms = (surprises or {}).get(made.runtime, 0.0) if len(loaded) > 1 else 0.0
-        return Timed(slower * made.milliseconds_p90 + late_ms, 1.0)
+        return Timing(slower * made.milliseconds_p90 + late_ms, 1.0)
 
     _, choice = choose_within_budget(budget_ms, ALL, lambda network, _: network, load, measure)  # type: ignore[arg-type]
     return choice, loaded
@@ -150,26 +150,26 @@ def chosen(
 @pytest.mark.parametrize(("budget_ms", "name"), [(7.0, "quick"), (15.0, "good"), (60.0, "mean")])
 def test_within_budget_takes_the_most_accurate_that_fits(budget_ms: float, name: str) -> None:
     choice, loaded = chosen(budget_ms)
-    assert choice.option.runtime == loaded[-1] == name
+    assert choice.setting.runtime == loaded[-1] == name
     assert choice.expected_ms <= budget_ms
     assert choice.best is MEAN
 
 
 def test_within_budget_measures_a_slow_machine() -> None:
-    assert chosen(15.0, slower=4.0)[0].option is QUICK
+    assert chosen(15.0, slower=4.0)[0].setting is QUICK
     with pytest.raises(BudgetError, match=rf"{re.escape(str(HANDOVER_MS + 9))} ms"):
         chosen(5.0, slower=4.0)
 
 
 def test_within_budget_gives_up_a_setting_slower_than_expected() -> None:
     choice, loaded = chosen(15.0, surprises={"good": 9.0})
-    assert (choice.option, loaded) == (QUICK, ["quick", "good", "quick"])
+    assert (choice.setting, loaded) == (QUICK, ["quick", "good", "quick"])
     with pytest.raises(BudgetError, match=rf"{re.escape(str(HANDOVER_MS + 13))} ms"):
         chosen(15.0, surprises={"good": 99.0, "quick": 10.0})
 
 
 def test_choice_names_its_error_and_averaging() -> None:
-    good, mean = (chosen(budget_ms)[0].told() for budget_ms in (15.0, 60.0))
+    good, mean = (chosen(budget_ms)[0].describe() for budget_ms in (15.0, 60.0))
     assert all(text in good for text in ("15.0 mm", "3.0 mm", MEAN.name))
     assert all(text in mean for text in ("4 frames", "50 ms", "best"))
 
@@ -180,21 +180,21 @@ def test_outcome_counts_averaging_towards_the_delay(p95_ms: float, kept: bool) -
     choice = BudgetChoice(60.0, MEAN, 55.0, MEAN)
     outcome = choice.outcome(report)
     assert (outcome["kept"], outcome["p95_ms"]) == (kept, pytest.approx(p95_ms + 50.0))
-    assert ("NOT" in choice.outcome_told(report)) != kept
+    assert ("NOT" in choice.describe_outcome(report)) != kept
 
 
-def test_options_here_leaves_out_what_cannot_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_available_settings_leaves_out_what_cannot_run(monkeypatch: pytest.MonkeyPatch) -> None:
     elsewhere = [
-        option(1.0, 1.0, threads=10_000),
-        option(1.0, 1.0, weights="/no/such/folder"),
-        option(1.0, 1.0, runtime="torch float32, cuda"),
+        setting(1.0, 1.0, threads=10_000),
+        setting(1.0, 1.0, weights="/no/such/folder"),
+        setting(1.0, 1.0, runtime="torch float32, cuda"),
     ]
-    monkeypatch.setattr("nlos_cam.cli.live.load_tradeoff", lambda _: [*elsewhere, *ALL])
-    monkeypatch.setattr("nlos_cam.cli.live.torch.cuda.is_available", lambda: False)
-    assert available_options(None, None) == ALL
-    monkeypatch.setattr("nlos_cam.cli.live.load_tradeoff", lambda _: elsewhere)
+    monkeypatch.setattr("nlos_cam.live.budget.load_tradeoff", lambda _: [*elsewhere, *ALL])
+    monkeypatch.setattr("nlos_cam.live.budget.torch.cuda.is_available", lambda: False)
+    assert available_settings(None, None) == ALL
+    monkeypatch.setattr("nlos_cam.live.budget.load_tradeoff", lambda _: elsewhere)
     with pytest.raises(BudgetError):
-        available_options(Path("other"), None)
+        available_settings(Path("other"), None)
 
 
 def test_timer_measures_late_calls_without_the_first() -> None:
@@ -204,6 +204,6 @@ def test_timer_measures_late_calls_without_the_first() -> None:
         calls.append(1)
         return sheet_network()
 
-    timed = timer(FrameCamera(0), lambda: next(ticks))(Pipeline(CalibratedRig(RIG), network))
+    timed = pipeline_timer(FrameCamera(0), lambda: next(ticks))(Pipeline(CalibratedRig(RIG), network))
     assert len(calls) == CALLS + 1
     assert (timed.network_ms, timed.rest_ms) == pytest.approx((4.0, 8.0))

@@ -65,7 +65,7 @@ def test_reader_closes_or_reports_a_source_that_hangs(monkeypatch: pytest.Monkey
     monkeypatch.setattr("nlos_cam.live.frame_queue.ABANDON_AFTER_S", 0.01)
     release = Event()
     source = FrameCamera(None, lambda _: release.wait(60.0))
-    with FrameReader(source, lossless=True, stop=Event(), let_go=release.set) as reader:
+    with FrameReader(source, lossless=True, stop=Event(), abandon_source=release.set) as reader:
         pass
     assert not reader._thread.is_alive()
     monkeypatch.setattr("nlos_cam.live.frame_queue.JOIN_TIMEOUT_S", 0.05)
@@ -79,7 +79,7 @@ def test_reader_closes_or_reports_a_source_that_hangs(monkeypatch: pytest.Monkey
 def test_reader_can_end_while_no_frame_arrives() -> None:
     release, asked = Event(), count_up()
     source = FrameCamera(None, lambda _: release.wait(60.0))
-    run: Any = {"lossless": True, "stop": Event(), "enough": lambda: next(asked) > 2, "let_go": release.set}
+    run: Any = {"lossless": True, "stop": Event(), "should_stop": lambda: next(asked) > 2, "abandon_source": release.set}
     with FrameReader(source, **run) as reader:
         assert list(reader) == []
         release.set()
@@ -93,7 +93,7 @@ def test_reader_calls_on_wait_while_no_frame_arrives() -> None:
         release.set()
 
     source = FrameCamera(4, lambda number: number == 3 and release.wait(60.0))
-    with FrameReader(source, lossless=True, stop=Event(), clock=lambda: 7.0, on_wait=on_wait) as reader:
+    with FrameReader(source, lossless=True, stop=Event(), clock=lambda: 7.0, on_idle=on_wait) as reader:
         assert numbers_of(reader) == [0, 1, 2, 3]
     assert waits
     assert waits[-1] == 7.0

@@ -15,7 +15,7 @@ from small_frames import FrameCamera, sheet_network, small_frame
 
 from nlos_cam.errors import CameraLostError, SceneError
 from nlos_cam.frames import Frame
-from nlos_cam.live.loop import describe_counts, paced, run_live, warm_up, watched
+from nlos_cam.live.loop import describe_counts, pace, run_live, warm_up, count_issues
 from nlos_cam.live.statistics import OUTSIDE_LATENCY, STALLED, RunReport
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import Pipeline
@@ -40,13 +40,13 @@ def test_paced_yields_frames_at_their_timestamps() -> None:
             return self.is_set()
 
     stop, given = Waits(), []
-    for each in paced(map(small_frame, (0, 1, 4, 2)), stop, lambda: now_s[0]):
+    for each in pace(map(small_frame, (0, 1, 4, 2)), stop, lambda: now_s[0]):
         given.append(each.frame_number)
         now_s[0] += 0.01
     assert given == [0, 1, 4, 2]
     assert waits_s == pytest.approx([0.0, PERIOD_S - 0.01, 3 * PERIOD_S - 0.01, 0.0])
     stop.set()
-    assert list(paced([small_frame(0)], stop, lambda: 0.0)) == []
+    assert list(pace([small_frame(0)], stop, lambda: 0.0)) == []
 
 
 class ListViewer(NullViewer):
@@ -269,7 +269,7 @@ def test_amiss_names_what_is_wrong_with_a_frame(depths: int, saturated: int, nam
 
 def test_watched_counts_frames_and_passes_them_on() -> None:
     frames, seen = [frame_with(0), frame_with(PIXELS), frame_with(0, PIXELS), frame_with(9)], Counter[str]()
-    given = list(watched(frames, seen))
+    given = list(count_issues(frames, seen))
     assert all(one is other for one, other in zip(frames, given, strict=True))
     assert seen == {"blank": 2, "saturated": 1, "half_invalid": 1}
 

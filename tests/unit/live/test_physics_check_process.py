@@ -34,8 +34,8 @@ while True:
 PARENT = """
 import os, signal, sys, time
 from nlos_calibration.rig import load_rig
-from nlos_cam.physics_check_runner import BackgroundChecks
-with BackgroundChecks(load_rig("bare-wall")) as checks:
+from nlos_cam.live import BackgroundPhysicsCheck
+with BackgroundPhysicsCheck(load_rig("bare-wall")) as checks:
     print(checks.process.pid, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -99,7 +99,7 @@ def test_background_checks_kill_a_process_that_will_not_end(monkeypatch: pytest.
     monkeypatch.setattr("nlos_cam.live.physics_check_process.END_WITHIN_S", 0.2)
     with BackgroundPhysicsCheck(RIG, command=python(DEAF)) as checks:
         checks.offer(0, DARK, NOTHING)
-        wait_until(lambda: checks.over)  # what it printed is no answer
+        wait_until(lambda: checks.ended)  # what it printed is no answer
     assert checks.process is not None
     assert checks.process.returncode == (1 if sys.platform == "win32" else -9)
 
@@ -112,7 +112,7 @@ def test_background_checks_report_a_failure_once_and_go_on() -> None:
             checks.offer(number, DARK, NOTHING)
             wait_until(lambda: not checks.waits)
         wait_until(lambda: bool(errors))
-        assert not checks.over
+        assert not checks.ended
     (error,) = errors
     assert "frame 0" in error
     assert "(no)" in error
@@ -124,7 +124,7 @@ def test_background_checks_report_a_missing_process_once(command: tuple[str, ...
     run: Any = {"period_s": 0.0, "clock": lambda: 100.0, "command": command, "on_error": errors.append}
     with BackgroundPhysicsCheck(RIG, **run) as checks:
         checks.offer(0, DARK, NOTHING)
-        wait_until(lambda: checks.over)
+        wait_until(lambda: checks.ended)
         checks.offer(1, DARK, NOTHING)
         assert not checks.waits
     assert len(errors) == 1

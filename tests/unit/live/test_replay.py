@@ -14,7 +14,7 @@ from small_frames import FrameCamera
 
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.live.loop import FRAMES_TOGETHER, MAX_BATCHES_AHEAD
+from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD
 from nlos_cam.live.replay import DIFFERENCE, REPORT, RESULT, SHEET, ReplayReport, replay_recording
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import Pipeline
@@ -100,7 +100,7 @@ def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:
             stop.set()
 
     report = replayed(tmp_path / "out", 1000, stop=stop, on_frame=on_frame)
-    assert report.frames == FRAMES_TOGETHER * (MAX_BATCHES_AHEAD + 2)
+    assert report.frames == BATCH_FRAMES * (MAX_BATCHES_AHEAD + 2)
     with np.load(tmp_path / "out" / RESULT) as result:
         assert result["frame_number"].tolist() == list(range(100, 100 + report.frames))
     assert "Interrupted" in (tmp_path / "out" / REPORT).read_text()

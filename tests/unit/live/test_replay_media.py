@@ -14,7 +14,7 @@ from small_frames import NOTHING
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.live.replay import REPORT, RESULT, SHEET, replay_recording
-from nlos_cam.live.replay_media import VIDEO, VIEW, Looks, Samples, _even_limits, _limits, draw_sheet, moment_of
+from nlos_cam.live.replay_media import VIDEO, VIEW, ReplayMedia, FrameSampler, _symmetric_limits, _limits, draw_contact_sheet, moment_of
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline
@@ -33,7 +33,7 @@ def network(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
 
 def replayed(out: Path, count: int, **asked: Any) -> set[str]:
     processing = Pipeline(BENCH, network)
-    replay_recording(Recorded(count), processing, out, stop=Event(), looks=Looks(BENCH, **asked))
+    replay_recording(Recorded(count), processing, out, stop=Event(), media=ReplayMedia(BENCH, **asked))
     return {file.name for file in out.iterdir()}
 
 
@@ -69,9 +69,10 @@ def test_replay_makes_no_more_stills_than_frames(tmp_path: Path) -> None:
 
 
 def test_media_of_a_failed_replay_have_no_stills(tmp_path: Path) -> None:
-    looks = Looks(BENCH, view=True, stills=2).into(tmp_path)
-    looks.__enter__().add(STEP, {})
-    assert not looks.__exit__(ZeroDivisionError, ZeroDivisionError(), None), "it is raised to the caller"
+    media = ReplayMedia(BENCH, view=True, stills=2)
+    with pytest.raises(ZeroDivisionError), media.into(tmp_path):
+        media.add(STEP, {})
+        raise ZeroDivisionError
     assert {file.name for file in tmp_path.iterdir()} == {VIEW}
 
 
@@ -87,10 +88,10 @@ def test_moment_of_step_is_complete_and_at_its_own_time() -> None:
 
 @pytest.mark.parametrize("count", [1, 5, 6, 7, 100, 1001])
 def test_samples_are_few_ordered_and_spread(count: int) -> None:
-    samples = Samples(6)
+    samples = FrameSampler(6)
     for number in range(count):
         samples.add(number)  # type: ignore[arg-type]
-    chosen = samples.chosen()
+    chosen = samples.results()
     assert len(chosen) == min(count, 6)
     assert chosen[0] == 0
     assert chosen == sorted(set(chosen))
@@ -109,7 +110,7 @@ def titles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[Fr
     def titles_of(steps: list[FrameResult]) -> list[str]:
         saved: list[Any] = []
         monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: saved.append(figure))
-        draw_sheet(tmp_path / "sheet.png", steps)
+        draw_contact_sheet(tmp_path / "sheet.png", steps)
         return [title for axis in saved[0].axes if (title := axis.get_ylabel() or axis.get_title())]
 
     return titles_of
@@ -128,7 +129,7 @@ def test_sheet_has_a_row_per_map_and_a_column_per_frame(titles: Callable[[list[F
 
 def test_sheet_without_returns_is_a_picture(tmp_path: Path) -> None:
     maps = replace(maps_from_frame(wall_frame(0)), depth_m=np.full((64, 80), np.nan, np.float32))
-    draw_sheet(tmp_path / "sheet.png", [wall_step(0, maps)])
+    draw_contact_sheet(tmp_path / "sheet.png", [wall_step(0, maps)])
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -141,7 +142,7 @@ def test_limits_of_a_sheet_span_its_values() -> None:
 def test_even_limits_leave_out_outliers() -> None:
     image = np.random.default_rng(0).normal(0.0, 1.0, (64, 80)).astype(np.float32)
     image[:2] = -500.0
-    low, high = _even_limits([image])
+    low, high = _symmetric_limits([image])
     assert low == -high
     assert 1.9 < high < 3.0
-    assert _even_limits([]) == (-1.0, 1.0)
+    assert _symmetric_limits([]) == (-1.0, 1.0)

@@ -61,7 +61,7 @@ def test_report_of_a_run_without_frames_is_zero() -> None:
     report = reported(RunStatistics())
     assert (report.frames, report.fps, report.dropped, report.stages_ms, report.counts) == (0, 0.0, 0, {}, {})
     assert set(report.latency_ms.values()) == {0.0}
-    assert RunStatistics().lasted_s(1e9) == 0.0
+    assert RunStatistics().duration_s(1e9) == 0.0
 
 
 def test_report_gives_rate_latency_and_stages_of_the_frames() -> None:
@@ -70,7 +70,7 @@ def test_report_gives_rate_latency_and_stages_of_the_frames() -> None:
     assert report.fps == pytest.approx(30.0)
     assert report.latency_ms == pytest.approx({"p50": 3.0, "p95": 3.0, "p99": 3.0}, abs=1e-6)
     assert report.stages_ms == pytest.approx({"wait": 1.0, "network": 160.0, "view": 2.0})
-    assert tally_of([0.5, 0.1]).lasted_s(4.5) == pytest.approx(4.0), "from the first result"
+    assert tally_of([0.5, 0.1]).duration_s(4.5) == pytest.approx(4.0), "from the first result"
 
 
 def test_report_counts_frames_by_verdict_and_warning() -> None:
@@ -96,7 +96,7 @@ def test_report_gives_delivery_of_steps_with_an_arrival() -> None:
 
 def test_report_counts_findings_and_lost_frames() -> None:
     tally = RunStatistics()
-    tally.seen.update(["blank", "blank"])
+    tally.issues.update(["blank", "blank"])
     tally.fail(small_frame(1), ZeroDivisionError("odd"), 1)
     report = reported(tally, 4, incomplete=2, dropped=3, counts=Counter(duplicate=1, stalled=0))
     lost = {"incomplete": 2, "dropped_camera": 3, "dropped_loop": 4, "failed": 1}
@@ -120,10 +120,10 @@ def test_warned_reports_begin_end_and_frames_of_a_warning(begins: list[tuple[str
     for step in (step_of(7), step_of(8, "hot"), step_of(9, "hot", "moved"), step_of(11, "moved"), step_of(12)):
         found.add(step)
     assert begins == [("hot", True), ("moved", True), ("hot", False), ("moved", False)]
-    assert found.held == [WarningSpan("hot", 2, 8, 9), WarningSpan("moved", 2, 9, 11)]
+    assert found.spans == [WarningSpan("hot", 2, 8, 9), WarningSpan("moved", 2, 9, 11)]
     found.add(step_of(20, "hot"))
     assert begins[-1] == ("hot", True)
-    assert found.held[0] == WarningSpan("hot", 3, 8, 20)
+    assert found.spans[0] == WarningSpan("hot", 3, 8, 20)
 
 
 def test_warned_ignores_figures_in_a_warning(begins: list[tuple[str, bool]]) -> None:
@@ -131,7 +131,7 @@ def test_warned_ignores_figures_in_a_warning(begins: list[tuple[str, bool]]) -> 
     for step in (step_of(1, "46.5 degrees"), step_of(2, "48 degrees"), step_of(3, "48 degrees", "48 mm"), step_of(4)):
         found.add(step)
     assert begins == [("46.5 degrees", True), ("48 mm", True), ("48 degrees", False), ("48 mm", False)]
-    assert found.frames() == {"48 degrees": 3, "48 mm": 1}
+    assert found.frames == {"48 degrees": 3, "48 mm": 1}
 
 
 @given(st.lists(st.floats(0.0, 10.0), max_size=50))
@@ -165,25 +165,25 @@ JUST_BEFORE_S = 0.999 * STALLED_AFTER_S
 def test_stall_watch_reports_a_stall_once_until_a_frame_comes(
     watch: StallWatch, begins: list[tuple[str, bool]]
 ) -> None:
-    assert not watch.look(1000.0, None), "no frame has come yet"
-    assert not watch.look(10.0 + JUST_BEFORE_S, 10.0)
-    shown = [time_s for time_s in (10.5, 10.6, 10.9, 11.0, 11.4, 11.6) if watch.look(time_s, 10.0)]
+    assert not watch.update(1000.0, None), "no frame has come yet"
+    assert not watch.update(10.0 + JUST_BEFORE_S, 10.0)
+    shown = [time_s for time_s in (10.5, 10.6, 10.9, 11.0, 11.4, 11.6) if watch.update(time_s, 10.0)]
     assert shown == [10.5, 11.0, 11.6]
-    watch.came(10.0)
+    watch.frame_arrived(10.0)
     assert begins == [(STALLED, True)], "a frame from before the stall does not end it"
-    watch.came(12.0)
-    watch.came(12.1)
+    watch.frame_arrived(12.0)
+    watch.frame_arrived(12.1)
     assert begins == [(STALLED, True), (STALLED, False)]
     assert (watch.stalls, watch.stalled_s) == (1, 2.0)
 
 
 def test_stall_watch_counts_a_stall_that_lasts_to_the_end(watch: StallWatch, begins: list[tuple[str, bool]]) -> None:
     for start_s in (0.0, 10.0):
-        assert watch.look(start_s + 1.0, start_s)
-        watch.came(start_s + 2.0)
-    watch.look(21.0, 20.0)
-    assert not watch.look(21.6, 21.5), "a frame without a result ends a stall too"
-    watch.look(24.0, 23.0)
+        assert watch.update(start_s + 1.0, start_s)
+        watch.frame_arrived(start_s + 2.0)
+    watch.update(21.0, 20.0)
+    assert not watch.update(21.6, 21.5), "a frame without a result ends a stall too"
+    watch.update(24.0, 23.0)
     watch.close(25.0)
     watch.close(99.0)
     assert [each for _, each in begins] == [True, False, True, False, True, False, True]

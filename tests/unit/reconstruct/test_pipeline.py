@@ -15,7 +15,7 @@ from small_frames import sheet_network
 
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.loop import FRAMES_TOGETHER, MAX_BATCHES_AHEAD, iterate_batched, iterate_results, with_telemetry
+from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD, iterate_batched, iterate_results, with_telemetry
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.network import Clock
 from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
@@ -31,14 +31,14 @@ from nlos_cam.reconstruct.verdict import FrameConditions, Verdict
 
 
 def all_steps(
-    processing: Pipeline, camera: WallCamera, clock: Clock = lambda: 0.0, *, ahead: bool = False
+    pipeline: Pipeline, camera: WallCamera, clock: Clock = lambda: 0.0, *, ahead: bool = False
 ) -> list[FrameResult]:
     """Results of a camera's frames: one by one, or `ahead` in batches."""
-    frames, thermometer = with_telemetry(camera, camera)
-    with FrameReader(frames, lossless=True, stop=Event(), clock=lambda: 0.0) as reader, processing.checks:
+    frames, telemetry = with_telemetry(camera)
+    with FrameReader(frames, lossless=True, stop=Event(), clock=lambda: 0.0) as reader, pipeline.checks:
         if ahead:
-            return list(iterate_batched(reader, processing, clock, thermometer))
-        return list(iterate_results(reader, processing, clock, thermometer=thermometer))
+            return list(iterate_batched(reader, pipeline, clock, telemetry))
+        return list(iterate_results(reader, pipeline, clock, telemetry=telemetry))
 
 
 @pytest.fixture
@@ -111,16 +111,16 @@ def looking(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
     return np.clip(np.nan_to_num(depth_m[:, :, :64]) + 0.5, 0.0, 1.0)
 
 
-@pytest.mark.parametrize("count", [0, 1, FRAMES_TOGETHER, FRAMES_TOGETHER * (MAX_BATCHES_AHEAD + 3) + 3])
-def test_steps_ahead_equal_steps_in_turn(tmp_path: Path, count: int) -> None:
+@pytest.mark.parametrize("count", [0, 1, BATCH_FRAMES, BATCH_FRAMES * (MAX_BATCHES_AHEAD + 3) + 3])
+def test_batched_results_equal_results_in_turn(tmp_path: Path, count: int) -> None:
     done: list[list[FrameResult]] = []
     for ahead in (False, True):
         bench, checks = (
             CalibratedRig(RIG, measured_wall(tmp_path)),
             PeriodicPhysicsCheck(RIG, every=5, accuracy="draft"),
         )
-        processing = Pipeline(bench, looking, average=3, uncertainty_model=FakeDoubter(), checks=checks)
-        done.append(all_steps(processing, WallCamera(count, moved=range(count // 2)), ahead=ahead))
+        pipeline = Pipeline(bench, looking, average=3, uncertainty_model=FakeDoubter(), checks=checks)
+        done.append(all_steps(pipeline, WallCamera(count, moved=range(count // 2)), ahead=ahead))
     assert [step.frame.frame_number for step in done[1]] == list(range(count))
     for one, other in zip(*done, strict=True):
         assert (one.verdict, one.warnings, one.arrived_s) == (other.verdict, other.warnings, other.arrived_s)
@@ -129,16 +129,16 @@ def test_steps_ahead_equal_steps_in_turn(tmp_path: Path, count: int) -> None:
             np.testing.assert_array_equal(getattr(one, name).depth_m, getattr(other, name).depth_m)
 
 
-def test_steps_ahead_share_the_network_time_of_a_batch() -> None:
+def test_batched_frames_share_the_network_time() -> None:
     ticks = iter(range(10_000))
     done = all_steps(Pipeline(CalibratedRig(RIG), sheet_network), WallCamera(4), lambda: float(next(ticks)), ahead=True)
-    assert len(done) == FRAMES_TOGETHER == 4
+    assert len(done) == BATCH_FRAMES == 4
     (share_s,) = {step.stages_s["network"] for step in done}
     assert share_s in {ticks / 4 for ticks in range(1, 100)}
 
 
 @pytest.mark.parametrize(("ahead", "count"), [(False, 12), (True, 40)])
-def test_steps_raise_the_error_of_a_frame(ahead: bool, count: int) -> None:
+def test_results_raise_the_error_of_a_frame(ahead: bool, count: int) -> None:
     odd_m = maps_from_frame(wall_frame(9)).depth_m
 
     def failing(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
@@ -174,7 +174,7 @@ def test_moved_lidar_overrules_the_networks_verdict(walled: CalibratedRig) -> No
 
 
 @pytest.mark.parametrize(
-    ("change", "signs"),
+    ("change", "conditions"),
     [
         ({}, FrameConditions()),
         ({"depth_m": np.full((64, 80), np.nan, np.float32)}, FrameConditions(invalid=True)),
@@ -185,13 +185,13 @@ def test_moved_lidar_overrules_the_networks_verdict(walled: CalibratedRig) -> No
         ({"ir": np.full((64, 80), 255, np.uint8)}, FrameConditions(saturated=True)),
     ],
 )
-def test_signs_of_names_what_is_wrong_with_a_frame(change: dict[str, np.ndarray], signs: FrameConditions) -> None:
+def test_frame_conditions_name_what_is_wrong_with_a_frame(change: dict[str, np.ndarray], conditions: FrameConditions) -> None:
     whole = replace(wall_frame(0), depth_m=np.full((64, 80), 0.3, np.float32))
-    assert frame_conditions(replace(whole, **change), BenchObservation(None, ()), None) == signs
+    assert frame_conditions(replace(whole, **change), BenchObservation(None, ()), None) == conditions
     check = PhysicsCheckResult(
         0, np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32), score=1.0, seconds=0.0
     )
-    assert frame_conditions(replace(whole, **change), BenchObservation(None, ()), check) == replace(signs, check=check)
+    assert frame_conditions(replace(whole, **change), BenchObservation(None, ()), check) == replace(conditions, check=check)
 
 
 DOUBTER: Any = object()
@@ -201,7 +201,7 @@ def trained(rig_name: str = RIG.name, rig_checksum: str = RIG.checksum, eats: st
     return SimpleNamespace(rig_name=rig_name, rig_checksum=rig_checksum, input=eats)
 
 
-def test_misfits_name_what_differs_from_the_training_rig() -> None:
+def test_compatibility_warnings_name_what_differs_from_the_training_rig() -> None:
     farther = RIG.model_copy(update={"lidar": RIG.lidar.model_copy(update={"distance_m": 0.3})})
     assert compatibility_warnings(CalibratedRig(RIG), trained(), DOUBTER) == []
     (note,) = compatibility_warnings(CalibratedRig(farther), trained(), DOUBTER)
@@ -211,13 +211,13 @@ def test_misfits_name_what_differs_from_the_training_rig() -> None:
 
 
 @pytest.mark.parametrize(("checksum", "notes"), [(RIG.checksum, 0), ("0" * 12, 1)])
-def test_misfits_know_an_unnamed_rig_by_its_checksum(checksum: str, notes: int) -> None:
+def test_compatibility_of_an_unnamed_rig_is_by_checksum(checksum: str, notes: int) -> None:
     assert (
         len(compatibility_warnings(CalibratedRig(RIG), trained("a rig of somebody else's", checksum), DOUBTER)) == notes
     )
 
 
-def test_misfits_name_a_wall_without_reference(walled: CalibratedRig) -> None:
+def test_compatibility_warnings_name_a_wall_without_reference(walled: CalibratedRig) -> None:
     bare = CalibratedRig(RIG, replace(walled.measured, reference=None))
     more = set(compatibility_warnings(bare, trained(), DOUBTER)) - set(
         compatibility_warnings(walled, trained(), DOUBTER)
@@ -226,15 +226,15 @@ def test_misfits_name_a_wall_without_reference(walled: CalibratedRig) -> None:
 
 
 @pytest.mark.parametrize("eats", ["raw maps", "difference maps"])
-def test_set_up_feeds_the_networks_their_kind_of_maps(walled: CalibratedRig, eats: str) -> None:
+def test_build_pipeline_feeds_the_networks_their_kind_of_maps(walled: CalibratedRig, eats: str) -> None:
     network = Noting()
     network.record = trained(eats=eats)
-    processing: Any = build_pipeline(walled, network, average=7)
-    done = all_steps(processing, WallCamera(1))
-    assert processing.network is network
+    pipeline: Any = build_pipeline(walled, network, average=7)
+    done = all_steps(pipeline, WallCamera(1))
+    assert pipeline.network is network
     fed = {"raw maps": done[0].maps, "difference maps": done[0].difference}[eats]
     np.testing.assert_array_equal(network.given[0], fed.depth_m)
-    assert len(processing._mean._last) == 7
+    assert len(pipeline._mean._last) == 7
 
 
 def test_load_networks_exports_into_the_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
