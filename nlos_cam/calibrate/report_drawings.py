@@ -1,7 +1,4 @@
-"""The report's drawing of the bench, to scale, from above and from the side.
-
-The report's drawing of the wall from the front: the cells that the lidar sees, the relay, what is hidden.
-"""
+"""Drawings of the bench for the report: to scale from above and from the side; the wall from the front."""
 
 from dataclasses import dataclass
 from math import atan2, cos, degrees, hypot, radians, sin
@@ -22,8 +19,8 @@ Style = dict[str, Any]
 
 WALL, LIDAR, EDGE, VIEW, OCCLUDER, OBJECT = "0.35", "#08306b", "#4292c6", "#9ecae1", "#000000", "#d95f02"
 FAR_M, MARGIN_M = 2.5, 0.12
-FARTHEST_DRAWN_M, HIGHEST_DRAWN_M = 0.9, 0.35
-"""From the foot: an optical axis that meets the wall beyond leaves the picture."""
+MAX_X_DRAWN_M, MAX_Y_DRAWN_M = 0.9, 0.35
+"""Limits from the foot: an optical axis that meets the wall beyond them leaves the picture."""
 BENCH_WIDTH_IN = 11.0
 X, Y, Z = 0, 1, 2
 NAMES = {X: "x along the wall (m)", Y: "y up (m)", Z: "z from the wall (m)"}
@@ -31,19 +28,19 @@ NAMES = {X: "x along the wall (m)", Y: "y up (m)", Z: "z from the wall (m)"}
 
 @dataclass(frozen=True)
 class _Side:
-    """A view along one axis of the wall frame: which axes go across and up the page."""
+    """View along one axis of the wall frame: the axes drawn across and up the page."""
 
     across: int
     up: int
     turned: bool
-    """Whether the axis that goes up the page is drawn downwards."""
+    """True if the axis that goes up the page points down."""
 
 
 ABOVE, BESIDE = _Side(X, Z, turned=True), _Side(Z, Y, turned=False)
 
 
 def bench_picture(record: WallRecord) -> Picture:
-    """The bench from above and from the side, both to one scale."""
+    """Return the bench from above and from the side, both to one scale."""
     limits = drawn_limits(record.rig)
     wide, tall, deep = (high - low for low, high in limits)
     figure = figure_of(BENCH_WIDTH_IN, 0.86 * BENCH_WIDTH_IN * max(tall, deep) / (wide + deep) + 0.9)
@@ -54,26 +51,26 @@ def bench_picture(record: WallRecord) -> Picture:
     above.set_title(f"from above: {record.distance_m:.3f} m away, facing {record.facing_deg:.1f}°", fontsize=11)
     beside.set_title(f"from the side: pitch {record.pitch_deg:+z.1f}°", fontsize=11)
     caption = (
-        "To scale, both alike. The lidar looks along the dash-dotted line; the blue area is its field of view, the "
-        "occluder taken away. Its dashed edges never meet the wall. Light goes from the lidar to the wall, past "
-        f"the occluder's edge to the hidden object, and back the same way. {_occluder_told(record)}"
+        "Both to the same scale. The dash-dotted line is the lidar's optical axis; the blue area is its field of view "
+        "without the occluder. Its dashed edges never meet the wall. Light goes from the lidar to the wall, past "
+        f"the occluder's edge to the hidden object, and back the same way. {_occluder_source(record)}"
     )
     return Picture("The bench", caption, png(figure))
 
 
-def _occluder_told(record: WallRecord) -> str:
+def _occluder_source(record: WallRecord) -> str:
     if record.rig.occluder is None:
         return "This rig has no occluder."
     if record.occluder is None:
-        return "The occluder is dashed: it is drawn where the paper has it, nobody has measured it here."
+        return "The dashed occluder has the paper's place: it was not measured here."
     return f"The occluder was {record.occluder.source}."
 
 
 def drawn_limits(rig: Rig) -> tuple[Limits, Limits, Limits]:
-    """What part of x, y and z is drawn: all that the bench has, and the optical axis as far as there is room."""
-    reached = _reached(rig)
-    highest = float(np.clip(reached[Y], -HIGHEST_DRAWN_M, HIGHEST_DRAWN_M))
-    x, y, z = [0.0, reached[X]], [highest, -0.15, 0.15], [rig.lidar.distance_m + 0.05]
+    """Return the drawn ranges of x, y and z: the whole bench, and the optical axis as far as it fits."""
+    axis_end = _axis_end(rig)
+    highest = float(np.clip(axis_end[Y], -MAX_Y_DRAWN_M, MAX_Y_DRAWN_M))
+    x, y, z = [0.0, axis_end[X]], [highest, -0.15, 0.15], [rig.lidar.distance_m + 0.05]
     for extent in (rig.object_box, rig.relay):
         if extent is not None:
             x += [extent.x_min_m, extent.x_max_m]
@@ -86,11 +83,11 @@ def drawn_limits(rig: Rig) -> tuple[Limits, Limits, Limits]:
     return (min(x) - MARGIN_M, max(x) + MARGIN_M), (min(y) - 0.05, max(y) + 0.05), (-0.04, max(z) + 0.04)
 
 
-def _reached(rig: Rig) -> Float64:
-    """Where the optical axis meets the wall, or how far along it there is room."""
+def _axis_end(rig: Rig) -> Float64:
+    """Return the point where the optical axis meets the wall, or where it leaves the picture."""
     along, distance_m = rig.wall_from_lidar[:3, 2], rig.lidar.distance_m
     aside = hypot(along[X], along[Y])
-    reach_m = min(distance_m / -along[Z], FARTHEST_DRAWN_M / aside if aside > 0.0 else FAR_M)
+    reach_m = min(distance_m / -along[Z], MAX_X_DRAWN_M / aside if aside > 0.0 else FAR_M)
     return np.array([0.0, 0.0, distance_m]) + reach_m * along
 
 
@@ -121,17 +118,20 @@ def _wall(axis: "Axes", side: _Side) -> None:
 
 
 def _view(axis: "Axes", side: _Side, rig: Rig) -> None:
-    """The frustum: its corner rays, what lies between them, the optical axis."""
+    """Draw the field of view: corner rays, the area between them, the optical axis."""
     pose, drawn = rig.wall_from_lidar, [side.across, side.up]
     start, corners = pose[:3, 3], [start := pose[:3, 3]]
     for edge in _corner_rays(rig) @ pose[:3, :3].T:
         end = start + edge * min(start[Z] / -edge[Z] if edge[Z] < 0.0 else FAR_M, FAR_M)
-        corners += [end, end * np.array([1.0, 1.0, 0.0])]  # what passes over a far part of the wall covers it
+        corners += [
+            end,
+            end * np.array([1.0, 1.0, 0.0]),
+        ]  # and its foot on the wall: rays that pass over the wall cover it
         line = "-" if edge[Z] < 0.0 else "--"
         axis.plot(*np.stack([start, end])[:, drawn].T, color=EDGE, linewidth=1.0, linestyle=line)
     outline = cv2.convexHull(np.array(corners, np.float32)[:, drawn])[:, 0]
     axis.fill(*outline.T, color=VIEW, alpha=0.3, linewidth=0.0, zorder=0)
-    path = np.stack([start, _reached(rig)])
+    path = np.stack([start, _axis_end(rig)])
     axis.plot(*path[:, drawn].T, color=LIDAR, linewidth=1.3, linestyle="-.")
 
 
@@ -142,12 +142,12 @@ def _corner_rays(rig: Rig) -> Float64:
 
 
 def _occluder_style(record: WallRecord) -> tuple[str, str]:
-    """How its line is drawn, and what it is called: whether somebody knows where it stands."""
+    """Return line style and label: dashed if its place is assumed."""
     return ("-", "occluder") if record.occluder is not None else ("--", "occluder (paper's)")
 
 
 def _occluder_from_above(axis: "Axes", record: WallRecord, low_m: float) -> None:
-    """Its sheet with its lean, and the gap before the wall."""
+    """Draw the sheet with its tilt, and the gap to the wall."""
     occluder, (line, label) = record.rig.occluder, _occluder_style(record)
     if occluder is None:
         return
@@ -158,8 +158,7 @@ def _occluder_from_above(axis: "Axes", record: WallRecord, low_m: float) -> None
     arrow: Style = {"arrowstyle": "<->", "color": OCCLUDER, "shrinkA": 0, "shrinkB": 0}
     axis.annotate("", (occluder.x_m, 0.0), xytext=tuple(top), arrowprops=arrow)
     axis.text(occluder.x_m + 0.01, 0.5 * occluder.z_min_m, f"gap {occluder.z_min_m:.3f} m", fontsize=9, va="center")
-    place = occluder.x_m + 0.02, low_m - 0.01
-    axis.text(*place, label, fontsize=9, rotation=90, ha="left", va="bottom")
+    axis.text(occluder.x_m + 0.02, low_m - 0.01, label, fontsize=9, rotation=90, ha="left", va="bottom")
 
 
 def _occluder_from_the_side(axis: "Axes", record: WallRecord, high_m: float) -> None:
@@ -180,13 +179,13 @@ def _object(axis: "Axes", side: _Side, box: ObjectBox) -> None:
     (left, right), (low, high) = spans[side.across], spans[side.up]
     style: Style = {"facecolor": to_rgba(OBJECT, 0.2), "edgecolor": OBJECT, "linewidth": 1.5}
     axis.add_patch(Rectangle((left, low), right - left, high - low, **style))
-    # in a corner: from the side, the lidar stands before the box
+    # the label in a corner: from the side, the lidar is drawn over the box
     style: Style = {"ha": "right", "va": "bottom" if side.turned else "top", "color": "#8c3b00", "fontsize": 9}
     axis.text(right - 0.008, high - 0.008, "hidden object", **style)
 
 
 def _dimension(axis: "Axes", record: WallRecord) -> None:
-    """The perpendicular with its length, and the angle between it and the optical axis, in the view from above."""
+    """Draw the perpendicular with its length, and its angle to the optical axis, in the view from above."""
     from matplotlib.patches import Arc
 
     distance_m, along = record.rig.lidar.distance_m, record.rig.wall_from_lidar[:3, 2]
@@ -194,12 +193,8 @@ def _dimension(axis: "Axes", record: WallRecord) -> None:
     axis.annotate("", (0.0, 0.0), xytext=(0.0, distance_m), arrowprops=arrow)
     axis.plot(0.0, 0.0, marker="o", markersize=5, color=LIDAR)
     inner, outer = ("left", "right") if along[X] >= 0.0 else ("right", "left")
-    style: Style = {
-        "fontsize": 10,
-        "color": LIDAR,
-        "va": "center",
-        "bbox": {"facecolor": "white", "alpha": 0.8, "pad": 1.0},
-    }
+    box = {"facecolor": "white", "alpha": 0.8, "pad": 1.0}
+    style: Style = {"fontsize": 10, "color": LIDAR, "va": "center", "bbox": box}
     aside_m = -0.012 if along[X] >= 0.0 else 0.012
     axis.text(aside_m, 0.4 * distance_m, f"{distance_m:.3f} m", ha=outer, **style)
     drawn_deg, radius_m = degrees(atan2(along[X], -along[Z])), 0.45 * distance_m
@@ -212,22 +207,19 @@ def _dimension(axis: "Axes", record: WallRecord) -> None:
 
 
 def _facing(record: WallRecord) -> str:
-    """The facing angle; and the yaw, which is what is seen from above, where it is another."""
+    """Return the facing angle, and the yaw, which the view from above shows, if it differs."""
     same = abs(record.facing_deg - abs(record.yaw_deg)) <= 0.3
     return f"{record.facing_deg:.1f}°" + ("" if same else f"\n(yaw {record.yaw_deg:+z.1f}°)")
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-RELAY, SEEN, SEEN_EDGE = "#1b9e77", "#c6dbef", "#6baed6"
+RELAY, VISIBLE, VISIBLE_EDGE = "#1b9e77", "#c6dbef", "#6baed6"
 CELLS_PER_LINE = 8
 FOOTPRINT_WIDTH_IN = 8.6
-FARTHEST_M = 100.0
+MAX_CELL_M = 100.0
 
 
 def footprint_picture(record: WallRecord) -> Picture:
-    """The wall from the front: what the lidar sees of it, what the object is seen by, what is hidden."""
+    """Return the wall from the front: the lidar's field of view, the relay, the hidden object's box."""
     rig = record.rig
     x, y, _ = drawn_limits(rig)
     figure = figure_of(FOOTPRINT_WIDTH_IN, min(FOOTPRINT_WIDTH_IN * (y[1] - y[0]) / (x[1] - x[0]) + 1.0, 9.0))
@@ -237,22 +229,22 @@ def footprint_picture(record: WallRecord) -> Picture:
     shown = Extent(x_min_m=x[0], x_max_m=x[1], y_min_m=y[0], y_max_m=y[1])
     if not _holds(rig.wall, shown):
         _rectangle(axis, rig.wall, WALL, "-", "edge of the wall")
-    _rectangle(axis, rig.relay, RELAY, "-", "relay: the part of the wall that the object is seen by")
+    _rectangle(axis, rig.relay, RELAY, "-", "relay: the part of the wall that reflects light to and from the object")
     if rig.object_box is not None:
         _rectangle(axis, rig.object_box, OBJECT, "--", "hidden object's box, behind the occluder")
     if rig.occluder is not None:
         style = "-" if record.occluder is not None else "--"
         axis.axvline(rig.occluder.x_m, color=OCCLUDER, linewidth=1.5, linestyle=style, label="occluder's edge")
-    marked: dict[str, Any] = {"color": LIDAR, "linestyle": "none"}
+    marked: Style = {"color": LIDAR, "linestyle": "none"}
     axis.plot(0.0, 0.0, marker="+", markersize=14, label="foot of the perpendicular from the lidar", **marked)
     meets = on_plane(rig.wall_from_lidar, np.array([0.0, 0.0, 1.0]))
     axis.plot(*meets, marker="x", markersize=10, label="where the optical axis meets the wall", **marked)
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     share = footprint(rig.wall_from_lidar, rig.pinhole, rig.wall).share
     caption = (
-        f"The wall from the front. Blue is what the lidar sees, with a line for every {CELLS_PER_LINE}th of the map's "
-        f"64 x 80 cells; {100.0 * share:.0f} % of the cells meet the wall. Light comes back only from where blue and "
-        "relay (green) overlap: the more, the better."
+        f"The wall from the front. Blue is the lidar's field of view, with a line for every {CELLS_PER_LINE}th of "
+        f"the map's 64 x 80 cells; {100.0 * share:.0f} % of the cells meet the wall. Light returns only from where blue and "
+        "relay (green) overlap: the larger the overlap, the better."
     )
     return Picture("What the lidar sees of the wall", caption, png(figure))
 
@@ -263,7 +255,7 @@ def _holds(outer: Extent, inner: Extent) -> bool:
 
 
 def _cells(axis: "Axes", rig: Rig) -> None:
-    """The edges of every eighth cell, where they meet the wall's plane."""
+    """Draw the grid of every eighth cell on the wall's plane."""
     from matplotlib.collections import PolyCollection
 
     rows, columns = MAP_SHAPE
@@ -273,21 +265,17 @@ def _cells(axis: "Axes", rig: Rig) -> None:
     rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], axis=-1, dtype=np.float64)
     at_m = on_plane(rig.wall_from_lidar, rays)
     quads = np.stack([at_m[:-1, :-1], at_m[:-1, 1:], at_m[1:, 1:], at_m[1:, :-1]], axis=2).reshape(-1, 4, 2)
-    seen = quads[np.abs(quads).max(axis=(1, 2)) < FARTHEST_M]  # False for NaN
-    axis.add_collection(PolyCollection(list(seen), facecolor=SEEN, edgecolor=SEEN_EDGE, linewidth=0.6, alpha=0.8))
+    visible = quads[np.abs(quads).max(axis=(1, 2)) < MAX_CELL_M]  # False for NaN
+    axis.add_collection(
+        PolyCollection(list(visible), facecolor=VISIBLE, edgecolor=VISIBLE_EDGE, linewidth=0.6, alpha=0.8)
+    )
 
 
-def _rectangle(axis: "Axes", extent: Extent, colour: str, line: str, label: str) -> None:
+def _rectangle(axis: "Axes", extent: Extent, color: str, line: str, label: str) -> None:
     from matplotlib.colors import to_rgba
     from matplotlib.patches import Rectangle
 
     size = extent.x_max_m - extent.x_min_m, extent.y_max_m - extent.y_min_m
-    fill = to_rgba(colour, 0.15 if line == "--" else 0.0)
-    style: dict[str, Any] = {
-        "edgecolor": colour,
-        "facecolor": fill,
-        "linestyle": line,
-        "linewidth": 1.8,
-        "label": label,
-    }
+    fill = to_rgba(color, 0.15 if line == "--" else 0.0)
+    style: Style = {"edgecolor": color, "facecolor": fill, "linestyle": line, "linewidth": 1.8, "label": label}
     axis.add_patch(Rectangle((extent.x_min_m, extent.y_min_m), *size, **style))

@@ -1,7 +1,4 @@
-"""The report's maps of the bare wall: residual, noise, saturation beside infrared, and how the residuals spread.
-
-How far the bare wall's mean depth is off the plane of its record, how far noise alone would put it, in blocks.
-"""
+"""Maps of the bare wall for the report: residual and its distribution, depth noise, infrared and saturation."""
 
 import io
 from dataclasses import dataclass
@@ -13,37 +10,42 @@ from nlos_calibration import FULL_SCALE, BareWall, MeanNoise, WallRecord, depth_
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.figure import Figure
+
 DRAWN_COLUMNS = 320
-"""Maps are drawn in blocks of pixels, at most so many across: what the wall does shows better without the noise."""
+"""Maps are averaged in blocks to at most this width, which shows the wall's shape better than noisy pixels."""
 
 
 def residual_m(record: WallRecord, reference: BareWall) -> Float64:
-    """How far behind the record's plane each pixel's mean is, normal to the wall (height, width); NaN: no return.
+    """Return each pixel's distance behind the record's plane, along its normal (height, width); NaN without return.
 
-    The range offset of the record is in it, by its cause (`nlos_calibration.range_offset`).
+    The record's range offset is applied, by its cause (`nlos_calibration.range_offset`).
     """
     return -wall_points_m(record, reference)[..., 2]
 
 
 def expected_std_m(record: WallRecord, reference: BareWall) -> Float64:
-    """The standard deviation that the lidar's noise alone gives a residual (height, width)."""
+    """Return the standard deviation of a residual in metres due to the lidar's noise alone (height, width).
+
+    A pixel at depth d lies at lidar + d * ray; its height above the plane changes with d by n . ray, n the normal.
+    """
     scale = 1.0 if record.noise_scale is None else record.noise_scale
     noise = MeanNoise(np.array([float(reference.frames)]), scale)
-    return noise.of(reference.depth_m.astype(np.float64)) * np.abs(_towards(record, reference))
-
-
-def _towards(record: WallRecord, reference: BareWall) -> Float64:
-    """How far each pixel's ray comes nearer to the wall with each metre of depth (height, width)."""
-    return -(reference.intrinsics.rays() @ np.array(record.wall_from_lidar)[2, :3])
+    return noise.of(reference.depth_m.astype(np.float64)) * np.abs(
+        reference.intrinsics.rays() @ np.array(record.wall_from_lidar)[2, :3]
+    )
 
 
 def block_side(columns: int) -> int:
-    """How many pixels a block of a map so wide is across."""
+    """Return the side of a block in pixels for a map of this width."""
     return ceil(columns / DRAWN_COLUMNS)
 
 
 def in_blocks(values: NDArray[np.floating], side: int) -> Float64:
-    """Means over blocks of side x side pixels, NaN left out; NaN where there is nothing else."""
+    """Return means over blocks of side x side pixels without NaN; NaN for a block of NaN only."""
     known = np.isfinite(values)
     count = _sums(known.astype(np.float64), side)
     return np.divide(
@@ -51,8 +53,8 @@ def in_blocks(values: NDArray[np.floating], side: int) -> Float64:
     )
 
 
-def most_of_block(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
-    """The blocks of which at least half is in the mask."""
+def block_majority(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+    """Return a mask of the blocks with at least half of their pixels in the mask."""
     return in_blocks(mask.astype(np.float64), side) >= 0.5
 
 
@@ -63,56 +65,45 @@ def _sums(values: NDArray[np.floating], side: int) -> Float64:
     return padded.reshape(rows // side, side, columns // side, side).sum(axis=(1, 3))
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colorbar import Colorbar
-    from matplotlib.figure import Figure
-
-
 DPI = 100
 STRAY, STRIPE, NO_RETURN = (0.72, 0.72, 0.72, 1.0), (0.35, 0.35, 0.35, 1.0), (0.9, 0.9, 0.9, 1.0)
 STRIPE_BLOCKS = 4
 LEVELS = 21
-"""Of colour: noise in more of them makes files large. Odd, so that the middle one is white."""
+"""Number of colors: noise in more of them makes files large. Odd, so that the middle one is white."""
 MIN_RESIDUAL_MM = 0.5
-"""A finer scale would make the noise of a good wall look like trouble."""
+"""Smallest end of the scale, so that the noise of a good wall stays pale."""
 ROUND = 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0
 SPREAD_POINTS = 500
-"""Pixels of which the expected spread is drawn."""
+"""Number of pixels whose expected distributions are averaged."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture of the report, or the reason why there is none."""
+    """Picture of the report, or the reason why there is none."""
 
     title: str
     caption: str
-    """What it shows, how to read it; all there is to say where `png` is None."""
+    """Content and reading of the picture; the reason where `png` is None."""
     png: bytes | None = None
 
 
 def figure_of(width_in: float, height_in: float) -> "Figure":
-    """An empty figure that arranges its own parts."""
+    """Return an empty figure with automatic layout."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
 def png(figure: "Figure") -> bytes:
-    """The figure as a PNG."""
+    """Return the figure as a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
     return buffer.getvalue()
 
 
 def wall_maps(record: WallRecord, reference: BareWall) -> list[Picture]:
-    """The pictures that the reference's maps give."""
-    return [
-        _residuals(record, reference),
-        _spread(record, reference),
-        _noise(reference),
-        _infrared(reference),
-    ]
+    """Return the pictures of the reference: residual, its distribution, noise, infrared."""
+    return [_residuals(record, reference), _spread(record, reference), _noise(reference), _infrared(reference)]
 
 
 def _residuals(record: WallRecord, reference: BareWall) -> Picture:
@@ -120,7 +111,7 @@ def _residuals(record: WallRecord, reference: BareWall) -> Picture:
     off_mm = 1e3 * residual_m(record, reference)
     known = np.isfinite(off_mm)
     if not known.any():
-        return Picture(title, "No pixel has depth in half of the frames: there is no distance from the plane to draw.")
+        return Picture(title, "No pixel has depth in half of the frames: there is no residual to draw.")
     stray = known & ~reference.inliers
     drawn = np.where(stray, np.nan, off_mm)
     side = block_side(drawn.shape[1])
@@ -128,17 +119,17 @@ def _residuals(record: WallRecord, reference: BareWall) -> Picture:
     figure = figure_of(8.6, 5.4)
     axis = figure.add_subplot()
     scale: dict[str, Any] = {"extend": "both", "cmap": "RdBu_r", "vmin": -limit_mm, "vmax": limit_mm}
-    _map(axis, drawn, "mm behind the plane (negative: before it)", **scale)
+    _map(axis, drawn, "mm behind the plane (negative: in front)", **scale)
     _shade(axis, stray, ~known)
     axis.set_title("distance of the mean depth from the plane, normal to the wall", fontsize=10)
     shares = f"Left out of the plane (striped): {_percent(stray)} of the pixels; without return: {_percent(~known)}."
     how = (
         "Even, pale speckle is noise on a flat wall. Broad red or blue areas are a bent wall or ripples of the lidar; "
-        f"a patch with a sharp edge is something that stands before the wall. Each dot is the mean of {side} x {side} "
+        f"a patch with a sharp edge is an object in front of the wall. Each dot is the mean of {side} x {side} "
         "pixels. "
     )
     if record.residual_m is None:
-        shares += " The depth was refused and the plane is the board's: this is how far they are apart."
+        shares += " The depth was refused and the plane is the board's: the map shows their difference."
     return Picture(title, how + shares, png(figure))
 
 
@@ -150,19 +141,20 @@ def _spread(record: WallRecord, reference: BareWall) -> Picture:
         return Picture(title, "No pixel is on the plane: there are no residuals to count.")
     rms_mm, expected_mm = (float(np.sqrt(np.mean(values**2))) for values in (off_mm, sigma_mm))
     reach_mm = 4.0 * max(rms_mm, expected_mm)
+    # a Gaussian for each of some pixels, averaged: noise grows with distance, so their mixture is not a Gaussian
     some_mm = sigma_mm[:: max(len(sigma_mm) // SPREAD_POINTS, 1), np.newaxis]
     at_mm = np.linspace(-reach_mm, reach_mm, 241)
     normal = np.exp(-0.5 * (at_mm / some_mm) ** 2) / (np.sqrt(2.0 * np.pi) * some_mm)
     figure = figure_of(8.6, 3.4)
     axis = figure.add_subplot()
     axis.hist(off_mm, bins=80, range=(-reach_mm, reach_mm), density=True, color="#9ecae1", label="measured")
-    axis.plot(at_mm, normal.mean(axis=0), color="#b2182b", label="expected of the lidar's noise")
+    axis.plot(at_mm, normal.mean(axis=0), color="#b2182b", label="expected from the lidar's noise")
     axis.axvline(0.0, color="0.4", linewidth=0.8)
     axis.set(xlabel="mm behind the plane", ylabel="share of pixels per mm", xlim=(-reach_mm, reach_mm))
     axis.legend(frameon=False)
     caption = (
         f"The pixels that the plane rests on are {rms_mm:.3f} mm RMS off it; noise, averaged over {reference.frames} "
-        f"frames, would leave {expected_mm:.3f} mm. Bars much wider than the line, or beside it, are no noise: "
+        f"frames, would leave {expected_mm:.3f} mm. Bars much wider than the line, or beside it, are not noise: "
         "ripples of the lidar, a wall that is not flat, or another plane."
     )
     return Picture(title, caption, png(figure))
@@ -172,7 +164,7 @@ def _noise(reference: BareWall) -> Picture:
     title = "Is the lidar as quiet as it should be?"
     std_m = reference.depth_std_m.astype(np.float64)
     if not np.isfinite(std_m).any():
-        return Picture(title, "No pixel has two samples of depth: its noise is not known.")
+        return Picture(title, "No pixel has two depth samples: the noise is unknown.")
     ratio = std_m / depth_noise_m(reference.depth_m.astype(np.float64))
     figure = figure_of(11.0, 3.9)
     left, right = figure.subplots(1, 2)
@@ -186,8 +178,8 @@ def _noise(reference: BareWall) -> Picture:
     right.set_title("against 0.5 mm + 2 mm per metre, the nominal", fontsize=10)
     typical = "" if not np.isfinite(ratio).any() else f" Typical here: {np.nanmedian(ratio):.2f} times the nominal."
     caption = (
-        "Left: how much one pixel's depth jumps from frame to frame. Right: white is as expected, orange is noisier "
-        "(weak returns, a cold lidar, light from elsewhere)."
+        "Left: standard deviation of one pixel's depth from frame to frame. Right: white is as expected, orange is "
+        "noisier (weak returns, a cold lidar, light from elsewhere)."
     )
     return Picture(title, caption + typical, png(figure))
 
@@ -197,28 +189,28 @@ def _infrared(reference: BareWall) -> Picture:
     ir, share = reference.ir.astype(np.float64), 100.0 * reference.saturated.astype(np.float64)
     if not np.isfinite(ir).any():
         return Picture(title, "There is no infrared image.")
-    blinded = share > 0.0
-    figure = figure_of(11.0, 3.9) if blinded.any() else figure_of(6.2, 4.0)
-    axes = figure.subplots(1, 2 if blinded.any() else 1, squeeze=False)[0]
+    saturated = share > 0.0
+    figure = figure_of(11.0, 3.9) if saturated.any() else figure_of(6.2, 4.0)
+    axes = figure.subplots(1, 2 if saturated.any() else 1, squeeze=False)[0]
     high = min(_limit(ir), float(FULL_SCALE))
     _map(axes[0], ir, "IR counts of 255", levels=3 * LEVELS, cmap="gray", vmin=0.0, vmax=high)
     axes[0].set_title("mean infrared image", fontsize=10)
-    if not blinded.any():
-        words = f"No pixel is saturated: the brightest is {np.nanmax(ir):.0f} of 255 counts on average."
-        return Picture(title, words, png(figure))
+    if not saturated.any():
+        caption = f"No pixel is saturated: the brightest is {np.nanmax(ir):.0f} of 255 counts on average."
+        return Picture(title, caption, png(figure))
     _map(axes[1], share, "% of the frames", cmap="magma", vmin=0.0, vmax=100.0)
     axes[1].set_title("saturated: at full scale", fontsize=10)
-    words = (
-        f"{_percent(blinded)} of the pixels were at full scale in some frame, {_percent(share >= 50.0)} in half of "
-        "them. There the lidar is blinded and its depth is not to be trusted: lower the laser power or the gain."
+    caption = (
+        f"{_percent(saturated)} of the pixels were at full scale in some frame, {_percent(share >= 50.0)} in half of "
+        "them. There the depth is unreliable: lower the laser power or the gain."
     )
-    return Picture(title, words, png(figure))
+    return Picture(title, caption, png(figure))
 
 
 def _map(
     axis: "Axes", values: Float64, label: str, *, extend: Any = "neither", levels: int = LEVELS, **style: Any
 ) -> "Colorbar":
-    """Draw an image of the sensor in blocks, and return its colour bar."""
+    """Draw an image of the sensor in blocks, and return its color bar."""
     from matplotlib import colormaps
 
     height, width = values.shape
@@ -231,35 +223,35 @@ def _map(
 
 
 def _shade(axis: "Axes", stray: NDArray[np.bool_], absent: NDArray[np.bool_]) -> None:
-    """Stripe what was left out of the plane, grey what has no return, and say so."""
+    """Stripe pixels left out of the plane, gray pixels without return, and add a legend."""
     from matplotlib.patches import Patch
 
     height, width = stray.shape
     side = block_side(width)
-    stray_blocks, absent_blocks = most_of_block(stray, side), most_of_block(absent, side)
+    stray_blocks, absent_blocks = block_majority(stray, side), block_majority(absent, side)
     rows, columns = np.indices(stray_blocks.shape)
     paint = np.zeros((*stray_blocks.shape, 4))
     paint[stray_blocks] = STRAY
     paint[stray_blocks & ((rows + columns) // STRIPE_BLOCKS % 2 == 0)] = STRIPE
     paint[absent_blocks] = NO_RETURN
     axis.imshow(paint, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
-    told = [Patch(facecolor=STRAY, edgecolor=STRIPE, hatch="///", label="left out of the plane")] * bool(stray.any())
-    told += [Patch(facecolor=NO_RETURN, edgecolor="0.6", label="no return")] * bool(absent.any())
-    if told:
-        axis.legend(handles=told, loc="lower right", fontsize=8, framealpha=0.95)
+    entries = [Patch(facecolor=STRAY, edgecolor=STRIPE, hatch="///", label="left out of the plane")] * bool(stray.any())
+    entries += [Patch(facecolor=NO_RETURN, edgecolor="0.6", label="no return")] * bool(absent.any())
+    if entries:
+        axis.legend(handles=entries, loc="lower right", fontsize=8, framealpha=0.95)
 
 
 def _percent(mask: NDArray[np.bool_]) -> str:
-    """A share in words that does not round a few pixels to none."""
+    """Return a share as text; a few pixels are not rounded to none."""
     share = 100.0 * float(mask.mean())
     return "none" if share == 0.0 else "less than 0.1 %" if share < 0.1 else f"{share:.1f} %"
 
 
 def _limit(values: Float64) -> float:
-    """Where a scale ends that holds 99 % of the values: the next round number; 0.1 where there are none above 0."""
+    """Return the end of a scale that holds 99 % of the values, rounded up; 0.1 without values above 0."""
     known = values[np.isfinite(values)]
-    most = float(np.percentile(known, 99.0)) if len(known) else 0.0
-    if most <= 0.0:
+    high = float(np.percentile(known, 99.0)) if len(known) else 0.0
+    if high <= 0.0:
         return 0.1
-    power = 10.0 ** floor(log10(most))
-    return next(step * power for step in ROUND if step * power >= most * (1.0 - 1e-9))
+    power = 10.0 ** floor(log10(high))
+    return next(step * power for step in ROUND if step * power >= high * (1.0 - 1e-9))

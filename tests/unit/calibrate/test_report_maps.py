@@ -11,11 +11,11 @@ from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.calibrate.report_maps import (
     Picture,
+    block_majority,
     block_side,
     expected_std_m,
     figure_of,
     in_blocks,
-    most_of_block,
     png,
     residual_m,
     wall_maps,
@@ -190,4 +190,4 @@ def test_blocks_are_means_of_known_pixels_and_majorities() -> None:
     np.testing.assert_array_equal(in_blocks(values, 1), values)
     assert [block_side(columns) for columns in (16, 320, 321, 640, 1024)] == [1, 1, 2, 2, 4]
     mask = np.array([[True, True, False, True], [False, False, False, False]])
-    assert most_of_block(mask, 2).tolist() == [[True, False]]
+    assert block_majority(mask, 2).tolist() == [[True, False]]
