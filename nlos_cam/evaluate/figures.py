@@ -1,4 +1,4 @@
-"""Pictures of a judgement: SI 6's Figure S2 as a sheet, metrics per category, error against surface, worst and best."""
+"""Figures of an evaluation: contact sheet (SI Figure S2), metrics per category, error against surface, extremes."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,19 +8,19 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64
 from numpy.typing import NDArray
 
-from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, Bin, Figures, Interval
+from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Bin, Figures, Interval
 
 SHEET_COLUMNS = 18
 MAX_PER_SHEET = 54
 GALLERY = 6
 DIFFERENCE_V = 0.5
-"""The difference that has the full colour; 0.1 is 31 mm in the paper's box."""
+"""Difference in v at the ends of the colour map; 0.1 is 31 mm in the paper's box."""
 Scale = tuple[str, float, float]
-"""A map of colours, and the values at its ends."""
+"""Name of a colour map, and the values at its ends."""
 VALUE: Scale = ("magma", 0.0, 1.0)
 DIFFERENCE: Scale = ("coolwarm", -DIFFERENCE_V, DIFFERENCE_V)
 TILE, HEAD = 70, 16
-"""Pixels from one object's picture to the next, and above them for its name."""
+"""Pixels from one object to the next, and above it for its name."""
 BLOCK = HEAD + 3 * TILE
 ROWS = "truth", "reconstruction", "difference"
 LABELS = {
@@ -32,18 +32,18 @@ LABELS = {
 
 
 def draw_sheet(path: Path, image: Float32, truth: Float32, titles: Sequence[str]) -> None:
-    """Truth, reconstruction and difference of up to 54 objects, evenly chosen where there are more (Figure S2)."""
+    """Draw truth, reconstruction and difference of up to 54 objects, evenly chosen if there are more (SI Figure S2)."""
     shown = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), MAX_PER_SHEET)).astype(int))
     columns = min(SHEET_COLUMNS, len(shown))
     figure = _figure((0.8 * columns + 1.6, 2.7 * -(-len(shown) // columns) + 0.2))
     axis = figure.subplots()
     _mosaic(axis, image[shown], truth[shown], [titles[int(k)] for k in shown], columns)
-    _colour_bars(figure, axis)
+    _color_bars(figure, axis)
     figure.savefig(path, dpi=100)
 
 
 def draw_gallery(path: Path, image: Float32, truth: Float32, titles: Sequence[str], iou: Float64) -> None:
-    """The objects with the lowest silhouette IoU above those with the highest, with their figures."""
+    """Draw the objects with the lowest silhouette IoU above those with the highest."""
     order = np.argsort(iou, kind="stable")
     count = min(GALLERY, len(order))
     figure = _figure((1.5 * count + 2, 10.4))
@@ -51,7 +51,7 @@ def draw_gallery(path: Path, image: Float32, truth: Float32, titles: Sequence[st
     for axis, chosen, title in zip(axes, (order[:count], order[::-1][:count]), ("worst", "best"), strict=True):
         _mosaic(axis, image[chosen], truth[chosen], [f"{titles[int(k)]}: {iou[k]:.2f}" for k in chosen], count)
         axis.set_title(f"{title} silhouettes (IoU)", fontsize=11)
-    _colour_bars(figure, list(axes))
+    _color_bars(figure, list(axes))
     figure.savefig(path, dpi=90)
 
 
@@ -62,7 +62,7 @@ def _figure(size: tuple[float, float]) -> Any:
 
 
 def _mosaic(axis: Any, image: Float32, truth: Float32, titles: Sequence[str], columns: int) -> None:
-    """Truth, reconstruction and difference one below the other, object beside object, as one picture."""
+    """Draw truth, reconstruction and difference below each other, objects side by side, as one image."""
     axis.imshow(mosaic(image, truth, columns))
     axis.set_axis_off()
     for k, title in enumerate(titles):
@@ -75,9 +75,9 @@ def _mosaic(axis: Any, image: Float32, truth: Float32, titles: Sequence[str], co
 
 
 def mosaic(image: Float32, truth: Float32, columns: int) -> NDArray[np.uint8]:
-    """The coloured tiles (rows, columns, 3) of images (n, 64, 64): blocks of HEAD and three rows of TILE pixels."""
+    """Return the colored tiles (rows, columns, 3) of images (n, 64, 64): blocks of HEAD and three TILE rows."""
     canvas = np.full((-(-len(truth) // columns) * BLOCK, columns * TILE, 3), 255, np.uint8)
-    rows = _coloured(truth, VALUE), _coloured(image, VALUE), _coloured(image - truth, DIFFERENCE)
+    rows = _colored(truth, VALUE), _colored(image, VALUE), _colored(image - truth, DIFFERENCE)
     for k in range(len(truth)):
         block, column = divmod(k, columns)
         for row, tiles in enumerate(rows):
@@ -94,28 +94,30 @@ def _mappable(scale: Scale) -> Any:
     return ScalarMappable(Normalize(low, high), name)
 
 
-def _coloured(images: Float32, scale: Scale) -> NDArray[np.uint8]:
-    """Images (n, 64, 64) as colours (n, 64, 64, 3)."""
+def _colored(images: Float32, scale: Scale) -> NDArray[np.uint8]:
+    """Map images (n, 64, 64) to colors (n, 64, 64, 3)."""
     mapped = _mappable(scale)
     return mapped.cmap(mapped.norm(images), bytes=True)[..., :3]
 
 
-def _colour_bars(figure: Any, axes: Any) -> None:
+def _color_bars(figure: Any, axes: Any) -> None:
     words = (VALUE, "v: 0 background, 1 near the wall"), (DIFFERENCE, "difference in v: red is too near")
     for scale, label in words:
         figure.colorbar(_mappable(scale), ax=axes, fraction=0.015, pad=0.005).set_label(label, fontsize=8)
 
 
 def draw_categories(path: Path, categories: Mapping[str, Figures], overall: Figures) -> None:
-    """Each metric per category with its interval, beside the mean of all objects and the bar."""
+    """Draw each metric per category with its interval, the mean of all objects and the target."""
     ordered = sorted(categories, key=lambda name: categories[name]["silhouette_iou"].value or 0.0)
     figure = _figure((13, 1.4 + 0.24 * len(ordered)))
     for axis, (metric, label) in zip(figure.subplots(1, 4, sharey=True), LABELS.items(), strict=True):
         _points(axis, [categories[name][metric] for name in ordered])
         if (mean := overall[metric].value) is not None:
             axis.axvline(mean, color="black", linewidth=1, label=f"all objects: {mean:.3g}")
-        axis.axvline(BARS[metric], color="tab:green", linestyle="--", linewidth=1, label=f"wanted: {BARS[metric]:g}")
-        better = "less" if metric in SMALLER_IS_BETTER else "more"
+        axis.axvline(
+            TARGETS[metric], color="tab:green", linestyle="--", linewidth=1, label=f"target: {TARGETS[metric]:g}"
+        )
+        better = "lower" if metric in SMALLER_IS_BETTER else "higher"
         axis.set(title=label, xlabel=f"{better} is better", yticks=range(len(ordered)), yticklabels=ordered)
         axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.6 / (1 + 0.24 * len(ordered))))
         axis.grid(alpha=0.3)
@@ -123,7 +125,7 @@ def draw_categories(path: Path, categories: Mapping[str, Figures], overall: Figu
 
 
 def _points(axis: Any, figures: Sequence[Interval]) -> None:
-    """Estimates and intervals; no bars, since the axis does not begin at 0."""
+    """Draw estimates and intervals as points and lines: the axis does not begin at 0."""
     for k, figure in enumerate(figures):
         if figure.value is not None:
             axis.plot([figure.low, figure.high], [k, k], color="tab:blue", linewidth=2, alpha=0.6)
@@ -132,18 +134,18 @@ def _points(axis: Any, figures: Sequence[Interval]) -> None:
 
 def draw_against_surface(
     path: Path,
-    like: Mapping[str, Float64],
+    surfaces: Mapping[str, Float64],
     errors: Mapping[str, Float64],
     curves: Mapping[str, Mapping[str, list[Bin]]],
 ) -> None:
-    """Every object's error against each measure of its surface, and the mean over bins of equally many objects."""
+    """Draw each object's error against size and detail of its surface, and means over bins with equal counts."""
     figure = _figure((11, 7.5))
-    axes = figure.subplots(len(errors), len(like), squeeze=False)
+    axes = figure.subplots(len(errors), len(surfaces), squeeze=False)
     for row, (error_name, error) in zip(axes, errors.items(), strict=True):
-        for axis, (like_name, value) in zip(row, like.items(), strict=True):
-            axis.plot(value, error, "o", markersize=4, alpha=0.5, color="tab:blue", label="an object")
-            _curve(axis, curves[like_name][error_name])
-            axis.set(xlabel=like_name, ylabel=error_name, ylim=(0, None))
+        for axis, (name, value) in zip(row, surfaces.items(), strict=True):
+            axis.plot(value, error, "o", markersize=4, alpha=0.5, color="tab:blue", label="object")
+            _curve(axis, curves[name][error_name])
+            axis.set(xlabel=name, ylabel=error_name, ylim=(0, None))
             axis.grid(alpha=0.3)
     axes[0, 0].legend(fontsize=8)
     figure.savefig(path, dpi=90)

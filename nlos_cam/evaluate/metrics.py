@@ -1,6 +1,6 @@
-"""Judge images of hidden objects: every metric by name with its interval, per category, and against the baselines.
+"""Metrics of reconstructed images with bootstrap intervals, per category and against baselines.
 
-Error against what a surface is like (SI 6): its size, its detail, and where on the image the error sits.
+And the error against size and detail of the surface, and by zone of the image (SI 6).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -15,40 +15,40 @@ from nlos_models import MIN_V, accuracy_mean_abs, accuracy_within_2_percent, for
 from numpy.typing import NDArray
 
 PerObject = dict[str, Float64]
-"""By the metric's name."""
+"""Values of every object (n,) by the metric's name."""
 
 RESAMPLES = 2000
-BARS = {
+TARGETS = {
     "silhouette_iou": 0.90,
     "accuracy_mean_abs": 0.98,
     "accuracy_within_2_percent": 0.92,
     "foreground_rmse_mm": 8.0,
 }
-"""What the project wants of each metric on the 54 test objects; of the last, at most so much."""
+"""The project's targets on the 54 test objects: lower limits, of the last metric an upper limit."""
 SMALLER_IS_BETTER = frozenset({"foreground_rmse_mm"})
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate over objects and its bootstrap 95 % interval."""
+    """Mean over objects and its bootstrap 95 % interval."""
 
     value: float | None
-    """None where no object has a value (no reconstruction shares a pixel with its truth)."""
+    """None if no object has a value (no reconstruction shares a pixel with its truth)."""
     low: float | None
     high: float | None
 
 
 Figures = dict[str, Interval]
-"""By the metric's name."""
+"""Estimates by the metric's name."""
 
 
 def mm_per_v(box: ObjectBox) -> float:
-    """Millimetres of depth that one unit of v stands for."""
+    """Return the depth in millimetres of one unit of v."""
     return 1000 * (box.z_far_m - box.z_near_m) / (1 - MIN_V)
 
 
 def per_object(image: Float32, truth: Float32, box: ObjectBox) -> PerObject:
-    """Every metric of images (n, 64, 64) against the truth."""
+    """Return every metric of images (n, 64, 64), per object."""
     return {
         "silhouette_iou": silhouette_iou(image, truth),
         "accuracy_mean_abs": accuracy_mean_abs(image, truth),
@@ -58,22 +58,22 @@ def per_object(image: Float32, truth: Float32, box: ObjectBox) -> PerObject:
 
 
 def plain(figures: Figures) -> dict[str, dict[str, float | None]]:
-    """Figures ready for JSON: {value, low, high} by the metric's name."""
+    """Return figures ready for JSON: {value, low, high} by the metric's name."""
     return {name: asdict(figure) for name, figure in figures.items()}
 
 
 def over_objects(values: Mapping[str, Float64]) -> Figures:
-    """The mean of each metric over objects, with its interval."""
+    """Return the mean of each metric over objects with its interval."""
     return {name: interval(value) for name, value in values.items()}
 
 
 def judge(image: Float32, truth: Float32, box: ObjectBox) -> Figures:
-    """Every metric of images (n, 64, 64) against the truth, over all objects."""
+    """Return every metric of images (n, 64, 64) over all objects."""
     return over_objects(per_object(image, truth, box))
 
 
 def per_category(values: Mapping[str, Float64], categories: Sequence[str]) -> dict[str, Figures]:
-    """The figures of each category's objects alone, in the order of first appearance."""
+    """Return the figures of each category, in the order of first appearance."""
     of = np.array(categories)
     return {
         category: over_objects({name: value[of == category] for name, value in values.items()})
@@ -84,9 +84,9 @@ def per_category(values: Mapping[str, Float64], categories: Sequence[str]) -> di
 def advantage(
     ours: Mapping[str, Float64], theirs: Mapping[str, Float64], smaller_is_better: Collection[str] = SMALLER_IS_BETTER
 ) -> Figures:
-    """By how much ours is better, object by object: positive is better, also where less is better.
+    """Return the mean per-object advantage of ours over theirs; positive is better for every metric.
 
-    An interval that excludes 0 tells them apart; objects that either has no value for are left out.
+    The difference is significant if the interval excludes 0. Objects without a value in either are left out.
     """
     return {
         name: interval((-1 if name in smaller_is_better else 1) * (value - theirs[name]))
@@ -95,7 +95,7 @@ def advantage(
 
 
 def interval(values: Float64) -> Interval:
-    """Mean over objects (n,) and its bootstrap 95 % interval; objects without a value are left out."""
+    """Return the mean of values (n,) and its bootstrap 95 % interval; NaN are left out."""
     values = values[~np.isnan(values)]
     if not values.size:
         return Interval(None, None, None)
@@ -105,65 +105,66 @@ def interval(values: Float64) -> Interval:
 
 
 def resampled(count: int) -> NDArray[np.int64]:
-    """Which objects (RESAMPLES, count) each resample holds; always the same ones."""
+    """Return the object indices (RESAMPLES, count) of each bootstrap resample, from a fixed seed."""
     return np.random.default_rng(0).integers(0, count, (RESAMPLES, count))
 
 
 def meets(name: str, figure: Interval) -> bool:
-    """Whether the estimate of a metric meets its bar."""
+    """Return True if the estimate of a metric meets its target."""
     if figure.value is None:
         return False
-    return figure.value <= BARS[name] if name in SMALLER_IS_BETTER else figure.value >= BARS[name]
+    return figure.value <= TARGETS[name] if name in SMALLER_IS_BETTER else figure.value >= TARGETS[name]
 
 
-def bars_met(figures: Figures) -> dict[str, dict[str, Any]]:
-    """Each metric's bar, and whether its estimate meets it."""
-    return {name: {"bar": bar, "met": meets(name, figures[name])} for name, bar in BARS.items()}
+def targets_met(figures: Figures) -> dict[str, dict[str, Any]]:
+    """Return each metric's target and whether the estimate meets it."""
+    return {name: {"bar": bar, "met": meets(name, figures[name])} for name, bar in TARGETS.items()}
 
 
 STEP_MM = 10.0
-"""Neighbouring surface pixels that differ by more in depth have an edge between them."""
+"""Depth difference above which neighbouring surface pixels have an edge between them."""
 RIM_PIXELS = 2.0
 BINS = 4
 ZONES = ("core", "rim inside", "rim outside", "far background")
 
 
 def surface_cm2(truth: Float32, box: ObjectBox) -> Float64:
-    """How large the surface of images (n, 64, 64) is, seen from the wall, (n,)."""
+    """Return the surface area in cm² of images (n, 64, 64) as seen from the wall, (n,)."""
     width_cm, height_cm = _pitch_cm(truth, box)
     return width_cm * height_cm * surface(truth).sum((-2, -1))
 
 
 def detail_per_cm(truth: Float32, box: ObjectBox) -> Float64:
-    """Length of the edges (outline, holes, steps in depth) for each area of surface, (n,); a large plate has least.
+    """Return the length of all edges (outline, holes, depth steps) per area of surface in 1/cm, (n,).
 
-    A square plate of side a has 4 / a. NaN where there is no surface.
+    A square plate of side a has 4 / a. NaN without surface.
     """
     width_cm, height_cm = _pitch_cm(truth, box)
     padded = np.pad(truth, ((0, 0), (1, 1), (1, 1)))
-    seen, step = surface(padded), STEP_MM / mm_per_v(box)
+    mask, step = surface(padded), STEP_MM / mm_per_v(box)
     beside, below = (
-        (np.diff(seen, axis=axis) | (_both(seen, axis) & (np.abs(np.diff(padded, axis=axis)) > step))).sum((-2, -1))
+        (np.diff(mask, axis=axis) | (_both(mask, axis) & (np.abs(np.diff(padded, axis=axis)) > step))).sum((-2, -1))
         for axis in (2, 1)
     )
     area = surface_cm2(truth, box)
     return np.where(area > 0, (beside * height_cm + below * width_cm) / np.maximum(area, 1e-9), np.nan)
 
 
-def _both(seen: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
-    first, second = (np.take(seen, np.arange(start, seen.shape[axis] - 1 + start), axis) for start in (0, 1))
+def _both(mask: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
+    """Return True where a pixel and its next neighbour along an axis are both in the mask."""
+    first, second = (np.take(mask, np.arange(start, mask.shape[axis] - 1 + start), axis) for start in (0, 1))
     return first & second
 
 
 def _pitch_cm(truth: Float32, box: ObjectBox) -> tuple[float, float]:
-    """Width and height of a pixel."""
+    """Return width and height of a pixel in cm."""
     rows, columns = truth.shape[-2:]
     return 100 * (box.x_max_m - box.x_min_m) / columns, 100 * (box.y_max_m - box.y_min_m) / rows
 
 
 @dataclass(frozen=True)
 class Bin:
-    """Objects that are alike, and their error."""
+    """Objects within a range of size or detail, and their mean error."""
 
     low: float
     high: float
@@ -171,34 +172,34 @@ class Bin:
     error: Interval
 
 
-def curve(like: Float64, error: Float64, bins: int = BINS) -> list[Bin]:
-    """Error over bins of equally many objects, from those with least of what `like` measures to those with most."""
-    order = np.argsort(like, kind="stable")
+def curve(measure: Float64, error: Float64, bins: int = BINS) -> list[Bin]:
+    """Return the error over bins with equal counts of objects, in ascending order of `measure` (n,)."""
+    order = np.argsort(measure, kind="stable")
     parts = [part for part in np.array_split(order, bins) if part.size]
-    return [Bin(float(like[p].min()), float(like[p].max()), len(p), interval(error[p])) for p in parts]
+    return [Bin(float(measure[p].min()), float(measure[p].max()), len(p), interval(error[p])) for p in parts]
 
 
-def rank_correlation(like: Float64, error: Float64) -> Interval:
-    """Spearman's: 1 where the error grows with what `like` measures, -1 where it falls; objects without one left out.
+def rank_correlation(measure: Float64, error: Float64) -> Interval:
+    """Return Spearman's correlation of error with `measure`, 1 if the error grows with it; NaN are left out.
 
-    None where fewer than three objects have both, or one of the two never varies. Resamples keep the ranks of all.
+    None for fewer than three objects, or if either is constant. Resamples keep the ranks of the whole set.
     """
-    kept = ~(np.isnan(like) | np.isnan(error))
-    if kept.sum() < 3 or np.ptp(like[kept]) == 0 or np.ptp(error[kept]) == 0:
+    valid = ~(np.isnan(measure) | np.isnan(error))
+    if valid.sum() < 3 or np.ptp(measure[valid]) == 0 or np.ptp(error[valid]) == 0:
         return Interval(None, None, None)
-    ranks = np.stack([_ranks(values[kept]) for values in (like, error)])
+    ranks = np.stack([_ranks(values[valid]) for values in (measure, error)])
     low, high = np.nanquantile(_correlation(ranks[:, resampled(ranks.shape[1])]), [0.025, 0.975])
     return Interval(float(_correlation(ranks[:, None])[0]), float(low), float(high))
 
 
 def _ranks(values: Float64) -> Float64:
-    """From 0; equal values share the mean of theirs."""
+    """Return ranks from 0; equal values share their mean rank."""
     _, which, count = np.unique(values, return_inverse=True, return_counts=True)
     return (np.cumsum(count) - (count + 1) / 2)[which]
 
 
 def _correlation(pairs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pearson's over the last axis of (2, m, n), as (m,)."""
+    """Return Pearson's correlation over the last axis of (2, m, n), as (m,)."""
     x, y = pairs - pairs.mean(-1, keepdims=True)
     scale = np.sqrt((x**2).sum(-1) * (y**2).sum(-1))
     return np.where(scale > 0, (x * y).sum(-1) / np.maximum(scale, 1e-12), np.nan)
@@ -206,15 +207,15 @@ def _correlation(pairs: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Zone:
-    """A part of all images together."""
+    """Share of pixels and of error of one zone, over all images."""
 
     share_of_pixels: float
     share_of_error: float | None
-    """Of the sum of |v - v_true|; None where there is no error at all."""
+    """Share of the sum of |v - v_true|; None without any error."""
 
 
-def where_the_error_is(image: Float32, truth: Float32) -> dict[str, Zone]:
-    """How the absolute error divides: well inside the true surface, its rim of two pixels, and outside likewise."""
+def error_by_zone(image: Float32, truth: Float32) -> dict[str, Zone]:
+    """Divide the absolute error among core, inner and outer rim (two pixels each) and far background."""
     zones = np.stack([_zones(mask) for mask in surface(truth)])
     error = np.abs(image.astype(np.float64) - truth)
     total = error.sum()
@@ -225,7 +226,7 @@ def where_the_error_is(image: Float32, truth: Float32) -> dict[str, Zone]:
 
 
 def _zones(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The index in ZONES of every pixel; beyond the image is background."""
+    """Return the index in ZONES of every pixel; background surrounds the image."""
     inside, outside = (
         cv2.distanceTransform(np.pad(part.astype(np.uint8), 1, constant_values=beyond), cv2.DIST_L2, 5)[1:-1, 1:-1]
         for part, beyond in ((mask, 0), (~mask, 1))

@@ -3,6 +3,7 @@
 A measured trade-off as a table for machines (JSON), a table for people (Markdown) and a Pareto plot.
 """
 
+import json
 import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -13,20 +14,19 @@ import numba
 import numpy as np
 
 from nlos_cam.errors import SceneError
+from nlos_cam.files import atomic_directory
 from nlos_cam.render import (
     STOPS,
     Accuracy,
     Agreement,
-    Echoes,
+    EchoMaps,
     Effects,
-    Prepared,
     Rendering,
     Scene,
-    SceneFacts,
     Stopwatch,
     agreement,
     least_seconds,
-    plan,
+    prepare,
     render,
     three_bounce,
 )
@@ -34,14 +34,14 @@ from nlos_cam.render import (
 Part = Literal["stop", "sub_bins", "relay grid", "object_stride", "beams_per_cell", "effect left out"]
 
 REPEATS = 7
-"""Of each setting but brute force; the least counts."""
+"""Repetitions of each setting but brute force; the shortest counts."""
 FINEST_BEAMS = 4
-"""Beams per cell, along each axis, that fewer are held against: brute force has one, and that is their error."""
+"""Beams per cell along each axis in the reference for `beams_per_cell`: brute force itself has only one."""
 
 
 @dataclass(frozen=True)
 class RenderSetting:
-    """One thing to measure: a stop, or `standard` with one ingredient changed."""
+    """Accuracy stop, or `standard` with one ingredient changed."""
 
     name: str
     part: Part
@@ -51,32 +51,32 @@ class RenderSetting:
 
 @dataclass(frozen=True)
 class RenderRow:
-    """What was measured of a setting."""
+    """Time and error of one setting."""
 
     name: str
     part: Part
     seconds: float
     speedup: float
-    """Over brute force, compiled as well."""
+    """Ratio to the time of compiled brute force."""
     errors: Agreement
-    """Against brute force; of `beams_per_cell`, against FINEST_BEAMS at `standard`."""
+    """Against brute force; for `beams_per_cell`, against FINEST_BEAMS at `standard`."""
 
 
 @dataclass(frozen=True)
 class RenderFacts:
-    """How large the scene is."""
+    """Size of the scene."""
 
     patches: int
     beams_on_wall: int
 
 
 def render_settings(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> list[RenderSetting]:
-    """All that is measured of a scene, brute force first."""
+    """Return all settings to measure on a scene, brute force first."""
     standard = stops["standard"]
     ordered = sorted(stops.values(), key=lambda stop: stop.sub_bins > 0)
     columns, rows = standard.relay_columns, standard.relay_rows
     grids = [(max(int(columns * share), 1), max(int(rows * share), 1)) for share in (0.25, 0.5, 1, 2)]
-    called_for = [effect.name for effect in plan(SceneFacts(scene, standard)) if effect.included]
+    called_for = [effect.name for effect in prepare(scene, standard).plan if effect.included]
     return [
         *(RenderSetting(stop.name, "stop", stop) for stop in ordered),
         *(RenderSetting(f"sub_bins {n}", "sub_bins", replace(standard, sub_bins=n)) for n in (1, 2, 4, 8, 16, 32, 64)),
@@ -94,45 +94,44 @@ def render_settings(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> list
 
 
 def render_facts(scene: Scene, stops: Mapping[str, Accuracy] = STOPS) -> RenderFacts:
-    """The scene's size. Raises SceneError where no three-bounce path is possible: there is nothing to trade."""
-    ready = Prepared.of(scene, stops["reference"], "auto")
-    job = ready.job()
+    """Return the scene's size. Raises SceneError if no three-bounce path is possible."""
+    job = prepare(scene, stops["reference"]).job
     if job is None:
         raise SceneError("nothing is hidden, or no light reaches it and returns: give an object within the gate")
-    return RenderFacts(len(job.patches.beta), len(job.foot_m))
+    return RenderFacts(len(job.patches.beta), len(job.laser_spot_m))
 
 
 def measure_renders(
     scene: Scene, stops: Mapping[str, Accuracy] = STOPS, stopwatch: Stopwatch = least_seconds
 ) -> Iterator[RenderRow]:
-    """One row for each of `settings`, as they are measured."""
+    """Measure each of `render_settings` and yield its row."""
     brute, *others = render_settings(scene, stops)
-    lit = Prepared.of(scene, brute.accuracy, "auto").beams.on_wall
+    lit = prepare(scene, brute.accuracy).beams.on_wall
     bin_m = scene.rig.device.bin_m
     three_bounce(scene, brute.accuracy, chosen=np.flatnonzero(lit)[:1])  # compiles
     slow_s, slow = _timed(scene, brute, stopwatch, 1)
-    truth = Echoes.of_beams(slow).some(lit)
+    truth = EchoMaps.of_beams(slow).select(lit)
     yield RenderRow(brute.name, brute.part, slow_s, 1.0, agreement(truth, truth, bin_m))
     finest = render(scene, replace(stops["standard"], beams_per_cell=FINEST_BEAMS))
-    true_cells = Echoes.of_cells(finest, scene).some(lit)
+    true_cells = EchoMaps.of_cells(finest, scene).select(lit)
     for setting in others:
         render(scene, setting.accuracy, setting.effects)  # compiles
         seconds, found = _timed(scene, setting, stopwatch, REPEATS)
         if setting.part == "beams_per_cell":
-            errors = agreement(Echoes.of_cells(found, scene).some(lit), true_cells, bin_m)
+            errors = agreement(EchoMaps.of_cells(found, scene).select(lit), true_cells, bin_m)
         else:
-            errors = agreement(Echoes.of_beams(found).some(lit), truth, bin_m)
+            errors = agreement(EchoMaps.of_beams(found).select(lit), truth, bin_m)
         yield RenderRow(setting.name, setting.part, seconds, slow_s / seconds, errors)
 
 
 def _timed(scene: Scene, setting: RenderSetting, stopwatch: Stopwatch, repeats: int) -> tuple[float, Rendering]:
-    kept: list[Rendering] = []
-    seconds = stopwatch(lambda: kept.append(render(scene, setting.accuracy, setting.effects)), repeats)
-    return seconds, kept[-1]
+    renderings: list[Rendering] = []
+    seconds = stopwatch(lambda: renderings.append(render(scene, setting.accuracy, setting.effects)), repeats)
+    return seconds, renderings[-1]
 
 
 def pareto_front(rows: list[RenderRow]) -> list[RenderRow]:
-    """The rows held against brute force of which no other is both quicker and nearer, from quick to slow."""
+    """Return the rows that no other beats in both time and error, from fast to slow."""
     front: list[RenderRow] = []
     for row in sorted(_alike(rows), key=lambda row: (row.seconds, row.errors.intensity_error_p99)):
         if not front or row.errors.intensity_error_p99 < front[-1].errors.intensity_error_p99:
@@ -141,7 +140,7 @@ def pareto_front(rows: list[RenderRow]) -> list[RenderRow]:
 
 
 def _alike(rows: list[RenderRow]) -> list[RenderRow]:
-    """Those whose intensity error tells what they miss: an effect left out may change the map alone."""
+    """Return the rows whose intensity error is comparable: leaving an effect out may change only the map."""
     return [row for row in rows if row.part not in {"beams_per_cell", "effect left out"}]
 
 
@@ -151,16 +150,15 @@ HEAD = (
     "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 BEAMS = f"{FINEST_BEAMS} x {FINEST_BEAMS}"
-NOTES = f"""Seconds are the least of several renderings, all in one run; brute force is compiled too, and ran once. Peak
-error is that of the strongest three-bounce bin, relative, over the beams that light the wall; depth is what the lidar
-reports.
-Ingredients are `standard` with one thing changed. `beams_per_cell` is held against {BEAMS} beams per cell at
-`standard`, cell by cell: brute force has one beam per cell, and that is its own error. Brute force stands on the same
-relay grid as `standard`: where a finer relay grid differs from it, the finer one is the nearer to the truth."""
+NOTES = f"""Seconds are the shortest of several renderings in one run; brute force is compiled too and ran once. Peak
+error: the relative error of the strongest three-bounce bin over the beams that light the wall; depth is the reported
+depth. Ingredients are `standard` with one change. `beams_per_cell` is compared with {BEAMS} beams per cell at
+`standard`, cell by cell, since brute force has one beam per cell. Brute force uses the relay grid of `standard`: where
+a finer grid differs from it, the finer grid is closer to the truth."""
 
 
 def machine() -> str:
-    """The machine in words."""
+    """Return a description of processor, system and Python."""
     cpu = Path("/proc/cpuinfo")
     lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -169,7 +167,7 @@ def machine() -> str:
 
 
 def as_table(facts: RenderFacts, rows: list[RenderRow], planned: int) -> dict[str, Any]:
-    """Everything, in the order of `measure`, ready for JSON; `complete` tells whether all that was planned is in it."""
+    """Return all rows in the order measured, ready for JSON; `complete` is False after an interruption."""
     flat = [
         {"name": row.name, "part": row.part, "seconds": row.seconds, "speedup": row.speedup, **asdict(row.errors)}
         for row in rows
@@ -186,15 +184,15 @@ def as_table(facts: RenderFacts, rows: list[RenderRow], planned: int) -> dict[st
 
 
 def render_markdown(table: dict[str, Any]) -> str:
-    """The table for people."""
+    """Return the table as Markdown."""
     size = f"{table['patches']} patches, {table['beams_on_wall']} beams on the wall"
     parts = [
         f"{table['machine']}; {size}; brute force {table['reference_seconds']:.3g} s."
-        + ("" if table["complete"] else " Interrupted: not all was measured."),
+        + ("" if table["complete"] else " Interrupted: some settings are missing."),
         "\n".join([HEAD, *map(_line, table["stops"])]),
         "\n".join([HEAD, *map(_line, table["ingredients"])]),
         NOTES,
-        f"Nothing measured is both quicker and nearer than: {', '.join(table['pareto_front'])}.",
+        f"Settings that no other beats in both time and error: {', '.join(table['pareto_front'])}.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -205,6 +203,20 @@ def _line(row: dict[str, Any]) -> str:
     depths = (f"{row[of]:.2g} mm" for of in ("depth_error_mm", "depth_error_mean_mm"))
     first = row["name"], f"{row['seconds']:.4f}", f"{row['speedup']:.0f}"
     return f"| {' | '.join([*first, *errors, *bins, *depths])} |"
+
+
+def write_table(folder: Path, table: Mapping[str, Any], text: str) -> None:
+    """Write a trade-off's table as JSON and as Markdown."""
+    (folder / "tradeoff.json").write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
+    (folder / "tradeoff.md").write_text(text, encoding="utf-8")
+
+
+def write_renders(folder: Path, table: dict[str, Any], rows: list[RenderRow], name: str) -> None:
+    """Write the measured trade-off as JSON, Markdown and a plot, titled with the object's name."""
+    title = f"{name}: {table['patches']} patches, {table['beams_on_wall']} beams on the wall"
+    with atomic_directory(folder) as part:
+        write_table(part, table, render_markdown(table))
+        draw_renders(part / "tradeoff.png", rows, title)
 
 
 def draw_renders(path: Path, rows: list[RenderRow], title: str) -> None:

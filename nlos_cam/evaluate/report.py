@@ -1,4 +1,4 @@
-"""A judgement as a folder that a person reads in a minute: report.md, pictures, figures.json, objects.csv."""
+"""Evaluation of weights on held-out objects, and its report: report.md, pictures, figures.json, objects.csv."""
 
 import csv
 import json
@@ -8,37 +8,53 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration import ObjectBox
+from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32, Float64
+from nlos_models import load_reconstructor
 
 from nlos_cam.evaluate import figures as pictures
-from nlos_cam.evaluate import metrics as surfaces
+from nlos_cam.evaluate import metrics
 from nlos_cam.evaluate.metrics import (
-    BARS,
     SMALLER_IS_BETTER,
+    TARGETS,
     Interval,
     PerObject,
     advantage,
-    bars_met,
     over_objects,
     per_category,
     per_object,
     plain,
+    targets_met,
 )
-from nlos_cam.files import atomic_directory
+from nlos_cam.evaluate.subjects import (
+    HeldOutObjects,
+    Tracked,
+    bare_wall_for,
+    baseline_answers,
+    dataset_objects,
+    left_out_categories,
+    network_input,
+    notes_about,
+    reconstruct_all,
+    rendered_objects,
+    rig_of,
+    untracked,
+)
+from nlos_cam.files import atomic_directory, cache_folder
 
+SHIPPED = "the shipped ones"
 SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
 SILHOUETTE_ERROR, DEPTH_ERROR = "1 - silhouette IoU", "foreground RMSE, mm"
 
 READ_WITH_CARE = (
     "Means over objects; intervals by bootstrap over objects. Foreground RMSE is over pixels that are surface in both, "
-    "so an answer that finds little of an object is not told by it: read it beside the silhouette IoU."
+    "so it ignores missed parts: read it together with the silhouette IoU."
 )
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """All that was judged: the images of one reconstructor and of the baselines, against the truth."""
+class Evaluation:
+    """Images of one reconstructor and of the baselines, with the truth."""
 
     names: Sequence[str]
     categories: Sequence[str]
@@ -48,106 +64,149 @@ class Judgement:
     guesses: Mapping[str, Float32]
     box: ObjectBox
     facts: Mapping[str, Any]
-    """What was judged on what, in words: goes to the figures as it is."""
+    """Weights, rig, runtime and notes: copied to the figures."""
     left_out: Sequence[str] = ()
-    """Categories that training kept out."""
+    """Categories that training left out."""
 
     @property
     def ours(self) -> PerObject:
-        """Every metric of every object."""
+        """Return every metric of every object."""
         return per_object(self.image, self.truth, self.box)
 
     @property
-    def like(self) -> dict[str, Float64]:
-        """What the true surfaces are like."""
+    def surfaces(self) -> dict[str, Float64]:
+        """Return size and detail of the true surfaces, (n,) each."""
         return {
-            SIZE: surfaces.surface_cm2(self.truth, self.box),
-            DETAIL: surfaces.detail_per_cm(self.truth, self.box),
+            SIZE: metrics.surface_cm2(self.truth, self.box),
+            DETAIL: metrics.detail_per_cm(self.truth, self.box),
         }
 
     @property
     def errors(self) -> dict[str, Float64]:
-        """The two errors that are held against the surface."""
+        """Return the two errors that are correlated with size and detail, (n,) each."""
         ours = self.ours
         return {SILHOUETTE_ERROR: 1 - ours["silhouette_iou"], DEPTH_ERROR: ours["foreground_rmse_mm"]}
 
 
-def as_figures(judgement: Judgement) -> dict[str, Any]:
-    """All figures, ready for JSON."""
-    ours = judgement.ours
-    theirs = {name: per_object(guess, judgement.truth, judgement.box) for name, guess in judgement.guesses.items()}
+def evaluate(
+    weights: Path | None,
+    objects: HeldOutObjects | Path | None = None,
+    *,
+    rig: Rig | None = None,
+    count: int | None = None,
+    wall: Path | None = None,
+    training: Path | None = None,
+    nearest: bool = True,
+    tracked: Tracked = untracked,
+) -> Evaluation:
+    """Reconstruct held-out objects with weights (the shipped ones if None) and with the baselines.
+
+    The objects are those given, those of a dataset (a path), or rendered: the 54 test objects, or `count` random ones,
+    on `rig` (the weights' own if None). `wall` is the bare wall of difference maps. `training` names the maps searched
+    for the nearest neighbour, unless it is left out. `tracked` opens progress bars. Raises SceneError, RecordingError.
+    """
+    reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
+    record = reconstructor.record
+    if isinstance(objects, Path):
+        objects = dataset_objects(objects)
+    elif objects is None:
+        objects = rendered_objects(rig or rig_of(record), count, tracked)
+    bare = bare_wall_for(record, objects.plan, wall)
+    guesses, searched = baseline_answers(objects, training, nearest=nearest, tracked=tracked)
+    image = reconstruct_all(reconstructor, network_input(objects.maps, bare))
+    facts = {
+        "what": objects.description,
+        "weights": str(weights or SHIPPED),
+        "rig": objects.plan.rig.name,
+        "runtime": reconstructor.runtime,
+        "input": record.input,
+        "training_objects": len(searched) if searched else None,
+        "notes": notes_about(record, objects, searched),
+    }
+    truth, left_out = objects.maps.image.astype(np.float32), left_out_categories(record)
+    return Evaluation(objects.names, objects.categories, truth, image, guesses, objects.plan.box, facts, left_out)
+
+
+def as_figures(evaluation: Evaluation) -> dict[str, Any]:
+    """Return all figures, ready for JSON."""
+    ours = evaluation.ours
+    theirs = {name: per_object(guess, evaluation.truth, evaluation.box) for name, guess in evaluation.guesses.items()}
     overall = over_objects(ours)
     nearest = theirs.get("nearest_neighbour")
     return {
         **plain(overall),
         "baselines": {name: plain(over_objects(values)) for name, values in theirs.items()},
         "advantage_over_nearest_neighbour": plain(advantage(ours, nearest)) if nearest else None,
-        "bars": bars_met(overall),
-        "per_category": {name: plain(figures) for name, figures in per_category(ours, judgement.categories).items()},
-        "shown_and_left_out": _by_shown(judgement),
+        "bars": targets_met(overall),
+        "per_category": {name: plain(figures) for name, figures in per_category(ours, evaluation.categories).items()},
+        "shown_and_left_out": _by_shown(evaluation),
         "rank_correlation": {
-            f"{error_name} with {like_name}": asdict(surfaces.rank_correlation(like, error))
-            for error_name, error in judgement.errors.items()
-            for like_name, like in judgement.like.items()
+            f"{error_name} with {measure_name}": asdict(metrics.rank_correlation(measure, error))
+            for error_name, error in evaluation.errors.items()
+            for measure_name, measure in evaluation.surfaces.items()
         },
         "where_the_error_is": {
-            name: asdict(zone) for name, zone in surfaces.where_the_error_is(judgement.image, judgement.truth).items()
+            name: asdict(zone) for name, zone in metrics.error_by_zone(evaluation.image, evaluation.truth).items()
         },
-        "objects": len(judgement.truth),
-        **judgement.facts,
+        "objects": len(evaluation.truth),
+        **evaluation.facts,
     }
 
 
-def _by_shown(judgement: Judgement) -> dict[str, Any] | None:
-    """The figures of the kinds that training kept out, and of the others; None where it kept none of these out."""
-    if not set(judgement.left_out) & set(judgement.categories):
+def _by_shown(evaluation: Evaluation) -> dict[str, Any] | None:
+    """Return the figures of left-out and of trained categories; None if none of these was left out."""
+    if not set(evaluation.left_out) & set(evaluation.categories):
         return None
-    shown = ["left out" if category in judgement.left_out else "shown" for category in judgement.categories]
-    return {name: plain(figures) for name, figures in per_category(judgement.ours, shown).items()}
+    shown = ["left out" if category in evaluation.left_out else "shown" for category in evaluation.categories]
+    return {name: plain(figures) for name, figures in per_category(evaluation.ours, shown).items()}
 
 
-def write(folder: Path, judgement: Judgement, figures: Mapping[str, Any]) -> None:
-    """The whole folder, in a folder that is there; what was in it is replaced once all is written."""
+def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any]) -> None:
+    """Write the report's folder; an earlier one is replaced once all files are written."""
     with atomic_directory(folder) as part:
         (part / "figures.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
-        _write_objects(part / "objects.csv", judgement)
-        _draw(part, judgement)
+        _write_objects(part / "objects.csv", evaluation)
+        _draw(part, evaluation)
         (part / "report.md").write_text(as_markdown(figures), encoding="utf-8")
 
 
-def _write_objects(path: Path, judgement: Judgement) -> None:
-    """One row for each object; an empty field where it has no value."""
-    columns = {**judgement.ours, "surface_cm2": judgement.like[SIZE], "detail_per_cm": judgement.like[DETAIL]}
+def _write_objects(path: Path, evaluation: Evaluation) -> None:
+    """Write one row per object; a field without a value is empty."""
+    columns = {
+        **evaluation.ours,
+        "surface_cm2": evaluation.surfaces[SIZE],
+        "detail_per_cm": evaluation.surfaces[DETAIL],
+    }
     with path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["name", "category", *columns])
-        for k, (name, category) in enumerate(zip(judgement.names, judgement.categories, strict=True)):
+        for k, (name, category) in enumerate(zip(evaluation.names, evaluation.categories, strict=True)):
             values = [float(column[k]) for column in columns.values()]
             rows.writerow([name, category, *("" if np.isnan(value) else f"{value:.6g}" for value in values)])
 
 
-def _draw(folder: Path, judgement: Judgement) -> None:
-    image, truth, names, ours = judgement.image, judgement.truth, judgement.names, judgement.ours
+def _draw(folder: Path, evaluation: Evaluation) -> None:
+    image, truth, names, ours = evaluation.image, evaluation.truth, evaluation.names, evaluation.ours
     pictures.draw_sheet(folder / "sheet.png", image, truth, names)
     pictures.draw_gallery(folder / "gallery.png", image, truth, names, ours["silhouette_iou"])
-    pictures.draw_categories(folder / "categories.png", per_category(ours, judgement.categories), over_objects(ours))
+    pictures.draw_categories(folder / "categories.png", per_category(ours, evaluation.categories), over_objects(ours))
     curves = {
-        like_name: {error_name: surfaces.curve(like, error) for error_name, error in judgement.errors.items()}
-        for like_name, like in judgement.like.items()
+        measure_name: {error_name: metrics.curve(measure, error) for error_name, error in evaluation.errors.items()}
+        for measure_name, measure in evaluation.surfaces.items()
     }
-    pictures.draw_against_surface(folder / "surface.png", judgement.like, judgement.errors, curves)
+    pictures.draw_against_surface(folder / "surface.png", evaluation.surfaces, evaluation.errors, curves)
 
 
 def as_markdown(figures: Mapping[str, Any]) -> str:
-    """The report, from the figures alone."""
+    """Return the report as Markdown, from the figures alone."""
     names = list(figures["baselines"])
-    head = "| metric | ours (95 % interval) | wanted | " + " | ".join(name.replace("_", " ") for name in names) + " |"
+    head = "| metric | ours (95 % interval) | target | " + " | ".join(name.replace("_", " ") for name in names) + " |"
     weights = f"{figures['weights']} ({figures['input']})"
     parts = [
         f"# Reconstruction of {figures['objects']} hidden objects",
         f"{figures['what']}. Weights: {weights}; rig: {figures['rig']}; {figures['runtime']}.",
         *(f"**Note**: {note}." for note in figures["notes"]),
-        "\n".join([head, "| --- " * (3 + len(names)) + "|", *(_row(figures, metric, names) for metric in BARS)]),
+        "\n".join([head, "| --- " * (3 + len(names)) + "|", *(_row(figures, metric, names) for metric in TARGETS)]),
         READ_WITH_CARE,
         _against_nearest(figures["advantage_over_nearest_neighbour"], figures["training_objects"]),
         _shown(figures["shown_and_left_out"]),
@@ -162,8 +221,8 @@ def as_markdown(figures: Mapping[str, Any]) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def in_words(figure: Mapping[str, float | None] | Interval) -> str:
-    """A figure and its interval."""
+def format_interval(figure: Mapping[str, float | None] | Interval) -> str:
+    """Format an estimate with its interval, "0.696 (0.66 to 0.73)"."""
     plain = asdict(figure) if isinstance(figure, Interval) else figure
     value, low, high = (plain[name] for name in ("value", "low", "high"))
     return "none" if value is None else f"{value:.3g} ({low:.3g} to {high:.3g})"
@@ -172,51 +231,49 @@ def in_words(figure: Mapping[str, float | None] | Interval) -> str:
 def _row(figures: Mapping[str, Any], metric: str, names: Sequence[str]) -> str:
     bar, verdict = figures["bars"][metric], "met" if figures["bars"][metric]["met"] else "not met"
     wanted = f"{'at most' if metric in SMALLER_IS_BETTER else 'at least'} {bar['bar']:g}: {verdict}"
-    others = [in_words(figures["baselines"][name][metric]).split(" ")[0] for name in names]
-    return f"| {metric} | {in_words(figures[metric])} | {wanted} | {' | '.join(others)} |"
+    others = [format_interval(figures["baselines"][name][metric]).split(" ")[0] for name in names]
+    return f"| {metric} | {format_interval(figures[metric])} | {wanted} | {' | '.join(others)} |"
 
 
 def _against_nearest(figures: Mapping[str, Any] | None, among: int | None) -> str:
     if not figures:
         return ""
-    told = [f"{metric} {in_words(figure)}" for metric, figure in figures.items()]
+    parts = [f"{metric} {format_interval(figure)}" for metric, figure in figures.items()]
     return (
-        f"The nearest neighbour is, of {among} training objects, the one whose maps are nearest (least squares over "
-        "all cells, each channel in units of its spread); the mean object is their mean. Better than the nearest, "
-        f"object by object where both have a value (positive is better), by: {'; '.join(told)}."
+        f"The nearest neighbour is the one of {among} training objects with the nearest maps (sum of squares over all "
+        "cells, each channel in units of its spread); the mean object is their mean. Advantage over the nearest "
+        f"neighbour per object, positive is better: {'; '.join(parts)}."
     )
 
 
 def _shown(figures: Mapping[str, Any] | None) -> str:
     if not figures:
         return ""
-    told = [f"{name} {in_words(group['silhouette_iou'])}" for name, group in figures.items()]
-    return f"Silhouette IoU of kinds that training was shown, and of those that it was not: {'; '.join(told)}."
+    parts = [f"{name} {format_interval(group['silhouette_iou'])}" for name, group in figures.items()]
+    return f"Silhouette IoU of categories in training and of left-out ones: {'; '.join(parts)}."
 
 
 def _where(zones: Mapping[str, Any]) -> str:
     if zones["core"]["share_of_error"] is None:
-        return "There is no error."
-    told = [
+        return "No error."
+    parts = [
         f"{name} {100 * zone['share_of_error']:.0f} % (of the pixels {100 * zone['share_of_pixels']:.0f} %)"
         for name, zone in zones.items()
     ]
-    return (
-        f"Where the absolute error is, the rim being two pixels on either side of the true outline: {', '.join(told)}."
-    )
+    return f"Absolute error by zone (the rim is two pixels on either side of the true outline): {', '.join(parts)}."
 
 
 def _categories(categories: Mapping[str, Any]) -> str:
     ordered = sorted(categories, key=lambda name: categories[name]["silhouette_iou"]["value"] or 0.0)
-    told = [f"{name} {categories[name]['silhouette_iou']['value']:.2f}" for name in ordered]
-    if len(told) < 6:
-        return f"Silhouette IoU by category: {', '.join(told)}."
+    parts = [f"{name} {categories[name]['silhouette_iou']['value']:.2f}" for name in ordered]
+    if len(parts) < 6:
+        return f"Silhouette IoU by category: {', '.join(parts)}."
     return (
-        f"Silhouette IoU by category: worst {', '.join(told[:3])}; best {', '.join(told[-3:])}. Of few objects (the "
-        "test set has three of each) an interval is rather too narrow than too wide."
+        f"Silhouette IoU by category: worst {', '.join(parts[:3])}; best {', '.join(parts[-3:])}. With few objects "
+        "(three of each in the test set) the intervals tend to be too narrow."
     )
 
 
 def _surface(correlations: Mapping[str, Any]) -> str:
-    told = [f"{name} {in_words(figure)}" for name, figure in correlations.items()]
-    return f"SI 6 finds least error on large or smooth surfaces. Rank correlations here: {'; '.join(told)}."
+    parts = [f"{name} {format_interval(figure)}" for name, figure in correlations.items()]
+    return f"SI 6 reports the smallest errors on large or smooth metrics. Rank correlations here: {'; '.join(parts)}."

@@ -1,7 +1,4 @@
-"""What accuracy costs in time when reconstructing: number formats, runtimes, threads and averaged frames.
-
-A measured trade-off of reconstruction as a table for machines (JSON), one for people (Markdown), and a plot.
-"""
+"""Trade-off of accuracy against time in reconstruction: number formats, runtimes, threads and averaged frames."""
 
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -12,68 +9,92 @@ from typing import Any
 
 import numpy as np
 import torch
-from nlos_calibration import ObjectBox, Rig
+from nlos_calibration import ObjectBox, Rig, rig_named
 from nlos_calibration.arrays import Float32
-from nlos_models import OnnxReconstructor, Reconstructor, Sample, TorchReconstructor, exported, load_pipeline, quantise
+from nlos_models import (
+    OnnxReconstructor,
+    Reconstructor,
+    Sample,
+    TorchReconstructor,
+    export_once,
+    load_pipeline,
+    load_record,
+    quantize,
+    refuse_color,
+    shipped_folder,
+)
 
 from nlos_cam.camera import FRAMES_PER_S
-from nlos_cam.dataset import TRAINING_SEED
-from nlos_cam.evaluate.metrics import BARS, SMALLER_IS_BETTER, Figures, judge, plain
-from nlos_cam.evaluate.subjects import Subject, as_map_set, echoes_of, seeded_objects, sense, truth_of
+from nlos_cam.dataset import TEST_SEED, TRAINING_SEED
+from nlos_cam.errors import SceneError
+from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Figures, judge, plain
+from nlos_cam.evaluate.render_tradeoff import write_table
+from nlos_cam.evaluate.subjects import (
+    Subject,
+    Tracked,
+    as_map_set,
+    echoes_of,
+    seeded_objects,
+    sense,
+    truth_of,
+    untracked,
+)
+from nlos_cam.files import atomic_directory
 from nlos_cam.frames import LidarMaps
+from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.render import MultiBounce
 
 FRAMES = 1, 4, 16
 THREADS = 1, 2
 CALIBRATING = 32
-"""Training objects that the ranges of 8-bit activations are learnt from."""
+"""Training objects that calibrate the ranges of 8-bit activations."""
 MIN_CALLS = 50
-"""Few objects are reconstructed again and again, until there are so many calls to take the median of."""
+"""Minimum number of calls for a median; a small set of objects is repeated until then."""
 AS_GOOD = {
     "silhouette_iou": 0.005,
     "accuracy_mean_abs": 0.001,
     "accuracy_within_2_percent": 0.005,
     "foreground_rmse_mm": 0.5,
 }
-"""What the recommended setting may lose against float32 in torch."""
+"""Losses that the recommended setting may have against float32 in torch."""
 
 OnProgress = Callable[[int, int], None]
 Make = Callable[[int], Reconstructor]
-"""A reconstructor for a number of threads."""
+"""Makes a reconstructor for a number of threads."""
 Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
 class RuntimeSetting:
-    """One way to reconstruct."""
+    """Weights, runtime, threads and averaged frames of one measurement."""
 
     name: str
     weights: str
     runtime: str
     threads: int
     frames: int
-    """Averaged, as `live --average` does."""
+    """Frames averaged, as by `live --average`."""
 
 
 @dataclass(frozen=True)
 class RuntimeRow:
-    """What was measured of a setting."""
+    """Time and accuracy of one setting."""
 
     setting: RuntimeSetting
     milliseconds: float
-    """Of one call on one object's maps: the median."""
+    """Median time of one call on one object's maps."""
     milliseconds_p90: float
     figures: Figures
 
     @property
     def wait_ms(self) -> float:
-        """Until so many frames have come, at the camera's rate."""
+        """Return the time in which the averaged frames arrive, at the camera's rate."""
         return 1000 * self.setting.frames / FRAMES_PER_S
 
 
 @dataclass(frozen=True)
 class RuntimeBench:
-    """Objects in front of the sensor: what every setting is measured on."""
+    """Objects and their echoes, on which every setting is measured."""
 
     rig: Rig
     box: ObjectBox
@@ -86,25 +107,47 @@ class RuntimeBench:
         return cls(rig, box, truth_of(subjects, box), echoes_of(subjects, rig, on_progress))
 
 
-def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dict[str, Make]:
-    """Every runtime and number format of some weights, by name; 8-bit ones are quantised when they are first made.
+def open_runtime_bench(
+    weights: Mapping[str, Path | None], count: int | None = None, tracked: Tracked = untracked
+) -> RuntimeBench:
+    """Render the 54 test objects, or `count` random ones, on the rig of all these weights (None: the shipped ones).
 
-    Their ranges are learnt from training objects.
+    Raises SceneError if the weights are for different rigs or expect difference maps, CheckpointError for color.
+    """
+    records = {name: load_record(folder or shipped_folder()) for name, folder in weights.items()}
+    for name, record in records.items():
+        refuse_color(record, weights[name])
+    rigs = {record.rig_name for record in records.values()}
+    if len(rigs) > 1:
+        raise SceneError(f"the weights are for different rigs ({', '.join(sorted(rigs))}): compare weights of one rig")
+    if inputs := {record.input for record in records.values()} - {"raw maps"}:
+        raise SceneError(f"the weights expect {inputs.pop()} but the test maps are raw: use weights for raw maps")
+    rig = rig_named(rigs.pop())
+    box = object_box(rig)
+    subjects = seeded_objects(TEST_SEED, count, box) if count else benchmark_objects(box)
+    with tracked("rendering") as on_progress:
+        return RuntimeBench.of(subjects, rig, box, on_progress)
+
+
+def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dict[str, Make]:
+    """Return a maker for every runtime and number format of weights, by name.
+
+    8-bit networks are quantised when first made, with ranges calibrated on training objects.
     """
     pipeline, record = load_pipeline(weights)
-    model = exported(pipeline, cache)
+    model = export_once(pipeline, cache)
 
     def onnx(path: Path, samples: Callable[[], Iterator[Sample] | None] = lambda: None) -> Make:
         def make(threads: int) -> Reconstructor:
             if not path.exists():
-                quantise(model, path, samples())
+                quantize(model, path, samples())
             return OnnxReconstructor(path, record, threads)
 
         return make
 
     def in_torch(device: str, dtype: torch.dtype) -> Make:
         def make(threads: int) -> Reconstructor:
-            del threads  # torch has one number of them for all networks, which `measure` sets
+            del threads  # torch has one number for all networks, set by `measure_runtimes`
             return TorchReconstructor(load_pipeline(weights)[0], record, device, dtype)
 
         return make
@@ -121,18 +164,18 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
 
 
 def calibration(rig: Rig, box: ObjectBox) -> Iterator[Sample]:
-    """Maps of training objects, one at a time."""
+    """Yield maps of training objects, one at a time."""
     subjects = seeded_objects(TRAINING_SEED, CALIBRATING, box)
-    for maps in sense(echoes_of(subjects, rig, _untold), rig):
+    for maps in sense(echoes_of(subjects, rig, _ignore_progress), rig):
         yield maps.depth_m[None], maps.intensity[None]
 
 
-def _untold(done: int, total: int) -> None:
+def _ignore_progress(done: int, total: int) -> None:
     del done, total
 
 
 def runtime_settings(weights: Sequence[str], runtime_names: Sequence[str]) -> list[RuntimeSetting]:
-    """All that is measured: every runtime on one frame, and more frames on the one that `live` uses."""
+    """Return all settings to measure: every runtime on one frame, and several frames on the runtime of `live`."""
     singles = [
         RuntimeSetting(f"{runtime}, {_threads(threads)}", name, runtime, threads, 1)
         for name in weights
@@ -158,14 +201,14 @@ def measure_runtimes(
     bench: RuntimeBench,
     clock: Clock = time.perf_counter,
 ) -> Iterator[RuntimeRow]:
-    """One row for each setting, as they are measured; `makes` has the runtimes of each weights by name."""
-    seen: dict[int, list[LidarMaps]] = {}
+    """Measure each setting and yield its row; `makes` has the runtimes of each folder of weights by name."""
+    maps: dict[int, list[LidarMaps]] = {}
     for setting in asked:
-        if setting.frames not in seen:
-            seen[setting.frames] = sense(bench.echoes, bench.rig, frames=setting.frames)
+        if setting.frames not in maps:
+            maps[setting.frames] = sense(bench.echoes, bench.rig, frames=setting.frames)
         with _torch_threads(setting.threads):
             reconstructor = makes[setting.weights][setting.runtime](setting.threads)
-            image, seconds = _timed(reconstructor, seen[setting.frames], bench.truth, clock)
+            image, seconds = _timed(reconstructor, maps[setting.frames], bench.truth, clock)
         middle, late = 1000 * np.quantile(seconds, [0.5, 0.9])
         yield RuntimeRow(setting, float(middle), float(late), judge(image, bench.truth, bench.box))
 
@@ -183,7 +226,7 @@ def _torch_threads(count: int) -> Generator[None]:
 def _timed(
     reconstructor: Reconstructor, maps: Sequence[LidarMaps], truth: Float32, clock: Clock
 ) -> tuple[Float32, list[float]]:
-    """Images of all maps, and the seconds of every call but the first, which allocates."""
+    """Return images of all maps and the seconds of every call but the first, which allocates."""
     both = as_map_set(maps, truth)
     reconstructor(both.depth_m[:1], both.intensity[:1])
     images: list[Float32] = []
@@ -191,16 +234,16 @@ def _timed(
     for _ in range(-(-MIN_CALLS // len(truth))):
         images.clear()
         for depth_m, intensity in zip(both.depth_m, both.intensity, strict=True):
-            started = clock()
+            start_s = clock()
             images.append(reconstructor(depth_m[None], intensity[None]))
-            seconds.append(clock() - started)
+            seconds.append(clock() - start_s)
     return np.concatenate(images), seconds
 
 
 def losses(row: RuntimeRow, base: RuntimeRow) -> dict[str, float]:
-    """By how much a row is worse than another, by metric; infinite where it has no value."""
+    """Return by how much a row is worse than the base, by metric; infinite without a value."""
     worse: dict[str, float] = {}
-    for name in BARS:
+    for name in TARGETS:
         mine, its = row.figures[name].value, base.figures[name].value
         sign = 1 if name in SMALLER_IS_BETTER else -1
         worse[name] = float("inf") if mine is None or its is None else sign * (mine - its)
@@ -208,20 +251,20 @@ def losses(row: RuntimeRow, base: RuntimeRow) -> dict[str, float]:
 
 
 def recommended(rows: Sequence[RuntimeRow]) -> RuntimeRow | None:
-    """The quickest setting of one frame that loses nothing to speak of against the first row; None without rows."""
+    """Return the fastest single-frame setting that loses at most AS_GOOD against the first row; None without rows."""
     if not rows:
         return None
     base = rows[0]
-    kept = [
+    candidates = [
         row
         for row in rows
         if row.setting.frames == 1 and all(loss <= AS_GOOD[name] for name, loss in losses(row, base).items())
     ]
-    return min(kept, key=lambda row: row.milliseconds, default=base)
+    return min(candidates, key=lambda row: row.milliseconds, default=base)
 
 
 def pareto_front(rows: Sequence[RuntimeRow]) -> list[RuntimeRow]:
-    """The rows of one frame of which no other is both quicker and better in silhouette, from quick to slow."""
+    """Return the single-frame rows that no other beats in both time and silhouette IoU, from fast to slow."""
     front: list[RuntimeRow] = []
     for row in sorted((row for row in rows if row.setting.frames == 1), key=lambda row: row.milliseconds):
         if not front or _iou(row) > _iou(front[-1]):
@@ -238,13 +281,13 @@ HEAD = (
     "| loses accuracy |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 NOTES = f"""Milliseconds are of one call on one object's maps: medians over all objects, after a first call
-that is not counted; they are this machine's, and of this run. More frames cost no network time: their maps
-are averaged while the next come, and the picture is as old as the wait. "Loses accuracy" is against the first row: by
+that is not counted; they are from this machine and run. More frames cost no network time: their maps are
+averaged while the next arrive, and the picture is as old as the wait. "Loses accuracy": worse than the first row by
 more than any of {", ".join(f"{least:g} of {name}" for name, least in AS_GOOD.items())}."""
 
 
 def runtime_facts(rows: Sequence[RuntimeRow], planned: int, objects: int, machine: str) -> dict[str, Any]:
-    """Everything, ready for JSON; `complete` tells whether all that was planned is in it."""
+    """Return all rows, ready for JSON; `complete` is False after an interruption."""
     pick = recommended(rows)
     return {
         "machine": machine,
@@ -267,13 +310,13 @@ def runtime_facts(rows: Sequence[RuntimeRow], planned: int, objects: int, machin
 
 
 def runtime_markdown(table: Mapping[str, Any]) -> str:
-    """The table for people."""
-    whole = "" if table["complete"] else " Interrupted: not all was measured."
+    """Return the table as Markdown."""
+    whole = "" if table["complete"] else " Interrupted: some settings are missing."
     parts = [
         f"{table['machine']}; {table['objects']} objects.{whole}",
         "\n".join([HEAD, *map(_line, table["settings"])]),
         NOTES,
-        f"Recommended: {_called(table['recommended'])} (the quickest of one frame that loses no accuracy)."
+        f"Recommended: {_called(table['recommended'])} (the fastest single-frame setting that loses no accuracy)."
         if table["recommended"]
         else "Nothing was measured.",
     ]
@@ -285,25 +328,32 @@ def _called(setting: Mapping[str, Any]) -> str:
 
 
 def _line(row: Mapping[str, Any]) -> str:
-    values = [row[name]["value"] for name in BARS]
-    told = ["none" if value is None else f"{value:.3f}" if value < 1 else f"{value:.1f}" for value in values]
+    values = [row[name]["value"] for name in TARGETS]
+    metrics = ["none" if value is None else f"{value:.3f}" if value < 1 else f"{value:.1f}" for value in values]
     times = f"{row['milliseconds']:.1f}", f"{row['milliseconds_p90']:.1f}", f"{row['wait_ms']:.0f}"
-    return f"| {' | '.join([_called(row), *times, *told, 'yes' if row['loses_accuracy'] else 'no'])} |"
+    return f"| {' | '.join([_called(row), *times, *metrics, 'yes' if row['loses_accuracy'] else 'no'])} |"
+
+
+def write_runtimes(folder: Path, table: Mapping[str, Any], rows: Sequence[RuntimeRow]) -> None:
+    """Write the measured trade-off as JSON, Markdown and a plot."""
+    with atomic_directory(folder) as part:
+        write_table(part, table, runtime_markdown(table))
+        draw_runtimes(part / "tradeoff.png", rows)
 
 
 def draw_runtimes(path: Path, rows: Sequence[RuntimeRow]) -> None:
-    """Silhouette IoU against milliseconds of one call, and against the frames averaged."""
+    """Draw silhouette IoU against milliseconds per call, and against averaged frames."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 5.5), layout="constrained")
     times, frames = figure.subplots(1, 2, width_ratios=(2, 1))
     front = pareto_front(rows)
     places = [row.milliseconds for row in front], [row.figures["silhouette_iou"].value for row in front]
-    times.plot(*places, color="0.8", linewidth=6, solid_capstyle="round", label="nothing is quicker and better")
+    times.plot(*places, color="0.8", linewidth=6, solid_capstyle="round", label="not beaten in both")
     singles = [row for row in rows if row.setting.frames == 1]
     for runtime in dict.fromkeys((row.setting.weights, row.setting.runtime) for row in singles):
         _series(times, [row for row in singles if (row.setting.weights, row.setting.runtime) == runtime])
-    times.set(xscale="log", xlabel="milliseconds a call (log)", ylabel="silhouette IoU, 95 % interval over objects")
+    times.set(xscale="log", xlabel="milliseconds per call (log)", ylabel="silhouette IoU, 95 % interval over objects")
     times.set_title("one frame: format, runtime, threads")
     times.legend(fontsize=8)
     for weights in dict.fromkeys(row.setting.weights for row in rows):
@@ -315,7 +365,7 @@ def draw_runtimes(path: Path, rows: Sequence[RuntimeRow]) -> None:
 
 
 def _series(axis: Any, rows: Sequence[RuntimeRow]) -> None:
-    """One runtime with its numbers of threads."""
+    """Draw one runtime with its numbers of threads."""
     setting = rows[0].setting
     label = setting.runtime if setting.weights == "shipped" else f"{setting.weights}: {setting.runtime}"
     (line,) = axis.plot(
@@ -329,7 +379,7 @@ def _series(axis: Any, rows: Sequence[RuntimeRow]) -> None:
 
 
 def _against_frames(axis: Any, weights: str, rows: Sequence[RuntimeRow]) -> None:
-    """The runtime that more frames were tried on."""
+    """Draw the runtime that was measured with several frames."""
     tried = {row.setting.runtime for row in rows if row.setting.frames > 1}
     some = [row for row in rows if row.setting.runtime in tried and row.setting.threads == 1]
     ious = [row.figures["silhouette_iou"] for row in some]

@@ -1,7 +1,4 @@
-"""The objects that weights are judged on, and the maps that a lidar with noise makes of them on any rig.
-
-What weights are judged on: the test objects or a dataset, as maps that the weights eat, on the rig of either.
-"""
+"""Held-out objects as maps with sensor noise: the fixed test objects, random ones, or those of a dataset."""
 
 import os
 from collections.abc import Callable, Generator, Sequence
@@ -14,7 +11,7 @@ import numpy as np
 from nlos_calibration import ObjectBox, Rig, rig_named
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import RecordFileError
-from nlos_models import CheckpointRecord, MapSet, Reconstructor, less_bare_wall
+from nlos_models import CheckpointRecord, MapSet, Reconstructor, subtract_bare_wall
 
 from nlos_cam.camera import World
 from nlos_cam.dataset import (
@@ -37,7 +34,7 @@ from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
 
 OnProgress = Callable[[int, int], None]
 Tracked = Callable[[str], AbstractContextManager[OnProgress]]
-"""Opens a progress bar with a description; its function takes what is done and the total."""
+"""Opens a progress bar with a description; yields the function that takes (done, total)."""
 
 
 @contextmanager
@@ -48,20 +45,20 @@ def untracked(description: str) -> Generator[OnProgress]:
 
 
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
-"""A sensor without noise or dead pixels; saturation and quantisation stay."""
+"""Sensor without noise or dead pixels; saturation and quantisation stay."""
 
 
 class Subject(Protocol):
-    """An object to judge on; those of the test set are such."""
+    """Object with a known depth map."""
 
     @property
     def name(self) -> str:
-        """What tables and pictures call it."""
+        """Name in tables and pictures."""
         ...
 
     @property
     def category(self) -> str:
-        """Its kind."""
+        """Category."""
         ...
 
     @property
@@ -72,7 +69,7 @@ class Subject(Protocol):
 
 @dataclass(frozen=True)
 class SeededObject:
-    """A random object."""
+    """Random object, reproducible from its seed."""
 
     name: str
     category: str
@@ -80,18 +77,19 @@ class SeededObject:
 
 
 def seeded_objects(first_seed: int, count: int, box: ObjectBox) -> list[SeededObject]:
-    """Random objects by their seeds."""
-    made = [object_depth(seed, box) for seed in range(first_seed, first_seed + count)]
-    return [SeededObject(f"{category} {first_seed + k}", category, depth) for k, (category, depth) in enumerate(made)]
+    """Return random objects of consecutive seeds."""
+    seeds = range(first_seed, first_seed + count)
+    objects = [(seed, *object_depth(seed, box)) for seed in seeds]
+    return [SeededObject(f"{category} {seed}", category, depth_m) for seed, category, depth_m in objects]
 
 
 def truth_of(subjects: Sequence[Subject], box: ObjectBox) -> Float32:
-    """The images (n, 64, 64) that a perfect reconstruction would be."""
+    """Return the true images v (n, 64, 64)."""
     return np.stack([image_from_depth(subject.depth_m, box) for subject in subjects])
 
 
 def echoes_of(subjects: Sequence[Subject], rig: Rig, on_progress: OnProgress) -> list[MultiBounce]:
-    """What comes back from each object on a rig, before any sensor."""
+    """Render the echoes of each object on a rig, without a sensor."""
     echoes: list[MultiBounce] = []
     for subject in subjects:
         echoes.append(render(Scene(rig, subject.depth_m)).multi)
@@ -100,9 +98,9 @@ def echoes_of(subjects: Sequence[Subject], rig: Rig, on_progress: OnProgress) ->
 
 
 def sense(echoes: list[MultiBounce], rig: Rig, sensor: SensorModel | None = None, frames: int = 1) -> list[LidarMaps]:
-    """The maps of each echo as `live` makes them: the sensor's chain, cells, and the mean of so many frames.
+    """Return each object's maps as `live` forms them: sensor, reduction to cells, mean over `frames` frames.
 
-    The frames are the simulated camera's, bit for bit, without the pace of a device: the same call gives the same maps.
+    The frames equal the simulated camera's bit for bit, so that the same call gives the same maps.
     """
     scene = SceneFile(name="test objects", rig=rig, sensor=sensor or SensorModel())
     world = World(scene, echoes, [None])
@@ -116,108 +114,104 @@ def _averaged(world: World, numbers: Sequence[int]) -> LidarMaps:
 
 
 def as_map_set(maps: Sequence[LidarMaps], truth: Float32) -> MapSet:
-    """Maps beside their truths (n, 64, 64)."""
+    """Return maps with their true images v (n, 64, 64)."""
     return MapSet(np.stack([m.depth_m for m in maps]), np.stack([m.intensity for m in maps]), truth)
 
 
 def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:
-    """Images (n, 64, 64), one object at a time, as live does it."""
+    """Reconstruct images v (n, 64, 64), one object at a time as `live` does."""
     pairs = zip(maps.depth_m, maps.intensity, strict=True)
     return np.concatenate([reconstructor(depth[None], intensity[None]) for depth, intensity in pairs])
 
 
 @dataclass(frozen=True)
-class Judged:
-    """Objects to judge on."""
+class HeldOutObjects:
+    """Held-out objects that weights are measured on."""
 
-    what: str
-    """In words, for the report."""
+    description: str
+    """Sentence for the report."""
     names: list[str]
     categories: list[str]
     maps: MapSet
-    """Raw ones, whatever the weights eat: the baselines look at these."""
+    """Raw maps, whichever input the weights expect: the baselines compare these."""
     plan: DatasetPlan
 
 
 def rig_of(record: CheckpointRecord) -> Rig:
-    """The rig that weights were trained for. Raises SceneError where it is neither packaged nor a file that is here."""
+    """Return the rig that weights were trained for. Raises SceneError if it is neither packaged nor a file here."""
     try:
         return rig_named(record.rig_name)
     except RecordFileError as error:
         raise SceneError(
-            f"these weights are for the rig {record.rig_name!r}, which is not at hand ({error}): name one with --rig"
+            f"the weights were trained for rig {record.rig_name!r}, which was not found ({error}): give one with --rig"
         ) from error
 
 
-def fresh_objects(rig: Rig, count: int | None = None, tracked: Tracked = untracked) -> Judged:
-    """The 54, or so many random objects, through the noise of the simulated camera on a rig."""
+def rendered_objects(rig: Rig, count: int | None = None, tracked: Tracked = untracked) -> HeldOutObjects:
+    """Render the 54 test objects, or `count` random ones, with the simulated camera's noise on a rig."""
     plan = DatasetPlan(rig, TEST_SEED)
     subjects = seeded_objects(plan.first_seed, count, plan.box) if count else benchmark_objects(plan.box)
     with tracked("rendering test objects") as on_progress:
         echoes = echoes_of(subjects, rig, on_progress)
     maps = as_map_set(sense(echoes, rig), truth_of(subjects, plan.box))
     kind = "random objects" if count else "fixed test objects"
-    what = f"{len(subjects)} {kind} that training never draws, through the sensor's noise"
-    return Judged(what, [one.name for one in subjects], [one.category for one in subjects], maps, plan)
+    description = f"{len(subjects)} held-out {kind}, with the sensor's noise"
+    return HeldOutObjects(description, [one.name for one in subjects], [one.category for one in subjects], maps, plan)
 
 
-def stored_objects(folder: Path) -> Judged:
-    """Those of a dataset."""
+def dataset_objects(folder: Path) -> HeldOutObjects:
+    """Return the objects and maps of a dataset."""
     opened = open_dataset(folder)
     categories = [str(category) for category in opened.column("category")]
     names = [f"{category} {seed}" for category, seed in zip(categories, opened.column("seed"), strict=True)]
-    return Judged(f"Maps of {folder}", names, categories, opened.arrays(), opened.plan)
+    return HeldOutObjects(f"Maps of {folder}", names, categories, opened.arrays(), opened.plan)
 
 
 def bare_wall_for(record: CheckpointRecord, plan: DatasetPlan, wall: Path | None = None) -> BareMaps | None:
-    """The bare wall that weights want their maps less of, as `train` took it; None where they eat raw maps.
+    """Return the bare wall to subtract for difference maps, as in training; None if the weights expect raw maps.
 
-    Raises SceneError for a measured wall that would be of no use.
+    Raises SceneError if a measured wall was given for raw maps.
     """
     if record.input == "raw maps":
         if wall:
-            raise SceneError(f"these weights eat raw maps, and {wall} is for difference maps: leave out --wall")
+            raise SceneError(f"--wall {wall} only applies to difference maps; these weights expect raw maps: omit it")
         return None
     return measured_bare_wall(wall) if wall else render_bare_wall(plan)
 
 
-def as_eaten(maps: MapSet, bare: BareMaps | None) -> MapSet:
-    """Raw maps as weights eat them."""
-    return less_bare_wall(maps, *bare) if bare else maps
+def network_input(maps: MapSet, bare: BareMaps | None) -> MapSet:
+    """Return the maps that the network takes: raw, or minus the bare wall."""
+    return subtract_bare_wall(maps, *bare) if bare else maps
 
 
-def baseline_images(
-    judged: Judged, training: Path | None, *, nearest: bool, tracked: Tracked = untracked
+def baseline_answers(
+    objects: HeldOutObjects, training: Path | None, *, nearest: bool, tracked: Tracked = untracked
 ) -> tuple[dict[str, Float32], Dataset | None]:
-    """The baselines' images, and the training objects that the nearest was looked for among, if it is wanted."""
+    """Return the baselines' images by name, and the training objects searched for the nearest neighbour, if wanted."""
     if not nearest:
-        images = procedural_images(TRAINING_SEED, trivial.NEIGHBOURS, judged.plan.box)
-        return trivial.without_maps(len(judged.names), trivial.mean_image(images)), None
+        images = procedural_images(TRAINING_SEED, trivial.NEIGHBOURS, objects.plan.box)
+        return trivial.trivial_answers(len(objects.names), trivial.mean_image(images)), None
     if training:
         opened = open_dataset(training)
     else:
         with tracked("rendering training objects for the nearest neighbour, once") as on_progress:
-            opened = trivial.training_maps(judged.plan, cache_folder(), os.cpu_count() or 1, on_progress)
-    with tracked("looking for the nearest") as on_progress:
-        return trivial.with_nearest(judged.maps, opened, on_progress), opened
+            opened = trivial.training_maps(objects.plan, cache_folder(), os.cpu_count() or 1, on_progress)
+    with tracked("searching the nearest neighbours") as on_progress:
+        return trivial.answers_with_nearest(objects.maps, opened, on_progress), opened
 
 
-def notes_on(record: CheckpointRecord, judged: Judged, training: Dataset | None) -> list[str]:
-    """What a reader has to know to read the figures."""
-    rig, told = judged.plan.rig, list[str]()
+def notes_about(record: CheckpointRecord, objects: HeldOutObjects, training: Dataset | None) -> list[str]:
+    """List mismatches between weights, objects and baselines that a reader of the figures has to know."""
+    rig, notes = objects.plan.rig, list[str]()
     if record.rig_checksum != rig.checksum:
-        told.append(
-            f"the weights were trained for the rig {record.rig_name}, and these maps are of another, {rig.name}"
-        )
+        notes.append(f"the weights were trained for rig {record.rig_name} but the maps are of rig {rig.name}")
     if training and training.plan.rig.checksum != rig.checksum:
-        told.append(
-            f"the nearest neighbour is of {training.folder}, whose maps are of another rig than those judged on"
-        )
-    if unseen := sorted(set(left_out_of(record)) & set(judged.categories)):
-        told.append(f"the weights' VAE was never shown {', '.join(unseen)}")
-    return told
+        notes.append(f"the nearest neighbours come from {training.folder}, whose maps are of another rig")
+    if unseen := sorted(set(left_out_categories(record)) & set(objects.categories)):
+        notes.append(f"the weights' VAE was trained without {', '.join(unseen)}")
+    return notes
 
 
-def left_out_of(record: CheckpointRecord) -> list[str]:
-    """The categories of objects that weights' VAE was not shown."""
+def left_out_categories(record: CheckpointRecord) -> list[str]:
+    """Return the categories that the weights' VAE was trained without."""
     return record.vae_recipe.left_out if record.vae_recipe else []

@@ -16,7 +16,7 @@ import typer
 
 from nlos_cam.camera import FRAMES_PER_S
 from nlos_cam.cli.main import build_app
-from nlos_cam.evaluate import BARS, in_words
+from nlos_cam.evaluate import TARGETS, format_interval
 
 DOCS = Path(__file__).parents[2] / "docs"
 HEAD = """# Every command and option
@@ -85,7 +85,7 @@ def commands_page() -> str:
 def comparison_row(figures: Mapping[str, Any], cost: Mapping[str, Any]) -> str:
     """Return our measured row of Table S3, with the figures behind it."""
     pick = next(one for one in cost["settings"] if cost["recommended"].items() <= one.items())
-    metrics = "; ".join(f"{name} {in_words(figures[name])}" for name in BARS)
+    metrics = "; ".join(f"{name} {format_interval(figures[name])}" for name in TARGETS)
     cells = (
         "nlos-cam, measured",
         "simulated consumer lidar (L515): depth and intensity maps",
@@ -102,17 +102,19 @@ def by_kind(figures: Mapping[str, Any]) -> str:
     """Return the table of figures for every kind of object, the worst first."""
     kinds: dict[str, Any] = figures["per_category"]
     worst_first = sorted(kinds, key=lambda kind: kinds[kind]["silhouette_iou"]["value"])
-    rows = [f"| {kind} | {' | '.join(in_words(kinds[kind][name]) for name in BARS)} |" for kind in worst_first]
-    bars = f"| **the bar** | {' | '.join(f'{bar:g}' for bar in BARS.values())} |"
-    mean = f"| **all 54** | {' | '.join(in_words(figures[name]) for name in BARS)} |"
-    return "\n".join([f"| kind | {' | '.join(BARS)} |", "| --- " * (1 + len(BARS)) + "|", *rows, mean, bars]) + "\n"
+    cells = {kind: " | ".join(format_interval(kinds[kind][name]) for name in TARGETS) for kind in worst_first}
+    rows = [f"| {kind} | {values} |" for kind, values in cells.items()]
+    targets = f"| **target** | {' | '.join(f'{bar:g}' for bar in TARGETS.values())} |"
+    mean = f"| **all 54** | {' | '.join(format_interval(figures[name]) for name in TARGETS)} |"
+    head = f"| kind | {' | '.join(TARGETS)} |", "| --- " * (1 + len(TARGETS)) + "|"
+    return "\n".join([*head, *rows, mean, targets]) + "\n"
 
 
 def by_limit(limits: Mapping[str, Any]) -> str:
     """Return the table of figures with one possible limit removed at a time."""
     names = "silhouette_iou", "foreground_rmse_mm"
     rows = [
-        f"| {row['name']} | {row['tells']} | {' | '.join(in_words(row['figures'][name]) for name in names)} |"
+        f"| {row['name']} | {row['tells']} | {' | '.join(format_interval(row['figures'][name]) for name in names)} |"
         for row in limits["rows"]
     ]
     return "\n".join([f"| what | how | {' | '.join(names)} |", "| --- " * 4 + "|", *rows]) + "\n"

@@ -27,7 +27,7 @@ from rosbags.rosbag1 import Reader
 
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.evaluate import machine
-from nlos_cam.recording import BagReader, ReplayCamera, ExportOptions, export_recording, repair_recording
+from nlos_cam.recording import BagReader, ExportOptions, ReplayCamera, export_recording, repair_recording
 
 DOCS = Path(__file__).parents[2] / "docs"
 MEMORY_BYTES = 1 << 30

@@ -15,16 +15,16 @@ from nlos_models import CheckpointRecord, load_record
 from weights import values_of
 
 from nlos_cam.evaluate import (
-    BARS,
     LABELS,
     SMALLER_IS_BETTER,
-    Judged,
+    TARGETS,
+    HeldOutObjects,
     PerObject,
     advantage,
-    fresh_objects,
-    in_words,
+    format_interval,
     over_objects,
     plain,
+    rendered_objects,
     rig_of,
 )
 
@@ -61,13 +61,13 @@ def judged(folders: Mapping[str, Path], count: int | None = None) -> list[Traine
 
     Raises CheckpointError for weights of full color, and for folders without weights.
     """
-    by_rig: dict[str, Judged] = {}
+    by_rig: dict[str, HeldOutObjects] = {}
     found = list[Trained]()
     for name, folder in folders.items():
         record = load_record(folder)
         rig = rig_of(record)
         if rig.checksum not in by_rig:
-            by_rig[rig.checksum] = fresh_objects(rig, count)
+            by_rig[rig.checksum] = rendered_objects(rig, count)
         found.append(Trained(name, record, values_of(folder, by_rig[rig.checksum])))
     return found
 
@@ -93,18 +93,22 @@ def as_markdown(table: Mapping[str, Any]) -> str:
     if others := table["compared"][1:]:
         head = f"Better than {table['against']} by"
         rows = [
-            [one["name"], *(harness.difference(one["better_than_first"][metric]) for metric in BARS)] for one in others
+            [one["name"], *(harness.difference(one["better_than_first"][metric]) for metric in TARGETS)]
+            for one in others
         ]
-        parts.append(harness.table([head, *BARS], rows))
+        parts.append(harness.table([head, *TARGETS], rows))
     if table["learning_curve"]:
         parts += ["## With more objects", _figures(table["learning_curve"])]
     return "\n\n".join([*parts, NOTES, "![every metric, by the way to train](images/ablations.png)"]) + "\n"
 
 
 def _figures(rows: Sequence[Mapping[str, Any]]) -> str:
-    head = ["weights", "steps", "eats", "objects", "epochs", *BARS]
+    head = ["weights", "steps", "input", "objects", "epochs", *TARGETS]
     facts = ("name", "steps", "input", "objects", "epochs")
-    lines = [[*(str(row.get(fact, "")) for fact in facts), *(in_words(row[metric]) for metric in BARS)] for row in rows]
+    lines = [
+        [*(str(row.get(fact, "")) for fact in facts), *(format_interval(row[metric]) for metric in TARGETS)]
+        for row in rows
+    ]
     return harness.table(head, lines)
 
 
@@ -113,8 +117,8 @@ def draw(table: Mapping[str, Any]) -> Figure:
     compared, curve = table["compared"], table["learning_curve"]
     heights = [1.2 + 0.3 * len(compared), *([3.0] if curve else [])]
     figure = Figure(figsize=(13, sum(heights)), layout="constrained")
-    rows = figure.subplots(len(heights), len(BARS), squeeze=False, height_ratios=heights)
-    for column, metric in enumerate(BARS):
+    rows = figure.subplots(len(heights), len(TARGETS), squeeze=False, height_ratios=heights)
+    for column, metric in enumerate(TARGETS):
         _points(rows[0, column], compared, metric)
         if curve:
             _curve(rows[1, column], curve, metric)
@@ -127,7 +131,7 @@ def _points(axis: Any, rows: Sequence[Mapping[str, Any]], metric: str) -> None:
         if (value := row[metric]["value"]) is not None:
             axis.plot([row[metric]["low"], row[metric]["high"]], [k, k], color="tab:blue", linewidth=2, alpha=0.6)
             axis.plot(value, k, "o", color="tab:blue")
-    axis.axvline(BARS[metric], color="tab:green", linestyle="--", linewidth=1)
+    axis.axvline(TARGETS[metric], color="tab:green", linestyle="--", linewidth=1)
     axis.set(title=LABELS[metric], xlabel=_better(metric), ylim=(len(rows) - 0.5, -0.5), yticks=range(len(rows)))
     axis.set_yticklabels([])
     axis.grid(alpha=0.3)
@@ -138,7 +142,7 @@ def _curve(axis: Any, rows: Sequence[Mapping[str, Any]], metric: str) -> None:
     at = [row["objects"] for row in known]
     axis.plot(at, [row[metric]["value"] for row in known], "o-", color="tab:blue")
     axis.fill_between(at, *([row[metric][end] for row in known] for end in ("low", "high")), alpha=0.2)
-    axis.axhline(BARS[metric], color="tab:green", linestyle="--", linewidth=1)
+    axis.axhline(TARGETS[metric], color="tab:green", linestyle="--", linewidth=1)
     axis.set(xscale="log", xlabel="objects trained on (log)", title=f"{LABELS[metric]}: {_better(metric)}")
     axis.grid(alpha=0.3)
 

@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 from nlos_calibration import load_rig
-from nlos_models import load_pipeline, load_recipe, load_vae, rebuilt, run
+from nlos_models import load_pipeline, load_recipe, load_vae, rebuild, run
 
 from nlos_cam.cli.common import PAPER_RIG, tracked
 from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, open_dataset
-from nlos_cam.evaluate import draw_colour_sheet, figures_of_colour, painted_maps
+from nlos_cam.evaluate import draw_color_sheet, figures_of_color, painted_maps
 from nlos_cam.objects import OBJECTS_PER_CATEGORY, benchmark_objects, object_box
 
 RECIPES = Path(__file__).parents[2] / "models" / "recipes"
@@ -50,11 +50,11 @@ def judge_all(out: Path, accuracy: str) -> dict[str, Any]:
     with tracked("rendering test objects in colour") as on_progress:
         maps = painted_maps(depths, rig, TEST_SEED, accuracy, on_progress)
     truth = maps.image.astype(np.float32)
-    image, alone = run(load_pipeline(out / "compressor")[0], maps), rebuilt(load_vae(out / "vae")[0], maps.image)
+    image, alone = run(load_pipeline(out / "compressor")[0], maps), rebuild(load_vae(out / "vae")[0], maps.image)
     for name, made in (("sheet", image), ("sheet-vae", alone)):
-        draw_colour_sheet(out / f"{name}.png", made[::OBJECTS_PER_CATEGORY], truth[::OBJECTS_PER_CATEGORY])
-    training = open_dataset(out / "train", colour=True).column("image")
-    return figures_of_colour(image, truth, {"vae_alone": alone}, training)
+        draw_color_sheet(out / f"{name}.png", made[::OBJECTS_PER_CATEGORY], truth[::OBJECTS_PER_CATEGORY])
+    training = open_dataset(out / "train", color=True).column("image")
+    return figures_of_color(image, truth, {"vae_alone": alone}, training)
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ from nlos_models.errors import ModelError
 
 from nlos_cam.cli.common import progress
 from nlos_cam.errors import NlosCamError
-from nlos_cam.evaluate import in_words
+from nlos_cam.evaluate import format_interval
 from nlos_cam.files import cache_folder
 
 ROOT = Path(__file__).parents[2]
@@ -106,7 +106,7 @@ def difference(figure: Mapping[str, float | None]) -> str:
     """Format a difference with its interval, in bold where the interval excludes 0."""
     low, high = figure["low"], figure["high"]
     apart = low is not None and high is not None and not low <= 0 <= high
-    return f"**{in_words(figure)}**" if apart else in_words(figure)
+    return f"**{format_interval(figure)}**" if apart else format_interval(figure)
 
 
 def write(name: str, facts: Any, folder: Path | None = None) -> None:

@@ -90,7 +90,7 @@ class Trial:
 
 def feet_m() -> Array:
     """Return the beams' spots on the wall (beams, 3)."""
-    return cast(RIG, Scene(RIG).cell_intrinsics).foot_m[BEAMS]
+    return cast(RIG, Scene(RIG).cell_intrinsics).laser_spot_m[BEAMS]
 
 
 def limit(case: Case, effects: tuple[str, ...] = EFFECTS, **change: Any) -> Array:

@@ -37,9 +37,8 @@ from nlos_cam.objects import Pose, category_triangles, object_box, object_depth,
 from nlos_cam.render import (
     STOPS,
     Accuracy,
-    Echoes,
+    EchoMaps,
     Effects,
-    Prepared,
     Rendering,
     Scene,
     TransportJob,
@@ -52,9 +51,10 @@ from nlos_cam.render import (
     included,
     least_seconds,
     paper_scene,
+    prepare,
     render,
     render_all,
-    some_of,
+    sample_beams,
     three_bounce,
 )
 
@@ -97,13 +97,13 @@ def sheet(cells: int, rows: int) -> Scene:
 
 def lit_beams(scene: Scene, accuracy: Accuracy) -> Any:
     """Return the indices of the beams on the wall."""
-    return np.flatnonzero(Prepared.of(scene, accuracy, "auto").beams.on_wall)
+    return np.flatnonzero(prepare(scene, accuracy).beams.on_wall)
 
 
 def histograms_of(scene: Scene, accuracy: Accuracy, beams: int | None = None) -> Work:
     """Return the work of rendering all beams on the wall, or some."""
     lit = lit_beams(scene, accuracy)
-    chosen = some_of(lit, beams or len(lit))
+    chosen = sample_beams(lit, beams or len(lit))
     return lambda: three_bounce(scene, accuracy, chosen=chosen)
 
 
@@ -224,10 +224,10 @@ def refined(numbers: list[int], rendered: Callable[[int], Rendering]) -> list[di
     scene = airplane_scene(64)
     lit, found = lit_beams(scene, FINE), [rendered(number) for number in numbers]
     per_cell = len({rendering.multi.peak.shape for rendering in found}) > 1
-    echoes = [Echoes.of_cells(one, scene) if per_cell else Echoes.of_beams(one) for one in found]
+    echoes = [EchoMaps.of_cells(one, scene) if per_cell else EchoMaps.of_beams(one) for one in found]
     rows: list[dict[str, Any]] = []
     for number, rendering, echo in zip(numbers, found, echoes, strict=True):
-        agreed = agreement(echo.some(lit), echoes[-1].some(lit), scene.rig.device.bin_m)
+        agreed = agreement(echo.select(lit), echoes[-1].select(lit), scene.rig.device.bin_m)
         won = None if per_cell else float((rendering.intensity == rendering.multi.peak).ravel()[lit].mean())
         keys = "intensity_error_median", "intensity_error_p99", "bin_within_1"
         rows.append({"setting": number, **{key: getattr(agreed, key) for key in keys}, "three_bounce_wins": won})
@@ -258,13 +258,13 @@ def convergence(_: argparse.Namespace) -> None:
 def jobs_of(scenes: Sequence[Scene], accuracy: str) -> Iterator[TransportJob]:
     """Plan scenes for the GPU."""
     for scene in scenes:
-        if (job := Prepared.of(scene, accuracy_named(accuracy), "auto").job()) is not None:
+        if (job := prepare(scene, accuracy_named(accuracy)).job) is not None:
             yield job
 
 
 def deviation(jobs: Sequence[TransportJob], device: torch.device) -> float:
     """Return the relative L1 deviation of some histograms from the numba renderer's."""
-    some = [job.some(np.arange(0, len(job.foot_m), 50)) for job in jobs]
+    some = [job.select(np.arange(0, len(job.laser_spot_m), 50)) for job in jobs]
     pairs = zip(histograms_of_all(some, device), map(histograms, some), strict=True)
     return max(float(np.abs(found - other).sum() / other.sum()) for found, other in pairs)
 

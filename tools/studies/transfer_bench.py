@@ -17,7 +17,7 @@ from nlos_cam.camera import FRAMES_PER_S, Recording, SimulatedCamera, World
 from nlos_cam.cli.common import tracked
 from nlos_cam.errors import RecordingError
 from nlos_cam.objects import CATEGORIES, BenchmarkObject, benchmark_objects, object_box
-from nlos_cam.recording import CaptureSession, CaptureTarget, load_sidecar, finalize, sidecar_path, verify
+from nlos_cam.recording import CaptureSession, CaptureTarget, finalize, load_sidecar, sidecar_path, verify
 from nlos_cam.render import Scene, SceneFile, SensedImages, load_scene, render
 
 SCENE = Path(__file__).parents[2] / "examples" / "bench.toml"
@@ -116,7 +116,11 @@ def record(take: Take, scene: SceneFile, frames: int) -> None:
 
 
 def record_all(
-    scene: SceneFile, things: Sequence[BenchmarkObject], folder: Path, frames: int, on_progress: Callable[[int, int], None]
+    scene: SceneFile,
+    things: Sequence[BenchmarkObject],
+    folder: Path,
+    frames: int,
+    on_progress: Callable[[int, int], None],
 ) -> Iterator[Path]:
     """Make the missing recordings in order; yield each when it exists."""
     for done, take in enumerate(every := takes(things, folder)):

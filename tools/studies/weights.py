@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from nlos_calibration import Rig, lidar_sees, load_rig
+from nlos_calibration import Rig, lidar_visible_share, load_rig
 from nlos_calibration.arrays import Float32
 from nlos_models import (
     MapSet,
@@ -32,7 +32,7 @@ from nlos_models import (
     load_pipeline,
     load_reconstructor,
     load_record,
-    refuse_colour,
+    refuse_color,
     run,
     shipped_folder,
 )
@@ -40,20 +40,21 @@ from nlos_models import (
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan
 from nlos_cam.evaluate import (
-    BARS,
     QUIET,
     SMALLER_IS_BETTER,
+    TARGETS,
     Figures,
-    Judged,
+    HeldOutObjects,
     PerObject,
     Subject,
     advantage,
-    as_eaten,
     as_map_set,
     bare_wall_for,
+    dataset_objects,
     echoes_of,
-    in_words,
+    format_interval,
     judge,
+    network_input,
     over_objects,
     per_object,
     plain,
@@ -61,7 +62,6 @@ from nlos_cam.evaluate import (
     rig_of,
     seeded_objects,
     sense,
-    stored_objects,
     truth_of,
 )
 from nlos_cam.files import cache_folder
@@ -130,11 +130,11 @@ def experiments(
         echoes = echoes_of([*subjects, *trained], rig, on_progress)
 
     def row(name: str, change: str, sensed: Any, images: Float32 = truth) -> Row:
-        maps = as_eaten(as_map_set(sensed, images), network.bare)
+        maps = network_input(as_map_set(sensed, images), network.bare)
         return Row(name, change, judge(run(network.pipeline, maps), maps.image, box), network.latent_error(maps))
 
     first = sense(echoes[:count], rig)
-    maps = as_eaten(as_map_set(first, truth), network.bare)
+    maps = network_input(as_map_set(first, truth), network.bare)
     yield row("as evaluated", "both steps, noise on, one frame", first)
     if (rebuilt := network.rebuilt(truth)) is not None:
         yield Row("VAE alone", "no compressor: the decoder on the true latent", judge(rebuilt, truth, box))
@@ -164,10 +164,10 @@ def limits_table(rows: Sequence[Row]) -> str:
     """Return the experiments as Markdown."""
     latent = ["" if row.latent_error is None else f"{row.latent_error:.0f}" for row in rows]
     cells = [
-        [row.name, row.tells, *(in_words(row.figures[name]) for name in BARS), e]
+        [row.name, row.tells, *(format_interval(row.figures[name]) for name in TARGETS), e]
         for row, e in zip(rows, latent, strict=True)
     ]
-    return harness.table(["experiment", "change", *BARS, "latent error"], cells)
+    return harness.table(["experiment", "change", *TARGETS, "latent error"], cells)
 
 
 @dataclass(frozen=True)
@@ -189,11 +189,11 @@ def cell(rig: Rig, subjects: Sequence[Subject], networks: Mapping[str, Reconstru
     box, plan = object_box(rig), DatasetPlan(rig, TEST_SEED)
     truth = truth_of(subjects, box)
     maps = as_map_set(sense(echoes_of(subjects, rig, lambda *_: None), rig), truth)
-    inputs = {name: as_eaten(maps, bare_wall_for(network.record, plan)) for name, network in networks.items()}
+    inputs = {name: network_input(maps, bare_wall_for(network.record, plan)) for name, network in networks.items()}
     found = {name: judge(reconstruct_all(network, inputs[name]), truth, box) for name, network in networks.items()}
     return {
         "rig_checksum": rig.checksum,
-        "share_of_box_in_direct_sight": lidar_sees(rig, box),
+        "share_of_box_in_direct_sight": lidar_visible_share(rig, box),
         "share_of_cells_with_a_return": float(np.mean(~np.isnan(maps.depth_m))),
         "weights": {name: plain(figures) for name, figures in found.items()},
     }
@@ -220,9 +220,9 @@ def draw_rigs(cells: Sequence[Mapping[str, Any]], rig: Rig) -> Figure:
     """Draw a heat map of each metric for each of the weights; the weights' own rig is framed."""
     names = list(cells[0]["weights"])
     distances, angles = (sorted({one[of] for one in cells}) for of in ("distance_m", "yaw_deg"))
-    figure = Figure(figsize=(3.4 * len(BARS), 2.9 * len(names)), layout="constrained")
-    for row, name in zip(figure.subplots(len(names), len(BARS), squeeze=False), names, strict=True):
-        for axis, metric in zip(row, BARS, strict=True):
+    figure = Figure(figsize=(3.4 * len(TARGETS), 2.9 * len(names)), layout="constrained")
+    for row, name in zip(figure.subplots(len(names), len(TARGETS), squeeze=False), names, strict=True):
+        for axis, metric in zip(row, TARGETS, strict=True):
             values = np.full((len(distances), len(angles)), np.nan)
             for one in cells:
                 at = distances.index(one["distance_m"]), angles.index(one["yaw_deg"])
@@ -252,11 +252,11 @@ def draw_heat(axis: Any, values: Any, metric: str) -> None:
     axis.set_title(metric.replace("_", " "), fontsize=9)
 
 
-def values_of(folder: Path, judged: Judged) -> PerObject:
+def values_of(folder: Path, judged: HeldOutObjects) -> PerObject:
     """Return every metric of every object. Raises CheckpointError for weights of full color."""
     pipeline, record = load_pipeline(folder)
-    refuse_colour(record, folder)
-    image = run(pipeline, as_eaten(judged.maps, bare_wall_for(record, judged.plan)))
+    refuse_color(record, folder)
+    image = run(pipeline, network_input(judged.maps, bare_wall_for(record, judged.plan)))
     return per_object(image, judged.maps.image, judged.plan.box)
 
 
@@ -284,17 +284,18 @@ def compared(
 
 def unseen(asked: argparse.Namespace) -> None:
     """Compare weights trained without and with some kinds of objects."""
-    judged = stored_objects(asked.held_out)
+    judged = dataset_objects(asked.held_out)
     without, with_them = (values_of(folder, judged) for _, folder in (asked.without, asked.with_them))
     rows = compared(without, with_them, judged.categories, asked.left_out)
     harness.write("unseen_kinds", {"left_out": asked.left_out, "rows": rows}, asked.out)
-    parts = ("without", in_words), ("with", in_words), ("without_better_by", harness.difference)
+    parts = ("without", format_interval), ("with", format_interval), ("without_better_by", harness.difference)
     cells = [
-        [f"{row['objects']} ({row['count']})", part.replace("_", " "), *(words(row[part][metric]) for metric in BARS)]
+        [f"{row['objects']} ({row['count']})", part.replace("_", " ")]
+        + [words(row[part][metric]) for metric in TARGETS]
         for row in rows
         for part, words in parts
     ]
-    print(harness.table(["objects", "training", *BARS], cells))
+    print(harness.table(["objects", "training", *TARGETS], cells))
 
 
 def main() -> None:

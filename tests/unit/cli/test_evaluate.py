@@ -16,10 +16,9 @@ from small_maps import SmallDataset
 
 from nlos_cam.cli import evaluate
 from nlos_cam.cli.main import main
-from nlos_cam.dataset import build
-from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED, DatasetPlan, procedural_images
-from nlos_cam.evaluate import baselines, subjects
-from nlos_cam.evaluate.metrics import BARS
+from nlos_cam.dataset import HELD_OUT_SEED, TRAINING_SEED, DatasetPlan, procedural_images
+from nlos_cam.evaluate import baselines, report, subjects
+from nlos_cam.evaluate.metrics import TARGETS
 from nlos_cam.objects.benchmark import benchmark_objects
 
 RIG = load_rig("paper-rig")
@@ -74,8 +73,8 @@ def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
 
     monkeypatch.setattr(baselines, "training_maps", training_maps)
     monkeypatch.setattr(baselines, "NEIGHBOURS", 4)
-    monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: Guesser())
-    monkeypatch.setattr(build, "open_dataset", lambda _: Stored(HELD_OUT_SEED, 3))
+    monkeypatch.setattr(report, "load_reconstructor", lambda *_: Guesser())
+    monkeypatch.setattr(subjects, "open_dataset", lambda _: Stored(HELD_OUT_SEED, 3))
     return asked
 
 
@@ -90,7 +89,7 @@ def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Any
 
 def test_evaluate_writes_figures_of_dataset_beside_baselines(tmp_path: Path, run: Callable[..., Any]) -> None:
     result, out = run(*STORED), tmp_path / "figures"
-    assert {*BARS, "baselines", "per_category", "objects", "seconds", "out"} < set(result)
+    assert {*TARGETS, "baselines", "per_category", "objects", "seconds", "out"} < set(result)
     assert (result["objects"], result["training_objects"]) == (3, 3)
     assert set(result["baselines"]) == {"all_background", "mean_object", "nearest_neighbour"}
     assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1  # it is the set itself
@@ -109,7 +108,7 @@ def test_evaluate_writes_figures_of_dataset_beside_baselines(tmp_path: Path, run
 def test_evaluate_uses_test_set_without_dataset(
     run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, guessing: list[DatasetPlan]
 ) -> None:
-    monkeypatch.setattr(subjects, "test_set", lambda box: benchmark_objects(box)[:2])
+    monkeypatch.setattr(subjects, "benchmark_objects", lambda box: benchmark_objects(box)[:2])
     result = run()
     assert (result["objects"], result["rig"], guessing[0].rig) == (2, RIG.name, RIG)
     assert list(result["per_category"]) == [benchmark_objects(DatasetPlan(RIG, 0).box)[0].category]
@@ -132,10 +131,10 @@ def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
     run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, maps: str, options: list[str], wall_m: float
 ) -> None:
     network, blank = Guesser(maps), np.zeros((64, 80), np.float32)
-    monkeypatch.setattr(evaluate, "load_reconstructor", lambda *_: network)
+    monkeypatch.setattr(report, "load_reconstructor", lambda *_: network)
     monkeypatch.setattr(subjects, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank))
     monkeypatch.setattr(subjects, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank))
-    monkeypatch.setattr(evaluate, "write", lambda *_: None)
+    monkeypatch.setattr(evaluate, "write_report", lambda *_: None)
     result, raw = run(*STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
     np.testing.assert_allclose(np.concatenate(network.seen), raw.depth_m - wall_m, atol=1e-6)
     assert result["input"] == maps
@@ -162,6 +161,6 @@ def test_evaluate_refuses_contradicting_options(
 def test_evaluate_without_weights_exits_with_4(
     tmp_path: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(evaluate, "load_reconstructor", load_reconstructor)
+    monkeypatch.setattr(report, "load_reconstructor", load_reconstructor)
     assert run("--weights", str(tmp_path / "none"), code=4)["error"]["type"] == "CheckpointError"
     assert not list(tmp_path.iterdir())

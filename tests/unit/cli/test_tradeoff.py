@@ -15,6 +15,7 @@ from nlos_models.recipe import Recipe
 
 from nlos_cam.cli import tradeoff as command
 from nlos_cam.cli.main import main
+from nlos_cam.evaluate import runtime_tradeoff
 from nlos_cam.evaluate.render_tradeoff import RenderRow, measure_renders, render_settings
 from nlos_cam.render.accuracy import STOPS
 from nlos_cam.render.renderer import render
@@ -41,8 +42,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> list[Scene]:
         asked.append(scene)
         return islice(measure_renders(shrunk(scene), SMALL, lambda work, _: (work(), 0.5)[1]), FIRST)
 
-    monkeypatch.setattr(command, "measure", measured)
-    monkeypatch.setattr(command, "settings", lambda scene: render_settings(shrunk(scene), SMALL)[:FIRST])
+    monkeypatch.setattr(command, "measure_renders", measured)
+    monkeypatch.setattr(command, "render_settings", lambda scene: render_settings(shrunk(scene), SMALL)[:FIRST])
     return asked
 
 
@@ -55,8 +56,8 @@ def plates(monkeypatch: pytest.MonkeyPatch) -> None:
         return np.full((1, 64, 64), 0.5, np.float32)
 
     made = {name: lambda _: plate for name in ("torch float32, cpu", "ONNX Runtime float32")}
-    monkeypatch.setattr(command.reconstruction, "runtimes", lambda *_: made)
-    monkeypatch.setattr(command.reconstruction, "MIN_CALLS", 2)
+    monkeypatch.setattr(command, "runtimes", lambda *_: made)
+    monkeypatch.setattr(runtime_tradeoff, "MIN_CALLS", 2)
 
 
 Run = Callable[..., dict[str, Any]]
@@ -117,8 +118,8 @@ def test_tradeoff_render_uses_object_that_render_renders(tmp_path: Path, run: Ru
 def test_tradeoff_keeps_rows_measured_before_signal(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, name: str, number: signal.Signals, rows: int
 ) -> None:
-    module = command if name == "render" else command.reconstruction
-    whole = module.measure
+    measure = "measure_renders" if name == "render" else "measure_runtimes"
+    whole = getattr(command, measure)
 
     def cut_short(*arguments: Any) -> Iterator[Any]:
         for at, row in enumerate(whole(*arguments)):
@@ -126,7 +127,7 @@ def test_tradeoff_keeps_rows_measured_before_signal(
                 signal.raise_signal(number)
             yield row
 
-    monkeypatch.setattr(module, "measure", cut_short)
+    monkeypatch.setattr(command, measure, cut_short)
     before = signal.getsignal(number)
     result = run(name, *(["--count", "1"] if name == "reconstruct" else []), code=130)
     assert signal.getsignal(number) == before

@@ -9,10 +9,9 @@ import pytest
 from nlos_calibration.rig import LidarPose, load_rig
 from nlos_models.data import MapSet
 
-from nlos_cam.dataset import build
-from nlos_cam.dataset.build import DatasetPlan, procedural_images
+from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan, Objects, procedural_images
 from nlos_cam.evaluate import baselines
-from nlos_cam.evaluate.baselines import mean_image, training_maps, with_nearest, without_maps
+from nlos_cam.evaluate.baselines import answers_with_nearest, mean_image, training_maps, trivial_answers
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import object_depth
@@ -50,13 +49,13 @@ class Chunked(SimpleNamespace):
 
 def _guesses(sought: MapSet, training: MapSet, size: int = 12, **others: object) -> dict[str, np.ndarray]:
     options = {"on_progress": lambda *_: None, **others}
-    return with_nearest(sought, Chunked(maps=training, size=size), **options)  # type: ignore[arg-type]
+    return answers_with_nearest(sought, Chunked(maps=training, size=size), **options)  # type: ignore[arg-type]
 
 
 def test_baselines_answer_every_object(images: np.ndarray) -> None:
     mean = mean_image(images.astype(np.float16))
     np.testing.assert_allclose(mean, images.mean(0), atol=1e-3)
-    alone, guesses = without_maps(5, mean), _guesses(_maps(images[:5], seed=1), _maps(images))
+    alone, guesses = trivial_answers(5, mean), _guesses(_maps(images[:5], seed=1), _maps(images))
     assert set(alone) == {"all_background", "mean_object"}
     assert set(guesses) == {*alone, "nearest_neighbour"}
     for guess in (*alone.values(), *guesses.values()):
@@ -84,11 +83,11 @@ def test_nearest_neighbour_weighs_channels_by_their_spread(images: np.ndarray, s
 def test_training_maps_are_cached_by_what_determines_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[tuple[DatasetPlan, int, Path]] = []
     shapes = {"images": np.zeros((2, 64, 64), np.float16)}
-    monkeypatch.setattr(build, "build_dataset", lambda plan, count, folder, **_: built.append((plan, count, folder)))
-    monkeypatch.setattr(build, "open_dataset", lambda folder: folder)
-    monkeypatch.setattr(build, "procedural_images", lambda *_: shapes["images"])
+    monkeypatch.setattr(baselines, "build_dataset", lambda *args, **_: built.append(args))
+    monkeypatch.setattr(baselines, "open_dataset", lambda folder: folder)
+    monkeypatch.setattr(baselines, "procedural_images", lambda *_: shapes["images"])
     monkeypatch.setattr(baselines, "NEIGHBOURS", 7)
-    plan = DatasetPlan(RIG, build.TEST_SEED, objects=build.Objects(("cup",)))
+    plan = DatasetPlan(RIG, TEST_SEED, objects=Objects(("cup",)))
     elsewhere = RIG.model_copy(update={"lidar": LidarPose(distance_m=0.3, yaw_deg=45)})
     for one in (plan, plan, replace(plan, rig=elsewhere), replace(plan, first_seed=5)):
         training_maps(one, tmp_path, 1, lambda *_: None)
@@ -99,9 +98,9 @@ def test_training_maps_are_cached_by_what_determines_them(tmp_path: Path, monkey
     assert len({first, moved, other_shapes}) == 3
     assert first.parent.parent == tmp_path
     assert built[0][1] == 7
-    assert (built[0][0].first_seed, built[0][0].objects) == (build.TRAINING_SEED, build.Objects())
+    assert (built[0][0].first_seed, built[0][0].objects) == (TRAINING_SEED, Objects())
 
 
 def test_objects_that_identify_the_cache_cover_all_categories() -> None:
-    seen = {object_depth(seed, object_box(RIG))[0] for seed in range(baselines.TOLD_BY)}
+    seen = {object_depth(seed, object_box(RIG))[0] for seed in range(baselines.FINGERPRINT_OBJECTS)}
     assert seen == set(CATEGORIES)

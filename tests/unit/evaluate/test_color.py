@@ -11,10 +11,10 @@ from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import make_samples
 from nlos_cam.evaluate.color import (
     better_than,
-    colour_guesses,
-    draw_colour_sheet,
-    figures_of_colour,
-    judge_colour,
+    color_baselines,
+    color_figures,
+    draw_color_sheet,
+    figures_of_color,
     painted_maps,
 )
 from nlos_cam.objects.textures import TEXTURES
@@ -26,14 +26,14 @@ NO_VALUE = {"value": None, "low": None, "high": None}
 
 
 def test_judge_color_scores_truth_and_background() -> None:
-    perfect, nothing = judge_colour(TRUTH, TRUTH), judge_colour(NOTHING, TRUTH)
+    perfect, nothing = color_figures(TRUTH, TRUTH), color_figures(NOTHING, TRUTH)
     assert perfect["silhouette_iou"] == perfect["accuracy_mean_abs"] == {"value": 1.0, "low": 1.0, "high": 1.0}
     assert perfect["colour_error"] == {"value": 0.0, "low": 0.0, "high": 0.0}
     assert (nothing["silhouette_iou"]["value"], nothing["colour_error"]) == (0.0, NO_VALUE)
 
 
 def test_color_guesses_are_background_mean_object_and_mean_color() -> None:
-    guesses = colour_guesses(TRUTH, TRUTH)
+    guesses = color_baselines(TRUTH, TRUTH)
     assert not guesses["all_background"].any()
     np.testing.assert_allclose(guesses["mean_object"][1], TRUTH.mean(0))
     expected = (TRUTH > 0) * np.array([0.55, 0.55, 0.1])[:, None, None]
@@ -45,13 +45,13 @@ def test_better_than_is_positive_for_every_metric_that_improves() -> None:
     assert gains.pop("colour_error") == NO_VALUE
     assert {"silhouette_iou", "accuracy_mean_abs", "root_mean_square_error"} == set(gains)
     assert all(gain["value"] is not None and gain["value"] > 0 for gain in gains.values())
-    losses = better_than(TRUTH, colour_guesses(TRUTH, TRUTH)["mean_object"], TRUTH)
+    losses = better_than(TRUTH, color_baselines(TRUTH, TRUTH)["mean_object"], TRUTH)
     assert losses["silhouette_iou"]["value"] == 0
     assert all((losses[name]["value"] or 0) < 0 for name in ("root_mean_square_error", "colour_error"))
 
 
 def test_color_figures_name_baselines_and_simulation() -> None:
-    figures = figures_of_colour(TRUTH, TRUTH, {"other": NOTHING}, TRUTH)
+    figures = figures_of_color(TRUTH, TRUTH, {"other": NOTHING}, TRUTH)
     assert (figures["note"], figures["objects"], figures["silhouette_iou"]["value"]) == (SIMULATION_ONLY, 2, 1.0)
     assert set(figures["baselines"]) == {"other", "all_background", "mean_object", "mean_colour"}
     assert set(figures["better_than"]) == {"mean_object", "mean_colour"}
@@ -69,7 +69,7 @@ def test_painted_maps_match_dataset_samples() -> None:
 
 
 def test_color_sheet_shows_truth_reconstruction_and_difference(tmp_path: Path) -> None:
-    draw_colour_sheet(tmp_path / "sheet.png", TRUTH[::-1], TRUTH)
+    draw_color_sheet(tmp_path / "sheet.png", TRUTH[::-1], TRUTH)
     pixels = imread(tmp_path / "sheet.png")[..., :3].reshape(-1, 3)
     colors = (1.0, 0.1, 0.1), (0.1, 1.0, 0.1), (0.9, 0.9, 0.0)
     red, green, yellow = ((np.abs(pixels - color) < 0.05).all(1).sum() for color in colors)

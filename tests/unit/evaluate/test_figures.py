@@ -21,7 +21,7 @@ from nlos_cam.evaluate.figures import (
     draw_sheet,
     mosaic,
 )
-from nlos_cam.evaluate.metrics import BARS, over_objects
+from nlos_cam.evaluate.metrics import TARGETS, over_objects
 
 
 @pytest.fixture
@@ -70,12 +70,12 @@ def test_sheet_names_up_to_54_objects_from_first_to_last(tmp_path: Path, figures
 
 def test_categories_are_drawn_from_worst_to_best(tmp_path: Path, figures: list[Any]) -> None:
     levels = {"cup": 0.9, "hat": 0.5}
-    by = {kind: over_objects({name: np.array([level] * 2) for name in BARS}) for kind, level in levels.items()}
+    by = {kind: over_objects({name: np.array([level] * 2) for name in TARGETS}) for kind, level in levels.items()}
     draw_categories(tmp_path / "categories.png", by, by["cup"])
     axis = figures[0].axes[0]
     assert [label.get_text() for label in axis.get_yticklabels()] == ["hat", "cup"]
     assert [text.get_text().count("0.9") for text in axis.get_legend().texts] == [1, 1]  # the estimate and the bar
-    nothing = {"cup": over_objects({name: np.array([np.nan]) for name in BARS})}
+    nothing = {"cup": over_objects({name: np.array([np.nan]) for name in TARGETS})}
     draw_categories(tmp_path / "empty.png", nothing, nothing["cup"])
     assert (tmp_path / "empty.png").read_bytes().startswith(b"\x89PNG")
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset.build import procedural_images
+from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate.metrics import (
-    BARS,
+    TARGETS,
     advantage,
-    bars_met,
     curve,
     detail_per_cm,
+    error_by_zone,
     interval,
     judge,
     meets,
@@ -22,7 +22,7 @@ from nlos_cam.evaluate.metrics import (
     plain,
     rank_correlation,
     surface_cm2,
-    where_the_error_is,
+    targets_met,
 )
 from nlos_cam.objects.depth_map import depth_from_image, object_box
 
@@ -41,7 +41,7 @@ def test_judge_scores_perfect_image_without_uncertainty(images: np.ndarray) -> N
     figures = judge(images, images, BOX)
     assert {name: figure.value for name, figure in figures.items()} == PERFECT
     assert all(figure.low == figure.value == figure.high for figure in figures.values())
-    assert all(bar["met"] for bar in bars_met(figures).values())
+    assert all(bar["met"] for bar in targets_met(figures).values())
 
 
 def test_judge_scores_worse_image_worse(images: np.ndarray) -> None:
@@ -90,14 +90,14 @@ def test_categories_average_to_the_whole(images: np.ndarray) -> None:
     values = per_object(0.9 * np.roll(images, 3, axis=2), images, BOX)
     by, whole = per_category(values, categories), over_objects(values)
     assert list(by) == ["cup", "hat", "car"]
-    for name in BARS:
+    for name in TARGETS:
         weighed = sum(categories.count(category) * by[category][name].value for category in by) / len(images)
         assert weighed == pytest.approx(whole[name].value)
 
 
 def test_advantage_is_positive_for_the_better_image(images: np.ndarray) -> None:
     good, bad = (per_object(share * np.roll(images, by, 2), images, BOX) for share, by in ((0.99, 1), (0.9, 9)))
-    for name in BARS:
+    for name in TARGETS:
         gained, lost = advantage(good, bad)[name], advantage(bad, good)[name]
         assert gained.value > 0
         assert gained.value == pytest.approx(-lost.value)
@@ -167,12 +167,12 @@ def test_zones_locate_an_error(at: tuple[int, int], zone: str) -> None:
     truth = plate(20)
     image = truth.copy()
     image[0][at] += 0.2
-    zones = where_the_error_is(image, truth)
+    zones = error_by_zone(image, truth)
     assert zones[zone].share_of_error == pytest.approx(1)
     assert sum(one.share_of_pixels for one in zones.values()) == pytest.approx(1)
     assert zones["core"].share_of_pixels == pytest.approx(16**2 / 64**2)
 
 
 def test_zones_of_perfect_image_and_of_empty_truth() -> None:
-    assert {zone.share_of_error for zone in where_the_error_is(plate(9), plate(9)).values()} == {None}
-    assert where_the_error_is(plate(9), EMPTY)["far background"].share_of_error == pytest.approx(1)
+    assert {zone.share_of_error for zone in error_by_zone(plate(9), plate(9)).values()} == {None}
+    assert error_by_zone(plate(9), EMPTY)["far background"].share_of_error == pytest.approx(1)

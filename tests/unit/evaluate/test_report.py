@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset.build import procedural_images
+from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate import report
-from nlos_cam.evaluate.metrics import BARS
-from nlos_cam.evaluate.report import Judgement, as_figures, as_markdown, in_words, write
+from nlos_cam.evaluate.metrics import TARGETS
+from nlos_cam.evaluate.report import Evaluation, as_figures, as_markdown, format_interval, write_report
 from nlos_cam.objects.depth_map import object_box
 
 BOX = object_box(load_rig("paper-rig"))
@@ -22,15 +22,15 @@ FACTS |= {"training_objects": 99, "notes": ["they are few"]}
 FILES = {"report.md", "figures.json", "objects.csv", "sheet.png", "gallery.png", "categories.png", "surface.png"}
 
 
-def _judgement(count: int = 7, *, guesses: bool = True) -> Judgement:
+def _judgement(count: int = 7, *, guesses: bool = True) -> Evaluation:
     truth = procedural_images(0, count, BOX).astype(np.float32)
     image = (0.95 * np.roll(truth, 2, axis=2)).astype(np.float32)
     others = {"all_background": np.zeros_like(truth), "nearest_neighbour": np.roll(truth, 1, axis=0)}
     categories, names = [f"kind {k % 3}" for k in range(count)], [f"object {k}" for k in range(count)]
-    return Judgement(names, categories, truth, image, others if guesses else {}, BOX, FACTS)
+    return Evaluation(names, categories, truth, image, others if guesses else {}, BOX, FACTS)
 
 
-def _figures(judgement: Judgement) -> dict[str, Any]:
+def _figures(judgement: Evaluation) -> dict[str, Any]:
     return json.loads(json.dumps(as_figures(judgement), allow_nan=False))
 
 
@@ -41,10 +41,10 @@ def _rows(folder: Path) -> list[dict[str, str]]:
 
 def test_figures_have_names_that_scripts_depend_on() -> None:
     figures = _figures(_judgement())
-    assert {*BARS, "baselines", "per_category", "objects", "bars", *FACTS} < set(figures)
+    assert {*TARGETS, "baselines", "per_category", "objects", "bars", *FACTS} < set(figures)
     assert set(figures["per_category"]) == {"kind 0", "kind 1", "kind 2"}
     for table in (figures, *figures["baselines"].values(), *figures["per_category"].values()):
-        assert all(set(table[name]) == {"value", "low", "high"} for name in BARS)
+        assert all(set(table[name]) == {"value", "low", "high"} for name in TARGETS)
     assert figures["objects"] == 7
     assert figures["baselines"]["all_background"]["foreground_rmse_mm"]["value"] is None
     assert figures["advantage_over_nearest_neighbour"]["silhouette_iou"]["value"] > 0
@@ -60,7 +60,7 @@ def test_report_of_perfect_reconstruction_meets_every_bar() -> None:
 
 def test_report_contains_metrics_pictures_and_notes() -> None:
     text = as_markdown(_figures(_judgement()))
-    for name in BARS:
+    for name in TARGETS:
         assert f"| {name} | " in text
     for name in FILES:
         assert not name.endswith(".png") or f"({name})" in text
@@ -73,7 +73,7 @@ def test_report_contains_metrics_pictures_and_notes() -> None:
 def test_folder_is_complete_for_any_number_of_objects(tmp_path: Path, count: int) -> None:
     judgement, out = _judgement(count), tmp_path / "out"
     figures = as_figures(judgement)
-    write(out, judgement, figures)
+    write_report(out, judgement, figures)
     assert {path.name for path in out.iterdir()} == FILES
     assert json.loads((out / "figures.json").read_text(encoding="utf-8")) == _figures(judgement)
     assert [row["name"] for row in _rows(out)] == judgement.names
@@ -101,7 +101,7 @@ def test_interrupted_write_leaves_earlier_folder(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(report.pictures, "draw_gallery", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        write(out, _judgement(3), as_figures(_judgement(3)))
+        write_report(out, _judgement(3), as_figures(_judgement(3)))
     assert {path.name: path.read_text() for path in out.iterdir()} == {"report.md": "earlier"}
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
@@ -109,6 +109,6 @@ def test_interrupted_write_leaves_earlier_folder(tmp_path: Path, monkeypatch: py
 def test_object_without_value_has_an_empty_field(tmp_path: Path) -> None:
     whole = _judgement(2, guesses=False)
     blank = replace(whole, image=0 * whole.truth)
-    write(tmp_path / "out", blank, as_figures(blank))
+    write_report(tmp_path / "out", blank, as_figures(blank))
     assert {row["foreground_rmse_mm"] for row in _rows(tmp_path / "out")} == {""}
-    assert in_words(_figures(blank)["foreground_rmse_mm"]) == "none"
+    assert format_interval(_figures(blank)["foreground_rmse_mm"]) == "none"

@@ -11,18 +11,18 @@ from nlos_models.recipe import Recipe
 from small_maps import SmallDataset, small_maps
 
 from nlos_cam.camera.simulated_world import World
-from nlos_cam.dataset.build import TEST_SEED, TRAINING_SEED, DatasetPlan, procedural_images
+from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan, procedural_images
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import baselines
 from nlos_cam.evaluate.subjects import (
     QUIET,
-    Judged,
+    HeldOutObjects,
     as_map_set,
-    baseline_images,
+    baseline_answers,
     echoes_of,
-    fresh_objects,
-    notes_on,
+    notes_about,
     reconstruct_all,
+    rendered_objects,
     rig_of,
     seeded_objects,
     sense,
@@ -40,7 +40,7 @@ BOX = object_box(RIG)
 PLAN = DatasetPlan(RIG, TEST_SEED)
 RECORD = CheckpointRecord(rig_name=RIG.name, rig_checksum=RIG.checksum)
 ELSEWHERE = replace(PLAN, rig=RIG.model_copy(update={"name": "elsewhere"}))
-JUDGED = Judged("some", ["cup 1", "hat 2"], ["cup", "hat"], small_maps(2, 0), PLAN)
+JUDGED = HeldOutObjects("some", ["cup 1", "hat 2"], ["cup", "hat"], small_maps(2, 0), PLAN)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_reconstruct_all_takes_one_object_at_a_time(echoes: list[MultiBounce]) -
 
 
 def test_fresh_objects_are_those_of_test_seeds() -> None:
-    judged = fresh_objects(RIG, 1)
+    judged = rendered_objects(RIG, 1)
     np.testing.assert_array_equal(judged.maps.image, truth_of(seeded_objects(TEST_SEED, 1, BOX), BOX))
     assert judged.maps.depth_m.shape == (1, 64, 80)
     assert (len(judged.names), judged.plan) == (1, PLAN)
@@ -115,7 +115,7 @@ def test_rig_of_weights_that_is_missing_is_asked_for() -> None:
 
 def test_guesses_without_nearest_take_mean_of_training_images(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "NEIGHBOURS", 3)
-    images, among = baseline_images(JUDGED, None, nearest=False)
+    images, among = baseline_answers(JUDGED, None, nearest=False)
     assert (set(images), among) == ({"all_background", "mean_object"}, None)
     mean = procedural_images(TRAINING_SEED, 3, BOX).astype(np.float32).mean(0)
     np.testing.assert_allclose(images["mean_object"][1], mean, atol=1e-3)
@@ -125,10 +125,10 @@ def test_notes_name_other_rigs_and_categories_left_out() -> None:
     recipe = Recipe(task="vae", objects=4, held_out=2, epochs=1, batch=2, learning_rate=1e-3, left_out=["hat", "car"])
     training = SmallDataset(JUDGED.maps, ELSEWHERE)
     training.folder = Path("train")
-    assert notes_on(RECORD, JUDGED, SmallDataset(JUDGED.maps, PLAN)) == []
-    other_rig, left_out = notes_on(
+    assert notes_about(RECORD, JUDGED, SmallDataset(JUDGED.maps, PLAN)) == []
+    other_rig, left_out = notes_about(
         RECORD.model_copy(update={"vae_recipe": recipe}), replace(JUDGED, plan=ELSEWHERE), training
     )
     assert ("paper-rig" in other_rig, "hat" in left_out, "car" in left_out) == (True, True, False)
-    (other_training,) = notes_on(RECORD, JUDGED, training)
+    (other_training,) = notes_about(RECORD, JUDGED, training)
     assert "train" in other_training

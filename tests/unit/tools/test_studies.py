@@ -16,9 +16,9 @@ from nlos_models import checkpoint
 from nlos_models.data import MapSet
 from small_maps import small_maps, untrained_weights, use_small_networks
 
-from nlos_cam.dataset.build import TEST_SEED, DatasetPlan
-from nlos_cam.evaluate.metrics import BARS
-from nlos_cam.evaluate.subjects import Judged, seeded_objects
+from nlos_cam.dataset import TEST_SEED, DatasetPlan
+from nlos_cam.evaluate.metrics import TARGETS
+from nlos_cam.evaluate.subjects import HeldOutObjects, seeded_objects
 from nlos_cam.objects.depth_map import object_box
 
 RIG = load_rig("paper-rig")
@@ -134,9 +134,9 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return [tmp_path / "two", tmp_path / "one"]
 
 
-def judged(*_: object) -> Judged:
+def judged(*_: object) -> HeldOutObjects:
     kinds = ["airplane", "table", "cup"]
-    return Judged("some", kinds, kinds, small_maps(3, 0), DatasetPlan(RIG, TEST_SEED))
+    return HeldOutObjects("some", kinds, kinds, small_maps(3, 0), DatasetPlan(RIG, TEST_SEED))
 
 
 @pytest.mark.slow
@@ -159,13 +159,13 @@ def test_rig_map_has_a_cell_for_every_place(
     monkeypatch.setattr(module, "ANGLES_DEG", (15.0, 45.0))
     table = run("weights", "rig_map", "rigs", "--weights", f"plate={weights[0]}")
     assert [(cell["distance_m"], cell["yaw_deg"]) for cell in table["cells"]] == [(0.2, 15.0), (0.2, 45.0)]
-    assert set(table["cells"][0]["weights"]["plate"]) >= set(BARS)
+    assert set(table["cells"][0]["weights"]["plate"]) >= set(TARGETS)
 
 
 def test_unseen_kinds_of_equal_weights_cost_nothing(
     tool: Tool, run: Read, weights: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tool("weights"), "stored_objects", judged)
+    monkeypatch.setattr(tool("weights"), "dataset_objects", judged)
     rows = run("weights", "unseen_kinds", "unseen", weights[0], f"again={weights[0]}")["rows"]
     assert {row["without_better_by"]["silhouette_iou"]["value"] for row in rows} == {0}
     with pytest.raises(SystemExit, match="no boat among the maps"):
@@ -176,7 +176,7 @@ def test_unseen_kinds_of_equal_weights_cost_nothing(
 def test_ablations_compare_and_draw(
     tool: Tool, run: Read, weights: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tool("ablations"), "fresh_objects", judged)
+    monkeypatch.setattr(tool("ablations"), "rendered_objects", judged)
     folder = tmp_path / "docs"
     table = run("ablations", "ablations", *weights, "--curve", *weights, "--out", folder)
     assert [row["name"] for row in table["compared"]] == ["two", "one"]
