@@ -12,8 +12,7 @@ import pytest
 from fake_librealsense import FakeSdk
 from fake_lidar import FakeLidar
 
-from nlos_cam.camera import Camera, Recording, open_camera
-from nlos_cam.camera.l515 import list_devices
+from nlos_cam.camera import Camera, Recording, connected, load_sdk, open_camera, shared_context
 from nlos_cam.camera.simulated_world import World, open_world
 from nlos_cam.errors import CameraError, NlosCamError
 from nlos_cam.frames import Frame
@@ -50,7 +49,8 @@ def opens(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> di
     if request.param == FAKE_L515:
         sdk = FakeSdk(FakeLidar("fake", runs=(10**6, 10**6), laser_power=93.0))
         monkeypatch.setattr("nlos_cam.camera.l515.load_sdk", lambda: sdk)
-    if request.param == "l515" and not any("L515" in info.name for info in list_devices()):
+    found = connected(load_sdk(), shared_context(load_sdk())) if request.param == "l515" else []
+    if request.param == "l515" and not any("L515" in info.name for _, info in found):
         pytest.skip("no L515 is connected")
     if request.param in READERS:
         return {"uri": f"bag:{request.getfixturevalue('bag')}", "reader": READERS[request.param]}

@@ -1,9 +1,9 @@
-"""What only a real L515 can show.
+"""Behavior that only a real L515 can show.
 
-The bench: one L515 (firmware 1.5.8.1) on USB 3, 0.2 m from a bare matt white wall, turned 45 degrees to it, nothing
-else within 1 m; no other program using it. Someone at the cable, where a test asks for it to be pulled (run with `-s`,
-and NLOS_CAM_AT_THE_BENCH=1); a second L515 for the test of two. The ten minutes want NLOS_CAM_TEN_MINUTES=1 and 20 GB.
-Run with `pytest -m hardware`; every test skips where what it needs is not there.
+Bench: one L515 (firmware 1.5.8.1) on USB 3, 0.2 m from a bare matt white wall, turned 45 degrees to it, nothing
+else within 1 m; no other program using it. A person pulls the cable when a test asks (run with `-s` and
+NLOS_CAM_AT_THE_BENCH=1); one test needs a second L515, one NLOS_CAM_TEN_MINUTES=1 and 20 GB.
+Run with `pytest -m hardware`; tests skip where something they need is missing.
 """
 
 import os
@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from nlos_cam.calibrate.color_view import capture_color_view
-from nlos_cam.camera import Camera, Recording, open_camera
-from nlos_cam.camera.l515 import NEAR_WALL, L515Camera, list_devices
+from nlos_cam.camera import Camera, Recording, connected, load_sdk, open_camera, shared_context
+from nlos_cam.camera.l515 import NEAR_WALL, L515Camera
 from nlos_cam.recording.playback import ReplayCamera, verify
 
 pytestmark = pytest.mark.hardware
@@ -24,7 +24,8 @@ SECONDS = 5
 
 
 def serials() -> list[str]:
-    return [info.serial for info in list_devices() if "L515" in info.name]
+    found = connected(load_sdk(), shared_context(load_sdk()))
+    return [info.serial for _, info in found if "L515" in info.name]
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Frames to maps: which pixel falls in which cell, and the values of a cell; and running means of maps."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,8 +10,6 @@ from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Frame, LidarMaps, MapMean, _e
 from nlos_cam.render.sensor.sensor import cell_of_pixels
 
 SIZES = [(480, 640), (240, 320), (768, 1024), (64, 80), (100, 90), (32, 40)]
-
-
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)
 
 
@@ -48,19 +44,6 @@ def test_pixel_belongs_to_one_cell(size: tuple[int, int]) -> None:
         depth[row, column] = 0.5
         found = np.argwhere(_maps(depth).valid).tolist()
         assert found == [[_cell(row, size[0], MAP_ROWS), _cell(column, size[1], MAP_COLUMNS)]]
-
-
-def test_depth_is_the_median_of_the_valid_samples() -> None:
-    generator = np.random.default_rng(1)
-    same_size = generator.uniform(0.2, 1, (64, 80)).astype(np.float32)
-    np.testing.assert_array_equal(_maps(same_size).depth_m, same_size)
-    depth = generator.uniform(0.2, 1, (480, 640)).astype(np.float32)
-    depth[generator.random(depth.shape) < 0.3] = np.nan
-    maps = _maps(depth)
-    for i, j in [(0, 0), (1, 5), (31, 40), (63, 79)]:
-        rows = [r for r in range(480) if _cell(r, 480, MAP_ROWS) == i]
-        samples = depth[rows][:, 8 * j : 8 * j + 8]
-        assert maps.depth_m[i, j] == pytest.approx(np.nanmedian(samples), rel=1e-6)
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
@@ -195,15 +178,3 @@ def test_map_mean_neither_changes_nor_keeps_its_input() -> None:
     np.testing.assert_array_equal(first.depth_m, kept)
     assert_equal(mean.add(noise(5)), mean_of([noise(4), noise(5)]))
     np.testing.assert_array_equal(kept, again.depth_m)
-
-
-def test_map_mean_memory_does_not_grow() -> None:
-    mean, maps = MapMean(10), noise(0)
-    for _ in range(20):
-        mean.add(maps)
-    tracemalloc.start()
-    for _ in range(200):
-        mean.add(maps)
-    grown, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert grown < 100_000

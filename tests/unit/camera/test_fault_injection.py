@@ -1,4 +1,4 @@
-"""What a faulty device hands over at each instant, before the SDK has it."""
+"""Deliveries of a faulty device at each instant, before the SDK gets them."""
 
 from typing import Any
 
@@ -38,10 +38,6 @@ def instants(came: list[Delivery]) -> list[int]:
     return [delivery.instant for delivery in came]
 
 
-def same(one: SensedImages, other: SensedImages) -> bool:
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("depth_z16", "ir", "confidence"))
-
-
 @given(st.integers(0, 1000))
 def test_device_without_faults_changes_nothing(instant: int) -> None:
     seen = images(instant)
@@ -51,38 +47,10 @@ def test_device_without_faults_changes_nothing(instant: int) -> None:
     assert delivery.streams == tuple(FORMATS)
 
 
-@pytest.mark.parametrize("kind", ["stall", "drops"])
-def test_stall_and_drops_hand_nothing_over(kind: Any) -> None:
-    came = handed(Fault(kind=kind, at_frame=3, frames=4))
-    assert instants(came) == [0, 1, 2, 7, 8, 9, 10, 11]
-    assert numbers(came) == (list(range(8)) if kind == "stall" else instants(came))  # the device counts its drops
-
-
-@pytest.mark.parametrize("stream", FORMATS)
-def test_one_stream_alone_may_lose_frames(stream: Any) -> None:
-    came = handed(Fault(kind="drops", at_frame=3, frames=4, stream=stream))
-    assert numbers(came) == list(range(12))
-    short = [delivery.number for delivery in came if stream not in delivery.streams]
-    assert short == [3, 4, 5, 6]
-    assert all(len(delivery.streams) >= 2 for delivery in came)
-
-
-def test_duplicates_come_twice_at_once() -> None:
-    assert numbers(handed(Fault(kind="duplicate", at_frame=1, frames=2), until=4)) == [0, 1, 1, 2, 2, 3]
-
-
 def test_out_of_order_frames_keep_their_own_time() -> None:
     came = handed(Fault(kind="out_of_order", at_frame=1, frames=2), until=7)
     assert numbers(came) == [0, 2, 1, 4, 3, 5, 6]
     assert [delivery.timestamp_s for delivery in came] == [START_S + number / 30 for number in numbers(came)]
-
-
-@pytest.mark.parametrize("kind", ["all_zero", "saturated", "half_invalid", "wrong_size"])
-def test_image_faults_spoil_only_frames_of_their_time(kind: Any) -> None:
-    came = handed(Fault(kind=kind, at_frame=2, frames=3), until=7)
-    assert numbers(came) == list(range(7))
-    spoiled = [each.number for each in came if not same(each.images, images(each.number))]
-    assert spoiled == [2, 3, 4]
 
 
 def test_image_faults_spoil_images_as_named_and_add_up() -> None:
@@ -94,6 +62,7 @@ def test_image_faults_spoil_images_as_named_and_add_up() -> None:
     assert (spoiled("saturated").ir == 255).all()
     assert np.count_nonzero(spoiled("half_invalid").depth_z16) == 12
     assert spoiled("wrong_size").depth_z16.shape == spoiled("wrong_size").ir.shape == (2, 3)
+    assert [each.images.ir.max() for each in handed(Fault(kind="saturated", at_frame=1), until=3)] == [100, 255, 100]
     both = spoiled("half_invalid", "saturated")
     assert (np.count_nonzero(both.depth_z16), both.ir.min()) == (12, 255)
 

@@ -16,8 +16,6 @@ from nlos_cam.recording.playback import ReplayCamera, verify
 from nlos_cam.render.sensor.sensor import SensedImages
 
 SATURATES_ABOVE = 60.0
-
-
 RANGES = dict.fromkeys(NEAR_WALL, (0.0, 6.0)) | {"visual_preset": (0.0, 6.0), "laser_power": (0.0, 100.0)}
 
 

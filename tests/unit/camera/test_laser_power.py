@@ -16,40 +16,21 @@ RANGES = [
 ]
 
 
-class Wall:
-    """A wall that saturates above a laser power, and keeps the powers that were set."""
-
-    def __init__(self, power: float, saturates_above: float) -> None:
-        self.power, self.saturates_above = power, saturates_above
-        self.put_values: list[float] = []
-
-    def look(self) -> float:
-        return 0.5 if self.power > self.saturates_above else 0.0
-
-    def put(self, power: float) -> bool:
-        self.put_values.append(power)
-        self.power = power
-        return True
-
-
 @pytest.mark.parametrize("limits", RANGES)
 @pytest.mark.parametrize("part", [0.0, 0.15, 0.5, 0.77, 1.0, 2.0])
 def test_turn_down_falls_above_darkness_as_far_as_needed(limits: PowerLimits, part: float) -> None:
-    threshold = limits.min + part * (limits.max - limits.min)
-    wall = Wall(limits.max, threshold)
-    settled = turn_down(limits.max, limits, wall.look, wall.put)
-    tried = [limits.max, *wall.put_values]
-    assert settled.power == tried[-1] == wall.power
+    threshold, tried = limits.min + part * (limits.max - limits.min), [limits.max]
+    settled = turn_down(
+        limits.max, limits, lambda: 0.5 if tried[-1] > threshold else 0.0, lambda power: not tried.append(power)
+    )
+    assert settled.power == tried[-1]
     assert len(tried) <= STRIDES + 2
     assert all(lower < higher for higher, lower in pairwise(tried))
     assert min(tried) >= max(limits.min, min(limits.step, limits.max))
     assert min(tried) > 0
     assert all(power > threshold for power in tried[:-1])
-    if settled.power > threshold:
-        assert settled.saturated == 0.5
-        assert not list(weaker(settled.power, limits))
-    else:
-        assert settled.saturated == 0.0
+    assert settled.saturated == (0.5 if settled.power > threshold else 0.0)
+    assert settled.power <= threshold or not list(weaker(settled.power, limits))
 
 
 @pytest.mark.parametrize("share", [0.0, MAX_SATURATED, None])

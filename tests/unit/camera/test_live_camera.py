@@ -30,7 +30,7 @@ def impatient(camera: L515Camera, silence_s: float = SILENCE_S) -> L515Camera:
 
 
 def rises(frames: list[Frame]) -> bool:
-    """Whether numbers and timestamps rise together."""
+    """Return True if numbers and timestamps rise together."""
     steps = [
         (next_one.frame_number - one.frame_number, next_one.timestamp_s - one.timestamp_s)
         for one, next_one in pairwise(frames)
@@ -72,12 +72,28 @@ def test_device_that_does_not_start_is_left_closed(fake_camera: Make) -> None:
     assert device.did == ["stop", "close"]
 
 
-def test_stall_is_cured_by_restarting_the_streams(fake_camera: Make) -> None:
-    with impatient(fake_camera(FakeLidar(usb="2.1", runs=(30, ENDLESS)))) as camera:
+@pytest.mark.parametrize(
+    ("runs", "flaps", "counts"),
+    [
+        ((30, ENDLESS), 0, {"restarted": 1}),
+        ((30, 0, 0, 0, ENDLESS), 0, {"restarted": 3, "reset": 1}),
+        ((30, ENDLESS), 1, {"replugged": 1}),
+    ],
+    ids=["restart", "reset", "replug"],
+)
+def test_silent_device_delivers_again_with_its_settings(
+    fake_camera: Make, runs: tuple[int, ...], flaps: int, counts: dict[str, int]
+) -> None:
+    lidar = FakeLidar(usb="2.1", runs=runs)
+    lidar.flaps = flaps
+    with impatient(fake_camera(lidar)) as camera:
         frames = list(islice(camera, 50))
-        assert camera.counts == {"restarted": 1}
+        assert camera.counts == counts
     assert rises(frames)
     assert camera.dropped + camera.incomplete == holes(frames) > 0
+    assert lidar.did.count("reset") == counts.get("reset", 0)
+    assert {name: lidar.options[name] for name in NEAR_WALL} == NEAR_WALL
+    assert (lidar.options["visual_preset"], frames[-1].settings["min_distance"]) == (5.0, 0.0)
 
 
 def test_each_silence_starts_with_a_restart(fake_camera: Make) -> None:
@@ -85,15 +101,6 @@ def test_each_silence_starts_with_a_restart(fake_camera: Make) -> None:
         while camera.counts["restarted"] < 5:
             next(iter(camera))
         assert camera.counts == {"restarted": 5}
-
-
-def test_device_is_reset_where_restarts_do_not_help(fake_camera: Make) -> None:
-    lidar = FakeLidar(usb="2.1", runs=(30, 0, 0, 0, ENDLESS))
-    with impatient(fake_camera(lidar)) as camera:
-        frames = list(islice(camera, 50))
-        assert camera.counts == {"restarted": 3, "reset": 1}
-    assert rises(frames)
-    assert lidar.did.count("reset") == 1
 
 
 def test_device_that_nothing_helps_is_lost_with_counts(fake_camera: Make) -> None:
@@ -118,17 +125,6 @@ def test_frames_of_some_streams_count_as_incomplete(fake_camera: Make) -> None:
         assert camera.incomplete == 70  # the youngest 30 may yet have become sets
         assert camera.incomplete + camera.dropped >= holes(seen)
     assert rises(seen)
-
-
-def test_replugged_device_gets_the_same_settings(fake_camera: Make) -> None:
-    lidar = FakeLidar(usb="2.1", runs=(30, ENDLESS))
-    lidar.flaps = 1
-    with impatient(fake_camera(lidar)) as camera:
-        frames = list(islice(camera, 50))
-        assert camera.counts == {"replugged": 1}
-    assert rises(frames)
-    assert {name: lidar.options[name] for name in NEAR_WALL} == NEAR_WALL
-    assert (lidar.options["visual_preset"], frames[-1].settings["min_distance"]) == (5.0, 0.0)
 
 
 def test_unplugged_device_that_stays_away_is_lost(fake_camera: Make, caplog: pytest.LogCaptureFixture) -> None:

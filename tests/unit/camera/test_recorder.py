@@ -1,12 +1,14 @@
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fake_lidar import NapClock
 from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.camera.recorder import (
@@ -26,7 +28,6 @@ from nlos_cam.camera.session import CAPACITY
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import DiskFullError, RecordingError
-from nlos_cam.frames import Frame
 from nlos_cam.recording.playback import ReplayCamera, verify
 
 Make = Callable[[Recording], SimulatedCamera]
@@ -75,17 +76,6 @@ def test_slow_reader_costs_the_recording_nothing(camera: Make, tmp_path: Path) -
     assert verify(recording.path).frames == 60
 
 
-def watch(recording: Recording, frames: Iterator[Frame]) -> list[int]:
-    """Return the numbers of a take's frames that a reader of the camera got."""
-    numbers: list[int] = []
-    for frame in frames:
-        if recording.covers(frame.timestamp_s):
-            numbers.append(frame.frame_number)
-        elif recording.done:
-            break
-    return numbers
-
-
 @pytest.mark.parametrize("limit", [{"frames": 6}, {"seconds": 0.2}])
 def test_takes_follow_each_other_on_a_running_camera(camera: Make, tmp_path: Path, limit: dict[str, Any]) -> None:
     paths = [tmp_path / f"{number}.bag" for number in range(3)]
@@ -95,11 +85,16 @@ def test_takes_follow_each_other_on_a_running_camera(camera: Make, tmp_path: Pat
         for path in paths:
             if path != paths[0]:
                 recording.next_take(path, last=path == paths[-1])
-            seen = watch(recording, frames)
+            seen = set[int]()
+            for frame in frames:
+                if recording.covers(frame.timestamp_s):
+                    seen.add(frame.frame_number)
+                elif recording.done:
+                    break
             recording.close()
             with ReplayCamera(path) as replayed:
                 recorded = [frame.frame_number for frame in replayed]
-            assert path == paths[0] or set(seen) <= set(recorded)
+            assert path == paths[0] or seen <= set(recorded)
             numbers += recorded
     for path in paths:
         found = verify(path)
@@ -190,24 +185,13 @@ class FakeRecorder:
         self.on_pause()
 
 
-class FakeTime:
-    def __init__(self) -> None:
-        self.time_s = 0.0
-
-    def now(self) -> float:
-        return self.time_s
-
-    def pass_by(self, seconds: float) -> None:
-        self.time_s += seconds
+@pytest.fixture
+def clock() -> NapClock:
+    return NapClock()
 
 
 @pytest.fixture
-def clock() -> FakeTime:
-    return FakeTime()
-
-
-@pytest.fixture
-def made(tmp_path: Path, clock: FakeTime) -> SdkRecorder:
+def made(tmp_path: Path, clock: NapClock) -> SdkRecorder:
     path = tmp_path / "a.bag"
     path.write_bytes(b"something else, and longer")
     made = SdkRecorder(path, "device", SimpleNamespace(recorder=FakeRecorder), now=clock.now)
@@ -222,10 +206,10 @@ def test_recorder_reports_a_place_that_cannot_be_written(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(("slow", "pauses"), [(0, 1), (3, 4), (10**6, MAX_FLUSHES)])
 def test_recorder_pauses_again_while_a_disk_is_behind(
-    made: SdkRecorder, clock: FakeTime, slow: int, pauses: int
+    made: SdkRecorder, clock: NapClock, slow: int, pauses: int
 ) -> None:
     fake = made._recorder
-    fake.on_pause = lambda: clock.pass_by(FLUSH_S + 1 if fake.pauses <= slow else 1.0)
+    fake.on_pause = lambda: clock.wait(Event(), FLUSH_S + 1 if fake.pauses <= slow else 1.0)
     if pauses == MAX_FLUSHES:
         with pytest.raises(DiskFullError, match=r"a\.bag"):
             made.close()
@@ -235,16 +219,16 @@ def test_recorder_pauses_again_while_a_disk_is_behind(
     assert fake.pauses == pauses
 
 
-def test_recorder_whose_file_grows_no_more_fails(made: SdkRecorder, clock: FakeTime) -> None:
+def test_recorder_whose_file_grows_no_more_fails(made: SdkRecorder, clock: NapClock) -> None:
     for _ in range(10):  # now and then
         made.watch()
-        clock.pass_by(STILL_S / 2)
+        clock.wait(Event(), STILL_S / 2)
         made.watch()
         with made.path.open("ab") as file:
             file.write(b"more")
     made.watch()
     assert made.failure is None
-    clock.pass_by(STILL_S + 1)
+    clock.wait(Event(), STILL_S + 1)
     made.watch()
     with pytest.raises(DiskFullError, match=r"nlos-cam repair .*a\.bag --out .*a-repaired\.bag") as raised:
         made.close()
@@ -301,14 +285,10 @@ def test_bytes_per_frame_bounds_a_recording(noise_world: type, recorded: Any, tm
     assert 0.5 * frames * bytes_per_frame(SMALL) < size < frames * bytes_per_frame(SMALL) + overhead
 
 
-def test_free_bytes_are_those_of_a_future_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert free_bytes(tmp_path / "none.bag") > 0
-    monkeypatch.chdir(tmp_path)
-    assert free_bytes(Path("none.bag")) > 0
-
-
 @pytest.mark.parametrize("seconds", [0, 1, 10, 600])
-def test_check_room_needs_frames_and_a_reserve(tmp_path: Path, seconds: int) -> None:
+def test_check_room_needs_frames_and_a_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: int) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert free_bytes(tmp_path / "none.bag") > 0 < free_bytes(Path("none.bag"))
     path, free = tmp_path / "a.bag", RESERVE_BYTES + 30 * seconds * bytes_per_frame(VGA)
     assert recording_s(VGA, free) == seconds
     assert recording_s(VGA, 0) == 0

@@ -11,7 +11,7 @@ from nlos_cam.errors import CameraNotFoundError, RecordingError, SceneError
 LATE = """
 import sys
 from nlos_cam.camera import open_camera
-print(*(name for name in ("pyrealsense2", "nlos_cam.camera.l515", "nlos_cam.camera.world") if name in sys.modules))
+print(*sys.modules.keys() & {"pyrealsense2", "nlos_cam.camera.l515", "nlos_cam.camera.simulated_world"})
 """
 
 

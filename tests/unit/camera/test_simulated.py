@@ -124,8 +124,6 @@ def test_native_threads_do_not_pile_up(noise_world: Any, hurried_clock: Any) -> 
 
 
 PINHOLE = load_rig("paper-rig").pinhole
-
-
 CELSIUS = {"ldd_temperature": 41.5, "apd_temperature": 36.25}
 
 

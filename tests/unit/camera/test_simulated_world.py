@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from nlos_cam.camera.simulated_world import World, open_world
-from nlos_cam.errors import SceneError
 from nlos_cam.render.sensor.sensor import SensedImages
 
 SCENE = """
@@ -160,8 +159,3 @@ def test_world_of_the_bare_wall_hides_nothing() -> None:
     assert world.truth_depth_m(11) is None
     assert world.rig.occluder is None
     assert not _equal(world.images(0), world.images(1))
-
-
-def test_open_world_names_a_missing_scene(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match=r"none\.toml"):
-        open_world(str(tmp_path / "none.toml"))
