@@ -243,8 +243,8 @@ def footprint_picture(record: WallRecord) -> Picture:
     share = footprint(rig.wall_from_lidar, rig.pinhole, rig.wall).share
     caption = (
         f"The wall from the front. Blue is the lidar's field of view, with a line for every {CELLS_PER_LINE}th of "
-        f"the map's 64 x 80 cells; {100.0 * share:.0f} % of the cells meet the wall. Light returns only from where blue and "
-        "relay (green) overlap: the larger the overlap, the better."
+        f"the map's 64 x 80 cells; {100.0 * share:.0f} % of the cells meet the wall. Light returns only from where "
+        "blue and relay (green) overlap: the larger the overlap, the better."
     )
     return Picture("What the lidar sees of the wall", caption, png(figure))
 

@@ -34,15 +34,15 @@ LIDAR_FROM_COLOUR = np.linalg.inv(np.vstack([COLOUR_FROM_DEPTH, [0.0, 0.0, 0.0, 
 FRAMES = 4
 
 
-class Desk:
-    """The pyrealsense2 module, whose context holds a software device: an L515 with a colour camera."""
+class SoftwareSdk:
+    """pyrealsense2 with a context that holds a software device: an L515 with a color camera, streaming in a thread."""
 
     def __init__(self) -> None:
         self.sdk = load_sdk()
         self.lidar, self._context = SoftwareLidar(SMALL, self.sdk), self.sdk.context()
         self.colour = SoftwareColour(self.lidar, SMALL, np.array(LENS), LIDAR_FROM_COLOUR)
         self.lidar.device.add_to(self._context)
-        self.looked_at, self._stop = 0, threading.Event()
+        self.delivered, self._stop = 0, threading.Event()
         self._thread = threading.Thread(target=self._deliver, name="colour")
         self._thread.start()
 
@@ -61,8 +61,8 @@ class Desk:
 
     def on_frame(self) -> None:
         """End the delivery with the last frame: a stopped software device must get none."""
-        self.looked_at += 1
-        if self.looked_at == FRAMES:
+        self.delivered += 1
+        if self.delivered == FRAMES:
             self.end()
 
     def end(self) -> None:
@@ -79,36 +79,30 @@ def recorded(path: Path, greys: list[int], form: str = "rgb8") -> Path:
     )
 
 
-def test_look_in_colour_averages_the_last_frames(tmp_path: Path) -> None:
-    path, told = recorded(tmp_path / "a.bag", [0, 10, 20, 40]), list[int]()
-    view = capture_color_view(f"bag:{path}", 2, on_frame=lambda: told.append(1))
+def test_color_view_averages_the_last_frames(tmp_path: Path) -> None:
+    path, calls = recorded(tmp_path / "a.bag", [0, 10, 20, 40]), list[int]()
+    view = capture_color_view(f"bag:{path}", 2, on_frame=lambda: calls.append(1))
     np.testing.assert_array_equal(view.image, np.full((24, 32), 30.0))
-    assert len(told) == 2
+    assert len(calls) == 2
     np.testing.assert_array_equal(capture_color_view(f"bag:{path}", 99).image, np.full((24, 32), 17.5))
 
 
-def assert_same_as_the_sdk(path: Path) -> None:
+@pytest.mark.parametrize("source", ["made", "real"])
+def test_color_view_reads_lens_and_pose_like_the_sdk(source: str, real_bag: Path, tmp_path: Path) -> None:
+    path = real_bag if source == "real" else recorded(tmp_path / "a.bag", [5])
     view = capture_color_view(f"bag:{path}", 1)
     sensors = load_sdk().context().load_device(str(path)).as_playback().query_sensors()
     profiles = {profile.stream_type().name: profile for s in sensors for profile in s.get_stream_profiles()}
-    told = profiles["color"].as_video_stream_profile().get_intrinsics()
-    np.testing.assert_allclose(view.distortion, told.coeffs)
-    assert (view.intrinsics.fx, view.intrinsics.ppy) == (told.fx, told.ppy)
+    lens = profiles["color"].as_video_stream_profile().get_intrinsics()
+    np.testing.assert_allclose(view.distortion, lens.coeffs)
+    assert (view.intrinsics.fx, view.intrinsics.ppy) == (lens.fx, lens.ppy)
     extrinsics = profiles["color"].get_extrinsics_to(profiles["depth"])
     np.testing.assert_allclose(view.lidar_from_camera[:3, :3], np.reshape(extrinsics.rotation, (3, 3)).T, atol=1e-6)
     np.testing.assert_allclose(view.lidar_from_camera[:3, 3], extrinsics.translation, atol=1e-7)
     assert (view.light, view.errors) == ("colour", CameraErrors())
-
-
-def test_look_in_colour_reads_lens_and_pose_like_the_sdk(tmp_path: Path) -> None:
-    assert_same_as_the_sdk(recorded(tmp_path / "a.bag", [5]))
-
-
-def test_look_in_colour_reads_a_real_recording_like_the_sdk(real_bag: Path) -> None:
-    assert_same_as_the_sdk(real_bag)
-    rgb = BagReader(real_bag).sample("color", 0).pixels
-    grey = capture_color_view(f"bag:{real_bag}", 1).image
-    np.testing.assert_allclose(grey, rgb @ [0.299, 0.587, 0.114], atol=1.0)
+    if source == "real":
+        rgb = BagReader(path).sample("color", 0).pixels
+        np.testing.assert_allclose(view.image, rgb @ [0.299, 0.587, 0.114], atol=1.0)
 
 
 def test_undistorted_inverts_the_sdks_lens() -> None:
@@ -126,12 +120,12 @@ def test_undistorted_inverts_the_sdks_lens() -> None:
 
 
 @pytest.mark.parametrize("form", TO_GRAY)
-def test_look_in_colour_makes_every_format_grey(tmp_path: Path, form: str) -> None:
+def test_color_view_converts_every_format_to_gray(tmp_path: Path, form: str) -> None:
     image = capture_color_view(f"bag:{recorded(tmp_path / 'a.bag', [77], form)}", 1).image
     np.testing.assert_array_equal(image, np.full((24, 32), 77.0))
 
 
-def test_grey_weighs_each_channel_by_its_luminance() -> None:
+def test_gray_weighs_each_channel_by_its_luminance() -> None:
     pixel = np.array([[[200, 100, 50, 255]]], np.uint8)
     expected = 0.299 * 200 + 0.587 * 100 + 0.114 * 50
     for form, order in {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2, 3], "bgra8": [2, 1, 0, 3]}.items():
@@ -140,7 +134,7 @@ def test_grey_weighs_each_channel_by_its_luminance() -> None:
     assert (TO_GRAY["yuyv"](luma)[0, 0], TO_GRAY["uyvy"](luma)[0, 0]) == (91, 7)
 
 
-def test_look_in_colour_refuses_unusable_recordings(noise_bag: Path, rewritten: Any, tmp_path: Path) -> None:
+def test_color_view_refuses_unusable_recordings(noise_bag: Path, rewritten: Any, tmp_path: Path) -> None:
     """Without colour, without the colour camera's pose, with images of another size than the lens is for."""
 
     def narrower(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
@@ -161,7 +155,7 @@ def test_look_in_colour_refuses_unusable_recordings(noise_bag: Path, rewritten: 
 
 
 @pytest.mark.parametrize("uri", ["sim", "sim:bare-wall", "bag:", "kinect", "l515:x"])
-def test_look_in_colour_refuses_a_camera_that_is_not_there(uri: str) -> None:
+def test_color_view_refuses_a_camera_that_is_not_there(uri: str) -> None:
     with pytest.raises(CameraError if uri.startswith("sim") else CameraNotFoundError, match=uri.removeprefix("l515:")):
         capture_color_view(uri, 5, sdk=FakeSdk(fake()))
 
@@ -172,7 +166,7 @@ def fake(brightness: Callable[[int], int] = lambda _: 100, **how: Any) -> FakeLi
     return lidar
 
 
-def test_look_in_colour_waits_for_a_live_cameras_exposure() -> None:
+def test_color_view_waits_for_a_live_cameras_exposure() -> None:
     lidar = fake(lambda number: 100 if number >= SETTLING_FRAMES else 200)
     view = capture_color_view("l515", 3, sdk=FakeSdk(lidar))
     np.testing.assert_array_equal(view.image, np.full((720, 1280), 100.0))
@@ -181,37 +175,32 @@ def test_look_in_colour_waits_for_a_live_cameras_exposure() -> None:
     assert lidar.did == ["start", "stop", "close"]
 
 
-def test_look_in_colour_on_usb_2_takes_the_size_offered() -> None:
+def test_color_view_on_usb_2_takes_the_size_offered() -> None:
     view = capture_color_view("l515:f0246262", 1, sdk=FakeSdk(fake(usb="2.1")))
     assert (view.intrinsics.width, view.intrinsics.height) == (640, 480)
 
 
-def test_look_in_colour_refuses_no_colour_and_unknown_lenses() -> None:
-    with pytest.raises(CameraError, match="colour"):
-        capture_color_view("l515", 1, sdk=FakeSdk(FakeLidar()))
-    lidar = fake()
-    lidar.lens_model = "inverse_brown_conrady"
-    with pytest.raises(NlosCamError, match="inverse_brown_conrady"):
-        capture_color_view("l515", 2, sdk=FakeSdk(lidar))
-
-
-def test_look_in_colour_closes_a_camera_that_fails() -> None:
-    silent, busy = fake(runs=(SETTLING_FRAMES + 1,)), fake()
-    with pytest.raises(CameraLostError, match=r"0\.2 s"):
-        capture_color_view("l515", 2, sdk=FakeSdk(silent), silence_s=0.2)
+def test_color_view_closes_a_camera_it_refuses_or_that_fails() -> None:
+    silent, busy, lens = fake(runs=(SETTLING_FRAMES + 1,)), fake(), fake()
+    busy.start_error, lens.lens_model = RuntimeError("busy"), "inverse_brown_conrady"
+    for lidar, error, word in (
+        (FakeLidar(), CameraError, "colour"),
+        (lens, NlosCamError, "inverse_brown_conrady"),
+        (silent, CameraLostError, r"0\.2 s"),
+        (busy, CameraError, "busy"),
+    ):
+        with pytest.raises(error, match=word):
+            capture_color_view("l515", 2, sdk=FakeSdk(lidar), silence_s=0.2)
     assert silent.did[-2:] == ["stop", "close"]
-    busy.start_error = RuntimeError("busy")
-    with pytest.raises(CameraError, match="busy"):
-        capture_color_view("l515", 2, sdk=FakeSdk(busy))
     assert busy.did[-1] == "close"
 
 
-def test_look_in_colour_works_on_librealsense_itself() -> None:
-    desk = Desk()
+def test_color_view_works_on_librealsense_itself() -> None:
+    sdk = SoftwareSdk()
     try:
-        view = capture_color_view("l515", FRAMES, sdk=desk, on_frame=desk.on_frame)
+        view = capture_color_view("l515", FRAMES, sdk=sdk, on_frame=sdk.on_frame)
     finally:
-        desk.end()
+        sdk.end()
     np.testing.assert_array_equal(view.image, np.full((48, 64), 90.0))
     np.testing.assert_allclose(view.distortion, LENS, rtol=1e-6)
     np.testing.assert_allclose(view.lidar_from_camera, LIDAR_FROM_COLOUR, atol=1e-6)

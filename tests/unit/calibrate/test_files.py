@@ -43,7 +43,7 @@ def test_written_wall_files_belong_together(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nlos_cam.calibrate.files.report", interrupted)
+    monkeypatch.setattr("nlos_cam.calibrate.files.report_html", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_record(files, record, replace(wall, depth_m=wall.depth_m + np.float32(0.1)))
     assert {path.name: path.read_bytes() for path in files.record.parent.iterdir()} == before

@@ -57,7 +57,7 @@ class Warming:
         return {"ldd_temperature": self.celsius}
 
 
-def test_look_collects_statistics_of_all_frames() -> None:
+def test_collect_statistics_averages_all_frames() -> None:
     camera = Warming(20)
     wall = collect_statistics(camera, 1000).reference(np.ones(SHAPE, np.bool_))
     depths_m = np.stack([frame.depth_m for frame in camera.given]).astype(np.float64)
@@ -69,13 +69,10 @@ def test_look_collects_statistics_of_all_frames() -> None:
     assert collect_statistics(Warming(10), 4).statistics.depth.frames == 4
 
 
-def test_look_reads_temperatures_now_and_then() -> None:
-    seen = collect_statistics(Warming(2 * CELSIUS_EVERY + 1), 1000)
-    assert seen.facts()["temperatures_c"] == {"ldd_temperature": 32.0}
-    assert seen.reference(np.ones(SHAPE, np.bool_)).celsius_span == {"ldd_temperature": 2.0}
-
-
-def test_look_refuses_a_camera_without_frames() -> None:
+def test_statistics_read_temperatures_now_and_then() -> None:
+    capture = collect_statistics(Warming(2 * CELSIUS_EVERY + 1), 1000)
+    assert capture.facts()["temperatures_c"] == {"ldd_temperature": 32.0}
+    assert capture.reference(np.ones(SHAPE, np.bool_)).celsius_span == {"ldd_temperature": 2.0}
     with pytest.raises(WallRefusedError, match="l515"):
         collect_statistics(Warming(0), 1000)
 
@@ -111,7 +108,7 @@ def bare(seen: CaptureStatistics) -> MeasuredWall:
     return measured(seen)
 
 
-def test_by_depth_measures_the_wall_and_the_tapes_offset(seen: CaptureStatistics) -> None:
+def test_measure_by_depth_measures_the_wall_and_the_tapes_offset(seen: CaptureStatistics) -> None:
     fit, facts = measure_by_depth(seen)
     assert facts == {}
     assert fit.distance_m == pytest.approx(0.2, abs=4 * fit.distance_std_m)
@@ -120,7 +117,7 @@ def test_by_depth_measures_the_wall_and_the_tapes_offset(seen: CaptureStatistics
     assert facts["range_offset_m"] == pytest.approx(0.004 * np.sqrt(2.0), abs=2e-5)
 
 
-def test_by_depth_and_by_board_refuse_what_they_cannot_find(seen: CaptureStatistics) -> None:
+def test_measure_by_depth_and_by_board_refuse_what_they_cannot_find(seen: CaptureStatistics) -> None:
     with pytest.raises(CalibrationError, match="300"):
         measure_by_depth(seen, 0.3)
     with pytest.raises(WallRefusedError):
@@ -130,7 +127,7 @@ def test_by_depth_and_by_board_refuse_what_they_cannot_find(seen: CaptureStatist
 
 
 @pytest.mark.parametrize(("x_m", "gap_m"), [(0.2, 0.1), (0.22, 0.08), (0.19, 0.11)])
-def test_by_occluder_finds_it_beside_the_known_wall(bare: MeasuredWall, x_m: float, gap_m: float) -> None:
+def test_measure_occluder_finds_it_beside_the_known_wall(bare: MeasuredWall, x_m: float, gap_m: float) -> None:
     seen = bench_seen(occluder=Occluder(x_m=x_m, z_min_m=gap_m))
     record, inliers = measure_occluder(seen, bare)
     assert record.occluder is not None
@@ -151,23 +148,23 @@ def test_by_occluder_finds_it_beside_the_known_wall(bare: MeasuredWall, x_m: flo
         (LidarPose(distance_m=0.2, yaw_deg=45.0, pitch_deg=1.0), r"\+1\.00"),  # facing the wall at 45 degrees as before
     ],
 )
-def test_by_occluder_refuses_a_lidar_that_moved(bare: MeasuredWall, lidar: LidarPose, amount: str) -> None:
+def test_measure_occluder_refuses_a_lidar_that_moved(bare: MeasuredWall, lidar: LidarPose, amount: str) -> None:
     with pytest.raises(WallRefusedError, match=amount):
         measure_occluder(bench_seen(lidar=lidar), bare)
 
 
-def test_by_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatistics) -> None:
+def test_measure_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatistics) -> None:
     """The beams meet 4 sqrt(2) mm before the glass at 45 degrees: x and distance of the glass are 4 mm from theirs."""
     wall = measured(seen, 0.204)
     assert wall.record.range_offset_cause == "origin"
-    told, _ = measure_occluder(bench_seen(), wall)
-    assert told.occluder is not None
-    assert told.occluder.x_m == pytest.approx(0.204, abs=2e-4)
-    assert told.occluder.gap_m == pytest.approx(0.1, abs=0.002)
-    assert told.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
+    record, _ = measure_occluder(bench_seen(), wall)
+    assert record.occluder is not None
+    assert record.occluder.x_m == pytest.approx(0.204, abs=2e-4)
+    assert record.occluder.gap_m == pytest.approx(0.1, abs=0.002)
+    assert record.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
 
 
-def test_by_occluder_notices_another_camera_and_settings(bare: MeasuredWall, seen: CaptureStatistics) -> None:
+def test_measure_occluder_notices_another_camera_and_settings(bare: MeasuredWall, seen: CaptureStatistics) -> None:
     with pytest.raises(CalibrationError, match=r"160x120.*80x60"):
         measure_occluder(bench_seen(RIG.pinhole.scaled(80, 60)), bare)
     now = replace(bench_seen(), serial="f2", settings={"laser_power": 40.0})
@@ -191,7 +188,7 @@ def frame_of(rig: Rig, width: int = 640, height: int = 480) -> Frame:
 
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (1024, 768), (100, 75)])
 @pytest.mark.parametrize(("distance_m", "yaw_deg"), [(0.2, 45.0), (0.15, 15.0), (0.3, -60.0)])
-def test_glance_measures_the_wall_in_one_thinned_frame(
+def test_fit_frame_measures_the_wall_in_one_thinned_frame(
     width: int, height: int, distance_m: float, yaw_deg: float
 ) -> None:
     pose = LidarPose(distance_m=distance_m, yaw_deg=yaw_deg)

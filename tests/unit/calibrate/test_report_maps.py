@@ -168,9 +168,9 @@ def test_residual_allows_for_the_range_offset(wall: MeasuredWall, offset_m: floa
         meeting = np.array(wall.record.wall_from_lidar)
         meeting[:3, 3] += offset_m * meeting[:3, 2]
         depth_m = wall_depth(meeting, reference.intrinsics)
-    told = {"range_offset_m": offset_m, "range_offset_cause": cause}
+    offset = {"range_offset_m": offset_m, "range_offset_cause": cause}
     near = reference.depth_m < 2.0
-    assert np.abs(seen(wall, depth_m, **told)[near]).max() < FLOAT32_M
+    assert np.abs(seen(wall, depth_m, **offset)[near]).max() < FLOAT32_M
     assert np.abs(seen(wall, depth_m)[near]).max() > 0.003
 
 

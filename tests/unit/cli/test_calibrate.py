@@ -32,8 +32,8 @@ from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
 
 RIG = load_rig("bare-wall")
 A4, FRAMES = BOARDS["a4"], 8
-INTRINSICS = load_rig("bare-wall").pinhole.scaled(160, 120)
-DEPTH_M = wall_depth(load_rig("bare-wall").wall_from_lidar, INTRINSICS)
+INTRINSICS = RIG.pinhole.scaled(160, 120)
+DEPTH_M = wall_depth(RIG.wall_from_lidar, INTRINSICS)
 Call = Callable[..., Any]
 
 
@@ -127,22 +127,6 @@ def test_calibrate_writes_device_and_reference(call: Call, out: Path, capsys: py
         assert part in shown
 
 
-def test_calibrate_takes_frames_of_a_recording(call: Call, out: Path) -> None:
-    camera = call("--wall", "--bag", "run.bag", "--frames", "3")
-    assert camera.uri == "bag:run.bag"
-    assert camera.taken == load_wall(out).frames == 3
-
-
-def test_calibrate_writes_an_entered_occluder(call: Call, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    call(*WALL, "--occluder-x-m", "0.25", "--occluder-gap-m", "0.08")
-    record = load_wall(out)
-    assert record.rig.occluder == Occluder(x_m=0.25, z_min_m=0.08)
-    assert record.occluder == OccluderRecord(source="entered", x_m=0.25, gap_m=0.08)
-    shown = capsys.readouterr().out
-    for part in ("250.0 mm", "80.0 mm", "entered"):
-        assert part in shown
-
-
 @pytest.mark.slow
 def test_calibrate_finds_the_occluder_on_a_simulated_bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wall, bench, scene = tmp_path / "wall.toml", tmp_path / "bench.toml", tmp_path / "empty.toml"
@@ -161,6 +145,20 @@ def test_calibrate_finds_the_occluder_on_a_simulated_bench(tmp_path: Path, capsy
     assert main([*run, "--overwrite"]) == 0
 
 
+def test_calibrate_takes_frames_and_the_entered_occluder(
+    call: Call, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = call("--wall", "--bag", "run.bag", "--frames", "3", "--occluder-x-m", "0.25", "--occluder-gap-m", "0.08")
+    record = load_wall(out)
+    assert camera.uri == "bag:run.bag"
+    assert camera.taken == record.frames == 3
+    assert record.rig.occluder == Occluder(x_m=0.25, z_min_m=0.08)
+    assert record.occluder == OccluderRecord(source="entered", x_m=0.25, gap_m=0.08)
+    shown = capsys.readouterr().out
+    for part in ("250.0 mm", "80.0 mm", "entered"):
+        assert part in shown
+
+
 def test_calibrate_measures_after_watching(
     call: Call, out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,17 +168,16 @@ def test_calibrate_measures_after_watching(
     assert load_wall(out).frames == 10
 
 
-def test_calibrate_moves_the_wall_by_the_tape(call: Call, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_moves_by_tape_and_reports_out_of_range(
+    call: Call, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     call(*WALL, "--tape-m", "0.203")
     record = load_wall(out)
     assert record.distance_m == record.rig.lidar.distance_m == pytest.approx(0.203, abs=2e-6)
     assert record.range_offset_m == pytest.approx(0.003 * np.sqrt(2.0), abs=1e-5)
     assert (record.range_offset_cause, record.verdict) == ("origin", "good")
     assert "+4.2 ± 1.4 mm" in capsys.readouterr().out
-
-
-def test_calibrate_writes_a_wall_out_of_range(call: Call, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    call(*WALL, scale=2.0)
+    call(*WALL, "--overwrite", scale=2.0)
     assert load_wall(out).verdict == "out of range"
     assert "10 cm" in capsys.readouterr().out
 
@@ -342,19 +339,17 @@ def frames(count: int) -> Iterator[Frame]:
         yield Frame(DEPTH_M.astype(np.float32), counts, counts, number / 30, number, INTRINSICS)
 
 
-def shown(seen: FrameFit) -> str:
+@pytest.mark.parametrize(
+    ("found", "parts"),
+    [
+        (lambda: fit_frame(next(frames(1))), ("200.0 mm", "45.00°", "good", "●")),
+        (lambda: FrameFit(None, "the wall [so to say] is not flat", 0.25), ("the wall [so to say] is not", "25.0%")),
+    ],
+)
+def test_watch_panel_shows_fit_or_refusal(found: Callable[[], FrameFit], parts: tuple[str, ...]) -> None:
     text = StringIO()
-    Console(file=text, width=140).print(panel(seen))
-    return text.getvalue()
-
-
-def test_watch_panel_shows_measures_or_the_refusal() -> None:
-    text = shown(fit_frame(next(frames(1))))
-    for part in ("200.0 mm", "45.00°", "good", "●"):
-        assert part in text
-    text = shown(FrameFit(None, "the wall [so to say] is not flat", 0.25))
-    assert "the wall [so to say] is not flat" in text
-    assert "25.0%" in text
+    Console(file=text, width=140).print(panel(found()))
+    assert all(part in text.getvalue() for part in parts)
 
 
 def test_watch_ends_with_the_camera_or_on_request() -> None:

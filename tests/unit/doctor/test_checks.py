@@ -13,7 +13,6 @@ import pytest
 import usb.core
 
 from nlos_cam.camera.sdk import WHEEL
-from nlos_cam.doctor.checks import version_numbers
 from nlos_cam.doctor.diagnosis import REPLUG
 
 DENIED = usb.core.USBError("Access denied (insufficient permissions)", -3, 13)
@@ -191,10 +190,7 @@ def test_container_that_hides_sensors_is_named_as_the_cause(bench: Any) -> None:
     [
         ("No module named 'pyrealsense2'", f"pip install {WHEEL}"),
         ("No module named 'libusb_package'", "libusb-package"),
-        (
-            "libusb-1.0.so.0: cannot open shared object file",
-            "apt install libusb-1.0-0, or `pip install libusb-package`",
-        ),
+        ("libusb-1.0.so.0: cannot open", "apt install libusb-1.0-0, or `pip install libusb-package`"),
         ("libudev.so.1: cannot open shared object file", "sudo apt install libudev1"),
         ("libstdc++.so.6: cannot open shared object file", "sudo apt install libstdc++6"),
         ("/lib/libc.so.6: version `GLIBC_2.17' not found", "newer release"),
@@ -246,10 +242,3 @@ def test_older_of_two_firmwares_counts(bench: Any, device: Any, fake_l515: Any) 
     bench.sdk_devices[1].info["firmware_version"] = "01.04.01.02"
     assert "f0246262" in (detail := bench.failed()["firmware"].detail)
     assert "01.04.01.02" in detail
-
-
-@pytest.mark.parametrize(
-    ("text", "version"), [("01.05.08.01", (1, 5, 8, 1)), ("2.54.2.5684", (2, 54, 2, 5684)), ("", ())]
-)
-def test_versions_are_numbers(text: str, version: tuple[int, ...]) -> None:
-    assert version_numbers(text) == version

@@ -16,22 +16,11 @@ NAMES = (
     "python system sdk sdk-version sdk-alone libusb usb-camera recovery link container udev-rules permissions "
     "video-driver hid-sensors in-use sdk-camera firmware metadata"
 )
-
-
 words = st.sampled_from(
     ["", "x", "2.54.2", "f0246262", "01.05.08.01", "L515", "linux", "windows", "darwin", "hid", "2-1"]
 )
-
-
-some = st.builds(
-    Sdk,
-    st.lists(st.tuples(words, words), max_size=2).map(tuple),
-    words,
-    words,
-    st.tuples(st.builds(DeviceInfo, words, words, words, words)) | st.just(()),
-)
-
-
+listed = st.tuples(st.builds(DeviceInfo, words, words, words, words)) | st.just(())
+sdks = st.builds(Sdk, st.lists(st.tuples(words, words), max_size=2).map(tuple), words, words, listed)
 devices = st.builds(
     UsbDevice,
     product_id=st.sampled_from([0x0B64, 0x0B55, 0x0B07]), kind=st.sampled_from(["camera", "recovery", "other"]),
@@ -39,8 +28,6 @@ devices = st.builds(
     speed=st.none() | st.integers(-1, 9), firmware=words, serial=words, product=words,
     interfaces=st.tuples(words), error=words, denied=st.booleans(),
 )  # fmt: skip
-
-
 cameras = st.builds(
     KernelCamera,
     words,
@@ -51,8 +38,6 @@ cameras = st.builds(
     st.just(()),
     st.tuples(words),
 )
-
-
 hosts = st.builds(
     Host,
     st.builds(Platform, words, words, st.tuples(st.integers(2, 4), st.integers(0, 20)), st.booleans(), st.booleans()),
@@ -61,8 +46,6 @@ hosts = st.builds(
     st.just(()) | st.tuples(st.builds(Node, words, words)),
     st.just(()) | st.tuples(st.builds(Holder, st.integers(1, 9), words, words)), st.integers(0, 2),
 )  # fmt: skip
-
-
 scans = st.builds(UsbScan, st.lists(devices, max_size=2).map(tuple), st.integers(0, 5), words)
 
 
@@ -74,7 +57,7 @@ def test_healthy_bench_passes_every_check_in_a_fixed_order(bench: Any) -> None:
     assert CAUSES.items() <= CHECKS.items()
 
 
-@given(st.builds(Facts, hosts, scans, some))
+@given(st.builds(Facts, hosts, scans, sdks))
 def test_diagnosis_of_any_facts_gives_each_fault_a_fix(facts: Facts) -> None:
     checks = diagnose(facts)
     assert [check.name for check in checks] == NAMES.split()
