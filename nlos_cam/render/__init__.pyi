@@ -6,18 +6,16 @@ __all__ = [
     "STOPS",
     "Accuracy",
     "Agreement",
-    "Echoes",
+    "EchoMaps",
     "Effects",
     "Fault",
     "FaultKind",
     "HiddenObject",
     "Material",
     "MultiBounce",
-    "Prepared",
     "Radiometry",
     "Rendering",
     "Scene",
-    "SceneFacts",
     "SceneFile",
     "SensedImages",
     "Sensor",
@@ -41,21 +39,31 @@ __all__ = [
     "load_scene",
     "paper_scene",
     "phong",
-    "plan",
+    "prepare",
     "render",
     "render_all",
     "render_scan",
     "retroreflective",
     "ripples",
+    "sample_beams",
     "sensor_effects",
     "smooth_patches",
-    "some_of",
     "three_bounce",
     "transient",
 ]
 
 from .accuracy import STOPS, Accuracy, Stop, accuracy_named
-from .accuracy_search import Agreement, Echoes, Stopwatch, Work, agreement, choose, costs, least_seconds, some_of
+from .accuracy_search import (
+    Agreement,
+    EchoMaps,
+    Stopwatch,
+    Work,
+    agreement,
+    choose,
+    costs,
+    least_seconds,
+    sample_beams,
+)
 from .backend_numba import histograms
 from .backend_torch import device_named, histograms_of_all
 from .echoes import MultiBounce
@@ -64,11 +72,10 @@ from .geometry import cast
 from .job import TransportJob
 from .material import Material, Surface, phong, retroreflective
 from .patches import JUMP_M
-from .planning import Prepared, plan
+from .planning import prepare
 from .renderer import Rendering, render, render_all, three_bounce, transient
 from .scanning import render_scan
 from .scene import Radiometry, Scene
-from .scene_facts import SceneFacts
 from .scene_file import (
     RENDERING_VERSION,
     Fault,

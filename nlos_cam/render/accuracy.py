@@ -1,4 +1,4 @@
-"""The accuracy dial: named stops, each a documented setting."""
+"""Accuracy of a rendering: named stops, each a documented setting."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -7,13 +7,13 @@ from nlos_cam.errors import SceneError
 
 Stop = Literal["draft", "standard", "fine", "reference"]
 MAX_RELAY_CELLS = 512
-"""Along a side of the relay wall."""
+"""Limit along each side of the relay wall."""
 MAX_BEAMS_PER_CELL = 8
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """What a stop of the dial sets. Raises SceneError for a setting that no renderer has."""
+    """Setting of a stop. Raises SceneError for a value that no renderer supports."""
 
     name: str
     relay_columns: int = 80
@@ -21,15 +21,15 @@ class Accuracy:
     sub_bins: int = 8
     """Table bins per bin of path length, a power of two; 0 is the brute-force reference."""
     object_stride: int = 1
-    """Cells of the depth map, along each axis, that are taken as one patch."""
+    """Cells of the depth map, along each axis, that form one patch."""
     sectors: int = 8
-    """Of each face of the horizon tables: decides time, not the result."""
+    """Sectors per face of the horizon tables: affects time, not the result."""
     beams_per_cell: int = 1
-    """Along each axis of a map cell."""
+    """Beams along each axis of a map cell."""
     scatter_error: float = 5e-3
-    """Of a BRDF that is not Lambertian, tabulated at so many places of incoming light as keep it (relative L1)."""
+    """Error (relative L1) of a BRDF's tables, which have as many nodes of incoming light as it takes."""
     tolerance: float = 1e-3
-    """What the effects that a plan leaves out may change together, as relative L1 of the transient."""
+    """Largest change (relative L1 of the transient) by all effects that a plan leaves out together."""
 
     def __post_init__(self) -> None:
         ranges = {
@@ -43,7 +43,7 @@ class Accuracy:
         }
         for field, (least, most) in ranges.items():
             if not least <= (value := getattr(self, field)) <= most:
-                raise SceneError(f"{field} is {value}: it must lie in {least} to {most}")
+                raise SceneError(f"{field} is {value}: it must be from {least} to {most}")
         if self.sub_bins not in {0, 1, 2, 4, 8, 16, 32, 64}:
             raise SceneError(f"sub_bins is {self.sub_bins}: it must be a power of two up to 64, or 0 for brute force")
 
@@ -57,7 +57,7 @@ STOPS = {
 
 
 def accuracy_named(name: str | Accuracy) -> Accuracy:
-    """The setting behind a stop's name. Raises SceneError where there is no such stop."""
+    """Return the setting of a stop's name. Raises SceneError if there is no such stop."""
     if isinstance(name, Accuracy):
         return name
     if name not in STOPS:

@@ -1,12 +1,8 @@
-"""The stop of the dial for a scene: the cheapest that keeps an error bound, or the most accurate within a time budget.
+"""Search for the cheapest accuracy within an error bound, or the most accurate within a time budget, on a given scene.
 
-Both are found out on the spot. The error: brute force on a few beams, and each stop on the same. The time: of a small
-share of the beams, in two sizes, since planning and tables are paid once and beams one by one. The look costs about as
-much as three beams in a hundred by brute force; the budget is for the rendering after it.
-
-How far one rendering of a scene is from another, echo by echo.
-
-What each effect of a plan costs: the time that a rendering takes with it, less the time without it.
+Errors are measured: brute force on some beams, and every stop on the same. Times are extrapolated from two sizes of a
+small share of the beams, since planning and tables are paid once and beams one by one. The search costs about as much
+as three beams in a hundred by brute force; the budget is for the rendering after it.
 """
 
 import time
@@ -23,47 +19,47 @@ from numpy.typing import NDArray
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import STOPS, Accuracy
 from nlos_cam.render.backend_numba import BEAM_TILE
-from nlos_cam.render.echoes import spread, strongest
-from nlos_cam.render.effects import Effects, Plan, included
+from nlos_cam.render.echoes import strongest, with_pulse
+from nlos_cam.render.effects import Effects, Plan
 from nlos_cam.render.geometry import cast
-from nlos_cam.render.planning import Prepared
-from nlos_cam.render.renderer import Rendering, histograms, render
+from nlos_cam.render.planning import prepare
+from nlos_cam.render.renderer import Rendering, beam_histograms, render
 from nlos_cam.render.scene import Scene
 
 Floating = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
-class Echoes:
-    """What is compared, one entry (n,) for each beam or each cell."""
+class EchoMaps:
+    """Echoes to compare, one entry (n,) for each beam or each cell."""
 
     intensity: Floating
     path_m: Floating
-    """NaN where nothing comes back."""
+    """NaN if nothing comes back."""
     depth_m: Floating
-    """What the lidar reports; NaN where nothing comes back."""
+    """Depth that the lidar reports; NaN if nothing comes back."""
 
     @classmethod
     def of_beams(cls, rendering: Rendering) -> Self:
-        """The strongest three-bounce bin of each beam, one per cell: stricter than maps, which a direct one may win."""
+        """Return the strongest three-bounce bin of each beam: stricter than maps, in which a direct return may win."""
         multi = rendering.multi
         return cls(multi.peak.ravel(), multi.path_m.ravel(), rendering.depth_m.ravel())
 
     @classmethod
     def of_cells(cls, rendering: Rendering, scene: Scene) -> Self:
-        """The maps (64, 80), for renderings with different numbers of beams per cell."""
+        """Return the maps (64, 80), for renderings with different numbers of beams per cell."""
         depth = rendering.depth_m.ravel()
         cos_axis = cast(scene.rig, scene.cell_intrinsics).cos_axis
         return cls(rendering.intensity.ravel(), 2 * depth / cos_axis, depth)
 
-    def some(self, which: Mask) -> "Echoes":
-        """Only some of them."""
-        return Echoes(self.intensity[which], self.path_m[which], self.depth_m[which])
+    def select(self, which: Mask) -> "EchoMaps":
+        """Return the entries with True in a mask."""
+        return EchoMaps(self.intensity[which], self.path_m[which], self.depth_m[which])
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """One rendering against another that is taken to be the truth."""
+    """Difference of one rendering from another that is taken as the truth."""
 
     intensity_error_median: float
     """Relative."""
@@ -73,18 +69,18 @@ class Agreement:
     """Share of echoes in the same bin of path length."""
     bin_within_1: float
     depth_error_mm: float
-    """Median, where both report a depth."""
+    """Median over the entries where both report a depth."""
     depth_error_mean_mm: float
 
 
 def relative_error(found: Floating, truth: Floating) -> Floating:
-    """|found - truth| / truth (n,); where nothing should come back, 0 if nothing does and else 1."""
+    """Return |found - truth| / truth (n,); where the truth is 0, 0 if nothing was found and else 1."""
     off = np.abs(found - truth)
     return np.divide(off, truth, out=(off > 0).astype(off.dtype), where=truth > 0)
 
 
-def agreement(found: Echoes, truth: Echoes, bin_m: float) -> Agreement:
-    """Hold echoes (at least one) against the true ones."""
+def agreement(found: EchoMaps, truth: EchoMaps, bin_m: float) -> Agreement:
+    """Return the agreement of echoes (at least one) with the true ones."""
     error = relative_error(found.intensity, truth.intensity)
     bins = np.abs(found.path_m - truth.path_m) / bin_m
     bins[np.isnan(found.path_m) & np.isnan(truth.path_m)] = 0  # NaN of one alone is in no bin of the other
@@ -102,31 +98,32 @@ def agreement(found: Echoes, truth: Echoes, bin_m: float) -> Agreement:
 
 
 SAMPLE_BEAMS = 32
-"""At least so many are summed by brute force."""
+"""Smallest number of beams summed by brute force."""
 CAUTION = 1.5
-"""The largest error of a sample, times this, is at least the 99th percentile of all in nine draws of ten."""
+"""Factor on the largest error of a sample: at least the 99th percentile of all in nine draws of ten."""
 SHARE = 4
-"""One beam of this many is timed, and one of as many of those."""
+"""One beam in SHARE is timed, and one in SHARE of those."""
 REPEATS = 3
+"""Runs of each timing; the shortest counts, as other load only adds time."""
 
 
 @dataclass(frozen=True)
-class Choice:
-    """A stop, and what it may be expected to cost and to miss by."""
+class AccuracyChoice:
+    """Stop with its predicted error and time."""
 
     accuracy: Accuracy
     predicted_error: float
-    """Of peak intensity: the 99th percentile of its relative error, rather too large than too small."""
+    """99th percentile of the relative error of the peak intensity, rather too large than too small."""
     predicted_seconds: float
 
 
 Work = Callable[[], object]
 Stopwatch = Callable[[Work, int], float]
-"""The least seconds that a piece of work took, in a number of repeats."""
+"""Function that returns the shortest of a number of runs of some work, in seconds."""
 
 
 def least_seconds(work: Work, repeats: int) -> float:
-    """A stopwatch by the clock."""
+    """Return the shortest of `repeats` runs by the clock, in seconds."""
     taken: list[float] = []
     for _ in range(repeats):
         started = time.perf_counter()
@@ -144,21 +141,21 @@ def choose(
     *,
     stops: Collection[Accuracy] = tuple(STOPS.values()),
     stopwatch: Stopwatch = least_seconds,
-) -> Choice:
-    """The cheapest stop that keeps `max_error`; with `max_seconds` alone, the most accurate that keeps it.
+) -> AccuracyChoice:
+    """Return the cheapest stop within `max_error`; with `max_seconds` alone, the most accurate within it.
 
-    Raises SceneError where none does, with what the nearest misses by, and where a bound is no bound.
+    Raises SceneError if no stop is, naming the nearest and its excess, and for bounds that are negative or not finite.
     """
     for name, value in (("max_error", max_error), ("max_seconds", max_seconds)):
         if value is not None and not 0 <= value < inf:
-            raise SceneError(f"{name} is {value}: it must be a finite number, not negative")
+            raise SceneError(f"{name} is {value}: it must be finite and at least 0")
     if max_error is None and max_seconds is None:
-        raise SceneError("neither max_error nor max_seconds is given: give one, or both")
+        raise SceneError("give max_error, max_seconds or both")
     return pick(predict(scene, effects, backend, stops, stopwatch), max_error, max_seconds)
 
 
-def pick(choices: Collection[Choice], max_error: float | None, max_seconds: float | None) -> Choice:
-    """The choice of `choose` among these."""
+def pick(choices: Collection[AccuracyChoice], max_error: float | None, max_seconds: float | None) -> AccuracyChoice:
+    """Return the choice of `choose` among these."""
     error, seconds = inf if max_error is None else max_error, inf if max_seconds is None else max_seconds
     kept = [choice for choice in choices if choice.predicted_error <= error and choice.predicted_seconds <= seconds]
     if not kept:
@@ -168,53 +165,55 @@ def pick(choices: Collection[Choice], max_error: float | None, max_seconds: floa
     return min(kept, key=lambda choice: (choice.predicted_seconds, choice.predicted_error))
 
 
-def _nothing_keeps(choices: Collection[Choice], max_error: float, max_seconds: float) -> str:
-    def missed(choice: Choice) -> float:
+def _nothing_keeps(choices: Collection[AccuracyChoice], max_error: float, max_seconds: float) -> str:
+    """Return the error message for bounds that no choice keeps, with the nearest."""
+
+    def missed(choice: AccuracyChoice) -> float:
         return max(choice.predicted_error / max(max_error, 1e-9), choice.predicted_seconds / max(max_seconds, 1e-9))
 
     nearest = min(choices, key=missed)
     error, seconds = nearest.predicted_error, nearest.predicted_seconds
     asked = [f"max_error {max_error:g}"] * (max_error < inf) + [f"max_seconds {max_seconds:g}"] * (max_seconds < inf)
     over = [f"an error of {error:.3g} is {error - max_error:.3g} too large"] * (error > max_error)
-    over += [f"{seconds:.3g} s are {seconds - max_seconds:.3g} s too long"] * (seconds > max_seconds)
+    over += [f"{seconds:.3g} s is {seconds - max_seconds:.3g} s too long"] * (seconds > max_seconds)
     return (
         f"no accuracy keeps {' and '.join(asked)}: the nearest is {nearest.accuracy.name}, where {' and '.join(over)}; "
-        "allow that much"
+        "raise the limit by that"
     )
 
 
 def predict(
     scene: Scene, effects: Effects, backend: str, stops: Collection[Accuracy], stopwatch: Stopwatch
-) -> list[Choice]:
-    """What each stop costs and misses by. One of them must be brute force, and all cast one beam per cell."""
+) -> list[AccuracyChoice]:
+    """Return the predicted error and time of each stop. One must be brute force, and all cast one beam per cell."""
     (brute,) = (stop for stop in stops if stop.sub_bins == 0)
-    whole = Prepared.of(scene, brute, effects)
-    ready = Prepared.of(scene, brute, _three_bounces_of(whole))
-    lit = np.flatnonzero(ready.beams.on_wall)
-    sample = some_of(lit, _whole_rounds(SAMPLE_BEAMS, 1))
-    truth = histograms(ready, ready.job(), backend, sample).max(1)
-    choices: list[Choice] = []
+    whole = prepare(scene, brute, effects)
+    problem = prepare(scene, brute, _three_bounces_of(whole.plan))
+    lit = np.flatnonzero(problem.beams.on_wall)
+    sample = sample_beams(lit, _whole_rounds(SAMPLE_BEAMS, 1))
+    truth = beam_histograms(problem, problem.job, backend, sample).max(1)
+    choices: list[AccuracyChoice] = []
     for stop in stops:
-        if stop is brute and included(whole.plan, "inter-reflection"):
+        if stop is brute and whole.includes("inter-reflection"):
             continue
         seconds = _seconds(scene, stop, effects, backend, lit, stopwatch)
         if stop is brute:
-            choices.append(Choice(stop, 0.0, seconds))
+            choices.append(AccuracyChoice(stop, 0.0, seconds))
             continue
-        there = Prepared.of(scene, stop, _three_bounces_of(Prepared.of(scene, stop, effects)))
-        found = histograms(there, there.job(), backend, sample).max(1)
+        problem = prepare(scene, stop, _three_bounces_of(prepare(scene, stop, effects).plan))
+        found = beam_histograms(problem, problem.job, backend, sample).max(1)
         error = CAUTION * float(relative_error(found, truth).max(initial=0.0))
-        choices.append(Choice(stop, error, seconds))
+        choices.append(AccuracyChoice(stop, error, seconds))
     return choices
 
 
-def _three_bounces_of(ready: Prepared) -> Effects:
-    """What a plan includes, but for inter-reflection: path by path that would take hours."""
-    return [effect.name for effect in ready.plan if effect.included and effect.name != "inter-reflection"]
+def _three_bounces_of(plan: Plan) -> Effects:
+    """Return the included effects without interreflection, which would take hours path by path."""
+    return [effect.name for effect in plan if effect.included and effect.name != "inter-reflection"]
 
 
-def some_of(lit: Int64, count: int) -> Int64:
-    """About `count` of the beams, spread over the map: one at random, but always the same, from each strip."""
+def sample_beams(lit: Int64, count: int) -> Int64:
+    """Return about `count` beams spread over the map: one from each strip, at random but always the same."""
     if len(lit) <= count:
         return lit
     edges = np.linspace(0, len(lit), count + 1)
@@ -223,19 +222,19 @@ def some_of(lit: Int64, count: int) -> Int64:
 
 
 def _whole_rounds(beams: float, tile: int) -> int:
-    """At least so many beams that every thread has as many tiles of them as every other."""
+    """Return the smallest number of beams, at least `beams`, that gives every thread the same number of tiles."""
     one_round = tile * numba.get_num_threads()
     return int(-(-beams // one_round)) * one_round
 
 
 def _seconds(scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: Int64, stopwatch: Stopwatch) -> float:
-    """Seconds of a whole rendering, told from those of some beams and of some of those."""
+    """Return the predicted seconds of a whole rendering, from the times of some beams and of some of those."""
     if stop.sub_bins == 0:
         tile, repeats, beams = 1, 1, SAMPLE_BEAMS
     else:
         tile, repeats, beams = BEAM_TILE, REPEATS, len(lit) / SHARE
-    few = some_of(lit, _whole_rounds(beams / SHARE, tile))
-    many = some_of(lit, max(_whole_rounds(beams, tile), 2 * len(few)))
+    few = sample_beams(lit, _whole_rounds(beams / SHARE, tile))
+    many = sample_beams(lit, max(_whole_rounds(beams, tile), 2 * len(few)))
 
     def rendered(chosen: Int64) -> Work:
         return lambda: _render_some(scene, stop, effects, backend, chosen)
@@ -244,6 +243,7 @@ def _seconds(scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: 
     of_few, of_many = (stopwatch(rendered(chosen), repeats) for chosen in (few, many))
     if len(few) == len(many):
         return of_many
+    # time(n) = fixed + each n: two sizes give both.
     each = max(of_many - of_few, 0.0) / (len(many) - len(few))
     return of_many + each * (len(lit) - len(many))
 
@@ -251,18 +251,15 @@ def _seconds(scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: 
 def _render_some(
     scene: Scene, stop: Accuracy, effects: Effects, backend: str, chosen: Int64
 ) -> NDArray[np.floating[Any]]:
-    """The work of a rendering, for some of the beams."""
-    ready = Prepared.of(scene, stop, effects)
+    """Do the work of a rendering for some of the beams, and return the last histograms."""
+    problem = prepare(scene, stop, effects)
     found = np.empty((0, 0))
-    for channel in [None] if ready.channels == 1 else [None, 0, 1, 2]:
-        found = histograms(ready, ready.job(channel), backend, chosen)
-        if included(ready.plan, "pulse"):
-            found = spread(found.astype(np.float32), scene.pulse_ns, scene.rig.device.bin_m)
+    for job in (problem.job, *problem.color_jobs):
+        found = beam_histograms(problem, job, backend, chosen)
+        if problem.includes("pulse"):
+            found = with_pulse(found.astype(np.float32), scene.pulse_ns, scene.rig.device.bin_m)
         strongest(found, scene.rig.device.bin_m)
     return found
-
-
-"""The least of so many: what disturbs a machine only ever adds."""
 
 
 def costs(
@@ -272,7 +269,7 @@ def costs(
     backend: str = "cpu",
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Seconds that each included effect adds to a rendering, by name; 0 for what is left out."""
+    """Return the seconds that each included effect adds to a rendering, by name; 0 for effects left out."""
     names = [effect.name for effect in plan if effect.included]
 
     def least(effects: list[str]) -> float:

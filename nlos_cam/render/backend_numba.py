@@ -1,16 +1,12 @@
-"""The fast renderer: S2 factorised at the object's patches, for the CPU (numba, float32).
+"""Fast backend for the CPU (numba, float32): S2 factorized at the object's patches.
 
-weight(p, s, q) = A(p, s) B(s, q) and length = (d1 + d2)(p, s) + (d3 + d4)(s, q). So each patch s gets one table of B
-over d3 + d4, counted in sub-bins, and each beam p adds it, shifted by d1 + d2 to the nearest sub-bin. The sums of
-sub-bins to bins are made beforehand for each of the shifts within a bin, so that a beam adds one row: one product for a
-patch and a bin. Neither rounding leans: a path lies anywhere within its sub-bin, and the nearest shift leaves the bin's
-edge in the middle of that.
+weight(p, s, q) = A(p, s) B(s, q) and length = (d1 + d2)(p, s) + (d3 + d4)(s, q) for beam p, patch s, relay cell q. So
+each patch gets one table of B over d3 + d4, counted in sub-bins, and each beam adds the table, shifted by d1 + d2 to
+the nearest sub-bin: n s + s q terms in place of n s q. The sums of sub-bins to bins are made in advance for each shift
+within a bin, so that a beam adds one row of a table per patch. Neither rounding is biased: a path lies anywhere within
+its sub-bin, and rounding to the nearest shift puts a bin's edge in the middle of a sub-bin.
 
-Legs between patches and points of the wall, many at a time (numba, float32): weight, length, visibility.
-
-These are compiled into `kernels`, whose cache looks at its own file alone: after a change here, delete __pycache__.
-
-The two sums of the fast renderer, compiled: relay cells into patches' tables, tables into beams' histograms.
+numba's cache depends on this file alone: after a change of a kernel that is imported here, delete __pycache__.
 """
 
 from typing import NamedTuple
@@ -21,14 +17,14 @@ from nlos_calibration.arrays import Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from nlos_cam.render.brdf_table import nodes, scattering
-from nlos_cam.render.interreflection import with_inter_reflection
+from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.visibility import HeightField, blocked, horizon_table
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-class Surface32(NamedTuple):
+class NumbaSurface(NamedTuple):
     """Patches as columns of float32."""
 
     x_m: Float32
@@ -38,13 +34,13 @@ class Surface32(NamedTuple):
     normal_y: Float32
     normal_z: Float32
     soft_m2: Float32
-    """What near contact adds to d^2: the area over the solid angle that the radiometry scatters into."""
+    """Near-contact term added to d^2."""
     row: NDArray[np.int64]
     column: NDArray[np.int64]
 
 
-class Points32(NamedTuple):
-    """Points of the wall: the feet of beams, or relay cells; with the rest of their way to the lidar."""
+class NumbaPoints(NamedTuple):
+    """Points of the wall, laser spots or relay cells, with the leg from each to the lidar."""
 
     x_m: Float32
     y_m: Float32
@@ -53,8 +49,8 @@ class Points32(NamedTuple):
     soft_m2: np.float32
 
 
-class Optics(NamedTuple):
-    """What all legs share."""
+class NumbaOptics(NamedTuple):
+    """Constants shared by all legs."""
 
     edge_x_m: np.float32
     edge_z_m: np.float32
@@ -62,13 +58,13 @@ class Optics(NamedTuple):
     """Square of the distance at which near contact begins."""
     lambertian: bool
     inverse_bin: np.float32
-    """Sub-bins per metre."""
+    """Sub-bins per meter."""
     sectors: int
-    """Of each face of the horizon tables; 0 where nothing shades."""
+    """Sectors per face of the horizon tables; 0 if nothing shades."""
 
 
-class Legs(NamedTuple):
-    """Scratch for the legs from one patch to many points of the wall."""
+class NumbaLegs(NamedTuple):
+    """Scratch memory for the legs from one patch to many points of the wall."""
 
     weight: Float32
     length_m: Float32
@@ -78,20 +74,19 @@ class Legs(NamedTuple):
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def geometry(
-    legs: Legs,
+    legs: NumbaLegs,
     s: int,
-    surface: Surface32,
-    points: Points32,
+    surface: NumbaSurface,
+    points: NumbaPoints,
     start: int,
     count: int,
-    optics: Optics,
+    optics: NumbaOptics,
     field: HeightField,
     outgoing: bool,
 ) -> None:
-    """Legs from patch s to points: weight without visibility and length, vector by vector.
+    """Fill in the legs from patch s to points: weight without visibility, and length, vector by vector.
 
-    Towards the lidar (`outgoing`) the weight has the wall's cosine, and in Lambertian radiometry the patch's; from it
-    the patch's, and in Lambertian radiometry the wall's.
+    Towards the lidar (`outgoing`) the weight has the wall's cosine, from it the patch's; in Lambertian radiometry both.
     """
     x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
     nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
@@ -109,7 +104,10 @@ def geometry(
         squared = dx * dx + dy * dy + z * z
         length = np.sqrt(squared)
         facing = nx * dx + ny * dy - nz * z
+        # The leg runs from the patch at height z to the wall at 0. It crosses the edge's plane at the share to_edge /
+        # dx, at height z (1 - to_edge / dx), if patch and point lie on both sides of it.
         cut = (to_edge * (optics.edge_x_m - at_x[i]) < nothing) & (z * (one - to_edge / dx) >= optics.edge_z_m)
+        # Near contact as in `geometry.softened`, without its branch.
         ramp = max(one - squared / optics.near_m2, nothing)
         cosine = z if outgoing else facing
         if optics.lambertian:
@@ -117,6 +115,7 @@ def geometry(
         weight = light[i] * cosine / (length * (squared + soft * ramp * ramp))
         legs.weight[i] = weight if (facing > nothing) & (not cut) else nothing
         legs.length_m[i] = length
+        # Sector of the horizon tables: the face by the major axis and its sign, then the tilt -1 to 1 in equal parts.
         u, v = dx * inverse_x, dy * inverse_y
         along_columns = abs(u) >= abs(v)
         major, minor = (u if along_columns else v), (v if along_columns else u)
@@ -128,10 +127,10 @@ def geometry(
 
 @numba.njit(cache=True)
 def shade(
-    legs: Legs,
+    legs: NumbaLegs,
     s: int,
-    surface: Surface32,
-    points: Points32,
+    surface: NumbaSurface,
+    points: NumbaPoints,
     start: int,
     count: int,
     field: HeightField,
@@ -141,6 +140,7 @@ def shade(
     """Set the weight of legs that the object blocks to 0."""
     z = surface.z_m[s]
     for i in range(count):
+        # Free above the upper bound of the horizon, blocked below the lower one; in between the leg is walked.
         if z >= legs.major[i] * high[s, legs.sector[i]]:
             continue
         if z >= legs.major[i] * low[s, legs.sector[i]]:
@@ -152,24 +152,24 @@ def shade(
 
 
 @numba.njit(cache=True, inline="always")
-def scratch(count: int) -> Legs:
-    return Legs(
+def scratch(count: int) -> NumbaLegs:
+    return NumbaLegs(
         np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int32), np.empty(count, np.float32)
     )
 
 
 LANES = 16
-"""Rows of tables are a whole number of the widest vectors."""
+"""Bins by which the rows of tables are padded: whole widest vectors."""
 BEAM_TILE = 64
-"""Beams whose histograms stay in the cache while the patches go by."""
+"""Beams per thread whose histograms stay in the cache during the loop over patches."""
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def _count(
     s: int,
-    surface: Surface32,
-    relay: Points32,
-    optics: Optics,
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
     field: HeightField,
     low: Float32,
     high: Float32,
@@ -177,7 +177,7 @@ def _count(
     per_bin: int,
     histogram: Float32,
 ) -> int:
-    """Count B over d3 + d4 of one patch in sub-bins; gives the bin at which they start."""
+    """Count B over d3 + d4 of one patch in sub-bins, and return the bin at which they start."""
     cells = len(relay.x_m)
     legs = scratch(cells)
     geometry(legs, s, surface, relay, 0, cells, optics, field, True)
@@ -201,9 +201,9 @@ def _count(
 
 @numba.njit(cache=True, parallel=True)
 def sub_bins(
-    surface: Surface32,
-    relay: Points32,
-    optics: Optics,
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
     field: HeightField,
     low: Float32,
     high: Float32,
@@ -211,7 +211,7 @@ def sub_bins(
     per_bin: int,
     width: int,
 ) -> tuple[Int32, Float32]:
-    """Histograms (n, width * per_bin) of B over d3 + d4 in sub-bins, and the bin (n,) at which each starts."""
+    """Return histograms (n, width * per_bin) of B over d3 + d4 in sub-bins, and the bin (n,) at which each starts."""
     patches = len(surface.x_m)
     first, histogram = np.zeros(patches, np.int32), np.zeros((patches, width * per_bin), np.float32)
     for s in numba.prange(patches):
@@ -221,13 +221,15 @@ def sub_bins(
 
 @numba.njit(cache=True, parallel=True)
 def tables(histogram: Float32, per_bin: int) -> Float32:
-    """Histograms (n, width * per_bin) in sub-bins as sums to bins (n, per_bin, width), for each shift by sub-bins."""
+    """Return sub-bin histograms (n, width * per_bin) as sums to bins (n, per_bin, width), for each shift."""
     patches, width = len(histogram), histogram.shape[1] // per_bin
     table = np.zeros((patches, per_bin, width), np.float32)
     for s in numba.prange(patches):
-        below = np.zeros(width * per_bin + 1)  # the sum of all that comes before
+        below = np.zeros(width * per_bin + 1)
         for k in range(width * per_bin):
             below[k + 1] = below[k] + histogram[s, k]
+        # With the running sum, bin i of a table shifted by `shift` is a difference: sub-bins i per_bin - shift to (i +
+        # 1) per_bin - shift. The running sum is float64, so that the difference of large sums keeps the small bins.
         for shift in range(per_bin):
             for i in range(width):
                 table[s, shift, i] = below[(i + 1) * per_bin - shift] - below[max(i * per_bin - shift, 0)]
@@ -238,9 +240,9 @@ def tables(histogram: Float32, per_bin: int) -> Float32:
 def _add_tile(
     start: int,
     count: int,
-    feet: Points32,
-    surface: Surface32,
-    optics: Optics,
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    optics: NumbaOptics,
     field: HeightField,
     low: Float32,
     high: Float32,
@@ -250,7 +252,7 @@ def _add_tile(
     bins: int,
     histogram: Float32,
 ) -> None:
-    """Add every patch to the histograms (count, bins) of a few beams."""
+    """Add every patch to the histograms (count, bins) of some beams."""
     _, per_bin, width = table.shape
     log = int(np.log2(per_bin) + 0.5)
     legs = scratch(count)
@@ -263,6 +265,8 @@ def _add_tile(
                 (legs.length_m[i] + feet.length_m[start + i]) * optics.inverse_bin + np.float32(0.5)
             )
         for i in range(count):
+            # per_bin is a power of two: the shift in sub-bins splits into whole bins (>> log) and the row of the table
+            # (& mask).
             at = (legs.sector[i] >> log) + first[s]
             if legs.weight[i] == 0 or at >= bins:
                 continue
@@ -274,9 +278,9 @@ def _add_tile(
 
 @numba.njit(cache=True, parallel=True)
 def shift_and_add(
-    feet: Points32,
-    surface: Surface32,
-    optics: Optics,
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    optics: NumbaOptics,
     field: HeightField,
     low: Float32,
     high: Float32,
@@ -285,7 +289,7 @@ def shift_and_add(
     table: Float32,
     bins: int,
 ) -> Float32:
-    """Histograms (n, bins) of beams: every patch's table, times A, shifted by d1 + d2."""
+    """Return histograms (n, bins) of beams: the sum of every patch's table, times A, shifted by d1 + d2."""
     beams = len(feet.x_m)
     histogram = np.zeros((beams, (bins + table.shape[2] + LANES) // LANES * LANES), np.float32)
     for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
@@ -310,27 +314,27 @@ def shift_and_add(
 
 
 def histograms(job: TransportJob) -> Float32:
-    """Histograms (n, bins) of I_multi over path length, for the job's beams.
+    """Return histograms (n, bins) of I_multi over path length, for the job's beams.
 
-    Does not depend on the number of threads: each histogram is summed by one thread, patches in order.
+    The result does not depend on the number of threads: one thread sums each histogram, patches in order.
     """
-    stage = _Stage(job)
+    numba_job = _NumbaJob(job)
     if job.brdf is None:
-        return stage.histograms(np.empty((0, 0), np.float32), np.ones(len(job.foot_m)))
-    total = np.zeros((len(job.foot_m), job.bins), np.float32)
+        return numba_job.histograms(np.empty((0, 0), np.float32), np.ones(len(job.laser_spot_m)))
+    total = np.zeros((len(job.laser_spot_m), job.bins), np.float32)
     for foot, share in nodes(job, job.brdf):
         factor = scattering(job.brdf)(foot, job.patches.point_m, job.patches.normal, job.relay.x_m, job.relay.y_m)
-        total += stage.histograms(factor.astype(np.float32), share)
+        total += numba_job.histograms(factor.astype(np.float32), share)
     return total
 
 
-class _Stage:
-    """A job in float32, with what does not depend on the BRDF made once."""
+class _NumbaJob:
+    """Job in float32, with everything that does not depend on the BRDF computed once."""
 
     def __init__(self, job: TransportJob) -> None:
         patches, relay = job.patches, job.relay
         self.job, accuracy = job, job.accuracy
-        self.surface = Surface32(
+        self.surface = NumbaSurface(
             *_columns(patches.point_m),
             *_columns(patches.normal),
             _single(job.soft_patch_m2),
@@ -341,7 +345,7 @@ class _Stage:
         self.relay = _points(columns, job.soft_wall_m2)
         self.low, self.high = horizons(job)
         edge_x, edge_z = job.edge_m
-        self.optics = Optics(
+        self.optics = NumbaOptics(
             np.float32(edge_x),
             np.float32(edge_z),
             np.float32(job.near_m**2),
@@ -352,14 +356,14 @@ class _Stage:
         self.width = table_width(job)
 
     def histograms(self, factor: Float32, share: Float64) -> Float32:
-        """Histograms (n, bins) of the beams, each taken to some share (n,)."""
+        """Return histograms (n, bins) of the beams, each with a weight (n,)."""
         job, shadow = self.job, (self.optics, self.job.field, self.low, self.high)
         some = np.flatnonzero(share)
-        x, y, _ = job.foot_m[some].T
+        x, y, _ = job.laser_spot_m[some].T
         feet = _points((x, y, job.length_m[some], job.beam_weight[some] * share[some]), 0.0)
         first, fine = sub_bins(self.surface, self.relay, *shadow, factor, job.accuracy.sub_bins, self.width)
         if job.more_bounces:
-            fine = with_inter_reflection(job, first, fine)
+            fine = add_interreflection(job, first, fine)
         table = tables(fine, job.accuracy.sub_bins)
         found = shift_and_add(feet, self.surface, *shadow, _single(job.strength), first, table, job.bins)
         if len(some) == len(share):
@@ -373,9 +377,9 @@ def _single(column: Float64) -> Float32:
     return np.ascontiguousarray(column, np.float32)
 
 
-def _points(columns: tuple[Float64, Float64, Float64, Float64], soft_m2: float) -> Points32:
+def _points(columns: tuple[Float64, Float64, Float64, Float64], soft_m2: float) -> NumbaPoints:
     x, y, length, weight = (_single(column) for column in columns)
-    return Points32(x, y, length, weight, np.float32(soft_m2))
+    return NumbaPoints(x, y, length, weight, np.float32(soft_m2))
 
 
 def _columns(points: Float64) -> tuple[Float32, Float32, Float32]:
@@ -383,12 +387,12 @@ def _columns(points: Float64) -> tuple[Float32, Float32, Float32]:
 
 
 def horizons(job: TransportJob) -> tuple[Float32, Float32]:
-    """The horizon tables (n, directions) that the job's accuracy asks for; empty where nothing shades."""
+    """Return the horizon tables (n, FACES * sectors), low and high, for the job's accuracy; empty if nothing shades."""
     patches, field, accuracy = job.patches, job.field, job.accuracy
     if not field.shades:
         return np.empty((0, 0), np.float32), np.empty((0, 0), np.float32)
-    x = np.concatenate([job.foot_m[:, 0], job.relay.x_m])
-    y = np.concatenate([job.foot_m[:, 1], job.relay.y_m])
+    x = np.concatenate([job.laser_spot_m[:, 0], job.relay.x_m])
+    y = np.concatenate([job.laser_spot_m[:, 1], job.relay.y_m])
     across = np.maximum(x.max() - patches.point_m[:, 0], patches.point_m[:, 0] - x.min()) / field.pitch_x_m
     along = np.maximum(y.max() - patches.point_m[:, 1], patches.point_m[:, 1] - y.min()) / field.pitch_y_m
     where = patches.row, patches.column, patches.point_m[:, 2].copy(), np.maximum(across, along)
@@ -396,10 +400,10 @@ def horizons(job: TransportJob) -> tuple[Float32, Float32]:
 
 
 def table_width(job: TransportJob) -> int:
-    """Bins from the shortest to the longest d3 + d4 of any patch, in whole vectors.
+    """Return the bins from the shortest to the longest d3 + d4 of any patch, in whole vectors.
 
-    The sum is convex over the wall: longest at a corner of the relay, and never shorter than the straight way to the
-    mirrored lidar.
+    d3 + d4 is convex over the wall: longest at a corner of the relay, and never shorter than the straight line to the
+    mirror image of the lidar behind the wall.
     """
     x, y, z = job.patches.point_m.T
     relay, lidar = job.relay, job.lidar_m

@@ -1,52 +1,53 @@
-"""The renderer that defines the others: every three-bounce path by itself, in float64 (S2 to S4).
+"""Reference backend, which defines the others: every three-bounce path by itself, in float64 (S2 to S4).
 
-Slow on purpose (it is compiled, and still takes a minute or two for a whole map): each line is an equation.
-
-Inter-reflection path by path, in float64: what `between` is held against. For small scenes; others are refused.
+Slow on purpose (compiled, and still a minute or two for a whole map): each line is an equation. Interreflection is
+summed path by path too, for small scenes only.
 """
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
-from nlos_calibration.arrays import Float64, Int64, Mask
+from nlos_calibration.arrays import Float64, Mask
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.brdf_table import scattering
 from nlos_cam.render.geometry import softened
 from nlos_cam.render.interreflection import object_factors, wall_cells, wall_factors
-from nlos_cam.render.job import TransportJob
+from nlos_cam.render.job import PatchArrays, TransportJob
 from nlos_cam.render.visibility import HeightField, occluded, visible
 
 MAX_PATHS = 3e10
-"""Some minutes' worth."""
+"""Some minutes of computing."""
 
 
-def more_paths(job: TransportJob, taken: Float64, given: Float64) -> Float64:
-    """Histograms (n, bins) of the paths that meet the object twice.
+def more_paths(job: TransportJob, incident: Float64, returned: Float64) -> Float64:
+    """Return histograms (n, bins) of the paths that meet the object twice.
 
-    `taken` (n, patches) is the light that each patch gives on of each beam, `given` (patches, m) what the lidar gets of
-    it by each relay cell. Raises SceneError where there are more than MAX_PATHS.
+    `incident` (n, patches) is the light of each beam that each patch gives on, `returned` (patches, m) the share of it
+    that reaches the lidar over each relay cell. Raises SceneError for more than MAX_PATHS.
     """
     point, cells = job.patches.point_m, wall_cells(job)
-    count = taken.size * given.size * len(cells)
+    count = incident.size * returned.size * len(cells)
     if count > MAX_PATHS:
         raise SceneError(
-            f"inter-reflection path by path would sum {count:.1g} paths, at most {MAX_PATHS:.0e}: choose fine, "
-            "or leave inter-reflection out of the effects"
+            f"inter-reflection path by path would sum {count:.1g} paths (limit {MAX_PATHS:.0e}): choose fine, "
+            "or drop inter-reflection from the effects"
         )
     relay = np.stack([job.relay.x_m, job.relay.y_m, np.zeros_like(job.relay.x_m)], 1)
     there, back = wall_factors(job, cells)
-    d2 = np.linalg.norm(job.foot_m[:, None] - point, axis=-1) + job.length_m[:, None]
+    d2 = np.linalg.norm(job.laser_spot_m[:, None] - point, axis=-1) + job.length_m[:, None]
     d3 = np.linalg.norm(point[:, None] - relay, axis=-1) + job.relay.length_m
     to_wall = np.linalg.norm(point[:, None] - cells, axis=-1)
     factors = object_factors(job)
-    return _sum(taken, d2, given, d3, factors, point, there, back, to_wall, job.bin_m, job.bins)
+    return _sum(incident, d2, returned, d3, factors, point, there, back, to_wall, job.bin_m, job.bins)
 
 
 @numba.njit(cache=True, parallel=True)
 def _sum(
-    taken: Float64,
+    incident: Float64,
     d2: Float64,
-    given: Float64,
+    returned: Float64,
     d3: Float64,
     factors: Float64,
     points: Float64,
@@ -56,19 +57,20 @@ def _sum(
     bin_m: float,
     bins: int,
 ) -> Float64:
-    histogram = np.zeros((len(taken), bins))
-    for p in numba.prange(len(taken)):
+    histogram = np.zeros((len(incident), bins))
+    for p in numba.prange(len(incident)):
         for a in range(len(points)):
-            if taken[p, a] == 0:
+            if incident[p, a] == 0:
                 continue
             for b in range(len(points)):
                 away = np.sqrt(((points[a] - points[b]) ** 2).sum())
-                for q in range(given.shape[1]):
-                    ends, light = d2[p, a] + d3[b, q], taken[p, a] * given[b, q]
+                for q in range(returned.shape[1]):
+                    ends, light = d2[p, a] + d3[b, q], incident[p, a] * returned[b, q]
                     if light == 0:
                         continue
                     k = int(np.floor((ends + away) / bin_m))
                     if k < bins:
+                        # Spot -> a -> b -> relay cell, and below spot -> a -> wall -> b -> relay cell.
                         histogram[p, k] += light * factors[a, b]
                     for w in range(there.shape[1]):
                         k = int(np.floor((ends + to_wall[a, w] + to_wall[b, w]) / bin_m))
@@ -81,188 +83,148 @@ BEAM_GROUP = 256
 """Beams summed in one compiled call."""
 
 
+class Spots(NamedTuple):
+    """Laser spots of some beams (n), with the patches that each lights."""
+
+    point_m: Float64
+    length_m: Float64
+    weight: Float64
+    lit: Mask
+    """(patches, n)."""
+
+
+class Cells(NamedTuple):
+    """Relay cells (m), with the patches that each is visible from."""
+
+    x_m: Float64
+    y_m: Float64
+    length_m: Float64
+    weight: Float64
+    soft_m2: float
+    visible: Mask
+    """(patches, m)."""
+
+
 @numba.njit(cache=True, parallel=True)
-def legs(
-    points: Float64,
-    normals: Float64,
-    rows: Int64,
-    columns: Int64,
-    x: Float64,
-    y: Float64,
-    edge_x: float,
-    edge_z: float,
-    field: HeightField,
-) -> Mask:
-    """V (n, m) of the legs between patches and points of the wall: lit side, occluder, the object itself."""
-    table = np.zeros((len(points), len(x)), np.bool_)
-    for s in numba.prange(len(points)):
-        point, normal = points[s], normals[s]
+def legs(patches: PatchArrays, x: Float64, y: Float64, edge_x: float, edge_z: float, field: HeightField) -> Mask:
+    """Return V (n, m) of the legs between patches and points of the wall: lit side, occluder, the object itself."""
+    table = np.zeros((len(patches.row), len(x)), np.bool_)
+    for s in numba.prange(len(patches.row)):
+        point, normal = patches.point_m[s], patches.normal[s]
         for w in range(len(x)):
             facing = normal[0] * (x[w] - point[0]) + normal[1] * (y[w] - point[1]) - normal[2] * point[2]
             if facing > 0 and not occluded(point[0], point[2], x[w], 0.0, edge_x, edge_z):
-                table[s, w] = visible(field, rows[s], columns[s], point, x[w], y[w])
+                table[s, w] = visible(field, patches.row[s], patches.column[s], point, x[w], y[w])
     return table
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _taken(
-    foot: Float64, normal: Float64, point: Float64, strength: float, soft: float, near_m: float, lambertian: bool
-) -> float:
-    """What of S2 the way from a beam's foot to a patch makes: the light that the patch gives on."""
-    to_foot = foot - point
-    d2 = np.sqrt((to_foot**2).sum())
-    cos_2 = (normal * to_foot).sum() / d2
-    taken = strength * cos_2 / softened(d2**2, soft, near_m)
-    return taken * point[2] / d2 if lambertian else taken  # leaving the wall
+def _incident(spot: Float64, patches: PatchArrays, s: int, near_m: float, lambertian: bool) -> float:
+    """Return the factors of S2 on the leg from a laser spot to a patch: the light that the patch gives on."""
+    to_spot = spot - patches.point_m[s]
+    d2 = np.sqrt((to_spot**2).sum())
+    cos_2 = (patches.normal[s] * to_spot).sum() / d2
+    incident = patches.strength[s] * cos_2 / softened(d2**2, patches.soft_m2[s], near_m)
+    # The rendering equation has the cosine at which the light leaves the wall too: z / d2.
+    return incident * patches.point_m[s, 2] / d2 if lambertian else incident
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _given(
-    dx: float, dy: float, z: float, facing: float, relay_weight: float, soft: float, near_m: float, lambertian: bool
+def _returned(
+    patches: PatchArrays, s: int, cells: Cells, q: int, near_m: float, lambertian: bool
 ) -> tuple[float, float]:
-    """What of S2 the way from a patch over a relay cell to the lidar makes; and d3.
-
-    The cell is (dx, dy, -z) away, which times the patch's normal is `facing`.
-    """
+    """Return the factors of S2 on the leg from a patch over a relay cell to the lidar, and d3."""
+    px, py, z = patches.point_m[s]
+    nx, ny, nz = patches.normal[s]
+    dx, dy = cells.x_m[q] - px, cells.y_m[q] - py
+    facing = nx * dx + ny * dy - nz * z
     squared = dx**2 + dy**2 + z**2
     d3 = np.sqrt(squared)
-    given = relay_weight * (z / d3) / softened(squared, soft, near_m)  # cos t3
-    return (given * facing / d3 if lambertian else given), d3
+    returned = cells.weight[q] * (z / d3) / softened(squared, cells.soft_m2, near_m)  # cos t3
+    return (returned * facing / d3 if lambertian else returned), d3
 
 
 @numba.njit(cache=True, parallel=True)
 def _paths(
-    foot: Float64,
-    d1: Float64,
-    beam_weight: Float64,
-    lit: Mask,
-    points: Float64,
-    normals: Float64,
-    strength: Float64,
-    soft_patch: Float64,
-    x: Float64,
-    y: Float64,
-    d4: Float64,
-    relay_weight: Float64,
-    soft_wall: float,
-    seen: Mask,
+    spots: Spots,
+    patches: PatchArrays,
+    cells: Cells,
     factor: Float64,
     near_m: float,
     lambertian: bool,
     bin_m: float,
     bins: int,
 ) -> Float64:
-    histogram = np.zeros((len(foot), bins))
-    for p in numba.prange(len(foot)):
-        for s in range(len(points)):
-            if not lit[s, p]:
+    """Return histograms (n, bins): for each path p, s, q its weight (S2) in the bin of its length (S4)."""
+    histogram = np.zeros((len(spots.point_m), bins))
+    for p in numba.prange(len(spots.point_m)):
+        for s in range(len(patches.row)):
+            if not spots.lit[s, p]:
                 continue
-            a = beam_weight[p] * _taken(foot[p], normals[s], points[s], strength[s], soft_patch[s], near_m, lambertian)
-            d2 = np.sqrt(((foot[p] - points[s]) ** 2).sum())
-            px, py, pz = points[s]
-            nx, ny, nz = normals[s]
-            for q in range(len(x)):
-                if not seen[s, q]:
+            a = spots.weight[p] * _incident(spots.point_m[p], patches, s, near_m, lambertian)
+            d2 = np.sqrt(((spots.point_m[p] - patches.point_m[s]) ** 2).sum())
+            for q in range(len(cells.x_m)):
+                if not cells.visible[s, q]:
                     continue
-                dx, dy = x[q] - px, y[q] - py
-                facing = nx * dx + ny * dy - nz * pz
-                b, d3 = _given(dx, dy, pz, facing, relay_weight[q], soft_wall, near_m, lambertian)
+                b, d3 = _returned(patches, s, cells, q, near_m, lambertian)
                 if factor.size:
                     b *= factor[s, q]
-                k = int(np.floor((d1[p] + d2 + d3 + d4[q]) / bin_m))  # S4
+                k = int(np.floor((spots.length_m[p] + d2 + d3 + cells.length_m[q]) / bin_m))
                 if k < bins:
-                    histogram[p, k] += a * b  # S2
+                    histogram[p, k] += a * b
     return histogram
 
 
 @numba.njit(cache=True)
-def _ends(
-    foot: Float64,
-    beam_weight: Float64,
-    lit: Mask,
-    points: Float64,
-    normals: Float64,
-    strength: Float64,
-    soft_patch: Float64,
-    x: Float64,
-    y: Float64,
-    relay_weight: Float64,
-    soft_wall: float,
-    seen: Mask,
-    near_m: float,
-    lambertian: bool,
-) -> tuple[Float64, Float64]:
-    """Both ends of every path: taken (beams, patches) and given (patches, cells)."""
-    taken, given = np.zeros((len(foot), len(points))), np.zeros((len(points), len(x)))
-    for s in range(len(points)):
-        for p in range(len(foot)):
-            if lit[s, p]:
-                taken[p, s] = beam_weight[p] * _taken(
-                    foot[p], normals[s], points[s], strength[s], soft_patch[s], near_m, lambertian
-                )
-        for q in range(len(x)):
-            if seen[s, q]:
-                dx, dy, z = x[q] - points[s, 0], y[q] - points[s, 1], points[s, 2]
-                facing = normals[s, 0] * dx + normals[s, 1] * dy - normals[s, 2] * z
-                given[s, q], _ = _given(dx, dy, z, facing, relay_weight[q], soft_wall, near_m, lambertian)
-    return taken, given
+def _ends(spots: Spots, patches: PatchArrays, cells: Cells, near_m: float, lambertian: bool) -> tuple[Float64, Float64]:
+    """Return both ends of every path: incident (beams, patches) and returned (patches, cells)."""
+    incident = np.zeros((len(spots.point_m), len(patches.row)))
+    returned = np.zeros((len(patches.row), len(cells.x_m)))
+    for s in range(len(patches.row)):
+        for p in range(len(spots.point_m)):
+            if spots.lit[s, p]:
+                incident[p, s] = spots.weight[p] * _incident(spots.point_m[p], patches, s, near_m, lambertian)
+        for q in range(len(cells.x_m)):
+            if cells.visible[s, q]:
+                returned[s, q], _ = _returned(patches, s, cells, q, near_m, lambertian)
+    return incident, returned
 
 
 def histograms(job: TransportJob) -> Float64:
-    """Histograms (n, bins) of I_multi over path length, for the job's beams."""
-    more = _more_bounces(job) if job.more_bounces else 0.0  # first: it refuses what would take too long
-    return _three_bounces(job) + more
+    """Return histograms (n, bins) of I_multi over path length, for the job's beams."""
+    cells = _cells(job)
+    more: Float64 | float = 0.0
+    if job.more_bounces:  # first: it refuses jobs that would take too long
+        ends = _ends(_spots(job, slice(None)), job.patch_arrays, cells, job.near_m, job.lambertian)
+        more = more_paths(job, *ends)
+    return _three_bounces(job, cells) + more
 
 
-def _three_bounces(job: TransportJob) -> Float64:
-    """In groups of beams, between which Ctrl-C is heard: one beam at a time where a BRDF couples the legs."""
-    patches, relay, count = job.patches, job.relay, len(job.foot_m)
-    seen = _visible(job, relay.x_m, relay.y_m)
+def _three_bounces(job: TransportJob, cells: Cells) -> Float64:
+    """Return the three-bounce histograms in groups of beams so that Ctrl-C works; single beams with a BRDF."""
+    patches, count = job.patch_arrays, len(job.laser_spot_m)
     histogram, group = np.zeros((count, job.bins)), BEAM_GROUP if job.brdf is None else 1
     for which in (slice(start, start + group) for start in range(0, count, group)):
         factor = np.empty((0, 0))
         if job.brdf is not None:
-            foot = job.foot_m[which.start]
-            factor = scattering(job.brdf)(foot, patches.point_m, patches.normal, relay.x_m, relay.y_m)
-        histogram[which] = _some(job, which, seen, factor)
+            spot = job.laser_spot_m[which.start]
+            factor = scattering(job.brdf)(spot, patches.point_m, patches.normal, cells.x_m, cells.y_m)
+        settings = job.near_m, job.lambertian, job.bin_m, job.bins
+        histogram[which] = _paths(_spots(job, which), patches, cells, factor, *settings)
     return histogram
 
 
-def _more_bounces(job: TransportJob) -> Float64:
-    p, relay = job.patches, job.relay
-    surface = p.point_m, p.normal, job.strength, job.soft_patch_m2
-    lit = _visible(job, job.foot_m[:, 0].copy(), job.foot_m[:, 1].copy())
-    wall = relay.x_m, relay.y_m, job.relay_weight, job.soft_wall_m2, _visible(job, relay.x_m, relay.y_m)
-    taken, given = _ends(job.foot_m, job.beam_weight, lit, *surface, *wall, job.near_m, job.lambertian)
-    return more_paths(job, taken, given)
+def _spots(job: TransportJob, which: slice) -> Spots:
+    spot = np.ascontiguousarray(job.laser_spot_m[which])
+    return Spots(spot, job.length_m[which], job.beam_weight[which], _visible(job, spot[:, 0].copy(), spot[:, 1].copy()))
+
+
+def _cells(job: TransportJob) -> Cells:
+    relay = job.relay
+    columns = relay.x_m, relay.y_m, relay.length_m, job.relay_weight, job.soft_wall_m2
+    return Cells(*columns, _visible(job, relay.x_m, relay.y_m))
 
 
 def _visible(job: TransportJob, x_m: Float64, y_m: Float64) -> Mask:
-    """V (n, m) of the legs between the job's patches and points of the wall."""
-    p = job.patches
-    return legs(p.point_m, p.normal, p.row, p.column, x_m, y_m, *job.edge_m, job.field)
-
-
-def _some(job: TransportJob, which: slice, seen: Mask, factor: Float64) -> Float64:
-    patches, relay, foot = job.patches, job.relay, np.ascontiguousarray(job.foot_m[which])
-    return _paths(
-        foot,
-        job.length_m[which],
-        job.beam_weight[which],
-        _visible(job, foot[:, 0].copy(), foot[:, 1].copy()),
-        patches.point_m,
-        patches.normal,
-        job.strength,
-        job.soft_patch_m2,
-        relay.x_m,
-        relay.y_m,
-        relay.length_m,
-        job.relay_weight,
-        job.soft_wall_m2,
-        seen,
-        factor,
-        job.near_m,
-        job.lambertian,
-        job.bin_m,
-        job.bins,
-    )
+    """Return V (n, m) of the legs between the job's patches and points of the wall."""
+    return legs(job.patch_arrays, x_m, y_m, *job.edge_m, job.field)

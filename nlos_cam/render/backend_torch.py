@@ -1,12 +1,9 @@
-"""The fast renderer on tensors (torch): the factorisation of `cpu`, for a batch of objects, on a GPU or the CPU.
+"""Fast backend on tensors (torch, float32): the factorization of `backend_numba` for a batch, on GPU or CPU.
 
-Patches of all objects stand one after another. Their legs are worked out in a few large kernels, the tables of patches
-are counted in integers, and each beam of an object sums windows of that object's tables, where they lie. No sum depends
-on the order in which threads arrive.
-
-Self-occlusion V on tensors: the lookup of `visibility`'s bounds and its exact walk, for many legs at a time.
-
-Legs between the patches of a batch and points of the wall, on tensors of float32: weight, length, scattering.
+Patches of all objects stand one after another. Their legs are computed by a few large kernels, the patches' tables are
+counted in integers, and each beam of an object sums windows of that object's tables, in place. No sum depends on the
+order in which threads arrive. Self-occlusion is the lookup of the bounds of `visibility` and its exact walk, for many
+legs at a time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,22 +18,22 @@ from torch.nn.functional import avg_pool1d, embedding_bag, pad
 from nlos_cam.errors import SceneError
 from nlos_cam.render.backend_numba import horizons, table_width
 from nlos_cam.render.brdf_table import nodes
-from nlos_cam.render.interreflection import with_inter_reflection
+from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Brdf
 from nlos_cam.render.visibility import FACES, bias_m
 
 
-class Fields(NamedTuple):
-    """The height fields of a batch, each turned so that a walk along any face goes up its rows; NaN all around."""
+class TorchFields(NamedTuple):
+    """Height fields of a batch, each turned so that a walk along any face goes up its rows; NaN all around."""
 
     depth_m: Tensor
-    """Flat, rows of `across` cells."""
+    """Flat, in rows of `across` cells."""
     across: int
     along: int
     """Rows of one face of one object: the grid, and the longest walk beyond it."""
     steps: int
-    """Of the longest walk."""
+    """Steps of the longest walk."""
     columns_per_m: float
     rows_per_m: float
     """Negative: rows run along -y."""
@@ -44,44 +41,45 @@ class Fields(NamedTuple):
     sectors: int
 
 
-class Sites(NamedTuple):
-    """What visibility needs of patches (n)."""
+class TorchSites(NamedTuple):
+    """Data of patches (n) for visibility."""
 
     depth_m: Tensor
     """(n, 1)."""
     low: Tensor
-    """(n, FACES * sectors); a leg below these is blocked."""
+    """(n, FACES * sectors); a leg below these bounds is blocked."""
     high: Tensor
-    """(n, FACES * sectors); a leg above these is free."""
+    """(n, FACES * sectors); a leg above these bounds is free."""
     start: Tensor
-    """(n, FACES); row of the fields that the patch stands in."""
+    """(n, FACES); row of the fields in which the patch stands."""
     across: Tensor
-    """(n, FACES); its place across."""
+    """(n, FACES); position of the patch across the walk."""
 
-    def part(self, start: int, end: int) -> "Sites":
-        """Only some patches, one after another."""
-        return Sites(*(column[start:end] for column in self))
+    def part(self, start: int, end: int) -> "TorchSites":
+        """Return the patches [start, end)."""
+        return TorchSites(*(column[start:end] for column in self))
 
 
-def lay_out(jobs: Sequence[TransportJob], device: torch.device) -> tuple[Fields, Sites]:
-    """The fields and sites of jobs that share a grid; an object that shades nothing has bounds of 0."""
+def lay_out(jobs: Sequence[TransportJob], device: torch.device) -> tuple[TorchFields, TorchSites]:
+    """Return fields and sites of jobs on one grid; an object that shades nothing has bounds of 0."""
     fields = [job.field for job in jobs]
     size = len(fields[0].depth_m)
     steps = max(max(f.last_row - f.first_row, f.last_column - f.first_column) for f in fields)
     rows = torch.as_tensor(np.stack([f.depth_m for f in fields]))
     columns = rows.transpose(1, 2)
+    # A walk along -columns goes up the rows of the transposed, flipped map, and so on: one loop serves all four faces.
     faces = torch.stack([columns, columns.flip(1), rows, rows.flip(1)], 1)
     padded = pad(faces, (1, 1, 0, steps), value=torch.nan).flatten().to(device, torch.float32)
     scale = 1 / fields[0].pitch_x_m, -1 / fields[0].pitch_y_m
     sectors = jobs[0].accuracy.sectors
-    shared = Fields(padded, size + 2, size + steps, steps, *scale, bias_m(fields[0]), sectors)
+    shared = TorchFields(padded, size + 2, size + steps, steps, *scale, bias_m(fields[0]), sectors)
     sites = [_sites(job, index, shared, size) for index, job in enumerate(jobs)]
     together = (torch.as_tensor(np.concatenate(column), device=device) for column in zip(*sites, strict=True))
-    return shared, Sites(*together)
+    return shared, TorchSites(*together)
 
 
-def _sites(job: TransportJob, index: int, fields: Fields, size: int) -> tuple[np.ndarray, ...]:
-    """The columns of one object's sites: depth, low, high, start and across."""
+def _sites(job: TransportJob, index: int, fields: TorchFields, size: int) -> tuple[np.ndarray, ...]:
+    """Return the columns of one object's sites: depth, low, high, start and across."""
     row, column = job.patches.row, job.patches.column
     free = np.zeros((len(row), FACES * fields.sectors), np.float32)
     low, high = horizons(job) if job.field.shades else (free, free)
@@ -91,8 +89,8 @@ def _sites(job: TransportJob, index: int, fields: Fields, size: int) -> tuple[np
     return job.patches.point_m[:, 2:].astype(np.float32), low, high, start, across
 
 
-def shade(weight: Tensor, dx_m: Tensor, dy_m: Tensor, sites: Sites, fields: Fields, chunk: int) -> None:
-    """Set the weight (n, m) of legs that the object blocks to 0: looked up where the bounds decide, else walked."""
+def shade(weight: Tensor, dx_m: Tensor, dy_m: Tensor, sites: TorchSites, fields: TorchFields, chunk: int) -> None:
+    """Set the weight (n, m) of legs that the object blocks to 0: looked up if the bounds decide, else walked."""
     u, v = dx_m * fields.columns_per_m, dy_m * fields.rows_per_m
     along_columns = u.abs() >= v.abs()
     far = torch.maximum(u.abs(), v.abs())
@@ -109,15 +107,15 @@ def shade(weight: Tensor, dx_m: Tensor, dy_m: Tensor, sites: Sites, fields: Fiel
 
 
 def _sector(tilt: Tensor, along_columns: Tensor, backward: Tensor, sectors: int) -> Tensor:
-    """Which of the FACES * sectors holds a direction."""
+    """Return the index of the sector, of FACES * sectors, that holds each direction."""
     inside = torch.add(sectors / 2, tilt, alpha=sectors / 2).clamp_(max=sectors - 1)  # floored when made whole
     return (inside + torch.where(along_columns, 0.0, 2.0 * sectors) + backward * float(sectors)).long()
 
 
-def blocked(fields: Fields, sites: Sites, which: Tensor, sector: Tensor, tilt: Tensor, far: Tensor) -> Tensor:
-    """Whether (k,) the object blocks legs from patches through sectors, `far` cells long, by `tilt` across for each.
+def blocked(fields: TorchFields, sites: TorchSites, which: Tensor, sector: Tensor, tilt: Tensor, far: Tensor) -> Tensor:
+    """Return whether (k,) the object blocks legs from patches: `far` cells long, by `tilt` across per cell.
 
-    `visibility.blocked` with all steps side by side; beyond its last step there is only background.
+    The walk of `visibility.blocked` with all steps side by side; beyond its last step there is only background.
     """
     face, step = sector // fields.sectors, torch.arange(1, fields.steps + 1, device=tilt.device)
     across = sites.across[which, face][:, None] + tilt[:, None] * step
@@ -130,10 +128,11 @@ def blocked(fields: Fields, sites: Sites, which: Tensor, sector: Tensor, tilt: T
     between = near + share * (beyond - near)
     between = torch.where(between.isnan(), torch.where(share < 0.5, near, beyond), between)
     depth = sites.depth_m[which]
+    # (z - z' - bias) / k > z / far, multiplied by k. NaN compares false.
     return (depth - between - fields.bias_m > step * (depth / far[:, None])).any(1)
 
 
-class Surface(NamedTuple):
+class TorchSurface(NamedTuple):
     """Patches as columns (n, 1)."""
 
     x_m: Tensor
@@ -146,21 +145,21 @@ class Surface(NamedTuple):
     strength: Tensor
 
     @classmethod
-    def of(cls, jobs: Sequence[TransportJob], device: torch.device) -> "Surface":
-        """The patches of all jobs, one after another."""
+    def of(cls, jobs: Sequence[TransportJob], device: torch.device) -> "TorchSurface":
+        """Return the patches of all jobs, one after another."""
         columns = [
             np.column_stack([j.patches.point_m, j.patches.normal, j.soft_patch_m2, j.strength]).T[..., None]
             for j in jobs
         ]
         return cls(*torch.as_tensor(np.concatenate(columns, 1).astype(np.float32), device=device))
 
-    def part(self, start: int, end: int) -> "Surface":
-        """Only some, one after another."""
-        return Surface(*(column[start:end] for column in self))
+    def part(self, start: int, end: int) -> "TorchSurface":
+        """Return the patches [start, end)."""
+        return TorchSurface(*(column[start:end] for column in self))
 
 
-class Wall(NamedTuple):
-    """Points of the wall (m,): the feet of beams, or relay cells; with the rest of their way to the lidar."""
+class TorchPoints(NamedTuple):
+    """Points of the wall (m,), laser spots or relay cells, with the leg from each to the lidar."""
 
     x_m: Tensor
     y_m: Tensor
@@ -168,32 +167,34 @@ class Wall(NamedTuple):
     weight: Tensor
 
     @classmethod
-    def of(cls, *columns: Float64, device: torch.device) -> "Wall":
-        """The same on a device."""
+    def of(cls, *columns: Float64, device: torch.device) -> "TorchPoints":
+        """Return the columns as float32 on a device."""
         return cls(*torch.as_tensor(np.stack(columns).astype(np.float32), device=device))
 
-    def part(self, start: int, end: int) -> "Wall":
-        """Only some, one after another."""
-        return Wall(*(column[start:end] for column in self))
+    def part(self, start: int, end: int) -> "TorchPoints":
+        """Return the points [start, end)."""
+        return TorchPoints(*(column[start:end] for column in self))
 
 
-class Optics(NamedTuple):
-    """What all legs of a batch share."""
+class TorchOptics(NamedTuple):
+    """Constants shared by all legs of a batch."""
 
     edge_m: tuple[float, float]
     near: bool
-    """Whether any patch is within near contact of the wall."""
+    """True if any patch is within near contact of the wall."""
     near_m2: float
     soft_wall_m2: float
     lambertian: bool
-    fields: Fields | None
-    """None where nothing shades."""
+    fields: TorchFields | None
+    """None if nothing shades."""
     chunk: int
-    """Elements that a tensor may have."""
+    """Largest number of elements of a tensor."""
 
 
-def legs(surface: Surface, sites: Sites | None, wall: Wall, optics: Optics, *, outgoing: bool) -> tuple[Tensor, Tensor]:
-    """Weights (n, m), 0 where nothing passes, and lengths (n, m) of the legs from patches to points of the wall.
+def legs(
+    surface: TorchSurface, sites: TorchSites | None, wall: TorchPoints, optics: TorchOptics, *, outgoing: bool
+) -> tuple[Tensor, Tensor]:
+    """Return weights (n, m), 0 for blocked legs, and lengths (n, m) of the legs from patches to points of the wall.
 
     Towards the lidar (`outgoing`) the weight has the wall's cosine, from it the patch's; in Lambertian radiometry both.
     """
@@ -215,51 +216,53 @@ def legs(surface: Surface, sites: Sites | None, wall: Wall, optics: Optics, *, o
     return weight, length
 
 
-def _cut(surface: Surface, wall: Wall, edge_m: tuple[float, float]) -> Tensor:
-    """Whether (n, m) the occluder stands in the way: for each patch, the wall from some place on beyond the edge.
+def _cut(surface: TorchSurface, wall: TorchPoints, edge_m: tuple[float, float]) -> Tensor:
+    """Return a mask (n, m) of the legs that the occluder blocks: for each patch, the wall from some x on.
 
-    A leg passes the edge at height z t / (t + d), from a patch at d this side of the edge to a wall point t beyond.
+    From a patch at distance d on this side of the edge to a wall point at distance t beyond it, the leg passes the edge
+    at height z t / (t + d). That is at least edge_z from t = edge_z d / (z - edge_z) on.
     """
     (edge_x, edge_z), z, d = edge_m, surface.z_m, surface.x_m - edge_m[0]
     begins = torch.where((z > edge_z) & (d != 0), edge_z * d.abs() / (z - edge_z), torch.inf)
     return (edge_x - wall.x_m) * d.sign() >= begins
 
 
-def scattered(brdf: Brdf, foot_m: Float64, surface: Surface, wall: Wall) -> Tensor:
-    """The factor (n, m) of a BRDF on the ways from one foot (3,) over patches to points of the wall."""
-    x, y, z = (float(place) - column for place, column in zip(foot_m, surface[:3], strict=True))
-    d2 = (x * x + y * y + z * z).sqrt().clamp(min=1e-12)  # where the object touches the wall
+def scattered(brdf: Brdf, laser_spot_m: Float64, surface: TorchSurface, wall: TorchPoints) -> Tensor:
+    """Return the factor (n, m) of a BRDF on the ways from one laser spot (3,) over patches to points of the wall."""
+    x, y, z = (float(place) - column for place, column in zip(laser_spot_m, surface[:3], strict=True))
+    d2 = (x * x + y * y + z * z).sqrt().clamp(min=1e-12)
     x, y, z = x / d2, y / d2, z / d2
     dx, dy, dz = wall.x_m - surface.x_m, wall.y_m - surface.y_m, -surface.z_m
     d3 = (dx * dx + dy * dy + dz * dz).sqrt().clamp(min=1e-12)
     cos_in = surface.normal_x * x + surface.normal_y * y + surface.normal_z * z
     cos_out = (surface.normal_x * dx + surface.normal_y * dy + surface.normal_z * dz) / d3
     cos_between = (x * dx + y * dy + z * dz) / d3
-    value = brdf(cos_in.clamp(min=0), cos_out.clamp(min=0), cos_between)  # legs cut the dark side off themselves
+    # Legs to the dark side have weight 0 already. Lengths are limited above 0 for objects that touch the wall.
+    value = brdf(cos_in.clamp(min=0), cos_out.clamp(min=0), cos_between)
     return torch.as_tensor(value, dtype=torch.float32, device=d3.device).expand(d3.shape)
 
 
 CPU_CHUNK = 1 << 18
-"""Elements of a tensor that stay in a CPU's cache."""
+"""Elements of a tensor that fit in a CPU's cache."""
 CUDA_CHUNK = 1 << 27
-"""Elements that keep a GPU busy; fewer where they would take more than half of its memory."""
+"""Elements that keep a GPU busy; fewer if they would take more than half of its memory."""
 BYTES_PER_ELEMENT = 160
-"""Of all tensors of legs together."""
+"""Bytes per element of all tensors of legs together."""
 WHOLE_STEPS = 2.0**44
-"""That the largest weight of a table counts: 2^18 of them still fit an integer of 64 bits."""
+"""Integer for the largest weight of a table: 2^18 of them still fit in 64 bits."""
 
 
 def device_named(backend: str) -> torch.device:
-    """The device of a backend: "torch" is the CPU, "cuda" the GPU. Raises SceneError where there is none."""
+    """Return the device of a backend: "torch" is the CPU, "cuda" the GPU. Raises SceneError if there is none."""
     if backend == "cuda" and not torch.cuda.is_available():
         raise SceneError(
-            "backend is 'cuda', and no CUDA device is here: choose cpu, or torch for the same code on the CPU"
+            "backend 'cuda' needs a CUDA device, and there is none: choose cpu, or torch for the same code on the CPU"
         )
     return torch.device("cuda" if backend == "cuda" else "cpu")
 
 
 def chunk_for(device: torch.device) -> int:
-    """How many legs to work out at a time."""
+    """Return the number of legs to compute at a time."""
     if device.type == "cpu":
         return CPU_CHUNK
     half = torch.cuda.get_device_properties(device).total_memory // 2
@@ -267,12 +270,12 @@ def chunk_for(device: torch.device) -> int:
 
 
 def histograms(job: TransportJob, device: torch.device) -> Float32:
-    """Histograms (n, bins) of I_multi over path length, for the job's beams."""
+    """Return histograms (n, bins) of I_multi over path length, for the job's beams."""
     return histograms_of_all([job], device)[0]
 
 
 def histograms_of_all(jobs: Sequence[TransportJob], device: torch.device) -> list[Float32]:
-    """The same of many jobs; those that differ in the object alone are worked out together."""
+    """Return the histograms of many jobs; those that differ in the object alone are computed together."""
     alike: dict[object, list[int]] = {}
     for index, job in enumerate(jobs):
         alike.setdefault(_shared(job) or index, []).append(index)
@@ -284,11 +287,11 @@ def histograms_of_all(jobs: Sequence[TransportJob], device: torch.device) -> lis
 
 
 def _shared(job: TransportJob) -> tuple[object, ...] | None:
-    """What jobs of one batch have in common; None for a job that is worked out alone."""
+    """Return a key of all that jobs of one batch have in common; None for a job that is computed alone."""
     if job.brdf is not None or job.more_bounces:
         return None
     relay, field = job.relay, job.field
-    feet = job.foot_m, job.length_m, job.beam_weight
+    feet = job.laser_spot_m, job.length_m, job.beam_weight
     columns = [column.tobytes() for column in (*feet, relay.x_m, relay.y_m, relay.length_m, job.relay_weight)]
     numbers = job.edge_m, job.near_m, job.soft_wall_m2, job.lambertian, job.bin_m, job.accuracy
     return *columns, *numbers, field.depth_m.shape, field.pitch_x_m, field.pitch_y_m
@@ -301,52 +304,54 @@ class _Batch:
         job = self.job = jobs[0]
         self.jobs, self.device, self.chunk = jobs, device, chunk_for(device)
         fields, self.sites = lay_out(jobs, device) if any(j.field.shades for j in jobs) else (None, None)
-        self.surface = Surface.of(jobs, device)
+        self.surface = TorchSurface.of(jobs, device)
         relay = job.relay
-        self.relay = Wall.of(relay.x_m, relay.y_m, relay.length_m, job.relay_weight, device=device)
+        self.relay = TorchPoints.of(relay.x_m, relay.y_m, relay.length_m, job.relay_weight, device=device)
         near = min(one.patches.point_m[:, 2].min() for one in jobs) < job.near_m
-        self.optics = Optics(
+        self.optics = TorchOptics(
             job.edge_m, bool(near), job.near_m**2, job.soft_wall_m2, job.lambertian, fields, self.chunk
         )
         self.per_bin, self.width = job.accuracy.sub_bins, max(map(table_width, jobs))
         self.per_m = self.per_bin / job.bin_m
 
     def histograms(self) -> list[Float32]:
-        """Of each job, (n, bins)."""
+        """Return the histograms (n, bins) of each job."""
         job = self.job
         if job.brdf is None:
-            found = self._sums(*self._tables(None), self._feet(np.ones(len(job.foot_m))))
+            found = self._sums(*self._tables(None), self._feet(np.ones(len(job.laser_spot_m))))
             return [histogram.cpu().numpy() for histogram in found]
-        total = torch.zeros((len(job.foot_m), job.bins), device=self.device)
+        total = torch.zeros((len(job.laser_spot_m), job.bins), device=self.device)
         for foot, share in nodes(job, job.brdf):
             lit = torch.as_tensor(np.flatnonzero(share), device=self.device)
             total[lit] += self._sums(*self._tables(foot), self._feet(share))[0]
         return [total.cpu().numpy()]
 
-    def _feet(self, share: Float64) -> Wall:
-        """The feet of beams that are taken to some share (n,)."""
+    def _feet(self, share: Float64) -> TorchPoints:
+        """Return the laser spots of the beams with a weight (n,) above 0."""
         job, lit = self.job, np.flatnonzero(share)
         weight = job.beam_weight[lit] * share[lit]
-        return Wall.of(job.foot_m[lit, 0], job.foot_m[lit, 1], job.length_m[lit], weight, device=self.device)
+        return TorchPoints.of(
+            job.laser_spot_m[lit, 0], job.laser_spot_m[lit, 1], job.length_m[lit], weight, device=self.device
+        )
 
-    def _parts(self, points: int) -> Iterator[tuple[Surface, Sites | None]]:
-        """Patches, as many at a time as their legs to so many points may be."""
+    def _parts(self, points: int) -> Iterator[tuple[TorchSurface, TorchSites | None]]:
+        """Yield the patches in parts whose legs to a number of points fit in a chunk."""
         count = max(self.chunk // points, 1)
         for start in range(0, len(self.surface.x_m), count):
             ends = start, start + count
             yield self.surface.part(*ends), self.sites.part(*ends) if self.sites else None
 
     def _tables(self, foot: Float64 | None) -> tuple[Tensor, Tensor]:
-        """The bins (n, 1) at which tables start, and the tables (n, per_bin, width): for light from a foot, or any."""
+        """Return first bins (n, 1) and tables (n, per_bin, width), for light from one spot or, for None, from any."""
         counts = [self._counts(*part, foot) for part in self._parts(len(self.relay.x_m))]
         first, fine = (torch.cat(parts) for parts in zip(*counts, strict=True))
         if self.job.more_bounces:
-            more = with_inter_reflection(self.job, first[:, 0].cpu().numpy(), fine.cpu().numpy())
+            more = add_interreflection(self.job, first[:, 0].cpu().numpy(), fine.cpu().numpy())
             fine = torch.as_tensor(more, device=self.device)
         return first, tables(fine, self.per_bin)
 
-    def _counts(self, surface: Surface, sites: Sites | None, foot: Float64 | None) -> tuple[Tensor, Tensor]:
-        """The first bin (n, 1) of some patches, and B over d3 + d4 in sub-bins from there on."""
+    def _counts(self, surface: TorchSurface, sites: TorchSites | None, foot: Float64 | None) -> tuple[Tensor, Tensor]:
+        """Return the first bin (n, 1) of some patches, and B over d3 + d4 in sub-bins from there on."""
         weight, length = legs(surface, sites, self.relay, self.optics, outgoing=True)
         if foot is not None and self.job.brdf is not None:
             weight *= scattered(self.job.brdf, foot, surface, self.relay)
@@ -354,8 +359,8 @@ class _Batch:
         first = at.amin(1, keepdim=True).int() // self.per_bin
         return first, counted((at - first * self.per_bin).long(), weight, self.width * self.per_bin)
 
-    def _sums(self, first: Tensor, table: Tensor, feet: Wall) -> list[Tensor]:
-        """Histograms (n, bins) of each job: its patches' tables, times A, shifted by d1 + d2."""
+    def _sums(self, first: Tensor, table: Tensor, feet: TorchPoints) -> list[Tensor]:
+        """Return histograms (n, bins) of each job: the sum of its patches' tables, times A, shifted by d1 + d2."""
         found = [torch.zeros((len(feet.x_m), job.bins), device=self.device) for job in self.jobs]
         sizes = [len(job.patches.beta) for job in self.jobs]
         count = max(self.chunk // len(first), 1)
@@ -371,9 +376,9 @@ class _Batch:
 
 
 def counted(at: Tensor, weight: Tensor, size: int) -> Tensor:
-    """Histograms (n, size) of weights (n, m) that fall into cells `at` (n, m).
+    """Return histograms (n, size) of weights (n, m) that fall into cells `at` (n, m).
 
-    In whole steps: integers add up to the same in whatever order a GPU's threads come.
+    Weights are rounded to whole steps: integers add up to the same in any order of a GPU's threads.
     """
     step = weight.amax(1, keepdim=True).double().clamp_(min=1e-300) / WHOLE_STEPS
     total = torch.zeros((len(at), size), dtype=torch.int64, device=at.device)
@@ -381,16 +386,17 @@ def counted(at: Tensor, weight: Tensor, size: int) -> Tensor:
 
 
 def tables(fine: Tensor, per_bin: int) -> Tensor:
-    """Histograms (n, width * per_bin) in sub-bins as sums to bins (n, per_bin, width), one for each shift."""
+    """Return histograms in sub-bins (n, width * per_bin) as sums to bins (n, per_bin, width), one for each shift."""
+    # A moving sum of per_bin sub-bins with stride 1 has every bin of every shift: shift k takes those ending at k less.
     sums = avg_pool1d(pad(fine, (per_bin - 1, 0))[:, None], per_bin, 1)[:, 0] * per_bin
     return sums.unflatten(1, (-1, per_bin)).flip(2).transpose(1, 2)
 
 
 def shifted_sum(table: Tensor, shift: Tensor, at: Tensor, weight: Tensor, bins: int) -> Tensor:
-    """Histograms (m, bins): of each patch a row of its table (n, per_bin, width), at a bin and to a weight (n, m).
+    """Return histograms (m, bins): each beam sums a row of every patch's table (n, per_bin, width), at a bin, weighted.
 
-    Each row stands behind as many zeros as a patch may be late. So what it adds to a beam's histogram, from the bin of
-    the earliest patch on, is a window of the rows as they lie.
+    Zeros in front of each row, one for every bin that a patch may be late. So the contribution of a row to a beam's
+    histogram, counted from the bin of the earliest patch, is a window of the rows in memory: no copy is needed.
     """
     earliest = at.amin(0)
     late = at - earliest
@@ -406,9 +412,9 @@ def shifted_sum(table: Tensor, shift: Tensor, at: Tensor, weight: Tensor, bins: 
 
 
 def window_sums(windows: Tensor, start: Tensor, weight: Tensor) -> Tensor:
-    """Weighted sums (m, span) of windows (k, span): for each of m its own n, `start` (m, n) and `weight` (m, n).
+    """Return weighted sums (m, span) of windows (k, span): for each of m its own n, `start` (m, n) and `weight` (m, n).
 
-    A GPU reads windows where they lie, each sum by one thread; that kernel's sibling on the CPU would copy all of them.
+    On a GPU one thread makes each sum and reads the windows in place; on the CPU that kernel would copy them all.
     """
     if windows.is_cuda:
         return embedding_bag(start, windows, per_sample_weights=weight, mode="sum")

@@ -1,4 +1,9 @@
-"""A BRDF on the legs of one beam's foot: the factor that couples the way to a patch with the way from it."""
+"""Tables of a BRDF for beams: the factor that couples the leg to a patch with the leg from it.
+
+A BRDF depends on both directions, so S2 no longer factorizes at the patch. But for one laser spot the incoming
+direction at each patch is fixed, and the patches' tables can hold the factor. Tables are made for a grid of spots
+(nodes), and each beam takes those around it with bilinear weights.
+"""
 
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -12,17 +17,17 @@ from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Brdf
 
 PROBES = 4096
-"""Legs on which an interpolation is tried."""
+"""Legs on which the interpolation is checked."""
 MAX_NODES = 64
-"""Along each axis."""
+"""Limit along each axis."""
 Scattering = Callable[[Float64, Float64, Float64, Float64, Float64], Float64]
 
 
 @lru_cache(maxsize=8)
 def scattering(brdf: Brdf) -> Scattering:
-    """The compiled factor of a BRDF: (foot (3,), points (n, 3), normals (n, 3), x (m,), y (m,)) -> (n, m).
+    """Return the compiled factor of a BRDF: (spot (3,), points (n, 3), normals (n, 3), x (m,), y (m,)) -> (n, m).
 
-    Compiled once a process and a BRDF, which takes some seconds.
+    Compiled once per process and BRDF, which takes some seconds.
     """
     compiled: Any = numba.njit(brdf)
 
@@ -46,7 +51,7 @@ def scattering(brdf: Brdf) -> Scattering:
 
 
 def scattered(brdf: Brdf, foot: Float64, point: Float64, normal: Float64, out: Float64) -> Float64:
-    """The same factor (n,) leg by leg: feet, points, normals and wall points (n, 3), for a look without compiling."""
+    """Return the same factor (n,) leg by leg: spots, points, normals and wall points (n, 3), without compiling."""
     to_foot, to_wall = foot - point, out - point
     to_foot /= np.maximum(np.linalg.norm(to_foot, axis=1, keepdims=True), 1e-12)
     to_wall /= np.maximum(np.linalg.norm(to_wall, axis=1, keepdims=True), 1e-12)
@@ -55,12 +60,12 @@ def scattered(brdf: Brdf, foot: Float64, point: Float64, normal: Float64, out: F
 
 
 def nodes(job: TransportJob, brdf: Brdf) -> Iterator[tuple[Float64, Float64]]:
-    """Feet (3,) that stand for those around them, and to what share (n,) each beam is one's: linear in between.
+    """Yield spots (3,) of a grid with their bilinear weights (n,) for each beam.
 
-    Their columns and rows are quantiles of the feet's own, so that they are dense where the beams are.
+    Columns and rows of the grid are quantiles of the map's own spots, so that nodes are dense where beams are.
     """
-    lines = _lines(job.map_foot_m, node_count(job, brdf))
-    hats = [_hats(job.foot_m[:, axis], line) for axis, line in enumerate(lines)]
+    lines = _lines(job.map_spots_m, node_count(job, brdf))
+    hats = [_hats(job.laser_spot_m[:, axis], line) for axis, line in enumerate(lines)]
     for i, x in enumerate(lines[0]):
         for j, y in enumerate(lines[1]):
             share = hats[0][i] * hats[1][j]
@@ -68,21 +73,23 @@ def nodes(job: TransportJob, brdf: Brdf) -> Iterator[tuple[Float64, Float64]]:
                 yield np.array([x, y, 0.0]), share
 
 
-def _lines(foot_m: Float64, count: int) -> list[Float64]:
-    return [np.unique(np.quantile(foot_m[:, axis], np.linspace(0, 1, count))) for axis in (0, 1)]
+def _lines(laser_spot_m: Float64, count: int) -> list[Float64]:
+    return [np.unique(np.quantile(laser_spot_m[:, axis], np.linspace(0, 1, count))) for axis in (0, 1)]
 
 
 def node_count(job: TransportJob, brdf: Brdf) -> int:
-    """As many nodes along each axis as keep the interpolation, tried on some legs, within the accuracy's error."""
+    """Return the nodes along each axis that keep the interpolation within the accuracy's error, on sample legs."""
     generator, patches, relay = np.random.default_rng(0), job.patches, job.relay
     s, q = generator.integers(len(patches.beta), size=PROBES), generator.integers(len(relay.x_m), size=PROBES)
     out = np.stack([relay.x_m[q], relay.y_m[q], np.zeros(PROBES)], 1)
-    foot = job.map_foot_m[generator.integers(len(job.map_foot_m), size=PROBES)]
+    foot = job.map_spots_m[generator.integers(len(job.map_spots_m), size=PROBES)]
     exact, count = scattered(brdf, foot, patches.point_m[s], patches.normal[s], out), 4
-    # legs to the dark side carry nothing, and are cut off where their weight is told
+    # Legs to the dark side of a patch carry no light: the backends set their weight to 0, so their error does not
+    # count.
     lit = np.all([((end - patches.point_m[s]) * patches.normal[s]).sum(1) > 0 for end in (foot, out)], axis=0)
+    # Bilinear interpolation is of second order: doubling the nodes divides the error of a smooth BRDF by about four.
     while count < MAX_NODES:
-        corners = [_bracket(foot[:, axis], line) for axis, line in enumerate(_lines(job.map_foot_m, count))]
+        corners = [_bracket(foot[:, axis], line) for axis, line in enumerate(_lines(job.map_spots_m, count))]
         guess = np.zeros(PROBES)
         for i in (0, 1):
             for j in (0, 1):
@@ -96,12 +103,12 @@ def node_count(job: TransportJob, brdf: Brdf) -> int:
 
 
 def _bracket(at: Float64, line: Float64) -> tuple[Float64, Float64, Float64]:
-    """The points of a line before and after, and how far in between (0 to 1)."""
+    """Return the points of a line before and after, and the position in between (0 to 1)."""
     before = np.clip(np.searchsorted(line, at, "right") - 1, 0, max(len(line) - 2, 0))
     low, high = line[before], line[np.minimum(before + 1, len(line) - 1)]
     return low, high, np.divide(at - low, high - low, out=np.zeros_like(at), where=high > low)
 
 
 def _hats(at: Float64, line: Float64) -> Float64:
-    """Linear interpolation between the points of a line as weights (len(line), len(at))."""
+    """Return linear interpolation between the points of a line as weights (len(line), len(at))."""
     return np.stack([np.interp(at, line, one) for one in np.eye(len(line))])

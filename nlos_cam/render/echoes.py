@@ -1,4 +1,4 @@
-"""The last step: of all that comes back along a beam, the strongest echo (S5)."""
+"""Echoes: of all light that comes back along a beam, the strongest bin (S5), after the pulse has spread it."""
 
 from dataclasses import dataclass
 
@@ -14,31 +14,31 @@ SIGMAS_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 
 @dataclass(frozen=True)
 class MultiBounce:
-    """The strongest and second strongest bins of each beam: of three bounces, or of the whole waveform."""
+    """Strongest and second strongest bins of each beam: of three bounces, or of the whole waveform."""
 
     peak: Float32
-    """(rows, columns); 0 where no path comes back."""
+    """(rows, columns); 0 if no path comes back."""
     runner_up: Float32
     """(rows, columns)."""
     path_m: Float32
-    """(rows, columns); path length at the strongest bin's centre, NaN where there is none."""
+    """(rows, columns); path length at the center of the strongest bin, NaN if there is none."""
     direct_included: bool = False
-    """Whether the direct return is in the waveform already: a pulse of some width mixes it with the rest."""
+    """True if the waveform contains the direct return: a pulse with a width mixes it with the rest."""
 
-    def of(self, shape: tuple[int, int]) -> "MultiBounce":
-        """The same in the shape of an image."""
+    def reshape(self, shape: tuple[int, int]) -> "MultiBounce":
+        """Return the echoes in the shape of an image."""
         maps = self.peak.reshape(shape), self.runner_up.reshape(shape), self.path_m.reshape(shape)
         return MultiBounce(*maps, self.direct_included)
 
     def spread_over(self, which: NDArray[np.bool_]) -> "MultiBounce":
-        """Those (k,) of some beams (n,) as (n,), with nothing for the others."""
-        every = nothing(len(which))
+        """Return the echoes (k,) of the beams in a mask as (n,), with no echo for the others."""
+        every = no_echoes(len(which))
         every.peak[which], every.runner_up[which], every.path_m[which] = self.peak, self.runner_up, self.path_m
         return every
 
 
-def nothing(count: int) -> MultiBounce:
-    """The echoes (n,) of beams that light no wall, or find nothing hidden."""
+def no_echoes(count: int) -> MultiBounce:
+    """Return the echoes (n,) of beams that light no wall, or find nothing hidden."""
     dark = np.zeros((2, count), np.float32)
     return MultiBounce(dark[0], dark[1], np.full(count, np.nan, np.float32))
 
@@ -60,14 +60,14 @@ def _two_strongest(histogram: NDArray[np.floating]) -> tuple[NDArray[np.int64], 
 
 
 def strongest(histogram: NDArray[np.floating], bin_m: float) -> MultiBounce:
-    """The strongest and second strongest bins of histograms (n, bins); ties go to the shortest path."""
+    """Return the strongest and second strongest bins of histograms (n, bins); ties go to the shortest path."""
     winner, peak, second = _two_strongest(histogram)
     path = np.where(peak > 0, (winner + 0.5) * bin_m, np.nan).astype(np.float32)
     return MultiBounce(peak, second, path)
 
 
 def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32]:
-    """S5: depth, intensity and margin (rows, columns) of the strongest echoes; a tie goes to the direct return."""
+    """Return depth, intensity and margin (rows, columns) of the strongest echoes (S5); ties go to the direct return."""
     direct, peak = beams.direct.astype(np.float32).reshape(beams.shape), multi.peak
     if multi.direct_included:
         direct = np.zeros_like(direct)
@@ -81,7 +81,7 @@ def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32
 
 
 def add_direct(histogram: Float32, beams: Beams, bin_m: float) -> Float32:
-    """Histograms (n, bins) with each beam's direct return in the bin of its own path, longer where that needs it."""
+    """Return histograms (n, bins) with each beam's direct return in the bin of its path; more bins if it needs them."""
     returns = np.flatnonzero(beams.direct > 0)
     at = np.floor(2 * beams.length_m[returns] / bin_m).astype(np.int64)
     longer = max(int(at.max(initial=-1)) + 1 - histogram.shape[1], 0)
@@ -91,12 +91,13 @@ def add_direct(histogram: Float32, beams: Beams, bin_m: float) -> Float32:
 
 
 def pulse_bins(pulse_ns: float, bin_m: float) -> float:
-    """Standard deviation, in bins of path length, of a Gaussian pulse of that full width at half height."""
+    """Return the standard deviation, in path-length bins, of a Gaussian pulse with that full width at half maximum."""
+    # A Gaussian is at half its maximum where x^2 = 2 ln(2) sigma^2, so FWHM = sqrt(8 ln 2) sigma.
     return pulse_ns * 1e-9 * SPEED_OF_LIGHT_M_PER_S * SIGMAS_PER_FWHM / bin_m
 
 
-def spread(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
-    """Histograms (n, bins) as a pulse of that width makes them; longer by its tail, none of the light is lost."""
+def with_pulse(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
+    """Return histograms (n, bins) convolved with the pulse; longer by its tail, so that no light is lost."""
     if pulse_ns == 0:
         return histogram
     kernel = _pulse(pulse_ns, bin_m)
@@ -108,12 +109,12 @@ def spread(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
 
 
 def peak_share(pulse_ns: float, bin_m: float) -> float:
-    """What the strongest bin holds of a return that came alone."""
+    """Return the share of a lone return's light that its strongest bin holds."""
     return float(_pulse(pulse_ns, bin_m).max()) if pulse_ns else 1.0
 
 
 def _pulse(pulse_ns: float, bin_m: float) -> Float64:
-    """The pulse over the bins around its middle, in all 1."""
+    """Return the pulse over the bins around its middle, normalized to 1: differences of the normal distribution."""
     sigma = pulse_bins(pulse_ns, bin_m)
     half = int(np.ceil(4 * sigma)) + 1
     edges = np.arange(-half, half + 2) - 0.5

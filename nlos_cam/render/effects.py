@@ -1,4 +1,4 @@
-"""Which effects a scene calls for: pure verdicts, gathered into a plan that the renderer reads."""
+"""Effects of light transport: verdicts with bounds, gathered into a plan that the renderer follows."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -21,35 +21,36 @@ EFFECTS = (
 """In the order in which light meets them."""
 
 Effects = Literal["auto"] | Collection[str]
-"""What a scene calls for, or exactly these by name."""
+""""auto" for those that a scene calls for, or exactly these by name."""
 
 
 @dataclass(frozen=True)
 class Effect:
-    """A verdict on one effect."""
+    """Verdict on one effect."""
 
     name: str
     included: bool
     reason: str
     bound: float
-    """At most this much of the transient (relative L1) changes without the effect; 1 is all of it or more."""
+    """Largest change of the transient (relative L1) without the effect; 1 is all of it or more."""
 
 
 Plan = tuple[Effect, ...]
 
 
 def included(verdicts: Plan, name: str) -> bool:
-    """Whether a plan includes an effect."""
+    """Return whether a plan includes an effect."""
     return next(effect.included for effect in verdicts if effect.name == name)
 
 
 def decide(findings: Collection[tuple[str, float, str]], tolerance: float, effects: Effects = "auto") -> Plan:
-    """A plan from findings (name, bound, reason): the omitted bounds sum to at most the tolerance, the smallest first.
+    """Return a plan from findings (name, bound, reason): omitted bounds sum to at most the tolerance, smallest first.
 
-    `effects` names exactly what to include instead. Raises SceneError where it names none of ours.
+    `effects` names exactly those to include instead. Raises SceneError for an unknown name.
     """
     if effects != "auto":
         return _asked(findings, effects)
+    # Changes add up at most (triangle inequality of L1); taking the smallest bounds first leaves out the most effects.
     spent, left_out = 0.0, set[str]()
     for name, bound, _ in sorted(findings, key=lambda finding: finding[1]):
         spent += bound
@@ -62,8 +63,8 @@ def decide(findings: Collection[tuple[str, float, str]], tolerance: float, effec
 def _asked(findings: Collection[tuple[str, float, str]], effects: Collection[str]) -> Plan:
     names = {effects} if isinstance(effects, str) else set(effects)
     if unknown := names - set(EFFECTS):
-        raise SceneError(f"no effect {min(unknown)!r}: choose of {', '.join(EFFECTS)}, or auto")
+        raise SceneError(f"no effect {min(unknown)!r}: choose from {', '.join(EFFECTS)}, or auto")
     verdicts = (Effect(name, name in names, reason, bound) for name, bound, reason in findings)
     return tuple(
-        replace(e, reason=f"{'asked for' if e.included else 'left out as asked'}; {e.reason}") for e in verdicts
+        replace(e, reason=f"{'requested' if e.included else 'left out on request'}; {e.reason}") for e in verdicts
     )

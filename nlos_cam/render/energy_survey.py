@@ -1,6 +1,8 @@
-"""How much light goes which way, told from a coarse look: some beams, some relay cells, every patch.
+"""Coarse survey of the light over each patch, from some beams and some relay cells.
 
-The verdicts on effects need to know what leaving one out would change, for a small part of what rendering costs.
+The plan's verdicts need the change that leaving an effect out would make, for a small part of the cost of rendering. S2
+factorizes at the patch: the energy over patch s is (sum over beams of A) x (sum over relay cells of B). So both sums,
+with and without an effect, bound the change of the whole.
 """
 
 from dataclasses import dataclass
@@ -18,62 +20,67 @@ from nlos_cam.render.visibility import BIAS_CELLS, HeightField, occluded
 
 SAMPLE_BEAMS, SAMPLE_CELLS = 160, 96
 CAUTION = 1.5
-"""What is told from a coarse look is taken this much larger before it is called a bound."""
+"""Factor on every surveyed change before it is used as a bound."""
 
 
 @dataclass(frozen=True)
 class EnergySurvey:
-    """For each patch (n,): the light that reaches it from the beams, and that which the lidar gets of what it gives."""
+    """Light per patch (n,): incident from the beams, and the share of it returned to the lidar over the relay wall."""
 
-    taken: Float64
-    given: Float64
-    taken_tilt: Float64
-    """How much of it changes, beam by beam, where the patch is taken to face the wall squarely."""
-    given_tilt: Float64
-    taken_cut: Float64
-    """How much more it would be without the occluder."""
-    given_cut: Float64
+    incident: Float64
+    returned: Float64
+    incident_tilt: Float64
+    """Change of incident light, summed beam by beam, if the patch faces the wall squarely."""
+    returned_tilt: Float64
+    incident_cut: Float64
+    """Light that the occluder keeps from the patch."""
+    returned_cut: Float64
     uneven: float
-    """How many times as much a BRDF may make one patch give as another."""
+    """Largest ratio of light between two patches that a BRDF may cause."""
 
     @property
     def energy(self) -> Float64:
-        """(n,); of three bounces over each patch."""
-        return self.taken * self.given
+        """(n,); energy of three bounces over each patch."""
+        return self.incident * self.returned
 
     def share(self, change: Float64) -> float:
-        """A change of each patch's energy (n,) as a bound on the relative change of the whole, 1 being all or more."""
+        """Return a bound on the relative change of the whole, at most 1, for a change of each patch's energy (n,)."""
         whole, part = float(self.energy.sum()), CAUTION * self.uneven * float(change.sum())
         return min(part / whole, 1.0) if whole > 0 else float(part > 0)
 
     @property
     def tilt(self) -> float:
-        """What leaving tilt out changes at most."""
-        return self.share(self.taken_tilt * (self.given + self.given_tilt) + self.taken * self.given_tilt)
+        """Bound on the change if tilt is left out."""
+        return self.share(
+            # (A + a)(B + b) - A B = a (B + b) + A b, with |a| and |b| the sums of changes leg by leg.
+            self.incident_tilt * (self.returned + self.returned_tilt) + self.incident * self.returned_tilt
+        )
 
     @property
     def occluder(self) -> float:
-        """What leaving the occluder out changes at most."""
-        return self.share((self.taken + self.taken_cut) * (self.given + self.given_cut) - self.energy)
+        """Bound on the change if the occluder is left out."""
+        return self.share((self.incident + self.incident_cut) * (self.returned + self.returned_cut) - self.energy)
 
 
 def survey(job: TransportJob, uneven: float) -> EnergySurvey:
-    """Look at some beams of a job, and some cells of its relay, which is whole: none cut off by the occluder.
+    """Return the survey of a job whose relay is whole: no cells removed behind the occluder.
 
-    `uneven` is how many times as much a BRDF may make one patch give as another.
+    `uneven` is the largest ratio of light between two patches that a BRDF may cause.
     """
     patches, relay = job.patches, job.relay
-    lit = slice(None, None, max(len(job.foot_m) // SAMPLE_BEAMS, 1))
+    lit = slice(None, None, max(len(job.laser_spot_m) // SAMPLE_BEAMS, 1))
     some = slice(None, None, max(len(relay.x_m) // SAMPLE_CELLS, 1))
     shape, start = (patches.point_m, patches.normal, patches.beta), job.beam_weight[lit]
-    feet = job.foot_m[lit, 0], job.foot_m[lit, 1], start, np.zeros(len(start), np.bool_)
+    feet = job.laser_spot_m[lit, 0], job.laser_spot_m[lit, 1], start, np.zeros(len(start), np.bool_)
     hidden = relay.behind(job.edge_m, job.lidar_m)[some]
     cells = relay.x_m[some], relay.y_m[some], job.relay_weight[some], hidden
     soft_wall = np.full_like(patches.beta, job.soft_wall_m2)
-    taken = _sums(*shape, *feet, job.soft_patch_m2, job.near_m, *job.edge_m, job.lambertian, False)
-    given = _sums(*shape, *cells, soft_wall, job.near_m, *job.edge_m, job.lambertian, True)
+    incident = _sums(*shape, *feet, job.soft_patch_m2, job.near_m, *job.edge_m, job.lambertian, False)
+    returned = _sums(*shape, *cells, soft_wall, job.near_m, *job.edge_m, job.lambertian, True)
     scale = job.strength / len(start)
-    return EnergySurvey(taken[0] * scale, given[0], taken[1] * scale, given[1], taken[2] * scale, given[2], uneven)
+    return EnergySurvey(
+        incident[0] * scale, returned[0], incident[1] * scale, returned[1], incident[2] * scale, returned[2], uneven
+    )
 
 
 @numba.njit(cache=True, parallel=True)
@@ -92,7 +99,7 @@ def _sums(
     lambertian: bool,
     outgoing: bool,
 ) -> Float64:
-    """Sums (3, n) over points of the wall: the light, what tilt changes of it, what the occluder cuts off."""
+    """Return sums (3, n) over points of the wall: light, its change by tilt, and light that the occluder cuts off."""
     sums = np.zeros((3, len(points)))
     for s in numba.prange(len(points)):
         point, normal = points[s], normals[s]
@@ -102,7 +109,9 @@ def _sums(
             length = max(np.sqrt(squared), 1e-12)  # where the object touches the wall
             at_wall = z / length
             tilted = max(normal[0] * dx + normal[1] * dy - normal[2] * z, 0.0) / length
-            # from the lidar a patch takes by its cosine and area, towards it gives (paper) whatever its cosine
+            # Incident light goes with the patch's cosine and area; returned light goes with it in Lambertian
+            # radiometry, and in the paper's only with the side that is lit. A level patch has cos = z / d and area /
+            # beta.
             bent = (tilted if lambertian else (1.0 if tilted > 0 else 0.0)) if outgoing else tilted
             level = (at_wall if lambertian else (1.0 if at_wall > 0 else 0.0)) if outgoing else at_wall / beta[s]
             if outgoing or lambertian:
@@ -117,14 +126,15 @@ def _sums(
 
 
 def occluder_meets(edge_m: tuple[float, float], patches: Patches, beams: Beams, relay: Relay) -> bool:
-    """Whether the occluder may cut any leg between wall and patches or wall and lidar; never wrongly no."""
+    """Return whether the occluder may cut any leg between wall and patches or wall and lidar; never wrongly False."""
     if edge_m == NO_OCCLUDER:
         return False
     if relay.behind(edge_m, beams.lidar_m).any():
         return True
-    feet = beams.foot_m[beams.on_wall, 0]
+    feet = beams.laser_spot_m[beams.on_wall, 0]
     x, z = patches.point_m[:, 0], patches.point_m[:, 2]
-    # inter-reflection goes over the wall about the object too
+    # Wall points range from `least` to `most`, interreflection around the object included. The leg to the farthest of
+    # them is the highest where it crosses the edge: z (edge - end) / (x - end) by similar triangles.
     least = min(relay.x_m.min(), feet.min(initial=np.inf), x.min() - AROUND_M)
     most = max(relay.x_m.max(), feet.max(initial=-np.inf), x.max() + AROUND_M)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -134,9 +144,9 @@ def occluder_meets(edge_m: tuple[float, float], patches: Patches, beams: Beams, 
 
 
 def shaded(patches: Patches, field: HeightField) -> NDArray[np.bool_]:
-    """Which patches (n,) have another rise above their tangent plane: the rest of the surface is its lower convex hull.
+    """Return a mask (n,) of the patches with another above their tangent plane: those off the lower convex hull.
 
-    Only such a patch can be shaded: what stays below the tangent plane cannot cut a leg to the lit side.
+    Only such a patch can be shaded: a surface below the tangent plane cannot cut a leg to the lit side.
     """
     point, slope = patches.point_m.astype(np.float32), patches.slope.astype(np.float32)
     bias = np.float32(BIAS_CELLS * max(field.pitch_x_m, field.pitch_y_m))
@@ -155,6 +165,8 @@ def _rises_above(
 ) -> NDArray[np.bool_]:
     result = np.zeros(len(x), np.bool_)
     for s in numba.prange(len(x)):
+        # Patch t is above the tangent plane of s if z_t - g . (x_t - x_s) < z_s - bias, as smaller z is nearer to the
+        # wall.
         lowest = np.float32(1e9)
         for t in range(len(x)):
             height = z[t] - slope_x[s] * x[t] - slope_y[s] * y[t]

@@ -1,9 +1,4 @@
-"""The first leg: where each beam of the lidar lands, and what returns straight from there (S1).
-
-Near contact: 1 / d^2 from the middle of a cell is its average only from afar.
-
-The third bounce: the relay wall as a grid of cells, and the leg from each back to the lidar.
-"""
+"""Geometry of the first and last leg: laser spots and direct returns (S1), near contact, cells of the relay wall."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -17,31 +12,34 @@ from numpy.typing import NDArray
 
 NEAR_DIAGONALS = 4
 """Near contact begins at this many diagonals of the larger cell."""
-MANY = 1.2
-"""Neighbours take their share too: without this a plane of square cells takes 7 % more than was sent. It suffices for
-cells up to twice as long as wide."""
+NEIGHBOR_GAIN = 1.2
+"""Factor on the near-contact term, as neighbors receive too: at 1 a plane of square cells receives 7 % more than was
+sent. Sufficient for cells up to twice as long as wide.
+"""
 Area = TypeVar("Area", Float64, float)
 
 
 def solid_angle(*, lambertian: bool) -> float:
-    """What each bounce spreads its light over: pi with the cosine of the rendering equation, 2 pi without (S1, S2)."""
+    """Return the solid angle over which a bounce spreads light: pi with the rendering equation's cosine, else 2 pi."""
     return np.pi if lambertian else 2 * np.pi
 
 
 def contact_m2(area_m2: Area, solid_angle: float) -> Area:
-    """What near contact adds to d^2 at one cell of many: with it, a plane of cells takes no more than was sent."""
-    return MANY * area_m2 / solid_angle
+    """Return the near-contact term added to d^2 at a cell: with it, a plane of cells receives no more than was sent."""
+    return NEIGHBOR_GAIN * area_m2 / solid_angle
 
 
 @numba.vectorize([numba.float64(numba.float64, numba.float64, numba.float64)], cache=True)
 def softened(squared_m2: Any, soft_m2: Any, near_m: Any) -> Any:
-    """d^2 that stays finite at contact: plus the receiving area over the solid angle, fading out towards `near_m`.
+    """Return d^2 limited at contact: plus the receiving area over the solid angle, fading out towards `near_m`.
 
-    On the axis of a disc of area a the average of 1 / d^2 is 1 / (d^2 + a / pi), by which it never takes more than
-    was sent. Beyond a few diagonals the two agree, and S1 and S2 hold to the letter. For arrays, and in compiled loops.
+    1 / d^2 from the middle of a cell is the average over the cell only from afar. On the axis of a disc of area a the
+    average of 1 / d^2 is 1 / (d^2 + a / pi), so the disc never receives more than was sent. Beyond a few diagonals the
+    two agree, and S1 and S2 hold exactly. Works on arrays and in compiled loops.
     """
     if squared_m2 >= near_m * near_m:
         return squared_m2
+    # The squared ramp goes to 0 with slope 0 at near_m: no step in light or in its derivative there.
     ramp = 1 - squared_m2 / (near_m * near_m)
     return squared_m2 + soft_m2 * ramp * ramp
 
@@ -51,27 +49,27 @@ SPEED_OF_LIGHT_M_PER_S = 299_792_458.0
 
 @dataclass(frozen=True)
 class Beams:
-    """Beams in the order of the image, flattened; lengths are NaN where a beam meets nothing."""
+    """Beams in the order of the image, flattened; lengths are NaN for beams that meet nothing."""
 
     shape: tuple[int, int]
-    foot_m: Float64
-    """(n, 3); where the beam lands, in the wall frame."""
+    laser_spot_m: Float64
+    """(n, 3); point where the beam lands, in the wall frame."""
     direction: Float64
     """(n, 3); unit, in the wall frame."""
     length_m: Float64
     """(n,); d1."""
     cos_incidence: Float64
-    """(n,); to the normal of what it meets."""
+    """(n,); to the normal of the surface it meets."""
     cos_axis: Float64
-    """(n,); beam to optical axis: S5 turns range into depth by it."""
+    """(n,); beam to optical axis: S5 converts range to depth with it."""
     on_wall: Mask
-    """(n,); the beam lights the wall, and so may reach the hidden object."""
+    """(n,); True for beams that light the wall and so may reach the hidden object."""
     direct: Float64
-    """(n,); I_direct, 0 where nothing returns inside the gate."""
+    """(n,); I_direct, 0 if nothing returns inside the gate."""
     lidar_m: Float64
     """(3,)."""
 
-    def met(
+    def with_hits(
         self,
         rig: Rig,
         which: NDArray[np.int64],
@@ -80,29 +78,31 @@ class Beams:
         albedo: Float64,
         solid_angle: float,
     ) -> "Beams":
-        """The same where some beams meet something on their way, at a length and a cosine (k,), and return from it."""
-        foot, length, incidence = self.foot_m.copy(), self.length_m.copy(), self.cos_incidence.copy()
+        """Return the beams with some stopped on their way, at a length and a cosine (k,), and returning from there."""
+        foot, length, incidence = self.laser_spot_m.copy(), self.length_m.copy(), self.cos_incidence.copy()
         on_wall, direct = self.on_wall.copy(), self.direct.copy()
         foot[which] = self.lidar_m + length_m[:, None] * self.direction[which]
         length[which], incidence[which], on_wall[which] = length_m, cosine, False
         direct[which] = albedo * returned(rig, length_m, cosine, solid_angle)
-        return replace(self, foot_m=foot, length_m=length, cos_incidence=incidence, on_wall=on_wall, direct=direct)
+        return replace(
+            self, laser_spot_m=foot, length_m=length, cos_incidence=incidence, on_wall=on_wall, direct=direct
+        )
 
-    def of_rows(self, start: int, end: int) -> "Beams":
-        """Those of some rows of the image."""
+    def rows(self, start: int, end: int) -> "Beams":
+        """Return the beams of the rows [start, end) of the image."""
         kept, columns = slice(start * self.shape[1], end * self.shape[1]), vars(self)
         parts = {name: columns[name][kept] for name in columns if name not in {"shape", "lidar_m"}}
         return Beams(shape=(end - start, self.shape[1]), lidar_m=self.lidar_m, **parts)
 
     def without_direct(self) -> "Beams":
-        """The same where nothing returns straight."""
+        """Return the beams without direct returns."""
         return replace(self, direct=np.zeros_like(self.direct))
 
 
 def cast(rig: Rig, intrinsics: Intrinsics, *, lambertian: bool = False, occluder: bool = True) -> Beams:
-    """One beam per pixel of the intrinsics: on to the occluder if that is nearer, else the wall, else nothing.
+    """Return one beam per pixel of the intrinsics, up to the occluder or the wall, whichever is nearer.
 
-    A rig's beams are worked out once, and cannot be written into.
+    Cached per rig; the arrays are read-only.
     """
     return _cast(rig, intrinsics, lambertian, occluder)  # pyright: ignore[reportArgumentType]  frozen, so hashable
 
@@ -112,9 +112,11 @@ def _cast(rig: Rig, intrinsics: Intrinsics, lambertian: bool, occluder: bool) ->
     pose = rig.wall_from_lidar
     lidar = pose[:3, 3]
     rays = intrinsics.rays().reshape(-1, 3)
+    # Rays have z = 1 in the lidar's frame, so the cosine to the optical axis is 1 / |ray|.
     cos_axis = 1 / np.linalg.norm(rays, axis=-1)
     direction = (rays @ pose[:3, :3].T) * cos_axis[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
+        # The wall is the plane z = 0: lidar_z + t direction_z = 0, ahead of the lidar only for rays towards the wall.
         wall_length = np.where(direction[:, 2] < 0, -lidar[2] / direction[:, 2], np.inf)
         wall_point = lidar + wall_length[:, None] * direction
         wall_length[~_inside(rig, wall_point)] = np.inf
@@ -133,7 +135,7 @@ def _cast(rig: Rig, intrinsics: Intrinsics, lambertian: bool, occluder: bool) ->
 
 
 def returned(rig: Rig, length_m: Float64, cosine: Float64, solid_angle: float) -> Float64:
-    """I_direct (n,) of S1, with S_unit_wall the device's receiver cell; 0 outside the gate or where nothing is met."""
+    """Return I_direct (n,) of S1, with the device's receiver cell as S_unit_wall; 0 outside the gate or for no hit."""
     cell_m2 = rig.device.receiver_cell_m2
     near_m = NEAR_DIAGONALS * np.sqrt(2 * cell_m2)
     in_gate = 2 * length_m < SPEED_OF_LIGHT_M_PER_S * rig.device.gate_s
@@ -142,7 +144,7 @@ def returned(rig: Rig, length_m: Float64, cosine: Float64, solid_angle: float) -
 
 
 def gate_bins(device: DeviceConstants) -> int:
-    """Bins of path length that begin inside the gate: the last may reach beyond it."""
+    """Return the number of path-length bins that begin inside the gate; the last may reach beyond it."""
     return max(int(np.ceil(SPEED_OF_LIGHT_M_PER_S * device.gate_s / device.bin_m)), 1)
 
 
@@ -152,7 +154,7 @@ def _inside(rig: Rig, point: Float64) -> Mask:
 
 
 def _occluder_length(rig: Rig, lidar: Float64, direction: Float64) -> Float64:
-    """How far along each beam the occluder's half plane stands; inf where the beam misses it."""
+    """Return the distance along each beam to the occluder's half plane; inf for beams that miss it."""
     if rig.occluder is None:
         return np.full(len(direction), np.inf)
     length = (rig.occluder.x_m - lidar[0]) / direction[:, 0]
@@ -161,12 +163,12 @@ def _occluder_length(rig: Rig, lidar: Float64, direction: Float64) -> Float64:
 
 
 NO_OCCLUDER = (np.inf, np.inf)
-"""An edge that blocks nothing: no x lies on both sides of it."""
+"""Edge that blocks nothing: no x lies on both sides of it."""
 
 
 @dataclass(frozen=True)
 class Relay:
-    """Cells of the relay wall."""
+    """Grid of cells on the relay wall, with the leg from each back to the lidar."""
 
     x_m: Float64
     """(n,)."""
@@ -175,28 +177,28 @@ class Relay:
     length_m: Float64
     """(n,); d4."""
     cos_lidar: Float64
-    """(n,); the way to the lidar against the wall's normal."""
+    """(n,); direction to the lidar against the wall's normal."""
     cell_m2: float
     diagonal_m: float
     """Of a cell."""
 
-    def kept(self, which: Mask) -> "Relay":
-        """Only some of the cells."""
+    def select(self, which: Mask) -> "Relay":
+        """Return the cells with True in a mask (n,)."""
         columns = self.x_m[which], self.y_m[which], self.length_m[which], self.cos_lidar[which]
         return Relay(*columns, self.cell_m2, self.diagonal_m)
 
     def behind(self, edge_m: tuple[float, float], lidar_m: Float64) -> Mask:
-        """Which cells (n,) an occluder of that edge hides from the lidar."""
+        """Return a mask (n,) of the cells that an occluder with that edge hides from the lidar."""
         return behind(edge_m, self.x_m, np.zeros_like(self.x_m), lidar_m)
 
 
 def occluder_edge(rig: Rig) -> tuple[float, float]:
-    """(x_m, z_min_m) of the occluder, or an edge that blocks nothing."""
+    """Return (x_m, z_min_m) of the occluder, or an edge that blocks nothing."""
     return (rig.occluder.x_m, rig.occluder.z_min_m) if rig.occluder else NO_OCCLUDER
 
 
 def relay_cells(rig: Rig, lidar_m: Float64, columns: int, rows: int) -> Relay:
-    """Cut the relay wall into columns x rows cells, as if nothing stood in front of it."""
+    """Return the relay wall as columns x rows cells, as if nothing stood in front of it."""
     extent = rig.relay
     pitch_x, pitch_y = (extent.x_max_m - extent.x_min_m) / columns, (extent.y_max_m - extent.y_min_m) / rows
     x, y = np.meshgrid(
@@ -209,8 +211,10 @@ def relay_cells(rig: Rig, lidar_m: Float64, columns: int, rows: int) -> Relay:
 
 
 def behind(edge_m: tuple[float, float], x_m: Float64, z_m: Float64, lidar_m: Float64) -> Mask:
-    """Which points (n,) the half plane x = edge_m[0], z >= edge_m[1] hides from the lidar."""
+    """Return a mask (n,) of the points that the half plane x = edge_m[0], z >= edge_m[1] hides from the lidar."""
     with np.errstate(invalid="ignore", divide="ignore"):
+        # Share of the way from lidar to point at which the line crosses x = edge_m[0]; it is cut there if it is high
+        # enough.
         share = (edge_m[0] - lidar_m[0]) / (x_m - lidar_m[0])
         height = lidar_m[2] + share * (z_m - lidar_m[2])
         return (share > 0) & (share < 1) & (height >= edge_m[1])

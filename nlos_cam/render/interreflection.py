@@ -1,7 +1,8 @@
-"""Inter-reflection: light that goes from patch to patch, straight or by way of the wall, before it comes back.
+"""Interreflection: light that goes from patch to patch, directly or over the wall, before it comes back.
 
-Both only lengthen what follows the first patch. So they are added to the patches' tables: a patch gives, beside its own
-returns, those of every patch that it lights, that much later and by the form factor weaker.
+Both detours only delay the part of the path after the first patch. So they are added to the patches' tables: patch a
+gives, beside its own returns, those of every patch b that it lights, later by the detour's length and weaker by the
+form factor F(a, b). One detour is the next term of the Neumann series of the rendering equation (Kajiya 1986).
 """
 
 import numba
@@ -10,14 +11,15 @@ from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.render.geometry import contact_m2, softened
-from nlos_cam.render.job import TransportJob
+from nlos_cam.render.job import PatchArrays, TransportJob
 from nlos_cam.render.visibility import HeightField, occluded, segment_blocked, visible
 
 WALL_CELLS = 24
-"""Along each side of the wall that the light may go over."""
+"""Cells along each side of the wall that the light may go over."""
 SAMPLE_PATCHES = 256
+"""Patches, at most, from which the share of interreflection is estimated."""
 AROUND_M = 0.4
-"""How far about the object that wall reaches: beyond, less than a hundredth of a patch's light arrives."""
+"""Margin of that wall around the object: beyond, less than a hundredth of a patch's light arrives."""
 
 
 @numba.njit(cache=True)
@@ -31,71 +33,47 @@ def form_factor(
     near_m: float,
     lambertian: bool,
 ) -> float:
-    """What part of the light that leaves at a is given on at b, but for what stands between."""
+    """Return the share of the light leaving a that b gives on, without what stands between."""
     leg = b - a
     squared = (leg**2).sum()
     length = np.sqrt(squared)
     cos_out, cos_in = (normal_a * leg).sum(), -(normal_b * leg).sum()
     if cos_out <= 0 or cos_in <= 0:
         return 0.0
+    # Receiving area x cosine / (solid angle x d^2), with the strength as albedo x area; the sender's cosine is part of
+    # the rendering equation only. near_m limits 1 / d^2 at contact as in S2.
     factor = strength * cos_in / length / ((np.pi if lambertian else 2 * np.pi) * (softened(squared, soft, near_m)))
     return factor * cos_out / length if lambertian else factor
 
 
 @numba.njit(cache=True)
 def _between_patches(
-    a: int,
-    b: int,
-    points: Float64,
-    normals: Float64,
-    strength: Float64,
-    soft: Float64,
-    rows: Int64,
-    columns: Int64,
-    field: HeightField,
-    near_m: float,
-    lambertian: bool,
+    a: int, b: int, patches: PatchArrays, field: HeightField, near_m: float, lambertian: bool
 ) -> float:
-    """The form factor from patch a to patch b, 0 where the object stands between."""
-    factor = form_factor(points[a], normals[a], points[b], normals[b], strength[b], soft[b], near_m, lambertian)
+    """Return the form factor from patch a to patch b, 0 if the object stands between."""
+    points, normals, rows, columns = patches.point_m, patches.normal, patches.row, patches.column
+    strength, soft = patches.strength[b], patches.soft_m2[b]
+    factor = form_factor(points[a], normals[a], points[b], normals[b], strength, soft, near_m, lambertian)
     if factor > 0 and segment_blocked(field, rows[a], columns[a], points[a, 2], rows[b], columns[b], points[b, 2]):
         return 0.0
     return factor
 
 
 @numba.njit(cache=True, parallel=True)
-def patch_to_patch(
-    points: Float64,
-    normals: Float64,
-    strength: Float64,
-    soft: Float64,
-    rows: Int64,
-    columns: Int64,
-    field: HeightField,
-    near_m: float,
-    lambertian: bool,
-) -> Float64:
-    """Form factors (n, n) from patch to patch, 0 where the object stands between."""
-    n = len(points)
+def patch_to_patch(patches: PatchArrays, field: HeightField, near_m: float, lambertian: bool) -> Float64:
+    """Return form factors (n, n) from patch to patch, 0 if the object stands between."""
+    n = len(patches.row)
     table = np.zeros((n, n))
     for a in numba.prange(n):
         for b in range(n):
-            table[a, b] = _between_patches(
-                a, b, points, normals, strength, soft, rows, columns, field, near_m, lambertian
-            )
+            table[a, b] = _between_patches(a, b, patches, field, near_m, lambertian)
     return table
 
 
 @numba.njit(cache=True, parallel=True)
 def patch_to_wall(
-    points: Float64,
-    normals: Float64,
-    strength: Float64,
-    soft: Float64,
-    rows: Int64,
-    columns: Int64,
-    x: Float64,
-    y: Float64,
+    patches: PatchArrays,
+    cells: Float64,
     cell_m2: float,
     soft_wall: float,
     edge_x: float,
@@ -104,24 +82,27 @@ def patch_to_wall(
     near_m: float,
     lambertian: bool,
 ) -> tuple[Float64, Float64]:
-    """Form factors (n, m) from patches to cells of the wall, and from the cells to the patches."""
-    there, back = np.zeros((len(points), len(x))), np.zeros((len(points), len(x)))
+    """Return form factors (n, m) from patches to cells (m, 3) of the wall, and from the cells to the patches."""
+    there, back = np.zeros((len(patches.row), len(cells))), np.zeros((len(patches.row), len(cells)))
     up = np.array([0.0, 0.0, 1.0])
-    for s in numba.prange(len(points)):
-        for w in range(len(x)):
-            cell = np.array([x[w], y[w], 0.0])
-            factor = form_factor(points[s], normals[s], cell, up, cell_m2, soft_wall, near_m, lambertian)
-            if factor == 0 or occluded(points[s, 0], points[s, 2], x[w], 0.0, edge_x, edge_z):
+    for s in numba.prange(len(patches.row)):
+        point, normal = patches.point_m[s], patches.normal[s]
+        for w in range(len(cells)):
+            x, y = cells[w, 0], cells[w, 1]
+            factor = form_factor(point, normal, cells[w], up, cell_m2, soft_wall, near_m, lambertian)
+            if factor == 0 or occluded(point[0], point[2], x, 0.0, edge_x, edge_z):
                 continue
-            if not visible(field, rows[s], columns[s], points[s], x[w], y[w]):
+            if not visible(field, patches.row[s], patches.column[s], point, x, y):
                 continue
             there[s, w] = factor
-            back[s, w] = form_factor(cell, up, points[s], normals[s], strength[s], soft[s], near_m, lambertian)
+            strength, soft = patches.strength[s], patches.soft_m2[s]
+            back[s, w] = form_factor(cells[w], up, point, normal, strength, soft, near_m, lambertian)
     return there, back
 
 
 @numba.njit(cache=True)
 def _add(target: Float32, at: int, weight: float, source: Float32) -> None:
+    """Add a histogram to another from bin `at` on, scaled."""
     start, scale = max(at, 0), np.float32(weight)
     for k in range(min(len(source), len(target) - start)):
         target[start + k] += scale * source[k]
@@ -129,12 +110,7 @@ def _add(target: Float32, at: int, weight: float, source: Float32) -> None:
 
 @numba.njit(cache=True, parallel=True)
 def _over_the_object(
-    points: Float64,
-    normals: Float64,
-    strength: Float64,
-    soft: Float64,
-    rows: Int64,
-    columns: Int64,
+    patches: PatchArrays,
     field: HeightField,
     near_m: float,
     lambertian: bool,
@@ -143,11 +119,11 @@ def _over_the_object(
     histogram: Float32,
     width: int,
 ) -> Float32:
-    """Of every other patch its histogram, as much later as it is away."""
-    out = np.zeros((len(points), width), np.float32)
+    """Return histograms (n, width): for each patch those of every other, later by its distance and scaled by F."""
+    points, out = patches.point_m, np.zeros((len(patches.row), width), np.float32)
     for a in numba.prange(len(points)):
         for b in range(len(points)):
-            factor = _between_patches(a, b, points, normals, strength, soft, rows, columns, field, near_m, lambertian)
+            factor = _between_patches(a, b, patches, field, near_m, lambertian)
             if factor > 0:
                 away = np.sqrt(((points[b] - points[a]) ** 2).sum())
                 _add(out[a], int(np.rint(away * per_m)) + start[b] - start[a], factor, histogram[b])
@@ -156,7 +132,7 @@ def _over_the_object(
 
 @numba.njit(cache=True, parallel=True)
 def _carry(factor: Float64, steps: Int64, histogram: Float32, width: int) -> Float32:
-    """Histograms (n, width): of every other (m,) the histogram (m, k), shifted by steps (n, m) and weighted."""
+    """Return histograms (n, width): the sum of others (m, k), shifted by steps (n, m) and scaled by factors (n, m)."""
     out = np.zeros((len(factor), width), np.float32)
     for a in numba.prange(len(factor)):
         for b in range(factor.shape[1]):
@@ -165,10 +141,10 @@ def _carry(factor: Float64, steps: Int64, histogram: Float32, width: int) -> Flo
     return out
 
 
-def with_inter_reflection(job: TransportJob, first: NDArray[np.int32], histogram: Float32) -> Float32:
-    """The patches' histograms (n, k) in sub-bins, from their bins `first` (n,) on, with one bounce more on the object.
+def add_interreflection(job: TransportJob, first: NDArray[np.int32], histogram: Float32) -> Float32:
+    """Return the patches' sub-bin histograms (n, k), from their bins `first` (n,) on, with one more bounce.
 
-    They come out wider by the longest detour.
+    The histograms get wider by the longest detour.
     """
     per_bin, point = job.accuracy.sub_bins, job.patches.point_m
     per_m, start = per_bin / job.bin_m, first.astype(np.int64) * per_bin
@@ -178,65 +154,64 @@ def with_inter_reflection(job: TransportJob, first: NDArray[np.int32], histogram
     longest_m = 2 * away.max() + float(np.linalg.norm(np.ptp(point, axis=0)))
     width = histogram.shape[1] + per_bin * (int(longest_m / job.bin_m) + 2)
     steps = np.rint(away * per_m).astype(np.int64)
+    # Over the wall in two passes, n m each instead of n^2 m: first every wall cell collects the histograms of the
+    # patches that it lights, then every patch collects those of the cells. All are aligned to the earliest start in
+    # between.
     on_wall = _carry(back.T.copy(), steps.T + start - start.min(), histogram, width)
     by_wall = _carry(there, steps + (start.min() - start)[:, None], on_wall, width)
-    straight = _over_the_object(*_patches(job), per_m, start, histogram, width)
-    return np.pad(histogram, [(0, 0), (0, width - histogram.shape[1])]) + by_wall + straight
+    over_object = _over_the_object(*_object(job), per_m, start, histogram, width)
+    return np.pad(histogram, [(0, 0), (0, width - histogram.shape[1])]) + by_wall + over_object
 
 
-def _patches(job: TransportJob) -> tuple[Float64, Float64, Float64, Float64, Int64, Int64, HeightField, float, bool]:
-    p = job.patches
-    where = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
-    return *where, job.field, job.near_m, job.lambertian
+def _object(job: TransportJob) -> tuple[PatchArrays, HeightField, float, bool]:
+    return job.patch_arrays, job.field, job.near_m, job.lambertian
 
 
 def object_factors(job: TransportJob) -> Float64:
-    """Form factors (n, n) from patch to patch of a job."""
-    return patch_to_patch(*_patches(job))
+    """Return form factors (n, n) from patch to patch of a job."""
+    return patch_to_patch(*_object(job))
 
 
-def wall_factors(job: TransportJob, cells: Float64) -> tuple[Float64, Float64]:
-    """Form factors (n, m) from the patches of a job to cells of the wall (m, 3), and back."""
-    p, cell_m2 = job.patches, wall_cell_m2(job)
-    where = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
-    wall = cells[:, 0].copy(), cells[:, 1].copy(), cell_m2, contact_m2(cell_m2, job.solid_angle)
-    return patch_to_wall(*where, *wall, *job.edge_m, job.field, job.near_m, job.lambertian)
+def wall_factors(job: TransportJob, cells: Float64, patches: PatchArrays | None = None) -> tuple[Float64, Float64]:
+    """Return form factors (n, m) from the patches of a job, or from others, to cells of the wall (m, 3), and back."""
+    cell_m2 = wall_cell_m2(job)
+    wall = cells, cell_m2, contact_m2(cell_m2, job.solid_angle), *job.edge_m
+    return patch_to_wall(patches or job.patch_arrays, *wall, job.field, job.near_m, job.lambertian)
 
 
 def _wall_extent(job: TransportJob) -> Float64:
-    """(2, 2); least and most x and y of the wall that inter-reflection goes over."""
+    """Return the corners (2, 2), low and high x and y, of the wall for interreflection."""
     wall = np.array(job.wall_m)
     low, high = job.patches.point_m[:, :2].min(0) - AROUND_M, job.patches.point_m[:, :2].max(0) + AROUND_M
     return np.stack([np.maximum(low, wall[[0, 2]]), np.minimum(high, wall[[1, 3]])])
 
 
 def wall_cell_m2(job: TransportJob) -> float:
-    """Area of a cell of that wall."""
+    """Return the area of a cell of that wall."""
     return float(np.prod(np.maximum(np.diff(_wall_extent(job), axis=0), 0.0)) / WALL_CELLS**2)
 
 
 def wall_cells(job: TransportJob) -> Float64:
-    """The middles (m, 3) of its cells."""
+    """Return the centers (m, 3) of its cells."""
     low, high = _wall_extent(job)
     steps = (np.arange(WALL_CELLS) + 0.5) / WALL_CELLS
     x, y = np.meshgrid(low[0] + steps * (high[0] - low[0]), low[1] + steps * (high[1] - low[1]))
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
 
 
-def share_of_more_bounces(job: TransportJob, taken: Float64, given: Float64) -> float:
-    """How much energy one bounce more carries, against three bounces, told from some of the patches.
+def interreflection_share(job: TransportJob, incident: Float64, returned: Float64) -> float:
+    """Return the energy of one more bounce over that of three bounces, estimated from a sample of the patches.
 
-    `taken` and `given` (n,) are the light that each patch gives on, and what the lidar gets of it.
+    `incident` and `returned` (n,) are the light that each patch gives on, and the share of it that reaches the lidar.
     """
-    step = -(-len(taken) // SAMPLE_PATCHES)
-    some = slice(None, None, step)
-    p = job.patches
-    where = p.point_m[some].copy(), p.normal[some].copy(), step * job.strength[some], step * job.soft_patch_m2[some]
-    taken, given, sites = taken[some], given[some], (p.row[some].copy(), p.column[some].copy())
-    straight = patch_to_patch(*where, *sites, job.field, job.near_m, job.lambertian) @ given
-    cells, cell_m2 = wall_cells(job), wall_cell_m2(job)
-    wall = cells[:, 0].copy(), cells[:, 1].copy(), cell_m2, contact_m2(cell_m2, job.solid_angle)
-    there, back = patch_to_wall(*where, *sites, *wall, *job.edge_m, job.field, job.near_m, job.lambertian)
-    by_wall = there @ (back.T @ given)
-    whole = float((taken * given).sum())
-    return float((taken * (straight + by_wall)).sum()) / whole if whole > 0 else 0.0
+    step = -(-len(incident) // SAMPLE_PATCHES)
+    # Energy of three bounces: sum_a I_a R_a. With one more: sum_a I_a sum_b F(a, b) R_b. Every step-th patch stands for
+    # `step` of them, so its area counts `step` times.
+    patches = PatchArrays._make(column[::step].copy() for column in job.patch_arrays)
+    patches = patches._replace(strength=step * patches.strength, soft_m2=step * patches.soft_m2)
+    incident, returned = incident[::step], returned[::step]
+    over_object = patch_to_patch(patches, job.field, job.near_m, job.lambertian) @ returned
+    there, back = wall_factors(job, wall_cells(job), patches)
+    by_wall = there @ (back.T @ returned)
+    whole = float((incident * returned).sum())
+    return float((incident * (over_object + by_wall)).sum()) / whole if whole > 0 else 0.0

@@ -1,10 +1,11 @@
-"""What every implementation of the renderer is given: a scene as its plan wants it, in float64, radiometry resolved."""
+"""Input of every backend: the transport of one render problem in float64, with the radiometry resolved to factors."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from nlos_calibration.arrays import Float64
+from nlos_calibration.arrays import Float64, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.render.accuracy import Accuracy
@@ -14,12 +15,25 @@ from nlos_cam.render.patches import Patches
 from nlos_cam.render.visibility import HeightField
 
 
+class PatchArrays(NamedTuple):
+    """Patches (n) as columns for compiled loops."""
+
+    point_m: Float64
+    normal: Float64
+    strength: Float64
+    """Albedo times true area."""
+    soft_m2: Float64
+    """Near-contact term."""
+    row: Int64
+    column: Int64
+
+
 @dataclass(frozen=True)
 class TransportJob:
-    """Some beams, the patches, the relay wall and all that decides their three-bounce histograms."""
+    """Three-bounce transport of some beams: beams, patches, relay wall and all else that decides their histograms."""
 
-    foot_m: Float64
-    """(n, 3); where the beams land on the wall."""
+    laser_spot_m: Float64
+    """(n, 3); points where the beams land on the wall."""
     length_m: Float64
     """(n,); d1."""
     cos_incidence: Float64
@@ -36,48 +50,48 @@ class TransportJob:
     bin_m: float
     bins: int
     accuracy: Accuracy
-    map_foot_m: Float64
-    """(k, 3); of every beam of the map: a BRDF is tabulated among these, whichever of them are rendered."""
+    map_spots_m: Float64
+    """(k, 3); laser spots of the whole map: BRDF tables are laid out among these, whichever beams are rendered."""
     wall_m: tuple[float, float, float, float]
-    """(x_min, x_max, y_min, y_max) of the physical wall, which inter-reflection goes over."""
+    """(x_min, x_max, y_min, y_max) of the physical wall, for interreflection."""
     brdf: Brdf | None = None
     """None is Lambertian."""
     more_bounces: bool = False
-    """Whether inter-reflection is wanted."""
+    """True to include interreflection."""
 
-    def some(self, which: NDArray[np.int64]) -> "TransportJob":
-        """The same for some of the beams."""
-        beams = {name: getattr(self, name)[which] for name in ("foot_m", "length_m", "cos_incidence")}
+    def select(self, which: NDArray[np.int64]) -> "TransportJob":
+        """Return the job for some of its beams (indices)."""
+        beams = {name: getattr(self, name)[which] for name in ("laser_spot_m", "length_m", "cos_incidence")}
         return replace(self, **beams)
 
     @property
     def solid_angle(self) -> float:
-        """What each bounce spreads its light over."""
+        """Solid angle over which each bounce spreads its light."""
         return solid_angle(lambertian=self.lambertian)
 
     @cached_property
     def near_m(self) -> float:
-        """The distance at which near contact begins."""
+        """Distance in meters at which near contact begins."""
         return NEAR_DIAGONALS * max(self.patches.diagonal_m, self.relay.diagonal_m)
 
     @cached_property
     def soft_patch_m2(self) -> Float64:
-        """(n,); what near contact adds to d2^2 at a patch."""
+        """(n,); near-contact term added to d2^2 at a patch."""
         return contact_m2(self.patches.area_m2, self.solid_angle)
 
     @property
     def soft_wall_m2(self) -> float:
-        """The same for d3^2 at a cell of the relay wall."""
+        """Near-contact term added to d3^2 at a cell of the relay wall."""
         return contact_m2(self.relay.cell_m2, self.solid_angle)
 
     @cached_property
     def beam_weight(self) -> Float64:
-        """(n,); what of S2 depends on the beam alone."""
+        """(n,); factors of S2 that depend on the beam alone."""
         return (np.ones_like(self.cos_incidence) if self.lambertian else self.cos_incidence) / self.solid_angle
 
     @cached_property
     def relay_weight(self) -> Float64:
-        """(m,); what of S2 depends on the relay cell alone: its area, and the way from it to the lidar."""
+        """(m,); factors of S2 that depend on the relay cell alone: its area, and the leg from it to the lidar."""
         relay = self.relay
         squared = softened(relay.length_m**2, self.soft_wall_m2, self.near_m)
         weight = relay.cell_m2 / (self.solid_angle**2 * squared)
@@ -85,14 +99,20 @@ class TransportJob:
 
     @cached_property
     def strength(self) -> Float64:
-        """(n,); what of S2 depends on the patch alone: albedo times true area."""
+        """(n,); factors of S2 that depend on the patch alone: albedo times true area."""
         return self.patches.albedo * self.patches.area_m2
 
+    @property
+    def patch_arrays(self) -> PatchArrays:
+        """Patches as columns for compiled loops."""
+        p = self.patches
+        return PatchArrays(p.point_m, p.normal, self.strength, self.soft_patch_m2, p.row, p.column)
 
-def near_legs(job: TransportJob) -> int:
-    """How many legs between patches and wall are shorter than near contact."""
+
+def count_near_legs(job: TransportJob) -> int:
+    """Return the number of legs between patches and wall that are shorter than near contact."""
     reach, count = job.near_m**2, 0
     for point in job.patches.point_m[job.patches.point_m[:, 2] < job.near_m]:
-        for x, y in ((job.foot_m[:, 0], job.foot_m[:, 1]), (job.relay.x_m, job.relay.y_m)):
+        for x, y in ((job.laser_spot_m[:, 0], job.laser_spot_m[:, 1]), (job.relay.x_m, job.relay.y_m)):
             count += int((((x - point[0]) ** 2 + (y - point[1]) ** 2 + point[2] ** 2) < reach).sum())
     return count

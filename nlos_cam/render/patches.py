@@ -1,4 +1,4 @@
-"""The hidden surface as the renderer sees it: one patch for each cell of the depth map that holds a surface."""
+"""Patches: the hidden surface for the renderer, one patch for each cell of the depth map that holds a surface."""
 
 from dataclasses import dataclass, replace
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from nlos_cam.objects import cell_centers_m
 
 JUMP_M = 0.02
-"""Neighbours further apart in depth than this are not one surface: beta (S3) must not join them by a curtain."""
+"""Neighbors farther apart in depth than this are separate surfaces, which beta (S3) must not join by a curtain."""
 
 
 @dataclass(frozen=True)
 class Patches:
-    """The active cells of a hidden surface, one row each: centre, normal towards the wall, beta (S3)."""
+    """Active cells of a hidden surface, one row each: center, normal towards the wall, beta (S3)."""
 
     point_m: Float64
     """(n, 3)."""
@@ -24,13 +24,13 @@ class Patches:
     beta: Float64
     """(n,); true area over projected area."""
     albedo: Float64
-    """(n,); what part of the light a patch gives back, times the share of its cell that it fills."""
+    """(n,); share of the light that a patch gives back, times the share of its cell that it fills."""
     row: NDArray[np.int64]
     column: NDArray[np.int64]
     cell_m2: float
     """S_unit_target: projected area of a cell."""
     diagonal_m: float
-    """Of a cell."""
+    """Diagonal of a cell."""
 
     @property
     def area_m2(self) -> Float64:
@@ -43,14 +43,14 @@ class Patches:
         return -self.normal[:, :2] / self.normal[:, 2:]
 
     def level(self) -> "Patches":
-        """The same without tilt: facing the wall squarely, beta 1."""
+        """Return the patches without tilt: facing the wall squarely, beta 1."""
         normal = np.zeros_like(self.normal)
         normal[:, 2] = -1.0
         return replace(self, normal=normal, beta=np.ones_like(self.beta))
 
 
 def slope_along(depth: Float64, axis: int, pitch_m: float, jump_m: float = JUMP_M) -> Float64:
-    """Forward difference along an axis; backward at an edge or a jump; 0 where no neighbour is the same surface."""
+    """Return the forward difference along an axis; backward at an edge or a jump; 0 without neighbors."""
     padding = [(1, 1) if a == axis else (0, 0) for a in range(2)]
     step = np.diff(np.pad(depth, padding, constant_values=np.nan), axis=axis)
     step = np.where(np.abs(step) <= jump_m, step, np.nan)
@@ -60,12 +60,14 @@ def slope_along(depth: Float64, axis: int, pitch_m: float, jump_m: float = JUMP_
 
 
 def make_patches(depth: Float64, box: ObjectBox, albedo: Float64, jump_m: float = JUMP_M) -> Patches:
-    """The patches of a depth map (rows, columns), NaN for background, with the albedo (rows, columns) of its cells."""
+    """Return the patches of a depth map (rows, columns), NaN for background, with its cells' albedo (rows, columns)."""
     x_m, y_m = cell_centers_m(box, len(depth))
     pitch_x, pitch_y = cell_pitch_m(box, depth.shape)
     row, column = np.nonzero(~np.isnan(depth))
     slope_x = slope_along(depth, 1, pitch_x, jump_m)[row, column]
     slope_y = -slope_along(depth, 0, pitch_y, jump_m)[row, column]  # rows run along -y
+    # The surface z(x, y) has tangents (1, 0, zx) and (0, 1, zy). Their cross product (-zx, -zy, 1) has the length of
+    # true over projected area; its negative points towards the wall.
     beta = np.sqrt(1 + slope_x**2 + slope_y**2)  # S3, divided through by dx dy
     normal = np.stack([slope_x, slope_y, -np.ones_like(beta)], axis=-1) / beta[:, None]
     point = np.stack([x_m[column], y_m[row], depth[row, column]], axis=-1)
@@ -74,15 +76,15 @@ def make_patches(depth: Float64, box: ObjectBox, albedo: Float64, jump_m: float 
 
 
 def cell_pitch_m(box: ObjectBox, shape: tuple[int, int]) -> tuple[float, float]:
-    """Width and height of a cell of a depth map (rows, columns) over a box."""
+    """Return width and height of a cell of a depth map (rows, columns) over a box."""
     return (box.x_max_m - box.x_min_m) / shape[1], (box.y_max_m - box.y_min_m) / shape[0]
 
 
 def clustered(patches: Patches, stride: int, size: int) -> Patches:
-    """Blocks of stride x stride cells of a grid (size, size) as one patch each: a beam hardly tells them apart.
+    """Return blocks of stride x stride cells of a grid (size, size) as one patch each.
 
-    What a block takes of the light is exact for its cells' own tilt, since S2 is linear in area times normal; that they
-    stand at their mean point is the error.
+    The light that a block receives is exact for its cells' own tilt, since S2 is linear in area times normal; the error
+    is that all its cells stand at their mean point.
     """
     block = patches.row // stride * size + patches.column // stride
     found = np.unique(block, return_inverse=True, return_counts=True)
@@ -109,7 +111,7 @@ def clustered(patches: Patches, stride: int, size: int) -> Patches:
 
 
 def coarser(depth: Float64, stride: int) -> Float64:
-    """The mean depth of blocks of stride x stride cells, NaN where none of them is a surface."""
+    """Return the mean depth of blocks of stride x stride cells, NaN for blocks without a surface."""
     size = len(depth) // stride
     blocks = depth.reshape(size, stride, size, stride)
     count = (~np.isnan(blocks)).sum((1, 3))

@@ -1,4 +1,4 @@
-"""The MEMS raster: a lidar's rows are scanned one after another, and what moves has moved on meanwhile."""
+"""Rolling acquisition of the MEMS raster: rows are scanned one after another while objects move."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,24 +14,24 @@ from nlos_cam.render.renderer import Rendering, render, three_bounce
 from nlos_cam.render.scene import Scene
 
 SceneAt = Callable[[float], Scene]
-"""The scene at a time of the scan, 0 (its top row) to 1 (its bottom row)."""
+"""Function from the time of the scan, 0 (top row) to 1 (bottom row), to the scene."""
 
 PROBES = 48
-"""Beams that tell how much a movement changes."""
+"""Beams from which the change by motion is estimated."""
 FINEST_SHARE = 2e-2
-"""Of the transient: slices of a scan are not made so thin that less than this changes within one."""
+"""Smallest change of the transient within a slice of a scan: thinner slices are not made."""
 
 
 def scan_effect(scene_at: SceneAt, accuracy: str | Accuracy = "standard") -> Effect:
-    """Whether the raster matters: how much the transient changes from the top row's instant to the bottom row's."""
+    """Return the verdict on the raster: the change of the transient from the top row's instant to the bottom row's."""
     setting, first, last = accuracy_named(accuracy), scene_at(0.0), scene_at(1.0)
     change = 0.0 if _alike(first, last) else min(CAUTION * _change(first, last), 1.0)
-    reason = f"what moves changes {change:.3g} of the transient during a scan" if change else "nothing moves"
+    reason = f"motion changes {change:.3g} of the transient during a scan" if change else "nothing moves"
     return Effect("scan-time", change > setting.tolerance, reason, change)
 
 
 def render_scan(scene_at: SceneAt, accuracy: str | Accuracy = "standard", effects: Effects = "auto") -> Rendering:
-    """One frame of a raster: its rows in slices, each at the instant of its middle row; the plan is the first's."""
+    """Return one frame of a raster: slices of rows, each at the instant of its middle row; the first gives the plan."""
     setting = accuracy_named(accuracy)
     verdict = scan_effect(scene_at, setting)
     count = slices(verdict, setting)
@@ -43,21 +43,21 @@ def render_scan(scene_at: SceneAt, accuracy: str | Accuracy = "standard", effect
 
 
 def slices(verdict: Effect, setting: Accuracy) -> int:
-    """In how many instants a scan is rendered: at most FINEST_SHARE, or the tolerance, changes within one."""
+    """Return the number of instants of a scan: within one, at most FINEST_SHARE or the tolerance changes."""
     if not verdict.included:
         return 1
     return int(np.clip(ceil(verdict.bound / max(setting.tolerance, FINEST_SHARE)), 2, MAP_ROWS))
 
 
 def joined(parts: list[Rendering], verdict: Effect) -> Rendering:
-    """Renderings of some rows each as one of all rows."""
+    """Return renderings of some rows each as one of all rows."""
     multi = replace(
         parts[0].multi,
         peak=np.concatenate([part.multi.peak for part in parts]),
         runner_up=np.concatenate([part.multi.runner_up for part in parts]),
         path_m=np.concatenate([part.multi.path_m for part in parts]),
     )
-    colours = [part.colour for part in parts if part.colour is not None]
+    colors = [part.color for part in parts if part.color is not None]
     return replace(
         parts[0],
         depth_m=np.concatenate([part.depth_m for part in parts]),
@@ -66,7 +66,7 @@ def joined(parts: list[Rendering], verdict: Effect) -> Rendering:
         multi=multi,
         plan=(*parts[0].plan, verdict),
         near_legs=sum(part.near_legs for part in parts),
-        colour=np.concatenate(colours) if colours else None,
+        color=np.concatenate(colors) if colors else None,
     )
 
 
@@ -77,7 +77,7 @@ def _alike(one: Scene, other: Scene) -> bool:
 
 
 def _change(first: Scene, last: Scene) -> float:
-    """Relative L1 between the transients of two instants, on some beams at draft."""
+    """Return the relative L1 between the transients of two instants, on some beams at draft."""
     count = first.cell_intrinsics.width * first.cell_intrinsics.height
     chosen = np.arange(count)[:: count // PROBES]
     one, other = (three_bounce(scene, "draft", chosen=chosen) for scene in (first, last))

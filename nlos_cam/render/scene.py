@@ -1,4 +1,4 @@
-"""What is rendered at one instant: a rig, the depth map of what is hidden, its surface, and by which radiometry."""
+"""Scene at one instant: rig, depth map of the hidden object, its surface, and the radiometry."""
 
 from dataclasses import dataclass, field
 from typing import Literal, get_args
@@ -14,14 +14,15 @@ from nlos_cam.render.material import Surface
 from nlos_cam.render.patches import JUMP_M, Patches, make_patches
 
 Radiometry = Literal["paper", "lambertian"]
-"""S1 to S5 to the letter, or every cosine and 1 / pi of the rendering equation for the same paths."""
+""""paper" is S1 to S5 to the letter, "lambertian" the rendering equation with every cosine for the same paths.
+"""
 FINEST_GRID = 256
-"""Cells along a side of a depth map: four times the default's number twice over, and tables within a gigabyte."""
+"""Cells along a side of a depth map: sixteen times the default's number, and tables within a gigabyte."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One instant. Raises SceneError where the object cannot be rendered."""
+    """Scene at one instant. Raises SceneError if the object cannot be rendered."""
 
     rig: Rig
     object_depth_m: Float32 | None = None
@@ -29,42 +30,42 @@ class Scene:
     surface: Surface = field(default_factory=Surface)
     radiometry: Radiometry = "paper"
     jump_m: float = JUMP_M
-    """Neighbours further apart in depth than this are not one surface."""
+    """Neighbors farther apart in depth than this are separate surfaces."""
     pulse_ns: float = 0.0
-    """Full width of the laser's pulse at half its height; 1 ns is 0.3 m of path. 0 is no width."""
+    """Full width of the laser's pulse at half maximum; 1 ns is 0.3 m of path. 0 is no width."""
 
     def __post_init__(self) -> None:
         if self.radiometry not in get_args(Radiometry):
             raise SceneError(f"no radiometry {self.radiometry!r}: choose one of {', '.join(get_args(Radiometry))}")
         for name in ("jump_m", "pulse_ns"):
             if not 0 <= (value := getattr(self, name)) < np.inf:
-                raise SceneError(f"{name} is {value}: it must be a finite number, not negative")
+                raise SceneError(f"{name} is {value}: it must be finite and at least 0")
         if self.object_depth_m is not None:
             _check_depth(self.object_depth_m)
             self.surface.over(self.object_depth_m.shape)
             _ = self.box  # refuse a rig that has none
 
     def intrinsics(self, beams_per_cell: int = 1) -> Intrinsics:
-        """beams_per_cell x beams_per_cell beams, evenly spread over each map cell."""
+        """Return intrinsics with beams_per_cell x beams_per_cell beams, evenly spread over each map cell."""
         return self.rig.pinhole.scaled(MAP_COLUMNS * beams_per_cell, MAP_ROWS * beams_per_cell)
 
     @property
     def cell_intrinsics(self) -> Intrinsics:
-        """One beam through the middle of each map cell."""
+        """Intrinsics with one beam through the center of each map cell."""
         return self.intrinsics()
 
     @property
     def box(self) -> ObjectBox:
-        """The object box; SceneError where the rig has none."""
+        """Object box of the rig. Raises SceneError if it has none."""
         return object_box(self.rig)
 
     @property
     def patches(self) -> Patches | None:
-        """The hidden surface as patches, with the mean of its albedo's channels; None where nothing is hidden."""
+        """Hidden surface as patches with the mean albedo of the channels; None if nothing is hidden."""
         return self.patches_of(None)
 
     def patches_of(self, channel: int | None) -> Patches | None:
-        """The patches with the albedo of one channel, None for the mean; None where nothing is hidden."""
+        """Return the patches with the albedo of one channel, None for the mean; None if nothing is hidden."""
         if self.object_depth_m is None or np.isnan(self.object_depth_m).all():
             return None
         every = self.surface.over(self.object_depth_m.shape)
@@ -74,13 +75,13 @@ class Scene:
 
 def _check_depth(depth: Float32) -> None:
     if depth.ndim != 2 or depth.shape[0] != depth.shape[1] or not 1 <= len(depth) <= FINEST_GRID:
-        raise SceneError(f"object depth has shape {depth.shape}: it must be (n, n), n of 1 to {FINEST_GRID}")
+        raise SceneError(f"object depth has shape {depth.shape}: it must be (n, n) with n from 1 to {FINEST_GRID}")
     if not np.issubdtype(depth.dtype, np.floating):
-        raise SceneError(f"object depth is of {depth.dtype}: it must be of floating point, NaN for background")
+        raise SceneError(f"object depth has type {depth.dtype}: use floating point, with NaN for background")
     surface = depth[~np.isnan(depth)]
     if surface.size and not (np.isfinite(surface).all() and surface.min() >= 0):
         where = "behind the wall" if surface.min() < 0 else "not finite"
         raise SceneError(
-            f"object depth runs from {surface.min():.3g} to {surface.max():.3g} m, {where}: every surface must "
+            f"object depth ranges from {surface.min():.3g} to {surface.max():.3g} m, {where}: every surface must "
             "be finite and at least 0 m off the wall (use NaN for background)",
         )

@@ -1,4 +1,4 @@
-"""A scene at an accuracy: the facts that verdicts and jobs are made of, each worked out at most once."""
+"""Facts of a scene at an accuracy, each computed at most once: the input of the effect plan."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,9 +10,9 @@ from nlos_calibration.arrays import Float64
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.energy_survey import EnergySurvey, survey
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, Beams, Relay, cast, gate_bins, occluder_edge, relay_cells
-from nlos_cam.render.interreflection import share_of_more_bounces
+from nlos_cam.render.interreflection import interreflection_share
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.line_of_sight import DirectVisibility, look
+from nlos_cam.render.line_of_sight import DirectVisibility, direct_visibility
 from nlos_cam.render.material import brdf_range
 from nlos_cam.render.patches import Patches, clustered, coarser
 from nlos_cam.render.scene import Scene
@@ -21,42 +21,42 @@ from nlos_cam.render.visibility import HeightField, height_field
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """The facts."""
+    """Scene and accuracy with everything that the plan of effects depends on, computed on first use."""
 
     scene: Scene
     accuracy: Accuracy
 
     @property
     def albedo(self) -> Float64:
-        """The albedo of every cell of the accuracy's grid, the mean of channels and block."""
+        """Albedo (rows, columns) of the accuracy's grid: mean of the channels and of each block of cells."""
         size, stride = len(self.depth_m), self.stride
         every = self.scene.surface.over((size * stride, size * stride)).mean(-1)
         return every.reshape(size, stride, size, stride).mean((1, 3))
 
     @property
     def lambertian(self) -> bool:
-        """Whether the scene's radiometry is that of the rendering equation."""
+        """True for the radiometry of the rendering equation, False for the paper's."""
         return self.scene.radiometry == "lambertian"
 
     @property
     def rig(self) -> Rig:
-        """The scene's rig."""
+        """Rig of the scene."""
         return self.scene.rig
 
     def beams(self, *, occluder: bool = True) -> Beams:
-        """The beams before the object is looked at."""
+        """Return the beams as they land on occluder and wall, before the object stops any of them."""
         intrinsics = self.scene.intrinsics(self.accuracy.beams_per_cell)
         return cast(self.rig, intrinsics, lambertian=self.lambertian, occluder=occluder)
 
     @property
     def stride(self) -> int:
-        """The accuracy's stride, where the depth map divides by it; else 1."""
+        """Stride of the accuracy if it divides the depth map; else 1."""
         depth = self.scene.object_depth_m
         return 1 if depth is None or len(depth) % self.accuracy.object_stride else self.accuracy.object_stride
 
     @cached_property
     def depth_m(self) -> Float64:
-        """The depth map on the accuracy's grid; (0, 0) where there is none."""
+        """Depth map on the accuracy's grid; (0, 0) for a scene without an object."""
         depth = self.scene.object_depth_m
         if depth is None:
             return np.empty((0, 0))
@@ -64,7 +64,7 @@ class SceneFacts:
 
     @cached_property
     def patches(self) -> Patches | None:
-        """The patches; None where nothing is hidden inside the gate, or no beam lights the wall."""
+        """Patches with the mean albedo; None if nothing is hidden inside the gate, or no beam lights the wall."""
         if np.isnan(self.depth_m).all() or not self.beams().on_wall.any():
             return None
         if 2 * np.nanmin(self.depth_m) >= SPEED_OF_LIGHT_M_PER_S * self.rig.device.gate_s:
@@ -72,60 +72,60 @@ class SceneFacts:
         return self.patches_of(None)
 
     def patches_of(self, channel: int | None) -> Patches | None:
-        """The patches with the albedo of one channel, None for the mean."""
+        """Return the patches with the albedo of one channel; None for the mean of the channels."""
         patches = self.scene.patches_of(channel)
         return clustered(patches, self.stride, len(self.depth_m)) if patches and self.stride > 1 else patches
 
     @cached_property
     def field(self) -> HeightField:
-        """The depth map laid out for walking."""
+        """Depth map laid out for walks along rays."""
         return height_field(self.depth_m, self.scene.box, shades=True)
 
     @cached_property
     def relay(self) -> Relay:
-        """The whole relay wall, with nothing in front of it."""
+        """Whole relay wall, with nothing in front of it."""
         return relay_cells(self.rig, self.beams().lidar_m, self.accuracy.relay_columns, self.accuracy.relay_rows)
 
     @cached_property
     def _whole_job(self) -> TransportJob | None:
-        """What is looked at for verdicts: every effect in, the whole relay wall."""
+        """Transport with every effect included and the whole relay wall: the basis of the surveys."""
         if self.patches is None:
             return None
         return self.job(self.beams(), self.patches, self.relay, occluder_edge(self.rig), self.field)
 
     @cached_property
     def light(self) -> EnergySurvey | None:
-        """The coarse look at the patches."""
+        """Coarse survey of the light over each patch."""
         low, high = self.brdf_range
         return None if self._whole_job is None else survey(self._whole_job, high / max(low, 1e-9))
 
     @cached_property
     def brdf_range(self) -> tuple[float, float]:
-        """The least and the largest value of the surface's BRDF."""
+        """Smallest and largest value of the surface's BRDF."""
         brdf = self.scene.surface.brdf
         return (1.0, 1.0) if brdf is None else brdf_range(brdf)
 
     @cached_property
-    def sight(self) -> DirectVisibility | None:
-        """What of the object stands in the lidar's own sight; None where nothing does."""
-        if np.isnan(self.depth_m).all():  # or there is none
+    def line_of_sight(self) -> DirectVisibility | None:
+        """Beams and relay cells that the object blocks from the lidar; None if it blocks none."""
+        if np.isnan(self.depth_m).all():  # also for an empty map
             return None
-        return look(self.beams(), self.relay, self.field, self.depth_m, self.scene.jump_m)
+        return direct_visibility(self.beams(), self.relay, self.field, self.depth_m, self.scene.jump_m)
 
     @cached_property
-    def more_bounces(self) -> float:
-        """How much energy inter-reflection carries, against three bounces."""
+    def interreflection(self) -> float:
+        """Energy of one more bounce as a share of the energy of three bounces."""
         if self._whole_job is None or self.light is None:
             return 0.0
-        return share_of_more_bounces(self._whole_job, self.light.taken, self.light.given)
+        return interreflection_share(self._whole_job, self.light.incident, self.light.returned)
 
     def job(
         self, beams: Beams, patches: Patches, relay: Relay, edge_m: tuple[float, float], field: HeightField
     ) -> TransportJob:
-        """The three-bounce histograms of all beams that light the wall, as a job."""
+        """Return the transport of all beams that light the wall over the patches to the relay cells."""
         lit, device, wall = beams.on_wall, self.rig.device, self.rig.wall
         return TransportJob(
-            foot_m=beams.foot_m[lit],
+            laser_spot_m=beams.laser_spot_m[lit],
             length_m=beams.length_m[lit],
             cos_incidence=beams.cos_incidence[lit],
             patches=patches,
@@ -138,17 +138,19 @@ class SceneFacts:
             bin_m=device.bin_m,
             bins=bins_of(beams, patches, relay, device),
             accuracy=self.accuracy,
-            map_foot_m=beams.foot_m[lit],
+            map_spots_m=beams.laser_spot_m[lit],
             wall_m=(wall.x_min_m, wall.x_max_m, wall.y_min_m, wall.y_max_m),
         )
 
 
 def bins_of(beams: Beams, patches: Patches, relay: Relay, device: DeviceConstants) -> int:
-    """Bins up to the gate or the longest three-bounce path: lengths are convex, longest at corners."""
+    """Return the number of bins up to the gate or the longest three-bounce path, whichever is less."""
+    # The distance to a fixed point is a convex function, and so is a sum of two: over a box of patches or a rectangle
+    # of relay cells it is largest at a corner. The far corners (largest z) suffice, as the wall lies at z = 0.
     x, y, z = ((column.min(), column.max()) for column in patches.point_m.T)
     corners = np.array([(a, b, z[1]) for a in x for b in y])
-    feet = beams.foot_m[beams.on_wall]
-    there = beams.length_m[beams.on_wall, None] + np.linalg.norm(feet[:, None] - corners[None], axis=-1)
+    spots = beams.laser_spot_m[beams.on_wall]
+    there = beams.length_m[beams.on_wall, None] + np.linalg.norm(spots[:, None] - corners[None], axis=-1)
     ends = np.array(
         [(a, b, 0.0) for a in (relay.x_m.min(), relay.x_m.max()) for b in (relay.y_m.min(), relay.y_m.max())]
     )

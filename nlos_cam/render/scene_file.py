@@ -1,9 +1,4 @@
-"""`scene.toml`: a rig, a hidden object, its motion and the sensor model, as one validated record.
-
-The records of a hidden object in scene files: what it is, what it is made of, how it stands and how it moves.
-
-The record of a fault in scene files: what befalls a simulated camera, when, and for how long.
-"""
+"""Scene files (`scene.toml`): rig, hidden object, motion, sensor model and faults as one validated record."""
 
 import hashlib
 import tomllib
@@ -66,7 +61,7 @@ def _mesh(value: object) -> MeshFile:
 
 
 def _within(low: float, high: float) -> AfterValidator:
-    """A range that NaN is outside of, told as a whole."""
+    """Return a validator of a range that also rejects NaN, with both ends in its message."""
 
     def check(value: float) -> float:
         if not low <= value <= high:
@@ -84,52 +79,52 @@ Angle = Annotated[float, _within(-360, 360)]
 
 
 class HiddenObject(Record):
-    """One variation of a procedural category, or a mesh from a file, and how it stands at rest."""
+    """Hidden object at rest: a variation of a procedural category, or a mesh from a file, and its pose."""
 
     category: Annotated[str, AfterValidator(_known)] | None = None
     seed: int = Field(default=0, ge=0)
-    """Which variation of the category."""
+    """Index of the category's variation."""
     size_m: Size = 0.18
-    """The larger of its extents along x and y, once turned: the unit of a mesh's file does not matter."""
+    """Larger of the extents along x and y after turning; the unit of a mesh's file does not matter."""
     tilt_x_deg: Angle = 0.0
     tilt_y_deg: Angle = 0.0
     turn_deg: Angle = 0.0
     x_m: Length = 0.0
     y_m: Length = 0.0
     front_m: Reach = 0.03
-    """From the box's near side to the object's nearest point."""
+    """Distance from the box's near side to the object's nearest point."""
     file: Mesh | None = None
-    """A .obj, .stl or .ply; a path in a scene file starts from its folder."""
+    """A .obj, .stl or .ply; in a scene file relative to its folder."""
     up: Up = "y"
-    """Which axis of the mesh's file points up."""
+    """Axis of the mesh's file that points up."""
     material: Material = Material()
 
     @model_validator(mode="after")
     def _one_thing(self) -> Self:
         if (self.category is None) == (self.file is None):
-            raise PydanticCustomError("one_thing", "give one of category and file")
+            raise PydanticCustomError("one_thing", "give either category or file")
         if self.file and self.seed:
-            raise PydanticCustomError("seed", "seed is for a category: a file has no variations")
+            raise PydanticCustomError("seed", "seed applies to a category: a file has no variations")
         if self.category and self.up != "y":
-            raise PydanticCustomError("up", "up is for a file: a category stands with y up")
+            raise PydanticCustomError("up", "up applies to a file: a category has y up")
         return self
 
     @property
     def label(self) -> str:
-        """What a message calls it: the category, or the file's path."""
+        """Name for messages: the category, or the file's path."""
         return str(self.file.path) if self.file else str(self.category)
 
     @property
     def triangles(self) -> Float64:
-        """(n, 3, 3), before it is placed: y up, -z towards the wall."""
+        """(n, 3, 3), before placing: y up, -z towards the wall."""
         return turn_upright(self.file.triangles, self.up) if self.file else category_triangles(self.label, self.seed)
 
 
 class Motion(Record):
-    """A loop of poses: each quantity swings to and fro by its amplitude, at its own whole number of swings a loop."""
+    """Closed loop of poses: each quantity oscillates by its amplitude, a whole number of times per loop."""
 
     poses: int = Field(default=90, gt=0)
-    """At 30 poses a second."""
+    """Number of poses, at 30 per second."""
     sway_x_m: Length = 0.0
     sway_y_m: Length = 0.0
     approach_m: Reach = 0.0
@@ -152,54 +147,54 @@ FaultKind = Literal[
 
 
 class Fault(Record):
-    """One `[[faults]]` table: `kind` says what the device does instead of delivering its frames as they are.
+    """Fault of a simulated camera: `kind` names what it does to the frames.
 
-    stall: it delivers nothing and does not count on. drops: it counts on, and delivers nothing. duplicate: each frame
-    comes twice. out_of_order: each comes after the one that follows it. all_zero: black in depth, infrared and
-    confidence. saturated: infrared is 255 throughout. half_invalid: no depth in the lower half. wrong_size: half the
-    rows and columns. unplug: the device is gone, and counts from 0 when it is back. clock_wrap: timestamps are of a
-    hardware clock of 32 bits of microseconds, which starts again at 0.
+    stall: delivers nothing and stops counting. drops: counts on, but delivers nothing. duplicate: every frame twice.
+    out_of_order: every frame after its successor. all_zero: depth, infrared and confidence are black. saturated:
+    infrared is 255 everywhere. half_invalid: no depth in the lower half. wrong_size: half the rows and columns. unplug:
+    the device is gone, and counts from 0 when it is back. clock_wrap: timestamps of a hardware clock of 32 bits of
+    microseconds, which restarts at 0.
     """
 
     kind: FaultKind
     at_frame: int = Field(ge=0)
-    """The first frame that it befalls; the world has 30 a second, counted from 0 when the camera is entered."""
+    """First frame with the fault; there are 30 per second, counted from 0 when the camera is entered."""
     frames: int = Field(default=1, gt=0)
-    """How many it befalls: for stall and unplug, that is how long they last; of out_of_order, those that are late."""
+    """Number of frames: for stall and unplug their duration; for out_of_order the number that are late."""
     stream: Literal["depth", "infrared", "confidence"] | None = None
-    """Of drops: the only stream that loses frames."""
+    """Only for drops: the stream that loses frames."""
 
     @model_validator(mode="after")
-    def _sensible(self) -> Self:
+    def _check_kind(self) -> Self:
         if self.stream and self.kind != "drops":
-            raise PydanticCustomError("stream", "stream is for drops: a {kind} befalls all", {"kind": self.kind})
+            raise PydanticCustomError("stream", "stream is for drops: {kind} affects all streams", {"kind": self.kind})
         if self.kind == "clock_wrap" and "frames" in self.model_fields_set:
-            raise PydanticCustomError("frames", "a clock_wrap is at one frame: leave `frames` away")
+            raise PydanticCustomError("frames", "a clock_wrap happens at one frame: omit `frames`")
         return self
 
     @property
     def until_frame(self) -> int:
-        """The first frame that it does not befall any more."""
+        """First frame after the fault."""
         return self.at_frame + self.frames * (2 if self.kind == "out_of_order" else 1)
 
     def befalls(self, frame: int) -> bool:
-        """Whether it lasts at this frame."""
+        """Return whether the fault lasts at this frame."""
         return self.at_frame <= frame < self.until_frame
 
 
 def one_wrap(faults: tuple[Fault, ...]) -> tuple[Fault, ...]:
-    """The same. Raises PydanticCustomError for a clock that wraps more often than every 71 minutes."""
+    """Return the faults. Raises PydanticCustomError for more than one clock_wrap."""
     if sum(fault.kind == "clock_wrap" for fault in faults) > 1:
         raise PydanticCustomError("clock_wrap", "a clock wraps every 71.6 minutes: give one clock_wrap")
     return faults
 
 
 RENDERING_VERSION = 3
-"""Raised with any change of what a scene renders to, so that cached worlds are rendered anew."""
+"""Number to raise with any change of rendering results, so that cached worlds are rendered again."""
 
 
 class SceneFile(Record):
-    """Everything that a simulated camera simulates."""
+    """Complete description of a simulated camera and its world."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
@@ -211,9 +206,9 @@ class SceneFile(Record):
     sensor: SensorModel = SensorModel()
     radiometry: Radiometry = "paper"
     jump_m: float = Field(default=JUMP_M, ge=0, allow_inf_nan=False)
-    """Neighbours further apart in depth than this are not one surface."""
+    """Neighbors farther apart in depth than this are separate surfaces."""
     faults: Annotated[tuple[Fault, ...], AfterValidator(one_wrap)] = ()
-    """What befalls the simulated camera; nothing of it is rendered."""
+    """Faults of the simulated camera; they do not affect the rendering."""
 
     @field_validator("rig", mode="before")
     @classmethod
@@ -230,31 +225,31 @@ class SceneFile(Record):
 
     @property
     def poses(self) -> int:
-        """How many instants the loop has."""
+        """Number of instants in the loop."""
         return self.motion.poses if self.hidden else 1
 
     @property
     def bare(self) -> Scene:
-        """The scene with nothing hidden."""
+        """Scene without the object."""
         material = self.hidden.material if self.hidden else Material()
         return Scene(self.rig, None, material.surface, self.radiometry, self.jump_m, self.sensor.pulse_ns)
 
     def scene_at(self, number: float) -> Scene:
-        """The scene at one instant of the loop; fractions lie between two frames."""
+        """Return the scene at an instant of the loop; fractions lie between two poses."""
         if self.hidden is None:
             return self.bare
         if self.rig.object_box is None:
-            raise SceneError(f"rig {self.rig.name!r} has no object_box to hide {self.hidden.label!r} in: add one")
+            raise SceneError(f"rig {self.rig.name!r} has no object_box for {self.hidden.label!r}: add one")
         placed = place(self.hidden.triangles, self.pose_at(self.hidden, number), self.rig.object_box)
         return replace(self.bare, object_depth_m=orthographic_depth(placed, self.rig.object_box))
 
     def shows_at(self, number: float) -> bool:
-        """Whether the wall sees any of the object at one instant of the loop."""
+        """Return whether the wall sees any of the object at an instant of the loop."""
         depth_m = self.scene_at(number).object_depth_m
         return depth_m is not None and bool(np.isfinite(depth_m).any())
 
     def pose_at(self, rest: HiddenObject, number: float) -> Pose:
-        """The pose at one instant of the loop of what stands at rest as `rest` says."""
+        """Return the pose, at an instant of the loop, of an object whose pose at rest is `rest`."""
         turn, motion = 2 * pi * number / self.poses, self.motion
         return Pose(
             tilt_x_rad=radians(rest.tilt_x_deg),
@@ -268,7 +263,7 @@ class SceneFile(Record):
 
 
 def paper_scene() -> SceneFile:
-    """The default scene: the paper's rig with an airplane in flight."""
+    """Return the default scene: the paper's rig with an airplane in flight."""
     return SceneFile(
         name="paper",
         rig=load_rig("paper-rig"),
@@ -278,12 +273,12 @@ def paper_scene() -> SceneFile:
 
 
 def bare_wall_scene() -> SceneFile:
-    """The wall alone."""
+    """Return the wall alone."""
     return SceneFile(name="bare-wall", rig=load_rig("bare-wall"))
 
 
 def load_scene(path: Path) -> SceneFile:
-    """A scene from TOML; the paths of a rig and a mesh in it start from its own folder.
+    """Return a scene from TOML; paths of a rig or a mesh in it are relative to its own folder.
 
     Raises SceneError with the first problem.
     """
@@ -291,9 +286,9 @@ def load_scene(path: Path) -> SceneFile:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
         scene = SceneFile.model_validate(_from_folder(content, path.parent))
     except RecordFileError as error:
-        raise SceneError(f"{path} is not a scene: rig: {error}") from error
+        raise SceneError(f"{path} is not a valid scene: rig: {error}") from error
     except ValidationError as error:
-        raise SceneError(f"{path} is not a scene: {first_problem(error)}") from error
+        raise SceneError(f"{path} is not a valid scene: {first_problem(error)}") from error
     except OSError as error:
         raise SceneError(f"{path} cannot be read ({error.strerror}): give the path of a scene.toml") from error
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -304,7 +299,7 @@ def load_scene(path: Path) -> SceneFile:
 
 
 def _from_folder(content: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The content of a scene file with its rig read and its mesh's path made whole, both from its own folder."""
+    """Return a scene file's content with rig loaded and mesh path resolved, both relative to its folder."""
     if isinstance(rig := content.get("rig"), str):
         beside = folder / rig
         content["rig"] = rig_named(str(beside if beside.is_file() else rig)).model_dump()

@@ -43,7 +43,7 @@ class Implementation:
 
     def histograms(self, job: TransportJob) -> np.ndarray:
         setting, backend = self._how(job.accuracy)
-        return renderer.implementation(setting, backend)(replace(job, accuracy=setting))
+        return renderer.transport(replace(job, accuracy=setting), backend)
 
 
 @pytest.fixture(scope="session", params=IMPLEMENTATIONS)

@@ -15,7 +15,7 @@ from nlos_cam.render.echoes import strongest
 from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.material import Surface
-from nlos_cam.render.planning import Prepared
+from nlos_cam.render.planning import prepare
 from nlos_cam.render.renderer import Rendering
 from nlos_cam.render.scene import Scene
 
@@ -122,17 +122,17 @@ def test_path_on_the_edge_of_a_bin_is_kept(implementation: Any) -> None:
     """The longest path of all beams ends exactly at the last bin."""
     depth, one = _grid(), replace(FEW, relay_columns=1, relay_rows=1)
     depth[3, 3] = 0.25
-    job = Prepared.of(Scene(OPEN, depth), one, ["three-bounce"]).job()
+    job = prepare(Scene(OPEN, depth), one, ["three-bounce"]).job
     assert job is not None
     cell = np.array([job.relay.x_m[0], job.relay.y_m[0], 0])
     point = job.patches.point_m[0]
-    path = job.length_m + np.linalg.norm(job.foot_m - point, axis=1) + np.linalg.norm(cell - point)
+    path = job.length_m + np.linalg.norm(job.laser_spot_m - point, axis=1) + np.linalg.norm(cell - point)
     longest = float((path + job.relay.length_m[0]).max())
     for bins in (50, 64, 100):
         device = OPEN.device.model_copy(update={"bin_m": longest / bins})
         rig = OPEN.model_copy(update={"device": device})
         found = implementation.three_bounce(Scene(rig, depth), effects=["three-bounce"], accuracy=one)
-        assert (found > 0).any(1).sum() == len(job.foot_m)
+        assert (found > 0).any(1).sum() == len(job.laser_spot_m)
 
 
 def test_equal_maxima_go_to_the_shorter_path(implementation: Any) -> None:

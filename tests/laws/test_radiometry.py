@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from nlos_calibration.rig import LidarPose, load_rig
 
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.echoes import pulse_bins, spread
+from nlos_cam.render.echoes import pulse_bins, with_pulse
 from nlos_cam.render.geometry import NEAR_DIAGONALS, cast, contact_m2, softened
 from nlos_cam.render.material import Brdf, Surface, phong, retroreflective
 from nlos_cam.render.renderer import render, three_bounce, transient
@@ -215,7 +215,7 @@ def test_pulse_of_zero_width_changes_nothing(implementation: Any) -> None:
 def test_pulse_spreads_an_echo_into_a_gaussian(pulse_ns: float) -> None:
     one = np.zeros((1, 400), np.float32)
     one[0, 200] = 2.0
-    wide = spread(one, pulse_ns, BIN_M)[0].astype(np.float64)
+    wide = with_pulse(one, pulse_ns, BIN_M)[0].astype(np.float64)
     at, sigma = np.arange(len(wide)) - 200, pulse_bins(pulse_ns, BIN_M)
     assert wide.sum() == pytest.approx(2)
     assert (wide * at).sum() == pytest.approx(0, abs=1e-3)
@@ -227,7 +227,7 @@ def test_pulse_spreads_an_echo_into_a_gaussian(pulse_ns: float) -> None:
 def test_pulse_of_1_ns_is_30_cm_of_path_at_half_height() -> None:
     one = np.zeros((1, 400), np.float32)
     one[0, 200] = 1.0
-    wide = spread(one, 1.0, BIN_M)[0]
+    wide = with_pulse(one, 1.0, BIN_M)[0]
     assert (wide >= wide.max() / 2).sum() * BIN_M == pytest.approx(0.30, abs=0.011)
     assert wide.shape[0] > 400 + 3 * pulse_bins(1.0, BIN_M)  # room for the tail
 

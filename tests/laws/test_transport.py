@@ -14,7 +14,7 @@ from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.geometry import Relay
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Surface, phong
-from nlos_cam.render.planning import Prepared
+from nlos_cam.render.planning import prepare
 from nlos_cam.render.scene import Radiometry, Scene
 
 RIG = load_rig("paper-rig")
@@ -40,7 +40,7 @@ def _rough(seed: int, low_m: float = 0.15, high_m: float = 0.35) -> np.ndarray:
 
 
 def _job(scene: Scene, accuracy: Accuracy = COARSE) -> TransportJob:
-    job = Prepared.of(scene, accuracy, ALL_BUT_MORE).job()
+    job = prepare(scene, accuracy, ALL_BUT_MORE).job
     assert job is not None
     return job
 
@@ -64,7 +64,7 @@ def test_relay_receives_less_light_than_left_the_spot(
 ) -> None:
     depth = _rough(seed, base_m, base_m + rough_m)
     job = _job(Scene(OPEN, depth, radiometry=radiometry, jump_m=0.5))
-    arrived = _arrived(implementation, job.some(np.arange(len(job.foot_m))[::37]))
+    arrived = _arrived(implementation, job.select(np.arange(len(job.laser_spot_m))[::37]))
     assert arrived.max() <= 1
     assert arrived.min() >= 0
     assert arrived.max() > 0
@@ -72,10 +72,10 @@ def test_relay_receives_less_light_than_left_the_spot(
 
 def _swapped(job: TransportJob) -> TransportJob:
     """The same with the feet where the relay cells were and the other way round."""
-    relay, foot = job.relay, job.foot_m
+    relay, foot = job.relay, job.laser_spot_m
     there = Relay(*foot[:, :2].T.copy(), job.length_m, np.ones(len(foot)), relay.cell_m2, relay.diagonal_m)
     feet = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1)
-    return replace(job, foot_m=feet, length_m=relay.length_m, cos_incidence=np.ones(len(feet)), relay=there)
+    return replace(job, laser_spot_m=feet, length_m=relay.length_m, cos_incidence=np.ones(len(feet)), relay=there)
 
 
 @pytest.mark.slow
@@ -85,10 +85,10 @@ def test_transport_is_reciprocal(implementation: Any, brdf: Any) -> None:
     scene = Scene(OPEN, _rough(1, 0.25, 0.35), Surface(0.7, brdf), "lambertian", jump_m=0.5)
     job = _job(scene, replace(COARSE, relay_columns=40, relay_rows=40))
     assert job.near_m < 0.25  # near contact depends on the direction
-    job = replace(job, relay=job.relay.kept(np.arange(len(job.relay.x_m)) == 905)).some(np.array([1500]))
-    job = replace(job, map_foot_m=job.foot_m)
+    job = replace(job, relay=job.relay.select(np.arange(len(job.relay.x_m)) == 905)).select(np.array([1500]))
+    job = replace(job, map_spots_m=job.laser_spot_m)
     there, back = job, _swapped(job)
-    back = replace(back, map_foot_m=back.foot_m)
+    back = replace(back, map_spots_m=back.laser_spot_m)
     sent = implementation.histograms(there)[0] / there.relay_weight[0]
     returned = implementation.histograms(back)[0] / back.relay_weight[0]
     assert sent.any()
@@ -99,9 +99,9 @@ def test_transport_is_reciprocal(implementation: Any, brdf: Any) -> None:
 
 def test_echoes_lie_between_shortest_and_longest_path(implementation: Any) -> None:
     scene = Scene(RIG, _rough(2))
-    job = _job(scene).some(np.arange(0, 2700, 50))
+    job = _job(scene).select(np.arange(0, 2700, 50))
     histogram, point, relay = implementation.histograms(job), job.patches.point_m, job.relay
-    d2 = np.linalg.norm(job.foot_m[:, None] - point, axis=-1)
+    d2 = np.linalg.norm(job.laser_spot_m[:, None] - point, axis=-1)
     cells = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1)
     rest = np.linalg.norm(point[:, None] - cells, axis=-1) + relay.length_m
     shortest = job.length_m + (d2 + rest.min(1)).min(1)
@@ -118,8 +118,8 @@ def test_single_path_has_its_bin_and_the_weight_of_s2(implementation: Any) -> No
     depth = np.full((8, 8), np.nan, np.float32)
     depth[3, 3] = 0.3
     job = _job(Scene(OPEN, depth), replace(COARSE, relay_columns=40, relay_rows=40, sub_bins=64))
-    job = replace(job, relay=job.relay.kept(np.arange(len(job.relay.x_m)) == 905))
-    foot, point, relay = job.foot_m, job.patches.point_m[0], job.relay
+    job = replace(job, relay=job.relay.select(np.arange(len(job.relay.x_m)) == 905))
+    foot, point, relay = job.laser_spot_m, job.patches.point_m[0], job.relay
     cell = np.array([relay.x_m[0], relay.y_m[0], 0])
     d2, d3 = np.linalg.norm(foot - point, axis=1), np.linalg.norm(cell - point)
     path = (job.length_m + d2 + d3 + relay.length_m[0]) / BIN_M
@@ -194,7 +194,7 @@ def test_transient_is_three_bounces_plus_the_direct_return(implementation: Any, 
     whole = implementation.transient(scene, ALL_BUT_MORE).reshape(5120, -1)
     rest = whole.copy()
     rest[:, : three.shape[1]] -= three.astype(np.float32)
-    direct = Prepared.of(scene, COARSE, ALL_BUT_MORE).beams.direct
+    direct = prepare(scene, COARSE, ALL_BUT_MORE).beams.direct
     np.testing.assert_allclose(rest.sum(1), direct, rtol=1e-5, atol=1e-6 * whole.max())
     rendering = implementation.render(scene, NO_WIDTH)
     np.testing.assert_allclose(

@@ -1,13 +1,12 @@
-"""What a device adds to the depth of each pixel, whatever is seen there: an offset, ripples, drift with temperature.
+"""Fixed patterns of the device and of the wall: depth bias of each pixel, and the wall's texture.
 
-Ripples and patches are fixed patterns of the device. Drift is told against the warm device: there the common drift is
-none and the patches are whole; where a warm-up begins it is the other way round.
+Bias is an offset, ripples and drift with temperature, the same for anything in view. Drift is relative to the warm
+device: there the common drift is 0 and the patches are complete; at the start of a warm-up it is the reverse.
 
-What the relay wall's own pattern (grain, paint, dirt) does to the light of each pixel: a factor that stays.
-
-The wall reflects a beam's direct return, and the first bounce of all its three-bounce paths, at one and the same point:
-its reflectance there is a factor of the whole echo, and changes no winner (S1, S2, S5). Third bounces come from the
-whole relay wall, whose texture they average: that is left out, as is any gloss.
+Texture (grain, paint, dirt) is a factor of each pixel's light. The wall reflects a beam's direct return and the first
+bounce of all its three-bounce paths at one point: its reflectance there is a factor of the whole echo, and changes no
+winner (S1, S2, S5). Third bounces come from the whole relay wall, whose texture they average: not modeled, nor is
+gloss.
 """
 
 from math import inf
@@ -25,23 +24,23 @@ BIASES = {
     "patchy drift": "patch_drift_m",
     "drift": "drift_m_per_celsius",
 }
-"""By the names of their verdicts, the fields that call for them."""
+"""Names of verdicts, with the fields of the model that call for them."""
 WAVES = 5.0
-"""Of the ripples across the view."""
+"""Number of ripples across the view."""
 RIPPLES_SEED, PATCHES_SEED = 1, 2
-"""Every device of ours has the same patterns."""
+"""Every simulated device has the same patterns."""
 NO_BIAS = np.zeros(0, np.float32)
 
 
 def ripples(shape: tuple[int, int], waves: float, generator: np.random.Generator) -> Float64:
-    """A wave (height, width) of amplitude 1 that runs any way, `waves` of it across the width."""
+    """Return a wave (height, width) of amplitude 1 in a random direction, `waves` of it across the width."""
     rows, columns = np.indices(shape) / shape[1]
     way, phase = generator.uniform(0.0, 2.0 * np.pi, 2)
     return np.sin(2.0 * np.pi * waves * (columns * np.cos(way) + rows * np.sin(way)) + phase)
 
 
 def smooth_patches(shape: tuple[int, int], generator: np.random.Generator, across: int = 12) -> Float64:
-    """A smooth pattern (height, width) of standard deviation 1, in about `across` patches across the width."""
+    """Return a smooth pattern (height, width) of standard deviation 1, with about `across` patches across the width."""
     height, width = shape
     coarse = generator.standard_normal((across * height // width + 3, across + 3)).astype(np.float32)
     rows, columns = np.linspace(1, coarse.shape[0] - 2, height), np.linspace(1, coarse.shape[1] - 2, width)
@@ -51,7 +50,7 @@ def smooth_patches(shape: tuple[int, int], generator: np.random.Generator, acros
 
 
 class DepthBias:
-    """The bias of a device with so many pixels (height, width), as far as the verdicts include it."""
+    """Depth bias of a device with (height, width) pixels, as far as the verdicts include it."""
 
     def __init__(self, shape: tuple[int, int], model: SensorModel, verdicts: Plan) -> None:
         offset_m, ripple_m, patch_m, self._per_celsius_m = (
@@ -67,7 +66,7 @@ class DepthBias:
             self._patches_m = (patch_m * (pattern - pattern.mean())).astype(np.float32).ravel()
 
     def at_m(self, celsius: float | None) -> Float32:
-        """What each pixel's depth is too much by (n,), at a temperature or in the warm device; empty for no bias."""
+        """Return the bias (n,) of each pixel's depth, at a temperature or in the warm device; empty for no bias."""
         celsius = self._warm_celsius if celsius is None else celsius
         bias_m = self._fixed_m
         if self._patches_m.size:
@@ -77,23 +76,22 @@ class DepthBias:
         return bias_m
 
     def _warmth(self, celsius: float) -> float:
-        """0 where the warm-up begins, 1 where it ends."""
+        """Return 0 at the start of the warm-up, 1 at its end."""
         warm = self._warm_up
         return (celsius - warm.from_celsius) / (warm.to_celsius - warm.from_celsius) if warm else 1.0
 
 
 TEXTURE_SEED = 3
-"""Every wall of ours has the same pattern."""
+"""Every simulated wall has the same pattern."""
 STAINS, GRAINS = 5, 90
-"""Patches across the view: of paint and dirt, and of what is about as small as a cell of the maps."""
+"""Patches across the view: of paint and dirt, and of grain about as small as a cell of the maps."""
 EVEN = np.zeros(0, np.float32)
 
 
 def texture(shape: tuple[int, int], strength: float) -> Float32:
-    """What each pixel (n,) of an image (height, width) receives of an even wall's light, 1 on average.
+    """Return each pixel's light (n,) relative to that of an even wall, 1 on average; empty for an even wall.
 
-    `strength` is the standard deviation of its logarithm, whose variance is half of stains, half of grain. Empty for
-    an even wall.
+    `strength` is the standard deviation of its logarithm, whose variance is half stains, half grain.
     """
     if not strength:
         return EVEN

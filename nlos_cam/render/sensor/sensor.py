@@ -1,16 +1,14 @@
-"""The sensor: echoes to the three images a device delivers, by the ordered chain of `sensor_chain`.
-
-Not modelled: the raster's scan time, mixed edges, IR and confidence that change with temperature. A pulse's width is
-the renderer's.
-
-The sensor's stages, in the order in which light meets them, and the loop that leads each pixel through them.
+"""Sensor: from echoes to the three images that a device delivers, by an ordered chain of stages.
 
     echo (S5) -> wall texture -> gain -> ambient light -> shot and read noise -> saturation -> 8 bits            IR
     signal above the noise, winner above the second -> 4 bits                                    confidence
     path / 2 x cos(beam, optical axis) -> bias -> range noise -> 0.25 mm -> dead pixels          depth
 
-Shot and read noise are independent, so one deviate carries the root of their summed variances. A pixel without an echo
-is left black: the device measures the amplitude of the echo that it finds.
+Shot and read noise are independent, so one deviate with the root of their summed variances carries both. A pixel
+without an echo is black: the device measures the amplitude of the echo that it finds.
+
+Not modeled: mixed edges, and IR and confidence that change with temperature. The raster's scan time and a pulse's width
+belong to the renderer.
 """
 
 from dataclasses import dataclass
@@ -36,20 +34,20 @@ from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, MAX_CONFIDENCE,
 
 
 class Chain(NamedTuple):
-    """What the stages know of the sensor, in IR counts and metres; a stage that is left out stands at 0."""
+    """Constants of the stages, in IR counts and meters; 0 for a stage that is left out."""
 
     gain: float
     """Counts for an intensity of I0."""
     ambient_counts: float
     shot_variance: float
-    """For each count of light."""
+    """Variance per count of light."""
     read_variance: float
     range_noise_m: float
     range_noise_per_m: float
 
 
-class Optics(NamedTuple):
-    """What each pixel meets whatever is hidden: its own direct return and where it looks; all of one length."""
+class PixelOptics(NamedTuple):
+    """Properties of each pixel (n,) that do not depend on the hidden object: its direct return and its direction."""
 
     direct: Float32
     """In units of I0."""
@@ -58,13 +56,13 @@ class Optics(NamedTuple):
     length_m: Float32
     cos_axis: Float32
     dead: NDArray[np.bool_]
-    """Empty where no pixel is dead."""
+    """Empty if no pixel is dead."""
     texture: Float32
     """Factors of the light; empty for an even wall."""
 
 
-class Echoes(NamedTuple):
-    """The map cells' echoes, flattened; 0 <= runner_up <= peak, and both are finite."""
+class CellEchoes(NamedTuple):
+    """Echoes of the map cells, flattened; 0 <= runner_up <= peak, and both are finite."""
 
     peak: Float32
     surety: Float64
@@ -74,8 +72,8 @@ class Echoes(NamedTuple):
 
 
 @numba.njit(cache=True)
-def compete(optics: Optics, pixel: int, echoes: Echoes, cell: int) -> tuple[float, float, float, float]:
-    """S5: intensity, surety and length of the pixel's own return or the cell's echo, the stronger; and the second."""
+def compete(optics: PixelOptics, pixel: int, echoes: CellEchoes, cell: int) -> tuple[float, float, float, float]:
+    """Return intensity, surety and length of the stronger of direct return and cell's echo (S5), and the second."""
     own, peak, runner_up = optics.direct[pixel], echoes.peak[cell], echoes.runner_up[cell]
     if peak > own:
         return peak, echoes.surety[cell], echoes.path_m[cell] / 2, max(own, runner_up)
@@ -84,25 +82,25 @@ def compete(optics: Optics, pixel: int, echoes: Echoes, cell: int) -> tuple[floa
 
 @numba.njit(cache=True)
 def noise_counts(light_counts: float, chain: Chain) -> float:
-    """The standard deviation that shot and read noise give to this much light, the ambient's own included."""
+    """Return the standard deviation of shot and read noise for an amount of light, ambient light included."""
     return np.sqrt(chain.read_variance + chain.shot_variance * light_counts)
 
 
 @numba.njit(cache=True)
 def saturate(light_counts: float, chain: Chain) -> float:
-    """The full scale cuts echo and ambient light together; then the ambient's mean is subtracted."""
+    """Return the light cut at full scale together with the ambient light, of which the mean is then subtracted."""
     return min(light_counts, SATURATED) - chain.ambient_counts
 
 
 @numba.njit(cache=True)
 def quantise(value: float, most: int) -> int:
-    """The nearest whole number from 0 to `most`; 0 for what is no number."""
+    """Return the nearest whole number from 0 to `most`; 0 for NaN."""
     return int(np.floor(min(value, most) + 0.5)) if value > 0 else 0
 
 
 @numba.njit(cache=True)
 def sure(counts: float, chain: Chain) -> float:
-    """From 0 to 1, how far a signal stands above the noise: as if dimmed by what ambient light adds to it."""
+    """Return from 0 to 1 how far a signal stands above the noise, dimmed by the noise that ambient light adds."""
     if chain.ambient_counts > 0:
         noise = noise_counts(counts + chain.ambient_counts, chain)
         if noise > 0:
@@ -112,7 +110,7 @@ def sure(counts: float, chain: Chain) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def signal_surety(intensity: Float32, chain: Chain) -> Float64:
-    """`sure` of intensities (n,), in units of I0."""
+    """Return `sure` of intensities (n,), in units of I0."""
     surety = np.empty(intensity.size)
     for i in range(intensity.size):
         surety[i] = sure(chain.gain * intensity[i], chain)
@@ -121,15 +119,15 @@ def signal_surety(intensity: Float32, chain: Chain) -> Float64:
 
 @numba.njit(cache=True, nogil=True)  # a simulated camera exposes while others reconstruct
 def expose(
-    optics: Optics,
-    echoes: Echoes,
+    optics: PixelOptics,
+    echoes: CellEchoes,
     cell: NDArray[np.int32],
     light_deviates: Float32,
     range_deviates: Float32,
     bias_m: Float32,
     chain: Chain,
 ) -> tuple[NDArray[np.uint16], UInt8, UInt8]:
-    """Depth, IR and confidence (n,) of n pixels, each with the cell it looks at; empty deviates are no noise."""
+    """Return depth, IR and confidence (n,) of n pixels, each with its map cell; empty deviates are no noise."""
     pixels = optics.direct.size
     z16, ir, confidence = np.zeros(pixels, np.uint16), np.zeros(pixels, np.uint8), np.zeros(pixels, np.uint8)
     for i in range(pixels):
@@ -172,13 +170,13 @@ class SensedImages:
     """(height, width); 0 to 15."""
 
     def frame(self, intrinsics: Intrinsics) -> Frame:
-        """The same in SI units, as a camera would yield it."""
+        """Return the images in SI units, as a camera yields them."""
         depth_m = np.where(self.depth_z16 == 0, np.float32(np.nan), self.depth_z16 * np.float32(DEPTH_UNIT_M))
         return Frame(depth_m, self.ir, self.confidence, timestamp_s=0.0, frame_number=0, intrinsics=intrinsics)
 
 
 class Sensor:
-    """A sensor on a rig: what depends on neither the object nor the frame is worked out once."""
+    """Sensor on a rig, with all that depends on neither object nor frame computed once; safe to share among threads."""
 
     def __init__(self, rig: Rig, model: SensorModel, radiometry: Radiometry = "paper") -> None:
         self.rig = rig
@@ -197,9 +195,9 @@ class Sensor:
     def expose(
         self, multi: MultiBounce, generator: np.random.Generator, *, celsius: float | None = None
     ) -> SensedImages:
-        """The images of one instant, with the generator's noise; maps (64 k, 80 k) hold k x k beams for each cell.
+        """Return the images of one instant, with the generator's noise.
 
-        `celsius` is the device's temperature; the warm device's unless given.
+        Maps (64 k, 80 k) hold k x k beams for each cell. `celsius` is the device's temperature (default: warm).
         """
         shape = (self.rig.intrinsics.height, self.rig.intrinsics.width)
         cell = cell_of_pixels(shape, multi.peak.shape)
@@ -210,12 +208,12 @@ class Sensor:
         return SensedImages(z16.reshape(shape), ir.reshape(shape), confidence.reshape(shape))
 
     def _deviates(self, generator: np.random.Generator, *, wanted: bool) -> Float32:
-        """One normal deviate for each pixel, or none: noise that is left out is not drawn."""
+        """Return one normal deviate per pixel, or none: noise that is left out is not drawn."""
         return generator.standard_normal(self._optics.direct.size, np.float32) if wanted else NO_DEVIATES
 
 
 def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...], *, lambertian: bool) -> Chain:
-    """The stages' constants, with 0 for each stage that the verdicts leave out."""
+    """Return the stages' constants, with 0 for each stage that the verdicts leave out."""
 
     def called_for(name: str, value: float) -> float:
         return value if included(verdicts, name) else 0.0
@@ -233,27 +231,27 @@ def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...], *, lamber
     )
 
 
-def _optics(beams: Beams, chain: Chain, dead_share: float, reflectance: Float32) -> Optics:
+def _optics(beams: Beams, chain: Chain, dead_share: float, reflectance: Float32) -> PixelOptics:
     direct = beams.direct.astype(np.float32)
     surety, length_m = signal_surety(direct, chain), beams.length_m.astype(np.float32)
     dead = np.random.default_rng(0).random(direct.size if dead_share else 0) < dead_share
-    return Optics(direct, surety, length_m, beams.cos_axis.astype(np.float32), dead, reflectance)
+    return PixelOptics(direct, surety, length_m, beams.cos_axis.astype(np.float32), dead, reflectance)
 
 
-def _echoes(multi: MultiBounce, chain: Chain) -> Echoes:
-    """The echoes flattened; an intensity that is no finite number is no echo."""
+def _echoes(multi: MultiBounce, chain: Chain) -> CellEchoes:
+    """Return the echoes flattened, without intensities that are not finite."""
     peak, runner_up = (
         np.where((map_ > 0) & (map_ < np.inf), map_, np.float32(0)).ravel() for map_ in (multi.peak, multi.runner_up)
     )
-    return Echoes(peak, signal_surety(peak, chain), np.minimum(runner_up, peak), multi.path_m.ravel())
+    return CellEchoes(peak, signal_surety(peak, chain), np.minimum(runner_up, peak), multi.path_m.ravel())
 
 
 @lru_cache(maxsize=4)
 def cell_of_pixels(image: tuple[int, int], maps: tuple[int, int]) -> NDArray[np.int32]:
-    """The flat index of the map cell that holds each pixel's centre, for (64 k, 80 k) cells; else SceneError."""
+    """Return the flat index of each pixel's map cell, for (64 k, 80 k) cells. Raises SceneError for other shapes."""
     (height, width), (rows, columns) = image, maps
     if rows < MAP_ROWS or rows % MAP_ROWS or columns * MAP_ROWS != rows * MAP_COLUMNS:
-        raise SceneError(f"echo maps of shape {maps}: give (64 k, 80 k) for k x k beams in each map cell")
+        raise SceneError(f"echo maps have shape {maps}: it must be (64 k, 80 k) for k x k beams in each map cell")
     row = (np.arange(height) + 0.5) * rows // height
     column = (np.arange(width) + 0.5) * columns // width
     return (row[:, None] * columns + column).astype(np.int32).ravel()

@@ -21,7 +21,7 @@ from nlos_cam.render.backend_torch import lay_out, shade
 from nlos_cam.render.geometry import NO_OCCLUDER
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import phong
-from nlos_cam.render.planning import Prepared
+from nlos_cam.render.planning import prepare
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.visibility import visible
@@ -39,9 +39,9 @@ def _scene(size: int = 12, step_m: float = 0.01) -> Scene:
 
 
 def _job(scene: Scene, beams: int = 30, accuracy: Accuracy = SMALL) -> TransportJob:
-    job = Prepared.of(scene, accuracy, "auto").job()
+    job = prepare(scene, accuracy, "auto").job
     assert job is not None
-    return job.some(np.arange(0, len(job.foot_m), len(job.foot_m) // beams))
+    return job.select(np.arange(0, len(job.laser_spot_m), len(job.laser_spot_m) // beams))
 
 
 def test_counted_and_window_sums_match_torch() -> None:
@@ -70,7 +70,7 @@ def test_histograms_do_not_depend_on_the_chunk_size(monkeypatch: pytest.MonkeyPa
 def _assert_as_alone(jobs: list[TransportJob]) -> None:
     for job, found in zip(jobs, backend_torch.histograms_of_all(jobs, CPU), strict=True):
         alone = backend_torch.histograms(job, CPU)
-        assert found.shape == alone.shape == (len(job.foot_m), job.bins)
+        assert found.shape == alone.shape == (len(job.laser_spot_m), job.bins)
         np.testing.assert_allclose(found, alone, rtol=1e-5, atol=1e-6 * alone.max())
 
 
@@ -133,17 +133,17 @@ def test_renderer_imports_torch_late() -> None:
 
 def _shading_job(depth: np.ndarray) -> TransportJob:
     accuracy = Accuracy("coarse", relay_columns=12, relay_rows=10)
-    job = Prepared.of(Scene(RIG, depth), accuracy, {"direct", "three-bounce", "self-occlusion", "tilt"}).job()
+    job = prepare(Scene(RIG, depth), accuracy, {"direct", "three-bounce", "self-occlusion", "tilt"}).job
     assert job is not None
-    return job.some(np.arange(0, len(job.foot_m), 60))
+    return job.select(np.arange(0, len(job.laser_spot_m), 60))
 
 
 def _shaded(jobs: list[TransportJob], job: TransportJob, first: int, chunk: int = 1 << 18) -> np.ndarray:
     """Visibility (n, m) of the legs of a job, computed within a batch."""
     fields, sites = lay_out(jobs, CPU)
     count = len(job.patches.beta)
-    weight = torch.ones(count, len(job.foot_m))
-    point, foot = torch.as_tensor(job.patches.point_m).float(), torch.as_tensor(job.foot_m).float()
+    weight = torch.ones(count, len(job.laser_spot_m))
+    point, foot = torch.as_tensor(job.patches.point_m).float(), torch.as_tensor(job.laser_spot_m).float()
     dx, dy = (foot[:, axis] - point[:, axis, None] for axis in (0, 1))
     shade(weight, dx, dy, sites.part(first, first + count), fields, chunk)
     return weight.numpy() > 0
@@ -161,7 +161,7 @@ def test_shade_agrees_with_the_exact_walk_for_every_leg() -> None:
     for job in jobs:
         p, found = job.patches, _shaded([job], job, 0)
         sites = zip(p.row, p.column, p.point_m, strict=True)
-        exact = np.array([[visible(job.field, *site, x, y) for x, y, _ in job.foot_m] for site in sites])
+        exact = np.array([[visible(job.field, *site, x, y) for x, y, _ in job.laser_spot_m] for site in sites])
         assert 0.02 < exact.mean() < 0.98
         assert (found != exact).mean() < 1e-4  # float32 at the edge of a shadow
         coarse = replace(job, accuracy=replace(job.accuracy, sectors=1))

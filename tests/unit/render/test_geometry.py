@@ -31,23 +31,13 @@ def _lidar(**pose: float) -> Rig:
 def test_beams_land_on_the_wall_along_the_rays_of_their_pixels(yaw_deg: float, pitch_deg: float) -> None:
     rig = _lidar(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     beams = cast(rig, _cells(rig))
-    np.testing.assert_allclose(beams.foot_m[beams.on_wall, 2], 0, atol=1e-12)
+    np.testing.assert_allclose(beams.laser_spot_m[beams.on_wall, 2], 0, atol=1e-12)
     pose = rig.wall_from_lidar
-    back = (beams.foot_m[beams.on_wall] - pose[:3, 3]) @ pose[:3, :3]
+    back = (beams.laser_spot_m[beams.on_wall] - pose[:3, 3]) @ pose[:3, :3]
     rays = _cells(rig).rays().reshape(-1, 3)[beams.on_wall]
     np.testing.assert_allclose(back / back[:, 2:], rays, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(back, axis=1), beams.length_m[beams.on_wall])
     np.testing.assert_allclose(back[:, 2] / np.linalg.norm(back, axis=1), beams.cos_axis[beams.on_wall])
-
-
-def test_level_lidar_sees_its_foot_in_the_middle() -> None:
-    rig = _lidar(yaw_deg=0.0)
-    beams = cast(rig, rig.pinhole.scaled(81, 65))
-    foot = beams.foot_m.reshape(65, 81, 3)
-    np.testing.assert_allclose(foot[32, 40], 0, atol=1e-9)
-    assert beams.direct.argmax() == 32 * 81 + 40
-    assert (np.diff(foot[:, :, 0], axis=1) > 0).all()
-    assert (np.diff(foot[:, :, 1], axis=0) < 0).all()
 
 
 def test_direct_return_scales_with_distance_and_receiver_cell() -> None:
@@ -76,17 +66,17 @@ def test_beams_beside_the_wall_have_no_length_and_no_return(yaw_deg: float) -> N
 def test_beams_end_at_the_wall_edge_and_at_the_occluder() -> None:
     small = BARE.model_copy(update={"wall": Extent(x_min_m=0, x_max_m=0.3, y_min_m=-0.1, y_max_m=0.1)})
     beams = cast(small, _cells(small))
-    feet = beams.foot_m[beams.on_wall]
+    feet = beams.laser_spot_m[beams.on_wall]
     assert (np.abs(feet - (0.15, 0, 0)) <= (0.15, 0.1, 1e-9)).all()
     assert np.isnan(beams.length_m[~beams.on_wall]).all()
     beams, free = cast(PAPER, _cells(PAPER)), cast(BARE, _cells(BARE))
     stopped = np.isfinite(beams.length_m) & ~beams.on_wall
     assert stopped.any()
-    np.testing.assert_allclose(beams.foot_m[stopped, 0], 0.2)
-    assert (beams.foot_m[stopped, 2] >= 0.1).all()
+    np.testing.assert_allclose(beams.laser_spot_m[stopped, 0], 0.2)
+    assert (beams.laser_spot_m[stopped, 2] >= 0.1).all()
     reached = beams.on_wall
     np.testing.assert_allclose(beams.length_m[reached], free.length_m[reached])
-    degrees = np.degrees(np.arctan2(beams.foot_m[stopped, 0], 0.2 - beams.foot_m[stopped, 2]))
+    degrees = np.degrees(np.arctan2(beams.laser_spot_m[stopped, 0], 0.2 - beams.laser_spot_m[stopped, 2]))
     assert degrees.min() > 63
 
 
@@ -102,9 +92,9 @@ def test_direct_return_after_the_gate_is_not_received() -> None:
 
 def test_beams_met_takes_the_place_of_the_wall() -> None:
     beams = cast(BARE, _cells(BARE))
-    met = beams.met(BARE, np.array([7]), np.array([0.1]), np.array([0.5]), np.array([0.25]), 2 * np.pi)
+    met = beams.with_hits(BARE, np.array([7]), np.array([0.1]), np.array([0.5]), np.array([0.25]), 2 * np.pi)
     assert not met.on_wall[7]
-    np.testing.assert_allclose(met.foot_m[7], beams.lidar_m + 0.1 * beams.direction[7])
+    np.testing.assert_allclose(met.laser_spot_m[7], beams.lidar_m + 0.1 * beams.direction[7])
     assert met.direct[7] == pytest.approx(0.25 * 0.5 * 1e-4 / (2 * np.pi * 0.01), rel=0.02)
     others = np.arange(5120) != 7
     np.testing.assert_array_equal(met.direct[others], beams.direct[others])
@@ -144,7 +134,7 @@ def test_relay_cells_and_points_behind_the_edge_are_hidden() -> None:
     assert occluder_edge(PAPER) == (0.2, 0.1)
     hidden = relay.behind(occluder_edge(PAPER), LIDAR_M)
     np.testing.assert_array_equal(hidden, relay.x_m > 0.4)
-    kept = relay.kept(~hidden)
+    kept = relay.select(~hidden)
     assert len(kept.x_m) == len(kept.y_m) == len(kept.cos_lidar) == 64 * 64
     assert (kept.cell_m2, kept.diagonal_m) == (relay.cell_m2, relay.diagonal_m)
     x, z = np.array([0.4, 0.4, 0.1, 0.0]), np.array([0.3, -0.1, 0.3, 0.3])
@@ -155,7 +145,7 @@ def test_relay_cells_are_hidden_by_a_low_occluder_only() -> None:
     def seen(z_min_m: float) -> np.ndarray:
         rig = BARE.model_copy(update={"occluder": Occluder(x_m=0.2, z_min_m=z_min_m)})
         relay = relay_cells(rig, LIDAR_M, 80, 64)
-        return relay.kept(~relay.behind(occluder_edge(rig), LIDAR_M)).x_m
+        return relay.select(~relay.behind(occluder_edge(rig), LIDAR_M)).x_m
 
     assert len(seen(0.25)) == 80 * 64
     assert seen(1e-6).max() < 0.2

@@ -18,7 +18,7 @@ from nlos_cam.render.energy_survey import CAUTION, EnergySurvey
 from nlos_cam.render.geometry import NO_OCCLUDER, SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Surface, phong
-from nlos_cam.render.planning import Prepared, plan
+from nlos_cam.render.planning import RenderProblem, plan, prepare
 from nlos_cam.render.scene import Radiometry, Scene
 from nlos_cam.render.scene_facts import SceneFacts
 
@@ -66,34 +66,25 @@ def test_plan_calls_for_a_small_tilt_on_a_shiny_surface() -> None:
     assert _called_for(Scene(RIG, gentle, shiny), "draft") >= {"tilt", "brdf"}
 
 
-@pytest.mark.parametrize("specular", [0.01, 0.1, 0.5])
-def test_plan_bounds_the_error_of_the_mean_brdf(specular: float) -> None:
-    verdicts = plan(SceneFacts(Scene(RIG, _plate(), Surface(1.0, phong(1 - specular, specular, 4))), STOPS["standard"]))
-    low, high = 1 - specular, 1 - specular + 3 * specular
-    bound = next(effect.bound for effect in verdicts if effect.name == "brdf")
-    assert bound == pytest.approx(min((high - low) / 2 / low, 1))
-    assert tuple(effect.name for effect in verdicts) == EFFECTS
-
-
-PREPARE_RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
 DEPTH = (0.25 + 0.01 * np.arange(8) * np.ones((8, 1))).astype(np.float32)
-SCENE = Scene(PREPARE_RIG, DEPTH, Surface(np.array([0.9, 0.6, 0.3]), phong(0.5, 0.5, 3)))
+SCENE = Scene(RIG, DEPTH, Surface(np.array([0.9, 0.6, 0.3]), phong(0.5, 0.5, 3)))
 
 
-def _without(*names: str) -> Prepared:
-    return Prepared.of(SCENE, COARSE, set(EFFECTS) - set(names))
+def _without(*names: str) -> RenderProblem:
+    return prepare(SCENE, COARSE, set(EFFECTS) - set(names))
 
 
-def _job(ready: Prepared) -> TransportJob:
-    job = ready.job()
+def _job(ready: RenderProblem) -> TransportJob:
+    job = ready.job
     assert job is not None
     return job
 
 
-def test_prepared_holds_every_effect_and_drops_those_left_out() -> None:
-    whole = _job(_without())
-    assert _without().channels == 3
+def test_problem_holds_every_effect_and_drops_those_left_out() -> None:
+    problem = _without()
+    whole = _job(problem)
+    assert len(problem.color_jobs) == 3
     assert whole.more_bounces
     assert whole.field.shades
     assert whole.brdf is SCENE.surface.brdf
@@ -101,30 +92,30 @@ def test_prepared_holds_every_effect_and_drops_those_left_out() -> None:
     assert whole.edge_m == (0.2, 0.1)
     assert whole.relay.x_m.max() < 0.4
     assert not _without("direct").beams.direct.any()
-    assert _without("three-bounce").job() is None
-    assert _without("colour").channels == 1
+    assert _without("three-bounce").job is None
+    assert not _without("colour").color_jobs
     assert _job(_without("tilt")).patches.beta.max() == 1
     assert not _job(_without("self-occlusion")).field.shades
     open_job, short, dull = (_job(_without(name)) for name in ("occluder", "inter-reflection", "brdf"))
     assert open_job.edge_m == NO_OCCLUDER
     assert len(open_job.relay.x_m) == 48
-    assert len(open_job.foot_m) > len(whole.foot_m)
+    assert len(open_job.laser_spot_m) > len(whole.laser_spot_m)
     assert not short.more_bounces
     assert short.bins < whole.bins
     assert dull.brdf is None
     assert dull.patches.albedo.mean() == pytest.approx(0.6 * (0.5 + 0.5 + 0.5 * 2.5) / 2)  # the middle of its range
 
 
-def test_prepared_refuses_histograms_that_do_not_fit() -> None:
-    device = PREPARE_RIG.device.model_copy(update={"bin_m": 1e-6})
-    scene = Scene(PREPARE_RIG.model_copy(update={"device": device}), DEPTH)
+def test_prepare_refuses_histograms_that_do_not_fit() -> None:
+    device = RIG.device.model_copy(update={"bin_m": 1e-6})
+    scene = Scene(RIG.model_copy(update={"device": device}), DEPTH)
     with pytest.raises(SceneError, match="GiB"):
-        Prepared.of(scene, COARSE, "auto").job()
+        prepare(scene, COARSE)
 
 
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
 def test_job_weights_are_the_factors_of_s2(radiometry: Radiometry) -> None:
-    job = _job(Prepared.of(Scene(PREPARE_RIG, DEPTH, Surface(0.5), radiometry), COARSE, "auto"))
+    job = _job(prepare(Scene(RIG, DEPTH, Surface(0.5), radiometry), COARSE))
     relay, solid = job.relay, np.pi if radiometry == "lambertian" else 2 * np.pi
     np.testing.assert_allclose(job.strength, 0.5 * job.patches.beta * job.patches.cell_m2)
     far = relay.length_m > job.near_m
@@ -200,9 +191,6 @@ def test_accuracy_refuses_values_out_of_range_by_field(field: str, value: float)
         replace(STOPS["standard"], **{field: value})
 
 
-ENERGY_SURVEY_RIG = load_rig("paper-rig")
-
-
 def test_survey_share_is_cautious_and_at_most_1() -> None:
     two = np.ones(2)
     found = EnergySurvey(two, two, 0 * two, 0 * two, 0 * two, 0 * two, 1.0)
@@ -221,40 +209,30 @@ def test_survey_bounds_the_energy_of_a_patch_on_the_wall(z_m: float) -> None:
     """A patch on the wall must not outweigh all others, whose bounds would then be too small."""
     depth = np.full((8, 8), 0.2, np.float32)
     depth[3, 3] = z_m
-    light = SceneFacts(Scene(ENERGY_SURVEY_RIG, depth, jump_m=0.5), COARSE).light
+    light = SceneFacts(Scene(RIG, depth, jump_m=0.5), COARSE).light
     assert light is not None
     assert np.isfinite(light.energy).all()
     assert light.energy.max() < 1e3 * np.median(light.energy)
 
 
-SCENE_FACTS_RIG = load_rig("paper-rig")
 LEVEL = np.full((8, 8), 0.25, np.float32)
 
 
 @pytest.mark.parametrize(("cells", "stride", "blocks"), [(8, 2, 4), (8, 1, 8), (7, 2, 7), (8, 4, 2)])
-def test_stage_takes_blocks_where_the_stride_divides_the_grid(cells: int, stride: int, blocks: int) -> None:
-    scene = Scene(SCENE_FACTS_RIG, LEVEL[:cells, :cells], Surface(np.linspace(0, 1, cells**2).reshape(cells, cells)))
-    stage = SceneFacts(scene, replace(COARSE, object_stride=stride))
-    assert stage.depth_m.shape == stage.albedo.shape == (blocks, blocks)
-    assert stage.patches is not None
-    assert len(stage.patches.beta) == blocks**2
-    assert stage.albedo.mean() == pytest.approx(0.5)
+def test_facts_take_blocks_where_the_stride_divides_the_grid(cells: int, stride: int, blocks: int) -> None:
+    scene = Scene(RIG, LEVEL[:cells, :cells], Surface(np.linspace(0, 1, cells**2).reshape(cells, cells)))
+    facts = SceneFacts(scene, replace(COARSE, object_stride=stride))
+    assert facts.depth_m.shape == facts.albedo.shape == (blocks, blocks)
+    assert facts.patches is not None
+    assert len(facts.patches.beta) == blocks**2
+    assert facts.albedo.mean() == pytest.approx(0.5)
 
 
-def test_stage_has_no_patches_of_empty_boxes_or_beyond_the_gate() -> None:
+def test_facts_have_no_patches_of_empty_boxes_or_beyond_the_gate() -> None:
     for depth in (None, np.full((8, 8), np.nan, np.float32)):
-        stage = SceneFacts(Scene(SCENE_FACTS_RIG, depth), COARSE)
-        assert stage.patches is stage.light is stage.sight is None
-        assert stage.more_bounces == 0
-    device = SCENE_FACTS_RIG.device.model_copy(update={"gate_s": 0.4999 / SPEED_OF_LIGHT_M_PER_S})
-    assert SceneFacts(Scene(SCENE_FACTS_RIG.model_copy(update={"device": device}), LEVEL), COARSE).patches is None
-    assert SceneFacts(Scene(SCENE_FACTS_RIG, LEVEL), COARSE).patches is not None
-
-
-def test_stage_of_a_coarse_stop_has_fewer_equally_bright_patches() -> None:
-    scene = Scene(SCENE_FACTS_RIG, LEVEL)
-    few, many = (SceneFacts(scene, STOPS[stop]).light for stop in ("draft", "standard"))
-    assert few is not None
-    assert many is not None
-    assert len(few.energy) == len(many.energy) // 4
-    assert few.taken.sum() == pytest.approx(many.taken.sum(), rel=0.05)
+        facts = SceneFacts(Scene(RIG, depth), COARSE)
+        assert facts.patches is facts.light is facts.line_of_sight is None
+        assert facts.interreflection == 0
+    device = RIG.device.model_copy(update={"gate_s": 0.4999 / SPEED_OF_LIGHT_M_PER_S})
+    assert SceneFacts(Scene(RIG.model_copy(update={"device": device}), LEVEL), COARSE).patches is None
+    assert SceneFacts(Scene(RIG, LEVEL), COARSE).patches is not None

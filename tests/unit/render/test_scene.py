@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from pydantic import ValidationError
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.material import Material, Surface, brdf_range, phong, retroreflective
@@ -60,7 +59,7 @@ def test_surface_refuses_albedos_out_of_range_or_shape(albedo: float | np.ndarra
 @pytest.mark.parametrize(("shape", "channels"), [((), 1), ((3,), 3), ((5, 5), 1), ((5, 5, 3), 3)])
 def test_surface_spreads_its_albedo_over_every_cell(shape: tuple[int, ...], channels: int) -> None:
     surface = Surface(np.full(shape, 0.5))
-    assert surface.coloured == (channels == 3)
+    assert surface.colored == (channels == 3)
     np.testing.assert_array_equal(surface.over((5, 5)), np.full((5, 5, channels), 0.5))
 
 
@@ -68,17 +67,9 @@ def test_material_makes_the_brdf_of_its_kind() -> None:
     assert Material().surface.brdf is None
     for kind, make in (("phong", phong), ("retroreflective", retroreflective)):
         material = Material(kind=kind, specular=0.3, exponent=7, albedo=(0.1, 0.2, 0.3))
-        assert material.surface.coloured
+        assert material.surface.colored
         assert material.brdf is not None
         assert material.brdf(0.6, 0.7, 0.8) == pytest.approx(make(0.7, 0.3, 7)(0.6, 0.7, 0.8))
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("kind", "velvet"), ("specular", 1.1), ("exponent", 0.5), ("albedo", 2.0), ("gloss", 1)]
-)
-def test_material_refuses_bad_values_by_field(field: str, value: object) -> None:
-    with pytest.raises(ValidationError, match=field):
-        Material.model_validate({field: value})
 
 
 def test_brdf_range_holds_the_lobe() -> None:

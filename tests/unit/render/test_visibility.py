@@ -197,14 +197,12 @@ def test_form_factor_of_two_squares_follows_s2(lambertian: bool) -> None:
 
 
 def test_patch_to_patch_is_reciprocal_and_loses_energy(job: TransportJob) -> None:
-    p = job.patches
-    surface = p.point_m, p.normal, job.strength, job.soft_patch_m2, p.row, p.column
-    table = patch_to_patch(*surface, job.field, 1e-9, True)  # beyond near contact
+    table = patch_to_patch(job.patch_arrays, job.field, 1e-9, True)  # beyond near contact
     assert (table > 0).any()
     assert not np.diag(table).any()
     given = table / job.strength
     np.testing.assert_allclose(given, given.T, atol=1e-9 * given.max())
-    near = patch_to_patch(*surface, job.field, job.near_m, True)
+    near = patch_to_patch(job.patch_arrays, job.field, job.near_m, True)
     assert near.sum(1).max() <= 1
 
 

@@ -16,10 +16,10 @@ from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Radiometry, Scene
-from nlos_cam.render.sensor.bias import EVEN, DepthBias, ripples, smooth_patches, texture
+from nlos_cam.render.sensor.bias import DepthBias, ripples, smooth_patches, texture
 from nlos_cam.render.sensor.effects import sensor_effects
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, STEADY_CELSIUS, SensorModel, WarmUp
-from nlos_cam.render.sensor.sensor import Echoes, Optics, Sensor, cell_of_pixels, compete
+from nlos_cam.render.sensor.sensor import Sensor, cell_of_pixels
 
 RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
@@ -91,20 +91,6 @@ def test_sensor_with_a_short_gate_gives_black_images() -> None:
     assert not images.confidence.any()
 
 
-def _finer(multi: MultiBounce, k: int) -> MultiBounce:
-    """The same echoes from k x k equal beams in each cell."""
-    maps = (np.repeat(np.repeat(m, k, 0), k, 1) for m in (multi.peak, multi.runner_up, multi.path_m))
-    return MultiBounce(*maps)
-
-
-@pytest.mark.parametrize("k", [2, 3, 8])
-def test_equal_beams_in_a_cell_are_one_beam(rendering: Rendering, k: int) -> None:
-    sensor = Sensor(RIG, SensorModel())
-    one, many = (sensor.expose(multi, _generator()) for multi in (rendering.multi, _finer(rendering.multi, k)))
-    for name in ("depth_z16", "ir", "confidence"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
-
-
 @pytest.mark.parametrize("k", [1, 2, 5])
 def test_cell_of_pixels_takes_the_beam_at_the_pixel_center(k: int) -> None:
     rows, columns = 64 * k, 80 * k
@@ -135,61 +121,24 @@ def test_included_direct_return_does_not_compete_again() -> None:
     assert (mixed.confidence >= apart.confidence).all()
 
 
-def test_compete_takes_the_stronger_or_direct_return() -> None:
-    for own, peak, outcome in ((2.0, 2.0, (2.0, 0.25, 3.0, 2.0)), (0.125, 2.5, (2.5, 0.75, 4.0, 0.5))):
-        optics = Optics(*(np.array([x], np.float32) for x in (own, 0.25, 3.0, 1.0)), np.zeros(0, np.bool_), EVEN)
-        echoes = Echoes(*(np.array([0.0, x], np.float32) for x in (peak, 0.75, 0.5, 8.0)))
-        assert compete(optics, 0, echoes, 1) == outcome
-
-
 @pytest.mark.parametrize(
-    ("field", "low", "high"),
+    ("field", "values"),
     [
-        *[(name, 0.0, 1.0) for name in ("wall_texture", "range_noise_per_m", "ripple_m", "patch_drift_m")],
-        *[(name, -1.0, 1.0) for name in ("range_offset_m", "drift_m_per_celsius")],
-        *[(name, 0.0, 255.0) for name in ("read_noise_counts", "shot_noise")],
-        ("pulse_ns", 0.0, 100.0),
-        ("ambient_counts", 0.0, 254.9),
-        ("range_noise_m", 0.0, 10.0),
-        ("dead_share", 0.0, 0.99),
-        ("bare_wall_counts", 1e-9, 1e6),
+        ("shot_noise", (-1e-8, 256.0, float("nan"), float("inf"))),
+        ("ambient_counts", (255.0, float("nan"))),
+        ("warm_up", ({"from_celsius": 45, "to_celsius": 45, "time_constant_s": 600},)),
     ],
 )
-def test_sensor_model_refuses_values_out_of_range_by_field(field: str, low: float, high: float) -> None:
-    for value in (low, high):
-        assert getattr(SensorModel.model_validate({field: value}), field) == value
-    for value in (low - 1e-8, 1.02 * high, float("nan"), float("inf")):
+def test_sensor_model_refuses_values_out_of_range_by_field(field: str, values: tuple[object, ...]) -> None:
+    for value in values:
         with pytest.raises(ValidationError, match=field):
             SensorModel.model_validate({field: value})
-
-
-def test_sensor_model_has_no_pulse_bias_or_warm_up_by_default() -> None:
-    bias = dict.fromkeys(("range_offset_m", "ripple_m", "patch_drift_m", "drift_m_per_celsius"), 0.0)
-    assert SensorModel() == SensorModel(pulse_ns=0, wall_texture=0, ambient_counts=0, warm_up=None, **bias)
-    assert SensorModel().celsius_at(0) == SensorModel().celsius_at(1e6) == STEADY_CELSIUS
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("from_celsius", 45.0),
-        ("from_celsius", -1.0),
-        ("to_celsius", 101.0),
-        ("to_celsius", float("nan")),
-        ("time_constant_s", 0.0),
-        ("time_constant_s", float("inf")),
-        ("time_constant_min", 1.0),
-    ],
-)
-def test_warm_up_refuses_bad_values_by_field(field: str, value: float) -> None:
-    fields = {"from_celsius": 25.0, "to_celsius": 45.0, "time_constant_s": 600.0}
-    with pytest.raises(ValidationError, match=field):
-        SensorModel.model_validate({"warm_up": fields | {field: value}})
 
 
 @given(st.floats(0, 1e5), st.floats(0, 1e5))
 def test_celsius_at_approaches_the_end_of_the_warm_up(one_s: float, other_s: float) -> None:
     model = SensorModel(warm_up=WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600))
+    assert SensorModel().celsius_at(one_s) == STEADY_CELSIUS
     earlier, later = (model.celsius_at(seconds) for seconds in sorted((one_s, other_s)))
     assert 25 <= earlier <= later <= 45
     # the remaining difference shrinks to 1/e in each time constant
