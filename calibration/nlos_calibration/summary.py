@@ -3,16 +3,12 @@
 The report (HTML), the live view (Markdown) and the terminal all render these rows.
 """
 
-from math import floor, log10
-
 from nlos_calibration.board_wall import BoardRecord
-from nlos_calibration.wall import INTERVAL_STDS
+from nlos_calibration.intervals import with_degrees, with_mm
 from nlos_calibration.wall_record import WallRecord
 
 Row = tuple[str, str, str]
 """Quantity, value with its unit, meaning."""
-MAX_DECIMALS_MM, MAX_DECIMALS_DEG = 2, 3
-"""Finest digits printed, however small the interval: an interval below one unit of them is printed as one unit."""
 
 
 def wall_facts(record: WallRecord) -> list[Row]:
@@ -47,7 +43,7 @@ def wall_facts(record: WallRecord) -> list[Row]:
         rows.append(_board_row(record.board))
     rows += _depth_rows(record)
     if record.footprint_share is not None:
-        rows.append(("view on the wall", f"{record.footprint_share:.1%}", "of the map's 64 x 80 cells"))
+        rows.append(("view on the wall", f"{100.0 * record.footprint_share:.1f} %", "of the map's 64 x 80 cells"))
     rows.append(("measured on", f"{record.created}", f"{record.frames} frames averaged"))
     if celsius := record.temperatures_c.values():
         span = dict.fromkeys(f"{value:.1f}" for value in (min(celsius), max(celsius)))
@@ -71,30 +67,6 @@ def board_agreement(board: BoardRecord) -> str:
         f"The board's plane is {1e3 * board.disagreement_m:+z.2f} mm and {board.disagreement_deg:.3f}° from the "
         f"depth's: {board.disagreement_sigmas:.1f} standard deviations."
     )
-
-
-def with_mm(value_m: float, std_m: float | None, sign: str = "") -> str:
-    """Return a length in metres as millimetres with its 95 % interval: "200.00 ± 0.01 mm"."""
-    return f"{_with_interval(1e3 * value_m, None if std_m is None else 1e3 * std_m, MAX_DECIMALS_MM, sign)} mm"
-
-
-def with_degrees(value_deg: float, std_deg: float | None, sign: str = "") -> str:
-    """Return an angle with its 95 % interval: "45.000 ± 0.001°"."""
-    return f"{_with_interval(value_deg, std_deg, MAX_DECIMALS_DEG, sign)}°"
-
-
-def _with_interval(value: float, std: float | None, max_decimals: int, sign: str) -> str:
-    """Return a value and the half width of its 95 % interval, with the digits that the interval justifies.
-
-    Without a standard uncertainty (records of version 1, what was entered by hand) the value stands alone.
-    """
-    if std is None:
-        return f"{value:{sign}z.{max_decimals - 1}f}"
-    half = max(INTERVAL_STDS * std, 10.0**-max_decimals)
-    # one significant digit of the half width, two where it begins with 1: none after the point from 2 to 20, one from
-    # 0.2 to 2, ...
-    decimals = min(max(-floor(log10(half / 2.0)), 0), max_decimals)
-    return f"{value:{sign}z.{decimals}f} ± {half:.{decimals}f}"
 
 
 def _board_row(board: BoardRecord) -> Row:

@@ -57,7 +57,8 @@ def format_result(record: WallRecord, files: WallFiles) -> str:
     rows = wall_facts(record)
     wide, wider = (max(len(row[column]) for row in rows) for column in (0, 1))
     lines = [f"{name:{wide}}  {value:{wider}}  [dim]{escape(meaning)}[/]" for name, value, meaning in rows]
-    lines.append(f"[bold {_color(record.verdict)}]Verdict: {record.verdict}.[/] {escape(record.advice)}")
+    advice = record.advice[:1].upper() + record.advice[1:]
+    lines.append(f"[bold {_color(record.verdict)}]Verdict: {record.verdict}.[/] {escape(advice)}.")
     lines += [f"Note: {escape(warning)}" for warning in record.warnings]
     written = [str(files.record), *([files.reference.name] if record.reference else []), files.report.name]
     return "\n".join([*lines, f"Wrote {escape(', '.join(written))}: open {escape(files.report.name)} for the report"])

@@ -9,6 +9,7 @@ from nlos_calibration.wall_record import MeasuredWall, OccluderRecord, WallRecor
 from nlos_cam.calibrate.report_drawings import _facing, bench_picture, drawn_limits, footprint_picture
 from nlos_cam.calibrate.report_maps import Picture
 
+pytestmark = pytest.mark.slow
 Measured = Callable[..., MeasuredWall]
 ENTERED = OccluderRecord(source="entered", x_m=0.2, gap_m=0.1)
 

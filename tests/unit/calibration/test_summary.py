@@ -60,7 +60,7 @@ def test_facts_hold_offset_board_occluder_and_footprint() -> None:
     )
     assert facts["occluder's tilt"] == "-1.50°"
     assert facts["printed board"] == "203.4 ± 1.0 mm, 40.10 ± 0.04°"
-    assert facts["view on the wall"] == "87.5%"
+    assert facts["view on the wall"] == "87.5 %"
     assert facts["temperature"] == "35.5 to 40.0 °C"
     entered = OccluderRecord(source="entered", x_m=0.21, gap_m=0.09)
     assert values(occluder=entered)["occluder's gap (entered)"] == "90.0 mm"

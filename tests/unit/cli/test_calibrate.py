@@ -392,16 +392,12 @@ def test_board_json_is_the_board_that_was_printed(out: Path, capsys: pytest.Capt
         assert Board.model_validate(result) == board
 
 
-def test_board_prints_how_to_print_it(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["board", "--out", str(out)]) == 0
-    shown = capsys.readouterr().out
-    for part in ("6 x 9", "30 mm", "a4", "100 %", "wall.toml"):
-        assert part in shown
-
-
-def test_board_keeps_an_existing_file_unless_asked(out: Path) -> None:
+def test_board_keeps_a_file_and_prints_how_to_print(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out.write_text("mine", encoding="utf-8")
     assert main(["board", "--out", str(out)]) == 1
     assert out.read_text(encoding="utf-8") == "mine"
     assert main(["board", "--out", str(out), "--overwrite"]) == 0
+    shown = capsys.readouterr().out
+    for part in ("6 x 9", "30 mm", "a4", "100 %", "wall.toml"):
+        assert part in shown
     assert main(["board", "--paper", "napkin", "--out", str(out)]) == 2

@@ -13,7 +13,7 @@ import usb.core
 import usb.util
 from usb.backend.libusb1 import _LibUSB
 
-from nlos_cam.doctor.usb import SPEEDS, SUPER_SPEED, UsbDevice, firmware_of, scan_usb, sdk_serial
+from nlos_cam.doctor.usb import SPEEDS, UsbDevice, firmware_of, scan_usb, sdk_serial
 
 Make = Callable[..., SimpleNamespace]
 Scan = Callable[..., list[UsbDevice]]
@@ -71,10 +71,7 @@ def test_link_is_slow_by_speed_or_else_by_version(
     assert ("USB 2" in found.link) == slow
 
 
-def test_every_speed_of_pyusb_is_described() -> None:
-    named = {getattr(usb.util, name) for name in dir(usb.util) if name.startswith("SPEED_")}
-    assert named - {usb.util.SPEED_UNKNOWN} <= SPEEDS.keys()
-    assert SUPER_SPEED == usb.util.SPEED_SUPER
+def test_speeds_have_pyusbs_codes() -> None:
     assert SPEEDS[usb.util.SPEED_HIGH] == "480 Mbit/s (USB 2)"
     assert SPEEDS[usb.util.SPEED_SUPER] == "5 Gbit/s (USB 3)"
 
