@@ -26,7 +26,7 @@ def nothing_left_running() -> Iterator[None]:
 
 
 class NoiseWorld:
-    """A small world of noise: every bit of a frame follows from its number."""
+    """Small world of noise, in which a frame's number determines its bits."""
 
     width, height = 64, 48
 
@@ -52,7 +52,7 @@ class NoiseWorld:
 
 
 class HurriedClock:
-    """A clock that moves only by waiting, and at once."""
+    """Clock that moves only by waiting, without delay."""
 
     def __init__(self, start_s: float = 1e9) -> None:
         self.time_s = start_s
@@ -91,7 +91,7 @@ def recorded() -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def noise_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of twenty frames of a NoiseWorld."""
+    """Record twenty frames of a NoiseWorld."""
     return record_noise(tmp_path_factory.mktemp("bags") / "noise.bag", 20)
 
 
@@ -107,7 +107,7 @@ def fake_sdk() -> type[FakeSdk]:
 
 @pytest.fixture
 def fake_camera() -> Callable[..., L515Camera]:
-    """Make an L515Camera on a fake SDK that sees these lidars, with a clock that moves only by waiting."""
+    """Make an L515Camera on a fake SDK with these lidars and a clock that moves only by waiting."""
 
     def make(
         *lidars: FakeLidar, serial: str = "", clock: NapClock | None = None, recording: Recording | None = None

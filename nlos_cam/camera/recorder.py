@@ -175,7 +175,7 @@ class Recording:
         """True if the camera goes on without it when it ends early, by a silent device or a full disk."""
         self.sets = 0
         """Complete sets in this take so far, from the first that the camera yields."""
-        self.begun = False
+        self.started = False
         """True once the file is this take's, and no longer the one it replaces."""
         self.disk_full = False
         """True if it stopped for want of disk space."""
@@ -190,7 +190,7 @@ class Recording:
         """Record the device's streams. Raises RecordingError where nothing can be written."""
         self._source = device, sdk
         self._recorder = SdkRecorder(self.path, device, sdk)
-        self.begun = True
+        self.started = True
 
     def next_take(self, path: Path, *, last: bool) -> None:
         """Record to `path` from the next set on, with the same device and settings, after this take was closed.
@@ -201,7 +201,7 @@ class Recording:
         self._changed.clear()
         self._changing.set()
         self._at_boundary.wait(BOUNDARY_WAIT_S)  # `add` holds the SDK's thread there: no set is cut in two
-        self.path, self.sets, self.begun, self._last = path, 0, False, last
+        self.path, self.sets, self.started, self._last = path, 0, False, last
         try:
             self.begin(*self._source)
         finally:

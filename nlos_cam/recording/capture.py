@@ -97,7 +97,7 @@ class CaptureSession:
         try:
             return iter(entered.enter_context(self._camera))
         except BaseException:
-            if self._recording.begun:  # and holds nothing
+            if self._recording.started:  # and holds nothing
                 self._recording.path.unlink(missing_ok=True)
             raise
 

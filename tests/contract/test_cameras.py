@@ -1,4 +1,4 @@
-"""One suite for every camera. Rows of a real L515 skip where none is connected; those of a fake one run."""
+"""One suite for every camera; rows of a real L515 are skipped where none is connected."""
 
 import json
 import subprocess
@@ -73,7 +73,7 @@ def look(camera: Camera, count: int = SEEN) -> list[Frame]:
 
 
 def world_of(uri: str) -> World | None:
-    """Open the world that the camera sees, where we know it."""
+    """Open the world of a camera, if it is known."""
     if uri.startswith("l515"):
         return None
     return open_world("" if uri == "sim" else "bare-wall")

@@ -33,7 +33,7 @@ class FakeNetwork:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Open cameras that soon count as silent, and are not waited for long."""
+    """Open cameras with short timeouts for silence and replugging."""
 
     def opened(uri: str, **options: Any) -> Any:
         camera: Any = open_camera(uri, **options)

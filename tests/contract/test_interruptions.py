@@ -1,10 +1,9 @@
-"""Live runs interrupted at random moments; tools/interrupt_live.py does the same fifty times."""
+"""Live runs interrupted at random moments; tools/robustness/interrupt_live.py does the same fifty times."""
 
-import importlib
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from interrupt_live import Plan, interrupt
 
 pytestmark = [
     pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="lists processes as Linux does"),
@@ -12,14 +11,7 @@ pytestmark = [
     pytest.mark.timeout(900),
 ]
 EARLY_S, LATE_S = 0.5, 8.0
-"""Seconds after its code began: while it starts, and mostly while it runs."""
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(Path(__file__).parents[2] / "tools")
-        return importlib.import_module("interrupt_live")
+"""Seconds after the process begins: during its start, and mostly while it runs."""
 
 
 @pytest.mark.parametrize(
@@ -32,9 +24,9 @@ def tool() -> ModuleType:
     ],
 )
 def test_interrupted_live_leaves_no_process_or_partial_file(
-    tool: ModuleType, tmp_path: Path, kind: str, after_s: float, view: bool
+    tmp_path: Path, kind: str, after_s: float, view: bool
 ) -> None:
-    outcome = tool.interrupt(tool.Plan(0, kind, after_s, 5, view), tmp_path)
+    outcome = interrupt(Plan(0, kind, after_s, 5, view), tmp_path)
     assert outcome.good, outcome
     if kind == "viewer killed":
         assert outcome.frames_recorded > 0

@@ -19,8 +19,8 @@ from nlos_cam.view.server import Send
 from nlos_cam.view.web import WebViewer
 
 RIG = load_rig("paper-rig")
-MEANWHILE = 100
-"""Frames that one and the same piece of the stream is not taken for."""
+MAX_WAITING_FRAMES = 100
+"""Frames for which the browser leaves one piece of the stream unread."""
 PATIENCE = 100_000
 
 
@@ -39,7 +39,7 @@ class Noted(WebViewer):
 
 
 class Camera(FrameCamera):
-    """Camera of noise that ends once a browser has kept a piece of the stream waiting for MEANWHILE frames."""
+    """Camera of noise that ends once a browser has kept a piece of the stream waiting for MAX_WAITING_FRAMES frames."""
 
     intrinsics = RIG.pinhole
 
@@ -55,7 +55,7 @@ class Camera(FrameCamera):
             waits = self._viewer.given > self._viewer.taken == waited_for
             self.kept_waiting = self.kept_waiting + 1 if waits else 0
             waited_for = self._viewer.taken
-            if self.kept_waiting == MEANWHILE:
+            if self.kept_waiting == MAX_WAITING_FRAMES:
                 return
             yield Frame(noise_m, ir, ir, number / 1000, number, RIG.pinhole)
 
@@ -71,6 +71,6 @@ def test_live_loop_never_waits_for_a_browser_that_reads_nothing(monkeypatch: pyt
         deaf.sendall(b"GET /live.rrd HTTP/1.0\r\nHost: localhost\r\n\r\n")
         camera: Any = Camera(viewer)
         report = run_live(camera, Pipeline(CalibratedRig(RIG), sheet_network), viewer, stop=Event(), recorded=True)
-    assert camera.kept_waiting == MEANWHILE
-    assert report.frames > MEANWHILE
+    assert camera.kept_waiting == MAX_WAITING_FRAMES
+    assert report.frames > MAX_WAITING_FRAMES
     assert report.dropped == 0

@@ -1,4 +1,4 @@
-"""Stands for the parts of pyrealsense2 that the camera package uses, over fake lidars.
+"""Fake of the parts of pyrealsense2 that the camera package uses, over fake lidars.
 
 Devices and sensors are handles on a `FakeLidar` that fail once it was unplugged, as librealsense's do.
 tests/unit/camera/test_fake_librealsense.py holds the names against the real module.
@@ -17,7 +17,7 @@ GONE = "failed to set power state"
 
 
 class FakeSensor:
-    """A handle on the lidar's depth sensor, or on its colour sensor."""
+    """Handle on the lidar's depth or color sensor."""
 
     def __init__(self, lidar: FakeLidar, generation: int, *, colour: bool = False) -> None:
         self.lidar, self.generation = lidar, generation
@@ -79,7 +79,7 @@ class FakeSensor:
 
 
 class FakeDevice:
-    """A handle on the lidar, good until it is unplugged."""
+    """Handle on the lidar, valid until it is unplugged."""
 
     def __init__(self, lidar: FakeLidar, generation: int) -> None:
         self.lidar, self.generation = lidar, generation
@@ -106,7 +106,7 @@ class FakeDevice:
 
 
 class FakeRecorder:
-    """Creates an empty file, and notes its start."""
+    """Recorder that creates an empty file and notes its start."""
 
     def __init__(self, path: str, device: FakeDevice) -> None:
         device.lidar.did.append("record")
@@ -128,7 +128,7 @@ class FakeContext:
 
 
 class Names:
-    """Stands for an enumeration, whose members are their own names; keeps the names in use."""
+    """Enumeration whose members are their own names; records the names in use."""
 
     def __init__(self, make: Callable[[str], Any]) -> None:
         self.make, self.asked = make, set[str]()

@@ -20,7 +20,7 @@ PACE_S = 0.002
 
 
 class NapClock:
-    """A clock that moves only by waiting, and notes each wait."""
+    """Clock that moves only by waiting, and records each wait."""
 
     def __init__(self) -> None:
         self.time_s, self.naps = 1e9, list[float]()
@@ -98,10 +98,10 @@ class FakeFrame:
 
 
 class FakeLidar:
-    """An L515 on USB. Each start of its sensor takes the next of `runs`: a number of frames, from number 0.
+    """L515 on USB. Each start of its sensor uses the next of `runs`: a number of frames, from number 0.
 
-    While it `flaps` more than once, it repeats the first run. Without `runs` it gives one frame on starting, and then
-    those of each call of `deliver`.
+    While it `flaps` more than once, it repeats the first run. Without `runs` it delivers one frame on starting, and
+    then those of each call of `deliver`.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class FakeLidar:
         self.plugged = True
 
     def look_for(self) -> bool:
-        """Look the device up on USB; returns whether it is there."""
+        """Look the device up on USB; return True if it is connected."""
         if not self.plugged and self.back_after:
             self.back_after -= 1
             self.plugged = self.back_after == 0
@@ -171,11 +171,6 @@ class FakeLidar:
         frames = 0 if not self.runs else self.runs[0] if self.flaps > 1 else self.runs.pop(0)
         self._thread = Thread(target=self._run, args=(frames, stopping), name="fake SDK", daemon=True)
         self._thread.start()
-
-    def finish_run(self) -> bool:
-        """Wait until a run has given its frames; returns whether it did within 5 s."""
-        self._thread.join(5.0)
-        return not self._thread.is_alive()
 
     def _run(self, frames: int, stopping: Event) -> None:
         for number in range(frames):

@@ -122,7 +122,7 @@ def test_next_take_starts_though_no_frame_comes(camera: Make, tmp_path: Path, mo
         source._end()
         recording.close()
         recording.next_take(tmp_path / "b.bag", last=True)
-        assert recording.begun
+        assert recording.started
         assert not recording.done
     assert (tmp_path / "b.bag").exists()
 
