@@ -6,7 +6,6 @@ __all__ = [
     "GAP_RANGE_M",
     "INTERVAL_STDS",
     "MAP_SHAPE",
-    "MIN_COLUMNS",
     "PAPER_MM",
     "QUANTUM_M",
     "TOLERANCE_DEG",
@@ -15,7 +14,6 @@ __all__ = [
     "BareWall",
     "BareWallStatistics",
     "Board",
-    "BoardFit",
     "BoardRecord",
     "BoardView",
     "CameraErrors",
@@ -47,8 +45,8 @@ __all__ = [
     "WallFit",
     "WallRecord",
     "board_agreement",
-    "depth_offset_m",
     "depth_noise_m",
+    "depth_offset_m",
     "dump_toml",
     "facing_angle_rad",
     "find_corners",
@@ -58,7 +56,7 @@ __all__ = [
     "fit_wall",
     "fit_with_tape_distance",
     "footprint",
-    "lidar_sees",
+    "lidar_visible_share",
     "load_measured",
     "load_rig",
     "load_wall",
@@ -85,12 +83,13 @@ __all__ = [
 ]
 
 from .board import BOARDS, PAPER_MM, Board, Corners, Light, Paper, find_corners
-from .board_pose import BoardFit, PrintErrors, fit_board
+from .board_pose import PrintErrors, fit_board
 from .board_wall import BoardRecord, BoardView, CameraErrors, WallByBoard, wall_with_board
 from .drift import WINDOW_FRAMES, Drift, DriftCheck, settings_changed
 from .geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
+from .intervals import INTERVAL_STDS, with_degrees, with_mm
 from .noise import QUANTUM_M, DepthMean, MeanNoise, depth_noise_m
-from .occluder import MIN_COLUMNS, OccluderFit, find_occluder
+from .occluder import OccluderFit, find_occluder
 from .range_offset import fit_with_tape_distance
 from .reference import FULL_SCALE, BareWall, BareWallStatistics, Moments, save_reference
 from .rig import (
@@ -109,12 +108,11 @@ from .rig import (
     first_problem,
     load_rig,
 )
-from .rig_check import GAP_RANGE_M, MAP_SHAPE, footprint, lidar_sees, on_plane, rig_difference
-from .summary import board_agreement, wall_facts, wall_summary, with_degrees, with_mm
+from .rig_check import GAP_RANGE_M, MAP_SHAPE, footprint, lidar_visible_share, on_plane, rig_difference
+from .summary import board_agreement, wall_facts, wall_summary
 from .wall import (
     DISTANCE_RANGE_M,
     FACING_RANGE_DEG,
-    INTERVAL_STDS,
     TOLERANCE_DEG,
     TOLERANCE_M,
     Verdict,

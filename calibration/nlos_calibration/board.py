@@ -1,12 +1,10 @@
-"""The ChArUco board that is printed and put on the wall: its measures, its pattern, its corners.
+"""Printed ChArUco board on the wall: dimensions, pattern, and its corners in an image.
 
-Board frame: origin at the pattern's upper left corner, x to the right, y down, z into the paper, as OpenCV has it.
+Board frame: origin at the pattern's upper left corner, x to the right, y down, z into the paper, as in OpenCV.
 
-Where a board's corners are in images: a mean over frames, contrast made even, OpenCV's detector.
-
-One detection in the mean of many frames, not the mean of many detections: noise falls alike, but dim corners are found
-that no single frame shows, and what the image's pixels do to a corner is in the residuals instead of being averaged
-over copies of itself.
+Corners are detected once in the mean of many frames, not as the mean of many detections: the noise falls equally, dim
+corners appear that no single frame shows, and sampling errors of the pixels stay visible in the residuals, where many
+detections would repeat them.
 """
 
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from nlos_calibration.arrays import Float64
+from nlos_calibration.arrays import Float64, Int64, UInt8
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.rig import Positive, Record
 
@@ -28,12 +26,12 @@ PAPER_MM: dict[Paper, tuple[float, float]] = {"a4": (210.0, 297.0), "a3": (297.0
 
 
 class Board(Record):
-    """A printed ChArUco board. What lies between its markers are chessboard corners, which is what is measured."""
+    """A printed ChArUco board. Measured are the chessboard corners between its markers."""
 
     squares_x: Annotated[int, Field(ge=3, le=40)]
     squares_y: Annotated[int, Field(ge=3, le=40)]
     square_mm: Positive
-    """As printed: measure it, printers scale."""
+    """Size on paper: measure it, since printers scale."""
     marker_mm: Positive
     dictionary: Dictionary = "DICT_4X4_50"
 
@@ -48,12 +46,12 @@ class Board(Record):
 
     @property
     def opencv_dictionary(self) -> cv2.aruco.Dictionary:
-        """The markers."""
+        """Marker dictionary for OpenCV."""
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
 
     @property
     def opencv_board(self) -> cv2.aruco.CharucoBoard:
-        """The same for OpenCV, in metres."""
+        """Board for OpenCV, in metres."""
         size = self.squares_x, self.squares_y
         return cv2.aruco.CharucoBoard(size, self.square_mm * 1e-3, self.marker_mm * 1e-3, self.opencv_dictionary)
 
@@ -64,17 +62,17 @@ class Board(Record):
 
     @property
     def corners_m(self) -> Float64:
-        """The chessboard corners (n, 3) in the board frame, by their ids."""
+        """Chessboard corners (n, 3) in the board frame, indexed by id."""
         return np.asarray(self.opencv_board.getChessboardCorners(), np.float64)
 
     def measured(self, square_mm: float) -> "Board":
-        """The same board where a print's squares turned out to measure `square_mm`."""
+        """Return the same board with squares that measure `square_mm` on paper."""
         return self.model_copy(
             update={"square_mm": square_mm, "marker_mm": self.marker_mm * square_mm / self.square_mm}
         )
 
-    def pattern(self, pixels_per_square: int) -> NDArray[np.uint8]:
-        """The pattern without a margin (squares_y k, squares_x k), 0 is black; each square has k x k pixels."""
+    def pattern(self, pixels_per_square: int) -> UInt8:
+        """Return the pattern without margin (squares_y k, squares_x k), 0 is black; each square has k x k pixels."""
         size = self.squares_x * pixels_per_square, self.squares_y * pixels_per_square
         return np.asarray(self.opencv_board.generateImage(size), np.uint8)
 
@@ -84,35 +82,35 @@ BOARDS: dict[Paper, Board] = {
     "a3": Board(squares_x=9, squares_y=13, square_mm=30.0, marker_mm=22.5, dictionary="DICT_4X4_100"),
     "letter": Board(squares_x=6, squares_y=8, square_mm=30.0, marker_mm=22.5),
 }
-"""Squares of 30 mm: larger ones leave too few corners in view at 0.15 m, smaller ones drown in the laser's spot."""
+"""Squares of 30 mm: larger ones leave too few corners in view at 0.15 m, the laser spot blurs smaller ones."""
 
 
 Light = Literal["infrared", "colour"]
 
 MIN_CORNERS = 8
-"""Fewer leave hardly a residual to judge the pose by."""
+"""With fewer corners, the residuals hardly test the pose."""
 BRIGHTEST_QUANTILE = 0.9995
 CONTRAST_LIMIT, CONTRAST_TILES = 4.0, (8, 8)
-UNSEEN: dict[Light, str] = {
-    "infrared": "put it where the view is bright, print it with toner (dye ink is white in infrared), and lower the "
-    "laser's power if it is washed out",
-    "colour": "put it where the colour camera sees it too, and light the room evenly, without gloss on the paper",
+REMEDIES: dict[Light, str] = {
+    "infrared": "place it where the view is bright, print it with toner (dye ink is white in infrared), and lower the "
+    "laser power if it is washed out",
+    "colour": "place it in the view of the colour camera too, and light the room evenly, without gloss on the paper",
 }
-"""What to do where no marker is read."""
+"""Advice where no marker is read."""
 
 
 @dataclass(frozen=True)
 class Corners:
-    """Chessboard corners of a board as they were found in an image."""
+    """Chessboard corners of a board, detected in an image."""
 
-    ids: NDArray[np.int64]
+    ids: Int64
     """(n,)."""
     pixels: Float64
     """(n, 2); x, y in pixel centres."""
 
 
-def find_corners(image: NDArray[np.floating] | NDArray[np.uint8], board: Board, light: Light = "infrared") -> Corners:
-    """The corners of `board` in an image (height, width) of any gain; `light` is for the advice in a refusal.
+def find_corners(image: NDArray[np.floating] | UInt8, board: Board, light: Light = "infrared") -> Corners:
+    """Detect the corners of `board` in an image (height, width) of any gain; `light` selects the advice in an error.
 
     Raises BoardRefusedError where fewer than MIN_CORNERS are found, or where the image is mirrored.
     """
@@ -121,22 +119,22 @@ def find_corners(image: NDArray[np.floating] | NDArray[np.uint8], board: Board, 
     if len(corners.ids) >= MIN_CORNERS:
         return corners
     if len(_detect(np.ascontiguousarray(even[:, ::-1]), board)[0].ids) >= MIN_CORNERS:
-        raise BoardRefusedError("the board is seen mirrored: the image is flipped, or the print is; put neither right")
+        raise BoardRefusedError("the board is mirrored: flip the image, or print the board without mirroring")
     raise BoardRefusedError(_too_few(len(corners.ids), markers, board, light))
 
 
-def even_contrast(image: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image (height, width) with its contrast limited and made even, in 8 bits: dim parts as clear as bright."""
+def even_contrast(image: NDArray[np.floating] | UInt8) -> UInt8:
+    """Return the image (height, width) in 8 bits with its local contrast equalised (CLAHE): dim parts become clear."""
     brightest = float(np.quantile(image, BRIGHTEST_QUANTILE))
     fine = np.clip(image / max(brightest, 1e-9) * 65535.0, 0.0, 65535.0).astype(np.uint16)
     even = np.asarray(cv2.createCLAHE(CONTRAST_LIMIT, CONTRAST_TILES).apply(fine), np.uint16)
     return (even >> 8).astype(np.uint8)
 
 
-def _detect(image: NDArray[np.uint8], board: Board) -> tuple[Corners, int]:
-    """The corners, and how many markers were read."""
+def _detect(image: UInt8, board: Board) -> tuple[Corners, int]:
+    """Return the corners and the number of markers that were read."""
     found: tuple[Any, ...] = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(image)
-    pixels, ids, _, markers = found  # each None where there are none, which OpenCV's types do not say
+    pixels, ids, _, markers = found  # each may be None, which OpenCV's types omit
     count = 0 if markers is None else len(markers)
     if ids is None:
         return Corners(np.zeros(0, np.int64), np.zeros((0, 2))), count
@@ -146,8 +144,8 @@ def _detect(image: NDArray[np.uint8], board: Board) -> tuple[Corners, int]:
 def _too_few(corners: int, markers: int, board: Board, light: Light) -> str:
     size = f"{board.squares_x} x {board.squares_y} squares of {board.square_mm:g} mm"
     if markers == 0:
-        return f"no board of {size} is seen in {light}: {UNSEEN[light]}"
+        return f"no board of {size} is visible in {light}: {REMEDIES[light]}"
     return (
-        f"{corners} corners of a board of {size} are seen ({markers} markers), {MIN_CORNERS} needed: bring more of it "
-        "into the near, bright side of the view, or average more frames"
+        f"{corners} corners of a board of {size} are visible ({markers} markers), {MIN_CORNERS} needed: move more of "
+        "it to the near, bright side of the view, or average more frames"
     )

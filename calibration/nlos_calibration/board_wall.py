@@ -1,14 +1,10 @@
-"""The wall from depth and board together: one pose, one verdict, and what the record keeps of the board.
+"""Wall from depth and a printed board together: one pose, one verdict, and the board's part of the record.
 
-A camera's view of a board, and the wall's plane in the lidar frame from it, whichever camera that is.
+Infrared shares the lidar's pinhole. Another camera has a distorting lens and a pose of its own: its plane is fitted in
+its own frame, and moved to the lidar's together with its covariance.
 
-Infrared is seen by the lidar itself. Another camera has a lens that distorts and a place of its own: its plane is
-fitted in its own frame, and moved to the lidar's together with its covariance.
-
-Two measurements of one plane, by the lidar's depth and by a board: how far apart they are, and what to make of both.
-
-Both are slopes = -normal / distance_m (3,) with a covariance. Where they agree, each counts by its weight. Where they
-do not, an average of the two would be neither: one is taken, and the likely causes are told with their amounts.
+Depth and board each give slopes = -normal / distance_m (3,) with a covariance. Where they agree, they are averaged by
+weight. Where they do not, an average would be neither: one is used, and the likely causes are listed with amounts.
 """
 
 from dataclasses import dataclass, field, replace
@@ -23,7 +19,7 @@ from nlos_calibration.arrays import Float64
 from nlos_calibration.board import Board, Corners, Light, find_corners
 from nlos_calibration.board_pose import BoardFit, PrintErrors, fit_board
 from nlos_calibration.errors import BoardRefusedError, WallRefusedError
-from nlos_calibration.geometry import Intrinsics, wall_from_plane
+from nlos_calibration.geometry import Intrinsics, plane_from_slopes, wall_from_plane
 from nlos_calibration.rig import Finite, NotNegative, Positive, Record
 from nlos_calibration.wall import Verdict, WallFit, WallMeasures, measures_of, out_of_range
 
@@ -32,48 +28,40 @@ UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """Standard uncertainties of a colour camera's calibration: assumed, since its maker publishes none.
+    """Standard uncertainties of a color camera's calibration: assumed, since its maker publishes none.
 
-    Owners of the L515 saw colour and depth 4 to 5 pixels apart at 4 m, which is a turn of 0.3 degrees.
+    Owners of the L515 saw color and depth 4 to 5 pixels apart at 4 m, which is a turn of 0.3 degrees.
     """
 
     turn_std_deg: float = 0.2
-    """Of its axes against the lidar's, about each of them; what is wrong with its principal point is the same."""
+    """Rotation against the lidar about each axis, errors of the principal point included."""
     shift_std_m: float = 0.0005
-    """Of its place, along each axis."""
+    """Position along each axis."""
     focal_std: float = 0.001
     """Relative; librealsense itself corrects it for the camera's temperature."""
 
 
 EXACT = CameraErrors(0.0, 0.0, 0.0)
-"""Of the lidar's infrared: depth is seen by the same pinhole, so that what is wrong with it is wrong with both."""
+"""Errors of the lidar's infrared: it shares the pinhole with the depth, so that both have the same errors."""
 
 
 @dataclass(frozen=True)
 class BoardView:
-    """An image in which a board is looked for, and what took it; the lidar in infrared, unless told otherwise."""
+    """Image of a board and the camera that took it, by default the lidar in infrared."""
 
     image: Float64
     """(height, width), the mean over frames; of any gain."""
     intrinsics: Intrinsics
     distortion: Float64 = field(default_factory=lambda: np.zeros(5))
-    """(5,): k1, k2, p1, p2, k3 of Brown and Conrady, as OpenCV and librealsense have them."""
+    """(5,): k1, k2, p1, p2, k3 of Brown and Conrady, in the order of OpenCV and librealsense."""
     lidar_from_camera: Float64 = field(default_factory=lambda: np.eye(4))
     """(4, 4)."""
     light: Light = "infrared"
     errors: CameraErrors = EXACT
 
 
-def find_in_view(view: BoardView, board: Board, printed: PrintErrors | None = None) -> BoardFit:
-    """The plane of `board` in the lidar frame, from where its corners are in a view.
-
-    Raises BoardRefusedError as `find_corners` and `fit_in_lidar` do.
-    """
-    return fit_in_lidar(find_corners(view.image, board, view.light), board, view, printed)
-
-
 def fit_in_lidar(corners: Corners, board: Board, view: BoardView, printed: PrintErrors | None = None) -> BoardFit:
-    """The plane of `board` in the lidar frame, from corners as they were found in the image of a view.
+    """Fit the plane of `board` in the lidar frame to corners detected in the image of a view.
 
     Raises BoardRefusedError as `fit_board` does, and where the lidar would be behind the plane.
     """
@@ -83,7 +71,7 @@ def fit_in_lidar(corners: Corners, board: Board, view: BoardView, printed: Print
 
 
 def undistorted(corners: Corners, view: BoardView) -> Corners:
-    """Where a pinhole of the same intrinsics would see the corners."""
+    """Return the corners as a pinhole of the same intrinsics would see them."""
     if not view.distortion.any():
         return corners
     points = corners.pixels.reshape(-1, 1, 2)
@@ -94,33 +82,31 @@ def undistorted(corners: Corners, view: BoardView) -> Corners:
 def plane_in_lidar(
     slopes: Float64, covariance: Float64, lidar_from_camera: Float64, errors: CameraErrors
 ) -> tuple[Float64, Float64]:
-    """A plane slopes . p = 1 of the camera's frame as one of the lidar's: slopes (3,) and covariance (3, 3).
+    """Move a plane slopes . p = 1 from the camera's to the lidar's frame: slopes (3,) and covariance (3, 3).
 
-    With u the slopes turned, and t the camera's place, u . (p - t) = 1: the lidar's slopes are u / (1 + u . t).
     Raises BoardRefusedError where the plane runs between camera and lidar.
     """
+    # With u = R slopes and t the camera's position, p_camera = R' (p - t) gives u . (p - t) = 1, so the lidar's slopes
+    # are v = u / h with h = 1 + u . t. Derivatives: dv/du = (I - v t') / h, dv/dt = -u u' / h^2 = -v v', and a small
+    # turn w changes u by w x u. Errors of turn and position have equal, independent axes.
     turn, place_m = lidar_from_camera[:3, :3], lidar_from_camera[:3, 3]
     turned = turn @ slopes
     height = 1.0 + float(turned @ place_m)
     if height <= 0.0:
         raise BoardRefusedError(
-            "the board's wall runs between colour camera and lidar: is the pose of one to the other right?"
+            "the board's wall runs between color camera and lidar: check the pose of one to the other"
         )
-    found = turned / height
-    by_turned = (np.eye(3) - np.outer(found, place_m)) / height
-    by_slopes, by_angle, by_place = by_turned @ turn, by_turned @ _turned_by(turned), -np.outer(found, found)
+    moved = turned / height
+    by_turned = (np.eye(3) - np.outer(moved, place_m)) / height
+    x, y, z = turned
+    cross = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # d (w x u) / d w
+    by_slopes, by_angle, by_place = by_turned @ turn, by_turned @ cross, -np.outer(moved, moved)
     angle_std = radians(errors.turn_std_deg)
-    return found, (
+    return moved, (
         by_slopes @ covariance @ by_slopes.T
         + angle_std**2 * by_angle @ by_angle.T
         + errors.shift_std_m**2 * by_place @ by_place.T
     )
-
-
-def _turned_by(vector: Float64) -> Float64:
-    """How a vector (3,) changes with a small turn, w x vector, by w: (3, 3)."""
-    x, y, z = vector
-    return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
 
 
 Used = Literal["both", "depth", "board"]
@@ -128,11 +114,11 @@ Used = Literal["both", "depth", "board"]
 AGREE_SIGMAS = 4.0
 """Chance alone puts two planes farther apart once in 900 times (chi-square of three unknowns)."""
 MAX_OFFSET_M, MAX_SCALE = 0.03, 0.2
-"""No lidar is farther off, and no printer."""
+"""Largest plausible range offset of a lidar, and scale error of a printer."""
 
 
 @dataclass(frozen=True)
-class Plane:
+class UncertainPlane:
     """A plane in the lidar frame with its uncertainty."""
 
     slopes: Float64
@@ -142,54 +128,62 @@ class Plane:
 
     @property
     def distance_m(self) -> float:
-        """From the lidar along the normal."""
-        return 1.0 / float(np.linalg.norm(self.slopes))
+        """Distance from the lidar along the normal."""
+        return plane_from_slopes(self.slopes)[1]
 
     @property
     def normal(self) -> Float64:
-        """(3,), unit, towards the lidar."""
-        return -self.slopes * self.distance_m
+        """Unit normal (3,), towards the lidar."""
+        return plane_from_slopes(self.slopes)[0]
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """How far the board's plane is from the depth's."""
+    """Difference of the board's plane from the depth's, with its size in joint standard uncertainties."""
 
     distance_m: float
     """The board's less the depth's."""
     angle_deg: float
     """Between the normals."""
     sigmas: float
-    """Of both together, by the uncertainties of both."""
+    """Of distance and angle together."""
     distance_sigmas: float
     angle_sigmas: float
 
 
 @dataclass(frozen=True)
 class Combined:
-    """The plane to use, and why."""
+    """The plane to use, its origin, and the comparison behind it."""
 
-    plane: Plane
+    plane: UncertainPlane
     used: Used
     disagreement: Disagreement
     causes: tuple[str, ...]
-    """What may lie behind a disagreement, each with its amount; empty where they agree."""
+    """Likely causes of a disagreement, each with its amount; empty where they agree."""
 
 
-def combine(depth: Plane, board: Plane, *, measured: bool) -> Combined:
-    """Both planes as one where they agree; else the board's if its squares were `measured` by hand, or the depth's."""
+def combine(depth: UncertainPlane, board: UncertainPlane, *, measured: bool) -> Combined:
+    """Average both planes where they agree; else use the board's if its squares were `measured`, or the depth's."""
     apart = disagreement(depth, board)
     if apart.sigmas <= AGREE_SIGMAS:
-        return Combined(_weighted(depth, board), "both", apart, ())
+        # Weighting by inverse covariances, written in Kalman's form: it needs no inverse of the depth's covariance,
+        # which may be zero.
+        gain = depth.covariance @ np.linalg.inv(depth.covariance + board.covariance)
+        slopes = depth.slopes + gain @ (board.slopes - depth.slopes)
+        average = UncertainPlane(slopes, depth.covariance - gain @ depth.covariance)
+        return Combined(average, "both", apart, ())
     used: Used = "board" if measured else "depth"
     return Combined(board if measured else depth, used, apart, _causes(depth, board, apart, measured=measured))
 
 
-def disagreement(depth: Plane, board: Plane) -> Disagreement:
-    """How far apart two planes are, and how far that is by their uncertainties."""
+def disagreement(depth: UncertainPlane, board: UncertainPlane) -> Disagreement:
+    """Compare two planes, also in units of their joint uncertainty."""
+    # 1 / |slopes| is the distance and their direction the normal, so the part of the difference along the slopes is a
+    # change of distance, and the two parts across them are a change of angle. The null space of a row is the last
+    # right singular vectors of its decomposition.
     difference, covariance = board.slopes - depth.slopes, board.covariance + depth.covariance
-    along = depth.distance_m * depth.slopes  # a change of the slopes along them is one of the distance
-    across = np.linalg.svd(along[np.newaxis])[2][1:]  # and across them one of the angle
+    along = depth.distance_m * depth.slopes
+    across = np.linalg.svd(along[np.newaxis])[2][1:]
     angle_rad = np.arctan2(np.linalg.norm(np.cross(depth.normal, board.normal)), depth.normal @ board.normal)
     return Disagreement(
         distance_m=board.distance_m - depth.distance_m,
@@ -201,22 +195,16 @@ def disagreement(depth: Plane, board: Plane) -> Disagreement:
 
 
 def _sigmas(axes: Float64, difference: Float64, covariance: Float64) -> float:
-    """The length of the difference along `axes` (k, 3), in standard deviations."""
+    """Return the Mahalanobis length sqrt(d' C^-1 d) of the difference along `axes` (k, 3)."""
     off = axes @ difference
     return sqrt(max(float(off @ np.linalg.solve(axes @ covariance @ axes.T, off)), 0.0))
 
 
-def _weighted(depth: Plane, board: Plane) -> Plane:
-    """By the inverse of the covariances, written so that a plane known exactly does no harm."""
-    gain = depth.covariance @ np.linalg.inv(depth.covariance + board.covariance)
-    slopes = depth.slopes + gain @ (board.slopes - depth.slopes)
-    return Plane(slopes, depth.covariance - gain @ depth.covariance)
-
-
-def _causes(depth: Plane, board: Plane, apart: Disagreement, *, measured: bool) -> tuple[str, ...]:
+def _causes(depth: UncertainPlane, board: UncertainPlane, apart: Disagreement, *, measured: bool) -> tuple[str, ...]:
+    """Return the usual causes of a disagreement that could explain this one, each with its amount."""
     causes: list[str] = []
-    scale = depth.distance_m / board.distance_m
-    offset_m = apart.distance_m / max(-float(depth.normal[2]), 1e-3)
+    scale = depth.distance_m / board.distance_m  # a board's distance is proportional to the assumed size of its squares
+    offset_m = apart.distance_m / max(-float(depth.normal[2]), 1e-3)  # along the axis, longer than along the normal
     if apart.distance_sigmas > AGREE_SIGMAS:
         if abs(scale - 1.0) <= MAX_SCALE and not measured:
             causes.append(
@@ -233,18 +221,18 @@ def _causes(depth: Plane, board: Plane, apart: Disagreement, *, measured: bool) 
             f"the angle: the normals are {apart.angle_deg:.2f} degrees apart; glue the board flat on the same wall, "
             "and let the lidar warm up (ripples turn the depth's plane)",
         )
-    return tuple(causes) or ("distance and angle together: none of the usual causes stands out; measure again",)
+    return tuple(causes) or ("distance and angle together: none of the usual causes fits; measure again",)
 
 
-COLOUR_IS_OFF = (
-    "the colour camera's pose against the lidar, which is the factory's and may have moved: look in infrared to see"
+COLOR_POSE_CAUSE = (
+    "the color camera's factory pose against the lidar, which may have shifted: measure in infrared to compare"
 )
-"""A further cause of a disagreement, where the board was seen in colour."""
+"""A further cause of a disagreement, where the board was seen in color."""
 
 
 @dataclass(frozen=True)
 class WallByBoard(WallMeasures):
-    """Where the wall is by a board alone, since its depth was refused."""
+    """Wall measured by a board alone, since its depth was refused."""
 
     wall_from_lidar: Float64
     """(4, 4)."""
@@ -254,16 +242,16 @@ class WallByBoard(WallMeasures):
 
 
 class BoardRecord(Record):
-    """What a board said of the wall, and what was made of it."""
+    """Measurement of the wall by a board, and its use."""
 
     printed: Board
     measured: bool
-    """Whether the squares' size was measured on the print, or is that of the drawing."""
+    """True if the squares' size was measured on the print; else it is that of the drawing."""
     seen_in: Light = "infrared"
     corners: Annotated[int, Field(gt=0)]
     residual_px: NotNegative
     stretch: Finite
-    """Of width over height, less 1."""
+    """Width over height, less 1."""
     bow_m: Finite
     distance_m: Positive
     distance_std_m: NotNegative
@@ -274,36 +262,53 @@ class BoardRecord(Record):
     facing_deg: Annotated[float, Field(ge=0, lt=90)]
     facing_std_deg: NotNegative
     used: Used
-    """Whose plane the pose of the record is."""
+    """Source of the record's pose."""
     disagreement_m: Finite | None = None
-    """The board's distance less the depth's; None, as all of the disagreement, where the depth was refused."""
+    """The board's distance less the depth's; None, like all of the disagreement, where the depth was refused."""
     disagreement_deg: NotNegative | None = None
     disagreement_sigmas: NotNegative | None = None
     causes: tuple[str, ...] = ()
-    """What may lie behind a disagreement that chance does not explain."""
+    """Likely causes of a disagreement that chance does not explain."""
     depth_refused: str = ""
-    """Why; empty where it was not."""
+    """Reason why the depth was refused; empty where it was not."""
 
 
 def wall_with_board(
     depth: WallFit | WallRefusedError, view: BoardView, board: Board, *, measured: bool
 ) -> tuple[WallFit | WallByBoard, BoardRecord]:
-    """The wall from its depth, or the reason why that was refused, and from a view of a board.
+    """Measure the wall from its depth (or the reason why that was refused) and a view of a board.
 
-    `measured` says that the board's squares were. Raises BoardRefusedError where the board says nothing.
+    `measured` states that the board's squares were measured by hand. Raises BoardRefusedError for an unusable view.
     """
-    fit = find_in_view(view, board)
-    plane = Plane(fit.slopes, fit.covariance)
-    record = _record(fit, board, view.light, measured=measured)
+    fit = fit_in_lidar(find_corners(view.image, board, view.light), board, view)
+    plane = UncertainPlane(fit.slopes, fit.covariance)
+    record = BoardRecord(
+        **vars(measures_of(fit.slopes, fit.covariance)),
+        **{name: getattr(fit, name) for name in ("corners", "residual_px", "stretch", "bow_m")},
+        printed=board,
+        measured=measured,
+        seen_in=view.light,
+        used="board",
+    )
     if isinstance(depth, WallRefusedError):
         return _by_board(plane, depth), record.model_copy(update={"depth_refused": str(depth)})
-    both = combine(Plane(-depth.wall_from_lidar[2, :3] / depth.distance_m, depth.covariance), plane, measured=measured)
+    by_depth = UncertainPlane(-depth.wall_from_lidar[2, :3] / depth.distance_m, depth.covariance)
+    both = combine(by_depth, plane, measured=measured)
     if both.causes and view.light == "colour":
-        both = replace(both, causes=(*both.causes, COLOUR_IS_OFF))
-    return _by_both(depth, both), record.model_copy(update=_compared(both))
+        both = replace(both, causes=(*both.causes, COLOR_POSE_CAUSE))
+    apart = both.disagreement
+    comparison = {
+        "used": both.used,
+        "disagreement_m": apart.distance_m,
+        "disagreement_deg": apart.angle_deg,
+        "disagreement_sigmas": apart.sigmas,
+        "causes": both.causes,
+    }
+    return _by_both(depth, both), record.model_copy(update=comparison)
 
 
-def _by_board(plane: Plane, refusal: WallRefusedError) -> WallByBoard:
+def _by_board(plane: UncertainPlane, refusal: WallRefusedError) -> WallByBoard:
+    """Return the board's wall, doubtful for want of a depth to compare it with."""
     measures = measures_of(plane.slopes, plane.covariance)
     doubt = f"the plane is the board's alone, since the depth was refused: {refusal}"
     problems = out_of_range(measures.distance_m, measures.facing_deg)
@@ -312,50 +317,21 @@ def _by_board(plane: Plane, refusal: WallRefusedError) -> WallByBoard:
 
 
 def _by_both(depth: WallFit, both: Combined) -> WallFit:
+    """Return the depth's wall with the combined plane, and the verdict on both."""
     measures = measures_of(both.plane.slopes, both.plane.covariance)
     problems = out_of_range(measures.distance_m, measures.facing_deg)
     verdict, advice = depth.verdict, depth.advice
     if both.causes:
-        verdict, advice = "doubtful", "; ".join([_conflict(both), *problems])
+        apart = both.disagreement
+        conflict = (
+            f"depth and board disagree by {1e3 * apart.distance_m:+.1f} mm and {apart.angle_deg:.2f} degrees "
+            f"({apart.sigmas:.0f} standard deviations), the {both.used}'s plane is used; likely causes: "
+            + " | ".join(both.causes)
+        )
+        verdict, advice = "doubtful", "; ".join([conflict, *problems])
     elif verdict != "doubtful":
         verdict = "out of range" if problems else "good"
         advice = "; ".join(problems) or f"{depth.advice}; depth and board agree"
     pose = wall_from_plane(both.plane.normal, both.plane.distance_m)
     fitted = replace(depth, **vars(measures), wall_from_lidar=pose, covariance=both.plane.covariance)
     return replace(fitted, verdict=verdict, advice=advice)
-
-
-def _conflict(both: Combined) -> str:
-    apart = both.disagreement
-    return (
-        f"depth and board disagree by {1e3 * apart.distance_m:+.1f} mm and {apart.angle_deg:.2f} degrees "
-        f"({apart.sigmas:.0f} standard deviations), the {both.used}'s plane is used; likely causes: "
-        + " | ".join(both.causes)
-    )
-
-
-def _record(fit: BoardFit, board: Board, light: Light, *, measured: bool) -> BoardRecord:
-    """What the board said, where there is no depth to compare it with."""
-    return BoardRecord(
-        **vars(measures_of(fit.slopes, fit.covariance)),
-        printed=board,
-        measured=measured,
-        seen_in=light,
-        corners=fit.corners,
-        residual_px=fit.residual_px,
-        stretch=fit.stretch,
-        bow_m=fit.bow_m,
-        used="board",
-    )
-
-
-def _compared(both: Combined) -> dict[str, object]:
-    """What the record says of the comparison with the depth."""
-    apart = both.disagreement
-    return {
-        "used": both.used,
-        "disagreement_m": apart.distance_m,
-        "disagreement_deg": apart.angle_deg,
-        "disagreement_sigmas": apart.sigmas,
-        "causes": both.causes,
-    }

@@ -11,8 +11,8 @@ import numpy as np
 
 from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.errors import CalibrationError
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.noise import SCATTER_PER_MEDIAN, with_uncertainty
+from nlos_calibration.intervals import with_degrees, with_mm
+from nlos_calibration.noise import SCATTER_PER_MEDIAN
 from nlos_calibration.reference import BareWall
 from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall_tracker import WallObservation, WallTrack
@@ -68,14 +68,14 @@ class Drift:
         return abs(self.distance_m - other.distance_m) > TOLERANCE_M or turn_deg > TOLERANCE_DEG
 
     def __str__(self) -> str:
-        """Return one line: the kind of drift, its amount, the remedy."""
+        """Return one line: kind of drift, amount with its 95 % interval, remedy."""
         if self.uniform:
             return (
                 "the range has drifted (or the lidar has moved straight back or forth): depths of the wall are "
                 f"{_amount(self.range_m, self.range_std_m, 'longer', 'shorter')} than in the calibration: let the "
                 "lidar warm up, then calibrate the wall again"
             )
-        turn = with_uncertainty(hypot(self.yaw_deg, self.pitch_deg), max(self.yaw_std_deg, self.pitch_std_deg), "°")
+        turn = with_degrees(hypot(self.yaw_deg, self.pitch_deg), max(self.yaw_std_deg, self.pitch_std_deg))
         return (
             f"the lidar has moved: the wall is {_amount(self.distance_m, self.distance_std_m, 'farther', 'nearer')} "
             f"and turned by {turn} against the calibration: calibrate the wall again"
@@ -83,7 +83,7 @@ class Drift:
 
 
 def _amount(change_m: float, std_m: float, more: str, less: str) -> str:
-    return f"{with_uncertainty(abs(change_m) * 1e3, std_m * 1e3, 'mm')} {more if change_m > 0 else less}"
+    return f"{with_mm(abs(change_m), std_m)} {more if change_m > 0 else less}"
 
 
 class DriftWindow:
@@ -159,15 +159,6 @@ def settings_changed(reference: BareWall, settings: Mapping[str, float]) -> tupl
     return tuple(f"{name} was {then[name]:g} and is {settings[name]:g}" for name in names)
 
 
-def _check_size(shape: tuple[int, ...], then: Intrinsics) -> None:
-    if shape != (then.height, then.width):
-        size = " x ".join(str(pixels) for pixels in reversed(shape))
-        raise CalibrationError(
-            f"a frame of {size} pixels does not match the bare wall of {then.width} x {then.height}: open the camera "
-            "at that size, or calibrate the wall again",
-        )
-
-
 class DriftCheck:
     """Comparison of a stream's frames with the bare wall's reference, with warnings that do not flicker.
 
@@ -193,7 +184,7 @@ class DriftCheck:
 
     @property
     def moved(self) -> bool:
-        """True while a warning says that the lidar has moved or no longer sees the wall; False for a small range drift."""
+        """True while a warning reports a lidar that has moved or lost the wall; a small range drift does not count."""
         if (drift := self._reported) is None:
             return bool(self._blindness)
         return not drift.uniform or abs(drift.range_m) > MAX_RANGE_DRIFT_M
@@ -203,7 +194,12 @@ class DriftCheck:
 
         Raises CalibrationError for a frame of another size.
         """
-        _check_size(depth_m.shape, self._reference.intrinsics)
+        then, (height, width) = self._reference.intrinsics, depth_m.shape
+        if (height, width) != (then.height, then.width):
+            raise CalibrationError(
+                f"a frame of {width} x {height} pixels does not match the bare wall of {then.width} x {then.height}: "
+                "open the camera at that size, or calibrate the wall again",
+            )
         if settings != self._settings:
             self._settings = dict(settings)
             self._about_settings = settings_changed(self._reference, settings)
@@ -239,6 +235,7 @@ class DriftCheck:
         """Begin, renew or end the reported drift; while the wall is hidden, it stays as it is."""
         if self.drift is None:
             return
+        # begins above a tolerance with certainty, ends clearly below it, and is renewed only by a different drift
         if self._reported is None:
             self._reported = self.drift if self.drift.tolerances(SURE_SIGMAS) > 1.0 else None
         elif self.drift.tolerances() < ENDS_AT:

@@ -1,7 +1,7 @@
 """Range noise of the lidar: of one sample and of the mean over many frames, with streaming statistics of depth."""
 
 from dataclasses import dataclass, field, replace
-from math import exp, floor, log10, pi, sqrt
+from math import exp, pi, sqrt
 from typing import TypeVar
 
 import numpy as np
@@ -21,12 +21,6 @@ STATISTICS_POINTS = 20_000
 """Points that medians and percentiles are computed from."""
 MEDIAN_PER_SIGMA, SCATTER_PER_MEDIAN = 0.67449, 1.4826
 """Median of |x| of a normal distribution over its standard deviation, and the inverse."""
-
-
-def with_uncertainty(value: float, std: float, unit: str) -> str:
-    """Return "value ± std unit" to the first significant digit of the uncertainty, e.g. "200.00 ± 0.01 mm"."""
-    decimals = min(max(-floor(log10(std)), 0), 4) if std > 0.0 else 4
-    return f"{value:.{decimals}f} ± {std:.{decimals}f}{'' if unit == '°' else ' '}{unit}"
 
 
 def depth_noise_m(depth_m: Depth) -> Depth:

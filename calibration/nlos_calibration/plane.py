@@ -74,14 +74,6 @@ class _Points:
         return self.at(slice(None, None, max(len(self.rays) // STATISTICS_POINTS, 1)))
 
 
-def fit_plane(points_m: Float64, generator: np.random.Generator, noise: MeanNoise | None = None) -> PlaneFit:
-    """Fit the plane of most of the points (N, 3) in the lidar frame: `fit_depth` for points."""
-    depth_m = np.where(np.isfinite(points_m).all(axis=1), points_m[:, 2], np.nan)
-    valid = depth_m >= MIN_DEPTH_M
-    rays = np.divide(points_m, depth_m[:, np.newaxis], out=np.zeros_like(points_m), where=valid[:, np.newaxis])
-    return fit_depth(rays, depth_m, generator, noise)
-
-
 def fit_depth(
     rays: Float64,
     depth_m: Float64,

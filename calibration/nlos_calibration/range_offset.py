@@ -47,6 +47,8 @@ def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
 
     Raises CalibrationError where tape and lidar cannot both be right.
     """
+    # an origin that moves back along the optical axis moves away from the wall by cos(facing) of that: exact. A depth
+    # offset also bends an oblique wall, so its effect on the distance is found numerically.
     plain = fit_with(0.0, 0.0)
     axis_share = cos(radians(plain.facing_deg))
     origin_m = (tape_m - plain.distance_m) / axis_share

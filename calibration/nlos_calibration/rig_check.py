@@ -1,10 +1,6 @@
-"""How one rig differs from another, in words, where it is by more than a calibration may err.
+"""Checks of a whole rig: difference from another rig, footprint on the wall, lines of sight to the hidden object.
 
-Where the lidar's view meets the wall: its corners, the cells of the map, and how many of them are on the wall.
-
-Who sees the hidden object's box past the occluder: the lidar, which must not, and the wall, which must.
-
-From a whole rig to its problems: occluder, footprint, and who sees the hidden object; each with what to do.
+The lidar must not see the object's box past the occluder, and the lit wall must. Each problem comes with its remedy.
 """
 
 from collections.abc import Callable
@@ -12,31 +8,30 @@ from dataclasses import dataclass
 from math import atan, degrees
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nlos_calibration.arrays import Float64
+from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import Extent, LidarPose, ObjectBox, Occluder, OccluderRecord, PinholeRecord, Rig
+from nlos_calibration.rig import Extent, LidarPose, ObjectBox, Occluder, OccluderRecord, Rig
 from nlos_calibration.wall import FACING_RANGE_DEG, TOLERANCE_DEG, TOLERANCE_M, Verdict, at_least
 
 
 def rig_difference(rig: Rig, other: Rig) -> tuple[str, ...]:
-    """What `rig` is or has against `other`, each with its amount; empty where a network would not notice."""
+    """Return the differences of `rig` from `other` beyond calibration error, each with its amount."""
     lidar, theirs = rig.lidar, other.lidar
-    told = [
+    lines = [
         _moved("the lidar", lidar.distance_m - theirs.distance_m, "farther from the wall", "closer to the wall"),
         _turned("yaw", lidar.yaw_deg - theirs.yaw_deg),
         _turned("pitch", lidar.pitch_deg - theirs.pitch_deg),
         *_occluder(rig, other),
-        _field(rig.intrinsics, other.intrinsics),
+        _field(rig.pinhole, other.pinhole),
         "another object box" if rig.object_box != other.object_box else "",
         "other device constants" if rig.device != other.device else "",
     ]
-    return tuple(difference for difference in told if difference)
+    return tuple(line for line in lines if line)
 
 
-def _moved(what: str, by_m: float, more: str, less: str) -> str:
-    return f"{what} {abs(by_m) * 1e3:.0f} mm {more if by_m > 0 else less}" if abs(by_m) > TOLERANCE_M else ""
+def _moved(part: str, by_m: float, more: str, less: str) -> str:
+    return f"{part} {abs(by_m) * 1e3:.0f} mm {more if by_m > 0 else less}" if abs(by_m) > TOLERANCE_M else ""
 
 
 def _turned(angle: str, by_deg: float) -> str:
@@ -51,59 +46,57 @@ def _occluder(rig: Rig, other: Rig) -> tuple[str, ...]:
     return place, _moved("its gap", here.z_min_m - there.z_min_m, "wider", "narrower")
 
 
-def _field(here: PinholeRecord, there: PinholeRecord) -> str:
-    (across, down), (across_there, down_there) = (_field_deg(pinhole) for pinhole in (here, there))
+def _field(here: Intrinsics, there: Intrinsics) -> str:
+    (across, down), (across_there, down_there) = (
+        [degrees(atan(far) - atan(near)) for near, far in _view_edges(pinhole)] for pinhole in (here, there)
+    )
     if max(abs(across - across_there), abs(down - down_there)) <= TOLERANCE_DEG:
         return ""
     return f"a field of view of {across:.1f} x {down:.1f} degrees, not {across_there:.1f} x {down_there:.1f}"
 
 
-def _field_deg(pinhole: PinholeRecord) -> tuple[float, float]:
-    """Across and down, from edge to edge."""
-    spans = (
-        (pinhole.ppx + 0.5, pinhole.width - pinhole.ppx - 0.5, pinhole.fx),
-        (pinhole.ppy + 0.5, pinhole.height - pinhole.ppy - 0.5, pinhole.fy),
-    )
-    across, down = (degrees(atan(before / focal) + atan(after / focal)) for before, after, focal in spans)
-    return across, down
-
-
 MAP_SHAPE = 64, 80
-"""Rows and columns of the map that a frame is reduced to."""
+"""Rows and columns of a frame's map."""
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """Points of the wall plane in the wall frame's x and y; NaN where a beam never meets it."""
+    """The lidar's view on the wall plane, in the wall frame's x and y; NaN where a beam never meets it."""
 
     corners_m: Float64
     """(4, 2); of the view: upper left, upper right, lower right, lower left."""
     cells_m: Float64
-    """(rows, columns, 2); where the beam through each cell's centre meets the plane. cells_m[i] is row i's line."""
-    on_wall: NDArray[np.bool_]
+    """(rows, columns, 2); points where the beams through the cells' centres meet the plane."""
+    on_wall: Mask
     """(rows, columns); the cells that meet the plane within the wall's extent."""
 
     @property
     def share(self) -> float:
-        """Of the cells that are on the wall."""
+        """Cells on the wall as a share of all."""
         return float(self.on_wall.mean())
 
 
 def footprint(
     wall_from_lidar: Float64, intrinsics: Intrinsics, wall: Extent, shape: tuple[int, int] = MAP_SHAPE
 ) -> Footprint:
-    """The footprint of a map of `shape` cells seen from the pose (4, 4)."""
+    """Return the footprint of a map of `shape` cells seen from the pose (4, 4)."""
     cells_m = on_plane(wall_from_lidar, intrinsics.scaled(shape[1], shape[0]).rays())
-    edges = intrinsics.scaled(1, 1)
-    x, y = (np.array([-0.5, 0.5]) - edges.ppx) / edges.fx, (np.array([-0.5, 0.5]) - edges.ppy) / edges.fy
-    corners = np.array([[x[0], y[0], 1.0], [x[1], y[0], 1.0], [x[1], y[1], 1.0], [x[0], y[1], 1.0]])
+    (left, right), (top, bottom) = _view_edges(intrinsics)
+    corners = np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0], [left, bottom, 1.0]])
     across, up = cells_m[..., 0], cells_m[..., 1]
     on_wall = (across >= wall.x_min_m) & (across <= wall.x_max_m) & (up >= wall.y_min_m) & (up <= wall.y_max_m)
     return Footprint(on_plane(wall_from_lidar, corners), cells_m, on_wall)
 
 
+def _view_edges(intrinsics: Intrinsics) -> tuple[Float64, Float64]:
+    """Return x (left, right) and y (top, bottom) of the view's edges at unit depth."""
+    pinhole = intrinsics.scaled(1, 1)  # one pixel, whose edges are at -0.5 and 0.5
+    edges = np.array([-0.5, 0.5])
+    return (edges - pinhole.ppx) / pinhole.fx, (edges - pinhole.ppy) / pinhole.fy
+
+
 def on_plane(wall_from_lidar: Float64, rays: Float64) -> Float64:
-    """Wall x and y (..., 2) of where rays (..., 3) in the lidar frame meet the wall plane; NaN where they never do."""
+    """Return wall x and y (..., 2) where rays (..., 3) in the lidar frame meet the wall plane; NaN without hit."""
     directions = rays @ wall_from_lidar[:3, :3].T
     origin = wall_from_lidar[:3, 3]
     towards = np.where(directions[..., 2] < 0.0, -directions[..., 2], np.nan)
@@ -111,26 +104,27 @@ def on_plane(wall_from_lidar: Float64, rays: Float64) -> Float64:
 
 
 SLICES = 24
-"""Of the box along y, in which the share of it that the lidar sees is added up."""
+"""Number of slices of the box along y for the volume that the lidar sees."""
 
 
-def lidar_sees(rig: Rig, box: ObjectBox) -> float:
-    """The share of the box's volume inside the lidar's field that the occluder does not hide."""
-    edges = (np.arange(SLICES) + 0.5) / SLICES
-    across_m = box.y_min_m + edges * (box.y_max_m - box.y_min_m)
+def lidar_visible_share(rig: Rig, box: ObjectBox) -> float:
+    """Return the share of the box's volume that is in the lidar's field of view and not behind the occluder."""
+    # A plane through the lidar cuts each slice y = const of the box along a line. The occluder, endless in y, and the
+    # four sides of the field of view are such planes: the visible part of a slice is a convex polygon.
+    middles = (np.arange(SLICES) + 0.5) / SLICES
+    slices_m = box.y_min_m + middles * (box.y_max_m - box.y_min_m)
     past = [_past_edge(rig.occluder, (0.0, rig.lidar.distance_m))] if rig.occluder else []
-    return float(np.mean([_visible_share(box, [*past, *_field_half_planes(rig, y_m)]) for y_m in across_m]))
+    return float(np.mean([_visible_share(box, [*past, *_field_half_planes(rig, y_m)]) for y_m in slices_m]))
 
 
-def wall_sees(rig: Rig, box: ObjectBox, seen: Footprint) -> float:
-    """The share of the box's volume that is seen from the lit wall, by the cell that sees most of it.
-
-    That is the farthest from the lidar's foot: no cell before it sees what it does not.
-    """
-    x_m = seen.cells_m[..., 0][seen.on_wall]
+def wall_visible_share(rig: Rig, box: ObjectBox, view: Footprint) -> float:
+    """Return the share of the box's volume in sight of the lit wall, from the cell that sees most of it."""
+    # from a cell at x before the sheet, the line of sight past the edge rises by gap / (x_m - x): the farthest lit cell
+    # sees all that any other does
+    x_m = view.cells_m[..., 0][view.on_wall]
     occluder = rig.occluder
     if occluder is not None:
-        # a cell beyond the sheet is lit if the beam passes below the edge: z = distance (1 - x_m / x) there
+        # a cell at x beyond the sheet is lit if the beam, at z = distance (1 - x_m / x) there, passes below the edge
         distance_m = rig.lidar.distance_m
         x_m = x_m[(x_m <= occluder.x_m) | (distance_m * (x_m - occluder.x_m) < occluder.z_min_m * x_m)]
     if len(x_m) == 0:
@@ -142,26 +136,24 @@ def wall_sees(rig: Rig, box: ObjectBox, seen: Footprint) -> float:
 
 
 def _past_edge(occluder: Occluder, eye: tuple[float, float]) -> Float64:
-    """Half plane (a, b, c), a x + b z + c >= 0, of what is seen below the edge from an eye (x, z) before the sheet.
-
-    The sight to (x, z) meets the sheet at eye_z + (z - eye_z) (x_m - eye_x) / (x - eye_x), to be below the edge.
-    """
+    """Return the half plane a x + b z + c >= 0 as (a, b, c), visible below the edge from an eye (x, z)."""
+    # The line from the eye to (x, z) meets the sheet at eye_z + (z - eye_z) run / (x - eye_x), visible if that is below
+    # the edge: (z - eye_z) run <= rise (x - eye_x).
     run_m, rise_m = occluder.x_m - eye[0], occluder.z_min_m - eye[1]
     return np.array([rise_m, -run_m, run_m * eye[1] - rise_m * eye[0]])
 
 
 def _field_half_planes(rig: Rig, y_m: float) -> list[Float64]:
-    """The half planes (a, b, c) that the four sides of the lidar's field of view leave of a slice at y."""
-    pinhole, pose = rig.pinhole.scaled(1, 1), rig.wall_from_lidar
-    left, right = (np.array([-0.5, 0.5]) - pinhole.ppx) / pinhole.fx
-    top, bottom = (np.array([-0.5, 0.5]) - pinhole.ppy) / pinhole.fy
+    """Return the half planes (a, b, c) in a slice at y that the four sides of the field of view leave."""
+    pose, ((left, right), (top, bottom)) = rig.wall_from_lidar, _view_edges(rig.pinhole)
     inward = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
+    # a side n . q >= 0 of the lidar frame is (R n) . (p - t) >= 0 in the wall frame, a line in x and z at fixed y
     sides = inward @ pose[:3, :3].T
     return [np.array([x, z, y * y_m - side @ pose[:3, 3]]) for side in sides for x, y, z in [side]]
 
 
 def _visible_share(box: ObjectBox, half_planes: list[Float64]) -> float:
-    """Of the box's cross-section in x and z, what all half planes leave."""
+    """Return the share of the box's cross-section in x and z that is inside all half planes."""
     x, z = (box.x_min_m, box.x_max_m), (box.z_near_m, box.z_far_m)
     corners = np.array([[x[0], z[0]], [x[1], z[0]], [x[1], z[1]], [x[0], z[1]]])
     left = corners
@@ -171,19 +163,19 @@ def _visible_share(box: ObjectBox, half_planes: list[Float64]) -> float:
 
 
 def _cut(corners: Float64, half_plane: Float64) -> Float64:
-    """A convex polygon (n, 2) cut by a half plane (Sutherland and Hodgman); (0, 2) where nothing is left."""
+    """Cut a convex polygon (n, 2) by a half plane (Sutherland and Hodgman, 1974); (0, 2) where nothing is left."""
     inside = corners @ half_plane[:2] + half_plane[2]
-    kept: list[Float64] = []
+    points: list[Float64] = []
     for here, there, at, to in zip(corners, np.roll(corners, -1, 0), inside, np.roll(inside, -1), strict=True):
         if at >= 0.0:
-            kept.append(here)
+            points.append(here)
         if (at >= 0.0) != (to >= 0.0):
-            kept.append(here + at / (at - to) * (there - here))
-    return np.array(kept).reshape(-1, 2)
+            points.append(here + at / (at - to) * (there - here))
+    return np.array(points).reshape(-1, 2)
 
 
 def _area(corners: Float64) -> float:
-    """By the shoelace formula."""
+    """Return the area of a polygon (n, 2) by the shoelace formula."""
     x, z = corners.T
     return float(abs(x @ np.roll(z, -1) - z @ np.roll(x, -1)) / 2.0)
 
@@ -193,48 +185,49 @@ GAP_RANGE_M = 0.05, 0.20
 PAPER_X_M = 0.20
 WARN_TILT_DEG = 2.0
 MIN_SHARE = 0.55
-"""Of the map's cells on the wall. The paper's rig keeps 57 % at its worst: 75 degrees, 0.30 m."""
+"""Share of the map's cells on the wall. The paper's rig has 57 % in its worst pose: 75 degrees, 0.30 m."""
 MAX_LEAK = 0.001
-"""Of the box, in the lidar's sight: less is within what a calibrated edge may err by."""
+"""Share of the box in the lidar's sight: less is within the error of a calibrated edge."""
 MIN_SEEN = 0.5
-"""Of the box, to be seen from some part of the wall that the lidar lights; the paper's rig has all, at any angle."""
+"""Share of the box in sight of some part of the lit wall; the paper's rig has all of it, at any angle."""
 FARTHEST_CM, FARTHEST_DEG = 20, 90
-"""How far advice goes."""
+"""Largest move and turn that is advised."""
 
 
-def judge_rig(rig: Rig, seen: Footprint, occluder: OccluderRecord | None) -> tuple[str, ...]:
-    """What keeps the rig from working as the paper's does, each with what to do; what `out_of_range` says is not here.
+def judge_rig(rig: Rig, view: Footprint, occluder: OccluderRecord | None) -> tuple[str, ...]:
+    """Return the problems that keep the rig from working like the paper's, each with its remedy.
 
-    `occluder` is how that of the rig is known; None where it is the paper's, assumed.
+    `occluder` is the source of the rig's; None where the paper's is assumed. Distance and angle are not repeated here:
+    see `out_of_range`.
     """
     name = "the occluder" if occluder or not rig.occluder else "the occluder (not measured, the paper's is assumed)"
-    problems = _too_little_wall(rig, seen)
+    problems = _too_little_wall(rig, view)
     if rig.occluder is not None:
         tilt_deg = occluder.tilt_deg if occluder else None
-        problems += _stand(rig.occluder, rig.object_box, tilt_deg or 0.0, name)
+        problems += _occluder_position(rig.occluder, rig.object_box, tilt_deg or 0.0, name)
     if rig.object_box is not None and _between(rig.occluder, rig.object_box):
-        problems += _leak(rig, rig.object_box, name) + _aperture(rig, rig.object_box, seen, name)
+        problems += _leak(rig, rig.object_box, name) + _aperture(rig, rig.object_box, view, name)
     return tuple(problems)
 
 
 def combined(verdict: Verdict, advice: str, problems: tuple[str, ...]) -> tuple[Verdict, str]:
-    """The wall's verdict and advice with the rig's problems in them."""
+    """Return the wall's verdict and advice with the rig's problems added."""
     if not problems:
         return verdict, advice
     return "out of range" if verdict == "good" else verdict, "; ".join((advice, *problems))
 
 
-def _too_little_wall(rig: Rig, seen: Footprint) -> list[str]:
-    """Too much of the map off the wall; beyond the paper's angles `out_of_range` says to turn."""
-    if seen.share >= MIN_SHARE or rig.facing_deg > FACING_RANGE_DEG[1] + TOLERANCE_DEG:
+def _too_little_wall(rig: Rig, view: Footprint) -> list[str]:
+    """Report a map that is mostly off the wall; beyond the paper's angles `out_of_range` already advises to turn."""
+    if view.share >= MIN_SHARE or rig.facing_deg > FACING_RANGE_DEG[1] + TOLERANCE_DEG:
         return []
-    turn = _first(FARTHEST_DEG, lambda degrees: _seen(_turned_to_wall(rig, degrees)).share >= MIN_SHARE)
-    cure = f"turn the lidar {_degrees(turn)} towards the wall" if turn else "take a larger wall"
-    return [f"{seen.share:.0%} of the map's cells meet the wall, {MIN_SHARE:.0%} needed: {cure}"]
+    turn = _first(FARTHEST_DEG, lambda degrees: _footprint(_turned_to_wall(rig, degrees)).share >= MIN_SHARE)
+    cure = f"turn the lidar {_degrees(turn)} towards the wall" if turn else "use a larger wall"
+    return [f"{view.share:.0%} of the map's cells meet the wall, {MIN_SHARE:.0%} needed: {cure}"]
 
 
-def _stand(occluder: Occluder, box: ObjectBox | None, tilt_deg: float, name: str) -> list[str]:
-    """The occluder against the paper's ranges."""
+def _occluder_position(occluder: Occluder, box: ObjectBox | None, tilt_deg: float, name: str) -> list[str]:
+    """Compare the occluder's gap, position and tilt with the paper's ranges."""
     problems: list[str] = []
     (low_m, high_m), gap_m = GAP_RANGE_M, occluder.z_min_m
     if not low_m - TOLERANCE_M <= gap_m <= high_m + TOLERANCE_M:
@@ -243,10 +236,8 @@ def _stand(occluder: Occluder, box: ObjectBox | None, tilt_deg: float, name: str
         needed = f"{low_m:.2f} to {high_m:.2f} needed"
         problems.append(f"{name} has a gap of {gap_m:.3f} m, {needed}: move it {by_cm} cm {way} the wall")
     if not _between(occluder, box):
-        by_cm, way = (
-            at_least(100.0 * abs(occluder.x_m - PAPER_X_M)),
-            "away from" if occluder.x_m < PAPER_X_M else "towards",
-        )
+        way = "away from" if occluder.x_m < PAPER_X_M else "towards"
+        by_cm = at_least(100.0 * abs(occluder.x_m - PAPER_X_M))
         ends = f"the lidar at 0 and the object{f' from {box.x_min_m:.3f} m on' if box else ''}"
         problems.append(
             f"{name} stands at x = {occluder.x_m:.3f} m, not between {ends}: move it {by_cm} cm {way} the lidar, to "
@@ -259,48 +250,53 @@ def _stand(occluder: Occluder, box: ObjectBox | None, tilt_deg: float, name: str
 
 
 def _between(occluder: Occluder | None, box: ObjectBox | None) -> bool:
-    """Whether the sheet, if there is one, stands between lidar and object."""
+    """Return True if the sheet, if there is one, stands between lidar and object."""
     return occluder is None or 0.0 < occluder.x_m <= (box.x_min_m if box else float("inf"))
 
 
 def _leak(rig: Rig, box: ObjectBox, name: str) -> list[str]:
-    """The object in the lidar's own sight."""
-    if (share := lidar_sees(rig, box)) <= MAX_LEAK:
+    """Report an object in the lidar's own sight, with the smallest move of the occluder that hides it."""
+    if (share := lidar_visible_share(rig, box)) <= MAX_LEAK:
         return []
-    what = f"the lidar sees {share:.1%} of the object's box itself"
+    problem = f"the lidar itself sees {share:.1%} of the object's box"
     if rig.occluder is None:
-        return [f"{what}: put an occluder at x = {PAPER_X_M:.2f} m before it"]
+        return [f"{problem}: put an occluder at x = {PAPER_X_M:.2f} m before it"]
 
     def hidden(x_cm: int, z_cm: int) -> bool:
         moved = _with_occluder_moved(rig, x_cm, z_cm)
-        return moved is not None and lidar_sees(moved, box) <= MAX_LEAK
+        return moved is not None and lidar_visible_share(moved, box) <= MAX_LEAK
 
     if by_cm := _first(FARTHEST_CM, lambda cm: hidden(0, -cm)):
-        return [f"{what}, past {name}: move the occluder {by_cm} cm towards the wall"]
+        return [f"{problem}, past {name}: move the occluder {by_cm} cm towards the wall"]
     if by_cm := _first(FARTHEST_CM, lambda cm: hidden(-cm, 0)):
-        return [f"{what}, past {name}: move the occluder {by_cm} cm towards the lidar"]
-    return [f"{what}, past {name}: move the object out of its sight, away from the wall"]
+        return [f"{problem}, past {name}: move the occluder {by_cm} cm towards the lidar"]
+    return [f"{problem}, past {name}: move the object out of its sight, away from the wall"]
 
 
-def _aperture(rig: Rig, box: ObjectBox, seen: Footprint, name: str) -> list[str]:
-    """No light by way of the wall."""
-    if (share := wall_sees(rig, box, seen)) >= MIN_SEEN:
+def _aperture(rig: Rig, box: ObjectBox, view: Footprint, name: str) -> list[str]:
+    """Report a box out of sight of the lit wall, with the smallest turn or move that opens the way."""
+    if (share := wall_visible_share(rig, box, view)) >= MIN_SEEN:
         return []
-    what = f"the wall that the lidar lights sees {share:.1%} of the object's box past {name}, {MIN_SEEN:.0%} needed"
+    problem = f"the lit wall sees {share:.1%} of the object's box past {name}, {MIN_SEEN:.0%} needed"
+
+    def turned(degrees: int) -> bool:
+        if (yaw_deg := rig.lidar.yaw_deg + degrees) > FACING_RANGE_DEG[1]:
+            return False
+        turned = _posed(rig, yaw_deg, rig.lidar.pitch_deg)
+        return wall_visible_share(turned, box, _footprint(turned)) >= MIN_SEEN
 
     def opened(cm: int) -> bool:
         moved = _with_occluder_moved(rig, 0, cm)
-        return moved is not None and wall_sees(moved, box, seen) >= MIN_SEEN
+        return moved is not None and wall_visible_share(moved, box, view) >= MIN_SEEN
 
-    turned = _first(FARTHEST_DEG, lambda degrees: _sees_when_turned(rig, box, degrees))
-    if turned:
-        return [f"{what}: turn the lidar {_degrees(turned)} towards the occluder"]
+    if by_deg := _first(FARTHEST_DEG, turned):
+        return [f"{problem}: turn the lidar {_degrees(by_deg)} towards the occluder"]
     by_cm = _first(FARTHEST_CM, opened)
-    return [f"{what}: " + (f"move the occluder {by_cm} cm away from the wall" if by_cm else "take a larger wall")]
+    return [f"{problem}: " + (f"move the occluder {by_cm} cm away from the wall" if by_cm else "use a larger wall")]
 
 
 def _with_occluder_moved(rig: Rig, x_cm: int, z_cm: int) -> Rig | None:
-    """The rig with its occluder moved; None where that is past the lidar or out of the paper's gaps."""
+    """Return the rig with its occluder moved; None where that is past the lidar or out of the paper's gaps."""
     if rig.occluder is None:
         return None
     x_m, gap_m = rig.occluder.x_m + x_cm / 100.0, rig.occluder.z_min_m + z_cm / 100.0
@@ -309,16 +305,8 @@ def _with_occluder_moved(rig: Rig, x_cm: int, z_cm: int) -> Rig | None:
     return rig.model_copy(update={"occluder": Occluder(x_m=x_m, z_min_m=gap_m)})
 
 
-def _sees_when_turned(rig: Rig, box: ObjectBox, degrees: int) -> bool:
-    yaw_deg = rig.lidar.yaw_deg + degrees
-    if yaw_deg > FACING_RANGE_DEG[1]:
-        return False
-    turned = _posed(rig, yaw_deg, rig.lidar.pitch_deg)
-    return wall_sees(turned, box, _seen(turned)) >= MIN_SEEN
-
-
 def _turned_to_wall(rig: Rig, degrees: int) -> Rig:
-    """The rig with its lidar turned towards the wall's normal, as far as that at most."""
+    """Return the rig with its lidar turned by `degrees` towards the wall's normal, at most onto it."""
     left = max(1.0 - degrees / max(rig.facing_deg, 1e-9), 0.0)
     return _posed(rig, left * rig.lidar.yaw_deg, left * rig.lidar.pitch_deg)
 
@@ -328,13 +316,13 @@ def _posed(rig: Rig, yaw_deg: float, pitch_deg: float) -> Rig:
     return rig.model_copy(update={"lidar": lidar})
 
 
-def _seen(rig: Rig) -> Footprint:
+def _footprint(rig: Rig) -> Footprint:
     return footprint(rig.wall_from_lidar, rig.pinhole, rig.wall)
 
 
-def _first(most: int, cures: Callable[[int], bool]) -> int:
-    """The least whole amount that cures; 0 where none does."""
-    return next((amount for amount in range(1, most + 1) if cures(amount)), 0)
+def _first(limit: int, cures: Callable[[int], bool]) -> int:
+    """Return the smallest whole amount that cures; 0 where none up to the limit does."""
+    return next((amount for amount in range(1, limit + 1) if cures(amount)), 0)
 
 
 def _degrees(amount: int) -> str:

@@ -137,10 +137,6 @@ def at_least(amount: float) -> int:
     return max(ceil(amount - 1e-3), 1)
 
 
-INTERVAL_STDS = 1.96
-"""Half the width of a 95 % interval, in standard uncertainties."""
-
-
 @dataclass(frozen=True)
 class WallMeasures:
     """Distance and angles of a plane 1 / z = slopes . ray, with standard uncertainties; 1.96 of them hold 95 %."""
@@ -239,6 +235,7 @@ class WallFit(WallMeasures):
 
 def wall_depth(wall_from_lidar: Float64, intrinsics: Intrinsics) -> Float64:
     """Return the depth (height, width) in metres of a bare, endless wall; inf where a beam never meets it."""
+    # depth x ray . normal + distance = 0, with the normal the third row of the rotation
     away = -(intrinsics.rays() @ wall_from_lidar[2, :3])
     depth_m = np.full(away.shape, np.inf)
     return np.divide(wall_from_lidar[2, 3], away, out=depth_m, where=away > 0.0)
@@ -268,6 +265,7 @@ def fit_wall(
     flat, rippled = flatness(plane, rays), ripples(plane, rays)
     check_flat(flat, rippled.rms_m)
     measures = measures_of(plane.slopes, rippled.covariance)
+    # the origin is at -origin_m z, farther from the plane by the normal's component along that
     measures = replace(measures, distance_m=plane.distance_m - origin_m * float(plane.normal[2]))
     verdict, advice = judge(measures.distance_m, measures.facing_deg, flat, rippled.rms_m)
     return WallFit(

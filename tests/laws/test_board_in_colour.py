@@ -1,11 +1,25 @@
-"""A board seen by the colour camera gives the lidar's wall, as certainly as the camera is calibrated."""
+"""A board seen by the color camera gives the lidar's wall, as certainly as the camera is calibrated."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from board_in_colour import A4, COLOUR, LENS, ROOM, TOLD, as_told, colour_frames, coverage
-from board_trials import Bench
+from board_trials import (
+    A4,
+    CALIBRATION,
+    COLOR,
+    FLAT,
+    LENS,
+    ROOM,
+    BoardBench,
+    ColorCamera,
+    Coverage,
+    coverage,
+    random_bench,
+    random_camera,
+)
+from nlos_calibration.board_pose import BoardFit, PrintErrors
 from nlos_calibration.board_wall import EXACT, CameraErrors, wall_with_board
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.noise import DepthMean
@@ -25,13 +39,13 @@ def recorded(path: Path, frames: int = 4) -> Path:
     """Record the rig's bare wall with a board on it: depth, infrared without the board, and colour."""
     rig, generator = load_rig("bare-wall"), np.random.default_rng(0)
     seen = View(rig.wall_from_lidar, rig.pinhole)
-    bench = Bench(A4, seen, at_near_edge(A4, seen), ROOM)
+    bench = BoardBench(A4, seen, at_near_edge(A4, seen), ROOM, ColorCamera())
     depth_m = [np.nan_to_num(depth_frame(seen.depth_m, generator)) for _ in range(frames)]
     dim = np.full(depth_m[0].shape, 15, np.uint8)
     images = [SensedImages(np.rint(each / DEPTH_UNIT_M).astype(np.uint16), dim, dim) for each in depth_m]
-    grey = colour_frames(bench, as_told(), frames, generator)
+    grey = bench.frames(frames, generator)
     lidar = SoftwareLidar(rig.pinhole, load_sdk())
-    camera = SoftwareColour(lidar, COLOUR, LENS, TOLD.lidar_from_camera)
+    camera = SoftwareColour(lidar, COLOR, LENS, CALIBRATION.lidar_from_camera)
     return record_with_colour(path, lidar, camera, images, [np.repeat(each[..., np.newaxis], 3, 2) for each in grey])
 
 
@@ -55,6 +69,20 @@ def test_board_in_a_recordings_colour_gives_the_lidars_wall(tmp_path: Path) -> N
     assert (alone.yaw_deg, alone.pitch_deg) == pytest.approx((45.0, 0.0), abs=0.15)
 
 
+def coverage_in_color(count: int, sigma_px: float | None, seed: int, errors: CameraErrors) -> Coverage:
+    """Fit random benches, prints and cameras: by corners with noise, or by 4 rendered frames if `sigma_px` is None."""
+    generator, calibration = np.random.default_rng(seed), replace(CALIBRATION, errors=errors)
+    printed = FLAT if sigma_px is None else PrintErrors()
+
+    def fit(bench: BoardBench) -> BoardFit:
+        bench = replace(bench, camera=random_camera(generator, errors))
+        if sigma_px is None:
+            return bench.fit_image(4, generator, calibration)
+        return bench.fit_corners(sigma_px, generator, printed, calibration)
+
+    return coverage(count, lambda: random_bench(generator, printed, ROOM), fit)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "errors",
@@ -63,16 +91,15 @@ def test_board_in_a_recordings_colour_gives_the_lidars_wall(tmp_path: Path) -> N
 )
 def test_board_in_colour_interval_holds_the_truth_as_stated(errors: CameraErrors) -> None:
     """For each calibration error by itself: it would not, were that error left out of the uncertainty."""
-    told = coverage(300, 0.05, 7, errors)
-    assert told["refused"] <= 3
-    for share in told["in_95_percent_interval"].values():
-        assert 0.91 < share < 0.985
+    found = coverage_in_color(300, 0.05, 7, errors)
+    assert found.refused <= 3
+    assert ((found.inside > 0.91) & (found.inside < 0.985)).all()
 
 
 @pytest.mark.slow
 def test_rendered_board_in_colour_interval_holds_the_truth() -> None:
     """Of 15 benches, three quantities each: pooled, a share of 95 % is found above 84 % but once in 1000."""
-    told = coverage(15, None, 8)
-    assert told["refused"] <= 1
-    assert told["in_95_percent_interval_pooled"] > 0.84
-    assert told["p95"]["distance_mm"] < 3.0
+    found = coverage_in_color(15, None, 8, CameraErrors())
+    assert found.refused <= 1
+    assert found.inside.mean() > 0.84
+    assert found.p95_mm < 3.0

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from occluder_trials import BARELY, IN_VIEW, Setting, drawn, find_occluder, looked_at, sensed, trial
+from occluder_trials import BARELY, IN_VIEW, Setting, draw, find_occluder, simulated_trial, trial
 
-from nlos_cam.calibrate.synthetic import bench_depth
+from nlos_cam.calibrate.synthetic import bench_depth, depth_statistics
 
 SENSOR = load_rig("paper-rig").pinhole.scaled(160, 120)
 LOOKS = {
@@ -14,11 +14,6 @@ LOOKS = {
     "mixed pixels": {"frames": 6, "beams": 4},
     "outliers": {"frames": 6, "outliers": 0.05},
 }
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("occluder_trials.SIZE", (96, 72))
 
 
 @pytest.mark.slow
@@ -53,8 +48,8 @@ def test_occluder_is_found_only_where_one_is_in_view(facing_deg: float) -> None:
 def test_occluder_of_more_frames_has_a_surer_sheet_but_same_edge() -> None:
     def stds(frames: int) -> tuple[float, float]:
         generator = np.random.default_rng(4)
-        seen, sheet = drawn(Setting(lean_deg=0.0), generator)
-        mean = looked_at(bench_depth(seen, sheet), generator, frames=frames)
+        seen, sheet = draw(Setting(lean_deg=0.0), generator)
+        mean = depth_statistics(bench_depth(seen, sheet), generator, frames=frames, noise=1.0)
         fit = find_occluder(mean.mean_m(), mean.noise(), seen.pinhole, seen.pose, generator)
         return fit.x_std_m, fit.gap_std_m
 
@@ -65,7 +60,7 @@ def test_occluder_of_more_frames_has_a_surer_sheet_but_same_edge() -> None:
 
 @pytest.mark.parametrize(("facing_deg", "x_m", "gap_m"), [(45.0, 0.2, 0.1), (60.0, 0.15, 0.06), (40.0, 0.12, 0.13)])
 def test_occluder_of_the_simulated_camera_is_found(facing_deg: float, x_m: float, gap_m: float) -> None:
-    one = sensed(Setting(0.2, facing_deg, x_m, gap_m, frames=4), np.random.default_rng(2), SENSOR)
+    one = simulated_trial(Setting(0.2, facing_deg, x_m, gap_m, frames=4), np.random.default_rng(2), SENSOR)
     assert not one.refused
     assert abs(one.x_error_m) < 1e-3
     assert abs(one.gap_error_m) < 2e-3

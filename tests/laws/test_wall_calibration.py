@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import angles_from_normal, wall_from_plane
-from nlos_calibration.plane import fit_plane
+from nlos_calibration.plane import fit_depth
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall, wall_depth
 from numpy.typing import NDArray
@@ -80,7 +80,7 @@ def test_wall_pose_and_angles_are_inverse(distance_m: float, yaw_deg: float, pit
     st.floats(-3.0, 3.0),
     st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(0.0, 0.1)),
 )
-def test_fit_plane_moves_with_its_points(
+def test_fit_depth_moves_with_its_points(
     yaw_rad: float, pitch_rad: float, roll_rad: float, shift: tuple[float, ...]
 ) -> None:
     wall = view(0.2, 20.0, 5.0, PINHOLE.scaled(40, 30))
@@ -89,7 +89,8 @@ def test_fit_plane_moves_with_its_points(
     turn = (
         roll @ view(1.0, np.degrees(yaw_rad), np.degrees(pitch_rad), PINHOLE).pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
     )
-    fit = fit_plane(points @ turn.T + shift, np.random.default_rng(0))
+    points = points @ turn.T + shift
+    fit = fit_depth(points / points[:, 2:], points[:, 2], np.random.default_rng(0))
     normal = turn @ wall.pose[2, :3]
     np.testing.assert_allclose(fit.normal, normal, atol=1e-6)
     assert fit.distance_m == pytest.approx(0.2 - normal @ shift, abs=1e-6)

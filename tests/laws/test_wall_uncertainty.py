@@ -4,25 +4,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from wall_trials import Outcome, Setting, trial
+from wall import Setting, trial
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wall_trials.SIZE", (80, 60))
+    monkeypatch.setattr("wall.SIZE", (80, 60))
 
 
-def outcomes(count: int, **setting: Any) -> list[Outcome]:
+def outcomes(count: int, **setting: Any) -> list[dict[str, Any]]:
     tried = [trial(Setting(**setting), np.random.default_rng([7, n])) for n in range(count)]
-    return [one for one in tried if not one.refused]
+    return [one for one in tried if not one["refused"]]
 
 
 def inside(count: int, at_least: int, **setting: Any) -> Any:
     found = outcomes(count, **setting)
     assert len(found) > at_least
-    return np.array([one.inside for one in found])
+    return np.array([one["inside"] for one in found])
 
 
 @pytest.mark.parametrize("frames", [1, 6, 20])
@@ -51,7 +51,7 @@ def test_wall_interval_allows_for_outliers_ripples_and_flicker(
 
 def test_wall_error_falls_with_more_frames_and_less_noise() -> None:
     def facing_error_deg(**setting: float) -> float:
-        return float(np.median([abs(one.facing_error_deg) for one in outcomes(40, **setting)]))
+        return float(np.median([abs(one["facing_error_deg"]) for one in outcomes(40, **setting)]))
 
     assert facing_error_deg(frames=30) < 0.4 * facing_error_deg(frames=1)
     assert facing_error_deg(noise=1.0) < 0.5 * facing_error_deg(noise=4.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS, Board, Corners
-from nlos_calibration.board_pose import PrintErrors, SeenCorners, _linear, fit_board, refine_pose, solve_pose
+from nlos_calibration.board_pose import CornerObservations, PrintErrors, _linear, fit_board, refine_pose, solve_pose
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.geometry import Intrinsics, normal_from_angles
 from nlos_calibration.wall import WallMeasures, measures_of
@@ -20,8 +20,8 @@ PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)
 NORMAL, DISTANCE_M = normal_from_angles(np.radians(45.0), np.radians(5.0)), 0.2
 
 
-def seen_of(parameters: Float64, sigma_px: float, generator: np.random.Generator) -> SeenCorners:
-    drawn = SeenCorners(
+def seen_of(parameters: Float64, sigma_px: float, generator: np.random.Generator) -> CornerObservations:
+    drawn = CornerObservations(
         A4.corners_m,
         np.zeros((len(A4.corners_m), 2)),
         CAMERA,

@@ -5,8 +5,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from board_in_colour import LIDAR, TOLD, as_told, through_lens
-from board_trials import Bench
+from board_trials import CALIBRATION, LIDAR, ColorCamera, bench_at, through_lens
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS, Corners, Light, find_corners
 from nlos_calibration.board_pose import PrintErrors, fit_board
@@ -14,11 +13,10 @@ from nlos_calibration.board_wall import (
     AGREE_SIGMAS,
     EXACT,
     BoardView,
-    Plane,
+    UncertainPlane,
     WallByBoard,
     combine,
     disagreement,
-    find_in_view,
     fit_in_lidar,
     plane_in_lidar,
     wall_with_board,
@@ -35,7 +33,6 @@ from nlos_cam.calibrate.synthetic import (
     corners_px,
     depth_statistics,
     infrared_frames,
-    view,
 )
 
 RIG = load_rig("bare-wall")
@@ -47,16 +44,11 @@ POSE[:3, 3] = [0.02, -0.014, 0.007]
 NO_PRINT = PrintErrors(0.0, 1e-9, 1e-9)
 
 
-def bench_at(distance_m: float, yaw_deg: float, pitch_deg: float) -> Bench:
-    seen = view(distance_m, yaw_deg, pitch_deg, LIDAR)
-    return Bench(A4, seen, at_near_edge(A4, seen))
-
-
 @pytest.fixture
 def corners() -> Corners:
-    """Exact corners of a board on a wall at 0.25 m, as a colour camera without calibration errors sees them."""
+    """Exact corners of a board on a wall at 0.25 m, as a color camera without calibration errors sees them."""
     bench = bench_at(0.25, 40.0, 5.0)
-    straight = corners_px(A4, as_told().seen(bench), bench.placed)
+    straight = corners_px(A4, ColorCamera().view(bench.seen), bench.placed)
     inside = np.flatnonzero(((straight > 0.0) & (straight < [1280.0, 720.0])).all(axis=1))
     return Corners(inside, through_lens(straight[inside]))
 
@@ -65,9 +57,9 @@ def moved(slopes: Float64) -> Float64:
     return plane_in_lidar(slopes, np.zeros((3, 3)), POSE, EXACT)[0]
 
 
-def test_find_in_view_of_infrared_is_the_lidars_own_view() -> None:
-    image = bench_at(0.2, 45.0, 0.0).frames(4, np.random.default_rng(0)).mean(axis=0)
-    ours, direct = find_in_view(BoardView(image, LIDAR), A4), fit_board(find_corners(image, A4), A4, LIDAR)
+def test_fit_in_lidar_of_infrared_is_fit_board() -> None:
+    corners = find_corners(bench_at(0.2, 45.0, 0.0).frames(4, np.random.default_rng(0)).mean(axis=0), A4)
+    ours, direct = fit_in_lidar(corners, A4, BoardView(np.zeros((1, 1)), LIDAR)), fit_board(corners, A4, LIDAR)
     np.testing.assert_allclose(ours.slopes, direct.slopes, rtol=1e-12)
     np.testing.assert_allclose(ours.covariance, direct.covariance, rtol=1e-12)
 
@@ -93,18 +85,13 @@ def test_plane_in_lidar_between_camera_and_lidar_is_refused() -> None:
 
 def test_fit_in_lidar_of_exact_corners_needs_lens_and_pose(corners: Corners) -> None:
     def found(**change: Any) -> WallMeasures:
-        fit = fit_in_lidar(corners, A4, replace(TOLD, **change), NO_PRINT)
+        fit = fit_in_lidar(corners, A4, replace(CALIBRATION, **change), NO_PRINT)
         return measures_of(fit.slopes, fit.covariance)
 
     exact = found(errors=EXACT)
     assert (exact.distance_m, exact.yaw_deg, exact.pitch_deg) == pytest.approx((0.25, 40.0, 5.0), abs=1e-4)
     for wrong in (found(distortion=np.zeros(5)), found(lidar_from_camera=np.eye(4))):
         assert abs(wrong.distance_m - 0.25) > 3.0 * wrong.distance_std_m
-
-
-def test_find_in_view_refusal_names_the_light() -> None:
-    with pytest.raises(BoardRefusedError, match="colour"):
-        find_in_view(TOLD, A4)
 
 
 @cache
@@ -155,8 +142,8 @@ def test_wall_with_board_measured_at_97_percent_agrees(depth: WallFit) -> None:
 def test_wall_with_board_in_colour_may_blame_the_colour_camera(depth: WallFit, light: Light) -> None:
     fit, record = wall_with_board(depth, replace(infrared(0.97), light=light), A4, measured=False)
     assert record.seen_in == light
-    for told in (fit.advice, record.causes[-1]):
-        assert ("colour camera" in told) is (light == "colour")
+    for text in (fit.advice, record.causes[-1]):
+        assert ("color camera" in text) is (light == "colour")
     _, agreed = wall_with_board(depth, replace(infrared(), light=light), A4, measured=False)
     assert (agreed.seen_in, agreed.causes) == (light, ())
 
@@ -186,20 +173,23 @@ def test_wall_with_board_out_of_range_gives_advice() -> None:
     assert "10 cm" in fit.advice
 
 
-def test_wall_with_board_refuses_a_view_without_a_board(depth: WallFit) -> None:
-    with pytest.raises(BoardRefusedError):
-        wall_with_board(depth, BoardView(np.full((480, 640), 40.0), PINHOLE), A4, measured=False)
+def test_wall_with_board_refusal_names_the_light(depth: WallFit) -> None:
+    for view, light in ((BoardView(np.full((480, 640), 40.0), PINHOLE), "infrared"), (CALIBRATION, "colour")):
+        with pytest.raises(BoardRefusedError, match=light):
+            wall_with_board(depth, view, A4, measured=False)
 
 
-def plane(distance_m: float, yaw_deg: float = 45.0, *, std_m: float = 1e-4, std_deg: float = 0.02) -> Plane:
+def plane(distance_m: float, yaw_deg: float = 45.0, *, std_m: float = 1e-4, std_deg: float = 0.02) -> UncertainPlane:
     normal = normal_from_angles(np.radians(yaw_deg), 0.1)
     along = np.outer(normal, normal)
     covariance = (std_m / distance_m**2) ** 2 * along
-    return Plane(-normal / distance_m, covariance + (np.radians(std_deg) / distance_m) ** 2 * (np.eye(3) - along))
+    return UncertainPlane(
+        -normal / distance_m, covariance + (np.radians(std_deg) / distance_m) ** 2 * (np.eye(3) - along)
+    )
 
 
-def shaken(of: Plane, generator: np.random.Generator) -> Plane:
-    return Plane(generator.multivariate_normal(of.slopes, of.covariance), of.covariance)
+def shaken(of: UncertainPlane, generator: np.random.Generator) -> UncertainPlane:
+    return UncertainPlane(generator.multivariate_normal(of.slopes, of.covariance), of.covariance)
 
 
 def test_combine_of_equal_planes_halves_the_covariance() -> None:
@@ -221,7 +211,7 @@ def test_combine_takes_each_quantity_from_the_better_plane() -> None:
 
 
 def test_combine_keeps_an_exact_plane() -> None:
-    exact = Plane(plane(0.2).slopes, np.zeros((3, 3)))
+    exact = UncertainPlane(plane(0.2).slopes, np.zeros((3, 3)))
     both = combine(exact, plane(0.2001), measured=False)
     np.testing.assert_allclose(both.plane.slopes, exact.slopes)
     np.testing.assert_allclose(both.plane.covariance, 0.0, atol=1e-15)

@@ -186,6 +186,6 @@ def test_drift_is_measured_in_tolerances(drift: Drift, tolerances: float) -> Non
 
 def test_drift_text_holds_amounts_and_uncertainties() -> None:
     moved = str(replace(STILL, distance_m=0.0018, distance_std_m=0.0002, yaw_deg=-0.3, pitch_deg=0.4))
-    assert "1.8 ± 0.2 mm" in moved
-    assert "0.50 ± 0.01°" in moved
-    assert "1.30 ± 0.01 mm" in str(replace(STILL, range_m=-0.0013, uniform=True))
+    assert "1.8 ± 0.4 mm" in moved
+    assert "0.500 ± 0.020°" in moved
+    assert "1.30 ± 0.02 mm" in str(replace(STILL, range_m=-0.0013, uniform=True))

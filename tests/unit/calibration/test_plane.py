@@ -4,12 +4,17 @@ from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import normal_from_angles
 from nlos_calibration.noise import MeanNoise, depth_noise_m
-from nlos_calibration.plane import MIN_POINTS, fit_depth, fit_plane
+from nlos_calibration.plane import MIN_POINTS, PlaneFit, fit_depth
 
 
 @pytest.fixture
 def generator() -> np.random.Generator:
     return np.random.default_rng(7)
+
+
+def fit_plane(points_m: Float64, generator: np.random.Generator, noise: MeanNoise | None = None) -> PlaneFit:
+    depth_m = np.where(np.isfinite(points_m).all(axis=1), points_m[:, 2], np.nan)
+    return fit_depth(points_m / np.where(depth_m > 0.0, depth_m, 1.0)[:, np.newaxis], depth_m, generator, noise)
 
 
 def wall_points(generator: np.random.Generator, count: int = 2000, *, noise: float = 1.0) -> tuple[Float64, Float64]:
@@ -25,7 +30,7 @@ def angle_deg(a: Float64, b: Float64) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))
 
 
-def test_fit_plane_finds_an_exact_plane_exactly(generator: np.random.Generator) -> None:
+def test_fit_depth_finds_an_exact_plane_exactly(generator: np.random.Generator) -> None:
     points, normal = wall_points(generator, noise=0.0)
     before = points.copy()
     fit = fit_plane(points, generator)
@@ -37,7 +42,7 @@ def test_fit_plane_finds_an_exact_plane_exactly(generator: np.random.Generator) 
     np.testing.assert_array_equal(points, before)
 
 
-def test_fit_plane_residual_is_the_rms_distance_of_inliers(generator: np.random.Generator) -> None:
+def test_fit_depth_residual_is_the_rms_distance_of_inliers(generator: np.random.Generator) -> None:
     points, _ = wall_points(generator)
     points[::10] += [0.0, 0.0, 0.1]
     fit = fit_plane(points, generator)
@@ -47,7 +52,7 @@ def test_fit_plane_residual_is_the_rms_distance_of_inliers(generator: np.random.
     assert not fit.inliers[::10].any()
 
 
-def test_fit_plane_weighs_points_by_their_samples(generator: np.random.Generator) -> None:
+def test_fit_depth_weighs_points_by_their_samples(generator: np.random.Generator) -> None:
     points, _ = wall_points(generator, 1000)
     one = fit_plane(points, generator, MeanNoise(np.full(1000, 4.0)))
     half = np.where(points[:, 0] > 0.0, 400.0, 4.0)
@@ -56,7 +61,7 @@ def test_fit_plane_weighs_points_by_their_samples(generator: np.random.Generator
     assert not np.allclose(both.slopes, one.slopes, rtol=1e-6)
 
 
-def test_fit_plane_inlier_gate_follows_the_noise_of_the_mean(generator: np.random.Generator) -> None:
+def test_fit_depth_inlier_gate_follows_the_noise_of_the_mean(generator: np.random.Generator) -> None:
     """Points 3 mm behind the wall are within the noise of one sample, but not of a mean of a hundred."""
     points, normal = wall_points(generator, 4000, noise=0.1)
     away = generator.random(4000) < 0.1
@@ -68,7 +73,7 @@ def test_fit_plane_inlier_gate_follows_the_noise_of_the_mean(generator: np.rando
 
 
 @pytest.mark.parametrize("count", [0, 3, MIN_POINTS - 1])
-def test_fit_plane_refuses_too_few_points(generator: np.random.Generator, count: int) -> None:
+def test_fit_depth_refuses_too_few_points(generator: np.random.Generator, count: int) -> None:
     with pytest.raises(WallRefusedError, match=f"{count} points"):
         fit_plane(wall_points(generator, count)[0], generator)
     with pytest.raises(WallRefusedError, match="0 points"):
@@ -76,14 +81,14 @@ def test_fit_plane_refuses_too_few_points(generator: np.random.Generator, count:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -0.2, 1e-3])
-def test_fit_plane_refuses_points_that_are_not_in_front(generator: np.random.Generator, value: float) -> None:
+def test_fit_depth_refuses_points_that_are_not_in_front(generator: np.random.Generator, value: float) -> None:
     with pytest.raises(WallRefusedError, match="0 points"):
         fit_plane(np.full((500, 3), value), generator)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 @pytest.mark.parametrize("stray_share", [0.0, 0.2, 0.4])
-def test_fit_plane_refuses_collinear_points(generator: np.random.Generator, noise: float, stray_share: float) -> None:
+def test_fit_depth_refuses_collinear_points(generator: np.random.Generator, noise: float, stray_share: float) -> None:
     depth_m = np.linspace(0.2, 0.5, 1000)
     depth_m += noise * generator.standard_normal(1000) * depth_noise_m(depth_m)
     points = np.linspace(-0.5, 0.5, 1000)[:, np.newaxis] * [1.0, 0.3, 0.0] + [0.0, 0.05, 1.0]
@@ -94,7 +99,7 @@ def test_fit_plane_refuses_collinear_points(generator: np.random.Generator, nois
         fit_plane(points, generator)
 
 
-def test_fit_plane_refuses_what_is_no_plane(generator: np.random.Generator) -> None:
+def test_fit_depth_refuses_what_is_no_plane(generator: np.random.Generator) -> None:
     """One point many times; a plane x = 0.1 z, which holds the lidar itself; a cloud."""
     in_plane = generator.uniform([-0.5, 0.2], [0.5, 1.0], (1000, 2))
     edge_on = np.column_stack([0.1 * in_plane[:, 1], in_plane])

@@ -72,5 +72,5 @@ def test_tape_offset_is_less_certain_on_an_oblique_wall() -> None:
 
 @pytest.mark.parametrize("tape_m", [0.1, 0.3])
 def test_tape_far_from_the_measured_distance_is_refused(tape_m: float) -> None:
-    with pytest.raises(CalibrationError, match=str(tape_m)):
+    with pytest.raises(CalibrationError, match=f"{1e3 * tape_m:.1f} mm"):
         fit_with_tape_distance(seen(bare(0.2, 45.0)), tape_m)

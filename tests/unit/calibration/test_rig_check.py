@@ -12,10 +12,10 @@ from nlos_calibration.rig_check import (
     combined,
     footprint,
     judge_rig,
-    lidar_sees,
+    lidar_visible_share,
     on_plane,
     rig_difference,
-    wall_sees,
+    wall_visible_share,
 )
 from nlos_calibration.wall_record import OccluderRecord
 from numpy.typing import NDArray
@@ -99,7 +99,7 @@ def test_judge_rig_advises_the_least_move_that_hides(bench: Rig) -> None:
 
     def leak(closer_m: float) -> float:
         nearer = Occluder(x_m=bench.occluder.x_m, z_min_m=bench.occluder.z_min_m - closer_m)
-        return lidar_sees(bench.model_copy(update={"occluder": nearer}), bench.object_box)
+        return lidar_visible_share(bench.model_copy(update={"occluder": nearer}), bench.object_box)
 
     assert leak(by_m) <= 0.001 < leak(by_m - 0.01)
 
@@ -124,7 +124,7 @@ def test_judge_rig_advises_the_least_turn_to_the_occluder() -> None:
 
     def seen(yaw_deg: float) -> float:
         bench = rig(yaw_deg=yaw_deg)
-        return wall_sees(bench, bench.object_box, seen_by(bench))
+        return wall_visible_share(bench, bench.object_box, seen_by(bench))
 
     assert seen(turn - 45.0) >= MIN_SEEN > seen(turn - 46.0)
 
@@ -181,13 +181,13 @@ def test_lidar_sees_the_share_of_sampled_points(bench: Rig) -> None:
     row = row + pinhole.ppy
     inside = (seen[:, 2] > 0) & (column > -0.5) & (column < 639.5) & (row > -0.5) & (row < 479.5)
     share = (inside & passes(bench, pose[:3, 3], points_m)).mean()
-    assert lidar_sees(bench, BOX) == pytest.approx(share, abs=0.008)
+    assert lidar_visible_share(bench, BOX) == pytest.approx(share, abs=0.008)
 
 
 def test_lidar_sees_without_occluder_what_is_in_its_field() -> None:
     bare = rig(0.2, 0.1, yaw_deg=70.0).model_copy(update={"occluder": None})
-    assert lidar_sees(bare, BOX) > 0.7
-    assert lidar_sees(rig(0.2, 0.1, yaw_deg=70.0), BOX) == 0.0
+    assert lidar_visible_share(bare, BOX) > 0.7
+    assert lidar_visible_share(rig(0.2, 0.1, yaw_deg=70.0), BOX) == 0.0
 
 
 @pytest.mark.parametrize("bench", [rig(0.2, 0.1, yaw_deg=-45.0), rig(0.3, 0.05, 0.15, 15.0), rig(0.2, 0.1)])
@@ -198,12 +198,12 @@ def test_wall_sees_as_much_as_its_best_lit_cell(bench: Rig) -> None:
     feet_m = np.column_stack([cells, np.zeros(len(cells))])
     lit = [foot for foot in feet_m if foot[0] <= bench.occluder.x_m or passes(bench, lidar_m, foot[np.newaxis])[0]]
     best = max((passes(bench, foot, points_m) | (foot[0] >= bench.occluder.x_m)).mean() for foot in lit)
-    assert wall_sees(bench, BOX, seen) == pytest.approx(best, abs=0.03)
+    assert wall_visible_share(bench, BOX, seen) == pytest.approx(best, abs=0.03)
 
 
 def test_wall_sees_nothing_from_unlit_wall() -> None:
     def share(bench: Rig, x_min_m: float, x_max_m: float) -> float:
-        return wall_sees(bench, BOX, seen_by(on_wall(bench, x_min_m, x_max_m, -1.0, 1.0)))
+        return wall_visible_share(bench, BOX, seen_by(on_wall(bench, x_min_m, x_max_m, -1.0, 1.0)))
 
     assert share(rig(), -3.0, -2.0) == 0.0
     assert share(rig(0.2, 0.001, yaw_deg=60.0), 0.21, 2.0) == 0.0  # behind the sheet it is dark

@@ -1,0 +1,104 @@
+"""Random benches with an occluder, measured from noisy depth, against the truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from nlos_calibration.errors import OccluderRefusedError
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.intervals import INTERVAL_STDS
+from nlos_calibration.noise import DepthMean
+from nlos_calibration.occluder import MIN_COLUMNS, find_occluder
+from nlos_calibration.rig import LidarPose, Occluder, PinholeRecord, load_rig
+from wall import NO_ECHO
+
+from nlos_cam.calibrate.synthetic import Sheet, View, bench_depth, depth_statistics, view, with_outliers
+from nlos_cam.render import Sensor, SensorModel
+
+Generator = np.random.Generator
+
+PAPER = load_rig("paper-rig")
+PINHOLE = PAPER.pinhole.scaled(96, 72)
+PITCHES_DEG = -12.0, 0.0, 0.0, 8.0
+IN_VIEW, BARELY, NOT_IN_VIEW, EDGE_HIDDEN = "in view", "barely in view", "out of view", "edge out of view"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Approximate pose of lidar and sheet, and conditions of the depth."""
+
+    distance_m: float = 0.2
+    facing_deg: float = 45.0
+    x_m: float = 0.2
+    gap_m: float = 0.1
+    noise: float = 1.0
+    """Over nominal."""
+    frames: int = 30
+    beams: int = 1
+    """Beams across a pixel: more than one mix on the edge."""
+    outliers: float = 0.0
+    """Share of pixels with a random depth, the same in each frame."""
+    lean_deg: float = 1.0
+    """Largest lean, twist and tilt of the edge."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Refusal or errors of one trial."""
+
+    shown: str
+    """Visibility of the sheet."""
+    refused: str = ""
+    x_error_m: float = np.nan
+    gap_error_m: float = np.nan
+    tilt_error_deg: float = np.nan
+    inside: tuple[bool, bool, bool] = (False, False, False)
+    """True for x, gap and tilt with the truth inside their 95 % interval."""
+
+
+def draw(setting: Setting, generator: Generator) -> tuple[View, Sheet]:
+    """Return a bench near the setting, at random against the pixels' grid."""
+    yaw_deg, distance_m = setting.facing_deg + generator.uniform(-1.0, 1.0), generator.uniform(-0.005, 0.005)
+    lean_deg, twist_deg, edge_deg = generator.uniform(-setting.lean_deg, setting.lean_deg, 3)
+    x_m, gap_m = setting.x_m + generator.uniform(-0.01, 0.01), setting.gap_m + generator.uniform(-0.005, 0.005)
+    seen = view(setting.distance_m + distance_m, yaw_deg, float(generator.choice(PITCHES_DEG)), PINHOLE)
+    return seen, Sheet(x_m, gap_m, lean_deg, twist_deg, edge_deg)
+
+
+def trial(setting: Setting, generator: Generator) -> Outcome:
+    """Draw a bench near the setting and find its occluder."""
+    seen, sheet = draw(setting, generator)
+    depth_m = with_outliers(bench_depth(seen, sheet, beams=setting.beams), setting.outliers, generator)
+    mean = depth_statistics(depth_m, generator, frames=setting.frames, noise=setting.noise)
+    return outcome(seen, sheet, mean, generator)
+
+
+def simulated_trial(setting: Setting, generator: Generator, pinhole: Intrinsics) -> Outcome:
+    """Find an upright occluder in frames of the renderer's beams and the simulated camera's sensor."""
+    sheet = Sheet((drawn := draw(setting, generator))[1].x_m, drawn[1].gap_m)
+    rig = PAPER.model_copy(
+        update={
+            "lidar": LidarPose(distance_m=float(drawn[0].pose[2, 3]), yaw_deg=setting.facing_deg),
+            "intrinsics": PinholeRecord.model_validate(vars(pinhole)),
+            "occluder": Occluder(x_m=sheet.x_m, z_min_m=sheet.gap_m),
+        }
+    )
+    sensor, mean = Sensor(rig, SensorModel()), DepthMean(pinhole.height, pinhole.width)
+    for _ in range(setting.frames):
+        mean.add(sensor.expose(NO_ECHO, generator).frame(pinhole).depth_m)
+    return outcome(View(rig.wall_from_lidar, pinhole), sheet, mean, generator)
+
+
+def outcome(seen: View, sheet: Sheet, mean: DepthMean, generator: Generator) -> Outcome:
+    """Find the occluder and compare it with the truth."""
+    on_sheet = bench_depth(seen, sheet) < bench_depth(seen, None)
+    columns = np.median(on_sheet.sum(axis=1))
+    shown = IN_VIEW if columns >= 2 * MIN_COLUMNS else BARELY if on_sheet.any() else NOT_IN_VIEW
+    shown = EDGE_HIDDEN if on_sheet[:, 0].mean() > 0.5 else shown
+    try:
+        fit = find_occluder(mean.mean_m(), mean.noise(), seen.pinhole, seen.pose, generator)
+    except OccluderRefusedError as error:
+        return Outcome(shown, refused=str(error))
+    errors = fit.x_m - sheet.x_m, fit.gap_m - sheet.gap_m, fit.tilt_deg - sheet.lean_deg
+    stds = fit.x_std_m, fit.gap_std_m, fit.tilt_std_deg
+    x, gap, tilt = (abs(error) <= INTERVAL_STDS * std for error, std in zip(errors, stds, strict=True))
+    return Outcome(shown, "", *errors, inside=(x, gap, tilt))
