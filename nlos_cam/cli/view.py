@@ -1,7 +1,4 @@
-"""`nlos-cam view`, and what `live` and `replay` share with it: a saved view is looked at again.
-
-Where `nlos-cam live` shows its view, and what it tells of that.
-"""
+"""The command `view`, and the view options that `live` and `replay` share with it."""
 
 import os
 import sys
@@ -19,21 +16,27 @@ from nlos_cam.view import LOOPBACK, NullViewer, Viewer, Viewers, exposed
 
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 ViewPort = Annotated[
-    int | None, typer.Option("--view-port", min=1, max=65535, help="Serve the view here or nowhere; else 9090 or near.")
+    int | None,
+    typer.Option(
+        "--view-port",
+        min=1,
+        max=65535,
+        help="Port of the live view; fails if taken (default: 9090, or the next free port).",
+    ),
 ]
 ViewHost = Annotated[
     str | None,
-    typer.Option("--view-host", help="Serve the view to others, at this address of this machine (0.0.0.0: all)."),
+    typer.Option("--view-host", help="Address to serve the view on for other machines (0.0.0.0: all)."),
 ]
 Open = Annotated[bool, typer.Option("--open", help="Open the view in the default browser.")]
 DESKTOPS = "DISPLAY", "WAYLAND_DISPLAY", "BROWSER"
 
 
 def viewer_of(bench: CalibratedRig, *, no_view: bool, host: str | None = None, port: int | None = None) -> Viewer:
-    """What shows a live run. Raises typer.BadParameter where none is wanted and yet a place for it is named."""
+    """Return the viewer of a live run. Raises typer.BadParameter for a host or port together with --no-view."""
     if no_view:
         if host is not None or port is not None:
-            raise typer.BadParameter("--view-host and --view-port say where the view is: leave --no-view away")
+            raise typer.BadParameter("--view-host and --view-port need a view: drop --no-view")
         return NullViewer()
     from nlos_cam.view import WebViewer
 
@@ -41,31 +44,32 @@ def viewer_of(bench: CalibratedRig, *, no_view: bool, host: str | None = None, p
 
 
 class Addressed(Protocol):
-    """What a browser can find: a live view, or a saved one."""
+    """View with an address: live or saved."""
 
     @property
     def address(self) -> str | None: ...
 
 
-def tell_of_view(
+def announce_view(
     viewer: Addressed, *, host: str | None, port: int | None, open_it: bool, what: str = "live view"
 ) -> None:
-    """Say where the view is, who else can see it, and open it if that is wanted."""
+    """Print the view's address and who else can see it, and open it on request."""
     if not viewer.address:
-        say("running without a view (Ctrl-C ends it)")
+        say("Running without a view. Press Ctrl-C to stop.")
         return
     from nlos_cam.view import PREFERRED_PORT
 
     taken = port is None and urlsplit(viewer.address).port != PREFERRED_PORT
-    say(f"{what}: {viewer.address}  (Ctrl-C ends it{f'; port {PREFERRED_PORT} is taken' if taken else ''})")
-    if host and (told := exposed(host, urlsplit(viewer.address).port or 0)):
-        say(f"[yellow]note:[/] {told}", marked=True)
+    note = f" Port {PREFERRED_PORT} is taken." if taken else ""
+    say(f"{what}: {viewer.address}  Press Ctrl-C to stop.{note}")
+    if host and (note := exposed(host, urlsplit(viewer.address).port or 0)):
+        say(f"[yellow]note:[/] {note}", marked=True)
     if open_it and not opened_in_browser(viewer.address):
-        say(f"note: no browser could be opened here: open {viewer.address} in one")
+        say(f"note: no browser could be opened: open {viewer.address} yourself")
 
 
 def opened_in_browser(address: str) -> bool:
-    """Open an address in the default browser, in a window: one for terminals would take this one over."""
+    """Open an address in the default browser; return False without a desktop, where a text browser would open."""
     if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in DESKTOPS):
         return False
     try:
@@ -75,12 +79,18 @@ def opened_in_browser(address: str) -> bool:
 
 
 SUFFIX = ".rrd"
-SaveView = Annotated[Path | None, typer.Option("--save-view", help="Also save the view (F.rrd), for `nlos-cam view`.")]
-SaveReplayView = Annotated[bool, typer.Option("--save-view", help="Also write DIR/view.rrd, for `nlos-cam view`.")]
-Stills = Annotated[int, typer.Option("--stills", min=0, max=100, help="Also write so many still pictures (PNG).")]
-Video = Annotated[bool, typer.Option("--video", help="Also write DIR/replay.webm.")]
-ViewFile = Annotated[Path, typer.Argument(metavar="F.RRD", help="What --save-view wrote.")]
-Seconds = Annotated[float | None, typer.Option("--seconds", min=0.1, help="Stop after so long; else at Ctrl-C.")]
+SaveView = Annotated[
+    Path | None, typer.Option("--save-view", help="Save the view to this .rrd file, for `nlos-cam view`.")
+]
+SaveReplayView = Annotated[
+    bool, typer.Option("--save-view", help="Save the view to DIR/view.rrd, for `nlos-cam view`.")
+]
+Stills = Annotated[int, typer.Option("--stills", min=0, max=100, help="Number of still pictures to write (PNG).")]
+Video = Annotated[bool, typer.Option("--video", help="Write a video, DIR/replay.webm.")]
+ViewFile = Annotated[Path, typer.Argument(metavar="F.RRD", help="File written by --save-view.")]
+Seconds = Annotated[
+    float | None, typer.Option("--seconds", min=0.1, help="Stop after this many seconds (default: run until Ctrl-C).")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -96,13 +106,13 @@ def view(
     open_view: Open = False,
     json: Json = False,
 ) -> None:
-    """Look at a saved view in a browser, with play, pause and scrubbing."""
+    """Open a saved view in a browser, with play, pause and scrubbing."""
     from nlos_cam.view import RecordedView
 
     with interrupted_by_signals():
         recorded = RecordedView(file, host=view_host or LOOPBACK, port=view_port)
     with stop_on_signals() as stop, recorded:
-        tell_of_view(recorded, host=view_host, port=view_port, open_it=open_view, what="saved view")
+        announce_view(recorded, host=view_host, port=view_port, open_it=open_view, what="saved view")
         address = recorded.address
         stop.wait(seconds)
     finish({"file": str(file), "address": address}, as_json=json, text=f"{file} was at {address}")
@@ -111,7 +121,7 @@ def view(
 
 
 def saving(viewer: Viewer, bench: CalibratedRig, path: Path | None) -> Viewer:
-    """The viewer, and beside it one that saves what it shows, if there is a path to save it to."""
+    """Return the viewer, joined by one that saves to `path` if given."""
     if path is None:
         return viewer
     from nlos_cam.view import RrdFile

@@ -1,4 +1,4 @@
-"""The files of the page: ours, and the Rerun viewer compiled for the browser."""
+"""Files of the web page: ours, and the Rerun viewer compiled for the browser."""
 
 import os
 import socket
@@ -22,14 +22,15 @@ Assets = Mapping[str, tuple[str, bytes]]
 
 
 LIVE, RECORDED = b'data-time="live"', b'data-time="recorded"'
-"""How the page knows whether it shows the panel of time."""
+"""Marker in the page that selects the time panel."""
 
 
 def page_assets(*, recorded: bool = False) -> Assets:
-    """Everything the page loads, so that no browser fetches anything from elsewhere; what is `recorded` has a time.
+    """Return every file that the page loads, so that a browser fetches nothing from elsewhere.
 
-    The viewer's own server hands out its compiled files; it is asked for them once, and stopped. Its page loads fonts
-    from the internet and its data port listens on every interface, so neither is used. Raises NlosCamError.
+    A `recorded` page has a time panel. Rerun's own server provides its compiled files; it is started for that and
+    stopped. Its page loads fonts from the internet and its data port listens on every interface, so neither is used.
+    Raises NlosCamError.
     """
     page = (resources.files("nlos_cam.view") / "page.html").read_bytes()
     page = page.replace(LIVE, RECORDED) if recorded else page
@@ -40,7 +41,7 @@ def page_assets(*, recorded: bool = False) -> Assets:
 
 @contextmanager
 def _viewer_files_server() -> Generator[int]:
-    """The port, on the loopback, of Rerun's own web server, which lasts as long as the block."""
+    """Run Rerun's own web server within the block; yield its port on the loopback."""
     port, unused = _free_port(), _free_port()
     ports = ["--port", str(unused), "--web-viewer-port", str(port)]
     command = [str(_rerun_program()), "--serve-web", "--bind", LOOPBACK, *ports]

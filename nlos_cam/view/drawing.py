@@ -1,9 +1,4 @@
-"""What the viewer draws: the bench in 3D, the calibration if there is one, and each moment, as Rerun data.
-
-The bench as Rerun data, in the wall frame: wall, occluder, object box, lidar and the way of the light.
-
-What is plotted over time: latency by stage, frames lost, temperatures, the physics check's score.
-"""
+"""Rerun data of the view: the bench in 3D (wall frame), the calibration, each moment's pictures and plots."""
 
 import uuid
 from collections.abc import Callable, Iterator, Mapping
@@ -21,18 +16,18 @@ from nlos_cam.view.images import (
     NOTED_PIXELS,
     PICTURE_WIDTH,
     RESIDUAL_SPAN_M,
-    as_believed,
     banner_rgb,
     change_span_m,
     confidence_rgb,
     depth_span_m,
     difference_rgb,
+    dim_untrusted,
     encoded,
     faded,
     hidden_rgb,
     infrared_grey,
+    is_trusted,
     lidar_rgb,
-    may_be_believed,
     surface,
     uncertainty_rgb,
 )
@@ -43,7 +38,7 @@ from nlos_cam.view.wall_drawing import bench_drawings, calibration_text, wall_na
 WALL_RGBA, OCCLUDER_RGBA, LIGHT_RGBA = (120, 130, 140, 70), (90, 150, 255, 90), (255, 210, 80, 200)
 BOX_RGB, LIDAR_RGB = (150, 150, 150), (255, 110, 90)
 OCCLUDER_HEIGHT_M = 0.3
-"""How much is drawn of what has no end."""
+"""Length in metres drawn of endless parts."""
 MARGIN_M = 0.1
 FRUSTUM_M = 0.12
 
@@ -51,7 +46,7 @@ Corners = list[tuple[float, float, float]]
 
 
 def bench_parts(rig: Rig) -> Iterator[tuple[str, Any]]:
-    """What there is, by path; none of it moves. Raises SceneError for a rig without an object box."""
+    """Return the static parts of the bench by path. Raises SceneError for a rig without an object box."""
     low, high = _seen_of_wall(rig)
     on_wall = [(x_m, y_m, 0.0) for x_m, y_m in _around((low[0], high[0]), (low[1], high[1]))]
     yield "bench/wall", _rectangle(on_wall, WALL_RGBA)
@@ -86,14 +81,14 @@ def _edges(box: ObjectBox) -> rr.Boxes3D:
 
 
 def _seen_of_wall(rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (x, y) of the part of the wall that is drawn: what matters to light, not the endless plane."""
+    """Return the corners (x, y) of the wall part to draw: the lit part of the endless plane."""
     relay = rig.relay
     low = np.array([relay.x_min_m - MARGIN_M, relay.y_min_m])
     return low, np.array([relay.x_max_m + MARGIN_M, relay.y_max_m])
 
 
 def _light_path(rig: Rig, box: ObjectBox) -> NDArray[np.float64]:
-    """The way of one three-bounce echo (5, 3): lidar, wall, hidden object, wall, lidar."""
+    """Return the path of one three-bounce echo (5, 3): lidar, wall, hidden object, wall, lidar."""
     eye = rig.wall_from_lidar[:3, 3]
     middle = np.array([(box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2, box.z_near_m])
     there, back = (np.array([middle[0] * 0.6, y_m, 0.0]) for y_m in (-0.04, 0.04))
@@ -115,11 +110,11 @@ STAGE_RGB = ((235, 240, 245), (90, 170, 255), (255, 190, 90), (80, 220, 120), (2
 SENSOR_RGB = ((255, 120, 90), (255, 190, 90), (120, 200, 255), (160, 230, 140))
 DROPS_RGB, SCORE_RGB = (255, 110, 90), (90, 170, 255)
 WAITED_FOR = "wait"
-"""Of all stages, the one that is no work: the loop waits for the camera."""
+"""Stage without work: the loop waits for the camera."""
 
 
 class Plots:
-    """Logs each moment's figures; what is plotted is named where it first appears."""
+    """Plots of each moment's figures; a series is named when it first appears."""
 
     def __init__(self, log: Log, first: Moment) -> None:
         self._log = log
@@ -131,7 +126,7 @@ class Plots:
         self._name("physics/score", ["score"], [SCORE_RGB])
 
     def draw(self, moment: Moment) -> None:
-        """Log the figures of a moment; the check's when it is a new one."""
+        """Log the figures of a moment, and those of a new physics check."""
         stages_s = [moment.stages_s.get(name, nan) for name in self._stages]
         self._log("latency", rr.Scalars([1e3 * value for value in (moment.latency_s, *stages_s)]))
         self._log("drops", rr.Scalars([moment.dropped]))
@@ -156,11 +151,11 @@ class Plots:
 APPLICATION = "nlos-cam"
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg"}
 NEVER = "never drawn"
-"""What no verdict equals, None included."""
+"""Sentinel that differs from every verdict and from None."""
 
 
 def new_recording(batcher: rr.ChunkBatcherConfig | None = None) -> rr.RecordingStream:
-    """A recording of its own, whose only times are those that `Drawing` sets."""
+    """Return a new Rerun recording whose only timelines are those of `Drawing`."""
     recording = rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4(), batcher_config=batcher)
     recording.set_log_tick_enabled(False)
     recording.set_log_time_enabled(False)
@@ -168,9 +163,9 @@ def new_recording(batcher: rr.ChunkBatcherConfig | None = None) -> rr.RecordingS
 
 
 class Drawing:
-    """Draws moments into a recording, which is one browser's or one file's.
+    """Drawing of moments into one browser's or one file's recording.
 
-    Of a `saved` one pictures are compressed and the lidar's smaller, and the panel of time opens with it.
+    For a `saved` one, pictures are compressed, the lidar's are smaller, and the time panel is open.
     """
 
     def __init__(
@@ -198,14 +193,14 @@ class Drawing:
             self._draw_wall(measured)
 
     def draw(self, moment: Moment, *, with_lidar: bool, with_surface: bool = True) -> None:
-        """Draw a moment, and what is large of it if asked to: the lidar's pictures, the surface in 3D."""
+        """Draw a moment; the lidar's pictures and the 3D surface only if requested."""
         self._recording.set_time(TIMELINE, duration=moment.published_s - self._begun_s)
         self._recording.set_time(FRAME_TIMELINE, sequence=moment.frame.frame_number)
         self._plots.draw(moment)
         self._draw_verdict(moment)
         self._draw_hidden(moment)
         if with_surface:
-            self._draw_surface(moment.reconstruction.depth_m, believed=may_be_believed(moment.verdict))
+            self._draw_surface(moment.reconstruction.depth_m, trusted=is_trusted(moment.verdict))
         if with_lidar:
             self._draw_lidar_pictures(moment)
         if self._measured:
@@ -215,9 +210,9 @@ class Drawing:
         self._recording.log(path, thing, static=static)
 
     def _picture(self, path: str, picture: NDArray[np.uint8], suffix: str = ".png") -> None:
-        """Log a picture; in a file compressed, small ones without loss.
+        """Log a picture, compressed in a file (small ones without loss).
 
-        All of one path must be of one kind: Rerun takes such a sequence for a video, and would start it anew live.
+        All pictures of one path have one kind: Rerun treats them as a video and would restart it otherwise.
         """
         if self._saved:
             self._log(path, rr.EncodedImage(contents=encoded(picture, suffix), media_type=MEDIA_TYPES[suffix]))
@@ -225,24 +220,24 @@ class Drawing:
             self._log(path, rr.Image(picture))
 
     def _draw_verdict(self, moment: Moment) -> None:
-        """Show the verdict in its panel, if it is another than before; a picture with a note on it is larger."""
+        """Draw the verdict in its panel if it has changed; a picture with a note is larger."""
         if moment.verdict == self._verdict:
             return
         self._verdict = moment.verdict
         self._picture("verdict", banner_rgb(moment.verdict))
-        scale = 1.0 if may_be_believed(moment.verdict) else OBJECT_PIXELS / NOTED_PIXELS
+        scale = 1.0 if is_trusted(moment.verdict) else OBJECT_PIXELS / NOTED_PIXELS
         self._log("reconstruction", rr.Transform3D(scale=[scale, scale, 1.0]))
 
     def _draw_hidden(self, moment: Moment) -> None:
         depth_m, truth_m = moment.reconstruction.depth_m, moment.frame.truth_depth_m
         uncertainty_m, rgb = moment.reconstruction.uncertainty_m, hidden_rgb(depth_m, self._box)
-        self._picture("reconstruction", as_believed(rgb, moment.verdict))
+        self._picture("reconstruction", dim_untrusted(rgb, moment.verdict))
         if uncertainty_m is not None:
             self._picture("uncertainty", uncertainty_rgb(uncertainty_m, depth_m))
         if truth_m is not None:
             self._picture("truth", hidden_rgb(truth_m, self._box))
 
-    def _draw_surface(self, depth_m: NDArray[np.float32], *, believed: bool) -> None:
+    def _draw_surface(self, depth_m: NDArray[np.float32], *, trusted: bool) -> None:
         mesh = surface(depth_m, self._box)
         if len(mesh.triangles) == 0:
             self._log("bench/hidden", rr.Clear(recursive=False))
@@ -251,7 +246,7 @@ class Drawing:
             vertex_positions=mesh.points_m,
             triangle_indices=mesh.triangles,
             vertex_normals=mesh.normals,
-            vertex_colors=mesh.rgb if believed else faded(mesh.rgb),
+            vertex_colors=mesh.rgb if trusted else faded(mesh.rgb),
         )
         self._log("bench/hidden", drawn)
 
@@ -274,7 +269,7 @@ class Drawing:
             self._log(f"wall/{name}", rr.Image(picture), static=True)
 
     def _tell(self, text: str) -> None:
-        """Show the calibration's page, if it says something else than before."""
+        """Draw the calibration's text if it has changed."""
         if text != self._told:
             self._told = text
             self._log("calibration", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))

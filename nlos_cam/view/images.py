@@ -1,7 +1,4 @@
-"""Maps as pictures and surfaces: pure functions from arrays to arrays.
-
-A verdict as large, coloured text: a banner for its panel, and a note to lay over what may not be believed.
-"""
+"""Pictures and surfaces from maps, and the verdict's banner: pure functions from arrays to arrays."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -18,30 +15,30 @@ from nlos_cam.objects import cell_centers_m, image_from_depth
 from nlos_cam.reconstruct import Verdict
 
 BACKGROUND_RGB = (13, 16, 17)
-"""The page's own dark: what has no surface has no colour."""
+"""Color of the page's background, for pixels without surface."""
 PICTURE_WIDTH = 320
-"""What the lidar sees pixel by pixel is thinned to about this many columns."""
+"""Columns to which lidar pictures are thinned."""
 DARKEST = 60
 """Where in the colour map the farthest surface starts, so that it stands out from the background."""
 JUMP_M = 0.03
-"""Neighbours that differ by more are not one surface."""
+"""Depth difference above which neighbours are separate surfaces."""
 DIVERGING_RGB = (255, 150, 60), (70, 155, 130), (50, 160, 255)
-"""Red, green and blue of what is nearer, as expected, and farther."""
+"""Colors of nearer, expected and farther depth."""
 SATURATED_RGB = (255, 0, 200)
 ROUND_STEPS = 1.0, 2.0, 3.0, 5.0, 10.0
 CHANGED_M, FEW_CHANGED, QUIET_SPAN_M = 0.01, 0.02, 0.02
-"""Less is noise and ripples; where few cells differ by more, the span shows these."""
+"""Differences below are noise and ripples; if few cells differ by more, the span shows these."""
 MAX_UNCERTAINTY_M = 0.03
-"""What is drawn brightest: the object box is 0.28 m deep."""
+"""Uncertainty drawn brightest; the object box is 0.28 m deep."""
 RESIDUAL_SPAN_M = 0.02
 """Of the physics check; the lidar's own noise is a tenth of it."""
 MAX_CONFIDENCE = 15
 FADED = 0.35
-"""The share of its colour that is left to what may not be believed."""
+"""Share of color left in an untrusted picture."""
 
 
 def hidden_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
-    """Hidden depth (64, 64) as a picture (64, 64, 3): bright is near the wall, the background dark."""
+    """Return hidden depth (64, 64) as a picture (64, 64, 3): bright near the wall, dark background."""
     v = image_from_depth(depth_m, box)
     rgb = _coloured(DARKEST + v * (255 - DARKEST), cv2.COLORMAP_INFERNO)
     rgb[np.isnan(depth_m)] = BACKGROUND_RGB
@@ -49,7 +46,7 @@ def hidden_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
 
 
 def lidar_rgb(depth_m: Float32, near_m: float, far_m: float) -> UInt8:
-    """Lidar depth (height, width) as a picture, red (near) to blue (far); no return is dark."""
+    """Return lidar depth (height, width) as a picture, red (near) to blue (far), dark without a return."""
     share = (depth_m - near_m) / max(far_m - near_m, 1e-6)
     rgb = _coloured(np.nan_to_num(1.0 - np.clip(share, 0.0, 1.0)) * 255, cv2.COLORMAP_TURBO)
     rgb[np.isnan(depth_m)] = BACKGROUND_RGB
@@ -57,17 +54,17 @@ def lidar_rgb(depth_m: Float32, near_m: float, far_m: float) -> UInt8:
 
 
 def infrared_grey(ir: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """IR counts (height, width) under a square root: weak and strong returns are both visible."""
+    """Return IR counts (height, width) as grey under a square root, so that weak returns are visible too."""
     return np.sqrt(ir * np.float32(255.0)).astype(np.uint8)
 
 
 def confidence_rgb(confidence: NDArray[np.uint8]) -> UInt8:
-    """Confidence 0 to 15 (height, width) as a picture, dark to bright."""
+    """Return confidence 0 to 15 (height, width) as a picture, dark to bright."""
     return _coloured(np.minimum(confidence, MAX_CONFIDENCE) * (255.0 / MAX_CONFIDENCE), cv2.COLORMAP_BONE)
 
 
 def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> UInt8:
-    """How uncertain the hidden depth is (64, 64) as a picture, bright where it is; dark where there is no surface."""
+    """Return the uncertainty of hidden depth (64, 64) as a picture, bright where large, dark without surface."""
     share = np.clip(np.nan_to_num(uncertainty_m, nan=np.inf) / MAX_UNCERTAINTY_M, 0.0, 1.0)
     rgb = _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_VIRIDIS)
     rgb[np.isnan(depth_m)] = BACKGROUND_RGB
@@ -75,7 +72,7 @@ def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> UInt8:
 
 
 def relief_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
-    """Hidden depth (64, 64) as if lit from the top left, where the surface faces."""
+    """Return hidden depth (64, 64) as a relief lit from the top left."""
     pitch_m = (box.x_max_m - box.x_min_m) / depth_m.shape[1]
     down, right = np.gradient(np.nan_to_num(depth_m, nan=box.z_far_m), pitch_m)
     facing = (1.0 - 0.7 * right - 0.7 * down) / np.sqrt((1.0 + right**2 + down**2) * (1.0 + 2 * 0.7**2))
@@ -86,19 +83,19 @@ def relief_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
 
 
 def faded(rgb: UInt8) -> UInt8:
-    """The same picture (..., 3) with little colour left, for what may not be believed."""
+    """Return a picture (..., 3) with little color left, for an unreliable reconstruction."""
     grey = rgb.mean(axis=-1, keepdims=True)
     return np.rint(grey + FADED * (rgb - grey)).astype(np.uint8)
 
 
 def encoded(picture: NDArray[np.uint8], suffix: str) -> bytes:
-    """A picture (height, width[, 3]) as a file of its own, ".png" or ".jpg"."""
+    """Encode a picture (height, width[, 3]) as ".png" or ".jpg"."""
     turned = np.ascontiguousarray(picture[..., ::-1]) if picture.ndim == 3 else picture
     return cv2.imencode(suffix, turned)[1].tobytes()
 
 
 def depth_span_m(depth_m: Float32) -> tuple[float, float]:
-    """The range that most of a depth map lies in; (0, 1) for a map without a return."""
+    """Return the range of most of a depth map; (0, 1) without a return."""
     seen = depth_m[np.isfinite(depth_m)]
     if seen.size == 0:
         return 0.0, 1.0
@@ -107,7 +104,7 @@ def depth_span_m(depth_m: Float32) -> tuple[float, float]:
 
 
 def difference_rgb(further: NDArray[np.floating], span: float) -> UInt8:
-    """What is farther than expected as a picture: blue, and nearer red, grey as expected; NaN is dark."""
+    """Return a depth difference as a picture: blue farther, red nearer, grey as expected, dark for NaN."""
     share = np.clip(np.nan_to_num(further) / span, -1.0, 1.0)
     rgb = np.stack([np.interp(share, (-1.0, 0.0, 1.0), stops) for stops in DIVERGING_RGB], axis=-1).astype(np.uint8)
     rgb[np.isnan(further)] = BACKGROUND_RGB
@@ -115,21 +112,21 @@ def difference_rgb(further: NDArray[np.floating], span: float) -> UInt8:
 
 
 def noise_rgb(noise: NDArray[np.floating], span: float) -> UInt8:
-    """A spread as a picture, bright where it is large; NaN is dark."""
+    """Return a spread as a picture, bright where large, dark for NaN."""
     rgb = _coloured(DARKEST + np.clip(np.nan_to_num(noise) / span, 0.0, 1.0) * (255 - DARKEST), cv2.COLORMAP_INFERNO)
     rgb[np.isnan(noise)] = BACKGROUND_RGB
     return rgb
 
 
 def saturated_rgb(ir: NDArray[np.floating], saturated: NDArray[np.floating]) -> UInt8:
-    """Mean IR counts in grey, and in its own colour what was ever saturated."""
+    """Return mean IR counts in grey, with pixels that ever saturated in a color."""
     rgb = np.repeat(infrared_grey(np.nan_to_num(ir).astype(np.uint8))[..., np.newaxis], 3, axis=-1)
     rgb[saturated > 0.0] = SATURATED_RGB
     return rgb
 
 
 def round_span(values: NDArray[np.floating], percent: float = 95.0, otherwise: float = 1.0) -> float:
-    """The next of 1, 2, 3, 5, 10 times a power of ten, above most magnitudes; `otherwise` where all are zero or NaN."""
+    """Return 1, 2, 3, 5 or 10 times a power of ten above most magnitudes; `otherwise` if all are zero or NaN."""
     seen = np.abs(values[np.isfinite(values)])
     most = float(np.percentile(seen, percent)) if seen.size else 0.0
     if most <= 0.0:
@@ -139,7 +136,7 @@ def round_span(values: NDArray[np.floating], percent: float = 95.0, otherwise: f
 
 
 def change_span_m(difference_m: Float32) -> float:
-    """A round span that most of what has changed lies in; an occluder, far before the wall, may lie beyond."""
+    """Return a round span for most changes; an occluder far in front of the wall may lie beyond."""
     changed_m = difference_m[np.abs(difference_m) > CHANGED_M]  # without NaN
     few = changed_m.size < FEW_CHANGED * difference_m.size
     return QUIET_SPAN_M if few else round_span(changed_m, percent=75.0)
@@ -147,7 +144,7 @@ def change_span_m(difference_m: Float32) -> float:
 
 @dataclass(frozen=True)
 class Surface:
-    """A triangle mesh in the wall frame."""
+    """Triangle mesh in the wall frame."""
 
     points_m: NDArray[np.float32]
     """(n, 3)."""
@@ -160,7 +157,7 @@ class Surface:
 
 
 def surface(depth_m: Float32, box: ObjectBox) -> Surface:
-    """The mesh of a hidden depth map (64, 64): squares whose corners are surface and do not jump."""
+    """Return the mesh of a hidden depth map (64, 64): squares whose corners are surface without a depth jump."""
     x_m, y_m = np.meshgrid(*cell_centers_m(box, len(depth_m)))
     points = np.stack([x_m, y_m, depth_m], axis=-1).astype(np.float32)
     corners = np.stack([depth_m[:-1, :-1], depth_m[:-1, 1:], depth_m[1:, :-1], depth_m[1:, 1:]])
@@ -175,7 +172,7 @@ def surface(depth_m: Float32, box: ObjectBox) -> Surface:
 
 
 def _normals(points_m: NDArray[np.float32], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
-    """The mean of the normals of the triangles that meet in each point, weighted by their areas."""
+    """Return each point's normal: the mean over its triangles, weighted by area."""
     a, b, c = (points_m[triangles[:, corner]] for corner in range(3))
     across = np.cross(c - a, b - a)  # towards +z: the rows run down, the columns right
     total = np.zeros_like(points_m)
@@ -194,43 +191,43 @@ NOTED_PIXELS = 512
 HATCH_PIXELS = 32
 HATCH_ALPHA, FRAME_ALPHA = 70, 255
 DIM = 0.16
-"""How much of its colour the banner's ground has."""
+"""Share of the verdict's color in the banner's background."""
 PALE_RGB = (214, 224, 230)
 
 
 @dataclass(frozen=True)
-class Look:
-    """How a verdict is shown."""
+class VerdictStyle:
+    """Color and advice of a verdict."""
 
     rgb: tuple[int, int, int]
     advice: str
 
 
-LOOKS = {
-    Verdict.SEEN: Look((80, 220, 120), "the shape may be believed to within the uncertainty beside it"),
-    Verdict.NOTHING: Look((150, 175, 190), "the light that comes back is that of an empty box"),
-    Verdict.OUTSIDE: Look((255, 180, 60), "unlike all that the networks were trained on: do not believe the shape"),
-    Verdict.SATURATED: Look((255, 120, 200), "the sensor is blinded: lower the laser's power or shade the light"),
-    Verdict.WALL_MOVED: Look((255, 110, 90), "wall or lidar are not where they were: calibrate the wall again"),
-    Verdict.STALLED: Look((255, 110, 90), "no new frame comes: what is shown is old"),
+STYLES = {
+    Verdict.SEEN: VerdictStyle((80, 220, 120), "shape within the uncertainty shown beside it"),
+    Verdict.NOTHING: VerdictStyle((150, 175, 190), "the returning light is that of an empty box"),
+    Verdict.OUTSIDE: VerdictStyle((255, 180, 60), "unlike the training data: shape not reliable"),
+    Verdict.SATURATED: VerdictStyle((255, 120, 200), "sensor saturated: lower the laser power or shade the light"),
+    Verdict.WALL_MOVED: VerdictStyle((255, 110, 90), "wall or lidar have moved: calibrate the wall again"),
+    Verdict.STALLED: VerdictStyle((255, 110, 90), "no new frame: the picture is old"),
 }
-UNTOLD = Look(PALE_RGB, "these networks do not tell how far they may be believed")
+NO_VERDICT = VerdictStyle(PALE_RGB, "no uncertainty network: reliability unknown")
 
 
-def look_of(verdict: Verdict | None) -> Look:
-    """Colour and advice; of no verdict too."""
-    return LOOKS[verdict] if verdict else UNTOLD
+def style_of(verdict: Verdict | None) -> VerdictStyle:
+    """Return color and advice of a verdict or of none."""
+    return STYLES[verdict] if verdict else NO_VERDICT
 
 
-def may_be_believed(verdict: Verdict | None) -> bool:
-    """Whether what is drawn of a frame is drawn in full colour; networks that do not tell are not doubted for it."""
+def is_trusted(verdict: Verdict | None) -> bool:
+    """Return True if a reconstruction is drawn in full color; also without an uncertainty network."""
     return verdict in {None, Verdict.SEEN}
 
 
 @cache
 def banner_rgb(verdict: Verdict | None) -> UInt8:
-    """The verdict's panel: its name large, what to do or think below, on a ground of its colour."""
-    look = look_of(verdict)
+    """Return the verdict's panel: its name large, the advice below, on its color."""
+    look = style_of(verdict)
     ground = tuple(int(b + DIM * (c - b)) for b, c in zip(BACKGROUND_RGB, look.rgb, strict=True))
     image = Image.new("RGB", (BANNER_WIDTH, BANNER_HEIGHT), ground)
     pen = ImageDraw.Draw(image)
@@ -240,12 +237,12 @@ def banner_rgb(verdict: Verdict | None) -> UInt8:
     return np.asarray(image)
 
 
-def as_believed(rgb: UInt8, verdict: Verdict | None) -> UInt8:
-    """A reconstruction's picture (64, 64, 3) as it is; if it may not be believed (512, 512, 3): faded, framed, named.
+def dim_untrusted(rgb: UInt8, verdict: Verdict | None) -> UInt8:
+    """Return a trusted reconstruction (64, 64, 3) unchanged, an untrusted one (512, 512, 3) faded, framed and labelled.
 
-    What is doubted is hatched too; what is nothing is not.
+    A doubtful shape is hatched too, an empty one is not.
     """
-    if verdict is None or may_be_believed(verdict):
+    if verdict is None or is_trusted(verdict):
         return rgb
     large = faded(rgb).repeat(NOTED_PIXELS // len(rgb), axis=0).repeat(NOTED_PIXELS // len(rgb), axis=1)
     note = note_rgba(verdict)
@@ -255,9 +252,9 @@ def as_believed(rgb: UInt8, verdict: Verdict | None) -> UInt8:
 
 @cache
 def note_rgba(verdict: Verdict) -> NDArray[np.uint8]:
-    """What is laid over such a picture (512, 512, 4)."""
+    """Return the overlay of an untrusted picture (512, 512, 4)."""
     image = Image.new("RGBA", (NOTED_PIXELS, NOTED_PIXELS), (0, 0, 0, 0))
-    pen, rgb, end = ImageDraw.Draw(image), look_of(verdict).rgb, NOTED_PIXELS
+    pen, rgb, end = ImageDraw.Draw(image), style_of(verdict).rgb, NOTED_PIXELS
     if verdict is not Verdict.NOTHING:
         for start in range(-end, end, HATCH_PIXELS):
             pen.line((start, end, start + end, 0), fill=(*rgb, HATCH_ALPHA), width=3)
@@ -271,5 +268,5 @@ def note_rgba(verdict: Verdict) -> NDArray[np.uint8]:
 
 @cache
 def font(pixels: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The font of everything that we write into pictures; it comes with Pillow."""
+    """Return the font of all texts in pictures; it comes with Pillow."""
     return ImageFont.load_default(pixels)

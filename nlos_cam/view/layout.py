@@ -1,4 +1,4 @@
-"""The viewer's layout: which views a newcomer sees, where, and under which names."""
+"""Layout of the page: views, places and names."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ MEASURED_AWAY = 1.2
 
 @dataclass(frozen=True)
 class WallNames:
-    """The names of the views of a measured wall, which state their scales; empty for what there is nothing to show."""
+    """Names of a measured wall's views, with their scales; empty where there is nothing to show."""
 
     difference: str = ""
     residual: str = ""
@@ -29,25 +29,25 @@ class WallNames:
     saturated: str = ""
 
     def pictures(self) -> list[rrb.Spatial2DView]:
-        """The views of the reference."""
+        """Return the views of the bare-wall reference."""
         named = {"residual": self.residual, "noise": self.noise, "saturated": self.saturated}
         return [_picture(f"wall/{path}", name) for path, name in named.items() if name]
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What there is to show."""
+    """Available data of a run."""
 
     with_truth: bool = False
-    """What is hidden is known, as in simulation."""
+    """True if the hidden object is known, as in simulation."""
     wall: WallNames | None = None
-    """Where a wall was measured."""
+    """Names of the views of a measured wall."""
     scrubbed: bool = False
-    """Whether it has an end, and time can be gone back in."""
+    """True for a recording with an end, in which one can scrub."""
 
 
 def layout(rig: Rig, shown: Shown) -> rrb.Blueprint:
-    """What a newcomer sees: verdict, reconstruction, its uncertainty and the bench; below, what they were made from."""
+    """Return the layout: verdict, reconstruction, uncertainty and bench; below them the inputs."""
     hidden = rrb.Horizontal(
         _picture("reconstruction", "Reconstruction (bright: near the wall)"),
         _picture("uncertainty", f"Uncertainty (bright: {1e3 * MAX_UNCERTAINTY_M:g} mm)"),
@@ -82,7 +82,7 @@ def _bench_tabs(rig: Rig, wall: WallNames | None) -> rrb.Tabs | rrb.Spatial3DVie
 
 
 def _bottom(shown: Shown) -> rrb.Horizontal:
-    """Truth, what the lidar sees, and plots; what was measured of a wall comes before what can be seen without."""
+    """Return the bottom row: truth, lidar images and plots; a measured wall comes first."""
     wall = shown.wall
     truth = [_picture("truth", "Truth (simulated)")] if shown.with_truth else []
     change = [_picture("lidar/difference", wall.difference)] if wall and wall.difference else []
@@ -101,7 +101,7 @@ def _plots(*, scrubbed: bool) -> list[rrb.TimeSeriesView]:
 
 
 def _plot(origin: str, name: str, *, scrubbed: bool) -> rrb.TimeSeriesView:
-    """The last seconds of what goes on; all of what has an end."""
+    """Return a plot of the last seconds, or of a whole recording."""
     window = rrb.VisibleTimeRange(
         TIMELINE,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-PLOT_WINDOW_S),
@@ -126,7 +126,7 @@ def _bench(rig: Rig, away: float = 1.0) -> rrb.Spatial3DView:
 
 
 def _eye(rig: Rig, away: float) -> rrb.EyeControls3D:
-    """From above and behind the lidar, looking at the wall between lidar and box."""
+    """Return the eye above and behind the lidar, looking at the wall between lidar and box."""
     box = object_box(rig)
     middle = np.array([box.x_max_m / 2 + 0.03, 0.0, rig.lidar.distance_m / 2])
     position = middle + away * np.array([-0.36, 0.42, 0.72])

@@ -1,4 +1,4 @@
-"""A viewer that writes what a browser would see to a file (.rrd), to be looked at later, from beginning to end."""
+"""Viewer that saves the view to a .rrd file."""
 
 from datetime import timedelta
 from pathlib import Path
@@ -13,23 +13,22 @@ from nlos_cam.view.drawing import Drawing, new_recording
 from nlos_cam.view.viewer import Moment
 
 PERIOD_S = 0.1
-"""Between moments that are kept, by their own clock."""
+"""Seconds between saved moments, by their own clock."""
 LIDAR_EVERY, SURFACE_EVERY = 5, 2
 SLACK_S = 0.01
 """Frames come at 30 per second: every third is kept, and not every fourth because of a thousandth."""
 QUEUE_MOMENTS = 4
 BATCH_S = 1.0
-"""What a kill may cost of the end."""
+"""Seconds that a kill may cost."""
 MAX_BYTES = 2 << 30
-"""A file ends there, two hours on: browsers cannot load more."""
+"""Largest size, about two hours: browsers cannot load more."""
 
 
 class RrdFile:
-    """Writes to `path` while entered, in a thread of its own: ten moments per second.
+    """Writer of ten moments per second to `path`, in its own thread while entered.
 
-    Of five of them it writes the surface in 3D, of two the lidar's pictures. A moment for which there is no room in the
-    queue is left out, or, where it `keeps_all`, waited for. What is at `path` is replaced. After a kill the file is
-    without its last second, and can be looked at.
+    Five of them have the 3D surface, two the lidar's pictures. A moment that finds the queue full is skipped, or waited
+    for with `keeps_all`. An existing file is replaced. After a kill the file lacks its last second and is readable.
     """
 
     address: str | None = None
@@ -40,7 +39,7 @@ class RrdFile:
         self.left_out = 0
         """Moments that were due and did not fit."""
         self.full = False
-        """Whether the file has ended before the run."""
+        """True if the file ended before the run."""
         self._path, self._rig, self._measured, self._keeps_all = path, rig, measured, keeps_all
         self._queue = BoundedQueue[Moment](QUEUE_MOMENTS)
         self._due_s = float("-inf")

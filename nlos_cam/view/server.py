@@ -1,12 +1,8 @@
-"""A web server for the view: fixed files, and one endless stream per browser, on the loopback unless asked otherwise.
+"""Web server of the view: fixed files and one endless stream per browser, on the loopback by default.
 
-Whoever may connect may look, so: a name that is not this machine's is refused (a page elsewhere that had its own name
-point here could read the view through a visitor's browser), nothing can be written, and streams and connections are
-limited. A browser that takes no data is let go.
-
-What the view's server answers to a request: a file, the stream, or why not.
-
-Hosts: which address a name stands for, which names are this machine's, what an address is called in a browser.
+The view has no password, therefore: foreign host names are refused (DNS rebinding would let a page elsewhere read the
+view through a visitor's browser), nothing can be written, streams and connections are limited, and a browser that
+reads nothing is disconnected.
 """
 
 import ipaddress
@@ -27,7 +23,7 @@ from nlos_cam.view.assets import LOOPBACK, Assets
 Send = Callable[[bytes], None]
 STREAM_PATH = "/live.rrd"
 WRITE_TIMEOUT_S = 5.0
-"""A browser that takes no data, or gives no request, for this long is let go."""
+"""Seconds without data taken or a request, after which a browser is disconnected."""
 PIECE_BYTES = 1 << 18
 """A file goes out in pieces, each within that time: the viewer has 30 MB, and a link may be slow."""
 MAX_STREAMS = 8
@@ -48,7 +44,7 @@ HEADERS = {
 
 @dataclass(frozen=True)
 class Served:
-    """What a server gives to whoever asks by a `known` name."""
+    """Files, stream and limits of a server for requests with a known host name."""
 
     assets: Assets
     stream: Callable[[Send], None]
@@ -58,7 +54,7 @@ class Served:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answers GET and HEAD; whatever else is asked is not implemented."""
+    """Handler of GET and HEAD; other methods are not implemented."""
 
     served: Served
     timeout = WRITE_TIMEOUT_S
@@ -124,18 +120,18 @@ class Handler(BaseHTTPRequestHandler):
 def handler_of(
     assets: Assets, stream: Callable[[Send], None], known: Callable[[str], bool], most_streams: int
 ) -> type[Handler]:
-    """A handler for requests whose Host header is `known`; at most so many streams are given at once."""
+    """Return a handler class for requests with a known Host header and a limited number of streams."""
     served = Served(assets, stream, known, most_streams, BoundedSemaphore(most_streams))
     return type("ViewHandler", (Handler,), {"served": served})
 
 
 LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
 EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  looked up, not bound
-"""What listens on every interface, and where a browser on this machine finds it."""
+"""Addresses that listen on every interface, and the address for a browser on this machine."""
 
 
 def resolved(host: str) -> tuple[socket.AddressFamily, str]:
-    """The family and the address of a host to listen at. Raises NlosCamError for a name that stands for none."""
+    """Return family and address of a host to listen on. Raises NlosCamError for a name without an address."""
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError) as error:
@@ -145,14 +141,14 @@ def resolved(host: str) -> tuple[socket.AddressFamily, str]:
 
 
 def is_loopback(address: str) -> bool:
-    """Whether only this machine reaches an address."""
+    """Return True if only this machine reaches an address."""
     return ipaddress.ip_address(address.partition("%")[0]).is_loopback
 
 
 def exposed(host: str, port: int) -> str:
-    """What others than this machine's users see of what is served there, in one line; empty on the loopback.
+    """Return a line about who else can see the view at a host; empty on the loopback.
 
-    Raises NlosCamError for a name that stands for no address.
+    Raises NlosCamError for a name without an address.
     """
     _, address = resolved(host)
     if is_loopback(address):
@@ -165,7 +161,7 @@ def exposed(host: str, port: int) -> str:
 
 
 def names_of(host: str, address: str) -> Callable[[str], bool]:
-    """Whether a browser's Host header names this machine, or an address, which no other's name server can forge."""
+    """Return the check of a Host header: this machine's names, or an address (which no name server can forge)."""
     names = LOCAL_NAMES | {host.lower(), socket.gethostname().lower()}
     local_only = is_loopback(address)
 
@@ -177,7 +173,7 @@ def names_of(host: str, address: str) -> Callable[[str], bool]:
 
 
 def name_in(header: str) -> str:
-    """The host of a Host header, without its port: where a port is forwarded it is another."""
+    """Return the host of a Host header without its port, which differs behind a forwarded port."""
     name = header.strip().lower()
     if name.startswith("["):
         return name[1:].partition("]")[0]
@@ -185,7 +181,7 @@ def name_in(header: str) -> str:
 
 
 def address_of(host: str, port: int) -> str:
-    """The URL by which a browser on this machine finds it."""
+    """Return the URL for a browser on this machine."""
     host = EVERYWHERE.get(host, host)
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
@@ -201,13 +197,13 @@ def _is_address(name: str) -> bool:
 __all__ = ["Send", "ViewServer"]
 
 MAX_CONNECTIONS = 32
-"""At once; a further one is closed."""
+"""Connections at once; a further one is closed."""
 CLOSE_AFTER_S = 1.0
-"""Streams that were told to end have so long to do so, before their connections are cut."""
+"""Seconds that ended streams have before their connections are cut."""
 
 
 class _Threads(ThreadingHTTPServer):
-    """A thread for each connection, as many as there is room for, none of which outlives `server_close`."""
+    """Server with a limited number of connection threads, all joined by `server_close`."""
 
     daemon_threads = False  # so that closing waits for them
     allow_reuse_address = os.name == "posix"  # elsewhere two programs would share the port
@@ -221,7 +217,7 @@ class _Threads(ThreadingHTTPServer):
         super().__init__((host, port), handler)
 
     def server_bind(self) -> None:
-        """Without asking a name server what this machine is called, which may take long and serves nothing here."""
+        """Bind without a name lookup of this machine, which may take long."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
@@ -243,10 +239,10 @@ class _Threads(ThreadingHTTPServer):
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A connection that breaks is the browser's right, and no traceback on the person's terminal."""
+        """Ignore broken connections: no traceback on the terminal."""
 
     def cut(self, after_s: float) -> None:
-        """Wait so long for the connections to end, and cut those that do not."""
+        """Wait for the connections to end, then cut the others."""
         with self._changed:
             self._changed.wait_for(lambda: not self._open, after_s)
             for request in self._open:
@@ -255,10 +251,9 @@ class _Threads(ThreadingHTTPServer):
 
 
 class ViewServer:
-    """Serves from the moment it is made until `close`.
+    """Server that runs from its construction until `close`, in its own thread.
 
-    Takes the preferred port, or any free one if that is busy, unless only that one `exact`ly will do. Raises
-    NlosCamError where it cannot listen there.
+    Takes the preferred port, or any free one if that is busy, unless `exact`. Raises NlosCamError if it cannot listen.
     """
 
     def __init__(
@@ -292,11 +287,11 @@ class ViewServer:
 
     @property
     def address(self) -> str:
-        """Where a browser on this machine finds it."""
+        """Return the URL for a browser on this machine."""
         return address_of(self._host, self.port)
 
     def close(self) -> None:
-        """Stop listening and wait for the answers under way: the streams must have been told to end."""
+        """Stop listening and wait for running answers; end the streams first."""
         self._server.shutdown()
         self._thread.join()
         self._server.cut(CLOSE_AFTER_S)

@@ -1,7 +1,4 @@
-"""A viewer that films what it is shown, as a video that browsers play (VP8 in WebM).
-
-A moment as one picture that we draw ourselves, for talks and videos: no browser is needed.
-"""
+"""Viewer that writes a video for browsers (VP8 in WebM), and stills; both drawn without a browser."""
 
 import os
 from collections.abc import Generator
@@ -21,9 +18,9 @@ from nlos_cam.view.images import (
     BACKGROUND_RGB,
     MAX_UNCERTAINTY_M,
     PALE_RGB,
-    as_believed,
     banner_rgb,
     depth_span_m,
+    dim_untrusted,
     font,
     hidden_rgb,
     infrared_grey,
@@ -46,7 +43,7 @@ BAR_STEPS = 64
 
 
 class Still:
-    """Pictures of moments of one run: what its first one spans, all do."""
+    """Pictures of one run's moments; the first one's color ranges hold for all."""
 
     def __init__(self, rig: Rig, first: Moment) -> None:
         self._box, self._begun_s = object_box(rig), first.published_s
@@ -54,7 +51,7 @@ class Still:
         self._seen = first
 
     def rgb(self, moment: Moment, *, with_lidar: bool = True) -> UInt8:
-        """(720, 1280, 3); without new pictures of the lidar's, whose noise is hard to compress, those before stay."""
+        """Return the picture (720, 1280, 3); the lidar's pictures, hard to compress, stay unless renewed."""
         self._seen = moment if with_lidar else self._seen
         page = _Page()
         page.banner(moment)
@@ -69,7 +66,7 @@ class Still:
 
     def _draw_hidden(self, page: "_Page", moment: Moment) -> None:
         depth_m, box = moment.reconstruction.depth_m, self._box
-        rgb = as_believed(hidden_rgb(depth_m, box), moment.verdict)
+        rgb = dim_untrusted(hidden_rgb(depth_m, box), moment.verdict)
         page.picture(LARGE_AT, "Hidden around the corner: reconstruction", rgb, (LARGE, LARGE))
         scale = np.linspace(box.z_near_m, box.z_far_m, BAR_STEPS, dtype=np.float32)[:, np.newaxis]
         page.bar(LARGE_AT, LARGE, hidden_rgb(scale, box), f"{1e2 * box.z_near_m:.0f} cm", f"{1e2 * box.z_far_m:.0f} cm")
@@ -101,7 +98,7 @@ def _footer(moment: Moment, since_s: float) -> str:
 
 
 class _Page:
-    """The picture as it is drawn."""
+    """Canvas of one picture."""
 
     def __init__(self) -> None:
         self.image = Image.new("RGB", (WIDTH, HEIGHT), BACKGROUND_RGB)
@@ -114,7 +111,7 @@ class _Page:
         self._pen.text((x, y + 74), "seeing around a corner", fill=QUIET_RGB, font=font(21), anchor="rm")
 
     def picture(self, at: tuple[int, int], title: str, rgb: UInt8, size: tuple[int, int]) -> None:
-        """Below its title, as large as fits, in the middle of its panel."""
+        """Draw an image below its title, scaled to its panel."""
         (x, y), (width, height) = at, size
         self._pen.rectangle((x, y, x + width - 1, y + height - 1), fill=PANEL_RGB)
         self._pen.text((x, y - TITLE / 2), title, fill=PALE_RGB, font=font(18), anchor="lm")
@@ -123,7 +120,7 @@ class _Page:
         self.image.paste(Image.fromarray(fitted), (x + right, y + down))
 
     def bar(self, at: tuple[int, int], size: int, rgb: UInt8, top: str, bottom: str) -> None:
-        """The scale of colours to the right of a square picture."""
+        """Draw a color bar to the right of a square picture."""
         x, y = at[0] + size + 10, at[1]
         self.image.paste(Image.fromarray(rgb).resize((BAR, size), Image.Resampling.BILINEAR), (x, y))
         for text, height, anchor in ((top, y, "lt"), (bottom, y + size, "lb")):
@@ -134,7 +131,7 @@ class _Page:
 
 
 def _fitted(rgb: UInt8, width: int, height: int) -> UInt8:
-    """As large as fits; cells stay cells, and photographs are thinned smoothly."""
+    """Return an image scaled to fit: cells stay sharp, photographs are smoothed."""
     scale = min(width / rgb.shape[1], height / rgb.shape[0])
     size = max(round(rgb.shape[1] * scale), 1), max(round(rgb.shape[0] * scale), 1)
     return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST).astype(np.uint8)
@@ -148,7 +145,7 @@ CODEC = "VP80"
 
 
 class VideoFile:
-    """Films moments while entered, 15 per second of their own clock; drawing is done by whoever shows them."""
+    """Video of moments, 15 per second of their own clock, while entered; drawn in the thread of `show`."""
 
     address: str | None = None
 
@@ -167,7 +164,7 @@ class VideoFile:
         self._writer.release()
 
     def show(self, moment: Moment) -> None:
-        """VideoFile a moment if one is due."""
+        """Add a moment if one is due."""
         if moment.published_s < self._due_s:
             return
         self._due_s = moment.published_s + 1.0 / FRAMES_PER_S - SLACK_S
@@ -177,7 +174,7 @@ class VideoFile:
 
 
 def _writer(path: Path) -> Any:
-    """Raises NlosCamError where this OpenCV has no such codec."""
+    """Open the video writer. Raises NlosCamError if this OpenCV lacks the codec."""
     import cv2
 
     with _without_native_warnings():
@@ -193,7 +190,7 @@ def _writer(path: Path) -> Any:
 
 @contextmanager
 def _without_native_warnings() -> Generator[None]:
-    """OpenCV tells the terminal that WebM has no name for VP8, which it then gives it."""
+    """Silence OpenCV's warning that WebM has no tag for VP8, which it then sets."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)

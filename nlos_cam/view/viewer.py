@@ -1,4 +1,4 @@
-"""What the streaming loop asks of a viewer, and the viewer that shows nothing."""
+"""Protocol of viewers, the moment they show, and the viewer that shows nothing."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -11,7 +11,7 @@ from nlos_cam.reconstruct import PhysicsCheckResult, Reconstruction, Verdict
 
 @dataclass(frozen=True)
 class Moment:
-    """One frame and what came of it."""
+    """One frame and its result."""
 
     frame: Frame
     reconstruction: Reconstruction
@@ -20,27 +20,27 @@ class Moment:
     latency_s: float
     """From the frame's timestamp to `published_s`, on one clock."""
     difference: LidarMaps | None = None
-    """The maps less the bare wall's; None without a reference."""
+    """Maps minus the bare wall's; None without a reference."""
     warnings: tuple[str, ...] = ()
-    """What the person at the bench should know now, such as that the lidar has moved."""
+    """Warnings about the bench, such as that the lidar has moved."""
     verdict: Verdict | None = None
-    """None from networks that do not tell."""
+    """None without an uncertainty network."""
     check: PhysicsCheckResult | None = None
     """The newest physics check, of this frame or an earlier one; None until there is one."""
     stages_s: Mapping[str, float] = field(default_factory=dict[str, float])
     """Seconds by stage."""
     dropped: int = 0
-    """Frames lost up to now, whoever lost them."""
+    """Frames lost so far."""
     celsius: Mapping[str, float] = field(default_factory=dict[str, float])
     """The device's last temperatures, by name; empty where none were read."""
 
 
 class Viewer(Protocol):
-    """Shows the newest moment. `show` returns at once: a viewer may skip moments, and never slows the loop."""
+    """Viewer of the newest moment. `show` returns at once: a viewer may skip moments and never slows the loop."""
 
     @property
     def address(self) -> str | None:
-        """Where a browser finds it."""
+        """URL of the view; None without one."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -51,7 +51,7 @@ class Viewer(Protocol):
 
 
 class NullViewer:
-    """A viewer for runs that nobody watches."""
+    """Viewer that shows nothing."""
 
     address: str | None = None
 
@@ -66,7 +66,7 @@ class NullViewer:
 
 
 class Viewers:
-    """Several viewers as one: each sees every moment."""
+    """Several viewers as one."""
 
     def __init__(self, viewers: Sequence[Viewer]) -> None:
         self._viewers = viewers
@@ -74,7 +74,7 @@ class Viewers:
 
     @property
     def address(self) -> str | None:
-        """The first that there is."""
+        """URL of the first viewer that has one."""
         return next((viewer.address for viewer in self._viewers if viewer.address), None)
 
     def __enter__(self) -> Self:

@@ -1,7 +1,4 @@
-"""The live view in a browser: a web server on the loopback, and for each browser a drawing of the newest moments.
-
-A saved view in a browser: the same page and server as the live one, and time to go back and forth in.
-"""
+"""Live view and saved view in a browser, through a web server on the loopback."""
 
 import struct
 import time
@@ -24,13 +21,12 @@ DRAW_PERIOD_S = 1 / 12
 LIDAR_EVERY = 2
 """Lidar pictures, which are large, go out with every second drawing."""
 PATIENCE_S = 0.05
-"""For the next moment, where one is there: drawing that begins with a moment is done when the loop's next frame comes,
-and takes nothing from it."""
+"""Seconds to wait for the next moment: drawing that begins with a moment ends before the loop's next frame."""
 WAIT_S = 0.5
 
 
 class WebViewer:
-    """Serves the view while entered. Nobody watching costs nothing: drawing is done for each browser, in its thread."""
+    """Live view, served while entered; each browser's thread draws for it, so that no browser costs nothing."""
 
     def __init__(
         self,
@@ -65,13 +61,13 @@ class WebViewer:
         self._server.close()
 
     def show(self, moment: Moment) -> None:
-        """Hand over the newest moment; one that was not drawn yet is forgotten."""
+        """Replace the newest moment; an undrawn one is skipped."""
         self._moments.put(moment)
 
     def _stream(self, send: Send) -> None:
-        """Draw for one browser until it leaves, which `send` tells by an OSError, or the viewer closes.
+        """Draw for one browser until it leaves (`send` raises OSError) or the viewer closes.
 
-        While a slow browser keeps `send` waiting nothing is drawn for it: it skips moments, and memory stays as it is.
+        While a slow browser blocks `send`, nothing is drawn for it: it skips moments and memory stays constant.
         """
         self._on_stream_thread()
         recording = new_recording()
@@ -94,18 +90,18 @@ class WebViewer:
 
 
 MAGIC = b"RRF2"
-"""What a file of this version of Rerun begins with."""
+"""First bytes of a file of this Rerun version."""
 HEADER_BYTES, END = 12, 0
 MESSAGE = struct.Struct("<QQ")
-"""What each message begins with: its kind, and how many bytes follow. The kind END comes before what ends a file."""
+"""Head of each message: its kind and number of bytes. The kind END precedes the end of a file."""
 CHUNK_BYTES = 1 << 18
 
 
 class RecordedView:
-    """Serves a file that a `SavedView` wrote while entered, up to where it is whole. Raises RecordingError."""
+    """Saved view of an `RrdFile`, served while entered, up to its last whole message. Raises RecordingError."""
 
     def __init__(self, path: Path, *, host: str = LOOPBACK, port: int | None = None) -> None:
-        """At this `port` or nowhere; without one, at 9090 or where there is room."""
+        """Prepare a server at `port`, or without one at 9090 or the next free port."""
         self.address: str | None = None
         self._path, self._host, self._port = path, host, port
         try:
@@ -135,7 +131,7 @@ class RecordedView:
 
 
 def whole_bytes(file: BinaryIO) -> int:
-    """How much of a saved view is whole messages: all of it, but for one whose writer was killed."""
+    """Return the number of bytes in whole messages: all, unless the writer was killed."""
     size, end = file.seek(0, 2), HEADER_BYTES
     while end + MESSAGE.size <= size:
         file.seek(end)

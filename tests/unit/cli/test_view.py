@@ -17,7 +17,7 @@ from small_frames import sheet_network
 from view_streams import EVERYWHERE, ask
 
 from nlos_cam.cli.main import main
-from nlos_cam.cli.view import opened_in_browser, saving, tell_of_view, viewer_of
+from nlos_cam.cli.view import announce_view, opened_in_browser, saving, viewer_of
 from nlos_cam.errors import NlosCamError
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.view.rrd_file import RrdFile
@@ -28,8 +28,7 @@ BENCH = CalibratedRig(RIG)
 
 @pytest.fixture(autouse=True)
 def no_assets(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("rerun_viewer", "recorded"):
-        monkeypatch.setattr(f"nlos_cam.view.{module}.page_assets", lambda **_: {"/": ("text/html", b"page")})
+    monkeypatch.setattr("nlos_cam.view.web.page_assets", lambda **_: {"/": ("text/html", b"page")})
 
 
 @pytest.fixture
@@ -115,7 +114,7 @@ def printed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def serve(*, no_view: bool = False, host: str | None = None, port: int | None = None, open_it: bool = False) -> None:
     """Serve a view with these options, print where, and end it."""
     with viewer_of(BENCH, no_view=no_view, host=host, port=port) as viewer:
-        tell_of_view(viewer, host=host, port=port, open_it=open_it)
+        announce_view(viewer, host=host, port=port, open_it=open_it)
 
 
 def test_no_view_serves_nothing_and_refuses_an_address(printed: list[str]) -> None:

@@ -15,28 +15,28 @@ from nlos_cam.view.images import (
     BANNER_WIDTH,
     FADED,
     JUMP_M,
-    LOOKS,
     MAX_UNCERTAINTY_M,
     QUIET_SPAN_M,
     SATURATED_RGB,
-    as_believed,
+    STYLES,
     banner_rgb,
     change_span_m,
     confidence_rgb,
     depth_span_m,
     difference_rgb,
+    dim_untrusted,
     encoded,
     faded,
     hidden_rgb,
     infrared_grey,
+    is_trusted,
     lidar_rgb,
-    look_of,
-    may_be_believed,
     noise_rgb,
     note_rgba,
     relief_rgb,
     round_span,
     saturated_rgb,
+    style_of,
     surface,
     uncertainty_rgb,
 )
@@ -212,17 +212,19 @@ DOUBTED = [verdict for verdict in Verdict if verdict is not Verdict.SEEN]
 
 
 def test_only_the_verdict_seen_looks_trusted() -> None:
-    assert set(LOOKS) == set(Verdict)
-    assert [verdict for verdict in Verdict if may_be_believed(verdict)] == [Verdict.SEEN]
-    assert may_be_believed(None), "networks that do not tell are not doubted for it"
-    assert all(look.rgb != LOOKS[Verdict.SEEN].rgb for verdict, look in LOOKS.items() if verdict is not Verdict.SEEN)
+    assert set(STYLES) == set(Verdict)
+    assert [verdict for verdict in Verdict if is_trusted(verdict)] == [Verdict.SEEN]
+    assert is_trusted(None), "networks that do not tell are not doubted for it"
+    assert all(
+        style.rgb != STYLES[Verdict.SEEN].rgb for verdict, style in STYLES.items() if verdict is not Verdict.SEEN
+    )
 
 
 @pytest.mark.parametrize("verdict", [*Verdict, None])
 def test_banner_has_its_verdicts_color_and_fitting_words(verdict: Verdict | None) -> None:
     banner = banner_rgb(verdict)
     assert banner.shape == (BANNER_HEIGHT, BANNER_WIDTH, 3)
-    assert tuple(banner[40, 5]) == look_of(verdict).rgb
+    assert tuple(banner[40, 5]) == style_of(verdict).rgb
     ground = banner[0, -1]
     assert (banner[:, -20:] == ground).all(), "nothing is written up to the edge"
     assert (banner[:, 30:600] != ground).any()
@@ -234,7 +236,7 @@ def test_banner_has_its_verdicts_color_and_fitting_words(verdict: Verdict | None
 def test_note_frames_the_picture_and_hatches_doubted_ones(verdict: Verdict) -> None:
     note = note_rgba(verdict)
     frame = np.concatenate([note[0], note[-1], note[:, 0], note[:, -1]])
-    assert (frame == (*look_of(verdict).rgb, 255)).all()
+    assert (frame == (*style_of(verdict).rgb, 255)).all()
     assert (note[..., 3] > 200).mean() < 0.25
     assert (note[20:200, 20:200, 3] > 0).any() == (verdict is not Verdict.NOTHING)
 
@@ -242,8 +244,8 @@ def test_note_frames_the_picture_and_hatches_doubted_ones(verdict: Verdict) -> N
 def test_picture_under_a_note_keeps_its_place_and_loses_color() -> None:
     rgb = np.full((64, 64, 3), BACKGROUND_RGB, np.uint8)
     rgb[10:20, 30:40] = 255, 160, 0
-    assert as_believed(rgb, None) is as_believed(rgb, Verdict.SEEN) is rgb
-    noted = as_believed(rgb, Verdict.NOTHING).astype(int)
+    assert dim_untrusted(rgb, None) is dim_untrusted(rgb, Verdict.SEEN) is rgb
+    noted = dim_untrusted(rgb, Verdict.NOTHING).astype(int)
     assert noted.shape == (512, 512, 3)
     inside, outside = noted[100, 300], noted[40, 40]
     assert inside.sum() > outside.sum() + 200
