@@ -86,12 +86,12 @@ class BackgroundPhysicsCheck:
 
     @property
     def waits(self) -> bool:
-        """Whether a frame waits for its check."""
+        """True while a frame waits for its check."""
         return len(self._queue) > 0
 
     @property
     def ended(self) -> bool:
-        """Whether there will be no more checks."""
+        """True once there will be no more checks."""
         return self._queue.closed
 
     def _run(self, process: subprocess.Popen[bytes]) -> None:

@@ -50,7 +50,7 @@ class Reconstruction:
 
     @property
     def has_surface(self) -> bool:
-        """Whether any pixel shows a surface."""
+        """True if any pixel shows a surface."""
         return bool(np.isfinite(self.depth_m).any())
 
     @property

@@ -72,7 +72,9 @@ def test_choose_takes_the_most_accurate_setting_in_budget(
 
 
 @given(some_settings, st.floats(1.0, 500.0), st.floats(1.0, 10.0))
-def test_choose_is_no_less_accurate_with_a_larger_budget(settings: list[Setting], budget_ms: float, more: float) -> None:
+def test_choose_is_no_less_accurate_with_a_larger_budget(
+    settings: list[Setting], budget_ms: float, more: float
+) -> None:
     least_ms = min(map(AS_MEASURED.expected_ms, keeping_pace(settings, AS_MEASURED)))
     assert choose(settings, AS_MEASURED, least_ms) in settings
     if budget_ms >= least_ms:
@@ -80,28 +82,17 @@ def test_choose_is_no_less_accurate_with_a_larger_budget(settings: list[Setting]
         assert wide.rmse_mm <= tight.rmse_mm + 0.01
 
 
-def test_averaging_delays_by_half_of_its_frames() -> None:
-    assert setting(1.0, 1.0).averaging_ms == 0.0
-    assert setting(1.0, 1.0, frames=4).averaging_ms == pytest.approx(1.5 * PERIOD_MS)
-    assert AS_MEASURED.expected_ms(setting(1.0, 5.0, frames=3)) == pytest.approx(HANDOVER_MS + 1.0 + 5.0 + PERIOD_MS)
-
-
-def test_choose_leaves_out_settings_that_cannot_keep_pace() -> None:
+def test_choose_weighs_pace_speed_of_the_machine_and_threads() -> None:
     quick, slow = setting(20.0, 4.0), setting(10.0, BUSY_SHARE * PERIOD_MS)
     assert choose([slow, quick], AS_MEASURED, 1e6) == quick
     assert choose([slow, setting(20.0, 99.0)], AS_MEASURED, 1e6) == slow
-
-
-def test_choose_takes_a_quicker_setting_on_a_slower_machine() -> None:
     settings = [setting(10.0, 12.0), setting(20.0, 2.0)]
     assert choose(settings, AS_MEASURED, 20.0).rmse_mm == 10.0
     assert choose(settings, Machine(slower=3.0, rest_ms=1.0), 20.0).rmse_mm == 20.0
-
-
-def test_choose_prefers_fewer_threads_at_equal_accuracy() -> None:
     one, two = setting(20.0, 6.0), setting(20.0, 3.0, threads=2)
     assert choose([two, one], AS_MEASURED, 20.0) == one
     assert choose([two, one], AS_MEASURED, 8.0) == two
+    assert AS_MEASURED.expected_ms(setting(1.0, 5.0, frames=3)) == pytest.approx(HANDOVER_MS + 1.0 + 5.0 + PERIOD_MS)
 
 
 def test_shipped_weights_have_a_tradeoff_table() -> None:
@@ -116,9 +107,6 @@ def test_load_tradeoff_refuses_other_files(tmp_path: Path, content: bytes | None
         (tmp_path / "tradeoff.json").write_bytes(content)
     with pytest.raises(RecordingError, match="tradeoff reconstruct"):
         load_tradeoff(tmp_path)
-
-
-def test_load_tradeoff_takes_a_folder_or_a_file(tmp_path: Path) -> None:
     file = tmp_path / "tradeoff.json"
     file.write_text(json.dumps({"settings": [setting(3.0, 2.0).model_dump()], "machine": "any"}))
     assert load_tradeoff(tmp_path) == load_tradeoff(file) == [setting(3.0, 2.0)]
@@ -132,7 +120,7 @@ ALL = [GOOD, QUICK, MEAN]
 def chosen(
     budget_ms: float, slower: float = 1.0, surprises: dict[str, float] | None = None
 ) -> tuple[BudgetChoice, list[str]]:
-    """BudgetChoice on a machine `slower` than the table's, where some settings take longer still, and what was loaded."""
+    """Choice on a machine `slower` than the table's, with `surprises` in ms by runtime, and the loaded runtimes."""
     loaded: list[str] = []
 
     def load(wanted: Setting) -> Any:

@@ -79,7 +79,12 @@ def test_reader_closes_or_reports_a_source_that_hangs(monkeypatch: pytest.Monkey
 def test_reader_can_end_while_no_frame_arrives() -> None:
     release, asked = Event(), count_up()
     source = FrameCamera(None, lambda _: release.wait(60.0))
-    run: Any = {"lossless": True, "stop": Event(), "should_stop": lambda: next(asked) > 2, "abandon_source": release.set}
+    run: Any = {
+        "lossless": True,
+        "stop": Event(),
+        "should_stop": lambda: next(asked) > 2,
+        "abandon_source": release.set,
+    }
     with FrameReader(source, **run) as reader:
         assert list(reader) == []
         release.set()

@@ -53,19 +53,19 @@ def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> System:
     return system
 
 
-def test_precedence_holds_for_all_threads_until_it_is_left(system: System) -> None:
-    def fail() -> None:
-        with realtime_priority() as allowed:
-            assert allowed
-            assert set(system.schedules.values()) == {(ROUND_ROBIN, LOOP)}
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fail()
+def test_realtime_priority_holds_for_all_threads_until_it_is_left(system: System) -> None:
+    with pytest.raises(ZeroDivisionError), realtime_priority() as allowed:  # noqa: PT012  an error leaves it too
+        assert allowed
+        assert set(system.schedules.values()) == {(ROUND_ROBIN, LOOP)}
+        raise ZeroDivisionError
     assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
 
 
-def test_precedence_changes_nothing_where_not_possible(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_realtime_priority_changes_nothing_where_not_possible(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    system.missing = "7"
+    with realtime_priority() as allowed:
+        assert allowed
+        assert system.schedules["8"] == (ROUND_ROBIN, LOOP), "a thread that ended is passed over"
     system.may = False
     with realtime_priority() as allowed:
         assert not allowed
@@ -75,13 +75,6 @@ def test_precedence_changes_nothing_where_not_possible(system: System, monkeypat
     yield_to_loop()
     drop_realtime_priority()
     assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
-
-
-def test_precedence_passes_over_a_thread_that_ended(system: System) -> None:
-    system.missing = "7"
-    with realtime_priority() as allowed:
-        assert allowed
-        assert system.schedules["8"] == (ROUND_ROBIN, LOOP)
 
 
 def test_drawing_goes_after_the_loop_and_before_the_rest(system: System) -> None:
@@ -95,7 +88,7 @@ def test_drawing_goes_after_the_loop_and_before_the_rest(system: System) -> None
 
 
 @pytest.mark.skipif(not TASKS.is_dir(), reason="this system has no /proc/self/task")
-def test_precedence_restores_the_threads_of_this_process() -> None:
+def test_realtime_priority_restores_the_threads_of_this_process() -> None:
     ended, began, found = Event(), Event(), list[int]()
 
     def work() -> None:
@@ -120,29 +113,17 @@ class Loop:
         self.me = self
 
 
-def test_undisturbed_freezes_live_objects_and_collects_garbage() -> None:
-    earlier = weakref.ref(Loop())
-    with low_latency_interpreter():
+def test_interpreter_collects_once_and_shortens_turns_until_left() -> None:
+    before_s, earlier = sys.getswitchinterval(), weakref.ref(Loop())
+    with pytest.raises(ZeroDivisionError), low_latency_interpreter():  # noqa: PT012  an error leaves it too
+        assert sys.getswitchinterval() == pytest.approx(SWITCH_S, rel=0.01)
         assert earlier() is None
-        assert gc.get_freeze_count() > 1000
         known = gc.get_freeze_count()
+        assert known > 1000
         later = weakref.ref(Loop())
         gc.collect()
         assert later() is None
         assert gc.get_freeze_count() == known
-    assert gc.get_freeze_count() < known
-
-
-def test_undisturbed_shortens_thread_turns_until_it_is_left() -> None:
-    before_s, within_s = sys.getswitchinterval(), 0.0
-
-    def fail() -> None:
-        nonlocal within_s
-        with low_latency_interpreter():
-            within_s = sys.getswitchinterval()
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fail()
-    assert within_s == pytest.approx(SWITCH_S, rel=0.01)
+        raise ZeroDivisionError
     assert sys.getswitchinterval() == before_s
+    assert gc.get_freeze_count() < known

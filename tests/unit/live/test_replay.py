@@ -17,6 +17,7 @@ from nlos_cam.frames import Frame
 from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD
 from nlos_cam.live.replay import DIFFERENCE, REPORT, RESULT, SHEET, ReplayReport, replay_recording
 from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck
 from nlos_cam.reconstruct.pipeline import Pipeline
 
 
@@ -64,12 +65,14 @@ def test_replay_writes_every_frame_with_number_time_and_place(tmp_path: Path) ->
         assert np.nanmax(file["depth_m"]) <= file["z_far_m"] + 1e-6
         assert file["verdict"].tolist() == [""] * 12
         assert np.isnan(file["uncertainty_m"]).all()
+        assert file["check_score"].size == file["check_frame_number"].size == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == ["out"]
     assert sorted(file.name for file in out.iterdir()) == sorted([RESULT, SHEET, REPORT])
     assert (out / SHEET).read_bytes().startswith(b"\x89PNG")
     text = (out / REPORT).read_text()
     assert "12" in text
     assert "2 duplicate, 1 out of order" in text
+    assert "physics" not in text
 
 
 def test_replay_writes_uncertainty_and_verdict_of_each_frame(tmp_path: Path) -> None:
@@ -84,11 +87,17 @@ def test_replay_writes_uncertainty_and_verdict_of_each_frame(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_replay_is_reproducible_to_the_bit(tmp_path: Path) -> None:
+def test_replay_with_checks_is_reproducible_to_the_bit(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        replayed(tmp_path / name, 12)
+        checks = PeriodicPhysicsCheck(RIG, every=9, accuracy="draft")
+        replayed(tmp_path / name, 12, pipeline=Pipeline(CalibratedRig(RIG), network, checks=checks))
     for file in (RESULT, SHEET, REPORT):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    with np.load(tmp_path / "a" / RESULT) as result:
+        assert result["check_frame_number"].tolist() == [100, 109]
+        assert result["check_score"].shape == (2,)
+        assert (result["check_score"] > 0.5).all()
+    assert "check of 2 frames" in (tmp_path / "a" / REPORT).read_text()
 
 
 def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:
@@ -106,25 +115,18 @@ def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:
     assert "Interrupted" in (tmp_path / "out" / REPORT).read_text()
 
 
-def test_replay_refuses_a_recording_without_frames(tmp_path: Path) -> None:
+def test_replay_refuses_empty_recordings_and_keeps_other_files(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no frame"):
         replayed(tmp_path / "out", 0)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_replay_replaces_only_files_of_the_same_name(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("keep me")
     (tmp_path / REPORT).write_text("old")
     replayed(tmp_path)
     assert (tmp_path / "mine.txt").read_text() == "keep me"
     assert "Replay" in (tmp_path / REPORT).read_text()
-
-
-def test_replay_refuses_a_file_as_its_folder(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("mine")
-    with pytest.raises(OutputExistsError, match="out"):
-        replayed(tmp_path / "out")
-    assert (tmp_path / "out").read_text() == "mine"
+    with pytest.raises(OutputExistsError, match=r"mine\.txt"):
+        replayed(tmp_path / "mine.txt")
+    assert (tmp_path / "mine.txt").read_text() == "keep me"
 
 
 def test_replay_writes_difference_maps_and_their_reference(tmp_path: Path) -> None:

@@ -14,7 +14,16 @@ from small_frames import NOTHING
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.live.replay import REPORT, RESULT, SHEET, replay_recording
-from nlos_cam.live.replay_media import VIDEO, VIEW, ReplayMedia, FrameSampler, _symmetric_limits, _limits, draw_contact_sheet, moment_of
+from nlos_cam.live.replay_media import (
+    VIDEO,
+    VIEW,
+    FrameSampler,
+    ReplayMedia,
+    _limits,
+    _symmetric_limits,
+    draw_contact_sheet,
+    moment_of,
+)
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline
@@ -64,15 +73,10 @@ def test_replay_removes_media_of_an_earlier_one_and_nothing_else(tmp_path: Path)
     assert replayed(out, 3, stills=1) == NAMES | {"mine.png", "still-000000.png"}
 
 
-def test_replay_makes_no_more_stills_than_frames(tmp_path: Path) -> None:
-    assert len(replayed(tmp_path / "out", 2, stills=4) - NAMES) == 2
-
-
 def test_media_of_a_failed_replay_have_no_stills(tmp_path: Path) -> None:
     media = ReplayMedia(BENCH, view=True, stills=2)
     with pytest.raises(ZeroDivisionError), media.into(tmp_path):
-        media.add(STEP, {})
-        raise ZeroDivisionError
+        media.add(STEP, 1 / 0)  # type: ignore[arg-type]
     assert {file.name for file in tmp_path.iterdir()} == {VIEW}
 
 
@@ -127,19 +131,10 @@ def test_sheet_has_a_row_per_map_and_a_column_per_frame(titles: Callable[[list[F
     assert doubted[-1] == "uncertainty (mm)"
 
 
-def test_sheet_without_returns_is_a_picture(tmp_path: Path) -> None:
-    maps = replace(maps_from_frame(wall_frame(0)), depth_m=np.full((64, 80), np.nan, np.float32))
-    draw_contact_sheet(tmp_path / "sheet.png", [wall_step(0, maps)])
-    assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_limits_of_a_sheet_span_its_values() -> None:
+def test_limits_of_a_sheet_span_its_values_or_leave_out_outliers() -> None:
     images = [np.array([[np.nan, 2.0]], np.float32), np.array([[-1.0, 0.5]], np.float32)]
     assert _limits(images) == (-1.0, 2.0)
     assert _limits([np.full((2, 2), np.nan, np.float32)]) == (0.0, 1.0)
-
-
-def test_even_limits_leave_out_outliers() -> None:
     image = np.random.default_rng(0).normal(0.0, 1.0, (64, 80)).astype(np.float32)
     image[:2] = -500.0
     low, high = _symmetric_limits([image])

@@ -73,16 +73,6 @@ def test_report_gives_rate_latency_and_stages_of_the_frames() -> None:
     assert tally_of([0.5, 0.1]).duration_s(4.5) == pytest.approx(4.0), "from the first result"
 
 
-def test_report_counts_frames_by_verdict_and_warning() -> None:
-    tally, passed = RunStatistics(), [Verdict.SEEN, None, Verdict.NOTHING, Verdict.SEEN, Verdict.WALL_MOVED]
-    for number, verdict in enumerate(passed):
-        tally.add(step_of(number, *["hot"] * (number > 2), verdict=verdict), view_s=0.0)
-    report = reported(tally)
-    assert report.verdicts == {"object seen": 2, "nothing there": 1, "wall moved": 1}
-    assert list(report.verdicts) == [verdict.value for verdict in Verdict if verdict in passed]
-    assert report.warnings == {"hot": 2}
-
-
 def test_report_gives_delivery_of_steps_with_an_arrival() -> None:
     tally = RunStatistics()
     for number in range(9):
@@ -94,17 +84,22 @@ def test_report_gives_delivery_of_steps_with_an_arrival() -> None:
     assert "delivery" not in reported(tally_of([0.1])).stages_ms
 
 
-def test_report_counts_findings_and_lost_frames() -> None:
-    tally = RunStatistics()
+def test_report_counts_verdicts_warnings_issues_and_lost_frames() -> None:
+    tally, passed = RunStatistics(), [Verdict.SEEN, None, Verdict.NOTHING, Verdict.SEEN, Verdict.WALL_MOVED]
+    for number, verdict in enumerate(passed):
+        tally.add(step_of(number, *["hot"] * (number > 2), verdict=verdict), view_s=0.0)
     tally.issues.update(["blank", "blank"])
     tally.fail(small_frame(1), ZeroDivisionError("odd"), 1)
     report = reported(tally, 4, incomplete=2, dropped=3, counts=Counter(duplicate=1, stalled=0))
     lost = {"incomplete": 2, "dropped_camera": 3, "dropped_loop": 4, "failed": 1}
     assert report.counts == {"duplicate": 1, **lost, "blank": 2}
     assert report.dropped == 2 + 3 + 4 + 1
+    assert report.verdicts == {"object seen": 2, "nothing there": 1, "wall moved": 1}
+    assert list(report.verdicts) == [verdict.value for verdict in Verdict if verdict in passed]
+    assert report.warnings == {"hot": 2}
 
 
-def test_tally_raises_after_many_failures_in_a_row() -> None:
+def test_statistics_raise_after_many_failures_in_a_row() -> None:
     tally = RunStatistics()
     for in_a_row in range(1, MAX_FAILED_IN_A_ROW):
         tally.fail(small_frame(in_a_row), ZeroDivisionError("an odd frame"), in_a_row)
@@ -115,7 +110,7 @@ def test_tally_raises_after_many_failures_in_a_row() -> None:
         tally.fail(small_frame(1), SceneError("no object_box"), 1)
 
 
-def test_warned_reports_begin_end_and_frames_of_a_warning(begins: list[tuple[str, bool]]) -> None:
+def test_warning_log_reports_begin_end_and_frames_of_a_warning(begins: list[tuple[str, bool]]) -> None:
     found = WarningLog(lambda *about: begins.append(about))
     for step in (step_of(7), step_of(8, "hot"), step_of(9, "hot", "moved"), step_of(11, "moved"), step_of(12)):
         found.add(step)
@@ -126,7 +121,7 @@ def test_warned_reports_begin_end_and_frames_of_a_warning(begins: list[tuple[str
     assert found.spans[0] == WarningSpan("hot", 3, 8, 20)
 
 
-def test_warned_ignores_figures_in_a_warning(begins: list[tuple[str, bool]]) -> None:
+def test_warning_log_ignores_numbers_in_a_warning(begins: list[tuple[str, bool]]) -> None:
     found = WarningLog(lambda *about: begins.append(about))
     for step in (step_of(1, "46.5 degrees"), step_of(2, "48 degrees"), step_of(3, "48 degrees", "48 mm"), step_of(4)):
         found.add(step)

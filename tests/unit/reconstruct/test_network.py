@@ -8,7 +8,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_map import depth_from_image, image_from_depth, object_box
-from nlos_cam.reconstruct.network import box_pose, estimate_doubt, reconstruct
+from nlos_cam.reconstruct.network import box_pose, estimate_doubt, reconstruct, reconstruct_all
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -38,29 +38,16 @@ def test_reconstruct_inverts_the_image_of_a_depth_map(seed: int) -> None:
     np.testing.assert_allclose(found.depth_m, truth_m, atol=1e-6)  # NaN where NaN
 
 
-def test_reconstruct_gives_the_network_a_batch_of_one() -> None:
-    given = []
-
-    def network(*maps: np.ndarray) -> np.ndarray:
-        given.extend(maps)
-        return half()
-
-    maps = some_maps()
-    reconstruct(maps, RIG, network)
-    np.testing.assert_array_equal(given[0], maps.depth_m[None])
-    np.testing.assert_array_equal(given[1], maps.intensity[None])
-
-
 def test_pose_of_box_stands_on_the_wall_before_its_middle() -> None:
     pose = box_pose(BOX)
     np.testing.assert_allclose(pose @ [0, 0, 0, 1], [0.45, 0.0, 0.0, 1.0])
     np.testing.assert_array_equal(pose[:3, :3], np.eye(3))
 
 
-def test_reconstruct_times_the_network_with_the_given_clock() -> None:
+def test_reconstruct_all_shares_the_network_time() -> None:
     ticks = itertools.count()
-    found = reconstruct(some_maps(), RIG, half, lambda: float(next(ticks)))
-    assert (found.timings_s, found.uncertainty_m) == ({"network": 1.0}, None)
+    found = reconstruct_all([some_maps()] * 4, RIG, lambda *_: np.repeat(half(), 4, 0), lambda: float(next(ticks)))
+    assert [(each.timings_s, each.uncertainty_m) for each in found] == [({"network": 0.25}, None)] * 4
 
 
 def test_reconstruct_with_doubt_adds_uncertainty_and_a_stage() -> None:
@@ -71,7 +58,11 @@ def test_reconstruct_with_doubt_adds_uncertainty_and_a_stage() -> None:
     assert (found.doubt.nothing, found.doubt.outside) == (0.25, 0.5)
     assert found.uncertainty_m is found.doubt.error_m
     assert [part.shape for part in doubter.asked[0]] == [(1, 64, 80), (1, 64, 80), (1, 64, 64)]
-    np.testing.assert_array_equal(doubter.asked[0][2], half())
+    for asked, given in zip(doubter.asked[0], (some_maps().depth_m, some_maps().intensity, half()[0]), strict=True):
+        np.testing.assert_array_equal(asked[0], given)
+    hidden = found.without_surface
+    assert found.has_surface
+    assert (hidden.has_surface, hidden.uncertainty_m, hidden.doubt) == (False, found.uncertainty_m, found.doubt)
 
 
 def test_reconstruct_without_returns_still_asks_for_doubt() -> None:
@@ -81,13 +72,6 @@ def test_reconstruct_without_returns_still_asks_for_doubt() -> None:
     assert not found.has_surface
     assert found.uncertainty_m is not None
     assert not doubter.asked[0][2].any()
-
-
-def test_hidden_reconstruction_keeps_uncertainty_and_doubt() -> None:
-    found = reconstruct(some_maps(), RIG, half, uncertainty_model=FakeDoubter())
-    assert found.has_surface
-    assert not found.without_surface.has_surface
-    assert (found.without_surface.uncertainty_m, found.without_surface.doubt) == (found.uncertainty_m, found.doubt)
 
 
 def test_reconstruct_refuses_a_rig_without_object_box() -> None:

@@ -1,7 +1,5 @@
-import logging
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from threading import Event
 
 import numpy as np
@@ -13,13 +11,11 @@ from small_frames import sheet_network
 
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live.loop import run_live
-from nlos_cam.live.replay import REPORT, RESULT, replay_recording
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.physics_check import (
     Expected,
-    NullPhysicsCheck,
     PeriodicPhysicsCheck,
     check_reconstruction,
     describe_failure,
@@ -56,20 +52,19 @@ def score(seen: LidarMaps, expected: Expected) -> float:
     return explain(seen, expected, expected.bare).score
 
 
-def test_score_of_expected_maps_is_zero_and_noise_hardly_matters() -> None:
-    assert score(maps_of(expected_object()), expected_object()) == pytest.approx(0.0, abs=1e-6)
-    assert score(maps_of(expected_object(), noise_m=1e-4), expected_object()) < 0.1
-
-
-def test_score_of_the_bare_bench_for_an_object_is_one() -> None:
-    assert score(maps_of(expected_object()), expected_object().bare) == 1.0
+def test_score_of_expected_maps_is_zero_and_of_an_empty_bench_one() -> None:
+    scene, nothing = expected_object(), Expected(np.full(SHAPE, np.nan), np.zeros(SHAPE), *[np.zeros(SHAPE)] * 2)
+    assert score(maps_of(scene), scene) == pytest.approx(0.0, abs=1e-6)
+    assert score(maps_of(scene, noise_m=1e-4), scene) < 0.1
+    assert score(maps_of(scene), scene.bare) == 1.0
+    assert score(maps_of(nothing), nothing) == 0.0
+    assert score(maps_of(nothing), scene) == pytest.approx(1.0)
 
 
 def test_score_rises_with_the_distance_from_the_object() -> None:
-    seen = maps_of(expected_object(0.5))
-    scores = [score(seen, expected_object(0.5 + off_m)) for off_m in (0.0, 0.005, 0.01, 0.03, 0.1)]
-    assert scores == sorted(scores)
-    assert scores[1] < scores[2] < scores[3] < scores[4]
+    maps = maps_of(expected_object(0.5))
+    scores = [score(maps, expected_object(0.5 + off_m)) for off_m in (0.0, 0.005, 0.01, 0.03, 0.1)]
+    assert scores[0] <= scores[1] < scores[2] < scores[3] < scores[4]
     assert scores[-1] > 0.9
 
 
@@ -79,11 +74,15 @@ def test_score_of_an_object_for_a_bare_bench_is_above_one() -> None:
     assert score(seen, expected_object(strength=20.0)) > 1.0
 
 
-def test_score_is_independent_of_the_gain() -> None:
-    seen = maps_of(expected_object(0.51), noise_m=1e-4)
-    dimmed = replace(seen, intensity=seen.intensity * np.float32(0.25))
-    assert score(dimmed, expected_object()) == pytest.approx(score(seen, expected_object()), rel=1e-5)
-    assert fit_gain(dimmed, expected_object().bare) == pytest.approx(0.25 * GAIN, rel=1e-5)
+@pytest.mark.parametrize("albedo", [0.75, 1.0, (4 / 3) ** 0.5])
+def test_explain_fits_gain_and_albedo(albedo: float) -> None:
+    maps, scene = maps_of(expected_object(), albedo=albedo), expected_object()
+    best = explain(maps, scene, scene.bare)
+    assert best.albedo == pytest.approx(albedo, rel=1e-6)
+    assert best.score == pytest.approx(0.0, abs=1e-6)
+    dimmed = explain(replace(maps, intensity=maps.intensity * np.float32(0.25)), scene, scene.bare)
+    assert dimmed.score == pytest.approx(best.score, abs=1e-6)
+    assert dimmed.gain == pytest.approx(0.25 * GAIN, rel=1e-5)
 
 
 def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
@@ -92,13 +91,6 @@ def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
     far = replace(seen, depth_m=seen.depth_m + np.float32(0.2))
     assert fit_gain(far, expected_object().bare) > 1e4
     assert fit_gain(replace(seen, valid=np.zeros(SHAPE, np.bool_)), expected_object().bare) == 1.0
-
-
-@pytest.mark.parametrize("albedo", [0.75, 1.0, (4 / 3) ** 0.5])
-def test_explanation_fits_the_albedo(albedo: float) -> None:
-    best = explain(maps_of(expected_object(), albedo=albedo), expected_object(), expected_object().bare)
-    assert best.albedo == pytest.approx(albedo, rel=1e-6)
-    assert best.score == pytest.approx(0.0, abs=1e-6)
 
 
 def test_mean_cost_lets_nearly_equal_echoes_swap() -> None:
@@ -115,12 +107,6 @@ def test_mean_cost_counts_cells_that_wrongly_return_or_do_not() -> None:
     assert mean_cost(maps_of(wall), half, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), wall, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), half, GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_score_of_no_returns_is_zero_if_none_are_expected() -> None:
-    nothing = Expected(np.full(SHAPE, np.nan), np.zeros(SHAPE), np.full(SHAPE, np.nan), np.zeros(SHAPE))
-    assert score(maps_of(nothing), nothing) == 0.0
-    assert score(maps_of(nothing), expected_object()) == pytest.approx(1.0)
 
 
 def test_mean_cost_lets_full_scale_hide_more_light_only() -> None:
@@ -162,17 +148,23 @@ def test_check_scores_the_true_object_best() -> None:
 
 
 def test_check_explains_the_true_object_to_within_noise() -> None:
-    found = check_reconstruction(seen(SEEDS[0]), hidden(SEEDS[0]), RIG)
+    found = check_reconstruction(seen(SEEDS[0]), hidden(SEEDS[0]), RIG, clock=iter([5.0, 7.5]).__next__)
     assert found.score < 0.05
     assert np.nanquantile(np.abs(found.residual_depth_m), 0.95) < 2e-3
     assert np.nanquantile(np.abs(found.residual_intensity), 0.95) < 3
     assert found.residual_depth_m.dtype == found.residual_intensity.dtype == np.float32
+    assert found.seconds == 2.5
 
 
-def test_check_renders_nothing_as_the_bare_bench() -> None:
-    assert check_reconstruction(seen(None), EMPTY, RIG).score < 0.05
+def test_check_renders_the_bare_bench_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert check_reconstruction(seen(None), hidden(SEEDS[0]), RIG).score > 1.0
-    assert check_reconstruction(seen(SEEDS[0]), EMPTY, RIG).score == 1.0
+    maps, nan_m, dark = seen(SEEDS[0]), np.full((64, 80), np.nan, np.float32), np.zeros((64, 80), np.float32)
+    monkeypatch.setattr("nlos_cam.reconstruct.physics_check.render", lambda *_: pytest.fail("rendered again"))
+    assert check_reconstruction(seen(None), EMPTY, RIG).score < 0.05
+    assert check_reconstruction(maps, EMPTY, RIG).score == 1.0
+    blank = check_reconstruction(LidarMaps(nan_m, dark, dark > 0), EMPTY, RIG)
+    assert blank.score == 1.0
+    assert np.isnan(blank.residual_depth_m).all()
 
 
 def test_check_works_on_a_rig_without_object_box() -> None:
@@ -183,18 +175,7 @@ def test_check_works_on_a_rig_without_object_box() -> None:
     assert check_reconstruction(maps, hidden(SEEDS[0]), bare).score < 1e-3
 
 
-def test_check_of_maps_without_returns_has_no_residual_depth() -> None:
-    nan_m, dark = np.full((64, 80), np.nan, np.float32), np.zeros((64, 80), np.float32)
-    found = check_reconstruction(LidarMaps(nan_m, dark, dark > 0), EMPTY, RIG)
-    assert found.score == 1.0
-    assert np.isnan(found.residual_depth_m).all()
-
-
-def test_check_is_timed_with_the_given_clock() -> None:
-    assert check_reconstruction(seen(None), EMPTY, RIG, clock=iter([5.0, 7.5]).__next__).seconds == 2.5
-
-
-def test_every_frames_check_is_independent_of_earlier_frames() -> None:
+def test_periodic_check_is_independent_of_earlier_frames() -> None:
     forwards, backwards = {}, {}
     for found, order in ((forwards, SEEDS), (backwards, SEEDS[::-1])):
         checks = PeriodicPhysicsCheck(RIG, every=1, accuracy="draft")
@@ -206,7 +187,7 @@ def test_every_frames_check_is_independent_of_earlier_frames() -> None:
         np.testing.assert_array_equal(forwards[seed].residual_depth_m, backwards[seed].residual_depth_m)
 
 
-def test_every_frames_checks_each_third_frame() -> None:
+def test_periodic_check_takes_each_third_frame() -> None:
     numbers = []
     with PeriodicPhysicsCheck(RIG, every=3) as checks:
         for number in range(8):
@@ -215,44 +196,17 @@ def test_every_frames_checks_each_third_frame() -> None:
     assert numbers == [0, 0, 0, 3, 3, 3, 6, 6]
 
 
-def test_every_frames_reports_a_failed_check_once() -> None:
-    errors, behind_the_wall = [], np.full((64, 64), -1.0, np.float32)
-    checks = PeriodicPhysicsCheck(RIG, every=1, on_error=errors.append)
+def test_periodic_check_reports_a_failure_once(caplog: pytest.LogCaptureFixture) -> None:
+    behind_the_wall = np.full((64, 64), -1.0, np.float32)
+    checks = PeriodicPhysicsCheck(RIG, every=1)
     for number, depth_m in enumerate([behind_the_wall, behind_the_wall, EMPTY]):
         checks.offer(number, seen(None), depth_m)
-    assert len(errors) == 1
-    assert "frame 0" in errors[0]
+    (message,) = caplog.messages
+    assert "frame 0" in message
     assert checks.newest is not None
     assert checks.newest.frame_number == 2
-
-
-@pytest.mark.slow
-def test_replay_writes_reproducible_checks(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        processing = Pipeline(
-            CalibratedRig(RIG), sheet_network, checks=PeriodicPhysicsCheck(RIG, every=3, accuracy="draft")
-        )
-        replay_recording(WallCamera(4), processing, tmp_path / name, stop=Event())
-    for file in (RESULT, REPORT):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
-    with np.load(tmp_path / "a" / RESULT) as result:
-        assert result["check_frame_number"].tolist() == [0, 3]
-        assert result["check_score"].shape == (2,)
-        assert (result["check_score"] > 0.5).all()
-    assert "check of 2 frames" in (tmp_path / "a" / REPORT).read_text()
-
-
-def test_replay_without_checks_writes_none(tmp_path: Path) -> None:
-    replay_recording(WallCamera(2), Pipeline(CalibratedRig(RIG), sheet_network), tmp_path / "out", stop=Event())
-    with np.load(tmp_path / "out" / RESULT) as result:
-        assert result["check_score"].size == result["check_frame_number"].size == 0
-    assert "physics" not in (tmp_path / "out" / REPORT).read_text()
-
-
-def test_check_renders_the_bare_bench_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    check_reconstruction(seen(None), EMPTY, RIG)
-    monkeypatch.setattr("nlos_cam.reconstruct.physics_check.render", lambda *_: pytest.fail("rendered again"))
-    check_reconstruction(seen(None), EMPTY, RIG)
+    log_warning(describe_failure(7, "SceneError: 100 % wrong"))
+    assert "SceneError: 100 % wrong" in caplog.messages[1]
 
 
 def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
@@ -268,18 +222,3 @@ def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
     )
     run_live(WallCamera(5, period_s=0.0), processing, Noting(), stop=Event(), recorded=True)
     assert shown == [0, 0, 2, 2, 4]
-
-
-def test_no_checks_never_yields_a_check() -> None:
-    nothing = np.zeros((64, 80), np.float32)
-    with NullPhysicsCheck() as checks:
-        checks.offer(1, LidarMaps(nothing, nothing, nothing > 0), nothing[:, :64])
-        assert checks.newest is None
-
-
-def test_failure_is_logged_with_its_frame(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        log_warning(describe_failure(7, "SceneError: 100 % wrong"))
-    (message,) = caplog.messages
-    assert "frame 7" in message
-    assert "SceneError: 100 % wrong" in message

@@ -129,14 +129,6 @@ def test_batched_results_equal_results_in_turn(tmp_path: Path, count: int) -> No
             np.testing.assert_array_equal(getattr(one, name).depth_m, getattr(other, name).depth_m)
 
 
-def test_batched_frames_share_the_network_time() -> None:
-    ticks = iter(range(10_000))
-    done = all_steps(Pipeline(CalibratedRig(RIG), sheet_network), WallCamera(4), lambda: float(next(ticks)), ahead=True)
-    assert len(done) == BATCH_FRAMES == 4
-    (share_s,) = {step.stages_s["network"] for step in done}
-    assert share_s in {ticks / 4 for ticks in range(1, 100)}
-
-
 @pytest.mark.parametrize(("ahead", "count"), [(False, 12), (True, 40)])
 def test_results_raise_the_error_of_a_frame(ahead: bool, count: int) -> None:
     odd_m = maps_from_frame(wall_frame(9)).depth_m
@@ -151,47 +143,26 @@ def test_results_raise_the_error_of_a_frame(ahead: bool, count: int) -> None:
 
 
 @pytest.mark.parametrize(("nothing", "verdict"), [(0.9, Verdict.NOTHING), (0.0, Verdict.SEEN)])
-def test_step_shows_what_its_verdict_says(nothing: float, verdict: Verdict) -> None:
-    doubter = FakeDoubter(lambda *_: (nothing, 0.0))
-    for step in all_steps(Pipeline(CalibratedRig(RIG), sheet_network, uncertainty_model=doubter), WallCamera(3)):
+def test_result_shows_what_its_verdict_says(walled: CalibratedRig, nothing: float, verdict: Verdict) -> None:
+    noting, doubter = Noting(), FakeDoubter(lambda *_: (nothing, 0.0))
+    pipeline = Pipeline(walled, noting, uses_difference=True, average=3, uncertainty_model=doubter)
+    done = all_steps(pipeline, WallCamera(100, moved=range(50, 100)))
+    for step, asked, given in zip(done[:50], doubter.asked, noting.given, strict=False):
         assert step.verdict == verdict
         assert step.reconstruction.has_surface == (verdict is Verdict.SEEN)
         assert step.reconstruction.uncertainty_m is not None
-
-
-def test_doubt_network_is_given_the_input_of_the_network(walled: CalibratedRig) -> None:
-    noting, doubter = Noting(), FakeDoubter()
-    all_steps(Pipeline(walled, noting, uses_difference=True, average=3, uncertainty_model=doubter), WallCamera(4))
-    for asked, given in zip(doubter.asked, noting.given, strict=True):
         np.testing.assert_array_equal(asked[0][0], given)
-
-
-def test_moved_lidar_overrules_the_networks_verdict(walled: CalibratedRig) -> None:
-    doubter = FakeDoubter(lambda *_: (0.0, 0.9))
-    done = all_steps(Pipeline(walled, sheet_network, uncertainty_model=doubter), WallCamera(100, moved=range(50, 100)))
-    assert {step.verdict for step in done[:50]} == {Verdict.OUTSIDE}
     assert done[-1].verdict == Verdict.WALL_MOVED
 
 
-@pytest.mark.parametrize(
-    ("change", "conditions"),
-    [
-        ({}, FrameConditions()),
-        ({"depth_m": np.full((64, 80), np.nan, np.float32)}, FrameConditions(invalid=True)),
-        (
-            {"depth_m": np.where(np.arange(80) < 40, np.float32(0.3), np.nan) * np.ones((64, 1))},
-            FrameConditions(invalid=True),
-        ),
-        ({"ir": np.full((64, 80), 255, np.uint8)}, FrameConditions(saturated=True)),
-    ],
-)
-def test_frame_conditions_name_what_is_wrong_with_a_frame(change: dict[str, np.ndarray], conditions: FrameConditions) -> None:
-    whole = replace(wall_frame(0), depth_m=np.full((64, 80), 0.3, np.float32))
-    assert frame_conditions(replace(whole, **change), BenchObservation(None, ()), None) == conditions
-    check = PhysicsCheckResult(
-        0, np.zeros((64, 80), np.float32), np.zeros((64, 80), np.float32), score=1.0, seconds=0.0
-    )
-    assert frame_conditions(replace(whole, **change), BenchObservation(None, ()), check) == replace(conditions, check=check)
+@pytest.mark.parametrize("missing", [0, 40, 80])
+@pytest.mark.parametrize("saturated", [False, True])
+def test_frame_conditions_follow_frame_issues_and_bench(missing: int, saturated: bool) -> None:
+    depth_m = np.where(np.arange(80) < missing, np.float32(np.nan), np.float32(0.3)) * np.ones((64, 1), np.float32)
+    frame = replace(wall_frame(0), depth_m=depth_m, ir=np.full((64, 80), 255 if saturated else 9, np.uint8))
+    check = PhysicsCheckResult(0, depth_m, depth_m, score=1.0, seconds=0.0)
+    conditions = frame_conditions(frame, BenchObservation(None, (), moved=saturated), check)
+    assert conditions == FrameConditions(saturated, missing > 0, moved=saturated, check=check)
 
 
 DOUBTER: Any = object()

@@ -42,9 +42,7 @@ ALL = FrameConditions(saturated=True, invalid=True, moved=True, check=checked(1.
         (found(nothing=0.9), ALL, Verdict.WALL_MOVED),
     ],
 )
-def test_judge_gives_the_last_verdict_that_holds(
-    made: Reconstruction, signs: FrameConditions, verdict: Verdict
-) -> None:
+def test_verdict_is_the_last_that_holds(made: Reconstruction, signs: FrameConditions, verdict: Verdict) -> None:
     assert VerdictFilter(LIMITS).decide(made, signs)[1] == verdict
 
 
@@ -54,7 +52,7 @@ def test_verdicts_are_ordered_by_precedence() -> None:
 
 
 @pytest.mark.parametrize("signs", [FrameConditions(), ALL])
-def test_judge_hides_the_surface_only_if_nothing_is_there(signs: FrameConditions) -> None:
+def test_verdict_hides_the_surface_only_if_nothing_is_there(signs: FrameConditions) -> None:
     shown, _ = VerdictFilter(LIMITS).decide(found(nothing=0.9), signs)
     assert np.isnan(shown.depth_m).all()
     assert shown.uncertainty_m is not None
@@ -64,31 +62,21 @@ def test_judge_hides_the_surface_only_if_nothing_is_there(signs: FrameConditions
 
 
 @pytest.mark.parametrize("judge", [VerdictFilter(None), VerdictFilter(LIMITS)])
-def test_judge_without_doubt_considers_the_lidar_only(judge: VerdictFilter) -> None:
+def test_verdict_without_doubt_considers_the_lidar_only(judge: VerdictFilter) -> None:
     plain = replace(found(), doubt=None, uncertainty_m=None)
     assert judge.decide(plain, FrameConditions()) == (plain, None)
     assert judge.decide(plain, FrameConditions(saturated=True))[1] == Verdict.SATURATED
     assert judge.decide(plain, FrameConditions(moved=True, saturated=True))[1] == Verdict.WALL_MOVED
 
 
-def test_judge_smooths_out_of_range_over_frames() -> None:
-    judge = VerdictFilter(LIMITS)
-    given = [judge.decide(found(outside=p), FrameConditions())[1] for p in [0.0] * 10 + [1.0] + [0.0] * 10]
-    assert set(given) == {Verdict.SEEN}
-    after = [judge.decide(found(outside=1.0), FrameConditions())[1] for _ in range(STEADY_FRAMES)]
-    assert after[-1] == Verdict.OUTSIDE
+def test_verdict_smooths_out_of_distribution_but_not_empty_frames() -> None:
+    smoothed, forgetting = VerdictFilter(LIMITS), VerdictFilter(LIMITS)
+    p_outside = [0.0] * 10 + [1.0] + [0.0] * 10 + [1.0] * STEADY_FRAMES
+    verdicts = [smoothed.decide(found(outside=p), FrameConditions())[1] for p in p_outside]
+    assert set(verdicts[:21]) == {Verdict.SEEN}
+    assert verdicts[-1] == Verdict.OUTSIDE
     assert STEADY_FRAMES / 30 < 0.2
-
-
-def test_judge_follows_an_object_without_delay() -> None:
-    judge = VerdictFilter(LIMITS)
-    given = [judge.decide(found(nothing=p), FrameConditions())[1] for p in (0.0, 0.0, 0.9, 0.9, 0.0)]
-    assert given == [Verdict.SEEN, Verdict.SEEN, Verdict.NOTHING, Verdict.NOTHING, Verdict.SEEN]
-
-
-def test_judge_forgets_doubt_of_the_range_after_an_empty_frame() -> None:
-    judge = VerdictFilter(LIMITS)
-    for _ in range(STEADY_FRAMES):
-        judge.decide(found(outside=1.0), FrameConditions())
-    judge.decide(found(nothing=1.0), FrameConditions())
-    assert judge.decide(found(), FrameConditions())[1] == Verdict.SEEN
+    p_empty = [0.0] * STEADY_FRAMES + [0.9, 0.0]
+    verdicts = [forgetting.decide(found(p, outside=1.0 - p), FrameConditions())[1] for p in p_empty[:-1]]
+    assert verdicts[-2:] == [Verdict.OUTSIDE, Verdict.NOTHING]
+    assert forgetting.decide(found(), FrameConditions())[1] == Verdict.SEEN
