@@ -116,7 +116,7 @@ def fake_device(product: int = 0x0B64, serial: str = "00000000F0246262", **chang
 
 
 class FakeLinux:
-    """The file systems of a Linux host, as far as they matter: plain files and links below `root`."""
+    """File systems of a Linux host: plain files and links below `root`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -174,7 +174,7 @@ class FakeLinux:
 
 
 class Bench:
-    """A healthy L515 on a healthy Linux, to be spoilt; `facts` and `checks` come from the real code."""
+    """A healthy L515 on a healthy Linux, for faults to be added; `facts` and `checks` come from the real code."""
 
     def __init__(self, root: Path) -> None:
         self.usb = FakeUsb(fake_device())

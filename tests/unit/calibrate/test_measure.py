@@ -87,7 +87,7 @@ def seen_of(depth_m: np.ndarray, frames: int, intrinsics: Intrinsics = INTRINSIC
 
 
 def bench_seen(intrinsics: Intrinsics = INTRINSICS, **changes: object) -> CaptureStatistics:
-    """What the lidar of the paper's rig sees with its occluder in place and nothing hidden, by its beams."""
+    """Return statistics of the paper's rig with its occluder and no hidden object, rendered by its beams."""
     beams = cast(BENCH.model_copy(update=changes), intrinsics)
     return seen_of((beams.length_m * beams.cos_axis).reshape(intrinsics.height, intrinsics.width), 20, intrinsics, 1)
 
@@ -117,7 +117,7 @@ def test_measure_by_depth_measures_the_wall_and_the_tapes_offset(seen: CaptureSt
     assert facts["range_offset_m"] == pytest.approx(0.004 * np.sqrt(2.0), abs=2e-5)
 
 
-def test_measure_by_depth_and_by_board_refuse_what_they_cannot_find(seen: CaptureStatistics) -> None:
+def test_measure_refuses_wrong_tape_no_depth_and_no_board(seen: CaptureStatistics) -> None:
     with pytest.raises(CalibrationError, match="300"):
         measure_by_depth(seen, 0.3)
     with pytest.raises(WallRefusedError):

@@ -1,7 +1,7 @@
-"""Each check on a bench that was spoilt in one way: which checks fail, and what one of them says and advises.
+"""Each check on a bench with one fault: the checks that fail, and the detail and fix of one of them.
 
-A case has the steps that spoil, the names of the checks that fail, one check with its status ("failed" where none is
-named), and words of its detail and fix.
+A case has the steps that cause the fault, the names of the checks that fail, one check with its status ("failed" if none
+is given), and words of its detail and fix.
 """
 
 from operator import attrgetter
@@ -129,6 +129,14 @@ WSL = write("proc/version", "Linux version 6.6.87-microsoft-standard-WSL2")
         ([do("run_on", "linux", "riscv64"), NO_SDK], "python sdk", "python", "riscv64|BUILD_PYTHON_BINDINGS"),
         ([do("run_on", "darwin", "arm64", 13), NO_SDK], "python system sdk", "python", "arm64|python3.12 -m venv"),
         ([do("run_on", "linux", "x86_64", is_musl=True), NO_SDK], "python sdk", "python", "glibc"),
+        *(([put("sdk_error", ImportError(error))], "sdk", "sdk", f"{error}|{fix}") for error, fix in (
+            ("No module named 'pyrealsense2'", f"pip install {WHEEL}"),
+            ("No module named 'libusb_package'", "libusb-package"),
+            ("libusb-1.0.so.0: cannot open", "apt install libusb-1.0-0, or `pip install libusb-package`"),
+            ("libudev.so.1: cannot open", "sudo apt install libudev1"),
+            ("libstdc++.so.6: cannot open", "sudo apt install libstdc++6"),
+            ("/lib/libc.so.6: version `GLIBC_2.17' not found", "newer release"),
+            ("DLL load failed while importing pyrealsense2", "vc_redist"))),
         ([put("load_sdk", object)], "sdk", "sdk", "attribute|--force-reinstall"),
         ([put("load_sdk", lambda: Mock(context=Mock(side_effect=RuntimeError("no power"))))], "sdk", "sdk",
          "no power|unplug"),
@@ -183,25 +191,6 @@ def test_container_that_hides_sensors_is_named_as_the_cause(bench: Any) -> None:
     (bench.linux.root / "sys/bus/iio/devices").rmdir()
     (bench.linux.root / "sys/bus/iio").rmdir()
     assert "-v /sys:/sys" in bench.failed()["hid-sensors"].fix
-
-
-@pytest.mark.parametrize(
-    ("error", "fix"),
-    [
-        ("No module named 'pyrealsense2'", f"pip install {WHEEL}"),
-        ("No module named 'libusb_package'", "libusb-package"),
-        ("libusb-1.0.so.0: cannot open", "apt install libusb-1.0-0, or `pip install libusb-package`"),
-        ("libudev.so.1: cannot open shared object file", "sudo apt install libudev1"),
-        ("libstdc++.so.6: cannot open shared object file", "sudo apt install libstdc++6"),
-        ("/lib/libc.so.6: version `GLIBC_2.17' not found", "newer release"),
-        ("DLL load failed while importing pyrealsense2", "vc_redist"),
-    ],
-)
-def test_sdk_that_cannot_be_loaded_fails_with_what_it_lacks(bench: Any, error: str, fix: str) -> None:
-    bench.sdk_error = ImportError(error)
-    check = bench.failed()["sdk"]
-    assert check.detail == error
-    assert fix in check.fix
 
 
 @pytest.mark.parametrize("version", ["2.55.1.6486", "2.59.1.11053", "3.0"])

@@ -1,4 +1,4 @@
-"""What holds for every diagnosis; each cause is tested in test_checks.py."""
+"""Laws of every diagnosis; each cause is tested in test_checks.py."""
 
 from typing import Any, get_args
 
