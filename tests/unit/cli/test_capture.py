@@ -32,10 +32,10 @@ sys.exit(app(sys.argv[1:], standalone_mode=False) or 0)
 Run = Callable[..., dict[str, Any]]
 
 
-def app() -> typer.Typer:
-    found = typer.Typer()
-    capture.register(found)
-    return found
+def run_app(*arguments: str) -> int:
+    app = typer.Typer()
+    capture.register(app)
+    return app(list(arguments), standalone_mode=False) or 0
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def run(
         return SimulatedCamera(uri, noise_world(), clock=hurried_clock(), recording=recording)
 
     def call(*arguments: str) -> dict[str, Any]:
-        code = app()(["--camera", "sim", "--json", *arguments], standalone_mode=False) or 0
+        code = run_app("--camera", "sim", "--json", *arguments)
         return json.loads(capsys.readouterr().out.splitlines()[-1]) | {"exit": code}
 
     monkeypatch.setattr(capture, "open_camera", open_noise)
@@ -69,15 +69,18 @@ def out(tmp_path: Path) -> str:
     return str(tmp_path / "a.bag")
 
 
-def test_capture_json_reports_the_file(run: Run, tmp_path: Path, out: str) -> None:
+def test_capture_json_reports_the_file(run: Run, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch) -> None:
     found = run("--frames", "9", "--label", "a cup", "--out", out)
     assert (found["frames"], found["dropped"], found["seconds"], found["out"]) == (9, 0, 0.267, out)
     assert (found["exit"], found["state"], found["sidecar"]) == (0, "complete", str(tmp_path / "a.json"))
     assert verify(Path(out)).streams == found["streams"] == {"depth": 9, "infrared": 9, "confidence": 9}
     assert found["label"] == load_sidecar(tmp_path / "a.json").label == "a cup"
-    assert run("--seconds", "1", "--out", str(tmp_path / "b.bag"))["frames"] == 30  # of device time
+    monkeypatch.chdir(tmp_path)
+    by_time = run("--seconds", "1")
+    assert (by_time["frames"], Path(by_time["out"]).exists()) == (30, True)  # a second of device time, a default name
 
 
+@pytest.mark.slow
 def test_capture_numbers_and_labels_takes(run: Run, tmp_path: Path, out: str) -> None:
     labels = "--label", "a cup", "--label", "a ball", "--label", "a box"
     found = run("--takes", "3", "--frames", "4", *labels, "--out", out)
@@ -91,6 +94,7 @@ def test_capture_numbers_and_labels_takes(run: Run, tmp_path: Path, out: str) ->
     assert [take["label"] for take in found["takes"]] == ["cup", "cup"]
 
 
+@pytest.mark.slow
 def test_capture_pauses_between_takes(run: Run, out: str, monkeypatch: pytest.MonkeyPatch) -> None:
     paused: list[float | None] = []
     monkeypatch.setattr(capture, "_pause", lambda _bar, _stop, pause_s, _text: paused.append(pause_s))
@@ -125,25 +129,11 @@ def test_capture_overwrites_only_with_the_option(run: Run, tmp_path: Path, out: 
     assert load_sidecar(precious.with_suffix(".json")).state == "complete"
 
 
-def test_capture_default_name_is_a_new_file(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert Path(run("--frames", "1")["out"]).exists()
+WRONG = """--seconds 1 --frames 2|--out a.mp4|--frames 0|--seconds 0|--seconds inf|--takes 2
+--frames 1 --takes 2 --pause-s inf|--takes 3 --frames 1 --label a --label b|--frames 1 --label a --label b"""
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        "--seconds 1 --frames 2",
-        "--out a.mp4",
-        "--frames 0",
-        "--seconds 0",
-        "--seconds inf",
-        "--frames 1 --takes 2 --pause-s inf",
-        "--takes 2",
-        "--takes 3 --frames 1 --label a --label b",
-        "--frames 1 --label a --label b",
-    ],
-)
+@pytest.mark.parametrize("wrong", WRONG.replace("\n", "|").split("|"))
 def test_capture_refuses_contradictory_options(run: Run, wrong: str) -> None:
     with pytest.raises(typer.BadParameter):
         run(*wrong.split())
@@ -203,7 +193,7 @@ def test_capture_of_an_impossible_camera_leaves_no_file(
 ) -> None:
     camera = f"bag:{noise_bag}" if uri == "bag" else uri
     with pytest.raises(error):
-        app()(["--camera", camera, "--out", str(tmp_path / "a.bag")], standalone_mode=False)
+        run_app("--camera", camera, "--out", str(tmp_path / "a.bag"))
     assert list(tmp_path.iterdir()) == []
 
 

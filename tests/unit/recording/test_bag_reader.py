@@ -17,6 +17,7 @@ from nlos_cam.recording.bag_reader import BagReader
 from nlos_cam.recording.playback import verify
 from nlos_cam.recording.rosbag import CHUNK_LIMIT
 
+
 @pytest.fixture(params=["noise_bag", "noise_bag_uncompressed", "real_bag"])
 def bag(request: pytest.FixtureRequest) -> BagReader:
     return BagReader(request.getfixturevalue(request.param))

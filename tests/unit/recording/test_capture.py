@@ -32,21 +32,30 @@ def world(noise_world: Any) -> Any:
 
 
 @pytest.fixture
-def run(world: Any, hurried_clock: Any, tmp_path: Path) -> Run:
+def session(world: Any, hurried_clock: Any, tmp_path: Path) -> Callable[..., tuple[CaptureSession, SimulatedCamera]]:
+    """Make a session of takes 0.bag, 1.bag, ... of a NoiseWorld, and its camera."""
+
+    def make(count: int = 1, **limits: Any) -> tuple[CaptureSession, SimulatedCamera]:
+        targets = [CaptureTarget(tmp_path / f"{number}.bag", label=f"object {number}") for number in range(count)]
+        recording = Recording(targets[0].path, last=count == 1, **limits)
+        camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
+        return CaptureSession(camera, recording, targets), camera
+
+    return make
+
+
+@pytest.fixture
+def run(session: Any) -> Run:
     """Record takes of a NoiseWorld and finalize each; stop, as by Ctrl-C, after `stop_at` sets."""
 
-    def call(
-        count: int = 1, stop_at: int | None = None, read_back: Callable[[Path], VerifyResult | None] = verify, **limits: Any
-    ) -> list[CaptureResult]:
-        targets = [CaptureTarget(tmp_path / f"{number}.bag", label=f"object {number}") for number in range(count)]
-        recording, stop = Recording(targets[0].path, last=count == 1, **limits), Event()
-        camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
+    def call(count: int = 1, stop_at: int | None = None, read_back: Any = verify, **limits: Any) -> list[CaptureResult]:
+        stop = Event()
 
         def on_sets(sets: int) -> None:
             if stop_at is not None and sets >= stop_at:
                 stop.set()
 
-        with closing(CaptureSession(camera, recording, targets).record(stop, on_sets)) as takes:
+        with closing(session(count, **limits)[0].record(stop, on_sets)) as takes:
             return [finalize(take, read_back) for take in takes]
 
     return call
@@ -73,6 +82,7 @@ def test_take_holds_what_came_and_its_sidecar_agrees(run: Run, noise_world: Any)
     assert take.quality.confidence_mean == pytest.approx(sum(image.confidence.mean() for image in images) / 5)
 
 
+@pytest.mark.slow
 def test_takes_have_own_files_and_follow_each_other(run: Run, tmp_path: Path) -> None:
     there: list[list[str]] = []
 
@@ -112,25 +122,23 @@ def test_take_of_a_vanishing_camera_is_whole(run: Run, world: Any) -> None:
     assert take.verified.frames == 8
 
 
-def test_take_without_a_frame_leaves_no_file(world: Any, tmp_path: Path, hurried_clock: Any) -> None:
-    recording, targets = Recording(tmp_path / "0.bag"), [CaptureTarget(tmp_path / "0.bag")]
-    camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
+def test_take_without_a_frame_leaves_no_file(session: Any, world: Any, tmp_path: Path) -> None:
+    takes, _ = session()
     world.vanishes_at = 0
-    (take,) = [finalize(one, verify) for one in CaptureSession(camera, recording, targets).record(Event(), print)]
+    (take,) = [finalize(take, verify) for take in takes.record(Event(), print)]
     assert (take.state, take.sets, take.verified) == ("lost", 0, None)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_camera_that_does_not_start_leaves_no_file(world: Any, tmp_path: Path, hurried_clock: Any) -> None:
-    recording = Recording(tmp_path / "0.bag")
-    camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
+def test_camera_that_does_not_start_leaves_no_file(session: Any, tmp_path: Path) -> None:
+    takes, camera = session()
 
     def fail(_: Any) -> None:
         raise CameraLostError("sim does not start: replug it")
 
     camera._prepare = fail
     with pytest.raises(CameraLostError, match="does not start"):
-        list(CaptureSession(camera, recording, [CaptureTarget(tmp_path / "0.bag")]).record(Event(), print))
+        list(takes.record(Event(), print))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -191,14 +199,12 @@ def test_take_that_cannot_be_read_back_is_damaged(run: Run) -> None:
     assert (take.state, str(take.error)) == ("damaged", f"{take.target.path} is cut short")
 
 
-def test_closing_between_takes_stops_the_camera(world: Any, hurried_clock: Any, tmp_path: Path) -> None:
-    targets = [CaptureTarget(tmp_path / "0.bag"), CaptureTarget(tmp_path / "1.bag")]
-    recording = Recording(targets[0].path, frames=3, last=False)
-    camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
-    takes = CaptureSession(camera, recording, targets).record(Event(), print)
+def test_closing_between_takes_stops_the_camera(session: Any, tmp_path: Path) -> None:
+    recorder, camera = session(2, frames=3)
+    takes = recorder.record(Event(), print)
     next(takes)
     assert camera._thread
     takes.close()
     assert camera._thread is None
-    assert verify(targets[0].path).frames == 3
-    assert not targets[1].path.exists()
+    assert verify(tmp_path / "0.bag").frames == 3
+    assert not (tmp_path / "1.bag").exists()

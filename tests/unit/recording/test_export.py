@@ -13,7 +13,7 @@ from nlos_cam.camera import open_camera
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording.bag_reader import BagReader
-from nlos_cam.recording.export import INFO, ExportResult, ExportOptions, export_recording
+from nlos_cam.recording.export import INFO, ExportOptions, ExportResult, export_recording
 
 FRAMES = 20
 
@@ -34,6 +34,10 @@ def rows(out: Path, stream: str) -> list[dict[str, str]]:
 def test_export_writes_every_bit_into_png(noise_bag: Path, tmp_path: Path) -> None:
     made = exported(noise_bag, tmp_path / "out")
     assert made.frames == dict.fromkeys(FORMATS, FRAMES) | {"points": 1}
+    info = json.loads((tmp_path / "out" / INFO).read_text())
+    assert (info["device"]["name"], info["depth_unit_m"]) == ("Simulated L515", pytest.approx(0.00025))
+    assert (set(info["streams"]), info["capture"]) == (set(FORMATS), None)
+    assert info["streams"]["depth"]["intrinsics"]["height"] == 48
     for stream in FORMATS:
         for row, sample in zip(rows(tmp_path / "out", stream), samples(noise_bag, stream), strict=True):
             pixels = cv2.imread(str(tmp_path / "out" / row["file"]), cv2.IMREAD_UNCHANGED)
@@ -78,16 +82,6 @@ def test_export_writes_only_chosen_streams_and_frames(noise_bag: Path, tmp_path:
     assert not (tmp_path / "none").exists()
 
 
-def test_export_writes_common_facts_once(noise_bag: Path, tmp_path: Path) -> None:
-    exported(noise_bag, tmp_path / "out")
-    info = json.loads((tmp_path / "out" / INFO).read_text())
-    assert info["device"]["name"] == "Simulated L515"
-    assert info["depth_unit_m"] == pytest.approx(0.00025)
-    assert set(info["streams"]) == set(FORMATS)
-    assert info["streams"]["depth"]["intrinsics"]["height"] == 48
-    assert info["capture"] is None
-
-
 def test_export_that_is_stopped_keeps_written_frames(noise_bag: Path, tmp_path: Path) -> None:
     stop, seen = Event(), []
 
@@ -96,7 +90,9 @@ def test_export_that_is_stopped_keeps_written_frames(noise_bag: Path, tmp_path: 
         if len(seen) == 6:
             stop.set()
 
-    made = export_recording(BagReader(noise_bag), tmp_path / "out", ExportOptions(format="npz"), stop=stop, on_frame=after_six)
+    made = export_recording(
+        BagReader(noise_bag), tmp_path / "out", ExportOptions(format="npz"), stop=stop, on_frame=after_six
+    )
     assert made.frames == {"depth": 2, "infrared": 2, "confidence": 2, "points": 1}
     with np.load(tmp_path / "out" / "depth.npz") as found:
         assert found["pixels"].shape == (2, 48, 64)

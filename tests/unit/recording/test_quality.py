@@ -8,11 +8,7 @@ from nlos_cam.frames import Frame
 from nlos_cam.recording.quality import MIN_PAIRS, Quality, QualityMeter
 
 SHAPE = 48, 64
-
-
 PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
-
-
 FRAMES = 60
 
 
@@ -91,13 +87,3 @@ def test_quality_of_no_frame_and_of_one_has_no_spread() -> None:
     assert (found.frames_seen, found.saturated_share, found.invalid_share) == (1, 0.0, 0.0)
     assert found.temporal_noise_mm is None
     assert found.jitter_ms is None
-
-
-def test_meter_memory_does_not_grow_with_frames() -> None:
-    meter, frames = QualityMeter(), noisy()
-    kept: list[set[int]] = []
-    for _ in range(3):
-        for frame in frames:
-            meter.add(frame)
-        kept.append({np.asarray(array).nbytes for array in (meter._squares, meter._pairs)})
-    assert kept[0] == kept[1] == kept[2] == {48 * 64 * 4}

@@ -30,11 +30,7 @@ from nlos_cam.recording.rosbag import (
 )
 
 NAMES = st.text(st.characters(codec="ascii", exclude_characters="="), min_size=1, max_size=9)
-
-
 FIELDS = st.dictionaries(NAMES.filter(lambda name: name != "op"), st.binary(max_size=30), max_size=5)
-
-
 DESCRIBED = {"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"string data"}
 
 

@@ -17,7 +17,7 @@ from nlos_cam.recording.rosbag import (
     read_record,
     reader,
 )
-from nlos_cam.recording.salvage import Scan, examine, find_chunk, is_headless, salvage_set_up, scan_bag, unpack
+from nlos_cam.recording.salvage import Scan, examine, find_chunk, scan_bag, unpack
 
 DESCRIPTION = {"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"string data"}
 CONNECTION = pack_record({"conn": bytes(4), "op": b"\x07", "topic": b"/topic"}, pack_record(DESCRIPTION, b"")[4:-4])
@@ -93,31 +93,6 @@ def test_unpack_refuses_a_bomb(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.recording.salvage.CHUNK_LIMIT", len(CONTENT) - 1)
     assert examined(DATA["lz4"])[0].chunk is None
     assert examined(CONTENT, "none")[0].ending == Ending.BROKEN
-
-
-def test_salvage_set_up_takes_descriptions_from_a_broken_chunk() -> None:
-    data = bytearray(DATA["lz4"])
-    data[-20] ^= 1
-    file = pack_chunk_head("lz4", len(CONTENT), len(data)) + data
-    record = read_record(reader(file), 0)
-    chunk, connections = salvage_set_up(reader(file), 0, record, len(file))
-    assert chunk is not None
-    assert chunk.content == CONNECTION + message(SET_UP_S)
-    assert list(chunk.index) == list(connections) == [0]
-    data[7:] = bytes(len(data) - 7)
-    assert salvage_set_up(reader(file[: record.data_at] + data), 0, record, len(file)) == (None, {})
-
-
-@pytest.mark.parametrize(
-    ("start", "compression"), [(DATA["lz4"], b"lz4"), (CONTENT, b"none"), (message(FIRST_S) * 2, b"none")]
-)
-def test_find_chunk_finds_data_without_its_header(start: bytes, compression: bytes) -> None:
-    found = find_chunk(reader(start + AFTER), 0)
-    assert found is not None
-    assert is_headless(found)
-    assert found.fields["compression"] == compression
-    ended = examine(reader(start + AFTER), 0, found, len(start + AFTER))
-    assert (ended.ending, ended.end, ended.why) == (Ending.WHOLE, len(start), "")
 
 
 def test_find_chunk_refuses_other_records_and_compressions() -> None:

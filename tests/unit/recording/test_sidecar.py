@@ -1,9 +1,9 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,26 +12,26 @@ import pytest
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Rig, dump_toml, load_rig
-from nlos_calibration.wall_record import WallRecord
+from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality
-from nlos_cam.recording.sidecar import TEMPERATURE_INTERVAL_S, SidecarFile, load_sidecar, sidecar_path, summary_of, versions, load_measured_wall
+from nlos_cam.recording.sidecar import (
+    TEMPERATURE_INTERVAL_S,
+    SidecarFile,
+    load_measured_wall,
+    load_sidecar,
+    sidecar_path,
+    summary_of,
+    versions,
+)
 
 PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
-
-
 DARK = np.zeros((48, 64), np.uint8)
-
-
 WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
-
-
 SEEN = Quality(9, 0.25, 0.5, 7.0, 1.5, 0.1)
-
-
 READ = VerifyResult(frames=9, dropped=2, seconds=0.5, streams={"depth": 9, "infrared": 9, "confidence": 9})
 
 
@@ -65,10 +65,8 @@ def test_sidecar_exists_from_the_start_of_a_recording(path: Path) -> None:
     SidecarFile(path, Warm(), label="a cup", started=WHEN)
     found, fields = load_sidecar(path), json.loads(path.read_text())
     assert (found.label, found.camera, found.state, found.summary) == ("a cup", "l515", "recording", None)
-    assert found.started == WHEN
     assert found.device == {"name": "L515", "serial": "f0246262"}
-    assert (found.intrinsics.fx, found.intrinsics.width) == (46.0, 64)
-    assert found.settings["laser_power"] == 40.0
+    assert (found.started, found.intrinsics.fx, found.settings["laser_power"]) == (WHEN, 46.0, 40.0)
     assert (fields["label"], fields["camera"], fields["started"][-1]) == ("a cup", "l515", "Z")
 
 
@@ -85,7 +83,9 @@ def test_sidecar_samples_temperatures_over_device_time(path: Path) -> None:
     for number in range(900):
         sidecar.on_frame(frame(1e9 + number / 30))
     series = load_sidecar(path).temperatures
-    assert [look.time_s for look in series] == pytest.approx([0.0, TEMPERATURE_INTERVAL_S, 2 * TEMPERATURE_INTERVAL_S], abs=0.05)
+    assert [look.time_s for look in series] == pytest.approx(
+        [0.0, TEMPERATURE_INTERVAL_S, 2 * TEMPERATURE_INTERVAL_S], abs=0.05
+    )
     celsius = [look.celsius["ldd_temperature"] for look in series]
     assert celsius == sorted(celsius)
     assert set(series[0].celsius) == {"ldd_temperature"}
@@ -108,21 +108,19 @@ def test_sidecar_thins_a_long_series_evenly(path: Path, monkeypatch: pytest.Monk
 
 
 def test_sidecar_ends_with_a_state_and_a_summary(path: Path) -> None:
-    SidecarFile(path, Warm()).finish("lost", summary_of(READ, SEEN, {"restarted": 1}))
+    SidecarFile(path, Warm()).finish("lost", expected := summary_of(READ, SEEN, {"restarted": 1}))
     found = load_sidecar(path)
-    assert found.state == "lost"
-    assert found.summary
-    assert (found.summary.frames, found.summary.dropped, found.summary.frames_per_s) == (9, 2, 16.0)
-    assert (found.summary.saturated_share, found.summary.temporal_noise_mm) == (0.25, 1.5)
-    assert found.summary.events == {"restarted": 1}
+    assert (found.state, found.summary) == ("lost", expected)
+    assert (expected.frames, expected.dropped, expected.frames_per_s) == (9, 2, 16.0)
+    assert (expected.saturated_share, expected.temporal_noise_mm, expected.events) == (0.25, 1.5, {"restarted": 1})
 
 
 def test_summary_writes_unknown_values_as_null(path: Path) -> None:
-    SidecarFile(path, Warm()).finish("disk full", summary_of(None, Quality(), {}))
+    SidecarFile(path, Warm()).finish("disk full", expected := summary_of(None, Quality(), {}))
     assert "NaN" not in path.read_text()
     summary = json.loads(path.read_text())["summary"]
     assert summary["frames"] is summary["temporal_noise_mm"] is summary["saturated_share"] is None
-    assert load_sidecar(path).summary == summary_of(None, Quality(), {})
+    assert load_sidecar(path).summary == expected
     assert summary_of(VerifyResult(1, 0, 0.0, {"depth": 1}), Quality(), {}).frames_per_s is None
 
 
@@ -141,28 +139,18 @@ def test_sidecar_stays_whole_on_a_full_disk(path: Path, monkeypatch: pytest.Monk
     assert path.read_bytes() == before
 
 
-def test_sidecar_prefers_the_rig_of_a_measured_wall(path: Path, tmp_path: Path) -> None:
-    bench, rig = load_rig("bare-wall"), load_rig("paper-rig").model_copy(update={"name": "measured"})
-    record = WallRecord(
-        **rig.lidar.model_dump(include={"distance_m", "yaw_deg", "pitch_deg"}),
-        **dict.fromkeys(("camera", "advice"), "sim"),
-        created=date(2026, 1, 2),
-        frames=30,
-        facing_deg=45.0,
-        residual_m=0.001,
-        inlier_fraction=0.99,
-        verdict="good",
-        rig=rig,
-        wall_from_lidar=tuple(map(tuple, rig.wall_from_lidar.tolist())),
-    )
+def test_sidecar_prefers_the_rig_of_a_measured_wall(
+    path: Path, tmp_path: Path, measured: Callable[..., MeasuredWall]
+) -> None:
+    bench, record = load_rig("bare-wall"), measured().record
     wall_toml = tmp_path / "wall.toml"
     wall_toml.write_text(dump_toml(record))
     SidecarFile(path, Warm(rig=bench))
     assert load_sidecar(path).rig == bench
-    measured, wall = load_measured_wall(wall_toml)
-    SidecarFile(path, Warm(rig=bench), wall=(measured, wall))
+    rig, wall = load_measured_wall(wall_toml)
+    SidecarFile(path, Warm(rig=bench), wall=(rig, wall))
     found = load_sidecar(path)
-    assert found.rig == measured == rig != bench
+    assert found.rig == rig == record.rig != bench
     assert found.wall
     assert found.wall.sha256 == hashlib.sha256(wall_toml.read_bytes()).hexdigest()
     with pytest.raises(RecordFileError):
@@ -177,14 +165,7 @@ def test_versions_name_the_program_and_no_machine() -> None:
 
 @pytest.mark.parametrize(
     ("changed", "key"),
-    [
-        ({"colour": "red"}, "colour"),
-        ({"state": "asleep"}, "state"),
-        ({"schema_version": 2}, "schema_version"),
-        ({"intrinsics": "wide"}, "intrinsics"),
-        ({"settings": {"laser_power": "40"}}, "laser_power"),
-        ({"label": ...}, "label"),
-    ],
+    [({"colour": "red"}, "colour"), ({"schema_version": 2}, "schema_version"), ({"label": ...}, "label")],
 )
 def test_load_sidecar_names_the_wrong_field_in_one_line(path: Path, changed: dict[str, Any], key: str) -> None:
     SidecarFile(path, Warm())
