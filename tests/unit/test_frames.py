@@ -36,15 +36,6 @@ def test_edges_give_pixels_to_cells_that_hold_their_centres(pixels: int, cells: 
     assert found.tolist() == [_cell(k, pixels, cells) for k in range(pixels)]
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_pixel_belongs_to_one_cell(size: tuple[int, int]) -> None:
-    generator = np.random.default_rng(0)
-    for row, column in generator.integers((0, 0), size, (40, 2)):
-        depth = np.full(size, np.nan)
-        depth[row, column] = 0.5
-        found = np.argwhere(_maps(depth).valid).tolist()
-        assert found == [[_cell(row, size[0], MAP_ROWS), _cell(column, size[1], MAP_COLUMNS)]]
-
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**16), valid=st.integers(0, 60), values=st.sampled_from([1, 2, 5, 1000]))
