@@ -1,6 +1,6 @@
 """Each check on a bench with one fault: the checks that fail, and the detail and fix of one of them.
 
-A case has the steps that cause the fault, the names of the checks that fail, one check with its status ("failed" if none
+A case: steps that cause the fault, names of the checks that fail, one check with its status ("failed" if none
 is given), and words of its detail and fix.
 """
 
