@@ -1,4 +1,4 @@
-"""The bare wall from a recording, and its record: `python examples/calibrate_bag.py RUN.BAG [WALL.toml]`"""
+"""Measure the bare wall from a recording and write its record: `python examples/calibrate_bag.py RUN.BAG [WALL.toml]`"""
 
 import sys
 from datetime import datetime

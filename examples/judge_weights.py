@@ -1,4 +1,4 @@
-"""How well weights do, kind by kind: `python examples/judge_weights.py [OBJECTS [WEIGHTS]]`"""
+"""Measure weights on each category of objects: `python examples/judge_weights.py [OBJECTS [WEIGHTS]]`"""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Ten lines: open a camera, loop, have what is hidden in metres. `python examples/live_depth.py [CAMERA]`"""
+"""Ten lines: open a camera, loop, get the hidden depth in metres. `python examples/live_depth.py [CAMERA]`"""
 
 import sys
 

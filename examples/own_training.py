@@ -1,4 +1,4 @@
-"""A network and a training loop of your own on our data: `python examples/own_training.py DATASET [EPOCHS]`"""
+"""Train a network of your own on our data: `python examples/own_training.py DATASET [EPOCHS]`"""
 
 import sys
 from pathlib import Path

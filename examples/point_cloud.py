@@ -1,4 +1,4 @@
-"""A recording to one point cloud of what was hidden: `python examples/point_cloud.py RUN.BAG [OUT.ply]`"""
+"""Turn a recording into one point cloud of the hidden object: `python examples/point_cloud.py RUN.BAG [OUT.ply]`"""
 
 import sys
 from pathlib import Path

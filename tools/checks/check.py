@@ -1,4 +1,4 @@
-"""Every gate in one command: formatting, lint, types, import layers, docs, length of files (`make check`)."""
+"""Every gate in one command: formatting, lint, types, import layers, docs, words, length of files (`make check`)."""
 
 import subprocess
 import sys
@@ -12,6 +12,7 @@ GATES = (
     ("pyright",),
     ("lint-imports",),
     ("python", "tools/docs/build_site.py", "--check"),
+    ("python", "tools/checks/words.py"),
 )
 FOLDERS = "nlos_cam", "calibration", "models", "tools", "examples", "tests"
 MAX_LINES = 500

@@ -136,10 +136,11 @@ def test_view_is_on_the_loopback_by_default(printed: list[str]) -> None:
 def test_view_moves_from_a_taken_port_unless_asked_for(printed: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        monkeypatch.setattr("nlos_cam.view.web.PREFERRED_PORT", port)
+        for module in ("nlos_cam.view", "nlos_cam.view.web"):
+            monkeypatch.setattr(f"{module}.PREFERRED_PORT", port)
         serve()
         [line] = printed
-        assert f"{port} " in line
+        assert f"{port} is taken" in line
         assert f"127.0.0.1:{port}/" not in line
         with pytest.raises(NlosCamError, match="--view-port"):
             serve(port=port)

@@ -214,7 +214,7 @@ DOUBTED = [verdict for verdict in Verdict if verdict is not Verdict.SEEN]
 def test_only_the_verdict_seen_looks_trusted() -> None:
     assert set(STYLES) == set(Verdict)
     assert [verdict for verdict in Verdict if is_trusted(verdict)] == [Verdict.SEEN]
-    assert is_trusted(None), "networks that do not tell are not doubted for it"
+    assert is_trusted(None), "without an uncertainty network nothing is dimmed"
     assert all(
         style.rgb != STYLES[Verdict.SEEN].rgb for verdict, style in STYLES.items() if verdict is not Verdict.SEEN
     )
