@@ -5,15 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models.doubt_checkpoint import (
-    DOUBT_RECORD,
-    WATCHED,
-    DoubtRecord,
-    checksum_of_watched,
-    load_doubt,
-    load_uncertainty_model,
-    save_doubt,
-)
+from nlos_models import doubt_checkpoint
+from nlos_models.doubt_checkpoint import DoubtRecord
 from nlos_models.doubt_network import CalibratedDoubt
 from nlos_models.errors import CheckpointError
 from small_doubt import untrained_doubt, watched_weights
@@ -32,7 +25,7 @@ def record(tmp_path: Path, watched: Path) -> DoubtRecord:
 
 
 def _load(folder: Path) -> tuple[CalibratedDoubt, DoubtRecord]:
-    loaded = load_doubt(folder)
+    loaded = doubt_checkpoint.load_doubt(folder)
     assert loaded is not None
     return loaded
 
@@ -44,56 +37,53 @@ def test_saved_doubt_restores_with_watched_weights(tmp_path: Path, watched: Path
     assert network.temperature.tolist() == [0.5, 2.0]
     assert float(network.error_scale) == 1.5
     assert (tmp_path / "run" / "doubt.safetensors").stat().st_size < 700_000
-    for name in (*WATCHED, "checkpoint.json"):
+    for name in (*doubt_checkpoint.WATCHED, "checkpoint.json"):
         assert (tmp_path / "run" / name).read_bytes() == (watched / name).read_bytes()
 
 
 def test_weights_without_doubt_network_load_none(tmp_path: Path, watched: Path) -> None:
-    assert load_doubt(watched) is None
-    assert load_uncertainty_model(watched, tmp_path) is None
+    assert doubt_checkpoint.load_doubt(watched) is None
+    assert doubt_checkpoint.load_uncertainty_model(watched, tmp_path) is None
+    with pytest.raises(CheckpointError, match="compressor"):
+        doubt_checkpoint.checksum_of_watched(tmp_path)
 
 
 @pytest.mark.usefixtures("record")
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        *((name, b"another") for name in WATCHED),
-        *((DOUBT_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
+        *((name, b"another") for name in doubt_checkpoint.WATCHED),
+        *((doubt_checkpoint.DOUBT_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
     ],
 )
 def test_load_doubt_refuses_other_weights_or_damaged_record(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / "run" / name).write_bytes(content)
-    with pytest.raises(CheckpointError, match=DOUBT_RECORD):
-        load_doubt(tmp_path / "run")
+    with pytest.raises(CheckpointError, match=doubt_checkpoint.DOUBT_RECORD):
+        doubt_checkpoint.load_doubt(tmp_path / "run")
 
 
 def test_save_doubt_refuses_weights_changed_since_training(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
-    (watched / WATCHED[0]).write_bytes(b"another network")
+    (watched / doubt_checkpoint.WATCHED[0]).write_bytes(b"another network")
     with pytest.raises(CheckpointError, match="watched"):
-        save_doubt(tmp_path / "other", _load(tmp_path / "run")[0].network, record, watched)
+        doubt_checkpoint.save_doubt(tmp_path / "other", _load(tmp_path / "run")[0].network, record, watched)
 
 
 def test_saved_bare_wall_keeps_its_precision(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
     network, wall_m = _load(tmp_path / "run")[0].network, 0.3 + 1e-4 * torch.rand(5, 64, 80)
     network.learn_bare(wall_m, wall_m)
-    save_doubt(tmp_path / "second", network, record, watched)
+    doubt_checkpoint.save_doubt(tmp_path / "second", network, record, watched)
     again = _load(tmp_path / "second")[0].network
     torch.testing.assert_close(again.bare_depth_m, wall_m.median(0).values, rtol=0, atol=0)
-
-
-def test_checksum_of_watched_refuses_folder_without_weights(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="compressor"):
-        checksum_of_watched(tmp_path)
 
 
 @pytest.mark.slow
 def test_doubter_onnx_equals_torch_and_is_exported_once(tmp_path: Path, record: DoubtRecord) -> None:
     folder, cache = tmp_path / "run", tmp_path / "cache"
-    doubter = load_uncertainty_model(folder, cache)
+    doubter = doubt_checkpoint.load_uncertainty_model(folder, cache)
     assert doubter is not None
     (model,) = cache.glob("doubt-*.onnx")
     written_ns = model.stat().st_mtime_ns
-    again = load_uncertainty_model(folder, cache)
+    again = doubt_checkpoint.load_uncertainty_model(folder, cache)
     assert again is not None
     assert again.record == doubter.record == record
     assert model.stat().st_mtime_ns == written_ns

@@ -117,12 +117,6 @@ def _record(out: Path, *recipes: Recipe, starts: tuple[Path | None, ...] = ()) -
     return record_run(recipes[-1], out, NAMED, list(recipes[:-1]), *starts)
 
 
-def test_record_run_names_recipe_rig_and_earlier_runs(tmp_path: Path) -> None:
-    record = _record(tmp_path / "run", VAE, OTHER_VAE, starts=(None, tmp_path / "start"))
-    assert (record.vae_recipe, record.earlier) == (OTHER_VAE, [VAE])
-    assert (record.rig_name, record.rig_checksum) == NAMED
-
-
 @pytest.mark.parametrize("recipes", [(VAE,), (OTHER_VAE,), (OTHER_VAE, VAE)])
 def test_record_run_refuses_weights_of_another_run(tmp_path: Path, recipes: tuple[Recipe, ...]) -> None:
     record = _record(tmp_path, VAE, OTHER_VAE).model_copy(update={"figures": {"held_out_loss": 1.5}})

@@ -16,22 +16,8 @@ from typing import NoReturn
 import pytest
 import torch
 from nlos_models import recipe as schedule
+from nlos_models import train
 from nlos_models.errors import CheckpointError, RecipeError, TrainingError
-from nlos_models.train import (
-    BEST,
-    LAST,
-    LOG,
-    PREVIOUS,
-    TensorBoardLog,
-    compile_network,
-    digest_of,
-    explain_compile_errors,
-    read_best,
-    read_last,
-    write_best,
-    write_last,
-    write_log,
-)
 from small_run import (
     STEPS,
     Executioner,
@@ -86,7 +72,7 @@ def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> No
         child.join()
         ends.append(child.exitcode)
     assert ends[:3] == [-signal.SIGKILL] * 3
-    assert (tmp_path / "killed" / LAST).exists()
+    assert (tmp_path / "killed" / train.LAST).exists()
     _assert_same(_trained(tmp_path / "killed", schedule="one-cycle", epochs=2), whole)
 
 
@@ -111,12 +97,6 @@ def test_run_saves_state_at_checkpoint_interval(tmp_path: Path) -> None:
     assert _trained(tmp_path, epochs=1).steps[0][0] in {3, 4, 5}
 
 
-def test_run_is_decided_by_seed(tmp_path: Path) -> None:
-    first, again = (_trained(tmp_path / name) for name in ("first", "again"))
-    _assert_same(first, again)
-    assert _trained(tmp_path / "other", seed=1).log != first.log
-
-
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 def test_held_out_loss_falls(tmp_path: Path, precision: str) -> None:
     log = _trained(tmp_path, epochs=10, precision=precision).log
@@ -124,24 +104,22 @@ def test_held_out_loss_falls(tmp_path: Path, precision: str) -> None:
     assert float(log[-1]["held_out_loss"]) < 0.5 * float(log[0]["held_out_loss"])
 
 
-def test_progress_counts_every_step_and_epoch(tmp_path: Path) -> None:
-    run, epochs = SmallRun(small_recipe(), tmp_path), list[dict[str, float]]()
-    run.go(on_epoch=epochs.append)
+def test_progress_counts_steps_and_finished_run_is_not_repeated(tmp_path: Path) -> None:
+    (run, again), epochs = (SmallRun(small_recipe(), tmp_path) for _ in range(2)), list[dict[str, float]]()
+    figures = run.go(on_epoch=epochs.append)
     assert run.steps == [(k + 1, 4 * STEPS) for k in range(4 * STEPS)]
     assert run.done == [k / (4 * STEPS) for k in range(4 * STEPS)]
     assert [row["epoch"] for row in epochs] == [0, 1, 2, 3]
     assert not (tmp_path / "tensorboard").exists()
-
-
-def test_finished_run_returns_figures_without_training(tmp_path: Path) -> None:
-    run, again = (SmallRun(small_recipe(), tmp_path) for _ in range(2))
-    figures = run.go()
     assert again.go() == figures == run.score()
     assert again.steps == []
     _assert_same(again, run)
+    assert _trained(tmp_path / "other", seed=1).log != run.log
 
 
-def test_run_of_other_recipe_or_origin_is_refused(tmp_path: Path) -> None:
+def test_run_of_other_recipe_or_origin_or_of_few_objects_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="25"):
+        SmallRun(small_recipe(objects=25, batch=25), tmp_path).go()
     run = SmallRun(small_recipe(epochs=1), tmp_path)
     run.go(origin="these weights")
     reworded = SmallRun(small_recipe(epochs=1, deviations=["other words"]), tmp_path)
@@ -151,10 +129,9 @@ def test_run_of_other_recipe_or_origin_is_refused(tmp_path: Path) -> None:
         _trained(tmp_path, learning_rate=0.5)
     with pytest.raises(RecipeError, match="weights"):
         SmallRun(run.recipe, tmp_path).go(origin="those weights")
-    state = read_last(tmp_path, pytest.fail)
-    assert state is not None
+    state = train.read_last(tmp_path, pytest.fail)
     del state["origin"]  # a state that does not name its origin is accepted
-    write_last(tmp_path, state)
+    train.write_last(tmp_path, state)
     SmallRun(run.recipe, tmp_path).go(origin="those weights")
 
 
@@ -193,24 +170,7 @@ def test_diverged_run_keeps_earlier_epochs(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": float("nan")})
     with pytest.raises(TrainingError, match="epoch 0"):
         _trained(tmp_path / "nan")
-    assert not (tmp_path / "nan" / BEST).exists()
-
-
-def test_frozen_parameters_stay_unchanged(tmp_path: Path) -> None:
-    run = SmallRun(small_recipe(), tmp_path)
-    run.net[0].weight.requires_grad_(requires_grad=False)
-    before = state_of(run.net)
-    run.go()
-    changed = changed_tensors(before, run.net.state_dict())
-    assert "0.weight" not in changed
-    assert {"0.bias", f"{len(run.net) - 1}.weight"} <= changed
-
-
-def test_fewer_objects_than_batch_are_refused(tmp_path: Path) -> None:
-    run = SmallRun(small_recipe(), tmp_path)
-    run.recipe = run.recipe.model_copy(update={"batch": 32})
-    with pytest.raises(RecipeError, match="32"):
-        run.go()
+    assert not (tmp_path / "nan" / train.BEST).exists()
 
 
 def _state(step: int) -> dict[str, object]:
@@ -226,73 +186,67 @@ def _damage(path: Path, how: str) -> None:
     path.write_bytes(b"" if how == "empty" else raw)
 
 
-def _step_of(state: dict[str, object] | None) -> object:
-    assert state is not None
-    return state["step"]
-
-
 def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
-    assert read_last(tmp_path, pytest.fail) is None
+    assert train.read_last(tmp_path, pytest.fail) is None
     for step in range(3):
-        write_last(tmp_path, _state(step))
-    state = read_last(tmp_path, pytest.fail)
-    assert state is not None
+        train.write_last(tmp_path, _state(step))
+    state = train.read_last(tmp_path, pytest.fail)
     assert (state["step"], state["rows"]) == (2, [{"loss": 2.0}])
     assert torch.equal(state["module"]["weight"], torch.arange(4.0) + 2)
-    assert {path.name for path in tmp_path.iterdir()} == {LAST, PREVIOUS}
-    (tmp_path / LAST).unlink()  # as a kill between the two renames leaves it
-    assert _step_of(read_last(tmp_path, pytest.fail)) == 1
+    assert {path.name for path in tmp_path.iterdir()} == {train.LAST, train.PREVIOUS}
+    (tmp_path / train.LAST).unlink()  # as a kill between the two renames leaves it
+    assert train.read_last(tmp_path, pytest.fail)["step"] == 1
 
 
 @pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
 def test_read_last_falls_back_to_previous_state(tmp_path: Path, how: str) -> None:
     for step in (1, 2):
-        write_last(tmp_path, _state(step))
-    _damage(tmp_path / LAST, how)
+        train.write_last(tmp_path, _state(step))
+    _damage(tmp_path / train.LAST, how)
     messages: list[str] = []
-    assert _step_of(read_last(tmp_path, messages.append)) == 1
+    assert train.read_last(tmp_path, messages.append)["step"] == 1
     assert len(messages) == 1
-    assert str(tmp_path / LAST) in messages[0]
-    _damage(tmp_path / PREVIOUS, "flipped")
-    with pytest.raises(CheckpointError, match=LAST) as caught:
-        read_last(tmp_path, pytest.fail)
+    assert str(tmp_path / train.LAST) in messages[0]
+    _damage(tmp_path / train.PREVIOUS, "flipped")
+    with pytest.raises(CheckpointError, match=train.LAST) as caught:
+        train.read_last(tmp_path, pytest.fail)
     assert caught.value.exit_code == 4
     assert "\n" not in str(caught.value)
 
 
 def test_full_disk_keeps_earlier_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_last(tmp_path, _state(1))
-    write_log(tmp_path, [{"loss": 1.0}])
+    train.write_last(tmp_path, _state(1))
+    train.write_log(tmp_path, [{"loss": 1.0}])
 
     def full(file: int) -> NoReturn:
         raise OSError(errno.ENOSPC, "No space left on device", str(file))
 
     monkeypatch.setattr(os, "fsync", full)
-    for write in (lambda: write_last(tmp_path, _state(2)), lambda: write_log(tmp_path, [{"loss": 2.0}])):
+    for write in (lambda: train.write_last(tmp_path, _state(2)), lambda: train.write_log(tmp_path, [{"loss": 2.0}])):
         with pytest.raises(TrainingError, match="No space left on device"):
             write()
-    assert _step_of(read_last(tmp_path, pytest.fail)) == 1
-    assert {path.name for path in tmp_path.iterdir()} == {LAST, LOG}
-    assert "1.0" in (tmp_path / LOG).read_text(encoding="utf-8")
+    assert train.read_last(tmp_path, pytest.fail)["step"] == 1
+    assert {path.name for path in tmp_path.iterdir()} == {train.LAST, train.LOG}
+    assert "1.0" in (tmp_path / train.LOG).read_text(encoding="utf-8")
 
 
 def test_read_best_refuses_missing_or_damaged_state(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=BEST):
-        read_best(tmp_path)
-    write_best(tmp_path, _state(3))
-    assert read_best(tmp_path)["step"] == 3
-    _damage(tmp_path / BEST, "cut")
-    with pytest.raises(CheckpointError, match=BEST):
-        read_best(tmp_path)
+    with pytest.raises(CheckpointError, match=train.BEST):
+        train.read_best(tmp_path)
+    train.write_best(tmp_path, _state(3))
+    assert train.read_best(tmp_path)["step"] == 3
+    _damage(tmp_path / train.BEST, "cut")
+    with pytest.raises(CheckpointError, match=train.BEST):
+        train.read_best(tmp_path)
 
 
 def test_digest_depends_on_every_bit_and_order() -> None:
     torch.manual_seed(0)
-    net, digests = nn.Linear(3, 2), {digest_of(), digest_of("a"), digest_of("b"), digest_of(None)}
-    digests.add(before := digest_of(net))
-    assert digest_of(copy.deepcopy(net)) == before
+    net, digest = nn.Linear(3, 2), train.digest_of
+    digests = {digest(), digest("a"), digest("b"), digest(None), before := digest(net)}
+    assert digest(copy.deepcopy(net)) == before
     net.bias.data[0] += 1e-3
-    digests |= {digest_of(net), digest_of(net, "a"), digest_of("a", net), digest_of(nn.Linear(3, 2).half())}
+    digests |= {digest(net), digest(net, "a"), digest("a", net), digest(nn.Linear(3, 2).half())}
     assert len(digests) == 9
 
 
@@ -311,7 +265,7 @@ def test_tensorboard_logs_figures_of_each_epoch(tmp_path: Path) -> None:
 def test_missing_tensorboard_names_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", None)
     with pytest.raises(TrainingError, match=r"nlos-cam\[train\]"):
-        TensorBoardLog(tmp_path, 0)
+        train.TensorBoardLog(tmp_path, 0)
 
 
 @pytest.fixture
@@ -322,30 +276,22 @@ def compiler() -> Iterator[None]:
     torch.compiler.reset()
 
 
-class Noisy(nn.Module):
-    """Linear map with dropout and noise of its own."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.linear, self.dropout = nn.Linear(3, 2), nn.Dropout(0.5)
-
-    def noisy(self, x: Tensor) -> Tensor:
-        """Return a noisy linear map of x, as a part of a network that is compiled alone."""
-        return self.dropout(self.linear(x + 0.2 * torch.randn_like(x)))
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(not any(map(shutil.which, filter(None, config.cpp.cxx))), reason="torch.compile needs a compiler")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
 @pytest.mark.usefixtures("compiler")
 def test_compiled_part_has_loss_and_gradients_of_plain_one() -> None:
-    network, x, found = Noisy(), torch.rand(8, 3), []
-    for part in (network.noisy, compile_network(network.noisy)):
-        network.zero_grad()
+    linear, dropout, x, found = nn.Linear(3, 2), nn.Dropout(0.5), torch.rand(8, 3), []
+
+    def noisy(x: Tensor) -> Tensor:
+        return dropout(linear(x + 0.2 * torch.randn_like(x)))
+
+    for part in (noisy, train.compile_network(noisy)):
+        linear.zero_grad()
         torch.manual_seed(5)
         loss = part(x).square().sum()
         loss.backward()
-        found.append((loss.detach(), network.linear.weight.grad.clone()))
+        found.append((loss.detach(), linear.weight.grad.clone()))
     torch.testing.assert_close(*found)
 
 
@@ -360,11 +306,11 @@ def _no_gradients(_: Tensor) -> None:
 @pytest.mark.usefixtures("compiler")
 @pytest.mark.parametrize("network", [torch.compile(nn.Linear(3, 2), backend=_no_compiler), _no_gradients])
 def test_failed_compilation_is_one_line(network: nn.Module) -> None:
-    with pytest.raises(TrainingError, match=r"--compile .*No g\+\+") as caught, explain_compile_errors():
+    with pytest.raises(TrainingError, match=r"--compile .*No g\+\+") as caught, train.explain_compile_errors():
         network(torch.rand(1, 3))
     assert "\n" not in str(caught.value)
 
 
 def test_error_of_network_is_not_blamed_on_compiler() -> None:
-    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"), explain_compile_errors():
+    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"), train.explain_compile_errors():
         nn.Linear(3, 2)(torch.rand(1, 4))
