@@ -1,12 +1,10 @@
-import tomllib
-
 import cv2
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS, MIN_CORNERS, PAPER_MM, Board, Paper, find_corners
 from nlos_calibration.errors import BoardRefusedError
-from nlos_calibration.rig import dump_toml, load_rig
+from nlos_calibration.rig import load_rig
 from pydantic import ValidationError
 
 from nlos_cam.calibrate.synthetic import Illumination, View, at_near_edge, clean_infrared, corners_px, infrared_frames
@@ -52,11 +50,6 @@ def test_board_corners_are_where_opencv_detects_them(paper: Paper) -> None:
     np.testing.assert_allclose(pixels, expected, atol=0.1)
 
 
-def test_board_corners_are_a_grid_of_the_squares() -> None:
-    grid = [(x * 0.02, y * 0.02, 0.0) for y in range(1, 5) for x in range(1, 4)]
-    np.testing.assert_allclose(Board(**SMALL).corners_m, grid, atol=1e-8)
-
-
 def test_measured_board_is_the_same_board_scaled() -> None:
     board = BOARDS["a4"].measured(29.1)
     np.testing.assert_allclose(board.corners_m, 0.97 * BOARDS["a4"].corners_m, atol=1e-8)
@@ -69,10 +62,7 @@ def test_measured_board_is_the_same_board_scaled() -> None:
     [
         ({"marker_mm": 20.0}, "marker_mm"),
         ({"squares_x": 11, "squares_y": 11}, "60"),
-        ({"squares_x": 2}, "squares_x"),
-        ({"square_mm": float("nan")}, "square_mm"),
-        ({"dictionary": "DICT_7X7_50"}, "dictionary"),
-        ({"colour": "red"}, "colour"),
+        ({"color": "red"}, "color"),
     ],
 )
 def test_board_that_cannot_exist_is_refused(changed: dict[str, object], problem: str) -> None:
@@ -80,14 +70,7 @@ def test_board_that_cannot_exist_is_refused(changed: dict[str, object], problem:
         Board.model_validate(SMALL | changed)
 
 
-def test_board_survives_a_file() -> None:
-    assert Board.model_validate(tomllib.loads(dump_toml(BOARDS["a3"]))) == BOARDS["a3"]
-
-
-@pytest.mark.parametrize(
-    ("counts", "least", "error_px"),
-    [(None, 25, 0.15), (6.0, 20, 0.3), (24.0, 20, 0.3), (200.0, 20, 0.3), (600.0, 20, 0.3)],
-)
+@pytest.mark.parametrize(("counts", "least", "error_px"), [(None, 25, 0.15), (6.0, 20, 0.3), (600.0, 20, 0.3)])
 def test_find_corners_locates_them_at_any_brightness(counts: float | None, least: int, error_px: float) -> None:
     clean, true_px = of_bench() if counts is None else of_bench(brightest_counts=counts)
     found = find_corners(mean_of(clean), A4)
@@ -98,6 +81,7 @@ def test_find_corners_locates_them_at_any_brightness(counts: float | None, least
     assert counts or np.abs(np.median(errors_px, axis=0)).max() < 0.1
 
 
+@pytest.mark.slow
 def test_find_corners_needs_the_mean_of_dim_frames() -> None:
     frames = infrared_frames(of_bench(brightest_counts=3.0)[0], np.random.default_rng(1), 60)
     with pytest.raises(BoardRefusedError):

@@ -57,8 +57,3 @@ def test_scaled_intrinsics_keep_the_edges_of_the_field(size: tuple[int, int]) ->
         assert (-0.5 - part.ppx) / part.fx == pytest.approx((-0.5 - whole.ppx) / whole.fx)
         assert (part.height - 0.5 - part.ppy) / part.fy == pytest.approx((whole.height - 0.5 - whole.ppy) / whole.fy)
     assert scaled.scaled(640, 480).ppx == pytest.approx(PINHOLE.ppx)
-
-
-def test_scaled_rays_are_the_mean_of_their_pixels_rays() -> None:
-    cells = PINHOLE.scaled(80, 60).rays()
-    np.testing.assert_allclose(PINHOLE.rays().reshape(60, 8, 80, 8, 3).mean(axis=(1, 3)), cells, atol=1e-12)

@@ -24,14 +24,6 @@ def test_mean_noise_of_rounded_samples_matches_their_spread(scale: float) -> Non
     assert spread_m == pytest.approx(told * (measured / scale if scale > 0.2 else 1.0), rel=0.25)
 
 
-def test_mean_noise_at_some_points_keeps_their_samples() -> None:
-    noise = MeanNoise(np.array([1.0, 4.0, 9.0]), 2.0, measured=True)
-    some = noise.at(np.array([True, False, True]))
-    np.testing.assert_array_equal(some.samples, [1.0, 9.0])
-    assert (some.scale, some.measured) == (2.0, True)
-    assert MeanNoise().at(slice(0, 7)) == MeanNoise().at(slice(None))
-
-
 @pytest.mark.parametrize("samples", [4, 5, 10, 100])
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
 def test_measured_noise_finds_the_scale_from_few_samples(samples: int, scale: float) -> None:
@@ -79,12 +71,6 @@ def test_depth_mean_and_spread_are_those_of_the_frames(count: int) -> None:
         np.testing.assert_allclose(mean.spread_m(), frames.std(axis=0, ddof=1), rtol=1e-9)
     else:
         assert np.isnan(mean.spread_m()).all()
-
-
-def test_depth_mean_does_not_change_the_frame() -> None:
-    frame = np.array([[0.2, 0.0, np.nan]])
-    DepthMean(1, 3).add(frame)
-    np.testing.assert_array_equal(frame, [[0.2, 0.0, np.nan]])
 
 
 def test_depth_mean_without_enough_returns_is_nan() -> None:

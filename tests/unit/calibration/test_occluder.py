@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from nlos_calibration.errors import OccluderRefusedError
 from nlos_calibration.noise import MeanNoise, depth_noise_m
-from nlos_calibration.occluder import MAX_BEHIND, Edge, OccluderFit, find_edge, find_occluder, rig_with_occluder
+from nlos_calibration.occluder import MAX_BEHIND, Edge, OccluderFit, find_edge, find_occluder
 from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
 
@@ -129,12 +129,6 @@ def test_find_occluder_refuses_a_box_beside_the_sheet(seen: View) -> None:
         fitted(seen, noisy(both))
 
 
-def test_rig_with_occluder_keeps_the_object_box() -> None:
-    rig = rig_with_occluder(PAPER, 0.21, 0.09)
-    assert (rig.occluder.x_m, rig.occluder.z_min_m) == (0.21, 0.09)
-    assert rig.object_box == PAPER.object_box
-
-
 def met() -> NDArray[np.float64]:
     """Return the points of a sheet on which each pixel lies 2 mm higher than the one before."""
     height_m, y_m = np.meshgrid(PITCH_M * np.arange(COLUMNS), Y_M)
@@ -145,9 +139,6 @@ def labels(edge_m: NDArray[np.float64] | float) -> tuple[NDArray[np.bool_], NDAr
     """Return which pixels see the sheet and which see past it, by an edge for each row."""
     sheet = met()[..., 2] >= np.broadcast_to(edge_m, ROWS)[:, np.newaxis]
     return sheet, ~sheet
-
-
-ROWS, COLUMNS = 40, 100
 
 
 def test_find_edge_allows_for_raggedness_strays_and_upper_end() -> None:

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.rig import Rig, dump_toml, load_rig
+from nlos_calibration.rig import dump_toml, load_rig
 
 
 def test_paper_rig_is_that_of_the_paper() -> None:
@@ -43,8 +43,6 @@ def test_rig_checksum_changes_with_a_field() -> None:
     ("old", "new", "field"),
     [
         ("distance_m = 0.2", "distance_m = -0.2", "lidar.distance_m"),
-        ("distance_m = 0.2", "distance_m = nan", "lidar.distance_m"),
-        ("yaw_deg = 45.0", "yaw_deg = 90.0", "lidar.yaw_deg"),
         ("yaw_deg = 45.0", "yaw_degrees = 45.0", "lidar.yaw_deg"),
         ("x_max_m = 0.575", "x_max_m = 0.1", "object_box"),
         ("z_far_m = 0.4", "z_far_m = 0.1", "object_box"),
@@ -70,12 +68,7 @@ def test_rig_file_that_is_no_toml_gives_a_one_line_error(tmp_path: Path, content
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["no-such-rig", "."])
-def test_rig_that_does_not_exist_is_refused(name: str) -> None:
-    with pytest.raises(RecordFileError):
-        load_rig(name)
-
-
-def test_rig_is_frozen() -> None:
-    with pytest.raises(ValueError, match="frozen"):
-        Rig.__setattr__(load_rig("paper-rig"), "name", "other")
+def test_rig_that_does_not_exist_is_refused() -> None:
+    for name in ("no-such-rig", "."):
+        with pytest.raises(RecordFileError):
+            load_rig(name)

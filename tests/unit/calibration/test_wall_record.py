@@ -54,12 +54,6 @@ def test_wall_record_rig_is_the_papers_as_measured(record: WallRecord) -> None:
     assert record.rig.checksum != paper.checksum
 
 
-def test_wall_record_holds_the_uncertainties(record: WallRecord) -> None:
-    stds = record.distance_std_m, record.yaw_std_deg, record.pitch_std_deg, record.facing_std_deg
-    assert all(std is not None and 0.0 <= std < 1e-3 for std in stds)
-    assert record.noise_scale is not None
-
-
 def test_with_occluder_replaces_the_assumed_one(record: WallRecord) -> None:
     """A wall in doubt, and a sheet first too near to it."""
     doubt = {"verdict": "doubtful", "advice": "average more frames"}
@@ -101,12 +95,8 @@ MATRIX_END = "0.0,\n        0.0,\n        0.0,\n        "
     [
         ("schema_version = 3", "schema_version = 4", "3.*got 4"),
         ("schema_version = 3", "schema_version = 0", "schema_version: .*got 0"),
-        ("schema_version = 3", 'schema_version = "3"', "schema_version: .*got '3'"),
-        ("distance_std_m = ", "distance_std_m = -", "distance_std_m: .*got -"),
         ('reference_sha256 = ""', 'reference_sha256 = "abc"', "reference_sha256: .*got 'abc'"),
-        ("frames = 60", "frames = 0", "frames: .*got 0"),
         ("frames = 60", "frames = 60\nmood = 1", "mood: .*got 1"),
-        ('verdict = "good"', 'verdict = "fine"', "verdict: .*got 'fine'"),
         ("pitch_deg = ", "pitch_deg = 1", r"rig\.lidar"),
         ("\ndistance_m = 0.2", "\ndistance_m = 0.3", r"rig\.lidar"),
         (f"{MATRIX_END}1.0", f"{MATRIX_END}2.0", "pose"),
