@@ -159,7 +159,7 @@ def capture(
     measured = load_measured_wall(wall) if wall else None
     recording = Recording(targets[0].path, frames=frames, seconds=seconds, last=takes == 1)
     try:
-        with interrupted_by_signals(), tracked(PRE_RENDERING) as on_progress:
+        with interrupted_by_signals(), tracked(PRE_RENDERING, at_once=False) as on_progress:
             source = open_camera(camera, on_progress=on_progress, recording=recording)
     except KeyboardInterrupt:
         result, text = empty_result(targets[0], several=takes > 1), f"Interrupted before the first frame; {NOTHING}"

@@ -136,9 +136,8 @@ def test_bag_without_a_depth_unit_is_an_error(rewritten: Any, tail_m: float | No
 
 
 def test_bag_without_intrinsics_is_an_error(rewritten: Any) -> None:
-    path = rewritten(lambda topic, time_ns, raw: [] if topic.endswith("camera_info") else [(time_ns, raw)])
     with pytest.raises(RecordingError, match="camera_info"):
-        BagReader(path)
+        BagReader(rewritten(lambda topic, time_ns, raw: [] if topic.endswith("camera_info") else [(time_ns, raw)]))
 
 
 def test_unknown_encoding_is_an_error_when_read(rewritten: Any) -> None:
