@@ -55,36 +55,6 @@ def test_the_watch_notices_each_kind_of_harm_and_goes_on(tool: Tool, tmp_path: P
 
 
 @pytest.mark.slow
-def test_actions_that_fail_on_a_whole_recording_are_told(tool: Tool, tmp_path: Path) -> None:
-    actions, whole = tmp_path / "actions.py", tmp_path / "whole"
-    actions.write_text(BAD_ACTIONS)
-    whole.write_text("unexpected")
-    with (
-        tool("fuzz").Watched(actions, whole) as watched,
-        pytest.raises(RuntimeError, match="fail on a whole recording"),
-    ):
-        watched.judge(whole)
-
-
-@pytest.mark.slow
-def test_a_bad_case_is_told_with_its_seed_and_kept(tool: Tool, tmp_path: Path) -> None:
-    actions, whole, keep = tmp_path / "actions.py", tmp_path / "whole", tmp_path / "keep"
-    actions.write_text(
-        "def act(path, folder):\n    if path.read_bytes()[:100] != bytes(range(100)):\n        raise ValueError\n"
-        "ACTIONS = {'act': act}\n"
-    )
-    whole.write_bytes(bytes(range(200)))
-    keep.mkdir()
-    findings = tool("fuzz").fuzz({"whole": whole}, actions, 12, 7, keep)
-    assert findings.verdicts["unexpected"] == len(findings.bad) > 3
-    for case in findings.bad:
-        ways, content = tool("corruption").corrupt(whole.read_bytes(), np.random.default_rng(case["seed"]))
-        assert (keep / f"whole-{case['seed']}.bag").read_bytes() == content
-        assert (case["ways"], case["verdict"]) == (ways, "unexpected")
-    assert len(list(keep.iterdir())) == len(findings.bad)
-
-
-@pytest.mark.slow
 def test_corruption_is_the_same_for_the_same_seed_and_every_way_is_taken(
     tool: Tool, noise_bags: dict[str, Path]
 ) -> None:

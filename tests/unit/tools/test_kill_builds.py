@@ -1,7 +1,5 @@
 """The kills of dataset builds compare bit for bit, and count what a kill leaves."""
 
-import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -58,23 +56,3 @@ def test_a_lost_or_changed_shard_is_seen(kills: ModuleType, tmp_path: Path) -> N
     found = kills.kill([sys.executable, "-c", cut, str(shard_path(folder, 0))], folder, 0, 60.0)
     assert found.lost == 1
     assert not found.killed  # it was through before
-
-
-def test_children_are_found_and_their_end_is_seen(kills: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kills, "GRACE_S", 0.1)
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
-        assert child.pid in kills.children_of(os.getpid())
-        assert kills._still_running([child.pid]) == 1
-        child.kill()
-    assert kills._still_running([child.pid]) == 0
-
-
-def test_kills_come_early_and_late_and_leave_work_to_the_last(kills: ModuleType) -> None:
-    planned = kills.plan_kills(300, 10, 60.0, 10, 0)
-    assert planned == kills.plan_kills(300, 10, 60.0, 10, 0)
-    shards = [already for already, _ in planned]
-    assert shards == sorted(shards)
-    assert len(set(shards)) > 6
-    assert 0 <= shards[0] < 10
-    assert 20 < shards[-1] < 29
-    assert all(0 <= then_s <= 2 for _, then_s in planned)
