@@ -62,10 +62,9 @@ class RrdFile:
         if self.full or moment.published_s < self._due_s:
             return
         self._due_s = moment.published_s + PERIOD_S - SLACK_S
-        wait_s = BATCH_S if self._keeps_all else 0.0
-        while not (has_room := self._queue.wait_for_room(wait_s)) and self._keeps_all and self._thread.is_alive():
+        while self._keeps_all and self._thread.is_alive() and not self._queue.wait_for_room(BATCH_S):
             pass
-        if has_room:
+        if self._queue.wait_for_room(0.0):
             self._queue.put(moment)
         else:
             self.left_out += 1
