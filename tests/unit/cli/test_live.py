@@ -119,17 +119,14 @@ def test_live_json_and_log_have_their_fields(run: Run) -> None:
     assert run(*arguments)[0] == 1
 
 
-def test_live_does_not_wait_for_a_live_camera(opened: Opened, run: Run) -> None:
+def test_live_ends_with_a_live_camera_or_after_its_seconds(opened: Opened, run: Run) -> None:
     code, report, _ = run(*SIMULATED)
     assert (code, report["frames"] + report["dropped"]) == (0, 20)
-    assert [uri for uri, _ in opened.calls] == ["sim"]
-
-
-def test_live_ends_after_its_seconds(opened: Opened, run: Run) -> None:
     opened.on_frame = lambda number: threading.Event().wait(0.05 if number else 0.0)
     code, report, _ = run(*SIMULATED, "--seconds", "0.2")
     assert code == 0
     assert report["frames"] < 20
+    assert [uri for uri, _ in opened.calls] == ["sim", "sim"]
 
 
 @pytest.mark.usefixtures("opened")

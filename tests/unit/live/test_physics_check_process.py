@@ -80,10 +80,16 @@ def test_background_checks_take_the_newest_frame_once_a_period() -> None:
             assert (checks.waits, checks.dropped) == (waits, dropped)
 
 
-def test_background_checks_never_wait_for_their_process() -> None:
+def background(command: tuple[str, ...]) -> tuple[BackgroundPhysicsCheck, list[str]]:
+    """Checks in a process of that command, always due, and the errors that they report."""
     errors = list[str]()
-    run: Any = {"period_s": 0.0, "clock": lambda: 100.0, "command": python(SILENT), "on_error": errors.append}
-    with BackgroundPhysicsCheck(RIG, **run) as checks:
+    run: Any = {"period_s": 0.0, "clock": lambda: 100.0, "command": command, "on_error": errors.append}
+    return BackgroundPhysicsCheck(RIG, **run), errors
+
+
+def test_background_checks_never_wait_for_their_process() -> None:
+    checks, errors = background(python(SILENT))
+    with checks:
         for number in range(1000):
             checks.offer(number, DARK, NOTHING)
         assert checks.dropped >= 1000 - 3
@@ -105,9 +111,8 @@ def test_background_checks_kill_a_process_that_will_not_end(monkeypatch: pytest.
 
 
 def test_background_checks_report_a_failure_once_and_go_on() -> None:
-    errors = list[str]()
-    run: Any = {"period_s": 0.0, "clock": lambda: 100.0, "command": python(REFUSES), "on_error": errors.append}
-    with BackgroundPhysicsCheck(RIG, **run) as checks:
+    checks, errors = background(python(REFUSES))
+    with checks:
         for number in range(4):
             checks.offer(number, DARK, NOTHING)
             wait_until(lambda: not checks.waits)
@@ -120,15 +125,13 @@ def test_background_checks_report_a_failure_once_and_go_on() -> None:
 
 @pytest.mark.parametrize("command", [python(GONE), ("/no/such/python",)])
 def test_background_checks_report_a_missing_process_once(command: tuple[str, ...]) -> None:
-    errors = list[str]()
-    run: Any = {"period_s": 0.0, "clock": lambda: 100.0, "command": command, "on_error": errors.append}
-    with BackgroundPhysicsCheck(RIG, **run) as checks:
+    checks, errors = background(command)
+    with checks:
         checks.offer(0, DARK, NOTHING)
         wait_until(lambda: checks.ended)
         checks.offer(1, DARK, NOTHING)
         assert not checks.waits
-    assert len(errors) == 1
-    assert checks.newest is None
+    assert (len(errors), checks.newest) == (1, None)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")
@@ -155,16 +158,11 @@ def answers(*frames: object, end: bytes = b"") -> list[Any]:
     return found
 
 
-def test_worker_answers_each_frame_in_order() -> None:
-    found = answers((4, DARK, NOTHING), (9, DARK, NOTHING))
-    assert [each.frame_number for each in found] == [4, 9]
-    assert found[0].score == check_reconstruction(DARK, NOTHING, RIG, accuracy="draft").score
-
-
-def test_worker_names_the_error_of_a_frame_and_goes_on() -> None:
-    said, found = answers((1, "no maps", NOTHING), (2, DARK, NOTHING))
-    assert said.startswith("AttributeError: ")
-    assert found.frame_number == 2
+def test_worker_answers_each_frame_in_order_or_names_its_error() -> None:
+    found, error, later = answers((4, DARK, NOTHING), (1, "no maps", NOTHING), (9, DARK, NOTHING))
+    assert (found.frame_number, later.frame_number) == (4, 9)
+    assert found.score == check_reconstruction(DARK, NOTHING, RIG, accuracy="draft").score
+    assert error.startswith("AttributeError: ")
 
 
 @pytest.mark.parametrize("end", [b"", pickle.dumps((3, DARK, NOTHING))[:-9], b"not a pickle"])

@@ -30,25 +30,24 @@ def camera(uri: str, **values: float) -> Any:
     return SimpleNamespace(uri=uri, telemetry=lambda end: {name: values[name] for name in values if name.endswith(end)})
 
 
-def readings(thermometer: Telemetry, frames: list[Frame]) -> list[Mapping[str, float] | None]:
-    return [thermometer.at(frame) for frame in thermometer.watch(frames)]
+def readings(telemetry: Telemetry, frames: list[Frame]) -> list[Mapping[str, float] | None]:
+    return [telemetry.at(frame) for frame in telemetry.watch(frames)]
 
 
-def test_thermometer_reads_periodically_by_the_frames_clock() -> None:
+def test_telemetry_reads_periodically_by_the_frames_clock() -> None:
     asked = Asked()
     assert list(Telemetry(asked, every_s=1.0).watch(FRAMES)) == FRAMES
     assert asked.times_s == pytest.approx([0.0, 1.0, 2.0, 3.0])
     given = readings(Telemetry(Asked(), every_s=1.0), FRAMES)
     assert [bool(celsius) for celsius in given] == [number % 3 == 0 for number in range(10)], "each reading once"
     assert given[3] == {"ldd_temperature": 42.0}
-
-
-def test_thermometer_serves_a_late_consumer() -> None:
-    thermometer = Telemetry(Asked(), every_s=1.0)
-    ahead = list(thermometer.watch(FRAMES))
-    assert thermometer.at(ahead[2]) == {"ldd_temperature": 41.0}
-    assert thermometer.at(ahead[2]) is None
-    assert thermometer.at(ahead[9]) == {"ldd_temperature": 44.0}  # frames between were dropped
+    late = Telemetry(Asked(), every_s=1.0)
+    ahead = list(late.watch(FRAMES))
+    assert [late.at(ahead[number]) for number in (2, 2, 9)] == [
+        {"ldd_temperature": 41.0},
+        None,
+        {"ldd_temperature": 44.0},  # frames between were dropped
+    ]
 
 
 @pytest.mark.parametrize(
@@ -59,7 +58,7 @@ def test_thermometer_serves_a_late_consumer() -> None:
         ("bag:no-sidecar.bag", {"ldd_temperature": 39.0}, {"ldd_temperature": 39.0}),
     ],
 )
-def test_thermometer_of_a_camera_reads_temperatures_only(
+def test_telemetry_of_a_camera_reads_temperatures_only(
     uri: str, values: dict[str, float], celsius: dict[str, float] | None
 ) -> None:
     assert readings(telemetry_of(camera(uri, **values)), FRAMES[:1]) == [celsius]
@@ -81,16 +80,16 @@ def write_sidecar(path: Path) -> None:
     path.write_text(sidecar.model_dump_json())
 
 
-def test_thermometer_of_a_recording_reads_its_sidecar(tmp_path: Path) -> None:
+def test_telemetry_of_a_recording_reads_its_sidecar(tmp_path: Path) -> None:
     bag = tmp_path / "wall.bag"
     write_sidecar(sidecar_path(bag))
-    thermometer = telemetry_of(camera(f"bag:{bag}", ldd_temperature=99.0))
+    telemetry = telemetry_of(camera(f"bag:{bag}", ldd_temperature=99.0))
     frames = [wall_frame(300 * k) for k in range(5)]  # 10 s apart
-    given = [celsius and celsius["ldd_temperature"] for celsius in readings(thermometer, frames)]
+    given = [celsius and celsius["ldd_temperature"] for celsius in readings(telemetry, frames)]
     assert given == [40.0, 41.0, 42.0, 43.0, 43.0]
 
 
-def test_thermometer_warns_of_a_broken_sidecar(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_telemetry_warns_of_a_broken_sidecar(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bag = tmp_path / "wall.bag"
     sidecar_path(bag).write_text("{")
     assert readings(telemetry_of(camera(f"bag:{bag}", ldd_temperature=39.0)), FRAMES[:2]) == [None, None]

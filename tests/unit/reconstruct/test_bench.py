@@ -51,21 +51,15 @@ def test_open_bench_takes_rig_and_reference_from_the_record(wall: Path, tmp_path
     assert observe(bare).difference is None
 
 
-def test_difference_of_the_bare_wall_is_noise(bench: CalibratedRig) -> None:
-    difference = observe(bench, 999).difference
-    assert difference is not None
-    off_m = difference.depth_m[difference.valid]
-    assert abs(off_m.mean()) < 1e-4
-    assert off_m.std() == pytest.approx(5e-4, rel=0.1)
-    assert abs(difference.intensity[difference.valid].mean()) < 0.5
-
-
-def test_difference_is_corrected_for_range_drift(bench: CalibratedRig) -> None:
+def test_difference_of_the_bare_wall_is_noise_without_range_drift(bench: CalibratedRig) -> None:
     levels_m = list[float]()
     for number in range(100, 160):
         difference = observe(bench, number, nearer_m=0.0006).difference
         assert difference is not None
-        levels_m.append(float(difference.depth_m[difference.valid].mean()))
+        off_m = difference.depth_m[difference.valid]
+        levels_m.append(float(off_m.mean()))
+        assert off_m.std() == pytest.approx(5e-4, rel=0.1)
+        assert abs(difference.intensity[difference.valid].mean()) < 0.5
     assert levels_m[0] == pytest.approx(-0.0006, abs=1e-4)
     assert np.mean(levels_m[-20:]) == pytest.approx(0.0, abs=1e-4)
 
@@ -88,21 +82,23 @@ def test_difference_is_valid_where_maps_and_reference_are() -> None:
 
 
 @pytest.mark.parametrize(
-    ("nearer_m", "moved", "frames"), [(0.0, False, 40), (0.002, False, 40), (0.01, True, 40), (-1.0, True, 300)]
+    ("nearer_m", "celsius", "moved", "frames"),
+    [
+        (0.0, 41.0, False, 40),
+        (0.0, 75.0, False, 40),
+        (0.002, 41.0, False, 40),
+        (0.01, 41.0, True, 40),
+        (-1.0, 41.0, True, 300),
+    ],
 )
-def test_bench_warns_of_drift_and_of_a_moved_lidar(
-    bench: CalibratedRig, nearer_m: float, moved: bool, frames: int
+def test_bench_warns_of_drift_heat_and_of_a_moved_lidar(
+    bench: CalibratedRig, nearer_m: float, celsius: float, moved: bool, frames: int
 ) -> None:
+    bench.update_temperatures({"ldd_temperature": celsius})
     looks = [observe(bench, number + 500, nearer_m) for number in range(frames)]
     assert not looks[0].moved
     assert looks[-1].moved == moved
-    assert bool(looks[-1].warnings) == (nearer_m != 0)
-
-
-def test_bench_warns_of_a_much_hotter_lidar(bench: CalibratedRig) -> None:
-    for celsius, warned in ((41.0, False), (75.0, True)):
-        bench.update_temperatures({"ldd_temperature": celsius})
-        assert [bool(observe(bench, number + 500).warnings) for number in range(40)][-1] == warned
+    assert bool(looks[-1].warnings) == (nearer_m != 0 or celsius > 70.0)
 
 
 @pytest.mark.parametrize("reference", [False, True])
