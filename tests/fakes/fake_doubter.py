@@ -1,4 +1,4 @@
-"""Stands for a doubt network: says what it is told to, and keeps what it was asked."""
+"""Fake uncertainty model: returns given probabilities, and keeps its inputs."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Moments of a run that never was, with everything in them that a view can show."""
+"""Moments of a made-up run, with every field that a view can show."""
 
 from dataclasses import replace
 from typing import Any

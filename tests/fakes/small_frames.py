@@ -1,4 +1,4 @@
-"""Small frames, a camera that yields them and a network that sees the same in all of them."""
+"""Small frames, a camera that yields them, and a network with the same result for all."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
