@@ -33,8 +33,8 @@ from nlos_cam.cli.view import (
     Video,
     ViewHost,
     ViewPort,
+    announce_view,
     saving,
-    tell_of_view,
     viewer_of,
 )
 from nlos_cam.evaluate import runtimes
@@ -154,7 +154,7 @@ def live(
         low_latency_interpreter(),
         opened as source,
     ):
-        tell_of_view(viewer, host=view_host, port=view_port, open_it=open_view)
+        announce_view(viewer, host=view_host, port=view_port, open_it=open_view)
         report = run_live(
             source,
             pipeline,
