@@ -11,7 +11,7 @@ from nlos_cam.camera import open_camera
 
 
 def main(bag: Path, out: Path) -> None:
-    """Fit the wall over 60 frames, say where it is and how surely, and write record, reference and report."""
+    """Fit the wall to 60 frames, print its distance and angle, and write record, reference and report."""
     with open_camera(f"bag:{bag}") as camera:
         seen = collect_statistics(camera, 60)
     fit, facts = measure_by_depth(seen)

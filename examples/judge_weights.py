@@ -12,11 +12,11 @@ from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import load_networks
 
 FIRST_SEED = 20_000_000
-"""Training draws none from here on."""
+"""First seed of objects that training never draws."""
 
 
 def main(count: int = 36, weights: Path | None = None) -> None:
-    """Print the mean silhouette IoU of each kind among random objects that training never draws."""
+    """Print the mean silhouette IoU of each category, over random objects that training never draws."""
     network, rig = load_networks(weights), load_rig("paper-rig")
     objects = seeded_objects(FIRST_SEED, count, object_box(rig))
     truth = truth_of(objects, object_box(rig))

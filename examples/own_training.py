@@ -16,7 +16,7 @@ def main(folder: Path, epochs: int = 3) -> None:
     """Train a small network from maps to silhouettes; DATASET is what `nlos-cam dataset build` wrote."""
     torch.manual_seed(0)
     data, normal = open_dataset(folder), Preprocess()
-    maps = next(data.chunks())  # one shard tells mean and spread well enough
+    maps = next(data.chunks())  # one shard is enough to estimate mean and spread
     normal.learn(split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)))
     layers = nn.Conv2d(4, 16, 5, 3), nn.ReLU(), nn.Conv2d(16, 32, 5, 3), nn.ReLU(), nn.Flatten()
     network = nn.Sequential(*layers, nn.Linear(32 * 10 * 10, 64 * 64))

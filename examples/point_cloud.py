@@ -10,9 +10,9 @@ import nlos_cam
 
 
 def main(bag: Path, out: Path) -> None:
-    """Write every frame's surface as points in the wall frame, in metres; grey is later."""
+    """Write every frame's surface as points in the wall frame, in metres; later frames are lighter."""
     with nlos_cam.open(f"bag:{bag}") as stream:
-        clouds = [seen.points_m for seen in stream]
+        clouds = [result.points_m for result in stream]
     greys = np.linspace(0, 255, len(clouds)).repeat([len(points) for points in clouds])
     colours = np.stack([greys] * 3, 1).astype(np.uint8)
     trimesh.PointCloud(np.concatenate(clouds), colours).export(out)

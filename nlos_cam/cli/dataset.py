@@ -52,8 +52,7 @@ SpreadMm = Annotated[
     float, typer.Option("--rig-spread-mm", min=0, help="Largest shift of lidar and occluder, drawn per object, in mm.")
 ]
 SpreadDeg = Annotated[
-    float,
-    typer.Option("--rig-spread-deg", min=0, help="Largest turn of the lidar in yaw and pitch, drawn per object."),
+    float, typer.Option("--rig-spread-deg", min=0, help="Largest turn of the lidar in yaw and pitch, drawn per object.")
 ]
 GainSpread = Annotated[
     float, typer.Option("--gain-spread-percent", min=0, help="Largest change of the intensity gain, drawn per object.")
@@ -63,13 +62,11 @@ Workers = Annotated[
     int, typer.Option("--workers", min=1, show_default="as many as cores", help="Processes on this machine.")
 ]
 RayAddress = Annotated[
-    str | None,
-    typer.Option("--ray", help="Ray cluster to use instead: auto, HOST:PORT, ray://HOST:PORT, local."),
+    str | None, typer.Option("--ray", help="Ray cluster to use instead: auto, HOST:PORT, ray://HOST:PORT, local.")
 ]
 Recordings = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of recordings with labels.")]
 Wall = Annotated[
-    Path | None,
-    typer.Option("--wall", help="Wall record of the bench, as for `live`: corrects the maps."),
+    Path | None, typer.Option("--wall", help="Wall record of the bench, as for `live`: corrects the maps.")
 ]
 Frames = Annotated[int, typer.Option("--frames", min=1, help="Frames per recording, evenly spread over it.")]
 

@@ -107,7 +107,8 @@ def _stimulus(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Stimulus:
 
 
 def _sense(stimulus: Stimulus, rendering: Rendering, noise: np.random.Generator) -> LidarMaps:
-    images = cached_sensor(stimulus.rig, stimulus.sensor).expose(rendering.multi, noise)
+    sensor = cached_sensor(stimulus.rig, stimulus.sensor)  # pyright: ignore[reportArgumentType]  frozen, so hashable
+    images = sensor.expose(rendering.multi, noise)
     return maps_from_frame(images.frame(stimulus.rig.pinhole))
 
 

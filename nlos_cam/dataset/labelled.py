@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,16 @@ import numpy as np
 from nlos_calibration import ObjectBox, Rig, first_problem, load_rig
 from nlos_calibration.arrays import Float32
 from nlos_models import MapSet
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.plan import DatasetPlan, scene_row
+from nlos_cam.dataset.reader import MAP_CHANNELS
 from nlos_cam.dataset.samples import OnProgress, Samples, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, shard_path, store
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_directory
-from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
+from nlos_cam.frames import OBJECT_PIXELS, maps_from_frame
 from nlos_cam.objects import (
     DEPTH_MAP_SUFFIX,
     MESH_SUFFIXES,
@@ -132,17 +133,6 @@ class Labelled:
     """Rig of the bench that all were recorded on."""
 
 
-@dataclass(frozen=True)
-class _Recorded:
-    """Maps and truth of one recording."""
-
-    path: Path
-    label: str
-    maps: list[LidarMaps]
-    truth_m: Float32
-    rig: Rig
-
-
 def list_recordings(folder: Path) -> list[Path]:
     """Return the recordings of a folder, sorted by name. Raises RecordingError where there is none."""
     if paths := sorted(folder.glob("*.bag")):
@@ -164,7 +154,7 @@ def read_labelled(
     bench's wall record; without one the rig is the sidecars', or the paper's. Frames without any return are left out.
     Raises RecordingError for a recording without a label, a truth or a frame, and for recordings of two benches.
     """
-    read: list[_Recorded] = []
+    parts: list[Labelled] = []
     objects: dict[str, Mapping[str, Float32]] = {}
 
     def objects_on(rig: Rig) -> Mapping[str, Float32]:
@@ -173,17 +163,18 @@ def read_labelled(
         return objects[rig.checksum]
 
     for path in recordings:
-        read.append(_read(path, objects_on, wall, frames))
-        if read[0].rig != read[-1].rig:
+        parts.append(_read(path, objects_on, wall, frames))
+        one, other = parts[0].rig, parts[-1].rig
+        if one != other:
             raise RecordingError(
-                f"{read[0].path} and {path} are of two benches (rigs {read[0].rig.name} {read[0].rig.checksum} and "
-                f"{read[-1].rig.name} {read[-1].rig.checksum}): label one bench at a time, or give its --wall"
+                f"{recordings[0]} and {path} are of two benches (rigs {one.name} {one.checksum} and {other.name} "
+                f"{other.checksum}): label one bench at a time, or give its --wall"
             )
-        on_progress(len(read), len(recordings))
-    return _join(read)
+        on_progress(len(parts), len(recordings))
+    return _join(parts)
 
 
-def _read(path: Path, objects_on: Callable[[Rig], Mapping[str, Float32]], wall: Path | None, frames: int) -> _Recorded:
+def _read(path: Path, objects_on: Callable[[Rig], Mapping[str, Float32]], wall: Path | None, frames: int) -> Labelled:
     sidecar = load_sidecar(sidecar_path(path))
     if not sidecar.label:
         raise RecordingError(
@@ -198,7 +189,11 @@ def _read(path: Path, objects_on: Callable[[Rig], Mapping[str, Float32]], wall: 
         maps = [bench.correct_range(one) for one in raw if one.valid.any()]
     if not maps:
         raise RecordingError(f"{path} has no frame with any return: inspect it with `nlos-cam replay`")
-    return _Recorded(path, sidecar.label, maps, truth_m, bench.rig)
+    depth_m, intensity = (np.stack([getattr(one, name) for one in maps]) for name in ("depth_m", "intensity"))
+    truths_m = np.repeat(truth_m[None], len(maps), axis=0)
+    image = image_from_depth(truths_m, object_box(bench.rig)).astype(np.float16)
+    labels, names = (sidecar.label,) * len(maps), (path.name,) * len(maps)
+    return Labelled(MapSet(depth_m, intensity, image), truths_m, labels, names, bench.rig)
 
 
 def spread(count: int, wanted: int) -> frozenset[int]:
@@ -218,19 +213,11 @@ def _bench(path: Path, sidecar: Sidecar, wall: Path | None, camera: ReplayCamera
     return CalibratedRig(sidecar.rig if sidecar.rig and sidecar.rig.object_box else load_rig("paper-rig"))
 
 
-def _join(read: Sequence[_Recorded]) -> Labelled:
-    counts = [len(one.maps) for one in read]
-    box = object_box(read[0].rig)
-    truth_m = np.repeat([one.truth_m for one in read], counts, axis=0)
-    depth_m, intensity = (
-        np.stack([getattr(some, name) for one in read for some in one.maps]) for name in ("depth_m", "intensity")
-    )
-    image: NDArray[np.float16] = image_from_depth(truth_m, box).astype(np.float16)
-    label, recording = (
-        tuple(text for text, count in zip(texts, counts, strict=True) for _ in range(count))
-        for texts in ([one.label for one in read], [one.path.name for one in read])
-    )
-    return Labelled(MapSet(depth_m, intensity, image), truth_m, label, recording, read[0].rig)
+def _join(parts: Sequence[Labelled]) -> Labelled:
+    maps = (np.concatenate([getattr(one.maps, name) for one in parts]) for name in MAP_CHANNELS)
+    depth_m = np.concatenate([one.object_depth_m for one in parts])
+    labels, names = (tuple(chain(*texts)) for texts in ((one.label for one in parts), (one.recording for one in parts)))
+    return Labelled(MapSet(*maps), depth_m, labels, names, parts[0].rig)
 
 
 def label_recordings(

@@ -15,6 +15,7 @@ from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
 from trimesh.transformations import euler_matrix
 
+from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects import (
     CATEGORIES,
@@ -99,18 +100,6 @@ NO_OCCLUDER_SHARE = 0.1
 """Share of empty benches without an occluder: a bare wall."""
 
 
-def move_lidar(rig: Rig, place_m: float, yaw_deg: float, pitch_deg: float) -> Rig:
-    """Return the rig with its lidar `place_m` farther from the wall, and turned."""
-    lidar = rig.lidar.model_copy(
-        update={
-            "distance_m": rig.lidar.distance_m + place_m,
-            "yaw_deg": rig.lidar.yaw_deg + yaw_deg,
-            "pitch_deg": rig.lidar.pitch_deg + pitch_deg,
-        }
-    )
-    return rig.model_copy(update={"lidar": lidar})
-
-
 def vary_bench(rig: Rig, sensor: SensorModel, spread: BenchSpread, generator: Generator) -> tuple[Rig, SensorModel]:
     """Return a rig and a sensor near the given ones."""
     place, yaw, pitch, gain, offset = generator.uniform(-1, 1, 5).tolist()
@@ -141,20 +130,15 @@ def vary_empty_bench(rig: Rig, sensor: SensorModel, generator: Generator) -> tup
 
 def small(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object of 15 to 35 % of the box."""
-    box = stimulus.box
-    size_m, (right, up) = (
-        box_width_m(box) * generator.uniform(0.15, 0.35),
-        generator.uniform(-0.3, 0.3, 2) * box_width_m(box),
-    )
-    return replace(stimulus, depth_m=draw_object(generator, box, size_m=size_m, x_m=right, y_m=up))
+    width_m = box_width_m(stimulus.box)
+    size_m, (x_m, y_m) = width_m * generator.uniform(0.15, 0.35), generator.uniform(-0.3, 0.3, 2) * width_m
+    return replace(stimulus, depth_m=draw_object(generator, stimulus.box, size_m=size_m, x_m=x_m, y_m=y_m))
 
 
 def large(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object of 125 to 180 % of the box, whose sides are cut off."""
-    box = stimulus.box
-    return replace(
-        stimulus, depth_m=draw_object(generator, box, size_m=box_width_m(box) * generator.uniform(1.25, 1.8))
-    )
+    size_m = box_width_m(stimulus.box) * generator.uniform(1.25, 1.8)
+    return replace(stimulus, depth_m=draw_object(generator, stimulus.box, size_m=size_m))
 
 
 def far(generator: Generator, stimulus: Stimulus) -> Stimulus:

@@ -38,6 +38,18 @@ _RIG_STREAM = 2
 """Stream of an object's random numbers; its noise has stream 1."""
 
 
+def move_lidar(rig: Rig, place_m: float, yaw_deg: float, pitch_deg: float) -> Rig:
+    """Return the rig with its lidar `place_m` farther from the wall, and turned."""
+    lidar = rig.lidar.model_copy(
+        update={
+            "distance_m": rig.lidar.distance_m + place_m,
+            "yaw_deg": rig.lidar.yaw_deg + yaw_deg,
+            "pitch_deg": rig.lidar.pitch_deg + pitch_deg,
+        }
+    )
+    return rig.model_copy(update={"lidar": lidar})
+
+
 class RigSpread(Record):
     """Largest deviation of each object's rig from the plan's; drawn uniformly, by the object's seed."""
 
@@ -69,22 +81,13 @@ class RigSpread(Record):
         if self == RigSpread():
             return rig, sensor
         distance, yaw, pitch, place, gap, gain = np.random.default_rng([seed, _RIG_STREAM]).uniform(-1, 1, 6).tolist()
-        lidar = rig.lidar.model_copy(
-            update={
-                "distance_m": rig.lidar.distance_m + self.place_m * distance,
-                "yaw_deg": rig.lidar.yaw_deg + self.angle_deg * yaw,
-                "pitch_deg": rig.lidar.pitch_deg + self.angle_deg * pitch,
-            }
-        )
-        occluder = rig.occluder and rig.occluder.model_copy(
-            update={
-                "x_m": rig.occluder.x_m + self.place_m * place,
-                "z_min_m": rig.occluder.z_min_m + self.place_m * gap,
-            }
-        )
-        counts = sensor.bare_wall_counts * (1 + self.gain_share * gain)
-        drawn = rig.model_copy(update={"lidar": lidar, "occluder": occluder})
-        return drawn, sensor.model_copy(update={"bare_wall_counts": counts})
+        occluder = rig.occluder
+        if occluder:
+            shift = {"x_m": occluder.x_m + self.place_m * place, "z_min_m": occluder.z_min_m + self.place_m * gap}
+            occluder = occluder.model_copy(update=shift)
+        drawn = move_lidar(rig, self.place_m * distance, self.angle_deg * yaw, self.angle_deg * pitch)
+        counts = {"bare_wall_counts": sensor.bare_wall_counts * (1 + self.gain_share * gain)}
+        return drawn.model_copy(update={"occluder": occluder}), sensor.model_copy(update=counts)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from nlos_cam.objects import (
     image_from_depth,
     mesh_depth,
     object_depth,
-    object_depths,
     paint,
     read_mesh,
 )
@@ -56,10 +55,11 @@ def procedural_images(
 
     With textures, they are in color: (count, 3, 64, 64).
     """
-    seeds = range(first_seed, first_seed + count)
-    depths = object_depths(seeds, box, categories, backgrounds=backgrounds)
-    pairs = zip(seeds, depths, strict=True)
-    return np.stack([_image(depth, box, _coat(seed, depth, textures)).astype(np.float16) for seed, depth in pairs])
+    images = list[NDArray[np.float16]]()
+    for seed in range(first_seed, first_seed + count):
+        depth_m = object_depth(seed, box, categories, backgrounds=backgrounds)[1]
+        images.append(_image(depth_m, box, _coat(seed, depth_m, textures)).astype(np.float16))
+    return np.stack(images)
 
 
 def sense_object(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard", exposure: int = 0) -> LidarMaps:
@@ -117,19 +117,15 @@ def _sense(
     plan: DatasetPlan, depth_m: Float32, coat: Coat | None, rig: Rig, model: SensorModel, seed: int
 ) -> LidarMaps:
     scene = Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, model.pulse_ns)
-    sensor = cached_sensor(rig, model, plan.radiometry)
+    sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]  frozen, so hashable
     if coat is None:
         return sense_object(scene, sensor, seed, plan.accuracy)
     return sense_color(replace(scene, surface=Surface(coat.albedo, plan.material.brdf)), sensor, seed, plan.accuracy)
 
 
+@lru_cache(maxsize=1)
 def cached_sensor(rig: Rig, model: SensorModel, radiometry: Radiometry = "paper") -> Sensor:
     """Return a sensor, kept until one of another rig, model or radiometry is requested."""
-    return _sensor(rig, model, radiometry)  # pyright: ignore[reportArgumentType]  frozen, so hashable
-
-
-@lru_cache(maxsize=1)
-def _sensor(rig: Rig, model: SensorModel, radiometry: Radiometry) -> Sensor:
     return Sensor(rig, model, radiometry)
 
 

@@ -104,14 +104,10 @@ def read_maps(recipe: Recipe, data: Path, held_out_data: Path, wall: Path | None
     held_out = first_of(other.arrays(), recipe.held_out)
     if bare:
         held_out = subtract_bare_wall(held_out, *bare)
-    return MapSplit(_source(training, recipe.objects, bare, stream=stream), held_out, plan)
-
-
-def _source(training: Dataset, count: int, bare: BareMaps | None, *, stream: bool) -> MapSource:
     if stream:
-        return Streamed(training, training.column("image"), bare)
-    maps = first_of(training.arrays(), count)
-    return InMemory(subtract_bare_wall(maps, *bare) if bare else maps)
+        return MapSplit(Streamed(training, training.column("image"), bare), held_out, plan)
+    maps = first_of(training.arrays(), recipe.objects)
+    return MapSplit(InMemory(subtract_bare_wall(maps, *bare) if bare else maps), held_out, plan)
 
 
 def measured_bare_wall(path: Path) -> BareMaps:

@@ -50,11 +50,7 @@ EDGE = 1e-9
 
 
 @numba.njit(cache=True)
-def _fill(
-    triangles: NDArray[np.float64],
-    x_m: NDArray[np.float64],
-    y_m: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _fill(triangles: NDArray[np.float64], x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:
     # Cell centres inside a triangle (a, b, c) in x and y have barycentric coordinates u, v, 1 - u - v >= 0: signed
     # areas of the sub-triangles (b, c, p) and (c, a, p) over the area of (a, b, c). Depth is linear in them. Rows
     # i0..i1 and columns j0..j1 are the centres within the triangle's bounding box (y falls as the row grows).

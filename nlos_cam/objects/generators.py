@@ -95,6 +95,10 @@ def category(**settings: Setting) -> Callable[[Callable[..., Float64]], Category
 SIDES = (-1, 1)
 
 
+def _at_corners(solid: Float64, x: float, y: float, z: float) -> list[Float64]:
+    return [at(solid, s * x, y, t * z) for s in SIDES for t in SIDES]
+
+
 @category(
     width=Setting(0.8, 1.0, held_out=(0.875, 0.93)),
     height=Setting(0.5, 0.64, held_out=(0.55, 0.595)),
@@ -129,7 +133,7 @@ def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float
     shut = at(door * (-1, 1, 1), width / 2, z=-depth / 2 - 0.02)
     wide = at(turned(door, (0, 1, 0), ajar), -width / 2, z=-depth / 2 - 0.02)
     cornice = at(box(width + 0.08, 0.06, depth + 0.06), y=0.47)
-    legs = [at(box(0.08, 0.1, 0.08), s * (width / 2 - 0.05), -0.5, z * depth / 3) for s in SIDES for z in SIDES]
+    legs = _at_corners(box(0.08, 0.1, 0.08), width / 2 - 0.05, -0.5, depth / 3)
     return tipped(joined(case, *boards, middle, shut, wide, cornice, *legs), tip)
 
 
@@ -147,11 +151,8 @@ def oven(width: float, depth: float, window: float, knobs: float, tip: float) ->
     body = joined(at(box(width, 0.6, depth - 0.14), y=-0.2, z=0.07), at(box(width, 0.26, depth), y=0.23))
     dials = [at(disc(0.05, 0.1), width * ((k + 0.5) / count - 0.5), 0.23, front - 0.05) for k in range(count)]
     handle = at(box(width * 0.7, 0.05, 0.05), 0, 0.03, front - 0.08)
-    rings = [
-        at(lathe([(0.05, 0), (0.05, 0.06), (0.12, 0.06), (0.12, 0)]), s * width / 4, 0.36, z * depth / 4)
-        for s in SIDES
-        for z in SIDES
-    ]
+    ring_profile = [(0.05, 0), (0.05, 0.06), (0.12, 0.06), (0.12, 0)]
+    rings = _at_corners(lathe(ring_profile), width / 4, 0.36, depth / 4)
     return tipped(joined(door, body, *dials, handle, *rings), tip)
 
 
@@ -184,11 +185,7 @@ def _speaker(width: float, height: float, radius: float) -> Float64:
 )
 def table(width: float, depth: float, leg: float, height: float, tip: float) -> Float64:
     """Build a table seen a little from above: top and four legs."""
-    legs = [
-        at(box(leg, height, leg), s * (width - leg) / 2, -height / 2, z * (depth - leg) / 2)
-        for s in SIDES
-        for z in SIDES
-    ]
+    legs = _at_corners(box(leg, height, leg), (width - leg) / 2, -height / 2, (depth - leg) / 2)
     return tipped(joined(box(width, 0.09, depth), *legs), tip)
 
 
@@ -245,10 +242,7 @@ def baskets(bottom: float, height: float, handle: float, ribs: float, tip: float
     return tipped(joined(shell, arch(top - 0.02, 0.04) * (1, handle, 1.4)), tip)
 
 
-@category(
-    rim=Setting(0.4, 0.52, held_out=(0.44, 0.475)),
-    waist=Setting(0.2, 0.28, held_out=(0.23, 0.255)),
-)
+@category(rim=Setting(0.4, 0.52, held_out=(0.44, 0.475)), waist=Setting(0.2, 0.28, held_out=(0.23, 0.255)))
 def bell(rim: float, waist: float) -> Float64:
     """Build a bell with a flared rim, a crown and a clapper."""
     crown = [(0, 0.34), (waist * 0.7, 0.32), (waist, 0.2)]

@@ -234,12 +234,7 @@ def folder_objects(folder: Path) -> list[Path]:
 
 
 def mesh_depth(
-    seed: int,
-    meshes: Sequence[Mesh],
-    box: ObjectBox,
-    up: Up = "y",
-    *,
-    read: Callable[[Mesh], MeshFile],
+    seed: int, meshes: Sequence[Mesh], box: ObjectBox, up: Up = "y", *, read: Callable[[Mesh], MeshFile]
 ) -> tuple[Mesh, Float32]:
     """Return one of the meshes and its depth map (64, 64) in metres, NaN background; the seed picks mesh and pose.
 

@@ -1,6 +1,6 @@
 """Placement of objects in the object box: poses, random objects, and the posts and panels beside some of them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import radians
 
@@ -169,11 +169,3 @@ def object_depth(
     triangles = category_triangles(category, int(generator.integers(2**31)))
     depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
     return category, add_background(depth_m, box, generator) if generator.random() < backgrounds else depth_m
-
-
-def object_depths(
-    seeds: Sequence[int], box: ObjectBox, categories: Sequence[str] | None = None, *, backgrounds: float = 0.0
-) -> Iterator[Float32]:
-    """Yield the depth maps (64, 64) of many random objects, in the order of their seeds; see `object_depth`."""
-    for seed in seeds:
-        yield object_depth(seed, box, categories, backgrounds=backgrounds)[1]

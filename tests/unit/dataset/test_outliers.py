@@ -16,11 +16,11 @@ from nlos_cam.dataset.outliers import (
     BenchSpread,
     Stimulus,
     draw_outlier,
-    move_lidar,
     ordinary,
     vary_bench,
     vary_empty_bench,
 )
+from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.objects.depth_map import object_box
 from nlos_cam.render.sensor.model import SensorModel
 

@@ -52,7 +52,7 @@ def _assert_as_stored(found: MapBatch) -> None:
         np.testing.assert_array_equal(found.image[k, 0], samples["image"][k][turn].astype(np.float32))
 
 
-def test_dataset_is_read_as_stored(data: Dataset, folder: Path) -> None:
+def test_dataset_is_read_as_stored(data: Dataset) -> None:
     maps, plan = data.arrays(), data.plan
     assert (len(data), plan) == (COUNT, PLAN)
     for name in MAP_CHANNELS:

@@ -13,30 +13,7 @@ from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
 
 from nlos_cam.objects.depth_map import object_box, orthographic_depth
-from nlos_cam.objects.generators import (
-    CATEGORIES,
-    Category,
-    Setting,
-    airplane,
-    baskets,
-    bell,
-    birdhouse,
-    boat,
-    bowl,
-    car,
-    category,
-    computer,
-    cup,
-    cupboard,
-    hat,
-    lamp,
-    motorcycle,
-    oven,
-    rocket,
-    soundbox,
-    table,
-    tower,
-)
+from nlos_cam.objects.generators import CATEGORIES, Category, Setting, category
 from nlos_cam.objects.placement import category_triangles, place, random_pose
 from nlos_cam.objects.primitives import box
 from nlos_cam.render.scene_file import paper_scene
@@ -49,7 +26,7 @@ def _runs(line: NDArray[np.bool_]) -> int:
 
 
 def test_computer_has_a_recessed_screen_a_neck_and_a_keyboard(straight_view: View) -> None:
-    depth = straight_view(computer, tip=14.0)
+    depth = straight_view(CATEGORIES["computer"], tip=14.0)
     rows = np.flatnonzero(np.isfinite(depth).any(axis=1))
     screen, edge = depth[rows[12], 32], depth[rows[2], 32]
     assert screen > edge + 0.01
@@ -57,7 +34,7 @@ def test_computer_has_a_recessed_screen_a_neck_and_a_keyboard(straight_view: Vie
     neck = rows[widths[rows[0] : rows[-1]].argmin()]
     assert widths[neck] < 0.5 * widths[rows].max()
     assert rows[0] < neck < rows[-1]
-    depth = straight_view(computer)
+    depth = straight_view(CATEGORIES["computer"])
     rows = np.flatnonzero(np.isfinite(depth).any(axis=1))
     assert np.nanmean(depth[rows[-3]]) < np.nanmean(depth[rows[5]]) - 0.03
 
@@ -65,21 +42,21 @@ def test_computer_has_a_recessed_screen_a_neck_and_a_keyboard(straight_view: Vie
 @pytest.mark.parametrize("shelves", [2, 3, 4])
 def test_cupboard_shows_its_shelves_beside_the_open_door(straight_view: View, shelves: int) -> None:
     """Between the boards the depth is that of the back."""
-    depth = straight_view(cupboard, shelves=float(shelves), ajar=95.0, tip=0.0)
+    depth = straight_view(CATEGORIES["cupboard"], shelves=float(shelves), ajar=95.0, tip=0.0)
     columns = np.flatnonzero(np.isfinite(depth).sum(axis=0) > 40)
     inside = depth[:, columns[0] + (columns[-1] - columns[0]) // 3]
     assert _runs(inside > np.nanmin(depth[:, columns[-6]]) + 0.03) == shelves
 
 
 def test_cupboard_door_reaches_towards_the_wall(straight_view: View) -> None:
-    wide, less = (straight_view(cupboard, ajar=ajar, tip=0.0) for ajar in (90.0, 60.0))
+    wide, less = (straight_view(CATEGORIES["cupboard"], ajar=ajar, tip=0.0) for ajar in (90.0, 60.0))
     assert np.nanmin(wide[:, 34:58]) - np.nanmin(wide) > 0.03
     assert np.nanmin(less[:, 34:58]) - np.nanmin(less) < np.nanmin(wide[:, 34:58]) - np.nanmin(wide)
 
 
 @pytest.mark.parametrize("knobs", [3, 4, 5])
 def test_oven_has_its_knobs_in_a_row_and_a_recessed_window(straight_view: View, knobs: int) -> None:
-    depth = straight_view(oven, knobs=float(knobs), tip=18.0)
+    depth = straight_view(CATEGORIES["oven"], knobs=float(knobs), tip=18.0)
     found = [_runs(row < np.nanmedian(row) - 0.01) for row in depth if np.isfinite(row).sum() > 20]
     assert knobs in found
     rows, columns = (np.flatnonzero(np.isfinite(depth).any(axis=axis)) for axis in (1, 0))
@@ -88,7 +65,7 @@ def test_oven_has_its_knobs_in_a_row_and_a_recessed_window(straight_view: View, 
 
 
 def test_soundbox_cones_are_sunk_and_the_lower_is_larger(straight_view: View) -> None:
-    depth = straight_view(soundbox)
+    depth = straight_view(CATEGORIES["soundbox"])
     front = np.nanmedian(depth)
     sunk = depth > front + 0.01
     upper, lower = sunk[:26], sunk[26:]
@@ -96,7 +73,7 @@ def test_soundbox_cones_are_sunk_and_the_lower_is_larger(straight_view: View) ->
 
 
 def test_table_stands_on_legs(straight_view: View) -> None:
-    surface = np.isfinite(straight_view(table, tip=15.0))
+    surface = np.isfinite(straight_view(CATEGORIES["table"], tip=15.0))
     rows = np.flatnonzero(surface.any(axis=1))
     assert _runs(surface[rows[1]]) == 1
     assert _runs(surface[rows[len(rows) * 3 // 4]]) >= 2
@@ -104,7 +81,7 @@ def test_table_stands_on_legs(straight_view: View) -> None:
 
 
 def test_birdhouse_has_a_hole_a_perch_and_a_gable_roof(straight_view: View) -> None:
-    depth = straight_view(birdhouse)
+    depth = straight_view(CATEGORIES["birdhouse"])
     front = np.nanmedian(depth)
     assert (depth > front + 0.03).sum() > 20
     assert (depth < front - 0.03).sum() >= 4
@@ -117,7 +94,7 @@ def test_birdhouse_has_a_hole_a_perch_and_a_gable_roof(straight_view: View) -> N
 
 
 def test_tower_is_slender_with_battlements(straight_view: View) -> None:
-    surface = np.isfinite(straight_view(tower, turn=0.0))
+    surface = np.isfinite(straight_view(CATEGORIES["tower"], turn=0.0))
     rows = np.flatnonzero(surface.any(axis=1))
     widths = surface.sum(axis=1)
     assert len(rows) > 1.5 * widths.max()
@@ -131,29 +108,31 @@ def _widths(depth: NDArray[np.float32]) -> NDArray[np.int64]:
     return counts[counts > 0]
 
 
-@pytest.mark.parametrize("kind", [baskets, bell, bowl, hat, lamp, airplane, rocket], ids=lambda kind: kind.name)
-def test_symmetric_kind_is_the_same_on_both_sides(straight_view: View, kind: Category) -> None:
-    surface = np.isfinite(straight_view(kind))
+@pytest.mark.parametrize("kind", ["baskets", "bell", "bowl", "hat", "lamp", "airplane", "rocket"])
+def test_symmetric_kind_is_the_same_on_both_sides(straight_view: View, kind: str) -> None:
+    surface = np.isfinite(straight_view(CATEGORIES[kind]))
     assert (surface != surface[:, ::-1]).mean() < 0.01
 
 
-@pytest.mark.parametrize("kind", [baskets, bowl], ids=lambda kind: kind.name)
-def test_hollow_is_deeper_than_its_rim(straight_view: View, kind: Category) -> None:
-    column = straight_view(kind)[:, 32]
+@pytest.mark.parametrize("kind", ["baskets", "bowl"])
+def test_hollow_is_deeper_than_its_rim(straight_view: View, kind: str) -> None:
+    column = straight_view(CATEGORIES[kind])[:, 32]
     column = column[np.isfinite(column)]
     assert column.max() - column.min() > 0.05
     assert np.abs(np.diff(column)).max() > 0.02
 
 
 def test_basket_and_cup_have_an_open_handle(straight_view: View) -> None:
-    assert _runs(np.isfinite(straight_view(baskets, tip=10.0))[:, 32]) == 2
-    surface = np.isfinite(straight_view(cup))
+    assert _runs(np.isfinite(straight_view(CATEGORIES["baskets"], tip=10.0))[:, 32]) == 2
+    surface = np.isfinite(straight_view(CATEGORIES["cup"]))
     rows = np.flatnonzero(surface.any(axis=1))
     assert _runs(surface[rows[len(rows) // 2]]) == 2
 
 
 def test_silhouettes_have_the_widths_of_their_kinds(straight_view: View) -> None:
-    plane, bells, brim, stand, nose = (_widths(straight_view(kind)) for kind in (airplane, bell, hat, lamp, rocket))
+    plane, bells, brim, stand, nose = (
+        _widths(straight_view(CATEGORIES[kind])) for kind in ("airplane", "bell", "hat", "lamp", "rocket")
+    )
     middle, tail = plane[: len(plane) * 3 // 4].max(), plane[len(plane) * 3 // 4 :].max()
     assert middle > 1.5 * tail > 1.5 * plane[len(plane) // 5]
     assert bells[len(bells) * 4 // 5] > 1.3 * bells[len(bells) * 2 // 5] > 2 * bells[0]
@@ -164,14 +143,14 @@ def test_silhouettes_have_the_widths_of_their_kinds(straight_view: View) -> None
 
 
 def test_boat_sail_narrows_upwards_above_its_hull(straight_view: View) -> None:
-    widths = _widths(straight_view(boat))
+    widths = _widths(straight_view(CATEGORIES["boat"]))
     assert widths[:4].max() <= 6
     assert widths[-10:].max() > 50
     assert np.corrcoef(np.arange(30), widths[5:35])[0, 1] > 0.9
 
 
 def test_car_stands_on_two_wheels_and_has_recessed_windows(straight_view: View) -> None:
-    depth = straight_view(car)
+    depth = straight_view(CATEGORIES["car"])
     rows = np.flatnonzero(np.isfinite(depth).any(axis=1))
     ground = np.isfinite(depth[rows[-2]])
     assert _runs(ground) == 2
@@ -182,7 +161,7 @@ def test_car_stands_on_two_wheels_and_has_recessed_windows(straight_view: View) 
 
 def test_motorcycle_wheels_are_open(straight_view: View) -> None:
     """The surface has holes between hub and tyre."""
-    surface = np.isfinite(straight_view(motorcycle))
+    surface = np.isfinite(straight_view(CATEGORIES["motorcycle"]))
     outside = np.zeros_like(surface)
     outside[0] = outside[-1] = outside[:, 0] = outside[:, -1] = True
     outside &= ~surface
@@ -201,9 +180,7 @@ def test_motorcycle_wheels_are_open(straight_view: View) -> None:
 
 BOX = object_box(load_rig("paper-rig"))
 SEEDS = (*range(47), 10_000_000, 20_000_000, 2**31 - 1)
-SI_1 = {"airplane", "baskets", "birdhouse", "bowl", "oven", "motorcycle", "tower", "soundbox", "table", "rocket", "cup"}
-
-SI_1 |= {"lamp", "bell", "cupboard", "computer", "hat", "car", "boat"}
+SI_1 = "airplane baskets bell birdhouse boat bowl car computer cup cupboard hat lamp motorcycle oven rocket soundbox"
 
 DEFAULT_AIRPLANE = "1ab023dab17e054a"
 """SHA-256 of the mesh shown in the README, vertices rounded to 9 decimals."""
@@ -211,7 +188,7 @@ DEFAULT_AIRPLANE = "1ab023dab17e054a"
 
 def test_categories_are_those_of_the_paper_in_fixed_order() -> None:
     """A seed picks by position: sorting or inserting would change every dataset."""
-    assert list(CATEGORIES) == sorted(SI_1)
+    assert list(CATEGORIES) == [*SI_1.split(), "table", "tower"]
     assert all(kind.name == name for name, kind in CATEGORIES.items())
 
 
@@ -254,15 +231,6 @@ def test_default_scene_keeps_the_airplane_of_the_readme() -> None:
     hidden = paper_scene().hidden
     assert hidden is not None
     assert hashlib.sha256(np.round(hidden.triangles, 9).tobytes()).hexdigest()[:16] == DEFAULT_AIRPLANE
-
-
-def test_airplane_settings_are_drawn_evenly_and_in_turn() -> None:
-    """Held-out intervals of the airplane lie beside its ranges, so draws are those of numpy."""
-    ranges = {name: (setting.low, setting.high) for name, setting in CATEGORIES["airplane"].settings.items()}
-    for seed in SEEDS:
-        generator = np.random.default_rng(seed)
-        settings = {name: generator.uniform(low, high) for name, (low, high) in ranges.items()}
-        np.testing.assert_array_equal(category_triangles("airplane", seed), CATEGORIES["airplane"].make(**settings))
 
 
 UNIT = st.floats(0, 1)
@@ -336,15 +304,10 @@ def test_category_holds_out_enough_and_trains_on_most(kind: Category) -> None:
         trained = sum(b - a for a, b in setting.training_intervals)
         assert 0.1 < (high - low) / trained < 0.5
         assert all(
-            not a < u < b for a, b in setting.training_intervals for u in (np.nextafter(low, high), np.nextafter(high, low))
+            not a < u < b
+            for a, b in setting.training_intervals
+            for u in (np.nextafter(low, high), np.nextafter(high, low))
         )
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.floats(0.01, 0.99))
-def test_setting_kept_lies_in_the_held_out_interval(unit: float) -> None:
-    assert 1 < Setting(0, 4, (1, 2)).draw_held_out(unit) < 2
-    assert Setting(0, 4).draw_held_out(unit) == Setting(0, 4).draw(unit) == 4 * unit
 
 
 def test_category_decorator_keeps_name_and_setting_order() -> None:
