@@ -122,14 +122,14 @@ Stopwatch = Callable[[Work, int], float]
 """Function that returns the shortest of a number of runs of some work, in seconds."""
 
 
-def least_seconds(work: Work, repeats: int) -> float:
+def least_seconds(work: Work, repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
     """Return the shortest of `repeats` runs by the clock, in seconds."""
-    taken: list[float] = []
+    seconds: list[float] = []
     for _ in range(repeats):
-        started = time.perf_counter()
+        start_s = clock()
         work()
-        taken.append(time.perf_counter() - started)
-    return min(taken)
+        seconds.append(clock() - start_s)
+    return min(seconds)
 
 
 def choose(
@@ -273,12 +273,7 @@ def costs(
     names = [effect.name for effect in plan if effect.included]
 
     def least(effects: list[str]) -> float:
-        times: list[float] = []
-        for _ in range(REPEATS):
-            started = clock()
-            render(scene, accuracy, effects, backend)
-            times.append(clock() - started)
-        return min(times)
+        return least_seconds(lambda: render(scene, accuracy, effects, backend), REPEATS, clock)
 
     least(names)  # compiles
     whole = least(names)

@@ -35,8 +35,13 @@ class NumbaSurface(NamedTuple):
     normal_z: Float32
     soft_m2: Float32
     """Near-contact term added to d^2."""
+    strength: Float32
+    """Albedo times true area."""
     row: NDArray[np.int64]
     column: NDArray[np.int64]
+    low: Float32
+    """(n, FACES * sectors); bounds of the horizons, empty if nothing shades."""
+    high: Float32
 
 
 class NumbaPoints(NamedTuple):
@@ -94,11 +99,8 @@ def geometry(
     to_edge, nothing, one, two = optics.edge_x_m - x, np.float32(0), np.float32(1), np.float32(2)
     inverse_x, inverse_y = np.float32(1 / field.pitch_x_m), np.float32(-1 / field.pitch_y_m)
     half, last, faces = np.float32(optics.sectors / 2), np.float32(optics.sectors - 1), np.float32(optics.sectors)
-    at_x, at_y, light = (
-        points.x_m[start : start + count],
-        points.y_m[start : start + count],
-        points.weight[start : start + count],
-    )
+    end = start + count
+    at_x, at_y, light = points.x_m[start:end], points.y_m[start:end], points.weight[start:end]
     for i in range(count):
         dx, dy = at_x[i] - x, at_y[i] - y
         squared = dx * dx + dy * dy + z * z
@@ -127,23 +129,15 @@ def geometry(
 
 @numba.njit(cache=True)
 def shade(
-    legs: NumbaLegs,
-    s: int,
-    surface: NumbaSurface,
-    points: NumbaPoints,
-    start: int,
-    count: int,
-    field: HeightField,
-    low: Float32,
-    high: Float32,
+    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, count: int, field: HeightField
 ) -> None:
     """Set the weight of legs that the object blocks to 0."""
     z = surface.z_m[s]
     for i in range(count):
         # Free above the upper bound of the horizon, blocked below the lower one; in between the leg is walked.
-        if z >= legs.major[i] * high[s, legs.sector[i]]:
+        if z >= legs.major[i] * surface.high[s, legs.sector[i]]:
             continue
-        if z >= legs.major[i] * low[s, legs.sector[i]]:
+        if z >= legs.major[i] * surface.low[s, legs.sector[i]]:
             u = (points.x_m[start + i] - surface.x_m[s]) / field.pitch_x_m
             v = (surface.y_m[s] - points.y_m[start + i]) / field.pitch_y_m
             if legs.weight[i] == 0 or not blocked(field, surface.row[s], surface.column[s], z, u, v):
@@ -171,8 +165,6 @@ def _count(
     relay: NumbaPoints,
     optics: NumbaOptics,
     field: HeightField,
-    low: Float32,
-    high: Float32,
     factor: Float32,
     per_bin: int,
     histogram: Float32,
@@ -182,10 +174,11 @@ def _count(
     legs = scratch(cells)
     geometry(legs, s, surface, relay, 0, cells, optics, field, True)
     if optics.sectors:
-        shade(legs, s, surface, relay, 0, cells, field, low, high)
+        shade(legs, s, surface, relay, 0, cells, field)
     if len(factor):
         for q in range(cells):
             legs.weight[q] *= factor[s, q]
+    # The table starts at the first bin that any path of this patch falls into: its rows then need the spread only.
     shortest = np.float32(np.inf)
     for q in range(cells):
         legs.length_m[q] = (legs.length_m[q] + relay.length_m[q]) * optics.inverse_bin
@@ -205,8 +198,6 @@ def sub_bins(
     relay: NumbaPoints,
     optics: NumbaOptics,
     field: HeightField,
-    low: Float32,
-    high: Float32,
     factor: Float32,
     per_bin: int,
     width: int,
@@ -215,7 +206,7 @@ def sub_bins(
     patches = len(surface.x_m)
     first, histogram = np.zeros(patches, np.int32), np.zeros((patches, width * per_bin), np.float32)
     for s in numba.prange(patches):
-        first[s] = _count(s, surface, relay, optics, field, low, high, factor, per_bin, histogram[s])
+        first[s] = _count(s, surface, relay, optics, field, factor, per_bin, histogram[s])
     return first, histogram
 
 
@@ -228,8 +219,8 @@ def tables(histogram: Float32, per_bin: int) -> Float32:
         below = np.zeros(width * per_bin + 1)
         for k in range(width * per_bin):
             below[k + 1] = below[k] + histogram[s, k]
-        # With the running sum, bin i of a table shifted by `shift` is a difference: sub-bins i per_bin - shift to (i +
-        # 1) per_bin - shift. The running sum is float64, so that the difference of large sums keeps the small bins.
+        # Bin i of the table for a shift is a difference of running sums, from sub-bin i per_bin - shift to
+        # (i + 1) per_bin - shift. The sums are float64, so that the difference of large sums keeps the small bins.
         for shift in range(per_bin):
             for i in range(width):
                 table[s, shift, i] = below[(i + 1) * per_bin - shift] - below[max(i * per_bin - shift, 0)]
@@ -244,9 +235,6 @@ def _add_tile(
     surface: NumbaSurface,
     optics: NumbaOptics,
     field: HeightField,
-    low: Float32,
-    high: Float32,
-    strength: Float32,
     first: Int32,
     table: Float32,
     bins: int,
@@ -259,18 +247,17 @@ def _add_tile(
     for s in range(len(table)):
         geometry(legs, s, surface, feet, start, count, optics, field, False)
         if optics.sectors:
-            shade(legs, s, surface, feet, start, count, field, low, high)
+            shade(legs, s, surface, feet, start, count, field)
         for i in range(count):
             legs.sector[i] = np.int32(
                 (legs.length_m[i] + feet.length_m[start + i]) * optics.inverse_bin + np.float32(0.5)
             )
         for i in range(count):
-            # per_bin is a power of two: the shift in sub-bins splits into whole bins (>> log) and the row of the table
-            # (& mask).
+            # per_bin is a power of two: a shift splits into whole bins (>> log) and the row of the table (& mask).
             at = (legs.sector[i] >> log) + first[s]
             if legs.weight[i] == 0 or at >= bins:
                 continue
-            weight = legs.weight[i] * strength[s]
+            weight = legs.weight[i] * surface.strength[s]
             row, out = table[s, legs.sector[i] & (per_bin - 1)], histogram[i, at : at + width]
             for k in range(width):
                 out[k] += weight * row[k]
@@ -282,9 +269,6 @@ def shift_and_add(
     surface: NumbaSurface,
     optics: NumbaOptics,
     field: HeightField,
-    low: Float32,
-    high: Float32,
-    strength: Float32,
     first: Int32,
     table: Float32,
     bins: int,
@@ -295,21 +279,7 @@ def shift_and_add(
     for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
         start = tile * BEAM_TILE
         end = min(start + BEAM_TILE, beams)
-        _add_tile(
-            start,
-            end - start,
-            feet,
-            surface,
-            optics,
-            field,
-            low,
-            high,
-            strength,
-            first,
-            table,
-            bins,
-            histogram[start:end],
-        )
+        _add_tile(start, end - start, feet, surface, optics, field, first, table, bins, histogram[start:end])
     return histogram
 
 
@@ -334,38 +304,30 @@ class _NumbaJob:
     def __init__(self, job: TransportJob) -> None:
         patches, relay = job.patches, job.relay
         self.job, accuracy = job, job.accuracy
-        self.surface = NumbaSurface(
-            *_columns(patches.point_m),
-            *_columns(patches.normal),
-            _single(job.soft_patch_m2),
-            patches.row,
-            patches.column,
-        )
+        geometry = *_columns(patches.point_m), *_columns(patches.normal), _single(job.soft_patch_m2)
+        sites = patches.row, patches.column, *horizons(job)
+        self.surface = NumbaSurface(*geometry, _single(job.strength), *sites)
         columns = relay.x_m, relay.y_m, relay.length_m, job.relay_weight
         self.relay = _points(columns, job.soft_wall_m2)
-        self.low, self.high = horizons(job)
         edge_x, edge_z = job.edge_m
-        self.optics = NumbaOptics(
-            np.float32(edge_x),
-            np.float32(edge_z),
-            np.float32(job.near_m**2),
-            job.lambertian,
-            np.float32(accuracy.sub_bins / job.bin_m),
-            accuracy.sectors if job.field.shades else 0,
-        )
+        edge = np.float32(edge_x), np.float32(edge_z), np.float32(job.near_m**2)
+        sectors = accuracy.sectors if job.field.shades else 0
+        self.optics = NumbaOptics(*edge, job.lambertian, np.float32(accuracy.sub_bins / job.bin_m), sectors)
         self.width = table_width(job)
 
     def histograms(self, factor: Float32, share: Float64) -> Float32:
         """Return histograms (n, bins) of the beams, each with a weight (n,)."""
-        job, shadow = self.job, (self.optics, self.job.field, self.low, self.high)
+        job = self.job
         some = np.flatnonzero(share)
         x, y, _ = job.laser_spot_m[some].T
         feet = _points((x, y, job.length_m[some], job.beam_weight[some] * share[some]), 0.0)
-        first, fine = sub_bins(self.surface, self.relay, *shadow, factor, job.accuracy.sub_bins, self.width)
+        first, fine = sub_bins(
+            self.surface, self.relay, self.optics, job.field, factor, job.accuracy.sub_bins, self.width
+        )
         if job.more_bounces:
             fine = add_interreflection(job, first, fine)
         table = tables(fine, job.accuracy.sub_bins)
-        found = shift_and_add(feet, self.surface, *shadow, _single(job.strength), first, table, job.bins)
+        found = shift_and_add(feet, self.surface, self.optics, job.field, first, table, job.bins)
         if len(some) == len(share):
             return found[:, : job.bins]
         histogram = np.zeros((len(share), job.bins), np.float32)

@@ -51,22 +51,18 @@ def slices(verdict: Effect, setting: Accuracy) -> int:
 
 def joined(parts: list[Rendering], verdict: Effect) -> Rendering:
     """Return renderings of some rows each as one of all rows."""
-    multi = replace(
-        parts[0].multi,
-        peak=np.concatenate([part.multi.peak for part in parts]),
-        runner_up=np.concatenate([part.multi.runner_up for part in parts]),
-        path_m=np.concatenate([part.multi.path_m for part in parts]),
-    )
-    colors = [part.color for part in parts if part.color is not None]
+
+    def stacked(name: str, of: Callable[[Rendering], object] = lambda part: part) -> np.ndarray:
+        return np.concatenate([getattr(of(part), name) for part in parts])
+
+    multi = {name: stacked(name, lambda part: part.multi) for name in ("peak", "runner_up", "path_m")}
     return replace(
         parts[0],
-        depth_m=np.concatenate([part.depth_m for part in parts]),
-        intensity=np.concatenate([part.intensity for part in parts]),
-        margin=np.concatenate([part.margin for part in parts]),
-        multi=multi,
+        **{name: stacked(name) for name in ("depth_m", "intensity", "margin")},
+        multi=replace(parts[0].multi, **multi),
         plan=(*parts[0].plan, verdict),
         near_legs=sum(part.near_legs for part in parts),
-        color=np.concatenate(colors) if colors else None,
+        color=None if any(part.color is None for part in parts) else stacked("color"),
     )
 
 
