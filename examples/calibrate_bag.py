@@ -1,4 +1,4 @@
-"""Measure the bare wall from a recording and write its record: `python examples/calibrate_bag.py RUN.BAG [WALL.toml]`"""
+"""Measure the bare wall in a recording, write its record: `python examples/calibrate_bag.py RUN.BAG [WALL.toml]`"""
 
 import sys
 from datetime import datetime
@@ -13,12 +13,12 @@ from nlos_cam.camera import open_camera
 def main(bag: Path, out: Path) -> None:
     """Fit the wall to 60 frames, print its distance and angle, and write record, reference and report."""
     with open_camera(f"bag:{bag}") as camera:
-        seen = collect_statistics(camera, 60)
-    fit, facts = measure_by_depth(seen)
-    about = {"camera": seen.camera, "frames": seen.statistics.depth.frames}
-    today, others = datetime.now().astimezone().date(), seen.facts() | facts
-    record = new_wall_record(fit, seen.intrinsics, **about, created=today, others=others)
-    write_record(WallFiles.beside(out, overwrite=False), record, seen.reference(fit.inliers))
+        result = collect_statistics(camera, 60)
+    fit, facts = measure_by_depth(result)
+    about = {"camera": result.camera, "frames": result.statistics.depth.frames}
+    today, others = datetime.now().astimezone().date(), result.facts() | facts
+    record = new_wall_record(fit, result.intrinsics, **about, created=today, others=others)
+    write_record(WallFiles.beside(out, overwrite=False), record, result.reference(fit.inliers))
     print(f"{1e3 * record.distance_m:.1f} mm to the wall, {record.facing_deg:.2f} degrees: {record.verdict}")
 
 

@@ -1,4 +1,4 @@
-"""Hide an object, render the lidar's report of it, reconstruct it: `python examples/hide_and_seek.py [CATEGORY [SEED]]`"""
+"""Hide an object, render its lidar maps, reconstruct it: `python examples/hide_and_seek.py [CATEGORY [SEED]]`"""
 
 import sys
 
