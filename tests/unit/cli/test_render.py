@@ -11,7 +11,6 @@ from nlos_calibration.rig import Rig, dump_toml, load_rig
 
 from nlos_cam.cli.main import main
 from nlos_cam.cli.render import hidden_depth
-from nlos_cam.errors import SceneError
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.renderer import render
@@ -78,17 +77,6 @@ def test_render_places_its_object_as_a_scene_file_does(
     options = [text for field, value in fields.items() for text in (f"--{field.replace('_', '-')}", value)]
     _, file = _render(capsys, name, *options, "--accuracy", "draft", "--out", tmp_path / "maps.npz")
     np.testing.assert_array_equal(file["object_depth_m"], _of_scene(**{kind: name, **fields}))
-
-
-def test_render_overwrites_only_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "cup.npz"
-    out.write_bytes(b"precious")
-    arguments = ["render", "cup", "--accuracy", "draft", "--out", str(out), "--json"]
-    assert main(arguments) == 1
-    assert json.loads(capsys.readouterr().out.splitlines()[-1])["error"]["type"] == "OutputExistsError"
-    assert out.read_bytes() == b"precious"
-    assert main([*arguments, "--overwrite"]) == 0
-    assert out.read_bytes() != b"precious"
 
 
 def test_render_takes_the_rig_of_a_scene_and_reports_its_file(
@@ -170,13 +158,6 @@ def _included(result: dict[str, Any]) -> set[str]:
     return {effect["name"] for effect in result["effects"] if effect["included"]}
 
 
-def test_render_keeps_the_radiometry_in_its_file(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
-    _, paper = _rendered(plate, capsys)
-    _, lambertian = _rendered(plate, capsys, "--radiometry", "lambertian")
-    assert (str(paper["radiometry"]), str(lambertian["radiometry"])) == ("paper", "lambertian")
-    assert lambertian["intensity"].max() > 1.5 * paper["intensity"].max()  # 1/pi in place of 1/(2 pi)
-
-
 @pytest.mark.slow
 def test_render_takes_a_material_and_an_albedo(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
     result, _ = _rendered(
@@ -196,14 +177,13 @@ def test_render_with_three_albedos_gives_color(plate: str, capsys: pytest.Captur
     assert (file["colour"][..., 0] > file["colour"][..., 2]).any()
 
 
-def test_render_includes_the_named_effects(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
-    result, file = _rendered(plate, capsys, "--effects", "three-bounce")
-    assert _included(result) & {"direct", "occluder", "three-bounce"} == {"three-bounce"}
-    assert (file["intensity"] > 0).any()
-
-
-def test_render_takes_a_pulse_and_beams_per_cell(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_render_takes_effects_radiometry_pulse_and_beams(plate: str, capsys: pytest.CaptureFixture[str]) -> None:
+    only, _ = _rendered(plate, capsys, "--effects", "three-bounce")
+    assert _included(only) & {"direct", "occluder", "three-bounce"} == {"three-bounce"}
     plain, sharp = _rendered(plate, capsys)
+    _, lambertian = _rendered(plate, capsys, "--radiometry", "lambertian")
+    assert (str(sharp["radiometry"]), str(lambertian["radiometry"])) == ("paper", "lambertian")
+    assert lambertian["intensity"].max() > 1.5 * sharp["intensity"].max()  # 1/pi in place of 1/(2 pi)
     wide, blurred = _rendered(plate, capsys, "--pulse-ns", "1")
     assert "pulse" in _included(wide) - _included(plain)
     assert not np.array_equal(sharp["intensity"], blurred["intensity"])
@@ -267,10 +247,3 @@ def test_hidden_depth_warns_of_a_flattened_object(mesh: str, capsys: pytest.Capt
     warning = capsys.readouterr().err
     assert all(word in warning for word in (mesh, "0.3 m", "0.08 m"))
     assert warning.count("\n") == 1
-
-
-def test_hidden_depth_refuses_an_edge_on_plate(tmp_path: Path) -> None:
-    plate = tmp_path / "plate.obj"
-    plate.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", encoding="utf-8")
-    with pytest.raises(SceneError, match=r"plate\.obj"):
-        hidden_depth(str(plate), RIG, {"tilt_y_deg": 90})

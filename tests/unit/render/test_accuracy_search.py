@@ -67,14 +67,12 @@ DIAL = _choices(("rough", 0.03, 0.005), ("middling", 0.003, 0.02), ("good", 0.00
 @pytest.mark.parametrize(
     ("max_error", "max_seconds", "name"),
     [
-        (0.05, None, "rough"),
-        (0.01, None, "middling"),
-        (0.001, None, "good"),
-        (0.0, None, "exact"),
-        (None, 0.025, "middling"),
-        (None, 100.0, "exact"),
-        (0.05, 100.0, "rough"),
-        (0.001, 0.03, "good"),
+        *[
+            (error, None, name)
+            for error, name in ((0.05, "rough"), (0.01, "middling"), (0.001, "good"), (0.0, "exact"))
+        ],
+        *[(None, seconds, name) for seconds, name in ((0.025, "middling"), (100.0, "exact"))],
+        *[(0.05, 100.0, "rough"), (0.001, 0.03, "good")],
     ],
 )
 def test_pick_takes_the_cheapest_stop_within_its_bounds(
@@ -174,10 +172,8 @@ def test_choose_keeps_the_bounds() -> None:
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        ({"max_error": -0.1}, "max_error"),
-        ({"max_error": np.nan}, "max_error"),
-        ({"max_seconds": np.inf}, "max_seconds"),
-        ({"max_seconds": -1.0}, "max_seconds"),
+        *[({"max_error": value}, "max_error") for value in (-0.1, np.nan)],
+        *[({"max_seconds": value}, "max_seconds") for value in (-1.0, np.inf)],
         ({}, "max_error"),
         ({"max_error": 0.1, "backend": "abacus"}, "abacus"),
     ],
@@ -229,10 +225,7 @@ def test_agreement_counts_echoes_that_only_one_has() -> None:
 
 
 def test_echoes_of_cells_are_those_of_beams_that_win() -> None:
-    rig = load_rig("paper-rig")
-    depth = np.full((16, 16), np.nan, np.float32)
-    depth[6:10, 6:10] = 0.2
-    scene = Scene(rig, depth)
+    scene = _scene()
     rendering = render(scene, "draft")
     cells, beams = EchoMaps.of_cells(rendering, scene), EchoMaps.of_beams(rendering)
     wins = cells.intensity == beams.intensity
