@@ -2,12 +2,14 @@
 
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from nlos_models.errors import RecipeError
+
+if TYPE_CHECKING:
+    import torch
 
 MapKind = Literal["raw maps", "difference maps"]
 ImageLoss = Literal["squared", "absolute"]
@@ -148,8 +150,10 @@ WARM_UP = 0.15
 """Share of a one-cycle run in which the rate rises."""
 
 
-def schedule_of(recipe: Recipe, optimizer: torch.optim.Optimizer, steps: int) -> Any:
+def schedule_of(recipe: Recipe, optimizer: "torch.optim.Optimizer", steps: int) -> Any:
     """Return the recipe's schedule: one-cycle over `steps`, stepped at each, or plateau, stepped at each epoch."""
+    import torch  # late: dataset workers read recipes' constants, and torch takes seconds
+
     if recipe.schedule == "one-cycle":
         return torch.optim.lr_scheduler.OneCycleLR(
             optimizer, recipe.learning_rate, total_steps=steps, pct_start=WARM_UP, cycle_momentum=False
