@@ -42,10 +42,14 @@ def test_atomic_file_appears_when_it_is_on_disk(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
 def test_atomic_writes_leave_nothing_after_an_error(tmp_path: Path, error: type[BaseException]) -> None:
-    with pytest.raises(error), atomic_directory(tmp_path / "folder") as folder, atomic_file(tmp_path / "file") as file:
-        (folder / "a.txt").write_text("a")
-        file.write_text("b")
-        raise error
+    def write() -> None:
+        with atomic_directory(tmp_path / "folder") as folder, atomic_file(tmp_path / "file") as file:
+            (folder / "a.txt").write_text("a")
+            file.write_text("b")
+            raise error
+
+    with pytest.raises(error):
+        write()
     assert list(tmp_path.iterdir()) == []
 
 

@@ -36,7 +36,6 @@ def test_edges_give_pixels_to_cells_that_hold_their_centres(pixels: int, cells: 
     assert found.tolist() == [_cell(k, pixels, cells) for k in range(pixels)]
 
 
-
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**16), valid=st.integers(0, 60), values=st.sampled_from([1, 2, 5, 1000]))
 def test_median_equals_numpys_for_every_count_and_tie(seed: int, valid: int, values: int) -> None:

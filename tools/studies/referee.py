@@ -25,7 +25,7 @@ import harness
 import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration.arrays import Mask
-from referee_mitransient import PLATE, RIG, STEP, Array, Estimate, Face, Job, hidden, load, sample
+from referee_mitransient import PLATE, RIG, STEP, Estimate, Face, Float64, Job, hidden, load, sample
 
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.render import Accuracy, Scene, cast, three_bounce
@@ -82,46 +82,46 @@ class Trial:
 
     case: Case
     job: Job
-    ours: Array
+    ours: Float64
     """(beams, bins)."""
     theirs: Estimate
     figures: dict[str, Any]
 
 
-def feet_m() -> Array:
+def feet_m() -> Float64:
     """Return the beams' spots on the wall (beams, 3)."""
     return cast(RIG, Scene(RIG).cell_intrinsics).laser_spot_m[BEAMS]
 
 
-def limit(case: Case, effects: tuple[str, ...] = EFFECTS, **change: Any) -> Array:
+def limit(case: Case, effects: tuple[str, ...] = EFFECTS, **change: Any) -> Float64:
     """Return our transients (beams, bins) of a case, or of one with its scene changed, in the limit of small cells."""
     fine = _histograms(case, case.cells, effects, **change)
     return 2 * fine - _histograms(case, case.cells // 2, effects, **change) if case.extrapolated else fine
 
 
-def _histograms(case: Case, cells: int, effects: tuple[str, ...] = EFFECTS, **change: Any) -> Array:
+def _histograms(case: Case, cells: int, effects: tuple[str, ...] = EFFECTS, **change: Any) -> Float64:
     found = three_bounce(hidden(case.faces, cells, **change), case.accuracy, effects, chosen=BEAMS)
     return found[:, :BINS].astype(np.float64)
 
 
-def bright(ours: Array) -> Mask:
+def bright(ours: Float64) -> Mask:
     """Mask the bins (beams, bins) that are compared."""
     return ours > FAINT * ours.max(1, keepdims=True)
 
 
-def reduced_chi_square(ours: Array, estimate: Array, error: Array, which: Mask) -> float:
+def reduced_chi_square(ours: Float64, estimate: Float64, error: Float64, which: Mask) -> float:
     """Return the mean square of the difference in standard errors: 1 for noise alone, with nothing fitted."""
     return float((((estimate - ours)[which] / error[which]) ** 2).mean())
 
 
-def best_scale(ours: Array, estimate: Array, error: Array, which: Mask) -> tuple[float, float]:
+def best_scale(ours: Float64, estimate: Float64, error: Float64, which: Mask) -> tuple[float, float]:
     """Return the factor on ours that fits best, by least squares, and its standard error."""
     a, b, weight = ours[which], estimate[which], error[which] ** -2.0
     information = float((weight * a * a).sum())
     return float((weight * a * b).sum()) / information, information**-0.5
 
 
-def relative_error(difference: Array, truth: Array, which: Mask) -> float:
+def relative_error(difference: Float64, truth: Float64, which: Mask) -> float:
     """Return the root mean square of a difference as a share of the truth, bin by bin."""
     return float(np.sqrt(((difference[which] / truth[which]) ** 2).mean()))
 
@@ -158,14 +158,14 @@ def trial(case: Case) -> Trial:
     return Trial(case, job, ours, theirs, figures)
 
 
-def _wrong(case: Case, ours: Array, theirs: Estimate, which: Mask) -> dict[str, float]:
+def _wrong(case: Case, ours: Float64, theirs: Estimate, which: Mask) -> dict[str, float]:
     """Return the same figure of wrong renderers, some with a fitted scale: near 1 they would go unnoticed."""
     found = {
         "one bin late": reduced_chi_square(np.roll(ours, 1, axis=1), theirs.mean, theirs.error, which),
         "1 % brighter": reduced_chi_square(1.01 * ours, theirs.mean, theirs.error, which),
     }
     if case.extrapolated:
-        variants: dict[str, Callable[[], Array]] = {
+        variants: dict[str, Callable[[], Float64]] = {
             "without self-occlusion": lambda: limit(case, ("three-bounce", "tilt"))
         }
     else:
@@ -201,7 +201,7 @@ def race(plate: Trial) -> dict[str, Any]:
     }
 
 
-def _against(stop: str, truth: Array, which: Mask, cost: float, lit: int) -> dict[str, Any]:
+def _against(stop: str, truth: Float64, which: Mask, cost: float, lit: int) -> dict[str, Any]:
     """Return one stop, and the core-seconds that mitransient takes to its error: cost / error^2 for each beam."""
     scene, seconds = hidden(PLATE, OBJECT_PIXELS), list[float]()
     found = three_bounce(scene, stop, EFFECTS)
