@@ -159,3 +159,11 @@ def test_world_of_the_bare_wall_hides_nothing() -> None:
     assert world.truth_depth_m(11) is None
     assert world.rig.occluder is None
     assert not _equal(world.images(0), world.images(1))
+
+
+def test_world_opens_without_a_cache_that_cannot_be_written(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("NLOS_CAM_CACHE", "/dev/null/cache")
+    assert open_world("bare-wall").images(0).depth_z16.any()
+    assert "NLOS_CAM_CACHE" in caplog.text
