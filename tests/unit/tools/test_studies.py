@@ -154,7 +154,7 @@ def test_rig_map_has_a_cell_for_every_place(
     module = tool("weights")
     network = type("Plate", (), {"record": SimpleNamespace(input="raw maps"), "__call__": plate})()
     monkeypatch.setattr(module, "load_reconstructor", lambda *_: network)
-    monkeypatch.setattr(module, "test_set", lambda box: seeded_objects(0, 1, box))
+    monkeypatch.setattr(module, "benchmark_objects", lambda box: seeded_objects(0, 1, box))
     monkeypatch.setattr(module, "DISTANCES_M", (0.2,))
     monkeypatch.setattr(module, "ANGLES_DEG", (15.0, 45.0))
     table = run("weights", "rig_map", "rigs", "--weights", f"plate={weights[0]}")
@@ -229,7 +229,7 @@ def test_physics_check_scores_true_objects_lowest(
     tool: Tool, run: Read, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = tool("physics_check")
-    monkeypatch.setattr(study, "test_set", lambda box: seeded_objects(20_000_000, 3, box))
+    monkeypatch.setattr(study, "benchmark_objects", lambda box: seeded_objects(20_000_000, 3, box))
     monkeypatch.setattr(study, "load_reconstructor", lambda *_: plate)
     table = run("physics_check", "physics_check", "--new", 2, "--outside", 0, "--out", tmp_path / "docs")
     scores = table["scores"]
