@@ -9,11 +9,11 @@ live: .venv/.live
 
 # The quick tests, in two processes: to be run before every commit.
 test: .venv/.test
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not bench and not slow' tests/laws tests/unit tests/contract
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not bench and not slow' tests/laws tests/unit tests/contract tests/hardware
 
-# All tests, quick and slow; tests that draw in a browser run last, alone.
-test-all: .venv/.test
-	$(BIN)/python -m pytest -n 2 --dist loadfile tests/laws tests/unit tests/contract tests/bench tests/hardware
+# All tests: the quick ones first, then the slow ones, and alone those that draw in a browser.
+test-all: test
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'slow and not bench' tests/laws tests/unit tests/contract
 	$(BIN)/python -m pytest tests/browser
 
 check: .venv/.test
