@@ -278,12 +278,6 @@ def at_near_edge(board: Board, seen: View) -> Placement:
     return Placement(edge_m + board.size_mm[0] * 0.5e-3)
 
 
-def at_optical_axis(seen: View) -> Placement:
-    """Return an upright board where the optical axis meets the wall."""
-    axis = seen.pose[:3, 2]
-    return Placement(*(-axis[:2] / axis[2] * seen.pose[2, 3]))
-
-
 def corners_px(board: Board, seen: View, placed: Placement, bow_m: tuple[float, float] = (0.0, 0.0)) -> Float64:
     """Return the true places of the chessboard corners (n, 2) in pixels, also outside the image.
 

@@ -6,7 +6,6 @@ resumes where an interrupted run stopped. `write` and `save` put the results int
 
 import hashlib
 import json
-import sys
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,7 +26,6 @@ from nlos_cam.files import cache_folder
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PRODUCT = "nlos_cam", "calibration", "models"
-sys.path.append(str(ROOT / "tools"))  # the synthetic scenes are modules of tools/
 
 Record = dict[str, Any]
 

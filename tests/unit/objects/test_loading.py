@@ -43,3 +43,10 @@ def test_load_object_suggests_the_nearest_category(name: str, hint: str) -> None
 def test_load_object_refuses_arguments_that_do_not_apply(name: str, arguments: dict[str, object]) -> None:
     with pytest.raises(SceneError, match="seed is for categories"):
         load_object(name, BOX, **arguments)  # type: ignore[arg-type]
+
+
+def test_load_object_refuses_a_plate_seen_edge_on(tmp_path: Path) -> None:
+    plate = tmp_path / "plate.obj"
+    plate.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", encoding="utf-8")
+    with pytest.raises(SceneError, match=r"plate\.obj"):
+        load_object(str(plate), BOX, Pose(tilt_y_rad=np.pi / 2))
