@@ -2,10 +2,11 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: live test test-all check docs
+.PHONY: live test test-all check wheel docs
 
+# The base installation alone, without torch.
 live: .venv/.live
-	$(BIN)/nlos-cam live --camera sim
+	$(BIN)/nlos-cam demo
 
 # The quick tests, in two processes: to be run before every commit.
 test: .venv/.test
@@ -18,6 +19,10 @@ test-all: test
 
 check: .venv/.test
 	$(BIN)/python tools/checks/check.py
+
+# The wheel and the sdist, installed and used from an empty folder without the extra "train".
+wheel: .venv/.test
+	$(BIN)/python tools/checks/wheel.py
 
 # The docs as a site, in site/; a link that leads nowhere ends it.
 docs: .venv/.docs

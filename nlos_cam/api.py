@@ -29,7 +29,7 @@ from nlos_cam.camera import Camera, OnProgress, open_camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live import FrameReader, RunStatistics, iterate_results, warm_up, with_telemetry
-from nlos_cam.objects import cell_centers_m, object_box
+from nlos_cam.objects import SurfaceMesh, cell_centers_m, mesh_from_depth, object_box
 from nlos_cam.reconstruct import (
     Clock,
     FrameResult,
@@ -81,6 +81,10 @@ class Glimpse:
         x_m, y_m = np.meshgrid(*cell_centers_m(self.box))
         points_m = np.stack([x_m, y_m, self.depth_m], -1).astype(np.float32)
         return points_m[np.isfinite(self.depth_m)]
+
+    def to_mesh(self) -> SurfaceMesh:
+        """Return the hidden surface as a mesh in the wall frame; its `save` writes .ply, .glb, .obj, .csv or .npz."""
+        return mesh_from_depth(self.depth_m, self.box, self.uncertainty_m)
 
     @property
     def maps(self) -> LidarMaps:

@@ -2,6 +2,8 @@
 
     NlosCamError                     exit 1   root; one clear line: what was wrong, the value, what to do
     ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be rendered
+    │   ├── SceneFileError           exit 4   a scene, mesh or depth map that is missing or unreadable
+    │   └── UnknownNameError         exit 2   no object, scene or setting of that name
     ├── BudgetError (ValueError)     exit 1   a latency budget that no setting meets on this machine
     ├── OutputExistsError (FileExistsError)  exit 1   --out exists and --overwrite was not given
     ├── DiskFullError (OSError)      exit 1   too little disk space for the output, or none left
@@ -9,12 +11,15 @@
     ├── WorkersLostError (ChildProcessError)  exit 1   worker processes that cannot start, or that keep dying
     ├── CameraError (OSError)        exit 3   a device that is missing or does not respond as it should
     │   ├── CameraNotFoundError      exit 3   no such device
+    │   │   └── UnknownCameraError   exit 2   a mistyped name of a camera
     │   └── CameraLostError          exit 3   a device that vanished or went silent while in use
     └── RecordingError (OSError)     exit 4   a recording, dataset or record that cannot be read
         └── StreamMissingError       exit 4   a readable recording without a stream that is needed
 
 `nlos_calibration.errors` and `nlos_models.errors` hold their packages' roots; the command line catches all three.
 """
+
+from collections.abc import Iterable
 
 
 class NlosCamError(Exception):
@@ -25,6 +30,18 @@ class NlosCamError(Exception):
 
 class SceneError(NlosCamError, ValueError):
     """Scene, object or accuracy that cannot be rendered: "no object 'cupp': did you mean 'cup'?"."""
+
+
+class SceneFileError(SceneError):
+    """Scene, mesh or depth-map file that is missing or unreadable: "a.toml is a wall record, not a scene"."""
+
+    exit_code = 4
+
+
+class UnknownNameError(SceneError):
+    """Name of nothing: "no object 'cupp'. Did you mean 'cup'?"."""
+
+    exit_code = 2
 
 
 class BudgetError(NlosCamError, ValueError):
@@ -57,6 +74,12 @@ class CameraNotFoundError(CameraError):
     """Camera that is not connected: "no L515 found (librealsense sees no device): check the USB 3 cable and port"."""
 
 
+class UnknownCameraError(CameraNotFoundError):
+    """Mistyped name of a camera: "no camera 'simm'. Did you mean 'sim'?"."""
+
+    exit_code = 2
+
+
 class CameraLostError(CameraError):
     """Camera that vanished or went silent while in use: "l515 did not stop within 5 s: replug it"."""
 
@@ -69,3 +92,11 @@ class RecordingError(NlosCamError, OSError):
 
 class StreamMissingError(RecordingError):
     """Recording without a stream that is needed: "run.bag has no infrared stream (it has color, depth)"."""
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """Return " Did you mean ...?" with the nearest of the names, empty where none is near."""
+    from difflib import get_close_matches
+
+    nearest = get_close_matches(name, list(names), 1)
+    return f" Did you mean {nearest[0]!r}?" if nearest else ""

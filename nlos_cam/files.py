@@ -1,55 +1,92 @@
-"""Atomic writes of results, and the location of the cache directory."""
+"""Atomic writes of results (see also nlos_models.files), and the location of the cache directory."""
 
+import ctypes
 import os
-import secrets
 import shutil
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+from nlos_models import atomic_file, claim, load_cached, reservations, sync_folder
+
 from nlos_cam.errors import OutputExistsError
 
-
-def _unfinished(path: Path) -> Path:
-    """Return a name beside `path` that no other process or container uses, unlike a process id."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-
-
-@contextmanager
-def atomic_file(path: Path) -> Generator[Path]:
-    """Yield a path to write to; on success flush that file to disk and rename it to `path`, else delete it.
-
-    Readers see the old file or the whole new one, also after a power cut or a full disk.
-    """
-    part = _unfinished(path)
-    try:
-        yield part
-        with part.open("r+b") as file:
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+__all__ = ["atomic_directory", "atomic_file", "cache_folder", "claim", "load_cached", "reservations"]
+AT_FDCWD, RENAME_EXCHANGE = -100, 2
+"""Of Linux' renameat2."""
 
 
 @contextmanager
 def atomic_directory(out: Path) -> Generator[Path]:
-    """Yield an empty directory beside `out`; on success move its entries into `out`, and delete it in any case.
+    """Yield an empty directory; on success flush it to disk and let it take the place of `out` in one rename.
 
-    Entries of `out` with the same names are replaced, others stay. Raises OutputExistsError where `out` is a file.
+    Entries of `out` with other names stay. Raises OutputExistsError where `out` is a file, or appeared meanwhile, and
+    FileBusyError while another process writes it.
     """
     if out.exists() and not out.is_dir():
         raise OutputExistsError(f"{out} is a file, but --out must be a directory: choose another name")
-    part = _unfinished(out)
-    part.mkdir()
-    try:
+    out, existed = out.resolve(), out.exists()
+    with claim(out) as folder:
+        part = folder / out.name
+        part.mkdir()
         yield part
-        out.mkdir(exist_ok=True)
-        for entry in part.iterdir():
-            if entry.is_dir():
-                shutil.rmtree(out / entry.name, ignore_errors=True)
-            entry.replace(out / entry.name)
-    finally:
-        shutil.rmtree(part)
+        _flush(part)
+        if existed:
+            _replace_directory(part, out, folder)
+        else:
+            _rename_new(part, out)
+        sync_folder(out.parent)
+
+
+def _flush(folder: Path) -> None:
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            with Path(parent, name).open("r+b") as file:
+                os.fsync(file.fileno())
+        sync_folder(Path(parent))
+
+
+def _rename_new(part: Path, out: Path) -> None:
+    try:
+        part.rename(out)  # fails unless `out` is missing or empty
+    except OSError as error:
+        if not out.exists():
+            raise
+        raise OutputExistsError(f"{out} appeared while it was being written: choose another name") from error
+
+
+def _replace_directory(part: Path, out: Path, folder: Path) -> None:
+    replaced = [entry.name for entry in part.iterdir()]
+    others = [entry for entry in out.iterdir() if entry.name not in replaced]
+    fixed = Path.cwd().is_relative_to(out) or any(entry.is_mount() for entry in (out, *others))
+    if not fixed and _link_all(others, part) and _exchange(part, out):
+        return
+    for name in replaced:  # entry by entry where the directory itself has to stay, or the system cannot exchange two
+        if (out / name).is_dir():
+            (out / name).rename(folder / f"old {name}")
+        (part / name).replace(out / name)
+
+
+def _link_all(entries: list[Path], target: Path) -> bool:
+    """Link entries into a second directory, so that either is whole; return False where the file system cannot."""
+    try:
+        for entry in entries:
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.copytree(entry, target / entry.name, symlinks=True, copy_function=os.link)
+            else:
+                os.link(entry, target / entry.name, follow_symlinks=False)
+    except (OSError, shutil.Error, NotImplementedError):
+        return False
+    return True
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Exchange two directories in one step; return False where the system cannot."""
+    try:
+        call = ctypes.CDLL(None, use_errno=True).renameat2
+    except (AttributeError, OSError, TypeError):
+        return False
+    return call(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0
 
 
 def cache_folder() -> Path:

@@ -121,6 +121,21 @@ def _mean_near(bits: Int32, depth_m: Float32, counts: NDArray[np.uint8], median_
     return np.float32(total) / np.float32(near)
 
 
+@numba.njit(cache=True, error_model="numpy")
+def reduce_cell(
+    bits: Int32, samples_m: Float32, counts: NDArray[np.uint8], valid: np.int32, middle: Int32, middle_m: Float32
+) -> tuple[Real, Real]:
+    """Return depth and intensity of a cell's samples (n,), of which some are valid: median depth, and mean near it.
+
+    `samples_m` and `middle_m` show the bits of `bits` and `middle` (2,), which is scratch memory, as depths.
+    """
+    middle[0], middle[1] = _two_from(bits, (valid - np.int32(1)) >> 1)
+    depth = middle_m[0] if valid % 2 else (middle_m[0] + middle_m[1]) / np.float32(2.0)
+    mean = _mean_near(bits, samples_m, counts, depth, np.float32(WINNER_SPREAD_M))
+    # the two middle samples may be of two echoes, with no sample near their mean: take all valid ones then
+    return depth, mean if mean == mean else _mean_near(bits, samples_m, counts, 0.0, np.inf)  # noqa: PLR0124  NaN
+
+
 @numba.njit(cache=True, error_model="numpy", nogil=True)  # so that another thread can read the next frame
 def _reduce_cells(
     depth_bits: Int32,
@@ -142,11 +157,8 @@ def _reduce_cells(
             valid = _gather(depth_bits[top:bottom, left:right], ir[top:bottom, left:right], bits[:n], counts[:n])
             if valid == 0:
                 continue
-            middle[0], middle[1] = _two_from(bits[:n], (valid - np.int32(1)) >> 1)
-            depth[i, j] = middle_m[0] if valid % 2 else (middle_m[0] + middle_m[1]) / np.float32(2.0)
-            mean = _mean_near(bits[:n], samples_m[:n], counts[:n], depth[i, j], np.float32(WINNER_SPREAD_M))
-            # the two middle samples may be of two echoes, with no sample near their mean: take all valid ones then
-            intensity[i, j] = mean if mean == mean else _mean_near(bits[:n], samples_m[:n], counts[:n], 0.0, np.inf)  # noqa: PLR0124  NaN
+            found = reduce_cell(bits[:n], samples_m[:n], counts[:n], valid, middle, middle_m)
+            depth[i, j], intensity[i, j] = found
     return depth, intensity
 
 

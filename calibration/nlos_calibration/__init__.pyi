@@ -64,7 +64,10 @@ __all__ = [
     "new_wall_record",
     "normal_from_angles",
     "on_plane",
+    "packaged_rigs",
     "points_m",
+    "read_toml",
+    "record_kind",
     "rig_difference",
     "rig_named",
     "save_reference",
@@ -74,7 +77,6 @@ __all__ = [
     "wall_from_plane",
     "wall_from_zero",
     "wall_points_m",
-    "wall_summary",
     "wall_with_board",
     "watched_pixels",
     "with_degrees",
@@ -107,9 +109,12 @@ from .rig import (
     dump_toml,
     first_problem,
     load_rig,
+    packaged_rigs,
+    read_toml,
+    record_kind,
 )
 from .rig_check import GAP_RANGE_M, MAP_SHAPE, footprint, lidar_visible_share, on_plane, rig_difference
-from .summary import board_agreement, wall_facts, wall_summary
+from .summary import board_agreement, wall_facts
 from .wall import (
     DISTANCE_RANGE_M,
     FACING_RANGE_DEG,

@@ -48,6 +48,7 @@ class Drift:
         """Return the drift in tolerances, less `sigmas` standard uncertainties."""
         if self.uniform:
             return (abs(self.range_m) - sigmas * self.range_std_m) / TOLERANCE_M
+        # The worst of three, not their sum: each tolerance is one that the reconstruction bears by itself.
         return max(
             (abs(self.distance_m) - sigmas * self.distance_std_m) / TOLERANCE_M,
             (abs(self.yaw_deg) - sigmas * self.yaw_std_deg) / TOLERANCE_DEG,
@@ -62,8 +63,10 @@ class Drift:
 
     def apart(self, other: "Drift") -> bool:
         """Return True if two drifts differ in kind, or by more than a tolerance."""
+        # A change of range and a moved lidar explain the same depths: their figures cannot be compared with each other.
         if self.uniform or other.uniform:
             return self.uniform != other.uniform or abs(self.range_m - other.range_m) > TOLERANCE_M
+        # Yaw and pitch turn about perpendicular axes: for small angles the whole turn is their hypotenuse.
         turn_deg = hypot(self.yaw_deg - other.yaw_deg, self.pitch_deg - other.pitch_deg)
         return abs(self.distance_m - other.distance_m) > TOLERANCE_M or turn_deg > TOLERANCE_DEG
 

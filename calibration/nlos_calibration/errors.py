@@ -4,7 +4,8 @@ CalibrationError (ValueError)    exit 1   root
 ├── WallRefusedError             exit 1   "only 31.0% of the depth lies on one plane (50% needed), ..."
 ├── BoardRefusedError            exit 1   "4 corners of a board of 6 x 9 squares of 30 mm are seen, 8 needed: ..."
 ├── OccluderRefusedError         exit 1   "the occluder touches the wall (gap 1.2 mm, known to 2.0 mm): ..."
-└── RecordFileError              exit 4   "wall.toml is not a wall record: frames: ... (got 0)"
+└── RecordFileError              exit 4   "wall.toml is not a wall record: frames: must be greater than 0 (got 0)"
+    └── UnknownRigError          exit 2   "no rig 'paper-rgi'. Did you mean 'paper-rig'?"
 """
 
 
@@ -30,3 +31,9 @@ class RecordFileError(CalibrationError):
     """A rig or wall record cannot be read."""
 
     exit_code = 4
+
+
+class UnknownRigError(RecordFileError):
+    """Mistyped name of a packaged rig."""
+
+    exit_code = 2

@@ -17,7 +17,6 @@ from nlos_calibration.geometry import Intrinsics, propagated_std
 from nlos_calibration.intervals import with_mm
 from nlos_calibration.noise import SCATTER_PER_MEDIAN, MeanNoise, depth_noise_m
 from nlos_calibration.plane import GATE_SIGMAS, PlaneFit, fit_depth, plane_depth_m
-from nlos_calibration.rig import Occluder, Rig
 
 WALL_BAND_M = 0.004
 """Distance of a wall point from the plane by errors of the wall's pose and the lidar's ripples, beside noise."""
@@ -224,6 +223,8 @@ class OccluderFit:
     pixels: Mask = field(repr=False)
     """(height, width); inliers of the sheet's plane."""
     warnings: tuple[str, ...]
+    doubt: str = ""
+    """Reason not to use the reference that was taken along: an object seems to be hidden."""
 
 
 def find_occluder(
@@ -266,15 +267,11 @@ def find_occluder(
         edge_deg=degrees(np.arctan(edge.slope)),
         residual_m=sheet.plane.residual_m,
         pixels=pixels,
-        warnings=_warnings(view, sheet),
+        warnings=_warnings(sheet),
+        doubt=_doubt(view),
     )
     _check_edge(fit)
     return fit
-
-
-def rig_with_occluder(rig: Rig, x_m: float, gap_m: float) -> Rig:
-    """Return the rig with its occluder at x_m, gap_m."""
-    return rig.model_copy(update={"occluder": Occluder(x_m=x_m, z_min_m=gap_m)})
 
 
 def _check_in_view(view: ClassifiedView) -> None:
@@ -370,12 +367,16 @@ def _check_edge(fit: OccluderFit) -> None:
         )
 
 
-def _warnings(view: ClassifiedView, sheet: SheetFit) -> tuple[str, ...]:
+def _doubt(view: ClassifiedView) -> str:
+    """Return the sign of a hidden object in the view, whose echoes the reference then holds too; else empty."""
+    if view.behind_share <= WARN_BEHIND_SHARE:
+        return ""
+    return f"an object seems to be hidden ({view.behind_share:.0%} of the depth is behind the wall)"
+
+
+def _warnings(sheet: SheetFit) -> tuple[str, ...]:
     """Return remarks on an occluder that was found nevertheless."""
     lines: list[str] = []
-    if view.behind_share > WARN_BEHIND_SHARE:
-        share = f"{view.behind_share:.0%} of the depth is behind the wall"
-        lines.append(f"an object seems to be hidden ({share}): remove it and measure again")
     if sheet.plane.inlier_fraction < WARN_ON_SHEET_SHARE:
         off = 1.0 - sheet.plane.inlier_fraction
         lines.append(f"{off:.0%} of the pixels in front of the wall are not on the occluder: remove everything else")

@@ -4,9 +4,10 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from nlos_calibration.rig_check import MAP_SHAPE
 
 FULL_SCALE = 255
 """IR counts of a saturated pixel."""
+MAX_BYTES = 1 << 28
+"""Bound on a reference file, and on its unpacked content: one of 640 x 480 pixels has some 20 MB."""
 
 
 class Moments:
@@ -153,7 +156,8 @@ def load_reference(path: Path, sha256: str) -> BareWall:
     """Read the reference that a record names. Raises RecordFileError if it is missing, damaged or another record's."""
     advice = "calibrate the wall again"
     try:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        content = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
+        digest = hashlib.sha256(content).hexdigest()
     except OSError as error:
         raise RecordFileError(
             f"cannot read the bare-wall reference {path} ({error.strerror}): keep it beside its record, or {advice}",
@@ -164,9 +168,17 @@ def load_reference(path: Path, sha256: str) -> BareWall:
             f"restore the original file, or {advice}"
         )
     try:
-        with np.load(path) as file:
+        _check_unpacked_size(content)
+        with np.load(BytesIO(content)) as file:
             facts = json.loads(str(file["facts"]))
             arrays = {name: file[name] for name in ARRAYS}
         return BareWall(**arrays, **(facts | {"intrinsics": Intrinsics(**facts["intrinsics"])}))
-    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
-        raise RecordFileError(f"{path} is not a bare-wall reference ({error}): {advice}") from error
+    except Exception as error:  # numpy, zipfile and JSON raise almost anything for crafted bytes
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RecordFileError(f"{path} is not a bare-wall reference ({reason:.200}): {advice}") from error
+
+
+def _check_unpacked_size(content: bytes) -> None:
+    with ZipFile(BytesIO(content)) as archive:
+        if (unpacked := sum(entry.file_size for entry in archive.infolist())) > MAX_BYTES:
+            raise ValueError(f"it unpacks to {unpacked} bytes")

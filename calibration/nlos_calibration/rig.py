@@ -1,25 +1,41 @@
 """Rig record: lidar pose and intrinsics, wall, occluder, object box and device constants, as validated TOML."""
 
 import hashlib
+import re
 import tomllib
-from importlib import resources
+from collections.abc import Mapping
+from difflib import get_close_matches
 from importlib.resources.abc import Traversable
 from math import degrees, radians
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from nlos_calibration.errors import RecordFileError
+from nlos_calibration.errors import RecordFileError, UnknownRigError
 from nlos_calibration.geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 R = TypeVar("R", bound=BaseModel)
+TOML_LIMIT = 1 << 20
+"""Bound on a file's bytes: a record has some kB."""
+KINDS = {"schema_version": "wall record", "task": "training recipe", "lidar": "rig", "rig": "scene"}
+"""Kind of a TOML file by a field of it, in this order: a wall record has a rig too."""
+WORDING = {
+    "^Value error, ": "",
+    "^Field required$": "is missing",
+    "^Extra inputs are not permitted$": "is no known field",
+    "^Input should be ": "must be ",
+    "a valid integer.*": "a whole number",
+    "a valid (dictionary|mapping).*": "a table",
+    "(a )?valid (number|string|boolean|list|tuple|date).*": r"a \2",
+}
+"""Phrases of pydantic as patterns, and how a person says them."""
 
 
 class Record(BaseModel):
@@ -149,32 +165,67 @@ class Rig(Record):
 def first_problem(error: ValidationError) -> str:
     """Return the first problem of a validation as one line: field, problem, value."""
     problem = error.errors()[0]
-    field = ".".join(str(part) for part in problem["loc"]) or "record"
-    return f"{field}: {problem['msg']} (got {problem['input']!r:.80})"
+    field, text, value = ".".join(str(part) for part in problem["loc"]), problem["msg"], problem["input"]
+    for library, plain in WORDING.items():
+        text = re.sub(library, plain, text)
+    got = "" if isinstance(value, dict | list) else f" (got {value!r:.80})"
+    return f"{field or 'record'}: {text}{got}"
+
+
+def record_kind(content: Mapping[str, object]) -> str:
+    """Return the kind of file that a TOML document is, by a field that only this kind has; empty if unknown."""
+    return next((kind for field, kind in KINDS.items() if field in content), "")
+
+
+def packaged_rigs() -> list[Path]:
+    """Return the files of the rigs that come with the package."""
+    return sorted((Path(__file__).parent / "rigs").glob("*.toml"))
 
 
 def load_rig(name_or_path: str | Path) -> Rig:
     """Load a packaged rig by name (`paper-rig`, `bare-wall`), or a rig from a TOML file.
 
-    Raises RecordFileError where it cannot be read.
+    Raises RecordFileError where it cannot be read, UnknownRigError for a name that no rig has.
     """
-    packaged = resources.files("nlos_calibration") / "rigs" / f"{name_or_path}.toml"
-    source = packaged if packaged.is_file() else Path(name_or_path)
+    packaged, source = {path.stem: path for path in packaged_rigs()}, Path(name_or_path)
+    if str(name_or_path) in packaged:
+        source = packaged[str(name_or_path)]
+    elif not source.exists() and str(name_or_path) == source.stem:
+        names = [*packaged]
+        near = "".join(f" Did you mean {name!r}?" for name in get_close_matches(source.stem, names, 1))
+        raise UnknownRigError(f"no rig {source.stem!r}.{near} Give {' or '.join(names)}, or a rig's TOML file")
     return read_record(source, Rig, "rig", "give a packaged name (paper-rig) or a file")
+
+
+def read_toml(source: Traversable) -> dict[str, Any]:
+    """Return the content of a TOML file. Raises OSError, UnicodeDecodeError or TOMLDecodeError."""
+    with source.open("rb") as file:
+        content = file.read(TOML_LIMIT + 1)
+    if len(content) > TOML_LIMIT:
+        raise tomllib.TOMLDecodeError(f"it is longer than {TOML_LIMIT >> 20} MiB")
+    try:
+        return tomllib.loads(content.decode())
+    except RecursionError as error:
+        raise tomllib.TOMLDecodeError("it is nested too deeply") from error
 
 
 def read_record(source: Traversable, model: type[R], kind: str, advice: str) -> R:
     """Read a validated record from a TOML file. Raises RecordFileError, with `advice` if there is no such file."""
+    content: dict[str, object] = {}
     try:
-        return model.model_validate(tomllib.loads(source.read_text(encoding="utf-8")))
+        content = read_toml(source)
+        return model.model_validate(content)
     except FileNotFoundError as error:
         raise RecordFileError(f"no {kind} {source}: {advice}") from error
     except ValidationError as error:
+        if (other := record_kind(content)) not in {"", kind}:
+            raise RecordFileError(f"{source} is a {other}, not a {kind}: {advice}") from error
         raise RecordFileError(f"{source} is not a {kind}: {first_problem(error)}") from error
     except UnicodeDecodeError as error:
         raise RecordFileError(f"{source} is a binary file, not a TOML {kind}: {advice}") from error
     except (OSError, tomllib.TOMLDecodeError) as error:
-        raise RecordFileError(f"{source} cannot be read as TOML ({error}): {advice}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise RecordFileError(f"{source} cannot be read as TOML ({reason}): {advice}") from error
 
 
 def dump_toml(record: BaseModel) -> str:

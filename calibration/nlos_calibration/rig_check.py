@@ -295,6 +295,11 @@ def _aperture(rig: Rig, box: ObjectBox, view: Footprint, name: str) -> list[str]
     return [f"{problem}: " + (f"move the occluder {by_cm} cm away from the wall" if by_cm else "use a larger wall")]
 
 
+def rig_with_occluder(rig: Rig, x_m: float, gap_m: float) -> Rig:
+    """Return the rig with its occluder at x_m, gap_m."""
+    return rig.model_copy(update={"occluder": Occluder(x_m=x_m, z_min_m=gap_m)})
+
+
 def _with_occluder_moved(rig: Rig, x_cm: int, z_cm: int) -> Rig | None:
     """Return the rig with its occluder moved; None where that is past the lidar or out of the paper's gaps."""
     if rig.occluder is None:
@@ -302,7 +307,7 @@ def _with_occluder_moved(rig: Rig, x_cm: int, z_cm: int) -> Rig | None:
     x_m, gap_m = rig.occluder.x_m + x_cm / 100.0, rig.occluder.z_min_m + z_cm / 100.0
     if x_m <= 0.0 or not GAP_RANGE_M[0] <= gap_m <= GAP_RANGE_M[1]:
         return None
-    return rig.model_copy(update={"occluder": Occluder(x_m=x_m, z_min_m=gap_m)})
+    return rig_with_occluder(rig, x_m, gap_m)
 
 
 def _turned_to_wall(rig: Rig, degrees: int) -> Rig:

@@ -1,6 +1,6 @@
-"""Summary of a wall record for readers: quantities with 95 % intervals, as rows and as Markdown.
+"""Summary of a wall record for readers: quantities with 95 % intervals, as rows.
 
-The report (HTML), the live view (Markdown) and the terminal all render these rows.
+The report, the live view and the terminal all show these rows.
 """
 
 from nlos_calibration.board_wall import BoardRecord
@@ -49,14 +49,6 @@ def wall_facts(record: WallRecord) -> list[Row]:
         span = dict.fromkeys(f"{value:.1f}" for value in (min(celsius), max(celsius)))
         rows.append(("temperature", f"{' to '.join(span)} °C", "of the camera"))
     return rows
-
-
-def wall_summary(record: WallRecord, status: str = "") -> str:
-    """Return a record as Markdown: verdict and advice, the `status` of now, a table of quantities, warnings."""
-    rows = [f"| {name} | {value} |" for name, value, _ in wall_facts(record)]
-    table = "\n".join(["| quantity | value (± 95 %) |", "|---|---|", *rows])
-    notes = [f"Note: {warning}" for warning in record.warnings]
-    return "\n\n".join(filter(None, [f"**{record.verdict.upper()}**: {record.advice}", status, table, *notes]))
 
 
 def board_agreement(board: BoardRecord) -> str:

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board_wall import BoardRecord, WallByBoard
 from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.occluder import OccluderFit, rig_with_occluder
+from nlos_calibration.occluder import OccluderFit
 from nlos_calibration.range_offset import Cause
 from nlos_calibration.reference import BareWall, load_reference
 from nlos_calibration.rig import (
@@ -27,7 +27,7 @@ from nlos_calibration.rig import (
     load_rig,
     read_record,
 )
-from nlos_calibration.rig_check import combined, footprint, judge_rig
+from nlos_calibration.rig_check import combined, footprint, judge_rig, rig_with_occluder
 from nlos_calibration.wall import Verdict, WallFit, range_verdict
 
 Row = tuple[Finite, Finite, Finite, Finite]
@@ -135,21 +135,27 @@ def new_wall_record(
     return WallRecord.model_validate(measured | {"camera": camera, "frames": frames, "created": created, "rig": rig})
 
 
+UNUSABLE = "do not use this record"
+
+
 def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
     """Return the record with an occluder that was detected since.
 
-    Doubts about the wall itself stay; remarks on the previous occluder, the paper's or an earlier one, go.
+    Signs of a hidden object make it doubtful. Doubts about the wall itself stay; remarks on the
+    previous occluder, the paper's or an earlier one, go.
     """
     measured = {name: value for name, value in vars(fit).items() if name in OccluderRecord.model_fields}
     occluder = OccluderRecord(source="detected", **measured)
     rig = rig_with_occluder(record.rig, occluder.x_m, occluder.gap_m)
     pose = np.array(record.wall_from_lidar)
-    if record.verdict == "doubtful":
+    if record.verdict == "doubtful" and not record.advice.startswith(UNUSABLE):
         assumed = judge_rig(record.rig, footprint(pose, record.rig.pinhole, record.rig.wall), record.occluder)
         wall = record.verdict, record.advice.removesuffix("".join(f"; {problem}" for problem in assumed))
     else:
         wall = range_verdict(record.distance_m, record.facing_deg)
     verdict, advice = combined(*wall, judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder))
+    if fit.doubt:
+        verdict, advice = "doubtful", f"{UNUSABLE}: {fit.doubt}; remove the object and measure again"
     changed = {"occluder": occluder, "rig": rig, "verdict": verdict, "advice": advice}
     changed |= {"warnings": tuple(dict.fromkeys((*record.warnings, *fit.warnings)))}
     return WallRecord.model_validate(record.model_dump() | changed)

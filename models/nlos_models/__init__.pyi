@@ -1,18 +1,26 @@
 __all__ = [
     "BACKGROUND_BELOW_V",
     "BLACK_V",
+    "CHECKSUMS",
+    "DISK_ERRORS",
     "MIN_V",
     "SIMULATION_ONLY",
     "SMALLER_IS_BETTER",
     "SMALLEST_SPREAD",
+    "TEXT_LIMIT",
     "Accelerator",
+    "CellNormal",
     "CheckpointRecord",
+    "DirectNetwork",
     "DoubtRecord",
     "DoubtSet",
+    "FileBusyError",
     "InMemory",
     "MapBatch",
     "MapSet",
     "MapSource",
+    "NormalBatch",
+    "NormalSource",
     "OnnxReconstructor",
     "Preprocess",
     "Recipe",
@@ -26,34 +34,48 @@ __all__ = [
     "accuracy_mean_abs",
     "accuracy_within_2_percent",
     "as_batch",
+    "atomic_file",
     "brightness",
     "channel_statistics",
+    "checksums_of",
+    "claim",
     "color_metrics",
     "compressor_start",
     "cut_silhouette",
+    "describe",
     "digest_of",
-    "export_once",
+    "export_folder",
     "first_of",
     "foreground_rmse_mm",
     "latent_error",
     "launch",
     "lift_edges",
+    "load_cached",
     "load_encoder",
+    "load_network",
     "load_pipeline",
     "load_recipe",
     "load_reconstructor",
     "load_record",
     "load_uncertainty_model",
     "load_vae",
+    "missing_extra",
+    "network_export",
     "open_fabric",
+    "packaged_recipes",
     "parts_of",
     "quantize",
+    "read_bounded",
+    "read_toml",
     "rebuild",
     "record_doubt_run",
     "record_run",
     "refuse_color",
+    "require",
+    "reservations",
     "run",
     "run_compressor",
+    "run_direct",
     "run_doubt",
     "run_transfer",
     "run_vae",
@@ -62,23 +84,43 @@ __all__ = [
     "split_and_stack",
     "subtract_bare_wall",
     "surface",
+    "sync_folder",
+    "train_direct",
     "transfer_start",
     "vae_start",
+    "write_checked",
 ]
 
-from .checkpoint import CheckpointRecord, load_encoder, load_pipeline, load_record, load_vae, shipped_folder
+from .checkpoint import load_encoder, load_network, load_pipeline, load_vae
 from .data import InMemory, MapBatch, MapSet, MapSource, as_batch, first_of, subtract_bare_wall
+from .direct import CellNormal, DirectNetwork
+from .direct_training import NormalBatch, NormalSource, train_direct
 from .distributed import Accelerator, launch, open_fabric
-from .doubt_checkpoint import DoubtRecord, UncertaintyModel, load_uncertainty_model
 from .doubt_training import DoubtSet
+from .errors import FileBusyError
+from .export import Sample, TorchReconstructor, export_folder, network_export, quantize
+from .extras import missing_extra, require
+from .files import (
+    CHECKSUMS,
+    DISK_ERRORS,
+    TEXT_LIMIT,
+    atomic_file,
+    checksums_of,
+    claim,
+    describe,
+    load_cached,
+    read_bounded,
+    read_toml,
+    reservations,
+    sync_folder,
+    write_checked,
+)
 from .inference import (
     OnnxReconstructor,
     Reconstructor,
-    Sample,
-    TorchReconstructor,
-    export_once,
+    UncertaintyModel,
     load_reconstructor,
-    quantize,
+    load_uncertainty_model,
     refuse_color,
 )
 from .losses import latent_error
@@ -96,13 +138,15 @@ from .metrics import (
     surface,
 )
 from .pipeline import SMALLEST_SPREAD, Preprocess, channel_statistics, cut_silhouette, lift_edges, split_and_stack
-from .recipe import SIMULATION_ONLY, Recipe, load_recipe
+from .recipe import SIMULATION_ONLY, Recipe, load_recipe, packaged_recipes
+from .records import CheckpointRecord, DoubtRecord, load_record, shipped_folder
 from .runs import (
     TrainingRun,
     compressor_start,
     record_doubt_run,
     record_run,
     run_compressor,
+    run_direct,
     run_doubt,
     run_transfer,
     run_vae,

@@ -1,94 +1,24 @@
 """Checkpoints: one float16 safetensors file per network, beside a JSON record of runs, rig and held-out figures."""
 
 import json
-from collections.abc import Iterable, Mapping
-from importlib import resources
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save
 from torch import nn
 
+from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError
+from nlos_models.files import TENSOR_LIMIT, describe, read_checked, write_checked
 from nlos_models.pipeline import RemappingNetwork, new_pipeline, new_vae
-from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
+from nlos_models.records import DIRECT, RECORD, CheckpointRecord, load_record, shipped_folder
 from nlos_models.vae import Encoder, ResVae
 
-
-class CheckpointRecord(BaseModel):
-    """Origin of a checkpoint's tensors: rig, kind of maps, recipes of the runs, and held-out figures."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    rig_name: str
-    rig_checksum: str
-    input: MapKind = "raw maps"
-    """The compressor's input; difference maps are maps minus the bare wall's."""
-    vae_recipe: Recipe | None = None
-    """None for a compressor and decoder trained in one step."""
-    compressor_recipe: Recipe | None = None
-    """None for a VAE alone."""
-    transfer_recipe: Recipe | None = None
-    """None for weights trained on synthetic maps alone."""
-    earlier: list[Recipe] = []
-    """Recipes of the runs before those above, the oldest first."""
-    figures: dict[str, float] = {}
-    """Held-out figures at the end of training."""
-    note: str = Field(default="", validate_default=True)
-    """SIMULATION_ONLY for color weights, else empty, whatever value is passed in."""
-
-    @field_validator("note")
-    @classmethod
-    def _note_color(cls, note: str, info: ValidationInfo) -> str:
-        del note
-        return SIMULATION_ONLY if _any_in_color(info.data.get("vae_recipe"), info.data.get("compressor_recipe")) else ""
-
-    @classmethod
-    def of(cls, runs: Iterable[Recipe], rig: tuple[str, str], maps: MapKind = "raw maps") -> Self:
-        """Return the record of the weights that these runs made, the oldest first; `rig` is its (name, checksum)."""
-        last, earlier = dict[str, Recipe](), list[Recipe]()
-        for recipe in runs:
-            replaced = ("compressor", "transfer") if recipe.task == "compressor" else (recipe.task,)
-            earlier += [last.pop(task) for task in replaced if task in last]
-            last[recipe.task] = recipe
-        recipes = {f"{task}_recipe": recipe for task, recipe in last.items()}
-        return cls.model_validate(
-            {"rig_name": rig[0], "rig_checksum": rig[1], "input": maps, "earlier": earlier} | recipes
-        )
-
-    @property
-    def runs(self) -> list[Recipe]:
-        """Recipes of all runs behind these weights, the oldest first."""
-        own = (self.vae_recipe, self.compressor_recipe, self.transfer_recipe)
-        return [*self.earlier, *(recipe for recipe in own if recipe)]
-
-    @property
-    def vae_runs(self) -> list[Recipe]:
-        """Recipes of the runs that trained the encoder or decoder."""
-        return [recipe for recipe in self.runs if recipe.task == "vae" or recipe.steps == "two-then-joint"]
-
-    @property
-    def width(self) -> float:
-        """Channels of the compressor's layers as a share of Table S2's."""
-        return self.compressor_recipe.width if self.compressor_recipe else 1.0
-
-    @property
-    def color(self) -> bool:
-        """True for weights of full color, which is simulation only."""
-        return _any_in_color(self.vae_recipe, self.compressor_recipe)
-
-
-def _any_in_color(*recipes: Recipe | None) -> bool:
-    return any(recipe is not None and recipe.colour for recipe in recipes)
-
-
-RECORD = "checkpoint.json"
-SHIPPED = "paper-rig"
 PIPELINE_PARTS = "compressor", "preprocess", "decoder"
-FULL = frozenset({"mean", "spread", "bare_depth_m", "bare_intensity"})
+FULL = frozenset({"mean", "median", "spread", "bare_depth_m", "bare_intensity"})
 """Tensors that stay in float32."""
 
 
@@ -125,8 +55,28 @@ def save_pipeline(
     _save(folder, {**parts, "encoder": encoder} if encoder else parts, record)
 
 
+def save_direct(folder: Path, network: DirectNetwork, record: CheckpointRecord) -> None:
+    """Write a direct network and its record into a folder."""
+    _save(folder, {DIRECT: network}, record)
+
+
+def load_network(folder: Path | None = None) -> tuple[RemappingNetwork | DirectNetwork, CheckpointRecord]:
+    """Return the network from maps to images in a folder, of either kind, in eval mode, with its record.
+
+    Raises CheckpointError.
+    """
+    folder = folder or shipped_folder()
+    record = load_record(folder)
+    if not record.direct_recipe:
+        return load_pipeline(folder)
+    network = DirectNetwork(record.direct_recipe.direct)
+    load_part(folder / f"{DIRECT}.safetensors", network)
+    return network.eval(), record
+
+
 def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
     """Return a Res-VAE in eval mode, with its record. Raises CheckpointError unless all tensors fit."""
+    _refuse_package_without_encoder(folder)
     record = load_record(folder)
     vae = new_vae(color=record.color)
     for name, module in (("encoder", vae.encoder), ("decoder", vae.decoder)):
@@ -150,6 +100,8 @@ def load_pipeline_partly(folder: Path) -> tuple[RemappingNetwork, CheckpointReco
 
 def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[RemappingNetwork, CheckpointRecord]:
     record = load_record(folder)
+    if record.direct_recipe:
+        raise CheckpointError(f"{folder} holds a direct network: name weights from `train compressor`")
     if not (folder / "compressor.safetensors").exists() and (folder / "encoder.safetensors").exists():
         raise CheckpointError(f"{folder} holds a VAE without a compressor: name weights from `train compressor`")
     pipeline = new_pipeline(color=record.color, width=record.width)
@@ -161,12 +113,21 @@ def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[RemappingNetwo
 def load_encoder(folder: Path | None = None) -> Encoder | None:
     """Return the encoder beside a pipeline's weights, in eval mode, or None where they were trained without one."""
     folder = folder or shipped_folder()
+    _refuse_package_without_encoder(folder)
     path = folder / "encoder.safetensors"
     if not path.exists():
         return None
     encoder = new_vae(color=load_record(folder).color).encoder
     load_part(path, encoder)
     return encoder.eval()
+
+
+def _refuse_package_without_encoder(folder: Path) -> None:
+    if folder == shipped_folder() and not (folder / "encoder.safetensors").exists():
+        raise CheckpointError(
+            "the encoder of the shipped weights (21 MB) is not in the installed package: train from a clone of the "
+            "repository, or name your own weights with --vae or --weights"
+        )
 
 
 def load_fitting(path: Path, module: nn.Module) -> LoadReport:
@@ -181,46 +142,30 @@ def load_fitting(path: Path, module: nn.Module) -> LoadReport:
     return LoadReport(fitting, missing, left_over, sorted(set(shared) - set(fitting)))
 
 
-def shipped_folder() -> Path:
-    """Return the folder of the weights that come with the package."""
-    return Path(str(resources.files("nlos_models") / "weights" / SHIPPED))
-
-
-def load_record(folder: Path) -> CheckpointRecord:
-    """Return the record of a checkpoint folder. Raises CheckpointError where it is missing or not a record."""
-    try:
-        return CheckpointRecord.model_validate_json((folder / RECORD).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise CheckpointError(
-            f"no checkpoint in {folder} ({RECORD} cannot be read): name a folder of weights"
-        ) from error
-    except ValidationError as error:
-        problem = error.errors()[0]
-        field = ".".join(str(part) for part in problem["loc"])
-        raise CheckpointError(f"{folder / RECORD} is not a checkpoint's record: {field}: {problem['msg']}") from error
-
-
 def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -> None:
-    without = None if record.note else {"note"}  # older readers refuse the field
-    text = json.dumps(record.model_dump(mode="json", exclude=without), indent=2)
+    unset = {name for name in ("note", "direct_recipe") if not getattr(record, name)}  # older readers refuse these
+    text = json.dumps(record.model_dump(mode="json", exclude=unset), indent=2)
     save_parts(folder, parts, {RECORD: text})
 
 
 def save_parts(folder: Path, parts: Mapping[str, nn.Module], texts: Mapping[str, str]) -> None:
-    """Write networks as NAME.safetensors, and texts by file name, into a folder. Raises CheckpointError."""
+    """Write networks as NAME.safetensors, texts by file name, and checksums of all into a folder.
+
+    Raises CheckpointError.
+    """
+    files = {f"{name}.safetensors": _pack(module) for name, module in parts.items()}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, module in parts.items():
-            tensors = {key: _to_half(key, tensor) for key, tensor in module.state_dict().items()}
-            save_file(tensors, folder / f"{name}.safetensors")
-        for name, text in texts.items():
-            (folder / name).write_text(text + "\n", encoding="utf-8")
+        write_checked(folder, files | {name: f"{text}\n".encode() for name, text in texts.items()})
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"cannot write weights to {folder} ({error}): free some space and run again") from error
 
 
+def _pack(module: nn.Module) -> bytes:
+    return save({name: _to_half(name, tensor) for name, tensor in module.state_dict().items()})
+
+
 def _to_half(name: str, tensor: torch.Tensor) -> torch.Tensor:
-    if not tensor.is_floating_point() or "running" in name or name in FULL:
+    if not tensor.is_floating_point() or "running" in name or name.rpartition(".")[2] in FULL:
         return tensor.contiguous()  # statistics are few, and float16 would flush the smallest to zero
     half = tensor.half().contiguous()
     if not torch.isfinite(half).all():
@@ -239,7 +184,10 @@ def load_part(path: Path, module: nn.Module) -> None:
 
 def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
     try:
-        tensors = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path} cannot be read as weights: {error}") from error
-    return {key: value.float() if value.is_floating_point() else value for key, value in tensors.items()}
+        tensors = load(read_checked(path, TENSOR_LIMIT))
+    except (OSError, ValueError, SafetensorError, MemoryError) as error:
+        raise CheckpointError(f"{path} cannot be read as weights: {describe(error)}") from error
+    floats = {key: value.float() if value.is_floating_point() else value for key, value in tensors.items()}
+    if bad := [key for key, value in floats.items() if not torch.isfinite(value).all()]:
+        raise CheckpointError(f"{path} cannot be used as weights: {bad[0]} is not finite; train or copy them again")
+    return floats

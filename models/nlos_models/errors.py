@@ -3,9 +3,14 @@
 ModelError (ValueError)                  exit 1   root
 ├── TrainingError                        exit 1   "the loss is nan in epoch 3: choose a smaller learning_rate"
 ├── OutputExistsError (FileExistsError)  exit 1   "runs/a holds weights from another run: choose another --out"
+├── FileBusyError (BlockingIOError)      exit 1   "a.bag is being written by process 7 on lab: wait for it, ..."
 ├── CheckpointError                      exit 4   "decoder.safetensors cannot be read as weights: ..."
-└── RecipeError                          exit 4   "recipe.toml: batch: Input should be greater than 1 (got 1)"
+└── RecipeError                          exit 4   "recipe.toml: batch: must be greater than 1 (got 1)"
+    └── UnknownRecipeError               exit 2   "no recipe 'vea'. Did you mean 'vae'?"
 """
+
+import re
+from typing import Any
 
 
 class ModelError(ValueError):
@@ -22,6 +27,10 @@ class OutputExistsError(ModelError, FileExistsError):
     """An output folder with other contents, which training would overwrite."""
 
 
+class FileBusyError(ModelError, BlockingIOError):
+    """A file or folder that another process is writing."""
+
+
 class CheckpointError(ModelError):
     """Weights that cannot be read or do not fit the model."""
 
@@ -32,3 +41,30 @@ class RecipeError(ModelError):
     """A training recipe that cannot be read or contradicts itself."""
 
     exit_code = 4
+
+
+class UnknownRecipeError(RecipeError):
+    """A mistyped name of a packaged recipe."""
+
+    exit_code = 2
+
+
+WORDING = {
+    "^Value error, |^Assertion failed, ": "",
+    "^Field required$": "is missing",
+    "^Extra inputs are not permitted$": "is no known field",
+    "^Input should be ": "must be ",
+    "a valid integer.*": "a whole number",
+    "a valid (number|string|boolean|list|dictionary).*": r"a \1",
+}
+"""Phrases of pydantic as patterns, and how a person says them."""
+
+
+def first_problem(error: Any) -> str:
+    """Return the first problem of pydantic's ValidationError as one line: field, problem, value."""
+    problem = error.errors()[0]
+    field, text, value = ".".join(map(str, problem["loc"])), problem["msg"], problem["input"]
+    for library, plain in WORDING.items():
+        text = re.sub(library, plain, text)
+    got = "" if isinstance(value, dict | list) or not field else f" (got {value!r:.80})"
+    return f"{field}: {text}{got}" if field else f"{text}{got}"

@@ -1,12 +1,15 @@
 """Training recipes, each a short TOML file that defines a run with its deviations from the paper, and schedules."""
 
+import math
 import tomllib
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from nlos_models.errors import RecipeError
+from nlos_models.errors import RecipeError, UnknownRecipeError, first_problem
+from nlos_models.files import read_toml
 
 if TYPE_CHECKING:
     import torch
@@ -17,17 +20,35 @@ SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
 """Note on all data, weights and results in color."""
 
 
+class DirectSize(BaseModel):
+    """Widths and depths of a direct network."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    features: int = Field(default=96, gt=1, multiple_of=2)
+    """Of an input token: 8 x 8 cells."""
+    width: int = Field(default=384, gt=0)
+    """Of each side in the trunk."""
+    blocks: int = Field(default=3, ge=0)
+    """Residual blocks of the trunk."""
+    token: int = Field(default=128, gt=0)
+    """Features of an output token: 8 x 8 pixels."""
+    mixers: int = Field(default=2, ge=0)
+    """Blocks that mix output tokens."""
+
+
 class Recipe(BaseModel):
     """Parameters of one training run."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    task: Literal["vae", "compressor", "transfer", "doubt"]
+    task: Literal["vae", "compressor", "transfer", "doubt", "direct"]
     colour: bool = False
     """Train on RGB albedo in place of depth, in simulation only."""
     seed: int = Field(default=0, ge=0)
     objects: int = Field(gt=0)
-    """Training objects: for a VAE seeds 0, 1, ..., else the first of a dataset; held-out objects are different ones."""
+    """Training objects: for a VAE seeds 0, 1, ..., else the first of a dataset; held-out objects are different ones.
+    For a direct network the samples of an epoch, drawn from all objects that are there when it begins."""
     held_out: int = Field(gt=0)
     epochs: int = Field(gt=0)
     """Upper limit; for a transfer, of its second phase."""
@@ -36,7 +57,15 @@ class Recipe(BaseModel):
     learning_rate: float = Field(gt=1e-8)
     """Initial rate, or one-cycle's peak; above the rate at which a plateau run ends (SI 3 and 4)."""
     betas: tuple[float, float] = (0.5, 0.999)
-    schedule: Literal["one-cycle", "plateau"] = "plateau"
+    schedule: Literal["one-cycle", "plateau", "cosine"] = "plateau"
+    warm_up_steps: int = Field(default=100, ge=0)
+    """Cosine schedule: steps in which the rate rises."""
+    weight_decay: float = Field(default=0.0, ge=0)
+    """Decoupled, as in AdamW; 0: Adam."""
+    average: float = Field(default=0.0, ge=0, lt=1)
+    """Decay of the moving average of the weights, which is then what is scored and kept; 0: none."""
+    gradient_limit: float = Field(default=0.0, ge=0)
+    """Largest norm of the gradients, which are scaled down to it; 0: none."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     kl_weight: float = 0.05
     latent_warm_up: float = Field(default=0.0, ge=0, le=0.5)
@@ -49,6 +78,10 @@ class Recipe(BaseModel):
     image_weight: float = Field(default=0.0, ge=0)
     surface_weight: float = Field(default=1.0, ge=1)
     """Weight of a surface pixel in an image's error, relative to a background pixel (`losses.image_error`)."""
+    noise: float = Field(default=0.0, ge=0)
+    """Direct network: standard deviation of the noise added to normalised maps."""
+    direct: DirectSize = DirectSize()
+    """Size of a direct network."""
     image_loss: ImageLoss = "squared"
     """Error of a pixel; the best answer is the mean ("squared") or median ("absolute") of possible images."""
     augmentation: Literal["mirror", "turns"] = "mirror"
@@ -81,7 +114,7 @@ class Recipe(BaseModel):
     def _check_consistency(self) -> Self:
         if self.batch > self.objects:
             raise ValueError(f"a batch of {self.batch} is larger than objects ({self.objects})")
-        if self.task != "vae" and not self.latent_weight + self.image_weight:
+        if self.task not in {"vae", "direct"} and not self.latent_weight + self.image_weight:
             raise ValueError("latent_weight and image_weight are both 0: set at least one of them")
         if self.steps == "one" and self.latent_weight:
             raise ValueError("steps = 'one' has no target latent: set latent_weight = 0")
@@ -131,33 +164,58 @@ class Recipe(BaseModel):
         return self.model_copy(update={"objects": objects, "batch": min(self.batch, objects)})
 
 
+def packaged_recipes() -> dict[str, Path]:
+    """Return the recipes that come with the package (in a clone: models/recipes) by name, less "paper-rig-"."""
+    here = Path(__file__).parent
+    folder = next((folder for folder in (here / "recipes", here.parent / "recipes") if folder.is_dir()), here)
+    return {path.stem.removeprefix("paper-rig-"): path for path in sorted(folder.glob("*.toml"))}
+
+
 def load_recipe(path: Path) -> Recipe:
-    """Read a recipe from TOML. Raises RecipeError with the first problem."""
+    """Read a recipe from TOML, or a packaged one by name. Raises RecipeError with the first problem."""
+    if str(path) == path.stem and not path.exists():
+        known = packaged_recipes()
+        if (name := path.stem.removeprefix("paper-rig-")) not in known:
+            near = "".join(f" Did you mean {match!r}?" for match in get_close_matches(name, known, 1))
+            raise UnknownRecipeError(f"no recipe {path.stem!r}.{near} Give {', '.join(known)}, or a recipe's TOML file")
+        path = known[name]
     try:
-        return Recipe.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        return Recipe.model_validate(read_toml(path))
     except ValidationError as error:
-        problem = error.errors()[0]
-        field = ".".join(str(part) for part in problem["loc"])
-        value = f" (got {problem['input']!r:.80})" if field else ""
-        raise RecipeError(": ".join(part for part in (str(path), field, problem["msg"]) if part) + value) from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise RecipeError(f"{path} cannot be read as a recipe: {error}") from error
+        raise RecipeError(f"{path}: {first_problem(error)}") from error
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path} is a binary file, not a recipe: see `nlos-cam recipes`") from error
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RecipeError(f"{path} cannot be read as a recipe ({reason}): see `nlos-cam recipes`") from error
 
 
 PLATEAU_FACTOR, PLATEAU_PATIENCE, SMALLEST_RATE = 0.3, 5, 1e-8
 """SI 3 and 4: factor of the learning rate after this many epochs without progress; a smaller rate ends the run."""
+SMALLEST_SHARE = 0.01
+"""Share of the rate that a cosine schedule ends with."""
 WARM_UP = 0.15
 """Share of a one-cycle run in which the rate rises."""
 
 
 def schedule_of(recipe: Recipe, optimizer: "torch.optim.Optimizer", steps: int) -> Any:
-    """Return the recipe's schedule: one-cycle over `steps`, stepped at each, or plateau, stepped at each epoch."""
+    """Return the recipe's schedule: one-cycle or cosine over `steps`, stepped at each, or plateau, at each epoch."""
     import torch  # late: dataset workers read recipes' constants, and torch takes seconds
 
     if recipe.schedule == "one-cycle":
         return torch.optim.lr_scheduler.OneCycleLR(
             optimizer, recipe.learning_rate, total_steps=steps, pct_start=WARM_UP, cycle_momentum=False
         )
+    if recipe.schedule == "cosine":
+        warm_up = min(recipe.warm_up_steps, steps // 2)
+
+        def share(step: int) -> float:
+            if step < warm_up:
+                return (step + 1) / warm_up
+            through = min(1.0, (step - warm_up) / max(1, steps - warm_up))
+            return SMALLEST_SHARE + (1 - SMALLEST_SHARE) * (1 + math.cos(math.pi * through)) / 2
+
+        return torch.optim.lr_scheduler.LambdaLR(optimizer, share)
     return torch.optim.lr_scheduler.ReduceLROnPlateau(
         optimizer,
         factor=PLATEAU_FACTOR,

@@ -1,7 +1,7 @@
 """Training runs: starting weights, output folder and record, and one function per task that trains and saves."""
 
 from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -10,23 +10,32 @@ from lightning_fabric import Fabric
 
 from nlos_models.arrays import Float16
 from nlos_models.checkpoint import (
-    RECORD,
-    CheckpointRecord,
     load_encoder,
     load_pipeline,
     load_pipeline_partly,
-    load_record,
     load_vae,
+    save_direct,
     save_pipeline,
     save_vae,
-    shipped_folder,
 )
 from nlos_models.data import MapSet, MapSource
-from nlos_models.doubt_checkpoint import DOUBT_RECORD, DoubtRecord, checksum_of_watched, save_doubt
+from nlos_models.direct_training import NormalSource, train_direct
+from nlos_models.doubt_checkpoint import save_doubt
 from nlos_models.doubt_training import DoubtSet, calibrate, train_doubt
 from nlos_models.errors import OutputExistsError, TrainingError
+from nlos_models.export import export_folder
+from nlos_models.files import claim
 from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
+from nlos_models.records import (
+    DOUBT_RECORD,
+    RECORD,
+    CheckpointRecord,
+    DoubtRecord,
+    checksum_of_watched,
+    load_record,
+    shipped_folder,
+)
 from nlos_models.tasks import Start, figures_of, run, train_compressor, train_transfer, train_vae
 from nlos_models.train import Running, Scores
 from nlos_models.vae import Encoder, ResVae
@@ -57,10 +66,15 @@ class TrainingRun:
     compiled: bool = False
     watch: Watch = unwatched
 
-    def watched(self, fabric: Fabric, name: str) -> AbstractContextManager[Running]:
-        """Open progress and interruption for a run of this name."""
+    @contextmanager
+    def watched(self, fabric: Fabric, name: str) -> Generator[Running]:
+        """Open progress and interruption for a run of this name. Raises FileBusyError where another run has `out`."""
         running = Running(fabric, tensorboard=self.tensorboard, compiled=self.compiled, origin=self.origin)
-        return self.watch(running, self.recipe, name)
+        with ExitStack() as held:
+            if fabric.is_global_zero:
+                self.out.mkdir(parents=True, exist_ok=True)
+                held.enter_context(claim(self.out, inside=True))
+            yield held.enter_context(self.watch(running, self.recipe, name))
 
     def with_figures(self, figures: Scores) -> CheckpointRecord:
         """Return the record with the held-out figures."""
@@ -112,6 +126,16 @@ def run_compressor(fabric: Fabric, training: TrainingRun, start: Start, maps: Ma
     if fabric.is_global_zero:
         encoder = start.vae.encoder if start.vae and recipe.steps != "one" else None
         save_pipeline(training.out, pipeline, training.with_figures(figures), encoder)
+        _export(training)
+    return figures
+
+
+def run_direct(fabric: Fabric, training: TrainingRun, source: NormalSource, held_out: MapSet) -> Scores:
+    """Train a direct network and save it; return its held-out figures."""
+    with training.watched(fabric, "direct network") as running:
+        network, figures = train_direct(training.recipe, source, held_out, training.out, running)
+    save_direct(training.out, network, training.with_figures(figures))
+    _export(training)
     return figures
 
 
@@ -129,6 +153,7 @@ def run_transfer(
         pipeline, after = train_transfer(training.recipe, pipeline, encoder, maps, held_out, training.out, running)
     if fabric.is_global_zero:
         save_pipeline(training.out, pipeline, training.with_figures(after), encoder)
+        _export(training)
     return {"before": before, "after": after}
 
 
@@ -142,7 +167,14 @@ def run_doubt(
     if fabric.is_global_zero:
         record = about.model_copy(update={**asdict(fitted), "figures": figures})
         save_doubt(training.out, network, record, watched)
+        _export(training)
     return {**figures, "error_scale": fitted.error_scale, "outside_above": fitted.outside_above}
+
+
+def _export(training: TrainingRun) -> None:
+    """Write the graphs for inference without torch beside new weights; those of color stay in torch."""
+    if not training.record.color:
+        export_folder(training.out)
 
 
 def vae_start(recipe: Recipe, weights: Path | None) -> tuple[ResVae, list[Recipe]]:

@@ -111,7 +111,7 @@ def set_for_training(pipeline: RemappingNetwork, recipe: Recipe) -> None:
 
 
 @torch.inference_mode()
-def run(pipeline: RemappingNetwork, maps: MapSet) -> Float32:
+def run(pipeline: nn.Module, maps: MapSet) -> Float32:
     """Return the images (n, 64, 64), in color (n, 3, 64, 64), that a pipeline in eval mode reconstructs from maps."""
     device = next(pipeline.parameters()).device
     pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)

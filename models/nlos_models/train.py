@@ -24,10 +24,13 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from nlos_models.distributed import Loss, LossStep, open_fabric, seed_of, share_of
-from nlos_models.errors import CheckpointError, RecipeError, TrainingError
+from nlos_models.errors import CheckpointError, ModelError, RecipeError, TrainingError
+from nlos_models.files import TENSOR_LIMIT, atomic_file, read_bounded
 from nlos_models.recipe import Recipe, has_ended, schedule_of
 
-LAST, PREVIOUS, BEST, LOG = "last.ckpt", "previous.ckpt", "best.ckpt", "log.csv"
+LAST, PREVIOUS, BEST, LOG, MINUTES = "last.ckpt", "previous.ckpt", "best.ckpt", "log.csv", "minutes.log"
+MINUTE_S = 60.0
+"""Interval between lines of MINUTES."""
 DIGEST = hashlib.sha256().digest_size
 """Bytes at the start of a checkpoint: the SHA-256 of the rest."""
 COMPILERS = ("torch._dynamo", "torch._inductor")
@@ -48,15 +51,15 @@ Network = TypeVar("Network", bound=Callable[..., Any])
 
 def write_last(folder: Path, state: State) -> None:
     """Write the run's last state; the one before it becomes the previous state. Raises TrainingError."""
-    part = _write_part(folder / LAST, _pack(state))
-    if (folder / LAST).exists():
-        (folder / LAST).replace(folder / PREVIOUS)
-    part.replace(folder / LAST)
+    with _written(folder / LAST, _pack(state)):
+        if (folder / LAST).exists():
+            (folder / LAST).replace(folder / PREVIOUS)
 
 
 def write_best(folder: Path, state: State) -> None:
     """Write the run's best state. Raises TrainingError where it cannot be written."""
-    _write_part(folder / BEST, _pack(state)).replace(folder / BEST)
+    with _written(folder / BEST, _pack(state)):
+        pass
 
 
 def write_log(folder: Path, rows: list[Scores]) -> None:
@@ -65,7 +68,8 @@ def write_log(folder: Path, rows: list[Scores]) -> None:
     writer = csv.DictWriter(text, list(rows[0]))
     writer.writeheader()
     writer.writerows(rows)
-    _write_part(folder / LOG, text.getvalue().encode()).replace(folder / LOG)
+    with _written(folder / LOG, text.getvalue().encode()):
+        pass
 
 
 def read_last(folder: Path, on_message: OnMessage) -> State | None:
@@ -112,28 +116,32 @@ def _pack(state: State) -> bytes:
 
 
 def _unpack(path: Path) -> State | None:
-    """Return the state in a file, or None where its digest does not match."""
-    raw = path.read_bytes()
-    if len(raw) < DIGEST or hashlib.sha256(memoryview(raw)[DIGEST:]).digest() != raw[:DIGEST]:
-        return None
-    return torch.load(io.BytesIO(raw[DIGEST:]), map_location="cpu", weights_only=True)
-
-
-def _write_part(path: Path, content: bytes) -> Path:
-    """Return a file beside `path`, complete and synced to disk, for the caller to rename to `path`."""
-    part = path.with_name(f"{path.name}.part")
+    """Return the state in a file, or None where it is none, or its digest does not match."""
     try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+        raw = read_bounded(path, TENSOR_LIMIT)
+        if len(raw) < DIGEST or hashlib.sha256(memoryview(raw)[DIGEST:]).digest() != raw[:DIGEST]:
+            return None
+        state = torch.load(io.BytesIO(raw[DIGEST:]), map_location="cpu", weights_only=True)
+    except Exception:  # noqa: BLE001  the unpickler raises almost anything for crafted bytes
+        return None
+    return cast("State", state) if isinstance(state, dict) else None
+
+
+@contextmanager
+def _written(path: Path, content: bytes) -> Generator[None]:
+    """Write a file beside `path`, and rename it to `path` at the end of the block. Raises TrainingError."""
+    try:
+        with atomic_file(path) as part:
+            with part.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())  # before the block: what it replaces goes when there is room for the new
+            yield
     except OSError as error:
-        part.unlink(missing_ok=True)
         reason = error.strerror or error
         raise TrainingError(
             f"{path} cannot be written ({reason}): free some space and repeat the command, which resumes the run"
         ) from error
-    return part
 
 
 class TensorBoardLog:
@@ -251,12 +259,16 @@ def fit(
                     value = run.forward(fabric.to_device(share_of(batch, rank, world)), share_done)
                     run.stepper.zero_grad(set_to_none=True)
                     fabric.backward(value)
+                if recipe.gradient_limit:
+                    fabric.clip_gradients(run.forward, run.stepper, max_norm=recipe.gradient_limit)
                 run.stepper.step()
-                if recipe.schedule == "one-cycle":
+                if recipe.schedule != "plateau":
                     run.schedule.step()
+                run.take_average()
                 run.total += value.detach().float()
                 run.step += 1
                 if leads:
+                    run.log_minute()
                     running.on_step(run.steps_done, run.steps_in_all)
                 stop = run.any_process_asks(stop=running.stop())
                 if leads and (stop or running.clock() - run.saved_s >= running.checkpoint_s):
@@ -267,8 +279,10 @@ def fit(
 
             train_loss = _finite("loss", float(run.over_all(run.total / max(run.step, 1), "mean")), run.epoch)
             module.eval()
-            figures: Scores = fabric.broadcast(score() if leads else {})
-            _finite("held-out loss", figures["held_out_loss"], run.epoch)
+            with run.averaged():
+                figures: Scores = fabric.broadcast(score() if leads else {})
+                _finite("held-out loss", figures["held_out_loss"], run.epoch)
+                run.keep_best(figures)
             run.end_epoch(train_loss, figures, running.clock() - start_s)
             if leads:
                 if board:
@@ -298,7 +312,11 @@ class _Run:
         self.fabric = running.fabric_for(recipe)
         self.leads = self.fabric.is_global_zero
         free = [p for p in module.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.Adam(free, recipe.learning_rate, recipe.betas)
+        kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
+        self.optimizer = kind(free, recipe.learning_rate, recipe.betas, weight_decay=recipe.weight_decay)
+        self.average = [p.detach().clone() for p in free] if recipe.average else []
+        """Moving average of the free parameters, in their order."""
+        self._free = free
         self.forward, self.stepper = self.fabric.setup(LossStep(module, loss), self.optimizer)
         self._steps, self.steps_in_all = steps, recipe.epochs * steps
         self.schedule = schedule_of(recipe, self.optimizer, self.steps_in_all)
@@ -308,7 +326,9 @@ class _Run:
         if self.leads:
             folder.mkdir(parents=True, exist_ok=True)
         self._resume()
-        self.saved_s = running.clock()
+        self.average = [average.to(self.fabric.device) for average in self.average]
+        self.saved_s = self._minute_s = running.clock()
+        self._minute_steps = self.steps_done
 
     @property
     def has_epochs_left(self) -> bool:
@@ -339,22 +359,57 @@ class _Run:
             return False
         return bool(self.over_all(torch.tensor(float(stop), device=self.fabric.device), "sum"))
 
+    def take_average(self) -> None:
+        """Move the average of the weights towards them; early on by more, so that it forgets the first ones."""
+        if self.average:
+            decay = min(self.recipe.average, self.steps_done / (self.steps_done + 10))
+            for average, own in zip(self.average, self._free, strict=True):
+                average.lerp_(own.detach(), 1 - decay)
+
+    @contextmanager
+    def averaged(self) -> Generator[None]:
+        """Put the averaged weights into the module, if there are any; put its own back afterwards."""
+        self._swap()
+        try:
+            yield
+        finally:
+            self._swap()
+
+    def _swap(self) -> None:
+        for own, average in zip(self._free, self.average, strict=True) if self.average else ():
+            own.data, average.data = average.data, own.data
+
+    def log_minute(self) -> None:
+        """Append a line to MINUTES: steps done, rate, mean loss of the epoch so far, samples per second."""
+        seconds = self._running.clock() - self._minute_s
+        if seconds < MINUTE_S:
+            return
+        pace = (self.steps_done - self._minute_steps) * self.recipe.batch / seconds
+        line = f"{time.strftime('%Y-%m-%dT%H:%M:%S')} epoch {self.epoch} step {self.steps_done}/{self.steps_in_all}"
+        mean = float(self.total) / max(self.step, 1)
+        with (self.folder / MINUTES).open("a", encoding="utf-8") as file:
+            file.write(f"{line} rate {self._rate:.3g} loss {mean:.4g} samples/s {pace:.0f}\n")
+        self._minute_s, self._minute_steps = self._running.clock(), self.steps_done
+
+    def keep_best(self, figures: Scores) -> None:
+        """Write the module as the best state if its held-out loss is the smallest so far."""
+        if self.leads and all(figures["held_out_loss"] < earlier["held_out_loss"] for earlier in self.rows):
+            write_best(self.folder, {"epoch": self.epoch, "module": self.module.state_dict()})
+
     def end_epoch(self, loss: float, figures: Scores, seconds: float) -> None:
-        """Log the epoch, step a plateau's schedule, and save the state; also as the best state if it is."""
-        best = all(figures["held_out_loss"] < earlier["held_out_loss"] for earlier in self.rows)
+        """Log the epoch, step a plateau's schedule, and save the state."""
         self.rows.append({"epoch": self.epoch, "rate": self._rate, "loss": loss, **figures, "seconds": seconds})
         if self.recipe.schedule == "plateau":
             self.schedule.step(figures["held_out_loss"])
         self.epoch, self.step, self.total = self.epoch + 1, 0, torch.zeros_like(self.total)
         if self.leads:
-            if best:
-                write_best(self.folder, {"epoch": self.epoch - 1, "module": self.module.state_dict()})
             write_log(self.folder, self.rows)
             self.save()
 
     def restore_best(self) -> Scores:
         """Load the epoch that the recipe keeps into the module, and return its figures."""
         row = self.rows[-1]
+        self._swap()
         if self.recipe.keep == "best":
             self.fabric.barrier()  # the leader may still be writing it
             best = read_best(self.folder)
@@ -366,6 +421,7 @@ class _Run:
         """Write the last state."""
         parts = {name: getattr(self, name).state_dict() for name in ("module", "optimizer", "schedule")}
         facts = {"epoch": self.epoch, "step": self.step, "total": self.total, "rows": self.rows}
+        facts |= {"average": self.average} if self.average else {}
         source = {"recipe": self.recipe.model_dump_json(), "origin": self._running.origin}
         write_last(self.folder, {**parts, **facts, **source})
         self.saved_s = self._running.clock()
@@ -374,6 +430,14 @@ class _Run:
         state = read_last(self.folder, self.report)
         if state is None:
             return
+        try:
+            self._restore(state)
+        except ModelError:
+            raise
+        except Exception as error:  # its parts have other types than ours
+            raise CheckpointError(f"{self.folder} holds no state of such a run: choose another --out") from error
+
+    def _restore(self, state: State) -> None:
         if not self.recipe.trains_like(Recipe.model_validate_json(state["recipe"])):
             raise RecipeError(f"{self.folder} holds a run of another recipe: choose another --out")
         if state.get("origin", self._running.origin) != self._running.origin:  # states of old runs have no origin
@@ -382,3 +446,4 @@ class _Run:
             getattr(self, name).load_state_dict(state[name])
         self.epoch, self.step, self.rows = state["epoch"], state["step"], state["rows"]
         self.total = state["total"].to(self.fabric.device)
+        self.average = state.get("average", self.average)

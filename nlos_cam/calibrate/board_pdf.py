@@ -1,12 +1,15 @@
 """Printable ChArUco board of `nlos-cam board`: the pattern to exact scale, a scale bar, and printing advice."""
 
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from nlos_calibration import BOARDS, PAPER_MM, Board, Paper
+
+from nlos_cam.files import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,7 +44,10 @@ def board_figure(paper: Paper) -> "Figure":
 
 def write_board_pdf(path: Path, paper: Paper) -> None:
     """Write the sheet as a PDF page of the paper's size."""
-    board_figure(paper).savefig(path, format="pdf", metadata={"Title": f"nlos-cam board, {paper}"})
+    page = BytesIO()
+    board_figure(paper).savefig(page, format="pdf", metadata={"Title": f"nlos-cam board, {paper}"})
+    with atomic_file(path) as part:
+        part.write_bytes(page.getvalue())
 
 
 def pattern_origin_mm(paper: Paper) -> tuple[float, float]:

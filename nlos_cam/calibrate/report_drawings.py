@@ -9,7 +9,7 @@ import numpy as np
 from nlos_calibration import MAP_SHAPE, Extent, ObjectBox, Rig, WallRecord, footprint, on_plane
 from nlos_calibration.arrays import Float64
 
-from nlos_cam.calibrate.report_maps import Picture, figure_of, png
+from nlos_cam.report import Picture, figure_of, png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +52,8 @@ def bench_picture(record: WallRecord) -> Picture:
     beside.set_title(f"from the side: pitch {record.pitch_deg:+z.1f}°", fontsize=11)
     caption = (
         "Both to the same scale. The dash-dotted line is the lidar's optical axis; the blue area is its field of view "
-        "without the occluder. Its dashed edges never meet the wall. Light goes from the lidar to the wall, past "
+        "without the occluder. Its dashed edges never meet the wall. From the side the hidden object (dashed) overlaps "
+        "the lidar: it stands beside it, behind the occluder. Light goes from the lidar to the wall, past "
         f"the occluder's edge to the hidden object, and back the same way. {_occluder_source(record)}"
     )
     return Picture("The bench", caption, png(figure))
@@ -177,11 +178,13 @@ def _object(axis: "Axes", side: _Side, box: ObjectBox) -> None:
 
     spans = {X: (box.x_min_m, box.x_max_m), Y: (box.y_min_m, box.y_max_m), Z: (box.z_near_m, box.z_far_m)}
     (left, right), (low, high) = spans[side.across], spans[side.up]
-    style: Style = {"facecolor": to_rgba(OBJECT, 0.2), "edgecolor": OBJECT, "linewidth": 1.5}
-    axis.add_patch(Rectangle((left, low), right - left, high - low, **style))
-    # the label in a corner: from the side, the lidar is drawn over the box
+    # from the side the box lies behind the lidar and the occluder: dashed, with its distance from the lidar's plane
+    behind = side is BESIDE
+    style: Style = {"facecolor": to_rgba(OBJECT, 0.07 if behind else 0.2), "edgecolor": OBJECT, "linewidth": 1.5}
+    axis.add_patch(Rectangle((left, low), right - left, high - low, linestyle="--" if behind else "-", **style))
     style: Style = {"ha": "right", "va": "bottom" if side.turned else "top", "color": "#8c3b00", "fontsize": 9}
-    axis.text(right - 0.008, high - 0.008, "hidden object", **style)
+    words = f"hidden object,\n{box.x_min_m:.2f} m to the\nside of the lidar" if behind else "hidden object"
+    axis.text(right - 0.008, high - 0.008, words, **style)
 
 
 def _dimension(axis: "Axes", record: WallRecord) -> None:

@@ -1,7 +1,5 @@
 """Maps of the bare wall for the report: residual and its distribution, depth noise, infrared and saturation."""
 
-import io
-from dataclasses import dataclass
 from math import ceil, floor, log10
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +8,11 @@ from nlos_calibration import FULL_SCALE, BareWall, MeanNoise, WallRecord, depth_
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
+from nlos_cam.report import Picture, figure_of, png
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colorbar import Colorbar
-    from matplotlib.figure import Figure
 
 DRAWN_COLUMNS = 320
 """Maps are averaged in blocks to at most this width, which shows the wall's shape better than noisy pixels."""
@@ -65,7 +64,6 @@ def _sums(values: NDArray[np.floating], side: int) -> Float64:
     return padded.reshape(rows // side, side, columns // side, side).sum(axis=(1, 3))
 
 
-DPI = 100
 STRAY, STRIPE, NO_RETURN = (0.72, 0.72, 0.72, 1.0), (0.35, 0.35, 0.35, 1.0), (0.9, 0.9, 0.9, 1.0)
 STRIPE_BLOCKS = 4
 LEVELS = 21
@@ -75,30 +73,6 @@ MIN_RESIDUAL_MM = 0.5
 ROUND = 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0
 SPREAD_POINTS = 500
 """Number of pixels whose expected distributions are averaged."""
-
-
-@dataclass(frozen=True)
-class Picture:
-    """Picture of the report, or the reason why there is none."""
-
-    title: str
-    caption: str
-    """Content and reading of the picture; the reason where `png` is None."""
-    png: bytes | None = None
-
-
-def figure_of(width_in: float, height_in: float) -> "Figure":
-    """Return an empty figure with automatic layout."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
-
-
-def png(figure: "Figure") -> bytes:
-    """Return the figure as a PNG."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-    return buffer.getvalue()
 
 
 def wall_maps(record: WallRecord, reference: BareWall) -> list[Picture]:

@@ -1,10 +1,12 @@
 __all__ = [
     "FORMATS",
     "FRAMES_PER_S",
+    "MAC_WHEEL",
     "NAMES",
     "RESERVE_BYTES",
     "SIMULATED",
     "WHEEL",
+    "WORLDS",
     "Camera",
     "ClockUnwrap",
     "DeviceInfo",
@@ -26,11 +28,15 @@ __all__ = [
     "find_streams",
     "frame_in_si",
     "free_bytes",
+    "full_uri",
     "intrinsics_of",
     "load_sdk",
     "open_camera",
     "open_world",
+    "pack_loop",
+    "read_packaged",
     "recording_s",
+    "render_loop",
     "repair_command",
     "sample_from_sdk",
     "shared_context",
@@ -40,11 +46,11 @@ __all__ = [
 from .l515 import DeviceInfo, connected, find_l515, shared_context
 from .protocol import Camera, WallClock
 from .recorder import RESERVE_BYTES, Recording, check_room, free_bytes, recording_s, repair_command
-from .registry import NAMES, SIMULATED, OnProgress, Reader, open_camera
-from .sdk import WHEEL, load_sdk
+from .registry import NAMES, SIMULATED, OnProgress, Reader, full_uri, open_camera
+from .sdk import MAC_WHEEL, WHEEL, load_sdk
 from .session import SampleQueue, Session, find_streams
 from .simulated import SimulatedCamera, SoftwareLidar
-from .simulated_world import World, open_world
+from .simulated_world import WORLDS, World, open_world, pack_loop, read_packaged, render_loop
 from .streams import (
     FORMATS,
     FRAMES_PER_S,

@@ -220,6 +220,36 @@ class L515Camera(LiveCamera):
             shares += [saturated_share(found.ir)] if index >= SETS_IN_FLIGHT else []
         return sum(shares) / len(shares)
 
+    def adjustable(self) -> list[dict[str, Any]]:
+        """Return name, value, min, max and step of laser power and near-wall options, as the firmware offers them."""
+        with self._changing:
+            options = Options(self._session.sensor, self._sdk) if self._session else None
+            if options is None or self._session is None:
+                return []
+            names = (LASER_POWER, *NEAR_WALL)
+            found = [(name, options.get(name), options.limits(name)) for name in names]
+        offered = [(name, value, limits) for name, value, limits in found if limits and value is not None]
+        return [{"name": name, "value": value, **asdict(limits)} for name, value, limits in offered]
+
+    def set_option(self, name: str, value: float) -> str:
+        """Set one of the `adjustable` options to the nearest allowed value, and return the outcome in words.
+
+        Raises CameraError where the firmware refuses it, or while the camera does not run.
+        """
+        if name != LASER_POWER and name not in NEAR_WALL:
+            raise CameraError(f"{name} cannot be set here: choose from {', '.join((LASER_POWER, *NEAR_WALL))}")
+        with self._changing:
+            if self._session is None:
+                raise CameraError(f"{self.uri} is not running: wait until it is back")
+            options = Options(self._session.sensor, self._sdk)
+            limits = options.limits(name)
+            wanted = limits.nearest(value) if limits else value
+            if problem := options.put(name, wanted):
+                raise CameraError(f"{name}: {problem}")
+            if name == LASER_POWER:
+                self._laser_power = wanted
+        return f"{name} is {wanted:g}" + ("" if wanted == value else f", the nearest to {value:g}")
+
     def _is_connected(self) -> bool:
         return self._reconnect() is not None
 

@@ -226,6 +226,36 @@ class LiveCamera:
             raise CameraLostError(f"{silence}: the recording is closed, and whole; replug the camera and record again")
         log.warning("%s: the recording is closed, whole, after %d frames", silence, recording.sets)
 
+    @property
+    def recording(self) -> Recording | None:
+        """The recording that runs, if any."""
+        return self._recording if self._recording and not self._recording.done else None
+
+    def start_recording(self, recording: Recording) -> None:
+        """Record from the next set on; `recording` must not be its `last` take, so that frames go on after it.
+
+        Raises CameraError while not running or while another recording runs, RecordingError if nothing can be written.
+        """
+        with self._changing:
+            if not self._session:
+                raise CameraError(f"{self.uri} is not running: wait for the first frame")
+            if self.recording:
+                raise CameraError(f"{self.recording.path} is being recorded (--record) until the run ends")
+            self._recording = recording  # before it begins: the SDK's thread must pass it a set, as a boundary
+            try:
+                recording.join(self._device, self._sdk)
+            except BaseException:
+                self._recording = None
+                raise
+
+    def stop_recording(self) -> None:
+        """Close the recording, if any; frames go on. Raises DiskFullError without room, unless it is optional."""
+        with self._changing:
+            if recording := self._recording:
+                recording.stop()
+                self._recording = None
+                recording.close()
+
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
         return session.telemetry(ending) if (session := self._session) else {}
 

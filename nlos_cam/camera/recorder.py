@@ -7,15 +7,18 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from shlex import quote
 from threading import Event
 from typing import Any
 
 from nlos_calibration import Intrinsics
+from nlos_models import FileBusyError
 
 from nlos_cam.camera.streams import BYTES_PER_PIXEL, FRAMES_PER_S, SAME_INSTANT_S, FrameSet
-from nlos_cam.errors import DiskFullError, RecordingError
+from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
+from nlos_cam.files import claim
 
 RESERVE_BYTES = 200_000_000
 """Disk space that a recording leaves free: five seconds of 640 x 480, and its index."""
@@ -168,6 +171,7 @@ class Recording:
         seconds: float | None = None,
         last: bool = True,
         optional: bool = False,
+        overwrite: bool = True,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
         self.path = path
@@ -180,6 +184,7 @@ class Recording:
         self.disk_full = False
         """True if it stopped for want of disk space."""
         self._frames, self._seconds, self._last, self._free = frames, seconds, last, free
+        self._overwrite, self._claim = overwrite, ExitStack()
         self._before_s, self._first_s, self._last_s = float("-inf"), 0.0, 0.0
         self._stopping, self._paused = Event(), Event()
         self._changing, self._at_boundary, self._changed = Event(), Event(), Event()
@@ -187,10 +192,33 @@ class Recording:
         self._recorder: SdkRecorder | None = None
 
     def begin(self, device: Any, sdk: Any) -> None:
-        """Record the device's streams. Raises RecordingError where nothing can be written."""
+        """Record the device's streams.
+
+        Raises RecordingError where nothing can be written, FileBusyError while another process writes the same file,
+        and, without `overwrite`, OutputExistsError where the file exists by now.
+        """
         self._source = device, sdk
+        self._own()
         self._recorder = SdkRecorder(self.path, device, sdk)
         self.started = True
+
+    def _own(self) -> None:
+        """Claim the path until `close`, so that no other process writes to it."""
+        self._claim.close()
+        try:
+            self._claim.enter_context(claim(self.path))
+        except FileBusyError:
+            raise
+        except OSError as error:
+            raise RecordingError(f"{self.path} cannot be written ({error.strerror}): choose another --out") from error
+        if not self._overwrite and not self.started and self.path.exists():
+            self._claim.close()
+            raise OutputExistsError(f"{self.path} exists by now: choose another --out, or add --overwrite")
+
+    def join(self, device: Any, sdk: Any) -> None:
+        """Begin with the next set of a device that runs. Raises RecordingError where nothing can be written."""
+        self._source = device, sdk
+        self.next_take(self.path, last=self._last)
 
     def next_take(self, path: Path, *, last: bool) -> None:
         """Record to `path` from the next set on, with the same device and settings, after this take was closed.
@@ -268,6 +296,8 @@ class Recording:
             if not self.optional:
                 raise
             log.warning("%s", error)
+        finally:
+            self._claim.close()
 
 
 def repair_command(path: Path) -> str:

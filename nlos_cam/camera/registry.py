@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from nlos_cam.camera.protocol import Camera
-from nlos_cam.errors import CameraNotFoundError, NlosCamError
+from nlos_cam.errors import NlosCamError, UnknownCameraError, did_you_mean
 
 if TYPE_CHECKING:
     from nlos_cam.camera.recorder import Recording
@@ -26,7 +26,7 @@ REPLAY_BACKENDS = {
     "sdk": ("nlos_cam.recording.sdk_playback", "SdkReplayCamera"),
 }
 """Module and class of each reader of recordings, by name: they stand in a layer above this one."""
-NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or bag:FILE.bag"
+NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or FILE.bag"
 
 
 def open_camera(
@@ -39,9 +39,11 @@ def open_camera(
     """Find and check the camera of that name without starting it; a live one can be recorded.
 
     `reader` chooses the reader of recordings: "plain" (built in) or "sdk" (librealsense). Raises CameraNotFoundError,
-    RecordingError, SceneError; NlosCamError for a recording of a recording.
+    RecordingError, SceneError; NlosCamError for a recording of a recording; UnknownCameraError for a mistyped name.
     """
-    scheme, _, rest = uri.partition(":")
+    scheme, colon, rest = (uri := full_uri(uri)).partition(":")
+    if colon and not rest:
+        raise UnknownCameraError(f"no camera {uri!r}: leave out the colon, or use {NAMES}")
     if scheme == "bag" and rest:
         if recording:
             raise NlosCamError(f"{uri} is already a recording: copy the file, or give a live camera (l515, sim)")
@@ -50,11 +52,22 @@ def open_camera(
     if scheme == "sim":
         from nlos_cam.camera.simulated import SimulatedCamera
         from nlos_cam.camera.simulated_world import open_world
+        from nlos_cam.render import packaged_scenes
 
+        if rest and not Path(rest).suffix and uri not in SIMULATED and not Path(rest).exists():
+            known = [*SIMULATED, *(f"sim:{name}" for name in packaged_scenes())]
+            if uri not in known:
+                raise UnknownCameraError(f"no camera {uri!r}.{did_you_mean(uri, known)} Use {NAMES}")
         world = open_world(rest, on_progress)
         return SimulatedCamera(uri, world, recording=recording, faults=world.scene.faults)
     if scheme == "l515":
         from nlos_cam.camera.l515 import L515Camera
 
         return L515Camera(uri, rest, recording=recording)
-    raise CameraNotFoundError(f"no camera is called {uri!r}: use {NAMES}")
+    raise UnknownCameraError(f"no camera {uri!r}.{did_you_mean(uri, ['l515', *SIMULATED])} Use {NAMES}")
+
+
+def full_uri(uri: str) -> str:
+    """Return a camera's name; that of a recording's path, run.bag, is bag:run.bag."""
+    is_path = uri.endswith(".bag") and not uri.startswith(("bag:", "sim:", "l515:"))
+    return f"bag:{uri}" if is_path else uri

@@ -215,6 +215,11 @@ class Session:
         self._held_back += began_before
         return not began_before or self._held_back >= len(FORMATS)
 
+    @property
+    def sensor(self) -> Any:
+        """The SDK's sensor; None once stopped."""
+        return self._sensor
+
     def telemetry(self, ending: str = "") -> dict[str, float]:
         """Return the options as they read now; empty when the device is gone or the session has stopped."""
         sensor = self._sensor

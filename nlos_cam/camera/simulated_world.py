@@ -1,7 +1,7 @@
 """World of a simulated camera: a scene's loop of poses, pre-rendered and cached; the sensor model runs live."""
 
-import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from io import BytesIO
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -10,7 +10,7 @@ from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
 
 from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.files import atomic_file, cache_folder
+from nlos_cam.files import cache_folder, load_cached
 from nlos_cam.render import (
     MultiBounce,
     SceneFile,
@@ -26,6 +26,8 @@ Loop = tuple[list[MultiBounce], list[Float32]]
 """Echoes of each frame, and hidden depth at the middle of its scan."""
 OnProgress = Callable[[int, int], None]
 """Called with the poses rendered so far and in all."""
+WORLDS = Path(__file__).parent / "worlds"
+"""Loops of the packaged scenes, written by tools/packaged/contents.py."""
 CELSIUS_ABOVE = {
     "ldd_temperature": 0.0,
     "mc_temperature": -3.0,
@@ -34,9 +36,6 @@ CELSIUS_ABOVE = {
     "humidity_temperature": -8.0,
 }
 """Offsets from the sensor's temperature, which is the laser driver's; names from the SDK, values assumed."""
-
-
-log = logging.getLogger(__name__)
 
 
 class World:
@@ -75,55 +74,57 @@ class World:
 
 
 def open_world(name: str, on_progress: OnProgress | None = None) -> World:
-    """Return the world of a scene: "" for the paper's rig with a moving object, "bare-wall", or a scene.toml's path.
+    """Return the world of a scene: "" for the paper's rig with a moving object, "bare-wall", or as `load_scene`.
 
-    Pre-renders the loop on first use and stores it in the cache folder. Raises SceneError for an invalid scene.
+    The loops of the first two come with the package; others are rendered on first use and stored in the cache folder.
+    Raises SceneError for an invalid scene.
     """
     scene = {"": paper_scene, "bare-wall": bare_wall_scene}.get(name, lambda: load_scene(Path(name)))()
-    cached = cache_folder() / "worlds" / f"{scene.checksum}.npz"
-    if (loop := _load(cached)) is None:
-        loop = _render_loop(scene, on_progress)
-        try:
-            _store(cached, *loop)
-        except OSError as error:
-            log.warning(
-                "%s cannot be written (%s): continuing without a cache; set NLOS_CAM_CACHE", cached, error.strerror
-            )
+    loop = read_packaged(scene)
+    if loop is None:
+        cached = cache_folder() / "worlds" / f"{scene.checksum}.npz"
+        loop = load_cached(cached, _unpack, lambda: pack_loop(*render_loop(scene, on_progress)))
     echoes, truths = loop
     return World(scene, echoes, list(truths) if scene.hidden else [None])
 
 
-def _load(path: Path) -> Loop | None:
-    """Return a cached loop; None where it is missing or damaged."""
+def read_packaged(scene: SceneFile) -> Loop | None:
+    """Return the loop of a scene that comes with the package; None where it does not, or is damaged."""
     try:
-        with np.load(path) as file:
-            poses = zip(file["peak"], file["runner_up"], file["path_m"], strict=True)
-            mixed = bool(file["direct_included"])
-            return [MultiBounce(*pose, mixed) for pose in poses], list(file["truth_m"])
+        return _unpack((WORLDS / f"{scene.checksum}.npz").read_bytes())
     except (OSError, ValueError, EOFError, KeyError, BadZipFile):
         return None
 
 
-def _render_loop(scene: SceneFile, on_progress: OnProgress | None) -> Loop:
+def render_loop(scene: SceneFile, on_progress: OnProgress | None = None, poses: Iterable[int] | None = None) -> Loop:
+    """Render the poses of a scene's loop, by default all."""
     echoes: list[MultiBounce] = []
     truths: list[Float32] = []
-    for number in range(scene.poses):
+    for number in range(scene.poses) if poses is None else poses:
         echoes.append(render_scan(lambda share, start=number: scene.scene_at(start + share)).multi)
         truth = scene.scene_at(number + 0.5).object_depth_m
         truths.append(np.zeros((0, 0), np.float32) if truth is None else truth)
         if on_progress:
-            on_progress(number + 1, scene.poses)
+            on_progress(len(echoes), scene.poses)
     return echoes, truths
 
 
-def _store(path: Path, echoes: list[MultiBounce], truths: list[Float32]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(path) as part, part.open("wb") as file:
-        np.savez_compressed(
-            file,
-            peak=np.stack([echo.peak for echo in echoes]),
-            runner_up=np.stack([echo.runner_up for echo in echoes]),
-            path_m=np.stack([echo.path_m for echo in echoes]),
-            direct_included=echoes[0].direct_included,
-            truth_m=np.stack(truths),
-        )
+def pack_loop(echoes: list[MultiBounce], truths: list[Float32]) -> bytes:
+    """Return a loop as the content of an .npz file."""
+    packed = BytesIO()
+    np.savez_compressed(
+        packed,
+        peak=np.stack([echo.peak for echo in echoes]),
+        runner_up=np.stack([echo.runner_up for echo in echoes]),
+        path_m=np.stack([echo.path_m for echo in echoes]),
+        direct_included=echoes[0].direct_included,
+        truth_m=np.stack(truths),
+    )
+    return packed.getvalue()
+
+
+def _unpack(content: bytes) -> Loop:
+    with np.load(BytesIO(content)) as file:
+        poses = zip(file["peak"], file["runner_up"], file["path_m"], strict=True)
+        mixed = bool(file["direct_included"])
+        return [MultiBounce(*pose, mixed) for pose in poses], list(file["truth_m"])

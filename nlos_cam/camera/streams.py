@@ -3,6 +3,7 @@
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -158,12 +159,16 @@ class FrameSynchronizer:
 
         duplicate: a sample came again. out_of_order: it came after its number was decided as incomplete or dropped.
         wrong_size: it has another shape. stalled: nothing came for a while, though no number is missing. renumbered:
-        the device restarted its count. stray: no set, and far from all other numbers, so that it is not `incomplete`.
+        the device restarted its count. stray: no set, and without a finite time or far from all other numbers, so that
+        it is not `incomplete`.
         """
         return self._occurrences.counts
 
     def add(self, sample: Sample) -> FrameSet | None:
         """Take a sample, and return the set that it completes, if any."""
+        if not isfinite(sample.timestamp_s):
+            self._occurrences.counts["stray"] += 1
+            return None
         sample = self._offsets.add(sample)
         number = sample.number
         if self._decided is not None and self._decided - LATE_NUMBERS <= number <= self._decided:

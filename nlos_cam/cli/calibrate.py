@@ -1,60 +1,38 @@
 """`nlos-cam calibrate` measures the bench before its use; `nlos-cam board` prints a board for it."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from threading import Event, Thread
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
+import nlos_calibration as walls
 import typer
-from nlos_calibration import (
-    BOARDS,
-    DISTANCE_RANGE_M,
-    FACING_RANGE_DEG,
-    PAPER_MM,
-    BoardView,
-    Light,
-    OccluderRecord,
-    Paper,
-    WallByBoard,
-    WallFit,
-    WallRecord,
-    load_measured,
-    new_wall_record,
-    wall_facts,
-)
-from numpy.typing import NDArray
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from nlos_cam.calibrate import (
-    CaptureStatistics,
-    FrameFit,
-    WallFiles,
-    capture_color_view,
-    collect_statistics,
-    fit_frame,
-    measure_by_board,
-    measure_by_depth,
-    measure_occluder,
-    write_board_pdf,
-    write_record,
-)
-from nlos_cam.camera import Camera, open_camera
-from nlos_cam.cli.common import Json, Overwrite, finish, output_path, progress, say, stderr, tracked
-from nlos_cam.frames import MAX_SATURATED
+from nlos_cam import calibrate as bench
+from nlos_cam import camera as cameras
+from nlos_cam.cli.common import Camera, Json, Overwrite, finish, output_path, progress, say, stderr, tracked
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+Paper = Literal["a4", "a3", "letter"]
+Light = Literal["infrared", "colour"]
 EVERY = 3
 """Frames between two updates of the display, of 30 a second."""
 GAUGE_WIDTH = 31
 
 
-def format_result(record: WallRecord, files: WallFiles) -> str:
+def format_result(record: walls.WallRecord, files: bench.WallFiles) -> str:
     """Return quantities with 95 % intervals, the verdict, warnings and the files written, with Rich's markup."""
-    rows = wall_facts(record)
+    rows = walls.wall_facts(record)
     wide, wider = (max(len(row[column]) for row in rows) for column in (0, 1))
     lines = [f"{name:{wide}}  {value:{wider}}  [dim]{escape(meaning)}[/]" for name, value, meaning in rows]
     advice = record.advice[:1].upper() + record.advice[1:]
@@ -68,13 +46,13 @@ def _color(verdict: str) -> str:
     return "green" if verdict == "good" else "yellow"
 
 
-def watch_wall(camera: Camera, stop: Callable[[], bool]) -> FrameFit | None:
+def watch_wall(camera: cameras.Camera, stop: Callable[[], bool]) -> bench.FrameFit | None:
     """Show the wall fitted to every third frame of an entered camera, until it ends or `stop`; return the last fit."""
-    last: FrameFit | None = None
+    last: bench.FrameFit | None = None
     with Live(console=stderr, auto_refresh=False, transient=True) as live:
         for number, frame in enumerate(camera):
             if number % EVERY == 0:
-                last = fit_frame(frame)
+                last = bench.fit_frame(frame)
                 live.update(panel(last), refresh=True)
             if stop():
                 break
@@ -93,15 +71,17 @@ def until_enter() -> Callable[[], bool]:
     return pressed.is_set
 
 
-def panel(found: FrameFit) -> Table:
+def panel(found: bench.FrameFit) -> Table:
     """Return the fit of one frame as a few lines, with gauges over the paper's ranges."""
+    from nlos_cam.frames import MAX_SATURATED
+
     table = Table.grid(padding=(0, 2))
     if found.fit is None:
         table.add_row("wall", f"[yellow]not measured:[/] {escape(found.refusal)}")
     else:
         fit = found.fit
-        table.add_row("distance", f"{1e3 * fit.distance_m:.1f} mm", gauge(fit.distance_m, *DISTANCE_RANGE_M))
-        table.add_row("facing", f"{fit.facing_deg:.2f}°", gauge(fit.facing_deg, *FACING_RANGE_DEG))
+        table.add_row("distance", f"{1e3 * fit.distance_m:.1f} mm", gauge(fit.distance_m, *walls.DISTANCE_RANGE_M))
+        table.add_row("facing", f"{fit.facing_deg:.2f}°", gauge(fit.facing_deg, *walls.FACING_RANGE_DEG))
         table.add_row("yaw, pitch", f"{fit.yaw_deg:+z.2f}°, {fit.pitch_deg:+z.2f}°")
         table.add_row("verdict", f"[{_color(fit.verdict)}]{fit.verdict}[/]", fit.advice)
     if found.saturated > MAX_SATURATED:
@@ -118,7 +98,6 @@ def gauge(value: float, low: float, high: float) -> str:
 
 
 Wall = Annotated[bool, typer.Option("--wall", help="Measure the bare wall: no object, no occluder.")]
-CameraUri = Annotated[str | None, typer.Option("--camera", help="l515, l515:SERIAL, sim:bare-wall, ...")]
 Bag = Annotated[Path | None, typer.Option("--bag", help="Recording of the bare wall.")]
 BareRecord = Annotated[
     Path | None,
@@ -189,8 +168,8 @@ def register(app: typer.Typer) -> None:
 
 
 def calibrate(
+    camera: Camera = "sim",
     wall: Wall = False,
-    camera: CameraUri = None,
     bag: Bag = None,
     occluder: BareRecord = None,
     frames: Frames = 60,
@@ -223,8 +202,10 @@ def calibrate(
         )
     if occluder and watch:
         raise typer.BadParameter("--watch shows the bare wall: position the lidar with it first, then add the occluder")
-    bare = load_measured(occluder) if occluder else None
-    files = WallFiles.beside(output_path(out, "wall", ".toml", overwrite=overwrite), overwrite=overwrite)
+    if occluder and out and out.resolve() == occluder.resolve():
+        raise typer.BadParameter(f"--out {out} is the record of the bare wall, which stays: choose another name")
+    bare = walls.load_measured(occluder) if occluder else None
+    files = bench.WallFiles.beside(output_path(out, "wall", ".toml", overwrite=overwrite), overwrite=overwrite)
     if watch:
         say("Position the lidar. [bold]Enter[/] measures, Ctrl-C cancels.", marked=True)
         with _opened(uri) as source:
@@ -236,14 +217,14 @@ def calibrate(
     capture = _capture(uri, frames)
     inliers: NDArray[np.bool_] | None
     if bare:
-        record, inliers = measure_occluder(capture, bare)
+        record, inliers = bench.measure_occluder(capture, bare)
     else:
         if board:
-            fit, facts = measure_by_board(capture, BOARDS[paper or "a4"], square_mm, color)
+            fit, facts = bench.measure_by_board(capture, walls.BOARDS[paper or "a4"], square_mm, color)
         else:
-            fit, facts = measure_by_depth(capture, tape_m)
-        record, inliers = _record(capture, fit, facts, by_hand), fit.inliers if isinstance(fit, WallFit) else None
-    record = write_record(files, record, None if inliers is None else capture.reference(inliers))
+            fit, facts = bench.measure_by_depth(capture, tape_m)
+        record, inliers = _record(capture, fit, facts, by_hand), fit.inliers if isinstance(fit, walls.WallFit) else None
+    record = bench.write_record(files, record, None if inliers is None else capture.reference(inliers))
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
     result = fields | {"out": str(files.record), "report": str(files.report)}
     finish(result, as_json=json, text=format_result(record, files), marked=True)
@@ -257,40 +238,43 @@ def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path 
         return f"bag:{bag}"
     if camera is not None and bag is None:
         return camera
-    raise typer.BadParameter("give one of --camera URI and --bag F.bag")
+    raise typer.BadParameter("give one of CAMERA and --bag F.bag")
 
 
-def _entered(x_m: float | None, gap_m: float | None) -> OccluderRecord | None:
+def _entered(x_m: float | None, gap_m: float | None) -> walls.OccluderRecord | None:
     """Return the occluder measured by hand. Raises typer.BadParameter for one of its two numbers."""
     if x_m is None and gap_m is None:
         return None
     if x_m is None or gap_m is None:
         raise typer.BadParameter("--occluder-x-m and --occluder-gap-m must be given together")
-    return OccluderRecord(source="entered", x_m=x_m, gap_m=gap_m)
+    return walls.OccluderRecord(source="entered", x_m=x_m, gap_m=gap_m)
 
 
-def _opened(uri: str) -> Camera:
+def _opened(uri: str) -> cameras.Camera:
     with tracked("Opening the camera") as on_progress:
-        return open_camera(uri, on_progress=on_progress)
+        return cameras.open_camera(uri, on_progress=on_progress)
 
 
-def _capture(uri: str, frames: int) -> CaptureStatistics:
+def _capture(uri: str, frames: int) -> bench.CaptureStatistics:
     with _opened(uri) as source, progress() as bar:
         task = bar.add_task("Measuring the wall", total=frames)
-        return collect_statistics(source, frames, lambda: bar.advance(task))
+        return bench.collect_statistics(source, frames, lambda: bar.advance(task))
 
 
-def _capture_color(uri: str, frames: int) -> BoardView:
+def _capture_color(uri: str, frames: int) -> walls.BoardView:
     with progress() as bar:
         task = bar.add_task("Averaging colour frames", total=frames)
-        return capture_color_view(uri, frames, on_frame=lambda: bar.advance(task))
+        return bench.capture_color_view(uri, frames, on_frame=lambda: bar.advance(task))
 
 
 def _record(
-    capture: CaptureStatistics, fit: WallFit | WallByBoard, facts: dict[str, object], occluder: OccluderRecord | None
-) -> WallRecord:
+    capture: bench.CaptureStatistics,
+    fit: walls.WallFit | walls.WallByBoard,
+    facts: dict[str, object],
+    occluder: walls.OccluderRecord | None,
+) -> walls.WallRecord:
     """Return today's record of a wall."""
-    return new_wall_record(
+    return walls.new_wall_record(
         fit,
         capture.intrinsics,
         camera=capture.camera,
@@ -307,13 +291,15 @@ OnSheet = Annotated[Paper, typer.Option("--paper", help="Paper size.")]
 
 def board(out: SheetOut = None, paper: OnSheet = "a4", overwrite: Overwrite = False, json: Json = False) -> None:
     """Write a ChArUco board as a PDF to scale, to be glued to the wall for `nlos-cam calibrate --wall --board`."""
+    if out is not None and out.suffix != ".pdf":
+        raise typer.BadParameter(f"--out {out}: choose a name that ends in .pdf")
     path = output_path(out, "board", ".pdf", overwrite=overwrite)
-    write_board_pdf(path, paper)
-    printed = BOARDS[paper]
+    bench.write_board_pdf(path, paper)
+    printed = walls.BOARDS[paper]
     text = (
         f"{printed.squares_x} x {printed.squares_y} squares of {printed.square_mm:g} mm on {paper}\n"
         "Print at 100 % with a laser printer (dye ink is white in infrared), and check that the bar measures 100 mm.\n"
         f"Wrote {path}"
     )
-    result = {"out": str(path), "paper": paper, "page_mm": list(PAPER_MM[paper]), **printed.model_dump()}
+    result = {"out": str(path), "paper": paper, "page_mm": list(walls.PAPER_MM[paper]), **printed.model_dump()}
     finish(result, as_json=json, text=text)

@@ -1,5 +1,7 @@
 """`nlos-cam capture`: record a live camera in one or several takes, and verify each recording."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Sequence
 from contextlib import closing
@@ -12,11 +14,13 @@ import typer
 from rich.markup import escape
 from rich.progress import Progress
 
-from nlos_cam.camera import FRAMES_PER_S, Camera, Recording, check_room, free_bytes, open_camera, recording_s
+from nlos_cam import camera as cameras
+from nlos_cam import recording as recordings
 from nlos_cam.cli.common import (
-    INTERRUPTED,
+    Camera,
     Json,
     Overwrite,
+    exit_interrupted,
     finish,
     interrupted_by_signals,
     output_path,
@@ -26,21 +30,9 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.errors import NlosCamError
-from nlos_cam.recording import (
-    CaptureResult,
-    CaptureSession,
-    CaptureTarget,
-    State,
-    Summary,
-    VerifyResult,
-    finalize,
-    load_measured_wall,
-    sidecar_path,
-    verify,
-)
 
 FIGURES = ("saturated_share", "invalid_share", "temporal_noise_mm")
-ENDINGS: dict[State, str] = {
+ENDINGS: dict[recordings.State, str] = {
     "interrupted": "Interrupted. ",
     "lost": "Camera lost. ",
     "disk full": "Disk full. ",
@@ -50,7 +42,7 @@ NOTHING = "nothing was recorded"
 PRE_RENDERING = "Pre-rendering the simulated scene (first run only, about 90 s)"
 
 
-def result_of(takes: Sequence[CaptureResult], *, several: bool) -> dict[str, Any]:
+def result_of(takes: Sequence[recordings.CaptureResult], *, several: bool) -> dict[str, Any]:
     """Return the takes for JSON: one as it is, several as {"takes": [...]} with totals; with the error of the last."""
     each = [_take_fields(take.target, take.state, take.summary, take.sidecar.path) for take in takes]
     result = _with_totals(each) if several else each[0]
@@ -59,10 +51,10 @@ def result_of(takes: Sequence[CaptureResult], *, several: bool) -> dict[str, Any
     return result
 
 
-def empty_result(target: CaptureTarget, *, several: bool) -> dict[str, Any]:
+def empty_result(target: recordings.CaptureTarget, *, several: bool) -> dict[str, Any]:
     """Return the same fields for an interruption before the camera started."""
-    empty = Summary(frames=0, dropped=0, seconds=0.0, streams={}, events={})
-    fields = _take_fields(target, "interrupted", empty, sidecar_path(target.path))
+    empty = recordings.Summary(frames=0, dropped=0, seconds=0.0, streams={}, events={})
+    fields = _take_fields(target, "interrupted", empty, recordings.sidecar_path(target.path))
     return _with_totals([fields]) if several else fields
 
 
@@ -70,7 +62,9 @@ def _with_totals(each: list[dict[str, Any]]) -> dict[str, Any]:
     return {"takes": each} | {key: sum(one[key] or 0 for one in each) for key in ("frames", "dropped", "seconds")}
 
 
-def _take_fields(target: CaptureTarget, state: State, summary: Summary, sidecar: Path) -> dict[str, Any]:
+def _take_fields(
+    target: recordings.CaptureTarget, state: recordings.State, summary: recordings.Summary, sidecar: Path
+) -> dict[str, Any]:
     fields: dict[str, Any] = {
         "frames": summary.frames,
         "dropped": summary.dropped,
@@ -84,7 +78,7 @@ def _take_fields(target: CaptureTarget, state: State, summary: Summary, sidecar:
     return fields if target.label is None else fields | {"label": target.label}
 
 
-def final_error(take: CaptureResult) -> NlosCamError | None:
+def final_error(take: recordings.CaptureResult) -> NlosCamError | None:
     """Return the error that ended a take, with the number of frames saved; None if its limit or the user ended it."""
     if take.error is None:
         return None
@@ -94,7 +88,7 @@ def final_error(take: CaptureResult) -> NlosCamError | None:
     return type(take.error)(f"{take.error}; {saved}")
 
 
-def format_take(take: CaptureResult) -> str:
+def format_take(take: recordings.CaptureResult) -> str:
     """Return the lines that report a take at the terminal."""
     ending = ENDINGS.get(take.state, "")
     if take.sets == 0:
@@ -112,14 +106,11 @@ def format_take(take: CaptureResult) -> str:
     )
 
 
-CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:bare-wall or sim:SCENE.toml.")]
 MAX_S = 1e9
 """Longer than any disk lasts; infinity cannot be converted to a number of frames."""
 Seconds = Annotated[
     float | None,
-    typer.Option(
-        "--seconds", min=1 / FRAMES_PER_S, max=MAX_S, help="Stop after this many seconds (default: run until Ctrl-C)."
-    ),
+    typer.Option("--seconds", min=0.03, max=MAX_S, help="Stop after this many seconds (default: run until Ctrl-C)."),
 ]
 Frames = Annotated[int | None, typer.Option("--frames", min=1, help="Stop after this many frames.")]
 TakeCount = Annotated[int, typer.Option("--takes", min=1, max=9999, help="Number of takes: F-01.bag, F-02.bag, ...")]
@@ -143,7 +134,7 @@ def register(app: typer.Typer) -> None:
 
 
 def capture(
-    camera: CameraUri,
+    camera: Camera = "sim",
     seconds: Seconds = None,
     frames: Frames = None,
     takes: TakeCount = 1,
@@ -156,26 +147,26 @@ def capture(
 ) -> None:
     """Record depth, infrared and confidence to .bag until --seconds, --frames or Ctrl-C, and verify each file."""
     targets = _targets(_base(seconds, frames, takes, out), takes, label or [], overwrite=overwrite)
-    measured = load_measured_wall(wall) if wall else None
-    recording = Recording(targets[0].path, frames=frames, seconds=seconds, last=takes == 1)
+    measured = recordings.load_measured_wall(wall) if wall else None
+    recording = cameras.Recording(targets[0].path, frames=frames, seconds=seconds, last=takes == 1, overwrite=overwrite)
     try:
         with interrupted_by_signals(), tracked(PRE_RENDERING, at_once=False) as on_progress:
-            source = open_camera(camera, on_progress=on_progress, recording=recording)
+            source = cameras.open_camera(camera, on_progress=on_progress, recording=recording)
     except KeyboardInterrupt:
         result, text = empty_result(targets[0], several=takes > 1), f"Interrupted before the first frame; {NOTHING}"
         finish(result, as_json=json, text=text)
-        raise typer.Exit(INTERRUPTED) from None
-    limit = frames or (round(seconds * FRAMES_PER_S) if seconds else None)
+        exit_interrupted(NOTHING)
+    limit = frames or (round(seconds * cameras.FRAMES_PER_S) if seconds else None)
     _check_disk(source, targets, limit)
     with stop_on_signals() as stop:
-        results = _record(CaptureSession(source, recording, targets, wall=measured), stop, limit, pause_s)
+        results = _record(recordings.CaptureSession(source, recording, targets, wall=measured), stop, limit, pause_s)
         interrupted = stop.is_set() or results[-1].state == "interrupted"
     finish(result_of(results, several=takes > 1), as_json=json, text="\n".join(map(format_take, results)))
     if error := final_error(results[-1]):
         say(f"[bold red]error:[/] {escape(str(error))}", marked=True)
         raise typer.Exit(error.exit_code)
     if interrupted:
-        raise typer.Exit(INTERRUPTED)
+        exit_interrupted(f"{sum(take.sets for take in results)} frames are kept")
 
 
 def _base(seconds: float | None, frames: int | None, takes: int, out: Path | None) -> Path:
@@ -189,38 +180,42 @@ def _base(seconds: float | None, frames: int | None, takes: int, out: Path | Non
     return out or output_path(None, "capture", ".bag", overwrite=False)
 
 
-def _targets(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> list[CaptureTarget]:
+def _targets(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> list[recordings.CaptureTarget]:
     """Return file and label of each take. Raises OutputExistsError for a file that may not be overwritten."""
     if len(labels) not in {0, 1, takes}:
         raise typer.BadParameter(f"{len(labels)} --label for {takes} takes: give one for all, or one for each")
     digits = max(2, len(str(takes)))
     numbered = [base.with_stem(f"{base.stem}-{number:0{digits}}") for number in range(1, takes + 1)]
     paths = numbered if takes > 1 else [base]
-    targets = list(map(CaptureTarget, paths, labels * takes if len(labels) == 1 else labels or [None] * takes))
+    targets = list(
+        map(recordings.CaptureTarget, paths, labels * takes if len(labels) == 1 else labels or [None] * takes)
+    )
     for target in targets:
-        for path in (target.path, sidecar_path(target.path)):
+        for path in (target.path, recordings.sidecar_path(target.path)):
             output_path(path, "", path.suffix, overwrite=overwrite)
     return targets
 
 
-def _check_disk(camera: Camera, targets: list[CaptureTarget], limit: int | None) -> None:
+def _check_disk(camera: cameras.Camera, targets: list[recordings.CaptureTarget], limit: int | None) -> None:
     """Raise DiskFullError where the takes may not fit; without a limit of frames, print how long the disk lasts."""
-    path, free = targets[0].path, free_bytes(targets[0].path)
-    check_room(path, camera.intrinsics, (limit or 0) * len(targets), free)
+    path, free = targets[0].path, cameras.free_bytes(targets[0].path)
+    cameras.check_room(path, camera.intrinsics, (limit or 0) * len(targets), free)
     if limit is None:
-        lasts_s = recording_s(camera.intrinsics, free)
+        lasts_s = cameras.recording_s(camera.intrinsics, free)
         time = f"{int(lasts_s / 60)} minutes" if lasts_s >= 120 else f"{int(lasts_s)} s"
         say(f"Disk space for at least {time} ({free / 1e9:.1f} GB free). Press Ctrl-C to stop.")
 
 
-def _record(session: CaptureSession, stop: Event, limit: int | None, pause_s: float | None) -> list[CaptureResult]:
+def _record(
+    session: recordings.CaptureSession, stop: Event, limit: int | None, pause_s: float | None
+) -> list[recordings.CaptureResult]:
     """Record the takes one after another and verify each."""
-    results: list[CaptureResult] = []
+    results: list[recordings.CaptureResult] = []
     with progress() as bar:
         task = bar.add_task("recording", total=limit)
         with closing(session.record(stop, lambda sets: bar.update(task, completed=sets))) as recorded:
             for take in recorded:
-                result = finalize(take, partial(_verify, bar, take.sets))
+                result = recordings.finalize(take, partial(_verify, bar, take.sets))
                 results.append(result)
                 if dropped := result.summary.dropped:
                     say(f"[yellow]Warning:[/] {dropped} frames were dropped; the recording has gaps", marked=True)
@@ -235,12 +230,12 @@ def _record(session: CaptureSession, stop: Event, limit: int | None, pause_s: fl
     return results
 
 
-def _verify(bar: Progress, sets: int, path: Path) -> VerifyResult | None:
+def _verify(bar: Progress, sets: int, path: Path) -> recordings.VerifyResult | None:
     """Return the contents of a closed file; None on Ctrl-C."""
     task = bar.add_task("verifying", total=sets)
     try:
         with interrupted_by_signals():
-            return verify(path, on_frame=lambda: bar.advance(task))
+            return recordings.verify(path, on_frame=lambda: bar.advance(task))
     except KeyboardInterrupt:
         return None
     finally:

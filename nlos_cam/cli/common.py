@@ -3,16 +3,18 @@
 import json as json_module
 import os
 import signal
+import sys
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from datetime import datetime
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread, Timer
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -26,14 +28,66 @@ from rich.table import Table
 
 from nlos_cam.errors import OutputExistsError
 
+Camera = Annotated[
+    str,
+    typer.Argument(
+        metavar="CAMERA",
+        help="l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or FILE.bag.",
+        show_default="sim, or the configured one",
+    ),
+]
+"""Also taken as the option --camera: `shared_options` makes one value of the two."""
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Overwrite the output if it exists.")]
 
 PAPER_RIG = "paper-rig"
 INTERRUPTED = 130
 """Exit code after Ctrl-C or SIGTERM."""
+LINE_PERIOD_S = 10.0
+"""Seconds between two lines of progress where stderr is no terminal."""
+NARROW_COLUMNS = 60
 
 stderr = Console(stderr=True, highlight=False)
+_outputs = ExitStack()
+_reserved: list[Path] = []
+"""Reserved output paths of the command that runs, and their reservations."""
+
+
+class Detail:
+    """Amount of messages of the command that runs: see `set_detail`."""
+
+    verbose = False
+    interruption = ""
+    """Line printed about an interruption, once."""
+
+
+def set_detail(*, verbose: bool = False, quiet: bool = False) -> None:
+    """Print details and the package's log too, or (`quiet`) no messages but errors, from the start of a command."""
+    Detail.verbose, stderr.quiet, Detail.interruption = verbose, quiet, ""
+    if verbose:
+        import logging
+
+        logging.basicConfig(format="%(name)s: %(message)s")
+        logging.getLogger("nlos_cam").setLevel(logging.DEBUG)
+
+
+def say_error(text: str) -> None:
+    """Print an error in one line, also if quiet."""
+    stderr.quiet = False
+    stderr.print(f"[bold red]error:[/] {escape(' '.join(text.split()))}", soft_wrap=True)
+
+
+def say_interrupted(kept: str = "nothing was written") -> None:
+    """Print that the command was interrupted and the results that it kept; the first call counts."""
+    if not Detail.interruption:
+        Detail.interruption = f"interrupted: {kept}"
+        say(Detail.interruption)
+
+
+def exit_interrupted(kept: str) -> NoReturn:
+    """End an interrupted command that has kept results."""
+    say_interrupted(kept)
+    raise typer.Exit(INTERRUPTED)
 
 
 def say(text: str, *, marked: bool = False) -> None:
@@ -55,16 +109,47 @@ def finish(result: dict[str, Any], *, as_json: bool, text: str, note: str = "", 
 
 
 def show(table: Table) -> None:
-    """Print a table to stdout."""
-    Console(highlight=False).print(table)
+    """Print a table to stdout without its empty columns; on a narrow terminal, each row as a block of lines."""
+    console = Console(highlight=False)
+    table.columns = [column for column in table.columns if any(column.cells)]
+    if console.width >= NARROW_COLUMNS:
+        console.print(table)
+        return
+    for cells in zip(*(column.cells for column in table.columns), strict=True):
+        named = zip(table.columns, cells, strict=True)
+        lines = [f"{column.header}: {cell}".removeprefix(": ") for column, cell in named if cell]
+        console.print("\n".join([*lines, ""]), soft_wrap=True)
 
 
 @contextmanager
-def progress(*others: ProgressColumn) -> Generator[Progress]:
-    """Show a progress bar on stderr, with further columns."""
+def progress(*others: ProgressColumn, period_s: float = LINE_PERIOD_S) -> Generator[Progress]:
+    """Show a progress bar with further columns on stderr; where that is no terminal, a line every `period_s`."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *others, TimeElapsedColumn()
-    with Progress(*columns, TimeRemainingColumn(), console=stderr, transient=True) as bar:
+    off = not stderr.is_terminal
+    bar = Progress(*columns, TimeRemainingColumn(), console=stderr, transient=True, disable=off)
+    with bar, _progress_lines(bar, period_s) if off else nullcontext():
         yield bar
+
+
+@contextmanager
+def _progress_lines(bar: Progress, period_s: float) -> Generator[None]:
+    """Print a line per running task every `period_s`, for a log."""
+    ended = Event()
+
+    def report() -> None:
+        while not ended.wait(period_s):
+            for task in bar.tasks:
+                if task.visible and not task.finished:
+                    amount = f"{task.completed:.0f}/{task.total:.0f}, " if task.total else ""
+                    say(f"{task.description}: {amount}{task.elapsed or 0:.0f} s")
+
+    thread = Thread(target=report, name="progress lines", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 @contextmanager
@@ -80,34 +165,61 @@ def tracked(description: str, *, at_once: bool = True) -> Generator[Callable[[in
 
 
 @contextmanager
-def stop_on_signals() -> Generator[Event]:
-    """Yield an event that Ctrl-C or SIGTERM sets within the block, so that the loop ends and results are printed."""
+def stop_on_signals(note: str = "") -> Generator[Event]:
+    """Yield an event that Ctrl-C or SIGTERM sets within the block, so that the loop ends and results are printed.
+
+    The first signal prints `note`, for loops whose end takes long.
+    """
     stop = Event()
-    with _on_signals(stop.set):
+
+    def set_stop() -> None:
+        if note and not stop.is_set():
+            with suppress(RuntimeError):  # the signal came within a write to stderr
+                say(note)
+        stop.set()
+
+    with _on_signals(set_stop):
         yield stop
 
 
 @contextmanager
-def interrupted_by_signals() -> Generator[None]:
+def interrupted_by_signals(kept: str = "nothing was written") -> Generator[None]:
     """Raise KeyboardInterrupt in the block on Ctrl-C or SIGTERM, also where a shell had them ignored.
 
-    It is raised at the end of the block too: a library may have swallowed it or turned it into another error.
+    It is raised at the end of the block too: a library may have swallowed it or turned it into another error. `kept`
+    completes the line "interrupted: ...", which the command line prints.
     """
     interrupted = Event()
 
     def interrupt() -> None:
         interrupted.set()
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(kept)
 
-    with _on_signals(interrupt):
+    def raise_again(ignored: Any, before: Any = sys.unraisablehook) -> None:
+        # Python ignores errors in destructors and weak references' callbacks, where a signal may happen to arrive.
+        if issubclass(ignored.exc_type, KeyboardInterrupt):
+            Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+        else:
+            before(ignored)
+
+    with _on_signals(interrupt), _unraisable_hook(raise_again):
         try:
             yield
         except Exception as error:
             if interrupted.is_set():
-                raise KeyboardInterrupt from error
+                raise KeyboardInterrupt(kept) from error
             raise
     if interrupted.is_set():
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(kept)
+
+
+@contextmanager
+def _unraisable_hook(hook: Callable[[Any], None]) -> Generator[None]:
+    before, sys.unraisablehook = sys.unraisablehook, hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 @contextmanager
@@ -127,6 +239,7 @@ def _on_signals(act: Callable[[], None]) -> Generator[None]:
 def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) -> Path:
     """Return the output path: `out`, or a dated name in the current folder.
 
+    It is reserved until `release_outputs`: raises FileBusyError, with the holder, where another process writes to it.
     Without a suffix the output is a folder, which may exist if it is empty. Raises OutputExistsError if something would
     be replaced without `overwrite`, or if the path cannot be written.
     """
@@ -135,10 +248,30 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
         raise OutputExistsError(f"{path} is a folder: name a {suffix} file in it")
     if not suffix and path.exists() and not path.is_dir():
         raise OutputExistsError(f"{path} is a file, but --out must be a folder: choose another name")
-    if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
-        raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
+    _refuse_existing(path, overwrite=overwrite)
     if not path.parent.is_dir():
         raise OutputExistsError(f"the folder of {path} does not exist: create {path.parent} first")
     if not os.access(path.parent, os.W_OK):
         raise OutputExistsError(f"the folder of {path} cannot be written to: choose another, or change its permissions")
+    from nlos_cam.files import reservations
+
+    _outputs.enter_context(reservations())(path)
+    _reserved.append(path)
+    _refuse_existing(path, overwrite=overwrite)  # it may have appeared before it was reserved
     return path
+
+
+def _refuse_existing(path: Path, *, overwrite: bool) -> None:
+    if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+        raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
+
+
+def release_outputs() -> None:
+    """Let other processes write to the output paths of a command that has ended."""
+    _outputs.close()
+    _reserved.clear()
+
+
+def reserved_outputs() -> list[Path]:
+    """Return the output paths of the command that runs."""
+    return _reserved

@@ -1,29 +1,33 @@
 """`dataset build` renders training data, and `dataset label` makes it from labelled recordings."""
 
+from __future__ import annotations
+
 import os
 import shlex
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
+import nlos_calibration as walls
+import nlos_models as models
 import typer
-from nlos_calibration import rig_named
-from nlos_models import SIMULATION_ONLY
 from rich.progress import ProgressColumn, Task
 from rich.text import Text
 
-from nlos_cam.cli.common import PAPER_RIG, Json, Overwrite, finish, output_path, progress, say, tracked
-from nlos_cam.dataset import (
-    FRAMES_PER_RECORDING,
-    DatasetPlan,
-    Objects,
-    RigSpread,
-    build_dataset,
-    label_recordings,
-    objects_from_folder,
-    ray_farm,
+from nlos_cam import dataset as data
+from nlos_cam import objects as shapes
+from nlos_cam import render as renderer
+from nlos_cam.cli.common import (
+    PAPER_RIG,
+    Json,
+    Overwrite,
+    exit_interrupted,
+    finish,
+    output_path,
+    progress,
+    say,
+    tracked,
 )
-from nlos_cam.objects import TEXTURES
-from nlos_cam.render import SceneFile, accuracy_named, load_scene
 
 PROCEDURAL = "procedural"
 
@@ -45,6 +49,10 @@ LeftOut = Annotated[str, typer.Option("--without", help="Categories to leave out
 Backgrounds = Annotated[
     float, typer.Option("--backgrounds", min=0, max=1, help="Share of objects with a post or a panel beside them.")
 ]
+ShareGeneric = Annotated[
+    float,
+    typer.Option("--share-generic", min=0, max=1, help="Share of generic shapes (solids, strokes, blobs, pairs, ...)."),
+]
 Color = Annotated[
     bool, typer.Option("--colour", help="Painted objects and maps in red, green and blue; simulation only.")
 ]
@@ -57,7 +65,9 @@ SpreadDeg = Annotated[
 GainSpread = Annotated[
     float, typer.Option("--gain-spread-percent", min=0, help="Largest change of the intensity gain, drawn per object.")
 ]
-AccuracyName = Annotated[str, typer.Option("--accuracy", help="draft, standard or fine.")]
+AccuracyName = Annotated[
+    Literal["draft", "standard", "fine", "reference"], typer.Option("--accuracy", help="Accuracy of the renderer.")
+]
 Workers = Annotated[
     int, typer.Option("--workers", min=1, show_default="as many as cores", help="Processes on this machine.")
 ]
@@ -89,6 +99,7 @@ def build(
     objects: HiddenObjects = PROCEDURAL,
     without: LeftOut = "",
     backgrounds: Backgrounds = 0.0,
+    share_generic: ShareGeneric = 0.0,
     colour: Color = False,
     rig_spread_mm: SpreadMm = 0.0,
     rig_spread_deg: SpreadDeg = 0.0,
@@ -101,19 +112,19 @@ def build(
     """Render random objects into HDF5 shards; give the same command again to resume after an interruption."""
     if scene and rig is not None:
         raise typer.BadParameter(f"{scene} has its own rig: drop --rig")
-    spread = RigSpread(place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100)
-    plan = DatasetPlan.of_scene(
-        load_scene(scene) if scene else SceneFile(name="bare", rig=rig_named(rig or PAPER_RIG)),
+    spread = data.RigSpread(place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100)
+    plan = data.DatasetPlan.of_scene(
+        renderer.load_scene(scene) if scene else renderer.SceneFile(name="bare", rig=walls.rig_named(rig or PAPER_RIG)),
         seed,
-        objects=_objects(objects, without, backgrounds),
-        accuracy=accuracy_named(accuracy).name,
+        objects=_objects(objects, without, backgrounds, share_generic),
+        accuracy=renderer.accuracy_named(accuracy).name,
         spread=spread,
-        textures=tuple(TEXTURES) if colour else (),
+        textures=tuple(shapes.TEXTURES) if colour else (),
     )
     with progress(Rate()) as bar:
         checks, renders = (bar.add_task(name, total=None, visible=False) for name in ("checking shards", "rendering"))
         try:
-            report = build_dataset(
+            report = data.build_dataset(
                 plan,
                 count,
                 out,
@@ -122,16 +133,15 @@ def build(
                 on_check=lambda done, total: bar.update(checks, completed=done, total=total, visible=done < total),
                 on_warning=say,
                 command=_command(context, "build"),
-                farm=ray_farm(ray) if ray else None,
+                farm=data.ray_farm(ray) if ray else None,
             )
         except KeyboardInterrupt:
-            say(f"interrupted: finished shards are kept in {out}; give the same command to resume")
-            raise
+            exit_interrupted(f"finished shards are kept in {out}; give the same command to resume")
     rate = report.objects_per_s
     facts = {"objects": report.objects, "made": report.made, "damaged": [str(path) for path in report.damaged]}
     result = {**facts, "seconds": report.seconds, "objects_per_s": rate, "out": str(out)}
     new = f" ({report.made} new, {rate:.1f} per second)" if rate else ""
-    note = SIMULATION_ONLY if colour else ""
+    note = models.SIMULATION_ONLY if colour else ""
     finish(result, as_json=json, text=f"{report.objects} objects in {out}{new}", note=note)
 
 
@@ -140,7 +150,7 @@ def label(
     recordings: Recordings,
     out: NewOut,
     wall: Wall = None,
-    frames: Frames = FRAMES_PER_RECORDING,
+    frames: Frames = 8,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -152,7 +162,7 @@ def label(
     folder = output_path(out, "dataset", "", overwrite=overwrite)
     with tracked("reading recordings") as on_progress:
         command = _command(context, "label")
-        labelled = label_recordings(
+        labelled = data.label_recordings(
             recordings, folder, wall=wall, frames=frames, command=command, on_progress=on_progress
         )
     samples, labels, files = len(labelled.label), sorted(set(labelled.label)), len(set(labelled.recording))
@@ -174,13 +184,14 @@ def _command(context: typer.Context, name: str) -> str:
     return shlex.join(words)
 
 
-def _objects(objects: str, without: str, backgrounds: float) -> Objects:
+def _objects(objects: str, without: str, backgrounds: float, share_generic: float) -> data.Objects:
     if objects == PROCEDURAL:
-        return Objects.without([name.strip() for name in without.split(",") if name.strip()], backgrounds)
+        left_out = [name.strip() for name in without.split(",") if name.strip()]
+        return data.Objects.without(left_out, backgrounds, share_generic)
     if without or backgrounds:
         raise typer.BadParameter("--without and --backgrounds are for procedural objects: drop them")
     with tracked("reading meshes") as on_progress:
-        return objects_from_folder(Path(objects), on_progress)
+        return replace(data.objects_from_folder(Path(objects), on_progress), share_generic=share_generic)
 
 
 class Rate(ProgressColumn):

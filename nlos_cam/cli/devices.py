@@ -1,5 +1,7 @@
 """`nlos-cam devices` lists the cameras that librealsense and USB see; `nlos-cam doctor` explains why one is missing."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -9,9 +11,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from nlos_cam.camera import SIMULATED, DeviceInfo
+from nlos_cam import camera as cameras
+from nlos_cam import doctor as diagnosis
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, show
-from nlos_cam.doctor import Check, Facts, Pair, UsbDevice, diagnose, gather_facts, install_command, rules_text
 from nlos_cam.errors import NlosCamError
 
 VISIBLE = {True: "yes", False: "[red]no[/]", None: ""}
@@ -26,13 +28,13 @@ def register(app: typer.Typer) -> None:
 
 def devices(json: Json = False) -> None:
     """List the cameras that librealsense and USB see, side by side, and the simulated cameras."""
-    facts = gather_facts()
+    facts = diagnosis.gather_facts()
     if not json:
         show(_table(facts))
     finish(_result(facts), as_json=json, text=_device_notes(facts), marked=True)
 
 
-def _result(facts: Facts) -> dict[str, Any]:
+def _result(facts: diagnosis.Facts) -> dict[str, Any]:
     seen = {id(pair.sdk): _usb_seen(facts, pair) for pair in facts.pairs if pair.sdk}
     real = [
         asdict(info) | {"uri": _uri(info), "simulated": False, "usb_seen": seen.get(id(info))}
@@ -40,7 +42,7 @@ def _result(facts: Facts) -> dict[str, Any]:
     ]
     simulated = [
         {"name": name, "serial": "", "firmware": "", "usb_type": "", "uri": uri, "simulated": True, "usb_seen": None}
-        for uri, name in SIMULATED.items()
+        for uri, name in cameras.SIMULATED.items()
     ]
     return {
         "devices": real + simulated,
@@ -50,7 +52,7 @@ def _result(facts: Facts) -> dict[str, Any]:
     }
 
 
-def _usb(device: UsbDevice) -> dict[str, Any]:
+def _usb(device: diagnosis.UsbDevice) -> dict[str, Any]:
     named = ("id", "kind", "meaning", "serial", "product", "firmware", "usb_type", "link", "port", "bus", "address")
     return {name: getattr(device, name) for name in named} | {
         "interfaces": list(device.interfaces),
@@ -58,23 +60,23 @@ def _usb(device: UsbDevice) -> dict[str, Any]:
     }
 
 
-def _usb_seen(facts: Facts, pair: Pair) -> bool | None:
+def _usb_seen(facts: diagnosis.Facts, pair: diagnosis.Pair) -> bool | None:
     return None if facts.usb.error else pair.usb is not None
 
 
-def _sdk_seen(facts: Facts, device: UsbDevice) -> bool | None:
+def _sdk_seen(facts: diagnosis.Facts, device: diagnosis.UsbDevice) -> bool | None:
     """Return whether the SDK lists a USB device; None if unknown: only cameras of the L515's family are paired."""
     if facts.sdk.error:
         return None
     return next((pair.sdk is not None for pair in facts.pairs if pair.usb is device), None)
 
 
-def _uri(info: DeviceInfo | None) -> str:
+def _uri(info: cameras.DeviceInfo | None) -> str:
     """Return the value of `--camera` for a device; empty if it is not an L515."""
     return f"l515:{info.serial}" if info and "L515" in info.name else ""
 
 
-def _table(facts: Facts) -> Table:
+def _table(facts: diagnosis.Facts) -> Table:
     table = Table("--camera", "name", "serial", "firmware", "link", "SDK", "USB", box=None, pad_edge=False)
     for pair in facts.pairs:
         table.add_row(*_row(facts, pair))
@@ -85,17 +87,17 @@ def _table(facts: Facts) -> Table:
     for info in facts.sdk.devices:
         if info not in facts.sdk.lidars:
             table.add_row("", *map(escape, (info.name, info.serial, info.firmware, info.usb_type)), VISIBLE[True], "")
-    for uri, name in SIMULATED.items():
+    for uri, name in cameras.SIMULATED.items():
         table.add_row(uri, escape(name))
     return table
 
 
-def _row(facts: Facts, pair: Pair) -> list[str]:
+def _row(facts: diagnosis.Facts, pair: diagnosis.Pair) -> list[str]:
     visible = VISIBLE[None if facts.sdk.error else pair.sdk is not None], VISIBLE[_usb_seen(facts, pair)]
     return [_uri(pair.sdk), *map(escape, (pair.name, pair.serial, pair.firmware, pair.link)), *visible]
 
 
-def _device_notes(facts: Facts) -> str:
+def _device_notes(facts: diagnosis.Facts) -> str:
     """Return the errors and the missing cameras, with the command that explains them."""
     notes: list[str] = []
     if error := facts.sdk.error:
@@ -117,7 +119,7 @@ def doctor(write_udev: WriteUdev = None, overwrite: Overwrite = False, json: Jso
     """Check everything between a camera and this program, and print fixes; the exit code is 0 even if checks fail."""
     if write_udev is not None:
         _write(output_path(write_udev, "", ".rules", overwrite=overwrite))
-    checks = diagnose(gather_facts())
+    checks = diagnosis.diagnose(diagnosis.gather_facts())
     if not json:
         show(_checks_table(checks))
     failures = sum(check.status == "failed" for check in checks)
@@ -127,22 +129,23 @@ def doctor(write_udev: WriteUdev = None, overwrite: Overwrite = False, json: Jso
 
 def _write(path: Path) -> None:
     try:
-        path.write_text(rules_text(), encoding="utf-8")
+        path.write_text(diagnosis.rules_text(), encoding="utf-8")
     except OSError as error:
         raise NlosCamError(
             f"cannot write {path} ({error.strerror}): write it to this folder, then install it"
         ) from error
-    say(f"Wrote {path}. To install it, run this, then plug the camera in again:\n  {install_command(str(path))}")
+    command = diagnosis.install_command(str(path))
+    say(f"Wrote {path}. To install it, run this, then plug the camera in again:\n  {command}")
 
 
-def _checks_table(checks: Sequence[Check]) -> Table:
+def _checks_table(checks: Sequence[diagnosis.Check]) -> Table:
     table = Table("", "check", "finding", box=None, pad_edge=False)
     for check in checks:
         table.add_row(f"[{COLORS[check.status]}]{check.status}[/]", check.name, escape(check.detail))
     return table
 
 
-def _fixes(checks: Sequence[Check], failures: int) -> str:
+def _fixes(checks: Sequence[diagnosis.Check], failures: int) -> str:
     """Return the fixes, each on a line that can be copied, and the number of failures."""
     fixes = [f"[bold]{check.name}[/]: {escape(check.fix)}" for check in checks if check.fix]
     total = f"{failures} of {len(checks)} checks failed" if failures else "All checks passed"

@@ -1,15 +1,16 @@
 """The command `evaluate`: weights to figures and pictures, on held-out objects."""
 
+from __future__ import annotations
+
 import time
 from pathlib import Path
 from typing import Annotated, Any
 
+import nlos_calibration as walls
 import typer
-from nlos_calibration import rig_named
 
+from nlos_cam import evaluate as measure
 from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
-from nlos_cam.evaluate import as_figures, format_interval, write_report
-from nlos_cam.evaluate import evaluate as evaluate_weights
 
 
 def register(app: typer.Typer) -> None:
@@ -36,6 +37,9 @@ def evaluate(
     no_nearest: Annotated[
         bool, typer.Option("--no-nearest", help="Omit the nearest neighbour, which renders 2000 objects once.")
     ] = False,
+    mirror: Annotated[
+        bool, typer.Option("--mirror", help="Join the answer with the one to the mirrored maps; twice the time.")
+    ] = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -46,20 +50,21 @@ def evaluate(
         raise typer.BadParameter("--training is searched for the nearest neighbour: omit it or --no-nearest")
     folder, start_s = output_path(out, "evaluation", "", overwrite=overwrite), time.perf_counter()
     with interrupted_by_signals():
-        evaluation = evaluate_weights(
+        evaluation = measure.evaluate(
             weights,
             data,
-            rig=rig_named(rig) if rig else None,
+            rig=walls.rig_named(rig) if rig else None,
             count=count,
             wall=wall,
             training=training,
             nearest=not no_nearest,
+            mirror=mirror,
             tracked=tracked,
         )
     for note in evaluation.facts["notes"]:
         say(f"note: {note}")
-    figures: dict[str, Any] = as_figures(evaluation) | {"seconds": time.perf_counter() - start_s}
-    write_report(folder, evaluation, figures)
-    iou = format_interval(figures["silhouette_iou"])
-    text = f"Silhouette IoU {iou} on {figures['objects']} objects: {folder / 'report.md'}"
+    figures: dict[str, Any] = measure.as_figures(evaluation) | {"seconds": time.perf_counter() - start_s}
+    measure.write_report(folder, evaluation, figures)
+    iou = measure.format_interval(figures["silhouette_iou"])
+    text = f"Silhouette IoU {iou} on {figures['objects']} objects: open {folder / measure.REPORT}"
     finish({**figures, "out": str(folder)}, as_json=json, text=text)

@@ -1,20 +1,27 @@
 """`nlos-cam live` and `nlos-cam replay`: options, messages and the report at the end."""
 
+from __future__ import annotations
+
 from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
+import nlos_models as models
 import typer
-from nlos_models import Reconstructor, UncertaintyModel
 from rich.markup import escape
 
-from nlos_cam.camera import Camera, Reader, Recording, WallClock, open_camera
+from nlos_cam import camera as cameras
+from nlos_cam import evaluate as measure
+from nlos_cam import live as loop
+from nlos_cam import reconstruct
 from nlos_cam.cli.common import (
-    INTERRUPTED,
+    Camera,
+    Detail,
     Json,
     Overwrite,
+    exit_interrupted,
     finish,
     interrupted_by_signals,
     output_path,
@@ -23,6 +30,7 @@ from nlos_cam.cli.common import (
     stop_on_signals,
     tracked,
 )
+from nlos_cam.cli.recordings import AsObject, object_formats
 from nlos_cam.cli.view import (
     SUFFIX,
     NoView,
@@ -34,42 +42,10 @@ from nlos_cam.cli.view import (
     ViewHost,
     ViewPort,
     announce_view,
+    each_of,
+    once,
     saving,
     viewer_of,
-)
-from nlos_cam.evaluate import runtimes
-from nlos_cam.live import (
-    LOG_SUFFIXES,
-    OUTSIDE_LATENCY,
-    REPORT,
-    SHIPPED,
-    BackgroundPhysicsCheck,
-    BudgetChoice,
-    FrameLog,
-    ReplayMedia,
-    RunReport,
-    available_settings,
-    choose_within_budget,
-    describe_counts,
-    ignore,
-    low_latency_interpreter,
-    pipeline_timer,
-    realtime_priority,
-    replay_recording,
-    run_live,
-    setting_loader,
-    warm_up,
-)
-from nlos_cam.reconstruct import (
-    CalibratedRig,
-    PhysicsCheck,
-    Pipeline,
-    Verdict,
-    build_pipeline,
-    compatibility_warnings,
-    load_networks,
-    load_uncertainty,
-    open_bench,
 )
 
 LOSSES = {
@@ -79,6 +55,8 @@ LOSSES = {
     "failed": "whose processing failed",
 }
 """Reason of a lost frame in words, by its name in RunReport.counts."""
+SLOW_DROPPED_SHARE, SLOW_MS = 0.05, 200.0
+"""Share of dropped frames and median latency above which the summary warns."""
 
 RecordTo = Annotated[Path | None, typer.Option("--record", help="Also record the camera's streams (F.bag).")]
 Log = Annotated[Path | None, typer.Option("--log", help="Write one line per frame: F.csv, or F.jsonl.")]
@@ -90,7 +68,6 @@ Tradeoff = Annotated[
     Path | None,
     typer.Option("--tradeoff", help="Table of `tradeoff reconstruct` for --budget-ms (default: beside the weights)."),
 ]
-CameraUri = Annotated[str, typer.Option("--camera", help="l515, l515:SERIAL, sim, sim:scene.toml, bag:run.bag.")]
 Wall = Annotated[Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall` (wall.toml).")]
 Weights = Annotated[Path | None, typer.Option("--weights", help="Folder of other weights than the shipped ones.")]
 Seconds = Annotated[
@@ -100,10 +77,12 @@ Seconds = Annotated[
 Average = Annotated[
     int, typer.Option("--average", min=1, max=1000, help="Number of frames to average; moving objects blur.")
 ]
-ReadBy = Annotated[Reader, typer.Option("--reader", help='Bag reader: built-in ("plain"), or librealsense ("sdk").')]
+ReadBy = Annotated[
+    Literal["plain", "sdk"], typer.Option("--reader", help='Bag reader: built-in ("plain"), or librealsense ("sdk").')
+]
 BagFile = Annotated[Path, typer.Argument(metavar="F.BAG", help="Recording with depth, infrared and confidence.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Directory to write (default: a dated one).")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print the time of each stage.")]
+Every = Annotated[int, typer.Option("--every", min=1, help="With --object, only every Nth frame (default: 1).")]
 
 
 def register(app: typer.Typer) -> None:
@@ -113,7 +92,7 @@ def register(app: typer.Typer) -> None:
 
 
 def live(
-    camera: CameraUri,
+    camera: Camera = "sim",
     wall: Wall = None,
     seconds: Seconds = None,
     no_view: NoView = False,
@@ -128,57 +107,71 @@ def live(
     tradeoff: Tradeoff = None,
     save_view: SaveView = None,
     overwrite: Overwrite = False,
-    verbose: Verbose = False,
     json: Json = False,
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
     if budget_ms is not None and average > 1:
         raise typer.BadParameter("--budget-ms chooses the number of averaged frames: drop --average")
+    if tradeoff is not None and budget_ms is None:
+        raise typer.BadParameter("--tradeoff is the table for --budget-ms: give both")
+    if no_view and open_view:
+        raise typer.BadParameter("--open needs a view: drop --no-view")
     check_output = partial(_check_output, overwrite=overwrite)
-    recording = Recording(check_output(record, "--record", ".bag"), optional=True) if record else None
-    frame_log = FrameLog(check_output(log, "--log", *LOG_SUFFIXES)) if log else None
+    recorded = check_output(record, "--record", ".bag") if record else None
+    recording = cameras.Recording(recorded, optional=True, overwrite=overwrite) if recorded else None
+    frame_log = loop.FrameLog(check_output(log, "--log", *loop.LOG_SUFFIXES)) if log else None
     view_file = check_output(save_view, "--save-view", SUFFIX) if save_view else None
-    with interrupted_by_signals():
-        with tracked("Pre-rendering the simulated scene (first run only, about 90 s)", at_once=False) as on_progress:
-            opened = open_camera(camera, on_progress=on_progress, recording=recording)
-        bench = open_bench(wall, opened)
-        checks = BackgroundPhysicsCheck(bench.rig, on_error=_warn_once)
-        pipeline, choice = _choose_pipeline(opened, bench, weights, average, budget_ms, tradeoff, checks)
-        warm_up(opened, pipeline)
-    viewer = saving(viewer_of(bench, no_view=no_view, host=view_host, port=view_port), bench, view_file)
-    with (
-        stop_on_signals() as stop,
-        realtime_priority(),
-        viewer,
-        frame_log or nullcontext(),
-        low_latency_interpreter(),
-        opened as source,
-    ):
-        announce_view(viewer, host=view_host, port=view_port, open_it=open_view)
-        report = run_live(
-            source,
-            pipeline,
-            viewer,
-            stop=stop,
-            seconds=seconds,
-            recorded=camera.startswith("bag:"),
-            clock=WallClock().now,
-            on_error=lambda report: say(summary(report, verbose=verbose)),
-            on_warning=warn,
-            on_moment=frame_log.add if frame_log else ignore,
-        )
+    control = loop.RunControl(camera)
+    with viewer_of(control, no_view=no_view, host=view_host, port=view_port) as viewer:  # serves before the camera runs
+        announce = once(partial(announce_view, viewer, host=view_host, port=view_port, open_it=open_view))
+        with interrupted_by_signals():
+            with tracked(
+                "Pre-rendering the simulated scene (first run only, about 90 s)", at_once=False
+            ) as on_progress:
+                on_rendering = each_of(lambda _, __: announce(), on_progress, control.show_progress)
+                opened = cameras.open_camera(camera, on_progress=on_rendering, recording=recording)
+            announce()
+            bench = reconstruct.open_bench(wall, opened)
+            checks = loop.BackgroundPhysicsCheck(bench.rig, on_error=_warn_once)
+            control.set_state("connecting", "loading the networks, first frame in a few seconds")
+            pipeline, choice = _choose_pipeline(opened, bench, weights, average, budget_ms, tradeoff, checks)
+            loop.warm_up(opened, pipeline)
+        viewer.begin(bench.rig, bench.measured)
+        control.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
+        loop.offer_settings(control, opened, bench, tradeoff, weights)
+        with (
+            stop_on_signals() as stop,
+            loop.realtime_priority(),
+            saving(viewer, bench, view_file) as viewers,
+            frame_log or nullcontext(),
+            loop.low_latency_interpreter(),
+            opened as source,
+        ):
+            report = loop.run_live(
+                source,
+                pipeline,
+                viewers,
+                stop=stop,
+                seconds=seconds,
+                recorded=camera.startswith("bag:"),
+                clock=cameras.WallClock().now,
+                on_error=lambda report: say(summary(report, verbose=Detail.verbose)),
+                on_warning=warn,
+                on_moment=frame_log.add if frame_log else loop.ignore,
+                control=control,
+            )
     if log:
         say(f"Logged each frame to {log}")
     if recording:
         say(f"Recorded {recording.sets} frames to {recording.path}")
     if view_file:
-        say(f"Saved the view: nlos-cam view {view_file}")
-    text, budget = summary(report, verbose=verbose), {}
+        say(f"Saved the view: open {view_file} in a browser")
+    text, budget = summary(report, verbose=Detail.verbose), {}
     if choice:
         text, budget = f"{text}\n{choice.describe_outcome(report)}", {"budget": choice.outcome(report)}
     finish({**asdict(report), **budget}, as_json=json, text=text)
     if stop.is_set():
-        raise typer.Exit(INTERRUPTED)
+        exit_interrupted(f"{report.frames} frames were processed")
 
 
 def replay(
@@ -191,33 +184,38 @@ def replay(
     save_view: SaveReplayView = False,
     stills: Stills = 0,
     video: Video = False,
+    as_object: AsObject = "",
+    every: Every = 1,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Reconstruct every frame of a recording: the same frames and the same bits each time."""
+    formats = object_formats(as_object)
     path = output_path(out, "replay", "", overwrite=overwrite)
     with interrupted_by_signals():
-        opened = open_camera(f"bag:{bag}", reader=reader)
-        bench = open_bench(wall, opened)
+        opened = cameras.open_camera(f"bag:{bag}", reader=reader)
+        bench = reconstruct.open_bench(wall, opened)
         from nlos_cam.reconstruct import PeriodicPhysicsCheck  # the renderer takes a second to import
 
         checks = PeriodicPhysicsCheck(bench.rig, on_error=_warn_once)
-        pipeline = _build_pipeline(bench, load_networks(weights), load_uncertainty(weights), average, checks)
+        pipeline = _build_pipeline(
+            bench, reconstruct.load_networks(weights), reconstruct.load_uncertainty(weights), average, checks
+        )
     with opened as source, stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("reconstructing", total=None)
-        report = replay_recording(
+        report = loop.replay_recording(
             source,
             pipeline,
             path,
             stop=stop,
             on_frame=lambda: bar.advance(task),
             on_warning=warn,
-            media=ReplayMedia(bench, view=save_view, stills=stills, video=video),
+            media=loop.ReplayMedia(bench, view=save_view, stills=stills, video=video, objects=formats, every=every),
         )
-    text = f"Reconstructed {report.frames} frames in {report.seconds:.1f} s: {path / REPORT}"
+    text = f"Reconstructed {report.frames} frames in {report.seconds:.1f} s: open {path / loop.REPORT}"
     finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
-        raise typer.Exit(INTERRUPTED)
+        exit_interrupted(f"{path} holds the first {report.frames} frames")
 
 
 def _check_output(path: Path, option: str, *suffixes: str, overwrite: bool) -> Path:
@@ -227,41 +225,49 @@ def _check_output(path: Path, option: str, *suffixes: str, overwrite: bool) -> P
     return output_path(path, "live", path.suffix, overwrite=overwrite)
 
 
+def _runtimes(*which: Any) -> Any:
+    """Return `evaluate.runtimes`, which imports torch, once a setting needs it."""
+    return measure.runtimes(*which)
+
+
 def _choose_pipeline(
-    camera: Camera,
-    bench: CalibratedRig,
+    camera: cameras.Camera,
+    bench: reconstruct.CalibratedRig,
     weights: Path | None,
     average: int,
     budget_ms: float | None,
     tradeoff: Path | None,
-    checks: PhysicsCheck,
-) -> tuple[Pipeline, BudgetChoice | None]:
+    checks: reconstruct.PhysicsCheck,
+) -> tuple[reconstruct.Pipeline, loop.BudgetChoice | None]:
     """Return the usual pipeline, or that of a latency budget with its choice."""
     if budget_ms is None:
-        return _build_pipeline(bench, load_networks(weights), load_uncertainty(weights), average, checks), None
-    settings, load = available_settings(tradeoff, weights), setting_loader(weights, runtimes)
-    uncertainty_model = load_uncertainty(weights)
+        return _build_pipeline(
+            bench, reconstruct.load_networks(weights), reconstruct.load_uncertainty(weights), average, checks
+        ), None
+    settings = loop.available_settings(tradeoff, weights)
+    load = loop.setting_loader(weights, _runtimes)
+    uncertainty_model = reconstruct.load_uncertainty(weights)
     # timed with the uncertainty model of `weights`: others take as long
-    build = partial(build_pipeline, bench, uncertainty_model=uncertainty_model)
-    network, choice = choose_within_budget(budget_ms, settings, build, load, pipeline_timer(camera))
+    build = partial(reconstruct.build_pipeline, bench, uncertainty_model=uncertainty_model)
+    network, choice = loop.choose_within_budget(budget_ms, settings, build, load, loop.pipeline_timer(camera))
     say(choice.describe())
-    if choice.setting.weights != SHIPPED:
-        uncertainty_model = load_uncertainty(Path(choice.setting.weights))
+    if choice.setting.weights != loop.SHIPPED:
+        uncertainty_model = reconstruct.load_uncertainty(Path(choice.setting.weights))
     return _build_pipeline(bench, network, uncertainty_model, choice.setting.frames, checks), choice
 
 
 def _build_pipeline(
-    bench: CalibratedRig,
-    network: Reconstructor,
-    uncertainty_model: UncertaintyModel | None,
+    bench: reconstruct.CalibratedRig,
+    network: models.Reconstructor,
+    uncertainty_model: models.UncertaintyModel | None,
     average: int,
-    checks: PhysicsCheck,
-) -> Pipeline:
+    checks: reconstruct.PhysicsCheck,
+) -> reconstruct.Pipeline:
     """Build the pipeline, and print the model's name and its mismatches with the bench."""
     say(f"Loaded model {network.record.rig_name} ({network.runtime})")
-    for warning in compatibility_warnings(bench, network.record, uncertainty_model):
+    for warning in reconstruct.compatibility_warnings(bench, network.record, uncertainty_model):
         say(f"note: {warning}")
-    return build_pipeline(bench, network, average, uncertainty_model=uncertainty_model, checks=checks)
+    return reconstruct.build_pipeline(bench, network, average, uncertainty_model=uncertainty_model, checks=checks)
 
 
 def warn(warning: str, begins: bool) -> None:
@@ -273,7 +279,7 @@ def _warn_once(warning: str) -> None:
     warn(warning, begins=True)
 
 
-def summary(report: RunReport, *, verbose: bool = False) -> str:
+def summary(report: loop.RunReport, *, verbose: bool = False) -> str:
     """Return the report as text, a sentence per line; `verbose` adds the time of each stage."""
     latency, counts = report.latency_ms, dict(report.counts)
     losses = [f"{counts.pop(name)} {reason}" for name, reason in LOSSES.items() if name in counts]
@@ -283,18 +289,22 @@ def summary(report: RunReport, *, verbose: bool = False) -> str:
     ]
     if report.dropped:
         lines.append(f"Dropped {report.dropped} frames: {', '.join(losses)}")
+    lost = report.dropped / max(report.frames + report.dropped, 1)
+    if lost > SLOW_DROPPED_SHARE or latency["p50"] > SLOW_MS:
+        slow = f"{lost:.0%} of the frames dropped, median latency {latency['p50']:.0f} ms"
+        lines.append(f"Warning: {slow}: close other programs, or give --budget-ms")
     if report.verdicts:
-        phrases = {Verdict.SEEN.value: "object detected"}
+        phrases = {reconstruct.Verdict.SEEN.value: "object detected"}
         verdicts = [f"{phrases.get(verdict, verdict)} in {count}" for verdict, count in report.verdicts.items()]
         verdicts[0] = f"{verdicts[0]} of {report.frames} frames".capitalize()
         lines.append(", ".join(verdicts))
     if counts:
-        lines.append(f"Irregular: {describe_counts(counts)}")
+        lines.append(f"Irregular: {loop.describe_counts(counts)}")
     if report.stalled_s:
         lines.append(f"Stalled for {report.stalled_s:.1f} s without a frame")
     lines += [f"Warning in {frames} frames: {text}" for text, frames in report.warnings.items()]
     if verbose:
         lines.append(f"{'Stage':10}{'median':>9}{'p99 (ms)':>11}")
-        stages = sorted(report.stages_percentiles_ms.items(), key=lambda stage: stage[0] in OUTSIDE_LATENCY)
+        stages = sorted(report.stages_percentiles_ms.items(), key=lambda stage: stage[0] in loop.OUTSIDE_LATENCY)
         lines += [f"{name:10}{times['p50']:9.1f}{times['p99']:11.1f}" for name, times in stages]
     return "\n".join(lines)

@@ -1,20 +1,33 @@
 """The command `nlos-cam`: arguments in, one call, an exit code out."""
 
-import errno
 import importlib
 import json
+import os
 import sys
-from importlib.metadata import version
+from contextlib import suppress
 from typing import Annotated, NamedTuple
 
+import nlos_models as models
 import typer
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 from typer.main import get_command
 
-from nlos_cam.cli.common import INTERRUPTED, interrupted_by_signals, stderr, stop_on_signals
+from nlos_cam.cli.common import (
+    INTERRUPTED,
+    interrupted_by_signals,
+    release_outputs,
+    reserved_outputs,
+    say_error,
+    say_interrupted,
+    set_detail,
+    stderr,
+    stop_on_signals,
+)
+from nlos_cam.cli.config import shared_options
 from nlos_cam.cli.plain_help import plain_help
-from nlos_cam.errors import DiskFullError, NlosCamError
+from nlos_cam.cli.usage import usage_lines, usage_reason
+from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError
 
 
 class Command(NamedTuple):
@@ -27,17 +40,24 @@ class Command(NamedTuple):
 
 START, BENCH, RECORDINGS, SIMULATION = "Start here", "Bench", "Recordings", "Simulation and training"
 COMMANDS = {
+    "demo": Command("demo", START, "Show the live view of a simulated bench; no camera is needed."),
     "live": Command("live", START, "Reconstruct a camera's frames live and show them in a browser."),
     "doctor": Command("devices", START, "Explain why a camera is not found, and how to fix it."),
     "devices": Command("devices", START, "List cameras, real and simulated."),
+    "config": Command("config", START, "Show the settings of nlos-cam.toml and the environment."),
     "calibrate": Command("calibrate", BENCH, "Measure a bare wall, a printed board or the occluder."),
     "board": Command("calibrate", BENCH, "Write the calibration board as a PDF to print."),
     "capture": Command("capture", RECORDINGS, "Record a camera to a .bag file and check the recording."),
     "replay": Command("live", RECORDINGS, "Reconstruct every frame of a recording, and write results and pictures."),
+    "info": Command("info", RECORDINGS, "Describe a file or folder: kind, origin, content, whether it is whole."),
     "view": Command("view", RECORDINGS, "Open a saved view in a browser."),
     "export": Command("recordings", RECORDINGS, "Export a recording as images, timestamps and point clouds."),
     "repair": Command("recordings", RECORDINGS, "Recover the whole frames of a cut or damaged recording."),
     "render": Command("render", SIMULATION, "Render the lidar's report of a hidden object."),
+    "scenes": Command("lists", SIMULATION, "List the packaged scenes: simulated benches."),
+    "objects": Command("lists", SIMULATION, "List the kinds of hidden objects."),
+    "rigs": Command("lists", SIMULATION, "List the packaged rigs."),
+    "recipes": Command("lists", SIMULATION, "List the packaged training recipes."),
     "dataset": Command("dataset", SIMULATION, "Build training data, or label recordings."),
     "train": Command("train", SIMULATION, "Train networks from a recipe."),
     "evaluate": Command("evaluate", SIMULATION, "Measure weights on held-out objects, beside trivial baselines."),
@@ -46,12 +66,18 @@ COMMANDS = {
 """Every command in the order of the help page."""
 
 SETTINGS = {"help_option_names": ["-h", "--help"]}
-DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
-"""Errors of the disk, not of the program: full, over its quota, read-only, broken."""
+EVERYWHERE = {"--json", "--verbose", "-v", "--quiet", "-q"}
+"""Options that may also stand before the command."""
+GROUPS = {"dataset", "train", "tradeoff"}
+"""Commands with commands of their own."""
+COMPLETION = "_NLOS_CAM_COMPLETE"
+"""Environment variable that a shell sets when it asks for completions."""
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
+        from importlib.metadata import version
+
         print(f"nlos-cam {version('nlos-cam')}")  # noqa: T201  the answer
         raise typer.Exit
 
@@ -76,6 +102,7 @@ def build_app(command: str | None = None) -> typer.Typer:
         rows = COMMANDS.values() if command is None else [COMMANDS[command]]
         for module in dict.fromkeys(row.module for row in rows):
             importlib.import_module(f"nlos_cam.cli.{module}").register(app)
+        _share_options(app)
         return app
     for name, row in COMMANDS.items():
         app.command(name, help=row.summary, rich_help_panel=row.group)(lambda: None)
@@ -83,50 +110,105 @@ def build_app(command: str | None = None) -> typer.Typer:
 
 
 def _empty_app() -> typer.Typer:
-    app = typer.Typer(name="nlos-cam", context_settings=SETTINGS, pretty_exceptions_enable=False, add_completion=False)
+    app = typer.Typer(name="nlos-cam", context_settings=SETTINGS, pretty_exceptions_enable=False)
     app.callback()(_root)
     return app
 
 
+def _share_options(app: typer.Typer, group: str = "") -> None:
+    for info in app.registered_commands:
+        if command := info.callback:
+            name = info.name or command.__name__
+            info.name, info.callback = name, shared_options(f"{group} {name}".strip(), command)
+    for group_info in app.registered_groups:
+        if group_info.typer_instance:
+            _share_options(group_info.typer_instance, str(group_info.name))
+
+
 def main(arguments: list[str]) -> int:
     """Run one command and return its exit code (see docs/reference.md: 0, 1, 2, 3, 4, 130)."""
-    command = next((argument for argument in arguments if not argument.startswith("-")), "")
+    as_json = "--json" in arguments
+    command, arguments = _split(arguments)
+    set_detail()
     try:
-        with interrupted_by_signals():
-            with stop_on_signals() as stop:  # an interrupted import can end in any error of any library
-                app = build_app(command)
-                tree = get_command(app)
-                plain_help(tree)
-            return INTERRUPTED if stop.is_set() else tree(arguments or ["--help"], standalone_mode=False) or 0
+        return _run(command, arguments)
     except (typer.Abort, KeyboardInterrupt):
+        say_interrupted()
         return INTERRUPTED
     except typer.TyperException as error:
-        stderr.print(error.format_message(), soft_wrap=True, markup=False)
-        return error.exit_code
+        return _report_usage(error, as_json=as_json)
     except (NlosCamError, CalibrationError, ModelError) as error:
-        return _report(error, as_json="--json" in arguments)
-    except OSError as error:
-        if error.errno not in DISK_ERRORS and error.filename is None:
+        return _report(error, as_json=as_json)
+    except ModuleNotFoundError as error:
+        if not (missing := models.missing_extra(error, f"nlos-cam {command}")):
             raise
-        return _report(_file_error(error), as_json="--json" in arguments)
+        return _report(missing, as_json=as_json)
+    except OSError as error:
+        if error.errno not in models.DISK_ERRORS and error.filename is None:
+            raise
+        return _report(_file_error(error), as_json=as_json)
+    finally:
+        release_outputs()
+
+
+def _run(command: str, arguments: list[str]) -> int:
+    with interrupted_by_signals():
+        with stop_on_signals() as stop:  # an interrupted import can end in any error of any library
+            app = build_app(None if COMPLETION in os.environ else command)
+            tree = get_command(app)
+            plain_help(tree)
+        if stop.is_set():
+            raise KeyboardInterrupt
+        code = tree(arguments or ["--help"], prog_name="nlos-cam", standalone_mode=False) or 0
+    if code == INTERRUPTED:
+        say_interrupted()
+    return code
+
+
+def _split(arguments: list[str]) -> tuple[str, list[str]]:
+    """Return the command, and the arguments with the options for all commands moved behind it."""
+    place = next((i for i, argument in enumerate(arguments) if not argument.startswith("-")), len(arguments))
+    early = [argument for argument in arguments[:place] if argument in EVERYWHERE]
+    before = [argument for argument in arguments[:place] if argument not in EVERYWHERE]
+    command, rest = "".join(arguments[place : place + 1]), arguments[place:]
+    words = 2 if command in GROUPS else 1
+    return command, [*before, *rest[:words], *(early if len(rest) >= words else []), *rest[words:]]
 
 
 def _file_error(error: OSError) -> NlosCamError:
     """Return the system's error about a file as one of ours."""
-    if error.errno not in DISK_ERRORS:
-        return NlosCamError(
+    if error.errno not in models.DISK_ERRORS:
+        return RecordingError(
             f"{error.filename}: {error.strerror}: check that the file exists and that you have permission"
         )
-    name = error.filename or "the output"
+    name = error.filename or " and ".join(map(str, reserved_outputs())) or "standard output"
     return DiskFullError(f"{name} cannot be written ({error.strerror}): free some space or choose another folder")
 
 
 def _report(error: NlosCamError | CalibrationError | ModelError, *, as_json: bool) -> int:
-    text = str(error).replace("[", "\\[").replace("\n", " ")
-    stderr.print(f"[bold red]error:[/] {text}", soft_wrap=True)
+    say_error(str(error))
     if as_json:
-        print(json.dumps({"error": {"type": type(error).__name__, "message": str(error)}}))  # noqa: T201
+        _print_error(type(error).__name__, str(error))
     return error.exit_code
+
+
+def _report_usage(error: typer.TyperException, *, as_json: bool) -> int:
+    usage, hint = usage_lines(error)
+    reason = usage_reason(error)
+    stderr.quiet = False
+    if usage:
+        stderr.print(usage, soft_wrap=True, markup=False)
+    say_error(reason)
+    if hint:
+        stderr.print(hint, soft_wrap=True, markup=False)
+    if as_json:
+        _print_error("UsageError", reason)
+    return error.exit_code
+
+
+def _print_error(kind: str, message: str) -> None:
+    with suppress(OSError):  # stdout may be full or closed: the line on stderr stands
+        print(json.dumps({"error": {"type": kind, "message": message}}), flush=True)  # noqa: T201
 
 
 def run() -> None:

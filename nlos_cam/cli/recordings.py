@@ -1,14 +1,19 @@
-"""`nlos-cam repair` and `nlos-cam export`: recover a damaged recording; write frames as files."""
+"""`nlos-cam repair` and `nlos-cam export`: recover a damaged recording; write frames or hidden surfaces as files."""
+
+from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+from nlos_cam import live as loop
+from nlos_cam import recording as bags
 from nlos_cam.cli.common import (
     INTERRUPTED,
     Json,
     Overwrite,
+    exit_interrupted,
     finish,
     interrupted_by_signals,
     output_path,
@@ -17,20 +22,41 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording import BagReader, ExportOptions, Format, RepairResult, export_recording, repair_recording
 
 DamagedBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="Recording that was killed, cut short or damaged.")]
 NewBag = Annotated[Path | None, typer.Option("--out", help="Recording to write (.bag).")]
-AnyBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="Recording of any RealSense camera.")]
+AnyBag = Annotated[
+    Path,
+    typer.Argument(metavar="FILE", help="Recording of any RealSense camera, or with --object a reconstruction.npz."),
+]
 Folder = Annotated[Path | None, typer.Option("--out", help="Folder to write.")]
-As = Annotated[Format, typer.Option("--format", help="png: a 16-bit PNG per frame. npz: one file per stream.")]
+As = Annotated[
+    Literal["png", "npz"], typer.Option("--format", help="png: a 16-bit PNG per frame. npz: one file per stream.")
+]
 Ply = Annotated[
     bool,
     typer.Option("--ply", help="Write a point cloud (PLY, metres, lidar frame) per frame, not for the first only."),
 ]
 Streams = Annotated[str, typer.Option("--streams", help="Only these streams, separated by commas (default: all).")]
 Every = Annotated[int, typer.Option("--every", min=1, help="Only every Nth frame, by its number (default: 1).")]
+AsObject = Annotated[
+    str,
+    typer.Option(
+        "--object",
+        metavar="FORMATS",
+        help="Write each frame's hidden surface, wall frame, in metres: some of ply, glb, obj (meshes), csv, npz, "
+        "points (a PLY without faces), separated by commas.",
+    ),
+]
 MAX_REPORTED = 5
+
+
+def object_formats(text: str) -> list[str]:
+    """Return the formats of --object. Raises typer.BadParameter for an unknown one."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if unknown := [name for name in names if name not in loop.OBJECT_FORMATS]:
+        raise typer.BadParameter(f"--object {','.join(unknown)}: choose from {', '.join(loop.OBJECT_FORMATS)}")
+    return names
 
 
 def register(app: typer.Typer) -> None:
@@ -45,7 +71,7 @@ def repair_bag(bag: DamagedBag, out: NewBag = None, overwrite: Overwrite = False
         raise typer.BadParameter(f"--out {out}: the name of a recording must end in .bag")
     path = output_path(out, "repaired", ".bag", overwrite=overwrite)
     with interrupted_by_signals(), tracked("repairing") as report:
-        repaired = repair_recording(bag, path, report)
+        repaired = bags.repair_recording(bag, path, report)
     result = {
         "recovered_frames": repaired.recovered_frames,
         "chunks": repaired.chunks,
@@ -55,7 +81,7 @@ def repair_bag(bag: DamagedBag, out: NewBag = None, overwrite: Overwrite = False
     finish(result, as_json=json, text=_format_repair(repaired))
 
 
-def _format_repair(repaired: RepairResult) -> str:
+def _format_repair(repaired: bags.RepairResult) -> str:
     frames = ", ".join(f"{count} {stream}" for stream, count in repaired.recovered_frames.items())
     lost = sum(damage.bytes for damage in repaired.damages)
     lines = [f"Recovered {frames} frames ({repaired.chunks} chunks); lost {lost} bytes"]
@@ -72,17 +98,21 @@ def export_bag(
     ply: Ply = False,
     streams: Streams = "",
     every: Every = 1,
+    as_object: AsObject = "",
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Write a recording's frames as files, with their timestamps, intrinsics and settings."""
+    """Write a recording's frames as files, or a replay's hidden surfaces for other programs."""
     folder = output_path(out, "export", "", overwrite=overwrite)
+    if bag.suffix == ".npz" or as_object:
+        _export_objects(bag, folder, object_formats(as_object), every, as_json=json)
+        return
     names = [name.strip() for name in streams.split(",") if name.strip()]
-    options, recording = ExportOptions(form, ply, names, every), BagReader(bag)
+    options, recording = bags.ExportOptions(form, ply, names, every), bags.BagReader(bag)
     total = sum(info.frames for name, info in recording.streams.items() if not names or name in names)
     with stop_on_signals() as stop, progress() as bar:
         task = bar.add_task("exporting", total=total)
-        exported = export_recording(recording, folder, options, stop=stop, on_frame=lambda: bar.advance(task))
+        exported = bags.export_recording(recording, folder, options, stop=stop, on_frame=lambda: bar.advance(task))
     if exported.damage:
         raise RecordingError(f"{exported.damage}; the frames before the damage are in {folder}")
     counts = dict(exported.frames)
@@ -90,5 +120,18 @@ def export_bag(
     text = ", ".join(f"{count} {name}" for name, count in counts.items()) + " images"
     text += f"; {clouds} point cloud{'' if clouds == 1 else 's'}" if clouds else ""
     finish({"frames": exported.frames, "out": exported.out}, as_json=json, text=f"{text}\nWrote {exported.out}")
+    if stop.is_set():
+        exit_interrupted(f"{exported.out} holds the frames until then")
+
+
+def _export_objects(result: Path, folder: Path, formats: list[str], every: int, *, as_json: bool) -> None:
+    if not formats:
+        raise typer.BadParameter(f"{result}: give the formats of its hidden surfaces, as in --object ply,glb,csv")
+    if result.suffix == ".bag":
+        raise typer.BadParameter(f"--object needs a replay's result: nlos-cam replay {result} --object ply,glb,csv")
+    with stop_on_signals() as stop, tracked("exporting") as on_frame:
+        count = loop.export_objects(result, folder, formats, every, stop=stop, on_frame=on_frame)
+    text = f"Hidden surfaces of {count} frames as {', '.join(formats)}\nWrote {folder}"
+    finish({"frames": {"objects": count}, "out": str(folder)}, as_json=as_json, text=text)
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)

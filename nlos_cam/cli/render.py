@@ -1,39 +1,38 @@
 """`render`: the maps that the lidar would report of one hidden object, as numbers and a picture."""
 
+from __future__ import annotations
+
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
+import nlos_calibration as walls
 import typer
-from nlos_calibration import Rig, first_problem, rig_named
-from nlos_calibration.arrays import Float32
-from pydantic import ValidationError
 from rich.table import Table
 
+from nlos_cam import objects
+from nlos_cam import render as renderer
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, stderr
-from nlos_cam.objects import CATEGORIES, OBJECT_FILES, Up, load_object, object_box, object_kind
-from nlos_cam.render import (
-    EFFECTS,
-    Accuracy,
-    Effects,
-    HiddenObject,
-    Material,
-    Rendering,
-    Scene,
-    SceneFile,
-    SensorModel,
-    accuracy_named,
-    choose,
-    costs,
-    load_scene,
-    render,
-    sensor_effects,
-)
 
+if TYPE_CHECKING:
+    from nlos_calibration.arrays import Float32
+
+DEFAULTS = {
+    "seed": 0,
+    "up": "y",
+    "size_m": 0.18,
+    "tilt_x_deg": 0.0,
+    "tilt_y_deg": 0.0,
+    "turn_deg": 0.0,
+    "x_m": 0.0,
+    "y_m": 0.0,
+    "front_m": 0.03,
+}
+"""Defaults of HiddenObject, for the help page, which does not wait for its import."""
 Stop = Annotated[
-    str | None, typer.Option("--accuracy", help="draft, standard, fine or reference.", show_default="standard")
+    Literal["draft", "standard", "fine", "reference"] | None,
+    typer.Option("--accuracy", help="Stop of the accuracy setting.", show_default="standard"),
 ]
 MaxError = Annotated[
     float | None, typer.Option("--max-error", help="Use the fastest accuracy with this relative peak error or less.")
@@ -44,31 +43,49 @@ MaxSeconds = Annotated[
 BeamsPerCell = Annotated[int | None, typer.Option("--beams-per-cell", help="Beams along each axis of a map cell.")]
 EffectNames = Annotated[
     str,
-    typer.Option("--effects", help=f"auto (those that matter in the scene), or a list from: {', '.join(EFFECTS)}."),
+    typer.Option(
+        "--effects", help=f"auto (those that matter in the scene), or a list from: {', '.join(renderer.EFFECTS)}."
+    ),
 ]
-Backend = Annotated[str, typer.Option("--backend", help="cpu, torch (on the CPU) or cuda.")]
-RadiometryName = Annotated[str | None, typer.Option("--radiometry", help="paper (S1 to S5) or lambertian.")]
-MaterialKind = Annotated[str | None, typer.Option("--material", help="lambertian, phong or retroreflective.")]
+Backend = Annotated[
+    Literal["cpu", "torch", "cuda"], typer.Option("--backend", help="Processor; torch runs the GPU code on the CPU.")
+]
+RadiometryName = Annotated[
+    Literal["paper", "lambertian"] | None, typer.Option("--radiometry", help="S1 to S5, or the rendering equation.")
+]
+MaterialKind = Annotated[
+    Literal["lambertian", "phong", "retroreflective"] | None, typer.Option("--material", help="Kind of the surface.")
+]
 Specular = Annotated[float | None, typer.Option("--specular", help="Share of the albedo in the specular lobe.")]
 Exponent = Annotated[float | None, typer.Option("--exponent", help="Exponent of the lobe; larger is narrower.")]
 Albedo = Annotated[str | None, typer.Option("--albedo", help="Albedo from 0 to 1: one number, or red,green,blue.")]
-PulseNs = Annotated[float | None, typer.Option("--pulse-ns", help="Full width of the pulse at half maximum, in ns.")]
+PulseNs = Annotated[
+    float | None, typer.Option("--pulse-ns", min=0, max=100, help="Full width of the pulse at half maximum, in ns.")
+]
 
 
-def scene_of(bare: Scene, material: dict[str, Any], options: dict[str, Any]) -> Scene:
+def scene_of(bare: renderer.Scene, material: dict[str, Any], options: dict[str, Any]) -> renderer.Scene:
     """Return a scene with the options that are not None: fields of Material, and of Scene.
 
     Raises typer.BadParameter or SceneError with the field, the value and the range.
     """
+    from pydantic import ValidationError
+
     given = {name: value for name, value in material.items() if value is not None}
     if isinstance(text := given.get("albedo"), str):
         given["albedo"] = _numbers(text)
     if given:
         try:
-            bare = replace(bare, surface=Material(**given).surface)
+            bare = replace(bare, surface=renderer.Material(**given).surface)
         except ValidationError as error:
-            raise typer.BadParameter(first_problem(error)) from error
+            raise typer.BadParameter(_as_option(walls.first_problem(error))) from error
     return replace(bare, **{name: value for name, value in options.items() if value is not None})
+
+
+def _as_option(problem: str) -> str:
+    """Return "--size-m must be ..." for a problem of the field size_m."""
+    field, _, text = problem.partition(": ")
+    return f"--{field.partition('.')[0].replace('_', '-')} {text}"
 
 
 def _numbers(text: str) -> float | tuple[float, ...]:
@@ -80,7 +97,7 @@ def _numbers(text: str) -> float | tuple[float, ...]:
     return values[0] if len(values) == 1 else values
 
 
-def effects_of(text: str) -> Effects:
+def effects_of(text: str) -> renderer.Effects:
     """Return the effects named by `--effects`."""
     return "auto" if text == "auto" else [name for name in text.split(",") if name]
 
@@ -90,30 +107,37 @@ def accuracy_of(
     max_error: float | None,
     max_seconds: float | None,
     beams_per_cell: int | None,
-    scene: Scene,
-    effects: Effects,
+    scene: renderer.Scene,
+    effects: renderer.Effects,
     backend: str,
-) -> Accuracy:
+) -> renderer.Accuracy:
     """Return the setting of a stop, or the one that keeps a bound. Raises typer.BadParameter for both."""
     if max_error is None and max_seconds is None:
-        setting = accuracy_named(stop or "standard")
+        setting = renderer.accuracy_named(stop or "standard")
         return setting if beams_per_cell is None else replace(setting, beams_per_cell=beams_per_cell)
     if stop is not None or beams_per_cell is not None:
         raise typer.BadParameter(
             "--max-error and --max-seconds choose the accuracy: drop --accuracy and --beams-per-cell"
         )
-    return choose(scene, max_error, max_seconds, effects, backend).accuracy
+    say("Measuring every accuracy on this scene first (up to a minute)")
+    return renderer.choose(scene, max_error, max_seconds, effects, backend).accuracy
 
 
 def _option(field: str, text: str) -> Any:
     """Return an option named like a field of HiddenObject: None unless set."""
-    default = HiddenObject.model_fields[field].default
-    return typer.Option(f"--{field.replace('_', '-')}", help=text, show_default=str(default))
+    return typer.Option(f"--{field.replace('_', '-')}", help=text, show_default=str(DEFAULTS[field]))
 
 
-Object = Annotated[str, typer.Argument(metavar="OBJECT", help=f"A category's name, {OBJECT_FILES}.")]
+Object = Annotated[
+    str,
+    typer.Argument(
+        metavar="OBJECT", help="A category's name, a mesh (.obj, .stl, .ply), a .npy depth map (n, n) in metres."
+    ),
+]
 Seed = Annotated[int | None, _option("seed", "Number of the category's variation.")]
-UpAxis = Annotated[Up | None, _option("up", "Axis of a mesh that points up; its -z (z up: its +y) faces the wall.")]
+UpAxis = Annotated[
+    Literal["y", "z"] | None, _option("up", "Axis of a mesh that points up; its -z (z up: its +y) faces the wall.")
+]
 Size = Annotated[float | None, _option("size_m", "Size in meters: the larger extent along x and y after turning.")]
 TiltX = Annotated[float | None, _option("tilt_x_deg", "Rotation about the wall's x in degrees, applied first.")]
 TiltY = Annotated[float | None, _option("tilt_y_deg", "Then about the wall's y (up): at 180 its back faces the wall.")]
@@ -125,26 +149,30 @@ Front = Annotated[
 ]
 
 
-def hidden_depth(hidden: str, rig: Rig, options: dict[str, Any]) -> Float32:
+def hidden_depth(hidden: str, rig: walls.Rig, options: dict[str, Any]) -> Float32:
     """Return the depth map (n, n) of OBJECT over the rig's object box; `options` are fields of HiddenObject, or None.
 
     Prints on stderr how the box changes it. Raises SceneError for an object that cannot be loaded or placed, and
     typer.BadParameter for options that do not apply to it or are out of range.
     """
-    given, kind = {name: value for name, value in options.items() if value is not None}, object_kind(hidden)
+    from pydantic import ValidationError
+
+    given, kind = {name: value for name, value in options.items() if value is not None}, objects.object_kind(hidden)
     unused = {"category": {"up"}, "mesh": {"seed"}, "depth map": set(given)}[kind]
     if extra := [f"--{name.replace('_', '-')}" for name in given if name in unused]:
         raise typer.BadParameter(f"{hidden} is a {kind}, to which {', '.join(extra)} does not apply: drop it")
     if kind == "depth map":
-        loaded = load_object(hidden, object_box(rig))
+        loaded = objects.load_object(hidden, objects.object_box(rig))
     else:
-        up: Up = given.pop("up", "y")
+        up: objects.Up = given.pop("up", "y")
         try:
-            rest = HiddenObject(category=next(iter(CATEGORIES)), **given)  # only checks the ranges of scene files
+            rest = renderer.HiddenObject(
+                category=next(iter(objects.CATEGORIES)), **given
+            )  # only checks the ranges of scene files
         except ValidationError as error:
-            raise typer.BadParameter(first_problem(error)) from error
-        pose = SceneFile(name=hidden, rig=rig).pose_at(rest, 0)
-        loaded = load_object(hidden, object_box(rig), pose, seed=rest.seed, up=up)
+            raise typer.BadParameter(_as_option(walls.first_problem(error))) from error
+        pose = renderer.SceneFile(name=hidden, rig=rig).pose_at(rest, 0)
+        loaded = objects.load_object(hidden, objects.object_box(rig), pose, seed=rest.seed, up=up)
     for warning in loaded.warnings:
         say(warning)
     return loaded.depth_m
@@ -190,9 +218,11 @@ def command(
     json: Json = False,
 ) -> None:
     """Render the maps that a lidar which reports its strongest echo gets of a hidden object."""
+    if out is not None and out.suffix not in {"", ".npz", ".png"}:
+        raise typer.BadParameter(f"--out {out}: choose a name that ends in .npz; the picture has the same name in .png")
     path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
-    file = load_scene(scene) if scene else None
-    bare = file.bare if file else Scene(rig_named(rig))
+    file = renderer.load_scene(scene) if scene else None
+    bare = file.bare if file else renderer.Scene(walls.rig_named(rig))
     surface = {"kind": material, "specular": specular, "exponent": exponent, "albedo": albedo}
     bare = scene_of(bare, surface, {"radiometry": radiometry, "pulse_ns": pulse_ns})
     angles = {"tilt_x_deg": tilt_x_deg, "tilt_y_deg": tilt_y_deg, "turn_deg": turn_deg}
@@ -201,11 +231,12 @@ def command(
     target, wanted = replace(bare, object_depth_m=depth_m), effects_of(effects)
     setting = accuracy_of(accuracy, max_error, max_seconds, beams_per_cell, target, wanted, backend)
     start_s = time.perf_counter()
-    rendering = render(target, setting, wanted, backend)
+    rendering = renderer.render(target, setting, wanted, backend)
     seconds = time.perf_counter() - start_s
     _save(path, target, depth_m, rendering)
-    _draw(path.with_suffix(".png"), depth_m, rendering)
-    sensor, measured = file.sensor if file else SensorModel(), explain and setting.sub_bins > 0
+    title = f"{hidden}{'' if seed is None else f' {seed}'} on {bare.rig.name}, accuracy {setting.name!r}"
+    _draw(path.with_suffix(".png"), title, depth_m, rendering)
+    sensor, measured = file.sensor if file else renderer.SensorModel(), explain and setting.sub_bins > 0
     verdicts = _effects(target, rendering, sensor, backend, measured=measured)
     if explain:
         stderr.print(_table(verdicts))
@@ -214,7 +245,11 @@ def command(
     finish({**facts, "effects": verdicts, "out": str(path)}, as_json=json, text=text)
 
 
-def _save(path: Path, scene: Scene, depth_m: Float32, rendering: Rendering) -> None:
+def _save(path: Path, scene: renderer.Scene, depth_m: Float32, rendering: renderer.Rendering) -> None:
+    import numpy as np
+
+    from nlos_cam.files import atomic_file
+
     arrays = {
         "depth_m": rendering.depth_m,
         "intensity": rendering.intensity,
@@ -226,15 +261,16 @@ def _save(path: Path, scene: Scene, depth_m: Float32, rendering: Rendering) -> N
     }
     if rendering.color is not None:
         arrays["colour"] = rendering.color
-    np.savez_compressed(path, allow_pickle=False, **arrays)
+    with atomic_file(path) as part:
+        np.savez_compressed(part, allow_pickle=False, **arrays)
 
 
 def _effects(
-    scene: Scene, rendering: Rendering, sensor: SensorModel, backend: str, *, measured: bool
+    scene: renderer.Scene, rendering: renderer.Rendering, sensor: renderer.SensorModel, backend: str, *, measured: bool
 ) -> list[dict[str, Any]]:
     """Return the verdicts as facts, with the seconds that each effect of the renderer costs if `measured`."""
-    seconds = costs(scene, rendering.accuracy, rendering.plan, backend) if measured else {}
-    effects = *rendering.plan, *sensor_effects(sensor)
+    seconds = renderer.costs(scene, rendering.accuracy, rendering.plan, backend) if measured else {}
+    effects = *rendering.plan, *renderer.sensor_effects(sensor)
     return [{**asdict(effect), "seconds": seconds.get(effect.name)} for effect in effects]
 
 
@@ -247,14 +283,22 @@ def _table(effects: list[dict[str, Any]]) -> Table:
     return table
 
 
-def _draw(path: Path, depth_m: Float32, rendering: Rendering) -> None:
+def _draw(path: Path, title: str, depth_m: Float32, rendering: renderer.Rendering) -> None:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 3), layout="constrained")
-    titles = "hidden depth (m)", "lidar depth (m)", "lidar intensity", "margin of the strongest echo"
-    maps = depth_m, rendering.depth_m, rendering.intensity, rendering.margin
-    for axis, title, image in zip(figure.subplots(1, 4), titles, maps, strict=True):
+    from nlos_cam.files import atomic_file
+
+    figure = Figure(figsize=(13, 3.3), layout="constrained")
+    maps = {
+        "hidden depth (m from the wall)": depth_m,
+        "lidar depth (m)": rendering.depth_m,
+        "lidar intensity (in units of $I_0$)": rendering.intensity,
+        "margin of the winning echo (0: a tie)": rendering.margin,
+    }
+    for axis, (name, image) in zip(figure.subplots(1, len(maps)), maps.items(), strict=True):
         figure.colorbar(axis.imshow(image, cmap="magma"), ax=axis)
-        axis.set_title(title)
+        axis.set_title(name, fontsize=10)
         axis.axis("off")
-    figure.savefig(path, dpi=100)
+    figure.suptitle(title)
+    with atomic_file(path) as part:
+        figure.savefig(part, dpi=100)

@@ -1,5 +1,7 @@
 """The commands `tradeoff render` and `tradeoff reconstruct`: accuracy against time, measured on this machine."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -7,26 +9,20 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from nlos_cam.cli.common import INTERRUPTED, Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
-from nlos_cam.cli.render import hidden_depth
-from nlos_cam.evaluate import (
-    RenderRow,
-    RuntimeRow,
-    as_table,
-    machine,
-    measure_renders,
-    measure_runtimes,
-    open_runtime_bench,
-    render_facts,
-    render_settings,
-    runtime_facts,
-    runtime_settings,
-    runtimes,
-    write_renders,
-    write_runtimes,
+from nlos_cam import evaluate as measure
+from nlos_cam import render as renderer
+from nlos_cam.cli.common import (
+    Json,
+    Overwrite,
+    exit_interrupted,
+    finish,
+    interrupted_by_signals,
+    output_path,
+    say,
+    tracked,
 )
+from nlos_cam.cli.render import hidden_depth
 from nlos_cam.files import cache_folder
-from nlos_cam.render import Scene, paper_scene
 
 R = TypeVar("R")
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the table and the plot.")]
@@ -54,13 +50,13 @@ def render(
         raise typer.BadParameter("--seed is the variation of an --object: give both")
     folder = output_path(out, "tradeoff", "", overwrite=overwrite)
     scene = _scene(category, seed or 0)
-    size, planned = render_facts(scene), len(render_settings(scene))
-    rows: list[RenderRow] = []
+    size, planned = measure.render_facts(scene), len(measure.render_settings(scene))
+    rows: list[measure.RenderRow] = []
     say("Rendering the reference first (slowest step, about 30 s)")
-    interrupted = _collect(measure_renders(scene), rows, planned)
-    table = as_table(size, rows, planned)
+    interrupted = _collect(measure.measure_renders(scene), rows, planned)
+    table = measure.as_table(size, rows, planned)
     if rows:
-        write_renders(folder, table, rows, category or "airplane")
+        measure.write_renders(folder, table, rows, category or "airplane")
     _finish(table, folder, len(rows), planned, as_json=json, interrupted=interrupted)
 
 
@@ -78,21 +74,24 @@ def reconstruct(
     """Measure number formats, runtimes, threads and averaged frames on the test objects (1 to 2 minutes)."""
     folder = output_path(out, "tradeoff", "", overwrite=overwrite)
     folders: dict[str, Path | None] = {str(path): path for path in weights} if weights else {"shipped": None}
-    rows: list[RuntimeRow] = []
+    rows: list[measure.RuntimeRow] = []
     with interrupted_by_signals():
         say("Rendering test objects, exporting and quantising networks first")
-        bench = open_runtime_bench(folders, count, tracked)
-        makes = {name: runtimes(path, bench.rig, bench.box, cache_folder() / "onnx") for name, path in folders.items()}
-    asked = runtime_settings([*makes], [*next(iter(makes.values()))])
-    interrupted = _collect(measure_runtimes(asked, makes, bench), rows, len(asked))
-    table = runtime_facts(rows, len(asked), len(bench.truth), machine())
+        bench = measure.open_runtime_bench(folders, count, tracked)
+        makes = {
+            name: measure.runtimes(path, bench.rig, bench.box, cache_folder() / "onnx")
+            for name, path in folders.items()
+        }
+    asked = measure.runtime_settings([*makes], [*next(iter(makes.values()))])
+    interrupted = _collect(measure.measure_runtimes(asked, makes, bench), rows, len(asked))
+    table = measure.runtime_facts(rows, len(asked), len(bench.truth), measure.machine())
     if rows:
-        write_runtimes(folder, table, rows)
+        measure.write_runtimes(folder, table, rows)
     _finish(table, folder, len(rows), len(asked), as_json=json, interrupted=interrupted)
 
 
-def _scene(category: str | None, seed: int) -> Scene:
-    scene = paper_scene().scene_at(0)
+def _scene(category: str | None, seed: int) -> renderer.Scene:
+    scene = renderer.paper_scene().scene_at(0)
     if category is None:
         return scene
     return replace(scene, object_depth_m=hidden_depth(category, scene.rig, {"seed": seed or None}))
@@ -114,7 +113,9 @@ def _collect(measured: Iterator[R], rows: list[R], planned: int) -> bool:
 def _finish(
     table: dict[str, object], folder: Path, done: int, planned: int, *, as_json: bool, interrupted: bool
 ) -> None:
-    text = f"Measured {done} of {planned} settings: {folder}" if done else "Interrupted; nothing measured."
+    text = "Nothing measured"
+    if done:
+        text = f"Measured {done} of {planned} settings: open {folder / measure.TRADEOFF_REPORT}"
     finish({**table, "out": str(folder) if done else None}, as_json=as_json, text=text)
     if interrupted:
-        raise typer.Exit(INTERRUPTED)
+        exit_interrupted(f"{done} of {planned} settings are measured")

@@ -1,4 +1,6 @@
-"""`train vae|compressor|transfer|doubt`: recipes to weights, with the options that these commands share."""
+"""`train vae|compressor|direct|transfer|doubt`: recipes to weights, with the options that these commands share."""
+
+from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Generator
@@ -6,53 +8,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import nlos_calibration as walls
+import nlos_models as models
 import typer
-from lightning_fabric import Fabric
-from nlos_calibration import rig_named
-from nlos_models import (
-    SIMULATION_ONLY,
-    Accelerator,
-    CheckpointRecord,
-    Recipe,
-    Running,
-    Scores,
-    TrainingRun,
-    compressor_start,
-    digest_of,
-    launch,
-    load_encoder,
-    load_recipe,
-    load_reconstructor,
-    open_fabric,
-    record_doubt_run,
-    record_run,
-    run_compressor,
-    run_doubt,
-    run_transfer,
-    run_vae,
-    shipped_folder,
-    transfer_start,
-    vae_start,
-)
 
+from nlos_cam import dataset as data_sets
+from nlos_cam import objects as shapes
 from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say, stop_on_signals, tracked
-from nlos_cam.dataset import (
-    HELD_OUT_SEED,
-    TRAINING_OUTLIERS,
-    TRAINING_SEED,
-    DatasetPlan,
-    Objects,
-    check_doubt_data,
-    doubt_sets,
-    open_dataset,
-    procedural_images,
-    read_maps,
-)
 from nlos_cam.errors import SceneError
 from nlos_cam.files import cache_folder
-from nlos_cam.objects import TEXTURES
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
 
 SAMPLES = "samples"
 """Folder of rendered samples in the output folder of `train doubt`."""
@@ -83,7 +52,8 @@ class RunOptions:
         int, typer.Option("--devices", min=1, help="Number of processes, one per GPU or on the CPU.")
     ] = 1
     accelerator: Annotated[
-        Accelerator, typer.Option("--accelerator", help="Device; auto: a GPU if there is one, else the CPU.")
+        Literal["auto", "cpu", "cuda"],
+        typer.Option("--accelerator", help="Device; auto: a GPU if there is one, else the CPU."),
     ] = "auto"
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also log for TensorBoard.")] = False
     compiled: Annotated[
@@ -91,9 +61,9 @@ class RunOptions:
     ] = False
     json: Json = False
 
-    def recipe(self, task: str, budget: float = 1.0) -> Recipe:
+    def recipe(self, task: str, budget: float = 1.0) -> models.Recipe:
         """Return the recipe at a share of its budget. Raises SceneError where it is for another task."""
-        recipe = load_recipe(self.recipe_file)
+        recipe = models.load_recipe(self.recipe_file)
         if recipe.task != task:
             raise SceneError(
                 f"{self.recipe_file} is a recipe for {recipe.task!r}, not {task!r}: choose another --recipe"
@@ -102,33 +72,33 @@ class RunOptions:
             recipe = recipe.of_objects(self.objects)
         return recipe.scaled(budget)
 
-    def fabric(self, recipe: Recipe) -> Fabric:
+    def fabric(self, recipe: models.Recipe) -> Fabric:
         """Open the devices that the recipe is run on."""
-        return open_fabric(recipe, accelerator=self.accelerator, devices=self.devices)
+        return models.open_fabric(recipe, accelerator=self.accelerator, devices=self.devices)
 
-    def training(self, recipe: Recipe, record: CheckpointRecord, origin: str) -> TrainingRun:
+    def training(self, recipe: models.Recipe, record: models.CheckpointRecord, origin: str) -> models.TrainingRun:
         """Return a run with progress and interruption; `record` is that of its weights, `origin` a `digest_of`."""
-        return TrainingRun(recipe, self.out, record, origin, self.tensorboard, self.compiled, watched_run)
+        return models.TrainingRun(recipe, self.out, record, origin, self.tensorboard, self.compiled, watched_run)
 
-    def finish(self, recipe: Recipe, figures: Scores, before: Scores | None = None) -> None:
+    def finish(self, recipe: models.Recipe, figures: models.Scores, before: models.Scores | None = None) -> None:
         """End a command with the figures of its weights, and of those that a transfer started from."""
         result, text = {"out": str(self.out), **figures}, f"weights in {self.out}: {_values(figures)}"
         if before is not None:
             result, text = {**result, "before": before}, f"{text}; before: {_values(before)}"
-        finish(result, as_json=self.json, text=text, note=SIMULATION_ONLY if recipe.colour else "")
+        finish(result, as_json=self.json, text=text, note=models.SIMULATION_ONLY if recipe.colour else "")
 
 
 @contextmanager
-def watched_run(running: Running, recipe: Recipe, name: str) -> Generator[Running]:
+def watched_run(running: models.Running, recipe: models.Recipe, name: str) -> Generator[models.Running]:
     """Show a run's progress, in the leading process; Ctrl-C or SIGTERM ends it after the current step, saved."""
-    with progress() as bar, stop_on_signals() as stop:
-        title = f"training the {name}" + (f" in color ({SIMULATION_ONLY})" if recipe.colour else "")
+    with progress() as bar, stop_on_signals("interrupting: saving after this step") as stop:
+        title = f"training the {name}" + (f" in color ({models.SIMULATION_ONLY})" if recipe.colour else "")
         task = bar.add_task(title, total=None, visible=running.fabric is None or running.fabric.is_global_zero)
 
         def on_step(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        def on_epoch(row: Scores) -> None:
+        def on_epoch(row: models.Scores) -> None:
             text = f"epoch {row['epoch'] + 1:.0f} done, loss {row['loss']:.4g}, held out {row['held_out_loss']:.4g}"
             bar.update(task, description=f"{title}: {text}")
 
@@ -143,12 +113,16 @@ def refuse_ignored(why: str, given: dict[str, bool]) -> None:
 
 def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
     """Replace a command's parameter `run` by the fields of RunOptions, so that typer sees each as an option."""
-    shared = inspect.signature(RunOptions).parameters
-    own = [each for name, each in inspect.signature(command).parameters.items() if name != "run"]
+    shared = inspect.signature(RunOptions, eval_str=True).parameters
+    own = [each for name, each in inspect.signature(command, eval_str=True).parameters.items() if name != "run"]
 
     @wraps(command)
     def expanded(**values: Any) -> None:
-        command(run=RunOptions(**{name: values.pop(name) for name in shared}), **values)
+        run = RunOptions(**{name: values.pop(name) for name in shared})
+        try:
+            command(run=run, **values)
+        except KeyboardInterrupt as interruption:
+            raise KeyboardInterrupt(f"once training has begun, the same command resumes in {run.out}") from interruption
 
     every = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*shared.values(), *own)]
     expanded.__annotations__ = {each.name: each.annotation for each in every}
@@ -159,7 +133,7 @@ def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     train = typer.Typer(help="Training.")
-    for command in (vae, compressor, transfer, doubt):
+    for command in (vae, compressor, direct, transfer, doubt):
         train.command(command.__name__)(with_run_options(command))
     app.add_typer(train, name="train")
 
@@ -173,20 +147,20 @@ def vae(
     budget: Budget = 1.0,
 ) -> None:
     """Train a Res-VAE on procedural objects (SI 3)."""
-    recipe, rig = run.recipe("vae", budget), rig_named(rig_name)
+    recipe, rig = run.recipe("vae", budget), walls.rig_named(rig_name)
     refuse_ignored('the recipe has start = "scratch"', {"--weights": bool(weights) and recipe.start == "scratch"})
     fabric = run.fabric(recipe)
-    start, runs = vae_start(recipe, weights) if recipe.start == "weights" else (None, [])
-    record = record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
-    job = run.training(recipe, record, digest_of(start, rig.checksum))
+    start, runs = models.vae_start(recipe, weights) if recipe.start == "weights" else (None, [])
+    record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+    job = run.training(recipe, record, models.digest_of(start, rig.checksum))
     say(f"generating {recipe.objects + recipe.held_out} objects")
-    box, kinds = DatasetPlan(rig, 0).box, Objects.without(recipe.left_out).categories
-    textures = tuple(TEXTURES) if recipe.colour else ()
+    box, kinds = data_sets.DatasetPlan(rig, 0).box, data_sets.Objects.without(recipe.left_out).categories
+    textures = tuple(shapes.TEXTURES) if recipe.colour else ()
     images, held_out = (
-        procedural_images(seed, count, box, kinds, backgrounds=recipe.backgrounds, textures=textures)
-        for seed, count in ((TRAINING_SEED, recipe.objects), (HELD_OUT_SEED, recipe.held_out))
+        data_sets.procedural_images(seed, count, box, kinds, backgrounds=recipe.backgrounds, textures=textures)
+        for seed, count in ((data_sets.TRAINING_SEED, recipe.objects), (data_sets.HELD_OUT_SEED, recipe.held_out))
     )
-    run.finish(recipe, launch(fabric, run_vae, job, start, images, held_out))
+    run.finish(recipe, models.launch(fabric, models.run_vae, job, start, images, held_out))
 
 
 def compressor(
@@ -207,12 +181,37 @@ def compressor(
     refuse_ignored("the recipe starts from scratch", {"--weights": bool(weights) and scratch})
     refuse_ignored(f"the recipe has steps = {recipe.steps!r}", {"--vae": bool(vae_folder) and recipe.steps != "two"})
     fabric = run.fabric(recipe)
-    start, runs = compressor_start(recipe, vae_folder, weights)
-    maps = read_maps(recipe, data, held_out_data, wall, stream=stream)
+    start, runs = models.compressor_start(recipe, vae_folder, weights)
+    maps = data_sets.read_maps(recipe, data, held_out_data, wall, stream=stream)
     recipe, rig = maps.limit_recipe(recipe), maps.plan.rig
-    record = record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights, vae_folder)
-    job = run.training(recipe, record, digest_of(start.vae, start.pipeline, maps.digest))
-    run.finish(recipe, launch(fabric, run_compressor, job, start, maps.training, maps.held_out))
+    record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights, vae_folder)
+    job = run.training(recipe, record, models.digest_of(start.vae, start.pipeline, maps.digest))
+    run.finish(recipe, models.launch(fabric, models.run_compressor, job, start, maps.training, maps.held_out))
+
+
+def direct(
+    run: RunOptions,
+    data: Annotated[
+        list[Path],
+        typer.Option("--dataset", help="Training maps; may be repeated. New shards are used as they appear."),
+    ],
+    held_out_data: HeldOut,
+    store: Annotated[
+        Path | None, typer.Option("--store", help="Folder of the packed maps, kept for other runs (default: in --out).")
+    ] = None,
+) -> None:
+    """Train a direct network: maps to images by two heads, without a latent; the project's own."""
+    recipe = run.recipe("direct")
+    if run.devices > 1:
+        raise SceneError(f"a direct network trains in one process, got --devices {run.devices}: drop it")
+    fabric = run.fabric(recipe)
+    with tracked("packing maps") as on_progress:
+        source = data_sets.PackedMaps(data, store or run.out / "packed", on_progress)
+    held_out = models.first_of(data_sets.open_dataset(held_out_data).arrays(), recipe.held_out)
+    recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
+    rig = source.plan.rig
+    record = models.record_run(recipe, run.out, (rig.name, rig.checksum), [])
+    run.finish(recipe, models.run_direct(fabric, run.training(recipe, record, source.digest), source, held_out))
 
 
 def transfer(
@@ -228,13 +227,13 @@ def transfer(
     """Fine-tune synthetic weights on a bench's recordings (SI 4): all layers first, then the classifier alone."""
     recipe = run.recipe("transfer")
     fabric = run.fabric(recipe)
-    pipeline, runs = transfer_start(recipe, weights, partial=partial, on_report=say)
-    encoder = load_encoder(weights)
-    maps = read_maps(recipe, data, held_out_data, wall)
+    pipeline, runs = models.transfer_start(recipe, weights, partial=partial, on_report=say)
+    encoder = models.load_encoder(weights)
+    maps = data_sets.read_maps(recipe, data, held_out_data, wall)
     recipe, rig = maps.limit_recipe(recipe), maps.plan.rig
-    record = record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
-    job = run.training(recipe, record, digest_of(pipeline, encoder, maps.digest))
-    figures = launch(fabric, run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
+    record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+    job = run.training(recipe, record, models.digest_of(pipeline, encoder, maps.digest))
+    figures = models.launch(fabric, models.run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
     run.finish(recipe, figures["after"], figures["before"])
 
 
@@ -247,17 +246,17 @@ def doubt(
     ] = None,
 ) -> None:
     """Train the uncertainty ("doubt") network of trained weights; --out then holds a copy of these weights too."""
-    recipe, watched = run.recipe("doubt"), weights or shipped_folder()
+    recipe, watched = run.recipe("doubt"), weights or models.shipped_folder()
     fabric = run.fabric(recipe)
-    pipeline = load_reconstructor(weights, cache_folder() / "onnx")
-    datasets = open_dataset(data), open_dataset(held_out_data)
-    check_doubt_data(recipe, pipeline, *datasets)
-    about = record_doubt_run(recipe, run.out, watched, list(TRAINING_OUTLIERS))
+    pipeline = models.load_reconstructor(weights, cache_folder() / "onnx")
+    datasets = data_sets.open_dataset(data), data_sets.open_dataset(held_out_data)
+    data_sets.check_doubt_data(recipe, pipeline, *datasets)
+    about = models.record_doubt_run(recipe, run.out, watched, list(data_sets.TRAINING_OUTLIERS))
     with tracked("rendering empty benches and outliers") as on_progress:
-        sets = doubt_sets(recipe, pipeline, datasets, run.out / SAMPLES, on_progress)
+        sets = data_sets.doubt_sets(recipe, pipeline, datasets, run.out / SAMPLES, on_progress)
     job = run.training(recipe, pipeline.record, about.watches)
-    run.finish(recipe, launch(fabric, run_doubt, job, about, watched, *sets))
+    run.finish(recipe, models.launch(fabric, models.run_doubt, job, about, watched, *sets))
 
 
-def _values(figures: Scores) -> str:
+def _values(figures: models.Scores) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in figures.items())

@@ -1,18 +1,24 @@
 """The command `view`, and the view options that `live` and `replay` share with it."""
 
+from __future__ import annotations
+
 import os
 import sys
 import webbrowser
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Protocol
 from urllib.parse import urlsplit
 
 import typer
 
-from nlos_cam.cli.common import INTERRUPTED, Json, finish, interrupted_by_signals, say, stop_on_signals
-from nlos_cam.live import yield_to_loop
-from nlos_cam.reconstruct import CalibratedRig
-from nlos_cam.view import LOOPBACK, NullViewer, Viewer, Viewers, exposed
+from nlos_cam import camera as cameras
+from nlos_cam import live as loop
+from nlos_cam import reconstruct
+from nlos_cam import view as views
+from nlos_cam.cli.common import Json, exit_interrupted, finish, interrupted_by_signals, say, stop_on_signals
 
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 ViewPort = Annotated[
@@ -32,15 +38,37 @@ Open = Annotated[bool, typer.Option("--open", help="Open the view in the default
 DESKTOPS = "DISPLAY", "WAYLAND_DISPLAY", "BROWSER"
 
 
-def viewer_of(bench: CalibratedRig, *, no_view: bool, host: str | None = None, port: int | None = None) -> Viewer:
+def viewer_of(
+    control: loop.RunControl, *, no_view: bool, host: str | None = None, port: int | None = None
+) -> views.NullViewer | views.WebViewer:
     """Return the viewer of a live run. Raises typer.BadParameter for a host or port together with --no-view."""
     if no_view:
         if host is not None or port is not None:
             raise typer.BadParameter("--view-host and --view-port need a view: drop --no-view")
-        return NullViewer()
-    from nlos_cam.view import WebViewer
+        return views.NullViewer()
+    control.thread_start = loop.yield_to_loop  # an ordinary thread could be stopped while it holds Python's lock
+    return views.WebViewer(host=host or views.LOOPBACK, port=port, controls=control, on_thread=loop.yield_to_loop)
 
-    return WebViewer(bench.rig, bench.measured, host=host or LOOPBACK, port=port, on_stream_thread=yield_to_loop)
+
+def once(function: Callable[[], None]) -> Callable[[], None]:
+    """Return the function, without effect after its first call."""
+    waiting = [function]
+
+    def call() -> None:
+        if waiting:
+            waiting.pop()()
+
+    return call
+
+
+def each_of(*functions: Callable[[int, int], None]) -> Callable[[int, int], None]:
+    """Return one function of progress (done, total) that calls several."""
+
+    def call(done: int, total: int) -> None:
+        for function in functions:
+            function(done, total)
+
+    return call
 
 
 class Addressed(Protocol):
@@ -57,12 +85,10 @@ def announce_view(
     if not viewer.address:
         say("Running without a view. Press Ctrl-C to stop.")
         return
-    from nlos_cam.view import PREFERRED_PORT
-
-    taken = port is None and urlsplit(viewer.address).port != PREFERRED_PORT
-    note = f" Port {PREFERRED_PORT} is taken." if taken else ""
+    taken = port is None and urlsplit(viewer.address).port != views.PREFERRED_PORT
+    note = f" Port {views.PREFERRED_PORT} is taken." if taken else ""
     say(f"{what}: {viewer.address}  Press Ctrl-C to stop.{note}")
-    if host and (note := exposed(host, urlsplit(viewer.address).port or 0)):
+    if host and (note := views.exposed(host, urlsplit(viewer.address).port or 0)):
         say(f"[yellow]note:[/] {note}", marked=True)
     if open_it and not opened_in_browser(viewer.address):
         say(f"note: no browser could be opened: open {viewer.address} yourself")
@@ -78,16 +104,17 @@ def opened_in_browser(address: str) -> bool:
         return False
 
 
-SUFFIX = ".rrd"
+SUFFIX = ".html"
 SaveView = Annotated[
-    Path | None, typer.Option("--save-view", help="Save the view to this .rrd file, for `nlos-cam view`.")
+    Path | None, typer.Option("--save-view", help="Save the view to this .html file, which any browser plays.")
 ]
 SaveReplayView = Annotated[
-    bool, typer.Option("--save-view", help="Save the view to DIR/view.rrd, for `nlos-cam view`.")
+    bool, typer.Option("--save-view", help="Save the view to DIR/view.html, which any browser plays.")
 ]
 Stills = Annotated[int, typer.Option("--stills", min=0, max=100, help="Number of still pictures to write (PNG).")]
 Video = Annotated[bool, typer.Option("--video", help="Write a video, DIR/replay.webm.")]
-ViewFile = Annotated[Path, typer.Argument(metavar="F.RRD", help="File written by --save-view.")]
+ViewFile = Annotated[Path, typer.Argument(metavar="FILE", help="Recording (.bag), or saved session (.html).")]
+Wall = Annotated[Path | None, typer.Option("--wall", help="Wall record of the recording's bench (wall.toml).")]
 Seconds = Annotated[
     float | None, typer.Option("--seconds", min=0.1, help="Stop after this many seconds (default: run until Ctrl-C).")
 ]
@@ -100,30 +127,43 @@ def register(app: typer.Typer) -> None:
 
 def view(
     file: ViewFile,
+    wall: Wall = None,
     seconds: Seconds = None,
     view_port: ViewPort = None,
     view_host: ViewHost = None,
     open_view: Open = False,
     json: Json = False,
 ) -> None:
-    """Open a saved view in a browser, with play, pause and scrubbing."""
-    from nlos_cam.view import RecordedView
-
-    with interrupted_by_signals():
-        recorded = RecordedView(file, host=view_host or LOOPBACK, port=view_port)
-    with stop_on_signals() as stop, recorded:
-        announce_view(recorded, host=view_host, port=view_port, open_it=open_view, what="saved view")
-        address = recorded.address
-        stop.wait(seconds)
+    """Play a recording or a saved session in a browser: play, pause, scrub, change the speed, export."""
+    host = view_host or views.LOOPBACK
+    announce = partial(announce_view, host=view_host, port=view_port, open_it=open_view)
+    if file.suffix != ".bag" and wall is not None:
+        raise typer.BadParameter("--wall is for a recording (.bag): a saved session holds its pictures")
+    if file.suffix == ".bag":
+        with interrupted_by_signals():
+            opened = cameras.open_camera(f"bag:{file}")
+            playback = loop.Playback(opened, reconstruct.open_bench(wall, opened), host=host, port=view_port)
+        with stop_on_signals() as stop, playback:
+            announce(playback, what="recording")
+            playback.reconstruct(stop)
+            stop.wait(seconds)
+        address = playback.address
+    else:
+        recorded = views.RecordedView(file, host=host, port=view_port)
+        with stop_on_signals() as stop, recorded:
+            announce(recorded, what="saved view")
+            address = recorded.address
+            stop.wait(seconds)
     finish({"file": str(file), "address": address}, as_json=json, text=f"{file} was at {address}")
     if stop.is_set():
-        raise typer.Exit(INTERRUPTED)
+        exit_interrupted("the view is closed")
 
 
-def saving(viewer: Viewer, bench: CalibratedRig, path: Path | None) -> Viewer:
-    """Return the viewer, joined by one that saves to `path` if given."""
+@contextmanager
+def saving(viewer: views.Viewer, bench: reconstruct.CalibratedRig, path: Path | None) -> Generator[views.Viewer]:
+    """Yield an entered viewer, joined by one that saves the session to `path` if given."""
     if path is None:
-        return viewer
-    from nlos_cam.view import RrdFile
-
-    return Viewers([viewer, RrdFile(path, bench.rig, bench.measured)])
+        yield viewer
+    else:
+        with views.SessionFile(path, bench.rig, bench.measured) as session:
+            yield views.Viewers([viewer, session])

@@ -16,9 +16,11 @@ __all__ = [
     "Dataset",
     "DatasetPlan",
     "Objects",
+    "PackedMaps",
     "RigSpread",
     "Stimulus",
     "build_dataset",
+    "check_arrays",
     "check_doubt_data",
     "doubt_sets",
     "draw_outlier",
@@ -29,12 +31,15 @@ __all__ = [
     "open_dataset",
     "procedural_images",
     "ray_farm",
+    "read_head",
     "read_labelled",
     "read_maps",
     "render_bare_wall",
     "samples_on_disk",
     "sense_color",
     "sense_object",
+    "shard_origin",
+    "shards_of",
     "write_shards",
 ]
 
@@ -42,9 +47,10 @@ from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, BuildReport, build_d
 from .doubt_samples import EMPTY, ORDINARY, check_doubt_data, doubt_sets, samples_on_disk
 from .labelled import FRAMES_PER_RECORDING, label_recordings, list_recordings, read_labelled, write_shards
 from .outliers import HELD_OUT_OUTLIERS, SHAPE_OUTLIERS, TRAINING_OUTLIERS, Stimulus, draw_outlier
+from .packed import PackedMaps
 from .plan import DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
 from .samples import objects_from_folder, procedural_images, sense_color, sense_object
-from .shards import PART_PATTERN, REQUIRED_ARRAYS, SHARD_PATTERN
+from .shards import PART_PATTERN, REQUIRED_ARRAYS, SHARD_PATTERN, check_arrays, read_head, shard_origin, shards_of
 from .training_maps import BareMaps, measured_bare_wall, read_maps, render_bare_wall

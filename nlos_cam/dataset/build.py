@@ -17,7 +17,6 @@ from pathlib import Path
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import OnProgress, Samples, ignore, join_samples, make_samples
 from nlos_cam.dataset.shards import (
-    PART_PATTERN,
     SHARD_PATTERN,
     Shard,
     check_arrays,
@@ -73,10 +72,13 @@ def build_dataset(
 ) -> BuildReport:
     """Bring a folder up to `count` objects, by `workers` processes on this machine or by another `farm`.
 
-    Raises RecordingError where the folder holds shards of another plan, FolderBusyError where another build uses it,
+    Raises OutputExistsError for a folder of other files, RecordingError for one with shards of another plan,
+    FolderBusyError where another build uses it,
     and DiskFullError and WorkersLostError, with all finished shards kept.
     """
     plan.check()
+    if folder.is_dir() and not any(folder.glob(SHARD_PATTERN)) and any(folder.glob("[!.]*")):
+        raise OutputExistsError(f"{folder} holds other files and no dataset: choose another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -84,8 +86,6 @@ def build_dataset(
             f"cannot create the folder {folder} ({error.strerror}): choose another --out"
         ) from error
     with only_builder(folder):
-        for part in folder.glob(PART_PATTERN):  # left by a build that was killed, since this one has the lock
-            part.unlink()
         wanted = [*_split(range(plan.first_seed, plan.first_seed + count), SHARD)]
         damaged = _find_damaged(folder, plan, on_check)
         missing = [seeds for seeds in wanted if not _holds(folder, seeds, damaged)]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration import ObjectBox, Rig, first_problem, load_rig
+from nlos_calibration import ObjectBox, Rig, first_problem, load_rig, read_toml
 from nlos_calibration.arrays import Float32
 from nlos_models import MapSet
 from pydantic import ValidationError
@@ -104,7 +104,7 @@ def _placed(path: Path, name: str, rig: Rig) -> Float32:
 
 def _hidden(path: Path, name: str) -> HiddenObject:
     try:
-        fields: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+        fields: dict[str, Any] = read_toml(path)
         meshes = _meshes(path.parent, name)
         if not fields.keys() & {"category", "file"} and meshes:
             fields["file"] = meshes[0].name

@@ -100,17 +100,19 @@ class Objects:
     """(path in the folder, SHA-256), in order; with meshes there are no categories."""
     backgrounds: float = 0.0
     """Share of the procedural objects with a post or a panel beside them."""
+    share_generic: float = 0.0
+    """Share of generic shapes (`nlos_cam.objects.generic_depth`) among the objects."""
     version: int = OBJECTS_VERSION
     folder: Path | None = field(default=None, compare=False)
     """Folder of the meshes on this machine."""
 
     @classmethod
-    def without(cls, left_out: Sequence[str], backgrounds: float = 0.0) -> Self:
+    def without(cls, left_out: Sequence[str], backgrounds: float = 0.0, share_generic: float = 0.0) -> Self:
         """Return all categories but these. Raises SceneError for an unknown one, or if none is left."""
         dropped = [find_category(name).name for name in left_out]
         if not (categories := tuple(name for name in CATEGORIES if name not in dropped)):
             raise SceneError("--without leaves no object category: keep at least one")
-        return cls(categories, backgrounds=backgrounds)
+        return cls(categories, backgrounds=backgrounds, share_generic=share_generic)
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,8 @@ class DatasetPlan:
             facts["note"] = SIMULATION_ONLY
         else:
             del facts["textures"]  # older readers refuse unknown fields
+        if not self.objects.share_generic:
+            del facts["objects"]["share_generic"]  # and checksums of older plans stay
         return json.dumps({**facts, "rig_checksum": self.rig.checksum})
 
     @classmethod

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from nlos_cam.dataset.plan import DatasetPlan, Objects, scene_row
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import LidarMaps, maps_from_frame
+from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import (
     Coat,
     MeshFile,
     folder_objects,
+    generic_depth,
     image_from_albedo,
     image_from_depth,
     mesh_depth,
@@ -33,6 +34,9 @@ from nlos_cam.render import Radiometry, Scene, Sensor, SensorModel, Surface, ren
 Samples = Mapping[str, NDArray[Any]]
 """Arrays with one row per object: depth_m and intensity (n, 64, 80), image and object_depth_m (n, 64, 64), seed (n,),
 scene (n, 6), category (n,). In color intensity is (n, 3, 64, 80), image (n, 3, 64, 64), and there is texture (n,)."""
+
+_SHARE_STREAM = 3
+"""Stream of an object's random numbers that decides whether it is generic; see `plan._RIG_STREAM`."""
 
 OnProgress = Callable[[int, int], None]
 """Callback with the count of finished items, and of all."""
@@ -65,8 +69,7 @@ def procedural_images(
 def sense_object(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard", exposure: int = 0) -> LidarMaps:
     """Return the maps of one rendered scene, by the sensor model and the reduction of live frames."""
     echoes = render(scene, accuracy).multi
-    images = sensor.expose(echoes, np.random.default_rng([seed, 1, exposure]))  # numpy: [seed, 1, 0] is [seed, 1]
-    return maps_from_frame(images.frame(sensor.rig.pinhole))
+    return sensor.maps(echoes, np.random.default_rng([seed, 1, exposure]))  # numpy: [seed, 1, 0] is [seed, 1]
 
 
 def sense_color(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard") -> LidarMaps:
@@ -135,7 +138,9 @@ def join_samples(parts: Sequence[Samples]) -> Samples:
 
 
 def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Float32]:
-    """Return one random object: its category or mesh path, and its depth map (64, 64) in metres, NaN background."""
+    """Return one random object: its category, family or mesh, and its depth map (64, 64) in metres, NaN background."""
+    if objects.share_generic and np.random.default_rng([seed, _SHARE_STREAM]).random() < objects.share_generic:
+        return generic_depth(seed, box)
     if not objects.meshes:
         return object_depth(seed, box, objects.categories, backgrounds=objects.backgrounds)
     if (folder := objects.folder) is None:

@@ -2,20 +2,19 @@
 
 import errno
 import hashlib
-import os
-import platform
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from io import BytesIO
 from itertools import pairwise
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
-from filelock import FileLock, Timeout
+from nlos_models import FileBusyError, claim, describe
 from numpy.typing import NDArray
 
 from nlos_cam.dataset.plan import SCENE_COLUMNS, DatasetPlan
@@ -24,8 +23,9 @@ from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, R
 from nlos_cam.files import atomic_file
 
 SHARD_PATTERN, PART_PATTERN = "shard-*.h5", "*shard-*.part"
-REQUIRED_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category")
-"""Arrays of every shard; newer ones, with checksums, also have scene."""
+REQUIRED_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category", "scene")
+MAX_ARRAY_BYTES, MAX_CHUNK_BYTES, MAX_RATIO = 1 << 30, 1 << 26, 1100
+"""Bounds on what an array may declare, in bytes and as a multiple of its file: gzip packs at most 1032 to 1."""
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """No space left, a quota reached, or a limit on the size of files."""
 
@@ -68,19 +68,25 @@ def shards_of(folder: Path) -> list[Shard]:
 def read_head(path: Path) -> Shard:
     """Return the head of a shard. Raises RecordingError where it cannot be read."""
     with open_shard(path) as file:
-        plan, seeds = str(file.attrs["plan"]), _checked(path, "seed", file["seed"])
-        if file.attrs.get("plan_sha256", "") not in {"", _digest(plan.encode())}:
-            raise _damaged(path, "the checksum of its plan differs")
+        plan, seeds = str(file.attrs["plan"]), _checked(path, "seed", file)
+        if file.attrs.get("plan_sha256", "") != _digest(plan.encode()):
+            raise _damaged(path, "the checksum of its plan is missing or differs")
         consecutive = seeds.ndim == 1 and len(seeds) and (np.diff(seeds) == 1).all()
         if not consecutive or shard_path(path.parent, seeds[0]) != path:
             raise _damaged(path, "its seeds do not match its name, or are not consecutive")
         return Shard(path, range(int(seeds[0]), int(seeds[-1]) + 1), plan)
 
 
+def shard_origin(path: Path) -> tuple[str, str]:
+    """Return the version of nlos-cam and the command that made a shard; "unknown" as far as it does not say."""
+    with open_shard(path) as file:
+        return str(file.attrs.get("package_version", "unknown")), str(file.attrs.get("command", "unknown"))
+
+
 def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
     """Return arrays of a shard. Raises RecordingError where one differs from its checksum."""
     with open_shard(head.path) as file:
-        found = [_checked(head.path, name, file[name]) for name in names]
+        found = [_checked(head.path, name, file) for name in names]
     for name, values in zip(names, found, strict=True):
         if len(values) != len(head.seeds):
             raise _damaged(head.path, f"{name} has {len(values)} rows for {len(head.seeds)} objects")
@@ -90,7 +96,7 @@ def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
 def check_arrays(head: Shard) -> None:
     """Read all arrays. Raises RecordingError where the shard is damaged."""
     with open_shard(head.path) as file:
-        names = {*map(str, file), *REQUIRED_ARRAYS, *(["scene"] if "plan_sha256" in file.attrs else [])}
+        names = {*map(str, file), *REQUIRED_ARRAYS}
     read_arrays(head, sorted(names))
 
 
@@ -146,21 +152,24 @@ def open_shard(path: Path) -> Generator[h5py.File]:
             yield file
     except RecordingError:
         raise
-    except (
-        OSError,
-        LookupError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        RuntimeError,
-    ) as error:  # raised by h5py for damage
-        raise _damaged(path, f"cannot be read as a shard: {' '.join(str(error).split())}") from error
+    except Exception as error:  # h5py raises almost anything for damage
+        raise _damaged(path, f"cannot be read as a shard: {describe(error)}") from error
 
 
-def _checked(path: Path, name: str, stored: Any) -> NDArray[Any]:
-    values: NDArray[Any] = stored.asstr()[:] if h5py.check_string_dtype(stored.dtype) else stored[:]
-    if stored.attrs.get("sha256", "") not in {"", content_checksum(values)}:
-        raise _damaged(path, f"the checksum of {name} differs")
+def _checked(path: Path, name: str, file: h5py.File) -> NDArray[Any]:
+    """Return an array of a shard whose checksum, size and storage have been verified."""
+    stored = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+    if not isinstance(stored, h5py.Dataset) or stored.external or stored.is_virtual:
+        raise _damaged(path, f"{name} is not an array of this file")
+    is_text = bool(h5py.check_string_dtype(stored.dtype))
+    chunk_bytes = prod(stored.chunks or ()) * stored.dtype.itemsize
+    if stored.nbytes > min(MAX_ARRAY_BYTES, MAX_RATIO * path.stat().st_size) or chunk_bytes > MAX_CHUNK_BYTES:
+        raise _damaged(path, f"{name} declares {stored.nbytes} bytes, in chunks of {chunk_bytes}")
+    if not is_text and stored.dtype.kind not in "fiu":
+        raise _damaged(path, f"{name} does not hold numbers")
+    values = np.asarray(stored.asstr()[:] if is_text else stored[:])
+    if stored.attrs.get("sha256", "") != content_checksum(values):
+        raise _damaged(path, f"the checksum of {name} is missing or differs")
     return values
 
 
@@ -168,38 +177,19 @@ def _damaged(path: Path, why: str) -> RecordingError:
     return RecordingError(f"{path} is damaged ({why}): build again to replace it, or delete it")
 
 
-LOCK, NOTE = ".build.lock", ".builder"
-
-
 @contextmanager
 def only_builder(folder: Path) -> Generator[None]:
-    """Hold a folder's lock, which the system releases when its holder dies.
+    """Hold the right to build in a folder, which the system releases when its holder dies.
 
     Raises FolderBusyError, with the holder's process id, where another process has it, and OutputExistsError where the
     folder cannot be written to.
     """
-    lock, note = FileLock(folder / LOCK), folder / NOTE
     try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        raise FolderBusyError(
-            f"{folder} is being built by {_holder(note)}: wait for it, or choose another --out"
-        ) from error
+        with claim(folder, inside=True):
+            yield
+    except FileBusyError as error:
+        raise FolderBusyError(str(error)) from error
     except PermissionError as error:
         raise OutputExistsError(
             f"{folder} cannot be written to: choose another --out, or change its permissions"
         ) from error
-    try:
-        with suppress(OSError):  # a full disk is reported when a shard is stored
-            note.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
-        yield
-    finally:
-        note.unlink(missing_ok=True)
-        lock.release()
-
-
-def _holder(note: Path) -> str:
-    try:
-        return note.read_text(encoding="utf-8") or "another process"
-    except OSError:  # the holder has just started, or just ended
-        return "another process"

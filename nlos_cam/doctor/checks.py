@@ -5,7 +5,7 @@ Each check answers one question about the facts with a finding: status, detail a
 
 import re
 
-from nlos_cam.camera import WHEEL
+from nlos_cam.camera import MAC_WHEEL, WHEEL
 from nlos_cam.doctor.facts import Facts, Finding, failed, ok, skipped, warning
 from nlos_cam.doctor.host import L515, LIDARS, Host, KernelCamera
 from nlos_cam.doctor.udev import RELOAD, WRITE_AND_INSTALL
@@ -173,7 +173,6 @@ def metadata(facts: Facts) -> Finding:
     return skipped("uvcvideo is not loaded" if on == "linux" else "only Linux and Windows have it")
 
 
-MACOS_WHEEL = "pyrealsense2-macosx==2.54.2"
 FROM_SOURCE = "build librealsense 2.54.2 from source with -DBUILD_PYTHON_BINDINGS=ON"
 NEWEST_PYTHON = {"linux x86_64": (3, 11), "windows amd64": (3, 11), "darwin": (3, 12)}
 """Newest Python with a wheel that has the L515's driver; the one for macOS is by the community."""
@@ -186,7 +185,7 @@ VC_RUNTIME = "install Microsoft's Visual C++ runtime: https://aka.ms/vs/17/relea
 
 
 def _wheel(on: str) -> str:
-    return MACOS_WHEEL if on == "darwin" else WHEEL
+    return MAC_WHEEL if on == "darwin" else WHEEL
 
 
 def version_numbers(version: str) -> tuple[int, ...]:
@@ -230,7 +229,7 @@ def _macos(facts: Facts) -> Finding:
     return finding(
         "macOS: simulation and recordings only; since macOS 12 librealsense needs root to reach a camera, and "
         "often fails even then",
-        f"use the camera on Linux or Windows; to try it here anyway: `pip install {MACOS_WHEEL}`, and run with sudo",
+        f"use the camera on Linux or Windows; to try it here anyway: `pip install {MAC_WHEEL}`, and run with sudo",
     )
 
 

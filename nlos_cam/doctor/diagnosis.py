@@ -13,17 +13,10 @@ REPLUG_WINDOWS = (
     "in the Device Manager uninstall every RealSense device together with its driver, unplug the camera and plug it in "
     "again: Windows' own camera driver has to take it, not one of Zadig or of a vendor"
 )
-CAUSES: dict[str, Callable[[Facts], Finding]] = {
-    "sdk-version": checks.sdk_version,
-    "sdk-alone": checks.sdk_alone,
-    "system": checks.system,
-    "container": checks.container,
-    "permissions": checks.permissions,
-    "video-driver": checks.video_driver,
-    "hid-sensors": checks.hid_sensors,
-    "in-use": checks.in_use,
-    "firmware": checks.firmware,
-}
+CAUSES = (
+    *("sdk-version", "sdk-alone", "system", "container", "permissions"),
+    *("video-driver", "hid-sensors", "in-use", "firmware"),
+)
 """Checks whose failure can hide a camera from librealsense that USB shows, the likeliest cause first."""
 
 
@@ -44,7 +37,7 @@ def sdk_camera(facts: Facts) -> Finding:
 
 def _hidden(facts: Facts, cameras: str) -> Finding:
     """Return a failure with every cause found, and the fix of the likeliest."""
-    found = {name: check(facts) for name, check in CAUSES.items()}
+    found = {name: CHECKS[name](facts) for name in CAUSES}
     causes = {name: finding for name, finding in found.items() if finding.status == "failed"}
     if not causes:
         fix = REPLUG_WINDOWS if facts.host.platform.system == "windows" else REPLUG

@@ -94,12 +94,8 @@ def path_exists(path: Path) -> bool:
 
 def kernel_cameras(root: Path = Path("/")) -> tuple[KernelCamera, ...]:
     """Return the cameras of the family that the kernel has enumerated; `root` holds `sys`."""
-    devices = list_folder(root / "sys/bus/usb/devices")
-    return tuple(_camera(root / "sys", device) for device in devices if _is_lidar(device))
-
-
-def _is_lidar(device: Path) -> bool:
-    return _hex(device / "idVendor") == INTEL and _hex(device / "idProduct") in LIDARS
+    intel = [one for one in list_folder(root / "sys/bus/usb/devices") if _hex(one / "idVendor") == INTEL]
+    return tuple(_camera(root / "sys", device) for device in intel if _hex(device / "idProduct") in LIDARS)
 
 
 def _hex(path: Path) -> int:

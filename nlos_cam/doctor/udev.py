@@ -29,12 +29,9 @@ WRITE_AND_INSTALL = f"nlos-cam doctor --write-udev {FILE_NAME} && {install_comma
 
 def rules_text() -> str:
     """Return the rules file: access to the camera's USB and video nodes and its motion sensors."""
-    access = [f"# {name}\n{_usb_rule(product_id)}\n" for product_id, (_, name) in LIDARS.items()]
+    rule = '# {}\nSUBSYSTEMS=="usb", {}, MODE:="0666", GROUP:="plugdev"\n'
+    access = [rule.format(name, _match(product_id)) for product_id, (_, name) in LIDARS.items()]
     return "\n".join([HEAD.format(name=FILE_NAME, reload=RELOAD), *access, MOTION.format(match=_match(L515))])
-
-
-def _usb_rule(product_id: int) -> str:
-    return f'SUBSYSTEMS=="usb", {_match(product_id)}, MODE:="0666", GROUP:="plugdev"'
 
 
 def _match(product_id: int) -> str:

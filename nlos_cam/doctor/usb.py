@@ -101,7 +101,7 @@ def scan_usb(backend: Any = None, root: Path = Path("/")) -> UsbScan:
 
 def _describe(device: Any, root: Path) -> UsbDevice:
     kind, meaning = LIDARS.get(device.idProduct) or ("other", f"RealSense {OTHERS[device.idProduct]}")
-    port = _port(device)
+    port = f"{device.bus}-{'.'.join(map(str, device.port_numbers))}" if device.port_numbers else ""  # as 2-1.4
     serial, product, error = _strings(device)
     kernel = root / "sys/bus/usb/devices" / port
     return UsbDevice(
@@ -120,11 +120,6 @@ def _describe(device: Any, root: Path) -> UsbDevice:
         error=str(error) if error else "",
         denied=isinstance(error, OSError) and error.errno in {errno.EACCES, errno.EPERM},
     )
-
-
-def _port(device: Any) -> str:
-    """Return bus and ports, as 2-1.4; empty for a device without a port."""
-    return f"{device.bus}-{'.'.join(map(str, device.port_numbers))}" if device.port_numbers else ""
 
 
 def _strings(device: Any) -> tuple[str, str, Exception | None]:

@@ -1,8 +1,10 @@
 __all__ = [
     "LABELS",
     "QUIET",
+    "REPORT",
     "SMALLER_IS_BETTER",
     "TARGETS",
+    "TRADEOFF_REPORT",
     "Evaluation",
     "Figures",
     "HeldOutObjects",
@@ -36,8 +38,8 @@ __all__ = [
     "per_object",
     "plain",
     "reconstruct_all",
+    "render_document",
     "render_facts",
-    "render_markdown",
     "render_settings",
     "rendered_objects",
     "rig_of",
@@ -67,17 +69,18 @@ from .metrics import (
     plain,
 )
 from .render_tradeoff import (
+    TRADEOFF_REPORT,
     RenderRow,
     as_table,
     draw_renders,
     machine,
     measure_renders,
+    render_document,
     render_facts,
-    render_markdown,
     render_settings,
     write_renders,
 )
-from .report import Evaluation, as_figures, evaluate, format_interval, write_report
+from .report import REPORT, Evaluation, as_figures, evaluate, format_interval, write_report
 from .runtime_tradeoff import (
     RuntimeRow,
     measure_runtimes,

@@ -1,10 +1,9 @@
 """Trivial baselines: background only, mean object, nearest training object."""
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -30,16 +29,6 @@ FINGERPRINT_OBJECTS = 200
 OnProgress = Callable[[int, int], None]
 
 
-class TrainingMaps(Protocol):
-    """Training objects' maps in chunks, such as a dataset."""
-
-    def __len__(self) -> int: ...
-
-    def chunks(self) -> Iterator[MapSet]:
-        """Yield all of them in parts."""
-        ...
-
-
 def trivial_answers(count: int, mean: Float32) -> dict[str, Float32]:
     """Return answers (count, 64, 64) that ignore the maps: background only, and the mean training image (64, 64)."""
     shape = (count, *mean.shape)
@@ -51,7 +40,7 @@ def mean_image(images: Float16) -> Float32:
     return images.mean(0, dtype=np.float64).astype(np.float32)
 
 
-def answers_with_nearest(maps: MapSet, training: TrainingMaps, on_progress: OnProgress) -> dict[str, Float32]:
+def answers_with_nearest(maps: MapSet, training: Dataset, on_progress: OnProgress) -> dict[str, Float32]:
     """Return the trivial answers and the image of the nearest training object; one part at a time is in memory.
 
     Nearest in the sum of squares over all cells of depth and intensity, each channel (left, right) minus its mean and
@@ -92,7 +81,7 @@ def _stacked(maps: MapSet) -> Tensor:
     return split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
 
 
-def _statistics(training: TrainingMaps) -> tuple[Tensor, Tensor]:
+def _statistics(training: Dataset) -> tuple[Tensor, Tensor]:
     parts = list[Tensor]()
     for chunk in training.chunks():
         parts.append(_stacked(chunk))

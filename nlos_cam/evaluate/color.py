@@ -16,9 +16,6 @@ from nlos_cam.render import Scene, Sensor, SensorModel, Surface
 
 ROWS = ("truth", "reconstruction", "difference")
 
-Figure = dict[str, float | None]
-"""Mean over objects and its bootstrap 95 % interval: value, low, high."""
-
 
 def painted_maps(
     depths_m: Sequence[Float32], rig: Rig, first_seed: int, accuracy: str, on_progress: Callable[[int, int], None]
@@ -33,16 +30,6 @@ def painted_maps(
         on_progress(len(images), len(depths_m))
     depth, intensity = (np.stack(one) for one in zip(*maps, strict=True))
     return MapSet(depth, intensity, np.stack(images))
-
-
-def color_figures(image: Float32, truth: Float32) -> dict[str, Figure]:
-    """Return every metric of color images (n, 3, 64, 64) against the truth."""
-    return plain(over_objects(color_metrics(image, truth)))
-
-
-def better_than(guess: Float32, image: Float32, truth: Float32) -> dict[str, Figure]:
-    """Return the per-object advantage of images over a guess; positive is better for every metric."""
-    return plain(advantage(color_metrics(image, truth), color_metrics(guess, truth), SMALLER_IS_BETTER))
 
 
 def color_baselines(image: Float32, training: Float16 | Float32) -> dict[str, Float32]:
@@ -61,13 +48,15 @@ def figures_of_color(
     image: Float32, truth: Float32, others: Mapping[str, Float32], training: Float16 | Float32
 ) -> dict[str, Any]:
     """Return all figures of images (n, 3, 64, 64) with those of other answers and of the baselines, ready for JSON."""
-    guesses = color_baselines(image, training)
+    guesses, ours = {**others, **color_baselines(image, training)}, color_metrics(image, truth)
+    theirs = {name: color_metrics(guess, truth) for name, guess in guesses.items()}
+    compared = ("mean_object", "mean_colour")
     return {
         "note": SIMULATION_ONLY,
         "objects": len(truth),
-        **color_figures(image, truth),
-        "baselines": {name: color_figures(guess, truth) for name, guess in {**others, **guesses}.items()},
-        "better_than": {name: better_than(guesses[name], image, truth) for name in ("mean_object", "mean_colour")},
+        **plain(over_objects(ours)),
+        "baselines": {name: plain(over_objects(values)) for name, values in theirs.items()},
+        "better_than": {name: plain(advantage(ours, theirs[name], SMALLER_IS_BETTER)) for name in compared},
     }
 
 

@@ -1,5 +1,6 @@
 """Figures of an evaluation: contact sheet (SI Figure S2), metrics per category, error against surface, extremes."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Bin, Figures, 
 SHEET_COLUMNS = 18
 MAX_PER_SHEET = 54
 GALLERY = 6
+SHEET_IN = 9.0
+"""Width of a sheet of few objects."""
+SEED, MAX_TITLE = re.compile(r"\d{9,}"), 18
 DIFFERENCE_V = 0.5
 """Difference in v at the ends of the colour map; 0.1 is 31 mm in the paper's box."""
 Scale = tuple[str, float, float]
@@ -35,24 +39,35 @@ def draw_sheet(path: Path, image: Float32, truth: Float32, titles: Sequence[str]
     """Draw truth, reconstruction and difference of up to 54 objects, evenly chosen if there are more (SI Figure S2)."""
     shown = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), MAX_PER_SHEET)).astype(int))
     columns = min(SHEET_COLUMNS, len(shown))
-    figure = _figure((0.8 * columns + 1.6, 2.7 * -(-len(shown) // columns) + 0.2))
+    wide_in = min(max(SHEET_IN / columns, 0.8), 1.6)
+    figure = _figure((wide_in * columns + 1.8, BLOCK / TILE * wide_in * -(-len(shown) // columns) + 0.2))
     axis = figure.subplots()
-    _mosaic(axis, image[shown], truth[shown], [titles[int(k)] for k in shown], columns)
+    _mosaic(axis, image[shown], truth[shown], [titles[int(k)] for k in shown], columns, wide_in)
     _color_bars(figure, axis)
     figure.savefig(path, dpi=100)
 
 
 def draw_gallery(path: Path, image: Float32, truth: Float32, titles: Sequence[str], iou: Float64) -> None:
-    """Draw the objects with the lowest silhouette IoU above those with the highest."""
+    """Draw the objects with the lowest silhouette IoU above those with the highest, each object once."""
     order = np.argsort(iou, kind="stable")
-    count = min(GALLERY, len(order))
-    figure = _figure((1.5 * count + 2, 10.4))
-    axes = figure.subplots(2, 1)
-    for axis, chosen, title in zip(axes, (order[:count], order[::-1][:count]), ("worst", "best"), strict=True):
-        _mosaic(axis, image[chosen], truth[chosen], [f"{titles[int(k)]}: {iou[k]:.2f}" for k in chosen], count)
+    worst = min(GALLERY, -(-len(order) // 2))
+    rows = {"worst": order[:worst], "best": order[::-1][: min(GALLERY, len(order) - worst)]}
+    rows = {title: chosen for title, chosen in rows.items() if len(chosen)}
+    figure = _figure((1.5 * worst + 2, 5.2 * len(rows)))
+    axes = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
+    for axis, (title, chosen) in zip(axes, rows.items(), strict=True):
+        _mosaic(
+            axis, image[chosen], truth[chosen], [f"{short(titles[int(k)])}: {iou[k]:.2f}" for k in chosen], worst, 1.5
+        )
         axis.set_title(f"{title} silhouettes (IoU)", fontsize=11)
     _color_bars(figure, list(axes))
     figure.savefig(path, dpi=90)
+
+
+def short(title: str) -> str:
+    """Return a title that fits above its tile: of a held-out seed (2000000003) the last digits."""
+    words = SEED.sub(lambda seed: str(int(seed[0]) % 10**6), title)
+    return words if len(words) <= MAX_TITLE else f"{words[: MAX_TITLE - 1]}\N{HORIZONTAL ELLIPSIS}"
 
 
 def _figure(size: tuple[float, float]) -> Any:
@@ -61,17 +76,18 @@ def _figure(size: tuple[float, float]) -> Any:
     return Figure(figsize=size, layout="constrained")
 
 
-def _mosaic(axis: Any, image: Float32, truth: Float32, titles: Sequence[str], columns: int) -> None:
-    """Draw truth, reconstruction and difference below each other, objects side by side, as one image."""
+def _mosaic(axis: Any, image: Float32, truth: Float32, titles: Sequence[str], columns: int, wide_in: float) -> None:
+    """Draw truth, reconstruction and difference below each other as one image, each object `wide_in` inches wide."""
+    size = min(7.5 * wide_in, 10.0)
     axis.imshow(mosaic(image, truth, columns))
     axis.set_axis_off()
     for k, title in enumerate(titles):
         block, column = divmod(k, columns)
-        axis.text(column * TILE + 32, block * BLOCK + HEAD - 3, title, fontsize=6.5, ha="center", va="bottom")
+        axis.text(column * TILE + 32, block * BLOCK + HEAD - 3, short(title), fontsize=size, ha="center", va="bottom")
     for block in range(-(-len(titles) // columns)):
         for row, name in enumerate(ROWS):
             middle = block * BLOCK + HEAD + row * TILE + 32
-            axis.text(-4, middle, name, fontsize=7, rotation=90, ha="right", va="center")
+            axis.text(-4, middle, name, fontsize=size, rotation=90, ha="right", va="center")
 
 
 def mosaic(image: Float32, truth: Float32, columns: int) -> NDArray[np.uint8]:
@@ -103,7 +119,7 @@ def _colored(images: Float32, scale: Scale) -> NDArray[np.uint8]:
 def _color_bars(figure: Any, axes: Any) -> None:
     words = (VALUE, "v: 0 background, 1 near the wall"), (DIFFERENCE, "difference in v: red is too near")
     for scale, label in words:
-        figure.colorbar(_mappable(scale), ax=axes, fraction=0.015, pad=0.005).set_label(label, fontsize=8)
+        figure.colorbar(_mappable(scale), ax=axes, fraction=0.015, pad=0.01).set_label(label, fontsize=8)
 
 
 def draw_categories(path: Path, categories: Mapping[str, Figures], overall: Figures) -> None:

@@ -1,14 +1,15 @@
 """What accuracy costs in time on one scene: the stops of the dial and their ingredients against brute force.
 
-A measured trade-off as a table for machines (JSON), a table for people (Markdown) and a Pareto plot.
+A measured trade-off as a table for machines (JSON), a report for people and a Pareto plot.
 """
 
 import json
 import platform
-from collections.abc import Iterator, Mapping
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numba
 import numpy as np
@@ -30,7 +31,11 @@ from nlos_cam.render import (
     render,
     three_bounce,
 )
+from nlos_cam.report import Bullets, Commands, Document, Picture, Section, Table, saved_picture, write_document
 
+TRADEOFF_REPORT = "tradeoff.html"
+INCOMPLETE = "Interrupted: some settings are missing."
+Row = TypeVar("Row")
 Part = Literal["stop", "sub_bins", "relay grid", "object_stride", "beams_per_cell", "effect left out"]
 
 REPEATS = 7
@@ -130,31 +135,34 @@ def _timed(scene: Scene, setting: RenderSetting, stopwatch: Stopwatch, repeats: 
     return seconds, renderings[-1]
 
 
-def pareto_front(rows: list[RenderRow]) -> list[RenderRow]:
-    """Return the rows that no other beats in both time and error, from fast to slow."""
-    front: list[RenderRow] = []
-    for row in sorted(_alike(rows), key=lambda row: (row.seconds, row.errors.intensity_error_p99)):
-        if not front or row.errors.intensity_error_p99 < front[-1].errors.intensity_error_p99:
+def undominated(rows: Iterable[Row], costs: Callable[[Row], tuple[float, float]]) -> list[Row]:
+    """Return the rows that no other beats in both `costs` (time, loss), from fast to slow."""
+    front: list[Row] = []
+    for row in sorted(rows, key=costs):
+        if not front or costs(row)[1] < costs(front[-1])[1]:
             front.append(row)
     return front
 
 
-def _alike(rows: list[RenderRow]) -> list[RenderRow]:
-    """Return the rows whose intensity error is comparable: leaving an effect out may change only the map."""
-    return [row for row in rows if row.part not in {"beams_per_cell", "effect left out"}]
+def pareto_front(rows: list[RenderRow]) -> list[RenderRow]:
+    """Return the rows that no other beats in both time and error; leaving an effect out may change only the map."""
+    alike = [row for row in rows if row.part not in {"beams_per_cell", "effect left out"}]
+    return undominated(alike, lambda row: (row.seconds, row.errors.intensity_error_p99))
 
 
 HEAD = (
-    "| setting | seconds | times faster | peak error: median | p99 | max | same bin | within one "
-    "| depth: median | mean |\n"
-    "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+    *("setting", "time, ms", "times faster", "peak error, %: median", "p99", "max"),
+    *("same bin, %", "within one, %", "depth error, mm: median", "mean"),
 )
 BEAMS = f"{FINEST_BEAMS} x {FINEST_BEAMS}"
-NOTES = f"""Seconds are the shortest of several renderings in one run; brute force is compiled too and ran once. Peak
-error: the relative error of the strongest three-bounce bin over the beams that light the wall; depth is the reported
-depth. Ingredients are `standard` with one change. `beams_per_cell` is compared with {BEAMS} beams per cell at
-`standard`, cell by cell, since brute force has one beam per cell. Brute force uses the relay grid of `standard`: where
-a finer grid differs from it, the finer grid is closer to the truth."""
+NOTES = (
+    "Times are the shortest of several renderings in one run; brute force is compiled too and ran once. Peak error: "
+    "the relative error of the strongest three-bounce bin over the beams that light the wall; depth is the reported "
+    "depth. Ingredients are `standard` with one change. `beams_per_cell` is compared with "
+    f"{BEAMS} beams per cell at `standard`, cell by cell, since brute force has one beam per cell. Brute force uses "
+    "the relay grid of `standard`: where a finer grid differs from it, the finer grid is closer to the truth."
+)
+PLOT_CAPTION = "Lower left is better: less time, less error. Labels are settings; stars are the stops of `--accuracy`."
 
 
 def machine() -> str:
@@ -183,40 +191,42 @@ def as_table(facts: RenderFacts, rows: list[RenderRow], planned: int) -> dict[st
     }
 
 
-def render_markdown(table: dict[str, Any]) -> str:
-    """Return the table as Markdown."""
+def render_document(table: Mapping[str, Any], name: str, plot: Path | None = None) -> Document:
+    """Return the report on a table about rendering an object called `name`."""
+    front = f"Settings that no other beats in both time and error: {', '.join(table['pareto_front'])}."
     size = f"{table['patches']} patches, {table['beams_on_wall']} beams on the wall"
-    parts = [
-        f"{table['machine']}; {size}; brute force {table['reference_seconds']:.3g} s."
-        + ("" if table["complete"] else " Interrupted: some settings are missing."),
-        "\n".join([HEAD, *map(_line, table["stops"])]),
-        "\n".join([HEAD, *map(_line, table["ingredients"])]),
-        NOTES,
-        f"Settings that no other beats in both time and error: {', '.join(table['pareto_front'])}.",
+    slow = f"brute force {table['reference_seconds']:.3g} s"
+    parts: list[Section | Picture] = [
+        Section("", [Bullets("Note", [] if table["complete"] else [INCOMPLETE])]),
+        Section("Stops of the accuracy setting", [Table(HEAD, [_line(row) for row in table["stops"]]), front]),
+        Section("Ingredients", [Table(HEAD, [_line(row) for row in table["ingredients"]]), NOTES]),
+        Section("Next commands", [Commands([f"nlos-cam render {shlex.quote(name)} --max-error 0.005"])]),
     ]
-    return "\n\n".join(parts) + "\n"
+    if plot:
+        parts.insert(2, saved_picture("Error against time", PLOT_CAPTION, plot))
+    return Document(f"Rendering {name}: accuracy against time", f"{table['machine']}; {size}; {slow}.", parts)
 
 
-def _line(row: dict[str, Any]) -> str:
-    errors = (f"{100 * row[f'intensity_error_{of}']:.3g} %" for of in ("median", "p99", "max"))
-    bins = (f"{100 * row[of]:.2f} %" for of in ("bin_exact", "bin_within_1"))
-    depths = (f"{row[of]:.2g} mm" for of in ("depth_error_mm", "depth_error_mean_mm"))
-    first = row["name"], f"{row['seconds']:.4f}", f"{row['speedup']:.0f}"
-    return f"| {' | '.join([*first, *errors, *bins, *depths])} |"
+def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
+    errors = (f"{100 * row[f'intensity_error_{of}']:.2g}" for of in ("median", "p99", "max"))
+    bins = (f"{100 * row[of]:.2f}" for of in ("bin_exact", "bin_within_1"))
+    depths = (f"{row[of]:.2f}" for of in ("depth_error_mm", "depth_error_mean_mm"))
+    time_ms = 1000 * row["seconds"]
+    return row["name"], f"{time_ms:.{1 if time_ms < 100 else 0}f}", f"{row['speedup']:.0f}", *errors, *bins, *depths
 
 
-def write_table(folder: Path, table: Mapping[str, Any], text: str) -> None:
-    """Write a trade-off's table as JSON and as Markdown."""
+def write_table(folder: Path, table: Mapping[str, Any], document: Document) -> None:
+    """Write a trade-off's table as JSON, and its report."""
     (folder / "tradeoff.json").write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
-    (folder / "tradeoff.md").write_text(text, encoding="utf-8")
+    write_document(document, folder / TRADEOFF_REPORT)
 
 
 def write_renders(folder: Path, table: dict[str, Any], rows: list[RenderRow], name: str) -> None:
-    """Write the measured trade-off as JSON, Markdown and a plot, titled with the object's name."""
+    """Write the measured trade-off as JSON, report and plot; `name` is the object's."""
     title = f"{name}: {table['patches']} patches, {table['beams_on_wall']} beams on the wall"
     with atomic_directory(folder) as part:
-        write_table(part, table, render_markdown(table))
         draw_renders(part / "tradeoff.png", rows, title)
+        write_table(part, table, render_document(table, name, part / "tradeoff.png"))
 
 
 def draw_renders(path: Path, rows: list[RenderRow], title: str) -> None:

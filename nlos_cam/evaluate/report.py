@@ -1,11 +1,13 @@
-"""Evaluation of weights on held-out objects, and its report: report.md, pictures, figures.json, objects.csv."""
+"""Evaluation of weights on held-out objects, and its report: report.html, pictures, figures.json, objects.csv."""
 
 import csv
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from math import floor, log10
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from nlos_calibration import ObjectBox, Rig
@@ -14,6 +16,7 @@ from nlos_models import load_reconstructor
 
 from nlos_cam.evaluate import figures as pictures
 from nlos_cam.evaluate import metrics
+from nlos_cam.evaluate.figures import LABELS
 from nlos_cam.evaluate.metrics import (
     SMALLER_IS_BETTER,
     TARGETS,
@@ -26,6 +29,7 @@ from nlos_cam.evaluate.metrics import (
     plain,
     targets_met,
 )
+from nlos_cam.evaluate.recognition import PER_KIND, recognised
 from nlos_cam.evaluate.subjects import (
     HeldOutObjects,
     Tracked,
@@ -41,15 +45,29 @@ from nlos_cam.evaluate.subjects import (
     untracked,
 )
 from nlos_cam.files import atomic_directory, cache_folder
+from nlos_cam.objects import CATEGORIES
+from nlos_cam.reconstruct import Mirrored
+from nlos_cam.report import Banner, Bullets, Commands, Document, Picture, Section, Table, saved_picture, write_document
 
+REPORT, UNSEEN_SHEET = "report.html", "sheet-unseen.png"
 SHIPPED = "the shipped ones"
 SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
 SILHOUETTE_ERROR, DEPTH_ERROR = "1 - silhouette IoU", "foreground RMSE, mm"
 
+SHEET_CAPTION = "Bright is near the wall. In the difference, red is too near and blue too far."
 READ_WITH_CARE = (
     "Means over objects; intervals by bootstrap over objects. Foreground RMSE is over pixels that are surface in both, "
     "so it ignores missed parts: read it together with the silhouette IoU."
 )
+
+
+class Unseen(NamedTuple):
+    """Images of objects of kinds that training never sees."""
+
+    names: Sequence[str]
+    truth: Float32
+    """(n, 64, 64)."""
+    image: Float32
 
 
 @dataclass(frozen=True)
@@ -67,6 +85,8 @@ class Evaluation:
     """Weights, rig, runtime and notes: copied to the figures."""
     left_out: Sequence[str] = ()
     """Categories that training left out."""
+    unseen: Unseen | None = None
+    """The second set of test objects; None beside other objects than the first."""
 
     @property
     def ours(self) -> PerObject:
@@ -97,23 +117,34 @@ def evaluate(
     wall: Path | None = None,
     training: Path | None = None,
     nearest: bool = True,
+    mirror: bool = False,
     tracked: Tracked = untracked,
 ) -> Evaluation:
     """Reconstruct held-out objects with weights (the shipped ones if None) and with the baselines.
 
     The objects are those given, those of a dataset (a path), or rendered: the 54 test objects, or `count` random ones,
     on `rig` (the weights' own if None). `wall` is the bare wall of difference maps. `training` names the maps searched
-    for the nearest neighbour, unless it is left out. `tracked` opens progress bars. Raises SceneError, RecordingError.
+    for the nearest neighbour, unless it is left out. `mirror` joins the answers to mirrored maps. `tracked` opens
+    progress bars. Raises SceneError, RecordingError.
     """
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
     record = reconstructor.record
+    if mirror:
+        reconstructor = Mirrored(reconstructor)
+    second: HeldOutObjects | None = None
     if isinstance(objects, Path):
         objects = dataset_objects(objects)
     elif objects is None:
-        objects = rendered_objects(rig or rig_of(record), count, tracked)
+        rig = rig or rig_of(record)
+        second = None if count else rendered_objects(rig, tracked=tracked, test="unseen")
+        objects = rendered_objects(rig, count, tracked)
     bare = bare_wall_for(record, objects.plan, wall)
     guesses, searched = baseline_answers(objects, training, nearest=nearest, tracked=tracked)
     image = reconstruct_all(reconstructor, network_input(objects.maps, bare))
+    unseen = None
+    if second:
+        answers = reconstruct_all(reconstructor, network_input(second.maps, bare))
+        unseen = Unseen(second.names, second.maps.image.astype(np.float32), answers)
     facts = {
         "what": objects.description,
         "weights": str(weights or SHIPPED),
@@ -124,7 +155,8 @@ def evaluate(
         "notes": notes_about(record, objects, searched),
     }
     truth, left_out = objects.maps.image.astype(np.float32), left_out_categories(record)
-    return Evaluation(objects.names, objects.categories, truth, image, guesses, objects.plan.box, facts, left_out)
+    box = objects.plan.box
+    return Evaluation(objects.names, objects.categories, truth, image, guesses, box, facts, left_out, unseen)
 
 
 def as_figures(evaluation: Evaluation) -> dict[str, Any]:
@@ -148,9 +180,28 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
         "where_the_error_is": {
             name: asdict(zone) for name, zone in metrics.error_by_zone(evaluation.image, evaluation.truth).items()
         },
+        "unseen": _unseen_figures(evaluation),
+        "recognised": _recognised(evaluation),
         "objects": len(evaluation.truth),
         **evaluation.facts,
     }
+
+
+def _unseen_figures(evaluation: Evaluation) -> dict[str, Any] | None:
+    """Return the figures of the second set of test objects, with their number."""
+    if not (second := evaluation.unseen):
+        return None
+    return plain(metrics.judge(second.image, second.truth, evaluation.box)) | {"objects": len(second.truth)}
+
+
+def _recognised(evaluation: Evaluation) -> dict[str, Any] | None:
+    """Return the shares of reconstructions, and of true images, recognised as their kind; None for other kinds."""
+    if not set(evaluation.categories) <= CATEGORIES.keys():
+        return None
+    each = {"reconstructions": evaluation.image, "truth": evaluation.truth}
+    return plain(
+        over_objects({name: recognised(images, evaluation.categories, evaluation.box) for name, images in each.items()})
+    )
 
 
 def _by_shown(evaluation: Evaluation) -> dict[str, Any] | None:
@@ -167,7 +218,7 @@ def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any
         (part / "figures.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
         _write_objects(part / "objects.csv", evaluation)
         _draw(part, evaluation)
-        (part / "report.md").write_text(as_markdown(figures), encoding="utf-8")
+        write_document(document(figures, part), part / REPORT)
 
 
 def _write_objects(path: Path, evaluation: Evaluation) -> None:
@@ -188,6 +239,8 @@ def _write_objects(path: Path, evaluation: Evaluation) -> None:
 def _draw(folder: Path, evaluation: Evaluation) -> None:
     image, truth, names, ours = evaluation.image, evaluation.truth, evaluation.names, evaluation.ours
     pictures.draw_sheet(folder / "sheet.png", image, truth, names)
+    if second := evaluation.unseen:
+        pictures.draw_sheet(folder / UNSEEN_SHEET, second.image, second.truth, second.names)
     pictures.draw_gallery(folder / "gallery.png", image, truth, names, ours["silhouette_iou"])
     pictures.draw_categories(folder / "categories.png", per_category(ours, evaluation.categories), over_objects(ours))
     curves = {
@@ -197,48 +250,90 @@ def _draw(folder: Path, evaluation: Evaluation) -> None:
     pictures.draw_against_surface(folder / "surface.png", evaluation.surfaces, evaluation.errors, curves)
 
 
-def as_markdown(figures: Mapping[str, Any]) -> str:
-    """Return the report as Markdown, from the figures alone."""
-    names = list(figures["baselines"])
-    head = "| metric | ours (95 % interval) | target | " + " | ".join(name.replace("_", " ") for name in names) + " |"
-    weights = f"{figures['weights']} ({figures['input']})"
-    parts = [
-        f"# Reconstruction of {figures['objects']} hidden objects",
-        f"{figures['what']}. Weights: {weights}; rig: {figures['rig']}; {figures['runtime']}.",
-        *(f"**Note**: {note}." for note in figures["notes"]),
-        "\n".join([head, "| --- " * (3 + len(names)) + "|", *(_row(figures, metric, names) for metric in TARGETS)]),
-        READ_WITH_CARE,
+def document(figures: Mapping[str, Any], folder: Path) -> Document:
+    """Return the report from the figures, with the pictures that are in `folder`."""
+    baselines = list(figures["baselines"])
+    met, count = sum(bar["met"] for bar in figures["bars"].values()), len(figures["bars"])
+    headline = f"Silhouette IoU {format_interval(figures['silhouette_iou'])}"
+    advice = f"{met} of {count} targets met, on {figures['objects']} objects. In brackets: 95 % interval over objects."
+    head = ("metric", "these weights (95 % interval)", "target", "met", *(name.replace("_", " ") for name in baselines))
+    details = [
         _against_nearest(figures["advantage_over_nearest_neighbour"], figures["training_objects"]),
         _shown(figures["shown_and_left_out"]),
         _where(figures["where_the_error_is"]),
-        "![truth, reconstruction, difference](sheet.png)",
         _categories(figures["per_category"]),
-        "![each metric per category](categories.png)",
-        _surface(figures["rank_correlation"]),
-        "![error against size and detail](surface.png)",
-        "![worst and best silhouettes](gallery.png)",
+        _kinds(figures["recognised"]),
     ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    return Document(
+        f"Reconstruction of {figures['objects']} hidden objects",
+        f"{figures['what']}. Weights: {figures['weights']} ({figures['input']}); rig: {figures['rig']}; "
+        f"{figures['runtime']}.",
+        [
+            Section("", [Banner("good" if met == count else "doubtful", headline, advice)]),
+            Section("", [Bullets("Note", figures["notes"])]),
+            Section("Metrics", [Table(head, [_row(figures, metric, baselines) for metric in TARGETS]), READ_WITH_CARE]),
+            saved_picture("Truth, reconstruction and difference", SHEET_CAPTION, folder / "sheet.png"),
+            *_unseen(figures["unseen"], folder),
+            Section("Where the error is", [text for text in details if text]),
+            saved_picture("Metrics by category", "Mean of each category with its interval.", folder / "categories.png"),
+            saved_picture(
+                "Error against size and detail", _surface(figures["rank_correlation"]), folder / "surface.png"
+            ),
+            saved_picture("Worst and best silhouettes", SHEET_CAPTION, folder / "gallery.png"),
+            Section("Next commands", [Commands(_next_commands(figures))]),
+        ],
+    )
 
 
-def format_interval(figure: Mapping[str, float | None] | Interval) -> str:
-    """Format an estimate with its interval, "0.696 (0.66 to 0.73)"."""
+def _unseen(figures: Mapping[str, Any] | None, folder: Path) -> list[Section | Picture]:
+    if not figures:
+        return []
+    rows = [(LABELS[metric], format_interval(figures[metric])) for metric in TARGETS]
+    title = f"{figures['objects']} objects of kinds that training never sees"
+    table = Section(title, [Table(("metric", "these weights (95 % interval)"), rows)])
+    return [table, saved_picture("Kinds never seen", SHEET_CAPTION, folder / UNSEEN_SHEET)]
+
+
+def _kinds(figures: Mapping[str, Any] | None) -> str:
+    if not figures:
+        return ""
+    ours, truth = (format_interval(figures[name]) for name in ("reconstructions", "truth"))
+    return (
+        f"Share recognised as their kind, by the nearest of {PER_KIND} silhouettes of each of the 18 kinds: {ours} of "
+        f"the reconstructions, {truth} of the true silhouettes."
+    )
+
+
+def _next_commands(figures: Mapping[str, Any]) -> list[str]:
+    chosen = "" if figures["weights"] == SHIPPED else f" --weights {shlex.quote(figures['weights'])}"
+    lines = [f"nlos-cam live --camera sim{chosen}", f"nlos-cam tradeoff reconstruct{chosen}"]
+    return lines if figures["training_objects"] else [*lines, f"nlos-cam evaluate{chosen}"]
+
+
+def format_interval(figure: Mapping[str, float | None] | Interval, digits: int | None = None) -> str:
+    """Format an estimate and its interval, by default with two digits of the half width, "0.696 (0.660 to 0.731)"."""
     plain = asdict(figure) if isinstance(figure, Interval) else figure
     value, low, high = (plain[name] for name in ("value", "low", "high"))
-    return "none" if value is None else f"{value:.3g} ({low:.3g} to {high:.3g})"
+    if value is None or low is None or high is None:
+        return "none"
+    if digits is None:
+        digits = min(max(1 - floor(log10((high - low) / 2)), 0), 3) if high > low else 3
+    return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
-def _row(figures: Mapping[str, Any], metric: str, names: Sequence[str]) -> str:
-    bar, verdict = figures["bars"][metric], "met" if figures["bars"][metric]["met"] else "not met"
-    wanted = f"{'at most' if metric in SMALLER_IS_BETTER else 'at least'} {bar['bar']:g}: {verdict}"
-    others = [format_interval(figures["baselines"][name][metric]).split(" ")[0] for name in names]
-    return f"| {metric} | {format_interval(figures[metric])} | {wanted} | {' | '.join(others)} |"
+def _row(figures: Mapping[str, Any], metric: str, baselines: Sequence[str]) -> tuple[str, ...]:
+    bar = figures["bars"][metric]
+    target = f"{'at most' if metric in SMALLER_IS_BETTER else 'at least'} {bar['bar']:g}"
+    ours = format_interval(figures[metric])
+    digits = len(ours.split(" ")[0].partition(".")[2])
+    others = [format_interval(figures["baselines"][name][metric], digits).split(" ")[0] for name in baselines]
+    return LABELS[metric], ours, target, "yes" if bar["met"] else "no", *others
 
 
 def _against_nearest(figures: Mapping[str, Any] | None, among: int | None) -> str:
     if not figures:
         return ""
-    parts = [f"{metric} {format_interval(figure)}" for metric, figure in figures.items()]
+    parts = [f"{LABELS[metric]} {format_interval(figure)}" for metric, figure in figures.items()]
     return (
         f"The nearest neighbour is the one of {among} training objects with the nearest maps (sum of squares over all "
         "cells, each channel in units of its spread); the mean object is their mean. Advantage over the nearest "
@@ -253,14 +348,14 @@ def _shown(figures: Mapping[str, Any] | None) -> str:
     return f"Silhouette IoU of categories in training and of left-out ones: {'; '.join(parts)}."
 
 
-def _where(zones: Mapping[str, Any]) -> str:
+def _where(zones: Mapping[str, Any]) -> Table | str:
     if zones["core"]["share_of_error"] is None:
         return "No error."
-    parts = [
-        f"{name} {100 * zone['share_of_error']:.0f} % (of the pixels {100 * zone['share_of_pixels']:.0f} %)"
+    rows = [
+        (name, *(f"{100 * zone[share]:.0f} %" for share in ("share_of_error", "share_of_pixels")))
         for name, zone in zones.items()
     ]
-    return f"Absolute error by zone (the rim is two pixels on either side of the true outline): {', '.join(parts)}."
+    return Table(("zone (the rim: 2 pixels either side of the true outline)", "absolute error", "pixels"), rows)
 
 
 def _categories(categories: Mapping[str, Any]) -> str:
@@ -276,4 +371,4 @@ def _categories(categories: Mapping[str, Any]) -> str:
 
 def _surface(correlations: Mapping[str, Any]) -> str:
     parts = [f"{name} {format_interval(figure)}" for name, figure in correlations.items()]
-    return f"SI 6 reports the smallest errors on large or smooth metrics. Rank correlations here: {'; '.join(parts)}."
+    return f"SI 6 reports the smallest errors on large or smooth objects. Rank correlations here: {'; '.join(parts)}."

@@ -1,5 +1,6 @@
 """Trade-off of accuracy against time in reconstruction: number formats, runtimes, threads and averaged frames."""
 
+import shlex
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,9 +17,10 @@ from nlos_models import (
     Reconstructor,
     Sample,
     TorchReconstructor,
-    export_once,
-    load_pipeline,
+    load_cached,
+    load_network,
     load_record,
+    network_export,
     quantize,
     refuse_color,
     shipped_folder,
@@ -27,8 +29,9 @@ from nlos_models import (
 from nlos_cam.camera import FRAMES_PER_S
 from nlos_cam.dataset import TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
+from nlos_cam.evaluate.figures import LABELS
 from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Figures, judge, plain
-from nlos_cam.evaluate.render_tradeoff import write_table
+from nlos_cam.evaluate.render_tradeoff import INCOMPLETE, undominated, write_table
 from nlos_cam.evaluate.subjects import (
     Subject,
     Tracked,
@@ -43,6 +46,7 @@ from nlos_cam.files import atomic_directory
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.render import MultiBounce
+from nlos_cam.report import Banner, Bullets, Commands, Document, Picture, Section, Table, saved_picture
 
 FRAMES = 1, 4, 16
 THREADS = 1, 2
@@ -134,50 +138,47 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
 
     8-bit networks are quantised when first made, with ranges calibrated on training objects.
     """
-    pipeline, record = load_pipeline(weights)
-    model = export_once(pipeline, cache)
+    folder = weights or shipped_folder()
+    record, (key, export) = load_record(folder), network_export(folder)
 
-    def onnx(path: Path, samples: Callable[[], Iterator[Sample] | None] = lambda: None) -> Make:
+    def onnx(suffix: str, make_content: Callable[[bytes], bytes] = bytes) -> Make:
         def make(threads: int) -> Reconstructor:
-            if not path.exists():
-                quantize(model, path, samples())
-            return OnnxReconstructor(path, record, threads)
+            def content() -> bytes:
+                return make_content(load_cached(cache / key, bytes, export))
+
+            path = (cache / key).with_suffix(suffix)
+            return load_cached(path, lambda model: OnnxReconstructor(model, record, threads), content)
 
         return make
 
     def in_torch(device: str, dtype: torch.dtype) -> Make:
         def make(threads: int) -> Reconstructor:
             del threads  # torch has one number for all networks, set by `measure_runtimes`
-            return TorchReconstructor(load_pipeline(weights)[0], record, device, dtype)
+            return TorchReconstructor(load_network(weights)[0], record, device, dtype)
 
         return make
 
     formats = {"float32": torch.float32, "bfloat16": torch.bfloat16}
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    dynamic, static = (model.with_suffix(f".{kind}.onnx") for kind in ("dynamic", f"static-{rig.checksum}"))
     return {
         **{f"torch {name}, {device}": in_torch(device, dtype) for device in devices for name, dtype in formats.items()},
-        "ONNX Runtime float32": onnx(model),
-        "ONNX Runtime int8 weights": onnx(dynamic),
-        "ONNX Runtime int8": onnx(static, lambda: calibration(rig, box)),
+        "ONNX Runtime float32": onnx(".onnx"),
+        "ONNX Runtime int8 weights": onnx(".dynamic.onnx", quantize),
+        "ONNX Runtime int8": onnx(f".static-{rig.checksum}.onnx", lambda model: quantize(model, calibration(rig, box))),
     }
 
 
 def calibration(rig: Rig, box: ObjectBox) -> Iterator[Sample]:
     """Yield maps of training objects, one at a time."""
     subjects = seeded_objects(TRAINING_SEED, CALIBRATING, box)
-    for maps in sense(echoes_of(subjects, rig, _ignore_progress), rig):
+    for maps in sense(echoes_of(subjects, rig, lambda _done, _total: None), rig):
         yield maps.depth_m[None], maps.intensity[None]
-
-
-def _ignore_progress(done: int, total: int) -> None:
-    del done, total
 
 
 def runtime_settings(weights: Sequence[str], runtime_names: Sequence[str]) -> list[RuntimeSetting]:
     """Return all settings to measure: every runtime on one frame, and several frames on the runtime of `live`."""
     singles = [
-        RuntimeSetting(f"{runtime}, {_threads(threads)}", name, runtime, threads, 1)
+        RuntimeSetting(f"{runtime}, {threads} thread{'s' * (threads > 1)}", name, runtime, threads, 1)
         for name in weights
         for runtime in runtime_names
         for threads in THREADS
@@ -189,10 +190,6 @@ def runtime_settings(weights: Sequence[str], runtime_names: Sequence[str]) -> li
         for frames in FRAMES[1:]
     ]
     return singles + averaged
-
-
-def _threads(count: int) -> str:
-    return f"{count} thread{'s' if count > 1 else ''}"
 
 
 def measure_runtimes(
@@ -265,25 +262,18 @@ def recommended(rows: Sequence[RuntimeRow]) -> RuntimeRow | None:
 
 def pareto_front(rows: Sequence[RuntimeRow]) -> list[RuntimeRow]:
     """Return the single-frame rows that no other beats in both time and silhouette IoU, from fast to slow."""
-    front: list[RuntimeRow] = []
-    for row in sorted((row for row in rows if row.setting.frames == 1), key=lambda row: row.milliseconds):
-        if not front or _iou(row) > _iou(front[-1]):
-            front.append(row)
-    return front
+    singles = (row for row in rows if row.setting.frames == 1)
+    return undominated(singles, lambda row: (row.milliseconds, -(row.figures["silhouette_iou"].value or 0.0)))
 
 
-def _iou(row: RuntimeRow) -> float:
-    return row.figures["silhouette_iou"].value or 0.0
-
-
-HEAD = (
-    "| setting | ms: median | 90 % | wait for frames, ms | IoU | mean abs | within 2 % | foreground RMSE, mm "
-    "| loses accuracy |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+HEAD = ("setting", "time, ms: median", "p90", "wait for frames, ms", *LABELS.values(), "loses accuracy")
+NOTES = (
+    "Times are of one call on one object's maps: medians over all objects, after a first call that is not counted; "
+    "they are from this machine and run. More frames cost no network time: their maps are averaged while the next "
+    'arrive, and the picture is as old as the wait. "Loses accuracy": worse than the first row by more than any of '
+    f"{', '.join(f'{least:g} of {LABELS[name]}' for name, least in AS_GOOD.items())}."
 )
-NOTES = f"""Milliseconds are of one call on one object's maps: medians over all objects, after a first call
-that is not counted; they are from this machine and run. More frames cost no network time: their maps are
-averaged while the next arrive, and the picture is as old as the wait. "Loses accuracy": worse than the first row by
-more than any of {", ".join(f"{least:g} of {name}" for name, least in AS_GOOD.items())}."""
+PLOT_CAPTION = "Left: one frame; numbers are threads. Right: averaged frames. Lines: 95 % intervals over objects."
 
 
 def runtime_facts(rows: Sequence[RuntimeRow], planned: int, objects: int, machine: str) -> dict[str, Any]:
@@ -309,36 +299,42 @@ def runtime_facts(rows: Sequence[RuntimeRow], planned: int, objects: int, machin
     }
 
 
-def runtime_markdown(table: Mapping[str, Any]) -> str:
-    """Return the table as Markdown."""
-    whole = "" if table["complete"] else " Interrupted: some settings are missing."
-    parts = [
-        f"{table['machine']}; {table['objects']} objects.{whole}",
-        "\n".join([HEAD, *map(_line, table["settings"])]),
-        NOTES,
-        f"Recommended: {_called(table['recommended'])} (the fastest single-frame setting that loses no accuracy)."
-        if table["recommended"]
-        else "Nothing was measured.",
+def runtime_document(table: Mapping[str, Any], folder: Path | None = None, out: str = "tradeoff") -> Document:
+    """Return the report on a table, with the plot in `folder`, which will be renamed to `out`."""
+    pick = table["recommended"]
+    banner = Banner("doubtful", "Nothing was measured", "")
+    if pick:
+        banner = Banner(
+            "good", f"Recommended: {_called(pick)}", "The fastest single-frame setting that loses no accuracy."
+        )
+    live = f"nlos-cam live --camera sim --budget-ms 30 --tradeoff {shlex.quote(f'{out}/tradeoff.json')}"
+    parts: list[Section | Picture] = [
+        Section("", [banner, Bullets("Note", [] if table["complete"] else [INCOMPLETE])]),
+        Section("Settings", [Table(HEAD, [_line(row) for row in table["settings"]]), NOTES]),
+        Section("Next commands", [Commands([live, "nlos-cam evaluate"])]),
     ]
-    return "\n\n".join(parts) + "\n"
+    if folder:
+        parts.insert(2, saved_picture("Accuracy against time", PLOT_CAPTION, folder / "tradeoff.png"))
+    subtitle = f"{table['machine']}; {table['objects']} objects."
+    return Document("Reconstruction: accuracy against time", subtitle, parts)
 
 
 def _called(setting: Mapping[str, Any]) -> str:
     return setting["name"] if setting["weights"] == "shipped" else f"{setting['weights']}: {setting['name']}"
 
 
-def _line(row: Mapping[str, Any]) -> str:
+def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
     values = [row[name]["value"] for name in TARGETS]
     metrics = ["none" if value is None else f"{value:.3f}" if value < 1 else f"{value:.1f}" for value in values]
     times = f"{row['milliseconds']:.1f}", f"{row['milliseconds_p90']:.1f}", f"{row['wait_ms']:.0f}"
-    return f"| {' | '.join([_called(row), *times, *metrics, 'yes' if row['loses_accuracy'] else 'no'])} |"
+    return _called(row), *times, *metrics, "yes" if row["loses_accuracy"] else "no"
 
 
 def write_runtimes(folder: Path, table: Mapping[str, Any], rows: Sequence[RuntimeRow]) -> None:
-    """Write the measured trade-off as JSON, Markdown and a plot."""
+    """Write the measured trade-off as JSON, report and plot."""
     with atomic_directory(folder) as part:
-        write_table(part, table, runtime_markdown(table))
         draw_runtimes(part / "tradeoff.png", rows)
+        write_table(part, table, runtime_document(table, part, str(folder)))
 
 
 def draw_runtimes(path: Path, rows: Sequence[RuntimeRow]) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal
 
 import numpy as np
 from nlos_calibration import ObjectBox, Rig, rig_named
@@ -29,7 +29,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import baselines as trivial
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
-from nlos_cam.objects import benchmark_objects, image_from_depth, object_depth
+from nlos_cam.objects import BenchmarkObject, benchmark_objects, image_from_depth, object_depth, unseen_objects
 from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
 
 OnProgress = Callable[[int, int], None]
@@ -44,27 +44,10 @@ def untracked(description: str) -> Generator[OnProgress]:
     yield lambda _done, _total: None
 
 
+TestSet = Literal["kinds", "unseen"]
+TEST_SETS: dict[TestSet, str] = {"kinds": "fixed test objects", "unseen": "fixed objects of kinds never seen"}
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 """Sensor without noise or dead pixels; saturation and quantisation stay."""
-
-
-class Subject(Protocol):
-    """Object with a known depth map."""
-
-    @property
-    def name(self) -> str:
-        """Name in tables and pictures."""
-        ...
-
-    @property
-    def category(self) -> str:
-        """Category."""
-        ...
-
-    @property
-    def depth_m(self) -> Float32:
-        """(64, 64); NaN for background."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -74,6 +57,11 @@ class SeededObject:
     name: str
     category: str
     depth_m: Float32
+    """(64, 64); NaN for background."""
+
+
+Subject = SeededObject | BenchmarkObject
+"""Object with a known depth map, a category, and a name for tables and pictures."""
 
 
 def seeded_objects(first_seed: int, count: int, box: ObjectBox) -> list[SeededObject]:
@@ -147,14 +135,17 @@ def rig_of(record: CheckpointRecord) -> Rig:
         ) from error
 
 
-def rendered_objects(rig: Rig, count: int | None = None, tracked: Tracked = untracked) -> HeldOutObjects:
-    """Render the 54 test objects, or `count` random ones, with the simulated camera's noise on a rig."""
+def rendered_objects(
+    rig: Rig, count: int | None = None, tracked: Tracked = untracked, *, test: TestSet = "kinds"
+) -> HeldOutObjects:
+    """Render the 54 test objects of a set, or `count` random ones, with the simulated camera's noise on a rig."""
     plan = DatasetPlan(rig, TEST_SEED)
-    subjects = seeded_objects(plan.first_seed, count, plan.box) if count else benchmark_objects(plan.box)
+    fixed = benchmark_objects if test == "kinds" else unseen_objects
+    subjects = seeded_objects(plan.first_seed, count, plan.box) if count else fixed(plan.box)
     with tracked("rendering test objects") as on_progress:
         echoes = echoes_of(subjects, rig, on_progress)
     maps = as_map_set(sense(echoes, rig), truth_of(subjects, plan.box))
-    kind = "random objects" if count else "fixed test objects"
+    kind = "random objects" if count else TEST_SETS[test]
     description = f"{len(subjects)} held-out {kind}, with the sensor's noise"
     return HeldOutObjects(description, [one.name for one in subjects], [one.category for one in subjects], maps, plan)
 

@@ -1,5 +1,6 @@
 __all__ = [
     "LOG_SUFFIXES",
+    "OBJECT_FORMATS",
     "OUTSIDE_LATENCY",
     "REPORT",
     "SHIPPED",
@@ -8,15 +9,19 @@ __all__ = [
     "BudgetChoice",
     "FrameLog",
     "FrameReader",
+    "Playback",
     "ReplayMedia",
+    "RunControl",
     "RunReport",
     "RunStatistics",
     "available_settings",
     "choose_within_budget",
     "describe_counts",
+    "export_objects",
     "ignore",
     "iterate_results",
     "low_latency_interpreter",
+    "offer_settings",
     "pipeline_timer",
     "realtime_priority",
     "replay_recording",
@@ -27,11 +32,22 @@ __all__ = [
     "yield_to_loop",
 ]
 
-from .budget import SHIPPED, BudgetChoice, available_settings, choose_within_budget, pipeline_timer, setting_loader
+from .budget import (
+    SHIPPED,
+    BudgetChoice,
+    available_settings,
+    choose_within_budget,
+    offer_settings,
+    pipeline_timer,
+    setting_loader,
+)
+from .control import RunControl
 from .frame_log import LOG_SUFFIXES, FrameLog
 from .frame_queue import FrameReader, ignore
 from .loop import describe_counts, iterate_results, run_live, warm_up
+from .object_files import OBJECT_FORMATS, export_objects
 from .physics_check_process import BackgroundPhysicsCheck
+from .playback import Playback
 from .realtime import low_latency_interpreter, realtime_priority, yield_to_loop
 from .replay import REPORT, replay_recording
 from .replay_media import VIDEO, ReplayMedia

@@ -11,26 +11,27 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from nlos_calibration import ObjectBox, Rig, rig_named
-from nlos_models import Reconstructor, load_record, shipped_folder
+from nlos_models import Reconstructor, load_reconstructor, load_record, shipped_folder
 from pydantic import BaseModel, Field, ValidationError
 
 from nlos_cam.camera import FRAMES_PER_S, Camera
 from nlos_cam.errors import BudgetError, RecordingError
 from nlos_cam.files import cache_folder
+from nlos_cam.live.control import RunControl
 from nlos_cam.live.loop import warm_up
 from nlos_cam.live.statistics import RunReport
 from nlos_cam.objects import object_box
-from nlos_cam.reconstruct import Clock, Pipeline
+from nlos_cam.reconstruct import CalibratedRig, Clock, Pipeline
 
 TRADEOFF = "tradeoff.json"
 """Table written by `tradeoff reconstruct`; one is beside the shipped weights."""
-SHIPPED = "shipped"
+SHIPPED, ONNX_FLOAT32 = "shipped", "ONNX Runtime float32"
 PERIOD_MS = 1000 / FRAMES_PER_S
 HANDOVER_MS = 2.4
 """From a frame's timestamp to its processing: 95th percentile of delivery and queue in docs/live.json."""
@@ -154,6 +155,33 @@ def load_tradeoff(path: Path) -> list[Setting]:
         ) from error
 
 
+def offer_settings(
+    control: RunControl, camera: Camera, bench: CalibratedRig, tradeoff: Path | None, weights: Path | None
+) -> None:
+    """Let a run's control choose between the measured settings in ONNX_FLOAT32; without a table, none.
+
+    The other runtimes are slower and no more accurate, and take seconds to import.
+    """
+    try:
+        available = available_settings(tradeoff, weights)
+    except (RecordingError, BudgetError):
+        return
+    settings = {each.name: each for each in available if each.runtime == ONNX_FLOAT32}
+    control.settings = [
+        (name, f"{name}: {each.milliseconds + each.averaging_ms:.0f} ms, error {each.rmse_mm:.1f} mm")
+        for name, each in settings.items()
+    ]
+
+    def load_setting(name: str) -> tuple[Reconstructor, int]:
+        setting = settings[name]
+        folder = weights if setting.weights == SHIPPED else Path(setting.weights)
+        network = load_reconstructor(folder, cache_folder() / "onnx", setting.threads)
+        warm_up(camera, Pipeline(bench, network))
+        return network, setting.frames
+
+    control.load_setting = load_setting
+
+
 def available_settings(tradeoff: Path | None, weights: Path | None) -> list[Setting]:
     """Return the measured settings that this machine can run. Raises RecordingError, and BudgetError without any."""
     processors = os.cpu_count() or 1
@@ -161,12 +189,19 @@ def available_settings(tradeoff: Path | None, weights: Path | None) -> list[Sett
         setting
         for setting in load_tradeoff(tradeoff or weights or shipped_folder())
         if setting.threads <= processors
-        and ("cuda" not in setting.runtime or torch.cuda.is_available())
+        and (setting.runtime == ONNX_FLOAT32 or find_spec("torch") is not None)  # others are made with torch
+        and ("cuda" not in setting.runtime or _has_cuda())
         and (setting.weights == SHIPPED or Path(setting.weights).is_dir())
     ]
     if not any(setting.frames == 1 for setting in available):
         raise BudgetError("this machine can run no setting of the trade-off: measure with `tradeoff reconstruct`")
     return available
+
+
+def _has_cuda() -> bool:
+    import torch
+
+    return torch.cuda.is_available()
 
 
 def keeping_pace(settings: Sequence[Setting], machine: Machine) -> list[Setting]:
@@ -234,8 +269,12 @@ def setting_loader(weights: Path | None, runtimes: Runtimes) -> Callable[[Settin
 
     def load(setting: Setting) -> Reconstructor:
         folder = weights if setting.weights == SHIPPED else Path(setting.weights)
+        if setting.runtime == ONNX_FLOAT32:
+            return load_reconstructor(folder, cache_folder() / "onnx", setting.threads)
         rig = rig_named(load_record(folder or shipped_folder()).rig_name)
         if setting.runtime.startswith("torch"):
+            import torch  # takes seconds, and is not needed for ONNX Runtime
+
             torch.set_num_threads(setting.threads)
         return runtimes(folder, rig, object_box(rig), cache_folder() / "onnx")[setting.runtime](setting.threads)
 

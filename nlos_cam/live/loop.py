@@ -12,6 +12,7 @@ import numpy as np
 
 from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.live.control import RunControl
 from nlos_cam.live.frame_queue import FrameReader, ignore
 from nlos_cam.live.statistics import DELIVERY, OnWarning, RunReport, RunStatistics
 from nlos_cam.live.telemetry import Telemetry, with_telemetry
@@ -125,23 +126,27 @@ def run_live(
     on_error: Callable[[RunReport], None] = ignore,
     on_warning: OnWarning = ignore,
     on_moment: Callable[[Moment], None] = ignore,
+    control: RunControl | None = None,
 ) -> RunReport:
     """Reconstruct and show an entered camera's frames until it ends, `stop` is set, or `seconds` have passed.
 
     A `recorded` camera loses no frame and is shown at the speed of its recording. If the camera does not stop in time,
     its context is closed from here. Frames that fail are counted. While no frame comes, the last one is shown again, as
-    stalled. `on_warning` is called when a warning begins and ends, `on_moment` for each result shown. Raises the
-    camera's errors, and NlosCamError if frame after frame fails, after `on_error` has received the report.
+    stalled. `on_warning` is called when a warning begins and ends, `on_moment` for each result shown. While `control`
+    is paused, frames are read and not reconstructed. Raises the camera's errors, and NlosCamError if frame after frame
+    fails, after `on_error` has received the report.
     """
-    statistics = RunStatistics(on_warning)
+    statistics, control = RunStatistics(on_warning), control or RunControl(clock=clock)
+    control.attach(camera, pipeline)
     frames, telemetry = with_telemetry(camera)
-    frames = count_issues(pace(frames, stop, clock) if recorded else frames, statistics.issues)
+    frames = control.watch(count_issues(pace(frames, stop, clock) if recorded else frames, statistics.issues))
 
     def should_stop() -> bool:
         return seconds is not None and statistics.duration_s(clock()) >= seconds
 
     def on_idle() -> None:
         if statistics.stall.update(clock(), reader.newest_s):
+            control.set_state("stalled", f"no frame for {clock() - (reader.newest_s or 0.0):.0f} s")
             display.show_stall()
 
     def report() -> RunReport:
@@ -160,13 +165,19 @@ def run_live(
     display = LiveDisplay(viewer, lambda: sum(statistics.lost(camera, reader).values()), reader, telemetry, clock)
     try:
         with reader, pipeline.checks:
-            for result in iterate_results(reader, pipeline, clock, statistics.fail, telemetry):
+            results = iterate_results(reader, pipeline, clock, statistics.fail, telemetry, lambda: control.paused)
+            for result in results:
                 moment = display.show(result)
                 statistics.add(result, clock() - result.published_s)
+                statistics.pace.update(statistics.frames, len(reader.dropped))
+                control.warnings = statistics.pace.warnings
+                control.add(moment)
                 on_moment(moment)
     except Exception:
         on_error(report())
         raise
+    finally:
+        control.end()
     return report()
 
 
@@ -181,10 +192,14 @@ def iterate_results(
     clock: Clock = time.time,
     on_failure: OnFailure = _raise_error,
     telemetry: Telemetry | None = None,
+    is_paused: Callable[[], bool] = lambda: False,
 ) -> Generator[FrameResult]:
-    """Yield the result of every frame of an entered reader, in order."""
+    """Yield the result of every frame of an entered reader, in order; frames that come while paused have none."""
     start_s, in_a_row = clock(), 0
     for arrival in reader:
+        if is_paused():
+            start_s = clock()
+            continue
         try:
             _update_temperatures(telemetry, arrival, pipeline)
             result = pipeline.process(arrival, clock, start_s)

@@ -19,14 +19,16 @@ from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.live.frame_queue import FrameReader, ignore
-from nlos_cam.live.loop import describe_counts, iterate_batched
+from nlos_cam.live.loop import iterate_batched
 from nlos_cam.live.replay_media import FrameSampler, ReplayMedia, draw_contact_sheet
+from nlos_cam.live.replay_report import ReplayFacts, replay_document
 from nlos_cam.live.statistics import OnWarning, WarningLog, frames_by_verdict
 from nlos_cam.live.telemetry import with_telemetry
 from nlos_cam.objects import object_box
-from nlos_cam.reconstruct import UNEXPLAINED, CalibratedRig, Clock, FrameResult, Pipeline, Verdict
+from nlos_cam.reconstruct import CalibratedRig, Clock, FrameResult, Pipeline, Verdict
+from nlos_cam.report import write_document
 
-RESULT, DIFFERENCE, SHEET, REPORT = "reconstruction.npz", "difference.npz", "frames.png", "report.md"
+RESULT, DIFFERENCE, SHEET, REPORT = "reconstruction.npz", "difference.npz", "frames.png", "report.html"
 SHEET_FRAMES = 6
 
 
@@ -69,7 +71,7 @@ class _Results:
         self.timestamps_s: list[float] = []
         self.numbers: list[int] = []
         self.verdict_of_frame: list[str] = []
-        self.with_surface = 0
+        self.with_surface, self.uncertainty_mm = 0, list[float]()
         self.verdicts: Counter[Verdict] = Counter()
         self.checks: dict[int, float] = {}
         """Scores by number of the checked frame."""
@@ -87,6 +89,8 @@ class _Results:
         self.numbers.append(result.frame.frame_number)
         self.verdict_of_frame.append(result.verdict or "")
         self.with_surface += reconstruction.has_surface
+        if reconstruction.has_surface and uncertainty_m is not None:
+            self.uncertainty_mm.append(1e3 * float(np.median(uncertainty_m[np.isfinite(depth_m)])))
         if result.check:
             self.checks[result.check.frame_number] = result.check.score
         self.samples.add(result)
@@ -135,7 +139,8 @@ def replay_recording(
         if bench.reference:
             np.savez_compressed(part / DIFFERENCE, **frame_fields, **_difference_fields(results, bench))
         draw_contact_sheet(part / SHEET, results.samples.results())
-        (part / REPORT).write_text(_report(camera, bench, results, stopped=stop.is_set()), encoding="utf-8")
+        facts = _facts(camera, bench, results, interrupted=stop.is_set())
+        write_document(replay_document(facts, part, out), part / REPORT)
     if not bench.reference:
         (out / DIFFERENCE).unlink(missing_ok=True)
     media.remove_stale(out)
@@ -173,31 +178,17 @@ def _difference_fields(results: _Results, bench: CalibratedRig) -> dict[str, Any
     }
 
 
-def _report(camera: Camera, bench: CalibratedRig, results: _Results, *, stopped: bool) -> str:
-    """Return the report as Markdown."""
-    frames, times_s, rig = len(results.numbers), results.timestamps_s, bench.rig
-    lines = [f"# Replay of {camera.uri}", ""]
-    if stopped:
-        lines += ["**Interrupted: only the frames up to then are included.**", ""]
-    lines += [
-        f"- frames: {frames}, numbers {results.numbers[0]} to {results.numbers[-1]}, {times_s[-1] - times_s[0]:.2f} s",
-        f"- skipped: {camera.incomplete} without all streams, {camera.dropped} missing from the recording",
-        f"- irregular messages: {describe_counts(camera.counts) or 'none'}",
-        f"- frames with a hidden surface: {results.with_surface} ({results.with_surface / frames:.0%})",
-        f"- rig: {rig.name} {rig.checksum}, {rig.lidar.distance_m:.3f} m to the wall, {rig.facing_deg:.1f} degrees",
-        f"- maps: {MAP_ROWS} x {MAP_COLUMNS}; hidden depth: {OBJECT_PIXELS} x {OBJECT_PIXELS} in `{RESULT}`",
-    ]
-    lines += [f"- verdict, {count} frames: {verdict}" for verdict, count in frames_by_verdict(results.verdicts).items()]
-    if scores := list(results.checks.values()):
-        unexplained = sum(score >= UNEXPLAINED for score in scores)
-        lines.append(
-            f"- physics check of {len(scores)} frames: median score {np.median(scores):.2f} (0: the reconstruction "
-            f"explains the maps, 1: no better than an empty bench), {unexplained} at {UNEXPLAINED:g} or more"
-        )
-    if bench.reference:
-        lines.append(f"- difference from the bare wall, the mean of {bench.reference.frames} frames: in `{DIFFERENCE}`")
-    lines += [
-        f"- warning, {each.frames} frames from {each.first} to {each.last}: {each.text}"
-        for each in results.warnings.spans
-    ]
-    return "\n".join([*lines, "", f"![some frames]({SHEET})", ""])
+def _facts(camera: Camera, bench: CalibratedRig, results: _Results, *, interrupted: bool) -> ReplayFacts:
+    return ReplayFacts(
+        camera,
+        bench.rig,
+        results.numbers,
+        results.timestamps_s,
+        results.with_surface,
+        results.uncertainty_mm,
+        frames_by_verdict(results.verdicts),
+        [*results.checks.values()],
+        results.warnings.spans,
+        bench.reference.frames if bench.reference else None,
+        interrupted=interrupted,
+    )

@@ -1,6 +1,7 @@
 """Media of a replay: contact sheet of some frames, saved view, still pictures, video."""
 
-from collections.abc import Generator, Mapping
+import shutil
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -9,10 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos_cam import view as view_package  # loads its heavy parts when they are used
+from nlos_cam.live.object_files import ObjectFiles
+from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import CalibratedRig, FrameResult
 from nlos_cam.view import MAX_UNCERTAINTY_M, Moment, Viewer
 
-VIEW, VIDEO, STILL, STILLS = "view.rrd", "replay.webm", "still-{:06d}.png", "still-*.png"
+VIEW, VIDEO, STILL, STILLS = "view.html", "replay.webm", "still-{:06d}.png", "still-*.png"
+OBJECT = "object"
+"""Folder of the hidden objects' files."""
 USUAL_PERCENT = 95
 Images = list[NDArray[np.float32]]
 
@@ -38,14 +43,25 @@ class FrameSampler:
 
 
 class ReplayMedia:
-    """Requested media of one replay: its view as a file, a number of stills, a video.
+    """Requested media of one replay: its view as a file, a number of stills, a video, the hidden objects' files.
 
     Give `add` the results while `into` is entered, which opens and closes the files; the stills, spread over the whole
     run, are drawn at its end.
     """
 
-    def __init__(self, bench: CalibratedRig, *, view: bool = False, stills: int = 0, video: bool = False) -> None:
+    def __init__(
+        self,
+        bench: CalibratedRig,
+        *,
+        view: bool = False,
+        stills: int = 0,
+        video: bool = False,
+        objects: Sequence[str] = (),
+        every: int = 1,
+    ) -> None:
         self._bench, self._view, self.video = bench, view, video
+        self._formats, self._every = objects, every
+        self._objects: ObjectFiles | None = None
         self._viewers: list[Viewer] = []
         self._stills = FrameSampler(stills) if stills else None
         self._names: set[str] = set()
@@ -55,9 +71,11 @@ class ReplayMedia:
         """Write the media into a folder; after an error there are no stills."""
         rig = self._bench.rig
         if self._view:
-            self._viewers.append(view_package.RrdFile(folder / VIEW, rig, self._bench.measured, keeps_all=True))
+            self._viewers.append(view_package.SessionFile(folder / VIEW, rig, self._bench.measured, keeps_all=True))
         if self.video:
             self._viewers.append(view_package.VideoFile(folder / VIDEO, rig))
+        if self._formats:
+            self._objects = ObjectFiles(folder / OBJECT, object_box(rig), self._formats, self._every)
         with ExitStack() as entered:
             for viewer in self._viewers:
                 entered.enter_context(viewer)
@@ -75,16 +93,19 @@ class ReplayMedia:
                 viewer.show(moment)
         if self._stills:
             self._stills.add(result)
+        if self._objects:
+            made = result.reconstruction
+            self._objects.add(result.frame.frame_number, made.depth_m, made.uncertainty_m)
 
     def remove_stale(self, out: Path) -> None:
         """Remove the media of an earlier replay from a folder."""
         for path in _media_in(out):
             if path.name not in self._names:
-                path.unlink()
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _media_in(folder: Path) -> list[Path]:
-    return [folder / name for name in (VIEW, VIDEO) if (folder / name).exists()] + list(folder.glob(STILLS))
+    return [folder / name for name in (VIEW, VIDEO, OBJECT) if (folder / name).exists()] + list(folder.glob(STILLS))
 
 
 def moment_of(result: FrameResult, celsius: Mapping[str, float] = MappingProxyType({})) -> Moment:

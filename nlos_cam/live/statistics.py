@@ -69,6 +69,34 @@ def percentiles_ms(seconds: NDArray[np.float64]) -> Percentiles:
     return {f"p{share}": 1e3 * float(value) for share, value in zip(SHARES, values, strict=True)}
 
 
+SLOW_FRAMES, MAX_SLOW_SHARE = 150, 0.02
+"""Of this many frames (5 s), the share dropped by slow processing above which there is a warning."""
+
+
+class PaceWatch:
+    """Detector of processing that is too slow, by the frames it drops; a warning begins and ends with it."""
+
+    def __init__(self, on_warning: OnWarning) -> None:
+        self.warnings: tuple[str, ...] = ()
+        self._on_warning, self._before = on_warning, (0, 0)
+
+    def update(self, frames: int, dropped: int) -> None:
+        """Take the numbers of frames with a result and of frames dropped so far; judged every SLOW_FRAMES."""
+        new, lost = frames - self._before[0], dropped - self._before[1]
+        if new + lost < SLOW_FRAMES:
+            return
+        self._before = frames, dropped
+        slow = lost > MAX_SLOW_SHARE * (new + lost)
+        text = (
+            f"processing is too slow: {lost} of the last {new + lost} frames were dropped; stop other programs "
+            "(another live run on these processors?), choose --budget-ms 30, or give each run processors of its own "
+            "(taskset)"
+        )
+        if slow != bool(self.warnings):
+            self._on_warning(text if slow else self.warnings[0], slow)
+        self.warnings = (text,) if slow else ()
+
+
 class StallWatch:
     """Detector of stalls: a warning begins and ends with each. Used by the loop's thread."""
 
@@ -183,7 +211,7 @@ class RunStatistics:
 
     def __init__(self, on_warning: OnWarning = ignore) -> None:
         self.warnings = WarningLog(on_warning)
-        self.stall = StallWatch(on_warning)
+        self.stall, self.pace = StallWatch(on_warning), PaceWatch(on_warning)
         self.frames = 0
         self.failed = 0
         """Frames whose processing raised an error."""

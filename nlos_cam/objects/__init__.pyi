@@ -9,6 +9,7 @@ __all__ = [
     "Coat",
     "MeshFile",
     "Pose",
+    "SurfaceMesh",
     "Up",
     "benchmark_objects",
     "box_width_m",
@@ -17,11 +18,13 @@ __all__ = [
     "depth_from_image",
     "find_category",
     "folder_objects",
+    "generic_depth",
     "image_from_albedo",
     "image_from_depth",
     "invisible_object_error",
     "load_object",
     "mesh_depth",
+    "mesh_from_depth",
     "object_box",
     "object_depth",
     "object_kind",
@@ -34,11 +37,13 @@ __all__ = [
     "read_depth_map",
     "read_mesh",
     "turn_upright",
+    "unseen_objects",
 ]
 
-from .benchmark import OBJECTS_PER_CATEGORY, BenchmarkObject, benchmark_objects
+from .benchmark import OBJECTS_PER_CATEGORY, BenchmarkObject, benchmark_objects, unseen_objects
 from .depth_map import cell_centers_m, depth_from_image, image_from_depth, object_box, orthographic_depth
 from .generators import CATEGORIES, find_category
+from .generic import generic_depth
 from .loading import OBJECT_FILES, load_object, object_kind
 from .meshes import (
     DEPTH_MAP_SUFFIX,
@@ -62,4 +67,5 @@ from .placement import (
     post,
     random_pose,
 )
+from .surface_mesh import SurfaceMesh, mesh_from_depth
 from .textures import TEXTURES, Coat, image_from_albedo, paint

@@ -1,7 +1,8 @@
-"""Benchmark of 54 fixed objects: three of each category, with settings that no training seed can draw.
+"""Two benchmarks of 54 fixed objects: of the 18 categories, with settings that no training seed can draw, and of 18
+kinds that training never sees.
 
 Nothing here is random. Each setting that has a held-out interval takes its value from it (`generators.Setting`); other
-settings and the poses are spread evenly over the training ranges.
+settings and the poses are spread evenly over the training ranges, and are the same in both benchmarks.
 """
 
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ from nlos_calibration.arrays import Float32, Float64
 from nlos_cam.objects.depth_map import orthographic_depth
 from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.placement import Pose, place, pose_from_units
+from nlos_cam.objects.unseen import KINDS
 
 OBJECTS_PER_CATEGORY = 3
 POSE_STEPS = (19, 7, 43, 13, 31, 25, 37)
@@ -43,11 +45,23 @@ def benchmark_objects(box: ObjectBox) -> list[BenchmarkObject]:
     return [_object(name, number, box) for name in CATEGORIES for number in range(OBJECTS_PER_CATEGORY)]
 
 
+def unseen_objects(box: ObjectBox) -> list[BenchmarkObject]:
+    """Return 54 objects of kinds that training never sees, three of each, bit for bit the same in every run."""
+    rows = ((name, make, k) for name, make in KINDS.items() for k in range(OBJECTS_PER_CATEGORY))
+    return [_placed(name, k, {}, make(k), row, box) for row, (name, make, k) in enumerate(rows)]
+
+
 def _object(name: str, k: int, box: ObjectBox) -> BenchmarkObject:
     kind, row = CATEGORIES[name], OBJECTS_PER_CATEGORY * list(CATEGORIES).index(name) + k
     settings = kind.draw_held_out(_even(k, 1 + n % 2, OBJECTS_PER_CATEGORY) for n in range(len(kind.settings)))
+    return _placed(name, k, settings, kind.make(**settings), row, box)
+
+
+def _placed(
+    name: str, k: int, settings: Mapping[str, float], shape: Float64, row: int, box: ObjectBox
+) -> BenchmarkObject:
     pose = pose_from_units([_even(row, step, OBJECTS_PER_CATEGORY * len(CATEGORIES)) for step in POSE_STEPS], box)
-    triangles = place(kind.make(**settings), pose, box)
+    triangles = place(shape, pose, box)
     depth_m = orthographic_depth(triangles, box)
     return BenchmarkObject(f"{name}-{k + 1}", name, k + 1, settings, pose, triangles, depth_m)
 

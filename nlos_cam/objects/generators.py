@@ -7,12 +7,11 @@ and from which the benchmark takes its values.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 import numpy as np
 from nlos_calibration.arrays import Float64
 
-from nlos_cam.errors import SceneError
+from nlos_cam.errors import UnknownNameError, did_you_mean
 from nlos_cam.objects.primitives import (
     arch,
     at,
@@ -413,13 +412,8 @@ CATEGORIES: dict[str, Category] = {
 
 
 def find_category(name: str) -> Category:
-    """Return a category by name. Raises SceneError, with the nearest name, where there is none."""
+    """Return a category by name. Raises UnknownNameError, with the nearest name, where there is none."""
     if name in CATEGORIES:
         return CATEGORIES[name]
-    raise SceneError(f"no object category {name!r}.{suggest_category(name)} Choose from {', '.join(CATEGORIES)}")
-
-
-def suggest_category(name: str) -> str:
-    """Return " Did you mean ...?" with the category nearest to a name, empty where none is near."""
-    nearest = get_close_matches(name, CATEGORIES, 1)
-    return f" Did you mean {nearest[0]!r}?" if nearest else ""
+    choices = f"Choose from {', '.join(CATEGORIES)}"
+    raise UnknownNameError(f"no object category {name!r}.{did_you_mean(name, CATEGORIES)} {choices}")

@@ -8,9 +8,9 @@ import numpy as np
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32
 
-from nlos_cam.errors import SceneError
+from nlos_cam.errors import SceneError, UnknownNameError, did_you_mean
 from nlos_cam.objects.depth_map import orthographic_depth
-from nlos_cam.objects.generators import CATEGORIES, suggest_category
+from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.meshes import DEPTH_MAP_SUFFIX, MESH_SUFFIXES, Up, read_depth_map, read_mesh, turn_upright
 from nlos_cam.objects.placement import Pose, category_triangles, fit_in_box, invisible_object_error, place
 
@@ -30,7 +30,7 @@ class LoadedObject:
 
 
 def object_kind(name_or_path: str) -> ObjectKind:
-    """Return the kind of an object by its name or file suffix. Raises SceneError, with the nearest category."""
+    """Return the kind of an object by its name or file suffix. Raises UnknownNameError, with the nearest category."""
     suffix = Path(name_or_path).suffix.lower()
     if name_or_path in CATEGORIES:
         return "category"
@@ -39,7 +39,7 @@ def object_kind(name_or_path: str) -> ObjectKind:
     if suffix == DEPTH_MAP_SUFFIX:
         return "depth map"
     advice = f"Give {OBJECT_FILES}, or one of {', '.join(CATEGORIES)}"
-    raise SceneError(f"no object {name_or_path!r}.{suggest_category(name_or_path)} {advice}")
+    raise UnknownNameError(f"no object {name_or_path!r}.{did_you_mean(name_or_path, CATEGORIES)} {advice}")
 
 
 def load_object(

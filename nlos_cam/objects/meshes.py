@@ -20,7 +20,7 @@ import trimesh
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
 
-from nlos_cam.errors import SceneError
+from nlos_cam.errors import SceneError, SceneFileError
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import orthographic_depth
 from nlos_cam.objects.placement import place, random_pose
@@ -31,6 +31,10 @@ _COMMENT = re.compile(rb"#[^\n]*")
 _RELATIVE = re.compile(rb" -(\d+)")
 _RELATIVE_FACE = re.compile(rb"^f [^\n]*-", re.MULTILINE)
 _VERTEX_0 = re.compile(rb"^f[^\n]* 0+(?!\d)", re.MULTILINE)
+
+
+class _MeshProblemError(ValueError):
+    """Problem of a mesh file, in words for its user."""
 
 
 def plain(content: bytes, suffix: str) -> bytes:
@@ -50,10 +54,10 @@ def plain(content: bytes, suffix: str) -> bytes:
 
 def _checked_binary(content: bytes, suffix: str) -> bytes:
     if suffix == ".obj":
-        raise ValueError("it is not text")
+        raise _MeshProblemError("it is not text")
     faces = int.from_bytes(content[80:84], "little")
     if suffix == ".stl" and len(content) != 84 + 50 * faces:
-        raise ValueError(f"it has {len(content)} bytes, but its {faces} faces take {84 + 50 * faces}")
+        raise _MeshProblemError(f"it has {len(content)} bytes, but its {faces} faces take {84 + 50 * faces}")
     return content
 
 
@@ -62,7 +66,7 @@ def _plain_obj(text: bytes) -> bytes:
     if _RELATIVE_FACE.search(text):
         text = _with_absolute_indices(text)
     if _VERTEX_0.search(text):
-        raise ValueError("a face names vertex 0, but vertices count from 1")
+        raise _MeshProblemError("a face names vertex 0, but vertices count from 1")
     return text
 
 
@@ -109,18 +113,18 @@ class MeshFile:
 
 
 def read_mesh(path: Path) -> MeshFile:
-    """Return a mesh with all its parts. Raises SceneError for a file without a mesh that can be placed."""
+    """Return a mesh with all its parts. Raises SceneFileError for a file without a mesh that can be placed."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise SceneError(f"{path} is not a mesh: give a file that ends in {', '.join(MESH_SUFFIXES)}")
+        raise SceneFileError(f"{path} is not a mesh: give a file that ends in {', '.join(MESH_SUFFIXES)}")
     with _readable(path, f"{suffix} file", "export it again, as triangles"):
         if (size := path.stat().st_size) > MAX_BYTES:
-            raise SceneError(f"{path} has {size / 2**20:.0f} MiB, the limit is {MAX_BYTES >> 20} MiB: {_REDUCE}")
+            raise SceneFileError(f"{path} has {size / 2**20:.0f} MiB, the limit is {MAX_BYTES >> 20} MiB: {_REDUCE}")
         content = path.read_bytes()
         parts = _parts(content, suffix)
         triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
     if problem := _problem(triangles):
-        raise SceneError(f"{path} {problem}")
+        raise SceneFileError(f"{path} {problem}")
     return MeshFile(path, hashlib.sha256(content).hexdigest(), triangles)
 
 
@@ -135,19 +139,19 @@ def turn_upright(triangles: Float64, up: Up) -> Float64:
 def read_depth_map(path: Path) -> Float32:
     """Return a depth map (n, n) in metres over the object box, NaN for background, from numbers of any real type.
 
-    Raises SceneError where the file holds anything else.
+    Raises SceneFileError where the file holds anything else.
     """
     with _readable(path, "depth map", "save one with numpy.save(file, depth_m)"):
         stored = np.lib.format.open_memmap(path, mode="r")  # no pickles; a huge shape in the header costs nothing
     if stored.dtype.kind not in "fiu":
-        raise SceneError(f"{path} holds {stored.dtype} values: a depth map holds real numbers, in metres")
+        raise SceneFileError(f"{path} holds {stored.dtype} values: a depth map holds real numbers, in metres")
     if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or not MIN_CELLS <= len(stored) <= MAX_CELLS:
         size = f"(n, n) with n from {MIN_CELLS} to {MAX_CELLS}"
-        raise SceneError(f"{path} has shape {stored.shape}: a depth map has shape {size}")
+        raise SceneFileError(f"{path} has shape {stored.shape}: a depth map has shape {size}")
     surface = stored[~np.isnan(stored)]
     if surface.size and not (surface.min() >= 0 and surface.max() <= MAX_DEPTH_M):
         worst = surface.min() if surface.min() < 0 else surface.max()
-        raise SceneError(
+        raise SceneFileError(
             f"{path} has a depth of {worst:g} m: depths are in metres from the wall into the room, "
             f"0 to {MAX_DEPTH_M:g} (negative is behind the wall), NaN for background"
         )
@@ -156,16 +160,16 @@ def read_depth_map(path: Path) -> Float32:
 
 @contextmanager
 def _readable(path: Path, kind: str, advice: str) -> Generator[None]:
-    """Raise any error of a parser on a missing or damaged file as one SceneError."""
+    """Raise any error of a parser on a missing or damaged file as one SceneFileError."""
     try:
         yield
     except SceneError:
         raise
     except OSError as error:
-        raise SceneError(f"{path} cannot be read as a {kind}: {error.strerror or error}") from error
+        raise SceneFileError(f"{path} cannot be read as a {kind}: {error.strerror or error}") from error
     except Exception as error:
-        detail = " ".join(f"{type(error).__name__}: {error}".split())
-        raise SceneError(f"{path} is damaged or not a {kind} ({detail:.120}): {advice}") from error
+        problem = f" ({error})" if isinstance(error, _MeshProblemError) else ""  # a parser's own words would not help
+        raise SceneFileError(f"{path} is damaged or not a {kind}{problem}: {advice}") from error
 
 
 @contextmanager
@@ -194,7 +198,7 @@ def _parts(content: bytes, suffix: str) -> list[trimesh.Trimesh]:
 def _triangles(part: trimesh.Trimesh) -> Float64:
     faces = np.asarray(part.faces, np.int64).reshape(-1, 3)
     if faces.size and faces.min() < 0:
-        raise ValueError(f"a face names vertex {faces.min()}")
+        raise _MeshProblemError(f"a face names vertex {faces.min()}")
     return np.asarray(part.vertices, np.float64)[faces]
 
 

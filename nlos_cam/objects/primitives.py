@@ -90,6 +90,16 @@ def slab(corners: Sequence[Point], thickness: float) -> Float64:
     return np.vstack([front, back])[np.asarray(faces)]
 
 
+def prism(outline: NDArray[np.float64], thickness: float, taper: float = 1.0) -> Float64:
+    """Return a star-shaped polygon (n, 2) about the origin with a thickness along z; its front is `taper` as wide."""
+    a, b = outline, np.roll(outline, -1, axis=0)
+    middle, half = np.zeros_like(a), thickness / 2
+    near = [np.pad(taper * points, ((0, 0), (0, 1)), constant_values=-half) for points in (a, b, middle)]
+    far = [np.pad(points, ((0, 0), (0, 1)), constant_values=half) for points in (a, b, middle)]
+    sides = [[near[0], near[1], far[1]], [near[0], far[1], far[0]]]
+    return np.concatenate([np.stack(corners, axis=1) for corners in (near, far, *sides)])
+
+
 def bar(start: Point, end: Point, width: float, thickness: float) -> Float64:
     """Return a straight bar in the x-y plane from one point to another."""
     (x0, y0), (x1, y1) = start, end

@@ -5,6 +5,7 @@ __all__ = [
     "Clock",
     "FrameConditions",
     "FrameResult",
+    "Mirrored",
     "PeriodicPhysicsCheck",
     "PhysicsCheck",
     "PhysicsCheckResult",
@@ -28,7 +29,7 @@ __all__ = [
 ]
 
 from .bench import CalibratedRig, check_intrinsics, open_bench
-from .network import Clock, Reconstruction, reconstruct
+from .network import Clock, Mirrored, Reconstruction, reconstruct
 from .physics_check import (
     UNEXPLAINED,
     PeriodicPhysicsCheck,

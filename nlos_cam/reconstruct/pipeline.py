@@ -87,7 +87,16 @@ class Pipeline:
         self.bench, self.network, self.uncertainty_model = bench, network, uncertainty_model
         self.checks = checks or NullPhysicsCheck()
         self._verdicts = VerdictFilter(verdict_limits(uncertainty_model) if uncertainty_model else None)
-        self._uses_difference, self._mean = uses_difference, MapMean(average)
+        self._uses_difference, self.average = uses_difference, average
+
+    @property
+    def average(self) -> int:
+        """Frames whose maps are averaged; setting it begins a new mean. Any thread may set it."""
+        return self._average
+
+    @average.setter
+    def average(self, frames: int) -> None:
+        self._average, self._mean = frames, MapMean(frames)
 
     def process(self, arrival: Arrival, clock: Clock, start_s: float) -> FrameResult:
         """Return the result of one frame; `start_s` is when the loop began to wait for it."""
@@ -97,15 +106,15 @@ class Pipeline:
 
     def prepare(self, arrival: Arrival, clock: Clock, start_s: float) -> PreparedFrame:
         """Return the maps of a frame as the networks need them; call in frame order."""
-        taken_s = clock()
+        taken_s, bench = clock(), self.bench  # another thread may replace it
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
         maps = self._mean.add(maps)
-        observation = self.bench.observe(arrival.frame, maps)
+        observation = bench.observe(arrival.frame, maps)
         observed_s = clock()
         stages_s = {"wait": taken_s - start_s, "queue": taken_s - arrival.arrived_s}
         stages_s |= {"maps": mapped_s - taken_s, "bench": observed_s - mapped_s}
-        corrected = self.bench.correct_range(maps)
+        corrected = bench.correct_range(maps)
         network_input = observation.difference if self._uses_difference and observation.difference else corrected
         return PreparedFrame(arrival, maps, observation, corrected, network_input, stages_s)
 

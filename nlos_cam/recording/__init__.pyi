@@ -1,4 +1,5 @@
 __all__ = [
+    "SAMPLE",
     "TEMPERATURE_INTERVAL_S",
     "BagReader",
     "CaptureResult",
@@ -7,10 +8,12 @@ __all__ = [
     "ExportOptions",
     "ExportResult",
     "Format",
+    "QualityMeter",
     "RepairResult",
     "ReplayCamera",
     "SdkReplayCamera",
     "Sidecar",
+    "SidecarFile",
     "State",
     "Summary",
     "VerifyResult",
@@ -24,10 +27,20 @@ __all__ = [
     "verify",
 ]
 
-from .bag_reader import BagReader
+from .bag_reader import SAMPLE, BagReader
 from .capture import CaptureResult, CaptureSession, CaptureTarget, finalize
 from .export import ExportOptions, ExportResult, Format, export_recording
 from .playback import ReplayCamera, VerifyResult, open_lidar_bag, verify
+from .quality import QualityMeter
 from .repair import RepairResult, repair_recording
 from .sdk_playback import SdkReplayCamera
-from .sidecar import TEMPERATURE_INTERVAL_S, Sidecar, State, Summary, load_measured_wall, load_sidecar, sidecar_path
+from .sidecar import (
+    TEMPERATURE_INTERVAL_S,
+    Sidecar,
+    SidecarFile,
+    State,
+    Summary,
+    load_measured_wall,
+    load_sidecar,
+    sidecar_path,
+)

@@ -1,7 +1,9 @@
 """Messages that librealsense writes into a .bag, as values: images, intrinsics, poses, metadata."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +38,11 @@ ENCODINGS = {
 """By the name in the file."""
 STREAM_INFO = "uint32 fps\nstring encoding\nbool is_recommended\n"
 """The one definition that ROS does not have. Never taken from the file: rosbags compiles definitions to Python."""
+INFO, CAMERA = "realsense_msgs/msg/StreamInfo", "sensor_msgs/msg/CameraInfo"
+IMAGE, NUMBER, PAIR = "sensor_msgs/msg/Image", "std_msgs/msg/Float32", "diagnostic_msgs/msg/KeyValue"
+TRANSFORM = "geometry_msgs/msg/Transform"
+MAX_PIXELS, MAX_TEXT = 1 << 23, 200
+"""Bounds on an image, four times the largest of a RealSense camera, and on the characters of a value."""
 TAIL_MARK = b"\x01\x00\x00\x001"
 """The frame_id of an image with its depth unit after it, against its definition; since librealsense 2.49."""
 TAIL_BYTES, FRAME_ID_AT = 4, 12
@@ -45,7 +52,7 @@ UNIT_TOLERANCE = 1e-3
 @cache
 def _types() -> Typestore:
     types = get_typestore(Stores.ROS1_NOETIC)
-    types.register(get_types_from_msg(STREAM_INFO, "realsense_msgs/msg/StreamInfo"))
+    types.register(get_types_from_msg(STREAM_INFO, INFO))
     return types
 
 
@@ -54,9 +61,14 @@ def is_known(message_type: str) -> bool:
     return message_type in _types().fielddefs
 
 
-def parse(raw: memoryview, message_type: str) -> Any:
-    """Return a message as rosbags deserialises it. Damaged bytes can raise almost any exception."""
-    if message_type == "sensor_msgs/msg/Image" and _has_tail(raw):
+def parse(raw: memoryview, message_type: str, expected: str = "") -> Any:
+    """Return a message as rosbags deserialises it. Damaged bytes can raise almost any exception.
+
+    Raises ValueError where it is of another type than `expected`.
+    """
+    if expected and message_type != expected:
+        raise ValueError(f"a message of type {message_type} in place of {expected}")
+    if message_type == IMAGE and _has_tail(raw):
         raw = raw[:-TAIL_BYTES]
     return _types().deserialize_ros1(raw, message_type)
 
@@ -92,14 +104,22 @@ def pixels(image: Any, encoding: str, intrinsics: Intrinsics) -> NDArray[Any]:
     is_declared = (image.width, image.height) == (intrinsics.width, intrinsics.height)
     if image.encoding != encoding or not (is_declared or image.step == row_bytes):
         raise ValueError(f"an image of {image.width} x {image.height} {image.encoding}")
+    if image.data.nbytes != image.height * image.step or image.width * image.height == 0:
+        raise ValueError(f"an image of {image.width} x {image.height} with {image.data.nbytes} bytes")
     rows = image.data.reshape(image.height, image.step)
     values = np.array(rows[:, :row_bytes]).view(dtype)
     return values.reshape(image.height, image.width, *([channels] if channels > 1 else []))
 
 
 def intrinsics_of(info: Any) -> Intrinsics:
-    """Return the pinhole parameters of a CameraInfo, whose K is the matrix (3, 3) by rows."""
-    return Intrinsics(info.width, info.height, *(float(info.K[i]) for i in (0, 4, 2, 5)))
+    """Return the pinhole parameters of a CameraInfo, whose K is the matrix (3, 3) by rows.
+
+    Raises ValueError where they are not finite, or the size is none of a camera.
+    """
+    numbers = [float(info.K[i]) for i in (0, 4, 2, 5)]
+    if not 0 < info.width * info.height <= MAX_PIXELS or not all(map(isfinite, numbers)):
+        raise ValueError(f"a camera of {info.width} x {info.height} pixels with the pinhole {numbers}")
+    return Intrinsics(info.width, info.height, *numbers)
 
 
 def lens_of(info: Any) -> tuple[str, Float64]:
@@ -133,6 +153,20 @@ class FrameMetadata:
 
 def metadata(pairs: list[Any]) -> FrameMetadata:
     """Return a frame's metadata from its KeyValue messages."""
-    values = {sdk_name(pair.key): pair.value for pair in pairs}
+    values = texts_of(pairs)
     domain = sdk_name(values.pop("timestamp_domain", ""))
-    return FrameMetadata(domain, {name: float(value) for name, value in values.items()})
+    return FrameMetadata(domain, finite({name: float(value) for name, value in values.items()}))
+
+
+def texts_of(pairs: list[Any]) -> dict[str, str]:
+    """Return the values of KeyValue messages by the SDK's name, printable and of bounded length."""
+    return {sdk_name(_printable(pair.key)): _printable(pair.value) for pair in pairs}
+
+
+def _printable(text: str) -> str:
+    return "".join(filter(str.isprintable, text[:MAX_TEXT]))
+
+
+def finite(values: Mapping[str, float]) -> dict[str, float]:
+    """Return the finite values: JSON has no others."""
+    return {name: value for name, value in values.items() if isfinite(value)}

@@ -4,34 +4,61 @@ import re
 from bisect import bisect_left, bisect_right
 from bz2 import BZ2Decompressor
 from collections import defaultdict
-from collections.abc import Generator, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from heapq import merge
 from io import BufferedReader, BytesIO, FileIO
-from itertools import count, repeat
+from itertools import count, pairwise, repeat
 from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from lz4.frame import LZ4FrameDecompressor
 from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float64
+from nlos_models import describe
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
 from nlos_cam.camera import Sample, repair_command
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording import bag_messages
-from nlos_cam.recording.bag_messages import ENCODINGS, FrameMetadata, sdk_name
-from nlos_cam.recording.rosbag import CHUNK_LIMIT, MAGIC
+from nlos_cam.recording.bag_messages import (
+    CAMERA,
+    ENCODINGS,
+    IMAGE,
+    INFO,
+    MAX_TEXT,
+    NUMBER,
+    PAIR,
+    TRANSFORM,
+    FrameMetadata,
+    sdk_name,
+)
+from nlos_cam.recording.rosbag import (
+    CHUNK_LIMIT,
+    FILE_HEADER_BYTES,
+    MAGIC,
+    MAX_CONNECTIONS,
+    BagFormatError,
+    number,
+    read_record,
+    reader,
+)
 
 DEVICE = "/device_0"
-STREAM = re.compile(DEVICE + r"/sensor_(\d+)/(\w+)_(\d+)(?=/image/data$)")
-OPTION = re.compile(DEVICE + r"/sensor_(\d+)/option/(.+)/value")
+STREAM = re.compile(DEVICE + r"/sensor_([0-9]{1,3})/([A-Za-z_]{1,40})_([0-9]{1,3})(?=/image/data$)")
+OPTION = re.compile(DEVICE + r"/sensor_([0-9]{1,3})/option/(.{1,80})/value")
+MAX_STREAMS = 64
+MIN_READS, BYTES_PER_READ = 2_000_000, 100
+"""Bound on the reads of an index, two for each entry, so that it cannot fill the memory."""
+T = TypeVar("T")
 STATIC_NS = 1
 """The time that librealsense gives to values in force when the recording began."""
+SAMPLE = Path(__file__).parent / "sample.bag"
+"""Recording that comes with the package: eight frames of the simulated airplane; the name "sample" stands for it."""
 DECOMPRESSORS = {"lz4": LZ4FrameDecompressor, "bz2": BZ2Decompressor}
 
 
@@ -86,7 +113,7 @@ class BagReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path = path = SAMPLE if str(path) == SAMPLE.stem and not path.exists() else path
         self.entries: dict[str, list[Entry]] = {}
         """Messages of each topic, in order of time."""
         self.types: dict[str, str] = {}
@@ -98,39 +125,47 @@ class BagReader:
         _check_start(path)
         with raise_as_recording_error(path, "is cut short or damaged"):
             self._read_index()
-        self.device: Mapping[str, str] = self._key_values(f"{DEVICE}/info")
+        self.device: Mapping[str, str] = bag_messages.texts_of(self._all(f"{DEVICE}/info"))
         """By the SDK's names: name, serial_number, firmware_version, product_line, ..."""
         matches = [match for topic, entries in self.entries.items() if entries and (match := STREAM.match(topic))]
-        infos = [self._stream_info(*match.groups(), topic=match[0]) for match in matches]
-        self.streams: Mapping[str, StreamInfo] = {info.name: info for info in infos}
-        """Streams with at least one frame, by name."""
+        with raise_as_recording_error(path, "is damaged"):
+            if len(matches) > MAX_STREAMS:
+                raise ValueError(f"it has {len(matches)} streams")
+            infos = [self._stream_info(*match.groups(), topic=match[0]) for match in matches]
+            self.streams: Mapping[str, StreamInfo] = {info.name: info for info in infos}
+            """Streams with at least one frame, by name."""
+            if len(self.streams) < len(infos):
+                raise ValueError("two of its streams have one name")
 
     def _read_index(self) -> None:
         found: dict[str, list[Entry]] = defaultdict(list)
+        _check_topics(self.path)
         with Reader(cast("Any", _BoundedPath(self.path))) as reader:
             for connection in reader.connections:
                 index = reader.indexes.pop(connection.id)  # half a million tuples for ten minutes: keep one copy
                 found[connection.topic].extend(Entry(*place, connection.id) for place in index)
-                self.types[connection.topic] = connection.msgtype
+                if self.types.setdefault(connection.topic, connection.msgtype) != connection.msgtype:
+                    raise ValueError(f"messages of two types on {connection.topic[:MAX_TEXT]}")
         if not found:
             raise ValueError("its index is empty")
         self.entries = {topic: sorted(entries) for topic, entries in found.items()}
+        if any(one[:3] == two[:3] for entries in self.entries.values() for one, two in pairwise(entries)):
+            raise ValueError("its index lists a message twice")
         self.end_ns = max((entries[-1].time_ns for entries in self.entries.values() if entries), default=0)
 
     def _stream_info(self, sensor: str, kind: str, index: str, topic: str) -> StreamInfo:
-        info, camera = self._first(f"{topic}/info"), self._first(f"{topic}/info/camera_info")
+        encoding, frames_per_s = self._first(f"{topic}/info", INFO, lambda info: (info.encoding[:MAX_TEXT], info.fps))
+        pinhole = self._first(f"{topic}/info/camera_info", CAMERA, bag_messages.intrinsics_of)
         name, frames = sdk_name(kind if index == "0" else f"{kind}_{index}"), len(self.entries[f"{topic}/image/data"])
-        pinhole = bag_messages.intrinsics_of(camera)
-        return StreamInfo(name, topic, int(sensor), info.encoding, info.fps, pinhole, frames)
+        return StreamInfo(name, topic, int(sensor), encoding, frames_per_s, pinhole, frames)
 
-    def _first(self, topic: str) -> Any:
+    def _first(self, topic: str, kind: str, convert: Callable[[Any], T]) -> T:
         if entries := self.entries.get(topic):
-            return self.read(topic, entries[0])
+            return self.read(topic, entries[0], kind, convert)
         raise RecordingError(f"{self.path} is damaged (it has no {topic}): {repair_advice(self.path)}")
 
-    def _key_values(self, topic: str) -> dict[str, str]:
-        pairs = [self.read(topic, entry) for entry in self.entries.get(topic, ())]
-        return {sdk_name(pair.key): pair.value for pair in pairs}
+    def _all(self, topic: str) -> list[Any]:
+        return [self.read(topic, entry, PAIR) for entry in self.entries.get(topic, ())]
 
     def check(self) -> None:
         """Read every message, in the order of the file. Raises RecordingError at the first damage."""
@@ -141,14 +176,14 @@ class BagReader:
                 raw = self.raw(entry)
                 if not bag_messages.is_known(self.types[topic]):
                     continue
-                message = bag_messages.parse(raw, self.types[topic])
+                message = bag_messages.parse(raw, self.types[topic], IMAGE if topic in images else "")
                 if topic in images:
                     bag_messages.pixels(message, images[topic].encoding, images[topic].intrinsics)
 
-    def read(self, topic: str, entry: Entry) -> Any:
-        """Return a message as rosbags deserialises it."""
+    def read(self, topic: str, entry: Entry, kind: str = "", convert: Callable[[Any], Any] = lambda it: it) -> Any:
+        """Return a message as rosbags deserialises it, converted; it has to be of the type `kind`, if given."""
         with self._locate(entry):
-            return bag_messages.parse(self.raw(entry), self.types[topic])
+            return convert(bag_messages.parse(self.raw(entry), self.types[topic], kind))
 
     def _locate(self, entry: Entry) -> AbstractContextManager[None]:
         """Raise any exception within the block as a RecordingError that names this place in the recording."""
@@ -194,17 +229,19 @@ class BagReader:
         info, entry = self.streams[stream], self._frames(stream)[index]
         if not info.format:
             raise RecordingError(f"{self.path}: unsupported encoding of the {stream} stream: {info.encoding}")
-        image = self.read(f"{info.topic}/image/data", entry)
-        with self._locate(entry):
+
+        def convert(image: Any) -> Sample:
             pixels = bag_messages.pixels(image, info.encoding, info.intrinsics)
-        return Sample(stream, image.header.seq, bag_messages.timestamp_s(image), pixels)
+            return Sample(stream, image.header.seq, bag_messages.timestamp_s(image), pixels)
+
+        return self.read(f"{info.topic}/image/data", entry, IMAGE, convert)
 
     def metadata(self, stream: str, index: int) -> FrameMetadata:
         """Return the metadata of a frame by its index in its stream."""
         frame, topic = self._frames(stream)[index], f"{self.streams[stream].topic}/image/metadata"
         entries = self.entries.get(topic, [])
         first, end = (side(entries, frame.time_ns, key=lambda e: e.time_ns) for side in (bisect_left, bisect_right))
-        pairs = [self.read(topic, entry) for entry in entries[first:end]]
+        pairs = [self.read(topic, entry, PAIR) for entry in entries[first:end]]
         with self._locate(frame):
             return bag_messages.metadata(pairs)
 
@@ -222,7 +259,7 @@ class BagReader:
 
     def lens(self, stream: str) -> tuple[str, Float64]:
         """Return the distortion model of a stream, by the SDK's name, and its coefficients."""
-        return bag_messages.lens_of(self._first(f"{self.streams[stream].topic}/info/camera_info"))
+        return self._first(f"{self.streams[stream].topic}/info/camera_info", CAMERA, bag_messages.lens_of)
 
     def pose(self, stream: str, other: str) -> Float64:
         """Return stream_from_other (4, 4): the pose of another stream's camera in the frame of this stream's.
@@ -240,8 +277,7 @@ class BagReader:
         start, poses = f"{self.streams[stream].topic}/tf/", dict[str, Float64]()
         for topic, entries in self.entries.items():
             if topic.startswith(start) and entries:
-                with self._locate(entries[0]):
-                    poses[topic.removeprefix(start)] = bag_messages.pose_of(self.read(topic, entries[0]))
+                poses[topic.removeprefix(start)] = self.read(topic, entries[0], TRANSFORM, bag_messages.pose_of)
         return poses
 
     def depth_unit_m(self) -> float:
@@ -272,8 +308,11 @@ class _SensorOptions:
         if due != self._applied:
             ahead = due > self._applied
             latest = {topic: entry for entry, topic in self._changes[self._applied if ahead else 0 : due]}
-            read = {self._names[topic]: float(self._bag.read(topic, entry).data) for topic, entry in latest.items()}
-            self._values, self._applied = self._values | read if ahead else read, due
+            read = {
+                self._names[topic]: self._bag.read(topic, entry, NUMBER, lambda number: float(number.data))
+                for topic, entry in latest.items()
+            }
+            self._values, self._applied = bag_messages.finite(self._values | read if ahead else read), due
         return self._values
 
 
@@ -283,11 +322,14 @@ class _BoundedFile(BufferedReader):
     def __init__(self, path: Path) -> None:
         super().__init__(FileIO(path))
         self._left = path.stat().st_size
+        self._reads = MIN_READS + self._left // BYTES_PER_READ
 
     def read(self, size: int | None = -1, /) -> bytes:
         wanted = self._left if size is None or size < 0 else size
         data = super().read(min(wanted, self._left, CHUNK_LIMIT))
-        self._left -= len(data)
+        self._left, self._reads = self._left - len(data), self._reads - 1
+        if self._reads < 0:
+            raise ValueError("its index has more entries than a recording of its size")
         return data
 
 
@@ -320,6 +362,14 @@ def _unpack(packed: bytes, compression: str, size: int) -> bytes:
     return content
 
 
+def _check_topics(path: Path) -> None:
+    """Raise OverflowError for a file header with absurdly many topics; rosbags reports a damaged one."""
+    with path.open("rb") as file, suppress(BagFormatError):
+        head = read_record(reader(file.read(FILE_HEADER_BYTES)), len(MAGIC))
+        if (topics := number(head.fields, "conn_count")) > MAX_CONNECTIONS:
+            raise OverflowError(f"it declares {topics} topics")
+
+
 def _check_start(path: Path) -> None:
     """Raise RecordingError for a path that is not a .bag, before rosbags reports it less clearly."""
     if not path.is_file():  # opening a pipe would wait for a writer
@@ -341,9 +391,9 @@ def raise_as_recording_error(path: Path, problem: str) -> Generator[None]:
     except RecordingError:
         raise
     except Exception as error:  # damaged bytes make the libraries raise almost anything
+        detail = describe(error)
         if isinstance(error, OSError) and error.strerror:
-            raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-        detail = " ".join(str(error).split()) or "its parts contradict each other"
+            raise RecordingError(f"{path} cannot be read: {detail}") from error
         if "not indexed" in detail:
             problem, detail = "was never closed", "the capture was killed, so it has no index"
         elif "index looks damaged" in detail:

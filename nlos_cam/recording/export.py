@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Event
@@ -15,6 +16,7 @@ import cv2
 import numpy as np
 import trimesh
 from nlos_calibration.arrays import Float64
+from nlos_models import TEXT_LIMIT, read_bounded
 
 from nlos_cam.camera import FORMATS, FrameSet, FrameSynchronizer, Sample
 from nlos_cam.errors import NlosCamError, RecordingError
@@ -246,8 +248,13 @@ def _info(bag: BagReader, options: ExportOptions) -> dict[str, Any]:
 
 
 def _read_json(path: Path) -> Any:
-    """Return a file's JSON; None where there is none."""
+    """Return a file's JSON, numbers that are not finite as null; None where there is none."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        text = read_bounded(path, TEXT_LIMIT).decode()
+        return json.loads(text, parse_constant=lambda _: None, parse_float=_finite)
+    except (OSError, ValueError, RecursionError):
         return None
+
+
+def _finite(digits: str) -> float | None:
+    return number if isfinite(number := float(digits)) else None

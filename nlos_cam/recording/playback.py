@@ -102,6 +102,8 @@ def open_lidar_bag(path: Path) -> BagReader:
             f"{path} has no {' and no '.join(missing)} stream (it has {', '.join(sorted(present))}): record depth, "
             "infrared and confidence with an L515, e.g. `nlos-cam capture --camera l515`"
         )
+    if min((pinhole := bag.streams["depth"].intrinsics).fx, pinhole.fy) <= 0:
+        raise RecordingError(f"{path} is damaged (a focal length of {pinhole.fx:g} x {pinhole.fy:g}): record it again")
     return bag
 
 

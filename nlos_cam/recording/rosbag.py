@@ -23,8 +23,6 @@ ENTRY_BYTES = 12
 SET_UP_TIME = struct.pack("<II", 0, 1)
 """The time that librealsense gives to all that describes the device, before any frame."""
 
-Read = Callable[[int, int], bytes]
-"""Returns up to that many bytes (second argument) from that offset (first), fewer at the end."""
 Fields = Mapping[str, bytes]
 
 
@@ -36,7 +34,50 @@ class BagCutError(BagFormatError):
     """A record that extends beyond the end of the file."""
 
 
+class BagBudgetError(Exception):
+    """More work than a file of its size deserves; never leaves the package."""
+
+
 CUT = "file truncated"
+MAX_CONNECTIONS = 10_000
+"""Bound on the topics of a file; librealsense writes some hundred."""
+MIN_WORK, BYTES_PER_WORK = 4_000_000, 8
+"""Bound on the work for a file: calls that read, and 4 KiB read or unpacked; a record takes four."""
+
+
+class Budget:
+    """Work left for a file, from its size in bytes, so that crafted files end in bounded time and memory."""
+
+    def __init__(self, file_bytes: int) -> None:
+        self._left = MIN_WORK + file_bytes // BYTES_PER_WORK
+
+    def spend(self, work: int) -> None:
+        """Take from the work left. Raises BagBudgetError when none is."""
+        self._left -= work
+        if self._left < 0:
+            raise BagBudgetError("more work than a recording of this size can need")
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Bytes to read; called with an offset and a number of bytes, it returns those, fewer at the end."""
+
+    fetch: Callable[[int, int], bytes]
+    budget: Budget
+
+    def __call__(self, at: int, count: int) -> bytes:
+        self.budget.spend(1 + (count >> 12))
+        return self.fetch(at, count)
+
+    def over(self, content: bytes) -> "Source":
+        """Return a source of bytes in memory, unpacked from this one."""
+        self.budget.spend(len(content) >> 12)
+        return Source(lambda at, count: content[at : at + count], self.budget)
+
+
+def reader(content: bytes) -> Source:
+    """Return a source of bytes in memory."""
+    return Source(lambda at, count: content[at : at + count], Budget(len(content)))
 
 
 class Op(IntEnum):
@@ -82,7 +123,7 @@ class Connection:
         return (self.topic, self.kind, self.md5sum) == (other.topic, other.kind, other.md5sum)
 
 
-def read_record(read: Read, at: int) -> BagRecord:
+def read_record(read: Source, at: int) -> BagRecord:
     """Return the record at an offset. Raises BagFormatError where there is none."""
     head = read(at, 4)
     if len(head) < 4:
@@ -149,7 +190,7 @@ def message_key(record: BagRecord) -> tuple[int, bytes]:
     return number(record.fields, "conn"), time
 
 
-def read_connection(read: Read, record: BagRecord) -> Connection:
+def read_connection(read: Source, record: BagRecord) -> Connection:
     """Return a connection record's content. Raises BagFormatError for one that readers of bags would refuse."""
     if record.data_bytes > HEADER_LIMIT:
         raise BagFormatError(f"implausible connection of {record.data_bytes} bytes")
@@ -167,7 +208,14 @@ def read_connection(read: Read, record: BagRecord) -> Connection:
     return Connection(number(record.fields, "conn"), topic, kind, _field(description, "md5sum"), packed)
 
 
-def check_bookkeeping(read: Read, record: BagRecord) -> None:
+def add_connection(connections: dict[int, Connection], found: Connection) -> None:
+    """Add a connection by its number. Raises BagFormatError beyond MAX_CONNECTIONS."""
+    connections[found.number] = found
+    if len(connections) > MAX_CONNECTIONS:
+        raise BagFormatError(f"more than {MAX_CONNECTIONS} topics")
+
+
+def check_bookkeeping(read: Source, record: BagRecord) -> None:
     """Raise BagFormatError for a file header, index or chunk info of an impossible length."""
     if record.op is Op.INDEX and record.data_bytes != ENTRY_BYTES * number(record.fields, "count"):
         raise BagFormatError("index whose length contradicts its number of entries")
@@ -262,7 +310,7 @@ class Content:
     """Damage after that; empty if there is none."""
 
 
-def read_content(read: Read, at: int, end: int, expected_bytes: int) -> Content:
+def read_content(read: Source, at: int, end: int, expected_bytes: int) -> Content:
     """Return the connections and messages from `at` on.
 
     They end after `expected_bytes`, if a record ends there, else at the first record of another kind, at most at `end`.
@@ -273,8 +321,7 @@ def read_content(read: Read, at: int, end: int, expected_bytes: int) -> Content:
     try:
         for start, record in _confirmed(_records(read, at, end, expected_bytes)):
             if record.op is Op.CONNECTION:
-                found = read_connection(read, record)
-                connections[found.number] = found
+                add_connection(connections, read_connection(read, record))
             else:
                 connection, time = message_key(record)
                 entries.setdefault(connection, []).append(time + (start - at).to_bytes(4, "little"))
@@ -288,7 +335,7 @@ def read_content(read: Read, at: int, end: int, expected_bytes: int) -> Content:
     return Content(connections, index, reached - at, ending, why)
 
 
-def _records(read: Read, at: int, end: int, expected_bytes: int) -> Iterator[tuple[int, BagRecord]]:
+def _records(read: Source, at: int, end: int, expected_bytes: int) -> Iterator[tuple[int, BagRecord]]:
     """Yield messages and connections with their offsets. Raises BagFormatError where neither follows."""
     expected_end = at + expected_bytes
     while at != expected_end and read(at, 1):
@@ -319,14 +366,9 @@ def _confirmed(records: Iterator[tuple[int, BagRecord]]) -> Iterator[tuple[int, 
         yield last
 
 
-def set_up_records(read: Read) -> Iterator[tuple[int, BagRecord]]:
+def set_up_records(read: Source) -> Iterator[tuple[int, BagRecord]]:
     """Yield the records that describe the device, and connections, with their offsets, up to the first damage."""
     with suppress(BagFormatError):
         for start, record in _records(read, 0, CHUNK_LIMIT, CHUNK_LIMIT):
             if record.op is Op.CONNECTION or message_key(record)[1] == SET_UP_TIME:
                 yield start, record
-
-
-def reader(content: bytes) -> Read:
-    """Return a Read of bytes in memory."""
-    return lambda at, count: content[at : at + count]

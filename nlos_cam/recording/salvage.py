@@ -13,23 +13,27 @@ from nlos_cam.recording.rosbag import (
     CHUNK_LIMIT,
     CUT,
     MAGIC,
+    MAX_CONNECTIONS,
     SET_UP_TIME,
+    BagBudgetError,
     BagFormatError,
     BagRecord,
+    Budget,
     Connection,
     Ending,
     Op,
-    Read,
+    Source,
     check_bookkeeping,
     read_connection,
     read_content,
     read_record,
-    reader,
     set_up_records,
 )
 
 MIN_PIECE_BYTES, MAX_PIECE_BYTES = 1 << 16, 4 << 20
 LZ4_MAGIC = b'\x04"M\x18'
+WORK_PER_CHUNK = 64
+"""Work that a chunk in memory counts for, besides reading it."""
 LZ4_TAIL_BYTES = 8
 """End mark and checksum of an lz4 frame."""
 
@@ -63,7 +67,7 @@ class Examined:
     """Damage; empty if there is none."""
 
 
-def find_chunk(read: Read, at: int) -> BagRecord | None:
+def find_chunk(read: Source, at: int) -> BagRecord | None:
     """Return the chunk at an offset, or the data of one without its header; None at another record.
 
     Raises BagFormatError where no record begins.
@@ -81,13 +85,13 @@ def is_headless(chunk: BagRecord) -> bool:
     return "size" not in chunk.fields
 
 
-def _is_message(read: Read, at: int) -> bool:
+def _is_message(read: Source, at: int) -> bool:
     with suppress(BagFormatError):
         return read_record(read, at).op is Op.MESSAGE
     return False
 
 
-def examine(read: Read, at: int, record: BagRecord, file_end: int) -> Examined:
+def examine(read: Source, at: int, record: BagRecord, file_end: int) -> Examined:
     """Unpack and check a chunk, given its record at `at`.
 
     The lengths in its header are not trusted: lz4 data mark their own end, other data end with the last message.
@@ -100,7 +104,7 @@ def examine(read: Read, at: int, record: BagRecord, file_end: int) -> Examined:
     return Examined(None, {}, record.data_at, Ending.BROKEN, "unknown compression, neither lz4 nor none")
 
 
-def _examine_plain(read: Read, at: int, record: BagRecord) -> Examined:
+def _examine_plain(read: Source, at: int, record: BagRecord) -> Examined:
     found = read_content(read, record.data_at, record.data_at + CHUNK_LIMIT, record.data_bytes or CHUNK_LIMIT)
     end = record.data_at + found.bytes
     chunk = Chunk(at, "none", found.bytes, record.data_at, found.bytes, None, found.index)
@@ -108,12 +112,12 @@ def _examine_plain(read: Read, at: int, record: BagRecord) -> Examined:
     return Examined(chunk if found.index else None, found.connections, end, found.ending, why)
 
 
-def _examine_lz4(read: Read, at: int, record: BagRecord, file_end: int) -> Examined:
+def _examine_lz4(read: Source, at: int, record: BagRecord, file_end: int) -> Examined:
     piece_bytes = min(max(record.data_bytes, MIN_PIECE_BYTES), MAX_PIECE_BYTES)  # a whole chunk, if its length is sane
     unpacked, end, ending, why = unpack(read, record.data_at, file_end, piece_bytes)
     if ending is Ending.BROKEN:
         return Examined(None, {}, record.data_at, ending, why)
-    found = read_content(reader(unpacked), 0, len(unpacked), len(unpacked))
+    found = read_content(read.over(unpacked), 0, len(unpacked), len(unpacked))
     if ending is Ending.CUT:
         chunk = Chunk(at, "none", found.bytes, 0, found.bytes, unpacked[: found.bytes], found.index)
         return Examined(chunk if found.index else None, found.connections, record.data_at, ending, why)
@@ -134,7 +138,7 @@ def _wrong_lengths(record: BagRecord, end: int, size: int) -> str:
     return ""
 
 
-def unpack(read: Read, at: int, end: int, piece_bytes: int) -> tuple[bytes, int, Ending, str]:
+def unpack(read: Source, at: int, end: int, piece_bytes: int) -> tuple[bytes, int, Ending, str]:
     """Return the content of the lz4 frame at `at`, the offset of its end, its condition there, and the damage.
 
     Reads `piece_bytes` at a time and never unpacks more than CHUNK_LIMIT.
@@ -154,16 +158,18 @@ def unpack(read: Read, at: int, end: int, piece_bytes: int) -> tuple[bytes, int,
     return b"".join(parts), at - len(decoder.unused_data or b""), Ending.WHOLE, ""
 
 
-def salvage_set_up(read: Read, at: int, record: BagRecord, file_end: int) -> tuple[Chunk | None, dict[int, Connection]]:
+def salvage_set_up(
+    read: Source, at: int, record: BagRecord, file_end: int
+) -> tuple[Chunk | None, dict[int, Connection]]:
     """Return the descriptions of device and streams, and connections, from a broken lz4 chunk, without its checksum.
 
     A recording holds them once and no frame can be read without them; unlike frames, they are used unverified.
     """
     end = min(record.end, file_end) - LZ4_TAIL_BYTES
-    unpacked = reader(unpack(read, record.data_at, end, MIN_PIECE_BYTES)[0])
+    unpacked = read.over(unpack(read, record.data_at, end, MIN_PIECE_BYTES)[0])
     connections = read_content(unpacked, 0, CHUNK_LIMIT, CHUNK_LIMIT).connections
     content = b"".join(unpacked(start, found.end - start) for start, found in set_up_records(unpacked))
-    index = read_content(reader(content), 0, len(content), len(content)).index
+    index = read_content(read.over(content), 0, len(content), len(content)).index
     return Chunk(at, "none", len(content), 0, len(content), content, index) if index else None, connections
 
 
@@ -213,6 +219,7 @@ class _Scanner:
     def __init__(self, file: BinaryIO, report: OnProgress) -> None:
         self._file, self._report = file, report
         self.end = file.seek(0, 2)
+        self.read = Source(self._fetch, Budget(self.end))
         self.chunks: list[Chunk] = []
         self.connections: dict[int, Connection] = {}
         self.trailing: dict[int, Connection] = {}
@@ -222,19 +229,22 @@ class _Scanner:
         self._has_set_up = False
         self._is_plain = self._first_chunk_is_plain()
 
-    def read(self, at: int, count: int) -> bytes:
+    def _fetch(self, at: int, count: int) -> bytes:
         """Return up to `count` bytes from an offset, fewer at the end of the file."""
         self._file.seek(at)
         return self._file.read(max(0, min(count, self.end - at)))
 
     def run(self) -> None:
-        """Scan to the end of the file."""
+        """Scan to the end of the file, or until its budget of work is spent."""
         at = len(MAGIC)
-        if self.read(0, at) != MAGIC:
-            at = self._skip(0, "no signature of a .bag", search_at=0)
-        while at < self.end:
-            at = self._step(at)
-            self._report(at, self.end)
+        try:
+            if self.read(0, at) != MAGIC:
+                at = self._skip(0, "no signature of a .bag", search_at=0)
+            while at < self.end:
+                at = self._step(at)
+                self._report(at, self.end)
+        except BagBudgetError as error:
+            self.damages.append(Damage(at, self.end - at, str(error)))
 
     def _step(self, at: int) -> int:
         try:
@@ -250,6 +260,8 @@ class _Scanner:
         """Note a connection, pass over index records. Raises BagFormatError where they are damaged."""
         if record.op is Op.CONNECTION:
             found = read_connection(self.read, record)
+            if len(self.trailing) >= MAX_CONNECTIONS:
+                raise BagBudgetError(f"more than {MAX_CONNECTIONS} topics")
             self.trailing.setdefault(found.number, found)
         check_bookkeeping(self.read, record)
         if record.end > self.end:
@@ -258,39 +270,40 @@ class _Scanner:
     def _take_chunk(self, at: int, record: BagRecord) -> int:
         found = examine(self.read, at, record, self.end)
         if found.ending is Ending.WHOLE:
-            if self._take(found) and found.why:
+            if self._take(at, found) and found.why:
                 self.damages.append(Damage(at, 0, found.why))
             return found.end
         resumed = self._search(found.end + 1)
         if found.chunk is None:
             self._drop_chunk(at, record, resumed, found.why)
         elif found.chunk.content is None or resumed == self.end:
-            self._take(found)
+            self._take(at, found)
             lost_at = at if found.chunk.content else found.end
             self.damages.append(Damage(lost_at, resumed - lost_at, f"{found.why} (undamaged messages recovered)"))
         else:
             self._drop_chunk(at, record, resumed, "damaged data of a chunk")
         return resumed
 
-    def _take(self, found: Examined) -> bool:
+    def _take(self, at: int, found: Examined) -> bool:
         """Add a chunk; return False for one that contradicts others or repeats one."""
-        if (chunk := found.chunk) is None:
-            self.connections |= found.connections
-            return True
-        why = ""
+        why, chunk = "", found.chunk
         if any(n in self.connections and not self.connections[n].is_like(c) for n, c in found.connections.items()):
             why = "chunk of another recording, with other topics"
-        elif (index := tuple(chunk.index.items())) in self._indexes:
+        elif len(self.connections.keys() | found.connections) > MAX_CONNECTIONS:
+            why = f"more than {MAX_CONNECTIONS} topics"
+        elif chunk and tuple(chunk.index.items()) in self._indexes:
             why = "chunk that is in the file twice"
         else:
-            self._indexes.add(index)
             self.connections |= found.connections
-            self._add(chunk)
+            if chunk:
+                self._indexes.add(tuple(chunk.index.items()))
+                self._add(chunk)
         if why:
-            self.damages.append(Damage(chunk.at, found.end - chunk.at, why))
+            self.damages.append(Damage(at, found.end - at, why))
         return not why
 
     def _add(self, chunk: Chunk) -> None:
+        self.read.budget.spend(WORK_PER_CHUNK)
         self.chunks.append(chunk)
         self._has_set_up |= any(entries.startswith(SET_UP_TIME) for entries in chunk.index.values())
 

@@ -32,7 +32,8 @@ class SdkReplayCamera:
     def __init__(self, path: Path) -> None:
         self.uri = f"bag:{path}"
         self.rig: Rig | None = None
-        self._path, self._bag, self._sdk = path, open_lidar_bag(path), load_sdk()
+        self._bag, self._sdk = open_lidar_bag(path), load_sdk()
+        self._path = self._bag.path
         self._check_all()
         self.identity: Mapping[str, str] = identity_of(self._bag)
         self.incomplete = self.dropped = 0

@@ -7,17 +7,18 @@ from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from nlos_calibration import Finite, PinholeRecord, Record, Rig, first_problem, load_wall
+from nlos_models import TEXT_LIMIT, describe, read_bounded
 from pydantic import AwareDatetime, Field, ValidationError
 
 from nlos_cam.camera import Camera
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import Frame
+from nlos_cam.recording.bag_messages import finite
 from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality
 
@@ -104,13 +105,13 @@ def sidecar_path(recording: Path) -> Path:
 def load_sidecar(path: Path) -> Sidecar:
     """Read a sidecar. Raises RecordingError, with the first problem, for any other file."""
     try:
-        return Sidecar.model_validate_json(path.read_bytes(), strict=True)
+        return Sidecar.model_validate_json(read_bounded(path, TEXT_LIMIT), strict=True)
     except FileNotFoundError as error:
         raise RecordingError(f"no sidecar {path}: `nlos-cam capture` writes one beside each recording") from error
     except ValidationError as error:
         raise RecordingError(f"{path} is not a sidecar: {first_problem(error)}") from error
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    except (OSError, MemoryError) as error:
+        raise RecordingError(f"{path} cannot be read: {describe(error)}") from error
 
 
 def versions() -> dict[str, str]:
@@ -134,11 +135,6 @@ def summary_of(found: VerifyResult | None, quality: Quality, events: Mapping[str
         figures |= asdict(found)
         figures["frames_per_s"] = (found.frames - 1) / found.seconds if found.seconds > 0 else None
     return Summary.model_validate(figures)
-
-
-def _finite(values: Mapping[str, float]) -> dict[str, float]:
-    """Return the finite values: JSON has no others."""
-    return {name: value for name, value in values.items() if isfinite(value)}
 
 
 class SidecarFile:
@@ -170,7 +166,7 @@ class SidecarFile:
             intrinsics=PinholeRecord.model_validate(vars(camera.intrinsics)),
             rig=wall[0] if wall else camera.rig,
             wall=wall[1] if wall else None,
-            settings=_finite(camera.telemetry()),
+            settings=finite(camera.telemetry()),
             temperatures=[],
         )
         self._write()
@@ -179,7 +175,7 @@ class SidecarFile:
         """Record the settings of the first frame, and the temperatures every TEMPERATURE_INTERVAL_S."""
         if self._first_s is None:
             self._first_s = frame.timestamp_s
-            self._sidecar = self._sidecar.model_copy(update={"settings": _finite(frame.settings)})
+            self._sidecar = self._sidecar.model_copy(update={"settings": finite(frame.settings)})
         if frame.timestamp_s - self._read_s >= self._every_s:
             self._read_s = frame.timestamp_s
             self._read_temperatures(frame.timestamp_s - self._first_s)
@@ -187,7 +183,7 @@ class SidecarFile:
                 self._write()
 
     def _read_temperatures(self, time_s: float) -> None:
-        celsius = _finite(self._camera.telemetry("_temperature"))
+        celsius = finite(self._camera.telemetry("_temperature"))
         if not celsius:
             return
         series = [*self._sidecar.temperatures, Temperatures(time_s=time_s, celsius=celsius)]

@@ -37,6 +37,7 @@ __all__ = [
     "included",
     "least_seconds",
     "load_scene",
+    "packaged_scenes",
     "paper_scene",
     "phong",
     "prepare",
@@ -84,6 +85,7 @@ from .scene_file import (
     SceneFile,
     bare_wall_scene,
     load_scene,
+    packaged_scenes,
     paper_scene,
 )
 from .sensor.bias import ripples, smooth_patches

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from nlos_cam.errors import SceneError
+from nlos_cam.errors import SceneError, UnknownNameError, did_you_mean
 
 Stop = Literal["draft", "standard", "fine", "reference"]
 MAX_RELAY_CELLS = 512
@@ -22,7 +22,7 @@ class Accuracy:
     """Table bins per bin of path length, a power of two; 0 is the brute-force reference."""
     object_stride: int = 1
     """Cells of the depth map, along each axis, that form one patch."""
-    sectors: int = 8
+    sectors: int = 16
     """Sectors per face of the horizon tables: affects time, not the result."""
     beams_per_cell: int = 1
     """Beams along each axis of a map cell."""
@@ -57,9 +57,9 @@ STOPS = {
 
 
 def accuracy_named(name: str | Accuracy) -> Accuracy:
-    """Return the setting of a stop's name. Raises SceneError if there is no such stop."""
+    """Return the setting of a stop's name. Raises UnknownNameError if there is no such stop."""
     if isinstance(name, Accuracy):
         return name
     if name not in STOPS:
-        raise SceneError(f"no accuracy {name!r}: choose one of {', '.join(STOPS)}")
+        raise UnknownNameError(f"no accuracy {name!r}.{did_you_mean(name, STOPS)} Choose one of {', '.join(STOPS)}")
     return STOPS[name]

@@ -216,6 +216,7 @@ def sample_beams(lit: Int64, count: int) -> Int64:
     """Return about `count` beams spread over the map: one from each strip, at random but always the same."""
     if len(lit) <= count:
         return lit
+    # Stratified: errors vary smoothly over the map, so one beam from each strip has less variance than free draws.
     edges = np.linspace(0, len(lit), count + 1)
     within = np.random.default_rng(0).random(count)
     return lit[(edges[:-1] + within * np.diff(edges)).astype(np.int64)]
@@ -223,6 +224,7 @@ def sample_beams(lit: Int64, count: int) -> Int64:
 
 def _whole_rounds(beams: float, tile: int) -> int:
     """Return the smallest number of beams, at least `beams`, that gives every thread the same number of tiles."""
+    # An incomplete round leaves threads idle, and its time would not grow with the beams in it.
     one_round = tile * numba.get_num_threads()
     return int(-(-beams // one_round)) * one_round
 

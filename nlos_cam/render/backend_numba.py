@@ -17,145 +17,32 @@ from nlos_calibration.arrays import Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from nlos_cam.render.brdf_table import nodes, scattering
+from nlos_cam.render.echoes import MultiBounce, strongest, strongest_between
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.visibility import HeightField, blocked, horizon_table
-
-FAST = {"contract", "reassoc", "nsz", "arcp"}
-
-
-class NumbaSurface(NamedTuple):
-    """Patches as columns of float32."""
-
-    x_m: Float32
-    y_m: Float32
-    z_m: Float32
-    normal_x: Float32
-    normal_y: Float32
-    normal_z: Float32
-    soft_m2: Float32
-    """Near-contact term added to d^2."""
-    strength: Float32
-    """Albedo times true area."""
-    row: NDArray[np.int64]
-    column: NDArray[np.int64]
-    low: Float32
-    """(n, FACES * sectors); bounds of the horizons, empty if nothing shades."""
-    high: Float32
-
-
-class NumbaPoints(NamedTuple):
-    """Points of the wall, laser spots or relay cells, with the leg from each to the lidar."""
-
-    x_m: Float32
-    y_m: Float32
-    length_m: Float32
-    weight: Float32
-    soft_m2: np.float32
-
-
-class NumbaOptics(NamedTuple):
-    """Constants shared by all legs."""
-
-    edge_x_m: np.float32
-    edge_z_m: np.float32
-    near_m2: np.float32
-    """Square of the distance at which near contact begins."""
-    lambertian: bool
-    inverse_bin: np.float32
-    """Sub-bins per meter."""
-    sectors: int
-    """Sectors per face of the horizon tables; 0 if nothing shades."""
-
-
-class NumbaLegs(NamedTuple):
-    """Scratch memory for the legs from one patch to many points of the wall."""
-
-    weight: Float32
-    length_m: Float32
-    sector: Int32
-    major: Float32
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
-def geometry(
-    legs: NumbaLegs,
-    s: int,
-    surface: NumbaSurface,
-    points: NumbaPoints,
-    start: int,
-    count: int,
-    optics: NumbaOptics,
-    field: HeightField,
-    outgoing: bool,
-) -> None:
-    """Fill in the legs from patch s to points: weight without visibility, and length, vector by vector.
-
-    Towards the lidar (`outgoing`) the weight has the wall's cosine, from it the patch's; in Lambertian radiometry both.
-    """
-    x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
-    nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
-    soft = points.soft_m2 if outgoing else surface.soft_m2[s]
-    to_edge, nothing, one, two = optics.edge_x_m - x, np.float32(0), np.float32(1), np.float32(2)
-    inverse_x, inverse_y = np.float32(1 / field.pitch_x_m), np.float32(-1 / field.pitch_y_m)
-    half, last, faces = np.float32(optics.sectors / 2), np.float32(optics.sectors - 1), np.float32(optics.sectors)
-    end = start + count
-    at_x, at_y, light = points.x_m[start:end], points.y_m[start:end], points.weight[start:end]
-    for i in range(count):
-        dx, dy = at_x[i] - x, at_y[i] - y
-        squared = dx * dx + dy * dy + z * z
-        length = np.sqrt(squared)
-        facing = nx * dx + ny * dy - nz * z
-        # The leg runs from the patch at height z to the wall at 0. It crosses the edge's plane at the share to_edge /
-        # dx, at height z (1 - to_edge / dx), if patch and point lie on both sides of it.
-        cut = (to_edge * (optics.edge_x_m - at_x[i]) < nothing) & (z * (one - to_edge / dx) >= optics.edge_z_m)
-        # Near contact as in `geometry.softened`, without its branch.
-        ramp = max(one - squared / optics.near_m2, nothing)
-        cosine = z if outgoing else facing
-        if optics.lambertian:
-            cosine = z * facing / length
-        weight = light[i] * cosine / (length * (squared + soft * ramp * ramp))
-        legs.weight[i] = weight if (facing > nothing) & (not cut) else nothing
-        legs.length_m[i] = length
-        # Sector of the horizon tables: the face by the major axis and its sign, then the tilt -1 to 1 in equal parts.
-        u, v = dx * inverse_x, dy * inverse_y
-        along_columns = abs(u) >= abs(v)
-        major, minor = (u if along_columns else v), (v if along_columns else u)
-        legs.major[i] = abs(major)
-        inside = min((minor / max(abs(major), np.float32(1e-20)) + one) * half, last)
-        face = (nothing if along_columns else two) + (nothing if major >= nothing else one)
-        legs.sector[i] = np.int32(face * faces + np.floor(inside))
-
-
-@numba.njit(cache=True)
-def shade(
-    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, count: int, field: HeightField
-) -> None:
-    """Set the weight of legs that the object blocks to 0."""
-    z = surface.z_m[s]
-    for i in range(count):
-        # Free above the upper bound of the horizon, blocked below the lower one; in between the leg is walked.
-        if z >= legs.major[i] * surface.high[s, legs.sector[i]]:
-            continue
-        if z >= legs.major[i] * surface.low[s, legs.sector[i]]:
-            u = (points.x_m[start + i] - surface.x_m[s]) / field.pitch_x_m
-            v = (surface.y_m[s] - points.y_m[start + i]) / field.pitch_y_m
-            if legs.weight[i] == 0 or not blocked(field, surface.row[s], surface.column[s], z, u, v):
-                continue
-        legs.weight[i] = 0
-
-
-@numba.njit(cache=True, inline="always")
-def scratch(count: int) -> NumbaLegs:
-    return NumbaLegs(
-        np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int32), np.empty(count, np.float32)
-    )
-
+from nlos_cam.render.legs import FAST, NumbaLegs, NumbaOptics, NumbaPoints, NumbaSurface, geometry, scratch, shade
+from nlos_cam.render.row_sum import WINDOW, add_rows
+from nlos_cam.render.visibility import HeightField, horizon_table
 
 LANES = 16
 """Bins by which the rows of tables are padded: whole widest vectors."""
 BEAM_TILE = 64
-"""Beams per thread whose histograms stay in the cache during the loop over patches."""
+"""Beams of a thread that go together: their windows of bins and their legs to some patches fit in the first cache."""
+PATCH_BLOCK = 16
+"""Patches whose legs are computed before their rows are added."""
+
+
+class NumbaTables(NamedTuple):
+    """Tables of the patches (n): B over d3 + d4 in bins, for each shift within a bin."""
+
+    first: Int32
+    """(n,); bin at which a patch's rows start."""
+    rows: Float32
+    """Flat; n * per_bin rows of WINDOW zeros and `width` bins, then WINDOW zeros: a window reads beyond both ends."""
+    rest: Float32
+    """(n, width + 1); largest value of any shift from a bin of the row on."""
+    per_bin: int
+    width: int
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -172,6 +59,7 @@ def _count(
     """Count B over d3 + d4 of one patch in sub-bins, and return the bin at which they start."""
     cells = len(relay.x_m)
     legs = scratch(cells)
+    # B(s, q) of S2: wall to lidar in the points' weights, patch to wall in the legs.
     geometry(legs, s, surface, relay, 0, cells, optics, field, True)
     if optics.sectors:
         shade(legs, s, surface, relay, 0, cells, field)
@@ -211,10 +99,11 @@ def sub_bins(
 
 
 @numba.njit(cache=True, parallel=True)
-def tables(histogram: Float32, per_bin: int) -> Float32:
-    """Return sub-bin histograms (n, width * per_bin) as sums to bins (n, per_bin, width), for each shift."""
+def tables(first: Int32, histogram: Float32, per_bin: int) -> NumbaTables:
+    """Return sub-bin histograms (n, width * per_bin) as sums to bins, for each shift."""
     patches, width = len(histogram), histogram.shape[1] // per_bin
-    table = np.zeros((patches, per_bin, width), np.float32)
+    rows = np.zeros((patches * per_bin + 1, WINDOW + width), np.float32)
+    rest = np.zeros((patches, width + 1), np.float32)
     for s in numba.prange(patches):
         below = np.zeros(width * per_bin + 1)
         for k in range(width * per_bin):
@@ -223,64 +112,158 @@ def tables(histogram: Float32, per_bin: int) -> Float32:
         # (i + 1) per_bin - shift. The sums are float64, so that the difference of large sums keeps the small bins.
         for shift in range(per_bin):
             for i in range(width):
-                table[s, shift, i] = below[(i + 1) * per_bin - shift] - below[max(i * per_bin - shift, 0)]
-    return table
+                value = np.float32(below[(i + 1) * per_bin - shift] - below[max(i * per_bin - shift, 0)])
+                rows[s * per_bin + shift, WINDOW + i] = value
+                rest[s, i] = max(rest[s, i], value)
+        for i in range(width - 1, -1, -1):
+            rest[s, i] = max(rest[s, i], rest[s, i + 1])
+    return NumbaTables(first, rows.ravel(), rest, per_bin, width)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def _ends(
+    start: int, count: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, table: NumbaTables
+) -> tuple[Float32, int]:
+    """Return a bin (count,) before every path of each beam, and the bins from there to the last path of any beam."""
+    near, far = np.full(count, np.float32(np.inf)), np.zeros(count, np.float32)
+    at_x, at_y = feet.x_m[start : start + count], feet.y_m[start : start + count]
+    for s in range(len(table.first)):
+        x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
+        begins = np.float32(table.first[s] * table.per_bin)
+        for i in range(count):
+            dx, dy = at_x[i] - x, at_y[i] - y
+            length = np.sqrt(dx * dx + dy * dy + z * z) * optics.inverse_bin + begins
+            near[i], far[i] = min(near[i], length), max(far[i], length)
+    spread, whole = 0, np.float32(1 / table.per_bin)
+    for i in range(count):
+        spread = max(spread, int((far[i] - near[i]) * whole))
+        # A beam's first path is d1 + min (d2 + d3 + d4) over the patches; one bin less covers rounding.
+        near[i] = np.floor((near[i] + feet.length_m[start + i] * optics.inverse_bin) * whole) - np.float32(1)
+    return near, spread + table.width + 3
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def _place(
+    legs: NumbaLegs, length_m: Float32, begin: Float32, strength: np.float32, first: np.float32, table: NumbaTables,
+    inverse_bin: np.float32, weight: Float32, row: Float32, ahead: Float32,
+) -> tuple[np.float32, np.float32]:  # fmt: skip
+    """Fill in each leg's weight, row of the patch's table, and bin of the row at which the beam's window begins.
+
+    Return the sum of the weights and the smallest of those bins. All numbers are whole, and exact in float32.
+    """
+    total, least = np.float32(0), np.float32(np.inf)
+    per_bin, whole, stride = np.float32(table.per_bin), np.float32(1 / table.per_bin), np.float32(WINDOW + table.width)
+    for i in range(len(begin)):
+        shift = np.floor((legs.length_m[i] + length_m[i]) * inverse_bin + np.float32(0.5))
+        bins = np.floor(shift * whole)
+        weight[i] = legs.weight[i] * strength
+        row[i] = (shift - bins * per_bin) * stride
+        ahead[i] = begin[i] - bins - first
+        total += weight[i]
+        least = min(least, ahead[i])
+    return total, least
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def _add_tile(
-    start: int,
-    count: int,
-    feet: NumbaPoints,
-    surface: NumbaSurface,
-    optics: NumbaOptics,
-    field: HeightField,
-    first: Int32,
-    table: Float32,
-    bins: int,
-    histogram: Float32,
-) -> None:
-    """Add every patch to the histograms (count, bins) of some beams."""
-    _, per_bin, width = table.shape
-    log = int(np.log2(per_bin) + 0.5)
-    legs = scratch(count)
-    for s in range(len(table)):
+    start: int, count: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField,
+    table: NumbaTables, begin: Float32, sums: Float32,
+) -> Float32:  # fmt: skip
+    """Add every patch to the windows (count, windows * WINDOW) of some beams, from a bin (count,) of each beam on.
+
+    Return a bound (count,) on every bin beyond: at most each patch's largest value from there on, times its weight.
+    """
+    # Legs of some patches first, then the rows of each beam: rows and windows stay in the first cache
+    legs, bound = scratch(count), np.zeros(count, np.float32)
+    weights, offsets = np.empty(PATCH_BLOCK * count, np.float32), np.empty(PATCH_BLOCK * count, np.int32)
+    weight, offset = weights.reshape(PATCH_BLOCK, count), offsets.reshape(PATCH_BLOCK, count)
+    row, ahead = np.empty((PATCH_BLOCK, count), np.float32), np.empty((PATCH_BLOCK, count), np.float32)
+    every, base, used = sums.ravel(), np.empty(PATCH_BLOCK, np.int64), 0
+    bins, width, length_m = sums.shape[1], np.float32(table.width), feet.length_m[start : start + count]
+    for s in range(len(table.first)):
         geometry(legs, s, surface, feet, start, count, optics, field, False)
         if optics.sectors:
             shade(legs, s, surface, feet, start, count, field)
-        for i in range(count):
-            legs.sector[i] = np.int32(
-                (legs.length_m[i] + feet.length_m[start + i]) * optics.inverse_bin + np.float32(0.5)
-            )
-        for i in range(count):
-            # per_bin is a power of two: a shift splits into whole bins (>> log) and the row of the table (& mask).
-            at = (legs.sector[i] >> log) + first[s]
-            if legs.weight[i] == 0 or at >= bins:
-                continue
-            weight = legs.weight[i] * surface.strength[s]
-            row, out = table[s, legs.sector[i] & (per_bin - 1)], histogram[i, at : at + width]
-            for k in range(width):
-                out[k] += weight * row[k]
+        strength, first = surface.strength[s], np.float32(table.first[s])
+        total, least = _place(
+            legs, length_m, begin, strength, first, table, optics.inverse_bin, weight[used], row[used], ahead[used]
+        )
+        if total > 0:
+            # h(k) = sum_s A(p, s) T_s(k - at_s): beyond the window each T_s is at most its largest value from there.
+            largest = table.rest[s, min(max(int(least) + bins, 0), table.width)]
+            for i in range(count):
+                bound[i] += weight[used, i] * largest
+            base[used] = s * table.per_bin * (WINDOW + table.width) + WINDOW
+            used += 1
+        if used < PATCH_BLOCK and s + 1 < len(table.first):
+            continue
+        for window in range(0, bins, WINDOW):
+            for j in range(used):
+                for i in range(count):
+                    at = min(max(ahead[j, i] + np.float32(window), np.float32(-WINDOW)), width)
+                    offset[j, i] = np.int32(row[j, i] + at)
+            for i in range(count):
+                add_rows(every, i * bins + window, table.rows, base, offsets, weights, i, count, used)
+        used = 0
+    return bound
+
+
+@numba.njit(cache=True)
+def _sum_tile(
+    start: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField, table: NumbaTables,
+    most: int,
+) -> tuple[Float32, Float32, Float32]:  # fmt: skip
+    """Return the first bin (count,) of a tile's beams, their sums from there on over `most` bins or all, and a bound.
+
+    The bound (count,) is on every bin beyond the sums.
+    """
+    count = min(BEAM_TILE, len(feet.x_m) - start)
+    begin, span = _ends(start, count, feet, surface, optics, table)
+    sums = np.zeros((count, (min(span, most) + WINDOW - 1) // WINDOW * WINDOW), np.float32)
+    return begin, sums, _add_tile(start, count, feet, surface, optics, field, table, begin, sums)
 
 
 @numba.njit(cache=True, parallel=True)
 def shift_and_add(
-    feet: NumbaPoints,
-    surface: NumbaSurface,
-    optics: NumbaOptics,
-    field: HeightField,
-    first: Int32,
-    table: Float32,
-    bins: int,
+    feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField, table: NumbaTables, bins: int
 ) -> Float32:
     """Return histograms (n, bins) of beams: the sum of every patch's table, times A, shifted by d1 + d2."""
     beams = len(feet.x_m)
-    histogram = np.zeros((beams, (bins + table.shape[2] + LANES) // LANES * LANES), np.float32)
+    histogram = np.zeros((beams, bins), np.float32)
     for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
         start = tile * BEAM_TILE
-        end = min(start + BEAM_TILE, beams)
-        _add_tile(start, end - start, feet, surface, optics, field, first, table, bins, histogram[start:end])
+        begin, sums, _ = _sum_tile(start, feet, surface, optics, field, table, bins)
+        for i in range(len(begin)):
+            first = int(begin[i])
+            for k in range(max(-first, 0), min(sums.shape[1], bins - first)):
+                histogram[start + i, first + k] = sums[i, k]
     return histogram
+
+
+@numba.njit(cache=True, parallel=True)
+def _strongest_in_window(
+    feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField, table: NumbaTables, bins: int
+) -> tuple[NDArray[np.int64], Float32, Float32, NDArray[np.bool_]]:
+    """Return bin, value and runner-up (n,) of the strongest of each beam's first WINDOW bins, and if no other can win.
+
+    Light comes back strongest from the shortest paths, so the first window nearly always holds both bins.
+    """
+    beams = len(feet.x_m)
+    winner, peak, second = np.zeros(beams, np.int64), np.zeros(beams, np.float32), np.zeros(beams, np.float32)
+    sure = np.zeros(beams, np.bool_)
+    for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
+        start = tile * BEAM_TILE
+        begin, sums, bound = _sum_tile(start, feet, surface, optics, field, table, WINDOW)
+        for i in range(len(begin)):
+            first = int(begin[i])
+            best = strongest_between(sums[i], max(-first, 0), min(WINDOW, bins - first))
+            winner[start + i], peak[start + i], second[start + i] = best[0] + first, best[1], best[2]
+            sure[start + i] = bound[i] * ROUNDED <= best[2]
+    return winner, peak, second, sure
+
+
+ROUNDED = np.float32(1.001)
+"""Factor on a bound, more than the rounding of its sum."""
 
 
 def histograms(job: TransportJob) -> Float32:
@@ -298,6 +281,27 @@ def histograms(job: TransportJob) -> Float32:
     return total
 
 
+def echoes(job: TransportJob) -> MultiBounce:
+    """Return the strongest bins (n,) of the job's beams: those of `histograms`, bit for bit, from a part of its work.
+
+    Each beam sums its first bins alone, with a bound on all others; the few beams that the bound does not decide sum
+    the rest too. A BRDF's tables need whole histograms.
+    """
+    if job.brdf is not None:
+        return strongest(histograms(job), job.bin_m)
+    numba_job = _NumbaJob(job)
+    every = numba_job.feet(np.ones(len(job.laser_spot_m)))
+    table = numba_job.tables(np.empty((0, 0), np.float32))
+    winner, peak, second, sure = _strongest_in_window(every, *numba_job.sites, table, job.bins)
+    path = np.where(peak > 0, (winner + 0.5) * job.bin_m, np.nan).astype(np.float32)
+    found = MultiBounce(peak, second, path)
+    if (unsure := np.flatnonzero(~sure)).size:
+        some = numba_job.feet((~sure).astype(np.float64))
+        rest = strongest(shift_and_add(some, *numba_job.sites, table, job.bins), job.bin_m)
+        found.peak[unsure], found.runner_up[unsure], found.path_m[unsure] = rest.peak, rest.runner_up, rest.path_m
+    return found
+
+
 class _NumbaJob:
     """Job in float32, with everything that does not depend on the BRDF computed once."""
 
@@ -305,7 +309,9 @@ class _NumbaJob:
         patches, relay = job.patches, job.relay
         self.job, accuracy = job, job.accuracy
         geometry = *_columns(patches.point_m), *_columns(patches.normal), _single(job.soft_patch_m2)
-        sites = patches.row, patches.column, *horizons(job)
+        low, high, walk = horizons(job)
+        shaded = high.max(1) * reach_cells(job) > patches.point_m[:, 2] if job.field.shades else np.empty(0, np.bool_)
+        sites = patches.row, patches.column, low, high, walk, shaded
         self.surface = NumbaSurface(*geometry, _single(job.strength), *sites)
         columns = relay.x_m, relay.y_m, relay.length_m, job.relay_weight
         self.relay = _points(columns, job.soft_wall_m2)
@@ -315,23 +321,31 @@ class _NumbaJob:
         self.optics = NumbaOptics(*edge, job.lambertian, np.float32(accuracy.sub_bins / job.bin_m), sectors)
         self.width = table_width(job)
 
+    @property
+    def sites(self) -> tuple[NumbaSurface, NumbaOptics, HeightField]:
+        """Arguments of the kernels that do not depend on beams and tables."""
+        return self.surface, self.optics, self.job.field
+
+    def feet(self, share: Float64) -> NumbaPoints:
+        """Return the beams with a weight (n,) above 0."""
+        some, job = np.flatnonzero(share), self.job
+        x, y, _ = job.laser_spot_m[some].T
+        return _points((x, y, job.length_m[some], job.beam_weight[some] * share[some]), 0.0)
+
+    def tables(self, factor: Float32) -> NumbaTables:
+        """Return the patches' tables, with a BRDF's factor (n, m) or an empty one."""
+        job, per_bin = self.job, self.job.accuracy.sub_bins
+        first, fine = sub_bins(self.surface, self.relay, self.optics, job.field, factor, per_bin, self.width)
+        return tables(first, add_interreflection(job, first, fine) if job.more_bounces else fine, per_bin)
+
     def histograms(self, factor: Float32, share: Float64) -> Float32:
         """Return histograms (n, bins) of the beams, each with a weight (n,)."""
-        job = self.job
-        some = np.flatnonzero(share)
-        x, y, _ = job.laser_spot_m[some].T
-        feet = _points((x, y, job.length_m[some], job.beam_weight[some] * share[some]), 0.0)
-        first, fine = sub_bins(
-            self.surface, self.relay, self.optics, job.field, factor, job.accuracy.sub_bins, self.width
-        )
-        if job.more_bounces:
-            fine = add_interreflection(job, first, fine)
-        table = tables(fine, job.accuracy.sub_bins)
-        found = shift_and_add(feet, self.surface, self.optics, job.field, first, table, job.bins)
-        if len(some) == len(share):
-            return found[:, : job.bins]
-        histogram = np.zeros((len(share), job.bins), np.float32)
-        histogram[some] = found[:, : job.bins]
+        bins = self.job.bins
+        found = shift_and_add(self.feet(share), *self.sites, self.tables(factor), bins)
+        if len(found) == len(share):
+            return found
+        histogram = np.zeros((len(share), bins), np.float32)
+        histogram[share > 0] = found
         return histogram
 
 
@@ -348,17 +362,23 @@ def _columns(points: Float64) -> tuple[Float32, Float32, Float32]:
     return _single(points[:, 0]), _single(points[:, 1]), _single(points[:, 2])
 
 
-def horizons(job: TransportJob) -> tuple[Float32, Float32]:
-    """Return the horizon tables (n, FACES * sectors), low and high, for the job's accuracy; empty if nothing shades."""
+def horizons(job: TransportJob) -> tuple[Float32, Float32, NDArray[np.uint8]]:
+    """Return the `horizon_table` of the job's patches at its accuracy; empty if nothing shades."""
     patches, field, accuracy = job.patches, job.field, job.accuracy
     if not field.shades:
-        return np.empty((0, 0), np.float32), np.empty((0, 0), np.float32)
+        return np.empty((0, 0), np.float32), np.empty((0, 0), np.float32), np.empty((0, 0, 2), np.uint8)
+    where = patches.row, patches.column, patches.point_m[:, 2].copy(), reach_cells(job)
+    return horizon_table(field, *where, accuracy.sectors)
+
+
+def reach_cells(job: TransportJob) -> Float64:
+    """Return the longest leg (n,) from each patch along an axis to a beam's spot or a relay cell, in cells."""
+    point, field = job.patches.point_m, job.field
     x = np.concatenate([job.laser_spot_m[:, 0], job.relay.x_m])
     y = np.concatenate([job.laser_spot_m[:, 1], job.relay.y_m])
-    across = np.maximum(x.max() - patches.point_m[:, 0], patches.point_m[:, 0] - x.min()) / field.pitch_x_m
-    along = np.maximum(y.max() - patches.point_m[:, 1], patches.point_m[:, 1] - y.min()) / field.pitch_y_m
-    where = patches.row, patches.column, patches.point_m[:, 2].copy(), np.maximum(across, along)
-    return horizon_table(field, *where, accuracy.sectors)
+    across = np.maximum(x.max() - point[:, 0], point[:, 0] - x.min()) / field.pitch_x_m
+    along = np.maximum(y.max() - point[:, 1], point[:, 1] - y.min()) / field.pitch_y_m
+    return np.maximum(across, along)
 
 
 def table_width(job: TransportJob) -> int:
@@ -369,6 +389,7 @@ def table_width(job: TransportJob) -> int:
     """
     x, y, z = job.patches.point_m.T
     relay, lidar = job.relay, job.lidar_m
+    # A convex function is largest at a corner of a rectangle; the shortest way is by the mirror image (Heron).
     longest = np.zeros_like(x)
     for corner_x in (relay.x_m.min(), relay.x_m.max()):
         for corner_y in (relay.y_m.min(), relay.y_m.max()):

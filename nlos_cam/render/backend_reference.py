@@ -36,6 +36,7 @@ def more_paths(job: TransportJob, incident: Float64, returned: Float64) -> Float
         )
     relay = np.stack([job.relay.x_m, job.relay.y_m, np.zeros_like(job.relay.x_m)], 1)
     there, back = wall_factors(job, cells)
+    # Both ends with their constant legs: d1 + d2 up to the first patch, d3 + d4 from the second.
     d2 = np.linalg.norm(job.laser_spot_m[:, None] - point, axis=-1) + job.length_m[:, None]
     d3 = np.linalg.norm(point[:, None] - relay, axis=-1) + job.relay.length_m
     to_wall = np.linalg.norm(point[:, None] - cells, axis=-1)
@@ -112,6 +113,7 @@ def legs(patches: PatchArrays, x: Float64, y: Float64, edge_x: float, edge_z: fl
     for s in numba.prange(len(patches.row)):
         point, normal = patches.point_m[s], patches.normal[s]
         for w in range(len(x)):
+            # The sheet is lit from one side only: n . (wall point - patch) > 0.
             facing = normal[0] * (x[w] - point[0]) + normal[1] * (y[w] - point[1]) - normal[2] * point[2]
             if facing > 0 and not occluded(point[0], point[2], x[w], 0.0, edge_x, edge_z):
                 table[s, w] = visible(field, patches.row[s], patches.column[s], point, x[w], y[w])
@@ -161,6 +163,7 @@ def _paths(
         for s in range(len(patches.row)):
             if not spots.lit[s, p]:
                 continue
+            # A(p, s) B(s, q) is S2 in two factors; here no sum uses that they separate.
             a = spots.weight[p] * _incident(spots.point_m[p], patches, s, near_m, lambertian)
             d2 = np.sqrt(((spots.point_m[p] - patches.point_m[s]) ** 2).sum())
             for q in range(len(cells.x_m)):
@@ -169,6 +172,7 @@ def _paths(
                 b, d3 = _returned(patches, s, cells, q, near_m, lambertian)
                 if factor.size:
                     b *= factor[s, q]
+                # S4: the bin is the floor of the whole path over the bin's width.
                 k = int(np.floor((spots.length_m[p] + d2 + d3 + cells.length_m[q]) / bin_m))
                 if k < bins:
                     histogram[p, k] += a * b
@@ -205,6 +209,7 @@ def _three_bounces(job: TransportJob, cells: Cells) -> Float64:
     patches, count = job.patch_arrays, len(job.laser_spot_m)
     histogram, group = np.zeros((count, job.bins)), BEAM_GROUP if job.brdf is None else 1
     for which in (slice(start, start + group) for start in range(0, count, group)):
+        # A BRDF couples both legs at the patch: its factor depends on the spot, so each beam has a table of its own.
         factor = np.empty((0, 0))
         if job.brdf is not None:
             spot = job.laser_spot_m[which.start]

@@ -82,7 +82,7 @@ def _sites(job: TransportJob, index: int, fields: TorchFields, size: int) -> tup
     """Return the columns of one object's sites: depth, low, high, start and across."""
     row, column = job.patches.row, job.patches.column
     free = np.zeros((len(row), FACES * fields.sectors), np.float32)
-    low, high = horizons(job) if job.field.shades else (free, free)
+    low, high = horizons(job)[:2] if job.field.shades else (free, free)
     along = np.stack([column, size - 1 - column, row, size - 1 - row], 1)
     across = np.stack([row, row, column, column], 1).astype(np.float32)
     start = (index * FACES + np.arange(FACES)) * fields.along + along
@@ -91,6 +91,7 @@ def _sites(job: TransportJob, index: int, fields: TorchFields, size: int) -> tup
 
 def shade(weight: Tensor, dx_m: Tensor, dy_m: Tensor, sites: TorchSites, fields: TorchFields, chunk: int) -> None:
     """Set the weight (n, m) of legs that the object blocks to 0: looked up if the bounds decide, else walked."""
+    # Offsets in cells; the larger one gives the face, the ratio of both the sector.
     u, v = dx_m * fields.columns_per_m, dy_m * fields.rows_per_m
     along_columns = u.abs() >= v.abs()
     far = torch.maximum(u.abs(), v.abs())
@@ -118,6 +119,7 @@ def blocked(fields: TorchFields, sites: TorchSites, which: Tensor, sector: Tenso
     The walk of `visibility.blocked` with all steps side by side; beyond its last step there is only background.
     """
     face, step = sector // fields.sectors, torch.arange(1, fields.steps + 1, device=tilt.device)
+    # Cell k of the walk: k rows up in the turned map, k tilt cells across, interpolated between two neighbors.
     across = sites.across[which, face][:, None] + tilt[:, None] * step
     below = across.floor()
     share = across - below
@@ -200,6 +202,7 @@ def legs(
     """
     z = surface.z_m
     dx, dy = wall.x_m - surface.x_m, wall.y_m - surface.y_m
+    # d^2 = dx^2 + dy^2 + z^2 and n . (wall point - patch), with fused multiply-adds in place of temporary tensors.
     squared = torch.addcmul(z * z, dx, dx).addcmul_(dy, dy)
     length = squared.sqrt()
     facing = torch.addcmul(-surface.normal_z * z, surface.normal_x, dx).addcmul_(surface.normal_y, dy)
@@ -352,6 +355,7 @@ class _Batch:
 
     def _counts(self, surface: TorchSurface, sites: TorchSites | None, foot: Float64 | None) -> tuple[Tensor, Tensor]:
         """Return the first bin (n, 1) of some patches, and B over d3 + d4 in sub-bins from there on."""
+        # B(s, q) over d3 + d4, counted from the patch's own first bin.
         weight, length = legs(surface, sites, self.relay, self.optics, outgoing=True)
         if foot is not None and self.job.brdf is not None:
             weight *= scattered(self.job.brdf, foot, surface, self.relay)
@@ -366,6 +370,7 @@ class _Batch:
         count = max(self.chunk // len(first), 1)
         for start in range(0, len(feet.x_m), count):
             some = feet.part(start, start + count)
+            # A(p, s) over d1 + d2: the shift in whole bins and the row of the table, as in `backend_numba`.
             weight, length = legs(self.surface, self.sites, some, self.optics, outgoing=False)
             sub_bin = torch.add(some.length_m * self.per_m + 0.5, length, alpha=self.per_m).int()
             columns = table, sub_bin % self.per_bin, sub_bin // self.per_bin + first, weight * self.surface.strength
@@ -380,6 +385,7 @@ def counted(at: Tensor, weight: Tensor, size: int) -> Tensor:
 
     Weights are rounded to whole steps: integers add up to the same in any order of a GPU's threads.
     """
+    # Integer addition is associative and float addition is not: atomic adds of integers give the same bits every time.
     step = weight.amax(1, keepdim=True).double().clamp_(min=1e-300) / WHOLE_STEPS
     total = torch.zeros((len(at), size), dtype=torch.int64, device=at.device)
     return (total.scatter_add_(1, at, (weight / step).long()) * step).float()

@@ -43,19 +43,25 @@ def no_echoes(count: int) -> MultiBounce:
     return MultiBounce(dark[0], dark[1], np.full(count, np.nan, np.float32))
 
 
+@numba.njit(cache=True)
+def strongest_between(histogram: NDArray[np.floating], start: int, end: int) -> tuple[int, np.float32, np.float32]:
+    """Return index and value of the strongest bin from `start` to before `end`, and the value of the second."""
+    best, second, at = np.float32(0), np.float32(0), 0
+    for k in range(start, end):
+        value = np.float32(histogram[k])
+        if value > best:  # a tie stays with the shorter path
+            best, second, at = value, best, k
+        elif value > second:
+            second = value
+    return at, best, second
+
+
 @numba.njit(cache=True, parallel=True)
 def _two_strongest(histogram: NDArray[np.floating]) -> tuple[NDArray[np.int64], Float32, Float32]:
     rows, bins = histogram.shape
     winner, peak, second = np.zeros(rows, np.int64), np.zeros(rows, np.float32), np.zeros(rows, np.float32)
     for i in numba.prange(rows):
-        best, next_best, at = np.float32(0), np.float32(0), 0
-        for k in range(bins):
-            value = np.float32(histogram[i, k])
-            if value > best:  # a tie stays with the shorter path
-                best, next_best, at = value, best, k
-            elif value > next_best:
-                next_best = value
-        winner[i], peak[i], second[i] = at, best, next_best
+        winner[i], peak[i], second[i] = strongest_between(histogram[i], 0, bins)
     return winner, peak, second
 
 
@@ -74,6 +80,7 @@ def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32
     wins = peak > direct
     intensity = np.where(wins, peak, direct)
     second = np.maximum(np.where(wins, direct, peak), multi.runner_up)
+    # The device divides every path by two, also one of three bounces (S5).
     length = np.where(wins, multi.path_m / 2, beams.length_m.reshape(beams.shape))
     depth = np.where(intensity > 0, length * beams.cos_axis.reshape(beams.shape), np.nan)
     margin = np.where(intensity > 0, 1 - second / np.maximum(intensity, np.finfo(np.float32).tiny), 0)
@@ -83,6 +90,7 @@ def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32
 def add_direct(histogram: Float32, beams: Beams, bin_m: float) -> Float32:
     """Return histograms (n, bins) with each beam's direct return in the bin of its path; more bins if it needs them."""
     returns = np.flatnonzero(beams.direct > 0)
+    # There and back along one leg: the path is 2 d1.
     at = np.floor(2 * beams.length_m[returns] / bin_m).astype(np.int64)
     longer = max(int(at.max(initial=-1)) + 1 - histogram.shape[1], 0)
     whole = np.pad(histogram, [(0, 0), (0, longer)])
@@ -103,6 +111,7 @@ def with_pulse(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
     kernel = _pulse(pulse_ns, bin_m)
     half = len(kernel) // 2
     size = histogram.shape[1] + 2 * half
+    # Convolution theorem; zero padding by the kernel's length keeps the end from wrapping to the start.
     spectrum = np.fft.rfft(histogram.astype(np.float64), size, axis=1) * np.fft.rfft(kernel, size)
     wide = np.fft.irfft(spectrum, size, axis=1)[:, half:]  # what would come before time 0 is cut
     return np.maximum(wide, 0).astype(np.float32)

@@ -4,7 +4,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from nlos_cam.errors import SceneError
+from nlos_cam.errors import SceneError, UnknownNameError, did_you_mean
 
 EFFECTS = (
     "direct",
@@ -63,7 +63,10 @@ def decide(findings: Collection[tuple[str, float, str]], tolerance: float, effec
 def _asked(findings: Collection[tuple[str, float, str]], effects: Collection[str]) -> Plan:
     names = {effects} if isinstance(effects, str) else set(effects)
     if unknown := names - set(EFFECTS):
-        raise SceneError(f"no effect {min(unknown)!r}: choose from {', '.join(EFFECTS)}, or auto")
+        near = did_you_mean(min(unknown), EFFECTS)
+        raise UnknownNameError(f"no effect {min(unknown)!r}.{near} Choose from {', '.join(EFFECTS)}, or auto")
+    if not names & {"direct", "three-bounce"}:
+        raise SceneError(f"effects {', '.join(sorted(names)) or 'none'}: no light arrives: add direct or three-bounce")
     verdicts = (Effect(name, name in names, reason, bound) for name, bound, reason in findings)
     return tuple(
         replace(e, reason=f"{'requested' if e.included else 'left out on request'}; {e.reason}") for e in verdicts

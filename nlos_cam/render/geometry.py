@@ -124,6 +124,7 @@ def _cast(rig: Rig, intrinsics: Intrinsics, lambertian: bool, occluder: bool) ->
     on_wall = wall_length < stop_length
     length = np.minimum(wall_length, stop_length)
     length[np.isinf(length)] = np.nan
+    # The wall's normal is +z and the occluder's is x: the cosine is that component of the unit direction.
     cosine = np.where(on_wall, -direction[:, 2], np.abs(direction[:, 0]))
     direct = returned(rig, length, cosine, solid_angle(lambertian=lambertian))
     foot = lidar + length[:, None] * direction
@@ -139,6 +140,7 @@ def returned(rig: Rig, length_m: Float64, cosine: Float64, solid_angle: float) -
     cell_m2 = rig.device.receiver_cell_m2
     near_m = NEAR_DIAGONALS * np.sqrt(2 * cell_m2)
     in_gate = 2 * length_m < SPEED_OF_LIGHT_M_PER_S * rig.device.gate_s
+    # S1: cos t1 S / (solid angle d^2), where d^2 is limited at contact. The cell S is the receiver's, not the grid's.
     light = cosine * cell_m2 / (solid_angle * softened(length_m**2, cell_m2 / solid_angle, near_m))
     return np.where(in_gate, light, 0.0)
 
@@ -157,6 +159,7 @@ def _occluder_length(rig: Rig, lidar: Float64, direction: Float64) -> Float64:
     """Return the distance along each beam to the occluder's half plane; inf for beams that miss it."""
     if rig.occluder is None:
         return np.full(len(direction), np.inf)
+    # The half plane is x = x_m: lidar_x + t direction_x = x_m, and it stops the beam if it is high enough there.
     length = (rig.occluder.x_m - lidar[0]) / direction[:, 0]
     height = lidar[2] + length * direction[:, 2]
     return np.where((length > 0) & (height >= rig.occluder.z_min_m), length, np.inf)

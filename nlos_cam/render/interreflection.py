@@ -123,6 +123,7 @@ def _over_the_object(
     points, out = patches.point_m, np.zeros((len(patches.row), width), np.float32)
     for a in numba.prange(len(points)):
         for b in range(len(points)):
+            # Neumann series, one term: L(a) = E(a) + sum_b F(a, b) L(b), with L(b) on the right cut to its own returns.
             factor = _between_patches(a, b, patches, field, near_m, lambertian)
             if factor > 0:
                 away = np.sqrt(((points[b] - points[a]) ** 2).sum())
@@ -157,6 +158,7 @@ def add_interreflection(job: TransportJob, first: NDArray[np.int32], histogram: 
     # Over the wall in two passes, n m each instead of n^2 m: first every wall cell collects the histograms of the
     # patches that it lights, then every patch collects those of the cells. All are aligned to the earliest start in
     # between.
+    # Patch b's sub-bins count from start[b], the wall's from the earliest start: b's come later by the difference.
     on_wall = _carry(back.T.copy(), steps.T + start - start.min(), histogram, width)
     by_wall = _carry(there, steps + (start.min() - start)[:, None], on_wall, width)
     over_object = _over_the_object(*_object(job), per_m, start, histogram, width)

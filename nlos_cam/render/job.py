@@ -92,6 +92,8 @@ class TransportJob:
     @cached_property
     def relay_weight(self) -> Float64:
         """(m,); factors of S2 that depend on the relay cell alone: its area, and the leg from it to the lidar."""
+        # S2 falls with 1 / d^2 on each leg; from the wall back to the lidar that leg is fixed for a cell. Near contact
+        # the area of the cell bounds it (see `softened`), or a cell below the lidar would send back more than it got.
         relay = self.relay
         squared = softened(relay.length_m**2, self.soft_wall_m2, self.near_m)
         weight = relay.cell_m2 / (self.solid_angle**2 * squared)

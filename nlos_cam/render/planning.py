@@ -61,6 +61,7 @@ def _occluder(facts: SceneFacts) -> Finding:
         return "occluder", 0.0, "no beam meets it, and nothing is hidden"
     if not occluder_meets(occluder_edge(facts.rig), facts.patches, beams, facts.relay):
         return "occluder", 0.0, "it blocks no leg"
+    # The survey samples points of the wall and may miss a thin shadow: one beam's share is the least that may be lost.
     return "occluder", max(facts.light.occluder, 1 / len(beams.length_m)), "legs cross it"
 
 
@@ -101,6 +102,8 @@ def _color(facts: SceneFacts) -> Finding:
     if facts.patches is None or not facts.scene.surface.colored:
         return "colour", 0.0, "the albedo has one channel"
     albedo = np.asarray(facts.scene.surface.albedo, np.float64)
+    # Light is linear in albedo: with the mean in place of a channel, each patch errs by |channel - mean| / mean, and a
+    # sum of patches by no more than the worst of them.
     grey = albedo.mean(-1, keepdims=True)
     apart = float((np.abs(albedo - grey).max(-1) / np.where(grey > 0, grey, 1)[..., 0]).max())
     return "colour", min(apart, 1.0), f"channels differ by up to {apart:.3g} of their mean"
@@ -119,6 +122,7 @@ def _pulse(facts: SceneFacts) -> Finding:
     if facts.scene.pulse_ns == 0:
         return "pulse", 0.0, "the pulse has no width"
     sigma = pulse_bins(facts.scene.pulse_ns, facts.rig.device.bin_m)
+    # A Gaussian moves a share of about sigma / bin of an echo over each edge of its bin; L1 counts it on both sides.
     return "pulse", min(4 * sigma, 1.0), f"{facts.scene.pulse_ns:g} ns spread an echo by {sigma:.3g} bins"
 
 

@@ -62,8 +62,7 @@ def render(
     """
     facts = SceneFacts(scene, accuracy_named(accuracy))
     problem = RenderProblem.of(facts, plan(facts, effects), rows)
-    histograms = transport(problem.job, backend)
-    return _rendering(problem, histograms, backend)
+    return _rendering(problem, _echoes(problem, backend), backend)
 
 
 def render_all(
@@ -73,9 +72,8 @@ def render_all(
     setting, rest = accuracy_named(accuracy), iter(scenes)
     while batch := list(islice(rest, 1 if backend == "cpu" else BATCH_OBJECTS)):
         problems = [prepare(scene, setting, effects) for scene in batch]
-        found = _transport_batch([problem.job for problem in problems], setting, backend)
-        for problem, histograms in zip(problems, found, strict=True):
-            yield _rendering(problem, histograms, backend)
+        for problem, echoes in zip(problems, _echoes_of_all(problems, setting, backend), strict=True):
+            yield _rendering(problem, echoes, backend)
 
 
 def transient(
@@ -110,6 +108,8 @@ def beam_histograms(
     """Return the three-bounce histograms of a problem's beams, or of the chosen; 0 for beams that miss the wall."""
     lit = problem.beams.on_wall
     chosen = np.arange(len(lit)) if chosen is None else chosen
+    # A job holds the beams that light the wall alone, in their order: the running count of lit beams is a beam's place
+    # among them.
     wanted = chosen[lit[chosen]]
     if job is None or not wanted.size:
         return np.zeros((len(chosen), job.bins if job else 1), np.float32)
@@ -135,17 +135,25 @@ def transport(job: TransportJob | None, backend: str) -> Histograms | None:
     return backend_torch.histograms(job, backend_torch.device_named(backend))
 
 
-def _transport_batch(
-    jobs: Sequence[TransportJob | None], accuracy: Accuracy, backend: str
-) -> Iterable[Histograms | None]:
-    """Return the histograms of every job, torch's in one batch."""
+def _echoes(problem: RenderProblem, backend: str) -> MultiBounce:
+    """Return the strongest bins (n,) of all beams, from a part of the transport where the backend can do that."""
+    job = problem.job
+    # A pulse mixes neighbouring bins, so that the strongest bin before it may not be the strongest after it: only a
+    # waveform without one may be summed in part.
+    if backend == "cpu" and job and job.accuracy.sub_bins and not problem.includes("pulse"):
+        return backend_numba.echoes(job).spread_over(problem.beams.on_wall)
+    return _strongest(problem, transport(job, backend))
+
+
+def _echoes_of_all(problems: Sequence[RenderProblem], accuracy: Accuracy, backend: str) -> Iterable[MultiBounce]:
+    """Return the strongest bins of every problem, torch's in one batch."""
     if backend not in {"torch", "cuda"} or accuracy.sub_bins == 0:
-        return [transport(job, backend) for job in jobs]
+        return [_echoes(problem, backend) for problem in problems]
     from nlos_cam.render import backend_torch
 
-    device = backend_torch.device_named(backend)
+    device, jobs = backend_torch.device_named(backend), [problem.job for problem in problems]
     found = iter(backend_torch.histograms_of_all([job for job in jobs if job is not None], device))
-    return [None if job is None else next(found) for job in jobs]
+    return [_strongest(problem, next(found) if problem.job else None) for problem in problems]
 
 
 def _spread_over(lit: NDArray[np.bool_], histograms: Histograms | None) -> Histograms:
@@ -157,16 +165,16 @@ def _spread_over(lit: NDArray[np.bool_], histograms: Histograms | None) -> Histo
     return every
 
 
-def _rendering(problem: RenderProblem, histograms: Histograms | None, backend: str) -> Rendering:
-    """Return the maps of a problem from the three-bounce histograms of its lit beams: echoes, S5, cells, color."""
-    echoes = _echoes(problem, histograms).reshape(problem.beams.shape)
+def _rendering(problem: RenderProblem, echoes: MultiBounce, backend: str) -> Rendering:
+    """Return the maps of a problem from the strongest bins (n,) of its beams: S5, cells, color."""
+    echoes = echoes.reshape(problem.beams.shape)
     depth, intensity, margin = compete(problem.beams, echoes)
     color = _color(problem, echoes, backend) if problem.color_jobs else None
     near = count_near_legs(problem.job) if problem.job else 0
     return Rendering(*_cells(depth, intensity, margin), echoes, problem.plan, problem.accuracy, near, color)
 
 
-def _echoes(problem: RenderProblem, histograms: Histograms | None) -> MultiBounce:
+def _strongest(problem: RenderProblem, histograms: Histograms | None) -> MultiBounce:
     """Return the strongest bins (n,) of all beams: of three bounces, or with a pulse of the whole waveform."""
     lit, bin_m = problem.beams.on_wall, problem.scene.rig.device.bin_m
     if problem.includes("pulse"):
@@ -178,6 +186,8 @@ def _echoes(problem: RenderProblem, histograms: Histograms | None) -> MultiBounc
 def _waveforms(problem: RenderProblem, histograms: Histograms) -> Float32:
     """Return three-bounce histograms with direct returns added and the pulse applied, up to the gate."""
     device = problem.scene.rig.device
+    # Convolution is linear, so one pulse over the sum of direct and three-bounce light stands for each echo's own; it
+    # comes before the gate, since light outside reaches in by the pulse's tail.
     whole = add_direct(histograms.astype(np.float32, copy=False), problem.beams, device.bin_m)
     if problem.includes("pulse"):
         whole = with_pulse(whole, problem.scene.pulse_ns, device.bin_m)
@@ -187,6 +197,8 @@ def _waveforms(problem: RenderProblem, histograms: Histograms) -> Float32:
 def _color(problem: RenderProblem, echoes: MultiBounce, backend: str) -> Float32:
     """Return the intensity (64, 80, 3) of each channel in the bin of the winning echo; the wall is white."""
     bin_m, beams = problem.scene.rig.device.bin_m, np.arange(echoes.peak.size)
+    # The winner is chosen on the mean albedo, as a lidar of one wavelength would; the channels only share its bin.
+    # Choosing anew in each channel could give one beam three depths.
     wins = (echoes.peak.ravel() > problem.beams.direct) | echoes.direct_included
     at = np.nan_to_num(echoes.path_m.ravel() / bin_m, nan=0).astype(np.int64)
     channels: list[Float32] = []
@@ -217,6 +229,8 @@ def _cells(depth: Float32, intensity: Float32, margin: Float32) -> tuple[Float32
     depths, values = _blocks(depth), _blocks(intensity)
     valid = ~np.isnan(depths)
     some = valid.any(-1)
+    # Median of depth, then mean of the intensities near it: a cell across an edge holds two echoes at two depths, and
+    # their mean depth would lie where there is nothing.
     median = np.full(some.shape, np.nan, np.float32)
     median[some] = np.nanmedian(depths[some], axis=-1)
     near = valid & (np.abs(depths - median[..., None]) <= WINNER_SPREAD_M)

@@ -24,6 +24,8 @@ FINEST_SHARE = 2e-2
 
 def scan_effect(scene_at: SceneAt, accuracy: str | Accuracy = "standard") -> Effect:
     """Return the verdict on the raster: the change of the transient from the top row's instant to the bottom row's."""
+    # Only the ends of the scan are compared: an object that comes back within it would go unseen, but a scan lasts
+    # 1/30 s.
     setting, first, last = accuracy_named(accuracy), scene_at(0.0), scene_at(1.0)
     change = 0.0 if _alike(first, last) else min(CAUTION * _change(first, last), 1.0)
     reason = f"motion changes {change:.3g} of the transient during a scan" if change else "nothing moves"
@@ -37,6 +39,7 @@ def render_scan(scene_at: SceneAt, accuracy: str | Accuracy = "standard", effect
     count = slices(verdict, setting)
     parts: list[Rendering] = []
     for rows in np.array_split(np.arange(MAP_ROWS), count):
+        # The middle of a slice makes the error of its timing odd in the row, so that it cancels to first order.
         share = float(rows.mean() + 0.5) / MAP_ROWS if verdict.included else 0.0
         parts.append(render(scene_at(share), setting, effects, rows=(int(rows[0]), int(rows[-1]) + 1)))
     return joined(parts, verdict)
@@ -46,6 +49,8 @@ def slices(verdict: Effect, setting: Accuracy) -> int:
     """Return the number of instants of a scan: within one, at most FINEST_SHARE or the tolerance changes."""
     if not verdict.included:
         return 1
+    # Change is taken as linear over the scan: a slice of 1 / n of the rows then changes 1 / n of the bound. Two slices
+    # are the fewest that show motion at all, and more than one a row there cannot be.
     return int(np.clip(ceil(verdict.bound / max(setting.tolerance, FINEST_SHARE)), 2, MAP_ROWS))
 
 
@@ -77,6 +82,7 @@ def _change(first: Scene, last: Scene) -> float:
     count = first.cell_intrinsics.width * first.cell_intrinsics.height
     chosen = np.arange(count)[:: count // PROBES]
     one, other = (three_bounce(scene, "draft", chosen=chosen) for scene in (first, last))
+    # L1 over all bins, relative to the light: an echo that leaves one bin for the next counts as lost and as new.
     bins = max(one.shape[1], other.shape[1])
     one, other = (np.pad(part, [(0, 0), (0, bins - part.shape[1])]) for part in (one, other))
     whole = float(np.abs(other).sum())

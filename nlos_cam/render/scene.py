@@ -16,6 +16,7 @@ from nlos_cam.render.patches import JUMP_M, Patches, make_patches
 Radiometry = Literal["paper", "lambertian"]
 """"paper" is S1 to S5 to the letter, "lambertian" the rendering equation with every cosine for the same paths.
 """
+MAX_PULSE_NS = 100
 FINEST_GRID = 256
 """Cells along a side of a depth map: sixteen times the default's number, and tables within a gigabyte."""
 
@@ -37,9 +38,10 @@ class Scene:
     def __post_init__(self) -> None:
         if self.radiometry not in get_args(Radiometry):
             raise SceneError(f"no radiometry {self.radiometry!r}: choose one of {', '.join(get_args(Radiometry))}")
-        for name in ("jump_m", "pulse_ns"):
-            if not 0 <= (value := getattr(self, name)) < np.inf:
-                raise SceneError(f"{name} is {value}: it must be finite and at least 0")
+        if not 0 <= self.jump_m < np.inf:
+            raise SceneError(f"jump_m is {self.jump_m}: it must be finite and at least 0")
+        if not 0 <= self.pulse_ns <= MAX_PULSE_NS:
+            raise SceneError(f"pulse_ns is {self.pulse_ns}: give 0 to {MAX_PULSE_NS} (30 m of path)")
         if self.object_depth_m is not None:
             _check_depth(self.object_depth_m)
             self.surface.over(self.object_depth_m.shape)

@@ -148,12 +148,13 @@ def bins_of(beams: Beams, patches: Patches, relay: Relay, device: DeviceConstant
     # The distance to a fixed point is a convex function, and so is a sum of two: over a box of patches or a rectangle
     # of relay cells it is largest at a corner. The far corners (largest z) suffice, as the wall lies at z = 0.
     x, y, z = ((column.min(), column.max()) for column in patches.point_m.T)
-    corners = np.array([(a, b, z[1]) for a in x for b in y])
-    spots = beams.laser_spot_m[beams.on_wall]
-    there = beams.length_m[beams.on_wall, None] + np.linalg.norm(spots[:, None] - corners[None], axis=-1)
-    ends = np.array(
-        [(a, b, 0.0) for a in (relay.x_m.min(), relay.x_m.max()) for b in (relay.y_m.min(), relay.y_m.max())]
-    )
-    back = np.linalg.norm(ends - beams.lidar_m, axis=-1) + np.linalg.norm(ends[:, None] - corners[None], axis=-1).max(1)
-    longest_bin = int((there.max() + back.max()) / device.bin_m)  # of a path on a bin's edge, the bin beyond it
+    spots, length = beams.laser_spot_m[beams.on_wall], beams.length_m[beams.on_wall]
+    ends = [(a, b) for a in (relay.x_m.min(), relay.x_m.max()) for b in (relay.y_m.min(), relay.y_m.max())]
+    there, back = 0.0, np.zeros(len(ends))
+    for corner_x, corner_y in ((a, b) for a in x for b in y):
+        to_corner = np.sqrt((spots[:, 0] - corner_x) ** 2 + (spots[:, 1] - corner_y) ** 2 + z[1] ** 2)
+        there = max(there, float((length + to_corner).max()))
+        back = np.maximum(back, [np.sqrt((a - corner_x) ** 2 + (b - corner_y) ** 2 + z[1] ** 2) for a, b in ends])
+    back += [np.linalg.norm(np.subtract((*end, 0.0), beams.lidar_m)) for end in ends]
+    longest_bin = int((there + back.max()) / device.bin_m)  # of a path on a bin's edge, the bin beyond it
     return min(longest_bin + 2, gate_bins(device))  # one to spare: the fast renderers round lengths

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from nlos_calibration import Record, Rig, first_problem, load_rig, rig_named
+from nlos_calibration import Record, Rig, first_problem, load_rig, read_toml, record_kind, rig_named
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import RecordFileError
 from pydantic import (
@@ -23,7 +23,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from nlos_cam.errors import SceneError
+from nlos_cam.errors import SceneError, SceneFileError
 from nlos_cam.objects import (
     CATEGORIES,
     MeshFile,
@@ -123,8 +123,8 @@ class HiddenObject(Record):
 class Motion(Record):
     """Closed loop of poses: each quantity oscillates by its amplitude, a whole number of times per loop."""
 
-    poses: int = Field(default=90, gt=0)
-    """Number of poses, at 30 per second."""
+    poses: int = Field(default=90, gt=0, le=3600)
+    """Number of poses, at 30 per second: two minutes at most, all rendered ahead."""
     sway_x_m: Length = 0.0
     sway_y_m: Length = 0.0
     approach_m: Reach = 0.0
@@ -189,8 +189,10 @@ def one_wrap(faults: tuple[Fault, ...]) -> tuple[Fault, ...]:
     return faults
 
 
-RENDERING_VERSION = 3
-"""Number to raise with any change of rendering results, so that cached worlds are rendered again."""
+RENDERING_VERSION = 4
+"""Number to raise with any change of rendering results or of datasets' noise: cached worlds are rendered again, and
+datasets of another number are not continued.
+"""
 
 
 class SceneFile(Record):
@@ -277,22 +279,36 @@ def bare_wall_scene() -> SceneFile:
     return SceneFile(name="bare-wall", rig=load_rig("bare-wall"))
 
 
-def load_scene(path: Path) -> SceneFile:
-    """Return a scene from TOML; paths of a rig or a mesh in it are relative to its own folder.
+def packaged_scenes() -> dict[str, Path]:
+    """Return the example scenes that come with the package (in a clone: examples) by name."""
+    here = Path(__file__).parent
+    folder = next((folder for folder in (here / "scenes", here.parents[1] / "examples") if folder.is_dir()), here)
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
-    Raises SceneError with the first problem.
+
+def load_scene(path: Path) -> SceneFile:
+    """Return a scene from TOML, or a packaged one by name; paths in it are relative to its own folder.
+
+    Raises SceneFileError with the first problem, SceneError for an object that cannot be seen.
     """
+    content: dict[str, Any] = {}
+    if str(path) == path.stem and not path.exists():
+        path = packaged_scenes().get(path.stem, path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = read_toml(path)
         scene = SceneFile.model_validate(_from_folder(content, path.parent))
     except RecordFileError as error:
-        raise SceneError(f"{path} is not a valid scene: rig: {error}") from error
+        raise SceneFileError(f"{path} is not a valid scene: rig: {error}") from error
     except ValidationError as error:
-        raise SceneError(f"{path} is not a valid scene: {first_problem(error)}") from error
+        if (kind := record_kind(content)) not in {"", "scene"}:
+            raise SceneFileError(f"{path} is a {kind}, not a scene: give the path of a scene.toml") from error
+        raise SceneFileError(f"{path} is not a valid scene: {first_problem(error)}") from error
     except OSError as error:
-        raise SceneError(f"{path} cannot be read ({error.strerror}): give the path of a scene.toml") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SceneError(f"{path} cannot be read as a scene: {error}") from error
+        raise SceneFileError(f"{path} cannot be read ({error.strerror}): give the path of a scene.toml") from error
+    except UnicodeDecodeError as error:
+        raise SceneFileError(f"{path} is a binary file, not a scene: give the path of a scene.toml") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SceneFileError(f"{path} cannot be read as a scene: {error}") from error
     if scene.hidden and not any(scene.shows_at(number) for number in range(scene.poses)):
         raise invisible_object_error(scene.hidden.label, object_box(scene.rig))
     return scene

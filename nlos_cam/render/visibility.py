@@ -27,6 +27,8 @@ BIAS_CELLS = 0.25
 """Height in cells by which a cell must rise above a leg to block it: less is the roughness of the grid itself."""
 ROUNDING = 1e-5
 """Relative widening of the bounds, so that a leg on a bound in float32 is walked in float64."""
+TOUCH = np.float32(1e-5)
+"""Height in meters per cell, above the rounding of float32, by which a step may fail to matter and is walked."""
 
 
 class HeightField(NamedTuple):
@@ -107,8 +109,13 @@ def _steps(field: HeightField, start: int, forward: bool, along_columns: bool) -
 
 
 @numba.njit(cache=True)
-def blocked(field: HeightField, row: int, column: int, depth_m: float, u: float, v: float) -> bool:
-    """Return whether the object blocks the leg from a cell to the wall point u columns and v rows away."""
+def blocked(
+    field: HeightField, row: int, column: int, depth_m: float, u: float, v: float, first: int = 1, last: int = 1 << 30
+) -> bool:
+    """Return whether the object blocks the leg from a cell to the wall point u columns and v rows away.
+
+    Steps before `first` and after `last` are known not to block it.
+    """
     along_columns = abs(u) >= abs(v)
     major, minor = (u, v) if along_columns else (v, u)
     if abs(major) < 1e-9:
@@ -116,7 +123,7 @@ def blocked(field: HeightField, row: int, column: int, depth_m: float, u: float,
     start, across = (column, row) if along_columns else (row, column)
     tilt, step = minor / abs(major), 1 if major > 0 else -1
     limit, bias = depth_m / abs(major), bias_m(field)
-    for k in range(1, _steps(field, start, major > 0, along_columns) + 1):
+    for k in range(first, min(_steps(field, start, major > 0, along_columns), last) + 1):
         # The highest surface there is cannot reach the leg any more, nor can any farther away: 1 / k only falls.
         if (depth_m - field.nearest_m - bias) / k <= limit:
             return False
@@ -151,64 +158,126 @@ def segment_blocked(
     return False
 
 
-@numba.njit(cache=True)
-def _bounds_at(
-    field: HeightField, along: int, across_a: float, across_b: float, along_columns: bool
-) -> tuple[float, float]:
-    """Return the smallest and the largest depth of `_between` from across_a to across_b; the latter NaN at a gap."""
-    a, b = _between(field, along, across_a, along_columns), _between(field, along, across_b, along_columns)
-    # Interpolation is linear between cells, so its extremes lie at both ends and at the cells in between. Cells within
-    # half a cell of the ends count too, as next to background the nearer neighbor stands for itself.
-    first, last = int(np.ceil(across_a - 0.5)), int(np.floor(across_b + 0.5))
-    gap = np.isnan(a) or np.isnan(b)
-    for across in range(first, last + 1):
-        gap = gap or np.isnan(_depth(field, along, across, along_columns))
-    least, most = np.inf, -np.inf
-    for depth in (a, b):
-        if not np.isnan(depth):
-            least, most = min(least, depth), max(most, depth)
-    for across in range(first, last + 1):
-        depth = _depth(field, along, across, along_columns)
-        if not np.isnan(depth) and (gap or across_a <= across <= across_b):
-            least, most = min(least, depth), max(most, depth)
-    return least, np.nan if gap else most
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _meet(
+    row: Float32,
+    offset: int,
+    share: np.float32,
+    over: bool,
+    rise_m: Float32,
+    last: Float32,
+    k: np.float32,
+    bounds: Float32,
+) -> None:
+    """Update a sector's bounds (4, n), those of `_line`, by the cells k steps on, for n neighbors at once.
+
+    `last` (2, n) holds the smallest and the largest depth in the direction where the sector begins; it is replaced by
+    those where it ends, `offset` cells across and a share of the next one. `over` is True if it crosses a cell.
+    """
+    nothing, inverse = np.float32(np.inf), np.float32(1) / k
+    least, most, low, high, first, until = last[0], last[1], bounds[0], bounds[1], bounds[2], bounds[3]
+    near, beyond = row[offset : offset + len(rise_m)], row[offset + 1 : offset + 1 + len(rise_m)]
+    for c in range(len(rise_m)):
+        a, b = near[c], beyond[c]
+        gap = (a == nothing) | (b == nothing)
+        between = a + share * (b - a)
+        # Next to background the nearer of both cells stands for itself: either may be the smallest, none the largest.
+        smallest, largest = (min(a, b) if gap else between), (nothing if gap else between)
+        crossed = a if over else smallest
+        above = (rise_m[c] - min(least[c], smallest, crossed)) * inverse
+        high[c] = max(high[c], above)
+        low[c] = max(low[c], (rise_m[c] - max(most[c], largest, a if over else largest)) * inverse)
+        # A step matters to a leg between the bounds if it may rise above the wall and above the lower bound.
+        first[c] = min(first[c], k if above > -TOUCH else nothing)
+        until[c] = k if above > low[c] - TOUCH else until[c]
+        least[c], most[c] = smallest, largest
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _line(cells: Float32, margin: int, start: int, step: int, steps: int, rise_m: Float32, sectors: int) -> Float32:
+    """Return bounds (sectors, 4, n) of the horizons of n neighbors on a line: low, high, first and last step to walk.
+
+    `cells` (lines, margin + n + ...) is the depth map with inf for background, neighbors side by side.
+    """
+    count = len(rise_m)
+    bounds = np.zeros((sectors, 4, count), np.float32)
+    bounds[:, 2] = np.inf
+    last = np.empty((2, count), np.float32)
+    # After k cells a sector from a to b covers k a to k b across. Every direction in it has at least the term of the
+    # largest depth there and at most that of the smallest; the maximum over k keeps both orders. Depth is linear
+    # between cells, so its extremes lie in the sector's two directions and at the cells in between.
+    for k in range(1, steps + 1):
+        row, before = cells[start + k * step], 0
+        for sector in range(sectors + 1):
+            across = k * (2.0 * sector / sectors - 1.0)
+            offset = int(np.floor(across))
+            if sector == 0:
+                last[:] = np.inf  # before the first sector: what it adds is true of the first one too
+            for cell in range(before + 1, offset if sector else before):
+                for c in range(count):
+                    depth = row[margin + cell + c]
+                    last[0, c], last[1, c] = min(last[0, c], depth), max(last[1, c], depth)
+            over, share = sector > 0 and offset > before, np.float32(across - offset)
+            _meet(row, margin + offset, share, over, rise_m, last, np.float32(k), bounds[max(sector - 1, 0)])
+            before = offset
+    return bounds
 
 
 @numba.njit(cache=True)
-def _horizons(
-    field: HeightField, row: int, column: int, depth_m: float, face: int, a: float, b: float, reach: float
-) -> tuple[float, float]:
-    """Return bounds of the horizon over a sector: directions that go a to b cells across per cell along the axis."""
-    along_columns, forward = face < 2, face % 2 == 0
-    start, across = (column, row) if along_columns else (row, column)
-    low, high, step, bias = 0.0, depth_m / reach, 1 if forward else -1, bias_m(field)
-    # After k cells the sector covers k a to k b across. Every direction in it has at least the term of the largest
-    # depth there and at most that of the smallest; the maximum over k keeps both orders. Horizons below z / reach block
-    # no leg that ends on the wall, so `high` starts there.
-    for k in range(1, _steps(field, start, forward, along_columns) + 1):
-        if (depth_m - field.nearest_m - bias) / k <= max(low, depth_m / reach):
-            break
-        least, most = _bounds_at(field, start + k * step, across + k * a, across + k * b, along_columns)
-        high = max(high, (depth_m - least - bias) / k)
-        if not np.isnan(most):
-            low = max(low, (depth_m - most - bias) / k)
-    return low, high
+def _side_by_side(field: HeightField, rows: Int64, columns: Int64, margin: int) -> tuple[Float32, Int64]:
+    """Return depths (2, n, n + 2 margin), inf for background, and the patch in each cell (2, n, n), -1 for none.
+
+    Of both axes: first by column with rows side by side, then by row with columns side by side.
+    """
+    size = len(field.depth_m)
+    cells, patch = np.full((2, size, size + 2 * margin), np.inf, np.float32), np.full((2, size, size), -1)
+    for s in range(len(rows)):
+        patch[0, columns[s], rows[s]] = patch[1, rows[s], columns[s]] = s
+    for i in range(size):
+        for j in range(size):
+            if not np.isnan(field.depth_m[i, j]):
+                cells[0, j, margin + i] = cells[1, i, margin + j] = field.depth_m[i, j]
+    return cells, patch
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, error_model="numpy", parallel=True)
 def horizon_table(
     field: HeightField, rows: Int64, columns: Int64, depth_m: Float64, reach: Float64, sectors: int
-) -> tuple[Float32, Float32]:
+) -> tuple[Float32, Float32, NDArray[np.uint8]]:
     """Return lower and upper bounds (n, FACES * sectors) of the horizons of patches, for every sector of directions.
 
-    `reach` (n,) is the longest leg to the wall in cells: horizons that no leg can meet are left out.
+    With them, first and last step (n, FACES * sectors, 2) of the walk of a leg between its bounds.
+    `reach` (n,) is the longest leg to the wall in cells: horizons that no leg can meet are left out. The patches of
+    a row or column go together, as a step in a direction takes all of them to neighbors again.
     """
-    low, high = np.empty((len(rows), FACES * sectors), np.float32), np.empty((len(rows), FACES * sectors), np.float32)
-    for s in numba.prange(len(rows)):
-        for face in range(FACES):
-            for sector in range(sectors):
-                a, b = 2.0 * sector / sectors - 1.0, 2.0 * (sector + 1) / sectors - 1.0
-                below, above = _horizons(field, rows[s], columns[s], depth_m[s], face, a, b, reach[s])
-                k = face * sectors + sector
-                low[s, k], high[s, k] = below * (1 - ROUNDING), above * (1 + ROUNDING)
-    return low, high
+    size, patches = len(field.depth_m), len(rows)
+    low, high = np.zeros((patches, FACES * sectors), np.float32), np.zeros((patches, FACES * sectors), np.float32)
+    walk, margin = np.zeros((patches, FACES * sectors, 2), np.uint8), size + 2
+    cells, patch = _side_by_side(field, rows, columns, margin)
+    # Depths are float32 here: bounds give way by more than their rounding.
+    slack_m = np.float32(1e-6 * depth_m.max())
+    for line in numba.prange(2 * size):
+        axis, start = line // size, line % size
+        some = np.flatnonzero(patch[axis, start] >= 0)
+        if not len(some):
+            continue
+        first, which = some[0], patch[axis, start]
+        rise_m, steps = np.zeros(some[-1] + 1 - first, np.float32), 0.0
+        for c in some:
+            s = which[c]
+            above_m = depth_m[s] - bias_m(field)
+            rise_m[c - first] = above_m
+            # No surface is nearer to the wall than nearest_m: after k steps a horizon is at most (above - nearest) / k,
+            # and below z / reach it blocks no leg that ends on the wall.
+            steps = max(steps, (above_m - field.nearest_m) * reach[s] / depth_m[s])
+        for back in range(2):
+            count = int(min(_steps(field, start, back == 0, axis == 0), steps))
+            bounds = _line(cells[axis], margin + first, start, 1 - 2 * back, count, rise_m, sectors)
+            for c in some:
+                s, k = which[c], (2 * axis + back) * sectors
+                for sector in range(sectors):
+                    below, above, begin, end = bounds[sector, :, c - first]
+                    low[s, k + sector] = max(below - slack_m, 0) * (1 - ROUNDING)
+                    high[s, k + sector] = (above + slack_m) * (1 + ROUNDING)
+                    walk[s, k + sector, 0], walk[s, k + sector, 1] = min(begin, 255), end
+    return low, high, walk

@@ -1,4 +1,4 @@
-"""Live view: in a browser, as a saved .rrd file, or as video."""
+"""Live view: in a browser, as a saved session, or as video."""
 
 import lazy_loader
 

@@ -2,22 +2,27 @@ __all__ = [
     "LOOPBACK",
     "MAX_UNCERTAINTY_M",
     "PREFERRED_PORT",
+    "SESSION_SUFFIX",
+    "Assessment",
+    "Controls",
     "Moment",
     "NullViewer",
+    "PlaybackViewer",
     "RecordedView",
-    "RrdFile",
+    "SessionFile",
     "Still",
     "VideoFile",
     "Viewer",
     "Viewers",
     "WebViewer",
+    "assess",
     "exposed",
 ]
 
-from .assets import LOOPBACK
+from .assessment import Assessment, assess
 from .images import MAX_UNCERTAINTY_M
-from .rrd_file import RrdFile
-from .server import exposed
+from .server import LOOPBACK, exposed
+from .session_file import SESSION_SUFFIX, SessionFile
 from .video import Still, VideoFile
-from .viewer import Moment, NullViewer, Viewer, Viewers
-from .web import PREFERRED_PORT, RecordedView, WebViewer
+from .viewer import Controls, Moment, NullViewer, Viewer, Viewers
+from .web import PREFERRED_PORT, PlaybackViewer, RecordedView, WebViewer

@@ -1,6 +1,5 @@
-"""Pictures and surfaces from maps, and the verdict's banner: pure functions from arrays to arrays."""
+"""Pictures from maps, and the banner of stills and videos: pure functions from arrays to arrays."""
 
-from dataclasses import dataclass
 from functools import cache
 from math import floor, log10
 
@@ -11,8 +10,7 @@ from nlos_calibration.arrays import Float32, UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from nlos_cam.objects import cell_centers_m, image_from_depth
-from nlos_cam.reconstruct import Verdict
+from nlos_cam.objects import image_from_depth
 
 BACKGROUND_RGB = (13, 16, 17)
 """Color of the page's background, for pixels without surface."""
@@ -20,8 +18,6 @@ PICTURE_WIDTH = 320
 """Columns to which lidar pictures are thinned."""
 DARKEST = 60
 """Where in the colour map the farthest surface starts, so that it stands out from the background."""
-JUMP_M = 0.03
-"""Depth difference above which neighbours are separate surfaces."""
 DIVERGING_RGB = (255, 150, 60), (70, 155, 130), (50, 160, 255)
 """Colors of nearer, expected and farther depth."""
 SATURATED_RGB = (255, 0, 200)
@@ -30,9 +26,6 @@ CHANGED_M, FEW_CHANGED, QUIET_SPAN_M = 0.01, 0.02, 0.02
 """Differences below are noise and ripples; if few cells differ by more, the span shows these."""
 MAX_UNCERTAINTY_M = 0.03
 """Uncertainty drawn brightest; the object box is 0.28 m deep."""
-RESIDUAL_SPAN_M = 0.02
-"""Of the physics check; the lidar's own noise is a tenth of it."""
-MAX_CONFIDENCE = 15
 FADED = 0.35
 """Share of color left in an untrusted picture."""
 
@@ -58,11 +51,6 @@ def infrared_grey(ir: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.sqrt(ir * np.float32(255.0)).astype(np.uint8)
 
 
-def confidence_rgb(confidence: NDArray[np.uint8]) -> UInt8:
-    """Return confidence 0 to 15 (height, width) as a picture, dark to bright."""
-    return _coloured(np.minimum(confidence, MAX_CONFIDENCE) * (255.0 / MAX_CONFIDENCE), cv2.COLORMAP_BONE)
-
-
 def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> UInt8:
     """Return the uncertainty of hidden depth (64, 64) as a picture, bright where large, dark without surface."""
     share = np.clip(np.nan_to_num(uncertainty_m, nan=np.inf) / MAX_UNCERTAINTY_M, 0.0, 1.0)
@@ -86,12 +74,6 @@ def faded(rgb: UInt8) -> UInt8:
     """Return a picture (..., 3) with little color left, for an unreliable reconstruction."""
     grey = rgb.mean(axis=-1, keepdims=True)
     return np.rint(grey + FADED * (rgb - grey)).astype(np.uint8)
-
-
-def encoded(picture: NDArray[np.uint8], suffix: str) -> bytes:
-    """Encode a picture (height, width[, 3]) as ".png" or ".jpg"."""
-    turned = np.ascontiguousarray(picture[..., ::-1]) if picture.ndim == 3 else picture
-    return cv2.imencode(suffix, turned)[1].tobytes()
 
 
 def depth_span_m(depth_m: Float32) -> tuple[float, float]:
@@ -142,45 +124,6 @@ def change_span_m(difference_m: Float32) -> float:
     return QUIET_SPAN_M if few else round_span(changed_m, percent=75.0)
 
 
-@dataclass(frozen=True)
-class Surface:
-    """Triangle mesh in the wall frame."""
-
-    points_m: NDArray[np.float32]
-    """(n, 3)."""
-    triangles: NDArray[np.uint32]
-    """(m, 3)."""
-    rgb: UInt8
-    """(n, 3)."""
-    normals: NDArray[np.float32]
-    """(n, 3); away from the wall, of length 1."""
-
-
-def surface(depth_m: Float32, box: ObjectBox) -> Surface:
-    """Return the mesh of a hidden depth map (64, 64): squares whose corners are surface without a depth jump."""
-    x_m, y_m = np.meshgrid(*cell_centers_m(box, len(depth_m)))
-    points = np.stack([x_m, y_m, depth_m], axis=-1).astype(np.float32)
-    corners = np.stack([depth_m[:-1, :-1], depth_m[:-1, 1:], depth_m[1:, :-1], depth_m[1:, 1:]])
-    whole = np.ptp(corners, axis=0) < JUMP_M  # false where a corner is NaN
-    index = np.arange(depth_m.size).reshape(depth_m.shape)
-    a, b, c, d = (part[whole] for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
-    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
-    used, triangles = np.unique(triangles, return_inverse=True)
-    rgb = hidden_rgb(depth_m, box).reshape(-1, 3)
-    points, triangles = points.reshape(-1, 3)[used], triangles.reshape(-1, 3).astype(np.uint32)
-    return Surface(points, triangles, rgb[used], _normals(points, triangles))
-
-
-def _normals(points_m: NDArray[np.float32], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
-    """Return each point's normal: the mean over its triangles, weighted by area."""
-    a, b, c = (points_m[triangles[:, corner]] for corner in range(3))
-    across = np.cross(c - a, b - a)  # towards +z: the rows run down, the columns right
-    total = np.zeros_like(points_m)
-    for corner in range(3):
-        np.add.at(total, triangles[:, corner], across)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
-
-
 def _coloured(values: NDArray[np.floating], colour_map: int) -> UInt8:
     bgr = cv2.applyColorMap(values.astype(np.uint8), colour_map)
     return np.ascontiguousarray(bgr[..., ::-1], dtype=np.uint8)
@@ -195,74 +138,38 @@ DIM = 0.16
 PALE_RGB = (214, 224, 230)
 
 
-@dataclass(frozen=True)
-class VerdictStyle:
-    """Color and advice of a verdict."""
-
-    rgb: tuple[int, int, int]
-    advice: str
-
-
-STYLES = {
-    Verdict.SEEN: VerdictStyle((80, 220, 120), "shape within the uncertainty shown beside it"),
-    Verdict.NOTHING: VerdictStyle((150, 175, 190), "the returning light is that of an empty box"),
-    Verdict.OUTSIDE: VerdictStyle((255, 180, 60), "unlike the training data: shape not reliable"),
-    Verdict.SATURATED: VerdictStyle((255, 120, 200), "sensor saturated: lower the laser power or shade the light"),
-    Verdict.WALL_MOVED: VerdictStyle((255, 110, 90), "wall or lidar have moved: calibrate the wall again"),
-    Verdict.STALLED: VerdictStyle((255, 110, 90), "no new frame: the picture is old"),
-}
-NO_VERDICT = VerdictStyle(PALE_RGB, "no uncertainty network: reliability unknown")
-
-
-def style_of(verdict: Verdict | None) -> VerdictStyle:
-    """Return color and advice of a verdict or of none."""
-    return STYLES[verdict] if verdict else NO_VERDICT
-
-
-def is_trusted(verdict: Verdict | None) -> bool:
-    """Return True if a reconstruction is drawn in full color; also without an uncertainty network."""
-    return verdict in {None, Verdict.SEEN}
-
-
-@cache
-def banner_rgb(verdict: Verdict | None) -> UInt8:
-    """Return the verdict's panel: its name large, the advice below, on its color."""
-    look = style_of(verdict)
-    ground = tuple(int(b + DIM * (c - b)) for b, c in zip(BACKGROUND_RGB, look.rgb, strict=True))
+def banner_rgb(headline: str, detail: str, rgb: tuple[int, int, int]) -> UInt8:
+    """Return the verdict's panel: headline in its color, the detail below."""
+    ground = tuple(int(b + DIM * (c - b)) for b, c in zip(BACKGROUND_RGB, rgb, strict=True))
     image = Image.new("RGB", (BANNER_WIDTH, BANNER_HEIGHT), ground)
     pen = ImageDraw.Draw(image)
-    pen.rectangle((0, 0, 13, BANNER_HEIGHT), fill=look.rgb)
-    pen.text((34, 32), (verdict or "no verdict").upper(), fill=look.rgb, font=font(44), anchor="lm")
-    pen.text((35, 74), look.advice, fill=PALE_RGB, font=font(21), anchor="lm")
+    pen.rectangle((0, 0, 13, BANNER_HEIGHT), fill=rgb)
+    pen.text((34, 32), headline, fill=rgb, font=font(40), anchor="lm")
+    pen.text((35, 74), detail, fill=PALE_RGB, font=font(21), anchor="lm")
     return np.asarray(image)
 
 
-def dim_untrusted(rgb: UInt8, verdict: Verdict | None) -> UInt8:
-    """Return a trusted reconstruction (64, 64, 3) unchanged, an untrusted one (512, 512, 3) faded, framed and labelled.
-
-    A doubtful shape is hatched too, an empty one is not.
-    """
-    if verdict is None or is_trusted(verdict):
-        return rgb
+def dim_untrusted(rgb: UInt8, note: str, note_rgb: tuple[int, int, int], *, hatched: bool) -> UInt8:
+    """Return an untrusted reconstruction (512, 512, 3) of (64, 64, 3): faded, framed and labelled."""
     large = faded(rgb).repeat(NOTED_PIXELS // len(rgb), axis=0).repeat(NOTED_PIXELS // len(rgb), axis=1)
-    note = note_rgba(verdict)
-    alpha = note[..., 3:].astype(np.uint16)
-    return ((note[..., :3] * alpha + large * (255 - alpha)) // 255).astype(np.uint8)
+    over = note_rgba(note, note_rgb, hatched=hatched)
+    alpha = over[..., 3:].astype(np.uint16)
+    return ((over[..., :3] * alpha + large * (255 - alpha)) // 255).astype(np.uint8)
 
 
 @cache
-def note_rgba(verdict: Verdict) -> NDArray[np.uint8]:
+def note_rgba(note: str, rgb: tuple[int, int, int], *, hatched: bool) -> NDArray[np.uint8]:
     """Return the overlay of an untrusted picture (512, 512, 4)."""
     image = Image.new("RGBA", (NOTED_PIXELS, NOTED_PIXELS), (0, 0, 0, 0))
-    pen, rgb, end = ImageDraw.Draw(image), style_of(verdict).rgb, NOTED_PIXELS
-    if verdict is not Verdict.NOTHING:
+    pen, end = ImageDraw.Draw(image), NOTED_PIXELS
+    if hatched:
         for start in range(-end, end, HATCH_PIXELS):
             pen.line((start, end, start + end, 0), fill=(*rgb, HATCH_ALPHA), width=3)
     pen.rectangle((0, 0, end - 1, end - 1), outline=(*rgb, FRAME_ALPHA), width=6)
-    middle = (end / 2, end / 2 if verdict is Verdict.NOTHING else end - 44)
-    left, top, right, bottom = pen.textbbox(middle, verdict, font=font(36), anchor="mm")
+    middle = (end / 2, end - 44 if hatched else end / 2)
+    left, top, right, bottom = pen.textbbox(middle, note, font=font(36), anchor="mm")
     pen.rounded_rectangle((left - 16, top - 12, right + 16, bottom + 12), 10, fill=(*BACKGROUND_RGB, 235))
-    pen.text(middle, verdict, fill=rgb, font=font(36), anchor="mm")
+    pen.text(middle, note, fill=rgb, font=font(36), anchor="mm")
     return np.asarray(image)
 
 

@@ -1,36 +1,44 @@
-"""Web server of the view: fixed files and one endless stream per browser, on the loopback by default.
+"""Web server of the view: fixed files, one endless stream per browser, and commands; on the loopback by default.
 
 The view has no password, therefore: foreign host names are refused (DNS rebinding would let a page elsewhere read the
-view through a visitor's browser), nothing can be written, streams and connections are limited, and a browser that
-reads nothing is disconnected.
+view through a visitor's browser), requests that another site's page makes are refused, a command needs the token of
+the printed address, streams and connections are limited, and a browser that sends or reads too slowly is cut.
 """
 
+import hmac
 import ipaddress
+import json
 import os
+import re
 import socket
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import BytesIO
 from socketserver import TCPServer
 from threading import BoundedSemaphore, Condition, Thread
 from typing import Any
 
 from nlos_cam.errors import NlosCamError
-from nlos_cam.view.assets import LOOPBACK, Assets
 
-Send = Callable[[bytes], None]
-STREAM_PATH = "/live.rrd"
-WRITE_TIMEOUT_S = 5.0
-"""Seconds without data taken or a request, after which a browser is disconnected."""
+LOOPBACK = "127.0.0.1"
+STREAM_PATH, COMMAND_PATH = "/stream", "/command"
+TIMEOUT_S = 5.0
+"""Seconds for a whole request, and for each piece of an answer, after which a browser is cut."""
 PIECE_BYTES = 1 << 18
-"""A file goes out in pieces, each within that time: the viewer has 30 MB, and a link may be slow."""
+MAX_REQUEST_BYTES = 1 << 16
 MAX_STREAMS = 8
-"""Browsers that watch at once; each costs a drawing, 12 times a second."""
+"""Browsers that watch at once."""
+MAX_CONNECTIONS = 32
+"""Connections at once; a further one takes the place of the oldest whose request is not whole yet, or is closed."""
+CLOSE_AFTER_S = 1.0
+"""Seconds that ended streams have before their connections are cut."""
 POLICY = (
-    "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data: blob:; worker-src 'self' blob:; frame-ancestors 'self'"
+    "default-src 'self'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; frame-ancestors 'self'"
 )
 """The browser itself refuses to fetch anything from elsewhere, or to show the view inside another's page."""
 HEADERS = {
@@ -41,93 +49,157 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 
+Send = Callable[[bytes], None]
+Assets = Mapping[str, tuple[str, bytes]]
+"""Content type and bytes by path."""
+Command = Callable[[str, Mapping[str, Any]], str]
+"""Runs a command by name with its arguments and returns its outcome in words. Raises NlosCamError with the reason."""
+
 
 @dataclass(frozen=True)
 class Served:
-    """Files, stream and limits of a server for requests with a known host name."""
+    """Files, stream, commands and limits of a server."""
 
     assets: Assets
     stream: Callable[[Send], None]
-    known: Callable[[str], bool]
-    most_streams: int
-    streams: BoundedSemaphore
+    command: Command | None = None
+    """None for a view without controls."""
+    token: str = ""
+    """Secret that a command must bring."""
+    max_streams: int = MAX_STREAMS
+    known: Callable[[str], bool] = field(default=lambda _: False)
+    """Check of a Host header."""
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Handler of GET and HEAD; other methods are not implemented."""
+    """Handler of GET, HEAD and POST; other methods are not implemented."""
 
     served: Served
-    timeout = WRITE_TIMEOUT_S
+    streams: BoundedSemaphore
+    timeout = TIMEOUT_S
     server_version, sys_version = "nlos-cam", ""
 
+    def setup(self) -> None:
+        super().setup()
+        self.rfile = BytesIO(self._whole_request())
+        self.server.request_read(self.request)  # type: ignore[attr-defined]
+
+    def _whole_request(self) -> bytes:
+        """Read one request within TIMEOUT_S in all: a byte now and then would else hold a connection for ever."""
+        deadline_s, content, needed = time.monotonic() + TIMEOUT_S, b"", 1
+        while len(content) < needed:
+            self.request.settimeout(max(deadline_s - time.monotonic(), 1e-3))
+            if not (more := self.request.recv(1 << 14)):
+                break
+            content += more
+            head, end, _ = content.partition(b"\r\n\r\n")
+            length = re.search(rb"\r\ncontent-length: *(\d{1,9})\r\n", head.lower() + b"\r\n") if end else None
+            needed = len(head) + 4 + int(length[1]) if length else len(content) + (not end)
+            if max(len(content), needed if end else 0) > MAX_REQUEST_BYTES:
+                break
+        self.request.settimeout(TIMEOUT_S)
+        return content
+
     def do_GET(self) -> None:
+        self._answer(self._get)
+
+    def do_HEAD(self) -> None:
+        self._answer(self._get)
+
+    def do_POST(self) -> None:
+        self._answer(self._post)
+
+    def _answer(self, answer: Callable[[str], None]) -> None:
+        path = self.path.partition("?")[0]
         try:
-            self._answer(self.path.partition("?")[0])
+            if not self.served.known(self.headers.get("Host", "")):
+                self._say(HTTPStatus.FORBIDDEN, "this is not a name of the machine: open the address that it printed")
+            elif self._is_foreign(path):
+                self._say(HTTPStatus.FORBIDDEN, "a page of another site may not ask: open the address yourself")
+            else:
+                answer(path)
         except OSError:
             self.close_connection = True  # the browser left, which is its right
 
-    def do_HEAD(self) -> None:
-        self.do_GET()
+    def _is_foreign(self, path: str) -> bool:
+        """Return True for a request made by another site's page, unless it only leads a person to the page."""
+        origin = self.headers.get("Origin")
+        if origin is not None and origin.partition("://")[2] != self.headers.get("Host", ""):
+            return True
+        visits = path == "/" and self.headers.get("Sec-Fetch-Mode", "navigate") == "navigate"
+        return self.headers.get("Sec-Fetch-Site", "none") not in {"none", "same-origin"} and not visits
 
-    def _answer(self, path: str) -> None:
-        if not self.served.known(self.headers.get("Host", "")):
-            self._tell(HTTPStatus.FORBIDDEN, "this is not the name of the machine: open the address as it was told")
-        elif path == STREAM_PATH:
+    def _get(self, path: str) -> None:
+        if path == STREAM_PATH:
             self._answer_stream()
         elif path in self.served.assets:
             kind, content = self.served.assets[path]
             self._begin(HTTPStatus.OK, kind, len(content))
             self._send(content)
         else:
-            self._tell(HTTPStatus.NOT_FOUND, "there is nothing here: the view is at /")
+            self._say(HTTPStatus.NOT_FOUND, "there is nothing here: the view is at /")
 
     def _answer_stream(self) -> None:
-        if not self.served.streams.acquire(blocking=False):
-            told = f"{self.served.most_streams} browsers watch already, and no more may: close one, and reload"
-            self._tell(HTTPStatus.SERVICE_UNAVAILABLE, told)
+        if not self.streams.acquire(blocking=False):
+            most = self.served.max_streams
+            self._say(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} browsers watch already: close one, and this page goes on")
             return
         try:
             self._begin(HTTPStatus.OK, "application/octet-stream")
             if self.command != "HEAD":
                 self.served.stream(self._send)
         finally:
-            self.served.streams.release()
+            self.streams.release()
 
-    def _tell(self, status: HTTPStatus, text: str) -> None:
+    def _post(self, path: str) -> None:
+        run = self.served.command
+        if path != COMMAND_PATH or run is None:
+            self._say(HTTPStatus.NOT_FOUND, "this view has no controls")
+        elif not hmac.compare_digest(self.headers.get("X-Token", "").encode(), self.served.token.encode()):
+            self._say(HTTPStatus.FORBIDDEN, "read-only: open the address that was printed, with its token, to control")
+        else:
+            try:
+                request = json.loads(self.rfile.read())
+                name, arguments = str(request.pop("command")), dict[str, Any](request)
+            except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+                self._say(HTTPStatus.BAD_REQUEST, 'not a command: send {"command": NAME, ...} as JSON')
+                return
+            try:
+                self._say(HTTPStatus.OK, run(name, arguments))
+            except NlosCamError as error:
+                self._say(HTTPStatus.CONFLICT, str(error))
+            except OSError:
+                raise
+            except Exception as error:  # noqa: BLE001  whatever it was, the page says it, and the run goes on
+                self._say(HTTPStatus.INTERNAL_SERVER_ERROR, f"unforeseen {type(error).__name__}: {error}")
+
+    def _say(self, status: HTTPStatus, text: str) -> None:
         content = f"{text}\n".encode()
         self._begin(status, "text/plain; charset=utf-8", len(content))
         self._send(content)
 
     def _begin(self, status: HTTPStatus, kind: str, length: int | None = None) -> None:
         self.send_response(status)
-        told = {"Content-Type": kind, **HEADERS}
+        headers = {"Content-Type": kind, **HEADERS}
         if length is not None:
-            told["Content-Length"] = str(length)
-        for name, value in told.items():
+            headers["Content-Length"] = str(length)
+        for name, value in headers.items():
             self.send_header(name, value)
         self.end_headers()
 
     def _send(self, content: bytes) -> None:
-        if self.command == "HEAD":
-            return
-        for start in range(0, len(content), PIECE_BYTES):
-            self.wfile.write(content[start : start + PIECE_BYTES])
+        if self.command != "HEAD":
+            for start in range(0, len(content), PIECE_BYTES):
+                self.wfile.write(content[start : start + PIECE_BYTES])  # the timeout holds for a whole piece
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the name http.server uses
         pass
 
 
-def handler_of(
-    assets: Assets, stream: Callable[[Send], None], known: Callable[[str], bool], most_streams: int
-) -> type[Handler]:
-    """Return a handler class for requests with a known Host header and a limited number of streams."""
-    served = Served(assets, stream, known, most_streams, BoundedSemaphore(most_streams))
-    return type("ViewHandler", (Handler,), {"served": served})
-
-
 LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
 EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  looked up, not bound
 """Addresses that listen on every interface, and the address for a browser on this machine."""
+HOST = re.compile(r"(?:\[(?P<six>[0-9a-f:.%]+)\]|(?P<name>[^\[\]:]*))(?::\d{1,5})?")
 
 
 def resolved(host: str) -> tuple[socket.AddressFamily, str]:
@@ -135,7 +207,8 @@ def resolved(host: str) -> tuple[socket.AddressFamily, str]:
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError) as error:
-        raise NlosCamError(f"--view-host {host}: no such address ({error}): give one of this machine's") from error
+        reason = "it has no address" if isinstance(error, OSError) else "it is no host name"
+        raise NlosCamError(f"--view-host {host}: {reason}; give a name or address of this machine") from error
     family, *_, address = found[0]
     return family, str(address[0])
 
@@ -156,7 +229,7 @@ def exposed(host: str, port: int) -> str:
     where = "any address of this machine" if address in EVERYWHERE else address
     return (
         f"anyone who can reach {where} at port {port} sees the bench's pictures and depth, unencrypted and without a "
-        "password"
+        "password; controls need the token in the address"
     )
 
 
@@ -173,11 +246,9 @@ def names_of(host: str, address: str) -> Callable[[str], bool]:
 
 
 def name_in(header: str) -> str:
-    """Return the host of a Host header without its port, which differs behind a forwarded port."""
-    name = header.strip().lower()
-    if name.startswith("["):
-        return name[1:].partition("]")[0]
-    return name.rpartition(":")[0] if ":" in name else name
+    """Return the host of a Host header without its port, which differs behind a forwarded port; empty if malformed."""
+    found = HOST.fullmatch(header.strip().lower())
+    return (found["six"] or found["name"] or "") if found else ""
 
 
 def address_of(host: str, port: int) -> str:
@@ -194,25 +265,19 @@ def _is_address(name: str) -> bool:
     return True
 
 
-__all__ = ["Send", "ViewServer"]
-
-MAX_CONNECTIONS = 32
-"""Connections at once; a further one is closed."""
-CLOSE_AFTER_S = 1.0
-"""Seconds that ended streams have before their connections are cut."""
-
-
 class _Threads(ThreadingHTTPServer):
     """Server with a limited number of connection threads, all joined by `server_close`."""
 
     daemon_threads = False  # so that closing waits for them
     allow_reuse_address = os.name == "posix"  # elsewhere two programs would share the port
     allow_reuse_port = False
+    request_queue_size = 64
 
     def __init__(self, family: socket.AddressFamily, host: str, port: int, handler: Any) -> None:
         self.address_family = family
         self._room = BoundedSemaphore(MAX_CONNECTIONS)
-        self._open: set[socket.socket] = set()
+        self._open: dict[socket.socket, bool] = {}
+        """By connection, oldest first, whether its request was read."""
         self._changed = Condition()
         super().__init__((host, port), handler)
 
@@ -222,19 +287,33 @@ class _Threads(ThreadingHTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        if not self._room.acquire(blocking=False):
+        if not self._room.acquire(blocking=False) and not self._cut_unread():
             self.shutdown_request(request)
             return
         with self._changed:
-            self._open.add(request)
+            self._open[request] = False
         super().process_request(request, client_address)
+
+    def _cut_unread(self) -> bool:
+        """Cut the oldest connection whose request is not whole, and take its place; return False without one."""
+        with self._changed:
+            unread = next((request for request, is_read in self._open.items() if not is_read), None)
+            if unread is not None:
+                with suppress(OSError):
+                    unread.shutdown(socket.SHUT_RDWR)
+        return unread is not None and self._room.acquire(timeout=CLOSE_AFTER_S)
+
+    def request_read(self, request: socket.socket) -> None:
+        """Note that a connection's request is whole."""
+        with self._changed:
+            self._open[request] = True
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
             with self._changed:
-                self._open.discard(request)
+                self._open.pop(request, None)
                 self._changed.notify_all()
             self._room.release()
 
@@ -256,19 +335,13 @@ class ViewServer:
     Takes the preferred port, or any free one if that is busy, unless `exact`. Raises NlosCamError if it cannot listen.
     """
 
-    def __init__(
-        self,
-        assets: Assets,
-        stream: Callable[[Send], None],
-        preferred_port: int,
-        *,
-        host: str = LOOPBACK,
-        exact: bool = False,
-        most_streams: int = MAX_STREAMS,
-    ) -> None:
+    def __init__(self, served: Served, preferred_port: int, *, host: str = LOOPBACK, exact: bool = False) -> None:
         family, self._host = resolved(host)
-        handler = handler_of(assets, stream, names_of(host, self._host), most_streams)
-        self._server = self._listening(family, preferred_port, handler, exact=exact)
+        members = {
+            "served": replace(served, known=names_of(host, self._host)),
+            "streams": BoundedSemaphore(served.max_streams),
+        }
+        self._server = self._listening(family, preferred_port, type("ViewHandler", (Handler,), members), exact=exact)
         self.port: int = self._server.server_address[1]
         self._thread = Thread(target=self._server.serve_forever, args=(0.1,), name="view server")
         self._thread.start()
@@ -282,8 +355,8 @@ class ViewServer:
                     raise
                 return _Threads(family, self._host, 0, handler)
         except OSError as error:
-            what = f"the view cannot be served at {address_of(self._host, port)} ({error.strerror})"
-            raise NlosCamError(f"{what}: choose another --view-port or --view-host, or leave them away") from error
+            problem = f"the view cannot be served at {address_of(self._host, port)} ({error.strerror})"
+            raise NlosCamError(f"{problem}: choose another --view-port or --view-host, or drop them") from error
 
     @property
     def address(self) -> str:

@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 
 from nlos_cam.errors import NlosCamError
 from nlos_cam.objects import object_box
+from nlos_cam.view.assessment import assess
 from nlos_cam.view.images import (
     BACKGROUND_RGB,
     MAX_UNCERTAINTY_M,
@@ -66,7 +67,9 @@ class Still:
 
     def _draw_hidden(self, page: "_Page", moment: Moment) -> None:
         depth_m, box = moment.reconstruction.depth_m, self._box
-        rgb = dim_untrusted(hidden_rgb(depth_m, box), moment.verdict)
+        rgb, assessment = hidden_rgb(depth_m, box), assess(moment)
+        if not assessment.trusted:
+            rgb = dim_untrusted(rgb, assessment.headline, assessment.rgb, hatched=assessment.tone == "warning")
         page.picture(LARGE_AT, "Hidden around the corner: reconstruction", rgb, (LARGE, LARGE))
         scale = np.linspace(box.z_near_m, box.z_far_m, BAR_STEPS, dtype=np.float32)[:, np.newaxis]
         page.bar(LARGE_AT, LARGE, hidden_rgb(scale, box), f"{1e2 * box.z_near_m:.0f} cm", f"{1e2 * box.z_far_m:.0f} cm")
@@ -105,7 +108,10 @@ class _Page:
         self._pen = ImageDraw.Draw(self.image)
 
     def banner(self, moment: Moment) -> None:
-        self.image.paste(Image.fromarray(banner_rgb(moment.verdict)), (MARGIN, MARGIN))
+        assessment = assess(moment)
+        self.image.paste(
+            Image.fromarray(banner_rgb(assessment.headline, assessment.detail, assessment.rgb)), (MARGIN, MARGIN)
+        )
         x, y = WIDTH - MARGIN, MARGIN
         self._pen.text((x, y + 34), "nlos-cam", fill=PALE_RGB, font=font(40), anchor="rm")
         self._pen.text((x, y + 74), "seeing around a corner", fill=QUIET_RGB, font=font(21), anchor="rm")

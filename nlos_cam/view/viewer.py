@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 from nlos_cam.frames import Frame, LidarMaps
 from nlos_cam.reconstruct import PhysicsCheckResult, Reconstruction, Verdict
@@ -35,6 +35,18 @@ class Moment:
     """The device's last temperatures, by name; empty where none were read."""
 
 
+class Controls(Protocol):
+    """Status and commands of a run, for a page; both may be called from any thread."""
+
+    def status(self) -> Mapping[str, Any]:
+        """Return what the page shows beside the pictures, ready for JSON; `state` at least."""
+        ...
+
+    def run(self, command: str, arguments: Mapping[str, Any]) -> str:
+        """Run a command and return its outcome in words. Raises NlosCamError with the reason."""
+        ...
+
+
 class Viewer(Protocol):
     """Viewer of the newest moment. `show` returns at once: a viewer may skip moments and never slows the loop."""
 
@@ -54,6 +66,9 @@ class NullViewer:
     """Viewer that shows nothing."""
 
     address: str | None = None
+
+    def begin(self, *_: object) -> None:
+        """Do nothing."""
 
     def __enter__(self) -> Self:
         return self

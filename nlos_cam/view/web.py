@@ -1,144 +1,257 @@
-"""Live view and saved view in a browser, through a web server on the loopback."""
+"""Live view, and view of a recording or a saved session, in a browser, through a web server on the loopback."""
 
-import struct
+import secrets
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from threading import Event
-from typing import BinaryIO, Self
+from threading import Condition, Event, Lock, Thread
+from typing import NamedTuple, Self
 
 from nlos_calibration import MeasuredWall, Rig
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.threads import LatestValue
-from nlos_cam.view.assets import LOOPBACK, page_assets
-from nlos_cam.view.drawing import Drawing, new_recording
-from nlos_cam.view.server import Send, ViewServer
-from nlos_cam.view.viewer import Moment
+from nlos_cam.view.messages import MomentPacker, bench_message, pack
+from nlos_cam.view.server import LOOPBACK, Assets, Send, Served, ViewServer
+from nlos_cam.view.session_file import SESSION_MARK, Chunks, page_html
+from nlos_cam.view.viewer import Controls, Moment
 
 PREFERRED_PORT = 9090
-DRAW_PERIOD_S = 1 / 12
-LIDAR_EVERY = 2
-"""Lidar pictures, which are large, go out with every second drawing."""
+PERIOD_S = 1 / 12
+"""Seconds between moments sent."""
 PATIENCE_S = 0.05
-"""Seconds to wait for the next moment: drawing that begins with a moment ends before the loop's next frame."""
-WAIT_S = 0.5
+"""Seconds to wait for the next moment: packing that begins with a moment ends before the loop's next frame."""
+STATUS_S = 0.5
+"""Seconds between messages of the status, also without moments."""
+ENDED = pack({"kind": "status", "state": "ended"})
+HTML = "text/html; charset=utf-8"
 
 
-class WebViewer:
-    """Live view, served while entered; each browser's thread draws for it, so that no browser costs nothing."""
+class Packet(NamedTuple):
+    """Newest messages, each with its number; 0 for none."""
+
+    bench: tuple[int, bytes] = (0, b"")
+    moment: tuple[int, bytes] = (0, b"")
+    status: tuple[int, bytes] = (0, b"")
+
+
+class Website:
+    """Page with a stream and commands, served while entered.
+
+    `controls` gives the status and runs commands, which need the token in the printed address.
+    """
+
+    mode = "live"
+
+    def __init__(self, *, host: str = LOOPBACK, port: int | None = None, controls: Controls | None = None) -> None:
+        """Prepare a server at `port`, or without one at 9090 or the next free port."""
+        self.address: str | None = None
+        self._host, self._port, self._controls = host, port, controls
+        self._token = secrets.token_urlsafe(12)
+
+    def __enter__(self) -> Self:
+        port = PREFERRED_PORT if self._port is None else self._port
+        command = self._controls.run if self._controls else None
+        served = Served(self._assets(), self._stream, command, self._token)
+        self._server = ViewServer(served, port, host=self._host, exact=self._port is not None)
+        self.address = self._server.address + (f"#{self._token}" if command else "")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.close()
+
+    def _assets(self) -> Assets:
+        return {"/": (HTML, page_html(self.mode).encode())}
+
+    def _stream(self, send: Send) -> None:
+        raise NotImplementedError
+
+    def _status(self) -> bytes:
+        status = self._controls.status() if self._controls else {"state": "running"}
+        return pack({"kind": "status", "controls": self._controls is not None, **status})
+
+
+class WebViewer(Website):
+    """Live view. A thread of its own packs the newest moment once for all browsers, and only if there is one."""
 
     def __init__(
         self,
-        rig: Rig,
+        rig: Rig | None = None,
         measured: MeasuredWall | None = None,
         clock: Callable[[], float] = time.monotonic,
         *,
         host: str = LOOPBACK,
         port: int | None = None,
-        on_stream_thread: Callable[[], None] = lambda: None,
+        controls: Controls | None = None,
+        on_thread: Callable[[], None] = lambda: None,
     ) -> None:
-        """Prepare a server at `port`, or without one at 9090 or the next free port.
+        """Prepare the view; without a rig it shows the status until `begin`. `on_thread` is called as threads work."""
+        super().__init__(host=host, port=port, controls=controls)
+        self._on_thread, self._clock = on_thread, clock
+        self._moments, self._packets = LatestValue[Moment](), LatestValue[Packet]()
+        self._closed, self._watching, self._lock = Event(), 0, Lock()
+        self._bench: tuple[int, bytes] = (0, b"")
+        self._packer: MomentPacker | None = None
+        self._thread = Thread(target=self._pack_all, name="view")
+        if rig:
+            self.begin(rig, measured)
 
-        `on_stream_thread` is called once in each browser's thread before it draws.
-        """
-        self._on_stream_thread = on_stream_thread
-        self.address: str | None = None
-        self._host, self._port = host, port
-        self._rig, self._measured, self._clock = rig, measured, clock
-        self._moments = LatestValue[Moment]()
-        self._closed = Event()
+    def begin(self, rig: Rig, measured: MeasuredWall | None = None) -> None:
+        """Show this bench from now on."""
+        self._bench, self._packer = (self._bench[0] + 1, bench_message(rig, measured)), MomentPacker(rig)
 
     def __enter__(self) -> Self:
-        port = PREFERRED_PORT if self._port is None else self._port
-        self._server = ViewServer(page_assets(), self._stream, port, host=self._host, exact=self._port is not None)
-        self.address = self._server.address
+        super().__enter__()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._closed.set()
         self._moments.close()
-        self._server.close()
+        self._thread.join()
+        self._packets.close()
+        super().__exit__()
 
     def show(self, moment: Moment) -> None:
-        """Replace the newest moment; an undrawn one is skipped."""
+        """Replace the newest moment; one that was not sent is skipped."""
         self._moments.put(moment)
 
+    def _pack_all(self) -> None:
+        seen, statuses, status_s = 0, 0, float("-inf")
+        packed = status = (0, b"")
+        while not self._closed.is_set():
+            self._on_thread()
+            start_s = self._clock()
+            newest = self._moments.fresh(seen, PATIENCE_S, STATUS_S)
+            if newest is None and seen > packed[0]:
+                newest = self._moments.after(seen - 1, 0.0)  # the last one, when nobody watched
+            if newest is not None:
+                seen = newest[0]
+            if self._watching == 0:
+                continue
+            if newest is not None and self._packer:
+                packed = seen, self._packer.pack(newest[1])
+            if newest is None or start_s - status_s >= STATUS_S:
+                status_s, statuses = start_s, statuses + 1
+                status = statuses, self._status()
+            self._packets.put(Packet(self._bench, packed, status))
+            self._closed.wait(max(0.0, start_s + PERIOD_S - self._clock()))
+
     def _stream(self, send: Send) -> None:
-        """Draw for one browser until it leaves (`send` raises OSError) or the viewer closes.
+        """Send to one browser until it leaves (`send` raises OSError) or the viewer closes.
 
-        While a slow browser blocks `send`, nothing is drawn for it: it skips moments and memory stays constant.
+        While a slow browser blocks `send`, it skips moments, and memory stays constant.
         """
-        self._on_stream_thread()
-        recording = new_recording()
-        stream, drawing = recording.binary_stream(), None
-        count = drawn = 0
+        with self._lock:
+            self._watching += 1
         try:
+            send(pack({"kind": "hello", "mode": self.mode}))
+            sent, count = Packet(), 0
             while not self._closed.is_set():
-                start_s = self._clock()
-                newest = self._moments.fresh(count, PATIENCE_S, WAIT_S)
-                if newest is None:
-                    continue
-                count, moment = newest
-                drawing = drawing or Drawing(recording, self._rig, moment, self._measured)
-                drawing.draw(moment, with_lidar=drawn % LIDAR_EVERY == 0)
-                send(stream.read() or b"")
-                drawn += 1
-                self._closed.wait(max(0.0, start_s + DRAW_PERIOD_S - self._clock()))
+                self._on_thread()
+                if newest := self._packets.after(count, STATUS_S):
+                    count, packet = newest
+                    send(b"".join(new[1] for new, old in zip(packet, sent, strict=True) if new[0] != old[0]))
+                    sent = packet
+            send(ENDED)
         finally:
-            recording.disconnect()
+            with self._lock:
+                self._watching -= 1
 
 
-MAGIC = b"RRF2"
-"""First bytes of a file of this Rerun version."""
-HEADER_BYTES, END = 12, 0
-MESSAGE = struct.Struct("<QQ")
-"""Head of each message: its kind and number of bytes. The kind END precedes the end of a file."""
-CHUNK_BYTES = 1 << 18
+class PlaybackViewer(Website):
+    """View of a recording while it is reconstructed: every moment stays, and the page plays, pauses and scrubs.
 
+    The moments are kept in a temporary file. `show` must get them all, in order; `finish` when there are no more.
+    """
 
-class RecordedView:
-    """Saved view of an `RrdFile`, served while entered, up to its last whole message. Raises RecordingError."""
+    mode = "recorded"
 
-    def __init__(self, path: Path, *, host: str = LOOPBACK, port: int | None = None) -> None:
-        """Prepare a server at `port`, or without one at 9090 or the next free port."""
-        self.address: str | None = None
-        self._path, self._host, self._port = path, host, port
-        try:
-            with path.open("rb") as file:
-                begins = file.read(len(MAGIC))
-        except OSError as error:
-            raise RecordingError(f"{path} cannot be read ({error.strerror}): name a saved view (.rrd)") from error
-        if begins != MAGIC:
-            raise RecordingError(f"{path} is no saved view: make one with `live --save-view` or `replay --save-view`")
+    def __init__(
+        self,
+        rig: Rig,
+        measured: MeasuredWall | None = None,
+        *,
+        host: str = LOOPBACK,
+        port: int | None = None,
+        controls: Controls | None = None,
+    ) -> None:
+        super().__init__(host=host, port=port, controls=controls)
+        self._bench, self._chunks = bench_message(rig, measured), Chunks(MomentPacker(rig))
+        self._changed, self._closed = Condition(), False
+        self._ends = [0]
+        """End of each chunk in the file, after a zero."""
 
     def __enter__(self) -> Self:
-        assets, port = page_assets(recorded=True), PREFERRED_PORT if self._port is None else self._port
-        self._server = ViewServer(assets, self._stream, port, host=self._host, exact=self._port is not None)
-        self.address = self._server.address
-        return self
+        self._file = tempfile.TemporaryFile()
+        return super().__enter__()
 
     def __exit__(self, *_: object) -> None:
-        self._server.close()
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        super().__exit__()
+        self._file.close()
+
+    def show(self, moment: Moment) -> None:
+        self._keep(self._chunks.add(moment))
+
+    def finish(self) -> None:
+        """Keep the last moments, which do not fill a chunk."""
+        self._keep(self._chunks.rest())
+
+    def _keep(self, chunk: bytes | None) -> None:
+        if chunk is not None:
+            with self._changed:
+                self._file.seek(self._ends[-1])
+                self._file.write(chunk)
+                self._ends.append(self._ends[-1] + len(chunk))
+                self._changed.notify_all()
 
     def _stream(self, send: Send) -> None:
-        with self._path.open("rb") as file:
-            left = whole_bytes(file)
-            file.seek(0)
-            while left and (chunk := file.read(min(left, CHUNK_BYTES))):
-                send(chunk)
-                left -= len(chunk)
+        send(pack({"kind": "hello", "mode": self.mode}) + self._bench)
+        for chunk in self._kept():
+            send(chunk or self._status())
+        send(ENDED)
+
+    def _kept(self) -> Iterator[bytes]:
+        """Yield the chunks as they come, and nothing every STATUS_S while none comes, until the view closes."""
+        sent = 0
+        while not self._closed:
+            with self._changed:
+                if len(self._ends) == sent + 1:
+                    self._changed.wait(STATUS_S)
+                chunk = b""
+                if len(self._ends) > sent + 1 and not self._closed:
+                    self._file.seek(self._ends[sent])
+                    chunk, sent = self._file.read(self._ends[sent + 1] - self._ends[sent]), sent + 1
+            yield chunk
 
 
-def whole_bytes(file: BinaryIO) -> int:
-    """Return the number of bytes in whole messages: all, unless the writer was killed."""
-    size, end = file.seek(0, 2), HEADER_BYTES
-    while end + MESSAGE.size <= size:
-        file.seek(end)
-        kind, length = MESSAGE.unpack(file.read(MESSAGE.size))
-        if end + MESSAGE.size + length > size:
-            break
-        if kind == END:
-            return size
-        end += MESSAGE.size + length
-    return min(end, size)
+class RecordedView(Website):
+    """View of a session saved as one HTML file, served while entered. Raises RecordingError for another file."""
+
+    mode = "recorded"
+
+    def __init__(self, path: Path, *, host: str = LOOPBACK, port: int | None = None) -> None:
+        super().__init__(host=host, port=port)
+        try:
+            self._content = path.read_bytes()
+        except OSError as error:
+            raise RecordingError(f"{path} cannot be read ({error.strerror}): name a saved session (.html)") from error
+        if self._content.startswith(b"RRF"):
+            raise RecordingError(
+                f"{path} was saved by an earlier version, for the Rerun viewer: open it with "
+                f"`pip install rerun-sdk==0.41.*` and `rerun {path}`"
+            )
+        if SESSION_MARK not in self._content[:1000]:
+            raise RecordingError(
+                f"{path} is no saved session: make one with `live --save-view` or `replay --save-view`"
+            )
+
+    def _assets(self) -> Assets:
+        return {"/": (HTML, self._content)}
+
+    def _stream(self, send: Send) -> None:
+        """Send nothing: the file holds it all."""

@@ -1,4 +1,4 @@
-"""`nlos-cam live --camera sim` in a headless Chromium, drawn in software."""
+"""`nlos-cam live --camera sim` and `nlos-cam view run.bag` in a headless Chromium, every control with its effect."""
 
 import os
 import re
@@ -6,28 +6,35 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 from browser_page import DEADLINE_S, Page, needs_browser
+from nlos_calibration.wall_record import load_measured
 
-pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(4 * DEADLINE_S)]
+from nlos_cam.recording.playback import verify
+from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(6 * DEADLINE_S)]
+
+FIRST_PAGE_S = 8.0
 
 
-class LiveView:
-    """The program, running and serving its view."""
+class Program:
+    """The program, running in a folder and serving its view."""
 
-    def __init__(self) -> None:
-        program = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()"]
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        program = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()", *arguments]
         self.process = subprocess.Popen(
-            [*program, "live", "--camera", "sim"], stderr=subprocess.PIPE, text=True, start_new_session=True
+            program, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True, cwd=folder
         )
         self.address = self._address()
 
     def _address(self) -> str:
-        """Read the address from stderr; a first run renders its scene before."""
         lines = []
         for line in self.process.stderr or ():
             lines.append(line)
@@ -47,24 +54,130 @@ class LiveView:
 
 
 @pytest.fixture
-def view() -> Iterator[LiveView]:
+def start(tmp_path: Path) -> Iterator[Callable[..., Program]]:
     needs_browser()
-    view = LiveView()
-    yield view
-    view.kill()
+    programs: list[Program] = []
+
+    def begin(*arguments: str) -> Program:
+        programs.append(Program(tmp_path, *arguments))
+        return programs[-1]
+
+    yield begin
+    for program in programs:
+        program.kill()
 
 
-def test_page_receives_frames_and_fetches_from_nowhere_else(view: LiveView, browser: Any) -> None:
-    page = Page(browser, view.address)
-    page.wait_until(lambda: {"/reconstruction", "/latency"} <= set(page.frames()), "a reconstruction and a plot")
-    first = page.frames()["/latency"]
-    page.wait_until(lambda: page.frames()["/latency"] > first, "later frames")
-    assert not page.has_panicked()
-    page.close()
-    assert page.hosts <= {"127.0.0.1", None}, "the page fetched from elsewhere"
-    assert view.interrupt() == 130
-    parts = urlsplit(view.address)
+def only(folder: Path, pattern: str) -> Path:
+    (path,) = folder.glob(pattern)
+    return path
+
+
+def test_controls_of_a_live_run_do_what_they_say(start: Callable[..., Program], browser: Any, tmp_path: Path) -> None:
+    program = start("live", "--camera", "sim")
+    page = Page(browser, program.address)
+    page.wait_drawn()  # from the address on, which is printed before networks and camera are there
+    again = Page(browser, program.address)
+    again.wait_drawn()
+    assert again.first_s < FIRST_PAGE_S
+    again.close()
+    page.wait_until(lambda: page.state()["status"].get("fps", 0) > 1, "the status")
+    for part in ("sim", "frames/s", "latency", "newest frame", "dropped", "°C", "disk for"):
+        assert part in page.state()["statusText"]
+
+    page.page.fill("#label", "cup")
+    assert "recording" in page.click("#record")
+    page.wait_until(lambda: "REC" in page.state()["statusText"], "the recording's time")
+    page.wait_until(lambda: page.page.inner_text("#record") == "Stop recording", "the button")
+    page.page.wait_for_timeout(1500)
+    assert "verified" in page.click("#record")
+    bag = only(tmp_path, "cup-*.bag")
+    assert verify(bag).frames > 10
+    assert load_sidecar(sidecar_path(bag)).label == "cup"
+
+    assert "wrote" in page.click("#snapshot")
+    with np.load(only(tmp_path, "snapshot-*.npz")) as arrays:
+        assert arrays["depth_m"].shape == (64, 64)
+    assert only(tmp_path, "snapshot-*.png").stat().st_size > 10_000
+
+    change_run(page)
+    save_session(page, browser, tmp_path)
+    assert "bare wall" in page.click("#reference"), "with an object hidden, the reference is refused, and why"
+    assert page.page.evaluate("document.querySelector('#answer').className") == "failed"
+    assert page.hosts == {"127.0.0.1"}, "the page fetched from elsewhere"
+    assert page.errors == []
+    assert program.interrupt() == 130
+    page.wait_until(lambda: page.state()["headline"] == "The run has ended", "the end")
+    parts = urlsplit(program.address)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((parts.hostname, parts.port), timeout=60.0)
-    with pytest.raises(ProcessLookupError):
-        os.killpg(view.process.pid, 0)
+
+
+def change_run(page: Page) -> None:
+    """Pause, average and change the precision."""
+    page.click("#pause")
+    page.wait_until(lambda: page.state()["headline"] == "Paused", "the pause")
+    frame = page.state()["frame"]
+    page.page.wait_for_timeout(1000)
+    assert page.state()["frame"] == frame
+    page.click("#pause")
+    page.wait_until(lambda: page.state()["frame"] > frame, "later frames")
+
+    page.page.fill("#average", "4")
+    assert "4 frames" in page.answer(lambda: page.page.press("#average", "Enter"))
+    page.wait_until(lambda: page.state()["status"]["control"]["average"] == 4, "the average")
+    name = page.state()["status"]["control"]["settings"][0][0]
+    assert "mm" in page.answer(lambda: page.page.select_option("#setting", name))
+    page.wait_until(lambda: page.state()["status"]["control"]["setting"] == name, "the setting")
+    assert page.state()["status"]["control"]["average"] == 1
+
+
+def save_session(page: Page, browser: Any, folder: Path) -> None:
+    """Save a second of the session, and play it from its file."""
+    page.wait_until(lambda: page.page.inner_text("#session") == "Save session", "the button")
+    page.click("#session")
+    page.wait_until(lambda: page.page.inner_text("#session") == "End session", "the button")
+    page.page.wait_for_timeout(1500)
+    assert "any browser" in page.click("#session")
+    session = Page(browser, only(folder, "session-*.html").as_uri())
+    session.wait_drawn()
+    session.close()
+
+
+def test_page_without_the_token_is_read_only(start: Callable[..., Program], browser: Any) -> None:
+    program = start("live", "--camera", "sim:bare-wall")
+    page = Page(browser, program.address.partition("#")[0])
+    page.wait_drawn()
+    page.wait_until(lambda: page.page.query_selector("#record") is not None, "the controls")
+    assert page.page.is_disabled("#record")
+    assert "Read-only" in page.page.inner_text("#answer")
+
+
+def test_empty_bench_is_taken_as_reference(start: Callable[..., Program], browser: Any, tmp_path: Path) -> None:
+    program = start("live", "--camera", "sim:bare-wall")
+    page = Page(browser, program.address)
+    page.wait_drawn()
+    assert "change" not in page.state()["arrays"]
+    page.wait_until(lambda: page.page.query_selector("#reference") is not None, "the controls")
+    assert "reference of 60 frames" in page.click("#reference")
+    page.wait_until(lambda: "change" in page.state()["arrays"], "difference maps")
+    assert load_measured(only(tmp_path, "bench-*.toml")).reference is not None
+
+
+def test_recording_opens_plays_and_exports_in_the_page(
+    start: Callable[..., Program], browser: Any, tmp_path: Path
+) -> None:
+    capture = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()", "capture", "--camera", "sim"]
+    subprocess.run([*capture, "--seconds", "2", "--out", "run.bag"], check=True, cwd=tmp_path, capture_output=True)
+    page = Page(browser, start("view", "run.bag").address)
+    page.wait_drawn()
+    page.wait_until(lambda: not page.state()["status"].get("message"), "the whole recording")
+    assert page.state()["end"] == pytest.approx(2.0, abs=0.3)
+    page.page.evaluate("(t => { t.value = 1; t.dispatchEvent(new Event('input')); })(document.querySelector('#time'))")
+    page.wait_until(lambda: page.state()["time_s"] == pytest.approx(1.0, abs=0.1), "the frame at 1 s")
+    frame = page.state()["frame"]
+    page.page.click("#play")
+    page.wait_until(lambda: page.state()["frame"] > frame, "it plays")
+    page.page.click("#play")
+    assert "wrote" in page.click("#save")
+    with np.load(only(tmp_path, "run-*.npz")) as arrays:
+        assert arrays["frame_number"] == page.state()["frame"]

@@ -11,7 +11,6 @@ import tomli_w
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.camera import open_camera
-from nlos_cam.cli import live as commands
 from nlos_cam.cli.main import main
 
 RIG = load_rig("paper-rig")
@@ -40,9 +39,9 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
         camera.silence_s, camera.replug_s = 0.5, 2.0
         return camera
 
-    monkeypatch.setattr(commands, "open_camera", opened)
-    monkeypatch.setattr(commands, "load_networks", lambda *_: FakeNetwork())
-    monkeypatch.setattr(commands, "load_uncertainty", lambda *_: None)
+    monkeypatch.setattr("nlos_cam.camera.open_camera", opened)
+    monkeypatch.setattr("nlos_cam.reconstruct.load_networks", lambda *_: FakeNetwork())
+    monkeypatch.setattr("nlos_cam.reconstruct.load_uncertainty", lambda *_: None)
 
 
 def run(folder: Path, faults: list[dict[str, Any]], *options: str) -> int:
@@ -84,7 +83,7 @@ def test_live_ends_with_counts_when_the_device_stays_away(tmp_path: Path, capsys
 
 
 def test_unknown_fault_is_an_error_of_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(tmp_path, [{"kind": "explode", "at_frame": 1}]) == 1
+    assert run(tmp_path, [{"kind": "explode", "at_frame": 1}]) == 4
     [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert "faults.0.kind" in line
     assert "explode" in line

@@ -62,13 +62,12 @@ class Camera(FrameCamera):
 
 @pytest.mark.slow
 def test_live_loop_never_waits_for_a_browser_that_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.view.web.page_assets", dict)
-    monkeypatch.setattr("nlos_cam.view.web.DRAW_PERIOD_S", 0.0)
+    monkeypatch.setattr("nlos_cam.view.web.PERIOD_S", 0.0)
     with Noted(RIG) as viewer, socket.socket() as deaf:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         place = urlsplit(viewer.address or "")
         deaf.connect((place.hostname, place.port))
-        deaf.sendall(b"GET /live.rrd HTTP/1.0\r\nHost: localhost\r\n\r\n")
+        deaf.sendall(b"GET /stream HTTP/1.0\r\nHost: localhost\r\n\r\n")
         camera: Any = Camera(viewer)
         report = run_live(camera, Pipeline(CalibratedRig(RIG), sheet_network), viewer, stop=Event(), recorded=True)
     assert camera.kept_waiting == MAX_WAITING_FRAMES

@@ -18,17 +18,9 @@ from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.intervals import INTERVAL_STDS
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import measures_of
+from synthetic_scenes import Illumination, Placement, at_near_edge, clean_infrared, corners_px, infrared_frames
 
-from nlos_cam.calibrate.synthetic import (
-    Illumination,
-    Placement,
-    View,
-    at_near_edge,
-    clean_infrared,
-    corners_px,
-    infrared_frames,
-    view,
-)
+from nlos_cam.calibrate.synthetic import View, view
 
 Generator = np.random.Generator
 

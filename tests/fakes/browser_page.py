@@ -1,7 +1,5 @@
 """Page of the view in a headless Chromium, asked for its own state: no test depends on how fast it draws."""
 
-import base64
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -9,17 +7,10 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from rerun.chunk import RrdReader
 from screenshots import CHROMIUM
 
-SIZE = {"width": 1280, "height": 800}
-DEADLINE_S = 900.0
+DEADLINE_S = 120.0
 """No machine on which the page works takes this long for one step."""
-EXPOSE_VIEWER = """
-;wasm_bindgen.WebHandle = class extends wasm_bindgen.WebHandle {
-  constructor(...options) { super(...options); window.viewer = this; }
-};"""
-"""Appended to Rerun's script, so that the page's viewer can be asked."""
 
 
 def needs_browser() -> None:
@@ -30,90 +21,46 @@ def needs_browser() -> None:
 
 
 class Page:
-    """Page at an address, with its viewer started."""
+    """Page at an address, opened; `first_s` is the time until it had drawn a first moment, once `wait_drawn` did."""
 
-    def __init__(self, browser: Any, address: str) -> None:
+    def __init__(self, browser: Any, address: str, size: tuple[int, int] = (1280, 800)) -> None:
         self.hosts: set[str | None] = set()
         """Hosts from which it fetched."""
-        self.page = browser.new_page(viewport=SIZE)
+        self.errors: list[str] = []
+        self.first_s = 0.0
+        self.page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         self.page.on("request", lambda request: self.hosts.add(urlsplit(request.url).hostname))
-        self.page.route("**/re_viewer.js", self._expose_viewer)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self._start_s = time.monotonic()
         self.page.goto(address, wait_until="commit", timeout=1e3 * DEADLINE_S)
-        self.page.locator("#note").wait_for(state="detached", timeout=1e3 * DEADLINE_S)
 
-    @staticmethod
-    def _expose_viewer(route: Any) -> None:
-        answer = route.fetch()
-        route.fulfill(response=answer, body=answer.text() + EXPOSE_VIEWER)
+    def state(self) -> dict[str, Any]:
+        """Return what the page shows; empty while it loads."""
+        return self.page.evaluate("window.nlos ? nlos.state() : {}")
 
-    def ask(self, method: str) -> bytes:
-        """Return the bytes that a method of the page's viewer gives; none while there is no recording."""
-        text = f"btoa(Array.from(viewer.{method}(), (byte) => String.fromCharCode(byte)).join(''))"
-        return base64.b64decode(self.page.evaluate(f"(() => {{ try {{ return {text} }} catch {{ return '' }} }})()"))
+    def wait_drawn(self) -> None:
+        """Wait for a drawn moment, and note the time since the page was opened."""
+        self.wait_until(lambda: self.state().get("shown", 0) > 0, "a drawn moment")
+        self.first_s = time.monotonic() - self._start_s
 
-    def has_panicked(self) -> bool:
-        return bool(self.page.evaluate("viewer.has_panicked()"))
-
-    def views(self) -> dict[str, str]:
-        """Return the views of the page: their names and the paths that they show."""
-        state = protobuf_fields(self.ask("viewer_state"))
-        named = [protobuf_fields(view) for view in state.get(5, ())]
-        return {view[3][0].decode(): view[4][0].decode() for view in named if 3 in view}
-
-    def cursor_s(self) -> float:
-        """Return the time at which the page shows its recording, in seconds."""
-        playing = protobuf_fields(protobuf_fields(self.ask("viewer_state"))[3][0])
-        cursor = protobuf_fields(protobuf_fields(playing[3][0])[3][0])
-        return cursor.get(1, [0])[0] / 1e9
-
-    def frames(self) -> dict[str, int]:
-        """Return the newest frame of each path in the page's recording; -1 for what has no time."""
-        if not (content := self.ask("save_recording")):
-            return {}
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "page.rrd"
-            path.write_bytes(content)
-            reader = RrdReader(path)
-            chunks = reader.stream().to_chunks() if reader.recordings() else []
-        newest: dict[str, int] = {}
-        for chunk in chunks:
-            numbers = [-1] if chunk.is_static else chunk.to_record_batch().column("frame").to_pylist()
-            newest[chunk.entity_path] = max(newest.get(chunk.entity_path, -1), *numbers)
-        return newest
-
-    def wait_until(self, holds: Callable[[], bool], what: str) -> None:
+    def wait_until(self, holds: Callable[[], bool], purpose: str) -> None:
         deadline_s = time.monotonic() + DEADLINE_S
         while not holds():
             if time.monotonic() > deadline_s:
-                pytest.fail(f"not within {DEADLINE_S:.0f} s: {what}")
-            self.page.wait_for_timeout(300)
+                pytest.fail(f"not within {DEADLINE_S:.0f} s: {purpose}; {self.state()}")
+            self.page.wait_for_timeout(50)
+
+    def answer(self, act: Callable[[], object]) -> str:
+        """Do something that runs a command, and return its answer."""
+        self.page.evaluate("document.querySelector('#answer').textContent = ''; undefined")
+        act()
+        finished = "(t => t && !t.endsWith('…'))(document.querySelector('#answer').textContent)"
+        self.wait_until(lambda: self.page.evaluate(finished), "the command's answer")
+        return self.state()["answer"]
+
+    def click(self, selector: str) -> str:
+        """Click a control, and return the command's answer."""
+        return self.answer(lambda: self.page.evaluate(f"document.querySelector('{selector}').click()"))
 
     def close(self) -> None:
         self.page.close()
-
-
-def protobuf_fields(message: bytes) -> dict[int, list[Any]]:
-    """Return the fields of an encoded message by number: whole numbers, and bytes of texts and messages."""
-    found: dict[int, list[Any]] = {}
-    at = 0
-
-    def number() -> int:
-        nonlocal at
-        value, shift = 0, 0
-        while True:
-            byte = message[at]
-            at += 1
-            value |= (byte & 127) << shift
-            shift += 7
-            if byte < 128:
-                return value
-
-    while at < len(message):
-        key = number()
-        if key & 7 == 0:
-            found.setdefault(key >> 3, []).append(number())
-            continue
-        size = {1: 8, 5: 4}.get(key & 7) or number()
-        found.setdefault(key >> 3, []).append(message[at : at + size])
-        at += size
-    return found

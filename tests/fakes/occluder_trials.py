@@ -9,9 +9,10 @@ from nlos_calibration.intervals import INTERVAL_STDS
 from nlos_calibration.noise import DepthMean
 from nlos_calibration.occluder import MIN_COLUMNS, find_occluder
 from nlos_calibration.rig import LidarPose, Occluder, PinholeRecord, load_rig
+from synthetic_scenes import Sheet, bench_depth
 from wall import NO_ECHO
 
-from nlos_cam.calibrate.synthetic import Sheet, View, bench_depth, depth_statistics, view, with_outliers
+from nlos_cam.calibrate.synthetic import View, depth_statistics, view, with_outliers
 from nlos_cam.render import Sensor, SensorModel
 
 Generator = np.random.Generator

@@ -1,4 +1,4 @@
-"""A colour camera beside a SoftwareLidar, in the same software device; and recordings of both."""
+"""A SoftwareLidar in front of a program, a colour camera beside it in the same device, and recordings of both."""
 
 import gc
 from pathlib import Path
@@ -12,6 +12,25 @@ from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.render.sensor.sensor import SensedImages
+
+
+class SoftwareSdk:
+    """Stands for pyrealsense2: its context sees the software device of one lidar, and nothing else."""
+
+    def __init__(self, pinhole: Intrinsics) -> None:
+        self.sdk = load_sdk()
+        self.lidar, self._context = SoftwareLidar(pinhole, self.sdk), self.sdk.context()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.sdk, name)
+
+    def context(self) -> Any:
+        return self._context
+
+    def plug_in(self) -> None:
+        """Show the device, with the sensors and options that it has by now."""
+        self.lidar.device.add_to(self._context)
+
 
 BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "yuyv": 2, "uyvy": 2}
 

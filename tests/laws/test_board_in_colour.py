@@ -26,9 +26,10 @@ from nlos_calibration.noise import DepthMean
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, fit_wall
 from software_colour import SoftwareColour, record_with_colour
+from synthetic_scenes import at_near_edge
 
 from nlos_cam.calibrate.color_view import capture_color_view
-from nlos_cam.calibrate.synthetic import View, at_near_edge, depth_frame
+from nlos_cam.calibrate.synthetic import View, depth_frame
 from nlos_cam.camera import open_camera
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.simulated import SoftwareLidar

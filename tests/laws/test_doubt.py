@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from nlos_models.doubt_checkpoint import load_uncertainty_model
-from nlos_models.inference import load_reconstructor
+from nlos_models.inference import load_reconstructor, load_uncertainty_model
 
 from nlos_cam.dataset.outliers import TRAINING_OUTLIERS, Stimulus, draw_outlier, ordinary, vary_empty_bench
 from nlos_cam.evaluate.subjects import echoes_of, sense

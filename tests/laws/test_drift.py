@@ -5,8 +5,7 @@ import pytest
 from nlos_calibration.drift import BLIND_FRAMES, WINDOW_FRAMES, DriftCheck
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M, wall_depth
-
-from nlos_cam.calibrate.synthetic import (
+from synthetic_scenes import (
     PINHOLE,
     SMALL,
     WallPose,

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
 from occluder_trials import BARELY, IN_VIEW, Setting, draw, find_occluder, simulated_trial, trial
+from synthetic_scenes import bench_depth
 
-from nlos_cam.calibrate.synthetic import bench_depth, depth_statistics
+from nlos_cam.calibrate.synthetic import depth_statistics
 
 SENSOR = load_rig("paper-rig").pinhole.scaled(160, 120)
 LOOKS = {

@@ -18,14 +18,13 @@ from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import MeasuredWall, new_wall_record
 from nlos_models import compressor, vae
-from rerun.chunk import RrdReader
 from rosbags.rosbag1 import Reader, Writer
 from view_streams import ASSETS, Streams
 
 from nlos_cam.objects.depth_map import object_box, orthographic_depth
 from nlos_cam.objects.generators import Category
 from nlos_cam.objects.placement import Pose, place
-from nlos_cam.view.server import ViewServer
+from nlos_cam.view.server import Served, ViewServer
 
 settings.register_profile("no clock", deadline=None)  # a machine that is busy fails no law
 settings.load_profile("no clock")
@@ -64,7 +63,7 @@ def streams() -> Streams:
 
 @pytest.fixture
 def server(streams: Streams) -> Iterator[ViewServer]:
-    server = ViewServer(ASSETS, streams, 0)
+    server = ViewServer(Served(ASSETS, streams), 0)
     yield server
     streams.end.set()
     server.close()
@@ -170,15 +169,3 @@ def narrow_networks() -> Iterator[None]:
         stages = tuple((within // 16, *others) for within, *others in compressor.COLOR_STAGES)
         patch.setattr(compressor, "COLOR_STAGES", stages)
         yield
-
-
-@pytest.fixture
-def chunks_of() -> Callable[[Path], list[Any]]:
-    """The chunks of a saved view's recording, as Rerun's own reader gives them."""
-
-    def read(path: Path) -> list[Any]:
-        reader = RrdReader(path)
-        assert len(reader.recordings()) == 1
-        return reader.stream(store=reader.recordings()[0]).to_chunks()
-
-    return read

@@ -105,6 +105,7 @@ def test_points_are_surface_in_wall_frame(opened: Open) -> None:
     assert seen.points_m[:, 0].max() < middle_x_m
     np.testing.assert_allclose(seen.points_m[[0, -1], 1], [box.y_max_m - pitch_y_m / 2, box.y_min_m + pitch_y_m / 2])
     np.testing.assert_array_equal(seen.points_m[:, 2], seen.depth_m[np.isfinite(seen.depth_m)])
+    assert {*map(tuple, seen.points_m)} <= {*map(tuple, seen.to_mesh().vertices_m.astype(np.float32))}
 
 
 class WatchedCamera(WallCamera):

@@ -78,6 +78,9 @@ def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Record, fo
     points = trimesh.load(folder / "cup.ply").vertices
     assert told == f"cup.ply: {len(points)} points of 3 frames\n"
     assert points[:, 2].min() >= box.z_near_m - 1e-6
+    triangles = int(re.findall(r"(\d+) triangles", run("hidden_mesh", str(bag), "cup.glb"))[0])
+    (mesh,) = trimesh.load_scene(folder / "cup.glb").geometry.values()
+    assert len(mesh.faces) == triangles > 100
 
 
 @pytest.mark.slow

@@ -1,6 +1,12 @@
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from nlos_models import FileBusyError
 
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import atomic_directory, atomic_file, cache_folder
@@ -30,13 +36,12 @@ def test_cache_folder_is_chosen_by_variables(
 def test_atomic_file_appears_when_it_is_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, synced = tmp_path / "out.txt", list[int]()
     out.write_text("old")
-    monkeypatch.setattr("nlos_cam.files.os.fsync", synced.append)
-    with atomic_file(out) as part, atomic_file(out) as other:  # two writers do not meet
+    monkeypatch.setattr("nlos_models.files.os.fsync", synced.append)
+    with atomic_file(out) as part:
         part.write_text("new")
-        other.write_text("other")
         assert out.read_text() == "old"
     assert out.read_text() == "new"
-    assert len(synced) == 2
+    assert len(synced) == 2, "the file, then its folder"
     assert list(tmp_path.iterdir()) == [out]
 
 
@@ -55,25 +60,85 @@ def test_atomic_writes_leave_nothing_after_an_error(tmp_path: Path, error: type[
 
 def test_atomic_directory_appears_when_it_is_whole(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with atomic_directory(out) as part, atomic_directory(out) as other:
+    with atomic_directory(out) as part:
         (part / "inner").mkdir()
         (part / "inner" / "a.txt").write_text("a")
-        (other / "b.txt").write_text("b")
         assert not out.exists()
+        with pytest.raises(FileBusyError), atomic_directory(out):
+            pytest.fail("two writers")
     assert (out / "inner" / "a.txt").read_text() == "a"
-    assert (out / "b.txt").read_text() == "b"
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_atomic_directory_replaces_entries_of_the_same_name(tmp_path: Path) -> None:
-    (tmp_path / "inner").mkdir()
-    (tmp_path / "inner" / "old.txt").write_text("old")
-    (tmp_path / "mine.txt").write_text("mine")
-    with atomic_directory(tmp_path) as part:
+def test_atomic_directory_refuses_one_that_appeared(tmp_path: Path) -> None:
+    def write() -> None:
+        with atomic_directory(tmp_path / "out") as part:
+            (part / "b.txt").write_text("b")
+            (tmp_path / "out").mkdir()
+            (tmp_path / "out" / "a.txt").write_text("a")
+
+    with pytest.raises(OutputExistsError, match="appeared"):
+        write()
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize("way", ["exchange", "no exchange", "no links", "current folder"])
+def test_atomic_directory_replaces_entries_of_the_same_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    out = tmp_path / "out"
+    for folder in ("inner", "kept/deep"):
+        (out / folder).mkdir(parents=True)
+        (out / folder / "old.txt").write_text("old")
+    (out / "mine.txt").write_text("mine")
+    if way == "no exchange":
+        monkeypatch.setattr("nlos_cam.files._exchange", lambda *_: False)
+    if way == "no links":
+        monkeypatch.setattr("nlos_cam.files._link_all", lambda *_: False)
+    if way == "current folder":
+        monkeypatch.chdir(out)
+    with atomic_directory(out) as part:
         (part / "inner").mkdir()
         (part / "inner" / "new.txt").write_text("new")
-    assert [path.name for path in (tmp_path / "inner").iterdir()] == ["new.txt"]
-    assert (tmp_path / "mine.txt").read_text() == "mine"
+    files = sorted(str(path.relative_to(out)) for path in out.rglob("*.txt"))
+    assert files == ["inner/new.txt", "kept/deep/old.txt", "mine.txt"]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def overwrite_and_die(out: Path, calls: int) -> None:
+    """Write a directory over another, and die before the call of the system with this number that renames or links."""
+    left, (rename, link, replace) = iter(range(calls)), (Path.rename, os.link, Path.replace)
+
+    def dying(call: Callable[..., Any]) -> Callable[..., Any]:
+        def act(*arguments: Any, **options: Any) -> Any:
+            if next(left, None) is None:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return call(*arguments, **options)
+
+        return act
+
+    Path.rename, os.link, Path.replace = dying(rename), dying(link), dying(replace)  # type: ignore[method-assign]
+    with atomic_directory(out) as part:
+        for name in "abc":
+            (part / name).mkdir()
+            (part / name / "new").write_text("new")
+
+
+def test_directory_is_old_or_new_whenever_its_writer_dies(tmp_path: Path) -> None:
+    fork, states = multiprocessing.get_context("fork"), set[str]()
+    for existed in (True, False):
+        for calls in range(4):
+            out = tmp_path / f"{existed}{calls}"
+            for name in ("a", "b", "mine1", "mine2") if existed else ():
+                (out / name).mkdir(parents=True)
+                (out / name / "old").write_text("old")
+            process = fork.Process(target=overwrite_and_die, args=(out, calls))
+            process.start()
+            process.join()
+            found = " ".join(sorted(f"{path.parent.name}/{path.name}" for path in out.rglob("*") if path.is_file()))
+            states.add(found)
+    old, whole = "a/old b/old mine1/old mine2/old", "a/new b/new c/new"
+    assert states == {old, f"{whole} mine1/old mine2/old", "", whole}
 
 
 def test_atomic_directory_refuses_to_replace_a_file(tmp_path: Path) -> None:

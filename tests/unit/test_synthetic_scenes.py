@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import synthetic_scenes as scenes
 from nlos_calibration.board import BOARDS
 from nlos_calibration.reference import BareWallStatistics
 from nlos_calibration.rig import LidarPose, Occluder, load_rig
@@ -13,8 +14,8 @@ from nlos_cam.render.geometry import cast
 RIG, PAPER = load_rig("bare-wall"), load_rig("paper-rig")
 PINHOLE, A4 = RIG.pinhole, BOARDS["a4"]
 SMALL_BARE, SMALL_PAPER = PINHOLE.scaled(80, 60), PAPER.pinhole.scaled(80, 60)
-TINY = synthetic.SMALL.scaled(80, 60)
-POSE: synthetic.WallPose = (0.2, 30.0, 0.0)
+TINY = scenes.SMALL.scaled(80, 60)
+POSE: scenes.WallPose = (0.2, 30.0, 0.0)
 
 
 @pytest.mark.parametrize("bend_deg", [-20.0, -1.0, 1.0, 20.0])
@@ -54,7 +55,7 @@ def test_scene_rays_are_the_renderers(yaw_deg: float, pitch_deg: float, x_m: flo
     rig = PAPER.model_copy(update={"lidar": lidar, "occluder": Occluder(x_m=x_m, z_min_m=gap_m)})
     beams = cast(rig, SMALL_PAPER)
     seen = synthetic.View(rig.wall_from_lidar, SMALL_PAPER)
-    depth_m = synthetic.bench_depth(seen, synthetic.Sheet(x_m, gap_m)).ravel()
+    depth_m = scenes.bench_depth(seen, scenes.Sheet(x_m, gap_m)).ravel()
     met = np.isfinite(beams.length_m) & (beams.laser_spot_m[:, 0] < 2.0) & (np.abs(beams.laser_spot_m[:, 1]) < 1.5)
     np.testing.assert_allclose(depth_m[met], (beams.length_m * beams.cos_axis)[met], rtol=1e-9)
     assert (~beams.on_wall & met).any()
@@ -62,10 +63,10 @@ def test_scene_rays_are_the_renderers(yaw_deg: float, pitch_deg: float, x_m: flo
 
 def test_tilted_sheet_is_at_its_parameters() -> None:
     seen = synthetic.view(0.2, 45.0, 0.0, SMALL_PAPER)
-    occluding_sheet = synthetic.Sheet(
+    occluding_sheet = scenes.Sheet(
         lean_deg=10.0, twist_deg=-5.0, edge_deg=4.0, height_m=0.05, bottom_m=-0.03, top_m=0.04
     )
-    depth_m, bare_m = synthetic.bench_depth(seen, occluding_sheet), synthetic.bench_depth(seen, None)
+    depth_m, bare_m = scenes.bench_depth(seen, occluding_sheet), scenes.bench_depth(seen, None)
     on = depth_m < bare_m
     x, y, z = (seen.pose[:3, 3] + (SMALL_PAPER.rays() * depth_m[..., np.newaxis])[on] @ seen.pose[:3, :3].T).T
     lean, twist, edge = np.tan(np.radians([10.0, -5.0, 4.0]))
@@ -79,8 +80,8 @@ def test_tilted_sheet_is_at_its_parameters() -> None:
 
 def test_sheet_mixes_only_pixels_on_its_edge() -> None:
     seen = synthetic.view(0.2, 45.0, 0.0, SMALL_PAPER)
-    occluding_sheet = synthetic.Sheet(gap_m=0.103)
-    sharp, mixed = synthetic.bench_depth(seen, occluding_sheet), synthetic.bench_depth(seen, occluding_sheet, beams=9)
+    occluding_sheet = scenes.Sheet(gap_m=0.103)
+    sharp, mixed = scenes.bench_depth(seen, occluding_sheet), scenes.bench_depth(seen, occluding_sheet, beams=9)
     off = np.abs(mixed - sharp) > 0.01
     assert off.sum(axis=1).max() == 1
     assert off.any()
@@ -88,7 +89,7 @@ def test_sheet_mixes_only_pixels_on_its_edge() -> None:
 
 def test_ball_is_round() -> None:
     seen = synthetic.view(0.2, 45.0, 0.0, SMALL_PAPER)
-    depth_m = synthetic.ball(seen, (0.15, 0.01, 0.12), 0.04)
+    depth_m = scenes.ball(seen, (0.15, 0.01, 0.12), 0.04)
     hit = np.isfinite(depth_m)
     points = seen.pose[:3, 3] + (SMALL_PAPER.rays()[hit] * depth_m[hit][:, np.newaxis]) @ seen.pose[:3, :3].T
     assert hit.sum() > 100
@@ -97,9 +98,9 @@ def test_ball_is_round() -> None:
 
 def test_paper_and_toner_have_their_counts() -> None:
     """Without a spot: the falloff of a bare wall, its brightest pixel at the gain, toner at its albedo."""
-    seen, light = synthetic.View(RIG.wall_from_lidar, PINHOLE), synthetic.Illumination(spot_mm=0.0)
-    away, placed = synthetic.Placement(50.0), synthetic.at_near_edge(A4, seen)
-    bare, with_board = (synthetic.clean_infrared(A4, seen, where, light) for where in (away, placed))
+    seen, light = synthetic.View(RIG.wall_from_lidar, PINHOLE), scenes.Illumination(spot_mm=0.0)
+    away, placed = scenes.Placement(50.0), scenes.at_near_edge(A4, seen)
+    bare, with_board = (scenes.clean_infrared(A4, seen, where, light) for where in (away, placed))
     assert bare.max() == pytest.approx(48.0)
     points = seen.pinhole.rays() * seen.depth_m[..., np.newaxis]
     length_m = np.linalg.norm(points, axis=-1)
@@ -107,12 +108,12 @@ def test_paper_and_toner_have_their_counts() -> None:
     inverse_cube = bare[lit] * length_m[lit] ** 3
     np.testing.assert_allclose(inverse_cube, inverse_cube[0], rtol=1e-3)
     albedo = with_board[bare > 1.0] / bare[bare > 1.0]
-    assert albedo.min() == pytest.approx(synthetic.TONER, abs=1e-3)
+    assert albedo.min() == pytest.approx(scenes.TONER, abs=1e-3)
     assert albedo.max() == pytest.approx(1.0, abs=1e-3)
 
 
 def test_board_placement_is_at_its_parameters() -> None:
-    placed = synthetic.Placement(0.2, 0.03, 0.0, scale=0.97, stretch=1.01)
+    placed = scenes.Placement(0.2, 0.03, 0.0, scale=0.97, stretch=1.01)
     middle = np.array([*(size * 0.5e-3 for size in A4.size_mm), 1.0])
     np.testing.assert_allclose(placed.wall_from_board(A4) @ middle, [0.2, 0.03, 0.0, 1.0], atol=1e-12)
     across, down = placed.wall_from_board(A4)[:2, 0], placed.wall_from_board(A4)[:2, 1]
@@ -123,23 +124,23 @@ def test_board_placement_is_at_its_parameters() -> None:
 
 def test_frames_have_the_lidars_noise_and_saturate() -> None:
     clean = np.full((40, 50), 25.0)
-    frames = synthetic.infrared_frames(clean, np.random.default_rng(0), 50).astype(float)
+    frames = scenes.infrared_frames(clean, np.random.default_rng(0), 50).astype(float)
     assert frames.mean() == pytest.approx(25.0, abs=0.05)
     assert frames.std() == pytest.approx(np.sqrt(0.7**2 + 0.09 * 25.0 + 1.0 / 12.0), rel=0.02)
-    assert synthetic.infrared_frames(np.full((2, 2), 400.0), np.random.default_rng(0), 1).max() == 255
+    assert scenes.infrared_frames(np.full((2, 2), 400.0), np.random.default_rng(0), 1).max() == 255
 
 
 def test_reference_matches_one_collected_from_frames() -> None:
     generator = np.random.default_rng(0)
-    drawn, collected = synthetic.reference_of_wall(POSE, TINY, generator), BareWallStatistics(TINY)
-    truth_m, cells = wall_depth(synthetic.wall_from_lidar(POSE), TINY), np.zeros((64, 80), np.float32)
-    for _ in range(synthetic.REFERENCE_FRAMES):
+    drawn, collected = scenes.reference_of_wall(POSE, TINY, generator), BareWallStatistics(TINY)
+    truth_m, cells = wall_depth(scenes.wall_from_lidar(POSE), TINY), np.zeros((64, 80), np.float32)
+    for _ in range(scenes.REFERENCE_FRAMES):
         collected.add(
-            synthetic.noisy_depth(truth_m, generator).astype(np.float32), np.full((60, 80), 40, np.uint8), cells, cells
+            scenes.noisy_depth(truth_m, generator).astype(np.float32), np.full((60, 80), 40, np.uint8), cells, cells
         )
     wall = collected.reference(drawn.inliers, serial="", settings={})
     for reference in (drawn, wall):
-        pulls = (reference.depth_m - truth_m) / (0.0005 + 0.002 * truth_m) * np.sqrt(synthetic.REFERENCE_FRAMES)
+        pulls = (reference.depth_m - truth_m) / (0.0005 + 0.002 * truth_m) * np.sqrt(scenes.REFERENCE_FRAMES)
         assert np.nanstd(pulls) == pytest.approx(1.0, abs=0.05)
     assert np.nanmean(drawn.depth_std_m / wall.depth_std_m) == pytest.approx(1.0, abs=0.03)
     assert set(vars(drawn)) == set(vars(wall))
@@ -149,14 +150,14 @@ def test_reference_matches_one_collected_from_frames() -> None:
 
 
 def test_multipath_is_longer_and_moves_and_a_sheet_is_nearer() -> None:
-    stream = synthetic.WallStream(POSE, TINY)
+    stream = scenes.WallStream(POSE, TINY)
     depth_m = np.full(len(stream.pixels), 0.3)
-    hide = synthetic.multipath(stream.places, 0.6, 1)
+    hide = scenes.multipath(stream.places, 0.6, 1)
     first, later = hide(depth_m, 0) - depth_m, hide(depth_m, 10) - depth_m
     assert (first > 0.0).mean() == pytest.approx(0.6, abs=0.01)
     assert first[first > 0.0].min() >= 0.03 - 1e-9
     assert first.max() <= 0.4 + 1e-9
     assert ((first > 0.0) != (later > 0.0)).any()
-    nearer = depth_m - synthetic.occluding_sheet(stream.places, 0.5)(depth_m, 0)
+    nearer = depth_m - scenes.occluding_sheet(stream.places, 0.5)(depth_m, 0)
     assert (nearer > 0.0).mean() == pytest.approx(0.5, abs=0.05)
     assert nearer[nearer > 0.0].min() >= 0.05

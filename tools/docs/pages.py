@@ -24,7 +24,12 @@ HEAD = """# Every command and option
 Written by `python tools/docs/pages.py commands` from the program itself, and compared with it by a test. Purpose of the
 commands, their `--json` answers, exit codes and files: [commands and files](reference.md).
 """
-EVERYWHERE = {"--json": "ends stdout with one JSON object", "--overwrite": "replaces the output, if it exists"}
+EVERYWHERE = {
+    "--json": "ends stdout with one JSON object",
+    "--overwrite": "replaces the output, if it exists",
+    "--quiet": "no messages and no progress, only results and errors",
+    "--verbose": "details too, such as the time of each stage",
+}
 """Options that mean the same wherever they are."""
 KINDS = {str: "text", Path: "path", int: "whole number", float: "number", bool: "switch"}
 

@@ -39,7 +39,7 @@ SCENE = 'name = "a wall"\nrig = "bare-wall"\n'
 UNPLUG = '[[faults]]\nkind = "unplug"\nat_frame = {at_frame}\nframes = {frames}\n'
 WATCHER = """
 import sys, urllib.request
-with urllib.request.urlopen(sys.argv[1] + "live.rrd") as stream:
+with urllib.request.urlopen(sys.argv[1].partition("#")[0] + "stream") as stream:
     print("watching", flush=True)
     while stream.read(1 << 16):
         pass

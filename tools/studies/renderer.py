@@ -29,8 +29,8 @@ from nlos_cam.evaluate import (
     draw_renders,
     machine,
     measure_renders,
+    render_document,
     render_facts,
-    render_markdown,
     render_settings,
 )
 from nlos_cam.objects import Pose, category_triangles, object_box, object_depth, orthographic_depth, place
@@ -72,7 +72,7 @@ def tradeoff(_: argparse.Namespace) -> None:
     harness.write("renderer", table)
     path = harness.DOCS / "images" / "tradeoff.png"
     draw_renders(path, rows, f"airplane: {size.patches} patches, {size.beams_on_wall} beams")
-    print(render_markdown(table))
+    print(render_document(table, "airplane").as_markdown())
 
 
 @dataclass(frozen=True)

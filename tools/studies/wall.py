@@ -13,7 +13,7 @@ from itertools import product
 from math import hypot
 from typing import Any
 
-import harness  # before the synthetic scenes: it puts their folder on the path
+import harness
 import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration import (

@@ -12,7 +12,7 @@ from fake_lidar import COLOUR_FROM_DEPTH, LENS, FakeLidar
 from nlos_calibration.board import Corners
 from nlos_calibration.board_wall import BoardView, CameraErrors, undistorted
 from nlos_calibration.geometry import Intrinsics
-from software_colour import SoftwareColour, record_with_colour
+from software_colour import SoftwareColour, SoftwareSdk, record_with_colour
 
 from nlos_cam.calibrate.color_view import SETTLING_FRAMES, TO_GRAY, capture_color_view
 from nlos_cam.camera.sdk import load_sdk
@@ -34,23 +34,16 @@ LIDAR_FROM_COLOUR = np.linalg.inv(np.vstack([COLOUR_FROM_DEPTH, [0.0, 0.0, 0.0, 
 FRAMES = 4
 
 
-class SoftwareSdk:
-    """pyrealsense2 with a context that holds a software device: an L515 with a color camera, streaming in a thread."""
+class StreamingColour(SoftwareSdk):
+    """An L515 with a color camera that streams in a thread."""
 
     def __init__(self) -> None:
-        self.sdk = load_sdk()
-        self.lidar, self._context = SoftwareLidar(SMALL, self.sdk), self.sdk.context()
+        super().__init__(SMALL)
         self.colour = SoftwareColour(self.lidar, SMALL, np.array(LENS), LIDAR_FROM_COLOUR)
-        self.lidar.device.add_to(self._context)
+        self.plug_in()
         self.delivered, self._stop = 0, threading.Event()
         self._thread = threading.Thread(target=self._deliver, name="colour")
         self._thread.start()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.sdk, name)
-
-    def context(self) -> Any:
-        return self._context
 
     def _deliver(self) -> None:
         number = 0
@@ -196,7 +189,7 @@ def test_color_view_closes_a_camera_it_refuses_or_that_fails() -> None:
 
 
 def test_color_view_works_on_librealsense_itself() -> None:
-    sdk = SoftwareSdk()
+    sdk = StreamingColour()
     try:
         view = capture_color_view("l515", FRAMES, sdk=sdk, on_frame=sdk.on_frame)
     finally:

@@ -4,22 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.reference import BareWall, BareWallStatistics
+from fake_wall import bare_wall
 from nlos_calibration.wall_record import MeasuredWall, load_measured
 
 from nlos_cam.calibrate.files import WallFiles, write_record
 from nlos_cam.calibrate.report import report_html
 from nlos_cam.errors import OutputExistsError
-
-
-@pytest.fixture
-def wall() -> BareWall:
-    statistics = BareWallStatistics(Intrinsics(16, 12, 11.4, 11.5, 7.5, 5.5))
-    blank, cells = np.full((12, 16), 0.2, np.float32), np.full((64, 80), 0.2, np.float32)
-    for _ in range(3):
-        statistics.add(blank, blank.astype(np.uint8), cells, cells)
-    return statistics.reference(blank > 0, serial="", settings={})
 
 
 @pytest.fixture
@@ -29,8 +19,9 @@ def files(tmp_path: Path) -> WallFiles:
 
 @pytest.mark.slow
 def test_written_wall_files_belong_together(
-    files: WallFiles, measured: Callable[..., MeasuredWall], wall: BareWall, monkeypatch: pytest.MonkeyPatch
+    files: WallFiles, measured: Callable[..., MeasuredWall], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    wall = bare_wall()
     record = write_record(files, measured().record, wall)
     loaded = load_measured(files.record)
     assert loaded.record == record

@@ -7,7 +7,7 @@ from nlos_calibration.rig import Extent
 from nlos_calibration.wall_record import MeasuredWall, OccluderRecord, WallRecord
 
 from nlos_cam.calibrate.report_drawings import _facing, bench_picture, drawn_limits, footprint_picture
-from nlos_cam.calibrate.report_maps import Picture
+from nlos_cam.report import Picture
 
 pytestmark = pytest.mark.slow
 Measured = Callable[..., MeasuredWall]

@@ -10,16 +10,14 @@ from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.calibrate.report_maps import (
-    Picture,
     block_majority,
     block_side,
     expected_std_m,
-    figure_of,
     in_blocks,
-    png,
     residual_m,
     wall_maps,
 )
+from nlos_cam.report import Picture, figure_of, png
 
 FLOAT32_M = 1e-6
 

@@ -1,13 +1,13 @@
-import cv2
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import BOARDS, MIN_CORNERS, PAPER_MM, Board, Paper, find_corners
+from nlos_calibration.board import BOARDS, MIN_CORNERS, Board, find_corners
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.rig import load_rig
 from pydantic import ValidationError
+from synthetic_scenes import Illumination, at_near_edge, clean_infrared, corners_px, infrared_frames
 
-from nlos_cam.calibrate.synthetic import Illumination, View, at_near_edge, clean_infrared, corners_px, infrared_frames
+from nlos_cam.calibrate.synthetic import View
 
 SMALL = {"squares_x": 4, "squares_y": 5, "square_mm": 20.0, "marker_mm": 15.0}
 A4 = BOARDS["a4"]
@@ -28,26 +28,6 @@ def mean_of(clean: Float64, frames: int = 30) -> Float64:
 @pytest.fixture(scope="module")
 def clean() -> Float64:
     return of_bench()[0]
-
-
-@pytest.mark.parametrize("paper", BOARDS)
-def test_default_board_leaves_a_margin_on_its_paper(paper: Paper) -> None:
-    """5 mm at each side, where printers do not print, and 20 mm below for the scale bar and its text."""
-    (width_mm, height_mm), (across_mm, down_mm) = PAPER_MM[paper], BOARDS[paper].size_mm
-    assert across_mm <= width_mm - 10.0
-    assert down_mm <= height_mm - 25.0
-
-
-@pytest.mark.parametrize("paper", BOARDS)
-def test_board_corners_are_where_opencv_detects_them(paper: Paper) -> None:
-    board, k = BOARDS[paper], 64
-    pattern = np.pad(board.pattern(k), k, constant_values=255)
-    pixels, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(pattern)
-    assert len(markers) == board.squares_x * board.squares_y // 2
-    assert sorted(ids.ravel()) == list(range((board.squares_x - 1) * (board.squares_y - 1)))
-    per_m = k / (board.square_mm * 1e-3)
-    expected = board.corners_m[ids.ravel(), :2] * per_m + k - 0.5
-    np.testing.assert_allclose(pixels, expected, atol=0.1)
 
 
 def test_measured_board_is_the_same_board_scaled() -> None:

@@ -5,10 +5,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from board_trials import CALIBRATION, LIDAR, ColorCamera, bench_at, through_lens
+from board_trials import CALIBRATION, ColorCamera, bench_at, through_lens
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import BOARDS, Corners, Light, find_corners
-from nlos_calibration.board_pose import PrintErrors, fit_board
+from nlos_calibration.board import BOARDS, Corners, Light
+from nlos_calibration.board_pose import PrintErrors
 from nlos_calibration.board_wall import (
     AGREE_SIGMAS,
     EXACT,
@@ -25,15 +25,9 @@ from nlos_calibration.errors import BoardRefusedError, WallRefusedError
 from nlos_calibration.geometry import normal_from_angles
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, WallMeasures, fit_wall, measures_of
+from synthetic_scenes import at_near_edge, clean_infrared, corners_px, infrared_frames
 
-from nlos_cam.calibrate.synthetic import (
-    View,
-    at_near_edge,
-    clean_infrared,
-    corners_px,
-    depth_statistics,
-    infrared_frames,
-)
+from nlos_cam.calibrate.synthetic import View, depth_statistics
 
 RIG = load_rig("bare-wall")
 PINHOLE, A4 = RIG.pinhole, BOARDS["a4"]
@@ -55,13 +49,6 @@ def corners() -> Corners:
 
 def moved(slopes: Float64) -> Float64:
     return plane_in_lidar(slopes, np.zeros((3, 3)), POSE, EXACT)[0]
-
-
-def test_fit_in_lidar_of_infrared_is_fit_board() -> None:
-    corners = find_corners(bench_at(0.2, 45.0, 0.0).frames(4, np.random.default_rng(0)).mean(axis=0), A4)
-    ours, direct = fit_in_lidar(corners, A4, BoardView(np.zeros((1, 1)), LIDAR)), fit_board(corners, A4, LIDAR)
-    np.testing.assert_allclose(ours.slopes, direct.slopes, rtol=1e-12)
-    np.testing.assert_allclose(ours.covariance, direct.covariance, rtol=1e-12)
 
 
 def test_plane_in_lidar_moves_plane_and_covariance() -> None:
@@ -240,15 +227,6 @@ def test_combine_interval_holds_the_truth_as_often_as_stated() -> None:
         off = both.slopes - depth.slopes
         inside.append(off @ np.linalg.solve(both.covariance, off) < 7.815)  # 95 % of a chi-square of three
     assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
-
-
-@pytest.mark.parametrize(("measured", "used"), [(False, "depth"), (True, "board")])
-def test_combine_of_planes_that_disagree_takes_one(measured: bool, used: str) -> None:
-    depth, board = plane(0.2), plane(0.206)
-    both = combine(depth, board, measured=measured)
-    assert both.used == used
-    assert both.plane is (board if measured else depth)
-    assert both.disagreement.sigmas > AGREE_SIGMAS
 
 
 def test_combine_names_causes_with_amounts_that_explain_it() -> None:

@@ -15,8 +15,7 @@ from nlos_calibration.drift import (
 from nlos_calibration.errors import CalibrationError
 from nlos_calibration.reference import BareWall
 from nlos_calibration.wall_tracker import WallObservation
-
-from nlos_cam.calibrate.synthetic import SMALL, WallPose, reference_of_wall, wall_from_lidar
+from synthetic_scenes import SMALL, WallPose, reference_of_wall, wall_from_lidar
 
 TINY = SMALL.scaled(32, 24)
 POSE: WallPose = (0.2, 45.0, 0.0)

@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
-from nlos_calibration.flatness import Flatness, Ripples, block_sums, flatness, ripples
+from nlos_calibration.flatness import Flatness, Ripples, flatness, ripples
 from nlos_calibration.noise import MeanNoise, depth_noise_m
 from nlos_calibration.plane import PlaneFit, fit_depth
 from nlos_calibration.rig import load_rig
@@ -91,12 +91,3 @@ def test_ripples_need_neighbours_that_agree() -> None:
     exact = ripples(fit_depth(RAYS.reshape(-1, 3), WALL_M.ravel(), np.random.default_rng(0)), RAYS)
     assert exact.rms_m < 1e-9
     assert np.isfinite(exact.covariance).all()
-
-
-def test_block_sums_include_the_incomplete_blocks() -> None:
-    values = np.arange(35.0).reshape(5, 7)
-    sums = block_sums(values, 3)
-    assert sums.shape == (2, 3)
-    assert sums.sum() == values.sum()
-    assert sums[0, 0] == values[:3, :3].sum()
-    assert sums[1, 2] == values[3:, 6:].sum()

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from measured_walls import BOARD, exact_wall
 from nlos_calibration.intervals import INTERVAL_STDS
 from nlos_calibration.rig import OccluderRecord
-from nlos_calibration.summary import wall_facts, wall_summary, with_degrees, with_mm
+from nlos_calibration.summary import wall_facts, with_degrees, with_mm
 
 RECORD = exact_wall().record
 OFFSET = {"range_offset_m": -0.0045, "range_offset_std_m": 0.0005, "range_offset_cause": "depth"}
@@ -79,12 +79,3 @@ def test_facts_compare_board_with_depth(apart: dict[str, Any], words: str) -> No
     [meaning] = [row[2] for row in wall_facts(RECORD.model_copy(update={"board": board})) if row[0] == "printed board"]
     assert words in meaning
     assert "24 corners; used: depth" in meaning
-
-
-def test_summary_holds_verdict_status_table_and_notes() -> None:
-    text = wall_summary(RECORD.model_copy(update={"warnings": ("it has ripples",)}), "all is well")
-    assert text.startswith("**GOOD**: ")
-    assert (
-        text.index("all is well") < text.index("| distance | 200.00 ± 0.20 mm |") < text.index("Note: it has ripples")
-    )
-    assert "Note" not in wall_summary(RECORD)

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_wall import bare_wall
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.geometry import Intrinsics, normal_from_angles, wall_from_plane
 from nlos_calibration.occluder import OccluderFit
-from nlos_calibration.reference import BareWallStatistics, save_reference
+from nlos_calibration.reference import save_reference
 from nlos_calibration.rig import ObjectBox, Occluder, dump_toml, load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import VERSION, WallRecord, load_measured, load_wall, new_wall_record, with_occluder
@@ -64,6 +65,14 @@ def test_with_occluder_replaces_the_assumed_one(record: WallRecord) -> None:
     assert "0.030 m" in first.advice
     again = with_occluder(first, replace(fit, gap_m=0.1))
     assert (again.advice, again.warnings) == ("average more frames", ("a stray",))
+
+
+def test_with_occluder_beside_a_hidden_object_is_not_good(record: WallRecord) -> None:
+    fit = OccluderFit(0.2, 1e-4, 0.1, 1e-3, 0.0, 0.1, 0.0, 0.0, 1e-4, np.zeros((2, 2), np.bool_), ())
+    polluted = with_occluder(record, replace(fit, doubt="an object seems to be hidden"))
+    assert polluted.verdict == "doubtful"
+    assert "do not use" in polluted.advice
+    assert with_occluder(polluted, fit).verdict == with_occluder(record, fit).verdict == "good"
 
 
 def test_load_wall_reads_version_1() -> None:
@@ -139,16 +148,12 @@ def test_load_wall_reads_the_worked_example() -> None:
 
 def test_load_measured_reads_the_reference_beside_the_record(tmp_path: Path, record: WallRecord) -> None:
     assert load_measured(written(tmp_path, record)).reference is None
-    blank = np.zeros((12, 16), np.float32)
-    statistics = BareWallStatistics(Intrinsics(16, 12, 11.4, 11.5, 7.5, 5.5))
-    cells = np.full((64, 80), 0.2, np.float32)
-    statistics.add(blank + np.float32(0.2), blank.astype(np.uint8), cells, cells)
-    wall = statistics.reference(blank == 0, serial="", settings={})
+    wall = bare_wall()
     named = {"reference": "wall.npz", "reference_sha256": save_reference(tmp_path / "wall.npz", wall)}
     path = written(tmp_path, record.model_copy(update=named))
     measured = load_measured(path)
     assert measured.reference is not None
-    assert measured.reference.frames == 1
+    assert measured.reference.frames == wall.frames
     (tmp_path / "wall.npz").unlink()
     with pytest.raises(RecordFileError, match=r"wall\.npz"):
         load_measured(path)

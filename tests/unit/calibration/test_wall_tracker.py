@@ -5,8 +5,7 @@ import pytest
 from nlos_calibration.reference import BareWall
 from nlos_calibration.wall import measures_of, wall_depth
 from nlos_calibration.wall_tracker import GRID, WallTrack, noise_scale, watched_pixels
-
-from nlos_cam.calibrate.synthetic import SMALL, WallPose, reference_of_wall, wall_from_lidar
+from synthetic_scenes import SMALL, WallPose, reference_of_wall, wall_from_lidar
 
 POSE: WallPose = (0.2, 45.0, -5.0)
 

@@ -240,8 +240,24 @@ def test_option_that_is_missing_or_refused_is_reported(lidar: FakeLidar, options
     assert "failed to set power state" in options.put("laser_power", 50.0)
 
 
-def test_options_are_set_in_order_and_report_differences(lidar: FakeLidar, options: Options) -> None:
-    lidar.stubborn = {"noise_filtering"}
-    differences = options.put_all({"min_distance": 0.0, "noise_filtering": 2.0, "laser_power": 40.0})
-    assert set(differences) == {"noise_filtering"}
-    assert lidar.did == ["min_distance", "noise_filtering", "laser_power"]
+def test_options_are_changed_while_the_camera_runs(fake_camera: Make) -> None:
+    lidar = FakeLidar(laser_power=40.0)
+    lidar.ranges["laser_power"] = (0.0, 100.0, 1.0)
+    camera = fake_camera(lidar)
+    assert camera.adjustable() == []
+    with pytest.raises(CameraError, match="not running"):
+        camera.set_option("laser_power", 20.0)
+    with camera:
+        offered = {each["name"]: each for each in camera.adjustable()}
+        assert {"laser_power", *NEAR_WALL} == set(offered)
+        limits = offered["laser_power"]
+        assert limits["min"] < limits["max"]
+        assert "laser_power is" in camera.set_option("laser_power", limits["min"] + 2 * limits["step"])
+        assert lidar.options["laser_power"] == limits["min"] + 2 * limits["step"]
+        assert "nearest" in camera.set_option("laser_power", 1e6)
+        assert lidar.options["laser_power"] == limits["max"]
+        lidar.refused = {"noise_filtering"}
+        with pytest.raises(CameraError, match=r"noise_filtering: .*out of range"):
+            camera.set_option("noise_filtering", 1.0)
+        with pytest.raises(CameraError, match="choose from"):
+            camera.set_option("visual_preset", 1.0)

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from fake_lidar import NapClock
 from nlos_calibration.rig import load_rig
+from software_colour import SoftwareSdk
 
 from nlos_cam.camera.l515 import NEAR_WALL, PRESET, L515Camera
 from nlos_cam.camera.recorder import Recording
-from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.simulated import SoftwareLidar
 from nlos_cam.recording.playback import ReplayCamera, verify
 from nlos_cam.render.sensor.sensor import SensedImages
 
@@ -19,16 +18,15 @@ SATURATES_ABOVE = 60.0
 RANGES = dict.fromkeys(NEAR_WALL, (0.0, 6.0)) | {"visual_preset": (0.0, 6.0), "laser_power": (0.0, 100.0)}
 
 
-class Desk:
-    """Stands for pyrealsense2; its context sees a software device with an L515's options."""
+class Desk(SoftwareSdk):
+    """A software device with an L515's options."""
 
     def __init__(self) -> None:
-        self.sdk = load_sdk()
         pinhole = load_rig("paper-rig").pinhole
-        self.lidar, self._context = SoftwareLidar(pinhole, self.sdk), self.sdk.context()
+        super().__init__(pinhole)
         for name, (low, high) in RANGES.items():
             self.lidar._sensor.add_option(getattr(self.sdk.option, name), self._range(low, high), True)
-        self.lidar.device.add_to(self._context)
+        self.plug_in()
         shape = pinhole.height, pinhole.width
         self.dim = SensedImages(
             np.full(shape, 800, np.uint16), np.full(shape, 48, np.uint8), np.full(shape, 15, np.uint8)
@@ -39,12 +37,6 @@ class Desk:
         made = self.sdk.option_range()
         made.min, made.max, made.step, made.default = low, high, 1.0, high
         return made
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.sdk, name)
-
-    def context(self) -> Any:
-        return self._context
 
     def deliver(self, stop: threading.Event) -> None:
         number = 0

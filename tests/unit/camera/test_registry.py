@@ -36,10 +36,11 @@ def test_reader_and_path_choose_the_playback(noise_bag: Path, tmp_path: Path, re
     assert (type(camera).__name__, camera.uri) == (kind, f"bag:{path}")
 
 
-def test_packaged_worlds_can_be_opened_and_report_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_worlds_can_be_opened_and_report_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for uri in SIMULATED:
         assert open_camera(uri).uri == uri
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
+    monkeypatch.setattr("nlos_cam.camera.simulated_world.WORLDS", tmp_path)
     progress: list[tuple[int, int]] = []
     open_camera("sim:bare-wall", on_progress=lambda done, total: progress.append((done, total)))
     assert progress == [(1, 1)]

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlos_cam.camera.simulated_world import World, open_world
+from nlos_cam.camera.simulated_world import World, open_world, read_packaged, render_loop
+from nlos_cam.render import SceneFile, bare_wall_scene, paper_scene
 from nlos_cam.render.sensor.sensor import SensedImages
 
 SCENE = """
@@ -94,7 +95,8 @@ def test_world_from_the_cache_equals_the_rendered_one(
     for number in (0, 1, 5):
         assert _equal(cached.images(number), fresh.images(number))
         assert _equal(world.images(number), fresh.images(number))
-    assert [path.name for path in (tmp_path / "worlds").iterdir()] == [f"{fresh.scene.checksum}.npz"]
+    (entry,) = (tmp_path / "worlds").iterdir()
+    assert entry.name.startswith(fresh.scene.checksum)
     other = tmp_path / "scene.toml"
     other.write_text(scene.read_text(encoding="utf-8") + "sensor = { dead_share = 0.5 }\n", encoding="utf-8")
     harmed = open_world(str(other)).images(0)  # another sensor, the same rendering
@@ -165,5 +167,41 @@ def test_world_opens_without_a_cache_that_cannot_be_written(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("NLOS_CAM_CACHE", "/dev/null/cache")
+    monkeypatch.setattr("nlos_cam.camera.simulated_world.WORLDS", Path("/dev/null"))
     assert open_world("bare-wall").images(0).depth_z16.any()
     assert "NLOS_CAM_CACHE" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "scene", [pytest.param(paper_scene(), marks=pytest.mark.slow), bare_wall_scene()], ids=["paper", "bare-wall"]
+)
+def test_packaged_loop_equals_the_renderers(scene: SceneFile) -> None:
+    """On the processor that rendered it bit for bit; others may contract sums differently."""
+    packaged = read_packaged(scene)
+    assert packaged is not None
+    assert [len(part) for part in packaged] == [scene.poses, scene.poses]
+    number = scene.poses // 2
+    (rendered,), (truth_m,) = render_loop(scene, poses=[number])
+    echoes = packaged[0][number]
+    np.testing.assert_array_equal(packaged[1][number], truth_m)
+    np.testing.assert_allclose(echoes.peak, rendered.peak, rtol=1e-4)
+    np.testing.assert_allclose(echoes.runner_up, rendered.runner_up, rtol=1e-4, atol=1e-4 * rendered.peak.max())
+    assert (np.nan_to_num(echoes.path_m) == np.nan_to_num(rendered.path_m)).mean() > 0.999
+
+
+def test_packaged_scenes_open_without_rendering_or_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
+    monkeypatch.setattr("nlos_cam.camera.simulated_world.render_scan", lambda *_: pytest.fail("rendered"))
+    for name in ("", "bare-wall"):
+        assert open_world(name).images(0).depth_z16.any()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("content", [b"", b"damaged"])
+def test_damaged_packaged_loop_counts_as_absent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, content: bytes
+) -> None:
+    monkeypatch.setattr("nlos_cam.camera.simulated_world.WORLDS", tmp_path)
+    assert read_packaged(paper_scene()) is None
+    (tmp_path / f"{paper_scene().checksum}.npz").write_bytes(content)
+    assert read_packaged(paper_scene()) is None

@@ -11,21 +11,21 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
-import typer
 from nlos_calibration.board import BOARDS, Board
 from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.rig import Occluder, OccluderRecord, load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import load_measured, load_wall
 from rich.console import Console
+from synthetic_scenes import at_near_edge, clean_infrared, infrared_frames
 
 from nlos_cam.calibrate.measure import FrameFit, fit_frame
-from nlos_cam.calibrate.synthetic import View, at_near_edge, clean_infrared, infrared_frames
+from nlos_cam.calibrate.synthetic import View
 from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.cli import calibrate
 from nlos_cam.cli.calibrate import EVERY, gauge, panel, until_enter, watch_wall
-from nlos_cam.cli.main import main
+from nlos_cam.cli.common import release_outputs
+from nlos_cam.cli.main import build_app, main
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.frames import Frame
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
@@ -82,11 +82,12 @@ def call(monkeypatch: pytest.MonkeyPatch, out: Path) -> Call:
             opened.append(FakeCamera(uri, scale, patch, frames))
             return opened[0]
 
-        monkeypatch.setattr("nlos_cam.cli.calibrate.open_camera", open_fake)
+        monkeypatch.setattr("nlos_cam.camera.open_camera", open_fake)
         monkeypatch.setattr("nlos_cam.calibrate.files.report_html", lambda *_: "")  # it takes a second to draw
-        app = typer.Typer()
-        calibrate.register(app)
-        app(["calibrate", *arguments, "--out", str(out)], standalone_mode=False)
+        try:
+            build_app("calibrate")(["calibrate", *arguments, "--out", str(out)], standalone_mode=False)
+        finally:
+            release_outputs()
         return opened[0] if opened else None
 
     return run
@@ -214,37 +215,10 @@ def test_calibrate_keeps_existing_files_unless_asked(call: Call, out: Path, name
 
 def test_calibrate_without_out_writes_a_dated_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("nlos_cam.cli.calibrate.open_camera", lambda uri, **_: FakeCamera(uri, 1.0, 1.0, 10))
+    monkeypatch.setattr("nlos_cam.camera.open_camera", lambda uri, **_: FakeCamera(uri, 1.0, 1.0, 10))
     assert main(["calibrate", *WALL]) == 0
     (path,) = tmp_path.glob("wall-*.toml")
     assert load_wall(path).verdict == "good"
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        "--camera sim",
-        "--wall",
-        "--wall --camera sim --bag run.bag",
-        "--wall --camera sim --frames 0",
-        "--wall --camera sim --tape-m 0",
-        "--wall --camera sim --occluder-x-m 0.2",
-        "--wall --camera sim --occluder-gap-m 0.1",
-        "--wall --camera sim --occluder wall.toml",
-        "--occluder wall.toml --camera sim --board",
-        "--occluder wall.toml --camera sim --watch",
-        "--occluder wall.toml --camera sim --tape-m 0.2",
-        "--wall --camera sim --board-in colour",
-        "--wall --bag x.bag --square-mm 30",
-        "--wall --bag x.bag --paper a4",
-        "--wall --bag x.bag --board --tape-m 0.2",
-        "--wall --bag x.bag --board --square-mm 0",
-    ],
-)
-def test_calibrate_refuses_options_that_do_not_fit(call: Call, arguments: str) -> None:
-    with pytest.raises(typer.BadParameter) as caught:
-        call(*arguments.split())
-    assert caught.value.exit_code == 2
 
 
 class BoardWorld:
@@ -383,7 +357,8 @@ def test_gauge_points_to_where_a_value_lies() -> None:
     assert len({len(gauge(value, 0.15, 0.3)) for value in (0.0, 0.2, 1.0)}) == 1
 
 
-def test_board_json_is_the_board_that_was_printed(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_board_json_is_the_board_that_was_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "board.pdf"
     for paper, board in BOARDS.items():
         assert main(["board", "--out", str(out), "--paper", paper, "--json", "--overwrite"]) == 0
         result = json_of(capsys)
@@ -392,12 +367,13 @@ def test_board_json_is_the_board_that_was_printed(out: Path, capsys: pytest.Capt
         assert Board.model_validate(result) == board
 
 
-def test_board_keeps_a_file_and_prints_how_to_print(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_board_keeps_a_file_and_prints_how_to_print(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "board.pdf"
     out.write_text("mine", encoding="utf-8")
     assert main(["board", "--out", str(out)]) == 1
     assert out.read_text(encoding="utf-8") == "mine"
     assert main(["board", "--out", str(out), "--overwrite"]) == 0
     shown = capsys.readouterr().out
-    for part in ("6 x 9", "30 mm", "a4", "100 %", "wall.toml"):
+    for part in ("6 x 9", "30 mm", "a4", "100 %", "board.pdf"):
         assert part in shown
     assert main(["board", "--paper", "napkin", "--out", str(out)]) == 2

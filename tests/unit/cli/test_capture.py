@@ -15,7 +15,8 @@ from nlos_cam.camera import Recording
 from nlos_cam.camera.simulated import SimulatedCamera
 from nlos_cam.cli import capture
 from nlos_cam.cli.capture import final_error, format_take, result_of
-from nlos_cam.cli.main import main
+from nlos_cam.cli.common import release_outputs
+from nlos_cam.cli.main import build_app, main
 from nlos_cam.errors import CameraLostError, CameraNotFoundError, DiskFullError, NlosCamError, OutputExistsError
 from nlos_cam.recording.capture import CaptureResult, CaptureTarget
 from nlos_cam.recording.playback import VerifyResult, verify
@@ -23,19 +24,18 @@ from nlos_cam.recording.quality import Quality
 from nlos_cam.recording.sidecar import load_sidecar
 
 PROGRAM = """
-import sys, typer
-from nlos_cam.cli import capture
-app = typer.Typer()
-capture.register(app)
-sys.exit(app(sys.argv[1:], standalone_mode=False) or 0)
+import sys
+from nlos_cam.cli.main import build_app
+sys.exit(build_app("capture")(["capture", *sys.argv[1:]], standalone_mode=False) or 0)
 """
 Run = Callable[..., dict[str, Any]]
 
 
 def run_app(*arguments: str) -> int:
-    app = typer.Typer()
-    capture.register(app)
-    return app(list(arguments), standalone_mode=False) or 0
+    try:
+        return build_app("capture")(["capture", *arguments], standalone_mode=False) or 0
+    finally:
+        release_outputs()
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def run(
         code = run_app("--camera", "sim", "--json", *arguments)
         return json.loads(capsys.readouterr().out.splitlines()[-1]) | {"exit": code}
 
-    monkeypatch.setattr(capture, "open_camera", open_noise)
+    monkeypatch.setattr("nlos_cam.camera.open_camera", open_noise)
     return call
 
 
@@ -142,7 +142,7 @@ def test_capture_refuses_contradictory_options(run: Run, wrong: str) -> None:
 def test_capture_checks_disk_space_before_writing(
     run: Run, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(capture, "free_bytes", lambda _: 210_000_000)
+    monkeypatch.setattr("nlos_cam.camera.free_bytes", lambda _: 210_000_000)
     with pytest.raises(DiskFullError, match=r"1000 .*64 x 48"):
         run("--takes", "2", "--frames", "500", "--out", out)
     assert list(tmp_path.iterdir()) == []
@@ -154,8 +154,8 @@ def test_capture_without_a_limit_reports_remaining_time(
 ) -> None:
     beside = SimpleNamespace(path=tmp_path / "a.json")
     ended = CaptureResult(CaptureTarget(Path(out)), "interrupted", 0, Quality(), beside)  # before the first frame
-    monkeypatch.setattr(capture, "free_bytes", lambda _: 200_000_000 + 64 * 48 * 4 * 30 * 90)
-    monkeypatch.setattr(capture.CaptureSession, "record", lambda *_: (one for one in [ended]))
+    monkeypatch.setattr("nlos_cam.camera.free_bytes", lambda _: 200_000_000 + 64 * 48 * 4 * 30 * 90)
+    monkeypatch.setattr("nlos_cam.recording.CaptureSession.record", lambda *_: (one for one in [ended]))
     assert run("--out", out)["exit"] == 130
     assert "at least 90 s" in lines[0]
 
@@ -163,12 +163,12 @@ def test_capture_without_a_limit_reports_remaining_time(
 def test_capture_reports_damage_and_gaps(
     run: Run, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch, lines: list[str]
 ) -> None:
-    monkeypatch.setattr(capture, "verify", lambda *_, **__: VerifyResult(3, 0, 0.1, {}))
+    monkeypatch.setattr("nlos_cam.recording.verify", lambda *_, **__: VerifyResult(3, 0, 0.1, {}))
     found = run("--frames", "5", "--out", out)
     assert (found["exit"], found["state"], found["error"]["type"]) == (4, "damaged", "RecordingError")
     assert "3 of the 5" in lines[-1]
     lines.clear()
-    monkeypatch.setattr(capture, "verify", lambda *_, **__: VerifyResult(5, 2, 0.1, {}))
+    monkeypatch.setattr("nlos_cam.recording.verify", lambda *_, **__: VerifyResult(5, 2, 0.1, {}))
     assert run("--frames", "5", "--out", str(tmp_path / "b.bag"))["dropped"] == 2
     assert "2 frames" in lines[0]
 
@@ -179,7 +179,7 @@ def test_capture_interrupted_while_reading_back_loses_nothing(
     def interrupted(path: Path, on_frame: Callable[[], None]) -> VerifyResult:
         return verify(path, lambda: (on_frame(), signal.raise_signal(signal.SIGINT))[0])
 
-    monkeypatch.setattr(capture, "verify", interrupted)
+    monkeypatch.setattr("nlos_cam.recording.verify", interrupted)
     found = run("--frames", "5", "--out", out)
     assert (found["exit"], found["state"], found["frames"]) == (130, "interrupted", None)
     assert verify(Path(out)).frames == 5
@@ -287,7 +287,7 @@ def test_lines_at_the_terminal_hold_the_figures(out: str) -> None:
 def test_capture_interrupted_before_start_has_the_same_fields(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, takes: int
 ) -> None:
-    monkeypatch.setattr(capture, "open_camera", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("nlos_cam.camera.open_camera", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     several = ["--takes", str(takes), "--frames", "2"] if takes > 1 else []
     folder = tmp_path / "empty"
     folder.mkdir()

@@ -124,8 +124,8 @@ def test_build_hides_meshes_of_folder(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 WRONG = {
-    1: ("--without hut", "--accuracy wrong", "--rig-spread-mm 500", "--rig bare-wall", "--objects none"),
-    2: ("--count 0", "--count many", "--backgrounds 2"),
+    1: ("--rig-spread-mm 500", "--rig bare-wall", "--objects none"),
+    2: ("--without hut", "--accuracy wrong", "--count 0", "--count many", "--backgrounds 2"),
 }
 
 

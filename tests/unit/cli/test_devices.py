@@ -20,7 +20,7 @@ def bench(tmp_path: Path) -> Bench:
 @pytest.fixture
 def listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], bench: Bench) -> Listed:
     """Return what the command prints of the bench."""
-    monkeypatch.setattr(devices, "gather_facts", bench.facts)
+    monkeypatch.setattr("nlos_cam.doctor.gather_facts", bench.facts)
     monkeypatch.setenv("COLUMNS", "160")
 
     def run(*, as_json: bool = False) -> str:

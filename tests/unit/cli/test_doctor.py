@@ -7,7 +7,6 @@ from unittest.mock import Mock
 import pytest
 from fake_bench import Bench
 
-from nlos_cam.cli import devices
 from nlos_cam.cli.main import main
 from nlos_cam.doctor.diagnosis import CHECKS
 from nlos_cam.doctor.udev import rules_text
@@ -23,7 +22,7 @@ def bench(tmp_path: Path) -> Bench:
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], bench: Any) -> Run:
     """Run the command on the bench; returns exit code, stdout and stderr."""
-    monkeypatch.setattr(devices, "gather_facts", bench.facts)
+    monkeypatch.setattr("nlos_cam.doctor.gather_facts", bench.facts)
     monkeypatch.setenv("COLUMNS", "160")
 
     def act(*arguments: str) -> tuple[int, str, str]:

@@ -14,7 +14,6 @@ from nlos_models.data import MapSet
 from nlos_models.inference import load_reconstructor
 from small_maps import SmallDataset
 
-from nlos_cam.cli import evaluate
 from nlos_cam.cli.main import main
 from nlos_cam.dataset import HELD_OUT_SEED, TRAINING_SEED, DatasetPlan, procedural_images
 from nlos_cam.evaluate import baselines, report, subjects
@@ -134,7 +133,7 @@ def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
     monkeypatch.setattr(report, "load_reconstructor", lambda *_: network)
     monkeypatch.setattr(subjects, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank))
     monkeypatch.setattr(subjects, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank))
-    monkeypatch.setattr(evaluate, "write_report", lambda *_: None)
+    monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
     result, raw = run(*STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
     np.testing.assert_allclose(np.concatenate(network.seen), raw.depth_m - wall_m, atol=1e-6)
     assert result["input"] == maps

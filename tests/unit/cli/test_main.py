@@ -1,27 +1,41 @@
 """Frame of the command line: exit codes, one line for an error, one JSON object for a machine, outputs kept safe."""
 
 import errno
+import inspect
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
 import typer
 from nlos_calibration.errors import CalibrationError, RecordFileError, WallRefusedError
 from nlos_models.errors import CheckpointError, ModelError, RecipeError
+from rich.table import Table
 from typer.main import get_command
 
 from nlos_cam import errors
 from nlos_cam.cli import main as module
-from nlos_cam.cli.common import Json, finish, output_path, say
-from nlos_cam.cli.main import COMMANDS, build_app, main, run
+from nlos_cam.cli.common import (
+    Json,
+    exit_interrupted,
+    finish,
+    interrupted_by_signals,
+    output_path,
+    progress,
+    say,
+    show,
+)
+from nlos_cam.cli.main import COMMANDS, _share_options, build_app, main, run
 from nlos_cam.cli.plain_help import plain_help, range_text
 
 CODES = {
@@ -50,6 +64,7 @@ def does(monkeypatch: pytest.MonkeyPatch) -> Callable[[Act | BaseException], Non
             act()
             finish({"count": count}, as_json=json, text=f"{count} done")
 
+        _share_options(app)
         monkeypatch.setattr(module, "build_app", lambda _: app)
 
     return install
@@ -87,11 +102,11 @@ DISK, FILE = (errno.ENOSPC, errno.EROFS, errno.EIO), (errno.EACCES, errno.ENOENT
 
 
 @pytest.mark.parametrize(
-    ("code", "kind"), [*((c, "DiskFullError") for c in DISK), *((c, "NlosCamError") for c in FILE)]
+    ("code", "kind"), [*((c, "DiskFullError") for c in DISK), *((c, "RecordingError") for c in FILE)]
 )
 def test_system_error_names_file_and_reason(does: Does, capsys: Capsys, code: int, kind: str) -> None:
     does(OSError(code, os.strerror(code), "out/F.npz"))
-    assert main(["act", "--json"]) == 1
+    assert main(["act", "--json"]) == (1 if code in DISK else 4)
     error = _json(capsys)["error"]
     assert error["type"] == kind
     assert "out/F.npz" in error["message"]
@@ -115,6 +130,42 @@ def _made_an_error() -> None:
         signal.raise_signal(signal.SIGTERM)
     except KeyboardInterrupt:
         raise errors.CameraError("initialization failed") from None
+
+
+def _inner_block() -> None:
+    with interrupted_by_signals("two rows are kept"):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_interrupted_command_says_once_what_it_kept(does: Does, capsys: Capsys) -> None:
+    does(_inner_block)
+    assert main(["act"]) == 130
+    assert capsys.readouterr().err == "interrupted: two rows are kept\n"
+    does(lambda: exit_interrupted("one row is kept"))
+    assert main(["act"]) == 130
+    assert capsys.readouterr().err == "interrupted: one row is kept\n"
+
+
+def test_progress_prints_lines_where_stderr_is_no_terminal(capsys: Capsys) -> None:
+    with progress(period_s=0.001) as bar:
+        bar.add_task("hidden", visible=False)
+        task = bar.add_task("rendering", total=4)
+        bar.update(task, completed=3)
+        while "rendering" not in (shown := capsys.readouterr().err):
+            time.sleep(0.001)
+    assert set(shown.splitlines()) == {"rendering: 3/4, 0 s"}
+    with progress() as bar:
+        bar.add_task("short")
+    assert capsys.readouterr().err == ""
+
+
+def test_quiet_prints_results_and_errors_only(does: Does, capsys: Capsys) -> None:
+    does(lambda: say("a note"))
+    assert main(["-q", "act"]) == 0
+    assert capsys.readouterr() == ("1 done\n", "")
+    does(errors.SceneError("no light"))
+    assert main(["act", "--quiet"]) == 1
+    assert capsys.readouterr() == ("", "error: no light\n")
 
 
 @pytest.mark.parametrize("act", [KeyboardInterrupt(), typer.Abort(), _swallowed, _made_an_error])
@@ -236,8 +287,68 @@ def test_output_path_refuses_read_only_folder(tmp_path: Path, monkeypatch: pytes
         output_path(out, "wall", ".toml", overwrite=True)
 
 
+def test_table_on_a_narrow_terminal_is_blocks_of_lines(monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
+    table = Table("camera", "serial", "name")
+    table.add_row("sim", "", "simulated: the paper's rig")
+    monkeypatch.setenv("COLUMNS", "30")
+    show(table)
+    assert capsys.readouterr().out == "camera: sim\nname: simulated: the paper's rig\n\n"
+    monkeypatch.setenv("COLUMNS", "80")
+    show(table)
+    assert "serial" not in capsys.readouterr().out
+
+
 def test_printed_text_is_literal_unless_marked(capsys: Capsys) -> None:
     finish({}, as_json=False, text="wrote runs/[bold]x")
     finish({}, as_json=False, text="[bold]good[/]", marked=True)
     say("kept in [red]")
     assert capsys.readouterr() == ("wrote runs/[bold]x\ngood\n", "kept in [red]\n")
+
+
+HEAVY = {"torch", "numba", "cv2", "onnxruntime", "rerun", "matplotlib", "h5py", "numpy"}
+
+
+def test_help_of_every_command_imports_nothing_heavy() -> None:
+    tree = get_command(build_app())
+    groups = {name: [*getattr(each, "commands", {})] for name, each in tree.commands.items()}  # type: ignore[attr-defined]
+    lines = [[name, *below] for name, parts in groups.items() for below in ([[]] + [[part] for part in parts])]
+    assert len(lines) > len(COMMANDS)
+    program = (
+        "import sys; from nlos_cam.cli.main import main; "
+        f"print([main([*line, '--help']) for line in {lines}], *sys.modules)"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    last = ended.stdout.rstrip().rpartition("\n")[2]
+    assert last.count("0, ") + 1 == len(lines)
+    assert not HEAVY & {*last.split()}
+
+
+def test_defaults_written_in_help_are_those_of_the_library() -> None:
+    from nlos_cam.cli.dataset import label
+    from nlos_cam.cli.render import DEFAULTS
+    from nlos_cam.dataset import FRAMES_PER_RECORDING
+    from nlos_cam.render import HiddenObject
+
+    assert {name: HiddenObject.model_fields[name].default for name in DEFAULTS} == DEFAULTS
+    assert inspect.signature(label).parameters["frames"].default == FRAMES_PER_RECORDING
+
+
+def test_interruption_that_python_ignores_is_raised_again() -> None:
+    """In a weak reference's callback an error only reaches sys.unraisablehook."""
+
+    class Gone:
+        pass
+
+    def lose_a_signal() -> None:
+        gone = Gone()
+        reference = weakref.ref(gone, lambda _: signal.raise_signal(signal.SIGINT))
+        with interrupted_by_signals("kept"):
+            del gone
+            assert reference() is None
+            Event().wait(20)
+            pytest.fail("the interruption was lost")
+
+    hook = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt, match="kept"):
+        lose_a_signal()
+    assert sys.unraisablehook is hook

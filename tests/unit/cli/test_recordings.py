@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 
@@ -12,6 +13,7 @@ from nlos_cam.cli import recordings
 from nlos_cam.cli.main import main
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.recording.playback import verify
+from nlos_cam.recording.repair import repair_recording
 
 Run = Callable[..., tuple[int, dict[str, Any], str]]
 
@@ -87,7 +89,7 @@ def test_repair_overwrites_with_the_option_but_not_its_input(
 def test_repair_interrupted_is_exit_code_130_without_output(
     run: Run, noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    repair = recordings.repair_recording
+    repair = repair_recording
 
     def interrupted(path: Path, out: Path, report: Callable[[int, int], None]) -> Any:
         def once_half_way(done: int, total: int) -> None:
@@ -97,7 +99,7 @@ def test_repair_interrupted_is_exit_code_130_without_output(
 
         return repair(path, out, once_half_way)
 
-    monkeypatch.setattr(recordings, "repair_recording", interrupted)
+    monkeypatch.setattr("nlos_cam.recording.repair_recording", interrupted)
     code, _, _ = run(noise_bags["plain"], "--out", tmp_path / "a.bag")
     assert code == 130
     assert list(tmp_path.iterdir()) == []
@@ -136,3 +138,18 @@ def test_export_of_wrong_streams_or_damage_is_exit_code_4(
     (tmp_path / "damaged.bag").write_bytes(content)
     assert main(["export", str(tmp_path / "damaged.bag"), *out]) == 4
     assert "nlos-cam repair" in capsys.readouterr().err
+
+
+def test_export_writes_hidden_surfaces_of_a_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    depth_m = np.full((2, 64, 64), np.nan, np.float32)
+    depth_m[0, 8:20, 8:20] = 0.2
+    box = {"origin_m": [0.3, 0.1], "pitch_m": [0.004, -0.004], "z_near_m": 0.12, "z_far_m": 0.4}
+    result = tmp_path / "reconstruction.npz"
+    np.savez(result, depth_m=depth_m, uncertainty_m=depth_m, frame_number=[5, 6], **box)  # pyright: ignore[reportArgumentType]
+    export = ["export", str(result), "--out", str(tmp_path / "out"), "--json"]
+    assert main([*export, "--object", "glb,points"]) == 0
+    assert json.loads(capsys.readouterr().out)["frames"] == {"objects": 1}
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"000005.glb", "000005-points.ply"}
+    for formats, word in (("", "--object ply"), ("ply,fbx", "fbx")):
+        assert main([*export, "--object", formats, "--overwrite"]) == 2
+        assert word in capsys.readouterr().err

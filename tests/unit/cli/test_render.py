@@ -91,54 +91,6 @@ def test_render_takes_the_rig_of_a_scene_and_reports_its_file(
     assert Path(result["out"]).is_file()
 
 
-@pytest.mark.parametrize(
-    ("code", "arguments", "word"),
-    [
-        *[
-            (1, name, name)
-            for name in ("teapot", "none.stl", "none.PLY", "none.npy", "none.NPY", "none.glb", "words.npy")
-        ],
-        *[(1, f"cup {options}", "cup") for options in ("--x-m 1", "--y-m -0.5", "--size-m 0.002")],
-        (1, "cup --accuracy perfect", "perfect"),
-        (1, "cup --front-m 0.5", "0.5 m"),
-        (1, "cup --rig bare-wall", "object_box"),
-        (1, "cup --scene none.toml", "none.toml"),
-        (4, "cup --rig no-rig", "no-rig"),
-        (2, "", ""),
-        *[(2, f"cup --{name} {value}", word) for name, value, word in (("seed", -1, "seed"), ("size-m", "nan", "nan"))],
-        *[(2, f"cup --{name} inf", name.replace("-", "_")) for name in ("turn-deg", "front-m")],
-        (2, "cup --up z", "--up"),
-        (2, "cup --up w", "z"),
-        (2, "none.stl --seed 1", "--seed"),
-        (2, "plate.npy --size-m 0.1 --up z", "--size-m"),
-        *[(1, f"plate.npy --{name} {value}", value) for name, value in (("radiometry", "magic"), ("pulse-ns", "-1"))],
-        *[(1, f"plate.npy --{name} {value}", value) for name, value in (("effects", "rain"), ("backend", "abacus"))],
-        *[(1, f"plate.npy --{name}", word) for name, word in (("beams-per-cell 0", "0"), ("max-error -1", "-1"))],
-        *[(2, f"plate.npy --albedo {value}", "albedo") for value in ("1.5", "white")],
-        (2, "plate.npy --material glass", "kind"),
-        (2, "plate.npy --exponent 0", "exponent"),
-        (2, "plate.npy --max-error 0.1 --accuracy fine", "--accuracy"),
-    ],
-)
-def test_render_refuses_bad_arguments_with_a_code_and_one_line(
-    plate: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    code: int,
-    arguments: str,
-    word: str,
-) -> None:
-    folder = Path(plate).parent
-    monkeypatch.chdir(folder)
-    (folder / "words.npy").write_bytes(b"hello")
-    assert main(["render", *arguments.split(), "--out", "maps.npz"]) == code
-    shown = capsys.readouterr()
-    assert word in shown.err
-    assert not shown.err or shown.err.count("\n") == 1
-    assert "Traceback" not in shown.err
-    assert not (folder / "maps.npz").exists()
-
-
 @pytest.fixture
 def plate(tmp_path: Path) -> str:
     depth = np.full((16, 16), np.nan, np.float32)

@@ -13,7 +13,7 @@ import pytest
 from nlos_models.checkpoint import CheckpointRecord
 from nlos_models.recipe import Recipe
 
-from nlos_cam.cli import tradeoff as command
+from nlos_cam import evaluate
 from nlos_cam.cli.main import main
 from nlos_cam.evaluate import runtime_tradeoff
 from nlos_cam.evaluate.render_tradeoff import RenderRow, measure_renders, render_settings
@@ -24,7 +24,7 @@ from nlos_cam.render.scene_file import paper_scene
 
 SMALL = {name: replace(stop, relay_columns=8, relay_rows=4) for name, stop in STOPS.items()}
 FIRST = 6  # measured rows: the accuracy stops, and two of the ingredients
-FILES = {"tradeoff.json", "tradeoff.md", "tradeoff.png"}
+FILES = {"tradeoff.html", "tradeoff.json", "tradeoff.md", "tradeoff.png"}
 
 
 @pytest.fixture(autouse=True)
@@ -42,8 +42,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> list[Scene]:
         asked.append(scene)
         return islice(measure_renders(shrunk(scene), SMALL, lambda work, _: (work(), 0.5)[1]), FIRST)
 
-    monkeypatch.setattr(command, "measure_renders", measured)
-    monkeypatch.setattr(command, "render_settings", lambda scene: render_settings(shrunk(scene), SMALL)[:FIRST])
+    monkeypatch.setattr("nlos_cam.evaluate.measure_renders", measured)
+    settings = lambda scene: render_settings(shrunk(scene), SMALL)[:FIRST]  # noqa: E731
+    monkeypatch.setattr("nlos_cam.evaluate.render_settings", settings)
     return asked
 
 
@@ -56,7 +57,7 @@ def plates(monkeypatch: pytest.MonkeyPatch) -> None:
         return np.full((1, 64, 64), 0.5, np.float32)
 
     made = {name: lambda _: plate for name in ("torch float32, cpu", "ONNX Runtime float32")}
-    monkeypatch.setattr(command, "runtimes", lambda *_: made)
+    monkeypatch.setattr("nlos_cam.evaluate.runtimes", lambda *_: made)
     monkeypatch.setattr(runtime_tradeoff, "MIN_CALLS", 2)
 
 
@@ -119,7 +120,7 @@ def test_tradeoff_keeps_rows_measured_before_signal(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, name: str, number: signal.Signals, rows: int
 ) -> None:
     measure = "measure_renders" if name == "render" else "measure_runtimes"
-    whole = getattr(command, measure)
+    whole = getattr(evaluate, measure)
 
     def cut_short(*arguments: Any) -> Iterator[Any]:
         for at, row in enumerate(whole(*arguments)):
@@ -127,7 +128,7 @@ def test_tradeoff_keeps_rows_measured_before_signal(
                 signal.raise_signal(number)
             yield row
 
-    monkeypatch.setattr(command, measure, cut_short)
+    monkeypatch.setattr(f"nlos_cam.evaluate.{measure}", cut_short)
     before = signal.getsignal(number)
     result = run(name, *(["--count", "1"] if name == "reconstruct" else []), code=130)
     assert signal.getsignal(number) == before
@@ -142,7 +143,7 @@ def test_tradeoff_keeps_rows_measured_before_signal(
 @pytest.mark.parametrize(
     ("options", "code", "word"),
     [
-        (["--object", "teapot"], 1, "teapot"),
+        (["--object", "teapot"], 2, "teapot"),
         (["--seed", "3"], 2, "--object"),
         (["--object", "cup", "--seed", "-1"], 2, ""),
     ],

@@ -66,9 +66,9 @@ def _small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         use_small_networks(patch, tasks, checkpoint, runs)
         counts = {"data": 8, "held-out": 4}
         sets = {name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in counts.items()}
-        for module in (command, training_maps):
-            patch.setattr(module, "open_dataset", lambda of, **_: sets[of.name])
-        patch.setattr(command, "procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
+        for module in ("nlos_cam.dataset", "nlos_cam.dataset.training_maps"):
+            patch.setattr(f"{module}.open_dataset", lambda of, **_: sets[of.name])
+        patch.setattr("nlos_cam.dataset.procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
         patch.setattr(doubt_samples, "samples_on_disk", _doubt_samples)
         patch.setenv("NLOS_CAM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -131,7 +131,7 @@ def test_train_vae_leaves_out_categories_of_recipe(go: Go, folder: Path, monkeyp
         shown.append({*kinds, f"{backgrounds}"})
         return small_images(count, seed)
 
-    monkeypatch.setattr(command, "procedural_images", images)
+    monkeypatch.setattr("nlos_cam.dataset.procedural_images", images)
     (folder / "vae.toml").write_text(RECIPES["vae"] + 'left_out = ["car", "boat"]\nbackgrounds = 0.25\n')
     assert go("vae")[0] == 0
     (folder / "vae.toml").write_text(RECIPES["vae"])
@@ -144,7 +144,7 @@ def test_interrupted_train_exits_130_and_resumes_to_same_weights(
     stop, messages = Event(), list[str]()
     stop.set()
     with monkeypatch.context() as patch:
-        patch.setattr(command, "stop_on_signals", lambda: nullcontext(stop))
+        patch.setattr(command, "stop_on_signals", lambda _: nullcontext(stop))
         patch.setattr(command, "say", messages.append)
         assert go("vae")[0] == 130
     assert "step 1" in messages[-1]
@@ -194,6 +194,7 @@ def test_train_transfer_reports_both_figures_and_keeps_decoder(go: Go, folder: P
     tensors = load_file(folder / "two" / "compressor.safetensors")
     other = Path(shutil.copytree(folder / "two", tmp_path / "other"))
     save_file({**tensors, "classifier.1.weight": torch.zeros(7, 100)}, other / "compressor.safetensors")
+    (other / "SHA256SUMS").unlink()
     assert go("transfer", "--weights", other)[0] == 4
     code, answer = go("transfer", "--weights", other, "--partial")
     assert (code, set(answer)) == (0, {"out", *FIGURES, "before"})
@@ -265,7 +266,7 @@ def test_train_doubt_refuses_other_maps_or_rig(
 @pytest.mark.slow
 def test_train_doubt_ignores_invisible_outliers(go: Go, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sets = list[Any]()
-    monkeypatch.setattr(command, "run_doubt", lambda *every: sets.extend(every[-2:]) or {})
+    monkeypatch.setattr("nlos_models.run_doubt", lambda *every: sets.extend(every[-2:]) or {})
     assert go("doubt", "--weights", folder / "two")[0] == 0
     training, per_kind = sets[0], dict.fromkeys(TRAINING_OUTLIERS, 7)
     every = _doubt_samples(Path(), {EMPTY: 14, ORDINARY: 7 * len(TRAINING_OUTLIERS) // 2, **per_kind}, 0)

@@ -19,30 +19,26 @@ from view_streams import EVERYWHERE, ask
 from nlos_cam.cli.main import main
 from nlos_cam.cli.view import announce_view, opened_in_browser, saving, viewer_of
 from nlos_cam.errors import NlosCamError
+from nlos_cam.live.control import RunControl
 from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.view.rrd_file import RrdFile
+from nlos_cam.view.session_file import SessionFile
 from nlos_cam.view.viewer import NullViewer
 
 BENCH = CalibratedRig(RIG)
 
 
-@pytest.fixture(autouse=True)
-def no_assets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.view.web.page_assets", lambda **_: {"/": ("text/html", b"page")})
-
-
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
-    with RrdFile(tmp_path / "view.rrd", RIG) as view:
+    with SessionFile(tmp_path / "view.html", RIG) as view:
         view.show(full_moment(0))
-    return tmp_path / "view.rrd"
+    return tmp_path / "view.html"
 
 
 def test_view_serves_a_saved_view_until_interrupted(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fetched: list[bytes] = []
 
     def fetch_and_interrupt(text: str) -> None:
-        with closing(ask(re.search(r"http://\S+", text)[0], "/live.rrd")) as answer:  # type: ignore[index]
+        with closing(ask(re.search(r"http://\S+", text)[0], "/")) as answer:  # type: ignore[index]
             fetched.append(answer.read())
         os.kill(os.getpid(), signal.SIGINT)
 
@@ -56,16 +52,17 @@ def test_view_ends_after_its_seconds(saved: Path) -> None:
 
 
 def test_view_exits_4_for_a_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["view", str(tmp_path / "none.rrd")]) == 4
-    assert "none.rrd" in capsys.readouterr().err
+    assert main(["view", str(tmp_path / "none.html")]) == 4
+    assert "none.html" in capsys.readouterr().err
 
 
 def test_saving_adds_a_file_to_another_viewer(tmp_path: Path) -> None:
     nobody = NullViewer()
-    assert saving(nobody, BENCH, None) is nobody
-    with saving(nobody, BENCH, tmp_path / "view.rrd") as viewers:
+    with saving(nobody, BENCH, None) as viewer:
+        assert viewer is nobody
+    with saving(nobody, BENCH, tmp_path / "view.html") as viewers:
         viewers.show(full_moment(0))
-    assert (tmp_path / "view.rrd").stat().st_size > 10_000
+    assert (tmp_path / "view.html").stat().st_size > 10_000
 
 
 @pytest.fixture
@@ -80,18 +77,18 @@ def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
     network: Any = FakeNetwork()
     network.record = record
-    monkeypatch.setattr("nlos_cam.cli.live.open_camera", lambda *_, **__: Recorded(12))
-    monkeypatch.setattr("nlos_cam.cli.live.load_networks", lambda *_: network)
-    monkeypatch.setattr("nlos_cam.cli.live.load_uncertainty", lambda *_: None)
+    monkeypatch.setattr("nlos_cam.camera.open_camera", lambda *_, **__: Recorded(12))
+    monkeypatch.setattr("nlos_cam.reconstruct.load_networks", lambda *_: network)
+    monkeypatch.setattr("nlos_cam.reconstruct.load_uncertainty", lambda *_: None)
     monkeypatch.chdir(tmp_path)
 
 
 @pytest.mark.usefixtures("opened")
 def test_live_saves_its_view_and_overwrites_only_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["live", "--camera", "bag:fake", "--no-view", "--save-view", "view.rrd"]
+    arguments = ["live", "--camera", "bag:fake", "--no-view", "--save-view", "view.html"]
     assert main(arguments) == 0
-    assert "nlos-cam view view.rrd" in capsys.readouterr().err
-    assert (tmp_path / "view.rrd").stat().st_size > 10_000
+    assert "open view.html" in capsys.readouterr().err
+    assert (tmp_path / "view.html").stat().st_size > 10_000
     assert main(arguments) == 1
     assert main([*arguments, "--overwrite"]) == 0
 
@@ -101,7 +98,7 @@ def test_live_saves_its_view_and_overwrites_only_when_asked(tmp_path: Path, caps
 def test_replay_saves_view_stills_and_video(tmp_path: Path) -> None:
     assert main(["replay", "run.bag", "--out", "out", "--save-view", "--stills", "2", "--video"]) == 0
     made = {file.name for file in (tmp_path / "out").iterdir()}
-    assert {"view.rrd", "replay.webm", "still-000000.png"} < made
+    assert {"view.html", "replay.webm", "still-000000.png"} < made
 
 
 @pytest.fixture
@@ -113,7 +110,7 @@ def printed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def serve(*, no_view: bool = False, host: str | None = None, port: int | None = None, open_it: bool = False) -> None:
     """Serve a view with these options, print where, and end it."""
-    with viewer_of(BENCH, no_view=no_view, host=host, port=port) as viewer:
+    with viewer_of(RunControl(), no_view=no_view, host=host, port=port) as viewer:
         announce_view(viewer, host=host, port=port, open_it=open_it)
 
 
@@ -121,10 +118,10 @@ def test_no_view_serves_nothing_and_refuses_an_address(printed: list[str]) -> No
     serve(no_view=True, open_it=True)
     [line] = printed
     assert "http" not in line
-    assert isinstance(viewer_of(BENCH, no_view=True), NullViewer)
+    assert isinstance(viewer_of(RunControl(), no_view=True), NullViewer)
     for place in ({"host": "127.0.0.1"}, {"port": 9090}):
         with pytest.raises(typer.BadParameter, match="--no-view"):
-            viewer_of(BENCH, no_view=True, **place)
+            viewer_of(RunControl(), no_view=True, **place)
 
 
 def test_view_is_on_the_loopback_by_default(printed: list[str]) -> None:

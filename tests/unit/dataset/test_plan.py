@@ -53,6 +53,13 @@ def test_plan_with_textures_is_noted_as_simulation_only() -> None:
     assert not {"textures", "note"} & json.loads(PLAN.provenance).keys()
 
 
+def test_plan_without_generic_shapes_keeps_its_checksum() -> None:
+    mixed = replace(PLAN, objects=Objects(share_generic=0.5))
+    assert json.loads(mixed.provenance)["objects"]["share_generic"] == 0.5
+    assert DatasetPlan.from_provenance(mixed.provenance) == mixed
+    assert "share_generic" not in json.loads(PLAN.provenance)["objects"]
+
+
 def test_plan_of_older_version_has_defaults() -> None:
     facts = json.loads(PLAN.provenance)
     for name in ("objects", "spread", "radiometry", "jump_m", "material"):

@@ -108,6 +108,18 @@ def test_backgrounds_fill_empty_pixels_of_some_objects() -> None:
     assert 3 < sum(more) < 17
 
 
+def test_generic_shapes_take_their_share_and_leave_the_other_objects_alone() -> None:
+    kinds, mixed = (
+        [hidden_object(one, seed, BOX) for seed in range(60)] for one in (Objects(), Objects(share_generic=0.5))
+    )
+    same = [
+        one[0] == two[0] and np.array_equal(one[1], two[1], equal_nan=True)
+        for one, two in zip(kinds, mixed, strict=True)
+    ]
+    assert 18 < sum(same) < 42
+    assert not {name for (name, _), is_same in zip(mixed, same, strict=True) if not is_same} & set(CATEGORIES)
+
+
 @pytest.fixture
 def meshes(tmp_path: Path) -> Path:
     (tmp_path / "sub").mkdir()

@@ -85,3 +85,20 @@ def test_gallery_shows_the_worst_and_the_best(tmp_path: Path, figures: list[Any]
     draw_gallery(tmp_path / "gallery.png", _images(20), _images(20), [str(k) for k in range(20)], iou)
     order = [f"{k}: {iou[k]:.2f}" for k in np.argsort(iou)]
     assert _titles(figures[0]) == [*order[:6], *order[::-1][:6]]
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_gallery_of_few_objects_shows_each_once(tmp_path: Path, figures: list[Any], count: int) -> None:
+    names = [f"hat {2_000_000_000 + k}" for k in range(count)]
+    draw_gallery(tmp_path / "gallery.png", _images(count), _images(count), names, np.linspace(0, 1, count))
+    assert sorted(title.partition(":")[0] for title in _titles(figures[0])) == [f"hat {k}" for k in range(count)]
+
+
+@pytest.mark.parametrize("count", [1, 4, 7, 54])
+def test_titles_of_a_sheet_do_not_overlap(tmp_path: Path, figures: list[Any], count: int) -> None:
+    names = [f"headphones {2_000_000_000 + k}" for k in range(count)]
+    draw_sheet(tmp_path / "sheet.png", _images(count), _images(count), names)
+    figure, (axis, *_) = figures[0], figures[0].axes
+    boxes = [text.get_window_extent() for text in axis.texts if text.get_text() not in ROWS]
+    assert not any(one.overlaps(other) for k, one in enumerate(boxes) for other in boxes[:k])
+    assert max(box.x1 for box in boxes) < min(bar.get_window_extent().x0 for bar in figure.axes[1:])

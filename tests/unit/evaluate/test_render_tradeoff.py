@@ -21,8 +21,8 @@ from nlos_cam.evaluate.render_tradeoff import (
     machine,
     measure_renders,
     pareto_front,
+    render_document,
     render_facts,
-    render_markdown,
     render_settings,
 )
 from nlos_cam.render.accuracy import STOPS
@@ -170,13 +170,11 @@ def test_table_markdown_and_plot_hold_what_was_measured(tmp_path: Path, measured
     assert table["complete"] == (rows == ROWS)
     assert len(table["stops"]) + len(table["ingredients"]) == measured
     if rows:
-        text = render_markdown(table)
-        assert (text == render_markdown({**table, "complete": True})) == (rows == ROWS)
+        text = render_document(table, "cup").as_markdown()
+        assert (text == render_document({**table, "complete": True}, "cup").as_markdown()) == (rows == ROWS)
         assert all(f"| {row.name} |" in text for row in rows)
         assert len({line.count("|") for line in text.splitlines() if line.startswith("|")}) == 1
-        assert (
-            measured < 2 or "| draft | 0.0050 | 4000 | 0.5 % | 3 % | 5 % | 80.00 % | 99.00 % | 0 mm | 1.4 mm |" in text
-        )
+        assert measured < 2 or "| draft | 5.0 | 4000 | 0.5 | 3 | 5 | 80.00 | 99.00 | 0.00 | 1.40 |" in text
         draw_renders(tmp_path / "plot.png", rows, "a title")
         assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     assert machine()

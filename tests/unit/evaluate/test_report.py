@@ -9,17 +9,29 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
+from page_reader import read_page
 
 from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate import report
-from nlos_cam.evaluate.metrics import TARGETS
-from nlos_cam.evaluate.report import Evaluation, as_figures, as_markdown, format_interval, write_report
-from nlos_cam.objects.depth_map import object_box
+from nlos_cam.evaluate.figures import LABELS
+from nlos_cam.evaluate.metrics import TARGETS, Interval
+from nlos_cam.evaluate.report import Evaluation, Unseen, as_figures, document, format_interval, write_report
+from nlos_cam.objects import object_box, object_depth
+from nlos_cam.report import figure_of, png
 
 BOX = object_box(load_rig("paper-rig"))
 FACTS = {"what": "Some objects", "weights": "mine", "rig": "paper-rig", "runtime": "none", "input": "raw maps"}
 FACTS |= {"training_objects": 99, "notes": ["they are few"]}
-FILES = {"report.md", "figures.json", "objects.csv", "sheet.png", "gallery.png", "categories.png", "surface.png"}
+FILES = {
+    "report.html",
+    "report.md",
+    "figures.json",
+    "objects.csv",
+    "sheet.png",
+    "gallery.png",
+    "categories.png",
+    "surface.png",
+}
 
 
 def _judgement(count: int = 7, *, guesses: bool = True) -> Evaluation:
@@ -32,6 +44,16 @@ def _judgement(count: int = 7, *, guesses: bool = True) -> Evaluation:
 
 def _figures(judgement: Evaluation) -> dict[str, Any]:
     return json.loads(json.dumps(as_figures(judgement), allow_nan=False))
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the pictures of a report."""
+    folder = tmp_path_factory.mktemp("drawn")
+    for name in FILES:
+        if name.endswith(".png"):
+            (folder / name).write_bytes(png(figure_of(1.0, 1.0)))
+    return folder
 
 
 def _rows(folder: Path) -> list[dict[str, str]]:
@@ -51,22 +73,23 @@ def test_figures_have_names_that_scripts_depend_on() -> None:
     assert sum(zone["share_of_error"] for zone in figures["where_the_error_is"].values()) == pytest.approx(1)
 
 
-def test_report_of_perfect_reconstruction_meets_every_bar() -> None:
+def test_report_of_perfect_reconstruction_meets_every_bar(drawn: Path) -> None:
     perfect = replace(_judgement(), image=_judgement().truth)
     figures = _figures(perfect)
     assert all(bar["met"] for bar in figures["bars"].values())
-    assert "not met" not in as_markdown(figures)
+    assert "4 of 4 targets met" in document(figures, drawn).as_markdown()
 
 
-def test_report_contains_metrics_pictures_and_notes() -> None:
-    text = as_markdown(_figures(_judgement()))
-    for name in TARGETS:
-        assert f"| {name} | " in text
+def test_report_contains_metrics_pictures_and_notes(drawn: Path) -> None:
+    made = document(_figures(_judgement()), drawn)
+    page, text = read_page(made.as_html()), made.as_markdown()
+    assert len(page.pictures) == 4
     for name in FILES:
         assert not name.endswith(".png") or f"({name})" in text
-    for words in ("not met", "nearest neighbour", "99", "they are few"):
+    for words in (*LABELS.values(), "0 of 4 targets met", "nearest neighbour", "99", "they are few", "nlos-cam live"):
+        assert words in page.text
         assert words in text
-    assert "nearest" not in as_markdown(_figures(_judgement(guesses=False)))
+    assert "nearest" not in document(_figures(_judgement(guesses=False)), drawn).as_markdown()
 
 
 @pytest.mark.parametrize("count", [1, 7])
@@ -81,7 +104,7 @@ def test_folder_is_complete_for_any_number_of_objects(tmp_path: Path, count: int
     assert mean == pytest.approx(figures["silhouette_iou"]["value"], rel=1e-4)
 
 
-def test_figures_separate_categories_left_out_of_training() -> None:
+def test_figures_separate_categories_left_out_of_training(drawn: Path) -> None:
     whole = _judgement()
     assert as_figures(whole)["shown_and_left_out"] is None
     blind = np.array([kind == "kind 1" for kind in whole.categories])[:, None, None]
@@ -89,7 +112,24 @@ def test_figures_separate_categories_left_out_of_training() -> None:
     by = guessed["shown_and_left_out"]
     assert by["left out"]["silhouette_iou"]["value"] == 0
     assert by["shown"]["silhouette_iou"]["value"] > guessed["silhouette_iou"]["value"] > 0
-    assert len(as_markdown(guessed)) > len(as_markdown({**guessed, "shown_and_left_out": None}))
+    assert "left out" in document(guessed, drawn).as_markdown()
+
+
+def test_second_set_and_recognition_have_their_figures(tmp_path: Path) -> None:
+    whole = _judgement(3)
+    assert as_figures(whole)["unseen"] is None
+    assert as_figures(whole)["recognised"] is None
+    kinds = replace(whole, categories=[object_depth(seed, BOX)[0] for seed in range(3)])
+    both = replace(kinds, unseen=Unseen(["a", "b"], whole.truth[:2], np.zeros_like(whole.truth[:2])))
+    figures = _figures(both)
+    assert figures["unseen"]["silhouette_iou"]["value"] == 0
+    assert figures["unseen"]["objects"] == 2
+    assert figures["recognised"]["truth"]["value"] == 1
+    write_report(tmp_path / "out", both, figures)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES, "sheet-unseen.png"}
+    text = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
+    assert "2 objects of kinds that training never sees" in text
+    assert "recognised as their kind" in text
 
 
 def test_interrupted_write_leaves_earlier_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,3 +152,16 @@ def test_object_without_value_has_an_empty_field(tmp_path: Path) -> None:
     write_report(tmp_path / "out", blank, as_figures(blank))
     assert {row["foreground_rmse_mm"] for row in _rows(tmp_path / "out")} == {""}
     assert format_interval(_figures(blank)["foreground_rmse_mm"]) == "none"
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ((0.6962, 0.6601, 0.7312), "0.696 (0.660 to 0.731)"),
+        ((21.61, 19.3, 24.2), "21.6 (19.3 to 24.2)"),
+        ((116.4, 96.0, 137.0), "116 (96 to 137)"),
+        ((0.0, 0.0, 0.0), "0.000 (0.000 to 0.000)"),
+    ],
+)
+def test_interval_has_two_digits_of_its_half_width(values: tuple[float, float, float], text: str) -> None:
+    assert format_interval(Interval(*values)) == text

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from nlos_calibration.rig import load_rig
+from page_reader import read_page
 
 from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.evaluate import runtime_tradeoff
@@ -25,8 +26,8 @@ from nlos_cam.evaluate.runtime_tradeoff import (
     measure_runtimes,
     pareto_front,
     recommended,
+    runtime_document,
     runtime_facts,
-    runtime_markdown,
     runtime_settings,
 )
 from nlos_cam.evaluate.subjects import seeded_objects
@@ -121,7 +122,8 @@ def test_table_and_plot_show_measured_rows(tmp_path: Path, measured: int) -> Non
     assert table["complete"] == (measured == len(ROWS))
     assert [row["name"] for row in table["settings"]] == [row.setting.name for row in ROWS[:measured]]
     assert [row["loses_accuracy"] for row in table["settings"]] == [False, False, True, False][:measured]
-    assert runtime_markdown(table)
+    page = read_page(runtime_document(table).as_html())
+    assert all(row["name"] in page.text for row in table["settings"])
     if measured:
         assert table["recommended"]["name"] == ("quick" if measured > 1 else "exact")
         draw_runtimes(tmp_path / "plot.png", ROWS[:measured])
@@ -135,4 +137,4 @@ def test_table_of_several_weights_names_the_recommended() -> None:
     table = _facts(rows, 8)
     assert table["recommended"] == {"name": "quick", "weights": "large"}
     assert {"name": "quicker", "weights": "large"} in table["pareto_front"]
-    assert "large: quick" in runtime_markdown(table)
+    assert "large: quick" in runtime_document(table).as_markdown()

@@ -29,6 +29,7 @@ from nlos_cam.evaluate.subjects import (
     truth_of,
 )
 from nlos_cam.frames import maps_from_frame
+from nlos_cam.objects import CATEGORIES, unseen_objects
 from nlos_cam.objects.benchmark import benchmark_objects as fixed_set
 from nlos_cam.objects.depth_map import image_from_depth, object_box
 from nlos_cam.objects.placement import object_depth
@@ -105,6 +106,14 @@ def test_fresh_objects_are_those_of_test_seeds() -> None:
     np.testing.assert_array_equal(judged.maps.image, truth_of(seeded_objects(TEST_SEED, 1, BOX), BOX))
     assert judged.maps.depth_m.shape == (1, 64, 80)
     assert (len(judged.names), judged.plan) == (1, PLAN)
+
+
+def test_second_set_is_of_other_kinds_in_the_same_poses() -> None:
+    kinds, unseen = fixed_set(BOX), unseen_objects(BOX)
+    assert [one.pose for one in unseen] == [one.pose for one in kinds]
+    names = {one.category for one in unseen}
+    assert (len(unseen), len(names), names & CATEGORIES.keys()) == (54, 18, set())
+    assert min(int(np.isfinite(one.depth_m).sum()) for one in unseen) > 150
 
 
 def test_rig_of_weights_that_is_missing_is_asked_for() -> None:

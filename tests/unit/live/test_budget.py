@@ -178,7 +178,7 @@ def test_available_settings_leaves_out_what_cannot_run(monkeypatch: pytest.Monke
         setting(1.0, 1.0, runtime="torch float32, cuda"),
     ]
     monkeypatch.setattr("nlos_cam.live.budget.load_tradeoff", lambda _: [*elsewhere, *ALL])
-    monkeypatch.setattr("nlos_cam.live.budget.torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     assert available_settings(None, None) == ALL
     monkeypatch.setattr("nlos_cam.live.budget.load_tradeoff", lambda _: elsewhere)
     with pytest.raises(BudgetError):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
 from fake_wall import RIG, SMALL, WallCamera, measured_wall, wall_frame
+from page_reader import read_page
 from small_frames import FrameCamera
 
 from nlos_cam.errors import OutputExistsError, RecordingError
@@ -19,6 +20,8 @@ from nlos_cam.live.replay import DIFFERENCE, REPORT, RESULT, SHEET, ReplayReport
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck
 from nlos_cam.reconstruct.pipeline import Pipeline
+
+TEXT = "report.md"
 
 
 def network(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
@@ -67,9 +70,10 @@ def test_replay_writes_every_frame_with_number_time_and_place(tmp_path: Path) ->
         assert np.isnan(file["uncertainty_m"]).all()
         assert file["check_score"].size == file["check_frame_number"].size == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == ["out"]
-    assert sorted(file.name for file in out.iterdir()) == sorted([RESULT, SHEET, REPORT])
+    assert sorted(file.name for file in out.iterdir()) == sorted([RESULT, SHEET, REPORT, TEXT])
     assert (out / SHEET).read_bytes().startswith(b"\x89PNG")
-    text = (out / REPORT).read_text()
+    assert len(read_page((out / REPORT).read_text()).pictures) == 1
+    text = (out / TEXT).read_text()
     assert "12" in text
     assert "2 duplicate, 1 out of order" in text
     assert "physics" not in text
@@ -91,13 +95,15 @@ def test_replay_with_checks_is_reproducible_to_the_bit(tmp_path: Path) -> None:
     for name in ("a", "b"):
         checks = PeriodicPhysicsCheck(RIG, every=9, accuracy="draft")
         replayed(tmp_path / name, 12, pipeline=Pipeline(CalibratedRig(RIG), network, checks=checks))
-    for file in (RESULT, SHEET, REPORT):
+    for file in (RESULT, SHEET):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    one, other = ((tmp_path / name / REPORT).read_text(encoding="utf-8") for name in ("a", "b"))
+    assert one.replace(str(tmp_path / "a"), str(tmp_path / "b")) == other
     with np.load(tmp_path / "a" / RESULT) as result:
         assert result["check_frame_number"].tolist() == [100, 109]
         assert result["check_score"].shape == (2,)
         assert (result["check_score"] > 0.5).all()
-    assert "check of 2 frames" in (tmp_path / "a" / REPORT).read_text()
+    assert "of 2 checked frames" in (tmp_path / "a" / TEXT).read_text()
 
 
 def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:
@@ -112,7 +118,7 @@ def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:
     assert report.frames == BATCH_FRAMES * (MAX_BATCHES_AHEAD + 2)
     with np.load(tmp_path / "out" / RESULT) as result:
         assert result["frame_number"].tolist() == list(range(100, 100 + report.frames))
-    assert "Interrupted" in (tmp_path / "out" / REPORT).read_text()
+    assert "Interrupted" in (tmp_path / "out" / TEXT).read_text()
 
 
 def test_replay_refuses_empty_recordings_and_keeps_other_files(tmp_path: Path) -> None:
@@ -123,7 +129,7 @@ def test_replay_refuses_empty_recordings_and_keeps_other_files(tmp_path: Path) -
     (tmp_path / REPORT).write_text("old")
     replayed(tmp_path)
     assert (tmp_path / "mine.txt").read_text() == "keep me"
-    assert "Replay" in (tmp_path / REPORT).read_text()
+    assert "Replay" in (tmp_path / TEXT).read_text()
     with pytest.raises(OutputExistsError, match=r"mine\.txt"):
         replayed(tmp_path / "mine.txt")
     assert (tmp_path / "mine.txt").read_text() == "keep me"
@@ -145,12 +151,12 @@ def test_replay_writes_difference_maps_and_their_reference(tmp_path: Path) -> No
         assert str(file["reference_sha256"]) == wall.record.reference_sha256
         assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
         np.testing.assert_array_equal(file["depth_m"][5], wall_frame(5).depth_m - wall.reference.map_depth_m)
-    text = (out / REPORT).read_text()
+    text = (out / TEXT).read_text()
     assert DIFFERENCE in text
     assert "20 frames" in text
     replay_recording(WallCamera(2), Pipeline(CalibratedRig(RIG), network), out, stop=Event())
     assert not (out / DIFFERENCE).exists(), "of an earlier replay"
-    assert "difference" not in (out / REPORT).read_text()
+    assert "difference maps" not in (out / TEXT).read_text()
 
 
 @pytest.mark.slow
@@ -158,7 +164,7 @@ def test_replay_reports_warnings_with_their_frames(tmp_path: Path) -> None:
     texts = []
     for out in ("a", "b"):
         camera = WallCamera(100, moved=range(30, 60), celsius=80.0)
-        texts.append((replayed_wall(tmp_path, camera, out) / REPORT).read_text())
+        texts.append((replayed_wall(tmp_path, camera, out) / TEXT).read_text().replace(f"/{out}/", "/"))
     assert texts[0] == texts[1]
     warnings = [tuple(map(int, re.findall(r"\d+", line)[:3])) for line in texts[0].splitlines() if "warning" in line]
     assert (100, 0, 99) in warnings

@@ -11,6 +11,7 @@ from fake_wall import wall_frame
 from made_up_moments import RIG, Recorded, bump, full_moment
 from matplotlib.figure import Figure
 from small_frames import NOTHING
+from view_streams import saved_moments
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.live.replay import REPORT, RESULT, SHEET, replay_recording
@@ -32,7 +33,7 @@ from nlos_cam.reconstruct.verdict import Verdict
 BENCH = CalibratedRig(RIG)
 FULL = full_moment(0)
 STEP = FrameResult(FULL.frame, maps_from_frame(FULL.frame), FULL.reconstruction, 0.0, {})
-NAMES = {REPORT, RESULT, SHEET}
+NAMES = {REPORT, RESULT, SHEET, "report.md"}
 
 
 def network(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
@@ -46,7 +47,7 @@ def replayed(out: Path, count: int, **asked: Any) -> set[str]:
     return {file.name for file in out.iterdir()}
 
 
-def test_replay_makes_view_video_and_stills_as_asked(tmp_path: Path, chunks_of: Any) -> None:
+def test_replay_makes_view_video_and_stills_as_asked(tmp_path: Path) -> None:
     assert replayed(tmp_path / "plain", 30) == NAMES
     made = replayed(tmp_path / "out", 30, view=True, stills=3, video=True) - NAMES
     assert {VIEW, VIDEO} <= made
@@ -58,17 +59,16 @@ def test_replay_makes_view_video_and_stills_as_asked(tmp_path: Path, chunks_of: 
     while video.read()[0]:
         frames += 1
     assert frames == 15
-    drops = [chunk for chunk in chunks_of(tmp_path / "out" / VIEW) if chunk.entity_path == "/drops"]
-    records = [chunk.to_record_batch() for chunk in drops if not chunk.is_static]
-    assert sorted(number for each in records for number in each.column("frame").to_pylist()) == list(range(0, 30, 3))
-    for file in (RESULT, REPORT):
-        assert (tmp_path / "plain" / file).read_bytes() == (tmp_path / "out" / file).read_bytes()
+    assert [each["frame"] for each in saved_moments(tmp_path / "out" / VIEW)] == list(range(0, 30, 3))
+    assert (tmp_path / "plain" / RESULT).read_bytes() == (tmp_path / "out" / RESULT).read_bytes()
+    assert VIDEO in (tmp_path / "out" / REPORT).read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
 def test_replay_removes_media_of_an_earlier_one_and_nothing_else(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    replayed(out, 12, view=True, stills=4)
+    replayed(out, 12, view=True, stills=4, objects=["csv"])
+    assert (out / "object" / "000003.csv").is_file()
     (out / "mine.png").write_text("keep me")
     assert replayed(out, 3, stills=1) == NAMES | {"mine.png", "still-000000.png"}
 

@@ -4,11 +4,13 @@ import json
 from pathlib import Path
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 import torch
 from nlos_models import checkpoint
 from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
+from nlos_models.files import CHECKSUMS
 from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.recipe import SIMULATION_ONLY
 from nlos_models.vae import Decoder, ResVae
@@ -47,9 +49,10 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(saved: Path, tmp_path: Path) -> Path:
-    """The same checkpoint as links, so that a test may replace files."""
+    """The same checkpoint as links and without checksums, so that a test may replace files."""
     for path in saved.iterdir():
-        (tmp_path / path.name).symlink_to(path)
+        if path.name != CHECKSUMS:
+            (tmp_path / path.name).symlink_to(path)
     return tmp_path
 
 
@@ -113,6 +116,27 @@ def test_load_pipeline_names_missing_or_corrupt_file(folder: Path, part: str, co
     if content is not None:
         path.write_bytes(whole[:-100] if isinstance(content, str) else content)
     with pytest.raises(CheckpointError, match=rf"{part}\.safetensors"):
+        checkpoint.load_pipeline(folder)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_load_pipeline_refuses_any_flipped_bit(folder: Path, saved: Path, seed: int) -> None:
+    (folder / CHECKSUMS).symlink_to(saved / CHECKSUMS)
+    random = np.random.default_rng(seed)
+    path = folder / f"{random.choice(PARTS)}.safetensors"
+    content = bytearray(path.read_bytes())
+    content[random.integers(len(content))] ^= 1 << random.integers(8)
+    _replace(path, bytes(content))
+    with pytest.raises(CheckpointError, match=rf"{path.stem}\.safetensors"):
+        checkpoint.load_pipeline(folder)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_load_pipeline_refuses_weights_that_are_not_finite(folder: Path, value: float) -> None:
+    path = folder / "compressor.safetensors"
+    floats = {name: tensor.float() for name, tensor in load_file(path).items()}
+    _replace(path, {name: torch.full_like(tensor, value) for name, tensor in floats.items()})
+    with pytest.raises(CheckpointError, match="not finite"):
         checkpoint.load_pipeline(folder)
 
 
@@ -198,7 +222,7 @@ def test_load_pipeline_partly_is_strict_but_for_compressor(folder: Path) -> None
 
 
 def test_save_vae_reports_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checkpoint, "save_file", Mock(side_effect=OSError(28, "No space left on device")))
+    monkeypatch.setattr(checkpoint, "write_checked", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(CheckpointError, match="No space left"):
         checkpoint.save_vae(tmp_path, ResVae(), RECORD)
 

@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models import doubt_checkpoint
-from nlos_models.doubt_checkpoint import DoubtRecord
+from nlos_models import doubt_checkpoint, records
 from nlos_models.doubt_network import CalibratedDoubt
 from nlos_models.errors import CheckpointError
+from nlos_models.inference import load_uncertainty_model
+from nlos_models.records import DoubtRecord
 from small_doubt import untrained_doubt, watched_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -37,33 +38,33 @@ def test_saved_doubt_restores_with_watched_weights(tmp_path: Path, watched: Path
     assert network.temperature.tolist() == [0.5, 2.0]
     assert float(network.error_scale) == 1.5
     assert (tmp_path / "run" / "doubt.safetensors").stat().st_size < 700_000
-    for name in (*doubt_checkpoint.WATCHED, "checkpoint.json"):
+    for name in (*records.WATCHED, "checkpoint.json"):
         assert (tmp_path / "run" / name).read_bytes() == (watched / name).read_bytes()
 
 
 def test_weights_without_doubt_network_load_none(tmp_path: Path, watched: Path) -> None:
     assert doubt_checkpoint.load_doubt(watched) is None
-    assert doubt_checkpoint.load_uncertainty_model(watched, tmp_path) is None
+    assert load_uncertainty_model(watched, tmp_path) is None
     with pytest.raises(CheckpointError, match="compressor"):
-        doubt_checkpoint.checksum_of_watched(tmp_path)
+        records.checksum_of_watched(tmp_path)
 
 
 @pytest.mark.usefixtures("record")
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        *((name, b"another") for name in doubt_checkpoint.WATCHED),
-        *((doubt_checkpoint.DOUBT_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
+        *((name, b"another") for name in records.WATCHED),
+        *((records.DOUBT_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
     ],
 )
 def test_load_doubt_refuses_other_weights_or_damaged_record(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / "run" / name).write_bytes(content)
-    with pytest.raises(CheckpointError, match=doubt_checkpoint.DOUBT_RECORD):
+    with pytest.raises(CheckpointError, match=records.DOUBT_RECORD):
         doubt_checkpoint.load_doubt(tmp_path / "run")
 
 
 def test_save_doubt_refuses_weights_changed_since_training(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
-    (watched / doubt_checkpoint.WATCHED[0]).write_bytes(b"another network")
+    (watched / records.WATCHED[0]).write_bytes(b"another network")
     with pytest.raises(CheckpointError, match="watched"):
         doubt_checkpoint.save_doubt(tmp_path / "other", _load(tmp_path / "run")[0].network, record, watched)
 
@@ -79,11 +80,11 @@ def test_saved_bare_wall_keeps_its_precision(tmp_path: Path, watched: Path, reco
 @pytest.mark.slow
 def test_doubter_onnx_equals_torch_and_is_exported_once(tmp_path: Path, record: DoubtRecord) -> None:
     folder, cache = tmp_path / "run", tmp_path / "cache"
-    doubter = doubt_checkpoint.load_uncertainty_model(folder, cache)
+    doubter = load_uncertainty_model(folder, cache)
     assert doubter is not None
     (model,) = cache.glob("doubt-*.onnx")
     written_ns = model.stat().st_mtime_ns
-    again = doubt_checkpoint.load_uncertainty_model(folder, cache)
+    again = load_uncertainty_model(folder, cache)
     assert again is not None
     assert again.record == doubter.record == record
     assert model.stat().st_mtime_ns == written_ns

@@ -1,18 +1,24 @@
 """Inference: ONNX Runtime held equal to torch, exports that are cached, and 8-bit networks."""
 
+import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
 import torch
-from nlos_models import inference
-from nlos_models.checkpoint import CheckpointRecord, save_pipeline
+from nlos_models import checkpoint, export, extras, inference
+from nlos_models.checkpoint import load_pipeline, save_pipeline
 from nlos_models.compressor import Compressor
-from nlos_models.errors import ModelError
-from nlos_models.inference import OnnxReconstructor, Reconstructor, TorchReconstructor, load_reconstructor, quantize
+from nlos_models.doubt_checkpoint import load_doubt
+from nlos_models.errors import CheckpointError, ModelError
+from nlos_models.export import TorchReconstructor, quantize
+from nlos_models.extras import MissingExtraError
+from nlos_models.inference import OnnxReconstructor, Reconstructor, load_reconstructor, load_uncertainty_model
 from nlos_models.metrics import MIN_V
 from nlos_models.pipeline import RemappingNetwork, split_and_stack
+from nlos_models.records import CheckpointRecord, checksum_of_watched, shipped_folder
 from nlos_models.vae import Decoder
 from onnx import TensorProto, helper, numpy_helper
 from small_maps import HARD_MAPS, hard_maps
@@ -21,9 +27,15 @@ from small_run import small_recipe
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 RECORD = CheckpointRecord.of([small_recipe()], ("paper-rig", "0123456789ab"))
+MAX_GRAPH_BYTES = 400_000
 HANDFUL = 8
 """Pixels of an image that may fall to the other side of the silhouette's threshold."""
 Pair = tuple[Reconstructor, Reconstructor]
+
+
+@pytest.fixture
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inference, "_has_cuda", lambda: False)
 
 
 def _maps(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -58,9 +70,9 @@ def folders(pipeline: RemappingNetwork, tmp_path_factory: pytest.TempPathFactory
 def pair(folders: tuple[Path, Path]) -> Pair:
     """The exported pipeline, and the same weights in torch."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.cuda, "is_available", lambda: False)
+        patch.setattr(inference, "_has_cuda", lambda: False)
         exported = load_reconstructor(*folders)
-    return exported, TorchReconstructor(*inference.load_pipeline(folders[0]), "cpu")
+    return exported, TorchReconstructor(*load_pipeline(folders[0]), "cpu")
 
 
 @pytest.mark.slow
@@ -92,46 +104,27 @@ def test_reconstruction_of_hard_maps_is_a_possible_image(pair: Pair, name: str) 
 
 @pytest.mark.slow
 def test_second_load_exports_nothing(folders: tuple[Path, Path], pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(inference, "export_onnx", lambda _, path: pytest.fail(f"{path} was exported again"))
+    monkeypatch.setattr(inference, "_has_cuda", lambda: False)
+    monkeypatch.setattr(export, "export_onnx", lambda _: pytest.fail("exported again"))
     again, maps = load_reconstructor(*folders), _maps(1)
     np.testing.assert_array_equal(again(*maps), pair[0](*maps))
     assert [path.suffix for path in folders[1].iterdir()] == [".onnx"]
 
 
-def _interrupted(path: Path) -> None:
-    path.write_bytes(b"half of it")
-    raise KeyboardInterrupt
-
-
-def test_interrupted_export_leaves_no_file(
-    tmp_path: Path, pipeline: RemappingNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Program:
-        def save(self, path: Path, **_: object) -> None:
-            _interrupted(path)
-
-    monkeypatch.setattr(torch.onnx, "export", lambda *_, **__: Program())
-    with pytest.raises(KeyboardInterrupt):
-        inference.export_onnx(pipeline, tmp_path / "network.onnx")
-    assert not list(tmp_path.iterdir())
-
-
-def test_color_networks_are_not_exported(pipeline: RemappingNetwork, tmp_path: Path) -> None:
+def test_color_networks_are_not_exported(pipeline: RemappingNetwork) -> None:
     color = RemappingNetwork(pipeline.compressor, Decoder(3, 512), intensities=3)
     with pytest.raises(ModelError, match="simulation only"):
-        inference.export_once(color, tmp_path)
-    assert not list(tmp_path.iterdir())
+        export.export_onnx(color)
 
 
 def test_export_checksum_depends_on_weights(pipeline: RemappingNetwork) -> None:
-    before = inference.checksum_of(pipeline)
-    assert inference.checksum_of(pipeline) == before
-    assert inference.checksum_of(RemappingNetwork(pipeline.compressor, Decoder())) != before
+    before = export.checksum_of(pipeline)
+    assert export.checksum_of(pipeline) == before
+    assert export.checksum_of(RemappingNetwork(pipeline.compressor, Decoder())) != before
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model() -> bytes:
     """A network of two convolutions, with a stale shape of the kind that exporters leave."""
     kernel = np.random.default_rng(0).normal(size=(8, 1, 3, 3)).astype(np.float32)
     mix = np.random.default_rng(1).normal(size=(1, 8, 1, 1)).astype(np.float32)
@@ -154,9 +147,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
         [numpy_helper.from_array(array, name) for name, array in constants.items()],
         value_info=[value("wide", "n", 3, 64, 80)],
     )
-    path = tmp_path_factory.mktemp("model") / "exact.onnx"
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), path)
-    return path
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9).SerializeToString()
 
 
 def _samples(seed: int) -> list[tuple[np.ndarray, ...]]:
@@ -164,24 +155,98 @@ def _samples(seed: int) -> list[tuple[np.ndarray, ...]]:
     return [tuple(generator.random((1, 64, 80), np.float32) for _ in range(2)) for _ in range(4)]
 
 
-def _answer(path: Path, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
-    return inference.open_session(path).run(None, {"depth_m": depth_m, "intensity": intensity})[0]
+def _answer(model: bytes, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+    return inference.open_session(model).run(None, {"depth_m": depth_m, "intensity": intensity})[0]
 
 
 @pytest.mark.parametrize("static", [False, True])
-def test_quantized_network_is_nearly_exact_for_any_batch(tmp_path: Path, model: Path, static: bool) -> None:
-    small = tmp_path / "small.onnx"
-    quantize(model, small, _samples(0) if static else None)
-    weights = {tensor.name: tensor.data_type for tensor in onnx.load(small).graph.initializer}
+def test_quantized_network_is_nearly_exact_for_any_batch(model: bytes, static: bool) -> None:
+    small = quantize(model, _samples(0) if static else None)
+    weights = {tensor.name: tensor.data_type for tensor in onnx.load_from_string(small).graph.initializer}
     assert {TensorProto.INT8, TensorProto.UINT8} & set(weights.values())
     both = [np.concatenate(maps) for maps in zip(*_samples(1), strict=True)]
-    exact, nearly = (_answer(path, *both) for path in (model, small))
+    exact, nearly = (_answer(network, *both) for network in (model, small))
     assert nearly.shape == exact.shape == (4, 1, 64, 80)
     assert 0 < np.abs(nearly - exact).mean() < 0.05 * exact.std()
-    assert [path.name for path in tmp_path.iterdir()] == ["small.onnx"]
 
 
-def test_failed_quantisation_leaves_no_file(tmp_path: Path, model: Path) -> None:
+def test_failed_quantisation_is_one_of_our_errors(model: bytes) -> None:
     with pytest.raises(ModelError, match="8 bits"):
-        quantize(model, tmp_path / "small.onnx", [])
-    assert not list(tmp_path.iterdir())
+        quantize(model, [])
+
+
+@pytest.mark.slow
+def test_linked_graphs_equal_full_exports_bit_for_bit(folders: tuple[Path, Path], pair: Pair, tmp_path: Path) -> None:
+    weights, maps = Path(shutil.copytree(folders[0], tmp_path / "weights")), _maps(3)
+    (graph,) = export.export_folder(weights)
+    assert graph.stat().st_size < MAX_GRAPH_BYTES
+    linked = load_reconstructor(weights, tmp_path / "unused")
+    np.testing.assert_array_equal(linked(*maps), pair[0](*maps))
+    assert not (tmp_path / "unused").exists()
+    content = bytearray((weights / "compressor.safetensors").read_bytes())
+    content[-1] ^= 1  # the graph still opens
+    (weights / "compressor.safetensors").write_bytes(content)
+    with pytest.raises(CheckpointError, match="other weights"):
+        OnnxReconstructor(graph, RECORD, checksum=checksum_of_watched(weights))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_gpu")
+def test_shipped_graphs_equal_shipped_checkpoint_in_torch() -> None:
+    """The images to within 1e-4, and at most a handful of pixels on the other side of the silhouette's threshold."""
+    shipped, maps = shipped_folder(), shipped_maps()
+    network, doubt = load_reconstructor(None, Path("unused")), load_uncertainty_model(None, Path("unused"))
+    assert isinstance(network, OnnxReconstructor)
+    mine, its = network(*maps), TorchReconstructor(*load_pipeline(), "cpu")(*maps)
+    both = (mine > 0) & (its > 0)
+    assert ((mine > 0) != (its > 0)).sum((1, 2)).max() <= HANDFUL
+    assert both.mean() > 0
+    np.testing.assert_allclose(mine[both], its[both], atol=1e-4)
+    reference = load_doubt(shipped)
+    assert doubt is not None
+    assert reference is not None
+    with torch.inference_mode():
+        theirs = reference[0](*(torch.from_numpy(part) for part in (*maps, mine)))
+    for said, wanted in zip(doubt(*maps, mine), theirs, strict=True):
+        np.testing.assert_allclose(said, wanted, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.usefixtures("no_gpu")
+def test_weights_without_graph_need_torch_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in shipped_folder().glob("*.*"):
+        if path.suffix != ".onnx":
+            (tmp_path / path.name).symlink_to(path)
+    monkeypatch.setitem(sys.modules, "nlos_models.export", None)
+    monkeypatch.setattr(extras, "import_module", _without_torch)
+    for load in (load_reconstructor, load_uncertainty_model):
+        with pytest.raises(MissingExtraError, match=r"onnx.* torch.*pip install \"nlos-cam\[train\]\"") as found:
+            load(tmp_path, tmp_path / "cache")
+        assert "\n" not in str(found.value)
+
+
+def _without_torch(module: str) -> None:
+    raise ModuleNotFoundError(f"No module named 'torch' for {module}", name="torch")
+
+
+def test_require_names_the_extra_for_its_modules_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert extras.require("json", "reading").__name__ == "json"
+    with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+        extras.require("no_such_module", "reading")
+    monkeypatch.setattr(extras, "import_module", _without_torch)
+    with pytest.raises(MissingExtraError, match="training needs torch"):
+        extras.require("nlos_models.train", "training")
+
+
+def shipped_maps() -> tuple[np.ndarray, np.ndarray]:
+    """Maps (3, 64, 80) of a slanted wall with a brighter patch that moves, as the shipped networks expect."""
+    rows, columns = np.mgrid[:64, :80]
+    depth_m = np.stack([0.2 + 0.004 * columns + 0.01 * k for k in range(3)]).astype(np.float32)
+    patch = np.exp(-(((rows - 32) / 12) ** 2) - ((columns - 30) / 15) ** 2)
+    return depth_m, np.stack([10 + 30 * np.roll(patch, 6 * k, 1) for k in range(3)]).astype(np.float32)
+
+
+def test_package_without_encoder_says_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoint, "shipped_folder", lambda: tmp_path)
+    for load in (checkpoint.load_vae, checkpoint.load_encoder):
+        with pytest.raises(CheckpointError, match=r"encoder.* clone"):
+            load(tmp_path)

@@ -5,7 +5,15 @@ from pathlib import Path
 import pytest
 import torch
 from nlos_models.errors import ModelError, RecipeError
-from nlos_models.recipe import PLATEAU_PATIENCE, SMALLEST_RATE, Recipe, has_ended, load_recipe, schedule_of
+from nlos_models.recipe import (
+    PLATEAU_PATIENCE,
+    SMALLEST_RATE,
+    Recipe,
+    has_ended,
+    load_recipe,
+    packaged_recipes,
+    schedule_of,
+)
 from small_run import small_recipe
 from torch import nn
 
@@ -152,3 +160,11 @@ def test_one_cycle_schedule_rises_to_rate_and_falls_to_end() -> None:
     assert rates == sorted(rates[: peak + 1]) + sorted(rates[peak + 1 :], reverse=True)
     assert optimizer.param_groups[0]["lr"] < SMALLEST_RATE
     assert not has_ended(recipe, 0.0)
+
+
+def test_packaged_recipes_load_by_name() -> None:
+    names = packaged_recipes()
+    assert {"transfer", "compressor", "si-vae"} <= names.keys()
+    assert load_recipe(Path("transfer")) == load_recipe(names["transfer"]) == load_recipe(Path("paper-rig-transfer"))
+    with pytest.raises(RecipeError, match="Did you mean 'transfer'"):
+        load_recipe(Path("transfre"))

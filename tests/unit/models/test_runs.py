@@ -8,6 +8,7 @@ from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint, runs
 from nlos_models.checkpoint import CheckpointRecord, save_pipeline, save_vae
 from nlos_models.errors import OutputExistsError, TrainingError
+from nlos_models.files import CHECKSUMS
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import Recipe
 from nlos_models.runs import compressor_start, record_doubt_run, record_run, transfer_start, vae_start
@@ -85,6 +86,7 @@ def test_start_refuses_weights_of_other_kind(weights: Path, recipe: Recipe, chan
 def test_start_refuses_color_weights_for_depth(weights: Path) -> None:
     record = CheckpointRecord.of([small_recipe(colour=True)], NAMED).model_dump_json()
     (weights / "checkpoint.json").write_text(record, encoding="utf-8")
+    (weights / CHECKSUMS).unlink()
     for recipe in (AGAIN, JOINT, TRANSFER):
         with pytest.raises(TrainingError, match="simulation only"):
             _start(recipe, weights)
@@ -101,6 +103,7 @@ def test_partial_start_fills_missing_tensors_by_seed(weights: Path) -> None:
     tensors, messages = load_file(weights / "compressor.safetensors"), list[str]()
     missing = tensors.pop("classifier.1.weight")
     save_file({**tensors, "more": missing}, weights / "compressor.safetensors")
+    (weights / CHECKSUMS).unlink()
     rows: list[torch.Tensor] = []
     for seed in (3, 3, 4):
         torch.rand(1)

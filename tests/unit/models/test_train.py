@@ -2,6 +2,8 @@
 
 import copy
 import errno
+import hashlib
+import io
 import multiprocessing
 import os
 import random
@@ -11,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import pytest
 import torch
@@ -314,3 +316,34 @@ def test_failed_compilation_is_one_line(network: nn.Module) -> None:
 def test_error_of_network_is_not_blamed_on_compiler() -> None:
     with pytest.raises(RuntimeError, match="shapes cannot be multiplied"), train.explain_compile_errors():
         nn.Linear(3, 2)(torch.rand(1, 4))
+
+
+class Hostile:
+    """Object whose unpickling would run code."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (print, ("unpickled",))
+
+
+@pytest.mark.parametrize(
+    "state",
+    [5, [1], Hostile(), {"recipe": 3}, {"recipe": "{}", "epoch": "a"}],
+    ids=["number", "list", "hostile", "recipe", "epoch"],
+)
+def test_state_of_another_kind_is_refused_in_one_line(
+    tmp_path: Path, state: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = io.BytesIO()
+    torch.save(state, content)
+    for name in (train.LAST, train.PREVIOUS):
+        (tmp_path / name).write_bytes(hashlib.sha256(content.getvalue()).digest() + content.getvalue())
+    with pytest.raises(CheckpointError, match=str(tmp_path)) as caught:
+        SmallRun(small_recipe(), tmp_path).go()
+    assert "\n" not in str(caught.value)
+    assert "unpickled" not in capsys.readouterr().out
+
+
+def test_state_that_is_a_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / train.LAST).mkdir()
+    with pytest.raises(CheckpointError, match="damaged"):
+        train.read_last(tmp_path, print)

@@ -94,23 +94,6 @@ def test_solid_is_closed(solid: Float64) -> None:
     assert (times == 2).all()
 
 
-@pytest.mark.parametrize(
-    ("solid", "area"),
-    [
-        (
-            slab([(0, 0), (0.4, 0), (0.5, 0.2), (0.4, 0.3), (0, 0.3)], 0.1),
-            2 * 0.135 + 0.1 * (1.1 + np.hypot(0.1, 0.2) + np.hypot(0.1, 0.1)),
-        ),
-        (pierced(0.5, 0.5, 0.1, 0.1), 2 * (0.25 - np.pi * 0.01) + 0.2 + 0.02 * np.pi),
-        (pierced(0.5, 0.2, 0.08, 0.1), 2 * (0.1 - np.pi * 0.0064) + 0.14 + 0.016 * np.pi),
-        (bar((0.1, 0.2), (0.4, 0.6), 0.06, 0.1), 2 * (0.5 * 0.06 + 0.5 * 0.1 + 0.06 * 0.1)),
-    ],
-    ids=["slab", "pierced", "pierced narrow", "bar"],
-)
-def test_solid_has_the_area_of_its_sides(solid: Float64, area: float) -> None:
-    assert _area(solid) == pytest.approx(area, rel=0.02 if len(solid) > 50 else 1e-6)
-
-
 def test_solids_move_turn_tip_and_join() -> None:
     np.testing.assert_allclose(_middle(at(box(1, 1, 1), 1, 2, 3)), [1, 2, 3])
     np.testing.assert_allclose(_middle(bar((0.1, 0.2), (0.4, 0.6), 0.06, 0.1)), [0.25, 0.4, 0], atol=1e-12)

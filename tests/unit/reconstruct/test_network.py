@@ -8,7 +8,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_map import depth_from_image, image_from_depth, object_box
-from nlos_cam.reconstruct.network import box_pose, estimate_doubt, reconstruct, reconstruct_all
+from nlos_cam.reconstruct.network import Mirrored, box_pose, estimate_doubt, reconstruct, reconstruct_all
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -29,6 +29,22 @@ def some_maps() -> LidarMaps:
 
 def half(*_: np.ndarray) -> np.ndarray:
     return np.full((1, 64, 64), 0.5, np.float32)
+
+
+def test_mirrored_answers_alike_to_mirrored_maps_and_takes_every_surface() -> None:
+    class Shifting:
+        record, runtime = None, "none"
+
+        def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+            del intensity
+            return np.roll(np.nan_to_num(depth_m[:, :, 8:72]), 1, axis=1)  # down, whatever the maps
+
+    depth_m = np.full((1, 64, 80), np.nan, np.float32)
+    depth_m[0, 20, 30], depth_m[0, 22, 30] = 0.4, 0.6
+    network = Mirrored(Shifting())  # type: ignore[arg-type]
+    image = network(depth_m, depth_m)
+    np.testing.assert_array_equal(network(depth_m[:, ::-1], depth_m[:, ::-1]), image[:, ::-1])
+    np.testing.assert_allclose(image[0, 18:25, 22], [0, 0.4, 0, 0.5, 0, 0.6, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -46,11 +46,6 @@ def test_verdict_is_the_last_that_holds(made: Reconstruction, signs: FrameCondit
     assert VerdictFilter(LIMITS).decide(made, signs)[1] == verdict
 
 
-def test_verdicts_are_ordered_by_precedence() -> None:
-    order = [Verdict.SEEN, Verdict.NOTHING, Verdict.OUTSIDE, Verdict.SATURATED, Verdict.WALL_MOVED, Verdict.STALLED]
-    assert list(Verdict) == order
-
-
 @pytest.mark.parametrize("signs", [FrameConditions(), ALL])
 def test_verdict_hides_the_surface_only_if_nothing_is_there(signs: FrameConditions) -> None:
     shown, _ = VerdictFilter(LIMITS).decide(found(nothing=0.9), signs)

@@ -13,7 +13,7 @@ from nlos_cam.recording.rosbag import (
     Content,
     Ending,
     Op,
-    Read,
+    Source,
     check_bookkeeping,
     message_key,
     number,
@@ -49,7 +49,7 @@ def message(seconds: int, nanoseconds: int, conn: int = 0) -> bytes:
     return pack_record(fields, bytes(50))
 
 
-def described(content: bytes) -> tuple[Read, BagRecord]:
+def described(content: bytes) -> tuple[Source, BagRecord]:
     return reader(content), read_record(reader(content), 0)
 
 

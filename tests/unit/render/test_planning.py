@@ -155,8 +155,9 @@ def test_decide_includes_exactly_the_named_effects(asked: Collection[str]) -> No
 
 
 def test_decide_takes_names_and_leaves_out_zero_bounds() -> None:
-    assert {e.name for e in decide(_findings([1.0] * len(EFFECTS)), 0.0, "pulse") if e.included} == {"pulse"}
-    assert not any(effect.included for effect in decide(_findings([1.0] * len(EFFECTS)), 0.0, []))
+    assert {e.name for e in decide(_findings([1.0] * len(EFFECTS)), 0.0, "direct") if e.included} == {"direct"}
+    with pytest.raises(SceneError, match="no light arrives"):
+        decide(_findings([1.0] * len(EFFECTS)), 0.0, [])
     with pytest.raises(SceneError, match="fog"):
         decide(_findings([0.0] * len(EFFECTS)), 0.0, ["direct", "fog"])
     plan = decide(_findings([0.0] * 5 + [1e-12] * 5), 0.0)

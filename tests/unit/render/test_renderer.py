@@ -1,7 +1,9 @@
 """Renderings, echoes, the rolling scan, BRDF tables and the numba backend (laws: tests/laws)."""
 
 from dataclasses import replace
+from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,8 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.objects import object_box, object_depth
+from nlos_cam.render import backend_numba, row_sum
 from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.backend_numba import LANES, tables
+from nlos_cam.render.backend_numba import LANES, echoes, histograms, tables
 from nlos_cam.render.brdf_table import MAX_NODES, node_count, nodes, scattered, scattering
 from nlos_cam.render.echoes import MultiBounce, compete, no_echoes, strongest
 from nlos_cam.render.effects import Effect
@@ -20,7 +24,7 @@ from nlos_cam.render.material import Brdf, Surface, phong
 from nlos_cam.render.planning import prepare
 from nlos_cam.render.renderer import render, transient
 from nlos_cam.render.scanning import render_scan, scan_effect, slices
-from nlos_cam.render.scene import Scene
+from nlos_cam.render.scene import Radiometry, Scene
 
 RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=4, relay_rows=3)
@@ -203,7 +207,53 @@ def test_tables_are_the_histogram_at_each_sub_bin_shift(per_bin: int) -> None:
     width = 2 * LANES
     fine = np.zeros((3, width * per_bin), np.float32)
     fine[:, : (width - 1) * per_bin] = np.random.default_rng(0).random((3, (width - 1) * per_bin))
-    table = tables(fine, per_bin)
+    found = tables(np.zeros(3, np.int32), fine, per_bin)
+    padded = found.rows.reshape(3 * per_bin + 1, -1)
+    assert not padded[:, : row_sum.WINDOW].any()
+    assert not padded[-1].any()
+    table = padded[:-1, row_sum.WINDOW :].reshape(3, per_bin, width)
     for shift in range(per_bin):
         later = np.roll(fine, shift, axis=1).reshape(3, width, per_bin).sum(-1)
         np.testing.assert_allclose(table[:, shift], later, rtol=1e-5, atol=1e-6)
+    for start in range(width + 1):
+        rest = table[:, :, start:].max((1, 2), initial=0)
+        np.testing.assert_array_equal(found.rest[:, start], rest)
+
+
+@pytest.mark.parametrize("bound", [backend_numba.ROUNDED, np.float32(np.inf)])
+@pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
+def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
+    bound: np.float32, radiometry: Radiometry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = prepare(Scene(RIG, object_depth(4, object_box(RIG))[1], radiometry=radiometry), STOPS["draft"]).job
+    assert job is not None
+    job = job.select(np.arange(0, len(job.laser_spot_m), 7))
+    # With bounds of infinity no window decides, and every beam sums all of its bins.
+    window = backend_numba._strongest_in_window
+
+    def undecided(*args: Any) -> Any:
+        *found, sure = window(*args)
+        return *found, sure & np.isfinite(bound)
+
+    monkeypatch.setattr(backend_numba, "_strongest_in_window", undecided)
+    found, whole = echoes(job), strongest(histograms(job), job.bin_m)
+    for name in ("peak", "runner_up", "path_m"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+
+
+def test_rows_are_added_in_order_with_their_weights() -> None:
+    generator = np.random.default_rng(0)
+    table, weight = generator.random(400, np.float32), generator.random(12, np.float32)
+    base, offset = np.array([0, 50, 200]), generator.integers(0, 100, 12).astype(np.int32)
+
+    @numba.njit
+    def add(sums: Any) -> None:
+        row_sum.add_rows(sums, 8, table, base, offset, weight, 1, 4, 3)
+
+    sums = np.zeros(48, np.float32)
+    add(sums)
+    expected = np.zeros(48)
+    for j in range(3):
+        start = base[j] + offset[1 + 4 * j]
+        expected[8 : 8 + row_sum.WINDOW] += weight[1 + 4 * j] * table[start : start + row_sum.WINDOW].astype(float)
+    np.testing.assert_allclose(sums, expected, rtol=1e-6)

@@ -22,6 +22,7 @@ from nlos_cam.render.scene_file import (
     bare_wall_scene,
     load_scene,
     one_wrap,
+    packaged_scenes,
     paper_scene,
 )
 from nlos_cam.render.sensor.model import SensorModel
@@ -259,3 +260,9 @@ def test_fault_refuses_fields_that_make_no_sense(fields: dict[str, Any], word: s
 def test_fault_lasts_from_its_frame_on(kind: Any, frames: list[int]) -> None:
     fault = Fault(kind=kind, at_frame=5, frames=3)
     assert [frame for frame in range(20) if fault.befalls(frame)] == frames
+
+
+def test_packaged_scenes_load_by_name() -> None:
+    names = packaged_scenes()
+    assert {"empty", "cup", "faults", "warming", "bench"} == names.keys()
+    assert load_scene(Path("empty")) == load_scene(names["empty"])

@@ -97,9 +97,9 @@ def test_horizon_table_bounds_the_walk_on_every_leg(seed: int, sectors: int) -> 
     rows, columns = np.nonzero(~np.isnan(field.depth_m))
     rows, columns = rows[::40], columns[::40]
     z = field.depth_m[rows, columns]
-    low, high = horizon_table(field, rows, columns, z, np.full(len(rows), 400.0), sectors)
+    low, high, walk = horizon_table(field, rows, columns, z, np.full(len(rows), 400.0), sectors)
     assert low.shape == high.shape == (len(rows), FACES * sectors)
-    generator, sure = np.random.default_rng(seed), 0
+    generator, sure, walked = np.random.default_rng(seed), 0, 0
     for s, row in enumerate(rows):
         for u, v in generator.uniform(-300, 300, (60, 2)):
             along = abs(u) >= abs(v)
@@ -113,7 +113,11 @@ def test_horizon_table_bounds_the_walk_on_every_leg(seed: int, sectors: int) -> 
             elif z[s] < abs(major) * low[s, k]:
                 assert shaded
                 sure += 1
-    assert sure > 0
+            else:
+                first, last = walk[s, k].tolist()
+                assert blocked(field, row, columns[s], z[s], u, v, first, last) == shaded
+                walked += 1
+    assert sure > 0 < walked
 
 
 PAPER = load_rig("paper-rig")

@@ -11,7 +11,8 @@ GOOD_RUN = {
     "frames": 18_000,
     "dropped": 18,
     "fps": 29.99,
-    "latency_ms": {"p99": 15.0},
+    "name": "alone",
+    "latency_ms": {"p50": 12.0, "p99": 15.0},
     "memory": {"mib_per_minute": 0.1},
 }
 
@@ -47,7 +48,9 @@ def test_what_is_left_or_half_written_or_ends_otherwise_is_not_good(interrupting
         ({}, []),
         ({"dropped": 19}, ["0.11% dropped"]),
         ({"fps": 29.8}, ["29.80 frames/s"]),
-        ({"latency_ms": {"p99": 20.1}}, ["p99 20.1 ms"]),
+        ({"latency_ms": {"p50": 14.0, "p99": 15.1}}, ["p99 15.1 ms"]),
+        ({"latency_ms": {"p50": 9.0, "p99": 14.0}}, ["p99 1.56 p50"]),
+        ({"name": "watched", "latency_ms": {"p50": 14.0, "p99": 17.9}}, []),
         ({"memory": {"mib_per_minute": 0.6}}, ["+0.60 MiB a minute"]),
     ],
 )

@@ -1,5 +1,5 @@
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from threading import Event
@@ -8,18 +8,12 @@ from typing import Any
 import pytest
 from made_up_moments import RIG, full_moment, moment
 from measured_walls import exact_wall
-from view_streams import ask
+from view_streams import ask, messages
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.view.drawing import Drawing
-from nlos_cam.view.rrd_file import RrdFile
-from nlos_cam.view.viewer import Moment
-from nlos_cam.view.web import RecordedView, WebViewer, whole_bytes
-
-
-@pytest.fixture(autouse=True)
-def no_assets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.view.web.page_assets", dict)
+from nlos_cam.view.messages import MomentPacker
+from nlos_cam.view.session_file import SessionFile
+from nlos_cam.view.web import PlaybackViewer, RecordedView, WebViewer
 
 
 @pytest.fixture
@@ -30,52 +24,50 @@ def viewer() -> Iterator[WebViewer]:
         ask(viewer.address or "", "/")
 
 
-def receive_until(viewer: WebViewer, *texts: bytes) -> None:
-    """Read the stream as a browser until it holds these; the test's own time limit ends a wait in vain."""
-    with closing(ask(viewer.address or "", "/live.rrd")) as answer:
-        received = b""
-        while not all(text in received for text in texts):
-            chunk = answer.read1()
-            assert chunk, "the stream ended"
-            received += chunk
-        assert received.startswith(b"RRF2")
+def frames(viewer: WebViewer | PlaybackViewer) -> Iterator[dict[str, Any]]:
+    """Yield the messages that a browser receives."""
+    with closing(ask(viewer.address or "", "/stream")) as answer:
+        yield from messages(answer)
 
 
-def test_browser_receives_moments_shown_while_it_watches(viewer: WebViewer) -> None:
-    viewer.show(moment(0))
-    with closing(ask(viewer.address or "", "/live.rrd")) as answer:
-        assert answer.read(4) == b"RRF2"
-        for number in range(1, 4):
-            viewer.show(moment(number))
-            assert answer.read(2000)
+def test_browsers_receive_bench_status_and_the_newest_moment(viewer: WebViewer) -> None:
+    viewer.show(full_moment(7))
+    for _ in range(3):  # the page is opened again, while no new moment comes
+        found = {}
+        for each in frames(viewer):
+            found[each["kind"]] = each
+            if len(found) == 4:
+                break
+        assert set(found) == {"hello", "bench", "status", "moment"}
+        assert found["moment"]["frame"] == 7
+        assert found["bench"]["rig"] == RIG.name
 
 
-def test_browsers_that_open_the_page_again_receive_everything(viewer: WebViewer) -> None:
-    viewer.show(full_moment(0))
-    for _ in range(3):
-        receive_until(viewer, b"bench/wall", b"uncertainty")
+def test_bench_is_sent_again_once_it_was_measured() -> None:
+    with WebViewer() as viewer:
+        received = frames(viewer)
+        assert next(each for each in received if each["kind"] == "status")["state"] == "running"
+        viewer.begin(RIG)
+        assert "calibration" not in next(each for each in received if each["kind"] == "bench")
+        viewer.begin(RIG, exact_wall())
+        measured = next(each for each in received if each["kind"] == "bench")
+        assert measured["calibration"][0][0] == "verdict"
+        assert "wall_residual" in measured["arrays"]
+        received.close()
 
 
-def test_closing_viewer_ends_streams_that_are_still_read() -> None:
+def test_leaving_ends_streams_with_the_word_ended() -> None:
     with WebViewer(RIG) as viewer:
-        answer = ask(viewer.address or "", "/live.rrd")
-        viewer.show(moment(0))
-        assert answer.read(4) == b"RRF2"
-    answer.read()
-    answer.close()
+        received = frames(viewer)
+        next(received)
+    assert list(received)[-1]["state"] == "ended"
 
 
-def test_showing_starts_no_thread_without_browser(viewer: WebViewer) -> None:
+def test_nothing_is_packed_without_browser(viewer: WebViewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MomentPacker, "pack", lambda *_, **__: pytest.fail("packed"))
     for number in range(1000):
         viewer.show(moment(number))
-    assert threading.active_count() <= 3
-
-
-def test_each_browser_receives_a_measured_wall() -> None:
-    with WebViewer(RIG, exact_wall()) as viewer:
-        viewer.show(moment(0))
-        for _ in range(2):
-            receive_until(viewer, b"bench/measured/footprint")
+    assert threading.active_count() <= 4
 
 
 class Starved:
@@ -85,22 +77,15 @@ class Starved:
         self.asked, self.let, self.taken = Event(), Event(), []
 
     def __call__(self, content: bytes) -> None:
-        self.asked.set()
-        if not self.let.wait(60.0):
-            raise TimeoutError
+        if b"moment" in content:
+            self.asked.set()
+            if not self.let.wait(60.0):
+                raise TimeoutError
         self.taken.append(content)
 
 
-def test_nothing_is_drawn_for_a_browser_that_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, drew_again, draw, browser = [], Event(), Drawing.draw, Starved()
-
-    def noted(self: Drawing, each: Moment, **options: bool) -> None:
-        drawn.append(each.frame.frame_number)
-        draw(self, each, **options)
-        if len(drawn) == 2:
-            drew_again.set()
-
-    monkeypatch.setattr(Drawing, "draw", noted)
+def test_slow_browser_skips_to_the_newest_moment() -> None:
+    browser = Starved()
     with WebViewer(RIG) as viewer:
         thread = threading.Thread(target=viewer._stream, args=(browser,))
         thread.start()
@@ -108,63 +93,73 @@ def test_nothing_is_drawn_for_a_browser_that_takes_nothing(monkeypatch: pytest.M
         assert browser.asked.wait(60.0)
         for number in range(1, 500):
             viewer.show(moment(number))
-        assert drawn == [0]
+        assert any(each.get("frame") == 499 for each in frames(viewer)), "another browser is not kept waiting"
         browser.let.set()
-        viewer.show(moment(500))
-        assert drew_again.wait(60.0)
     thread.join(60.0)
-    assert drawn[1] >= 499, "it receives the newest moment, and not those that it missed"
-    assert len(browser.taken) == len(drawn)
+    assert sum(b"moment" in content for content in browser.taken) < 10
 
 
-@pytest.fixture
-def saved(tmp_path: Path) -> Path:
-    with RrdFile(tmp_path / "view.rrd", RIG, keeps_all=True) as view:
-        for number in range(0, 30, 3):
-            view.show(full_moment(number))
-    return tmp_path / "view.rrd"
+class Scripted:
+    """Controls that record what they were asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, Mapping[str, Any]]] = []
+
+    def status(self) -> dict[str, Any]:
+        return {"state": "stalled", "camera": "sim"}
+
+    def run(self, command: str, arguments: Mapping[str, Any]) -> str:
+        self.asked.append((command, arguments))
+        return "done"
 
 
-def test_each_browser_receives_the_whole_saved_file(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+def test_page_controls_with_the_token_of_the_address() -> None:
+    controls = Scripted()
+    with WebViewer(RIG, controls=controls) as viewer:
+        address, _, token = (viewer.address or "").partition("#")
+        assert next(each for each in frames(viewer) if each["kind"] == "status")["state"] == "stalled"
+        for sent, status in ((token, 200), ("", 403)):
+            body = '{"command": "average", "frames": 4}'
+            with closing(ask(address, "/command", method="POST", body=body, X_Token=sent)) as answer:
+                assert answer.status == status
+    assert controls.asked == [("average", {"frames": 4})]
 
-    def assets(*, recorded: bool) -> dict[str, tuple[str, bytes]]:
-        asked.append(recorded)
-        return {"/": ("text/html", b"page")}
 
-    monkeypatch.setattr("nlos_cam.view.web.page_assets", assets)
-    with RecordedView(saved) as view:
+def test_page_is_whole_and_names_no_other_address(viewer: WebViewer) -> None:
+    with closing(ask(viewer.address or "", "/")) as answer:
+        page = answer.read().decode()
+    assert "class Bench" in page
+    assert "class Pictures" in page
+    assert "src=" not in page
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_playback_keeps_every_moment_for_every_browser() -> None:
+    with PlaybackViewer(RIG) as viewer:
+        for number in range(70):
+            viewer.show(full_moment(number))
+        viewer.finish()
         for _ in range(2):
-            with closing(ask(view.address or "", "/live.rrd")) as answer:
-                assert answer.read() == saved.read_bytes()
-    assert asked == [True]
+            times_s: list[float] = []
+            for each in frames(viewer):
+                times_s += each.get("times_s", [])
+                if len(times_s) == 70:
+                    break
+            assert times_s == pytest.approx([number / 30 for number in range(70)], abs=1e-3)
 
 
-@pytest.mark.parametrize("share", [0.4, 0.55, 0.9])
-def test_cut_saved_view_is_shown_as_far_as_it_is_whole(
-    saved: Path, tmp_path: Path, share: float, chunks_of: Callable[[Path], list[Any]]
-) -> None:
-    content, cut = saved.read_bytes(), tmp_path / "cut.rrd"
-    cut.write_bytes(content[: int(share * len(content))])
-    with cut.open("rb") as file:
-        whole = whole_bytes(file)
-    assert 0 < whole < cut.stat().st_size
-    cut.write_bytes(content[:whole])
-    with pytest.warns(match="no footer"):
-        assert 5 < len(chunks_of(cut)) <= len(chunks_of(saved))
+def test_recorded_view_serves_the_file_as_its_page(tmp_path: Path) -> None:
+    with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
+        session.show(full_moment(0))
+    with RecordedView(tmp_path / "view.html") as view, closing(ask(view.address or "", "/")) as answer:
+        assert answer.read() == (tmp_path / "view.html").read_bytes()
 
 
-def test_whole_bytes_of_whole_and_of_begun_files(saved: Path, tmp_path: Path) -> None:
-    with saved.open("rb") as file:
-        assert whole_bytes(file) == saved.stat().st_size
-    (tmp_path / "begun.rrd").write_bytes(saved.read_bytes()[:20])
-    with (tmp_path / "begun.rrd").open("rb") as file:
-        assert whole_bytes(file) == 12
-
-
-def test_recorded_view_refuses_other_files(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"none\.rrd"):
-        RecordedView(tmp_path / "none.rrd")
-    (tmp_path / "other.rrd").write_text("something else")
-    with pytest.raises(RecordingError, match=r"other\.rrd.*--save-view"):
+@pytest.mark.parametrize(
+    ("content", "advice"), [(None, "cannot be read"), (b"something else", "--save-view"), (b"RRF2 old", "rerun")]
+)
+def test_recorded_view_refuses_other_files(tmp_path: Path, content: bytes | None, advice: str) -> None:
+    if content is not None:
+        (tmp_path / "other.rrd").write_bytes(content)
+    with pytest.raises(RecordingError, match=rf"other\.rrd.*{advice}"):
         RecordedView(tmp_path / "other.rrd")

@@ -12,11 +12,14 @@ from nlos_calibration.rig import Occluder, load_rig
 from pydantic import ValidationError
 
 from nlos_cam.errors import SceneError
+from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects.placement import object_depth
+from nlos_cam.render.accuracy import STOPS
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, cast
 from nlos_cam.render.renderer import MultiBounce, Rendering, render
 from nlos_cam.render.scene import Radiometry, Scene
 from nlos_cam.render.sensor.bias import DepthBias, ripples, smooth_patches, texture
+from nlos_cam.render.sensor.cells import QUANTILES, draw_deviates, normal_quantiles
 from nlos_cam.render.sensor.effects import sensor_effects
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, STEADY_CELSIUS, SensorModel, WarmUp
 from nlos_cam.render.sensor.sensor import Sensor, cell_of_pixels
@@ -216,3 +219,65 @@ def test_texture_has_stains_and_grain_of_a_cell() -> None:
     near, far = (np.corrcoef(grain[:, :-by].ravel(), grain[:, by:].ravel())[0, 1] for by in (1, 2 * cell))
     assert near > 0.8  # no finer than a pixel
     assert abs(far) < 0.2
+
+
+CHANGES = (
+    {},
+    {"dead_share": 0.1, "ripple_m": 0.003},
+    {"ambient_counts": 60.0, "bare_wall_counts": 200.0},
+    {"wall_texture": 0.2},
+)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("beams", [1, 2])
+def test_maps_without_noise_are_those_of_the_images_bit_for_bit(change: dict[str, float], beams: int) -> None:
+    assert RIG.object_box is not None
+    scene = Scene(RIG, object_depth(3, RIG.object_box)[1])
+    multi = render(scene, replace(STOPS["draft"], beams_per_cell=beams)).multi
+    sensor = Sensor(RIG, QUIET.model_copy(update=change))
+    for echoes in (multi, replace(multi, direct_included=True)):
+        found = sensor.maps(echoes, _generator())
+        expected = maps_from_frame(sensor.expose(echoes, _generator()).frame(RIG.pinhole))
+        for name in ("depth_m", "intensity", "valid"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_maps_have_the_noise_of_the_images(rendering: Rendering) -> None:
+    sensor, frames = Sensor(RIG, SensorModel()), 40
+    exposed = [sensor.expose(rendering.multi, _generator(k)).frame(RIG.pinhole) for k in range(frames)]
+    drawn = [sensor.maps(rendering.multi, _generator(k)) for k in range(frames)]
+    for name in ("depth_m", "intensity"):
+        one, other = (np.stack([getattr(m, name) for m in maps]) for maps in (drawn, map(maps_from_frame, exposed)))
+        variance = (one.var(0) + other.var(0)) / 2
+        noisy = np.isfinite(variance) & (variance > 1e-12)
+        assert noisy.mean() > 0.5
+        apart = ((one.mean(0) - other.mean(0)) / np.sqrt(2 * variance / (frames - 1)))[noisy]
+        assert abs(apart.mean()) < 4 / np.sqrt(apart.size)
+        assert apart.std() == pytest.approx(1, abs=0.06)
+        with np.errstate(divide="ignore"):
+            ratio = np.log(one.var(0) / other.var(0))[noisy]
+        assert abs(np.median(ratio)) < 0.03
+        # Two-sample Kolmogorov-Smirnov on the residuals of all cells together.
+        middle, spread = (one.mean(0) + other.mean(0)) / 2, np.sqrt(variance)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            residuals = [np.sort(((maps - middle) / spread)[:, noisy].ravel()) for maps in (one, other)]
+        every = np.concatenate(residuals)
+        shares = [np.searchsorted(part, every, "right") / part.size for part in residuals]
+        assert np.abs(shares[0] - shares[1]).max() < 1.95 * np.sqrt(2 / residuals[0].size)
+
+
+def test_deviates_are_normal_and_follow_the_seed() -> None:
+    quantiles = normal_quantiles()
+    assert quantiles.size == QUANTILES
+    assert quantiles.astype(float).std() == pytest.approx(1, abs=1e-6)
+    light, ranges, again = np.empty((3, 200_000), np.float32)
+    draw_deviates(np.uint64(7), 0, light.size, quantiles, light, ranges)
+    draw_deviates(np.uint64(7), 0, light.size, quantiles, again, ranges)
+    np.testing.assert_array_equal(light, again)
+    for values in (light, ranges):
+        assert abs(values.mean()) < 0.01
+        assert values.var() == pytest.approx(1, abs=0.015)
+        assert abs((values[1:] * values[:-1]).mean()) < 0.01
+        assert (np.abs(values) > 3).mean() == pytest.approx(0.0027, abs=5e-4)
+    assert abs((light * ranges).mean()) < 0.01

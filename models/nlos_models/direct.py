@@ -1,0 +1,175 @@
+"""Direct network from maps to images: the project's own, beside the paper's pipeline; no latent, two heads.
+
+The rig is symmetric about y = 0, and so is the network: the answer to mirrored maps is the mirrored answer, exactly.
+Maps are folded into two sides, top and bottom, the bottom one upside down; each layer treats both sides alike. All
+layers are matrix products, which a CPU trains 14 times as fast as MobileNetV2's convolutions.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from nlos_models.metrics import MIN_V
+from nlos_models.recipe import DirectSize
+
+ROWS, COLUMNS = 64, 80
+PIXELS = 64
+CLIP = 5.0
+"""Limit of a normalised cell, in spreads."""
+KEPT_ABOVE = 0.44
+"""Lowest probability of a surface. On 400 held-out objects 0.32 is best for the silhouette's IoU, and 0.5 costs 0.009
+of it; the mean absolute error is least near 0.5. This value costs either of them little."""
+SMALLEST_SHARE = 0.3
+"""Smallest spread of a cell, as a share of the median spread: quiet cells would otherwise show noise alone."""
+PATCH, TOKEN = 4, 8
+"""Cells of a patch's side, and pixels of an output token's side; patches are merged two by two."""
+SIDE_PATCHES = (ROWS // 2 // PATCH, COLUMNS // PATCH)
+SIDE_INPUTS = SIDE_PATCHES[0] * SIDE_PATCHES[1] // 4
+SIDE_TOKENS = (PIXELS // 2 // TOKEN, PIXELS // TOKEN)
+
+
+class MirrorLinear(nn.Module):
+    """Linear layer (b, 2, ..., in) to (b, 2, ..., out) that commutes with swapping the two sides.
+
+    Such a layer acts on the sum and on the difference of the sides apart: half the products of a full one.
+    """
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.even, self.odd = nn.Linear(inputs, outputs), nn.Linear(inputs, outputs, bias=False)
+
+    def forward(self, sides: Tensor) -> Tensor:
+        """Map both sides."""
+        top, bottom = sides.unbind(1)
+        even, odd = self.even(0.7 * (top + bottom)), self.odd(0.7 * (top - bottom))
+        return 0.7 * torch.stack([even + odd, even - odd], dim=1)
+
+
+class Residual(nn.Module):
+    """Residual block: layer norm, two layers with GELU between them, dropout; the last layer starts at zero."""
+
+    def __init__(self, norm: int, layers: tuple[nn.Module, nn.Module], dropout: float, *, across: bool = False) -> None:
+        super().__init__()
+        self.norm, self.across = nn.LayerNorm(norm), across
+        self.first, self.second, self.dropout = *layers, nn.Dropout(dropout)
+        for parameter in self.second.parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (b, 2, ..., n) to the same shape; `across` mixes over the axis before the last."""
+        y = self.norm(x)
+        y = y.transpose(-1, -2) if self.across else y
+        y = self.dropout(self.second(functional.gelu(self.first(y))))
+        return x + (y.transpose(-1, -2) if self.across else y)
+
+
+class CellNormal(nn.Module):
+    """Normalisation of each cell's depth and log intensity by median and spread over the training set, clipped."""
+
+    median: Tensor
+    spread: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("median", torch.zeros(2, ROWS, COLUMNS))
+        self.register_buffer("spread", torch.ones(2, ROWS, COLUMNS))
+
+    def learn(self, depth_m: Tensor, intensity: Tensor) -> None:
+        """Set the statistics to those of maps (n, 64, 80), averaged with the mirrored ones."""
+        for channel, values in enumerate(_channels(depth_m, intensity).unbind(1)):
+            median = values.nanmedian(0).values.nan_to_num()
+            spread = (values - median).square().nanmean(0).sqrt().nan_to_num()
+            spread = spread.clamp(min=SMALLEST_SHARE * float(spread.median()))
+            self.median[channel] = (median + median.flip(0)) / 2
+            self.spread[channel] = (spread + spread.flip(0)) / 2
+
+    def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
+        """Map maps (n, 64, 80) to (n, 2, 64, 80); a cell without a return is 0 in both channels."""
+        normal = (_channels(depth_m, intensity) - self.median) / self.spread
+        return torch.where(torch.isnan(normal), 0.0, normal.clamp(-CLIP, CLIP))
+
+
+def _channels(depth_m: Tensor, intensity: Tensor) -> Tensor:
+    """Stack depth and log(1 + intensity) to (n, 2, 64, 80), NaN where there is no return."""
+    return torch.stack([depth_m, torch.where(torch.isnan(depth_m), depth_m, torch.log1p(intensity))], dim=1)
+
+
+class DirectNetwork(nn.Module):
+    """Network from maps (n, 64, 80) to images (n, 64, 64) in [0, 1] by two heads: is there a surface, and how deep."""
+
+    def __init__(self, size: DirectSize | None = None, dropout: float = 0.0) -> None:
+        super().__init__()
+        self.size = size = size or DirectSize()
+        self.normal = CellNormal()
+        within = size.features // 2
+        self.patch = nn.Linear(2 * PATCH**2, within)
+        self.merge = nn.Linear(4 * within, size.features)
+        self.into = MirrorLinear(SIDE_INPUTS * size.features, size.width)
+        self.trunk = nn.Sequential(
+            *(
+                Residual(
+                    size.width,
+                    (MirrorLinear(size.width, 2 * size.width), MirrorLinear(2 * size.width, size.width)),
+                    dropout,
+                )
+                for _ in range(size.blocks)
+            )
+        )
+        tokens = SIDE_TOKENS[0] * SIDE_TOKENS[1]
+        self.out = MirrorLinear(size.width, tokens * size.token)
+        self.place = nn.Parameter(0.02 * torch.randn(tokens, size.token))
+        mixers = list[nn.Module]()
+        for _ in range(size.mixers):
+            over_tokens = MirrorLinear(tokens, 2 * tokens), MirrorLinear(2 * tokens, tokens)
+            over_features = nn.Linear(size.token, 2 * size.token), nn.Linear(2 * size.token, size.token)
+            mixers += [Residual(size.token, over_tokens, 0.0, across=True), Residual(size.token, over_features, 0.0)]
+        self.mixers = nn.Sequential(*mixers)
+        self.norm = nn.LayerNorm(size.token)
+        self.heads = nn.Linear(size.token, 2 * TOKEN**2)
+
+    def logits(self, normal: Tensor) -> Tensor:
+        """Map normalised maps (n, 2, 64, 80) to two logits (n, 2, 64, 64): of a surface, and of its v in [0.1, 1]."""
+        sides = torch.stack([normal[..., : ROWS // 2, :], normal[..., ROWS // 2 :, :].flip(-2)], dim=1)
+        x = functional.gelu(self.patch(_patches(sides, PATCH)))  # (n, 2, 8, 20, within)
+        x = functional.gelu(self.merge(_patches(x.movedim(-1, 2), 2)))  # (n, 2, 4, 10, features)
+        x = self.trunk(self.into(x.flatten(2)))
+        x = self.out(x).unflatten(-1, self.place.shape) + self.place
+        x = self.heads(self.norm(self.mixers(x)))  # (n, 2, 32, 128)
+        x = x.unflatten(-1, (2, TOKEN, TOKEN)).unflatten(2, SIDE_TOKENS)  # (n, side, row, column, head, y, x)
+        x = x.permute(0, 1, 4, 2, 5, 3, 6).reshape(-1, 2, 2, PIXELS // 2, PIXELS)
+        return torch.cat([x[:, 0], x[:, 1].flip(-2)], dim=-2)
+
+    def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
+        """Return the images of maps (n, 64, 80) with NaN depth where there is no return."""
+        return image_from_logits(self.logits(self.normal(depth_m, intensity)))
+
+
+def _patches(x: Tensor, side: int) -> Tensor:
+    """Cut (n, 2, channels, rows, columns) into patches: (n, 2, rows / side, columns / side, channels * side**2)."""
+    x = x.unflatten(-1, (-1, side)).unflatten(3, (-1, side))  # (n, 2, c, row, y, column, x)
+    return x.permute(0, 1, 3, 5, 2, 4, 6).flatten(4)
+
+
+def image_from_logits(logits: Tensor) -> Tensor:
+    """Return images (n, 64, 64) of logits (n, 2, 64, 64): a surface where one has a probability of KEPT_ABOVE."""
+    occupied, depth = logits.float().unbind(1)
+    return torch.where(
+        occupied > math.log(KEPT_ABOVE / (1 - KEPT_ABOVE)), MIN_V + (1 - MIN_V) * torch.sigmoid(depth), 0.0
+    )
+
+
+def two_heads_error(logits: Tensor, truth: Tensor) -> Tensor:
+    """Return the loss of logits (n, 2, 64, 64) against images (n, 64, 64): cross-entropy, overlap and depth.
+
+    Cross-entropy of the silhouette, plus 0.5 (1 - soft intersection over union), plus 2 times the absolute error of v
+    over the surface; each is a mean over pixels or objects.
+    """
+    (occupied, depth), truth = logits.float().unbind(1), truth.float()
+    surface = (truth > 0).float()
+    entropy = functional.binary_cross_entropy_with_logits(occupied, surface)
+    share = torch.sigmoid(occupied)
+    both, one = (share * surface).sum((1, 2)), (share + surface - share * surface).sum((1, 2))
+    off = (MIN_V + (1 - MIN_V) * torch.sigmoid(depth) - truth).abs() * surface
+    return entropy + 0.5 * (1 - (both + 1) / (one + 1)).mean() + 2 * off.sum() / surface.sum().clamp(min=1)

@@ -1,0 +1,291 @@
+"""Export of networks to ONNX with torch: graphs that point into a checkpoint's tensors, and 8-bit networks."""
+
+import hashlib
+import json
+import logging
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import nn
+
+from nlos_models.arrays import Float32
+from nlos_models.checkpoint import load_network
+from nlos_models.direct import DirectNetwork
+from nlos_models.doubt_checkpoint import load_doubt
+from nlos_models.errors import CheckpointError, ModelError
+from nlos_models.files import write_checked
+from nlos_models.inference import (
+    CHECKSUM,
+    DOUBT_FILES,
+    DOUBT_INPUTS,
+    DOUBT_ONNX,
+    NETWORK_INPUTS,
+    NETWORK_ONNX,
+    UncertaintyEstimate,
+    refuse_color,
+)
+from nlos_models.pipeline import RemappingNetwork
+from nlos_models.recipe import SIMULATION_ONLY
+from nlos_models.records import DOUBT, CheckpointRecord, checksum_of_watched, watched_files
+
+OPSET, IR_VERSION = 18, 10
+"""ONNX Runtime 1.20 reads both."""
+NORM_EPSILON = np.float32(1e-5)
+"""Of torch's batch norms."""
+
+
+class TorchReconstructor:
+    """Pipeline in torch; in float32 it is the reference for the others."""
+
+    def __init__(
+        self,
+        pipeline: RemappingNetwork | DirectNetwork,
+        record: CheckpointRecord,
+        device: str,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        self.record, self.runtime = record, f"torch on {device}"
+        self._pipeline, self._device, self._dtype = pipeline.to(device).eval(), device, dtype
+
+    def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
+        mixed = torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
+        with torch.inference_mode(), mixed:
+            maps = [torch.from_numpy(np.ascontiguousarray(m)).to(self._device) for m in (depth_m, intensity)]
+            return self._pipeline(*maps).float().cpu().numpy()
+
+
+def load_torch_reconstructor(folder: Path) -> TorchReconstructor:
+    """Load a checkpoint folder's weights on the GPU."""
+    return TorchReconstructor(*load_network(folder), "cuda")
+
+
+DOUBT_OUTPUTS = list(UncertaintyEstimate._fields)
+
+
+def export_folder(folder: Path) -> list[Path]:
+    """Write the ONNX graphs of a checkpoint folder's networks beside their tensors, for inference without torch.
+
+    Raises CheckpointError where the weights cannot be read or are for color.
+    """
+    network, record = load_network(folder)
+    refuse_color(record, folder)
+    files = watched_files(folder)
+    parts = {"": files[0]} if record.direct_recipe else {f"{name.partition('.')[0]}.": name for name in files}
+    graphs = {NETWORK_ONNX: _linked_graph(network, folder, NETWORK_INPUTS, ["image"], parts, files)}
+    if loaded := load_doubt(folder):
+        parts = {"network.": DOUBT_FILES[0]}
+        graphs[DOUBT_ONNX] = _linked_graph(loaded[0], folder, DOUBT_INPUTS, DOUBT_OUTPUTS, parts, DOUBT_FILES)
+    write_checked(folder, graphs)
+    return [folder / name for name in graphs]
+
+
+Export = tuple[str, Callable[[], bytes]]
+"""File name in a cache, and the function that makes its content: a self-contained ONNX file."""
+
+
+def network_export(folder: Path) -> Export:
+    """Return the export of a folder's pipeline. Raises CheckpointError."""
+    pipeline = load_network(folder)[0]
+    return f"{checksum_of(pipeline)}.onnx", partial(export_onnx, pipeline)
+
+
+def doubt_export(folder: Path) -> Export:
+    """Return the export of a folder's uncertainty network. Raises CheckpointError."""
+    if not (loaded := load_doubt(folder)):
+        raise CheckpointError(f"{folder} has no uncertainty network: train one with `train doubt`")
+    return f"{DOUBT}-{checksum_of(loaded[0])}.onnx", partial(write_onnx, loaded[0], DOUBT_INPUTS, DOUBT_OUTPUTS)
+
+
+def export_onnx(pipeline: RemappingNetwork | DirectNetwork) -> bytes:
+    """Return the pipeline, preprocessing included, as an ONNX file for any batch size. Raises ModelError for color."""
+    if isinstance(pipeline, RemappingNetwork) and pipeline.intensities > 1:
+        raise ModelError(f"color networks ({SIMULATION_ONLY}) cannot be exported: use them in torch")
+    return write_onnx(pipeline, NETWORK_INPUTS, ["image"])
+
+
+def write_onnx(network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]) -> bytes:
+    """Return a network as an ONNX file for any batch size n; inputs are (n, *shape) by name."""
+    return _as_onnx(network, inputs, outputs).SerializeToString()
+
+
+def _as_onnx(network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]) -> onnx.ModelProto:
+    for noisy in ("onnxscript", "torch.onnx"):
+        logging.getLogger(noisy).setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter warns about its own internals
+        program = torch.onnx.export(
+            network.eval(),
+            tuple(torch.ones(2, *shape) for shape in inputs.values()),
+            dynamo=True,
+            input_names=list(inputs),
+            output_names=outputs,
+            dynamic_shapes=tuple({0: torch.export.Dim("n")} for _ in inputs),
+            opset_version=OPSET,
+            verbose=False,
+        )
+    if program is None:
+        raise ModelError("torch's exporter returned no ONNX program: install a torch between 2.6 and 2.13")
+    model = program.model_proto
+    model.ir_version = IR_VERSION
+    return model
+
+
+KINDS = {"F16": "<f2", "F32": "<f4"}
+"""NumPy's names of the types of safetensors files that are linked."""
+
+
+class _StoredTensor(NamedTuple):
+    """Tensor in a safetensors file, and its place there in bytes."""
+
+    values: np.ndarray
+    location: str
+    offset: int
+    length: int
+
+
+def _stored(path: Path, prefix: str) -> Iterator[tuple[str, _StoredTensor]]:
+    """Yield the tensors of a safetensors file: the header's length (8 bytes), the header (JSON), then the tensors."""
+    content = path.read_bytes()
+    start = 8 + int.from_bytes(content[:8], "little")
+    for name, entry in json.loads(content[8:start]).items():
+        if name != "__metadata__" and entry["dtype"] in KINDS:
+            first, last = (start + offset for offset in entry["data_offsets"])
+            values = np.frombuffer(content[first:last], KINDS[entry["dtype"]])
+            yield prefix + name, _StoredTensor(values.reshape(entry["shape"]), path.name, first, last - first)
+
+
+def _linked_graph(
+    network: nn.Module,
+    folder: Path,
+    inputs: Mapping[str, tuple[int, int]],
+    outputs: list[str],
+    parts: Mapping[str, str],
+    sources: Sequence[str],
+) -> bytes:
+    """Return an ONNX file whose large weights are external data in the safetensors files of a folder.
+
+    `parts` has the file of tensors by the prefix of their names in the network; `sources` go into the checksum.
+    """
+    model, stored = _as_onnx(network, inputs, outputs), dict[str, _StoredTensor]()
+    for prefix, name in parts.items():
+        stored.update(_stored(folder / name, prefix))
+    initializers = {initializer.name: initializer for initializer in model.graph.initializer}
+    nodes = list[onnx.NodeProto]()
+    for name in sorted(initializers.keys() & stored.keys()):
+        if linked := _linked(name, numpy_helper.to_array(initializers[name]), stored):
+            model.graph.initializer.remove(initializers[name])
+            model.graph.initializer.extend(linked[0])
+            nodes += linked[1]
+    rest = list(model.graph.node)
+    del model.graph.node[:]
+    for node in rest:
+        node.doc_string = ""
+        del node.metadata_props[:]
+    model.graph.node.extend([*nodes, *rest])
+    helper.set_model_props(model, {CHECKSUM: checksum_of_watched(folder, sources)})
+    return model.SerializeToString()
+
+
+def _linked(
+    name: str, exported: np.ndarray, stored: Mapping[str, _StoredTensor]
+) -> tuple[list[TensorProto], list[onnx.NodeProto]] | None:
+    """Return the initializers and nodes that make an exported weight from its stored float16; None for small ones.
+
+    The exporter multiplies the weights of a convolution by gamma / sqrt(variance + epsilon) of the batch norm after it.
+    The same product is left to ONNX Runtime, which computes constants once, when it opens the graph.
+    """
+    tensor, half = stored[name], f"{name}.half"
+    if tensor.values.dtype != np.float16 or tensor.values.ndim == 1:
+        return None
+    external = TensorProto(name=half, data_type=TensorProto.FLOAT16, dims=exported.shape)
+    external.data_location = TensorProto.EXTERNAL
+    for key, value in (("location", tensor.location), ("offset", tensor.offset), ("length", tensor.length)):
+        external.external_data.add(key=key, value=str(value))
+    plain = tensor.values.astype(np.float32)
+    if np.array_equal(exported, plain):
+        return [external], [helper.make_node("Cast", [half], [name], to=TensorProto.FLOAT)]
+    module, _, index = name.removesuffix(".weight").rpartition(".")
+    norm = f"{module}.{int(index) + 1}" if index.isdecimal() else ""
+    if f"{norm}.running_var" not in stored:
+        return None
+    gamma, variance = stored[f"{norm}.weight"].values, stored[f"{norm}.running_var"].values
+    scale = gamma.astype(np.float32) / np.sqrt(variance + NORM_EPSILON)
+    factor = scale.reshape(-1, *[1] * (plain.ndim - 1))
+    if not np.array_equal(exported, plain * factor):
+        return None
+    nodes = [
+        helper.make_node("Cast", [half], [f"{name}.plain"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", [f"{name}.plain", f"{norm}.scale"], [name]),
+    ]
+    return [external, numpy_helper.from_array(factor, f"{norm}.scale")], nodes
+
+
+def checksum_of(network: nn.Module) -> str:
+    """Return a checksum of all that an exported network depends on: exporter, weights and this package's code."""
+    digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    for name, tensor in sorted(network.state_dict().items()):
+        digest.update(name.encode() + tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+Sample = tuple[Float32, Float32]
+"""Depth and intensity maps, each (n, 64, 80)."""
+QUANTIZED = ["Conv", "MatMul", "Gemm"]
+"""Operators with nearly all of the work; the rest is preprocessing, activations and the silhouette."""
+
+
+def quantize(model: bytes, samples: Iterable[Sample] | None = None) -> bytes:
+    """Return an ONNX file with weights in 8 bits; given samples, also with activations in 8 bits of their ranges.
+
+    The weights take 7 of the 8 bits: where a processor has no VNNI instructions, ONNX Runtime adds two products of 8 by 8
+    bits in 16 bits, which then saturate (measured there: a mean error of 17 % of the picture's spread in place of 3 %).
+    Raises ModelError where ONNX Runtime fails.
+    """
+    from onnxruntime import quantization
+
+    plain = onnx.load_from_string(model)
+    del plain.graph.value_info[:]  # shapes from the exporter; they are wrong after the quantizer transposes a Gemm
+    options: dict[str, Any] = {"op_types_to_quantize": QUANTIZED, "reduce_range": True}
+    logging.getLogger().addFilter(_is_no_advice)  # advice to preprocess the model, sent through the root logger
+    try:
+        with TemporaryDirectory() as folder:
+            part = Path(folder) / "quantized.onnx"
+            if samples is None:
+                quantization.quantize_dynamic(plain, part, **options)
+            else:
+                quantization.quantize_static(plain, part, _reader(samples), per_channel=True, **options)
+            return part.read_bytes()
+    except (RuntimeError, ValueError, OSError) as error:
+        raise ModelError(f"the network cannot be quantised to 8 bits ({error}): use it as it is") from error
+    finally:
+        logging.getLogger().removeFilter(_is_no_advice)
+
+
+def _is_no_advice(record: logging.LogRecord) -> bool:
+    return "pre-processing before quantization" not in record.getMessage()
+
+
+def _reader(samples: Iterable[Sample]) -> Any:
+    from onnxruntime.quantization import CalibrationDataReader
+
+    class Reader(CalibrationDataReader):
+        """Reader of samples, one at a time; None at the end."""
+
+        def __init__(self) -> None:
+            self._rest: Iterator[Sample] = iter(samples)
+
+        def get_next(self) -> Any:
+            sample = next(self._rest, None)
+            return None if sample is None else dict(zip(("depth_m", "intensity"), sample, strict=True))
+
+    return Reader()

@@ -1,0 +1,172 @@
+"""Records of checkpoints, read without torch: runs, rig and held-out figures of weights and of uncertainty networks."""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+
+from nlos_models.errors import CheckpointError, first_problem
+from nlos_models.files import TEXT_LIMIT, read_checked
+from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
+
+RECORD = "checkpoint.json"
+SHIPPED = "paper-rig"
+DOUBT, DOUBT_RECORD = "doubt", "doubt.json"
+WATCHED = "compressor.safetensors", "preprocess.safetensors", "decoder.safetensors"
+DIRECT = "direct"
+
+
+class CheckpointRecord(BaseModel):
+    """Origin of a checkpoint's tensors: rig, kind of maps, recipes of the runs, and held-out figures."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rig_name: str
+    rig_checksum: str
+    input: MapKind = "raw maps"
+    """The compressor's input; difference maps are maps minus the bare wall's."""
+    vae_recipe: Recipe | None = None
+    """None for a compressor and decoder trained in one step."""
+    compressor_recipe: Recipe | None = None
+    """None for a VAE alone."""
+    transfer_recipe: Recipe | None = None
+    """None for weights trained on synthetic maps alone."""
+    direct_recipe: Recipe | None = None
+    """None for anything but a direct network, which has no other networks beside it."""
+    earlier: list[Recipe] = []
+    """Recipes of the runs before those above, the oldest first."""
+    figures: dict[str, float] = {}
+    """Held-out figures at the end of training."""
+    note: str = Field(default="", validate_default=True)
+    """SIMULATION_ONLY for color weights, else empty, whatever value is passed in."""
+
+    @field_validator("note")
+    @classmethod
+    def _note_color(cls, note: str, info: ValidationInfo) -> str:
+        del note
+        return SIMULATION_ONLY if _any_in_color(info.data.get("vae_recipe"), info.data.get("compressor_recipe")) else ""
+
+    @classmethod
+    def of(cls, runs: Iterable[Recipe], rig: tuple[str, str], maps: MapKind = "raw maps") -> Self:
+        """Return the record of the weights that these runs made, the oldest first; `rig` is its (name, checksum)."""
+        last, earlier = dict[str, Recipe](), list[Recipe]()
+        for recipe in runs:
+            replaced = ("compressor", "transfer") if recipe.task == "compressor" else (recipe.task,)
+            earlier += [last.pop(task) for task in replaced if task in last]
+            last[recipe.task] = recipe
+        recipes = {f"{task}_recipe": recipe for task, recipe in last.items()}
+        return cls.model_validate(
+            {"rig_name": rig[0], "rig_checksum": rig[1], "input": maps, "earlier": earlier} | recipes
+        )
+
+    @property
+    def runs(self) -> list[Recipe]:
+        """Recipes of all runs behind these weights, the oldest first."""
+        own = (self.vae_recipe, self.compressor_recipe, self.transfer_recipe, self.direct_recipe)
+        return [*self.earlier, *(recipe for recipe in own if recipe)]
+
+    @property
+    def vae_runs(self) -> list[Recipe]:
+        """Recipes of the runs that trained the encoder or decoder."""
+        return [recipe for recipe in self.runs if recipe.task == "vae" or recipe.steps == "two-then-joint"]
+
+    @property
+    def width(self) -> float:
+        """Channels of the compressor's layers as a share of Table S2's."""
+        return self.compressor_recipe.width if self.compressor_recipe else 1.0
+
+    @property
+    def color(self) -> bool:
+        """True for weights of full color, which is simulation only."""
+        return _any_in_color(self.vae_recipe, self.compressor_recipe)
+
+
+def _any_in_color(*recipes: Recipe | None) -> bool:
+    return any(recipe is not None and recipe.colour for recipe in recipes)
+
+
+def shipped_folder() -> Path:
+    """Return the folder of the weights that come with the package."""
+    return Path(str(resources.files("nlos_models") / "weights" / SHIPPED))
+
+
+def load_record(folder: Path) -> CheckpointRecord:
+    """Return the record of a checkpoint folder. Raises CheckpointError where it is missing or not a record."""
+    try:
+        return CheckpointRecord.model_validate_json(read_checked(folder / RECORD, TEXT_LIMIT))
+    except OSError as error:
+        raise CheckpointError(
+            f"no checkpoint in {folder} ({RECORD} cannot be read): name a folder of weights"
+        ) from error
+    except ValidationError as error:
+        raise CheckpointError(f"{folder / RECORD} is not a checkpoint's record: {first_problem(error)}") from error
+    except ValueError as error:
+        raise CheckpointError(f"{folder / RECORD} is {error}: copy or train the weights again") from error
+
+
+class DoubtRecord(BaseModel):
+    """Watched weights, recipe, calibration and held-out figures of an uncertainty network."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    watches: str
+    """`checksum_of_watched` of the weights whose images it judges."""
+    recipe: Recipe
+    learnt: list[str]
+    """Kinds of outliers in its training set."""
+    temperatures: tuple[float, float] = (1.0, 1.0)
+    """Divisors of the logits of nothing and of outside (out of distribution)."""
+    error_scale: float = Field(default=1.0, gt=0)
+    """Factor of the expected error."""
+    nothing_above: float = Field(default=0.5, ge=0, le=1)
+    """Lowest probability of the verdict that nothing is hidden."""
+    outside_above: float = Field(default=0.5, ge=0, le=1)
+    """Lowest probability of the verdict that a frame is out of distribution (outside the trained range)."""
+    figures: dict[str, float] = {}
+    """Held-out figures at the end of training and of the calibration."""
+
+
+def watched_files(folder: Path) -> tuple[str, ...]:
+    """Return the names of the files with the weights that make images: of a direct network, or of a pipeline."""
+    direct = f"{DIRECT}.safetensors"
+    return (direct,) if (folder / direct).exists() else WATCHED
+
+
+def checksum_of_watched(folder: Path, names: Sequence[str] = ()) -> str:
+    """Return a checksum, 12 hexadecimal digits, of files: by default `watched_files`. Raises CheckpointError."""
+    digest = hashlib.sha256()
+    for name in names or watched_files(folder):
+        try:
+            digest.update((folder / name).read_bytes())
+        except OSError as error:
+            raise CheckpointError(
+                f"{folder / name} cannot be read: name a folder with a compressor's weights"
+            ) from error
+    return digest.hexdigest()[:12]
+
+
+def load_doubt_record(folder: Path) -> DoubtRecord | None:
+    """Return the record of the uncertainty network beside a pipeline's weights, or None where there is none.
+
+    Raises CheckpointError where it cannot be read or watches other weights.
+    """
+    path = folder / DOUBT_RECORD
+    if not path.exists():
+        return None
+    try:
+        record = DoubtRecord.model_validate_json(read_checked(path, TEXT_LIMIT))
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: train it again with `train doubt`") from error
+    except ValidationError as error:
+        raise CheckpointError(f"{path} is not an uncertainty network's record: {first_problem(error)}") from error
+    except ValueError as error:
+        raise CheckpointError(f"{path} is {error}: train it again with `train doubt`") from error
+    if record.watches != (found := checksum_of_watched(folder)):
+        raise CheckpointError(
+            f"{path} watches other weights ({record.watches}) than those beside it ({found}): train it again with "
+            "`train doubt`, or remove it"
+        )
+    return record

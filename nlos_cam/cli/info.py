@@ -1,0 +1,49 @@
+"""The command `info`: kind, origin, content and damage of a file or folder, and the commands to go on with."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nlos_cam import info as inspect
+from nlos_cam.cli.common import Json, finish, interrupted_by_signals
+from nlos_cam.errors import RecordingError
+
+UNITS = (1e9, "GB"), (1e6, "MB"), (1e3, "kB")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("info")(info)
+
+
+def info(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="File or folder that nlos-cam wrote or reads.")],
+    verify: Annotated[bool, typer.Option("--verify", help="Read all of it, not its index or heads alone.")] = False,
+    json: Json = False,
+) -> None:
+    """Describe a file or folder: kind, origin, content, whether it is whole, next commands."""
+    with interrupted_by_signals():
+        found = inspect.describe(path, verify=verify)
+    result = {"path": str(path), "whole": not found.problem, **asdict(found)}
+    finish(result, as_json=json, text=_format(path, found))
+    if found.problem:
+        raise typer.Exit(RecordingError.exit_code)
+
+
+def _format(path: Path, found: inspect.Description) -> str:
+    facts = {"created": found.created, "made by": found.made_by, **found.facts}
+    whole = f"no: {found.problem}" if found.problem else "yes"
+    facts["whole"] = f"{whole} (checked: {found.checked})" if found.checked else whole
+    width = max(map(len, facts))
+    lines = [f"{path}: {found.kind}, {_format_size(found.bytes)}"]
+    lines += [f"  {name:{width}}  {value}" for name, value in facts.items() if value]
+    return "\n".join([*lines, *(["Next:"] if found.next else []), *(f"  {line}" for line in found.next)])
+
+
+def _format_size(size: int) -> str:
+    unit, name = next(((unit, name) for unit, name in UNITS if size >= unit), (1, "bytes"))
+    return f"{size / unit:.3g} {name}"

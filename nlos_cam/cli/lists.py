@@ -1,0 +1,55 @@
+"""`nlos-cam scenes|objects|rigs|recipes`: things that come with the package, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import nlos_calibration as walls
+import nlos_models as models
+import typer
+
+from nlos_cam import camera as cameras
+from nlos_cam import objects as shapes
+from nlos_cam import render as renderer
+from nlos_cam.cli.common import Json, finish
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    for command in (scenes, objects, rigs, recipes):
+        app.command()(command)
+
+
+def scenes(json: Json = False) -> None:
+    """List the packaged scenes: simulated benches, used as CAMERA."""
+    examples = {f"sim:{name}": _title(path) for name, path in renderer.packaged_scenes().items()}
+    _print("scenes", {**cameras.SIMULATED, **examples}, as_json=json)
+
+
+def objects(json: Json = False) -> None:
+    """List the kinds of hidden objects, for `render` and scene files."""
+    kinds = {name: f"varies in {', '.join(kind.settings)}" for name, kind in shapes.CATEGORIES.items()}
+    _print("objects", kinds, as_json=json)
+
+
+def rigs(json: Json = False) -> None:
+    """List the packaged rigs, for --rig and scene files."""
+    _print("rigs", {path.stem: _title(path) for path in walls.packaged_rigs()}, as_json=json)
+
+
+def recipes(json: Json = False) -> None:
+    """List the packaged training recipes, for --recipe."""
+    _print("recipes", {name: _title(path) for name, path in models.packaged_recipes().items()}, as_json=json)
+
+
+def _title(path: Path) -> str:
+    """Return the comment at the head of a TOML file, less the command in it."""
+    line = path.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ")
+    return line.partition(": `")[0].rstrip(".:")
+
+
+def _print(kind: str, found: Mapping[str, str], *, as_json: bool) -> None:
+    width = max(map(len, found))
+    text = "\n".join(f"{name:{width}}  {description}" for name, description in found.items())
+    finish({kind: [{"name": name, "description": what} for name, what in found.items()]}, as_json=as_json, text=text)

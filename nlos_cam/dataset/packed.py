@@ -1,0 +1,106 @@
+"""Packed store of datasets for the direct network: normalised maps and images in float16, mapped into memory.
+
+A store grows: shards that appear in the datasets are added when an epoch begins. It keeps the number of objects of
+every epoch, so that an interrupted run sees the same batches again.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nlos_models import CellNormal, NormalBatch
+
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.reader import MAP_CHANNELS, open_dataset
+from nlos_cam.dataset.samples import OnProgress, ignore
+from nlos_cam.dataset.shards import SHARD_PATTERN, read_arrays, read_head
+from nlos_cam.errors import RecordingError, SceneError
+from nlos_cam.files import atomic_file
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
+
+INDEX, MAPS, IMAGES, CELLS = "index.json", "maps.f16", "images.f16", "cells.npz"
+ROW = {MAPS: (2, MAP_ROWS, MAP_COLUMNS), IMAGES: (OBJECT_PIXELS, OBJECT_PIXELS)}
+STATISTICS_SHARDS = 40
+"""Shards of each dataset that the cells' statistics are taken from: 4,000 objects."""
+
+
+class PackedMaps:
+    """Normalised maps and images of one or more datasets of one rig, in a folder that is theirs alone."""
+
+    def __init__(self, datasets: Sequence[Path], store: Path, on_progress: OnProgress = ignore) -> None:
+        """Open or make the store. Raises RecordingError for no dataset, SceneError for datasets of two rigs."""
+        opened = [open_dataset(folder) for folder in datasets]
+        self.plan: DatasetPlan = opened[0].plan
+        """Of the first dataset."""
+        if others := [one.folder for one in opened if one.plan.rig != self.plan.rig]:
+            raise SceneError(f"{others[0]} and {datasets[0]} were rendered for different rigs: give datasets of one")
+        self._datasets, self._store, self.normal = list(datasets), store, CellNormal()
+        store.mkdir(parents=True, exist_ok=True)
+        self._index: dict[str, Any] = {"shards": {}, "epochs": {}}
+        if (store / INDEX).exists():
+            self._index = json.loads((store / INDEX).read_text(encoding="utf-8"))
+        if not (store / CELLS).exists():
+            some = [read_arrays(shard, MAP_CHANNELS[:2]) for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
+            self.normal.learn(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*some, strict=True)))
+            with atomic_file(store / CELLS) as part, part.open("wb") as file:
+                np.savez(file, **{name: values.numpy() for name, values in self.normal.state_dict().items()})
+        with np.load(store / CELLS) as cells:
+            self.normal.load_state_dict({name: torch.from_numpy(cells[name]) for name in cells})
+        self.refresh(on_progress)
+
+    def __len__(self) -> int:
+        return sum(self._index["shards"].values())
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the rig and of the cells' statistics: a run with others cannot be resumed."""
+        return hashlib.sha256(self.plan.rig.checksum.encode() + (self._store / CELLS).read_bytes()).hexdigest()
+
+    def refresh(self, on_progress: OnProgress = ignore) -> None:
+        """Add the shards that appeared in the datasets since the last time."""
+        known = self._index["shards"]
+        paths = [path for folder in self._datasets for path in sorted(folder.glob(SHARD_PATTERN))]
+        new = [path for path in paths if str(path.resolve()) not in known]
+        for name, shape in ROW.items():
+            path = self._store / name
+            path.touch()
+            with path.open("r+b") as file:  # rows after the last indexed one are left by an interruption
+                file.truncate(2 * len(self) * int(np.prod(shape)))
+        for number, path in enumerate(new, 1):
+            head = read_head(path)
+            depth_m, intensity, image = read_arrays(head, MAP_CHANNELS)
+            normal = self.normal(torch.from_numpy(depth_m), torch.from_numpy(intensity)).half().numpy()
+            for name, values in ((MAPS, normal), (IMAGES, image.astype(np.float16))):
+                with (self._store / name).open("ab") as file:
+                    file.write(np.ascontiguousarray(values).tobytes())
+            known[str(path.resolve())] = len(image)
+            if number % 50 == 0 or number == len(new):
+                self._write_index()
+            on_progress(number, len(new))
+
+    def _write_index(self) -> None:
+        with atomic_file(self._store / INDEX) as part:
+            part.write_text(json.dumps(self._index), encoding="utf-8")
+
+    def batches(self, batch: int, generator: torch.Generator) -> Iterator[NormalBatch]:
+        """Yield one pass over the objects in random order, without the last, smaller batch.
+
+        A generator's first pass adds new shards; a generator of the same seed sees the same objects again.
+        """
+        key, epochs = str(generator.initial_seed()), self._index["epochs"]
+        if key not in epochs:
+            self.refresh()
+            epochs[key] = len(self)
+            self._write_index()
+        count = int(epochs[key])
+        if count < batch:
+            raise RecordingError(f"{count} objects are fewer than a batch of {batch}: build more, or lower batch")
+        files = [np.memmap(self._store / name, np.float16, "r", shape=(count, *shape)) for name, shape in ROW.items()]
+        order = torch.randperm(count, generator=generator).numpy()
+        for start in range(0, count - batch + 1, batch):
+            rows = np.sort(order[start : start + batch])
+            yield NormalBatch(*(torch.from_numpy(file[rows]) for file in files))

@@ -1,0 +1,76 @@
+"""Dispatch of files and folders to the description of their kind."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from nlos_calibration.errors import CalibrationError
+from nlos_models.errors import ModelError
+
+from nlos_cam.errors import NlosCamError, RecordingError
+from nlos_cam.info.description import Description, size_of
+from nlos_cam.info.files import (
+    describe_bag,
+    describe_json,
+    describe_npz,
+    describe_page,
+    describe_rrd,
+    describe_shard,
+    describe_toml,
+)
+from nlos_cam.info.folders import FOLDERS
+from nlos_cam.recording import SAMPLE
+
+Describe = Callable[[Path, bool], Description | None]
+FILES: dict[str, tuple[str, Describe]] = {
+    ".bag": ("recording", describe_bag),
+    ".npz": ("arrays", describe_npz),
+    ".toml": ("record", describe_toml),
+    ".json": ("record", describe_json),
+    ".html": ("page", describe_page),
+    ".rrd": ("saved view", describe_rrd),
+    ".h5": ("dataset shard", describe_shard),
+}
+"""Word for a damaged file, and reader, by suffix."""
+KINDS = (
+    "recordings (.bag) and their sidecars (.json), .npz files, saved views and reports (.html), wall, scene, rig and "
+    "recipe files (.toml), dataset shards (.h5), and the folders of datasets, training runs, weights, replays, "
+    "exports, evaluations and trade-offs"
+)
+
+
+def describe(path: Path, *, verify: bool = False) -> Description:
+    """Return the description of a file or folder; `verify` reads all of it instead of its heads.
+
+    The name "sample" stands for the packaged recording. A damaged one has a `problem`. Raises RecordingError where
+    there is none, or it is of no known kind.
+    """
+    if not path.exists() and str(path) == SAMPLE.stem:
+        path = SAMPLE
+    if not path.exists():
+        raise RecordingError(f"{path} does not exist: check the name")
+    if not path.is_dir() and not path.is_file():  # opening a pipe would wait for a writer
+        raise RecordingError(f"{path} is neither a file nor a folder: check the name")
+    if path.is_dir():
+        readers = [(kind, reader) for mark, kind, reader in FOLDERS if any(path.glob(mark))]
+    else:
+        readers = [FILES[path.suffix]] if path.suffix in FILES else []
+    for kind, reader in readers:
+        try:
+            found = reader(path, verify)
+        except (NlosCamError, CalibrationError, ModelError) as error:
+            found = Description(kind, problem=" ".join(str(error).split()))
+        except (LookupError, TypeError, ValueError, AttributeError) as error:  # fields that the program never wrote
+            found = Description(
+                kind, problem=f"{path} is damaged ({type(error).__name__} in its fields): make it again"
+            )
+        except OSError as error:
+            raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from error
+        if found:
+            return replace(found, bytes=size_of(path), created=found.created or _file_date(path))
+    raise RecordingError(f"{path} is of no known kind. Known are {KINDS}")
+
+
+def _file_date(path: Path) -> str:
+    return f"{datetime.fromtimestamp(path.stat().st_mtime, UTC):%Y-%m-%d %H:%M:%S} UTC (file's date)"

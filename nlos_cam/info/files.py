@@ -1,0 +1,280 @@
+"""Descriptions of single files."""
+
+import json
+import shlex
+import tomllib
+import zlib
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile, ZipFile
+
+import numpy as np
+from nlos_calibration import load_rig, load_wall
+from nlos_models import load_recipe
+
+from nlos_cam.errors import NlosCamError, RecordingError
+from nlos_cam.info.description import Description, count
+
+MAX_TEXT_BYTES = 16 << 20
+SESSION_MARK = b"nlos-cam session"
+"""In the head of a saved view."""
+
+
+def describe_bag(path: Path, verify: bool) -> Description:
+    """Describe a recording from its index, or with `verify` from every message."""
+    from nlos_cam.camera import FORMATS
+    from nlos_cam.recording import BagReader, load_sidecar, sidecar_path
+
+    bag = BagReader(path)
+    facts = {"device": " ".join(bag.device.get(name, "") for name in ("name", "serial_number")).strip() or "not known"}
+    if longest := max(bag.streams.values(), key=lambda info: info.frames if info.format else 0, default=None):
+        ends_s = [bag.sample(longest.name, k).timestamp_s for k in (0, longest.frames - 1)]
+        facts["duration"] = f"{max(ends_s[1] - ends_s[0], 0.0):.1f} s"
+    for name, info in bag.streams.items():
+        size = f"{info.intrinsics.width} x {info.intrinsics.height}"
+        form = info.format or f"{info.encoding} (not readable)"
+        facts[name] = f"{count(info.frames, 'frame')}, {info.frames_per_s} per second, {size}, {form}"
+    created = made_by = problem = ""
+    if sidecar_path(path).exists():
+        try:
+            sidecar = load_sidecar(sidecar_path(path))
+            created, made_by = f"{sidecar.started:%Y-%m-%d %H:%M:%S} UTC", f"nlos-cam {sidecar.versions['nlos-cam']}"
+            facts |= {"label": sidecar.label or "none", "camera": sidecar.camera, "state": sidecar.state}
+        except (RecordingError, KeyError) as error:
+            facts["sidecar"] = f"not readable: {error}"
+    if verify:
+        try:
+            bag.check()
+        except RecordingError as error:
+            problem = str(error)
+    quoted = shlex.quote(str(path))
+    is_lidar = all(stream in bag.streams and bag.streams[stream].format == form for stream, form in FORMATS.items())
+    following = [f"nlos-cam export {quoted}"]
+    if is_lidar and not problem:
+        following = [f"nlos-cam replay {quoted} --out replayed", *following]
+    return Description(
+        "recording of a lidar" if is_lidar else "recording of a RealSense camera",
+        facts,
+        created,
+        made_by,
+        problem,
+        "every message" if verify else "index; --verify reads every message",
+        following,
+    )
+
+
+REPLAYED = "result of a replay"
+ARRAYS = (
+    ({"depth_m", "verdict", "origin_m"}, REPLAYED),
+    ({"depth_m", "reference_sha256"}, "difference maps of a replay"),
+    ({"object_depth_m", "margin", "radiometry"}, "rendering"),
+    ({"inliers", "map_depth_m", "facts"}, "reference of a bare wall"),
+    ({"pixels", "frame_number", "timestamp_s"}, "exported stream"),
+    ({"vertices_m", "faces"}, "mesh of a hidden surface"),
+)
+"""Names that all files of a kind have."""
+COUNTED = {"frame_number", "timestamp_s", "verdict", "object_depth_m", "facts", "vertices_m", "faces"}
+"""Arrays that are read, each up to MAX_ARRAY_BYTES."""
+MAX_ARRAY_BYTES = 256 << 20
+
+
+def describe_npz(path: Path, verify: bool) -> Description:
+    """Describe arrays of `replay`, `render`, `calibrate` or `export`, by their names."""
+    try:
+        with ZipFile(path) as file:
+            names = {Path(name).stem for name in file.namelist()}
+            if any(each.file_size > MAX_ARRAY_BYTES for each in file.infolist() if Path(each.filename).stem in COUNTED):
+                raise RecordingError(f"{path} holds more than {MAX_ARRAY_BYTES >> 20} MiB of numbers: make it again")
+            bad = file.testzip() if verify else None
+        with path.open("rb") as file:
+            arrays: Any = np.load(file)
+            kind, facts, following = _kind_of_arrays(path, names, arrays)
+    except (BadZipFile, OSError, ValueError, LookupError, EOFError, zlib.error) as error:
+        if isinstance(error, OSError) and error.errno:
+            raise
+        raise RecordingError(f"{path} is cut short or damaged ({error}): make it again") from error
+    problem = f"{path} is damaged (the checksum of {bad} differs): make it again" if bad else ""
+    checked = "checksums of all arrays" if verify else "list of arrays; --verify reads all"
+    return Description(kind, facts, "", "", problem, checked, following)
+
+
+def _kind_of_arrays(path: Path, names: set[str], arrays: Any) -> tuple[str, dict[str, str], list[str]]:
+    """Return kind, facts and next commands. Raises what numpy raises for damaged arrays."""
+    quoted, following = shlex.quote(str(path)), list[str]()
+    facts = {"rig": f"{arrays['rig_name']} {arrays['rig_checksum']}"} if "rig_name" in names else {}
+    kind = next((kind for needed, kind in ARRAYS if needed <= names), "arrays of another program")
+    facts |= _frames(arrays) if {"frame_number", "timestamp_s"} <= names else {}
+    if kind == REPLAYED:
+        verdicts, counts = np.unique(arrays["verdict"], return_counts=True)
+        facts["verdicts"] = ", ".join(f"{verdict or 'none'} {n}" for verdict, n in zip(verdicts, counts, strict=True))
+        following = [f"nlos-cam export {quoted} --object ply,glb,csv"]
+    elif "object_depth_m" in names:
+        known = np.isfinite(arrays["object_depth_m"])
+        facts |= {"radiometry": str(arrays["radiometry"]), "object": f"{known.sum()} of {known.size} pixels"}
+    elif "inliers" in names:
+        known = json.loads(str(arrays["facts"]))
+        facts |= {"frames": str(known.get("frames")), "serial": known.get("serial") or "not known"}
+        following = [f"nlos-cam info {shlex.quote(str(path.with_suffix('.toml')))}"]
+    elif "vertices_m" in names:
+        facts |= {"vertices": str(len(arrays["vertices_m"])), "faces": str(len(arrays["faces"]))}
+    else:
+        facts["arrays"] = ", ".join(sorted(names))
+    return kind, facts, following
+
+
+def _frames(arrays: Any) -> dict[str, str]:
+    numbers, times_s = arrays["frame_number"], arrays["timestamp_s"]
+    if not len(numbers):
+        return {"frames": "none"}
+    span_s = times_s[-1] - times_s[0]
+    return {"frames": f"{len(numbers)}, numbers {numbers[0]} to {numbers[-1]}", "duration": f"{span_s:.1f} s"}
+
+
+def describe_toml(path: Path, verify: bool) -> Description | None:
+    """Describe a wall record, scene, rig, recipe or settings file, by its keys."""
+    del verify  # it is always read whole
+    try:
+        keys = tomllib.loads(_text(path))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise RecordingError(f"{path} is not TOML ({error}): correct it, or write it again") from error
+    quoted, checked = shlex.quote(str(path)), "all fields"
+    if {"created", "verdict"} & set(keys):
+        return _wall(path, quoted)
+    if "task" in keys:
+        recipe = load_recipe(path)
+        facts = {"task": recipe.task, "epochs": str(recipe.epochs)}
+        return Description("training recipe", facts, checked=checked, next=[f"nlos-cam train {recipe.task} --help"])
+    if {"pinhole", "lidar"} & set(keys):
+        rig = load_rig(str(path))
+        facts = {"name": rig.name, "checksum": rig.checksum, **_pose(rig)}
+        return Description("rig", facts, checked=checked, next=[f"nlos-cam render cup --rig {quoted}"])
+    if {"rig", "object", "motion", "sensor", "faults", "radiometry"} & set(keys):
+        from nlos_cam.render import load_scene
+
+        scene = load_scene(path)
+        facts = {"name": scene.name, "rig": scene.rig.name, "radiometry": scene.radiometry}
+        facts["frames"] = f"{count(scene.motion.poses, 'pose')}, repeated" if scene.motion else "one pose"
+        following = [f"nlos-cam live --camera sim:{quoted}", f"nlos-cam capture --camera sim:{quoted} --out run.bag"]
+        return Description("scene of the simulated camera", facts, checked=checked, next=following)
+    if path.name == "nlos-cam.toml":
+        return Description("settings", {key: str(value) for key, value in keys.items()}, next=["nlos-cam config"])
+    return None
+
+
+def _wall(path: Path, quoted: str) -> Description:
+    record = load_wall(path)
+    facts = {"verdict": f"{record.verdict}: {record.advice}", "camera": record.camera, "frames": str(record.frames)}
+    facts |= {**_pose(record.rig), "occluder": record.occluder.source if record.occluder else "not measured"}
+    problem = ""
+    if record.reference:
+        reference = path.with_name(record.reference)
+        facts["reference"] = record.reference
+        problem = "" if reference.exists() else f"its reference {reference} is missing: put it back, or calibrate again"
+    following = [f"nlos-cam live --camera l515 --wall {quoted}"]
+    if record.occluder is None:
+        following.append(f"nlos-cam calibrate --occluder {quoted} --camera l515 --out bench.toml")
+    return Description(
+        "wall record", facts, str(record.created), "nlos-cam calibrate", problem, "all fields", following
+    )
+
+
+def _pose(rig: Any) -> dict[str, str]:
+    return {"lidar": f"{1e3 * rig.lidar.distance_m:.1f} mm from the wall, facing {rig.facing_deg:.2f}°"}
+
+
+def _text(path: Path) -> str:
+    """Return a file's text. Raises RecordingError for a binary file or one too long for a record."""
+    if path.stat().st_size > MAX_TEXT_BYTES:
+        raise RecordingError(f"{path} has {path.stat().st_size >> 20} MiB, too many for a record: check the name")
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path} is a binary file, not a {path.suffix} file: check the name") from error
+
+
+JSON_KINDS = {
+    "bars": "figures of an evaluation",
+    "pareto_front": "table of a trade-off",
+    "recording": "record of an export",
+    "rig_checksum": "record of weights",
+    "watches": "record of an uncertainty network",
+}
+"""Kinds of JSON files by a key that no other has."""
+
+
+def describe_json(path: Path, verify: bool) -> Description | None:
+    """Describe a sidecar, or one of the program's other JSON files."""
+    try:
+        keys = json.loads(_text(path))
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"{path} is not JSON ({error}): it is cut short or damaged; make it again") from error
+    if isinstance(keys, dict) and {"state", "started"} <= set(keys):
+        return _sidecar(path, verify)
+    kinds = [kind for key, kind in JSON_KINDS.items() if isinstance(keys, dict) and key in keys]
+    if not kinds:
+        return None
+    return Description(kinds[0], {}, checked="JSON")
+
+
+def _sidecar(path: Path, verify: bool) -> Description:
+    from nlos_cam.recording import load_sidecar
+
+    sidecar, bag = load_sidecar(path), path.with_suffix(".bag")
+    facts = {"camera": sidecar.camera, "state": sidecar.state, "label": sidecar.label or "none"}
+    if sidecar.summary and sidecar.summary.frames is not None:
+        facts["frames"] = f"{sidecar.summary.frames}, {sidecar.summary.dropped or 0} dropped"
+    problem = ""
+    if not bag.exists():
+        problem = f"its recording {bag} is missing: put it back beside this file"
+    elif verify:
+        problem = describe_bag(bag, verify).problem
+    made_by = f"nlos-cam {sidecar.versions.get('nlos-cam', '')} capture"
+    following = [] if problem else [f"nlos-cam info {shlex.quote(str(bag))}"]
+    created = f"{sidecar.started:%Y-%m-%d %H:%M:%S} UTC"
+    return Description("sidecar of a recording", facts, created, made_by, problem, "all fields", following)
+
+
+def describe_page(path: Path, verify: bool) -> Description | None:
+    """Describe a saved view or a report."""
+    del verify
+    with path.open("rb") as file:
+        head = file.read(1 << 14)
+        file.seek(max(path.stat().st_size - 64, 0))
+        end = file.read()
+    if SESSION_MARK in head:
+        return Description("saved view", checked="head", next=[f"nlos-cam view {shlex.quote(str(path))}"])
+    if b'<p class="under">' not in head:
+        return None
+    title = head.partition(b"<title>")[2].partition(b"</title>")[0].decode("utf-8", "replace")
+    problem = "" if b"</html>" in end else f"{path} is cut short: write the report again"
+    return Description("report", {"title": title}, problem=problem, checked="head and end")
+
+
+def describe_rrd(path: Path, verify: bool) -> Description | None:
+    """Describe a saved view of an earlier version, which Rerun opens."""
+    del verify
+    with path.open("rb") as file:
+        if file.read(3) != b"RRF":
+            return None
+    following = ["pip install 'rerun-sdk==0.41.*'", f"rerun {shlex.quote(str(path))}"]
+    return Description("saved view of an earlier version", checked="first bytes", next=following)
+
+
+def describe_shard(path: Path, verify: bool) -> Description:
+    """Describe a shard of a dataset; its heads have checksums."""
+    from nlos_cam.dataset import check_arrays, read_head, shard_origin
+
+    head = read_head(path)
+    problem = ""
+    if verify:
+        try:
+            check_arrays(head)
+        except NlosCamError as error:
+            problem = str(error)
+    version, command = shard_origin(path)
+    seeds = f"{len(head.seeds)}, seeds {head.seeds.start} to {head.seeds.stop - 1}"
+    facts = {"objects": seeds, "rig": head.plan.rig.name}
+    made_by = f"nlos-cam {version}: {command}"
+    checked = "checksums of all arrays" if verify else "checksums of plan and seeds; --verify reads all"
+    following = [f"nlos-cam info {shlex.quote(str(path.parent))}"]
+    return Description("dataset shard", facts, "", made_by, problem, checked, following)

@@ -1,0 +1,150 @@
+"""Descriptions of folders, known by a file that each kind holds."""
+
+import csv
+import hashlib
+import json
+import shlex
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from nlos_models import CHECKSUMS, checksums_of, load_record
+
+from nlos_cam.errors import NlosCamError, RecordingError
+from nlos_cam.info.description import Description, count
+from nlos_cam.info.files import describe_npz
+
+
+def describe_dataset(folder: Path, verify: bool) -> Description:
+    """Describe a dataset from the heads of its shards."""
+    from nlos_cam.dataset import check_arrays, shard_origin, shards_of
+
+    shards = shards_of(folder)
+    plan, (version, command) = shards[0].plan, shard_origin(shards[0].path)
+    objects, span = sum(len(shard.seeds) for shard in shards), shards[-1].seeds.stop - shards[0].seeds.start
+    facts = {
+        "objects": f"{objects} in {count(len(shards), 'shard')}",
+        "seeds": f"{shards[0].seeds.start} to {shards[-1].seeds.stop - 1}" + (", with gaps" if objects < span else ""),
+        "kind": "color" if plan.textures else "depth",
+        "rig": plan.rig.name,
+    }
+    problem = ""
+    if verify:
+        try:
+            for shard in shards:
+                check_arrays(shard)
+        except NlosCamError as error:
+            problem = str(error)
+    others = {shard.path.name for shard in shards if shard.provenance != shards[0].provenance}
+    if others and not problem:
+        facts["other plans"] = f"{count(len(others), 'shard')}, such as {min(others)}"
+    quoted = shlex.quote(str(folder))
+    following = [f"nlos-cam evaluate --dataset {quoted}", f"nlos-cam train compressor --dataset {quoted} --help"]
+    checked = "checksums of all arrays" if verify else "checksums of plans and seeds; --verify reads all"
+    return Description("dataset", facts, "", f"nlos-cam {version}: {command}", problem, checked, following)
+
+
+def describe_weights(folder: Path, verify: bool) -> Description:
+    """Describe weights from their record; their files have checksums."""
+    record, quoted = load_record(folder), shlex.quote(str(folder))
+    facts = {
+        "rig": f"{record.rig_name} {record.rig_checksum}",
+        "input": record.input,
+        "runs": ", ".join(f"{recipe.task} ({count(recipe.epochs, 'epoch')})" for recipe in record.runs) or "none",
+        "networks": ", ".join(sorted(path.stem for path in folder.glob("*.safetensors"))) or "none",
+        "uncertainty": "yes" if (folder / "doubt.json").exists() else "no",
+    }
+    facts |= {name: f"{value:.3g}" for name, value in record.figures.items()}
+    problem = _checksum_problem(folder)
+    del verify  # some 50 MB: always read
+    following = [f"nlos-cam evaluate --weights {quoted}", f"nlos-cam live --camera sim --weights {quoted}"]
+    return Description("weights", facts, "", "", problem, f"checksums in {CHECKSUMS}", following)
+
+
+def _checksum_problem(folder: Path) -> str:
+    """Return the first file that is missing or differs from its checksum; empty if none does."""
+    for name, digest in checksums_of(folder).items():
+        file = folder / name
+        if not file.exists():
+            return f"{file} is missing: copy the weights again"
+        if hashlib.sha256(file.read_bytes()).hexdigest() != digest:
+            return f"{file} is damaged (its checksum differs from {CHECKSUMS}): copy the weights again"
+    return ""
+
+
+def describe_run(folder: Path, verify: bool) -> Description:
+    """Describe a training run from its log."""
+    del verify
+    with (folder / "log.csv").open(encoding="utf-8", newline="") as file:
+        rows = [*csv.DictReader(file)]
+    finished = (folder / "checkpoint.json").exists()
+    facts = {"epochs": str(len(rows)), "state": "finished" if finished else "not finished: the same command resumes"}
+    if rows:
+        facts |= {f"last {name}": value for name, value in rows[-1].items() if name and value and name != "epoch"}
+    quoted = shlex.quote(str(folder))
+    following = [f"nlos-cam evaluate --weights {quoted}"] if finished else []
+    return Description("training run", facts, "", "", "", "log", following)
+
+
+def describe_replay(folder: Path, verify: bool) -> Description:
+    """Describe a replay from its result."""
+    found = describe_npz(folder / "reconstruction.npz", verify)
+    page = [f"open {shlex.quote(str(folder / 'report.html'))}"] if (folder / "report.html").exists() else []
+    return Description("replay", found.facts, "", "nlos-cam replay", found.problem, found.checked, [*page, *found.next])
+
+
+def describe_export(folder: Path, verify: bool) -> Description:
+    """Describe an export from its record."""
+    del verify
+    record = _json(folder / "export.json")
+    streams = record.get("streams", {})
+    facts = {"recording": str(record.get("recording")), "every": f"{record.get('every', 1)}. frame"}
+    for name in streams:
+        images = len([*(folder / name).glob("*.png")])
+        facts[name] = f"{images} images" if images else "arrays" if (folder / f"{name}.npz").exists() else "left out"
+    facts["point clouds"] = str(len([*(folder / "points").glob("*.ply")]))
+    return Description("export of a recording", facts, "", "nlos-cam export", "", "record")
+
+
+def describe_figures(folder: Path, verify: bool) -> Description:
+    """Describe an evaluation from its figures."""
+    del verify
+    figures = _json(folder / "figures.json")
+    facts = {name: str(figures[name]) for name in ("what", "objects", "weights", "rig", "runtime") if name in figures}
+    if iou := figures.get("silhouette_iou"):
+        facts["silhouette IoU"] = (
+            f"{iou['value']:.3f} ({iou['low']:.3f} to {iou['high']:.3f})" if iou["value"] else "none"
+        )
+    following = [f"open {shlex.quote(str(folder / 'report.html'))}"]
+    return Description("evaluation", facts, "", "nlos-cam evaluate", "", "JSON", following)
+
+
+def describe_tradeoff(folder: Path, verify: bool) -> Description:
+    """Describe a trade-off from its table."""
+    del verify
+    table = _json(folder / "tradeoff.json")
+    facts = {"machine": str(table.get("machine")), "complete": "yes" if table.get("complete") else "no: interrupted"}
+    following = [f"open {shlex.quote(str(folder / 'tradeoff.html'))}"]
+    return Description("trade-off", facts, "", "nlos-cam tradeoff", "", "JSON", following)
+
+
+def _json(path: Path) -> Mapping[str, dict[str, float]]:
+    """Return a JSON object. Raises RecordingError for anything else."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"{path} is not JSON ({error}): it is cut short or damaged; make it again") from error
+    if not isinstance(found, dict):
+        raise RecordingError(f"{path} is not a JSON object: make it again")
+    return found
+
+
+FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description]]] = [
+    ("shard-*.h5", "dataset", describe_dataset),
+    ("log.csv", "training run", describe_run),
+    ("checkpoint.json", "weights", describe_weights),
+    ("reconstruction.npz", "replay", describe_replay),
+    ("export.json", "export of a recording", describe_export),
+    ("figures.json", "evaluation", describe_figures),
+    ("tradeoff.json", "trade-off", describe_tradeoff),
+]
+"""File that each kind holds, kind and reader; the first that fits is taken."""

@@ -1,0 +1,70 @@
+"""Recording that begins and ends while a live run goes on, with its sidecar."""
+
+from collections import Counter
+from pathlib import Path
+
+from nlos_cam.camera import FRAMES_PER_S, Camera, Recording
+from nlos_cam.errors import NlosCamError
+from nlos_cam.frames import Frame
+from nlos_cam.reconstruct import Clock
+from nlos_cam.recording import (
+    CaptureResult,
+    CaptureTarget,
+    QualityMeter,
+    SidecarFile,
+    State,
+    finalize,
+    sidecar_path,
+    verify,
+)
+
+
+class LiveRecording:
+    """Recording of a running camera from construction to `stop`; `add` gets its frames in the reader's thread.
+
+    Raises NlosCamError for a camera that cannot be recorded, and the errors of `Recording`.
+    """
+
+    def __init__(self, camera: Camera, path: Path, label: str | None, clock: Clock) -> None:
+        self.path, self.start_s = path, clock()
+        self._camera, self._target = camera, CaptureTarget(path, label)
+        if not hasattr(camera, "start_recording"):
+            raise NlosCamError(f"{camera.uri} cannot be recorded: only a live camera (l515, sim) can")
+        self._sidecar, self._meter = SidecarFile(sidecar_path(path), camera, label=label), QualityMeter()
+        self._recording = Recording(path, optional=True, last=False)
+        try:
+            camera.start_recording(self._recording)  # type: ignore[attr-defined]  checked above
+        except BaseException:
+            self._sidecar.path.unlink(missing_ok=True)
+            raise
+
+    def add(self, frame: Frame) -> None:
+        """Note a frame, if it is part of the recording."""
+        if self._recording.covers(frame.timestamp_s):
+            self._meter.add(frame)
+            self._sidecar.on_frame(frame)
+
+    def stop(self) -> str:
+        """Close the file, read it back, write the sidecar's end, and return the outcome in words.
+
+        Raises RecordingError for a damaged file, DiskFullError where there was no room.
+        """
+        sets = self._recording.sets
+        self._camera.stop_recording()  # type: ignore[attr-defined]  it started one
+        state: State = "disk full" if self._recording.disk_full else "complete"
+        result = CaptureResult(
+            self._target,
+            state,
+            self._recording.sets or sets,
+            self._meter.quality(),
+            self._sidecar,
+            follows_another=True,
+            events=Counter(self._camera.counts),
+        )
+        final = finalize(result, verify)
+        if final.error:
+            raise final.error
+        if not final.sets:
+            return "nothing was recorded: no frame came"
+        full = "; the disk is full" if state == "disk full" else ""
+        return f"recorded {final.sets} frames ({final.sets / FRAMES_PER_S:.1f} s) to {self.path}; verified{full}"

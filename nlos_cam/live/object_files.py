@@ -1,0 +1,102 @@
+"""Hidden objects of a replay as files of other programs: a mesh or a point cloud per frame."""
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from nlos_calibration import ObjectBox
+from nlos_calibration.arrays import Float32
+
+from nlos_cam.errors import RecordingError
+from nlos_cam.files import atomic_directory
+from nlos_cam.live.frame_queue import ignore
+from nlos_cam.objects import mesh_from_depth
+
+OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
+"""Suffixes of `SurfaceMesh.save`, and "points" for a .ply without faces."""
+
+
+@dataclass
+class ObjectFiles:
+    """Writer of each frame's hidden surface, named by its number, in every format; skips frames without one."""
+
+    folder: Path
+    box: ObjectBox
+    formats: Sequence[str]
+    """Some of OBJECT_FORMATS."""
+    every: int = 1
+    """Only frames whose number is divisible by this."""
+    written: int = 0
+    """Frames with a surface so far."""
+
+    def add(self, number: int, depth_m: Float32, uncertainty_m: Float32 | None) -> None:
+        """Write a frame's depth map (64, 64), if it is due and has a surface."""
+        if number % self.every or not np.isfinite(depth_m).any():
+            return
+        mesh = mesh_from_depth(depth_m, self.box, uncertainty_m)
+        self.folder.mkdir(exist_ok=True)
+        for name in self.formats:
+            points = name == "points"
+            content = mesh.points_only.as_bytes(".ply") if points else mesh.as_bytes(f".{name}")
+            (self.folder / f"{number:06d}{'-points.ply' if points else f'.{name}'}").write_bytes(content)
+        self.written += 1
+
+
+def export_objects(
+    result: Path,
+    out: Path,
+    formats: Sequence[str],
+    every: int = 1,
+    *,
+    stop: Event,
+    on_frame: Callable[[int, int], None] = ignore,
+) -> int:
+    """Write the hidden surfaces of a replay's reconstruction.npz into the folder `out`; return their number.
+
+    Setting `stop` ends it early and keeps the files so far. Raises RecordingError for any other file.
+    """
+    arrays = _read(result)
+    depth_m, uncertainty_m, numbers = (arrays[name] for name in ("depth_m", "uncertainty_m", "frame_number"))
+    with atomic_directory(out) as part:
+        files = ObjectFiles(part, _box(arrays, depth_m.shape[1:]), formats, every)
+        for k, number in enumerate(numbers):
+            if stop.is_set():
+                break
+            known = np.isfinite(uncertainty_m[k]).any()
+            files.add(int(number), depth_m[k], uncertainty_m[k] if known else None)
+            on_frame(k + 1, len(numbers))
+    return files.written
+
+
+FIELDS = "depth_m", "uncertainty_m", "frame_number", "origin_m", "pitch_m", "z_near_m", "z_far_m"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:  # numpy leaves a damaged one open
+            arrays: Any = np.load(file)
+            return {name: arrays[name] for name in FIELDS}
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path} does not exist: give the reconstruction.npz of a replay") from error
+    except (OSError, LookupError, ValueError, EOFError, BadZipFile, zlib.error) as error:
+        raise RecordingError(
+            f"{path} is not the reconstruction.npz of a replay: make one with `nlos-cam replay F.bag`"
+        ) from error
+
+
+def _box(arrays: dict[str, Any], shape: tuple[int, ...]) -> ObjectBox:
+    """Return the box of a depth map from the centre of its first pixel and the steps to the next column and row."""
+    (x_m, y_m), (right_m, down_m), (rows, columns) = arrays["origin_m"], arrays["pitch_m"], shape
+    return ObjectBox(
+        x_min_m=x_m - right_m / 2,
+        x_max_m=x_m + (columns - 0.5) * right_m,
+        y_min_m=y_m + (rows - 0.5) * down_m,
+        y_max_m=y_m - down_m / 2,
+        z_near_m=float(arrays["z_near_m"]),
+        z_far_m=float(arrays["z_far_m"]),
+    )

@@ -1,0 +1,79 @@
+"""Assessment of a moment in words: graded by the uncertainty model's numbers, never a promise."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from nlos_cam.reconstruct import Reconstruction, Verdict
+from nlos_cam.view.viewer import Moment
+
+Tone = Literal["estimate", "quiet", "warning", "alarm"]
+RGB: dict[Tone, tuple[int, int, int]] = {
+    "estimate": (110, 180, 255),
+    "quiet": (150, 175, 190),
+    "warning": (255, 180, 60),
+    "alarm": (255, 110, 90),
+}
+"""Color by tone; none is green, since no frame is known to be right."""
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Headline and detail of a moment, with their tone."""
+
+    headline: str
+    detail: str
+    tone: Tone
+    trusted: bool = False
+    """True if the surface is drawn in full color; it is an estimate all the same."""
+
+    @property
+    def rgb(self) -> tuple[int, int, int]:
+        return RGB[self.tone]
+
+
+WORDS: dict[Verdict | None, tuple[str, str, Tone]] = {
+    Verdict.NOTHING: ("Nothing detected", "the returning light is that of an empty box", "quiet"),
+    Verdict.OUTSIDE: ("Shape not reliable", "unlike the training data, or not explained by physics", "warning"),
+    Verdict.SATURATED: ("Sensor saturated", "lower the laser power or shade the light", "alarm"),
+    Verdict.WALL_MOVED: ("Wall or lidar have moved", "calibrate the wall again", "alarm"),
+    Verdict.STALLED: ("Camera stalled", "no new frame: the pictures are old", "alarm"),
+    None: ("Object shape, error unknown", "these weights have no uncertainty model", "quiet"),
+}
+
+
+def assess(moment: Moment) -> Assessment:
+    """Return a moment's assessment; for a detected object, the share of its outline expected right and the depth error.
+
+    Both figures come from the uncertainty model, which is overconfident on unfamiliar shapes (docs/doubt.md).
+    """
+    verdict, found = moment.verdict, moment.reconstruction
+    if verdict is not Verdict.SEEN:
+        headline, detail, tone = WORDS[verdict]
+        return Assessment(headline, detail, tone, trusted=verdict is None)
+    overlap, error_m = expected_overlap(found), expected_error_m(found)
+    if overlap is None or error_m is None:
+        return Assessment("Object detected", "no estimate of the shape's error", "estimate", trusted=True)
+    detail = f"outline about {overlap:.0%} right, depth to about {1e3 * error_m:.0f} mm (the model's own estimate)"
+    return Assessment("Object detected", detail, "estimate", trusted=True)
+
+
+def expected_overlap(found: Reconstruction) -> float | None:
+    """Return the expected silhouette IoU from the probability p of a surface per pixel; None without p or a surface.
+
+    With the reconstructed mask M: intersection = sum of p over M, union = |M| + sum of p outside M.
+    """
+    mask = np.isfinite(found.depth_m)
+    if found.doubt is None or not mask.any():
+        return None
+    p = found.doubt.surface
+    return float(p[mask].sum() / (mask.sum() + p[~mask].sum()))
+
+
+def expected_error_m(found: Reconstruction) -> float | None:
+    """Return the median expected depth error in metres over the reconstructed surface; None without one."""
+    mask = np.isfinite(found.depth_m)
+    if found.uncertainty_m is None or not mask.any():
+        return None
+    return float(np.median(found.uncertainty_m[mask]))

@@ -1,0 +1,141 @@
+"""Saved sessions: one HTML file with the page and every kept moment, which any browser plays without installation."""
+
+import base64
+import zlib
+from importlib import resources
+from pathlib import Path
+from threading import Thread
+from typing import BinaryIO, Self
+
+import numpy as np
+from nlos_calibration import MeasuredWall, Rig
+
+from nlos_cam.threads import BoundedQueue
+from nlos_cam.view.messages import MomentPacker, bench_message, pack
+from nlos_cam.view.viewer import Moment
+
+PERIOD_S = 0.1
+"""Seconds between saved moments, by their own clock."""
+SLACK_S = 0.01
+"""Frames come at 30 per second: every third is kept, and not every fourth because of a thousandth."""
+CHUNK_S = 1.0
+"""Seconds of moments compressed together, and that a kill may cost."""
+LIDAR_S = 1.0
+"""Seconds between pictures of the lidar, which are most of a moment's bytes."""
+PICTURE_WIDTH = 160
+QUEUE_MOMENTS = 4
+MAX_BYTES = 512 << 20
+"""Largest size: browsers cannot load much more."""
+SESSION_MARK = b"nlos-cam session"
+SESSION_SUFFIX = ".html"
+
+
+def page_html(mode: str) -> str:
+    """Return the page with its scripts inside; `mode` is "live", "recorded" (streamed) or "session" (in the file)."""
+    folder = resources.files("nlos_cam.view")
+    page = (folder / "page.html").read_text(encoding="utf-8")
+    for name in ("bench.js", "pictures.js", "page.js"):
+        script = (folder / name).read_text(encoding="utf-8")
+        page = page.replace(f'<script src="{name}"></script>', f"<script>\n{script}</script>")
+    return page.replace('data-mode="live"', f'data-mode="{mode}"')
+
+
+class Chunks:
+    """Packer of moments into chunks: messages of CHUNK_S, compressed together."""
+
+    def __init__(self, packer: MomentPacker) -> None:
+        self._packer, self._messages = packer, list[bytes]()
+        self._times_s: list[float] = []
+        self._lidar_due_s, self._start_s = float("-inf"), None
+
+    def add(self, moment: Moment) -> bytes | None:
+        """Add a moment, and return the chunk before it if that is complete."""
+        now_s = moment.published_s
+        complete = self.rest() if self._times_s and now_s - self._times_s[0] >= CHUNK_S - SLACK_S else None
+        if with_lidar := now_s >= self._lidar_due_s or not self._messages:
+            self._lidar_due_s = now_s + LIDAR_S - SLACK_S
+        self._messages.append(self._packer.pack(moment, with_lidar=with_lidar))
+        self._times_s.append(now_s)
+        return complete
+
+    def rest(self) -> bytes | None:
+        """Return the last chunk, which may be shorter; None without moments."""
+        if not self._messages:
+            return None
+        start_s = self._start_s = self._times_s[0] if self._start_s is None else self._start_s
+        times_s = [round(each - start_s, 4) for each in self._times_s]
+        data = np.frombuffer(zlib.compress(b"".join(self._messages)), np.uint8)
+        self._messages, self._times_s = [], []
+        return pack({"kind": "chunk", "times_s": times_s}, {"data": data})
+
+
+class SessionFile:
+    """Writer of ten moments per second to an HTML file, in its own thread while entered.
+
+    A moment that finds the queue full is skipped, or waited for with `keeps_all`. An existing file is replaced. After a
+    kill the file lacks its last second and plays.
+    """
+
+    address: str | None = None
+
+    def __init__(self, path: Path, rig: Rig, measured: MeasuredWall | None = None, *, keeps_all: bool = False) -> None:
+        self.path = path
+        self.kept = 0
+        """Moments written."""
+        self.left_out = 0
+        """Moments that were due and did not fit."""
+        self.full = False
+        """True if the file ended before the run."""
+        self._bench, self._keeps_all = bench_message(rig, measured), keeps_all
+        self._chunks = Chunks(MomentPacker(rig, picture_width=PICTURE_WIDTH))
+        self._queue = BoundedQueue[Moment](QUEUE_MOMENTS)
+        self._due_s = float("-inf")
+        self._error: Exception | None = None
+        self._thread = Thread(target=self._write, name="saved session")
+
+    def __enter__(self) -> Self:
+        self.path.open("wb").close()  # a path that cannot be written to is an error now, not in the thread
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._queue.finish()
+        self._thread.join()
+        if self._error:
+            raise self._error
+
+    def show(self, moment: Moment) -> None:
+        """Queue a moment if one is due."""
+        if self.full or moment.published_s < self._due_s:
+            return
+        self._due_s = moment.published_s + PERIOD_S - SLACK_S
+        while self._keeps_all and self._thread.is_alive() and not self._queue.wait_for_room(CHUNK_S):
+            pass
+        if self._queue.wait_for_room(0.0):
+            self._queue.put(moment)
+        else:
+            self.left_out += 1
+
+    def _write(self) -> None:
+        try:
+            with self.path.open("wb") as file:
+                file.write(page_html("session").encode())
+                file.write(element(self._bench))
+                while (moment := self._queue.take()) is not None:
+                    if not self.full:
+                        self._append(file, self._chunks.add(moment))
+                        self.kept += 1
+                self._append(file, self._chunks.rest())
+        except Exception as error:  # noqa: BLE001  whatever it was, who entered raises it
+            self._error = error
+
+    def _append(self, file: BinaryIO, chunk: bytes | None) -> None:
+        if chunk is not None:
+            file.write(element(chunk))
+            file.flush()
+            self.full = file.tell() > MAX_BYTES
+
+
+def element(message: bytes) -> bytes:
+    """Return the element that holds a message in the page; a cut one is ignored there."""
+    return b'<script type="text/x-message">' + base64.b64encode(message) + b"</script>\n"

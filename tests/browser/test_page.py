@@ -1,0 +1,185 @@
+"""The view's page in a headless Chromium, with made-up moments."""
+
+import os
+import socket
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from browser_page import DEADLINE_S, Page
+from made_up_moments import RIG, full_moment
+from measured_walls import exact_wall
+from view_streams import ask
+
+from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.view.session_file import SessionFile
+from nlos_cam.view.web import PlaybackViewer, RecordedView, WebViewer
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(6 * DEADLINE_S)]
+
+SIZES = (1280, 800), (390, 844)
+LAYERS = {"depth", "truth", "error", "change", "residual", "lidar", "infrared"}
+NAMES = {"relay wall", "lidar", "occluder", "object box", "hidden surface", "bounce 1", "bounce 2", "bounce 3"}
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_page_shows_every_layer_name_and_new_moment(browser: Any, calibrated: bool, size: tuple[int, int]) -> None:
+    with WebViewer(RIG, exact_wall() if calibrated else None) as viewer:
+        for first in (0, 10):  # the page is opened again
+            viewer.show(full_moment(first))
+            page = Page(browser, viewer.address or "", size)
+            page.wait_drawn()
+            assert set(page.state()["arrays"]) >= LAYERS
+            assert set(page.state()["labels"]) == NAMES
+            assert page.state()["quads"] > 100
+            viewer.show(full_moment(first + 5, Verdict.OUTSIDE))
+            page.wait_until(lambda page=page, number=first + 5: page.state()["frame"] == number, "the next moment")
+            assert page.state()["headline"] == "Shape not reliable"
+            viewer.show(full_moment(first + 6, Verdict.NOTHING))
+            page.wait_until(lambda page=page: page.state()["quads"] == 0, "an empty bench")
+            assert page.page.evaluate("document.documentElement.scrollWidth") <= size[0], "nothing is beside the page"
+            assert page.errors == []
+            page.close()
+        assert ("distance" in page_text(browser, viewer)) == calibrated
+
+
+def page_text(browser: Any, viewer: WebViewer) -> str:
+    """Return the text of the calibration panel."""
+    page = Page(browser, viewer.address or "")
+    page.wait_drawn()
+    page.page.click("#tabs button:nth-child(3)")
+    with closing(page):
+        return page.page.inner_text("#facts")
+
+
+def test_page_says_ended_and_comes_back_with_the_next_run(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        port = urlsplit(viewer.address).port
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "")
+        page.wait_drawn()
+    page.wait_until(lambda: page.state()["headline"] == "The run has ended", "the end")
+    with WebViewer(RIG, port=port) as viewer:
+        viewer.show(full_moment(3))
+        page.wait_until(lambda: page.state()["frame"] == 3, "the next run")
+        assert page.state()["headline"] == "Object detected"
+        page.close()
+
+
+def test_five_pages_and_one_that_never_reads_share_a_view(browser: Any) -> None:
+    with WebViewer(RIG) as viewer, socket.socket() as deaf:
+        viewer.show(full_moment(0))
+        place = urlsplit(viewer.address or "")
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.connect((place.hostname, place.port))
+        deaf.sendall(b"GET /stream HTTP/1.0\r\nHost: localhost\r\n\r\n")
+        pages = [Page(browser, viewer.address or "") for _ in range(5)]
+        for page in pages:
+            page.wait_drawn()
+        for number in range(1, 60):
+            viewer.show(full_moment(number, size=(480, 640)))
+            time.sleep(0.02)
+        for page in pages:
+            page.wait_until(lambda page=page: page.state()["frame"] == 59, "the newest moment")
+            page.close()
+
+
+def test_saved_session_plays_from_the_file_alone(browser: Any, tmp_path: Path) -> None:
+    with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
+        for number in range(60):
+            session.show(replace(full_moment(number), published_s=0.5 * number))
+    page = Page(browser, (tmp_path / "view.html").as_uri())
+    page.wait_drawn()
+    play_through(page)
+    assert page.hosts <= {None, ""}
+    with page.page.expect_download() as download:
+        page.page.click("#save")
+    saved = Path(download.value.path()).read_text().splitlines()
+    assert saved[0] == "row,column,depth_m,expected_error_m"
+    assert len(saved) > 100
+    page.close()
+    with RecordedView(tmp_path / "view.html") as view:
+        served = Page(browser, view.address or "")
+        served.wait_drawn()
+        served.close()
+
+
+def test_playback_plays_scrubs_and_changes_speed(browser: Any) -> None:
+    with PlaybackViewer(RIG) as viewer:
+        for number in range(60):
+            viewer.show(replace(full_moment(number), published_s=0.5 * number))
+        viewer.finish()
+        page = Page(browser, viewer.address or "")
+        page.wait_drawn()
+        page.wait_until(lambda: page.state()["end"] == pytest.approx(29.5), "the whole recording")
+        play_through(page)
+        page.close()
+
+
+def play_through(page: Page) -> None:
+    """Scrub to the middle, play at eight times the speed to the end, and pause."""
+    page.page.evaluate("(t => { t.value = 15; t.dispatchEvent(new Event('input')); })(document.querySelector('#time'))")
+    page.wait_until(lambda: page.state()["frame"] == 30, "the frame at 15 s")
+    page.page.select_option("#speed", "8")
+    page.page.click("#play")
+    page.wait_until(lambda: page.state()["at"] > 20, "it plays")
+    page.wait_until(lambda: page.state()["frame"] == 59, "the last frame")
+    if page.state()["playing"]:
+        page.page.click("#play")
+    assert not page.state()["playing"]
+
+
+def resources() -> tuple[int, int, float]:
+    """Return this process's OS threads, file descriptors, and resident memory in MiB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    threads, descriptors = (len(list(Path(f"/proc/self/{kind}").iterdir())) for kind in ("task", "fd"))
+    return threads, descriptors, pages * os.sysconf("SC_PAGESIZE") / 2**20
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
+def test_watchers_that_come_and_go_leave_nothing_behind() -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(full_moment(0, size=(480, 640)))
+
+        def watch(number: int) -> None:
+            with closing(ask(viewer.address or "", "/stream")) as answer:
+                viewer.show(full_moment(number, size=(480, 640)))
+                answer.read(50_000)
+
+        for number in range(5):
+            watch(number)
+        threads, descriptors, memory_mib = settled()
+        for number in range(30):
+            watch(number)
+        after = settled()
+        assert after[0] <= threads
+        assert after[1] <= descriptors
+        assert after[2] < memory_mib + 8
+
+
+def settled() -> tuple[int, int, float]:
+    """Return the resources once no connection's thread is left, or after some time."""
+    deadline_s = time.monotonic() + DEADLINE_S
+    before = resources()
+    while time.monotonic() < deadline_s:
+        time.sleep(1.0)
+        if (now := resources())[:2] == before[:2]:
+            return now
+        before = now
+    return before
+
+
+def test_page_without_truth_shows_the_errors_in_its_place(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        real = full_moment(0)
+        viewer.show(replace(real, frame=replace(real.frame, truth_depth_m=None)))
+        page = Page(browser, viewer.address or "")
+        page.wait_drawn()
+        assert page.page.inner_text("#truth figcaption").startswith("Error")
+        assert not page.page.is_visible("#errors")
+        page.close()

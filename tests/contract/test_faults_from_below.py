@@ -1,0 +1,152 @@
+"""Faults of the system below every command that writes: limits of size, descriptors and memory, bad disks, clock jumps.
+
+Each command ends well, or with one line that names its output; nothing half-written stays under the output's name.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nlos_cam.recording import verify
+
+SHIM = r"""
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include <unistd.h>
+
+static int is_regular(int fd, const char *folder) {
+    char link[64], path[4096];
+    snprintf(link, sizeof link, "/proc/self/fd/%d", fd);
+    ssize_t n = readlink(link, path, sizeof path - 1);
+    if (n < 0) return 0;
+    path[n] = 0;
+    return strncmp(path, folder, strlen(folder)) == 0;
+}
+
+ssize_t write(int fd, const void *data, size_t count) {
+    static ssize_t (*next)(int, const void *, size_t);
+    static int writes;
+    if (!next) next = dlsym(RTLD_NEXT, "write");
+    const char *folder = getenv("SHIM_FOLDER"), *fail = getenv("SHIM_FAIL_AT"), *cut = getenv("SHIM_SHORT");
+    if (folder && is_regular(fd, folder)) {
+        if (fail && ++writes >= atoi(fail)) { errno = EIO; return -1; }
+        if (cut && count > 1000) count = count / 2;
+    }
+    return next(fd, data, count);
+}
+
+int clock_gettime(clockid_t id, struct timespec *now) {
+    static int (*next)(clockid_t, struct timespec *);
+    static long calls;
+    if (!next) next = dlsym(RTLD_NEXT, "clock_gettime");
+    int result = next(id, now);
+    const char *jump = getenv("SHIM_JUMP_S");
+    if (jump && id == CLOCK_REALTIME && ++calls % 20 >= 10) now->tv_sec += atol(jump);
+    return result;
+}
+"""
+EXPORT = "export {bag} --out {out}/export"
+REPAIR = "repair {bag} --out {out}/repaired.bag"
+RENDER = "render cup --out {out}/cup.npz"
+BOARD = "board --out {out}/board.pdf"
+COMMANDS = EXPORT, REPAIR, RENDER, BOARD
+
+
+START = "import resource, sys; from nlos_cam.cli.main import run; {limit}; run()"
+
+
+def ending(command: str, bag: Path, out: Path, limit: str = "") -> tuple[int, str]:
+    """Run a command in a process under a limit; return its exit code and what it wrote to stderr.
+
+    A fork of the tests would not do: OpenMP refuses to run in the child of a process that has used it.
+    """
+    out.mkdir(exist_ok=True)
+    words = [*command.format(bag=bag, out=out).split(), "--json"]
+    start = [sys.executable, "-c", START.format(limit=limit or "None"), *words]
+    ended = subprocess.run(start, capture_output=True, text=True, timeout=250, check=False)
+    return ended.returncode, ended.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit_bytes", [100, 1_000, 20_000, 1_000_000])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_full_disk_is_one_line_and_leaves_nothing(
+    noise_bag: Path, tmp_path: Path, command: str, limit_bytes: int
+) -> None:
+    out = tmp_path / "out"
+    code, said = ending(
+        command, noise_bag, out, f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))"
+    )
+    if code == 0:
+        assert all(path.stat().st_size <= limit_bytes for path in out.rglob("*") if path.is_file())
+        return
+    assert code == 1, said
+    assert len(said.strip().splitlines()) <= 2
+    assert str(out) in said
+    assert "a file cannot" not in said
+    left = [path for path in out.iterdir() if path.suffix != ".npz" or not np.load(path)["depth_m"].any()]
+    assert left == [], "the maps may be there, whole, without their picture"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", COMMANDS)
+def test_sixty_four_descriptors_are_enough(noise_bag: Path, tmp_path: Path, command: str) -> None:
+    code, said = ending(command, noise_bag, tmp_path / "out", "resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))")
+    assert code == 0, said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [EXPORT, REPAIR, BOARD])
+def test_folder_that_cannot_be_written_is_one_line(noise_bag: Path, tmp_path: Path, command: str) -> None:
+    code, said = ending(command.replace("{out}", "/proc"), noise_bag, tmp_path)
+    assert code in {1, 4}
+    assert "/proc" in said
+    assert len(said.strip().splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if not (compiler := shutil.which("cc")):
+        pytest.skip("needs a C compiler")
+    folder = tmp_path_factory.mktemp("shim")
+    (folder / "shim.c").write_text(SHIM, encoding="utf-8")
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", "shim.so", "shim.c", "-ldl"], cwd=folder, check=True)
+    return folder / "shim.so"
+
+
+def run_with(shim: Path, command: str, bag: Path, out: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    out.mkdir()
+    start = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()"]
+    environment = {**os.environ, "LD_PRELOAD": str(shim), "SHIM_FOLDER": str(out), **variables}
+    words = command.format(bag=bag, out=out).split()
+    return subprocess.run([*start, *words], env=environment, capture_output=True, text=True, timeout=200, check=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("write", [1, 2, 5])
+def test_disk_error_is_one_line_and_leaves_nothing(shim: Path, noise_bag: Path, tmp_path: Path, write: int) -> None:
+    ended = run_with(shim, REPAIR, noise_bag, out := tmp_path / "out", SHIM_FAIL_AT=str(write))
+    assert ended.returncode == 1, ended.stderr
+    assert "Input/output error" in ended.stderr
+    assert str(out) in ended.stderr
+    assert list(out.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variables", [{"SHIM_SHORT": "1"}, {"SHIM_JUMP_S": "100000000"}, {"SHIM_JUMP_S": "-90000"}])
+def test_short_writes_and_clock_jumps_change_nothing(
+    shim: Path, noise_bag: Path, tmp_path: Path, variables: dict[str, str]
+) -> None:
+    ended = run_with(shim, REPAIR, noise_bag, tmp_path / "out", **variables)
+    assert ended.returncode == 0, ended.stderr
+    assert verify(tmp_path / "out" / "repaired.bag").frames == verify(noise_bag).frames

@@ -1,0 +1,123 @@
+"""Settings: option before environment before the folder's file before the user's; unknown keys are refused."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from nlos_cam.cli import main as module
+from nlos_cam.cli.common import Camera
+from nlos_cam.cli.config import FILE, SETTINGS, read_settings, shared_options, variable
+from nlos_cam.cli.main import main
+from nlos_cam.errors import RecordingError
+
+LIVE = """camera = "sim:scene.toml"\nwall = "bench.toml"\nview_port = 9300\n"""
+
+
+@pytest.fixture(autouse=True)
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """An empty current folder, and an empty folder of the user's."""
+    here, users = tmp_path / "here", tmp_path / "users"
+    for folder in (here, users / "nlos-cam"):
+        folder.mkdir(parents=True)
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(typer, "get_app_dir", lambda name: str(users / name))
+    for name in SETTINGS:
+        monkeypatch.delenv(variable(name), raising=False)
+    return here, users / "nlos-cam"
+
+
+@pytest.fixture
+def live(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """The values that a command named live was called with."""
+    calls: list[dict[str, Any]] = []
+
+    def command(camera: Camera = "sim", wall: Path | None = None, view_port: int | None = None) -> None:
+        calls.append({"camera": camera, "wall": wall, "view_port": view_port})
+
+    def build_app(_: str | None) -> typer.Typer:
+        app = typer.Typer()
+        app.callback()(lambda: None)
+        app.command("live")(shared_options("live", command))
+        return app
+
+    monkeypatch.setattr(module, "build_app", build_app)
+    return calls
+
+
+def test_precedence_is_option_environment_folder_user_default(
+    folders: tuple[Path, Path], live: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main(["live"])
+    (folders[1] / FILE).write_text('camera = "l515"\nview_port = 9100\n', encoding="utf-8")
+    main(["live"])
+    (folders[0] / FILE).write_text(LIVE, encoding="utf-8")
+    main(["live"])
+    monkeypatch.setenv("NLOS_CAM_VIEW_PORT", "9400")
+    monkeypatch.setenv("NLOS_CAM_CAMERA", "sim")
+    main(["live"])
+    main(["live", "run.bag", "--view-port", "9500"])
+    assert live == [
+        {"camera": "sim", "wall": None, "view_port": None},
+        {"camera": "l515", "wall": None, "view_port": 9100},
+        {"camera": "sim:scene.toml", "wall": Path("bench.toml"), "view_port": 9300},
+        {"camera": "sim", "wall": Path("bench.toml"), "view_port": 9400},
+        {"camera": "bag:run.bag", "wall": None, "view_port": 9500},
+    ]
+
+
+@pytest.mark.parametrize("words", [["sim:a"], ["--camera", "sim:a"], ["sim:a", "--camera", "sim:a"]])
+def test_camera_is_an_argument_and_an_option(live: list[dict[str, Any]], words: list[str]) -> None:
+    assert main(["live", *words]) == 0
+    assert live[0]["camera"] == "sim:a"
+
+
+def test_paths_of_the_users_file_are_relative_to_it(folders: tuple[Path, Path]) -> None:
+    (folders[1] / FILE).write_text(LIVE, encoding="utf-8")
+    settings = read_settings({})
+    assert settings["wall"].value == str(folders[1] / "bench.toml")
+    assert settings["camera"].value == f"sim:{folders[1] / 'scene.toml'}"
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ('camrea = "sim"', "Did you mean 'camera'"),
+        ("view_port = 0", "65535"),
+        ('view_port = "9090"', "whole number"),
+        ("camera = 3", "text"),
+        ("camera = ", "TOML"),
+    ],
+)
+def test_wrong_file_is_refused_with_its_name(folders: tuple[Path, Path], text: str, word: str) -> None:
+    (folders[0] / FILE).write_text(text, encoding="utf-8")
+    with pytest.raises(RecordingError, match=word) as caught:
+        read_settings({})
+    assert FILE in str(caught.value)
+
+
+def test_wrong_variable_is_a_usage_error() -> None:
+    with pytest.raises(typer.BadParameter, match="NLOS_CAM_VIEW_PORT"):
+        read_settings({"NLOS_CAM_VIEW_PORT": "many"})
+
+
+def test_config_shows_values_with_their_sources(
+    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folders[0] / FILE).write_text(LIVE + 'cache = "c"', encoding="utf-8")
+    monkeypatch.setenv("NLOS_CAM_WEIGHTS", "mine")
+    assert main(["--json", "config"]) == 0
+    settings = json.loads(capsys.readouterr().out)["settings"]
+    assert settings["cache"] == {"value": "c", "source": FILE}
+    assert settings["weights"] == {"value": "mine", "source": "NLOS_CAM_WEIGHTS"}
+    assert settings["camera"]["source"] == FILE
+
+
+def test_settings_in_use_are_printed_with_verbose(
+    folders: tuple[Path, Path], live: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folders[0] / FILE).write_text(LIVE, encoding="utf-8")
+    assert (main(["-v", "live"]), len(live)) == (0, 1)
+    assert f"wall = bench.toml (from {FILE})" in capsys.readouterr().err

@@ -1,0 +1,306 @@
+"""Wrong command lines: each ends with its exit code and one line that names the fault; nothing is written."""
+
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nlos_cam.cli.main import main
+
+INTERNALS = "Traceback", "Input should", "Value error", "codec", "Errno", "{'", "validation error", "<class"
+"""Phrases of the interpreter and of libraries, which say nothing to a user."""
+SCENES = {
+    "scene.toml": 'name = "cup"\nrig = "paper-rig"\n[object]\ncategory = "cup"\n',
+    "wall.toml": "schema_version = 3\nframes = 60\n",
+    "rig.toml": 'name = "mine"\n[lidar]\ndistance_m = -1.0\n',
+    "recipe.toml": 'task = "vae"\nbatch = "many"\n',
+    "empty.toml": "",
+    "broken.toml": "name = \n",
+    "typo.toml": 'name = "cup"\nrig = "paper-rig"\nraidometry = "paper"\n',
+    "nan.toml": 'name = "cup"\nrig = "paper-rig"\n[object]\ncategory = "cup"\nsize_m = nan\n',
+    "long.toml": 'name = "cup"\nrig = "paper-rig"\n[object]\ncategory = "cup"\n[motion]\nposes = 1000000000\n',
+    "wide.toml": 'name = "cup"\nrig = "paper-rig"\n[object]\ncategory = "cup"\n[sensor]\npulse_ns = 1e9\n',
+    "cupp.toml": 'name = "cup"\nrig = "paper-rig"\n[object]\ncategory = "cupp"\n',
+    "norig.toml": 'name = "cup"\nrig = "paper-rgi"\n',
+}
+USAGE = """
+liev | live
+replai run.bag | replay
+--wersion | version
+live --secs 3 | --seconds
+live --seconds | needs a value
+live --seconds nan | nan
+live --seconds inf --camera l615 | l615
+live --seconds 0 | 0.1
+live --seconds x | number
+live --view-port 0 | 65535
+live --view-port 70000 | 65535
+live --view-port 9.5 | whole number
+live --average 0 | --average
+live --average 1.5 | whole number
+live --average 2 --budget-ms 30 | --average
+live --budget-ms 0 | --budget-ms
+live --tradeoff table.json | --budget-ms
+live --no-view --open | --no-view
+live --no-view --view-port 9191 | --no-view
+live --no-view --view-host localhost | --no-view
+live --record run.mp4 | .bag
+live --log run.txt | .csv
+live --save-view view.png | view.png
+live sim sim:bare-wall | unexpected
+live sim --camera l515 | l515
+live simm | sim
+live sim: | colon
+live l515: | colon
+live bag: | colon
+live webcam | webcam
+live sim:bare-wal | sim:bare-wall
+live -v -q | --quiet
+capture --seconds 1 --frames 2 | --frames
+capture --seconds 0 | --seconds
+capture --seconds inf | --seconds
+capture --frames 0 | --frames
+capture --frames -1 | --frames
+capture --takes 2 | --takes
+capture --takes 10000 --frames 1 | 9999
+capture --takes 2 --frames 1 --pause-s -1 | --pause-s
+capture --takes 3 --frames 1 --label a --label b | --label
+capture --frames 1 --label a --label b | --label
+capture --out run.mp4 | .bag
+replay | missing
+replay run.bag other.bag | unexpected
+replay run.bag --reader fast | plain or sdk
+replay run.bag --stills -1 | --stills
+replay run.bag --stills 101 | --stills
+export run.bag --format jpg | png or npz
+export run.bag --every 0 | --every
+repair run.bag --out run.txt | .bag
+view | missing
+view run.bag --view-port 0 | --view-port
+calibrate | --wall
+calibrate --wall --occluder wall.toml | --wall
+calibrate --wall sim --bag run.bag | --bag
+calibrate --wall --frames 0 | --frames
+calibrate --wall --tape-m 0 | --tape-m
+calibrate --wall --occluder-x-m 0.2 | together
+calibrate --wall --occluder-gap-m 0.1 | together
+calibrate --wall --board --tape-m 0.2 | --tape-m
+calibrate --wall --board-in colour | --board
+calibrate --wall --board-in violet | infrared or colour
+calibrate --wall --square-mm 30 | --board
+calibrate --wall --paper a4 | --board
+calibrate --wall --paper a5 | a4
+calibrate --wall --board --square-mm 0 | --square-mm
+calibrate --occluder wall.toml --board | --board
+calibrate --occluder wall.toml --watch | --watch
+calibrate --occluder wall.toml --tape-m 0.2 | --tape-m
+calibrate --occluder wall.toml --out wall.toml --overwrite | wall.toml
+board --paper a5 | a4
+board --out board.txt | .pdf
+render | missing
+render cupp | Did you mean 'cup'
+render cup --rig paper-rgi | paper-rig
+render cup --accuracy perfect | draft
+render cup --radiometry magic | paper
+render cup --backend abacus | cpu
+render cup --material glass | phong
+render cup --effects rain | rain
+render cup --effects three-bonce | three-bounce
+render cup --pulse-ns 1e9 | 100
+render cup --pulse-ns -1 | 100
+render cup --pulse-ns nan | nan
+render cup --seed -1 | --seed
+render cup --seed 1.5 | whole number
+render cup --size-m nan | --size-m
+render cup --turn-deg inf | --turn-deg
+render cup --front-m inf | --front-m
+render cup --up z | --up
+render cup --up w | y or z
+render cup --albedo 1.5 | --albedo
+render cup --albedo white | --albedo
+render cup --albedo 0.1,0.2 | --albedo
+render cup --exponent 0 | --exponent
+render cup --max-error 0.1 --accuracy fine | --accuracy
+render none.stl --seed 1 | --seed
+render plate.npy --size-m 0.1 --up z | --size-m
+render cup --out maps.txt | .npz
+dataset | build, label
+dataset bild | build, label
+dataset build --count 1 | --out
+dataset build --out d --count 0 | --count
+dataset build --out d --count x | whole number
+dataset build --out d --count 1 --backgrounds 2 | --backgrounds
+dataset build --out d --count 1 --rig-spread-mm -1 | --rig-spread-mm
+dataset build --out d --count 1 --workers 0 | --workers
+dataset build --out d --count 1 --scene scene.toml --rig paper-rig | --rig
+dataset build --out d --count 1 --objects meshes --without hat | --without
+dataset build --out d --count 1 --without hatt | hat
+dataset build --out d --count 1 --accuracy fin | fine
+dataset label . --out d --frames 0 | --frames
+train | vae
+train van | vae
+train vae | --recipe
+train vae --recipe recipe.toml | --out
+train vae --recipe recipe.toml --out d --budget 0 | --budget
+train vae --recipe recipe.toml --out d --budget 1.5 | --budget
+train vae --recipe recipe.toml --out d --devices 0 | --devices
+train vae --recipe recipe.toml --out d --accelerator tpu | auto
+train vae --recipe vea --out d | vae
+train compressor --recipe recipe.toml --out d --dataset x | --held-out
+evaluate --count 0 | --count
+evaluate --dataset d --count 3 | --count
+evaluate --training d --no-nearest | --no-nearest
+evaluate --rig paper-rgi | paper-rig
+tradeoff | render, reconstruct
+tradeoff rendre | render
+tradeoff render --seed 3 | --object
+tradeoff render --object cupp | cup
+tradeoff reconstruct --count 0 | --count
+devices extra | unexpected
+doctor --fix | no option
+config --set x | no option
+"""
+FILES = """
+live none.bag | none.bag
+live bag:none.bag | none.bag
+live random.bag | random.bag
+live zero.bag | zero.bag
+live folder.bag | folder.bag
+live loop.bag | loop.bag
+live sim:none.toml | none.toml
+live sim:binary.toml | binary
+live sim:empty.toml | name
+live sim:broken.toml | broken.toml
+live sim:typo.toml | raidometry
+live sim:nan.toml | size_m
+live sim:long.toml | poses
+live sim:wide.toml | pulse_ns
+live sim:cupp.toml | category
+live sim:norig.toml | paper-rig
+live sim:wall.toml | wall record
+live sim:recipe.toml | recipe
+live sim:folder.toml | folder.toml
+capture --wall none.toml | none.toml
+capture --wall scene.toml | scene
+capture --wall binary.toml | binary
+replay none.bag | none.bag
+replay random.bag | random.bag
+replay zero.bag --reader plain | zero.bag
+replay folder.bag | folder.bag
+export none.bag | none.bag
+export random.bag | random.bag
+export zero.bag | zero.bag
+repair none.bag | none.bag
+repair zero.bag | zero.bag
+repair random.bag | random.bag
+view none.bag | none.bag
+calibrate --wall --bag none.bag | none.bag
+calibrate --wall random.bag | random.bag
+calibrate --occluder none.toml | none.toml
+calibrate --occluder scene.toml | scene
+calibrate --occluder binary.toml | binary
+calibrate --occluder empty.toml | wall record
+calibrate --occluder folder.toml | folder.toml
+render none.stl | none.stl
+render none.PLY | none.PLY
+render none.npy | none.npy
+render words.npy | words.npy
+render words.stl | words.stl
+render zero.stl | zero.stl
+render wide.npy | wide.npy
+render folder.stl | folder.stl
+render cup --rig none.toml | none.toml
+render cup --rig rig.toml | rig.toml
+render cup --rig binary.toml | binary
+render cup --rig scene.toml | scene
+render cup --scene none.toml | none.toml
+render cup --scene wall.toml | wall record
+render cup --scene binary.toml | binary
+render cup --scene long.toml | poses
+dataset build --out d --count 1 --scene wall.toml | wall record
+dataset build --out d --count 1 --rig none.toml | none.toml
+dataset label none --out d | none
+dataset label precious --out d | precious
+train vae --recipe none.toml --out d | none.toml
+train vae --recipe binary.toml --out d | binary
+train vae --recipe recipe.toml --out d | recipe.toml
+train vae --recipe scene.toml --out d | scene
+evaluate --weights none | none
+evaluate --weights precious | precious
+tradeoff render --object none.stl | none.stl
+"""
+OTHERS = """
+render cup --effects tilt | light
+render cup --effects '' | light
+render cup --rig bare-wall | object_box
+render cup --x-m 1 | cup
+render cup --size-m 0.002 | cup
+render cup --front-m 0.5 | 0.5 m
+render cup --max-error -1 | -1
+render cup --beams-per-cell 0 | 0
+render cup --out taken.npz | --overwrite
+render cup --out nowhere/maps.npz | nowhere
+render cup --out precious/thesis.txt/a.npz | precious
+board --out taken.pdf | --overwrite
+capture --out taken.bag | --overwrite
+capture bag:none.bag --seconds 1 | recording
+capture run.bag --frames 1 | recording
+export random.bag --out precious | precious
+export random.bag --out taken.npz | taken.npz
+repair random.bag --out random.bag --overwrite | random.bag
+dataset build --out precious --count 1 | precious
+dataset build --out d --count 1 --objects nowhere | nowhere
+tradeoff render --out taken.npz | taken.npz
+doctor --write-udev taken.rules | --overwrite
+"""
+CASES = [
+    (code, *map(str.strip, line.split(" | ")))
+    for code, lines in ((2, USAGE), (4, FILES), (1, OTHERS))
+    for line in lines.strip().splitlines()
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with every kind of unusable file, whose name has a space and an accent."""
+    folder = tmp_path_factory.mktemp("wröng files")
+    for name, text in SCENES.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    noise = np.random.default_rng(5).bytes(5000)
+    for name in ("binary.toml", "random.bag"):
+        (folder / name).write_bytes(b"\x85\xff" + noise)
+    for name in ("zero.bag", "zero.stl", "taken.npz", "taken.pdf", "taken.bag", "taken.rules"):
+        (folder / name).touch()
+    for name in ("words.npy", "words.stl"):
+        (folder / name).write_bytes(b"hello")
+    for name in ("folder.bag", "folder.toml", "folder.stl", "precious"):
+        (folder / name).mkdir()
+    (folder / "precious" / "thesis.txt").write_text("years of work", encoding="utf-8")
+    (folder / "loop.bag").symlink_to("loop.bag")
+    np.save(folder / "plate.npy", np.full((16, 16), 0.2, np.float32))
+    np.save(folder / "wide.npy", np.full((16, 24), 0.2, np.float32))
+    return folder
+
+
+def _listing(folder: Path) -> dict[str, int]:
+    return {str(path.relative_to(folder)): path.lstat().st_size for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize(("code", "line", "word"), CASES)
+def test_wrong_command_has_its_exit_code_and_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], code: int, line: str, word: str
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(folder))
+    before = _listing(folder)
+    assert main(["--json", *shlex.split(line)]) == code
+    shown = capsys.readouterr()
+    errors = [text for text in shown.err.splitlines() if text.startswith("error: ")]
+    assert len(errors) == 1
+    assert word in errors[0]
+    assert not [phrase for phrase in INTERNALS if phrase in shown.err]
+    assert all(shown.err.splitlines())
+    assert json.loads(shown.out.splitlines()[-1])["error"]["message"]
+    assert _listing(folder) == before

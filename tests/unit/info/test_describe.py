@@ -1,0 +1,205 @@
+"""Description of files and folders: every kind is known, whole or damaged, and no content ends in another error."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from fake_farm import samples_of
+from nlos_calibration.rig import load_rig
+from nlos_models import shipped_folder
+
+from nlos_cam.calibrate import WallFiles, write_record
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.shards import shard_path, store
+from nlos_cam.errors import RecordingError
+from nlos_cam.info import Description, describe
+from nlos_cam.recording import BagReader, ExportOptions, export_recording
+from nlos_cam.report import Document
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+RIG = load_rig("paper-rig")
+FRAMES = {"frame_number": [3, 4], "timestamp_s": [0.0, 0.1], "rig_name": "paper-rig", "rig_checksum": "abc"}
+ARRAYS = {
+    "result of a replay": {**FRAMES, "depth_m": [1.0], "verdict": ["object seen", ""], "origin_m": [0.0, 0.0]},
+    "difference maps of a replay": {**FRAMES, "depth_m": [1.0], "reference_sha256": "abc"},
+    "rendering": {"object_depth_m": [np.nan, 1.0], "margin": [1.0], "radiometry": "paper"},
+    "exported stream": {**FRAMES, "pixels": [[1]], "encoding": "z16"},
+    "mesh of a hidden surface": {"vertices_m": np.zeros((3, 3)), "faces": np.zeros((1, 3))},
+    "arrays of another program": {"x": [1.0]},
+}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory, noise_bag: Path, measured: Callable) -> dict[str, Path]:
+    """A file or folder of every kind, by its kind."""
+    folder = tmp_path_factory.mktemp("kinds")
+    made = {kind: folder / f"{k}.npz" for k, kind in enumerate(ARRAYS)}
+    for kind, path in made.items():
+        np.savez(path, **ARRAYS[kind])  # pyright: ignore[reportArgumentType]
+    (folder / "data").mkdir()
+    made["dataset shard"] = shard_path(folder / "data", 40)
+    store(made["dataset shard"], samples_of(range(40, 43)), DatasetPlan(RIG, 40).provenance, "nlos-cam dataset build")
+    made["dataset"] = folder / "data"
+    made["wall record"] = folder / "wall.toml"
+    wall = measured()
+    write_record(WallFiles.beside(made["wall record"], overwrite=False), wall.record, wall.reference)
+    made["reference of a bare wall"] = folder / "wall.npz"
+    made["recording of a lidar"] = noise_bag
+    made["export of a recording"] = folder / "exported"
+    bag, options = BagReader(noise_bag), ExportOptions(every=10)
+    export_recording(bag, made["export of a recording"], options, stop=Event())
+    made["report"] = folder / "report.html"
+    made["report"].write_text(Document("a", "b", []).as_html())
+    made["scene of the simulated camera"] = EXAMPLES / "faults.toml"
+    made["weights"] = shipped_folder()
+    for name, content, kind in (
+        ("figures.json", '{"objects": 3, "bars": {}}', "evaluation"),
+        ("tradeoff.json", '{"machine": "a", "pareto_front": []}', "trade-off"),
+        ("log.csv", "epoch,loss\n1,0.5\n", "training run"),
+    ):
+        (folder / kind).mkdir()
+        (folder / kind / name).write_text(content)
+        made[kind] = folder / kind
+    made["figures of an evaluation"] = made["evaluation"] / "figures.json"
+    made["table of a trade-off"] = made["trade-off"] / "tradeoff.json"
+    return made
+
+
+KINDS = [
+    *ARRAYS,
+    *("dataset shard", "dataset", "wall record", "reference of a bare wall", "recording of a lidar", "report"),
+    *("export of a recording", "scene of the simulated camera", "weights", "evaluation", "trade-off", "training run"),
+    *("figures of an evaluation", "table of a trade-off"),
+]
+
+
+@pytest.mark.parametrize("verify", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_known_and_whole(files: dict[str, Path], kind: str, verify: bool) -> None:
+    found = describe(files[kind], verify=verify)
+    assert (found.kind, found.problem) == (kind, "")
+    assert found.created
+    assert all(line.split(" ")[0] in {"nlos-cam", "open"} for line in found.next)
+
+
+def test_facts_are_those_of_the_content(files: dict[str, Path]) -> None:
+    bag = describe(files["recording of a lidar"])
+    assert bag.facts["depth"].startswith("20 frames, 30 per second")
+    assert bag.facts["duration"] == "0.6 s"
+    assert describe(files["dataset"]).facts["objects"] == "3 in 1 shard"
+    assert "nlos-cam dataset build" in describe(files["dataset shard"]).made_by
+    replay = describe(files["result of a replay"]).facts
+    assert (replay["frames"], replay["verdicts"]) == ("2, numbers 3 to 4", "none 1, object seen 1")
+    assert describe(files["wall record"]).facts["verdict"].startswith("good")
+
+
+def test_sample_stands_for_the_packaged_recording() -> None:
+    assert describe(Path("sample")).facts["depth"].startswith("8 frames")
+
+
+def test_saved_view_of_rerun_names_the_program_that_opens_it(tmp_path: Path) -> None:
+    (path := tmp_path / "view.rrd").write_bytes(b"RRF2....")
+    assert describe(path).next[-1] == f"rerun {path}"
+    path.write_bytes(b"text")
+    with pytest.raises(RecordingError, match="known kind"):
+        describe(path)
+
+
+def test_pipes_and_arrays_that_would_fill_the_memory_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.mkfifo(tmp_path / "wall.toml")
+    with pytest.raises(RecordingError, match="neither a file"):
+        describe(tmp_path / "wall.toml")
+    monkeypatch.setattr("nlos_cam.info.files.MAX_ARRAY_BYTES", 1000)
+    np.savez_compressed(tmp_path / "bomb.npz", vertices_m=np.zeros((1000, 3)), faces=np.zeros((1, 3)))
+    assert "bomb.npz holds more" in describe(tmp_path / "bomb.npz").problem
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "cut": lambda content: content[: len(content) // 2],
+    "empty": lambda _: b"",
+    "noise": lambda content: np.random.default_rng(0).bytes(min(len(content), 10_000)),
+    "flipped": lambda content: bytes(byte ^ (at % 97 == 0) for at, byte in enumerate(content[:200_000])),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_file_has_one_line_that_says_so(files: dict[str, Path], tmp_path: Path, kind: str, damage: str) -> None:
+    if files[kind].is_dir():
+        marks = {"dataset": "shard-*.h5", "weights": "checkpoint.json", "training run": "log.csv"}
+        source = next(files[kind].glob(marks.get(kind, "*.json")))
+        place = tmp_path
+    else:
+        source, place = files[kind], tmp_path / files[kind].name
+    (tmp_path / source.name).write_bytes(DAMAGES[damage](source.read_bytes()))
+    try:
+        found = describe(place, verify=True)
+    except RecordingError as error:
+        found = Description("none", problem=str(error))
+    assert "\n" not in found.problem
+    assert "Traceback" not in found.problem
+    if damage in {"cut", "noise"} and kind not in {"training run", "scene of the simulated camera"}:
+        assert str(place) in found.problem or source.name in found.problem
+
+
+def test_cut_recording_names_the_repair(files: dict[str, Path], tmp_path: Path) -> None:
+    content = files["recording of a lidar"].read_bytes()
+    (bag := tmp_path / "cut.bag").write_bytes(content[: len(content) // 2])
+    assert f"nlos-cam repair {bag}" in describe(bag).problem
+
+
+def test_weights_that_differ_from_their_checksums_are_damaged(tmp_path: Path) -> None:
+    record = (shipped_folder() / "checkpoint.json").read_bytes()
+    (tmp_path / "checkpoint.json").write_bytes(record)
+    (tmp_path / "a.safetensors").write_bytes(b"a")
+    digest = hashlib.sha256(b"a").hexdigest()
+    (tmp_path / "SHA256SUMS").write_text(f"{digest}  a.safetensors\n")
+    assert describe(tmp_path).problem == ""
+    (tmp_path / "a.safetensors").write_bytes(b"b")
+    assert "a.safetensors is damaged" in describe(tmp_path).problem
+    (tmp_path / "a.safetensors").unlink()
+    assert "a.safetensors is missing" in describe(tmp_path).problem
+
+
+def test_files_that_belong_together_are_missed(files: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "wall.toml").write_bytes(files["wall record"].read_bytes())
+    assert "wall.npz is missing" in describe(tmp_path / "wall.toml").problem
+
+
+@pytest.mark.parametrize("name", ["thesis.txt", "photo.npy", "folder", "notes.toml", "list.json", "page.html"])
+def test_unknown_file_names_the_known_kinds(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.mkdir() if name == "folder" else path.write_text("[]" if name == "list.json" else "")
+    with pytest.raises(RecordingError, match="known kind"):
+        describe(path)
+    with pytest.raises(RecordingError, match="does not exist"):
+        describe(tmp_path / "nothing.bag")
+
+
+def test_recording_of_another_camera_is_described(real_bag: Path) -> None:
+    found = describe(real_bag, verify=True)
+    assert (found.kind, found.problem) == ("recording of a RealSense camera", "")
+    assert "D435" in found.facts["device"]
+    assert found.facts["depth"].endswith("640 x 480, z16")
+
+
+def test_command_prints_json_without_importing_torch(files: dict[str, Path]) -> None:
+    program = (
+        "import sys; from nlos_cam.cli.main import main; code = main(sys.argv[1:]); "
+        "print(code, *{'torch', 'matplotlib', 'h5py'} & {*sys.modules})"
+    )
+    run = [sys.executable, "-c", program, "info", str(files["recording of a lidar"]), "--json"]
+    answer, ended = subprocess.run(run, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert ended == "0"
+    found = json.loads(answer)
+    size = files["recording of a lidar"].stat().st_size
+    assert (found["kind"], found["whole"], found["bytes"]) == ("recording of a lidar", True, size)

@@ -1,0 +1,220 @@
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_wall import SMALL, wall_frame
+from made_up_moments import RIG, Recorded, full_moment, moment
+from nlos_calibration.wall_record import load_measured
+from small_frames import FrameCamera, sheet_network
+from view_streams import saved_moments
+
+from nlos_cam.errors import NlosCamError
+from nlos_cam.live.control import RunControl
+from nlos_cam.live.loop import run_live
+from nlos_cam.live.statistics import SLOW_FRAMES, PaceWatch
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.pipeline import Pipeline
+from nlos_cam.view.viewer import NullViewer
+
+
+@pytest.fixture
+def control(tmp_path: Path) -> RunControl:
+    """Controls of a running camera, with a first frame."""
+    control = RunControl(folder=tmp_path, clock=lambda: 10.0)
+    control.attach(Recorded(0), Pipeline(CalibratedRig(RIG), sheet_network))  # type: ignore[arg-type]
+    for number in range(30):
+        control.add(full_moment(number))
+    return control
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.suffix for path in folder.iterdir())
+
+
+def test_status_is_json_and_gives_pace_age_and_disk(control: RunControl) -> None:
+    status = json.loads(json.dumps(control.status(), allow_nan=False))
+    assert status["state"] == "running"
+    assert status["fps"] == pytest.approx(30.0)
+    assert status["p50_ms"] == status["p99_ms"] == pytest.approx(20.0)
+    assert status["age_s"] == pytest.approx(10.0 - 29 / 30 + 0.02, abs=0.01)
+    assert status["disk_s"] > 0
+
+
+def test_status_says_honestly_what_the_run_waits_for(tmp_path: Path) -> None:
+    now_s = iter(range(0, 1000, 10))
+    control = RunControl("sim", folder=tmp_path, clock=lambda: next(now_s))
+    assert control.status()["state"] == "connecting"
+    control.show_progress(1, 60)
+    control.show_progress(2, 60)
+    assert "first frame in about" in control.status()["message"]
+    control.attach(Recorded(0), Pipeline(CalibratedRig(RIG), sheet_network))  # type: ignore[arg-type]
+    assert "first frame" in control.status()["message"]
+    control.add(moment(0))
+    control.set_state("stalled", "no frame for 3 s")
+    assert (control.status()["state"], control.status()["message"]) == ("stalled", "no frame for 3 s")
+    control.add(moment(1))
+    assert control.status()["state"] == "running"
+    control.end()
+    assert control.status()["state"] == "ended"
+
+
+def test_snapshot_writes_picture_arrays_and_mesh(control: RunControl, tmp_path: Path) -> None:
+    told = control.run("snapshot", {})
+    assert files(tmp_path) == [".npz", ".ply", ".png"]
+    with np.load(next(tmp_path.glob("*.npz"))) as arrays:
+        np.testing.assert_array_equal(arrays["depth_m"], full_moment(29).reconstruction.depth_m)
+        assert arrays["frame_number"] == 29
+    assert ".npz" in told
+    control.run("snapshot", {})
+    assert len(files(tmp_path)) == 6, "the second one replaces nothing"
+
+
+def test_session_is_saved_between_two_commands(control: RunControl, tmp_path: Path) -> None:
+    control.run("save_session", {})
+    assert control.status()["control"]["saving"]
+    for number in range(30, 60):
+        control.add(full_moment(number))
+    control.run("end_session", {})
+    shown = [each["frame"] for each in saved_moments(next(tmp_path.glob("session-*.html")))]
+    assert shown[0] == 30
+    assert set(shown) <= set(range(30, 60))
+
+
+def test_average_and_setting_change_the_pipeline(control: RunControl) -> None:
+    pipeline = control._pipeline
+    assert pipeline is not None
+    control.run("average", {"frames": 4})
+    assert pipeline.average == control.status()["control"]["average"] == 4
+    other: Any = object()
+    control.settings, control.load_setting = [("fast", "fast: 3 ms, error 22 mm")], lambda _: (other, 1)
+    assert "22 mm" in control.run("setting", {"name": "fast"})
+    assert pipeline.network is other
+    assert pipeline.average == 1
+    assert control.status()["control"]["setting"] == "fast"
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "reason"),
+    [
+        ("fly", {}, "no command"),
+        ("average", {"frames": 0}, "1 to 1000"),
+        ("average", {"frames": "x"}, "average"),
+        ("average", {"of": 3}, "does not take"),
+        ("setting", {"name": "none"}, "no setting"),
+        ("stop_recording", {}, "nothing is being recorded"),
+        ("end_session", {}, "no session"),
+        ("record", {"label": "cup"}, "live camera"),
+        ("option", {"name": "laser_power", "value": 3}, "L515"),
+    ],
+)
+def test_refused_command_says_why(
+    control: RunControl, tmp_path: Path, command: str, arguments: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises(NlosCamError, match=reason):
+        control.run(command, arguments)
+    assert files(tmp_path) == []
+
+
+def test_commands_before_the_first_frame_say_to_wait(tmp_path: Path) -> None:
+    for command in ("snapshot", "record", "take_reference"):
+        with pytest.raises(NlosCamError, match="not running yet"):
+            RunControl(folder=tmp_path).run(command, {})
+
+
+def test_one_command_runs_at_a_time(control: RunControl) -> None:
+    entered, leave = Event(), Event()
+
+    def wait() -> None:
+        entered.set()
+        leave.wait(60.0)
+
+    control.thread_start = wait
+    thread = threading.Thread(target=control.run, args=("pause", {}))
+    thread.start()
+    assert entered.wait(60.0)
+    with pytest.raises(NlosCamError, match="another command"):
+        control.run("resume", {})
+    leave.set()
+    thread.join()
+    assert control.paused
+
+
+class Paced(FrameCamera):
+    """Endless camera that calls a function before each frame."""
+
+    intrinsics = RIG.pinhole
+
+    def __init__(self, on_frame: Callable[[int], object], count: int | None = None) -> None:
+        super().__init__(count, on_frame, make=lambda number: full_moment(number, size=(480, 640)).frame, uri="sim")
+
+
+def run(camera: Any, control: RunControl, **options: Any) -> Any:
+    pipeline = Pipeline(CalibratedRig(RIG), sheet_network)
+    return run_live(camera, pipeline, NullViewer(), stop=Event(), control=control, recorded=True, **options)
+
+
+def test_paused_run_reads_frames_and_reconstructs_none(tmp_path: Path) -> None:
+    control = RunControl(folder=tmp_path)
+
+    def act(number: int) -> None:
+        if number in {5, 15}:
+            control.run("pause" if number == 5 else "resume", {})
+
+    report = run(Paced(act, 30), control)
+    assert 14 <= report.frames <= 26
+    assert report.dropped == 0
+
+
+def test_run_ends_what_was_begun(tmp_path: Path) -> None:
+    control = RunControl(folder=tmp_path)
+    run(Paced(lambda number: control.run("save_session", {}) if number == 5 else None, 30), control)
+    assert control.status()["state"] == "ended"
+    assert saved_moments(next(tmp_path.glob("session-*.html")))
+
+
+def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
+    control, benches, told = RunControl(folder=tmp_path), list[CalibratedRig](), list[str]()
+    control.on_bench = benches.append
+
+    def act(number: int) -> None:
+        if number == 3:
+            command = threading.Thread(target=lambda: told.append(control.run("take_reference", {"frames": 8})))
+            command.start()
+            threads.append(command)
+        elif number > 3:
+            threads[0].join(0.02)
+
+    threads: list[threading.Thread] = []
+    camera = FrameCamera(200, act, make=wall_frame, uri="sim")
+    camera.intrinsics = SMALL
+    run(camera, control)
+    threads[0].join()
+    assert "reference of 8 frames" in told[0]
+    (bench,) = benches
+    assert bench.reference is not None
+    assert bench.rig is RIG
+    measured = load_measured(next(tmp_path.glob("bench-*.toml")))
+    assert measured.reference is not None
+    np.testing.assert_array_equal(measured.reference.map_depth_m, bench.reference.map_depth_m)
+
+
+def test_pace_watch_warns_once_and_says_what_to_do() -> None:
+    told: list[tuple[str, bool]] = []
+    watch = PaceWatch(lambda text, begins: told.append((text, begins)))
+    for frames in range(0, 4 * SLOW_FRAMES, 10):
+        watch.update(frames, 0)
+    assert told == []
+    for frames in range(0, 2 * SLOW_FRAMES, 10):
+        watch.update(4 * SLOW_FRAMES + frames, frames // 2)
+    assert [begins for _, begins in told] == [True]
+    assert "--budget-ms" in told[0][0]
+    assert watch.warnings
+    for frames in range(0, 3 * SLOW_FRAMES, 10):
+        watch.update(6 * SLOW_FRAMES + frames, SLOW_FRAMES)
+    assert [begins for _, begins in told] == [True, False]
+    assert watch.warnings == ()

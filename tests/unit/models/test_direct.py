@@ -1,0 +1,157 @@
+"""The direct network: mirror symmetry, its places of pixels, its loss, exact resuming, and its checkpoint."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nlos_models.checkpoint import load_network, load_pipeline, save_direct
+from nlos_models.data import as_images
+from nlos_models.direct import CLIP, CellNormal, DirectNetwork, MirrorLinear, image_from_logits, two_heads_error
+from nlos_models.direct_training import NormalBatch, train_direct
+from nlos_models.errors import CheckpointError
+from nlos_models.export import export_folder
+from nlos_models.inference import load_reconstructor
+from nlos_models.recipe import DirectSize, Recipe
+from nlos_models.records import CheckpointRecord
+from nlos_models.tasks import run as reconstruct
+from nlos_models.train import BEST, MINUTES, Running
+from small_maps import small_maps
+from small_run import changed_tensors
+from torch import Tensor, nn
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+SIZE = DirectSize(features=8, width=8, blocks=1, token=8, mixers=1)
+
+
+def _shaken(network: DirectNetwork) -> DirectNetwork:
+    """Give every parameter a random value: residual blocks would otherwise start as nothing."""
+    torch.manual_seed(1)
+    for parameter in network.parameters():
+        nn.init.normal_(parameter, 0, 0.2)
+    return network.eval()
+
+
+def _recipe(**changes: object) -> Recipe:
+    facts = {
+        "task": "direct", "objects": 16, "held_out": 4, "epochs": 2, "batch": 4, "learning_rate": 3e-3,
+        "schedule": "cosine", "warm_up_steps": 2, "weight_decay": 0.05, "average": 0.9, "gradient_limit": 1.0,
+        "dropout": 0.1, "noise": 0.02, "direct": SIZE,
+    }  # fmt: skip
+    return Recipe.model_validate(facts | changes)
+
+
+class Source:
+    """Twelve objects, fewer than an epoch's samples."""
+
+    def __init__(self) -> None:
+        self.maps, self.normal = small_maps(12, 0), CellNormal()
+        depth_m, intensity = (torch.from_numpy(values) for values in (self.maps.depth_m, self.maps.intensity))
+        self.normal.learn(depth_m, intensity)
+        self.batch = NormalBatch(self.normal(depth_m, intensity).half(), torch.from_numpy(self.maps.image))
+
+    def batches(self, batch: int, generator: torch.Generator) -> Iterable[NormalBatch]:
+        for rows in torch.randperm(12, generator=generator).split(batch):
+            yield NormalBatch(*(values[rows] for values in self.batch))
+
+
+def test_answer_to_mirrored_maps_is_the_mirrored_answer() -> None:
+    network, normal = _shaken(DirectNetwork(SIZE)), torch.randn(3, 2, 64, 80)
+    logits = network.logits(normal)
+    torch.testing.assert_close(network.logits(normal.flip(-2)), logits.flip(-2), rtol=0, atol=1e-5)
+    assert float(logits.detach().std()) > 0.1
+    assert (logits - logits.flip(-2)).abs().max() > 0.1
+
+
+def test_mirror_linear_is_a_linear_layer_of_both_sides() -> None:
+    layer, sides = MirrorLinear(5, 3), torch.randn(4, 2, 5)
+    own, other = (layer.even.weight + layer.odd.weight) / 2, (layer.even.weight - layer.odd.weight) / 2
+    top = 0.98 * (sides[:, 0] @ own.T + sides[:, 1] @ other.T) + 0.7 * layer.even.bias
+    torch.testing.assert_close(layer(sides)[:, 0], top)
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 0), (9, 21), (40, 63), (63, 5)])
+def test_each_pixel_has_its_place(row: int, column: int) -> None:
+    """A head's bias moves the same pixel of every token: its rows count down above, up below the middle."""
+    network = _shaken(DirectNetwork(SIZE))
+    normal, plain = torch.zeros(1, 2, 64, 80), network.logits(torch.zeros(1, 2, 64, 80))
+    within = (row if row < 32 else 63 - row) % 8
+    with torch.no_grad():
+        network.heads.bias[64 + 8 * within + column % 8] += 1  # the second head: depth
+    moved = (network.logits(normal) - plain).abs() > 0.5
+    assert moved[0, 1, row, column]
+    assert int(moved.sum()) == 64
+
+
+def test_cells_are_normalised_symmetrically_and_clipped() -> None:
+    maps, normal = small_maps(40, 0), CellNormal()
+    depth_m, intensity = torch.from_numpy(maps.depth_m.copy()), torch.from_numpy(maps.intensity)
+    depth_m[:, 3, 7] = torch.nan
+    normal.learn(depth_m, intensity)
+    values = normal(depth_m, intensity)
+    assert (values[:, :, 3, 7] == 0).all()
+    assert values.abs().max() <= CLIP
+    torch.testing.assert_close(normal(depth_m.flip(-2), intensity.flip(-2)), values.flip(-2))
+
+
+def test_loss_is_least_at_the_truth() -> None:
+    truth = torch.zeros(2, 64, 64)
+    truth[:, 10:30, 20:50] = torch.linspace(0.2, 0.9, 30)
+
+    def logits(surface: Tensor) -> Tensor:
+        depth = torch.logit((truth - 0.1).clamp(1e-3) / 0.9)
+        return torch.stack([torch.where(surface, 12.0, -12.0), depth], dim=1)
+
+    exact = logits(truth > 0)
+    assert float(two_heads_error(exact, truth)) < 1e-3
+    torch.testing.assert_close(image_from_logits(exact), truth, rtol=0, atol=1e-3)
+    assert two_heads_error(logits(truth.roll(1, -1) > 0), truth) > 0.1
+    assert two_heads_error(exact + torch.tensor([0.0, 0.5])[:, None, None], truth) > 0.05
+
+
+def test_run_stopped_halfway_resumes_exactly_with_its_average(tmp_path: Path) -> None:
+    whole, figures = train_direct(_recipe(), Source(), small_maps(4, 1), tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        train_direct(
+            _recipe(), Source(), small_maps(4, 1), tmp_path / "cut", Running(stop=iter([False] * 4 + [True]).__next__)
+        )
+    resumed, again = train_direct(_recipe(), Source(), small_maps(4, 1), tmp_path / "cut")
+    assert not changed_tensors(whole.state_dict(), resumed.state_dict())
+    assert figures == again
+    plain, _ = train_direct(_recipe(average=0.0), Source(), small_maps(4, 1), tmp_path / "plain")
+    assert changed_tensors(whole.state_dict(), plain.state_dict())
+
+
+def test_average_is_scored_and_kept_and_minutes_are_logged(tmp_path: Path) -> None:
+    times = iter(range(0, 100000, 45))
+    running = Running(clock=lambda: float(next(times)))
+    network, figures = train_direct(_recipe(), Source(), small_maps(4, 1), tmp_path, running)
+    truth = as_images(small_maps(4, 1).image)[:, 0].numpy()
+    error = np.square(reconstruct(network, small_maps(4, 1)) - truth).sum((1, 2)).mean()
+    assert figures["held_out_loss"] == pytest.approx(error, rel=1e-5)
+    assert (tmp_path / BEST).exists()
+    lines = (tmp_path / MINUTES).read_text(encoding="utf-8").splitlines()
+    assert lines[0].split()[1:3] == ["epoch", "0"]
+    assert "samples/s" in lines[-1]
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder, network = tmp_path_factory.mktemp("direct"), _shaken(DirectNetwork(SIZE))
+    network.normal.load_state_dict(Source().normal.state_dict())
+    save_direct(folder, network, CheckpointRecord.of([_recipe()], ("paper-rig", "0" * 64)))
+    export_folder(folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_path: Path) -> None:
+    network, record = load_network(weights)
+    assert record.runs == [_recipe()]
+    maps = Source().maps
+    images = load_reconstructor(weights, tmp_path)(maps.depth_m, maps.intensity)
+    np.testing.assert_allclose(images, reconstruct(network, maps), atol=1e-5)
+    assert not [*tmp_path.iterdir()]
+    with pytest.raises(CheckpointError, match="direct network"):
+        load_pipeline(weights)

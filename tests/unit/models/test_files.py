@@ -1,0 +1,196 @@
+"""Laws of atomic writes, claims, cache entries and checked files, also with processes killed or racing."""
+
+import multiprocessing
+import os
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import nlos_models.files
+import pytest
+from nlos_models.errors import FileBusyError, OutputExistsError
+from nlos_models.files import (
+    CHECKSUMS,
+    TEXT_LIMIT,
+    atomic_file,
+    claim,
+    describe,
+    load_cached,
+    read_bounded,
+    read_checked,
+    reservations,
+    write_checked,
+)
+
+FORK = multiprocessing.get_context("fork")
+
+
+def hold(path: Path, ready: Any, content: str = "half") -> None:
+    with claim(path) as folder:
+        (folder / "part").write_text(content, encoding="utf-8")
+        ready.set()
+        threading.Event().wait(60)
+
+
+def killed_holder(path: Path) -> None:
+    ready = FORK.Event()
+    process = FORK.Process(target=hold, args=(path, ready))
+    process.start()
+    assert ready.wait(20)
+    os.kill(process.pid or 0, signal.SIGKILL)
+    process.join()
+
+
+def test_exclusive_write_refuses_a_file_that_appeared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.txt"
+    for links in (True, False):
+        if not links:
+            monkeypatch.delattr("os.link")
+            monkeypatch.setattr("os.link", lambda *_: (_ for _ in ()).throw(OSError(95, "no links")), raising=False)
+        with atomic_file(path, exclusive=True) as part:
+            part.write_text("first", encoding="utf-8")
+        with pytest.raises(OutputExistsError, match=r"a\.txt exists"), atomic_file(path, exclusive=True) as part:
+            part.write_text("second", encoding="utf-8")
+        assert path.read_text(encoding="utf-8") == "first"
+        path.unlink()
+    assert not list(tmp_path.iterdir())
+
+
+def test_claim_refuses_a_second_writer_and_names_the_first(tmp_path: Path) -> None:
+    with claim(tmp_path / "a"), pytest.raises(FileBusyError, match=f"process {os.getpid()} on "), claim(tmp_path / "a"):
+        pytest.fail("two writers")
+    with claim(tmp_path / "a") as folder:
+        assert folder.is_dir()
+    assert not list(tmp_path.iterdir())
+
+
+def test_reserved_path_is_written_by_its_process_alone(tmp_path: Path) -> None:
+    with reservations() as reserve:
+        reserve(tmp_path / "a")
+        process = FORK.Process(target=race, args=(tmp_path / "a", *(parts := (FORK.Barrier(1), FORK.SimpleQueue())), 1))
+        nlos_models.files._reserved, held = set(), nlos_models.files._reserved
+        process.start()
+        process.join()
+        nlos_models.files._reserved = held
+        assert parts[1].get() is None
+        for content in ("one", "two"):
+            with atomic_file(tmp_path / "a") as part:
+                with pytest.raises(FileBusyError), claim(tmp_path / "a"):
+                    pytest.fail("two writers in one process")
+                part.write_text(content, encoding="utf-8")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_next_claim_in_a_folder_removes_what_a_killed_process_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed_holder(tmp_path / "a")
+    (tmp_path / ".mine.part").mkdir()  # somebody else's, without our lock
+    assert (tmp_path / ".a.part" / "part").exists()
+    monkeypatch.setattr("nlos_models.files._swept", set())
+    with claim(tmp_path / "b"):
+        assert not (tmp_path / ".a.part").exists()
+    assert [path.name for path in tmp_path.iterdir()] == [".mine.part"]
+
+
+def test_sweep_spares_a_living_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with claim(tmp_path / "a") as folder:
+        (folder / "part").write_bytes(b"1")
+        monkeypatch.setattr("nlos_models.files._swept", set())
+        with claim(tmp_path / "b"):
+            assert (folder / "part").exists()
+
+
+def race(path: Path, start: Any, results: Any, number: int) -> None:
+    start.wait()
+    try:
+        with atomic_file(path, exclusive=True) as part:
+            part.write_text(str(number), encoding="utf-8")
+        results.put(number)
+    except (FileBusyError, OutputExistsError):
+        results.put(None)
+
+
+def test_one_of_many_racing_writers_wins(tmp_path: Path) -> None:
+    for turn in range(10):
+        path, start, results = tmp_path / f"{turn}.txt", FORK.Barrier(4), FORK.SimpleQueue()
+        racers = [FORK.Process(target=race, args=(path, start, results, number)) for number in range(4)]
+        for racer in racers:
+            racer.start()
+        for racer in racers:
+            racer.join()
+        winners = [number for number in (results.get() for _ in racers) if number is not None]
+        assert winners == [int(path.read_text(encoding="utf-8"))]
+    assert len(list(tmp_path.iterdir())) == 10
+
+
+def upper(content: bytes) -> str:
+    return content.decode("ascii").upper()
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "flip", "foreign", "unreadable"])
+def test_damaged_cache_entry_counts_as_absent(tmp_path: Path, damage: str) -> None:
+    entry, made = tmp_path / "cache" / "world.npz", list[int]()
+
+    def make() -> bytes:
+        made.append(1)
+        return b"content"
+
+    assert [load_cached(entry, upper, make) for _ in range(3)] == ["CONTENT"] * 3
+    assert len(made) == 1
+    (file,) = entry.parent.iterdir()
+    if damage == "foreign":
+        load_cached(entry.with_name("other.npz"), upper, lambda: b"other")
+        (other,) = entry.parent.glob("other.*")
+        other.replace(file)
+    else:
+        damages = {"empty": b"", "cut": b"cont", "flip": b"cOntent", "unreadable": b"\xff\xfe"}
+        file.write_bytes(damages[damage])
+    assert [load_cached(entry, upper, make) for _ in range(2)] == ["CONTENT"] * 2
+    assert len(made) == 2
+    assert len(list(entry.parent.glob("world.*"))) == 1
+
+
+def test_cache_entry_that_cannot_be_read_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    load_cached(tmp_path / "a.npz", bytes, lambda: b"\xff")
+    assert load_cached(tmp_path / "a.npz", upper, lambda: b"new") == "NEW"
+    assert "making it again" in caplog.text
+
+
+@pytest.mark.parametrize("place", ["file/below", "/proc/none"])
+def test_unusable_cache_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture, place: str) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    assert load_cached(tmp_path / place / "a.npz", upper, lambda: b"made") == "MADE"
+    assert "NLOS_CAM_CACHE" in caplog.text
+
+
+def test_checked_files_are_refused_when_any_byte_differs(tmp_path: Path) -> None:
+    write_checked(tmp_path, {"a.bin": b"one", "b.bin": b"two"})
+    write_checked(tmp_path, {"b.bin": b"three"})
+    assert [read_checked(tmp_path / name, 10) for name in ("a.bin", "b.bin")] == [b"one", b"three"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [CHECKSUMS, "a.bin", "b.bin"]
+    (tmp_path / "a.bin").write_bytes(b"onf")
+    with pytest.raises(ValueError, match="checksum"):
+        read_checked(tmp_path / "a.bin", 10)
+    (tmp_path / CHECKSUMS).unlink()
+    assert read_checked(tmp_path / "a.bin", 10) == b"onf"  # weights from before checksums
+
+
+def test_bounded_read_refuses_long_files_and_pipes(tmp_path: Path) -> None:
+    (tmp_path / "long").write_bytes(bytes(TEXT_LIMIT + 1))
+    os.mkfifo(tmp_path / "pipe")
+    for name, problem in (("long", "longer than the 1 MiB"), ("pipe", "not a regular file")):
+        with pytest.raises(OSError, match=problem):
+            read_bounded(tmp_path / name, TEXT_LIMIT)
+
+
+def test_describe_gives_one_line() -> None:
+    errors = [RecursionError(), MemoryError(), OSError(28, "No space left on device"), ValueError("a\n b"), KeyError()]
+    assert [describe(error) for error in errors] == [
+        "it is nested too deeply",
+        "it needs more memory than there is",
+        "No space left on device",
+        "a b",
+        "its parts contradict each other",
+    ]

@@ -1,0 +1,134 @@
+"""Hours of `live` with a watcher that comes and goes: docs/soak.json and docs/images/soak.png.
+
+`soak.py [--minutes M] [--camera URI] [--out FILE]`. Once a minute it notes memory, threads and descriptors of the
+process, and latency and drops of that minute's frames. The files are written after each minute.
+"""
+
+import argparse
+import csv
+import json
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from http.client import HTTPConnection, HTTPException
+from pathlib import Path
+from threading import Event, Thread
+from urllib.parse import urlsplit
+
+import numpy as np
+from live_process import LiveProcess
+from matplotlib.figure import Figure
+
+from nlos_cam.evaluate import machine
+
+DOCS = Path(__file__).parents[2] / "docs"
+START_TIMEOUT_S, END_TIMEOUT_S, MINUTE_S = 300.0, 60.0, 60.0
+WATCH_S, PAUSE_S = 20.0, 10.0
+LATENCY, DROPPED = "latency_ms", "dropped"
+"""Columns of the frame log, by part of their name."""
+
+
+@dataclass(frozen=True)
+class Minute:
+    """State of the process at the end of a minute, and the frames of that minute."""
+
+    minute: int
+    rss_mib: float
+    threads: int
+    descriptors: int
+    frames: int
+    latency_p50_ms: float
+    latency_p99_ms: float
+    dropped: float
+    """Frames dropped since the start, as the log has it."""
+    watchers: int
+    """That came and went so far."""
+
+
+def watch(address: str, stop: Event, visits: list[int]) -> None:
+    """Read the view's stream for a while, leave, and come again, until told to stop."""
+    while not stop.wait(PAUSE_S):
+        until_s = time.monotonic() + WATCH_S
+        connection = HTTPConnection(urlsplit(address).netloc, timeout=WATCH_S)
+        with suppress(OSError, HTTPException):
+            connection.request("GET", "/stream")
+            stream = connection.getresponse()
+            while time.monotonic() < until_s and stream.read1(1 << 16) and not stop.is_set():
+                pass
+        connection.close()
+        visits.append(1)
+
+
+def state_of(pid: int) -> tuple[float, int, int]:
+    """Return memory in MiB, threads and descriptors of a process."""
+    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines())
+    descriptors = len(list(Path(f"/proc/{pid}/fd").iterdir()))
+    return int(status["VmRSS"].split()[0]) / 1024, int(status["Threads"]), descriptors
+
+
+def rows_of(log: Path, done: int) -> list[dict[str, str]]:
+    """Return the whole rows of the frame log after those already read."""
+    with log.open(encoding="utf-8", newline="") as file:
+        text = file.read()
+    return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))[done:]
+
+
+def _column(rows: list[dict[str, str]], part: str) -> list[float]:
+    name = next((name for name in rows[0] if part in name), "") if rows else ""
+    return [float(row[name]) for row in rows if name and row[name]]
+
+
+def summarize(number: int, state: tuple[float, int, int], rows: list[dict[str, str]], watchers: int) -> Minute:
+    """Return one minute's line."""
+    latency_ms, dropped = _column(rows, LATENCY) or [0.0], _column(rows, DROPPED) or [0.0]
+    p50, p99 = (float(value) for value in np.percentile(latency_ms, [50, 99]))
+    return Minute(number, *state, len(rows), p50, p99, dropped[-1], watchers)
+
+
+def draw(minutes: list[Minute], path: Path) -> None:
+    """Draw every figure over time."""
+    names = "rss_mib", "threads", "descriptors", "latency_p99_ms", "frames"
+    figure = Figure(figsize=(7, 8), layout="constrained")
+    for axis, name in zip(figure.subplots(len(names), 1, sharex=True), names, strict=True):
+        axis.plot([each.minute for each in minutes], [getattr(each, name) for each in minutes])
+        axis.set(ylabel=name.replace("_", " "), ylim=(0, None))
+    axis.set(xlabel="minutes")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> int:
+    """Soak; write after each minute; return the exit code of the run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=int, default=120)
+    parser.add_argument("--camera", default="sim")
+    parser.add_argument("--out", type=Path, default=DOCS / "soak.json")
+    chosen = parser.parse_args()
+    minutes, visits, stop, read = list[Minute](), list[int](), Event(), 0
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "frames.csv"
+        seconds = MINUTE_S * chosen.minutes + MINUTE_S / 2
+        with LiveProcess([chosen.camera, "--seconds", str(seconds), "--log", str(log), "--json"]) as run:
+            address = run.wait_for_address(START_TIMEOUT_S)
+            watcher = Thread(target=watch, args=(address, stop, visits), daemon=True)
+            watcher.start()
+            for number in range(1, chosen.minutes + 1):
+                time.sleep(MINUTE_S)
+                if run.process.poll() is not None:
+                    break
+                rows = rows_of(log, read)
+                read += len(rows)
+                minutes.append(summarize(number, state_of(run.process.pid), rows, len(visits)))
+                facts = {"machine": machine(), "camera": chosen.camera, "minutes": list(map(asdict, minutes))}
+                chosen.out.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+                draw(minutes, DOCS / "images" / f"{chosen.out.stem}.png")
+                print(minutes[-1], file=sys.stderr)
+            stop.set()
+            run.ended_within(END_TIMEOUT_S + MINUTE_S)
+            watcher.join(WATCH_S)
+            return run.process.returncode or 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
