@@ -247,8 +247,8 @@ QUANTIZED = ["Conv", "MatMul", "Gemm"]
 def quantize(model: bytes, samples: Iterable[Sample] | None = None) -> bytes:
     """Return an ONNX file with weights in 8 bits; given samples, also with activations in 8 bits of their ranges.
 
-    The weights take 7 of the 8 bits: where a processor has no VNNI instructions, ONNX Runtime adds two products of 8 by 8
-    bits in 16 bits, which then saturate (measured there: a mean error of 17 % of the picture's spread in place of 3 %).
+    The weights take 7 of the 8 bits: on a processor without VNNI instructions, ONNX Runtime adds two products of 8 by
+    8 bits in 16 bits, which saturate (measured there: a mean error of 17 % of the picture's spread in place of 3 %).
     Raises ModelError where ONNX Runtime fails.
     """
     from onnxruntime import quantization

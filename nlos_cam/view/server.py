@@ -142,7 +142,7 @@ class Handler(BaseHTTPRequestHandler):
     def _answer_stream(self) -> None:
         if not self.streams.acquire(blocking=False):
             most = self.served.max_streams
-            self._say(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} browsers watch already: close one, and this page goes on")
+            self._say(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} browsers watch already: close one to watch here")
             return
         try:
             self._begin(HTTPStatus.OK, "application/octet-stream")
