@@ -271,7 +271,7 @@ def histograms(job: TransportJob) -> Float32:
 
     The result does not depend on the number of threads: one thread sums each histogram, patches in order.
     """
-    numba_job = _NumbaJob(job)
+    numba_job = NumbaJob(job)
     if job.brdf is None:
         return numba_job.histograms(np.empty((0, 0), np.float32), np.ones(len(job.laser_spot_m)))
     total = np.zeros((len(job.laser_spot_m), job.bins), np.float32)
@@ -289,7 +289,7 @@ def echoes(job: TransportJob) -> MultiBounce:
     """
     if job.brdf is not None:
         return strongest(histograms(job), job.bin_m)
-    numba_job = _NumbaJob(job)
+    numba_job = NumbaJob(job)
     every = numba_job.feet(np.ones(len(job.laser_spot_m)))
     table = numba_job.tables(np.empty((0, 0), np.float32))
     winner, peak, second, sure = _strongest_in_window(every, *numba_job.sites, table, job.bins)
@@ -302,7 +302,7 @@ def echoes(job: TransportJob) -> MultiBounce:
     return found
 
 
-class _NumbaJob:
+class NumbaJob:
     """Job in float32, with everything that does not depend on the BRDF computed once."""
 
     def __init__(self, job: TransportJob) -> None:
