@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
 from nlos_models.errors import RecipeError, TrainingError
-from nlos_models.recipe import Recipe
+from nlos_models.recipe import Precision, Recipe
 
 Accelerator = Literal["auto", "cpu", "cuda"]
 Loss = Callable[[Any, float], Tensor]
@@ -45,7 +45,17 @@ def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: i
         requested = f"{devices} GPU{'s' if devices > 1 else ''} requested, {gpus or 'none'} available"
         raise TrainingError(f"{requested}: choose fewer --devices, or --accelerator cpu")
     strategy = "ddp_spawn" if devices > 1 else "auto"
-    return Fabric(accelerator=accelerator, devices=devices, strategy=strategy, precision=recipe.precision)
+    precision = precision_on(accelerator, recipe)
+    return Fabric(accelerator=accelerator, devices=devices, strategy=strategy, precision=precision)
+
+
+def precision_on(device: str, recipe: Recipe) -> Precision:
+    """Return the recipe's precision, or float32 on a CPU without wide vectors, where bfloat16 is emulated.
+
+    Measured on two threads of an AMD EPYC without AVX-512: 25 samples per second in bfloat16, 235 in float32.
+    """
+    emulated = device == "cpu" and torch.backends.cpu.get_cpu_capability() in {"DEFAULT", "AVX2"}
+    return "32-true" if emulated else recipe.precision
 
 
 def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:

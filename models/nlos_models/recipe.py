@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 MapKind = Literal["raw maps", "difference maps"]
 ImageLoss = Literal["squared", "absolute"]
+Precision = Literal["32-true", "bf16-mixed"]
 SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
 """Note on all data, weights and results in color."""
 
@@ -66,7 +67,8 @@ class Recipe(BaseModel):
     """Decay of the moving average of the weights, which is then what is scored and kept; 0: none."""
     gradient_limit: float = Field(default=0.0, ge=0)
     """Largest norm of the gradients, which are scaled down to it; 0: none."""
-    precision: Literal["32-true", "bf16-mixed"] = "32-true"
+    precision: Precision = "32-true"
+    """Of the products; on a CPU that emulates bfloat16, float32 takes its place (`distributed.precision_on`)."""
     kl_weight: float = 0.05
     latent_warm_up: float = Field(default=0.0, ge=0, le=0.5)
     """VAE: share of the run as a plain autoencoder; noise and divergence then rise over an equal share."""

@@ -23,7 +23,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from nlos_models.distributed import Loss, LossStep, open_fabric, seed_of, share_of
+from nlos_models.distributed import Loss, LossStep, open_fabric, precision_on, seed_of, share_of
 from nlos_models.errors import CheckpointError, ModelError, RecipeError, TrainingError
 from nlos_models.files import TENSOR_LIMIT, atomic_file, read_bounded
 from nlos_models.recipe import Recipe, has_ended, schedule_of
@@ -311,6 +311,8 @@ class _Run:
         self.module, self.recipe, self.folder, self._running = module, recipe, folder, running
         self.fabric = running.fabric_for(recipe)
         self.leads = self.fabric.is_global_zero
+        if precision_on(self.fabric.device.type, recipe) != recipe.precision:
+            self.report("this processor emulates bfloat16: training in float32, which is several times faster here")
         free = [p for p in module.parameters() if p.requires_grad]
         kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
         self.optimizer = kind(free, recipe.learning_rate, recipe.betas, weight_decay=recipe.weight_decay)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from nlos_models.distributed import launch, open_fabric, seed_of, share_of
+from nlos_models.distributed import launch, open_fabric, precision_on, seed_of, share_of
 from nlos_models.errors import RecipeError, TrainingError
 from small_run import SmallRun, on_two, small_recipe
 from torch import Tensor
@@ -62,6 +62,15 @@ def test_open_fabric_refuses_uneven_batch_and_missing_gpus(monkeypatch: pytest.M
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     with pytest.raises(TrainingError, match="2 GPUs"):
         open_fabric(small_recipe(), accelerator="cuda", devices=2)
+
+
+@pytest.mark.parametrize(("vectors", "made"), [("AVX2", "32-true"), ("AVX512", "bf16-mixed")])
+def test_cpu_that_emulates_bfloat16_trains_in_float32(monkeypatch: pytest.MonkeyPatch, vectors: str, made: str) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: vectors)
+    halves, singles = small_recipe(precision="bf16-mixed"), small_recipe()
+    assert precision_on("cpu", halves) == made
+    assert precision_on("cuda", halves) == "bf16-mixed"
+    assert precision_on("cpu", singles) == "32-true"
 
 
 KILLED = ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -9, "SIGKILL")
