@@ -30,7 +30,7 @@ TIMING_EPOCHS = 3
 SEED, HELD_OUT_SEED = 2_000_000, 10_000_000
 OBJECTS = 1_000_000
 """Upper limit of what is rendered; the time ends it earlier."""
-PROGRAM = (sys.executable, "-c", "import sys; from nlos_cam.cli.main import run; sys.argv[0] = 'nlos-cam'; run()")
+PROGRAM = (sys.executable, "-c", "import sys; from nlos_cam.cli import run; sys.argv[0] = 'nlos-cam'; run()")
 
 
 def go(out: Path, name: str, arguments: Sequence[str], ends: Callable[[float], bool] = lambda _: False) -> float:

@@ -3,7 +3,6 @@
 import importlib
 import json
 import os
-import sys
 from contextlib import suppress
 from typing import Annotated, NamedTuple
 
@@ -13,6 +12,7 @@ from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 from typer.main import get_command
 
+from nlos_cam.cli import run as run  # noqa: PLC0414  scripts of earlier installations find it here
 from nlos_cam.cli.common import (
     INTERRUPTED,
     interrupted_by_signals,
@@ -209,8 +209,3 @@ def _report_usage(error: typer.TyperException, *, as_json: bool) -> int:
 def _print_error(kind: str, message: str) -> None:
     with suppress(OSError):  # stdout may be full or closed: the line on stderr stands
         print(json.dumps({"error": {"type": kind, "message": message}}), flush=True)  # noqa: T201
-
-
-def run() -> None:
-    """Run the console script."""
-    raise SystemExit(main(sys.argv[1:]))

@@ -28,7 +28,7 @@ class Program:
     """The program, running in a folder and serving its view."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
-        program = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()", *arguments]
+        program = [sys.executable, "-c", "from nlos_cam.cli import run; run()", *arguments]
         self.process = subprocess.Popen(
             program, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True, cwd=folder
         )
@@ -166,7 +166,7 @@ def test_empty_bench_is_taken_as_reference(start: Callable[..., Program], browse
 def test_recording_opens_plays_and_exports_in_the_page(
     start: Callable[..., Program], browser: Any, tmp_path: Path
 ) -> None:
-    capture = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()", "capture", "--camera", "sim"]
+    capture = [sys.executable, "-c", "from nlos_cam.cli import run; run()", "capture", "--camera", "sim"]
     subprocess.run([*capture, "--seconds", "2", "--out", "run.bag"], check=True, cwd=tmp_path, capture_output=True)
     page = Page(browser, start("view", "run.bag").address)
     page.wait_drawn()

@@ -62,7 +62,7 @@ BOARD = "board --out {out}/board.pdf"
 COMMANDS = EXPORT, REPAIR, RENDER, BOARD
 
 
-START = "import resource, sys; from nlos_cam.cli.main import run; {limit}; run()"
+START = "import resource, sys; from nlos_cam.cli import run; {limit}; run()"
 
 
 def ending(command: str, bag: Path, out: Path, limit: str = "") -> tuple[int, str]:
@@ -126,7 +126,7 @@ def shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_with(shim: Path, command: str, bag: Path, out: Path, **variables: str) -> subprocess.CompletedProcess[str]:
     out.mkdir()
-    start = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()"]
+    start = [sys.executable, "-c", "from nlos_cam.cli import run; run()"]
     environment = {**os.environ, "LD_PRELOAD": str(shim), "SHIM_FOLDER": str(out), **variables}
     words = command.format(bag=bag, out=out).split()
     return subprocess.run([*start, *words], env=environment, capture_output=True, text=True, timeout=200, check=False)

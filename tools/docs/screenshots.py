@@ -28,7 +28,7 @@ FLAGS = [
     *("--disable-background-networking", "--disable-component-update"),
 ]
 IMAGES = Path("docs/images")
-PROGRAM = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()"]
+PROGRAM = [sys.executable, "-c", "from nlos_cam.cli import run; run()"]
 TIMEOUT_S = 180.0
 SITUATIONS: dict[str, tuple[list[str], str, str]] = {
     "object": (["live", "sim"], "", "Object detected"),

@@ -41,7 +41,7 @@ class Kill:
 
 def build_command(folder: Path, count: int, shard: int) -> list[str]:
     """Return the command that builds `count` objects in shards of another size."""
-    program = f"from nlos_cam import dataset; from nlos_cam.cli.main import run; dataset.SHARD = {shard}; run()"
+    program = f"from nlos_cam import dataset; from nlos_cam.cli import run; dataset.SHARD = {shard}; run()"
     options = ["--out", str(folder), "--count", str(count), "--workers", "2"]
     return [sys.executable, "-c", program, "dataset", "build", *options]
 

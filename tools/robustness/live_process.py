@@ -12,7 +12,7 @@ from typing import Self
 
 from processes import session_of
 
-PROGRAM = "import sys; from nlos_cam.cli.main import run; print('begun', file=sys.stderr, flush=True); run()"
+PROGRAM = "import sys; from nlos_cam.cli import run; print('begun', file=sys.stderr, flush=True); run()"
 ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+/")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-PROGRAM = [sys.executable, "-c", "from nlos_cam.cli.main import run; run()"]
+PROGRAM = [sys.executable, "-c", "from nlos_cam.cli import run; run()"]
 """Starts `nlos-cam` with this Python."""
 WARM_UP = 0.2
 """Share of a run in which buffers fill; memory is judged after it."""

@@ -25,6 +25,7 @@ from typer.main import get_command
 
 from nlos_cam import errors
 from nlos_cam.cli import main as module
+from nlos_cam.cli import run
 from nlos_cam.cli.common import (
     Json,
     exit_interrupted,
@@ -35,7 +36,7 @@ from nlos_cam.cli.common import (
     say,
     show,
 )
-from nlos_cam.cli.main import COMMANDS, _share_options, build_app, main, run
+from nlos_cam.cli.main import COMMANDS, _share_options, build_app, main
 from nlos_cam.cli.plain_help import plain_help, range_text
 
 CODES = {
@@ -196,10 +197,26 @@ def test_wrong_usage_exits_with_2(does: Does, capsys: Capsys, arguments: list[st
 def test_console_script_exits_with_the_code(does: Does, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
     does(errors.CameraNotFoundError("no device"))
     monkeypatch.setattr(sys, "argv", ["nlos-cam", "act"])
-    with pytest.raises(SystemExit) as caught:
-        run()
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit) as caught:
+            run()
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert caught.value.code == 3
     assert "no device" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("module_name", ["nlos_cam.cli.main", "typing", "typer", "rich.console", "rich.table"])
+def test_interruption_while_python_imports_is_one_line(module_name: str) -> None:
+    """The signal comes at the import of a module: before, between and after those of the command line itself."""
+    interrupt = f"lambda event, found: event == 'import' and found[0] == {module_name!r} and signal.raise_signal(2)"
+    program = f"import signal, sys; sys.addaudithook({interrupt}); from nlos_cam.cli import run; run()"
+    line = [sys.executable, "-c", program, "scenes"]
+    ended = subprocess.run(line, check=False, capture_output=True, text=True, timeout=120)
+    assert (ended.returncode, ended.stdout) == (130, "")
+    assert len(ended.stderr.splitlines()) == 1
+    assert ended.stderr.startswith("interrupted")
 
 
 def leaves(app: typer.Typer, path: str = "") -> list[tuple[str, object]]:
