@@ -85,6 +85,15 @@ class CellNormal(nn.Module):
             self.median[channel] = (median + median.flip(0)) / 2
             self.spread[channel] = (spread + spread.flip(0)) / 2
 
+    def shift(self, depth_m: Tensor, intensity: Tensor, channels: slice = slice(None)) -> None:
+        """Shift the medians of some or all channels as maps (n, 64, 80) of another bench ask for: its offset, its gain.
+
+        One number a channel, the median over the cells: a few objects do not tell each cell's own median.
+        """
+        medians = _channels(depth_m, intensity).nanmedian(0).values
+        shifts = (medians - self.median).flatten(1).nanmedian(1).values.nan_to_num()
+        self.median[channels] += shifts[channels, None, None]
+
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
         """Map maps (n, 64, 80) to (n, 2, 64, 80); a cell without a return is 0 in both channels."""
         normal = (_channels(depth_m, intensity) - self.median) / self.spread
@@ -140,6 +149,11 @@ class DirectNetwork(nn.Module):
         x = x.unflatten(-1, (2, TOKEN, TOKEN)).unflatten(2, SIDE_TOKENS)  # (n, side, row, column, head, y, x)
         x = x.permute(0, 1, 4, 2, 5, 3, 6).reshape(-1, 2, 2, PIXELS // 2, PIXELS)
         return torch.cat([x[:, 0], x[:, 1].flip(-2)], dim=-2)
+
+    @property
+    def last_layers(self) -> list[nn.Module]:
+        """Layers that the second phase of a transfer trains."""
+        return [self.norm, self.heads]
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
         """Return the images of maps (n, 64, 80) with NaN depth where there is no return."""

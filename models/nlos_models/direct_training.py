@@ -1,4 +1,4 @@
-"""Training of the direct network: maps normalised once, noise drawn anew at each step, two heads."""
+"""Training of the direct network, and its transfer to a bench: noise drawn anew at each step, two heads."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,10 +7,10 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from nlos_models.data import MapSet
+from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapSet, MapSource
 from nlos_models.direct import CellNormal, DirectNetwork, two_heads_error
 from nlos_models.recipe import Recipe
-from nlos_models.tasks import figures_of, run
+from nlos_models.tasks import figures_of, in_two_phases, run
 from nlos_models.train import Running, Scores, fit
 
 
@@ -62,6 +62,49 @@ def train_direct(
         folder=folder,
         running=running,
     )
+    return network.cpu().eval(), figures
+
+
+def transfer_direct(
+    recipe: Recipe,
+    network: DirectNetwork,
+    maps: MapSource,
+    held_out: MapSet,
+    folder: Path,
+    running: Running | None = None,
+) -> tuple[DirectNetwork, Scores]:
+    """Fine-tune a direct network in place on recordings' maps: all layers, then the heads; a second call resumes.
+
+    Returns it in eval mode, and its held-out figures.
+    """
+    torch.manual_seed(recipe.seed)
+    for block in network.trunk:
+        block.dropout.p = recipe.dropout  # type: ignore[union-attr]  (a Residual)
+    if recipe.statistics != "kept":
+        seen = maps.first(STATISTICS_OBJECTS)
+        channels = slice(1, None) if recipe.statistics == "own intensity" else slice(None)
+        network.normal.shift(torch.from_numpy(seen.depth_m), torch.from_numpy(seen.intensity), channels)
+
+    def loss(batch: MapBatch, _: float) -> Tensor:
+        normal = network.normal(batch.depth_m, batch.intensity)
+        return two_heads_error(network.logits(normal + recipe.noise * torch.randn_like(normal)), batch.image[:, 0])
+
+    def fit_phase(phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool) -> Scores:
+        network.requires_grad_(not last_layers)
+        for layer in network.last_layers:
+            layer.requires_grad_(requires_grad=True)
+        return fit(
+            network,
+            recipe=phase,
+            steps_per_epoch=len(maps.image) // phase.batch,
+            batches=lambda generator: maps.batches(phase.batch, generator),
+            loss=loss,
+            score=lambda: figures_of(run(network, held_out), held_out.image),
+            folder=phase_folder,
+            running=running,
+        )
+
+    figures = in_two_phases(recipe, len(maps.image), folder, running or Running(), fit_phase)
     return network.cpu().eval(), figures
 
 

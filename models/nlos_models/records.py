@@ -65,7 +65,7 @@ class CheckpointRecord(BaseModel):
     @property
     def runs(self) -> list[Recipe]:
         """Recipes of all runs behind these weights, the oldest first."""
-        own = (self.vae_recipe, self.compressor_recipe, self.transfer_recipe, self.direct_recipe)
+        own = (self.vae_recipe, self.compressor_recipe, self.direct_recipe, self.transfer_recipe)
         return [*self.earlier, *(recipe for recipe in own if recipe)]
 
     @property

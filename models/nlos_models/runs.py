@@ -11,6 +11,7 @@ from lightning_fabric import Fabric
 from nlos_models.arrays import Float16
 from nlos_models.checkpoint import (
     load_encoder,
+    load_network,
     load_pipeline,
     load_pipeline_partly,
     load_vae,
@@ -19,7 +20,8 @@ from nlos_models.checkpoint import (
     save_vae,
 )
 from nlos_models.data import MapSet, MapSource
-from nlos_models.direct_training import NormalSource, train_direct
+from nlos_models.direct import DirectNetwork
+from nlos_models.direct_training import NormalSource, train_direct, transfer_direct
 from nlos_models.doubt_checkpoint import save_doubt
 from nlos_models.doubt_training import DoubtSet, calibrate, train_doubt
 from nlos_models.errors import OutputExistsError, TrainingError
@@ -142,17 +144,23 @@ def run_direct(fabric: Fabric, training: TrainingRun, source: NormalSource, held
 def run_transfer(
     fabric: Fabric,
     training: TrainingRun,
-    pipeline: RemappingNetwork,
+    network: RemappingNetwork | DirectNetwork,
     encoder: Encoder | None,
     maps: MapSource,
     held_out: MapSet,
 ) -> dict[str, Scores]:
     """Fine-tune weights on recordings and save them; return their held-out figures before and after."""
-    before = figures_of(run(pipeline.to(fabric.device).eval(), held_out), held_out.image)
+    before = figures_of(run(network.to(fabric.device).eval(), held_out), held_out.image)
     with training.watched(fabric, "transfer") as running:
-        pipeline, after = train_transfer(training.recipe, pipeline, encoder, maps, held_out, training.out, running)
+        if isinstance(network, DirectNetwork):
+            network, after = transfer_direct(training.recipe, network, maps, held_out, training.out, running)
+        else:
+            network, after = train_transfer(training.recipe, network, encoder, maps, held_out, training.out, running)
     if fabric.is_global_zero:
-        save_pipeline(training.out, pipeline, training.with_figures(after), encoder)
+        if isinstance(network, DirectNetwork):
+            save_direct(training.out, network, training.with_figures(after))
+        else:
+            save_pipeline(training.out, network, training.with_figures(after), encoder)
         _export(training)
     return {"before": before, "after": after}
 
@@ -206,15 +214,16 @@ def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | No
 
 def transfer_start(
     recipe: Recipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
-) -> tuple[RemappingNetwork, list[Recipe]]:
-    """Load the pipeline that a transfer starts from (default: the shipped one) and the runs that made it.
+) -> tuple[RemappingNetwork | DirectNetwork, list[Recipe]]:
+    """Load the networks that a transfer starts from (default: the shipped ones) and the runs that made them.
 
     If `partial`, only matching layers of the compressor are loaded, `on_report` is called with a summary of them, and
     the others are initialised from the recipe's seed.
     """
-    if not partial:
-        return _pipeline_start(recipe, weights)
     _check_fits(recipe, weights)
+    if not partial:
+        network, record = load_network(weights)
+        return network, record.runs
     torch.manual_seed(recipe.seed)
     pipeline, record, report = load_pipeline_partly(weights or shipped_folder())
     on_report(f"compressor: {report}")

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -264,12 +264,28 @@ def train_transfer(
     figures.
     """
     torch.manual_seed(recipe.seed)
-    running = running or Running()
     set_for_training(pipeline, recipe)
     remapping = Remapping(pipeline, encoder, maps, held_out)
     if recipe.statistics != "kept":
         remapping.learn_statistics(CHANNELS[recipe.statistics])
-    steps = len(maps.image) // recipe.batch
+
+    def fit_phase(phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool) -> Scores:
+        features = [pipeline.compressor.get_submodule("features")] if last_layers else []
+        return remapping.fit(phase, [pipeline.decoder, *features], phase_folder, running)
+
+    figures = in_two_phases(recipe, len(maps.image), folder, running or Running(), fit_phase)
+    return pipeline.cpu().eval(), figures
+
+
+class FitPhase(Protocol):
+    """Training of one phase of a transfer: of all layers, or of the last ones alone."""
+
+    def __call__(self, phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool) -> Scores: ...
+
+
+def in_two_phases(recipe: Recipe, samples: int, folder: Path, running: Running, fit_phase: FitPhase) -> Scores:
+    """Train all layers for `all_layers_epochs`, then the last ones (SI 4); return the last phase's figures."""
+    steps = samples // recipe.batch
     before = recipe.all_layers_epochs * steps
     total = before + recipe.epochs * steps
 
@@ -281,7 +297,5 @@ def train_transfer(
 
     if recipe.all_layers_epochs:
         first = recipe.model_copy(update={"epochs": recipe.all_layers_epochs})
-        remapping.fit(first, [pipeline.decoder], folder / ALL_LAYERS, counting_from(0))
-    frozen = [pipeline.decoder, pipeline.compressor.get_submodule("features")]
-    figures = remapping.fit(recipe, frozen, folder / CLASSIFIER, counting_from(before))
-    return pipeline.cpu().eval(), figures
+        fit_phase(first, folder / ALL_LAYERS, counting_from(0), last_layers=False)
+    return fit_phase(recipe, folder / CLASSIFIER, counting_from(before), last_layers=True)

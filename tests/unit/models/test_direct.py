@@ -1,5 +1,6 @@
 """The direct network: mirror symmetry, its places of pixels, its loss, exact resuming, and its checkpoint."""
 
+import io
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -7,21 +8,25 @@ import numpy as np
 import pytest
 import torch
 from nlos_models.checkpoint import load_network, load_pipeline, save_direct
-from nlos_models.data import as_images
+from nlos_models.data import InMemory, as_images
 from nlos_models.direct import CLIP, CellNormal, DirectNetwork, MirrorLinear, image_from_logits, two_heads_error
-from nlos_models.direct_training import NormalBatch, train_direct
+from nlos_models.direct_training import NormalBatch, train_direct, transfer_direct
+from nlos_models.distributed import open_fabric
 from nlos_models.errors import CheckpointError
 from nlos_models.export import export_folder
 from nlos_models.inference import load_reconstructor
 from nlos_models.recipe import DirectSize, Recipe
-from nlos_models.records import CheckpointRecord
+from nlos_models.records import CheckpointRecord, load_record
+from nlos_models.runs import TrainingRun, record_run, run_transfer, transfer_start
+from nlos_models.tasks import figures_of
 from nlos_models.tasks import run as reconstruct
-from nlos_models.train import BEST, MINUTES, Running
+from nlos_models.train import BEST, LAST, MINUTES, Running
 from small_maps import small_maps
 from small_run import changed_tensors
 from torch import Tensor, nn
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+TRANSFER: dict[str, object] = {"task": "transfer", "latent_weight": 0.0, "image_weight": 1.0}
 SIZE = DirectSize(features=8, width=8, blocks=1, token=8, mixers=1)
 
 
@@ -155,3 +160,57 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
     assert not [*tmp_path.iterdir()]
     with pytest.raises(CheckpointError, match="direct network"):
         load_pipeline(weights)
+
+
+def test_shift_follows_another_bench_and_nothing_else() -> None:
+    maps, normal, shifted = small_maps(40, 0), CellNormal(), CellNormal()
+    depth_m, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
+    normal.learn(depth_m, intensity)
+    shifted.load_state_dict(normal.state_dict())
+    shifted.shift(depth_m, intensity)
+    torch.testing.assert_close(shifted.median, normal.median, rtol=0, atol=0.1)
+    shifted.load_state_dict(normal.state_dict())
+    brighter = torch.expm1(torch.log1p(intensity) + 0.4)  # a gain
+    shifted.shift(depth_m + 0.03, brighter, slice(1, None))
+    change = shifted.median - normal.median
+    assert (change[0] == 0).all()
+    torch.testing.assert_close(change[1], torch.full_like(change[1], float(change[1, 0, 0])))
+    assert float(change[1, 0, 0]) == pytest.approx(0.4, abs=0.1)
+
+
+def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> None:
+    def go(folder: Path, running: Running | None = None) -> tuple[DirectNetwork, float]:
+        network = _shaken(DirectNetwork(SIZE))
+        network.normal.load_state_dict(Source().normal.state_dict())
+        recipe = _recipe(
+            task="transfer", latent_weight=0.0, image_weight=1.0, all_layers_epochs=6, epochs=3, average=0.0
+        )
+        after, figures = transfer_direct(recipe, network, InMemory(Source().maps), small_maps(4, 1), folder, running)
+        return after, figures["held_out_loss"]
+
+    before = _shaken(DirectNetwork(SIZE))
+    before.normal.load_state_dict(Source().normal.state_dict())
+    network, loss = go(tmp_path / "whole")
+    assert loss < figures_of(reconstruct(before, small_maps(4, 1)), small_maps(4, 1).image)["held_out_loss"]
+    first = torch.load(io.BytesIO((tmp_path / "whole" / "all-layers" / LAST).read_bytes()[32:]), weights_only=True)
+    last = {name for name, values in network.state_dict().items() if not torch.equal(values, first["module"][name])}
+    assert {name.partition(".")[0] for name in last} <= {"norm", "heads"}
+    with pytest.raises(KeyboardInterrupt):
+        go(tmp_path / "cut", Running(stop=iter([False] * 20 + [True]).__next__))
+    resumed, again = go(tmp_path / "cut")
+    assert again == loss
+    assert not changed_tensors(network.state_dict(), resumed.state_dict())
+
+
+@pytest.mark.slow
+def test_transfer_of_direct_weights_is_saved_with_both_runs(weights: Path, tmp_path: Path) -> None:
+    recipe = _recipe(**TRANSFER, all_layers_epochs=1, epochs=1)
+    network, runs = transfer_start(recipe, weights, partial=False, on_report=pytest.fail)
+    record = record_run(recipe, tmp_path / "out", ("paper-rig", "0" * 64), runs, weights)
+    job = TrainingRun(recipe, tmp_path / "out", record)
+    figures = run_transfer(open_fabric(recipe), job, network, None, InMemory(Source().maps), small_maps(4, 1))
+    assert set(figures) == {"before", "after"}
+    assert load_record(tmp_path / "out").runs == [*runs, recipe]
+    maps, (loaded, _) = Source().maps, load_network(tmp_path / "out")
+    images = load_reconstructor(tmp_path / "out", tmp_path)(maps.depth_m, maps.intensity)
+    np.testing.assert_allclose(images, reconstruct(loaded, maps), atol=1e-5)
