@@ -3,6 +3,7 @@ __all__ = [
     "BLACK_V",
     "CHECKSUMS",
     "DISK_ERRORS",
+    "GOOD_IOU",
     "MIN_V",
     "SIMULATION_ONLY",
     "SMALLER_IS_BETTER",
@@ -23,6 +24,8 @@ __all__ = [
     "NormalSource",
     "OnnxReconstructor",
     "Preprocess",
+    "QualityRecord",
+    "QualitySet",
     "Recipe",
     "Reconstructor",
     "Running",
@@ -46,6 +49,7 @@ __all__ = [
     "digest_of",
     "export_folder",
     "first_of",
+    "fit_quality",
     "foreground_rmse_mm",
     "latent_error",
     "launch",
@@ -64,6 +68,8 @@ __all__ = [
     "open_fabric",
     "packaged_recipes",
     "parts_of",
+    "quality_features",
+    "quality_watches",
     "quantize",
     "read_bounded",
     "read_toml",
@@ -89,6 +95,7 @@ __all__ = [
     "transfer_start",
     "vae_start",
     "write_checked",
+    "write_quality",
 ]
 
 from .checkpoint import load_encoder, load_network, load_pipeline, load_vae
@@ -96,7 +103,7 @@ from .data import InMemory, MapBatch, MapSet, MapSource, as_batch, first_of, sub
 from .direct import CellNormal, DirectNetwork
 from .direct_training import NormalBatch, NormalSource, train_direct
 from .distributed import Accelerator, launch, open_fabric
-from .doubt_training import DoubtSet
+from .doubt_training import DoubtSet, QualitySet, fit_quality
 from .errors import FileBusyError
 from .export import Sample, TorchReconstructor, export_folder, network_export, quantize
 from .extras import missing_extra, require
@@ -123,7 +130,6 @@ from .inference import (
     load_uncertainty_model,
     refuse_color,
 )
-from .losses import latent_error
 from .metrics import (
     BACKGROUND_BELOW_V,
     BLACK_V,
@@ -138,6 +144,7 @@ from .metrics import (
     surface,
 )
 from .pipeline import SMALLEST_SPREAD, Preprocess, channel_statistics, cut_silhouette, lift_edges, split_and_stack
+from .quality import GOOD_IOU, QualityRecord, quality_features, quality_watches, write_quality
 from .recipe import SIMULATION_ONLY, Recipe, load_recipe, packaged_recipes
 from .records import CheckpointRecord, DoubtRecord, load_record, shipped_folder
 from .runs import (
@@ -155,3 +162,4 @@ from .runs import (
 )
 from .tasks import parts_of, rebuild, run
 from .train import Running, Scores, digest_of
+from .vae import latent_error

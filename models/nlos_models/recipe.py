@@ -79,7 +79,7 @@ class Recipe(BaseModel):
     latent_weight: float = Field(default=1.0, ge=0)
     image_weight: float = Field(default=0.0, ge=0)
     surface_weight: float = Field(default=1.0, ge=1)
-    """Weight of a surface pixel in an image's error, relative to a background pixel (`losses.image_error`)."""
+    """Weight of a surface pixel in an image's error, relative to a background pixel (`vae.image_error`)."""
     noise: float = Field(default=0.0, ge=0)
     """Direct network: standard deviation of the noise added to normalised maps."""
     direct: DirectSize = DirectSize()

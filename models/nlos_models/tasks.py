@@ -14,12 +14,11 @@ from torch import Tensor, nn
 from nlos_models.arrays import Float16, Float32
 from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapSet, MapSource, as_images, image_batches
 from nlos_models.errors import TrainingError
-from nlos_models.losses import image_error, kl_divergence, latent_error, variational_share
 from nlos_models.metrics import color_error, color_silhouette_iou, silhouette_iou
 from nlos_models.pipeline import RemappingNetwork, cut_silhouette, new_pipeline, new_vae, split_and_stack
 from nlos_models.recipe import Recipe
 from nlos_models.train import Running, Scores, fit
-from nlos_models.vae import Encoder, ResVae
+from nlos_models.vae import Encoder, ResVae, image_error, kl_divergence, latent_error, variational_share
 
 SCORING_BATCH = 100
 ALL_LAYERS, CLASSIFIER = "all-layers", "classifier"
