@@ -45,6 +45,7 @@ from nlos_cam.evaluate.subjects import (
 from nlos_cam.files import atomic_directory
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, object_box
+from nlos_cam.reconstruct import Mirrored
 from nlos_cam.render import MultiBounce
 from nlos_cam.report import Banner, Bullets, Commands, Document, Picture, Section, Table, saved_picture
 
@@ -158,13 +159,19 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
 
         return make
 
+    def mirrored(threads: int) -> Reconstructor:
+        return Mirrored(onnx(".onnx")(threads))
+
     formats = {"float32": torch.float32, "bfloat16": torch.bfloat16}
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     return {
         **{f"torch {name}, {device}": in_torch(device, dtype) for device in devices for name, dtype in formats.items()},
         "ONNX Runtime float32": onnx(".onnx"),
-        "ONNX Runtime int8 weights": onnx(".dynamic.onnx", quantize),
-        "ONNX Runtime int8": onnx(f".static-{rig.checksum}.onnx", lambda model: quantize(model, calibration(rig, box))),
+        **({} if record.direct_recipe else {"ONNX Runtime float32, mirrored": mirrored}),  # a direct network is exact
+        "ONNX Runtime int8 weights": onnx(".dynamic-7.onnx", quantize),
+        "ONNX Runtime int8": onnx(
+            f".static-7-{rig.checksum}.onnx", lambda model: quantize(model, calibration(rig, box))
+        ),
     }
 
 

@@ -29,6 +29,7 @@ from nlos_cam.evaluate.runtime_tradeoff import (
     runtime_document,
     runtime_facts,
     runtime_settings,
+    runtimes,
 )
 from nlos_cam.evaluate.subjects import seeded_objects
 from nlos_cam.objects.depth_map import object_box
@@ -73,15 +74,24 @@ def test_pareto_front_has_no_row_both_slower_and_worse() -> None:
 
 
 def test_settings_combine_weights_runtimes_and_threads_once() -> None:
-    runtimes = ["torch float32, cpu", "torch float32, cuda", "ONNX Runtime float32"]
-    asked = runtime_settings(["small", "large"], runtimes)
+    names = ["torch float32, cpu", "torch float32, cuda", "ONNX Runtime float32"]
+    asked = runtime_settings(["small", "large"], names)
     assert len({(one.weights, one.name) for one in asked}) == len(asked)
     for weights in ("small", "large"):
         mine = [one for one in asked if one.weights == weights]
         assert {one.frames for one in mine} == {1, 4, 16}
-        assert {one.runtime for one in mine} == set(runtimes)
+        assert {one.runtime for one in mine} == set(names)
         assert {one.threads for one in mine if one.runtime == "torch float32, cpu"} == {1, 2}
     assert asked[0].frames == 1  # the baseline of the others
+
+
+def test_mirrored_runtime_answers_mirrored_maps_with_the_mirrored_image(tmp_path: Path) -> None:
+    network = runtimes(None, RIG, BOX, tmp_path)["ONNX Runtime float32, mirrored"](1)
+    generator = np.random.default_rng(0)
+    depth_m, intensity = (generator.uniform(0.3, 0.5, (1, 64, 80)).astype(np.float32) for _ in range(2))
+    image = network(depth_m, intensity)
+    np.testing.assert_allclose(network(depth_m[:, ::-1], intensity[:, ::-1]), image[:, ::-1], atol=1e-6)
+    assert image.any()
 
 
 def test_measure_takes_median_and_restores_threads() -> None:
