@@ -168,8 +168,12 @@ def first_problem(error: ValidationError) -> str:
     field, text, value = ".".join(str(part) for part in problem["loc"]), problem["msg"], problem["input"]
     for library, plain in WORDING.items():
         text = re.sub(library, plain, text)
-    got = "" if isinstance(value, dict | list) else f" (got {value!r:.80})"
-    return f"{field or 'record'}: {text}{got}"
+    if isinstance(value, dict):  # a rule among fields: the values of those that its message names
+        given = {name: got for name, got in value.items() if re.search(rf"\b{re.escape(str(name))}\b", text)}
+        got = ", ".join(f"{name} = {got!r:.40}" for name, got in given.items() if str(got) not in text)
+    else:
+        got = "" if isinstance(value, list) else f"{value!r:.80}"
+    return f"{field or 'record'}: {text}{f' (got {got})' if got else ''}"
 
 
 def record_kind(content: Mapping[str, object]) -> str:

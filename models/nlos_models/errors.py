@@ -66,5 +66,10 @@ def first_problem(error: Any) -> str:
     field, text, value = ".".join(map(str, problem["loc"])), problem["msg"], problem["input"]
     for library, plain in WORDING.items():
         text = re.sub(library, plain, text)
-    got = "" if isinstance(value, dict | list) or not field else f" (got {value!r:.80})"
-    return f"{field}: {text}{got}" if field else f"{text}{got}"
+    if isinstance(value, dict):  # a rule among fields: the values of those that its message names
+        given = {name: got for name, got in value.items() if re.search(rf"\b{re.escape(str(name))}\b", text)}
+        got = ", ".join(f"{name} = {got!r:.40}" for name, got in given.items() if str(got) not in text)
+    else:
+        got = "" if isinstance(value, list) or not field else f"{value!r:.80}"
+    text += f" (got {got})" if got else ""
+    return f"{field}: {text}" if field else text

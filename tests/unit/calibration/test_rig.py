@@ -44,8 +44,8 @@ def test_rig_checksum_changes_with_a_field() -> None:
     [
         ("distance_m = 0.2", "distance_m = -0.2", r"lidar.distance_m: .*\(got "),
         ("yaw_deg = 45.0", "yaw_degrees = 45.0", "lidar.yaw_deg: is missing"),
-        ("x_max_m = 0.575", "x_max_m = 0.1", "object_box: .*x_min_m < x_max_m"),
-        ("z_far_m = 0.4", "z_far_m = 0.1", "object_box: .*z_near_m < z_far_m"),
+        ("x_max_m = 0.575", "x_max_m = 0.1", r"object_box: .*x_min_m < x_max_m .*\(got .*x_max_m = 0.1"),
+        ("z_far_m = 0.4", "z_far_m = 0.1", r"object_box: .*z_near_m < z_far_m \(got z_near_m = .*, z_far_m = 0.1\)"),
         ('name = "paper-rig"', 'name = "paper-rig"\nroof = 1', r"roof: .*\(got "),
     ],
 )
