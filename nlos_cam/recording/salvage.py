@@ -1,6 +1,7 @@
 """Scan of a bag without its index: undamaged chunks, places of damage, and parts of broken chunks."""
 
 import re
+from bz2 import BZ2Decompressor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,10 @@ from nlos_cam.recording.rosbag import (
     set_up_records,
 )
 
+DECODERS = {b"lz4": LZ4FrameDecompressor, b"bz2": BZ2Decompressor}
+"""Of compressed chunks; both mark the end of their data and hold checksums."""
+BZ2_WORK = 16
+"""Work of unpacking bz2 in units of that of lz4."""
 MIN_PIECE_BYTES, MAX_PIECE_BYTES = 1 << 16, 4 << 20
 LZ4_MAGIC = b'\x04"M\x18'
 WORK_PER_CHUNK = 64
@@ -94,14 +99,15 @@ def _is_message(read: Source, at: int) -> bool:
 def examine(read: Source, at: int, record: BagRecord, file_end: int) -> Examined:
     """Unpack and check a chunk, given its record at `at`.
 
-    The lengths in its header are not trusted: lz4 data mark their own end, other data end with the last message.
+    The lengths in its header are not trusted: packed data mark their own end, other data end with the last message.
     """
-    compression = record.fields.get("compression")
-    if compression == b"lz4":
-        return _examine_lz4(read, at, record, file_end)
+    compression = record.fields.get("compression", b"")
+    if compression in DECODERS:
+        return _examine_packed(read, at, record, file_end)
     if compression == b"none":
         return _examine_plain(read, at, record)
-    return Examined(None, {}, record.data_at, Ending.BROKEN, "unknown compression, neither lz4 nor none")
+    name = compression[:20].decode("utf-8", "replace")
+    return Examined(None, {}, record.data_at, Ending.BROKEN, f"unknown compression {name!r}, none of lz4, bz2, none")
 
 
 def _examine_plain(read: Source, at: int, record: BagRecord) -> Examined:
@@ -112,9 +118,10 @@ def _examine_plain(read: Source, at: int, record: BagRecord) -> Examined:
     return Examined(chunk if found.index else None, found.connections, end, found.ending, why)
 
 
-def _examine_lz4(read: Source, at: int, record: BagRecord, file_end: int) -> Examined:
+def _examine_packed(read: Source, at: int, record: BagRecord, file_end: int) -> Examined:
     piece_bytes = min(max(record.data_bytes, MIN_PIECE_BYTES), MAX_PIECE_BYTES)  # a whole chunk, if its length is sane
-    unpacked, end, ending, why = unpack(read, record.data_at, file_end, piece_bytes)
+    name = record.fields["compression"]
+    unpacked, end, ending, why = unpack(read, record.data_at, file_end, piece_bytes, name)
     if ending is Ending.BROKEN:
         return Examined(None, {}, record.data_at, ending, why)
     found = read_content(read.over(unpacked), 0, len(unpacked), len(unpacked))
@@ -123,7 +130,7 @@ def _examine_lz4(read: Source, at: int, record: BagRecord, file_end: int) -> Exa
         return Examined(chunk if found.index else None, found.connections, record.data_at, ending, why)
     if found.why:
         return Examined(None, {}, record.data_at, Ending.BROKEN, found.why)
-    chunk = Chunk(at, "lz4", len(unpacked), record.data_at, end - record.data_at, None, found.index)
+    chunk = Chunk(at, name.decode(), len(unpacked), record.data_at, end - record.data_at, None, found.index)
     why = _wrong_lengths(record, end, len(unpacked))
     return Examined(chunk if found.index else None, found.connections, end, ending, why)
 
@@ -138,20 +145,24 @@ def _wrong_lengths(record: BagRecord, end: int, size: int) -> str:
     return ""
 
 
-def unpack(read: Source, at: int, end: int, piece_bytes: int) -> tuple[bytes, int, Ending, str]:
-    """Return the content of the lz4 frame at `at`, the offset of its end, its condition there, and the damage.
+def unpack(
+    read: Source, at: int, end: int, piece_bytes: int, compression: bytes = b"lz4"
+) -> tuple[bytes, int, Ending, str]:
+    """Return the content of the packed data at `at`, the offset of its end, its condition there, and the damage.
 
     Reads `piece_bytes` at a time and never unpacks more than CHUNK_LIMIT.
     """
-    decoder, parts, room, limit = LZ4FrameDecompressor(), list[bytes](), CHUNK_LIMIT, at + 2 * CHUNK_LIMIT
+    decoder, parts, room, limit = DECODERS[compression](), list[bytes](), CHUNK_LIMIT, at + 2 * CHUNK_LIMIT
     while not decoder.eof:
         piece = read(at, min(piece_bytes, end - at)) if decoder.needs_input else b""
         if decoder.needs_input and not piece:
             return b"".join(parts), at, Ending.CUT, CUT
         try:
             parts.append(decoder.decompress(piece, min(room + 1, MAX_PIECE_BYTES)))
-        except RuntimeError:
+        except (RuntimeError, OSError):
             return b"".join(parts), at, Ending.BROKEN, "damaged data of a chunk"
+        if compression == b"bz2":
+            read.budget.spend(BZ2_WORK * len(parts[-1]) >> 12)
         at, room = at + len(piece), room - len(parts[-1])
         if room < 0 or at > limit:
             return b"", at, Ending.BROKEN, f"chunk of more than {CHUNK_LIMIT >> 20} MiB"
@@ -180,7 +191,7 @@ RECORD_START = re.compile(rb"\x00\x00\x00(?:compression|conn|op|chunk_pos|chunk_
 """First field of a record, after the first byte of its length; or the data of an lz4 chunk."""
 BEFORE_FIELD_BYTES = 5
 """Bytes from the start of a record to its match of RECORD_START."""
-COMPRESSION = re.compile(rb"\x00\x00\x00compression=(lz4|none)")
+COMPRESSION = re.compile(rb"\x00\x00\x00compression=(lz4|bz2|none)")
 
 
 @dataclass(frozen=True)
@@ -342,7 +353,7 @@ class _Scanner:
                 return True
             if is_headless(chunk):
                 return examine(self.read, at, chunk, self.end).chunk is not None
-            return chunk.fields.get("compression") in {b"lz4", b"none"}
+            return chunk.fields.get("compression") in {*DECODERS, b"none"}
         return False
 
     def _is_at_end(self, at: int) -> bool:
