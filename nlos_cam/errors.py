@@ -16,10 +16,13 @@
     └── RecordingError (OSError)     exit 4   a recording, dataset or record that cannot be read
         └── StreamMissingError       exit 4   a readable recording without a stream that is needed
 
+OutputExistsError is also the one of `nlos_models`, which atomic writes raise: to catch both, name that one.
 `nlos_calibration.errors` and `nlos_models.errors` hold their packages' roots; the command line catches all three.
 """
 
 from collections.abc import Iterable
+
+from nlos_models import errors as models
 
 
 class NlosCamError(Exception):
@@ -48,7 +51,7 @@ class BudgetError(NlosCamError, ValueError):
     """Latency budget that no setting meets on this machine: "--budget-ms 5: the fastest setting takes 9.1 ms"."""
 
 
-class OutputExistsError(NlosCamError, FileExistsError):
+class OutputExistsError(NlosCamError, models.OutputExistsError):
     """Output path that exists: "run.bag exists: choose another name, or add --overwrite to replace it"."""
 
 
