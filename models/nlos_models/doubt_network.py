@@ -4,13 +4,27 @@ Our own, not the paper's; about 200,000 parameters. Its inputs are the maps' dif
 coarse and at a fine scale, and the image; the two branches meet at 8 x 8.
 """
 
+import json
+import shutil
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from nlos_models.checkpoint import load_part, save_parts
 from nlos_models.compressor import conv_norm
+from nlos_models.errors import CheckpointError
+from nlos_models.records import (
+    DOUBT,
+    DOUBT_RECORD,
+    RECORD,
+    DoubtRecord,
+    checksum_of_watched,
+    load_doubt_record,
+    watched_files,
+)
 
 MAP_SHAPE = (64, 80)
 DEPTH_SCALES_M = (0.1, 0.005)
@@ -108,8 +122,31 @@ class CalibratedDoubt(nn.Module):
         self.register_buffer("error_scale", torch.tensor(error_scale))
 
     def forward(self, depth_m: Tensor, intensity: Tensor, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the four arrays of `doubt_checkpoint.UncertaintyEstimate`."""
+        """Return the four arrays of `inference.UncertaintyEstimate`."""
         raw = self.network(depth_m, intensity, image)
         nothing, outside = raw.nothing / self.temperature[0], raw.outside / self.temperature[1]
         error_v = (self.error_scale * raw.log_error.exp()).clamp(MIN_ERROR_V, MAX_ERROR_V)
         return torch.sigmoid(nothing), torch.sigmoid(outside), error_v, torch.sigmoid(raw.surface)
+
+
+def save_doubt(folder: Path, network: DoubtNetwork, record: DoubtRecord, watched: Path) -> None:
+    """Write an uncertainty network and its record into a folder, with a copy of the watched weights from elsewhere."""
+    if checksum_of_watched(watched) != record.watches:
+        raise CheckpointError(f"{watched} changed during the training of its uncertainty network: train again")
+    text = json.dumps(record.model_dump(mode="json"), indent=2)
+    save_parts(folder, {DOUBT: network}, {DOUBT_RECORD: text})
+    if folder.resolve() != watched.resolve():
+        for name in (*watched_files(watched), RECORD):
+            shutil.copyfile(watched / name, folder / name)
+
+
+def load_doubt(folder: Path) -> tuple[CalibratedDoubt, DoubtRecord] | None:
+    """Return the calibrated uncertainty network beside a pipeline's weights in eval mode, or None where there is none.
+
+    Raises CheckpointError where it cannot be read or watches other weights.
+    """
+    if (record := load_doubt_record(folder)) is None:
+        return None
+    network = DoubtNetwork()
+    load_part(folder / f"{DOUBT}.safetensors", network)
+    return CalibratedDoubt(network, record.temperatures, record.error_scale).eval(), record

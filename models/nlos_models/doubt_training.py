@@ -1,8 +1,10 @@
 """Training of an uncertainty ("doubt") network on a pipeline's images of ordinary objects, empty benches and outliers,
 and its calibration: temperatures, error scale and thresholds, fitted on held-out maps.
+
+And fit of the quality model that watches its answers, judged on kinds of objects that were left out of the fit.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -10,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
-from nlos_models.arrays import Float16, Float32, Float64, Mask
+from nlos_models.arrays import Float16, Float32, Float64, Int64, Mask
 from nlos_models.data import flip_some, shuffled
 from nlos_models.doubt_network import MAX_ERROR_V, MIN_ERROR_V, DoubtNetwork, DoubtOutput
+from nlos_models.quality import GOOD_IOU, LEVELS, PRECISION, QualityEstimate, QualityModel, QualityRecord, normalised
 from nlos_models.recipe import Recipe
 from nlos_models.tasks import in_channels_last, parts_of
 from nlos_models.train import Running, Scores, fit
@@ -186,3 +189,152 @@ def calibrate(network: DoubtNetwork, held_out: DoubtSet) -> Calibration:
 
 def _sigmoid(logits: Float64) -> Float64:
     return 1 / (1 + np.exp(-logits))
+
+
+FOLDS = 6
+"""Groups of kinds that are left out in turn."""
+WIDTH, STEPS, BATCH, RATE, DECAY, DROPOUT = 32, 1200, 256, 5e-3, 1e-2, 0.1
+MIN_TRUSTED = 20
+"""Fewest frames of left-out kinds from which a share of good ones is estimated."""
+CONFIDENCE = 1.645
+"""Standard deviations of the one-sided 95 % limit (Wilson) that PRECISION is asked of."""
+
+
+@dataclass(frozen=True)
+class QualitySet:
+    """Figures and true quality of n reconstructions."""
+
+    figures: Float32
+    """(n, FEATURES)."""
+    iou: Float32
+    """(n,): silhouette IoU."""
+    error_v: Float32
+    """(n,): mean absolute error of v where both have a surface; NaN without such a pixel."""
+    kind: NDArray[np.str_]
+    """(n,)."""
+    generic: Mask
+    """(n,): a generic shape rather than one of the 18 kinds."""
+
+
+def families(kind: str) -> set[str]:
+    """Return what a kind is composed of: itself, or the families of a carved shape or of a pair."""
+    return set(kind.removeprefix("carved ").split(" and "))
+
+
+def left_out_folds(kinds: Sequence[str]) -> list[tuple[Int64, Int64]]:
+    """Return (rows to fit, rows to judge) for each group of kinds: the fit sees no family of the group."""
+    of_row = [families(kind) for kind in kinds]
+    every = sorted(set().union(*of_row))
+    folds: list[tuple[Int64, Int64]] = []
+    for number in range(min(FOLDS, len(every))):
+        group = set(every[number::FOLDS])
+        fitted = np.flatnonzero([not group & own for own in of_row])
+        judged = np.flatnonzero([min(own) in group for own in of_row])
+        folds.append((fitted, judged))
+    return folds
+
+
+def fit_quality(samples: QualitySet, watches: str) -> QualityRecord:
+    """Fit a quality model; its threshold and figures come from kinds that were left out of further fits."""
+    count, outputs = len(samples.iou), len(LEVELS) + 2
+    raw = np.full((count, outputs), np.nan, np.float32)
+    for fitted, judged in left_out_folds(samples.kind.tolist()):
+        record = _fit(samples, fitted, watches)
+        raw[judged] = QualityModel(record).outputs(samples.figures[judged])
+    estimate = QualityEstimate.of(raw, None)
+    above = trusted_above(estimate.good, samples.iou >= GOOD_IOU, samples.generic)
+    figures = judged_figures(QualityEstimate.of(raw, above), samples)
+    whole = _fit(samples, np.arange(count), watches)
+    return whole.model_copy(update={"trusted_above": above, "figures": figures})
+
+
+def _fit(samples: QualitySet, rows: Int64, watches: str) -> QualityRecord:
+    """Return the model of some rows, without a threshold."""
+    figures = samples.figures[rows]
+    means, spreads = figures.mean(0), figures.std(0) + np.float32(1e-6)
+    x = torch.from_numpy(normalised(figures, means, spreads))
+    iou, error = torch.from_numpy(samples.iou[rows]), torch.from_numpy(samples.error_v[rows])
+    generator = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    network = nn.Sequential(
+        nn.Linear(x.shape[1], WIDTH),
+        nn.ReLU(),
+        nn.Dropout(DROPOUT),
+        nn.Linear(WIDTH, WIDTH),
+        nn.ReLU(),
+        nn.Linear(WIDTH, len(LEVELS) + 2),
+    )
+    optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, STEPS)
+    for _ in range(STEPS):
+        some = torch.randint(0, len(x), (BATCH,), generator=generator)
+        loss = quality_loss(network(x[some]), iou[some], error[some])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    linear = [layer for layer in network if isinstance(layer, nn.Linear)]
+    layers = [torch.cat([layer.weight.T, layer.bias[None]]).detach().numpy() for layer in linear]
+    rounded = [np.round(each.astype(np.float64), 5).tolist() for each in (means, spreads, *layers)]
+    return QualityRecord(
+        watches=watches, objects=len(rows), means=rounded[0], spreads=rounded[1], layers=list(rounded[2:])
+    )
+
+
+def quality_loss(output: Tensor, iou: Tensor, error_v: Tensor) -> Tensor:
+    """Return the quantile losses of the IoU, the cross-entropy of a good one, and the error's Laplace likelihood."""
+    level = torch.tensor(LEVELS)
+    off = iou[:, None] - torch.sigmoid(output[:, : len(LEVELS)])
+    loss = 10 * torch.maximum(level * off, (level - 1) * off).mean()
+    loss = loss + functional.binary_cross_entropy_with_logits(output[:, -2], (iou >= GOOD_IOU).float())
+    known = ~torch.isnan(error_v)
+    log_error, error = output[known, -1], error_v[known]
+    return loss + 0.3 * (log_error + error * torch.exp(-log_error)).mean()
+
+
+def trusted_above(good: Float32, is_good: Mask, generic: Mask) -> float | None:
+    """Return the least probability from which on at least PRECISION of each share's frames are good; None for none.
+
+    Judged by the lower 95 % limit over all frames, and by the share itself for generic shapes and for the 18 kinds.
+    """
+    for above in np.unique(good.round(3)):
+        chosen = good >= above
+        shares = [is_good[chosen & share] for share in (generic, ~generic)]
+        sure = chosen.sum() >= MIN_TRUSTED and lower_limit(is_good[chosen]) >= PRECISION
+        if sure and all(each.mean() >= PRECISION for each in shares if each.size):
+            return float(above)
+    return None
+
+
+def lower_limit(hits: Mask) -> float:
+    """Return the lower limit of a share (Wilson)."""
+    n, p, z = len(hits), float(hits.mean()), CONFIDENCE
+    return (p + z * z / (2 * n) - z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))) / (1 + z * z / n)
+
+
+def judged_figures(estimate: QualityEstimate, samples: QualitySet) -> dict[str, float]:
+    """Return correlation, error, coverage and trust by share of the data."""
+    shares = {"all": np.ones_like(samples.generic), "kinds": ~samples.generic, "generic": samples.generic}
+    found = dict[str, float]()
+    for name, share in shares.items():
+        if share.sum() < 3:
+            continue
+        iou, predicted_iou, trusted = samples.iou[share], estimate.iou[share], estimate.trusted[share]
+        found[f"{name}_objects"] = float(share.sum())
+        found[f"{name}_correlation"] = correlation(predicted_iou[:, 1], iou)
+        found[f"{name}_mean_error"] = float(np.abs(predicted_iou[:, 1] - iou).mean())
+        found[f"{name}_bias"] = float((predicted_iou[:, 1] - iou).mean())
+        found[f"{name}_within_interval"] = float(((iou >= predicted_iou[:, 0]) & (iou <= predicted_iou[:, 2])).mean())
+        found[f"{name}_depth_correlation"] = correlation(estimate.error_v[share], samples.error_v[share])
+        found[f"{name}_good"] = float((iou >= GOOD_IOU).mean())
+        found[f"{name}_trusted"] = float(trusted.mean())
+        if trusted.any():
+            found[f"{name}_trusted_good"] = float((iou[trusted] >= GOOD_IOU).mean())
+    return {name: round(value, 4) for name, value in found.items()}
+
+
+def correlation(one: Float32 | Float64, other: Float32 | Float64) -> float:
+    """Return Pearson's correlation where both are known; 0 where either is constant."""
+    known = ~(np.isnan(one) | np.isnan(other))
+    one, other = one[known], other[known]
+    return float(np.corrcoef(one, other)[0, 1]) if known.sum() > 2 and one.std() * other.std() > 0 else 0.0

@@ -19,7 +19,7 @@ from torch import nn
 from nlos_models.arrays import Float32
 from nlos_models.checkpoint import load_network
 from nlos_models.direct import DirectNetwork
-from nlos_models.doubt_checkpoint import load_doubt
+from nlos_models.doubt_network import load_doubt
 from nlos_models.errors import CheckpointError, ModelError
 from nlos_models.files import write_checked
 from nlos_models.inference import (

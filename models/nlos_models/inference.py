@@ -11,10 +11,9 @@ from nlos_models.arrays import Float32
 from nlos_models.errors import CheckpointError
 from nlos_models.extras import MissingExtraError, require
 from nlos_models.files import TENSOR_LIMIT, load_cached, read_checked
+from nlos_models.quality import DOUBT_FILES, QualityModel, load_quality_model
 from nlos_models.recipe import SIMULATION_ONLY
 from nlos_models.records import (
-    DOUBT,
-    DOUBT_RECORD,
     CheckpointRecord,
     DoubtRecord,
     checksum_of_watched,
@@ -28,7 +27,6 @@ NETWORK_INPUTS = {"depth_m": MAP_SHAPE, "intensity": MAP_SHAPE}
 DOUBT_INPUTS = {**NETWORK_INPUTS, "image": (64, 64)}
 NETWORK_ONNX, DOUBT_ONNX = "network.onnx", "doubt.onnx"
 """Graphs beside a checkpoint's tensors, which they point into as ONNX external data: nothing is stored twice."""
-DOUBT_FILES = f"{DOUBT}.safetensors", DOUBT_RECORD
 CHECKSUM = "weights"
 """Key of the graph's metadata with the checksum of the files that it was made from."""
 
@@ -73,6 +71,8 @@ class UncertaintyModel(Protocol):
     """Uncertainty network that is ready to run."""
 
     record: DoubtRecord
+    quality: QualityModel | None
+    """None for weights without a quality model."""
 
     def __call__(self, depth_m: Float32, intensity: Float32, image: Float32) -> UncertaintyEstimate:
         """Return the uncertainty of images (n, 64, 64) reconstructed from maps (n, 64, 80) with NaN for no return."""
@@ -84,6 +84,7 @@ class OnnxUncertaintyModel:
 
     def __init__(self, model: Path | bytes, record: DoubtRecord, threads: int = 1, checksum: str = "") -> None:
         self.record, self._session = record, open_session(model, threads, checksum)
+        self.quality: QualityModel | None = None
 
     def __call__(self, depth_m: Float32, intensity: Float32, image: Float32) -> UncertaintyEstimate:
         arrays = (np.ascontiguousarray(array, np.float32) for array in (depth_m, intensity, image))
@@ -134,16 +135,20 @@ def load_reconstructor(folder: Path | None, cache: Path, threads: int = 1) -> Re
 def load_uncertainty_model(folder: Path | None, cache: Path) -> UncertaintyModel | None:
     """Load the uncertainty network beside the weights in a folder (None: the shipped ones); None where there is none.
 
+    With it comes the quality model that watches it, if there is one.
+
     Without a valid graph it is exported as by `load_reconstructor`. Raises CheckpointError, MissingExtraError.
     """
     folder = folder or shipped_folder()
     if (record := load_doubt_record(folder)) is None:
         return None
     try:
-        return OnnxUncertaintyModel(folder / DOUBT_ONNX, record, checksum=checksum_of_watched(folder, DOUBT_FILES))
+        loaded = OnnxUncertaintyModel(folder / DOUBT_ONNX, record, checksum=checksum_of_watched(folder, DOUBT_FILES))
     except CheckpointError as error:
         key, export = _exporter(error).doubt_export(folder)
-        return load_cached(cache / key, lambda model: OnnxUncertaintyModel(model, record), export)
+        loaded = load_cached(cache / key, lambda model: OnnxUncertaintyModel(model, record), export)
+    loaded.quality = load_quality_model(folder)
+    return loaded
 
 
 def refuse_color(record: CheckpointRecord, folder: Path | None) -> None:

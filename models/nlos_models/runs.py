@@ -22,7 +22,7 @@ from nlos_models.checkpoint import (
 from nlos_models.data import MapSet, MapSource
 from nlos_models.direct import DirectNetwork
 from nlos_models.direct_training import NormalSource, train_direct, transfer_direct
-from nlos_models.doubt_checkpoint import save_doubt
+from nlos_models.doubt_network import save_doubt
 from nlos_models.doubt_training import DoubtSet, calibrate, train_doubt
 from nlos_models.errors import OutputExistsError, TrainingError
 from nlos_models.export import export_folder

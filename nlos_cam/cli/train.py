@@ -16,7 +16,16 @@ import typer
 
 from nlos_cam import dataset as data_sets
 from nlos_cam import objects as shapes
-from nlos_cam.cli.common import PAPER_RIG, Json, finish, progress, say, stop_on_signals, tracked
+from nlos_cam.cli.common import (
+    PAPER_RIG,
+    Json,
+    finish,
+    interrupted_by_signals,
+    progress,
+    say,
+    stop_on_signals,
+    tracked,
+)
 from nlos_cam.errors import SceneError
 from nlos_cam.files import cache_folder
 
@@ -135,6 +144,7 @@ def register(app: typer.Typer) -> None:
     train = typer.Typer(help="Training.")
     for command in (vae, compressor, direct, transfer, doubt):
         train.command(command.__name__)(with_run_options(command))
+    train.command("quality")(quality)
     app.add_typer(train, name="train")
 
 
@@ -256,6 +266,33 @@ def doubt(
         sets = data_sets.doubt_sets(recipe, pipeline, datasets, run.out / SAMPLES, on_progress)
     job = run.training(recipe, pipeline.record, about.watches)
     run.finish(recipe, models.launch(fabric, models.run_doubt, job, about, watched, *sets))
+
+
+def quality(
+    weights: Annotated[
+        Path,
+        typer.Option("--weights", help="Weights with an uncertainty network; gets quality.json."),
+    ],
+    data: Annotated[
+        Path,
+        typer.Option("--dataset", help="Maps that the weights were not trained on, with generic shapes."),
+    ],
+    objects: Annotated[int, typer.Option("--objects", min=100, help="Number of objects.")] = 6000,
+    json: Json = False,
+) -> None:
+    """Fit the model that predicts the outline's overlap and the depth error; judged on kinds left out of the fit."""
+    graphs = cache_folder() / "onnx"
+    pipeline, doubter = models.load_reconstructor(weights, graphs), models.load_uncertainty_model(weights, graphs)
+    if doubter is None:
+        raise SceneError(f"{weights} has no uncertainty network: train one with `train doubt`")
+    with interrupted_by_signals(), tracked("reconstructing") as on_progress:
+        samples = data_sets.quality_set(pipeline, doubter, data_sets.open_dataset(data), objects, on_progress)
+    record = models.fit_quality(samples, models.quality_watches(weights))
+    models.write_quality(weights, record)
+    values = {name: value for name, value in record.figures.items() if name.startswith("all_")}
+    text = f"quality model beside {weights}; on kinds left out: {_values(values)}"
+    trusted = {"trusted_above": record.trusted_above}
+    finish({"weights": str(weights), "objects": record.objects, **trusted, **record.figures}, as_json=json, text=text)
 
 
 def _values(figures: models.Scores) -> str:

@@ -30,6 +30,7 @@ __all__ = [
     "objects_from_folder",
     "open_dataset",
     "procedural_images",
+    "quality_set",
     "ray_farm",
     "read_head",
     "read_labelled",
@@ -44,7 +45,7 @@ __all__ = [
 ]
 
 from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
-from .doubt_samples import EMPTY, ORDINARY, check_doubt_data, doubt_sets, samples_on_disk
+from .doubt_samples import EMPTY, ORDINARY, check_doubt_data, doubt_sets, quality_set, samples_on_disk
 from .labelled import FRAMES_PER_RECORDING, label_recordings, list_recordings, read_labelled, write_shards
 from .outliers import HELD_OUT_OUTLIERS, SHAPE_OUTLIERS, TRAINING_OUTLIERS, Stimulus, draw_outlier
 from .packed import PackedMaps

@@ -8,7 +8,18 @@ from zlib import crc32
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
-from nlos_models import DoubtSet, MapSet, Recipe, Reconstructor, first_of, parts_of
+from nlos_models import (
+    DoubtSet,
+    MapSet,
+    QualitySet,
+    Recipe,
+    Reconstructor,
+    UncertaintyModel,
+    first_of,
+    parts_of,
+    quality_features,
+    silhouette_iou,
+)
 from numpy.typing import NDArray
 
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
@@ -27,7 +38,7 @@ from nlos_cam.dataset.samples import OnProgress, cached_sensor, ignore
 from nlos_cam.errors import SceneError
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
-from nlos_cam.objects import image_from_depth
+from nlos_cam.objects import CATEGORIES, image_from_depth
 from nlos_cam.render import Rendering, SensorModel, render
 
 EMPTY, ORDINARY = "empty", "ordinary"
@@ -205,6 +216,44 @@ def doubt_sets(
         )
         sets.append(_doubt_set(pipeline, first_of(dataset.arrays(), objects), samples))
     return sets
+
+
+def quality_set(
+    pipeline: Reconstructor,
+    uncertainty_model: UncertaintyModel,
+    dataset: Dataset,
+    objects: int,
+    on_progress: OnProgress,
+) -> QualitySet:
+    """Return figures and true quality of the reconstructions of a dataset's first objects.
+
+    Raises SceneError where weights and dataset do not fit together.
+    """
+    if pipeline.record.input != "raw maps" or dataset.plan.rig.checksum != pipeline.record.rig_checksum:
+        raise SceneError("the quality model needs raw maps of the weights' own rig: use another --dataset or --weights")
+    figures, iou, error_v, done = list[Float32](), list[Float32](), list[Float32](), 0
+    kinds = dataset.column("category").astype(np.str_)[:objects]
+    for maps in dataset.chunks():
+        if done == len(kinds):
+            break
+        for part in parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
+            depth_m, intensity, truth = maps.depth_m[part], maps.intensity[part], maps.image[part].astype(np.float32)
+            image = pipeline(depth_m, intensity)
+            figures.append(quality_features(image, uncertainty_model(depth_m, intensity, image)))
+            iou.append(silhouette_iou(image, truth).astype(np.float32))
+            error_v.append(shared_error_v(image, truth))
+            done += len(part)
+            on_progress(done, len(kinds))
+    found = np.concatenate(iou), np.concatenate(error_v)
+    generic = ~np.isin(kinds, tuple(CATEGORIES))
+    return QualitySet(np.concatenate(figures), *found, kinds, generic)
+
+
+def shared_error_v(image: Float32, truth: Float32) -> Float32:
+    """Return the mean absolute error of v where images (n, 64, 64) and truths have a surface; NaN where none is."""
+    shared = (image > 0) & (truth > 0)
+    total, count = (np.abs(image - truth) * shared).sum((1, 2)), shared.sum((1, 2))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
 def check_doubt_data(recipe: Recipe, pipeline: Reconstructor, training: Dataset, held_out: Dataset) -> None:

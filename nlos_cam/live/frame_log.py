@@ -17,6 +17,8 @@ log = logging.getLogger(__name__)
 
 def log_line(moment: Moment) -> dict[str, Any]:
     """Return the fields of a moment's line; None for unknown values."""
+    doubt = moment.reconstruction.doubt
+    quality = doubt.quality if doubt else None
     return {
         "frame_number": moment.frame.frame_number,
         "timestamp_s": round(moment.frame.timestamp_s, 6),
@@ -25,6 +27,8 @@ def log_line(moment: Moment) -> dict[str, Any]:
         **{f"{stage}_ms": round(1e3 * seconds, 3) for stage, seconds in moment.stages_s.items()},
         "dropped": moment.dropped,
         "verdict": moment.verdict.value if moment.verdict else None,
+        "expected_iou": round(quality.iou[1], 4) if quality else None,
+        "expected_error_mm": round(1e3 * quality.error_m, 2) if quality else None,
         "check_score": round(moment.check.score, 4) if moment.check else None,
         "celsius": max(moment.celsius.values(), default=None),
     }

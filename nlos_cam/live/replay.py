@@ -22,7 +22,7 @@ from nlos_cam.live.frame_queue import FrameReader, ignore
 from nlos_cam.live.loop import iterate_batched
 from nlos_cam.live.replay_media import FrameSampler, ReplayMedia, draw_contact_sheet
 from nlos_cam.live.replay_report import ReplayFacts, replay_document
-from nlos_cam.live.statistics import OnWarning, WarningLog, frames_by_verdict
+from nlos_cam.live.statistics import OnWarning, QualityLog, WarningLog, frames_by_verdict
 from nlos_cam.live.telemetry import with_telemetry
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import CalibratedRig, Clock, FrameResult, Pipeline, Verdict
@@ -44,6 +44,8 @@ class ReplayReport:
     """Number of frames by warning of the bench."""
     verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
     """Number of frames by verdict; empty without an uncertainty model."""
+    quality: Mapping[str, float] = field(default_factory=dict[str, float])
+    """As in `RunReport`."""
 
 
 class _Stack:
@@ -73,6 +75,7 @@ class _Results:
         self.verdict_of_frame: list[str] = []
         self.with_surface, self.uncertainty_mm = 0, list[float]()
         self.verdicts: Counter[Verdict] = Counter()
+        self.quality, self.expected = QualityLog(), list[tuple[float, float]]()
         self.checks: dict[int, float] = {}
         """Scores by number of the checked frame."""
         self.samples, self.warnings = FrameSampler(SHEET_FRAMES), WarningLog(on_warning)
@@ -91,6 +94,9 @@ class _Results:
         self.with_surface += reconstruction.has_surface
         if reconstruction.has_surface and uncertainty_m is not None:
             self.uncertainty_mm.append(1e3 * float(np.median(uncertainty_m[np.isfinite(depth_m)])))
+        self.quality.add(result)
+        quality = reconstruction.doubt.quality if reconstruction.doubt else None
+        self.expected.append((quality.iou[1], quality.error_m) if quality else (np.nan, np.nan))
         if result.check:
             self.checks[result.check.frame_number] = result.check.score
         self.samples.add(result)
@@ -150,6 +156,7 @@ def replay_recording(
         str(out),
         warnings=results.warnings.frames,
         verdicts=frames_by_verdict(results.verdicts),
+        quality=results.quality.summary,
     )
 
 
@@ -161,6 +168,8 @@ def _hidden_fields(results: _Results, rig: Rig) -> dict[str, Any]:
         "depth_m": results.hidden_m.all(),
         "uncertainty_m": results.uncertainty_m.all(),
         "verdict": np.array(results.verdict_of_frame, np.str_),
+        "expected_iou": np.array(results.expected)[:, 0],
+        "expected_error_m": np.array(results.expected)[:, 1],
         "origin_m": np.array([box.x_min_m + pitch_x_m / 2, box.y_max_m - pitch_y_m / 2]),  # wall (x, y) of pixel (0, 0)
         "pitch_m": np.array([pitch_x_m, -pitch_y_m]),  # wall (x, y) from one column, one row to the next
         "z_near_m": box.z_near_m,
@@ -186,6 +195,7 @@ def _facts(camera: Camera, bench: CalibratedRig, results: _Results, *, interrupt
         results.timestamps_s,
         results.with_surface,
         results.uncertainty_mm,
+        results.quality.summary,
         frames_by_verdict(results.verdicts),
         [*results.checks.values()],
         results.warnings.spans,

@@ -49,6 +49,8 @@ class ReplayFacts:
     with_surface: int
     uncertainty_mm: Sequence[float]
     """Median over the surface, by frame with a surface and an uncertainty model."""
+    quality: Mapping[str, float]
+    """As in `RunReport`."""
     verdicts: Mapping[str, int]
     check_scores: Sequence[float]
     warnings: Sequence[WarningSpan]
@@ -104,6 +106,11 @@ def _reconstruction(facts: ReplayFacts) -> dict[str, str]:
     if len(facts.uncertainty_mm):
         low, middle, high = np.percentile(facts.uncertainty_mm, [5, 50, 95])
         found["uncertainty"] = f"{middle:.0f} mm (median of the surface; 5 to 95 % of frames: {low:.0f} to {high:.0f})"
+    if facts.quality:
+        found["expected quality"] = (
+            f"outline typically {facts.quality['expected_iou']:.0%} right, depth to "
+            f"{facts.quality['expected_error_mm']:.0f} mm (medians of the frames with an object)"
+        )
     if len(facts.check_scores):
         checked, unexplained = len(facts.check_scores), sum(score >= UNEXPLAINED for score in facts.check_scores)
         found["physics check"] = (

@@ -204,6 +204,28 @@ class RunReport:
     """Number of frames by verdict; empty without an uncertainty model."""
     stalled_s: float = 0.0
     """Sum of the times without a frame; see `StallWatch`."""
+    quality: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Of the frames with an object: medians `expected_iou` and `expected_error_mm`, share `trusted`; empty without."""
+
+
+class QualityLog:
+    """Predicted qualities of the last frames with a detected object."""
+
+    def __init__(self) -> None:
+        self._predicted = StageTimes()
+
+    def add(self, result: FrameResult) -> None:
+        doubt = result.reconstruction.doubt
+        if result.verdict is Verdict.SEEN and doubt and (found := doubt.quality):
+            error_mm, trusted = 1e3 * found.error_m, float(found.trusted)
+            self._predicted.add({"expected_iou": found.iou[1], "expected_error_mm": error_mm, "trusted": trusted})
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """Medians of IoU and error, and share of trusted frames; empty without any frame."""
+        summaries = {"expected_iou": np.median, "expected_error_mm": np.median, "trusted": np.mean}
+        values = {name: self._predicted.of(name) for name in self._predicted.stages}
+        return {name: float(summaries[name](column)) for name, column in values.items()}
 
 
 class RunStatistics:
@@ -217,6 +239,7 @@ class RunStatistics:
         """Frames whose processing raised an error."""
         self.issues: Counter[str] = Counter()
         """Number of frames by issue."""
+        self.quality = QualityLog()
         self.verdicts: Counter[Verdict] = Counter()
         self._times = StageTimes()
         """Latency and delivery as differences of two clocks, the loop's and the frames'."""
@@ -234,6 +257,7 @@ class RunStatistics:
             self.stall.frame_arrived(result.arrived_s)
         self._times.add({**ages_s, **result.stages_s, "view": view_s})
         self.warnings.add(result)
+        self.quality.add(result)
         if result.verdict:
             self.verdicts[result.verdict] += 1
 
@@ -278,6 +302,7 @@ class RunStatistics:
             stages_percentiles_ms=stages,
             verdicts=frames_by_verdict(self.verdicts),
             stalled_s=self.stall.stalled_s,
+            quality=self.quality.summary,
         )
 
     def _percentiles_ms(self, offset_s: float) -> dict[str, Percentiles]:

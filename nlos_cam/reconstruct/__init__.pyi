@@ -11,6 +11,7 @@ __all__ = [
     "PhysicsCheckResult",
     "Pipeline",
     "PreparedFrame",
+    "Quality",
     "Reconstruction",
     "Verdict",
     "VerdictFilter",
@@ -29,7 +30,7 @@ __all__ = [
 ]
 
 from .bench import CalibratedRig, check_intrinsics, open_bench
-from .network import Clock, Mirrored, Reconstruction, reconstruct
+from .network import Clock, Mirrored, Quality, Reconstruction, reconstruct
 from .physics_check import (
     UNEXPLAINED,
     PeriodicPhysicsCheck,

@@ -37,6 +37,20 @@ class Mirrored:
 
 
 @dataclass(frozen=True)
+class Quality:
+    """Quality of a reconstruction, predicted by a model that was fitted to known objects."""
+
+    iou: tuple[float, float, float]
+    """10 %, 50 % and 90 % quantile of the silhouette IoU with the truth."""
+    good: float
+    """Probability that the IoU is at least 0.75."""
+    error_m: float
+    """Expected mean absolute error of the depth."""
+    trusted: bool
+    """At least 90 % of like frames have an IoU of at least 0.75."""
+
+
+@dataclass(frozen=True)
 class Doubt:
     """Uncertainty of a reconstruction, estimated by the uncertainty model ("doubt network")."""
 
@@ -48,6 +62,8 @@ class Doubt:
     """(64, 64): expected absolute error of the hidden depth if there is a surface; finite everywhere."""
     surface: Float32
     """(64, 64): probability that there is a surface."""
+    quality: Quality | None = None
+    """None without a surface or a quality model."""
 
 
 @dataclass(frozen=True)
@@ -139,5 +155,10 @@ def estimate_doubt(uncertainty_model: UncertaintyModel, maps: LidarMaps, image: 
     said = uncertainty_model(*(array[None] for array in (maps.depth_m, maps.intensity, image)))
     # v falls linearly from 1 at z_near to MIN_V at z_far, so an error of 1 in v is this many metres (depth_from_image)
     metres_per_v = (box.z_far_m - box.z_near_m) / (1 - MIN_V)
-    error_m = said.error_v[0] * metres_per_v
-    return Doubt(float(said.p_empty[0]), float(said.p_out_of_distribution[0]), error_m, said.p_surface[0])
+    error_m, quality = said.error_v[0] * metres_per_v, None
+    if uncertainty_model.quality and image.any():
+        found = uncertainty_model.quality(image[None], said)
+        low, middle, high = found.iou[0].tolist()
+        error = float(found.error_v[0]) * metres_per_v
+        quality = Quality((low, middle, high), float(found.good[0]), error, bool(found.trusted[0]))
+    return Doubt(float(said.p_empty[0]), float(said.p_out_of_distribution[0]), error_m, said.p_surface[0], quality)

@@ -165,12 +165,21 @@ class MomentPacker:
             "detail": assessment.detail,
             "tone": assessment.tone,
             "trusted": assessment.trusted,
+            "quality": _quality(moment),
             "warnings": moment.warnings,
             "lidar_span_m": self._span_m,
             "change_span_m": self._change_span_m,
             "residual_span_m": RESIDUAL_SPAN_M,
             "score": None if check is None or not np.isfinite(check.score) else round(check.score, 3),
         }
+
+
+def _quality(moment: Moment) -> dict[str, Any] | None:
+    """Return the predicted quality of a moment's reconstruction, ready for JSON."""
+    if (doubt := moment.reconstruction.doubt) is None or (quality := doubt.quality) is None:
+        return None
+    iou = [round(share, 3) for share in quality.iou]
+    return {"iou": iou, "error_mm": round(1e3 * quality.error_m, 1), "trusted": quality.trusted}
 
 
 def depth_bytes(depth_m: NDArray[np.floating], near_m: float, far_m: float) -> NDArray[np.uint8]:

@@ -15,6 +15,7 @@ Says = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[float, float]]
 class FakeDoubter:
     def __init__(self, says: Says = lambda *_: (0.0, 0.0), error_v: float = 0.1) -> None:
         self.record = DoubtRecord(watches="0123456789ab", recipe=RECIPE, learnt=[])
+        self.quality = None
         self.asked: list[tuple[np.ndarray, ...]] = []
         self._says, self._error_v = says, error_v
 

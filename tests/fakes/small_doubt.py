@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from fake_doubter import RECIPE
-from nlos_models.doubt_checkpoint import save_doubt
-from nlos_models.doubt_network import DoubtNetwork
+from nlos_models.doubt_network import DoubtNetwork, save_doubt
 from nlos_models.doubt_training import DoubtSet
 from nlos_models.records import WATCHED, DoubtRecord, checksum_of_watched
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from nlos_models import CHECKSUMS, write_checked
 
 WEIGHTS = Path(__file__).parents[2] / "models" / "nlos_models" / "weights"
-PATTERNS = "*.safetensors", "*.onnx", "checkpoint.json", "doubt.json"
+PATTERNS = "*.safetensors", "*.onnx", "checkpoint.json", "doubt.json", "quality.json"
 
 
 def write_checksums(weights: Path) -> None:

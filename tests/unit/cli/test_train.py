@@ -15,7 +15,7 @@ from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint, runs, tasks, train
 from nlos_models.arrays import Float16
 from nlos_models.checkpoint import load_pipeline, load_record
-from nlos_models.doubt_checkpoint import load_doubt
+from nlos_models.doubt_network import load_doubt
 from safetensors.torch import load_file, save_file
 from small_maps import SmallDataset, small_images, small_maps, untrained_weights, use_small_networks
 

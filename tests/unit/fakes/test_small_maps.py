@@ -8,7 +8,7 @@ import torch
 from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint
 from nlos_models.compressor import Compressor
-from nlos_models.doubt_checkpoint import load_doubt
+from nlos_models.doubt_network import load_doubt
 from nlos_models.vae import ResVae
 from small_doubt import small_doubt_set, untrained_doubt, watched_weights
 from small_maps import (

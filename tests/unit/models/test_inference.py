@@ -11,7 +11,7 @@ import torch
 from nlos_models import checkpoint, export, extras, inference
 from nlos_models.checkpoint import load_pipeline, save_pipeline
 from nlos_models.compressor import Compressor
-from nlos_models.doubt_checkpoint import load_doubt
+from nlos_models.doubt_network import load_doubt
 from nlos_models.errors import CheckpointError, ModelError
 from nlos_models.export import TorchReconstructor, quantize
 from nlos_models.extras import MissingExtraError

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from made_up_moments import NOTHING, bump, full_moment, moment
 
-from nlos_cam.reconstruct.network import Doubt
+from nlos_cam.reconstruct.network import Doubt, Quality
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view.assessment import RGB, assess, expected_error_m, expected_overlap
 
 
-def with_doubt(surface: np.ndarray, error_m: float = 0.017) -> object:
+def with_doubt(surface: np.ndarray, error_m: float = 0.017, quality: Quality | None = None) -> object:
     shown = full_moment(0)
     spread_m = np.full((64, 64), error_m, np.float32)
-    doubt = Doubt(0.0, 0.0, spread_m, surface.astype(np.float32))
+    doubt = Doubt(0.0, 0.0, spread_m, surface.astype(np.float32), quality)
     return replace(shown, reconstruction=replace(shown.reconstruction, doubt=doubt, uncertainty_m=spread_m))
 
 
@@ -34,6 +34,17 @@ def test_detected_object_is_graded_by_the_models_numbers() -> None:
     assert "71%" in told.detail
     assert "17 mm" in told.detail
     assert told.trusted
+
+
+@pytest.mark.parametrize("trusted", [True, False])
+@pytest.mark.parametrize("verdict", [Verdict.SEEN, Verdict.OUTSIDE])
+def test_only_a_trusted_quality_of_a_detected_object_is_green(trusted: bool, verdict: Verdict) -> None:
+    predicted = Quality((0.58, 0.71, 0.82), 0.6, 0.017, trusted=trusted)
+    shown = replace(with_doubt(np.ones((64, 64)), quality=predicted), verdict=verdict)  # type: ignore[type-var]
+    told = assess(shown)  # type: ignore[arg-type]
+    assert (told.tone == "good") == (trusted and verdict is Verdict.SEEN)
+    if verdict is Verdict.SEEN:
+        assert told.detail == "outline typically 71% right (58% to 82%), depth to 17 mm"
 
 
 @pytest.mark.parametrize("verdict", [*Verdict, None])

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models import doubt_checkpoint, records
+from nlos_models import doubt_network, records
 from nlos_models.doubt_network import CalibratedDoubt
 from nlos_models.errors import CheckpointError
 from nlos_models.inference import load_uncertainty_model
@@ -26,7 +26,7 @@ def record(tmp_path: Path, watched: Path) -> DoubtRecord:
 
 
 def _load(folder: Path) -> tuple[CalibratedDoubt, DoubtRecord]:
-    loaded = doubt_checkpoint.load_doubt(folder)
+    loaded = doubt_network.load_doubt(folder)
     assert loaded is not None
     return loaded
 
@@ -43,7 +43,7 @@ def test_saved_doubt_restores_with_watched_weights(tmp_path: Path, watched: Path
 
 
 def test_weights_without_doubt_network_load_none(tmp_path: Path, watched: Path) -> None:
-    assert doubt_checkpoint.load_doubt(watched) is None
+    assert doubt_network.load_doubt(watched) is None
     assert load_uncertainty_model(watched, tmp_path) is None
     with pytest.raises(CheckpointError, match="compressor"):
         records.checksum_of_watched(tmp_path)
@@ -60,19 +60,19 @@ def test_weights_without_doubt_network_load_none(tmp_path: Path, watched: Path) 
 def test_load_doubt_refuses_other_weights_or_damaged_record(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / "run" / name).write_bytes(content)
     with pytest.raises(CheckpointError, match=records.DOUBT_RECORD):
-        doubt_checkpoint.load_doubt(tmp_path / "run")
+        doubt_network.load_doubt(tmp_path / "run")
 
 
 def test_save_doubt_refuses_weights_changed_since_training(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
     (watched / records.WATCHED[0]).write_bytes(b"another network")
     with pytest.raises(CheckpointError, match="watched"):
-        doubt_checkpoint.save_doubt(tmp_path / "other", _load(tmp_path / "run")[0].network, record, watched)
+        doubt_network.save_doubt(tmp_path / "other", _load(tmp_path / "run")[0].network, record, watched)
 
 
 def test_saved_bare_wall_keeps_its_precision(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
     network, wall_m = _load(tmp_path / "run")[0].network, 0.3 + 1e-4 * torch.rand(5, 64, 80)
     network.learn_bare(wall_m, wall_m)
-    doubt_checkpoint.save_doubt(tmp_path / "second", network, record, watched)
+    doubt_network.save_doubt(tmp_path / "second", network, record, watched)
     again = _load(tmp_path / "second")[0].network
     torch.testing.assert_close(again.bare_depth_m, wall_m.median(0).values, rtol=0, atol=0)
 

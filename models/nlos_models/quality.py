@@ -1,0 +1,210 @@
+"""Quality of one reconstruction, predicted from its image and uncertainty: overlap of the outline, and depth error.
+
+A small network in numpy on some forty figures of the image and of the uncertainty network's answer, fitted to
+reconstructions of known objects by `train quality` (`doubt_training`).
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from nlos_models.arrays import Float32, Mask
+from nlos_models.errors import CheckpointError, first_problem
+from nlos_models.files import TEXT_LIMIT, read_checked, write_checked
+from nlos_models.records import DOUBT, DOUBT_RECORD, checksum_of_watched
+
+if TYPE_CHECKING:
+    from nlos_models.inference import UncertaintyEstimate
+
+QUALITY = "quality.json"
+DOUBT_FILES = f"{DOUBT}.safetensors", DOUBT_RECORD
+GOOD_IOU, PRECISION = 0.75, 0.9
+"""A frame is trusted where its silhouette IoU is at least the first in at least the second of like frames."""
+LEVELS = 0.1, 0.5, 0.9
+"""Quantiles of the predicted IoU."""
+OUTLINES = 0.1, 0.3, 0.5, 0.7, 0.9
+"""Probabilities of a surface whose outlines are compared with the image's."""
+FEATURES = 35
+CLIP = 4.0
+"""Limit of a normalised figure, in spreads: a strange frame is not extrapolated to."""
+
+
+class QualityRecord(BaseModel):
+    """Weights of a quality model, and what it was fitted to."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    watches: str
+    """Checksum of the files of the uncertainty network whose answers it takes."""
+    objects: int
+    means: list[float]
+    spreads: list[float]
+    layers: list[list[list[float]]]
+    """Each layer (inputs + 1, outputs), the last row its bias, with ReLU between layers."""
+    trusted_above: float | None = None
+    """Least probability of a good outline from which on a frame is trusted; None: no frame is."""
+    figures: dict[str, float] = Field(default_factory=dict)
+    """Of frames whose kind was left out of the fit, by share of the data."""
+
+
+@dataclass(frozen=True)
+class QualityEstimate:
+    """Predicted quality of n reconstructions."""
+
+    iou: Float32
+    """(n, 3): quantiles of the silhouette IoU at LEVELS, rising."""
+    good: Float32
+    """(n,): probability that the IoU is at least GOOD_IOU."""
+    error_v: Float32
+    """(n,): expected mean absolute error of v where image and truth both have a surface."""
+    trusted: Mask
+    """(n,)."""
+
+    @classmethod
+    def of(cls, outputs: Float32, trusted_above: float | None) -> Self:
+        """Return the estimate of a model's outputs (n, 5); without a threshold no frame is trusted."""
+        iou, good = np.sort(_sigmoid(outputs[:, : len(LEVELS)]), 1), _sigmoid(outputs[:, -2])
+        return cls(iou, good, np.exp(outputs[:, -1]), good >= (np.inf if trusted_above is None else trusted_above))
+
+
+class QualityModel:
+    """Quality model that is ready to run."""
+
+    def __init__(self, record: QualityRecord) -> None:
+        self.record = record
+        self._means, self._spreads, *self._layers = (
+            np.asarray(each, np.float32) for each in (record.means, record.spreads, *record.layers)
+        )
+
+    def __call__(self, image: Float32, estimate: "UncertaintyEstimate") -> QualityEstimate:
+        """Return the quality of images (n, 64, 64) in v with their uncertainty."""
+        return QualityEstimate.of(self.outputs(quality_features(image, estimate)), self.record.trusted_above)
+
+    def outputs(self, figures: Float32) -> Float32:
+        """Return the network's outputs (n, 5) for figures (n, FEATURES): logits of LEVELS and `good`, log error."""
+        x = normalised(figures, self._means, self._spreads)
+        for number, layer in enumerate(self._layers):
+            x = (np.maximum(x, 0.0) if number else x) @ layer[:-1] + layer[-1]
+        return x
+
+
+def normalised(figures: Float32, means: Float32, spreads: Float32) -> Float32:
+    """Return figures (n, k) in spreads from the mean, clipped."""
+    return ((figures - means) / spreads).clip(-CLIP, CLIP)
+
+
+def quality_features(image: Float32, estimate: "UncertaintyEstimate") -> Float32:
+    """Return the figures (n, FEATURES) that a quality is predicted from, finite also for an image without a surface.
+
+    They are the same for the mirrored image. All sums over pixels are divided by the area of the image's surface.
+    """
+    mask = image > 0
+    images = mask, image, estimate.p_surface, estimate.error_v
+    m, v, p, error = (_flat(np.asarray(each, np.float32)) for each in images)
+    area = np.maximum(m.sum(1), 1.0)
+
+    def share(values: Float32) -> Float32:
+        return values.sum(1) / area
+
+    inside, beside, unsure = share(p * m), share(p * (1 - m)), p * (1 - p)
+    overlap = inside / (1 + beside)
+    found = [overlap, _logit(overlap), area / 4096, np.log(area), np.sqrt(area), inside, beside]
+    found += [share(unsure), share(unsure * m)]
+    for level in OUTLINES:
+        above = (p > level).astype(np.float32)
+        joint, size = (above * m).sum(1), above.sum(1)
+        found += [joint / np.maximum(size + m.sum(1) - joint, 1.0), size / area]
+    mean = share(v)
+    found += [share(error * m), np.sqrt(share(error * error * m)), mean]
+    found += [np.sqrt(share((v - mean[:, None]) ** 2 * m))]
+    edges = [np.diff(mask, axis=axis).reshape(len(mask), -1).sum(1) for axis in (1, 2)]
+    rim = np.float32(edges[0] + edges[1])
+    found += [rim / np.sqrt(area), rim / area, *_slopes(image, mask, area), *_place(mask, area)]
+    found += [_logit(estimate.p_out_of_distribution), _logit(estimate.p_empty)]
+    return np.stack(found, 1).astype(np.float32)
+
+
+def _flat(images: Float32) -> Float32:
+    return images.reshape(len(images), -1)
+
+
+def _slopes(image: Float32, mask: Mask, area: Float32) -> list[Float32]:
+    """Return the mean depth step between neighbours that are both surface, down and across."""
+    down = np.abs(np.diff(image, axis=1)) * (mask[:, 1:] & mask[:, :-1])
+    across = np.abs(np.diff(image, axis=2)) * (mask[:, :, 1:] & mask[:, :, :-1])
+    return [_flat(step).sum(1) / area for step in (down, across)]
+
+
+def _place(mask: Mask, area: Float32) -> list[Float32]:
+    """Return place and extent of the surface: distance from the rig's plane of symmetry, column, spreads, fill."""
+    pixels = np.arange(mask.shape[1], dtype=np.float32)
+    rows, columns = (mask.sum(axis).astype(np.float32) for axis in (2, 1))
+    row, column = (rows @ pixels) / area, (columns @ pixels) / area
+    high = np.sqrt(np.maximum((rows @ pixels**2) / area - row**2, 0.0))
+    wide = np.sqrt(np.maximum((columns @ pixels**2) / area - column**2, 0.0))
+    middle = (mask.shape[1] - 1) / 2
+    return [np.abs(row - middle), column, high, wide, high / np.maximum(wide, 1.0), area / np.maximum(high * wide, 1.0)]
+
+
+def _logit(p: Float32) -> Float32:
+    inner = p.clip(1e-4, 1 - 1e-4)
+    return np.log(inner / (1 - inner)).astype(np.float32)
+
+
+def _sigmoid(x: Float32) -> Float32:
+    return (1 / (1 + np.exp(-x.clip(-30.0, 30.0)))).astype(np.float32)
+
+
+def quality_watches(folder: Path) -> str:
+    """Return the checksum of the uncertainty network in a folder, which a quality model is bound to."""
+    return checksum_of_watched(folder, DOUBT_FILES)
+
+
+def write_quality(folder: Path, record: QualityRecord) -> None:
+    """Write a quality model beside the weights that it watches, with its checksum. Raises OSError, FileBusyError."""
+    write_checked(folder, {QUALITY: (json.dumps(record.model_dump(mode="json")) + "\n").encode()})
+
+
+def load_quality_model(folder: Path) -> QualityModel | None:
+    """Load the quality model beside a checkpoint's weights; None where there is none.
+
+    Raises CheckpointError where it cannot be read or was fitted to another uncertainty network.
+    """
+    path = folder / QUALITY
+    if not path.exists():
+        return None
+    advice = "fit it again with `train quality`, or remove it"
+    try:
+        record = QualityRecord.model_validate_json(read_checked(path, TEXT_LIMIT))
+    except ValidationError as error:
+        raise CheckpointError(f"{path} is not a quality model: {first_problem(error)}") from error
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} cannot be read ({error}): {advice}") from error
+    if not _fits(record):
+        raise CheckpointError(f"{path} has layers that do not fit each other: {advice}")
+    if record.watches != (found := quality_watches(folder)):
+        other = f"another uncertainty network ({record.watches}, not {found})"
+        raise CheckpointError(f"{path} was fitted to {other}: {advice}")
+    return QualityModel(record)
+
+
+def _fits(record: QualityRecord) -> bool:
+    """Return True if the layers take the normalised figures, and each the outputs of the one before."""
+    sizes: Sequence[tuple[int, ...]] = []
+    try:
+        sizes = [np.asarray(layer, np.float32).shape for layer in record.layers]
+    except ValueError:  # rows of different lengths
+        return False
+    inputs = len(record.means)
+    if not sizes or inputs != FEATURES or inputs != len(record.spreads) or min(record.spreads) <= 0:
+        return False
+    for size in sizes:
+        if len(size) != 2 or size[0] != inputs + 1:
+            return False
+        inputs = size[1]
+    return inputs == len(LEVELS) + 2
