@@ -6,17 +6,21 @@ __all__ = [
     "STOPS",
     "Accuracy",
     "Agreement",
+    "DepthBound",
     "EchoMaps",
     "Effects",
     "Fault",
     "FaultKind",
+    "Gradients",
     "HiddenObject",
     "Material",
     "MultiBounce",
+    "PoseFit",
     "Radiometry",
     "Rendering",
     "Scene",
     "SceneFile",
+    "SceneVector",
     "SensedImages",
     "Sensor",
     "SensorModel",
@@ -31,12 +35,16 @@ __all__ = [
     "cast",
     "choose",
     "costs",
+    "depth_bound",
     "device_named",
+    "fit_pose",
     "histograms",
     "histograms_of_all",
     "included",
+    "intensity_noise",
     "least_seconds",
     "load_scene",
+    "moved",
     "packaged_scenes",
     "paper_scene",
     "phong",
@@ -70,6 +78,7 @@ from .backend_torch import device_named, histograms_of_all
 from .echoes import MultiBounce
 from .effects import EFFECTS, Effects, included
 from .geometry import cast
+from .gradients import DepthBound, Gradients, PoseFit, SceneVector, depth_bound, fit_pose, intensity_noise, moved
 from .job import TransportJob
 from .material import Material, Surface, phong, retroreflective
 from .patches import JUMP_M
