@@ -23,14 +23,20 @@ from processes import PROGRAM
 from nlos_cam.dataset import open_dataset
 from nlos_cam.evaluate import machine
 from nlos_cam.recording import load_sidecar, verify
+from nlos_cam.view import RecordedView
 
 DOCS = Path(__file__).parents[2] / "docs"
-TIMEOUT_S = 300.0
+TIMEOUT_S = 900.0
+REASONS = "being written", "exists", "in use"
+"""Words of the line in which the second of two commands says why it does not run."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Command line with {folder} for an empty folder and {bag} for a recording, its output, and the check of that."""
+    """Command line, its output, and the check of that.
+
+    {folder} stands for an empty folder, {bag} for a recording, and {recipe} for a small recipe.
+    """
 
     arguments: str
     output: str
@@ -47,11 +53,28 @@ def _capture(path: Path) -> object:
     return verify(path), load_sidecar(path.with_suffix(".json"))
 
 
+def _session(path: Path) -> object:
+    with RecordedView(path) as view:
+        return view.address
+
+
+RECIPE = """task = "vae"
+objects = 8
+held_out = 4
+epochs = 3
+batch = 4
+learning_rate = 1e-3
+"""
 COMMANDS = {
     "capture": Command("capture sim:bare-wall --frames 30 --out {folder}/a.bag", "a.bag", _capture),
     "export": Command("export {bag} --out {folder}/out", "out", _folder("export.json", "depth.csv")),
     "repair": Command("repair {bag} --out {folder}/a.bag", "a.bag", verify),
     "replay": Command("replay {bag} --out {folder}/out", "out", _folder("report.md")),
+    "save session": Command("live sim:bare-wall --no-view --seconds 2 --save-view {folder}/a.html", "a.html", _session),
+    "train": Command(
+        "train vae --recipe {recipe} --out {folder}/run", "run", _folder("checkpoint.json", "SHA256SUMS"), again=""
+    ),
+    "port": Command("live sim:bare-wall --view-port 18765 --seconds 8", ".", Path.exists, again=""),
     "render": Command("render cup --out {folder}/a.npz", "a.npz", lambda path: path.read_bytes()[0]),
     "dataset build": Command(
         "dataset build --count 4 --workers 1 --accuracy draft --out {folder}/data",
@@ -64,7 +87,11 @@ COMMANDS = {
 
 def line_of(command: Command, folder: Path, bag: Path, *options: str) -> list[str]:
     """Return a command's process arguments."""
-    return [*PROGRAM, *command.arguments.format(folder=folder, bag=bag).split(), *options]
+    return [
+        *PROGRAM,
+        *command.arguments.format(folder=folder, bag=bag, recipe=bag.with_name("small.toml")).split(),
+        *options,
+    ]
 
 
 def leftovers(folder: Path) -> list[str]:
@@ -83,8 +110,8 @@ def kill_once(command: Command, bag: Path, after_s: float) -> dict[str, Any]:
             process.kill()
         was_killed, output = process.wait() < 0, folder / command.output
         wrong = ""
-        if output.exists() and not command.arguments.startswith(("capture", "dataset")):
-            wrong = _problem(command, output)  # under its final name it has to be whole
+        if output.exists() and not command.arguments.startswith(("capture", "dataset", "train")):
+            wrong = problem_of(command, output)  # under its final name it has to be whole
         options = [command.again] if output.exists() and command.again else []
         again = subprocess.run(
             line_of(command, folder, bag, *options), capture_output=True, text=True, timeout=TIMEOUT_S, check=False
@@ -92,11 +119,12 @@ def kill_once(command: Command, bag: Path, after_s: float) -> dict[str, Any]:
         wrong = wrong or (
             f"the next run ends with {again.returncode}: {again.stderr[-200:]}" if again.returncode else ""
         )
-        wrong = wrong or _problem(command, output) or ", ".join(leftovers(folder))
+        wrong = wrong or problem_of(command, output) or ", ".join(leftovers(folder))
     return {"after_s": round(after_s, 2), "killed": was_killed, "wrong": wrong}
 
 
-def _problem(command: Command, output: Path) -> str:
+def problem_of(command: Command, output: Path) -> str:
+    """Return why an output is not whole; empty if it is."""
     try:
         command.is_whole(output)
     except Exception as error:  # noqa: BLE001  whatever reading it raises is the finding
@@ -115,11 +143,11 @@ def race_once(command: Command, bag: Path, apart_s: float) -> dict[str, Any]:
         said = [process.communicate(timeout=TIMEOUT_S)[1] for process in (first, second)]
         codes = sorted((first.returncode, second.returncode))
         lines = [text for process, text in zip((first, second), said, strict=True) if process.returncode]
-        wrong = _problem(command, folder / command.output) or ", ".join(leftovers(folder))
+        wrong = problem_of(command, folder / command.output) or ", ".join(leftovers(folder))
         is_build = command.again == ""
         if codes not in ([0, 1], *([[0, 0]] if is_build else [])):
             wrong = wrong or f"exit codes {codes}: {said}"
-        if any("Traceback" in text or not ("being written" in text or "exists" in text) for text in lines):
+        if any("Traceback" in text or not any(reason in text for reason in REASONS) for text in lines):
             wrong = wrong or f"no line that says so: {lines}"
     return {"apart_s": round(apart_s, 2), "codes": codes, "wrong": wrong}
 
@@ -144,6 +172,7 @@ def main() -> int:
     result = json.loads(chosen.out.read_text(encoding="utf-8")) if chosen.out.exists() else {"machine": machine()}
     with tempfile.TemporaryDirectory() as folder:
         bag = record(Path(folder) / "noise.bag", packed=True, frames=8)
+        bag.with_name("small.toml").write_text(RECIPE, encoding="utf-8")
         for name, command in COMMANDS.items():
             if chosen.only not in name:
                 continue

@@ -8,6 +8,7 @@ none, since it draws on the same processors.
 
 import argparse
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -102,6 +103,17 @@ def live(name: str, seconds: float) -> dict[str, Any]:
     return {"name": name, "seconds": seconds, **report, "memory": asdict(memory(looks)), **counts}
 
 
+def pace_line(run: Mapping[str, Any]) -> str:
+    """Return a run's pace in one line; the simulated camera computes in a thread of its own, beside the latency."""
+    latency, camera = run["latency_ms"], run["camera_ms"]
+    ratio = latency["p99"] / latency["p50"]
+    return (
+        f"{run['name']}: p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms, p99/p50 {ratio:.2f}, "
+        f"{run['dropped']} of {run['frames']} dropped; simulating the camera p50 "
+        f"{camera['p50']:.1f} ms, p99 {camera['p99']:.1f} ms"
+    )
+
+
 def misses(run: Mapping[str, Any]) -> list[str]:
     """Return the limits that a run misses, with the measured values."""
     latency_ms = run["latency_ms"]
@@ -136,11 +148,13 @@ def main() -> int:
     parser.add_argument("--runs", default="alone,watched", help=f"some of {', '.join(RUNS)}")
     parser.add_argument("--out", type=Path, default=DOCS / "live.json")
     chosen = parser.parse_args()
-    result: dict[str, Any] = {"machine": machine(), "runs": [], "missed": []}
+    load = os.getloadavg()[0]  # above 0.5 before the first run: other programs delay the frames
+    result: dict[str, Any] = {"machine": machine(), "load_before": load, "runs": [], "missed": []}
     for name in chosen.runs.split(","):
         print(f"{name}: {chosen.seconds:.0f} s", file=sys.stderr)
         run = live(name, chosen.seconds)
         result["runs"].append(run)
+        print(pace_line(run), file=sys.stderr)
         result["missed"] += [f"{name}: {value}" for value in misses(run) if name != "chromium"]
         chosen.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     result["replay"] = replayed(min(REPLAYED_S, chosen.seconds))
