@@ -65,7 +65,12 @@ def claim(path: Path, *, inside: bool = False) -> Generator[Path]:
 def _new_claim(path: Path, folder: Path) -> Generator[None]:
     _sweep(folder.parent)
     for _ in range(TRIES):
-        folder.mkdir(exist_ok=True)
+        try:
+            folder.mkdir(exist_ok=True)
+        except FileExistsError:
+            if folder.is_file():
+                raise
+            continue  # its last holder removed it between mkdir's two looks
         if lock := _acquire(folder):
             break
     else:
@@ -106,7 +111,7 @@ def _acquire(folder: Path) -> FileLock | None:
     lock = FileLock(folder / LOCK)
     try:
         lock.acquire(timeout=0)
-    except (Timeout, FileNotFoundError):  # held, or its folder was just removed
+    except (Timeout, FileNotFoundError, FileExistsError):  # held, or its folder was just removed
         return None
     if (folder / LOCK).exists():
         return lock

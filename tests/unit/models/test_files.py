@@ -110,6 +110,9 @@ def race(path: Path, start: Any, results: Any, number: int) -> None:
         results.put(number)
     except (FileBusyError, OutputExistsError):
         results.put(None)
+    except BaseException:
+        results.put(-1)  # so that nobody waits for it
+        raise
 
 
 def test_one_of_many_racing_writers_wins(tmp_path: Path) -> None:
@@ -123,6 +126,25 @@ def test_one_of_many_racing_writers_wins(tmp_path: Path) -> None:
         winners = [number for number in (results.get() for _ in racers) if number is not None]
         assert winners == [int(path.read_text(encoding="utf-8"))]
     assert len(list(tmp_path.iterdir())) == 10
+
+
+def test_claim_is_tried_again_where_its_folder_goes_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The holder before may end between the two looks of mkdir(exist_ok=True): by the claim, or by its lock."""
+    make, removed = Path.mkdir, iter([True, False, True, False, False])
+
+    def mkdir(folder: Path, *arguments: Any, **options: Any) -> None:
+        if next(removed):
+            raise FileExistsError(folder)
+        make(folder, *arguments, **options)
+
+    with monkeypatch.context() as patch, claim(tmp_path / "a") as folder:
+        assert folder.is_dir()
+        patch.setattr(Path, "mkdir", mkdir)
+        with claim(tmp_path / "b") as other:
+            assert other.is_dir()
+    (tmp_path / ".c.part").write_bytes(b"")
+    with pytest.raises(FileExistsError), claim(tmp_path / "c"):
+        pass
 
 
 def upper(content: bytes) -> str:
