@@ -131,7 +131,7 @@ def _export_objects(result: Path, folder: Path, formats: list[str], every: int, 
         raise typer.BadParameter(f"--object needs a replay's result: nlos-cam replay {result} --object ply,glb,csv")
     with stop_on_signals() as stop, tracked("exporting") as on_frame:
         count = loop.export_objects(result, folder, formats, every, stop=stop, on_frame=on_frame)
-    text = f"Hidden surfaces of {count} frames as {', '.join(formats)}\nWrote {folder}"
+    text = f"Hidden surfaces of {count} frame{'' if count == 1 else 's'} as {', '.join(formats)}\nWrote {folder}"
     finish({"frames": {"objects": count}, "out": str(folder)}, as_json=as_json, text=text)
     if stop.is_set():
         raise typer.Exit(INTERRUPTED)

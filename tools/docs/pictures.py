@@ -21,7 +21,7 @@ from nlos_calibration import ObjectBox, load_rig
 from nlos_calibration.arrays import Float32, Float64
 from nlos_models import silhouette_iou
 
-from nlos_cam.camera import FRAMES_PER_S, World, open_world
+from nlos_cam.camera import FRAMES_PER_S, World, open_world, render_loop
 from nlos_cam.cli.common import tracked
 from nlos_cam.evaluate import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
 from nlos_cam.files import atomic_file
@@ -38,6 +38,7 @@ from nlos_cam.objects import (
     random_pose,
 )
 from nlos_cam.reconstruct import CalibratedRig, build_pipeline, load_networks, load_uncertainty
+from nlos_cam.render import load_scene
 
 ROOT = Path(__file__).parents[2]
 WORST, NEAR_M, FAR_M = 6, 0.16, 0.24
@@ -167,12 +168,19 @@ def _advance(update: Callable[[int, int], None], done: Iterator[int], total: int
     update(next(done), total)
 
 
+def first_poses(path: Path, poses: int, on_progress: Callable[[int, int], None]) -> World:
+    """Return the world of a scene file with only its first poses, which are all that a still shows."""
+    scene = load_scene(path)
+    echoes, truths = render_loop(scene, on_progress, range(min(poses, scene.poses)))
+    return World(scene, echoes, list(truths) if scene.hidden else [None])
+
+
 def replays(out: Path) -> None:
     """Draw a still of each scene, and the video of one."""
     for name, scene in SCENES.items():
         frames = round(FILM_S * FRAMES_PER_S) if name == FILMED else STILL_FRAMES
         with tracked(f"rendering {name}") as on_progress:
-            world = open_world(str(ROOT / scene) if scene else "", on_progress)
+            world = first_poses(ROOT / scene, frames, on_progress) if scene else open_world("")
         bench = CalibratedRig(world.rig if world.rig.object_box else load_rig("paper-rig"))
         processing = build_pipeline(bench, load_networks(), uncertainty_model=load_uncertainty())
         media, camera = ReplayMedia(bench, stills=2, video=name == FILMED), Unhurried(world, frames)
