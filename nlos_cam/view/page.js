@@ -33,9 +33,26 @@ function split(buffer) {
   return [messages, buffer.subarray(at)];
 }
 
-async function receive() {
-  const answer = await fetch("stream");
-  if (!answer.ok) throw new Error(await answer.text());
+const HIDDEN_MS = 20000; // a page out of sight for this long leaves its stream, of eight, to others
+
+// Call `away` once the page has been hidden for a while; return what ends this.
+function whenHidden(away) {
+  let timer = 0;
+  const look = () => (clearTimeout(timer), (timer = document.hidden ? setTimeout(away, HIDDEN_MS) : 0));
+  document.addEventListener("visibilitychange", look);
+  look();
+  return () => (clearTimeout(timer), document.removeEventListener("visibilitychange", look));
+}
+
+const seen = () => new Promise((resume) => {
+  const look = () => document.hidden || (document.removeEventListener("visibilitychange", look), resume());
+  document.addEventListener("visibilitychange", look);
+  look();
+});
+
+async function receive(signal) {
+  const answer = await fetch("stream", { signal });
+  if (!answer.ok) throw new Error((await answer.text()).trim());
   const reader = answer.body.getReader();
   let rest = new Uint8Array(0);
   for (;;) {
@@ -50,16 +67,20 @@ async function receive() {
   }
 }
 
+// Watch while the page is in sight; a lost or refused stream is asked for again.
 async function follow() {
   for (;;) {
     let reason = "the connection was lost: is the program still running? Trying again";
+    const leaving = new AbortController(), ended = whenHidden(() => leaving.abort());
     try {
-      await receive();
+      await receive(leaving.signal);
     } catch (error) {
       if (error.message && !/fetch|network/i.test(error.message)) reason = error.message;
     }
+    ended();
+    if (leaving.signal.aborted) reason = "out of sight: goes on when it is looked at";
     if (state.status.state !== "ended") setStatus({ state: "no connection", message: reason });
-    await new Promise((resume) => setTimeout(resume, 1500));
+    await (leaving.signal.aborted ? seen() : new Promise((resume) => setTimeout(resume, 1500)));
   }
 }
 
@@ -208,6 +229,7 @@ function drawStatus() {
   if (live && now.fps !== undefined) {
     parts.push(`<b>${now.fps.toFixed(1)}</b> frames/s`);
     parts.push(`latency <b>${now.p50_ms.toFixed(0)}</b> ms, p99 <b>${now.p99_ms.toFixed(0)}</b> ms`);
+    if (now.camera_ms) parts.push(`simulation <b>${now.camera_ms.toFixed(0)}</b> ms`);
     parts.push(`newest frame <b>${(now.age_s + since).toFixed(1)}</b> s old`);
   }
   if (now.dropped !== undefined) parts.push(`dropped <b>${now.dropped}</b>`);
