@@ -16,6 +16,8 @@ STEP = re.compile(r"```sh\n(?P<commands>.*?)```\n\n```text\n(?P<answer>.*?)```",
 """Commands, and right after them their answers."""
 WIDTH = 110
 """Width of the terminal in characters."""
+PROGRESS = re.compile(r"[a-z][\w ]*: (?:\d+/\d+, )?\d+ s")
+"""A line of progress, which only a slow machine prints."""
 
 Runner = Callable[[list[str]], str]
 """Runs one command, given as its words, and returns its output. Raises CalledProcessError where it fails."""
@@ -52,7 +54,8 @@ def run_in(folder: Path) -> Runner:
     def run(words: list[str]) -> str:
         wide = {**os.environ, "COLUMNS": str(WIDTH), "PYTHONPATH": paths}
         ended = subprocess.run(as_program(words), cwd=folder, env=wide, capture_output=True, text=True, check=True)
-        return "".join(f"{line.rstrip()}\n" for line in (ended.stderr + ended.stdout).splitlines() if line.strip())
+        lines = [line.rstrip() for line in (ended.stderr + ended.stdout).splitlines()]
+        return "".join(f"{line}\n" for line in lines if line and not PROGRESS.fullmatch(line))
 
     return run
 
