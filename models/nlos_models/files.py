@@ -4,18 +4,24 @@ import errno
 import glob
 import hashlib
 import logging
+import math
 import os
 import platform
 import shutil
 import tomllib
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+from zipfile import ZipFile
 
 from filelock import FileLock, Timeout
 
 from nlos_models.errors import FileBusyError, OutputExistsError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 CLAIM, LOCK, HOLDER = ".{}.part", "lock", "holder"
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
@@ -23,8 +29,8 @@ DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 TRIES = 5
 """Attempts at a claim that another process gives up at the same moment."""
 DIGEST_DIGITS = 16
-TEXT_LIMIT, TENSOR_LIMIT = 1 << 20, 4 << 30
-"""Bounds in bytes of a text file (TOML, JSON) and of a file of arrays that somebody else may have written."""
+TEXT_LIMIT, TENSOR_LIMIT, ARRAYS_LIMIT = 1 << 20, 4 << 30, 2 << 30
+"""Bounds in bytes of a text file (TOML, JSON), of a file of tensors, and of the arrays unpacked from one .npz file."""
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -251,6 +257,39 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(read_bounded(path, TEXT_LIMIT).decode())
     except RecursionError as error:
         raise tomllib.TOMLDecodeError(describe(error)) from error
+
+
+def read_arrays(path: Path, names: Iterable[str] | None = None, limit: int = ARRAYS_LIMIT) -> "dict[str, NDArray[Any]]":
+    """Return arrays of an .npz file by name (None: all of them), without pickles.
+
+    Raises OSError, or ValueError where one is missing or damaged, where a header declares another size than the bytes
+    that follow it, or where they unpack to more than `limit` bytes.
+    """
+    try:
+        with ZipFile(path) as file:
+            chosen = [each.removesuffix(".npy") for each in file.namelist()] if names is None else names
+            infos = {name: file.getinfo(f"{name}.npy") for name in chosen}
+            if sum(info.file_size for info in infos.values()) <= limit:
+                return {name: _array(file.read(info)) for name, info in infos.items()}
+    except (OSError, ValueError):
+        raise
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds
+        raise ValueError(describe(error)) from error
+    raise ValueError(f"it unpacks to more than {limit >> 20} MiB")
+
+
+def _array(content: bytes) -> "NDArray[Any]":
+    """Return the array of an .npy file, whose size is compared before it is allocated."""
+    import numpy as np
+
+    memory = BytesIO(content)
+    old = np.lib.format.read_magic(memory) == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(memory)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content) - memory.tell():
+        raise ValueError("an array's size contradicts its bytes")
+    memory.seek(0)
+    return np.lib.format.read_array(memory, allow_pickle=False)
 
 
 CHECKSUMS = "SHA256SUMS"

@@ -10,7 +10,7 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from nlos_calibration import load_rig, load_wall
-from nlos_models import load_recipe
+from nlos_models import load_recipe, read_arrays
 
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.info.description import Description, count
@@ -75,6 +75,7 @@ ARRAYS = (
 """Names that all files of a kind have."""
 COUNTED = {"frame_number", "timestamp_s", "verdict", "object_depth_m", "facts", "vertices_m", "faces"}
 """Arrays that are read, each up to MAX_ARRAY_BYTES."""
+READ = COUNTED | {"rig_name", "rig_checksum", "radiometry"}
 MAX_ARRAY_BYTES = 256 << 20
 
 
@@ -86,10 +87,8 @@ def describe_npz(path: Path, verify: bool) -> Description:
             if any(each.file_size > MAX_ARRAY_BYTES for each in file.infolist() if Path(each.filename).stem in COUNTED):
                 raise RecordingError(f"{path} holds more than {MAX_ARRAY_BYTES >> 20} MiB of numbers: make it again")
             bad = file.testzip() if verify else None
-        with path.open("rb") as file:
-            arrays: Any = np.load(file)
-            kind, facts, following = _kind_of_arrays(path, names, arrays)
-    except (BadZipFile, OSError, ValueError, LookupError, EOFError, zlib.error) as error:
+        kind, facts, following = _kind_of_arrays(path, names, read_arrays(path, names & READ))
+    except (BadZipFile, OSError, ValueError, LookupError, TypeError, NotImplementedError, zlib.error) as error:
         if isinstance(error, OSError) and error.errno:
             raise
         raise RecordingError(f"{path} is cut short or damaged ({error}): make it again") from error

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from nlos_models import CHECKSUMS, checksums_of, load_record
+from nlos_models import CHECKSUMS, TEXT_LIMIT, checksums_of, load_record, read_bounded
 
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.info.description import Description, count
@@ -130,7 +130,7 @@ def describe_tradeoff(folder: Path, verify: bool) -> Description:
 def _json(path: Path) -> Mapping[str, dict[str, float]]:
     """Return a JSON object. Raises RecordingError for anything else."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(read_bounded(path, TEXT_LIMIT))
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"{path} is not JSON ({error}): it is cut short or damaged; make it again") from error
     if not isinstance(found, dict):

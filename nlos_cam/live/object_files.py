@@ -1,16 +1,15 @@
 """Hidden objects of a replay as files of other programs: a mesh or a point cloud per frame."""
 
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32
+from nlos_models import read_arrays
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory
@@ -78,12 +77,10 @@ FIELDS = "depth_m", "uncertainty_m", "frame_number", "origin_m", "pitch_m", "z_n
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:  # numpy leaves a damaged one open
-            arrays: Any = np.load(file)
-            return {name: arrays[name] for name in FIELDS}
+        return read_arrays(path, FIELDS)
     except FileNotFoundError as error:
         raise RecordingError(f"{path} does not exist: give the reconstruction.npz of a replay") from error
-    except (OSError, LookupError, ValueError, EOFError, BadZipFile, zlib.error) as error:
+    except (OSError, ValueError) as error:
         raise RecordingError(
             f"{path} is not the reconstruction.npz of a replay: make one with `nlos-cam replay F.bag`"
         ) from error

@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import pickle
+import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -343,6 +344,24 @@ def mutate_text(content: bytes, random: Random) -> tuple[str, bytes]:
     return way, "\n".join(lines).encode()
 
 
+NUMBER = re.compile(rb"-?\d+(?:\.\d+)?")
+HEADER_BYTES = 4096
+
+
+def mutate_numbers(content: bytes, random: Random) -> tuple[str, bytes]:
+    """Put other numbers into the text or the header of a mesh or an array, or another count into a binary one."""
+    bad = bytearray(content)
+    if content[:80] == bytes(80):  # a binary .stl
+        bad[80:84] = pick(random, NUMBERS).to_bytes(4, "little")
+        return "count", bytes(bad)
+    for _ in range(int(random.integers(1, 4))):
+        found = list(NUMBER.finditer(bytes(bad[:HEADER_BYTES])))
+        if found:
+            start, end = pick(random, found).span()
+            bad[start:end] = str(pick(random, (*NUMBERS, *FLOATS, -5, 10**30))).encode()
+    return "numbers", bytes(bad)
+
+
 class _Evil:
     def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
         return print, ("unpickled",)
@@ -378,6 +397,7 @@ FORMATS: Mapping[str, Callable[[bytes, Random], tuple[str, bytes]]] = {
     ".toml": mutate_text,
     ".json": mutate_text,
     ".ckpt": mutate_state,
+    **dict.fromkeys((".obj", ".ply", ".stl", ".npy"), mutate_numbers),
 }
 
 

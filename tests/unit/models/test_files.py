@@ -4,10 +4,13 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import nlos_models.files
+import numpy as np
 import pytest
 from nlos_models.errors import FileBusyError, OutputExistsError
 from nlos_models.files import (
@@ -17,6 +20,7 @@ from nlos_models.files import (
     claim,
     describe,
     load_cached,
+    read_arrays,
     read_bounded,
     read_checked,
     reservations,
@@ -216,3 +220,37 @@ def test_describe_gives_one_line() -> None:
         "a b",
         "its parts contradict each other",
     ]
+
+
+def _lying(folder: Path, edit: Callable[[bytes], bytes]) -> Path:
+    np.savez(folder / "whole.npz", depth_m=np.ones((4, 4), np.float32), other=np.ones(2))
+    with ZipFile(folder / "whole.npz") as whole, ZipFile(folder / "bad.npz", "w") as bad:
+        bad.writestr("depth_m.npy", edit(whole.read("depth_m.npy")))
+    return folder / "bad.npz"
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda content: content.replace(b"(4, 4)", b"(9999999999, 4)"),
+        lambda content: content.replace(b"<f4", b"|O "),
+        lambda content: content.replace(b"{'descr'", b"((((((((("),
+        lambda content: content[:-1],
+        lambda _: b"",
+    ],
+)
+def test_read_arrays_refuses_a_header_that_lies(tmp_path: Path, edit: Callable[[bytes], bytes]) -> None:
+    with pytest.raises(ValueError, match=r"^.+$"):
+        read_arrays(_lying(tmp_path, edit), ["depth_m"])
+
+
+def test_read_arrays_returns_what_was_saved_within_its_limit(tmp_path: Path) -> None:
+    path = _lying(tmp_path, bytes)
+    assert read_arrays(path)["depth_m"].tolist() == np.ones((4, 4)).tolist()
+    with pytest.raises(ValueError, match="more than 0 MiB"):
+        read_arrays(path, limit=100)
+    with pytest.raises(ValueError, match="other"):
+        read_arrays(path, ["other"])
+    path.write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="zip"):
+        read_arrays(path)
