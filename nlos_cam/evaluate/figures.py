@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 from nlos_calibration.arrays import Float32, Float64
+from nlos_models import GOOD_IOU
 from numpy.typing import NDArray
 
-from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Bin, Figures, Interval
+from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Bin, Figures, Interval, Predictions
 
 SHEET_COLUMNS = 18
 MAX_PER_SHEET = 54
@@ -146,6 +147,26 @@ def _points(axis: Any, figures: Sequence[Interval]) -> None:
         if figure.value is not None:
             axis.plot([figure.low, figure.high], [k, k], color="tab:blue", linewidth=2, alpha=0.6)
             axis.plot(figure.value, k, "o", color="tab:blue")
+
+
+def draw_quality(path: Path, sets: Mapping[str, tuple[Predictions, Float64]]) -> None:
+    """Draw the true IoU of each set's objects against the predicted one with its interval; trusted ones in green."""
+    figure = _figure((5 * len(sets), 4.6))
+    for axis, (name, (predicted, iou)) in zip(
+        figure.subplots(1, len(sets), squeeze=False)[0], sets.items(), strict=True
+    ):
+        lengths = [(predicted.iou - predicted.low).clip(0), (predicted.high - predicted.iou).clip(0)]
+        axis.errorbar(predicted.iou, iou, xerr=lengths, fmt="none", ecolor="tab:blue", alpha=0.25)
+        for chosen, color, label in (
+            (~predicted.trusted, "tab:blue", "estimate"),
+            (predicted.trusted, "tab:green", "shown in green"),
+        ):
+            axis.plot(predicted.iou[chosen], iou[chosen], "o", markersize=4, color=color, label=label)
+        axis.plot([0, 1], [0, 1], "k:", label="perfect")
+        axis.axhline(GOOD_IOU, color="tab:gray", linewidth=1, label=f"good: {GOOD_IOU:g}")
+        axis.set(title=name, xlabel="predicted IoU", ylabel="true IoU", xlim=(0, 1), ylim=(0, 1))
+        axis.legend(fontsize=8)
+    figure.savefig(path, dpi=90)
 
 
 def draw_against_surface(

@@ -11,7 +11,15 @@ import cv2
 import numpy as np
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
-from nlos_models import MIN_V, accuracy_mean_abs, accuracy_within_2_percent, foreground_rmse_mm, silhouette_iou, surface
+from nlos_models import (
+    GOOD_IOU,
+    MIN_V,
+    accuracy_mean_abs,
+    accuracy_within_2_percent,
+    foreground_rmse_mm,
+    silhouette_iou,
+    surface,
+)
 from numpy.typing import NDArray
 
 PerObject = dict[str, Float64]
@@ -119,6 +127,47 @@ def meets(name: str, figure: Interval) -> bool:
 def targets_met(figures: Figures) -> dict[str, dict[str, Any]]:
     """Return each metric's target and whether the estimate meets it."""
     return {name: {"bar": bar, "met": meets(name, figures[name])} for name, bar in TARGETS.items()}
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Predicted quality of n reconstructions, beside the true one."""
+
+    low: Float64
+    """(n,): 10 % quantile of the silhouette IoU."""
+    iou: Float64
+    """(n,): median."""
+    high: Float64
+    """(n,): 90 % quantile."""
+    error_mm: Float64
+    """(n,): expected mean absolute error of the depth."""
+    trusted: NDArray[np.bool_]
+    """(n,): the page shows the frame in green."""
+
+    def where(self, chosen: NDArray[np.bool_]) -> "Predictions":
+        """Return those of a mask (n,)."""
+        return Predictions(**{name: values[chosen] for name, values in vars(self).items()})
+
+
+QUALITY_TARGETS = {"correlation": 0.7, "trusted_good": 0.9}
+"""Lower limits: correlation of predicted with true IoU, and share of trusted frames with an IoU of GOOD_IOU."""
+
+
+def quality_figures(predicted: Predictions, iou: Float64) -> dict[str, Any]:
+    """Return how well the IoU (n,) was predicted, and how many trusted frames were good; None without any of them."""
+    good, trusted = iou >= GOOD_IOU, predicted.trusted
+    known = len(iou) > 2 and np.ptp(iou) > 0 and np.ptp(predicted.iou) > 0
+    return {
+        "correlation": float(np.corrcoef(predicted.iou, iou)[0, 1]) if known else None,
+        "mean_error": float(np.abs(predicted.iou - iou).mean()),
+        "bias": float((predicted.iou - iou).mean()),
+        "within_80_percent_interval": float(((iou >= predicted.low) & (iou <= predicted.high)).mean()),
+        "good": float(good.mean()),
+        "trusted": float(trusted.mean()),
+        "trusted_objects": int(trusted.sum()),
+        "trusted_good": float(good[trusted].mean()) if trusted.any() else None,
+        "targets": QUALITY_TARGETS,
+    }
 
 
 STEP_MM = 10.0

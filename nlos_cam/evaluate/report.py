@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32, Float64
-from nlos_models import load_reconstructor
+from nlos_models import GOOD_IOU, load_reconstructor, load_uncertainty_model, silhouette_iou
 
 from nlos_cam.evaluate import figures as pictures
 from nlos_cam.evaluate import metrics
@@ -22,6 +22,7 @@ from nlos_cam.evaluate.metrics import (
     TARGETS,
     Interval,
     PerObject,
+    Predictions,
     advantage,
     over_objects,
     per_category,
@@ -39,6 +40,7 @@ from nlos_cam.evaluate.subjects import (
     left_out_categories,
     network_input,
     notes_about,
+    predict_quality,
     reconstruct_all,
     rendered_objects,
     rig_of,
@@ -49,7 +51,18 @@ from nlos_cam.objects import CATEGORIES
 from nlos_cam.reconstruct import Mirrored
 from nlos_cam.report import Banner, Bullets, Commands, Document, Picture, Section, Table, saved_picture, write_document
 
-REPORT, UNSEEN_SHEET = "report.html", "sheet-unseen.png"
+REPORT, UNSEEN_SHEET, QUALITY = "report.html", "sheet-unseen.png", "quality.png"
+QUALITY_COLUMNS = {
+    "correlation": "correlation with the true IoU",
+    "mean_error": "mean error",
+    "bias": "predicted less true",
+    "within_80_percent_interval": "within the 80 % interval",
+    "good": f"share with IoU of {GOOD_IOU:g}",
+    "trusted": "shown in green",
+    "trusted_good": "of these with that IoU",
+}
+"""Titles of a quality's figures by name."""
+QUALITY_TARGETS_TEXT = "Wanted: a correlation of 0.7, and 0.9 of the frames shown in green with that IoU."
 SHIPPED = "the shipped ones"
 SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
 SILHOUETTE_ERROR, DEPTH_ERROR = "1 - silhouette IoU", "foreground RMSE, mm"
@@ -68,6 +81,7 @@ class Unseen(NamedTuple):
     truth: Float32
     """(n, 64, 64)."""
     image: Float32
+    predicted: Predictions | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +101,8 @@ class Evaluation:
     """Categories that training left out."""
     unseen: Unseen | None = None
     """The second set of test objects; None beside other objects than the first."""
+    predicted: Predictions | None = None
+    """None without a quality model, or for weights of difference maps."""
 
     @property
     def ours(self) -> PerObject:
@@ -140,11 +156,13 @@ def evaluate(
         objects = rendered_objects(rig, count, tracked)
     bare = bare_wall_for(record, objects.plan, wall)
     guesses, searched = baseline_answers(objects, training, nearest=nearest, tracked=tracked)
+    doubter = load_uncertainty_model(weights, cache_folder() / "onnx") if record.input == "raw maps" else None
     image = reconstruct_all(reconstructor, network_input(objects.maps, bare))
-    unseen = None
+    predicted, unseen = predict_quality(image, objects.maps, doubter, objects.plan.rig), None
     if second:
         answers = reconstruct_all(reconstructor, network_input(second.maps, bare))
-        unseen = Unseen(second.names, second.maps.image.astype(np.float32), answers)
+        sure = predict_quality(answers, second.maps, doubter, second.plan.rig)
+        unseen = Unseen(second.names, second.maps.image.astype(np.float32), answers, sure)
     facts = {
         "what": objects.description,
         "weights": str(weights or SHIPPED),
@@ -156,7 +174,7 @@ def evaluate(
     }
     truth, left_out = objects.maps.image.astype(np.float32), left_out_categories(record)
     box = objects.plan.box
-    return Evaluation(objects.names, objects.categories, truth, image, guesses, box, facts, left_out, unseen)
+    return Evaluation(objects.names, objects.categories, truth, image, guesses, box, facts, left_out, unseen, predicted)
 
 
 def as_figures(evaluation: Evaluation) -> dict[str, Any]:
@@ -181,6 +199,7 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
             name: asdict(zone) for name, zone in metrics.error_by_zone(evaluation.image, evaluation.truth).items()
         },
         "unseen": _unseen_figures(evaluation),
+        "quality": _quality(evaluation),
         "recognised": _recognised(evaluation),
         "objects": len(evaluation.truth),
         **evaluation.facts,
@@ -192,6 +211,25 @@ def _unseen_figures(evaluation: Evaluation) -> dict[str, Any] | None:
     if not (second := evaluation.unseen):
         return None
     return plain(metrics.judge(second.image, second.truth, evaluation.box)) | {"objects": len(second.truth)}
+
+
+def _predicted_sets(evaluation: Evaluation) -> dict[str, tuple[Predictions, Float64]]:
+    """Return predicted and true quality of each set of objects, by its name; mixed objects also by share."""
+    sets, second = dict[str, tuple[Predictions, Float64]](), evaluation.unseen
+    if predicted := evaluation.predicted:
+        iou, kinds = evaluation.ours["silhouette_iou"], np.isin(evaluation.categories, tuple(CATEGORIES))
+        sets["objects"] = predicted, iou
+        if kinds.any() and not kinds.all():
+            sets |= {"the 18 kinds": (predicted.where(kinds), iou[kinds])}
+            sets |= {"generic shapes": (predicted.where(~kinds), iou[~kinds])}
+    if second and second.predicted:
+        sets["kinds never seen"] = second.predicted, silhouette_iou(second.image, second.truth)
+    return sets
+
+
+def _quality(evaluation: Evaluation) -> dict[str, Any] | None:
+    """Return the figures of predicted quality by set of objects; None without a quality model."""
+    return {name: metrics.quality_figures(*each) for name, each in _predicted_sets(evaluation).items()} or None
 
 
 def _recognised(evaluation: Evaluation) -> dict[str, Any] | None:
@@ -243,6 +281,8 @@ def _draw(folder: Path, evaluation: Evaluation) -> None:
         pictures.draw_sheet(folder / UNSEEN_SHEET, second.image, second.truth, second.names)
     pictures.draw_gallery(folder / "gallery.png", image, truth, names, ours["silhouette_iou"])
     pictures.draw_categories(folder / "categories.png", per_category(ours, evaluation.categories), over_objects(ours))
+    if sets := _predicted_sets(evaluation):
+        pictures.draw_quality(folder / QUALITY, sets)
     curves = {
         measure_name: {error_name: metrics.curve(measure, error) for error_name, error in evaluation.errors.items()}
         for measure_name, measure in evaluation.surfaces.items()
@@ -274,6 +314,7 @@ def document(figures: Mapping[str, Any], folder: Path) -> Document:
             Section("Metrics", [Table(head, [_row(figures, metric, baselines) for metric in TARGETS]), READ_WITH_CARE]),
             saved_picture("Truth, reconstruction and difference", SHEET_CAPTION, folder / "sheet.png"),
             *_unseen(figures["unseen"], folder),
+            *_quality_section(figures["quality"], folder),
             Section("Where the error is", [text for text in details if text]),
             saved_picture("Metrics by category", "Mean of each category with its interval.", folder / "categories.png"),
             saved_picture(
@@ -292,6 +333,20 @@ def _unseen(figures: Mapping[str, Any] | None, folder: Path) -> list[Section | P
     title = f"{figures['objects']} objects of kinds that training never sees"
     table = Section(title, [Table(("metric", "these weights (95 % interval)"), rows)])
     return [table, saved_picture("Kinds never seen", SHEET_CAPTION, folder / UNSEEN_SHEET)]
+
+
+def _quality_section(figures: Mapping[str, Any] | None, folder: Path) -> list[Section | Picture]:
+    if not figures:
+        return []
+    rows: list[tuple[str, ...]] = []
+    for name, each in figures.items():
+        values = ("none" if each[key] is None else f"{each[key]:.2f}" for key in QUALITY_COLUMNS)
+        rows.append((name, *values))
+    head = ("set", *(title for title in QUALITY_COLUMNS.values()))
+    return [
+        Section("Predicted quality", [Table(head, rows), QUALITY_TARGETS_TEXT]),
+        saved_picture("Predicted and true overlap", "Bars: 80 % intervals.", folder / QUALITY),
+    ]
 
 
 def _kinds(figures: Mapping[str, Any] | None) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from nlos_calibration import ObjectBox, Rig, rig_named
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import RecordFileError
-from nlos_models import CheckpointRecord, MapSet, Reconstructor, subtract_bare_wall
+from nlos_models import CheckpointRecord, MapSet, Reconstructor, UncertaintyModel, subtract_bare_wall
 
 from nlos_cam.camera import World
 from nlos_cam.dataset import (
@@ -27,9 +27,26 @@ from nlos_cam.dataset import (
 )
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import baselines as trivial
+from nlos_cam.evaluate.metrics import Predictions
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
-from nlos_cam.objects import BenchmarkObject, benchmark_objects, image_from_depth, object_depth, unseen_objects
+from nlos_cam.objects import (
+    BenchmarkObject,
+    benchmark_objects,
+    depth_from_image,
+    image_from_depth,
+    object_box,
+    object_depth,
+    unseen_objects,
+)
+from nlos_cam.reconstruct import (
+    FrameConditions,
+    Reconstruction,
+    Verdict,
+    VerdictFilter,
+    estimate_doubt,
+    verdict_limits,
+)
 from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
 
 OnProgress = Callable[[int, int], None]
@@ -110,6 +127,29 @@ def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:
     """Reconstruct images v (n, 64, 64), one object at a time as `live` does."""
     pairs = zip(maps.depth_m, maps.intensity, strict=True)
     return np.concatenate([reconstructor(depth[None], intensity[None]) for depth, intensity in pairs])
+
+
+def predict_quality(
+    images: Float32, maps: MapSet, uncertainty_model: UncertaintyModel | None, rig: Rig
+) -> Predictions | None:
+    """Return the predicted quality of images (n, 64, 64) made from raw maps; None without a quality model.
+
+    A frame is trusted as on the page: a detected object, on a verdict from this frame alone, of a trusted quality.
+    """
+    if uncertainty_model is None or uncertainty_model.quality is None:
+        return None
+    rows, box = list[tuple[float, ...]](), object_box(rig)
+    for depth_m, intensity, image in zip(maps.depth_m, maps.intensity, images, strict=True):
+        doubt = estimate_doubt(uncertainty_model, LidarMaps(depth_m, intensity, ~np.isnan(depth_m)), image, box)
+        found = Reconstruction(depth_from_image(image, box), np.eye(4), doubt.error_m, {}, doubt)
+        _, verdict = VerdictFilter(verdict_limits(uncertainty_model)).decide(found, FrameConditions())
+        if quality := doubt.quality:
+            trusted = quality.trusted and verdict is Verdict.SEEN
+            rows.append((*quality.iou, 1e3 * quality.error_m, trusted))
+        else:  # no surface: no overlap
+            rows.append((0.0, 0.0, 0.0, 0.0, False))
+    low, middle, high, error_mm, trusted = np.array(rows, np.float64).reshape(-1, 5).T
+    return Predictions(low, middle, high, error_mm, trusted > 0)
 
 
 @dataclass(frozen=True)

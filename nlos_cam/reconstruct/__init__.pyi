@@ -20,6 +20,7 @@ __all__ = [
     "check_reconstruction",
     "compatibility_warnings",
     "describe_failure",
+    "estimate_doubt",
     "frame_issues",
     "load_networks",
     "load_uncertainty",
@@ -30,7 +31,7 @@ __all__ = [
 ]
 
 from .bench import CalibratedRig, check_intrinsics, open_bench
-from .network import Clock, Mirrored, Quality, Reconstruction, reconstruct
+from .network import Clock, Mirrored, Quality, Reconstruction, estimate_doubt, reconstruct
 from .physics_check import (
     UNEXPLAINED,
     PeriodicPhysicsCheck,

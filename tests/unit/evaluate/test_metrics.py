@@ -9,6 +9,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate.metrics import (
     TARGETS,
+    Predictions,
     advantage,
     curve,
     detail_per_cm,
@@ -19,6 +20,7 @@ from nlos_cam.evaluate.metrics import (
     over_objects,
     per_category,
     per_object,
+    quality_figures,
     rank_correlation,
     surface_cm2,
     targets_met,
@@ -167,3 +169,18 @@ def test_zones_locate_an_error(at: tuple[int, int], zone: str) -> None:
 def test_zones_of_perfect_image_and_of_empty_truth() -> None:
     assert {zone.share_of_error for zone in error_by_zone(plate(9), plate(9)).values()} == {None}
     assert error_by_zone(plate(9), EMPTY)["far background"].share_of_error == pytest.approx(1)
+
+
+def test_quality_figures_of_exact_and_of_blind_predictions() -> None:
+    iou = np.linspace(0.4, 0.95, 50)
+    exact = Predictions(iou - 0.05, iou, iou + 0.05, np.full(50, 10.0), iou >= 0.8)
+    found = quality_figures(exact, iou)
+    assert found["correlation"] == pytest.approx(1)
+    assert (found["mean_error"], found["bias"]) == pytest.approx((0, 0))
+    assert found["within_80_percent_interval"] == found["trusted_good"] == 1
+    assert found["trusted_objects"] == (iou >= 0.8).sum()
+    blind = Predictions(iou * 0 + 0.9, iou * 0 + 0.95, iou * 0 + 1, iou, np.zeros(50, bool))
+    found = quality_figures(blind, iou)
+    assert found["correlation"] is None
+    assert found["trusted_good"] is None
+    assert found["bias"] > 0.2

@@ -14,7 +14,7 @@ from page_reader import read_page
 from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate import report
 from nlos_cam.evaluate.figures import LABELS
-from nlos_cam.evaluate.metrics import TARGETS, Interval
+from nlos_cam.evaluate.metrics import TARGETS, Interval, Predictions
 from nlos_cam.evaluate.report import Evaluation, Unseen, as_figures, document, format_interval, write_report
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.report import figure_of, png
@@ -71,6 +71,22 @@ def test_figures_have_names_that_scripts_depend_on() -> None:
     assert figures["baselines"]["all_background"]["foreground_rmse_mm"]["value"] is None
     assert figures["advantage_over_nearest_neighbour"]["silhouette_iou"]["value"] > 0
     assert sum(zone["share_of_error"] for zone in figures["where_the_error_is"].values()) == pytest.approx(1)
+
+
+def test_predicted_quality_is_reported_by_set_and_share_with_a_picture(tmp_path: Path) -> None:
+    made = _judgement()
+    iou = made.ours["silhouette_iou"]
+    predicted = Predictions(iou - 0.1, iou, iou + 0.1, iou, iou > np.median(iou))
+    unseen = Unseen(made.names, made.truth, made.image, predicted)
+    mixed = replace(made, categories=["cup", *made.categories[1:]], predicted=predicted, unseen=unseen)
+    figures = _figures(mixed)
+    assert set(figures["quality"]) == {"objects", "the 18 kinds", "generic shapes", "kinds never seen"}
+    assert figures["quality"]["objects"]["correlation"] == pytest.approx(1)
+    write_report(tmp_path / "out", mixed, figures)
+    text = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
+    assert "(quality.png)" in text
+    assert "shown in green" in text
+    assert _figures(_judgement())["quality"] is None
 
 
 def test_report_of_perfect_reconstruction_meets_every_bar(drawn: Path) -> None:
