@@ -1,5 +1,6 @@
 """Simulated L515: a rendered world behind a software device of librealsense."""
 
+from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from threading import Event, Thread
 from typing import Any, Self
@@ -110,6 +111,8 @@ RESET_INSTANTS = FRAMES_PER_S
 EXPOSED_AHEAD_S = 0.5 / FRAMES_PER_S
 """Least time before a frame is due at which its exposure is computed: late, since a real device needs no processor for
 it and the last frame is still being reconstructed, and twice the time of the last exposure if that is longer."""
+REMEMBERED_EXPOSURES = 3000
+"""Frames (100 s) whose computing time is remembered."""
 MAX_TRUTHS = 1000
 """Frames whose instant is remembered for their ground truth; no reader is that late."""
 
@@ -134,6 +137,8 @@ class SimulatedCamera(LiveCamera):
     ) -> None:
         self._world, self._clock, self._faults = world, clock or WallClock(), tuple(faults)
         world.images(0)  # compile now: it would delay the first frames
+        self.exposures_s = deque[float](maxlen=REMEMBERED_EXPOSURES)
+        """Seconds that the last frames' images took to compute: a real camera takes none of this machine's."""
         self._stopping = Event()
         self._thread: Thread | None = None
         self._start_s: float | None = None
@@ -215,7 +220,8 @@ class SimulatedCamera(LiveCamera):
             if self._clock.wait(self._stopping, due_s - ahead_s - self._clock.now()):
                 return
             exposure_s, images = self._clock.now(), self._world.images(instant)
-            ahead_s = max(EXPOSED_AHEAD_S, 2 * (self._clock.now() - exposure_s))
+            self.exposures_s.append(self._clock.now() - exposure_s)
+            ahead_s = max(EXPOSED_AHEAD_S, 2 * self.exposures_s[-1])
             if self._clock.wait(self._stopping, due_s - self._clock.now()):
                 return
             for delivery in self._model.deliver(instant, due_s, images):

@@ -287,6 +287,12 @@ def summary(report: loop.RunReport, *, verbose: bool = False) -> str:
         f"{report.frames} frames, {report.fps:.1f} per second",
         f"Latency {latency['p50']:.0f} ms median, {latency['p95']:.0f} ms p95, {latency['p99']:.0f} ms p99",
     ]
+    if report.camera_ms:
+        middle, high = report.camera_ms["p50"], report.camera_ms["p99"]
+        lines.append(f"Simulating the camera took {middle:.0f} ms a frame beside it, {high:.0f} ms p99")
+    if report.quality:
+        typical, error_mm = report.quality["expected_iou"], report.quality["expected_error_mm"]
+        lines.append(f"Outline typically {typical:.0%} right, depth to {error_mm:.0f} mm (predicted)")
     if report.dropped:
         lines.append(f"Dropped {report.dropped} frames: {', '.join(losses)}")
     lost = report.dropped / max(report.frames + report.dropped, 1)

@@ -27,6 +27,7 @@ from nlos_cam.files import atomic_file
 from nlos_cam.frames import Frame
 from nlos_cam.live.frame_queue import ignore
 from nlos_cam.live.live_recording import LiveRecording
+from nlos_cam.live.statistics import camera_ms
 from nlos_cam.objects import mesh_from_depth, object_box
 from nlos_cam.reconstruct import CalibratedRig, Clock, Pipeline
 from nlos_cam.view import Moment
@@ -169,6 +170,8 @@ class RunControl:
             age_s = now_s - newest.published_s + newest.latency_s
             status |= {name: round(float(value), 2) for name, value in pace.items()}
             status |= {"p99_ms": round(1e3 * float(p99_s), 2), "age_s": round(age_s, 2), "dropped": newest.dropped}
+        if self._camera and (simulated := camera_ms(self._camera)):
+            status["camera_ms"] = round(simulated["p50"], 2)
         if self._camera and pipeline:
             status["disk_s"] = round(recording_s(self._camera.intrinsics, free_bytes(self.folder / "any.bag")))
         if recording := self._recording:

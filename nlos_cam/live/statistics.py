@@ -206,6 +206,8 @@ class RunReport:
     """Sum of the times without a frame; see `StallWatch`."""
     quality: Mapping[str, float] = field(default_factory=dict[str, float])
     """Of the frames with an object: medians `expected_iou` and `expected_error_mm`, share `trusted`; empty without."""
+    camera_ms: Mapping[str, float] = field(default_factory=dict[str, float])
+    """p50, p95 and p99 of computing a simulated camera's images, beside the latency; empty for other cameras."""
 
 
 class QualityLog:
@@ -303,6 +305,7 @@ class RunStatistics:
             verdicts=frames_by_verdict(self.verdicts),
             stalled_s=self.stall.stalled_s,
             quality=self.quality.summary,
+            camera_ms=camera_ms(camera),
         )
 
     def _percentiles_ms(self, offset_s: float) -> dict[str, Percentiles]:
@@ -310,6 +313,12 @@ class RunStatistics:
         offsets_s = {LATENCY: offset_s, DELIVERY: offset_s}
         names = [LATENCY, *(name for name in self._times.stages if name != LATENCY)]
         return {name: percentiles_ms(self._times.of(name) - offsets_s.get(name, 0.0)) for name in names}
+
+
+def camera_ms(camera: Camera) -> Percentiles:
+    """Return percentiles of the time in which a simulated camera computes an image; empty for other cameras."""
+    exposures_s = getattr(camera, "exposures_s", None)
+    return percentiles_ms(np.array(list(exposures_s))) if exposures_s else {}
 
 
 def frames_by_verdict(verdicts: Counter[Verdict]) -> dict[str, int]:

@@ -108,7 +108,7 @@ def test_live_json_and_log_have_their_fields(run: Run) -> None:
     code, report, _ = run(*arguments)
     assert code == 0
     fields = ("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings")
-    assert set(report) == {*fields, "stages_percentiles_ms", "verdicts", "stalled_s"}
+    assert set(report) == {*fields, "stages_percentiles_ms", "verdicts", "stalled_s", "quality", "camera_ms"}
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert report["verdicts"] == {Verdict.SEEN.value: 20}
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
@@ -168,7 +168,7 @@ def test_replay_on_a_wall_notes_that_the_rig_differs(tmp_path: Path, run: Run) -
 def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) -> None:
     code, report, printed = run(*REPLAY)
     assert code == 0
-    assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts"}
+    assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts", "quality"}
     assert (report["frames"], report["out"]) == (20, "out")
     assert "training rig" not in printed
     assert run(*REPLAY)[0] == 1

@@ -1,4 +1,5 @@
 from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,14 +15,17 @@ from nlos_cam.live.statistics import (
     MAX_FAILED_IN_A_ROW,
     STALLED,
     STALLED_AFTER_S,
+    QualityLog,
     RunReport,
     RunStatistics,
     StageTimes,
     StallWatch,
     WarningLog,
     WarningSpan,
+    camera_ms,
     percentiles_ms,
 )
+from nlos_cam.reconstruct.network import Doubt, Quality
 from nlos_cam.reconstruct.pipeline import FrameResult
 from nlos_cam.reconstruct.verdict import Verdict
 
@@ -184,3 +188,21 @@ def test_stall_watch_counts_a_stall_that_lasts_to_the_end(watch: StallWatch, beg
     assert [each for _, each in begins] == [True, False, True, False, True, False, True]
     assert watch.stalls == 4
     assert watch.stalled_s == pytest.approx(2.0 + 2.0 + 1.5 + 2.0)
+
+
+def test_predicted_quality_is_summarised_over_detected_objects_alone() -> None:
+    log = QualityLog()
+    assert log.summary == {}
+    for number, verdict in ((6, Verdict.SEEN), (8, Verdict.SEEN), (1, Verdict.OUTSIDE)):
+        share = number / 10
+        quality = Quality((share - 0.1, share, share + 0.1), share, share / 100, trusted=number == 8)
+        plane = np.zeros((64, 64), np.float32)
+        result = step_of(number, verdict=verdict)
+        doubt = Doubt(0.0, 0.0, plane, plane, quality)
+        log.add(replace(result, reconstruction=replace(result.reconstruction, doubt=doubt)))
+    assert log.summary == pytest.approx({"expected_iou": 0.7, "expected_error_mm": 7.0, "trusted": 0.5})
+
+
+def test_only_a_simulated_camera_has_computing_time() -> None:
+    assert camera_ms(SimpleNamespace()) == {}  # type: ignore[arg-type]
+    assert camera_ms(SimpleNamespace(exposures_s=[0.004] * 9))["p99"] == pytest.approx(4)  # type: ignore[arg-type]
