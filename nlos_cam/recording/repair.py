@@ -146,7 +146,7 @@ def _check_space(out: Path, scan: Scan) -> None:
     needed = scan.bytes + index + RECORD_BYTES * len(scan.chunks) + 2 * FILE_HEADER_BYTES
     free = shutil.disk_usage(out.parent).free
     if free < needed:
-        raise NlosCamError(f"{out} needs {needed >> 20} MB, but {free >> 20} MB are free: choose another --out")
+        raise NlosCamError(f"{out} needs {needed / 1e6:.3g} MB, but {free / 1e6:.3g} MB are free: choose another --out")
 
 
 class _Writer:
