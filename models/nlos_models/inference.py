@@ -96,8 +96,11 @@ def open_session(model: Path | bytes, threads: int = 1, checksum: str = "") -> A
 
     Raises CheckpointError where it cannot be read, or was made from other weights than those of `checksum`.
     """
-    import onnxruntime
-
+    try:
+        import onnxruntime
+    except ImportError as error:  # also where its libraries do not fit into the memory that is left
+        reason = " ".join(str(error).split())
+        raise MissingExtraError(f"ONNX Runtime cannot be loaded ({reason}): free memory or install it again") from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 4  # errors are raised too
