@@ -16,6 +16,7 @@ from measured_walls import exact_wall
 from view_streams import ask
 
 from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.view.server import MAX_STREAMS
 from nlos_cam.view.session_file import SessionFile
 from nlos_cam.view.web import PlaybackViewer, RecordedView, WebViewer
 
@@ -87,6 +88,31 @@ def test_five_pages_and_one_that_never_reads_share_a_view(browser: Any) -> None:
         for page in pages:
             page.wait_until(lambda page=page: page.state()["frame"] == 59, "the newest moment")
             page.close()
+
+
+def test_refused_page_goes_on_by_itself_and_a_hidden_one_makes_room(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(full_moment(0))
+        watchers = [ask(viewer.address or "", "/stream") for _ in range(MAX_STREAMS)]
+        page = Page(browser, viewer.address or "")
+        page.wait_until(lambda: "watch already" in page.state().get("note", ""), "the refusal")
+        watchers.pop().close()
+        for number in range(1, 20):  # a stream notices with the next messages that its browser left
+            viewer.show(full_moment(number, size=(480, 640)))
+            time.sleep(0.1)
+        page.wait_drawn()
+        for watcher in watchers:
+            watcher.close()
+        page.page.evaluate(
+            "Object.defineProperty(document, 'hidden', { get: () => window.away, configurable: true });"
+            "window.away = true; document.dispatchEvent(new Event('visibilitychange'))"
+        )
+        page.wait_until(lambda: "out of sight" in page.state()["status"].get("message", ""), "it leaves its stream")
+        viewer.show(full_moment(30))
+        page.page.evaluate("window.away = false; document.dispatchEvent(new Event('visibilitychange'))")
+        page.wait_until(lambda: page.state()["frame"] == 30, "it goes on when it is looked at")
+        assert page.errors == []
+        page.close()
 
 
 def test_saved_session_plays_from_the_file_alone(browser: Any, tmp_path: Path) -> None:
