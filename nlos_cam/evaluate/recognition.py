@@ -1,6 +1,7 @@
 """Recognition: the kind of a reconstruction, by the nearest silhouette among training objects of the 18 kinds."""
 
 from collections.abc import Sequence
+from functools import cache
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ def recognised(images: Float32, kinds: Sequence[str], box: ObjectBox) -> Float64
     return np.array([found == kind for found, kind in zip(recognise(images, box), kinds, strict=True)], np.float64)
 
 
+@cache  # a thousand objects are drawn, and `evaluate` asks for truth and for reconstructions
 def _gallery(box: ObjectBox) -> tuple[list[str], Float32]:
     """Return the kinds and standard silhouettes (18 PER_KIND, pixels) to compare with, the same in every run."""
     generator, names, images = np.random.default_rng(0), list[str](), list[Float32]()

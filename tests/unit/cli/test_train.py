@@ -169,6 +169,7 @@ def test_train_compressor_uses_shipped_vae_and_streams(
     assert _same_file("preprocess", tmp_path / "out", folder / "two")
 
 
+@pytest.mark.slow
 def test_joint_weights_keep_encoder_and_one_step_weights_have_none(go: Go, folder: Path, tmp_path: Path) -> None:
     assert go("joint", "--weights", folder / "two")[0] == 0
     assert not _same_file("decoder", tmp_path / "out", folder / "two")
@@ -179,6 +180,7 @@ def test_joint_weights_keep_encoder_and_one_step_weights_have_none(go: Go, folde
     load_pipeline(tmp_path / "one")
 
 
+@pytest.mark.slow
 def test_train_on_difference_maps_records_input(
     go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,6 +192,7 @@ def test_train_on_difference_maps_records_input(
     torch.testing.assert_close(raw["mean"] - difference["mean"], torch.tensor([0.0, 0.0, 3.0, 3.0]), atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow
 def test_train_transfer_reports_both_figures_and_keeps_decoder(go: Go, folder: Path, tmp_path: Path) -> None:
     tensors = load_file(folder / "two" / "compressor.safetensors")
     other = Path(shutil.copytree(folder / "two", tmp_path / "other"))

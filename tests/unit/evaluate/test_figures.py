@@ -59,7 +59,7 @@ def test_mosaic_shows_truth_reconstruction_and_difference() -> None:
     assert (canvas[BLOCK:, 2 * TILE :] == 255).all()
 
 
-@pytest.mark.parametrize("count", [1, 4, 54, 130])
+@pytest.mark.parametrize("count", [1, 4, pytest.param(54, marks=pytest.mark.slow), 130])
 def test_sheet_names_up_to_54_objects_from_first_to_last(tmp_path: Path, figures: list[Any], count: int) -> None:
     draw_sheet(tmp_path / "sheet.png", _images(count), _images(count), [str(k) for k in range(count)])
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
@@ -94,7 +94,7 @@ def test_gallery_of_few_objects_shows_each_once(tmp_path: Path, figures: list[An
     assert sorted(title.partition(":")[0] for title in _titles(figures[0])) == [f"hat {k}" for k in range(count)]
 
 
-@pytest.mark.parametrize("count", [1, 4, 7, 54])
+@pytest.mark.parametrize("count", [1, 7, pytest.param(54, marks=pytest.mark.slow)])
 def test_titles_of_a_sheet_do_not_overlap(tmp_path: Path, figures: list[Any], count: int) -> None:
     names = [f"headphones {2_000_000_000 + k}" for k in range(count)]
     draw_sheet(tmp_path / "sheet.png", _images(count), _images(count), names)

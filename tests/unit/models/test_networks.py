@@ -146,6 +146,7 @@ def test_log_variance_is_limited_to_finite_exponentials(value: float, precision:
     assert torch.isfinite(mean).all()
 
 
+@pytest.mark.slow
 def test_vae_trains_in_bfloat16() -> None:
     vae = ResVae().train()
     with torch.autocast("cpu", torch.bfloat16):
