@@ -89,6 +89,7 @@ def test_depth_derivatives_are_the_differences_of_the_reference(radiometry: Any)
     np.testing.assert_allclose(light.ravel()[beams], difference, atol=1e-4 * np.abs(difference).max())
 
 
+@pytest.mark.slow
 def test_derivative_over_a_path_is_the_difference_across_bin_edges() -> None:
     # Light crosses the edges of 5 cm bins while the plate recedes by 4 cm: the mean derivative is the difference. The
     # strongest bin changes on the way, and its intensity is continuous there.
@@ -105,6 +106,7 @@ def test_derivative_over_a_path_is_the_difference_across_bin_edges() -> None:
     assert np.linalg.norm(error) < 0.06 * np.linalg.norm(difference)  # relay cells that cross an edge one by one
 
 
+@pytest.mark.slow
 def test_albedo_times_its_derivative_is_the_intensity() -> None:
     found = Gradients(paper_scene().scene_at(0))
     sum_of_beams = found.pull(found.three_bounce.astype(np.float64))
@@ -175,6 +177,7 @@ def test_bound_falls_with_frames_and_is_below_the_prior() -> None:
     assert many.determined > few.determined
 
 
+@pytest.mark.slow
 def test_fit_finds_the_pose_of_a_displaced_lidar() -> None:
     problem = prepare(bent_plate(0.01, cells=12), COARSE, ECHOES)
     truth = np.array([0.003, -0.002, 0.002, 0.003, -0.004, 0.002])
