@@ -152,7 +152,7 @@ def test_measures_of_uncertainties_are_the_spread(yaw_deg: float, pitch_deg: flo
         assert getattr(told, f"{stem}_std_{unit}") == pytest.approx(spread, rel=0.06), name
 
 
-@pytest.mark.parametrize("facing_deg", [0.0, 0.02, 0.1, 0.3, 1.0, 5.0])
+@pytest.mark.parametrize("facing_deg", [0.0, 0.3, 5.0])
 @pytest.mark.parametrize("shape", [np.eye(3), SPREAD])
 def test_measures_of_a_wall_faced_squarely_reach_back_to_zero(facing_deg: float, shape: Float64) -> None:
     """Near 0 the angle cannot be negative: the estimate is too large, and its interval must reach back to 0."""

@@ -85,6 +85,7 @@ def test_settings_combine_weights_runtimes_and_threads_once() -> None:
     assert asked[0].frames == 1  # the baseline of the others
 
 
+@pytest.mark.slow
 def test_mirrored_runtime_answers_mirrored_maps_with_the_mirrored_image(tmp_path: Path) -> None:
     network = runtimes(None, RIG, BOX, tmp_path)["ONNX Runtime float32, mirrored"](1)
     generator = np.random.default_rng(0)
