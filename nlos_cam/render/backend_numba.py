@@ -20,8 +20,18 @@ from nlos_cam.render.brdf_table import nodes, scattering
 from nlos_cam.render.echoes import MultiBounce, strongest, strongest_between
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.legs import FAST, NumbaLegs, NumbaOptics, NumbaPoints, NumbaSurface, geometry, scratch, shade
-from nlos_cam.render.row_sum import WINDOW, add_rows
+from nlos_cam.render.legs import (
+    FAST,
+    WINDOW,
+    NumbaLegs,
+    NumbaOptics,
+    NumbaPoints,
+    NumbaSurface,
+    add_rows,
+    geometry,
+    scratch,
+    shade,
+)
 from nlos_cam.render.visibility import HeightField, horizon_table
 
 LANES = 16
@@ -45,6 +55,23 @@ class NumbaTables(NamedTuple):
     width: int
 
 
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
+def returns(
+    legs: NumbaLegs, s: int, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField
+) -> np.float32:
+    """Fill in B(s, q) of S2 for one patch with d3 + d4 in sub-bins as the length, and return the shortest."""
+    cells = len(relay.x_m)
+    # Wall to lidar in the points' weights, patch to wall in the legs.
+    geometry(legs, s, surface, relay, 0, cells, optics, field, True)
+    if optics.sectors:
+        shade(legs, s, surface, relay, 0, cells, field)
+    shortest = np.float32(np.inf)
+    for q in range(cells):
+        legs.length_m[q] = (legs.length_m[q] + relay.length_m[q]) * optics.inverse_bin
+        shortest = min(shortest, legs.length_m[q])
+    return shortest
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def _count(
     s: int,
@@ -59,19 +86,11 @@ def _count(
     """Count B over d3 + d4 of one patch in sub-bins, and return the bin at which they start."""
     cells = len(relay.x_m)
     legs = scratch(cells)
-    # B(s, q) of S2: wall to lidar in the points' weights, patch to wall in the legs.
-    geometry(legs, s, surface, relay, 0, cells, optics, field, True)
-    if optics.sectors:
-        shade(legs, s, surface, relay, 0, cells, field)
+    # The table starts at the first bin that any path of this patch falls into: its rows then need the spread only.
+    first = int(returns(legs, s, surface, relay, optics, field)) // per_bin
     if len(factor):
         for q in range(cells):
             legs.weight[q] *= factor[s, q]
-    # The table starts at the first bin that any path of this patch falls into: its rows then need the spread only.
-    shortest = np.float32(np.inf)
-    for q in range(cells):
-        legs.length_m[q] = (legs.length_m[q] + relay.length_m[q]) * optics.inverse_bin
-        shortest = min(shortest, legs.length_m[q])
-    first = int(shortest) // per_bin
     start = np.float32(first * per_bin)
     for q in range(cells):
         legs.sector[q] = np.int32(legs.length_m[q] - start)  # not negative: first is this patch's own floor
@@ -121,7 +140,7 @@ def tables(first: Int32, histogram: Float32, per_bin: int) -> NumbaTables:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
-def _ends(
+def ends(
     start: int, count: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, table: NumbaTables
 ) -> tuple[Float32, int]:
     """Return a bin (count,) before every path of each beam, and the bins from there to the last path of any beam."""
@@ -218,7 +237,7 @@ def _sum_tile(
     The bound (count,) is on every bin beyond the sums.
     """
     count = min(BEAM_TILE, len(feet.x_m) - start)
-    begin, span = _ends(start, count, feet, surface, optics, table)
+    begin, span = ends(start, count, feet, surface, optics, table)
     sums = np.zeros((count, (min(span, most) + WINDOW - 1) // WINDOW * WINDOW), np.float32)
     return begin, sums, _add_tile(start, count, feet, surface, optics, field, table, begin, sums)
 
@@ -274,6 +293,10 @@ def histograms(job: TransportJob) -> Float32:
     numba_job = NumbaJob(job)
     if job.brdf is None:
         return numba_job.histograms(np.empty((0, 0), np.float32), np.ones(len(job.laser_spot_m)))
+    from nlos_cam.render import glossy  # imports this file
+
+    if not job.more_bounces and (functions := glossy.basis(job, job.brdf)) is not None:
+        return glossy.histograms(numba_job, functions)
     total = np.zeros((len(job.laser_spot_m), job.bins), np.float32)
     for foot, share in nodes(job, job.brdf):
         factor = scattering(job.brdf)(foot, job.patches.point_m, job.patches.normal, job.relay.x_m, job.relay.y_m)
@@ -285,11 +308,14 @@ def echoes(job: TransportJob) -> MultiBounce:
     """Return the strongest bins (n,) of the job's beams: those of `histograms`, bit for bit, from a part of its work.
 
     Each beam sums its first bins alone, with a bound on all others; the few beams that the bound does not decide sum
-    the rest too. A BRDF's tables need whole histograms.
+    the rest too. A BRDF without few eigenfunctions needs whole histograms.
     """
-    if job.brdf is not None:
-        return strongest(histograms(job), job.bin_m)
     numba_job = NumbaJob(job)
+    if job.brdf is not None:
+        from nlos_cam.render import glossy
+
+        functions = None if job.more_bounces else glossy.basis(job, job.brdf)
+        return glossy.echoes(numba_job, functions) if functions else strongest(histograms(job), job.bin_m)
     every = numba_job.feet(np.ones(len(job.laser_spot_m)))
     table = numba_job.tables(np.empty((0, 0), np.float32))
     winner, peak, second, sure = _strongest_in_window(every, *numba_job.sites, table, job.bins)

@@ -2,7 +2,9 @@
 
 python tools/studies/renderer.py tradeoff     docs/renderer.json, docs/images/tradeoff.png, table of docs/accuracy.md
 python tools/studies/renderer.py scaling      docs/scaling.json and .png: time by patches and beams, peak memory
+python tools/studies/renderer.py glossy       docs/glossy.json: rank against error, time over a Lambertian object's
 python tools/studies/renderer.py convergence  docs/convergence.json and .png: each grid against its finest setting
+python tools/studies/renderer.py soak [--scenes 1000000]  docs/soak.json: random scenes against the reference
 python tools/studies/renderer.py cuda [--backend torch] [--objects 64] [--batch 1 4 16 64]: one line of JSON
 """
 
@@ -22,7 +24,7 @@ import harness
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from nlos_calibration import load_rig
+from nlos_calibration import Occluder, load_rig
 
 from nlos_cam.evaluate import (
     as_table,
@@ -33,6 +35,7 @@ from nlos_cam.evaluate import (
     render_facts,
     render_settings,
 )
+from nlos_cam.files import cache_folder
 from nlos_cam.objects import Pose, category_triangles, object_box, object_depth, orthographic_depth, place
 from nlos_cam.render import (
     STOPS,
@@ -41,22 +44,28 @@ from nlos_cam.render import (
     Effects,
     Rendering,
     Scene,
+    Surface,
     TransportJob,
     Work,
     accuracy_named,
     agreement,
+    backend_numba,
+    backend_reference,
     device_named,
     histograms,
     histograms_of_all,
     included,
     least_seconds,
     paper_scene,
+    phong,
     prepare,
     render,
     render_all,
+    retroreflective,
     sample_beams,
     three_bounce,
 )
+from nlos_cam.render.glossy import basis as glossy_basis
 
 STANDARD, FINE = STOPS["standard"], STOPS["fine"]
 DENSE = replace(STANDARD, beams_per_cell=2)
@@ -196,6 +205,45 @@ def draw_lines(lines: dict[str, Line]) -> Figure:
     return figure
 
 
+def cpu_s(work: Work) -> float:
+    """Return the shortest of three processor times, which other programs disturb less than the clock."""
+    work()
+    return least_seconds(work, 3, time.process_time)
+
+
+def glossy(_: argparse.Namespace) -> None:
+    """Measure glossy objects: rank against error, and the time of a rendering over that of a Lambertian one."""
+    scene = paper_scene().scene_at(0)
+    kinds = {
+        "Phong, exponent 20": phong(0.5, 0.5, 20),
+        "Phong, exponent 80": phong(0.1, 0.9, 80),
+        "retroreflective, exponent 200": retroreflective(0.5, 0.5, 200),
+    }
+    scenes = {name: replace(scene, surface=Surface(1.0, brdf)) for name, brdf in kinds.items()}
+    rows: list[dict[str, Any]] = []
+    for stop in ("draft", "standard"):
+        plain_s = cpu_s(partial(render, scene, stop))
+        for name, one in scenes.items():
+            if (job := prepare(one, STOPS[stop]).job) is None or job.brdf is None:
+                raise SystemExit("the default scene has no three-bounce light")
+            functions, some = glossy_basis(job, job.brdf), job.select(np.arange(0, len(job.length_m), 400))
+            error = np.abs(histograms(some).max(1) / backend_reference.histograms(some).max(1) - 1)
+            seconds = cpu_s(partial(render, one, stop))
+            row = {"kind": name, "stop": stop, "rank": len(functions.sign) if functions else None, "cpu_s": seconds}
+            row |= {"times_lambertian": seconds / plain_s, "peak_error_median": float(np.median(error))}
+            rows.append(row | {"peak_error_max": float(error.max())})
+            print(rows[-1], flush=True)
+    job = prepare(scenes["Phong, exponent 20"], STANDARD).job
+    ranks = [
+        {"kind": name, "error": error, "rank": len(functions.sign) if functions else None}
+        for name, brdf in kinds.items()
+        for error in (0.1, 0.03, 0.01, 5e-3, 1e-3)
+        if job
+        for functions in [glossy_basis(replace(job, accuracy=replace(STANDARD, scatter_error=error)), brdf)]
+    ]
+    harness.write("glossy", {"machine": machine(), "renderings": rows, "ranks": ranks})
+
+
 def airplane_scene(cells: int) -> Scene:
     """Return the same airplane on an object grid (cells, cells)."""
     empty = Scene(load_rig("paper-rig"))
@@ -255,6 +303,86 @@ def convergence(_: argparse.Namespace) -> None:
         print(name, *rows, sep="\n   ")
 
 
+SOAK_RIGS = [
+    load_rig("paper-rig").model_copy(update={"occluder": edge})
+    for edge in (None, *(Occluder(x_m=x, z_min_m=z) for x in (-0.3, 0.0, 0.43) for z in (0.05, 0.2)))
+]
+SHADE_EDGE = 1e-3
+"""Light of a bin, relative to the beam's, that legs on the very edge of a shadow may add or take in float32."""
+
+
+def random_scene(generator: np.random.Generator) -> Scene:
+    """Return a small scene: rough, smooth, spiked, cut by background or touching the wall, dark or white."""
+    size = int(generator.choice([1, 2, 3, 5, 8]))
+    y, x = np.mgrid[0:size, 0:size] / size
+    wave = 0.25 + 0.1 * np.sin(generator.uniform(0, 9) * x + 4) * np.cos(generator.uniform(0, 9) * y)
+    depth = (generator.uniform(0.05, 0.5, (size, size)), wave, wave + 0.1 * x)[generator.integers(3)]
+    depth = np.where(
+        generator.random((size, size)) < generator.choice([0, 0.05]), generator.choice([0, 1e-4, 3]), depth
+    )
+    depth[generator.random((size, size)) < generator.choice([0, 0.4])] = np.nan
+    albedo = generator.choice([0, 1, 0.5]) if generator.random() < 0.5 else generator.random((size, size))
+    rig = SOAK_RIGS[generator.integers(len(SOAK_RIGS))]
+    radiometry = ("paper", "lambertian")[generator.integers(2)]
+    return Scene(rig, depth.astype(np.float32), Surface(albedo), radiometry, jump_m=generator.choice([0.02, 1]))
+
+
+def soak_faults(seed: int) -> list[str]:
+    """Return what is wrong with the histograms and echoes of a random scene; nothing if they keep every bound.
+
+    The fast renderer moves a path by at most a sub-bin, so a bin holds at least the reference's light that is a sub-bin
+    or more within it, and at most the light to a sub-bin outside. A winner must be the strongest for some such light.
+    """
+    generator = np.random.default_rng([seed, 20])
+    accuracy = Accuracy("soak", 8, 6, sub_bins=int(generator.choice([1, 4, 8, 64])))
+    effects = "three-bounce", "direct", "line-of-sight", "occluder", "self-occlusion", "tilt"
+    job = prepare(random_scene(generator), accuracy, effects).job
+    if job is None:
+        return []
+    job, fine = job.select(generator.integers(len(job.length_m), size=12)), 64
+    found, echo = histograms(job).astype(np.float64), backend_numba.echoes(job)
+    exact = replace(job, accuracy=STOPS["reference"], bin_m=job.bin_m / fine, bins=job.bins * fine)
+    below = np.pad(np.cumsum(backend_reference.histograms(exact), 1), [(0, 0), (1, 0)])
+    at, moved = np.arange(job.bins) * fine, fine // accuracy.sub_bins + 1
+
+    def light(start: Any, end: Any) -> Any:
+        return below[:, np.clip(end, 0, below.shape[1] - 1)] - below[:, np.clip(start, 0, below.shape[1] - 1)]
+
+    whole = below[:, -1:]
+    most = light(at - moved, at + fine + moved) + SHADE_EDGE * whole
+    least = np.maximum(light(at + moved, at + fine - moved), 0) - SHADE_EDGE * whole
+    faults = {
+        "a number that is not finite": not np.isfinite(found).all() or not np.isfinite(echo.peak).all(),
+        "negative light": (found < 0).any() or (echo.peak < 0).any(),
+        "more light than the reference": (found.sum(1) > whole[:, 0] * (1 + SHADE_EDGE)).any(),
+        "a bin outside its bounds": (found > most).any() or (found < least).any(),
+        "an echo other than the histogram's": not np.array_equal(echo.peak, found.max(1).astype(np.float32)),
+    }
+    lit = echo.peak > 0
+    winner = (echo.path_m[lit] / job.bin_m).astype(int)
+    faults["a winner outside its margin"] = (most[lit, winner] < least[lit].max(1)).any()
+    return [name for name, wrong in faults.items() if wrong]
+
+
+def soak(options: argparse.Namespace) -> None:
+    """Render random small scenes and hold them against the reference; continue where a run stopped."""
+    store = cache_folder() / "studies" / "renderer-soak.json"
+    store.parent.mkdir(parents=True, exist_ok=True)
+    done: dict[str, Any] = {"scenes": 0, "faults": {}}
+    if store.exists():
+        done = json.loads(store.read_text(encoding="utf-8"))
+    while done["scenes"] < options.scenes:
+        for seed in range(done["scenes"], min(done["scenes"] + 500, options.scenes)):
+            for fault in soak_faults(seed):
+                done["faults"].setdefault(fault, []).append(seed)
+            done["scenes"] = seed + 1
+        part = store.with_suffix(".part")  # replaced whole: an interrupted run leaves the last one
+        part.write_text(json.dumps(done), encoding="utf-8")
+        part.replace(store)
+    harness.write("soak", {"machine": machine(), **done})
+    print(json.dumps(done))
+
+
 def jobs_of(scenes: Sequence[Scene], accuracy: str) -> Iterator[TransportJob]:
     """Plan scenes for the GPU."""
     for scene in scenes:
@@ -309,8 +437,11 @@ def main() -> None:
     """Run the named measurement."""
     parser = harness.options(__doc__)
     commands = parser.add_subparsers(required=True)
-    for work in (tradeoff, scaling, memory, convergence):
+    for work in (tradeoff, scaling, memory, glossy, convergence):
         commands.add_parser(work.__name__, help=work.__doc__).set_defaults(run=work)
+    long = commands.add_parser("soak", help=soak.__doc__)
+    long.set_defaults(run=soak)
+    long.add_argument("--scenes", type=int, default=1_000_000)
     gpu = commands.add_parser("cuda", help=bench_cuda.__doc__)
     gpu.set_defaults(run=bench_cuda)
     gpu.add_argument("--backend", choices=["torch", "cuda"], default="cuda")

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from nlos_cam.evaluate import machine
-from nlos_cam.render import accuracy_named, histograms, paper_scene, prepare, render, row_sum
+from nlos_cam.render import accuracy_named, histograms, legs, paper_scene, prepare, render
 
 ROWS, ROW_BINS, SUMS = 16, 96, 2000
 """Rows of one sum, their length (6 KiB of rows: the first cache), and sums of one timing for each thread."""
@@ -28,9 +28,9 @@ def sum_rows(threads: int, table: Any, base: Any, offset: Any, weight: Any) -> f
     """Add rows from the first cache, as the transport does once its legs are known."""
     total = np.zeros(threads)
     for thread in numba.prange(threads):
-        bins = np.zeros(row_sum.WINDOW, np.float32)
+        bins = np.zeros(legs.WINDOW, np.float32)
         for _ in range(SUMS):
-            row_sum.add_rows(bins, 0, table, base, offset, weight, 0, 1, ROWS)
+            legs.add_rows(bins, 0, table, base, offset, weight, 0, 1, ROWS)
         total[thread] = bins.sum()
     return total.sum()
 
@@ -59,13 +59,13 @@ def measure(threads: int) -> dict[str, float]:
     generator = np.random.default_rng(0)
     table, weight = generator.random(ROWS * ROW_BINS, np.float32), generator.random(ROWS, np.float32)
     base = np.arange(ROWS) * ROW_BINS
-    offset = generator.integers(0, ROW_BINS - row_sum.WINDOW, ROWS).astype(np.int32)
+    offset = generator.integers(0, ROW_BINS - legs.WINDOW, ROWS).astype(np.int32)
     arrays = [np.ones(MEMORY_FLOATS, np.float32) for _ in range(3)]
     adds = (
         threads
         * SUMS
         * ROWS
-        * row_sum.WINDOW
+        * legs.WINDOW
         / least_cpu_s(lambda: sum_rows(threads, table, base, offset, weight), threads)
     )
     bandwidth = 3 * arrays[0].nbytes / least_cpu_s(lambda: triad(*arrays), threads)
@@ -74,12 +74,12 @@ def measure(threads: int) -> dict[str, float]:
     for stop in ("draft", "standard"):
         if (job := prepare(scene, accuracy_named(stop)).job) is None:
             raise SystemExit("the default scene has no three-bounce light")
-        legs = len(job.laser_spot_m) * len(job.patches.beta)
+        pairs = len(job.laser_spot_m) * len(job.patches.beta)
         winner_s = least_cpu_s(partial(render, scene, stop), threads)
         whole_s = least_cpu_s(partial(histograms, job), threads)
         found[f"{stop}_render_s"], found[f"{stop}_histograms_s"] = winner_s, whole_s
-        found[f"{stop}_render_multiply_adds_per_s"] = legs * row_sum.WINDOW / winner_s
-        found[f"{stop}_share_of_row_sum"] = legs * row_sum.WINDOW / winner_s / adds
+        found[f"{stop}_render_multiply_adds_per_s"] = pairs * legs.WINDOW / winner_s
+        found[f"{stop}_share_of_row_sum"] = pairs * legs.WINDOW / winner_s / adds
     return found
 
 
@@ -87,7 +87,7 @@ def main() -> None:
     """Measure one thread, then all."""
     harness.options(__doc__).parse_args()
     counts = sorted({1, os.cpu_count() or 1})
-    result = {"machine": machine(), "bytes_a_leg": 4 * row_sum.WINDOW, "multiply_adds_a_leg": row_sum.WINDOW}
+    result = {"machine": machine(), "bytes_a_leg": 4 * legs.WINDOW, "multiply_adds_a_leg": legs.WINDOW}
     result["threads"] = {str(count): measure(count) for count in counts}
     harness.write("roofline", result)
     print(json.dumps(result, indent=2))

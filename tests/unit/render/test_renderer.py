@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects import object_box, object_depth
-from nlos_cam.render import backend_numba, row_sum
+from nlos_cam.render import backend_numba, legs
 from nlos_cam.render.accuracy import STOPS, Accuracy
 from nlos_cam.render.backend_numba import LANES, echoes, histograms, tables
 from nlos_cam.render.brdf_table import MAX_NODES, node_count, nodes, scattered, scattering
@@ -209,9 +209,9 @@ def test_tables_are_the_histogram_at_each_sub_bin_shift(per_bin: int) -> None:
     fine[:, : (width - 1) * per_bin] = np.random.default_rng(0).random((3, (width - 1) * per_bin))
     found = tables(np.zeros(3, np.int32), fine, per_bin)
     padded = found.rows.reshape(3 * per_bin + 1, -1)
-    assert not padded[:, : row_sum.WINDOW].any()
+    assert not padded[:, : legs.WINDOW].any()
     assert not padded[-1].any()
-    table = padded[:-1, row_sum.WINDOW :].reshape(3, per_bin, width)
+    table = padded[:-1, legs.WINDOW :].reshape(3, per_bin, width)
     for shift in range(per_bin):
         later = np.roll(fine, shift, axis=1).reshape(3, width, per_bin).sum(-1)
         np.testing.assert_allclose(table[:, shift], later, rtol=1e-5, atol=1e-6)
@@ -248,12 +248,12 @@ def test_rows_are_added_in_order_with_their_weights() -> None:
 
     @numba.njit
     def add(sums: Any) -> None:
-        row_sum.add_rows(sums, 8, table, base, offset, weight, 1, 4, 3)
+        legs.add_rows(sums, 8, table, base, offset, weight, 1, 4, 3)
 
     sums = np.zeros(48, np.float32)
     add(sums)
     expected = np.zeros(48)
     for j in range(3):
         start = base[j] + offset[1 + 4 * j]
-        expected[8 : 8 + row_sum.WINDOW] += weight[1 + 4 * j] * table[start : start + row_sum.WINDOW].astype(float)
+        expected[8 : 8 + legs.WINDOW] += weight[1 + 4 * j] * table[start : start + legs.WINDOW].astype(float)
     np.testing.assert_allclose(sums, expected, rtol=1e-6)

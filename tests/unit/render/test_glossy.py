@@ -1,0 +1,88 @@
+"""Eigenfunctions of a BRDF, and the transport with them (agreement with the reference: tests/laws)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from nlos_calibration.rig import load_rig
+
+from nlos_cam.render import backend_numba, glossy
+from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.render.brdf_table import scattered
+from nlos_cam.render.echoes import strongest
+from nlos_cam.render.job import TransportJob
+from nlos_cam.render.material import Brdf, Surface, phong, retroreflective
+from nlos_cam.render.planning import prepare
+from nlos_cam.render.scene import Scene
+
+pytestmark = pytest.mark.slow
+COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
+BRDF = phong(0.4, 0.6, 10)
+
+
+def _job(brdf: Brdf = BRDF) -> TransportJob:
+    depth = np.random.default_rng(0).uniform(0.1, 0.3, (4, 4)).astype(np.float32)
+    problem = prepare(Scene(load_rig("paper-rig"), depth, Surface(1.0, brdf)), COARSE, ("three-bounce", "tilt", "brdf"))
+    assert problem.job is not None
+    return problem.job
+
+
+JOB = _job()
+
+
+def _directions(count: int, normal: np.ndarray) -> np.ndarray:
+    """Directions on the lit side of normals, uniform on the hemisphere."""
+    found = np.random.default_rng(len(normal) + count).normal(size=(len(normal), 3))
+    return found * np.sign((found * normal).sum(1))[:, None]
+
+
+@pytest.mark.parametrize("brdf", [BRDF, retroreflective(0.2, 0.8, 30), phong(0.5, 0.5, 1)])
+def test_eigenfunctions_sum_to_the_brdf(brdf: Brdf) -> None:
+    normal = np.random.default_rng(1).normal(size=(500, 3)) - [0, 0, 1]
+    normal[:, 2] = -np.abs(normal[:, 2])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    one, other = _directions(1, normal), _directions(2, normal)
+    every = glossy.eigenfunctions(brdf, glossy.POINTS[0])
+    found = (glossy._at(every, one, normal) * glossy._at(every, other, normal) * every.sign).sum(1)
+    origin = np.zeros_like(normal)
+    exact = scattered(brdf, one.copy(), origin, normal, other.copy())
+    assert np.abs(found - exact).sum() < 3e-3 * exact.sum()
+    assert every.largest == pytest.approx(exact.max(), rel=0.5)
+
+
+def test_rank_follows_the_error_and_the_lobe() -> None:
+    def rank(error: float, brdf: Brdf = BRDF) -> int:
+        found = glossy.basis(replace(JOB, accuracy=replace(COARSE, scatter_error=error)), brdf)
+        assert found is not None
+        assert found.value.shape[1] == len(found.sign) == len(found.harmonic)
+        return len(found.sign)
+
+    assert rank(0.1) < rank(5e-3) < rank(1e-3) < rank(1e-3, phong(0.4, 0.6, 40))
+    assert rank(1e-4, phong(0.5, 0.0, 10)) == 1
+
+
+def test_a_lobe_too_sharp_for_the_limit_has_no_basis(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(glossy, "MAX_RANK", 10)
+    monkeypatch.setattr(glossy, "POINTS", glossy.POINTS[:1])
+    assert glossy.basis(JOB, BRDF) is None
+
+
+@pytest.mark.parametrize("sub_bins", [1, 8])
+def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
+    sub_bins: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = replace(JOB.select(np.arange(0, len(JOB.length_m), 9)), accuracy=replace(COARSE, sub_bins=sub_bins))
+    whole = backend_numba.histograms(job)
+    assert whole.min() >= 0
+    monkeypatch.setattr(glossy, "TABLE_BYTES", 1)  # patches in several blocks
+    for factor in (backend_numba.ROUNDED, np.float32(np.inf)):  # with bounds of infinity no window decides
+        monkeypatch.setattr(glossy, "ROUNDED", factor)
+        found, best = backend_numba.echoes(job), strongest(whole, job.bin_m)
+        for name in ("peak", "runner_up", "path_m"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(best, name))
+
+
+def test_a_constant_brdf_is_a_lambertian_surface() -> None:
+    found = backend_numba.histograms(replace(JOB, brdf=phong(0.6, 0.0, 10)))
+    plain = backend_numba.histograms(replace(JOB, brdf=None))
+    np.testing.assert_allclose(found, 0.6 * plain, rtol=1e-4, atol=1e-6 * plain.max())
