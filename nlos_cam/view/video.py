@@ -95,9 +95,10 @@ class Still:
 
 
 def _footer(moment: Moment, since_s: float) -> str:
-    latency = f"latency {1e3 * moment.latency_s:.0f} ms"
+    live = moment.published_s != moment.frame.timestamp_s  # a replay's latency would be the pace of its machine
+    latency = [f"latency {1e3 * moment.latency_s:.0f} ms"] if live else []
     score = [f"physics score {moment.check.score:.2f}"] if moment.check else []
-    return "     ".join([f"frame {moment.frame.frame_number}", f"{since_s:.2f} s", latency, *score])
+    return "     ".join([f"frame {moment.frame.frame_number}", f"{since_s:.2f} s", *latency, *score])
 
 
 class _Page:

@@ -90,7 +90,7 @@ def test_still_shows_each_part_of_a_moment_in_its_panel() -> None:
         "truth": replace(one, frame=replace(frame, truth_depth_m=NOTHING)),
         "infrared": replace(one, frame=replace(frame, ir=frame.ir + 90)),
         "depth": replace(one, frame=replace(frame, depth_m=frame.depth_m * np.float32(0.5))),
-        "footer": replace(one, latency_s=0.5),
+        "footer": replace(one, latency_s=0.5, published_s=0.5),
         "uncertainty": replace(
             one, reconstruction=replace(one.reconstruction, uncertainty_m=np.zeros((64, 64), np.float32))
         ),
