@@ -29,6 +29,9 @@ from nlos_cam.cli.plain_help import plain_help
 from nlos_cam.cli.usage import usage_lines, usage_reason
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError
 
+OUT_OF_MEMORY = "failed to map", "bad_alloc", "allocate memory"
+"""Words of the import error of a library that does not fit into the memory that is left."""
+
 
 class Command(NamedTuple):
     """Row of the help page: the module of this package that registers the command, its group and its summary."""
@@ -139,10 +142,13 @@ def main(arguments: list[str]) -> int:
         return _report_usage(error, as_json=as_json)
     except (NlosCamError, CalibrationError, ModelError) as error:
         return _report(error, as_json=as_json)
-    except ModuleNotFoundError as error:
-        if not (missing := models.missing_extra(error, f"nlos-cam {command}")):
+    except (MemoryError, ImportError) as error:
+        known: NlosCamError | ModelError | None = _memory_error(error)
+        if known is None and isinstance(error, ModuleNotFoundError):
+            known = models.missing_extra(error, f"nlos-cam {command}")
+        if known is None:
             raise
-        return _report(missing, as_json=as_json)
+        return _report(known, as_json=as_json)
     except OSError as error:
         if error.errno not in models.DISK_ERRORS and error.filename is None:
             raise
@@ -173,6 +179,13 @@ def _split(arguments: list[str]) -> tuple[str, list[str]]:
     command, rest = "".join(arguments[place : place + 1]), arguments[place:]
     words = 2 if command in GROUPS else 1
     return command, [*before, *rest[:words], *(early if len(rest) >= words else []), *rest[words:]]
+
+
+def _memory_error(error: MemoryError | ImportError) -> NlosCamError | None:
+    """Return the lack of memory, also of a library while it is imported, as one of our errors; None for others."""
+    if isinstance(error, MemoryError) or any(words in str(error) for words in OUT_OF_MEMORY):
+        return NlosCamError("out of memory: close other programs, or raise the limit of this one")
+    return None
 
 
 def _file_error(error: OSError) -> NlosCamError:

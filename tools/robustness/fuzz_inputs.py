@@ -65,6 +65,8 @@ def command(*arguments: str | Path) -> dict[str, Any] | None:
     lines = [line for line in err.getvalue().splitlines() if not PROGRESS.search(line)]
     if code not in EXIT_CODES or len(lines) > MAX_LINES or "Traceback" in err.getvalue():
         raise AssertionError(f"{arguments[0]} ends with {code} and {len(lines)} lines: {err.getvalue()[-300:]}")
+    if "out of memory" in err.getvalue():
+        raise MemoryError(err.getvalue()[-300:])
     result = json.loads(out.getvalue().splitlines()[-1], parse_constant=_refuse_constant)
     return result if code == 0 else None
 

@@ -25,8 +25,8 @@ from nlos_cam.evaluate import machine
 DOCS = Path(__file__).parents[2] / "docs"
 EXIT_CODES, MAX_LINES = {0, 1, 2, 3, 4}, 3
 MOUNT, UNMOUNT = "/bin/mount", "/bin/umount"
-LEAST_KIB, SPARE = 16, 1.2
-LEAST_AS_MIB, MOST_AS_MIB = 300, 4000
+MIN_KIB, SPARE = 16, 1.2
+MIN_AS_MIB, MAX_AS_MIB = 300, 4000
 NO_SHM = ["unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o ro,size=4k none /dev/shm && exec "$@"', "sh"]
 PROGRESS = "...", " s", "%"
 """Ends of lines that report progress."""
@@ -76,7 +76,7 @@ def need_kib(command: Command, bag: Path) -> int:
     """Return the size of everything that a command writes, in KiB."""
     with tempfile.TemporaryDirectory() as name:
         subprocess.run(line_of(command, Path(name), bag), check=True, capture_output=True, timeout=TIMEOUT_S)
-        return sum(path.stat().st_size for path in Path(name).rglob("*") if path.is_file()) // 1024 + LEAST_KIB
+        return sum(path.stat().st_size for path in Path(name).rglob("*") if path.is_file()) // 1024 + MIN_KIB
 
 
 def main() -> int:
@@ -96,7 +96,7 @@ def main() -> int:
                 continue
             done: dict[str, list[dict[str, Any]]] = result.setdefault(name, {})
             most_kib = int(SPARE * need_kib(command, bag))
-            bounds = {"disk_kib": (LEAST_KIB, most_kib), "memory_mib": (LEAST_AS_MIB, MOST_AS_MIB), "no_shm": (0, 0)}
+            bounds = {"disk_kib": (MIN_KIB, most_kib), "memory_mib": (MIN_AS_MIB, MAX_AS_MIB), "no_shm": (0, 0)}
             for way, (low, high) in bounds.items():
                 rows = done.setdefault(way, [])
                 while len(rows) < (chosen.count if high else 1):
