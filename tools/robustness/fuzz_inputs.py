@@ -32,7 +32,7 @@ from nlos_cam.render import load_scene
 
 ROOT = Path(__file__).parents[2]
 EXIT_CODES, MAX_LINES = {0, 1, 2, 3, 4}, 12
-PROGRESS = re.compile(r": \d+/\d+.*\d s")
+PROGRESS = re.compile(r": (\d+/\d+.*)?\d+ s$")
 """Lines that a slow command prints now and then."""
 DONE = "done"
 """File that marks a complete folder of files."""
