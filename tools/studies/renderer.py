@@ -128,7 +128,7 @@ def fitted(count: list[int], seconds: list[float]) -> Line:
     """Fit a straight line by least squares."""
     each, fixed = np.polyfit(count, seconds, 1)
     off = np.array(seconds) - (fixed + each * np.array(count))
-    r_squared = 1 - float((off**2).sum() / np.square(seconds - np.mean(seconds)).sum())
+    r_squared = 1 - float((off**2).sum() / np.square(np.array(seconds) - np.mean(seconds)).sum())
     return Line(count, seconds, float(each), float(fixed), r_squared, float((np.abs(off) / seconds).max()))
 
 
