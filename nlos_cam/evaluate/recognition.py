@@ -22,7 +22,7 @@ def recognise(images: Float32, box: ObjectBox) -> list[str]:
 
     Silhouettes are moved to the middle and scaled to one area; nearest is the largest correlation.
     """
-    names, gallery = _gallery(box)
+    names, gallery = _gallery(box)  # pyright: ignore[reportArgumentType] (a frozen model has a hash)
     standard = _standard(images)
     nearest = (standard @ gallery.T).argmax(1)
     return [names[k] if one.any() else "" for k, one in zip(nearest, standard, strict=True)]
