@@ -40,6 +40,7 @@ __all__ = [
     "atomic_file",
     "brightness",
     "channel_statistics",
+    "checksum_of_watched",
     "checksums_of",
     "claim",
     "color_metrics",
@@ -55,6 +56,7 @@ __all__ = [
     "launch",
     "lift_edges",
     "load_cached",
+    "load_doubt",
     "load_encoder",
     "load_network",
     "load_pipeline",
@@ -104,6 +106,7 @@ from .data import InMemory, MapBatch, MapSet, MapSource, as_batch, first_of, sub
 from .direct import CellNormal, DirectNetwork
 from .direct_training import NormalBatch, NormalSource, train_direct
 from .distributed import Accelerator, launch, open_fabric
+from .doubt_network import load_doubt
 from .doubt_training import DoubtSet, QualitySet, fit_quality
 from .errors import FileBusyError
 from .export import Sample, TorchReconstructor, export_folder, network_export, quantize
@@ -148,7 +151,7 @@ from .metrics import (
 from .pipeline import SMALLEST_SPREAD, Preprocess, channel_statistics, cut_silhouette, lift_edges, split_and_stack
 from .quality import GOOD_IOU, QualityRecord, quality_features, quality_watches, write_quality
 from .recipe import SIMULATION_ONLY, Recipe, load_recipe, packaged_recipes
-from .records import CheckpointRecord, DoubtRecord, load_record, shipped_folder
+from .records import CheckpointRecord, DoubtRecord, checksum_of_watched, load_record, shipped_folder
 from .runs import (
     TrainingRun,
     compressor_start,

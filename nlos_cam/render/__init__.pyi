@@ -38,6 +38,7 @@ __all__ = [
     "depth_bound",
     "device_named",
     "fit_pose",
+    "glossy_basis",
     "histograms",
     "histograms_of_all",
     "included",
@@ -78,6 +79,7 @@ from .backend_torch import device_named, histograms_of_all
 from .echoes import MultiBounce
 from .effects import EFFECTS, Effects, included
 from .geometry import cast
+from .glossy import glossy_basis
 from .gradients import DepthBound, Gradients, PoseFit, SceneVector, depth_bound, fit_pose, intensity_noise, moved
 from .job import TransportJob
 from .material import Material, Surface, phong, retroreflective

@@ -295,7 +295,7 @@ def histograms(job: TransportJob) -> Float32:
         return numba_job.histograms(np.empty((0, 0), np.float32), np.ones(len(job.laser_spot_m)))
     from nlos_cam.render import glossy  # imports this file
 
-    if not job.more_bounces and (functions := glossy.basis(job, job.brdf)) is not None:
+    if not job.more_bounces and (functions := glossy.glossy_basis(job, job.brdf)) is not None:
         return glossy.histograms(numba_job, functions)
     total = np.zeros((len(job.laser_spot_m), job.bins), np.float32)
     for foot, share in nodes(job, job.brdf):
@@ -314,7 +314,7 @@ def echoes(job: TransportJob) -> MultiBounce:
     if job.brdf is not None:
         from nlos_cam.render import glossy
 
-        functions = None if job.more_bounces else glossy.basis(job, job.brdf)
+        functions = None if job.more_bounces else glossy.glossy_basis(job, job.brdf)
         return glossy.echoes(numba_job, functions) if functions else strongest(histograms(job), job.bin_m)
     every = numba_job.feet(np.ones(len(job.laser_spot_m)))
     table = numba_job.tables(np.empty((0, 0), np.float32))

@@ -91,7 +91,7 @@ def eigenfunctions(brdf: Brdf, points: int) -> Basis:
     return Basis(value, (2 * orders[which][twice] + second).astype(np.int32), sign, float(np.abs(f).max()))
 
 
-def basis(job: TransportJob, brdf: Brdf) -> Basis | None:
+def glossy_basis(job: TransportJob, brdf: Brdf) -> Basis | None:
     """Return the functions that keep a BRDF within the accuracy's error on sample paths; None if none do."""
     generator, patches, relay = np.random.default_rng(0), job.patches, job.relay
     s, q = generator.integers(len(patches.beta), size=PROBES), generator.integers(len(relay.x_m), size=PROBES)

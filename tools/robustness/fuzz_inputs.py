@@ -17,8 +17,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from nlos_calibration import load_rig, load_wall, reference
-from nlos_models import OnnxReconstructor, checksums_of, load_cached, load_recipe, load_record, shipped_folder
-from nlos_models.records import checksum_of_watched
+from nlos_models import (
+    OnnxReconstructor,
+    checksum_of_watched,
+    checksums_of,
+    load_cached,
+    load_recipe,
+    load_record,
+    shipped_folder,
+)
 from noise_recordings import record
 from rosbags.rosbag1 import Reader
 
@@ -165,8 +172,7 @@ def is_listed(path: Path) -> bool:
 
 def read_weights(path: Path, folder: Path, random: np.random.Generator) -> None:
     """Load networks from a folder of weights, whose checksum may have been made right."""
-    from nlos_models import load_network
-    from nlos_models.doubt_network import load_doubt
+    from nlos_models import load_doubt, load_network
 
     del folder, random
     command("info", path.parent)

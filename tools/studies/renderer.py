@@ -52,6 +52,7 @@ from nlos_cam.render import (
     backend_numba,
     backend_reference,
     device_named,
+    glossy_basis,
     histograms,
     histograms_of_all,
     included,
@@ -65,7 +66,6 @@ from nlos_cam.render import (
     sample_beams,
     three_bounce,
 )
-from nlos_cam.render.glossy import basis as glossy_basis
 
 STANDARD, FINE = STOPS["standard"], STOPS["fine"]
 DENSE = replace(STANDARD, beams_per_cell=2)

@@ -52,7 +52,7 @@ def test_eigenfunctions_sum_to_the_brdf(brdf: Brdf) -> None:
 
 def test_rank_follows_the_error_and_the_lobe() -> None:
     def rank(error: float, brdf: Brdf = BRDF) -> int:
-        found = glossy.basis(replace(JOB, accuracy=replace(COARSE, scatter_error=error)), brdf)
+        found = glossy.glossy_basis(replace(JOB, accuracy=replace(COARSE, scatter_error=error)), brdf)
         assert found is not None
         assert found.value.shape[1] == len(found.sign) == len(found.harmonic)
         return len(found.sign)
@@ -64,7 +64,7 @@ def test_rank_follows_the_error_and_the_lobe() -> None:
 def test_a_lobe_too_sharp_for_the_limit_has_no_basis(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(glossy, "MAX_RANK", 10)
     monkeypatch.setattr(glossy, "POINTS", glossy.POINTS[:1])
-    assert glossy.basis(JOB, BRDF) is None
+    assert glossy.glossy_basis(JOB, BRDF) is None
 
 
 @pytest.mark.parametrize("sub_bins", [1, 8])
