@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from nlos_calibration import ObjectBox, load_rig
 from nlos_calibration.arrays import Float32, Float64
 from nlos_models import silhouette_iou
+from PIL import Image
 
 from nlos_cam.camera import FRAMES_PER_S, World, open_world, render_loop
 from nlos_cam.cli.common import tracked
@@ -134,8 +135,8 @@ def draw_sheet(path: Path, images: dict[str, list[Float32]]) -> Figure:
 def objects(out: Path) -> None:
     """Draw the sheets of training's and of the test set's objects."""
     box = object_box(load_rig("paper-rig"))
-    draw_sheet(out / "objects.png", {name: variations(name, box) for name in CATEGORIES})
-    draw_sheet(out / "test_objects.png", benchmark_depths(box))
+    draw_sheet(out / "objects.webp", {name: variations(name, box) for name in CATEGORIES})
+    draw_sheet(out / "test_objects.webp", benchmark_depths(box))
 
 
 class Unhurried:
@@ -188,7 +189,8 @@ def replays(out: Path) -> None:
             made, done = Path(folder) / "replay", iter(range(1, frames + 1))
             advance = partial(_advance, update, done, frames)
             replay_recording(camera, processing, made, stop=Event(), on_frame=advance, media=media)
-            shutil.copyfile(max(made.glob("still-*.png")), out / f"gallery-{name}.png")
+            with Image.open(max(made.glob("still-*.png"))) as still:
+                still.convert("RGB").save(out / f"gallery-{name}.webp", quality=85, method=6)
             if media.video:
                 shutil.copyfile(made / VIDEO, out / VIDEO)
     if (size := (out / VIDEO).stat().st_size) > MAX_BYTES:
