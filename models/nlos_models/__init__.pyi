@@ -108,9 +108,8 @@ from .direct_training import NormalBatch, NormalSource, train_direct
 from .distributed import Accelerator, launch, open_fabric
 from .doubt_network import load_doubt
 from .doubt_training import DoubtSet, QualitySet, fit_quality
-from .errors import FileBusyError
+from .errors import FileBusyError, missing_extra, require
 from .export import Sample, TorchReconstructor, export_folder, network_export, quantize
-from .extras import missing_extra, require
 from .files import (
     CHECKSUMS,
     DISK_ERRORS,

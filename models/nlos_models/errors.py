@@ -1,6 +1,7 @@
-"""Errors of the models package.
+"""Errors of the models package, and of a missing extra "train", whose libraries the base installation leaves out.
 
 ModelError (ValueError)                  exit 1   root
+├── MissingExtraError (ImportError)      exit 1   'training needs torch: pip install "nlos-cam[train]"'
 ├── TrainingError                        exit 1   "the loss is nan in epoch 3: choose a smaller learning_rate"
 ├── OutputExistsError (FileExistsError)  exit 1   "runs/a holds weights from another run: choose another --out"
 ├── FileBusyError (BlockingIOError)      exit 1   "a.bag is being written by process 7 on lab: wait for it, ..."
@@ -10,6 +11,7 @@ ModelError (ValueError)                  exit 1   root
 """
 
 import re
+from importlib import import_module
 from typing import Any
 
 
@@ -73,3 +75,32 @@ def first_problem(error: Any) -> str:
         got = "" if isinstance(value, list) or not field else f"{value!r:.80}"
     text += f" (got {got})" if got else ""
     return f"{field}: {text}" if field else text
+
+
+TRAIN = frozenset({"h5py", "lightning_fabric", "onnx", "onnxscript", "tensorboard", "torch"})
+"""Top-level modules of the extra "train"."""
+
+
+class MissingExtraError(ModelError, ImportError):
+    """Library of an extra that is not installed: 'training needs torch: pip install "nlos-cam[train]"'."""
+
+
+def require(module: str, purpose: str) -> Any:
+    """Return a module; `purpose` is the subject of the message if it, or an import in it, is missing from the extra.
+
+    Raises MissingExtraError with the command that installs the extra.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        if missing := missing_extra(error, purpose):
+            raise missing from error
+        raise
+
+
+def missing_extra(error: ModuleNotFoundError, purpose: str = "this command") -> MissingExtraError | None:
+    """Return a failed import as the error of a missing extra; None for other modules."""
+    name = (error.name or "").partition(".")[0]
+    if name not in TRAIN:
+        return None
+    return MissingExtraError(f'{purpose} needs {name}, which is not installed: pip install "nlos-cam[train]"')

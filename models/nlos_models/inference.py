@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from nlos_models.arrays import Float32
-from nlos_models.errors import CheckpointError
-from nlos_models.extras import MissingExtraError, require
+from nlos_models.errors import CheckpointError, MissingExtraError, require
 from nlos_models.files import TENSOR_LIMIT, load_cached, read_checked
 from nlos_models.quality import DOUBT_FILES, QualityModel, load_quality_model
 from nlos_models.recipe import SIMULATION_ONLY

@@ -1,4 +1,4 @@
 __all__ = ["KINDS", "Description", "describe"]
 
 from .describe import KINDS, describe
-from .description import Description
+from .files import Description

@@ -9,8 +9,8 @@ from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.info.description import Description, size_of
 from nlos_cam.info.files import (
+    Description,
     describe_bag,
     describe_json,
     describe_npz,
@@ -18,6 +18,7 @@ from nlos_cam.info.files import (
     describe_rrd,
     describe_shard,
     describe_toml,
+    size_of,
 )
 from nlos_cam.info.folders import FOLDERS
 from nlos_cam.recording import SAMPLE

@@ -1,9 +1,11 @@
-"""Descriptions of single files."""
+"""Description of a file or folder, and readers of single files."""
 
 import json
 import shlex
 import tomllib
 import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -13,11 +15,41 @@ from nlos_calibration import load_rig, load_wall
 from nlos_models import load_recipe, read_arrays
 
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.info.description import Description, count
 
 MAX_TEXT_BYTES = 16 << 20
 SESSION_MARK = b"nlos-cam session"
 """In the head of a saved view."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """Content of a file or folder in a few facts. A reader of a damaged one gives the facts that it could read."""
+
+    kind: str
+    facts: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Name and value with unit, in the order to print them."""
+    created: str = ""
+    """As the content says it; empty where it does not."""
+    made_by: str = ""
+    """Program, version and command, as far as the content says them."""
+    problem: str = ""
+    """Reason why it is not whole, with the remedy; empty where it is."""
+    checked: str = ""
+    """Extent of the check."""
+    next: Sequence[str] = ()
+    """Command lines to go on with."""
+    bytes: int = 0
+    """Size of the file, or of all files in the folder."""
+
+
+def size_of(path: Path) -> int:
+    """Return the bytes of a file, or of all files in a folder."""
+    files = [path] if path.is_file() else [each for each in path.rglob("*") if each.is_file()]
+    return sum(file.stat().st_size for file in files)
+
+
+def count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def describe_bag(path: Path, verify: bool) -> Description:

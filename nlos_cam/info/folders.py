@@ -10,8 +10,7 @@ from pathlib import Path
 from nlos_models import CHECKSUMS, TEXT_LIMIT, checksums_of, load_record, read_bounded
 
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.info.description import Description, count
-from nlos_cam.info.files import describe_npz
+from nlos_cam.info.files import Description, count, describe_npz
 
 
 def describe_dataset(folder: Path, verify: bool) -> Description:

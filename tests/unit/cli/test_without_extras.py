@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from nlos_models.extras import TRAIN
+from nlos_models.errors import TRAIN
 
 from nlos_cam.cli.main import main
 from nlos_cam.recording import SAMPLE

@@ -8,13 +8,12 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from nlos_models import checkpoint, export, extras, inference
+from nlos_models import checkpoint, errors, export, inference
 from nlos_models.checkpoint import load_pipeline, save_pipeline
 from nlos_models.compressor import Compressor
 from nlos_models.doubt_network import load_doubt
-from nlos_models.errors import CheckpointError, ModelError
+from nlos_models.errors import CheckpointError, MissingExtraError, ModelError
 from nlos_models.export import TorchReconstructor, quantize
-from nlos_models.extras import MissingExtraError
 from nlos_models.inference import OnnxReconstructor, Reconstructor, load_reconstructor, load_uncertainty_model
 from nlos_models.metrics import MIN_V
 from nlos_models.pipeline import RemappingNetwork, split_and_stack
@@ -217,7 +216,7 @@ def test_weights_without_graph_need_torch_in_one_line(tmp_path: Path, monkeypatc
         if path.suffix != ".onnx":
             (tmp_path / path.name).symlink_to(path)
     monkeypatch.setitem(sys.modules, "nlos_models.export", None)
-    monkeypatch.setattr(extras, "import_module", _without_torch)
+    monkeypatch.setattr(errors, "import_module", _without_torch)
     for load in (load_reconstructor, load_uncertainty_model):
         with pytest.raises(MissingExtraError, match=r"onnx.* torch.*pip install \"nlos-cam\[train\]\"") as found:
             load(tmp_path, tmp_path / "cache")
@@ -229,12 +228,12 @@ def _without_torch(module: str) -> None:
 
 
 def test_require_names_the_extra_for_its_modules_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert extras.require("json", "reading").__name__ == "json"
+    assert errors.require("json", "reading").__name__ == "json"
     with pytest.raises(ModuleNotFoundError, match="no_such_module"):
-        extras.require("no_such_module", "reading")
-    monkeypatch.setattr(extras, "import_module", _without_torch)
+        errors.require("no_such_module", "reading")
+    monkeypatch.setattr(errors, "import_module", _without_torch)
     with pytest.raises(MissingExtraError, match="training needs torch"):
-        extras.require("nlos_models.train", "training")
+        errors.require("nlos_models.train", "training")
 
 
 def shipped_maps() -> tuple[np.ndarray, np.ndarray]:
