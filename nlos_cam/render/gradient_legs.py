@@ -236,15 +236,21 @@ def _push_legs(s: int, surface: NumbaSurface, points: NumbaPoints, optics: Numba
 
 
 @numba.njit(cache=True)
+def _legs(s: int, points: NumbaPoints, outgoing: bool, surface: NumbaSurface, optics: NumbaOptics,
+          field: HeightField) -> NumbaLegs:  # fmt: skip
+    """Return the legs between patch `s` and all points, with their shadows."""
+    legs = scratch(len(points.x_m))
+    geometry(legs, s, surface, points, 0, len(points.x_m), optics, field, outgoing)
+    if optics.sectors:
+        shade(legs, s, surface, points, 0, len(points.x_m), field)
+    return legs
+
+
+@numba.njit(cache=True)
 def _pull_patch(s: int, feet: NumbaPoints, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics,
                 field: HeightField, winners: Winners, light: Float32, path: Float32, patch: Float64,
                 beams: Float32, cells: Float32) -> None:  # fmt: skip
-    back, there = scratch(len(relay.x_m)), scratch(len(feet.x_m))
-    geometry(back, s, surface, relay, 0, len(relay.x_m), optics, field, True)
-    geometry(there, s, surface, feet, 0, len(feet.x_m), optics, field, False)
-    if optics.sectors:
-        shade(back, s, surface, relay, 0, len(relay.x_m), field)
-        shade(there, s, surface, feet, 0, len(feet.x_m), field)
+    back, there = _legs(s, relay, True, surface, optics, field), _legs(s, feet, False, surface, optics, field)
     table = _spread(s, back, surface, relay, optics.inverse_bin, winners)
     total, rate = _sums(table, back.weight)
     low, high = _edges(there, feet, table, winners, optics.inverse_bin)
@@ -294,12 +300,7 @@ def pull(feet: NumbaPoints, surface: NumbaSurface, relay: NumbaPoints, optics: N
 def _push_patch(s: int, feet: NumbaPoints, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics,
                 field: HeightField, winners: Winners, change: PatchChange, spots: PointChange, cells: PointChange,
                 light: Float32, path: Float32) -> None:  # fmt: skip
-    back, there = scratch(len(relay.x_m)), scratch(len(feet.x_m))
-    geometry(back, s, surface, relay, 0, len(relay.x_m), optics, field, True)
-    geometry(there, s, surface, feet, 0, len(feet.x_m), optics, field, False)
-    if optics.sectors:
-        shade(back, s, surface, relay, 0, len(relay.x_m), field)
-        shade(there, s, surface, feet, 0, len(feet.x_m), field)
+    back, there = _legs(s, relay, True, surface, optics, field), _legs(s, feet, False, surface, optics, field)
     table = _spread(s, back, surface, relay, optics.inverse_bin, winners)
     total, rate = _sums(table, back.weight)
     brighter, longer = np.empty_like(back.weight), np.empty_like(back.weight)
