@@ -5,6 +5,7 @@ __all__ = [
     "DISK_ERRORS",
     "GOOD_IOU",
     "MIN_V",
+    "SHIPPED_NAMES",
     "SIMULATION_ONLY",
     "SMALLER_IS_BETTER",
     "SMALLEST_SPREAD",
@@ -96,7 +97,9 @@ __all__ = [
     "sync_folder",
     "train_direct",
     "transfer_start",
+    "transfer_weights",
     "vae_start",
+    "weights_folder",
     "write_checked",
     "write_quality",
 ]
@@ -150,7 +153,15 @@ from .metrics import (
 from .pipeline import SMALLEST_SPREAD, Preprocess, channel_statistics, cut_silhouette, lift_edges, split_and_stack
 from .quality import GOOD_IOU, QualityRecord, quality_features, quality_watches, write_quality
 from .recipe import SIMULATION_ONLY, Recipe, load_recipe, packaged_recipes
-from .records import CheckpointRecord, DoubtRecord, checksum_of_watched, load_record, shipped_folder
+from .records import (
+    SHIPPED_NAMES,
+    CheckpointRecord,
+    DoubtRecord,
+    checksum_of_watched,
+    load_record,
+    shipped_folder,
+    weights_folder,
+)
 from .runs import (
     TrainingRun,
     compressor_start,
@@ -162,6 +173,7 @@ from .runs import (
     run_transfer,
     run_vae,
     transfer_start,
+    transfer_weights,
     vae_start,
 )
 from .tasks import parts_of, rebuild, run

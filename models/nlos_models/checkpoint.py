@@ -14,10 +14,10 @@ from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError
 from nlos_models.files import TENSOR_LIMIT, describe, read_checked, write_checked
 from nlos_models.pipeline import RemappingNetwork, new_pipeline, new_vae
-from nlos_models.records import DIRECT, RECORD, CheckpointRecord, load_record, shipped_folder
+from nlos_models.records import DIRECT, PAPER, RECORD, CheckpointRecord, load_record, weights_folder
 from nlos_models.vae import Encoder, ResVae
 
-PIPELINE_PARTS = "compressor", "preprocess", "decoder"
+PIPELINE_PARTS, ENCODER = ("compressor", "preprocess", "decoder"), "encoder.safetensors"
 FULL = frozenset({"mean", "median", "spread", "bare_depth_m", "bare_intensity"})
 """Tensors that stay in float32."""
 
@@ -65,7 +65,7 @@ def load_network(folder: Path | None = None) -> tuple[RemappingNetwork | DirectN
 
     Raises CheckpointError.
     """
-    folder = folder or shipped_folder()
+    folder = weights_folder(folder)
     record = load_record(folder)
     if not record.direct_recipe:
         return load_pipeline(folder)
@@ -76,8 +76,13 @@ def load_network(folder: Path | None = None) -> tuple[RemappingNetwork | DirectN
 
 def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
     """Return a Res-VAE in eval mode, with its record. Raises CheckpointError unless all tensors fit."""
-    _refuse_package_without_encoder(folder)
+    folder = weights_folder(folder, PAPER)
     record = load_record(folder)
+    if not (folder / ENCODER).exists() and folder == weights_folder(None, PAPER):
+        raise CheckpointError(
+            "the encoder of the paper's weights (21 MB) does not come with them, since only training needs it: make it "
+            "again with `nlos-cam train vae --recipe vae-encoder --out DIR`, and give --vae DIR"
+        )
     vae = new_vae(color=record.color)
     for name, module in (("encoder", vae.encoder), ("decoder", vae.decoder)):
         load_part(folder / f"{name}.safetensors", module)
@@ -85,8 +90,8 @@ def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
 
 
 def load_pipeline(folder: Path | None = None) -> tuple[RemappingNetwork, CheckpointRecord]:
-    """Return a pipeline in eval mode (default: the shipped one), with its record. Raises CheckpointError."""
-    return _load_pipeline(folder or shipped_folder(), PIPELINE_PARTS)
+    """Return a pipeline in eval mode (default: the paper's), with its record. Raises CheckpointError."""
+    return _load_pipeline(weights_folder(folder, PAPER), PIPELINE_PARTS)
 
 
 def load_pipeline_partly(folder: Path) -> tuple[RemappingNetwork, CheckpointRecord, LoadReport]:
@@ -102,7 +107,7 @@ def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[RemappingNetwo
     record = load_record(folder)
     if record.direct_recipe:
         raise CheckpointError(f"{folder} holds a direct network: name weights from `train compressor`")
-    if not (folder / "compressor.safetensors").exists() and (folder / "encoder.safetensors").exists():
+    if not (folder / "compressor.safetensors").exists() and (folder / ENCODER).exists():
         raise CheckpointError(f"{folder} holds a VAE without a compressor: name weights from `train compressor`")
     pipeline = new_pipeline(color=record.color, width=record.width)
     for name in names:
@@ -112,22 +117,13 @@ def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[RemappingNetwo
 
 def load_encoder(folder: Path | None = None) -> Encoder | None:
     """Return the encoder beside a pipeline's weights, in eval mode, or None where they were trained without one."""
-    folder = folder or shipped_folder()
-    _refuse_package_without_encoder(folder)
-    path = folder / "encoder.safetensors"
+    folder = weights_folder(folder, PAPER)
+    path = folder / ENCODER
     if not path.exists():
         return None
     encoder = new_vae(color=load_record(folder).color).encoder
     load_part(path, encoder)
     return encoder.eval()
-
-
-def _refuse_package_without_encoder(folder: Path) -> None:
-    if folder == shipped_folder() and not (folder / "encoder.safetensors").exists():
-        raise CheckpointError(
-            "the encoder of the shipped weights (21 MB) is not in the installed package: train from a clone of the "
-            "repository, or name your own weights with --vae or --weights"
-        )
 
 
 def load_fitting(path: Path, module: nn.Module) -> LoadReport:

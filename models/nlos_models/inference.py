@@ -18,7 +18,7 @@ from nlos_models.records import (
     checksum_of_watched,
     load_doubt_record,
     load_record,
-    shipped_folder,
+    weights_folder,
 )
 
 MAP_SHAPE = (64, 80)
@@ -122,7 +122,7 @@ def load_reconstructor(folder: Path | None, cache: Path, threads: int = 1) -> Re
     `threads` are ONNX Runtime's. Weights without a valid graph beside them are exported into the folder `cache`, which
     takes torch. Raises CheckpointError where they cannot be read or are for color, MissingExtraError without torch.
     """
-    folder = folder or shipped_folder()
+    folder = weights_folder(folder)
     record = load_record(folder)
     refuse_color(record, folder)
     if _has_cuda():
@@ -141,7 +141,7 @@ def load_uncertainty_model(folder: Path | None, cache: Path) -> UncertaintyModel
 
     Without a valid graph it is exported as by `load_reconstructor`. Raises CheckpointError, MissingExtraError.
     """
-    folder = folder or shipped_folder()
+    folder = weights_folder(folder)
     if (record := load_doubt_record(folder)) is None:
         return None
     try:

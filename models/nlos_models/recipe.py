@@ -92,8 +92,9 @@ class Recipe(BaseModel):
     """Object categories left out of a VAE's training; for a compressor, the dataset's plan decides."""
     backgrounds: float = Field(default=0.0, ge=0, le=1)
     """Share of a VAE's objects with a post or a panel beside them."""
-    start: Literal["scratch", "weights"] = "scratch"
-    """VAE or compressor: random initial weights, or those of an earlier run (--weights)."""
+    start: Literal["scratch", "weights", "decoder"] = "scratch"
+    """VAE or compressor: random initial weights, or those of an earlier run (--weights); or, for a VAE, an untrained
+    encoder before the decoder of such weights, which stays as it is."""
     keep: Literal["last", "best"] = "last"
     """Epoch whose weights are saved; the best one has the smallest held-out loss."""
     steps: Literal["two", "one", "two-then-joint"] = "two"
@@ -136,6 +137,8 @@ class Recipe(BaseModel):
             raise ValueError(f"steps = {self.steps!r} is for a compressor: a transfer keeps the decoder")
         if self.start == "weights" and (self.task == "transfer" or self.steps != "two"):
             raise ValueError("start = 'weights' is for a VAE or a two-step compressor: drop it")
+        if self.start == "decoder" and self.task != "vae":
+            raise ValueError("start = 'decoder' is for a VAE: drop it")
         if self.width != 1 and (self.colour or self.task != "compressor"):
             raise ValueError("width applies to a compressor of depth only: drop it")
         if (self.outliers > 0, self.empties > 0) != ((self.task == "doubt"),) * 2:

@@ -13,10 +13,11 @@ from nlos_models.files import TEXT_LIMIT, read_checked
 from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
 
 RECORD = "checkpoint.json"
-SHIPPED = "paper-rig"
+DIRECT, PAPER = "direct", "paper"
+SHIPPED_NAMES = (PAPER,)
+"""Weights that come with the project, by name; the first are the default. A wheel holds the default ones alone."""
 DOUBT, DOUBT_RECORD = "doubt", "doubt.json"
 WATCHED = "compressor.safetensors", "preprocess.safetensors", "decoder.safetensors"
-DIRECT = "direct"
 
 
 class CheckpointRecord(BaseModel):
@@ -88,9 +89,24 @@ def _any_in_color(*recipes: Recipe | None) -> bool:
     return any(recipe is not None and recipe.colour for recipe in recipes)
 
 
-def shipped_folder() -> Path:
-    """Return the folder of the weights that come with the package."""
-    return Path(str(resources.files("nlos_models") / "weights" / SHIPPED))
+def shipped_folder(name: str = SHIPPED_NAMES[0]) -> Path:
+    """Return the folder of the weights of this name in SHIPPED_NAMES."""
+    return Path(str(resources.files("nlos_models") / "weights" / name))
+
+
+def weights_folder(weights: Path | None, default: str = SHIPPED_NAMES[0]) -> Path:
+    """Return the folder that a choice of weights means: a folder, a name in SHIPPED_NAMES, or None for the default.
+
+    A name counts where no folder of that name is here. Raises CheckpointError for weights that a wheel does not hold.
+    """
+    name = default if weights is None else str(weights)
+    if name not in SHIPPED_NAMES or (weights is not None and weights.exists()):
+        return Path(name)
+    if not (folder := shipped_folder(name)).is_dir():
+        raise CheckpointError(
+            f"the weights {name!r} are not in the installed package, to keep it small: use a clone of the repository"
+        )
+    return folder
 
 
 def load_record(folder: Path) -> CheckpointRecord:

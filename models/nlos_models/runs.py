@@ -30,13 +30,15 @@ from nlos_models.files import claim
 from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
 from nlos_models.records import (
+    DIRECT,
     DOUBT_RECORD,
+    PAPER,
     RECORD,
     CheckpointRecord,
     DoubtRecord,
     checksum_of_watched,
     load_record,
-    shipped_folder,
+    weights_folder,
 )
 from nlos_models.tasks import Start, figures_of, run, train_compressor, train_transfer, train_vae
 from nlos_models.train import Running, Scores
@@ -186,9 +188,15 @@ def _export(training: TrainingRun) -> None:
 
 
 def vae_start(recipe: Recipe, weights: Path | None) -> tuple[ResVae, list[Recipe]]:
-    """Load the VAE that a recipe starts from (default: the shipped one) and the runs that made it."""
+    """Load the VAE that a recipe starts from (default: the paper's) and the runs that made it."""
     _check_same_color(recipe, weights)
-    vae, record = load_vae(weights or shipped_folder())
+    folder = weights_folder(weights, PAPER)
+    if recipe.start == "decoder":
+        torch.manual_seed(recipe.seed)
+        vae, (pipeline, record) = new_vae(color=recipe.colour), load_pipeline(folder)
+        vae.decoder = pipeline.decoder
+    else:
+        vae, record = load_vae(folder)
     return vae, record.vae_runs
 
 
@@ -203,19 +211,24 @@ def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | No
         pipeline, runs = _pipeline_start(recipe, weights)
         return Start(vae, pipeline), [*(run for run in runs if run not in vae_runs), *vae_runs]
     pipeline, runs = _pipeline_start(recipe, weights)
+    if not (encoder := load_encoder(weights)):
+        if recipe.latent_weight:
+            raise TrainingError(f"{weights or PAPER} has no encoder to aim at: set latent_weight = 0 in the recipe")
+        return Start(None, pipeline), runs
     vae = new_vae(color=recipe.colour)
-    if encoder := load_encoder(weights):
-        vae.encoder = encoder
-    elif recipe.latent_weight:
-        raise TrainingError(f"{weights} has no encoder to aim at: set latent_weight = 0 in the recipe")
-    vae.decoder = pipeline.decoder
+    vae.encoder, vae.decoder = encoder, pipeline.decoder
     return Start(vae, pipeline), runs
 
 
+def transfer_weights(recipe: Recipe, weights: Path | None) -> Path:
+    """Return the weights that a transfer starts from: by default the paper's if the recipe aims at its latent."""
+    return weights_folder(weights, PAPER if recipe.latent_weight else DIRECT)
+
+
 def transfer_start(
-    recipe: Recipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
+    recipe: Recipe, weights: Path, *, partial: bool, on_report: Callable[[str], None]
 ) -> tuple[RemappingNetwork | DirectNetwork, list[Recipe]]:
-    """Load the networks that a transfer starts from (default: the shipped ones) and the runs that made them.
+    """Load the networks that a transfer starts from and the runs that made them.
 
     If `partial`, only matching layers of the compressor are loaded, `on_report` is called with a summary of them, and
     the others are initialised from the recipe's seed.
@@ -225,7 +238,7 @@ def transfer_start(
         network, record = load_network(weights)
         return network, record.runs
     torch.manual_seed(recipe.seed)
-    pipeline, record, report = load_pipeline_partly(weights or shipped_folder())
+    pipeline, record, report = load_pipeline_partly(weights)
     on_report(f"compressor: {report}")
     return pipeline, record.runs
 
@@ -249,11 +262,11 @@ def _check_fits(recipe: Recipe, folder: Path | None) -> None:
 
 def _check_same_color(recipe: Recipe, folder: Path | None) -> CheckpointRecord:
     """Return the weights' record; raise TrainingError unless weights and recipe are both of depth or both in color."""
-    record = load_record(folder or shipped_folder())
+    record = load_record(weights_folder(folder, PAPER))
     if record.color != recipe.colour:
         holds, wants = (f"color ({SIMULATION_ONLY})" if color else "depth" for color in (record.color, recipe.colour))
         raise TrainingError(
-            f"{folder or 'the shipped folder'} holds weights for {holds} but the recipe is for {wants}: name others "
+            f"{folder or PAPER} holds weights for {holds} but the recipe is for {wants}: name others "
             "with --vae or --weights"
         )
     return record

@@ -88,7 +88,10 @@ class Remapping:
         if not recipe.latent_weight:
             return []
         if self.encoder is None:
-            raise TrainingError("these weights have no encoder to aim at: set latent_weight = 0, or name a VAE (--vae)")
+            raise TrainingError(
+                "these weights have no encoder to aim at: set latent_weight = 0, or name a VAE (--vae); that of the "
+                "paper's weights is made again by `nlos-cam train vae --recipe vae-encoder --out DIR`"
+            )
         encoder = in_channels_last(self.encoder).to(fabric.device).requires_grad_(requires_grad=False).eval()
         with fabric.autocast():
             return [
@@ -161,9 +164,11 @@ def train_vae(
     torch.manual_seed(recipe.seed)
     running = running or Running()
     vae = in_channels_last(start or new_vae(color=recipe.colour))
-    forward = running.maybe_compile(vae)
+    forward, kept = running.maybe_compile(vae), recipe.start == "decoder"
+    vae.decoder.requires_grad_(not kept)
 
     def loss(image: Tensor, done: float) -> Tensor:
+        vae.decoder.train(not kept)  # a decoder that is kept keeps the statistics of its batch norms too
         if recipe.augmentation == "turns":
             image = turn_some(image, torch.randint(4, (len(image),), device=image.device))
         image = image.contiguous(memory_format=torch.channels_last)

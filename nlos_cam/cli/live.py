@@ -69,7 +69,9 @@ Tradeoff = Annotated[
     typer.Option("--tradeoff", help="Table of `tradeoff reconstruct` for --budget-ms (default: beside the weights)."),
 ]
 Wall = Annotated[Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall` (wall.toml).")]
-Weights = Annotated[Path | None, typer.Option("--weights", help="Folder of other weights than the shipped ones.")]
+Weights = Annotated[
+    Path | None, typer.Option("--weights", help="Folder of weights, `direct` or `paper` (default: direct).")
+]
 Seconds = Annotated[
     float | None,
     typer.Option("--seconds", min=0.1, help="Stop after this many seconds (default: run until Ctrl-C)."),

@@ -63,7 +63,8 @@ def render(
 def reconstruct(
     out: Out = None,
     weights: Annotated[
-        list[Path] | None, typer.Option("--weights", help="Folder of weights (default: shipped); repeat to compare.")
+        list[Path] | None,
+        typer.Option("--weights", help="Folder of weights, `direct` or `paper` (default: direct); repeat to compare."),
     ] = None,
     count: Annotated[
         int | None, typer.Option("--count", min=1, help="Number of random objects, instead of the 54 test objects.")

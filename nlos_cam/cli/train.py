@@ -42,7 +42,7 @@ Wall = Annotated[
     Path | None, typer.Option("--wall", help="Bare wall for difference maps (wall.toml; default: rendered).")
 ]
 Weights = Annotated[
-    Path | None, typer.Option("--weights", help="Weights that the run starts from (default: the shipped ones).")
+    Path | None, typer.Option("--weights", help="Weights that the run starts from (default: the paper's).")
 ]
 
 
@@ -177,7 +177,7 @@ def compressor(
     run: RunOptions,
     data: Maps,
     held_out_data: HeldOut,
-    vae_folder: Annotated[Path | None, typer.Option("--vae", help="Trained VAE (default: the shipped one).")] = None,
+    vae_folder: Annotated[Path | None, typer.Option("--vae", help="Trained VAE (default: the paper's).")] = None,
     weights: Weights = None,
     wall: Wall = None,
     stream: Annotated[
@@ -228,7 +228,13 @@ def transfer(
     run: RunOptions,
     data: Maps,
     held_out_data: HeldOut,
-    weights: Weights = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option("--weights", help="Weights that the run starts from (default: shipped ones that fit the recipe)."),
+    ] = None,
+    vae_folder: Annotated[
+        Path | None, typer.Option("--vae", help="VAE whose encoder gives the target latents (default: the weights').")
+    ] = None,
     partial: Annotated[
         bool, typer.Option("--partial", help="Load matching layers only, and report which ones were loaded.")
     ] = False,
@@ -237,8 +243,9 @@ def transfer(
     """Fine-tune synthetic weights on a bench's recordings (SI 4): all layers first, then the classifier alone."""
     recipe = run.recipe("transfer")
     fabric = run.fabric(recipe)
+    weights = models.transfer_weights(recipe, weights)
     pipeline, runs = models.transfer_start(recipe, weights, partial=partial, on_report=say)
-    encoder = models.load_encoder(weights)
+    encoder = models.load_encoder(vae_folder or weights)
     maps = data_sets.read_maps(recipe, data, held_out_data, wall)
     recipe, rig = maps.limit_recipe(recipe), maps.plan.rig
     record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
@@ -252,11 +259,11 @@ def doubt(
     data: Maps,
     held_out_data: HeldOut,
     weights: Annotated[
-        Path | None, typer.Option("--weights", help="Weights whose images are judged (default: the shipped ones).")
+        Path | None, typer.Option("--weights", help="Weights whose images are judged (default: direct).")
     ] = None,
 ) -> None:
     """Train the uncertainty ("doubt") network of trained weights; --out then holds a copy of these weights too."""
-    recipe, watched = run.recipe("doubt"), weights or models.shipped_folder()
+    recipe, watched = run.recipe("doubt"), models.weights_folder(weights)
     fabric = run.fabric(recipe)
     pipeline = models.load_reconstructor(weights, cache_folder() / "onnx")
     datasets = data_sets.open_dataset(data), data_sets.open_dataset(held_out_data)

@@ -23,7 +23,7 @@ from nlos_models import (
     network_export,
     quantize,
     refuse_color,
-    shipped_folder,
+    weights_folder,
 )
 
 from nlos_cam.camera import FRAMES_PER_S
@@ -119,7 +119,7 @@ def open_runtime_bench(
 
     Raises SceneError if the weights are for different rigs or expect difference maps, CheckpointError for color.
     """
-    records = {name: load_record(folder or shipped_folder()) for name, folder in weights.items()}
+    records = {name: load_record(weights_folder(folder)) for name, folder in weights.items()}
     for name, record in records.items():
         refuse_color(record, weights[name])
     rigs = {record.rig_name for record in records.values()}
@@ -139,7 +139,7 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
 
     8-bit networks are quantised when first made, with ranges calibrated on training objects.
     """
-    folder = weights or shipped_folder()
+    folder = weights_folder(weights)
     record, (key, export) = load_record(folder), network_export(folder)
 
     def onnx(suffix: str, make_content: Callable[[bytes], bytes] = bytes) -> Make:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from nlos_calibration import ObjectBox, Rig, rig_named
-from nlos_models import Reconstructor, load_reconstructor, load_record, shipped_folder
+from nlos_models import SHIPPED_NAMES, Reconstructor, load_reconstructor, load_record, weights_folder
 from pydantic import BaseModel, Field, ValidationError
 
 from nlos_cam.camera import FRAMES_PER_S, Camera
@@ -57,7 +57,7 @@ class Setting(BaseModel):
 
     name: str
     weights: str
-    """"shipped", or a folder."""
+    """"shipped", a name of weights that come with the project, or a folder."""
     runtime: str
     threads: int = Field(ge=1)
     frames: int = Field(ge=1)
@@ -187,11 +187,11 @@ def available_settings(tradeoff: Path | None, weights: Path | None) -> list[Sett
     processors = os.cpu_count() or 1
     available = [
         setting
-        for setting in load_tradeoff(tradeoff or weights or shipped_folder())
+        for setting in load_tradeoff(tradeoff or weights_folder(weights))
         if setting.threads <= processors
         and (setting.runtime == ONNX_FLOAT32 or find_spec("torch") is not None)  # others are made with torch
         and ("cuda" not in setting.runtime or _has_cuda())
-        and (setting.weights == SHIPPED or Path(setting.weights).is_dir())
+        and (setting.weights in {SHIPPED, *SHIPPED_NAMES} or Path(setting.weights).is_dir())
     ]
     if not any(setting.frames == 1 for setting in available):
         raise BudgetError("this machine can run no setting of the trade-off: measure with `tradeoff reconstruct`")
@@ -271,7 +271,7 @@ def setting_loader(weights: Path | None, runtimes: Runtimes) -> Callable[[Settin
         folder = weights if setting.weights == SHIPPED else Path(setting.weights)
         if setting.runtime == ONNX_FLOAT32:
             return load_reconstructor(folder, cache_folder() / "onnx", setting.threads)
-        rig = rig_named(load_record(folder or shipped_folder()).rig_name)
+        rig = rig_named(load_record(weights_folder(folder)).rig_name)
         if setting.runtime.startswith("torch"):
             import torch  # takes seconds, and is not needed for ONNX Runtime
 

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float64
-from nlos_models import Reconstructor, UncertaintyModel, load_reconstructor, load_uncertainty_model, shipped_folder
+from nlos_models import Reconstructor, UncertaintyModel, load_reconstructor, load_uncertainty_model, weights_folder
 from numpy.typing import NDArray
 
 from nlos_cam.cli.common import tracked
@@ -245,7 +245,7 @@ def main() -> None:
         network = load_reconstructor(asked.weights, cache_folder() / "onnx")
         doubter = load_uncertainty_model(asked.weights, cache_folder() / "onnx")
         if doubter is None:
-            raise SceneError(f"{asked.weights or shipped_folder()} has no doubt network: train one with `train doubt`")
+            raise SceneError(f"{weights_folder(asked.weights)} has no doubt network: train one with `train doubt`")
         pipeline = Pipeline(rig_of(network.record), network, doubter)
         start = doubter.record.recipe.held_out
         result = study(pipeline, asked.held_out, asked.samples, asked.count, asked.empty, start)

@@ -35,6 +35,7 @@ from nlos_models import (
     refuse_color,
     run,
     shipped_folder,
+    weights_folder,
 )
 
 from nlos_cam.cli.common import tracked
@@ -206,7 +207,7 @@ def rigs(asked: argparse.Namespace) -> None:
     rig = load_rig(asked.rig)
     subjects = benchmark_objects(object_box(rig))
     places = [Place(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG]
-    files = [file for folder in folders.values() for file in sorted((folder or shipped_folder()).iterdir())]
+    files = [file for folder in folders.values() for file in sorted(weights_folder(folder).iterdir())]
     key = hashlib.sha256(b"".join(file.read_bytes() for file in files if file.is_file())).hexdigest()
     cells = harness.collect("rigs", places, lambda place, _: cell(place.rig(rig), subjects, networks), key=key)
     harness.write("rig_map", {"objects": len(subjects), "cells": cells}, asked.out)
@@ -306,7 +307,7 @@ def main() -> None:
     for work in (limits, rigs, unseen):
         parts[work.__name__].set_defaults(run=work)
         parts[work.__name__].add_argument("--out", type=Path, help="folder of the results (default: docs)")
-    parts["limits"].add_argument("--weights", type=Path, default=shipped_folder())
+    parts["limits"].add_argument("--weights", type=Path, default=shipped_folder("paper"))
     parts["limits"].add_argument("--frames", type=int, nargs="*", default=list(FRAMES))
     parts["rigs"].add_argument("--weights", type=harness.named, action="append", default=[])
     parts["rigs"].add_argument("--rig", default="paper-rig")

@@ -157,7 +157,7 @@ def test_interrupted_train_exits_130_and_resumes_to_same_weights(
 def test_train_compressor_uses_shipped_vae_and_streams(
     go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runs, "shipped_folder", lambda: folder / "vae")
+    monkeypatch.setattr(runs, "weights_folder", lambda *_: folder / "vae")
     assert go("two")[0] == 0
     assert _same_file("compressor", tmp_path / "out", folder / "two")
     record = load_record(tmp_path / "out")
