@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from nlos_calibration import ObjectBox, Rig, rig_named
-from nlos_models import SHIPPED_NAMES, Reconstructor, load_reconstructor, load_record, weights_folder
+from nlos_models import Reconstructor, load_reconstructor, load_record, weights_folder
 from pydantic import BaseModel, Field, ValidationError
 
 from nlos_cam.camera import FRAMES_PER_S, Camera
@@ -57,7 +57,7 @@ class Setting(BaseModel):
 
     name: str
     weights: str
-    """"shipped", a name of weights that come with the project, or a folder."""
+    """"shipped", or a folder."""
     runtime: str
     threads: int = Field(ge=1)
     frames: int = Field(ge=1)
@@ -191,7 +191,7 @@ def available_settings(tradeoff: Path | None, weights: Path | None) -> list[Sett
         if setting.threads <= processors
         and (setting.runtime == ONNX_FLOAT32 or find_spec("torch") is not None)  # others are made with torch
         and ("cuda" not in setting.runtime or _has_cuda())
-        and (setting.weights in {SHIPPED, *SHIPPED_NAMES} or Path(setting.weights).is_dir())
+        and (setting.weights == SHIPPED or Path(setting.weights).is_dir())
     ]
     if not any(setting.frames == 1 for setting in available):
         raise BudgetError("this machine can run no setting of the trade-off: measure with `tradeoff reconstruct`")
