@@ -179,9 +179,18 @@ def _linked_graph(
         stored.update(_stored(folder / name, prefix))
     initializers = {initializer.name: initializer for initializer in model.graph.initializer}
     nodes = list[onnx.NodeProto]()
-    for name in sorted(initializers.keys() & stored.keys()):
-        if linked := _linked(name, numpy_helper.to_array(initializers[name]), stored):
-            model.graph.initializer.remove(initializers[name])
+    halves = {name: tensor.values for name, tensor in stored.items() if tensor.values.dtype == np.float16}
+    turned = {_key(values.T): name for name, values in halves.items() if values.ndim == 2}
+    for name, initializer in sorted(initializers.items()):
+        values = numpy_helper.to_array(initializer)
+        if name in stored:
+            linked = _linked(name, values, stored)
+        elif source := turned.get(_key(values)) if values.ndim == 2 else None:
+            linked = _linked_turned(name, stored[source])
+        else:
+            continue
+        if linked:
+            model.graph.initializer.remove(initializer)
             model.graph.initializer.extend(linked[0])
             nodes += linked[1]
     rest = list(model.graph.node)
@@ -192,6 +201,27 @@ def _linked_graph(
     model.graph.node.extend([*nodes, *rest])
     helper.set_model_props(model, {CHECKSUM: checksum_of_watched(folder, sources)})
     return model.SerializeToString()
+
+
+def _key(values: np.ndarray) -> tuple[tuple[int, ...], bytes]:
+    return values.shape, np.ascontiguousarray(values, np.float32).tobytes()
+
+
+def _linked_turned(name: str, tensor: _StoredTensor) -> tuple[list[TensorProto], list[onnx.NodeProto]]:
+    """Return the initializer and nodes of a weight that the exporter has transposed."""
+    nodes = [
+        helper.make_node("Cast", [f"{name}.half"], [f"{name}.plain"], to=TensorProto.FLOAT),
+        helper.make_node("Transpose", [f"{name}.plain"], [name], perm=[1, 0]),
+    ]
+    return [_external(f"{name}.half", tensor)], nodes
+
+
+def _external(name: str, tensor: _StoredTensor) -> TensorProto:
+    external = TensorProto(name=name, data_type=TensorProto.FLOAT16, dims=tensor.values.shape)
+    external.data_location = TensorProto.EXTERNAL
+    for key, value in (("location", tensor.location), ("offset", tensor.offset), ("length", tensor.length)):
+        external.external_data.add(key=key, value=str(value))
+    return external
 
 
 def _linked(
@@ -205,11 +235,7 @@ def _linked(
     tensor, half = stored[name], f"{name}.half"
     if tensor.values.dtype != np.float16 or tensor.values.ndim == 1:
         return None
-    external = TensorProto(name=half, data_type=TensorProto.FLOAT16, dims=exported.shape)
-    external.data_location = TensorProto.EXTERNAL
-    for key, value in (("location", tensor.location), ("offset", tensor.offset), ("length", tensor.length)):
-        external.external_data.add(key=key, value=str(value))
-    plain = tensor.values.astype(np.float32)
+    external, plain = _external(half, tensor), tensor.values.astype(np.float32)
     if np.array_equal(exported, plain):
         return [external], [helper.make_node("Cast", [half], [name], to=TensorProto.FLOAT)]
     module, _, index = name.removesuffix(".weight").rpartition(".")

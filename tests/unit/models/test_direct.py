@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from nlos_models.checkpoint import load_network, load_pipeline, save_direct
@@ -21,6 +22,7 @@ from nlos_models.runs import TrainingRun, record_run, run_transfer, transfer_sta
 from nlos_models.tasks import figures_of
 from nlos_models.tasks import run as reconstruct
 from nlos_models.train import BEST, LAST, MINUTES, Running
+from onnx import TensorProto
 from small_maps import small_maps
 from small_run import changed_tensors
 from torch import Tensor, nn
@@ -158,6 +160,9 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
     images = load_reconstructor(weights, tmp_path)(maps.depth_m, maps.intensity)
     np.testing.assert_allclose(images, reconstruct(network, maps), atol=1e-5)
     assert not [*tmp_path.iterdir()]
+    stored = onnx.load(weights / "network.onnx", load_external_data=False).graph.initializer
+    inline = [each.name for each in stored if len(each.dims) == 2 and each.data_location != TensorProto.EXTERNAL]
+    assert not inline  # no matrix is stored twice, the transposed ones included
     with pytest.raises(CheckpointError, match="direct network"):
         load_pipeline(weights)
 
