@@ -123,18 +123,6 @@ def test_build_hides_meshes_of_folder(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "--without" in capsys.readouterr().err
 
 
-WRONG = {
-    1: ("--rig-spread-mm 500", "--rig bare-wall", "--objects none"),
-    2: ("--without hut", "--accuracy wrong", "--count 0", "--count many", "--backgrounds 2"),
-}
-
-
-@pytest.mark.parametrize(("options", "code"), [(options, code) for code, some in WRONG.items() for options in some])
-def test_build_refuses_bad_options_before_writing(tmp_path: Path, options: str, code: int) -> None:
-    assert _build(tmp_path / "d", *options.split()) == code
-    assert not (tmp_path / "d").exists()
-
-
 def test_build_without_ray_names_the_extra(tmp_path: Path, built: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     assert "nlos-cam[many]" in built(tmp_path / "d", "--ray", "auto", code=1)["error"]["message"]

@@ -37,12 +37,3 @@ def test_info_of_damaged_or_unknown_file_is_exit_code_4(
 )
 def test_sizes_have_one_unit_and_three_digits(size: int, text: str) -> None:
     assert _format_size(size) == text
-
-
-@pytest.mark.parametrize("command", ["replay", "export"])
-def test_unknown_format_of_hidden_surfaces_is_wrong_usage(
-    noise_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
-    assert main([command, str(noise_bag), "--object", "fbx", "--out", str(tmp_path / "out")]) == 2
-    assert "fbx" in capsys.readouterr().err
-    assert not any(tmp_path.iterdir())

@@ -148,12 +148,6 @@ def test_live_record_overwrites_only_when_asked(opened: Opened, tmp_path: Path, 
 
 
 @pytest.mark.usefixtures("opened")
-@pytest.mark.parametrize("option", ["--record", "--log", "--save-view"])
-def test_live_refuses_outputs_with_another_suffix(option: str) -> None:
-    assert main([*RECORDED, option, "run.txt"]) == 2
-
-
-@pytest.mark.usefixtures("opened")
 def test_replay_on_a_wall_notes_that_the_rig_differs(tmp_path: Path, run: Run) -> None:
     write_wall(tmp_path / "wall.toml")
     code, _, printed = run(*WALLED, "wall.toml")

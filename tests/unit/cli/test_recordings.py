@@ -60,15 +60,6 @@ def test_repair_prints_what_was_recovered_and_lost(
     assert 1 < len(capsys.readouterr().out.splitlines()) < len(shown.splitlines())
 
 
-def test_repair_without_frames_is_exit_code_4(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "bad.bag").write_bytes(b"nothing")
-    for path in (tmp_path / "bad.bag", tmp_path / "none.bag"):
-        code, found, shown = run(path, "--out", tmp_path / "a.bag")
-        assert (code, found["error"]["type"]) == (4, "RecordingError")
-        assert "Traceback" not in shown
-    assert not (tmp_path / "a.bag").exists()
-
-
 def test_repair_overwrites_with_the_option_but_not_its_input(
     run: Run, noise_bags: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -140,24 +140,6 @@ def test_tradeoff_keeps_rows_measured_before_signal(
         assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "word"),
-    [
-        (["--object", "teapot"], 2, "teapot"),
-        (["--seed", "3"], 2, "--object"),
-        (["--object", "cup", "--seed", "-1"], 2, ""),
-    ],
-)
-def test_tradeoff_refuses_bad_options(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], code: int, word: str
-) -> None:
-    assert main(["tradeoff", "render", *options, "--out", str(tmp_path / "cost")]) == code
-    shown = capsys.readouterr()
-    assert word in shown.err
-    assert "Traceback" not in shown.err
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.slow
 def test_tradeoff_overwrites_only_on_demand(tmp_path: Path, run: Run) -> None:
     (tmp_path / "cost").mkdir()
@@ -166,12 +148,6 @@ def test_tradeoff_overwrites_only_on_demand(tmp_path: Path, run: Run) -> None:
     assert precious.read_text() == "precious"
     run("render", "--overwrite")
     assert precious.read_text() != "precious"
-
-
-def test_tradeoff_without_readable_weights_exits_with_4(tmp_path: Path, run: Run) -> None:
-    result = run("reconstruct", "--weights", str(tmp_path / "none"), code=4)
-    assert result["error"]["type"] == "CheckpointError"
-    assert not list(tmp_path.iterdir())
 
 
 def test_tradeoff_refuses_color_weights_before_rendering(tmp_path: Path, run: Run) -> None:

@@ -24,6 +24,7 @@ from nlos_cam.cli.main import main
 from nlos_cam.dataset import DatasetPlan, doubt_samples, training_maps
 from nlos_cam.dataset.doubt_samples import EMPTY, ORDINARY, DoubtSamples
 from nlos_cam.dataset.outliers import TRAINING_OUTLIERS
+from nlos_cam.files import claim
 from nlos_cam.objects.generators import CATEGORIES
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -277,3 +278,12 @@ def test_train_doubt_ignores_invisible_outliers(go: Go, folder: Path, monkeypatc
     assert training.nothing.sum() == 14
     assert (~training.nothing & ~training.outside).sum() == 8 + ((every.kind == ORDINARY) & visible).sum()
     assert training.outside.sum() == (outliers & visible).sum() < outliers.sum()
+
+
+def test_train_direct_refuses_a_store_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (recipe := tmp_path / "direct.toml").write_text('task = "direct"\n' + BASE)
+    (store := tmp_path / "store").mkdir()
+    maps = ["--dataset", str(tmp_path), "--held-out", str(tmp_path), "--store", str(store)]
+    with claim(store, inside=True):
+        assert main(["train", "direct", "--recipe", str(recipe), "--out", str(tmp_path / "out"), *maps]) == 1
+    assert "being written" in capsys.readouterr().err

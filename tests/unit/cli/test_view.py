@@ -51,11 +51,6 @@ def test_view_ends_after_its_seconds(saved: Path) -> None:
     assert main(["view", str(saved), "--seconds", "0.1"]) == 0
 
 
-def test_view_exits_4_for_a_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["view", str(tmp_path / "none.html")]) == 4
-    assert "none.html" in capsys.readouterr().err
-
-
 def test_saving_adds_a_file_to_another_viewer(tmp_path: Path) -> None:
     nobody = NullViewer()
     with saving(nobody, BENCH, None) as viewer:

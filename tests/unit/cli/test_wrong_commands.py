@@ -66,16 +66,20 @@ capture --frames -1 | --frames
 capture --takes 2 | --takes
 capture --takes 10000 --frames 1 | 9999
 capture --takes 2 --frames 1 --pause-s -1 | --pause-s
+capture --takes 2 --frames 1 --pause-s inf | --pause-s
 capture --takes 3 --frames 1 --label a --label b | --label
 capture --frames 1 --label a --label b | --label
 capture --out run.mp4 | .bag
+capture webcam --frames 1 | webcam
 replay | missing
 replay run.bag other.bag | unexpected
 replay run.bag --reader fast | plain or sdk
 replay run.bag --stills -1 | --stills
 replay run.bag --stills 101 | --stills
+replay random.bag --object fbx | fbx
 export run.bag --format jpg | png or npz
 export run.bag --every 0 | --every
+export random.bag --object fbx | fbx
 repair run.bag --out run.txt | .bag
 view | missing
 view run.bag --view-port 0 | --view-port
@@ -152,11 +156,13 @@ train compressor --recipe recipe.toml --out d --dataset x | --held-out
 evaluate --count 0 | --count
 evaluate --dataset d --count 3 | --count
 evaluate --training d --no-nearest | --no-nearest
+evaluate --dataset d --rig paper-rig | --rig
 evaluate --rig paper-rgi | paper-rig
 tradeoff | render, reconstruct
 tradeoff rendre | render
 tradeoff render --seed 3 | --object
 tradeoff render --object cupp | cup
+tradeoff render --object cup --seed -1 | --seed
 tradeoff reconstruct --count 0 | --count
 devices extra | unexpected
 doctor --fix | no option
@@ -229,6 +235,7 @@ train vae --recipe recipe.toml --out d | recipe.toml
 train vae --recipe scene.toml --out d | scene
 evaluate --weights none | none
 evaluate --weights precious | precious
+tradeoff reconstruct --weights none | none
 tradeoff render --object none.stl | none.stl
 """
 OTHERS = """
@@ -252,6 +259,8 @@ export random.bag --out taken.npz | taken.npz
 repair random.bag --out random.bag --overwrite | random.bag
 dataset build --out precious --count 1 | precious
 dataset build --out d --count 1 --objects nowhere | nowhere
+dataset build --out d --count 1 --rig bare-wall | object_box
+dataset build --out d --count 1 --rig-spread-mm 500 | 500
 tradeoff render --out taken.npz | taken.npz
 doctor --write-udev taken.rules | --overwrite
 """
