@@ -27,7 +27,7 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.errors import SceneError
-from nlos_cam.files import cache_folder
+from nlos_cam.files import cache_folder, claim
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -215,13 +215,17 @@ def direct(
     if run.devices > 1:
         raise SceneError(f"a direct network trains in one process, got --devices {run.devices}: drop it")
     fabric = run.fabric(recipe)
-    with tracked("packing maps") as on_progress:
-        source = data_sets.PackedMaps(data, store or run.out / "packed", on_progress)
-    held_out = models.first_of(data_sets.open_dataset(held_out_data).arrays(), recipe.held_out)
-    recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
-    rig = source.plan.rig
-    record = models.record_run(recipe, run.out, (rig.name, rig.checksum), [])
-    run.finish(recipe, models.run_direct(fabric, run.training(recipe, record, source.digest), source, held_out))
+    store = store or run.out / "packed"
+    store.mkdir(parents=True, exist_ok=True)
+    with claim(store, inside=True):
+        with tracked("packing maps") as on_progress:
+            source = data_sets.PackedMaps(data, store, on_progress)
+        held_out = models.first_of(data_sets.open_dataset(held_out_data).arrays(), recipe.held_out)
+        recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
+        rig = source.plan.rig
+        record = models.record_run(recipe, run.out, (rig.name, rig.checksum), [])
+        job = run.training(recipe, record, source.digest)
+        run.finish(recipe, models.run_direct(fabric, job, source, held_out))
 
 
 def transfer(

@@ -18,6 +18,7 @@ from nlos_models import (
     first_of,
     parts_of,
     quality_features,
+    read_arrays,
     silhouette_iou,
 )
 from numpy.typing import NDArray
@@ -151,12 +152,13 @@ def samples_on_disk(
     done, total, parts = 0, sum(counts.values()), list[DoubtSamples]()
     for kind, seeds in _pieces(counts, first_seed):
         path = folder / f"{about}-{kind.replace(' ', '_')}-{seeds.start}-{len(seeds)}.npz"
-        if not path.exists():
+        try:
+            part = DoubtSamples(**read_arrays(path))
+        except (OSError, ValueError, TypeError):  # absent, or damaged: it is made again
             part = make_samples(kind, seeds, rig, sensor, accuracy)
             with atomic_file(path) as unfinished, unfinished.open("wb") as file:
                 np.savez(file, **vars(part))
-        with np.load(path) as file:
-            parts.append(DoubtSamples(**file))
+        parts.append(part)
         on_progress(done := done + len(seeds), total)
     return DoubtSamples(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
 

@@ -6,13 +6,14 @@ every epoch, so that an interrupted run sees the same batches again.
 
 import hashlib
 import json
+import operator
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from nlos_models import CellNormal, NormalBatch
+from nlos_models import CellNormal, NormalBatch, read_bounded
+from nlos_models import read_arrays as read_npz
 
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.reader import MAP_CHANNELS, open_dataset
@@ -24,8 +25,26 @@ from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 
 INDEX, MAPS, IMAGES, CELLS = "index.json", "maps.f16", "images.f16", "cells.npz"
 ROW = {MAPS: (2, MAP_ROWS, MAP_COLUMNS), IMAGES: (OBJECT_PIXELS, OBJECT_PIXELS)}
+INDEX_LIMIT = 1 << 26
+"""Bytes of the index: some hundred thousand shards."""
 STATISTICS_SHARDS = 40
 """Shards of each dataset that the cells' statistics are taken from: 4,000 objects."""
+
+
+def _read_index(store: Path) -> dict[str, dict[str, int]]:
+    if not (store / INDEX).exists():
+        return {"shards": {}, "epochs": {}}
+    try:
+        found = json.loads(read_bounded(store / INDEX, INDEX_LIMIT))
+        return {
+            kind: {str(key): operator.index(found[kind][key]) for key in found[kind]} for kind in ("shards", "epochs")
+        }
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise _damaged(store, INDEX) from error
+
+
+def _damaged(store: Path, name: str) -> RecordingError:
+    return RecordingError(f"{store / name} is damaged: delete {store}, the packed maps are then made again")
 
 
 class PackedMaps:
@@ -40,16 +59,17 @@ class PackedMaps:
             raise SceneError(f"{others[0]} and {datasets[0]} were rendered for different rigs: give datasets of one")
         self._datasets, self._store, self.normal = list(datasets), store, CellNormal()
         store.mkdir(parents=True, exist_ok=True)
-        self._index: dict[str, Any] = {"shards": {}, "epochs": {}}
-        if (store / INDEX).exists():
-            self._index = json.loads((store / INDEX).read_text(encoding="utf-8"))
+        self._index = _read_index(store)
         if not (store / CELLS).exists():
             some = [read_arrays(shard, MAP_CHANNELS[:2]) for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
             self.normal.learn(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*some, strict=True)))
             with atomic_file(store / CELLS) as part, part.open("wb") as file:
                 np.savez(file, **{name: values.numpy() for name, values in self.normal.state_dict().items()})
-        with np.load(store / CELLS) as cells:
-            self.normal.load_state_dict({name: torch.from_numpy(cells[name]) for name in cells})
+        try:
+            cells = read_npz(store / CELLS)
+            self.normal.load_state_dict({name: torch.from_numpy(values) for name, values in cells.items()})
+        except (OSError, ValueError, TypeError, RuntimeError) as error:
+            raise _damaged(store, CELLS) from error
         self.refresh(on_progress)
 
     def __len__(self) -> int:
@@ -66,10 +86,12 @@ class PackedMaps:
         paths = [path for folder in self._datasets for path in sorted(folder.glob(SHARD_PATTERN))]
         new = [path for path in paths if str(path.resolve()) not in known]
         for name, shape in ROW.items():
-            path = self._store / name
+            path, size = self._store / name, 2 * len(self) * int(np.prod(shape))
             path.touch()
+            if path.stat().st_size < size:
+                raise _damaged(self._store, name)
             with path.open("r+b") as file:  # rows after the last indexed one are left by an interruption
-                file.truncate(2 * len(self) * int(np.prod(shape)))
+                file.truncate(size)
         for number, path in enumerate(new, 1):
             head = read_head(path)
             depth_m, intensity, image = read_arrays(head, MAP_CHANNELS)

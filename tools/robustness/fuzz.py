@@ -222,6 +222,9 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--files", type=Path, help="folder of the whole files, kept for the next call")
     chosen = parser.parse_args()
+    for needed in (chosen.keep, chosen.files):
+        if needed:
+            needed.mkdir(parents=True, exist_ok=True)
     spawn = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder:
         chosen.files = chosen.files or Path(folder)

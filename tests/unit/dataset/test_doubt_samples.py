@@ -85,3 +85,7 @@ def test_samples_on_disk_makes_only_missing_samples(tmp_path: Path, monkeypatch:
     assert both.kind.tolist() == [EMPTY] * 150 + ["far"] * 20
     assert told == [(100, 170), (150, 170), (170, 170)]
     assert both.where(both.kind == "far").cells.tolist() == list(range(7, 27))
+    damaged = next(tmp_path.glob("*-far-*.npz"))
+    damaged.write_bytes(damaged.read_bytes()[:-40])
+    samples_on_disk(tmp_path, asked, 7, RIG, SENSOR)
+    assert made[3:] == [("far", 7)]

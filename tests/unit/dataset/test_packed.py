@@ -8,7 +8,7 @@ import torch
 from fake_farm import samples_of
 from nlos_calibration.rig import load_rig
 
-from nlos_cam.dataset.packed import MAPS, PackedMaps
+from nlos_cam.dataset.packed import CELLS, IMAGES, INDEX, MAPS, PackedMaps
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
@@ -66,6 +66,16 @@ def test_new_shards_enter_new_epochs_and_an_epoch_can_be_seen_again(tmp_path: Pa
     for one, other in zip(_epoch(again, 1), first, strict=True):
         np.testing.assert_array_equal(one, other)
     assert len(_epoch(again, 3)[0]) == 10
+
+
+@pytest.mark.parametrize("name", [CELLS, INDEX, MAPS, IMAGES])
+def test_damaged_store_is_refused(tmp_path: Path, name: str) -> None:
+    folder = _add(tmp_path / "a", 0)
+    PackedMaps([folder], tmp_path / "store")
+    file = tmp_path / "store" / name
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(RecordingError, match=f"{name} is damaged"):
+        PackedMaps([folder], tmp_path / "store")
 
 
 def test_datasets_of_two_rigs_and_too_few_objects_are_refused(tmp_path: Path) -> None:
