@@ -5,6 +5,7 @@ import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from math import floor, log10
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -104,12 +105,12 @@ class Evaluation:
     predicted: Predictions | None = None
     """None without a quality model, or for weights of difference maps."""
 
-    @property
+    @cached_property
     def ours(self) -> PerObject:
         """Return every metric of every object."""
         return per_object(self.image, self.truth, self.box)
 
-    @property
+    @cached_property
     def surfaces(self) -> dict[str, Float64]:
         """Return size and detail of the true surfaces, (n,) each."""
         return {
@@ -117,7 +118,7 @@ class Evaluation:
             DETAIL: metrics.detail_per_cm(self.truth, self.box),
         }
 
-    @property
+    @cached_property
     def errors(self) -> dict[str, Float64]:
         """Return the two errors that are correlated with size and detail, (n,) each."""
         ours = self.ours

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ FILES = {
 }
 
 
+@cache
 def _judgement(count: int = 7, *, guesses: bool = True) -> Evaluation:
     truth = procedural_images(0, count, BOX).astype(np.float32)
     image = (0.95 * np.roll(truth, 2, axis=2)).astype(np.float32)
@@ -44,6 +46,19 @@ def _judgement(count: int = 7, *, guesses: bool = True) -> Evaluation:
 
 def _figures(judgement: Evaluation) -> dict[str, Any]:
     return json.loads(json.dumps(as_figures(judgement), allow_nan=False))
+
+
+@cache
+def _usual(*, guesses: bool = True) -> dict[str, Any]:
+    return _figures(_judgement(guesses=guesses))
+
+
+@pytest.fixture
+def undrawn(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of one inch, for tests of the text beside them."""
+    small = (drawn / "sheet.png").read_bytes()
+    for name in ("sheet", "gallery", "categories", "against_surface"):
+        monkeypatch.setattr(report.pictures, f"draw_{name}", lambda path, *_: path.write_bytes(small))
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +77,7 @@ def _rows(folder: Path) -> list[dict[str, str]]:
 
 
 def test_figures_have_names_that_scripts_depend_on() -> None:
-    figures = _figures(_judgement())
+    figures = _usual()
     assert {*TARGETS, "baselines", "per_category", "objects", "bars", *FACTS} < set(figures)
     assert set(figures["per_category"]) == {"kind 0", "kind 1", "kind 2"}
     for table in (figures, *figures["baselines"].values(), *figures["per_category"].values()):
@@ -73,6 +88,7 @@ def test_figures_have_names_that_scripts_depend_on() -> None:
     assert sum(zone["share_of_error"] for zone in figures["where_the_error_is"].values()) == pytest.approx(1)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_predicted_quality_is_reported_by_set_and_share_with_a_picture(tmp_path: Path) -> None:
     made = _judgement()
     iou = made.ours["silhouette_iou"]
@@ -86,7 +102,7 @@ def test_predicted_quality_is_reported_by_set_and_share_with_a_picture(tmp_path:
     text = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
     assert "(quality.png)" in text
     assert "shown in green" in text
-    assert _figures(_judgement())["quality"] is None
+    assert _usual()["quality"] is None
 
 
 def test_report_of_perfect_reconstruction_meets_every_bar(drawn: Path) -> None:
@@ -97,7 +113,7 @@ def test_report_of_perfect_reconstruction_meets_every_bar(drawn: Path) -> None:
 
 
 def test_report_contains_metrics_pictures_and_notes(drawn: Path) -> None:
-    made = document(_figures(_judgement()), drawn)
+    made = document(_usual(), drawn)
     page, text = read_page(made.as_html()), made.as_markdown()
     assert len(page.pictures) == 4
     for name in FILES:
@@ -105,16 +121,16 @@ def test_report_contains_metrics_pictures_and_notes(drawn: Path) -> None:
     for words in (*LABELS.values(), "0 of 4 targets met", "nearest neighbour", "99", "they are few", "nlos-cam live"):
         assert words in page.text
         assert words in text
-    assert "nearest" not in document(_figures(_judgement(guesses=False)), drawn).as_markdown()
+    assert "nearest" not in document(_usual(guesses=False), drawn).as_markdown()
 
 
 @pytest.mark.parametrize("count", [1, 7])
 def test_folder_is_complete_for_any_number_of_objects(tmp_path: Path, count: int) -> None:
     judgement, out = _judgement(count), tmp_path / "out"
-    figures = as_figures(judgement)
+    figures = _figures(judgement)
     write_report(out, judgement, figures)
     assert {path.name for path in out.iterdir()} == FILES
-    assert json.loads((out / "figures.json").read_text(encoding="utf-8")) == _figures(judgement)
+    assert json.loads((out / "figures.json").read_text(encoding="utf-8")) == figures
     assert [row["name"] for row in _rows(out)] == judgement.names
     mean = np.mean([float(row["silhouette_iou"]) for row in _rows(out)])
     assert mean == pytest.approx(figures["silhouette_iou"]["value"], rel=1e-4)
@@ -122,7 +138,7 @@ def test_folder_is_complete_for_any_number_of_objects(tmp_path: Path, count: int
 
 def test_figures_separate_categories_left_out_of_training(drawn: Path) -> None:
     whole = _judgement()
-    assert as_figures(whole)["shown_and_left_out"] is None
+    assert _usual()["shown_and_left_out"] is None
     blind = np.array([kind == "kind 1" for kind in whole.categories])[:, None, None]
     guessed = _figures(replace(whole, image=np.where(blind, 0, whole.image), left_out=["kind 1", "kind 9"]))
     by = guessed["shown_and_left_out"]
@@ -131,10 +147,10 @@ def test_figures_separate_categories_left_out_of_training(drawn: Path) -> None:
     assert "left out" in document(guessed, drawn).as_markdown()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_second_set_and_recognition_have_their_figures(tmp_path: Path) -> None:
     whole = _judgement(3)
-    assert as_figures(whole)["unseen"] is None
-    assert as_figures(whole)["recognised"] is None
+    assert _usual()["unseen"] is _usual()["recognised"] is None
     kinds = replace(whole, categories=[object_depth(seed, BOX)[0] for seed in range(3)])
     both = replace(kinds, unseen=Unseen(["a", "b"], whole.truth[:2], np.zeros_like(whole.truth[:2])))
     figures = _figures(both)
@@ -148,6 +164,7 @@ def test_second_set_and_recognition_have_their_figures(tmp_path: Path) -> None:
     assert "recognised as their kind" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_interrupted_write_leaves_earlier_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (out := tmp_path / "out").mkdir()
     (out / "report.md").write_text("earlier")
@@ -157,7 +174,7 @@ def test_interrupted_write_leaves_earlier_folder(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(report.pictures, "draw_gallery", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        write_report(out, _judgement(3), as_figures(_judgement(3)))
+        write_report(out, _judgement(3), {})
     assert {path.name: path.read_text() for path in out.iterdir()} == {"report.md": "earlier"}
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
@@ -165,9 +182,9 @@ def test_interrupted_write_leaves_earlier_folder(tmp_path: Path, monkeypatch: py
 def test_object_without_value_has_an_empty_field(tmp_path: Path) -> None:
     whole = _judgement(2, guesses=False)
     blank = replace(whole, image=0 * whole.truth)
-    write_report(tmp_path / "out", blank, as_figures(blank))
+    write_report(tmp_path / "out", blank, figures := _figures(blank))
     assert {row["foreground_rmse_mm"] for row in _rows(tmp_path / "out")} == {""}
-    assert format_interval(_figures(blank)["foreground_rmse_mm"]) == "none"
+    assert format_interval(figures["foreground_rmse_mm"]) == "none"
 
 
 @pytest.mark.parametrize(

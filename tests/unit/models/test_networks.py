@@ -2,9 +2,12 @@
 
 import pytest
 import torch
+from nlos_models import checkpoint
 from nlos_models.compressor import Bottleneck, Compressor, InvertedResidual, ResNet50
 from nlos_models.pipeline import CHANNELS, COLOR_OUTPUTS, new_vae
+from nlos_models.records import shipped_folder
 from nlos_models.vae import LATENT, LOG_VARIANCE_LIMIT, Encoder, ResBlock, ResVae
+from safetensors.torch import load_file
 from torch import nn
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -154,3 +157,14 @@ def test_vae_trains_in_bfloat16() -> None:
         loss = image.float().sum() + mean.float().sum() + log_variance.float().sum()
     loss.backward()
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in vae.parameters())
+
+
+def test_shipped_weights_load_bit_for_bit_with_record() -> None:
+    loaded, record = checkpoint.load_pipeline()
+    for part in ("compressor", "preprocess", "decoder"):
+        stored, tensors = load_file(shipped_folder("paper") / f"{part}.safetensors"), getattr(loaded, part).state_dict()
+        assert tensors.keys() == stored.keys()
+        for name, tensor in stored.items():
+            assert torch.equal(tensors[name], tensor.to(tensors[name].dtype)), name
+    assert (record.vae_recipe.augmentation, record.vae_recipe.keep) == ("mirror", "last")
+    assert record.transfer_recipe is None
