@@ -16,16 +16,7 @@ import typer
 
 from nlos_cam import dataset as data_sets
 from nlos_cam import objects as shapes
-from nlos_cam.cli.common import (
-    PAPER_RIG,
-    Json,
-    finish,
-    interrupted_by_signals,
-    progress,
-    say,
-    stop_on_signals,
-    tracked,
-)
+from nlos_cam.cli.common import PAPER_RIG, Json, finish, interrupted_by_signals, progress, say, stop_on_signals, tracked
 from nlos_cam.errors import SceneError
 from nlos_cam.files import cache_folder, claim
 
@@ -160,7 +151,7 @@ def vae(
     recipe, rig = run.recipe("vae", budget), walls.rig_named(rig_name)
     refuse_ignored('the recipe has start = "scratch"', {"--weights": bool(weights) and recipe.start == "scratch"})
     fabric = run.fabric(recipe)
-    start, runs = models.vae_start(recipe, weights) if recipe.start == "weights" else (None, [])
+    start, runs = models.vae_start(recipe, weights) if recipe.start != "scratch" else (None, [])
     record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
     job = run.training(recipe, record, models.digest_of(start, rig.checksum))
     say(f"generating {recipe.objects + recipe.held_out} objects")

@@ -15,7 +15,7 @@ from nlos_models.runs import compressor_start, record_doubt_run, record_run, tra
 from safetensors.torch import load_file, save_file
 from small_doubt import untrained_doubt, watched_weights
 from small_maps import SmallCompressor, SmallVae, use_small_networks
-from small_run import small_recipe
+from small_run import changed_tensors, small_recipe
 
 RIG = load_rig("paper-rig")
 NAMED = (RIG.name, RIG.checksum)
@@ -46,6 +46,16 @@ def test_vae_start_lists_runs_of_vae_alone(weights: Path) -> None:
     assert runs == [VAE]
     stored = load_file(weights / "decoder.safetensors")["output.weight"].float()
     assert torch.equal(trained.decoder.output.weight, stored)
+
+
+def test_vae_start_with_a_decoder_alone_leaves_the_encoder_untrained(weights: Path) -> None:
+    stored = load_file(weights / "decoder.safetensors")["output.weight"].float()
+    (weights / "encoder.safetensors").unlink()
+    recipe = small_recipe(start="decoder")
+    (one, runs), (other, _) = vae_start(recipe, weights), vae_start(recipe, weights)
+    assert runs == [VAE]
+    assert torch.equal(one.decoder.output.weight, stored)
+    assert not changed_tensors(one.state_dict(), other.state_dict())
 
 
 def test_compressor_start_lists_runs_of_weights_and_vae(weights: Path, tmp_path: Path) -> None:

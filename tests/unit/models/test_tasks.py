@@ -102,6 +102,16 @@ def test_vae_continues_from_given_weights(trained: Trained, tmp_path: Path) -> N
     assert figures["held_out_loss"] == pytest.approx(trained[1]["held_out_loss"], rel=0.05)
 
 
+def test_encoder_is_trained_for_a_decoder_that_is_kept(trained: Trained, tmp_path: Path) -> None:
+    torch.manual_seed(5)
+    start = SmallVae()
+    start.decoder.load_state_dict(kept := state_of(trained[0].decoder))
+    encoder = state_of(start.encoder)
+    vae, _ = _vae(_recipe("vae", start="decoder", epochs=1), tmp_path, start=start)
+    assert not changed_tensors(kept, vae.decoder.state_dict())
+    assert changed_tensors(encoder, vae.encoder.state_dict())
+
+
 def test_compressor_keeps_vae_frozen_and_learns_statistics(trained: Trained, tmp_path: Path) -> None:
     before = state_of(trained[0])
     recipe = _recipe("compressor", epochs=1, image_weight=1.0, left_noise=0.1)
