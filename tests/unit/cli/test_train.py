@@ -16,6 +16,7 @@ from nlos_models import checkpoint, runs, tasks, train
 from nlos_models.arrays import Float16
 from nlos_models.checkpoint import load_pipeline, load_record
 from nlos_models.doubt_network import load_doubt
+from nlos_models.export import export_folder
 from safetensors.torch import load_file, save_file
 from small_maps import SmallDataset, small_images, small_maps, untrained_weights, use_small_networks
 
@@ -62,8 +63,11 @@ def _arguments(folder: Path, recipe: str, out: Path, *options: str) -> list[str]
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
+    """Small networks and datasets; the folders of weights whose graphs are not exported, since that takes seconds."""
+    folders = list[Path]()
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs, "export_folder", folders.append)
         use_small_networks(patch, tasks, checkpoint, runs)
         counts = {"data": 8, "held-out": 4}
         sets = {name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in counts.items()}
@@ -72,7 +76,7 @@ def _small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setattr("nlos_cam.dataset.procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
         patch.setattr(doubt_samples, "samples_on_disk", _doubt_samples)
         patch.setenv("NLOS_CAM_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
+        yield folders
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +122,6 @@ def test_train_follows_shared_options(go: Go, tmp_path: Path, monkeypatch: pytes
     assert go("vae", "--budget", "0.5", "--objects", "6", "--compile")[0] == 0
     assert len(compiled) == 1
     recipe = load_record(tmp_path / "out").vae_recipe
-    assert recipe is not None
     assert (recipe.epochs, recipe.objects) == (1, 6)
     assert "0.5" in recipe.deviations[-1]
 
@@ -156,10 +159,11 @@ def test_interrupted_train_exits_130_and_resumes_to_same_weights(
 
 
 def test_train_compressor_uses_shipped_vae_and_streams(
-    go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exported: list[Path]
 ) -> None:
     monkeypatch.setattr(runs, "weights_folder", lambda *_: folder / "vae")
     assert go("two")[0] == 0
+    assert exported[-1] == tmp_path / "out"
     assert _same_file("compressor", tmp_path / "out", folder / "two")
     record = load_record(tmp_path / "out")
     assert [run.task for run in record.runs] == ["vae", "compressor"]
@@ -171,8 +175,12 @@ def test_train_compressor_uses_shipped_vae_and_streams(
 
 
 @pytest.mark.slow
-def test_joint_weights_keep_encoder_and_one_step_weights_have_none(go: Go, folder: Path, tmp_path: Path) -> None:
+def test_joint_weights_keep_encoder_and_one_step_weights_have_none(
+    go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runs, "export_folder", export_folder)
     assert go("joint", "--weights", folder / "two")[0] == 0
+    assert (tmp_path / "out" / "network.onnx").is_file()
     assert not _same_file("decoder", tmp_path / "out", folder / "two")
     assert _same_file("encoder", tmp_path / "out", folder / "two")
     assert go("one", "--out", tmp_path / "one")[0] == 0
@@ -245,7 +253,6 @@ def test_train_doubt_writes_weights_with_doubt_once(go: Go, folder: Path, tmp_pa
     assert code == 0
     load_pipeline(tmp_path / "out")
     loaded = load_doubt(tmp_path / "out")
-    assert loaded is not None
     assert loaded[1].learnt == list(TRAINING_OUTLIERS)
     assert loaded[1].figures == {"held_out_loss": answer["held_out_loss"]}
     for out in ("out", "two"):
