@@ -5,7 +5,6 @@ __all__ = [
     "DISK_ERRORS",
     "GOOD_IOU",
     "MIN_V",
-    "SHIPPED_NAMES",
     "SIMULATION_ONLY",
     "SMALLER_IS_BETTER",
     "SMALLEST_SPREAD",
@@ -97,7 +96,6 @@ __all__ = [
     "sync_folder",
     "train_direct",
     "transfer_start",
-    "transfer_weights",
     "vae_start",
     "weights_folder",
     "write_checked",
@@ -154,7 +152,6 @@ from .pipeline import SMALLEST_SPREAD, Preprocess, channel_statistics, cut_silho
 from .quality import GOOD_IOU, QualityRecord, quality_features, quality_watches, write_quality
 from .recipe import SIMULATION_ONLY, Recipe, load_recipe, packaged_recipes
 from .records import (
-    SHIPPED_NAMES,
     CheckpointRecord,
     DoubtRecord,
     checksum_of_watched,
@@ -173,7 +170,6 @@ from .runs import (
     run_transfer,
     run_vae,
     transfer_start,
-    transfer_weights,
     vae_start,
 )
 from .tasks import parts_of, rebuild, run

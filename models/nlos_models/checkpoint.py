@@ -14,7 +14,7 @@ from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError
 from nlos_models.files import TENSOR_LIMIT, describe, read_checked, write_checked
 from nlos_models.pipeline import RemappingNetwork, new_pipeline, new_vae
-from nlos_models.records import DIRECT, PAPER, RECORD, CheckpointRecord, load_record, weights_folder
+from nlos_models.records import DIRECT, RECORD, CheckpointRecord, load_record, weights_folder
 from nlos_models.vae import Encoder, ResVae
 
 PIPELINE_PARTS, ENCODER = ("compressor", "preprocess", "decoder"), "encoder.safetensors"
@@ -76,9 +76,9 @@ def load_network(folder: Path | None = None) -> tuple[RemappingNetwork | DirectN
 
 def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
     """Return a Res-VAE in eval mode, with its record. Raises CheckpointError unless all tensors fit."""
-    folder = weights_folder(folder, PAPER)
+    folder = weights_folder(folder)
     record = load_record(folder)
-    if not (folder / ENCODER).exists() and folder == weights_folder(None, PAPER):
+    if not (folder / ENCODER).exists() and folder == weights_folder(None):
         raise CheckpointError(
             "the encoder of the paper's weights (21 MB) does not come with them, since only training needs it: make it "
             "again with `nlos-cam train vae --recipe vae-encoder --out DIR`, and give --vae DIR"
@@ -91,7 +91,7 @@ def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
 
 def load_pipeline(folder: Path | None = None) -> tuple[RemappingNetwork, CheckpointRecord]:
     """Return a pipeline in eval mode (default: the paper's), with its record. Raises CheckpointError."""
-    return _load_pipeline(weights_folder(folder, PAPER), PIPELINE_PARTS)
+    return _load_pipeline(weights_folder(folder), PIPELINE_PARTS)
 
 
 def load_pipeline_partly(folder: Path) -> tuple[RemappingNetwork, CheckpointRecord, LoadReport]:
@@ -117,7 +117,7 @@ def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[RemappingNetwo
 
 def load_encoder(folder: Path | None = None) -> Encoder | None:
     """Return the encoder beside a pipeline's weights, in eval mode, or None where they were trained without one."""
-    folder = weights_folder(folder, PAPER)
+    folder = weights_folder(folder)
     path = folder / ENCODER
     if not path.exists():
         return None

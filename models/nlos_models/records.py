@@ -13,9 +13,8 @@ from nlos_models.files import TEXT_LIMIT, read_checked
 from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
 
 RECORD = "checkpoint.json"
-DIRECT, PAPER = "direct", "paper"
-SHIPPED_NAMES = (PAPER,)
-"""Weights that come with the project, by name; the first are the default. A wheel holds the default ones alone."""
+DIRECT, SHIPPED = "direct", "paper"
+"""File with a direct network's tensors, less its ending; name of the weights that come with the package."""
 DOUBT, DOUBT_RECORD = "doubt", "doubt.json"
 WATCHED = "compressor.safetensors", "preprocess.safetensors", "decoder.safetensors"
 
@@ -89,24 +88,14 @@ def _any_in_color(*recipes: Recipe | None) -> bool:
     return any(recipe is not None and recipe.colour for recipe in recipes)
 
 
-def shipped_folder(name: str = SHIPPED_NAMES[0]) -> Path:
-    """Return the folder of the weights of this name in SHIPPED_NAMES."""
-    return Path(str(resources.files("nlos_models") / "weights" / name))
+def shipped_folder() -> Path:
+    """Return the folder of the weights that come with the package."""
+    return Path(str(resources.files("nlos_models") / "weights" / SHIPPED))
 
 
-def weights_folder(weights: Path | None, default: str = SHIPPED_NAMES[0]) -> Path:
-    """Return the folder that a choice of weights means: a folder, a name in SHIPPED_NAMES, or None for the default.
-
-    A name counts where no folder of that name is here. Raises CheckpointError for weights that a wheel does not hold.
-    """
-    name = default if weights is None else str(weights)
-    if name not in SHIPPED_NAMES or (weights is not None and weights.exists()):
-        return Path(name)
-    if not (folder := shipped_folder(name)).is_dir():
-        raise CheckpointError(
-            f"the weights {name!r} are not in the installed package, to keep it small: use a clone of the repository"
-        )
-    return folder
+def weights_folder(weights: Path | None) -> Path:
+    """Return the folder of weights: the package's for None, and for SHIPPED unless a folder of that name is here."""
+    return shipped_folder() if weights is None or (str(weights) == SHIPPED and not weights.exists()) else weights
 
 
 def load_record(folder: Path) -> CheckpointRecord:

@@ -30,9 +30,7 @@ from nlos_models.files import claim
 from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
 from nlos_models.records import (
-    DIRECT,
     DOUBT_RECORD,
-    PAPER,
     RECORD,
     CheckpointRecord,
     DoubtRecord,
@@ -190,7 +188,7 @@ def _export(training: TrainingRun) -> None:
 def vae_start(recipe: Recipe, weights: Path | None) -> tuple[ResVae, list[Recipe]]:
     """Load the VAE that a recipe starts from (default: the paper's) and the runs that made it."""
     _check_same_color(recipe, weights)
-    folder = weights_folder(weights, PAPER)
+    folder = weights_folder(weights)
     if recipe.start == "decoder":
         torch.manual_seed(recipe.seed)
         vae, (pipeline, record) = new_vae(color=recipe.colour), load_pipeline(folder)
@@ -213,22 +211,19 @@ def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | No
     pipeline, runs = _pipeline_start(recipe, weights)
     if not (encoder := load_encoder(weights)):
         if recipe.latent_weight:
-            raise TrainingError(f"{weights or PAPER} has no encoder to aim at: set latent_weight = 0 in the recipe")
+            raise TrainingError(
+                f"{weights_folder(weights)} has no encoder to aim at: set latent_weight = 0 in the recipe"
+            )
         return Start(None, pipeline), runs
     vae = new_vae(color=recipe.colour)
     vae.encoder, vae.decoder = encoder, pipeline.decoder
     return Start(vae, pipeline), runs
 
 
-def transfer_weights(recipe: Recipe, weights: Path | None) -> Path:
-    """Return the weights that a transfer starts from: by default the paper's if the recipe aims at its latent."""
-    return weights_folder(weights, PAPER if recipe.latent_weight else DIRECT)
-
-
 def transfer_start(
-    recipe: Recipe, weights: Path, *, partial: bool, on_report: Callable[[str], None]
+    recipe: Recipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
 ) -> tuple[RemappingNetwork | DirectNetwork, list[Recipe]]:
-    """Load the networks that a transfer starts from and the runs that made them.
+    """Load the networks that a transfer starts from (default: the paper's) and the runs that made them.
 
     If `partial`, only matching layers of the compressor are loaded, `on_report` is called with a summary of them, and
     the others are initialised from the recipe's seed.
@@ -238,7 +233,7 @@ def transfer_start(
         network, record = load_network(weights)
         return network, record.runs
     torch.manual_seed(recipe.seed)
-    pipeline, record, report = load_pipeline_partly(weights)
+    pipeline, record, report = load_pipeline_partly(weights_folder(weights))
     on_report(f"compressor: {report}")
     return pipeline, record.runs
 
@@ -262,11 +257,11 @@ def _check_fits(recipe: Recipe, folder: Path | None) -> None:
 
 def _check_same_color(recipe: Recipe, folder: Path | None) -> CheckpointRecord:
     """Return the weights' record; raise TrainingError unless weights and recipe are both of depth or both in color."""
-    record = load_record(weights_folder(folder, PAPER))
+    record = load_record(weights_folder(folder))
     if record.color != recipe.colour:
         holds, wants = (f"color ({SIMULATION_ONLY})" if color else "depth" for color in (record.color, recipe.colour))
         raise TrainingError(
-            f"{folder or PAPER} holds weights for {holds} but the recipe is for {wants}: name others "
+            f"{weights_folder(folder)} holds weights for {holds} but the recipe is for {wants}: name others "
             "with --vae or --weights"
         )
     return record

@@ -69,9 +69,7 @@ Tradeoff = Annotated[
     typer.Option("--tradeoff", help="Table of `tradeoff reconstruct` for --budget-ms (default: beside the weights)."),
 ]
 Wall = Annotated[Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall` (wall.toml).")]
-Weights = Annotated[
-    Path | None, typer.Option("--weights", help="Folder of weights, `direct` or `paper` (default: direct).")
-]
+Weights = Annotated[Path | None, typer.Option("--weights", help="Folder of weights (default: the paper's).")]
 Seconds = Annotated[
     float | None,
     typer.Option("--seconds", min=0.1, help="Stop after this many seconds (default: run until Ctrl-C)."),

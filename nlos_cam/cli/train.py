@@ -223,10 +223,7 @@ def transfer(
     run: RunOptions,
     data: Maps,
     held_out_data: HeldOut,
-    weights: Annotated[
-        Path | None,
-        typer.Option("--weights", help="Weights that the run starts from (default: shipped ones that fit the recipe)."),
-    ] = None,
+    weights: Weights = None,
     vae_folder: Annotated[
         Path | None, typer.Option("--vae", help="VAE whose encoder gives the target latents (default: the weights').")
     ] = None,
@@ -238,7 +235,6 @@ def transfer(
     """Fine-tune synthetic weights on a bench's recordings (SI 4): all layers first, then the classifier alone."""
     recipe = run.recipe("transfer")
     fabric = run.fabric(recipe)
-    weights = models.transfer_weights(recipe, weights)
     pipeline, runs = models.transfer_start(recipe, weights, partial=partial, on_report=say)
     encoder = models.load_encoder(vae_folder or weights)
     maps = data_sets.read_maps(recipe, data, held_out_data, wall)
@@ -254,7 +250,7 @@ def doubt(
     data: Maps,
     held_out_data: HeldOut,
     weights: Annotated[
-        Path | None, typer.Option("--weights", help="Weights whose images are judged (default: direct).")
+        Path | None, typer.Option("--weights", help="Weights whose images are judged (default: the paper's).")
     ] = None,
 ) -> None:
     """Train the uncertainty ("doubt") network of trained weights; --out then holds a copy of these weights too."""

@@ -17,7 +17,7 @@ from nlos_models.export import TorchReconstructor, quantize
 from nlos_models.inference import OnnxReconstructor, Reconstructor, load_reconstructor, load_uncertainty_model
 from nlos_models.metrics import MIN_V
 from nlos_models.pipeline import RemappingNetwork, split_and_stack
-from nlos_models.records import SHIPPED_NAMES, CheckpointRecord, checksum_of_watched, shipped_folder, weights_folder
+from nlos_models.records import CheckpointRecord, checksum_of_watched, shipped_folder, weights_folder
 from nlos_models.vae import Decoder
 from onnx import TensorProto, helper, numpy_helper
 from small_maps import HARD_MAPS, hard_maps
@@ -244,26 +244,21 @@ def shipped_maps() -> tuple[np.ndarray, np.ndarray]:
     return depth_m, np.stack([10 + 30 * np.roll(patch, 6 * k, 1) for k in range(3)]).astype(np.float32)
 
 
-@pytest.mark.skipif((shipped_folder("paper") / "encoder.safetensors").exists(), reason="the encoder is there")
-def test_paper_weights_without_encoder_name_the_recipe_that_makes_it() -> None:
+def test_package_without_encoder_names_the_recipe_that_makes_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for path in shipped_folder().glob("*.*"):
+        if path.name != "encoder.safetensors":
+            (tmp_path / path.name).symlink_to(path)
+    monkeypatch.setattr(records, "shipped_folder", lambda: tmp_path)
     with pytest.raises(CheckpointError, match=r"encoder.*train vae --recipe vae-encoder"):
-        checkpoint.load_vae(shipped_folder("paper"))
+        checkpoint.load_vae(tmp_path)
     assert checkpoint.load_encoder() is None
 
 
-@pytest.mark.parametrize("name", SHIPPED_NAMES)
-def test_weights_by_name_give_way_to_a_folder_of_that_name(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_weights_by_name_give_way_to_a_folder_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert weights_folder(Path(name)) == weights_folder(None, name) == shipped_folder(name)
-    assert weights_folder(shipped_folder(name)) == shipped_folder(name)
-    Path(name).mkdir()
-    assert weights_folder(Path(name)) == Path(name)
-    assert weights_folder(tmp_path / "other") == tmp_path / "other"
-
-
-def test_weights_that_a_wheel_does_not_hold_take_a_clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(records, "shipped_folder", lambda name: tmp_path / name)
-    with pytest.raises(CheckpointError, match=r"'paper'.*clone"):
-        weights_folder(Path("paper"))
+    name = Path("paper")
+    assert weights_folder(name) == weights_folder(None) == shipped_folder()
+    name.mkdir()
+    assert (weights_folder(name), weights_folder(tmp_path / "other")) == (name, tmp_path / "other")
