@@ -16,15 +16,7 @@ from pathlib import Path
 
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import OnProgress, Samples, ignore, join_samples, make_samples
-from nlos_cam.dataset.shards import (
-    SHARD_PATTERN,
-    Shard,
-    check_arrays,
-    only_builder,
-    read_head,
-    shard_path,
-    store,
-)
+from nlos_cam.dataset.shards import SHARD_PATTERN, Shard, check_arrays, only_builder, read_head, shard_path, store
 from nlos_cam.dataset.worker import begin_worker
 from nlos_cam.errors import OutputExistsError, RecordingError, WorkersLostError
 

@@ -39,14 +39,7 @@ from nlos_cam.objects import (
     object_depth,
     unseen_objects,
 )
-from nlos_cam.reconstruct import (
-    FrameConditions,
-    Reconstruction,
-    Verdict,
-    VerdictFilter,
-    estimate_doubt,
-    verdict_limits,
-)
+from nlos_cam.reconstruct import FrameConditions, Reconstruction, Verdict, VerdictFilter, estimate_doubt, verdict_limits
 from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
 
 OnProgress = Callable[[int, int], None]

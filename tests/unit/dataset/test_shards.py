@@ -15,15 +15,7 @@ from nlos_calibration.rig import load_rig
 
 import nlos_cam
 from nlos_cam.dataset.plan import DatasetPlan
-from nlos_cam.dataset.shards import (
-    check_arrays,
-    only_builder,
-    read_arrays,
-    read_head,
-    shard_path,
-    shards_of,
-    store,
-)
+from nlos_cam.dataset.shards import check_arrays, only_builder, read_arrays, read_head, shard_path, shards_of, store
 from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40)

@@ -9,12 +9,7 @@ from nlos_models.recipe import SIMULATION_ONLY
 
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import make_samples
-from nlos_cam.evaluate.color import (
-    color_baselines,
-    draw_color_sheet,
-    figures_of_color,
-    painted_maps,
-)
+from nlos_cam.evaluate.color import color_baselines, draw_color_sheet, figures_of_color, painted_maps
 from nlos_cam.objects.textures import TEXTURES
 
 TRUTH = np.zeros((2, 3, 64, 64), np.float32)
