@@ -101,11 +101,6 @@ def fake_l515() -> type[FakeLidar]:
 
 
 @pytest.fixture
-def fake_sdk() -> type[FakeSdk]:
-    return FakeSdk
-
-
-@pytest.fixture
 def fake_camera() -> Callable[..., L515Camera]:
     """Make an L515Camera on a fake SDK with these lidars and a clock that moves only by waiting."""
 

@@ -130,7 +130,6 @@ def test_measure_refuses_wrong_tape_no_depth_and_no_board(seen: CaptureStatistic
 def test_measure_occluder_finds_it_beside_the_known_wall(bare: MeasuredWall, x_m: float, gap_m: float) -> None:
     seen = bench_seen(occluder=Occluder(x_m=x_m, z_min_m=gap_m))
     record, inliers = measure_occluder(seen, bare)
-    assert record.occluder is not None
     assert (record.occluder.source, record.verdict) == ("detected", "good")
     assert (record.occluder.x_m, record.occluder.gap_m) == pytest.approx((x_m, gap_m), abs=0.002)
     assert record.rig.occluder == Occluder(x_m=record.occluder.x_m, z_min_m=record.occluder.gap_m)
@@ -158,7 +157,6 @@ def test_measure_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatisti
     wall = measured(seen, 0.204)
     assert wall.record.range_offset_cause == "origin"
     record, _ = measure_occluder(bench_seen(), wall)
-    assert record.occluder is not None
     assert record.occluder.x_m == pytest.approx(0.204, abs=2e-4)
     assert record.occluder.gap_m == pytest.approx(0.1, abs=0.002)
     assert record.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
@@ -193,7 +191,6 @@ def test_fit_frame_measures_the_wall_in_one_thinned_frame(
 ) -> None:
     pose = LidarPose(distance_m=distance_m, yaw_deg=yaw_deg)
     seen = fit_frame(frame_of(RIG.model_copy(update={"lidar": pose}), width, height))
-    assert seen.fit is not None
     assert seen.fit.distance_m == pytest.approx(distance_m, abs=max(0.0005, 4 * seen.fit.distance_std_m))
     assert seen.fit.yaw_deg == pytest.approx(yaw_deg, abs=max(0.1, 4 * seen.fit.yaw_std_deg))
 

@@ -41,7 +41,6 @@ def test_report_escapes_hostile_names(measured: Measured) -> None:
 
 def test_report_shows_maps_only_of_a_reference_with_depth(measured: Measured) -> None:
     wall = measured()
-    assert wall.reference is not None
     assert len(read(MeasuredWall(wall.record, None)).pictures) == 2
     nothing = np.full_like(wall.reference.depth_m, np.nan)
     depth_less = replace(wall.reference, depth_m=nothing, depth_std_m=nothing, inliers=nothing > 0.0)
@@ -52,7 +51,6 @@ def test_report_shows_maps_only_of_a_reference_with_depth(measured: Measured) ->
 @pytest.mark.slow
 def test_report_of_noise_stays_small(measured: Measured) -> None:
     wall, noise = measured(width=640), np.random.default_rng(0)
-    assert wall.reference is not None
     shape = wall.reference.depth_m.shape
     loud = replace(
         wall.reference,
@@ -75,8 +73,6 @@ def marker_and_range(value: float) -> tuple[float, float, float]:
     drawn = report.range_bar("distance", value, (15.0, 30.0), 0.1, "cm", 45.0)
     marker = re.search(r"M ([\d.]+) ", drawn)
     allowed = re.search(r"x='([\d.]+)' y='14' width='([\d.]+)' height='14' class='allowed'", drawn)
-    assert marker is not None
-    assert allowed is not None
     return float(marker[1]), float(allowed[1]), float(allowed[1]) + float(allowed[2])
 
 

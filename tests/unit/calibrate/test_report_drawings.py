@@ -43,7 +43,6 @@ def test_bench_picture_holds_the_whole_bench(
 ) -> None:
     rig = measured(distance_m, yaw_deg, pitch_deg).record.rig
     limits, box = drawn_limits(rig), rig.object_box
-    assert box is not None
     near, far = (box.x_min_m, box.y_min_m, box.z_near_m), (box.x_max_m, box.y_max_m, box.z_far_m)
     for axis, (low, high) in enumerate(limits):
         assert low < min(near[axis], 0.0, rig.wall_from_lidar[axis, 3])

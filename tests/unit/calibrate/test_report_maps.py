@@ -9,14 +9,7 @@ from nlos_calibration.reference import BareWall
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import MeasuredWall
 
-from nlos_cam.calibrate.report_maps import (
-    block_majority,
-    block_side,
-    expected_std_m,
-    in_blocks,
-    residual_m,
-    wall_maps,
-)
+from nlos_cam.calibrate.report_maps import block_majority, block_side, expected_std_m, in_blocks, residual_m, wall_maps
 from nlos_cam.report import Picture, figure_of, png
 
 FLOAT32_M = 1e-6

@@ -121,9 +121,7 @@ def filled(sights: np.ndarray, reference_frames: int = MANY) -> DriftWindow:
 
 
 def drift_of(sights: np.ndarray, reference_frames: int = MANY) -> Drift:
-    drift = filled(sights, reference_frames).drift()
-    assert drift is not None
-    return drift
+    return filled(sights, reference_frames).drift()
 
 
 def sights(count: int, seed: int = 0) -> np.ndarray:

@@ -10,7 +10,6 @@ def test_paper_rig_is_that_of_the_paper() -> None:
     rig = load_rig("paper-rig")
     assert rig.wall_from_lidar[2, 3] == 0.2
     assert rig.facing_deg == pytest.approx(45.0)
-    assert rig.occluder is not None
     assert (rig.occluder.x_m, rig.occluder.z_min_m) == (0.2, 0.1)
     rays = rig.pinhole.scaled(2, 2)
     width_deg, height_deg = (2 * np.degrees(np.arctan(1 / f)) for f in (rays.fx, rays.fy))

@@ -58,7 +58,6 @@ def test_wall_track_finds_an_exact_pose_exactly(exact: BareWall, shift: WallPose
     for _ in range(60):
         sight = track.follow(frame)
     now = measures_of(-pose[2, :3] / pose[2, 3], np.zeros((3, 3)))
-    assert sight is not None
     assert sight.distance_m == pytest.approx(now.distance_m - POSE[0], abs=2e-6)
     assert sight.yaw_deg == pytest.approx(now.yaw_deg - POSE[1], abs=1e-3)
     assert sight.pitch_deg == pytest.approx(now.pitch_deg - POSE[2], abs=1e-3)

@@ -178,7 +178,6 @@ def test_world_opens_without_a_cache_that_cannot_be_written(
 def test_packaged_loop_equals_the_renderers(scene: SceneFile) -> None:
     """On the processor that rendered it bit for bit; others may contract sums differently."""
     packaged = read_packaged(scene)
-    assert packaged is not None
     assert [len(part) for part in packaged] == [scene.poses, scene.poses]
     number = scene.poses // 2
     (rendered,), (truth_m,) = render_loop(scene, poses=[number])

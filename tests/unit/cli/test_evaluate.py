@@ -85,7 +85,9 @@ def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Any
     return call
 
 
-def test_evaluate_writes_figures_of_dataset_beside_baselines(tmp_path: Path, run: Callable[..., Any]) -> None:
+def test_evaluate_writes_figures_of_dataset_beside_baselines(
+    tmp_path: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     result, out = run(*STORED), tmp_path / "figures"
     assert {*TARGETS, "baselines", "per_category", "objects", "seconds", "out"} < set(result)
     assert (result["objects"], result["training_objects"]) == (3, 3)
@@ -99,6 +101,7 @@ def test_evaluate_writes_figures_of_dataset_beside_baselines(tmp_path: Path, run
         assert [row["name"] for row in csv.DictReader(file)] == ["cup 0", "hat 1", "cup 2"]
     assert (out / "sheet.png").read_bytes().startswith(b"\x89PNG")
     assert run(*STORED, code=1)["error"]["type"] == "OutputExistsError"
+    monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
     run(*STORED, "--overwrite")
 
 
@@ -113,7 +116,10 @@ def test_evaluate_uses_test_set_without_dataset(
     assert "nearest_neighbour" in result["baselines"]
 
 
-def test_evaluate_count_uses_seeded_objects(run: Callable[..., Any], guessing: list[DatasetPlan]) -> None:
+def test_evaluate_count_uses_seeded_objects(
+    run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, guessing: list[DatasetPlan]
+) -> None:
+    monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
     result = run("--count", "1", "--no-nearest")
     assert result["objects"] == 1
     assert set(result["baselines"]) == {"all_background", "mean_object"}

@@ -33,7 +33,6 @@ def small(monkeypatch: pytest.MonkeyPatch) -> list[Scene]:
     asked: list[Scene] = []
 
     def shrunk(scene: Scene) -> Scene:
-        assert scene.object_depth_m is not None
         depth = np.full((16, 16), np.nan, np.float32)
         depth[4:12, 4:12] = scene.object_depth_m[24:40:2, 24:40:2]
         return replace(scene, object_depth_m=depth)

@@ -74,7 +74,6 @@ def test_color_training_notes_simulation_and_continues(go: Go, folder: Path, tmp
     held_out = open_dataset(folder / "data-held-out", color=True).arrays()
     assert run(pipeline, held_out).shape == held_out.image.shape == (2, 3, 64, 64)
     encoder, vae = load_encoder(tmp_path / "out"), load_vae(folder / "vae")[0]
-    assert encoder is not None
     torch.testing.assert_close(encoder.state_dict(), vae.encoder.state_dict(), rtol=0, atol=0)
     with pytest.raises(CheckpointError, match="simulation only"):
         load_reconstructor(tmp_path / "out", tmp_path / "onnx")

@@ -267,7 +267,6 @@ def test_processes_make_the_samples_of_one_process(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_worker_ends_with_killed_parent() -> None:
     with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
         assert parent.stdout.readline().strip().isdigit()
         parent.send_signal(signal.SIGKILL)
         parent.wait()

@@ -20,7 +20,6 @@ from nlos_cam.render.scene_file import SceneFile
 from nlos_cam.render.sensor.model import SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
-assert RIG.occluder is not None
 PLAN = DatasetPlan(RIG, 7)
 SPREAD = RigSpread(place_m=0.02, angle_deg=5, gain_share=0.3)
 CHANGES: dict[str, Any] = {

@@ -55,7 +55,6 @@ def test_recommended_is_fastest_setting_without_loss() -> None:
     blind = replace(ROWS[1], figures={**ROWS[1].figures, "foreground_rmse_mm": Interval(None, None, None)})
     for rows, name in ((ROWS, "quick"), (ROWS[:1], "exact"), ([ROWS[0], blind], "exact")):
         pick = recommended(rows)
-        assert pick is not None
         assert pick.setting.name == name
     assert recommended([]) is None
 

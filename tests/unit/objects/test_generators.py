@@ -109,7 +109,6 @@ def test_category_settings_all_change_the_depth_map(category: str) -> None:
 def test_default_scene_keeps_the_airplane_of_the_readme() -> None:
     """Changes to the generators must leave the default scene as it is."""
     hidden = paper_scene().hidden
-    assert hidden is not None
     assert hashlib.sha256(np.round(hidden.triangles, 9).tobytes()).hexdigest()[:16] == DEFAULT_AIRPLANE
 
 

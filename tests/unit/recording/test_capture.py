@@ -72,7 +72,6 @@ def test_take_holds_what_came_and_its_sidecar_agrees(run: Run, noise_world: Any)
     found = load_sidecar(sidecar_path(take.target.path))
     assert (found.state, found.label, found.camera) == ("complete", "object 0", "sim")
     assert found.summary == take.summary
-    assert found.summary
     assert (found.summary.frames, found.summary.streams["infrared"]) == (5, 5)
     assert found.rig
     assert take.quality.frames_seen == 5
@@ -102,7 +101,6 @@ def test_takes_have_own_files_and_follow_each_other(run: Run, tmp_path: Path) ->
 def test_interrupted_take_keeps_frames_and_is_the_last(run: Run, tmp_path: Path) -> None:
     (take,) = run(count=3, frames=500, stop_at=7)
     assert take.state == saved_state(take) == "interrupted"
-    assert take.verified
     assert take.verified.frames == take.sets >= 7
     assert not (tmp_path / "1.bag").exists()
 
@@ -118,7 +116,6 @@ def test_take_of_a_vanishing_camera_is_whole(run: Run, world: Any) -> None:
     (take,) = run(count=2, frames=500)
     assert (take.state, saved_state(take), take.sets) == ("lost", "lost", 8)
     assert isinstance(take.error, CameraLostError)
-    assert take.verified
     assert take.verified.frames == 8
 
 
@@ -147,7 +144,6 @@ def test_take_ends_whole_where_disk_space_is_low(run: Run) -> None:
     assert (take.state, saved_state(take), take.sets) == ("disk full", "disk full", 1)
     assert isinstance(take.error, DiskFullError)
     assert "200 MB" in str(take.error)
-    assert take.verified
     assert take.verified.frames == 1
 
 
@@ -174,7 +170,6 @@ def test_take_whose_file_cannot_be_closed_is_not_read_back(
     assert (take.state, saved_state(take), take.closed, take.verified) == ("disk full", "disk full", False, None)
     assert "nlos-cam repair" in str(take.error)
     summary = load_sidecar(take.sidecar.path).summary
-    assert summary
     assert (summary.frames, summary.frames_seen) == (None, 4)
 
 

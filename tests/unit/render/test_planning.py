@@ -16,7 +16,6 @@ from nlos_cam.render.accuracy import MAX_BEAMS_PER_CELL, MAX_RELAY_CELLS, STOPS,
 from nlos_cam.render.effects import EFFECTS, decide, included
 from nlos_cam.render.energy_survey import CAUTION, EnergySurvey
 from nlos_cam.render.geometry import NO_OCCLUDER, SPEED_OF_LIGHT_M_PER_S
-from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Surface, phong
 from nlos_cam.render.planning import RenderProblem, plan, prepare
 from nlos_cam.render.scene import Radiometry, Scene
@@ -73,15 +72,9 @@ def _without(*names: str) -> RenderProblem:
     return prepare(SCENE, COARSE, set(EFFECTS) - set(names))
 
 
-def _job(ready: RenderProblem) -> TransportJob:
-    job = ready.job
-    assert job is not None
-    return job
-
-
 def test_problem_holds_every_effect_and_drops_those_left_out() -> None:
     problem = _without()
-    whole = _job(problem)
+    whole = problem.job
     assert len(problem.color_jobs) == 3
     assert whole.more_bounces
     assert whole.field.shades
@@ -92,9 +85,9 @@ def test_problem_holds_every_effect_and_drops_those_left_out() -> None:
     assert not _without("direct").beams.direct.any()
     assert _without("three-bounce").job is None
     assert not _without("colour").color_jobs
-    assert _job(_without("tilt")).patches.beta.max() == 1
-    assert not _job(_without("self-occlusion")).field.shades
-    open_job, short, dull = (_job(_without(name)) for name in ("occluder", "inter-reflection", "brdf"))
+    assert _without("tilt").job.patches.beta.max() == 1
+    assert not _without("self-occlusion").job.field.shades
+    open_job, short, dull = (_without(name).job for name in ("occluder", "inter-reflection", "brdf"))
     assert open_job.edge_m == NO_OCCLUDER
     assert len(open_job.relay.x_m) == 48
     assert len(open_job.laser_spot_m) > len(whole.laser_spot_m)
@@ -113,7 +106,7 @@ def test_prepare_refuses_histograms_that_do_not_fit() -> None:
 
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
 def test_job_weights_are_the_factors_of_s2(radiometry: Radiometry) -> None:
-    job = _job(prepare(Scene(RIG, DEPTH, Surface(0.5), radiometry), COARSE))
+    job = prepare(Scene(RIG, DEPTH, Surface(0.5), radiometry), COARSE).job
     relay, solid = job.relay, np.pi if radiometry == "lambertian" else 2 * np.pi
     np.testing.assert_allclose(job.strength, 0.5 * job.patches.beta * job.patches.cell_m2)
     far = relay.length_m > job.near_m
@@ -209,7 +202,6 @@ def test_survey_bounds_the_energy_of_a_patch_on_the_wall(z_m: float) -> None:
     depth = np.full((8, 8), 0.2, np.float32)
     depth[3, 3] = z_m
     light = SceneFacts(Scene(RIG, depth, jump_m=0.5), COARSE).light
-    assert light is not None
     assert np.isfinite(light.energy).all()
     assert light.energy.max() < 1e3 * np.median(light.energy)
 
@@ -222,7 +214,6 @@ def test_facts_take_blocks_where_the_stride_divides_the_grid(cells: int, stride:
     scene = Scene(RIG, LEVEL[:cells, :cells], Surface(np.linspace(0, 1, cells**2).reshape(cells, cells)))
     facts = SceneFacts(scene, replace(COARSE, object_stride=stride))
     assert facts.depth_m.shape == facts.albedo.shape == (blocks, blocks)
-    assert facts.patches is not None
     assert len(facts.patches.beta) == blocks**2
     assert facts.albedo.mean() == pytest.approx(0.5)
 
