@@ -84,7 +84,6 @@ class ListViewer(NullViewer):
 
 
 def instant_of(frame: Frame) -> int:
-    assert frame.truth_depth_m is not None
     return int(frame.truth_depth_m[0, 0])
 
 

@@ -28,7 +28,6 @@ shifts = pytest.mark.parametrize("shift", SHIFTS)
 def assert_right(stream: WallStream, shift: WallPose) -> None:
     """Check that the drift is the lidar's move within its uncertainty, which must be small."""
     drift = stream.check.drift
-    assert drift is not None
     assert abs(drift.distance_m - shift[0]) < SIGMAS * drift.distance_std_m < TOLERANCE_M
     assert abs(drift.yaw_deg - shift[1]) < SIGMAS * drift.yaw_std_deg < 2 * TOLERANCE_DEG
     assert abs(drift.pitch_deg - shift[2]) < SIGMAS * drift.pitch_std_deg < 2 * TOLERANCE_DEG
@@ -114,7 +113,6 @@ def test_drift_check_names_a_range_that_drifts(pose: WallPose) -> None:
     (line,) = stream.check.warnings
     assert "range" in line
     drift = stream.check.drift
-    assert drift is not None
     assert abs(drift.range_m - 1.5 * TOLERANCE_M) < SIGMAS * drift.range_std_m < 0.2 * TOLERANCE_M
 
 
@@ -168,7 +166,6 @@ def test_drift_check_measures_whole_frames_with_holes() -> None:
     for number in range(40):
         frame = noisy_depth(depth_m, generator) if number % 4 else np.full_like(depth_m, np.nan)
         check.observe(frame.astype(np.float32), {})
-    assert check.drift is not None
     assert abs(check.drift.distance_m - 0.002) < SIGMAS * check.drift.distance_std_m < TOLERANCE_M
     (line,) = check.warnings
     assert "moved" in line

@@ -17,11 +17,7 @@ from nlos_cam.objects.generators import CATEGORIES
 from nlos_cam.objects.meshes import read_mesh, turn_upright
 from nlos_cam.objects.placement import Pose, category_triangles, object_depth, place
 
-PAPER = load_rig("paper-rig").object_box
-
-assert PAPER is not None
-
-BOX: ObjectBox = PAPER
+BOX: ObjectBox = load_rig("paper-rig").object_box
 POSE = Pose(tilt_x_rad=0.2, tilt_y_rad=-0.3, turn_z_rad=0.4, size_m=0.19, x_m=0.01, y_m=-0.02)
 EXPORTS: dict[str, Callable[[trimesh.Trimesh], bytes]] = {
     "text.obj": lambda mesh: mesh.export(file_type="obj", digits=12).encode(),

@@ -98,7 +98,6 @@ def test_points_are_surface_in_wall_frame(opened: Open) -> None:
     with opened(WallCamera(1)) as stream:
         seen = next(stream)
     box = stream.rig.object_box
-    assert box is not None
     assert (seen.points_m.shape, seen.points_m.dtype) == ((64 * 32, 3), np.float32)
     middle_x_m, pitch_y_m = (box.x_min_m + box.x_max_m) / 2, (box.y_max_m - box.y_min_m) / 64
     assert seen.points_m[:, 0].min() > box.x_min_m

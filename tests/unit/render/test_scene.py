@@ -43,7 +43,6 @@ def test_scene_has_patches_where_an_object_is() -> None:
     for empty in (Scene(RIG), Scene(load_rig("bare-wall")), Scene(RIG, np.full((8, 8), np.nan, np.float32))):
         assert empty.patches is None
     touching = Scene(RIG, _depth(0.0)).patches
-    assert touching is not None
     assert len(touching.beta) == 12
 
 
@@ -80,9 +79,6 @@ def test_brdf_range_holds_the_lobe() -> None:
 
 
 BOX = load_rig("paper-rig").object_box
-
-assert BOX is not None
-
 PITCH = 0.25 / 64
 
 

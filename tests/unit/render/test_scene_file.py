@@ -117,7 +117,6 @@ def test_checksum_ignores_name_and_sensor_except_the_pulse() -> None:
     scene = paper_scene()
     same = scene.model_copy(update={"name": "other", "sensor": SensorModel(shot_noise=0)})
     assert same.checksum == scene.checksum
-    assert scene.hidden is not None
     others = [
         scene.model_copy(update={"motion": Motion(poses=91)}),
         scene.model_copy(update={"hidden": scene.hidden.model_copy(update={"x_m": 0.001})}),
@@ -143,7 +142,6 @@ def test_material_and_radiometry_reach_the_scene(tmp_path: Path) -> None:
 
 def test_paper_scene_moves_between_frames_and_is_not_trained_on() -> None:
     scene = paper_scene()
-    assert scene.hidden is not None
     assert scene.hidden.seed >= 20_000_000
     poses = [scene.pose_at(scene.hidden, number) for number in (3, 3.5, 4)]
     assert poses[0].x_m < poses[1].x_m < poses[2].x_m
@@ -161,7 +159,6 @@ def test_paper_scene_stays_in_its_box() -> None:
     scene = paper_scene()
     for number in range(0, scene.poses, 3):
         depth = scene.scene_at(number).object_depth_m
-        assert depth is not None
         assert np.isnan(np.concatenate([depth[0], depth[-1], depth[:, 0], depth[:, -1]])).all()
 
 
@@ -202,7 +199,6 @@ def test_mesh_path_is_relative_to_the_scene(tmp_path: Path, monkeypatch: pytest.
     path = _wedge(tmp_path)
     monkeypatch.chdir(tmp_path.parent)
     scene = _load(tmp_path, WEDGE)
-    assert scene.hidden is not None
     assert scene.hidden.file == read_mesh(path)
     assert scene.shows_at(0)
 
