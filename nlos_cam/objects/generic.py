@@ -10,7 +10,6 @@ from itertools import pairwise
 import numpy as np
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
-from trimesh.transformations import quaternion_matrix, rotation_matrix
 
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import orthographic_depth
@@ -26,6 +25,8 @@ MIN_PIXELS = 40
 
 def _turn(generator: Generator) -> Float64:
     """Return a rotation (3, 3), uniform over all of them: a normalised Gaussian quaternion."""
+    from trimesh.transformations import quaternion_matrix
+
     return np.asarray(quaternion_matrix(generator.standard_normal(4)))[:3, :3]
 
 
@@ -116,6 +117,8 @@ def blobs(generator: Generator) -> Float64:
 
 def plates(generator: Generator) -> Float64:
     """Build one to three thin plates, whole, pierced or open like a frame, tilted up to 60 degrees."""
+    from trimesh.transformations import rotation_matrix
+
     parts = list[Float64]()
     for _ in range(int(generator.integers(1, 4))):
         width, height = generator.uniform(0.25, 1.0, 2).tolist()

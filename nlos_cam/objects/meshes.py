@@ -3,6 +3,8 @@
 Mesh files are simplified before trimesh parses them, so that none of its optional packages is needed.
 """
 
+from __future__ import annotations
+
 import hashlib
 import logging
 import re
@@ -13,10 +15,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
-import trimesh
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
 
@@ -24,6 +25,9 @@ from nlos_cam.errors import SceneError, SceneFileError
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import orthographic_depth
 from nlos_cam.objects.placement import place, random_pose
+
+if TYPE_CHECKING:
+    import trimesh
 
 _PLAIN = bytes(range(128)).replace(b"\t", b" ") + b"?" * 128
 """Translation of bytes: tab to blank, non-ASCII (only in names and comments) to "?"."""
@@ -189,6 +193,8 @@ def _strict() -> Generator[None]:
 
 def _parts(content: bytes, suffix: str) -> list[trimesh.Trimesh]:
     """Return every mesh in a file, unprocessed. From a stream, trimesh cannot search for materials and textures."""
+    import trimesh
+
     with _strict():
         stream = BytesIO(plain(content, suffix))
         scene = trimesh.load_scene(stream, suffix[1:], process=False, fix_texture=False)

@@ -7,7 +7,6 @@ from math import radians
 import numpy as np
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
-from trimesh.transformations import euler_matrix
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import OBJECT_PIXELS
@@ -107,6 +106,8 @@ def invisible_object_error(label: str, box: ObjectBox) -> SceneError:
 
 def _turn_and_scale(triangles: Float64, pose: Pose) -> Float64:
     """Return the corners (3 n, 3), turned and scaled about their middle."""
+    from trimesh.transformations import euler_matrix
+
     turn = euler_matrix(pose.tilt_x_rad, pose.tilt_y_rad, pose.turn_z_rad)[:3, :3]
     points = triangles.reshape(-1, 3) @ turn.T
     points = points - (points.min(0) + points.max(0)) / 2

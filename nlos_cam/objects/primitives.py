@@ -1,13 +1,14 @@
-"""Primitive solids of the object generators, as triangles (n, 3, 3): y is up, the wall lies towards -z."""
+"""Primitive solids of the object generators, as triangles (n, 3, 3): y is up, the wall lies towards -z.
+
+trimesh takes longer to import than all else here, and no camera needs it: its users import it when they run.
+"""
 
 from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-import trimesh
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
-from trimesh import transformations
 
 SECTIONS = 28
 """Facets of a full turn."""
@@ -22,7 +23,9 @@ def at(triangles: Float64, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Fl
 
 def turned(triangles: Float64, axis: Sequence[float], angle_deg: float) -> Float64:
     """Return the solid turned about an axis through the origin."""
-    turn = np.asarray(transformations.rotation_matrix(np.radians(angle_deg), axis))
+    from trimesh.transformations import rotation_matrix
+
+    turn = np.asarray(rotation_matrix(np.radians(angle_deg), axis))
     return triangles @ turn[:3, :3].T
 
 
@@ -131,12 +134,16 @@ def frame(width: float, height: float, border: float, thickness: float) -> Float
 
 @cache
 def _unit_box() -> Float64:
-    return np.asarray(trimesh.creation.box().triangles, np.float64)
+    from trimesh import creation
+
+    return np.asarray(creation.box().triangles, np.float64)
 
 
 @cache
 def _unit_sphere(subdivisions: int) -> Float64:
-    return np.asarray(trimesh.creation.icosphere(subdivisions).triangles, np.float64)
+    from trimesh import creation
+
+    return np.asarray(creation.icosphere(subdivisions).triangles, np.float64)
 
 
 def _grid_surface(points: NDArray[np.float64]) -> Float64:
