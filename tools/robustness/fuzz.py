@@ -43,8 +43,9 @@ from nlos_cam.files import atomic_file
 
 DOCS = Path(__file__).parents[2] / "docs"
 GROUPS = "light", "torch"
-MEMORY_BYTES, TIMEOUT_S, WALL_TIMEOUT_S = 1 << 30, 30.0, 600.0
-"""Memory of a case with the loaded program; its processor time; and its time on the clock of a busy machine."""
+MEMORY_BYTES, TIMEOUT_S, WALL_TIMEOUT_S, STILL_S = 1 << 30, 30.0, 600.0, 0.5
+"""Memory of a case with the loaded program; its processor time; and the time on the clock of a busy machine in which it
+spends less than STILL_S of processor time where it waits for ever."""
 OURS = NlosCamError, CalibrationError, ModelError
 MAX_KEPT_BYTES = 20_000
 GOOD = "done", "refused"
@@ -81,8 +82,7 @@ def judge(action: Callable[[], None], memory_bytes: int = MEMORY_BYTES, timeout_
         finally:
             os._exit(0)
     os.close(write_end)
-    is_late = not select.select([read_end], [], [], WALL_TIMEOUT_S if timeout_s >= TIMEOUT_S else timeout_s)[0]
-    if is_late:
+    if is_late := _stands_still(pid, read_end, WALL_TIMEOUT_S if timeout_s >= TIMEOUT_S else timeout_s):
         os.kill(pid, signal.SIGKILL)
     answer = b"".join(iter(partial(os.read, read_end, 1 << 16), b""))
     os.close(read_end)
@@ -94,6 +94,17 @@ def judge(action: Callable[[], None], memory_bytes: int = MEMORY_BYTES, timeout_
         return Verdict("crash", f"exit code {os.waitstatus_to_exitcode(status)}", mib, cpu_s)
     kind, details, modules = json.loads(answer)
     return Verdict(kind, details, mib, cpu_s, tuple(modules))
+
+
+def _stands_still(pid: int, answer: int, wall_s: float) -> bool:
+    """Wait for a process's answer; return True where it spends no processor time for so long on the clock."""
+    spent_s = -STILL_S
+    while not select.select([answer], [], [], wall_s)[0]:
+        ticks = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[11:13]
+        if (now_s := sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")) < spent_s + STILL_S:
+            return True
+        spent_s = now_s
+    return False
 
 
 def _end_of(action: Callable[[], None]) -> tuple[str, str]:

@@ -1,36 +1,35 @@
-"""Captures of the simulated camera, killed at random moments and repaired: docs/kills.json (arguments: count, seed).
+"""Captures of the simulated camera, killed at random moments and repaired: docs/kills.json.
 
-Chunks and frames on disk are counted by a reader of its own, which knows only the framing of the format. Exits with 1
-where a chunk was lost, or a frame differs from the camera's.
+`kill_captures.py [--kills N] [--seed S] [--out FILE]`. Chunks and frames on disk are counted by a reader of its own,
+which knows only the framing of the format. A second call resumes. Exits with 1 where a chunk was lost, or a frame
+differs from the camera's.
 """
 
 import hashlib
-import json
 import re
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from random import Random
 from typing import Protocol
 
 import lz4.frame
 import numpy as np
-from processes import PROGRAM
+from trials import Forked, Results, Row, empty_folder, in_fork, load_program, options
 
 from nlos_cam.camera import open_world
 from nlos_cam.errors import RecordingError
-from nlos_cam.evaluate import machine
 from nlos_cam.recording import BagReader, SdkReplayCamera, repair_recording
 from nlos_cam.render import SensedImages
 
-DOCS = Path(__file__).parents[2] / "docs"
-CAMERA, LONGEST_S = "sim:bare-wall", 6.0
-START_TIMEOUT_S = 120.0
+CAMERA, LONGEST_S = "sim:bare-wall", 3.0
+START_TIMEOUT_S = 1800.0
 FIRST_CHUNK_AT = 4117
 STREAM = re.compile(rb"(?s)conn=(.{4})\x04\x00\x00\x00op=\x07.{4}topic=[^\n]{0,80}?/(\w+)_0/image/data")
 MESSAGE = re.compile(rb"(?s)conn=(.{4})\x04\x00\x00\x00op=\x02")
@@ -68,26 +67,21 @@ class Kill:
         return kept and whole and self.frames_wrong == 0
 
 
-def capture_command(path: Path) -> list[str]:
-    """Return the command of a capture that lasts longer than any kill waits."""
-    return [*PROGRAM, "capture", "--camera", CAMERA, "--seconds", str(10 * LONGEST_S), "--out", str(path)]
-
-
-def kill(command: list[str], path: Path, after_s: float) -> None:
-    """Start a capture, and kill it `after_s` after its recording begins. Raises RuntimeError if it ends before."""
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        try:
-            deadline_s = time.monotonic() + START_TIMEOUT_S
-            while not (path.exists() and path.stat().st_size) and time.monotonic() < deadline_s:
-                if process.poll() is not None:
-                    break
-                time.sleep(0.01)
-            else:
-                time.sleep(after_s)
+def kill(process: "subprocess.Popen[bytes] | Forked", path: Path, after_s: float) -> None:
+    """Kill a capture `after_s` after its recording begins. Raises RuntimeError if it ended before."""
+    try:
+        deadline_s = time.monotonic() + START_TIMEOUT_S
+        while not (path.exists() and path.stat().st_size) and time.monotonic() < deadline_s:
             if process.poll() is not None:
-                raise RuntimeError(f"the capture ended by itself, with exit code {process.returncode}")
-        finally:
-            process.kill()
+                break
+            time.sleep(0.01)
+        else:
+            time.sleep(after_s)
+        if (code := process.poll()) is not None:
+            raise RuntimeError(f"the capture ended by itself, with exit code {code}")
+    finally:
+        process.kill()
+        process.wait()
 
 
 def chunks_in(path: Path) -> Iterator[bytes]:
@@ -145,34 +139,29 @@ def examine(path: Path, after_s: float, world: World) -> Kill:
     return Kill(after_s, size, len(on_disk), frames, recovered_chunks, recovered, shown, wrong, repair_s)
 
 
-def summary(kills: list[Kill]) -> str:
-    """Return a table with one line per kill."""
-    rows = ["after s   MB on disk   chunks   recovered   frames on disk   recovered   played   wrong"]
-    for each in kills:
-        counts = [min(frames.values()) for frames in (each.frames_on_disk, each.frames_recovered, each.frames_played)]
-        rows.append(
-            f"{each.after_s:7.2f}   {each.file_bytes / 1e6:10.1f}   {each.chunks_on_disk:6}   "
-            f"{each.chunks_recovered:9}   {counts[0]:14}   {counts[1]:9}   {counts[2]:6}   {each.frames_wrong:5}"
-        )
-    return "\n".join(rows)
+def trial(random: Random) -> Row:
+    """Kill a capture at a random moment, repair and examine its recording."""
+    after_s = random.uniform(0, LONGEST_S)
+    with empty_folder() as folder:
+        path = folder / "killed.bag"
+        command = ["capture", "--camera", CAMERA, "--seconds", str(100 * LONGEST_S), "--out", str(path)]
+        kill(Forked(command, folder, folder.with_name("said")), path, after_s)
+        found = in_fork(partial(_examined, path, after_s))
+    return {**asdict(found), "wrong": "" if found.good else "not every chunk, or another frame"}
 
 
-def main() -> None:
-    """Kill, write, print."""
-    count, seed = (int(sys.argv[i]) if len(sys.argv) > i else default for i, default in ((1, 20), (2, 0)))
-    world, kills = open_world(CAMERA.removeprefix("sim:")), list[Kill]()
-    for after_s in np.random.default_rng(seed).uniform(0, LONGEST_S, count):
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "killed.bag"
-            kill(capture_command(path), path, after_s)
-            kills.append(examine(path, float(after_s), world))
-    good = sum(each.good for each in kills)
-    result = {"machine": machine(), "camera": CAMERA, "seed": seed, "good": good, "kills": [asdict(k) for k in kills]}
-    (DOCS / "kills.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    print(summary(kills))
-    print(f"{good} of {count} kills: every whole chunk recovered, every frame played and as it was")
-    sys.exit(0 if good == count else 1)
+def _examined(path: Path, after_s: float) -> Kill:
+    return examine(path, after_s, open_world(CAMERA.removeprefix("sim:")))
+
+
+def main() -> int:
+    """Kill, and write after each; return 1 after a finding."""
+    chosen = options(__doc__, "kills.json", kills=100).parse_args()
+    load_program()
+    results = Results(chosen.out, chosen.seed)
+    results.repeat("capture", "kills", chosen.kills, trial)
+    return int(bool(results.findings))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,191 +1,187 @@
 """Commands killed at random moments, and pairs of them started at once on one output: docs/kill_commands.json.
 
 `kill_commands.py [--kills N] [--races N] [--seed S] [--only NAME] [--out FILE]`. After each kill the same command runs
-again: it has to end well, nothing half-written may be accepted, and nothing may be left over. Of two commands on one
-output one has to win, and the other to name the reason in a line. A second call resumes. Exits with 1 after a finding.
+again: it has to end well, nothing half-written may be accepted, and nothing may be left over, no process either. Of two
+commands on one output one has to win, and the other to name the reason in a line. A second call resumes. Exits with 1
+after a finding.
 """
 
-import argparse
 import json
-import random
-import subprocess
+import re
+import signal
 import sys
-import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
+from http.client import HTTPConnection
 from pathlib import Path
-from typing import Any
+from random import Random
 
-from noise_recordings import record
-from processes import PROGRAM
+from processes import children_of, session_of
+from trials import (
+    COMMANDS,
+    TIMEOUT_S,
+    Command,
+    Forked,
+    Results,
+    Row,
+    check_session,
+    duration_s,
+    empty_folder,
+    finish,
+    in_fork,
+    inputs_of,
+    leftovers,
+    load_program,
+    options,
+    problem_of,
+    started,
+)
 
-from nlos_cam.dataset import open_dataset
-from nlos_cam.evaluate import machine
-from nlos_cam.recording import load_sidecar, verify
-from nlos_cam.view import RecordedView
+from nlos_cam.cli.common import INTERRUPTED
 
-DOCS = Path(__file__).parents[2] / "docs"
-TIMEOUT_S = 900.0
 REASONS = "being written", "exists", "in use"
 """Words of the line in which the second of two commands says why it does not run."""
+NOT_KILLED, NOT_RACED = {"cache", "port", "capture"}, {"save session"}
+"""Commands of the other kind alone; kill_captures.py kills captures."""
+GRACE_S, EARLIER = 120.0, 0.7
+"""Time for a killed command's processes to end, here; factor of a moment that came after the command's end."""
+PAGE = Command("live sim:bare-wall", "", lambda path, _: path.stat())
+ADDRESS = re.compile(r"http://127\.0\.0\.1:(\d+)/#([\w-]+)")
+SAVING_S = 2.0
 
 
-@dataclass(frozen=True)
-class Command:
-    """Command line, its output, and the check of that.
-
-    {folder} stands for an empty folder, {bag} for a recording, and {recipe} for a small recipe.
-    """
-
-    arguments: str
-    output: str
-    is_whole: Callable[[Path], object]
-    again: str = "--overwrite"
-    """Option of the run after the kill."""
-
-
-def _folder(*names: str) -> Callable[[Path], object]:
-    return lambda path: [(path / name).read_bytes()[0] for name in names]
-
-
-def _capture(path: Path) -> object:
-    return verify(path), load_sidecar(path.with_suffix(".json"))
-
-
-def _session(path: Path) -> object:
-    with RecordedView(path) as view:
-        return view.address
+def kill_once(command: Command, inputs: Path, random: Random) -> Row:
+    """Kill a command at a random moment, run it again, and return what is wrong."""
+    after_s, was_killed = random.uniform(0, duration_s(command, inputs)), False
+    while not was_killed:
+        with empty_folder() as folder:
+            with started(command, folder, inputs) as process:
+                time.sleep(after_s)
+                children = children_of(process.pid) if process.poll() is None else []
+            was_killed, output = process.wait() == -signal.SIGKILL, folder / command.output
+            if not was_killed:
+                after_s *= EARLIER
+                continue
+            wrong, parts = survivors(children), len(leftovers(folder))
+            if output.exists() and command.is_atomic:
+                wrong = wrong or problem_of(command, folder, inputs)
+            again = finish(command, folder, inputs, *([command.again] if output.exists() and command.again else []))
+            if again.poll():
+                wrong = wrong or f"the next run ends with {again.poll()}: {again.said[-300:]}"
+            wrong = wrong or problem_of(command, folder, inputs) or ", ".join(leftovers(folder))
+    return {"after_s": round(after_s, 3), "parts_left": parts, "wrong": wrong}
 
 
-RECIPE = """task = "vae"
-objects = 8
-held_out = 4
-epochs = 3
-batch = 4
-learning_rate = 1e-3
-"""
-COMMANDS = {
-    "capture": Command("capture sim:bare-wall --frames 30 --out {folder}/a.bag", "a.bag", _capture),
-    "export": Command("export {bag} --out {folder}/out", "out", _folder("export.json", "depth.csv")),
-    "repair": Command("repair {bag} --out {folder}/a.bag", "a.bag", verify),
-    "replay": Command("replay {bag} --out {folder}/out", "out", _folder("report.md")),
-    "save session": Command("live sim:bare-wall --no-view --seconds 2 --save-view {folder}/a.html", "a.html", _session),
-    "train": Command(
-        "train vae --recipe {recipe} --out {folder}/run", "run", _folder("checkpoint.json", "SHA256SUMS"), again=""
-    ),
-    "port": Command("live sim:bare-wall --view-port 18765 --seconds 8", ".", Path.exists, again=""),
-    "render": Command("render cup --out {folder}/a.npz", "a.npz", lambda path: path.read_bytes()[0]),
-    "dataset build": Command(
-        "dataset build --count 4 --workers 1 --accuracy draft --out {folder}/data",
-        "data",
-        lambda path: open_dataset(path).column("seed"),
-        again="",
-    ),
-}
+def survivors(children: list[int]) -> str:
+    """Return which processes of a killed command run on; empty if they end."""
+    deadline_s = time.monotonic() + GRACE_S
+    while (left := [each for each in children if session_of(each) is not None]) and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    return f"{len(left)} of its processes run on" if left else ""
 
 
-def line_of(command: Command, folder: Path, bag: Path, *options: str) -> list[str]:
-    """Return a command's process arguments."""
-    return [
-        *PROGRAM,
-        *command.arguments.format(folder=folder, bag=bag, recipe=bag.with_name("small.toml")).split(),
-        *options,
-    ]
+def race_once(command: Command, inputs: Path, random: Random) -> Row:
+    """Start two commands on one output, and return the exit codes and what is wrong."""
+    apart_s = random.uniform(0, 0.3 if command.endless else 0.6 * duration_s(command, inputs))
+    with empty_folder() as folder, started(command, folder, inputs) as first:
+        time.sleep(apart_s)
+        with started(command, folder, inputs, name="second") as second:
+            if command.endless:
+                end_winner([first, second])
+            codes = sorted(process.wait() for process in (first, second))
+            wrong = problem_of(command, folder, inputs) or ", ".join(leftovers(folder))
+            wanted = [1, INTERRUPTED] if command.endless else [0, 1]
+            if codes != wanted and not (command.both_may_win and codes == [0, 0]):
+                wrong = wrong or f"exit codes {codes}: {first.said[-300:]} {second.said[-300:]}"
+            for loser in (process for process in (first, second) if process.poll() == 1):
+                if "Traceback" in loser.said or not any(reason in loser.said for reason in REASONS):
+                    wrong = wrong or f"no line that says so: {loser.said[-300:]}"
+    return {"apart_s": round(apart_s, 3), "codes": codes, "wrong": wrong}
 
 
-def leftovers(folder: Path) -> list[str]:
-    """Return what no finished command leaves."""
-    return [str(path.relative_to(folder)) for path in folder.rglob("*") if path.name.endswith(".part")]
+def end_winner(processes: list[Forked]) -> None:
+    """Wait until one process has ended and the other serves its view, and end that."""
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while time.monotonic() < deadline_s and all(process.poll() is None for process in processes):
+        time.sleep(0.02)
+    for process in processes:
+        if process.poll() is None:
+            address_of(process)
+            process.terminate()
 
 
-def kill_once(command: Command, bag: Path, after_s: float) -> dict[str, Any]:
-    """Kill a command after a time, run it again, and return what is wrong."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        process = subprocess.Popen(line_of(command, folder, bag), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            process.wait(after_s)
-        except subprocess.TimeoutExpired:
-            process.kill()
-        was_killed, output = process.wait() < 0, folder / command.output
-        wrong = ""
-        if output.exists() and not command.arguments.startswith(("capture", "dataset", "train")):
-            wrong = problem_of(command, output)  # under its final name it has to be whole
-        options = [command.again] if output.exists() and command.again else []
-        again = subprocess.run(
-            line_of(command, folder, bag, *options), capture_output=True, text=True, timeout=TIMEOUT_S, check=False
-        )
-        wrong = wrong or (
-            f"the next run ends with {again.returncode}: {again.stderr[-200:]}" if again.returncode else ""
-        )
-        wrong = wrong or problem_of(command, output) or ", ".join(leftovers(folder))
-    return {"after_s": round(after_s, 2), "killed": was_killed, "wrong": wrong}
+def address_of(process: Forked) -> tuple[int, str]:
+    """Return port and token of a live view, once it prints them. Raises TimeoutError."""
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while time.monotonic() < deadline_s and process.poll() is None:
+        if found := ADDRESS.search(process.said):
+            return int(found[1]), found[2]
+        time.sleep(0.02)
+    raise TimeoutError(f"no view: {process.said[-300:]}")
 
 
-def problem_of(command: Command, output: Path) -> str:
-    """Return why an output is not whole; empty if it is."""
+def ask(process: Forked, command: str) -> str:
+    """Send a command as the page does, until it is accepted; return the answer."""
+    port, token = address_of(process)
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while time.monotonic() < deadline_s:
+        connection = HTTPConnection("127.0.0.1", port, timeout=60.0)
+        connection.request("POST", "/command", json.dumps({"command": command}), {"X-Token": token})
+        answer = connection.getresponse()
+        said = answer.read().decode()
+        connection.close()
+        if answer.status == 200:
+            return said
+        time.sleep(0.1)
+    raise TimeoutError(f"{command}: {said}")
+
+
+def kill_page(inputs: Path, random: Random) -> Row:
+    """Kill a live run while its page saves a session; the file has to play, and the next run to save a whole one."""
+    after_s, wrong = random.uniform(0, SAVING_S), ""
+    with empty_folder() as folder:
+        with started(PAGE, folder, inputs) as process:
+            ask(process, "save_session")
+            time.sleep(after_s)
+            children = children_of(process.pid)
+        wrong = survivors(children)
+        content = next(folder.glob("session-*.html")).read_bytes()
+        with started(PAGE, folder, inputs, name="next") as process:
+            ask(process, "save_session")
+            ask(process, "end_session")
+            process.terminate()
+            if (code := process.wait()) != INTERRUPTED:
+                wrong = wrong or f"the next run ends with {code}: {process.said[-300:]}"
+        whole = max(folder.glob("session-*.html")).read_bytes()
+        wrong = wrong or in_fork(lambda: _unplayable(content, "of the killed run") or _unplayable(whole, "after it"))
+        wrong = wrong or ", ".join(leftovers(folder))
+    return {"after_s": round(after_s, 3), "bytes": len(content), "wrong": wrong}
+
+
+def _unplayable(content: bytes, which: str) -> str:
+    """Return why a session does not play; an empty one, of a run killed as it opened the file, is none at all."""
     try:
-        command.is_whole(output)
-    except Exception as error:  # noqa: BLE001  whatever reading it raises is the finding
-        return f"{output.name} is not whole: {error}"[:300]
+        if content:
+            check_session(content)
+    except Exception as error:  # noqa: BLE001  any error is the finding
+        return f"the session {which}: {error!r}"
     return ""
 
 
-def race_once(command: Command, bag: Path, apart_s: float) -> dict[str, Any]:
-    """Start a command twice on one output, and return the exit codes and what is wrong."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-        first = subprocess.Popen(line_of(command, folder, bag), **pipes)
-        time.sleep(apart_s)
-        second = subprocess.Popen(line_of(command, folder, bag), **pipes)
-        said = [process.communicate(timeout=TIMEOUT_S)[1] for process in (first, second)]
-        codes = sorted((first.returncode, second.returncode))
-        lines = [text for process, text in zip((first, second), said, strict=True) if process.returncode]
-        wrong = problem_of(command, folder / command.output) or ", ".join(leftovers(folder))
-        is_build = command.again == ""
-        if codes not in ([0, 1], *([[0, 0]] if is_build else [])):
-            wrong = wrong or f"exit codes {codes}: {said}"
-        if any("Traceback" in text or not any(reason in text for reason in REASONS) for text in lines):
-            wrong = wrong or f"no line that says so: {lines}"
-    return {"apart_s": round(apart_s, 2), "codes": codes, "wrong": wrong}
-
-
-def duration_s(command: Command, bag: Path) -> float:
-    """Return how long the command takes here."""
-    with tempfile.TemporaryDirectory() as name:
-        start_s = time.monotonic()
-        subprocess.run(line_of(command, Path(name), bag), check=True, capture_output=True, timeout=TIMEOUT_S)
-        return time.monotonic() - start_s
-
-
 def main() -> int:
-    """Kill, race, write after each command; return 1 after a finding."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=30)
-    parser.add_argument("--races", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="only commands with this in their name")
-    parser.add_argument("--out", type=Path, default=DOCS / "kill_commands.json")
-    chosen = parser.parse_args()
-    result = json.loads(chosen.out.read_text(encoding="utf-8")) if chosen.out.exists() else {"machine": machine()}
-    with tempfile.TemporaryDirectory() as folder:
-        bag = record(Path(folder) / "noise.bag", packed=True, frames=8)
-        bag.with_name("small.toml").write_text(RECIPE, encoding="utf-8")
+    """Kill, race, write after each trial; return 1 after a finding."""
+    chosen = options(__doc__, "kill_commands.json", kills=30, races=50).parse_args()
+    load_program()
+    results = Results(chosen.out, chosen.seed)
+    with inputs_of(chosen) as inputs:
         for name, command in COMMANDS.items():
-            if chosen.only not in name:
-                continue
-            done = result.setdefault(name, {"kills": [], "races": []})
-            takes_s = duration_s(command, bag)
-            for kind, count, act in (("kills", chosen.kills, kill_once), ("races", chosen.races, race_once)):
-                for number in range(len(done[kind]), count):
-                    moment = random.Random(f"{chosen.seed} {name} {number}").uniform(0, takes_s)  # noqa: S311
-                    done[kind].append(act(command, bag, moment if kind == "kills" else 0.3 * moment))
-                    print(name, kind, number, done[kind][-1], flush=True)
-                    chosen.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    rows = [row for name in COMMANDS for kind in ("kills", "races") for row in result.get(name, {}).get(kind, [])]
-    return int(any(row["wrong"] for row in rows))
+            if chosen.only in name and name not in NOT_KILLED:
+                results.repeat(name, "kills", chosen.kills, partial(kill_once, command, inputs))
+            if chosen.only in name and name not in NOT_RACED:
+                results.repeat(name, "races", chosen.races, partial(race_once, command, inputs))
+        if chosen.only in "page session":
+            results.repeat("page session", "kills", chosen.kills, partial(kill_page, inputs))
+    return int(bool(results.findings))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,16 @@
 """Attacks of tools/robustness: they notice what they look for."""
 
+import struct
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 from types import ModuleType
 
 import pytest
+
+from nlos_cam.view.messages import pack
+from nlos_cam.view.session_file import element, page_html
 
 Tool = Callable[[str], ModuleType]
 
@@ -28,7 +33,7 @@ def test_starved_command_that_ends_badly_is_noticed(
     tool: Tool, tmp_path: Path, code: int, said: str, wrong: str
 ) -> None:
     starve = tool("starve_commands")
-    found = starve.wrong_with(starve.COMMANDS["render"], tmp_path, ended(code, said))
+    found = starve.wrong_with(starve.COMMANDS["render"], tmp_path, tmp_path, ended(code, said))
     assert wrong in found
     assert bool(found) == bool(wrong)
 
@@ -36,10 +41,10 @@ def test_starved_command_that_ends_badly_is_noticed(
 def test_starved_command_that_leaves_parts_is_noticed(tool: Tool, tmp_path: Path) -> None:
     starve = tool("starve_commands")
     (tmp_path / ".a.npz.part").mkdir()
-    assert ".a.npz.part" in starve.wrong_with(starve.COMMANDS["render"], tmp_path, ended(1, "error: full"))
+    assert ".a.npz.part" in starve.wrong_with(starve.COMMANDS["render"], tmp_path, tmp_path, ended(1, "error: full"))
     (tmp_path / ".a.npz.part").rmdir()
     (tmp_path / "a.npz").touch()
-    assert "not whole" in starve.wrong_with(starve.COMMANDS["render"], tmp_path, ended(1, "error: full"))
+    assert "not whole" in starve.wrong_with(starve.COMMANDS["render"], tmp_path, tmp_path, ended(1, "error: full"))
 
 
 def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
@@ -55,3 +60,41 @@ def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
 
 def test_page_that_nobody_serves_is_not_served(tool: Tool) -> None:
     assert tool("attack_view").page_ms("http://127.0.0.1:9/") is None
+
+
+def test_trials_resume_and_a_failed_one_is_a_finding(tool: Tool, tmp_path: Path) -> None:
+    trials, drawn = tool("trials"), list[float]()
+
+    def trial(random: Random) -> dict[str, str]:
+        drawn.append(random.random())
+        if len(drawn) == 3:
+            raise TimeoutError("it never ends")
+        return {"wrong": ""}
+
+    trials.Results(tmp_path / "a.json", 0).repeat("render", "kills", 2, trial)
+    results = trials.Results(tmp_path / "a.json", 0)
+    results.repeat("render", "kills", 4, trial)
+    assert len(set(drawn)) == len(results.facts["render"]["kills"]) == 4
+    assert [row["wrong"] for row in results.findings] == ["TimeoutError('it never ends')"]
+
+
+def test_session_that_does_not_play_is_noticed(tool: Tool) -> None:
+    trials, messages = tool("trials"), [pack({"kind": "bench"}), pack({"kind": "chunk"})]
+    whole = page_html("session").encode() + b"".join(map(element, messages))
+    assert trials.check_session(whole) == 2
+    assert trials.check_session(whole[:-12]) == 1
+    for bad in (b"", page_html("session").encode()):
+        with pytest.raises(ValueError, match="no saved session"):
+            trials.check_session(bad)
+    with pytest.raises(struct.error):
+        trials.check_session(whole.replace(element(messages[0]), element(b"bad")))
+
+
+def test_processes_of_a_killed_command_that_run_on_are_noticed(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    kills = tool("kill_commands")
+    monkeypatch.setattr(kills, "GRACE_S", 0.1)
+    with subprocess.Popen(["/bin/sleep", "60"]) as process:
+        assert "1 of its processes" in kills.survivors([process.pid])
+        process.kill()
+        process.wait()
+    assert not kills.survivors([process.pid])

@@ -1,5 +1,6 @@
 """Killed captures, with a small world in place of the wall."""
 
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -28,12 +29,12 @@ def test_every_chunk_of_a_killed_capture_is_recovered(
     kills: ModuleType, noise_world: Any, tmp_path: Path, after_s: float
 ) -> None:
     path = tmp_path / "killed.bag"
-    kills.kill([sys.executable, "-c", CAPTURE, str(Path(__file__).parents[2]), str(path)], path, after_s)
+    command = [sys.executable, "-c", CAPTURE, str(Path(__file__).parents[2]), str(path)]
+    kills.kill(subprocess.Popen(command), path, after_s)
     found = kills.examine(path, after_s, noise_world())
     assert found.good
     assert found.chunks_on_disk == found.chunks_recovered > 0
     assert min(found.frames_on_disk.values()) > 40
-    assert str(found.chunks_on_disk) in kills.summary([found])
 
 
 def test_the_count_of_what_is_on_disk_is_that_of_a_whole_recording(
