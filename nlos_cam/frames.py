@@ -10,6 +10,8 @@ from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float32, Int32
 from numpy.typing import NDArray
 
+from nlos_cam.kernels import inner
+
 MAP_ROWS, MAP_COLUMNS = 64, 80
 OBJECT_PIXELS = 64
 WINNER_SPREAD_M = 0.01
@@ -65,7 +67,7 @@ NO_SAMPLE = np.int32(0x7FFFFFFF)
 INFINITE_BITS = np.int32(0x7F800000)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _gather(depth_bits: Int32, ir: NDArray[np.uint8], bits: Int32, counts: NDArray[np.uint8]) -> np.int32:
     """Copy one cell's samples to `bits` and `counts`; return how many are valid (not NaN, 0, negative or infinite)."""
     valid, k = np.int32(0), 0
@@ -79,7 +81,7 @@ def _gather(depth_bits: Int32, ir: NDArray[np.uint8], bits: Int32, counts: NDArr
     return valid
 
 
-@numba.njit(cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _two_from(bits: Int32, rank: np.int32) -> tuple[np.int32, np.int32]:
     """Return the bits of the samples of this rank (0 is the smallest) and the next one."""
     # Bisection between the smallest and the largest valid sample, without sorting: count the samples up to the middle.
@@ -110,7 +112,7 @@ def _two_from(bits: Int32, rank: np.int32) -> tuple[np.int32, np.int32]:
     return low, low if up_to > rank + 1 else above
 
 
-@numba.njit(cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _mean_near(bits: Int32, depth_m: Float32, counts: NDArray[np.uint8], median_m: Real, spread_m: Real) -> np.floating:
     """Return the mean count of the samples within `spread_m` of the median; NaN without any."""
     total, near = np.int32(0), np.int32(0)
@@ -121,7 +123,7 @@ def _mean_near(bits: Int32, depth_m: Float32, counts: NDArray[np.uint8], median_
     return np.float32(total) / np.float32(near)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def reduce_cell(
     bits: Int32, samples_m: Float32, counts: NDArray[np.uint8], valid: np.int32, middle: Int32, middle_m: Float32
 ) -> tuple[Real, Real]:
@@ -133,7 +135,17 @@ def reduce_cell(
     depth = middle_m[0] if valid % 2 else (middle_m[0] + middle_m[1]) / np.float32(2.0)
     mean = _mean_near(bits, samples_m, counts, depth, np.float32(WINNER_SPREAD_M))
     # the two middle samples may be of two echoes, with no sample near their mean: take all valid ones then
-    return depth, mean if mean == mean else _mean_near(bits, samples_m, counts, 0.0, np.inf)  # noqa: PLR0124  NaN
+    return depth, mean if mean == mean else _mean_near(bits, samples_m, counts, np.float32(0), np.float32(np.inf))  # noqa: PLR0124  NaN
+
+
+Scratch = tuple[Int32, Float32, Int32, Float32, NDArray[np.uint8]]
+"""Memory for the samples of one cell: bits and the same as depths, those of the two in the middle, and counts."""
+
+
+def scratch_memory(samples: int) -> Scratch:
+    """Return memory for cells of up to that many samples; compiled functions compile what they allocate."""
+    bits, middle = np.empty(samples, np.int32), np.empty(2, np.int32)
+    return bits, bits.view(np.float32), middle, middle.view(np.float32), np.empty(samples, np.uint8)
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)  # so that another thread can read the next frame
@@ -142,13 +154,13 @@ def _reduce_cells(
     ir: NDArray[np.uint8],
     row_edges: NDArray[np.int64],
     column_edges: NDArray[np.int64],
-    max_samples: int,
-) -> tuple[Float32, Float32]:
-    """Return depth and intensity of every cell, NaN and 0 without valid samples."""
-    rows, columns = row_edges.size - 1, column_edges.size - 1
-    depth, intensity = np.full((rows, columns), np.nan, np.float32), np.zeros((rows, columns), np.float32)
-    bits, middle, counts = np.empty(max_samples, np.int32), np.empty(2, np.int32), np.empty(max_samples, np.uint8)
-    samples_m, middle_m = bits.view(np.float32), middle.view(np.float32)
+    scratch: Scratch,
+    depth: Float32,
+    intensity: Float32,
+) -> None:
+    """Fill in depth and intensity of every cell with valid samples."""
+    bits, samples_m, middle, middle_m, counts = scratch
+    rows, columns = depth.shape
     for i in range(rows):
         top, bottom = row_edges[i], row_edges[i + 1]
         for j in range(columns):
@@ -159,7 +171,6 @@ def _reduce_cells(
                 continue
             found = reduce_cell(bits[:n], samples_m[:n], counts[:n], valid, middle, middle_m)
             depth[i, j], intensity[i, j] = found
-    return depth, intensity
 
 
 def _edges(pixels: int, cells: int) -> NDArray[np.int64]:
@@ -173,7 +184,10 @@ def maps_from_frame(frame: Frame) -> LidarMaps:
     height, width = frame.depth_m.shape
     max_samples = ceil(height / MAP_ROWS + 1) * ceil(width / MAP_COLUMNS + 1)
     edges = _edges(height, MAP_ROWS), _edges(width, MAP_COLUMNS)
-    depth, intensity = _reduce_cells(frame.depth_m.view(np.int32), frame.ir, *edges, max_samples)
+    depth = np.full((MAP_ROWS, MAP_COLUMNS), np.nan, np.float32)
+    intensity = np.zeros((MAP_ROWS, MAP_COLUMNS), np.float32)
+    scratch = scratch_memory(max_samples)
+    _reduce_cells(frame.depth_m.view(np.int32), frame.ir, *edges, scratch, depth, intensity)
     return LidarMaps(depth, intensity, ~np.isnan(depth))
 
 

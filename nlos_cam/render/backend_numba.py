@@ -16,6 +16,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int32
 from numpy.typing import NDArray
 
+from nlos_cam.kernels import inner, int64
 from nlos_cam.render.brdf_table import nodes, scattering
 from nlos_cam.render.echoes import MultiBounce, strongest, strongest_between
 from nlos_cam.render.interreflection import add_interreflection
@@ -64,7 +65,7 @@ def returns(
     # Wall to lidar in the points' weights, patch to wall in the legs.
     geometry(legs, s, surface, relay, 0, cells, optics, field, True)
     if optics.sectors:
-        shade(legs, s, surface, relay, 0, cells, field)
+        shade(legs, s, surface, relay, int64(0), cells, field)
     shortest = np.float32(np.inf)
     for q in range(cells):
         legs.length_m[q] = (legs.length_m[q] + relay.length_m[q]) * optics.inverse_bin
@@ -72,7 +73,7 @@ def returns(
     return shortest
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=FAST)
 def _count(
     s: int,
     surface: NumbaSurface,
@@ -113,7 +114,7 @@ def sub_bins(
     patches = len(surface.x_m)
     first, histogram = np.zeros(patches, np.int32), np.zeros((patches, width * per_bin), np.float32)
     for s in numba.prange(patches):
-        first[s] = _count(s, surface, relay, optics, field, factor, per_bin, histogram[s])
+        first[s] = _count(int64(s), surface, relay, optics, field, factor, per_bin, histogram[s])
     return first, histogram
 
 
@@ -139,7 +140,7 @@ def tables(first: Int32, histogram: Float32, per_bin: int) -> NumbaTables:
     return NumbaTables(first, rows.ravel(), rest, per_bin, width)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=FAST)
 def ends(
     start: int, count: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, table: NumbaTables
 ) -> tuple[Float32, int]:
@@ -161,7 +162,7 @@ def ends(
     return near, spread + table.width + 3
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=FAST)
 def _place(
     legs: NumbaLegs, length_m: Float32, begin: Float32, strength: np.float32, first: np.float32, table: NumbaTables,
     inverse_bin: np.float32, weight: Float32, row: Float32, ahead: Float32,
@@ -183,7 +184,7 @@ def _place(
     return total, least
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=FAST)
 def _add_tile(
     start: int, count: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField,
     table: NumbaTables, begin: Float32, sums: Float32,
@@ -227,7 +228,7 @@ def _add_tile(
     return bound
 
 
-@numba.njit(cache=True)
+@inner()
 def _sum_tile(
     start: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField, table: NumbaTables,
     most: int,
@@ -272,7 +273,7 @@ def _strongest_in_window(
     sure = np.zeros(beams, np.bool_)
     for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
         start = tile * BEAM_TILE
-        begin, sums, bound = _sum_tile(start, feet, surface, optics, field, table, WINDOW)
+        begin, sums, bound = _sum_tile(start, feet, surface, optics, field, table, int64(WINDOW))
         for i in range(len(begin)):
             first = int(begin[i])
             best = strongest_between(sums[i], max(-first, 0), min(WINDOW, bins - first))

@@ -12,7 +12,7 @@ from nlos_calibration.arrays import Float64, Mask
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.brdf_table import scattering
-from nlos_cam.render.geometry import softened
+from nlos_cam.render.geometry import softened_leg
 from nlos_cam.render.interreflection import object_factors, wall_cells, wall_factors
 from nlos_cam.render.job import PatchArrays, TransportJob
 from nlos_cam.render.visibility import HeightField, occluded, visible
@@ -126,7 +126,7 @@ def _incident(spot: Float64, patches: PatchArrays, s: int, near_m: float, lamber
     to_spot = spot - patches.point_m[s]
     d2 = np.sqrt((to_spot**2).sum())
     cos_2 = (patches.normal[s] * to_spot).sum() / d2
-    incident = patches.strength[s] * cos_2 / softened(d2**2, patches.soft_m2[s], near_m)
+    incident = patches.strength[s] * cos_2 / softened_leg(d2**2, patches.soft_m2[s], near_m)
     # The rendering equation has the cosine at which the light leaves the wall too: z / d2.
     return incident * patches.point_m[s, 2] / d2 if lambertian else incident
 
@@ -142,7 +142,7 @@ def _returned(
     facing = nx * dx + ny * dy - nz * z
     squared = dx**2 + dy**2 + z**2
     d3 = np.sqrt(squared)
-    returned = cells.weight[q] * (z / d3) / softened(squared, cells.soft_m2, near_m)  # cos t3
+    returned = cells.weight[q] * (z / d3) / softened_leg(squared, cells.soft_m2, near_m)  # cos t3
     return (returned * facing / d3 if lambertian else returned), d3
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
-from nlos_cam.render.geometry import NO_OCCLUDER, Beams, Relay, softened
+from nlos_cam.render.geometry import NO_OCCLUDER, Beams, Relay, softened_leg
 from nlos_cam.render.interreflection import AROUND_M
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.patches import Patches
@@ -72,15 +72,21 @@ def survey(job: TransportJob, uneven: float) -> EnergySurvey:
     some = slice(None, None, max(len(relay.x_m) // SAMPLE_CELLS, 1))
     shape, start = (patches.point_m, patches.normal, patches.beta), job.beam_weight[lit]
     feet = job.laser_spot_m[lit, 0], job.laser_spot_m[lit, 1], start, np.zeros(len(start), np.bool_)
-    hidden = relay.behind(job.edge_m, job.lidar_m)[some]
-    cells = relay.x_m[some], relay.y_m[some], job.relay_weight[some], hidden
+    cells = relay.x_m[some], relay.y_m[some], job.relay_weight[some], relay.behind(job.edge_m, job.lidar_m)[some]
     soft_wall = np.full_like(patches.beta, job.soft_wall_m2)
-    incident = _sums(*shape, *feet, job.soft_patch_m2, job.near_m, *job.edge_m, job.lambertian, False)
-    returned = _sums(*shape, *cells, soft_wall, job.near_m, *job.edge_m, job.lambertian, True)
+    incident = _sums(*shape, *_contiguous(*feet), job.soft_patch_m2, job.near_m, *job.edge_m, job.lambertian, False)
+    returned = _sums(*shape, *_contiguous(*cells), soft_wall, job.near_m, *job.edge_m, job.lambertian, True)
     scale = job.strength / len(start)
     return EnergySurvey(
         incident[0] * scale, returned[0], incident[1] * scale, returned[1], incident[2] * scale, returned[2], uneven
     )
+
+
+def _contiguous(
+    x: Float64, y: Float64, weight: Float64, hidden: NDArray[np.bool_]
+) -> tuple[Float64, Float64, Float64, NDArray[np.bool_]]:
+    """Return points of the wall in one layout, so that `_sums` is compiled once."""
+    return np.ascontiguousarray(x), np.ascontiguousarray(y), np.ascontiguousarray(weight), np.ascontiguousarray(hidden)
 
 
 @numba.njit(cache=True, parallel=True)
@@ -116,7 +122,7 @@ def _sums(
             level = (at_wall if lambertian else (1.0 if at_wall > 0 else 0.0)) if outgoing else at_wall / beta[s]
             if outgoing or lambertian:
                 bent, level = bent * at_wall, level * at_wall
-            light = weight[w] / softened(squared, soft[s], near_m)
+            light = weight[w] / softened_leg(squared, soft[s], near_m)
             if hidden[w] or occluded(point[0], z, x[w], 0.0, edge_x, edge_z):
                 sums[2, s] += light * bent
             else:

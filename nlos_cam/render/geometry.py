@@ -4,11 +4,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, TypeVar
 
-import numba
 import numpy as np
 from nlos_calibration import DeviceConstants, Intrinsics, Rig
 from nlos_calibration.arrays import Float64, Mask
 from numpy.typing import NDArray
+
+from nlos_cam.kernels import inner
 
 NEAR_DIAGONALS = 4
 """Near contact begins at this many diagonals of the larger cell."""
@@ -29,19 +30,19 @@ def contact_m2(area_m2: Area, solid_angle: float) -> Area:
     return NEIGHBOR_GAIN * area_m2 / solid_angle
 
 
-@numba.vectorize([numba.float64(numba.float64, numba.float64, numba.float64)], cache=True)
 def softened(squared_m2: Any, soft_m2: Any, near_m: Any) -> Any:
     """Return d^2 limited at contact: plus the receiving area over the solid angle, fading out towards `near_m`.
 
     1 / d^2 from the middle of a cell is the average over the cell only from afar. On the axis of a disc of area a the
     average of 1 / d^2 is 1 / (d^2 + a / pi), so the disc never receives more than was sent. Beyond a few diagonals the
-    two agree, and S1 and S2 hold exactly. Works on arrays and in compiled loops.
+    two agree, and S1 and S2 hold exactly. For arrays; compiled loops call `softened_leg`.
     """
-    if squared_m2 >= near_m * near_m:
-        return squared_m2
     # The squared ramp goes to 0 with slope 0 at near_m: no step in light or in its derivative there.
-    ramp = 1 - squared_m2 / (near_m * near_m)
+    ramp = np.maximum(1 - squared_m2 / (near_m * near_m), 0.0)
     return squared_m2 + soft_m2 * ramp * ramp
+
+
+softened_leg: Any = inner(error_model="numpy")(softened)
 
 
 SPEED_OF_LIGHT_M_PER_S = 299_792_458.0

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int32, Int64, Mask
 
+from nlos_cam.kernels import int64
 from nlos_cam.render.geometry import NEAR_DIAGONALS, softened, solid_angle
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.legs import FAST, NumbaLegs, NumbaOptics, NumbaPoints, NumbaSurface, geometry, scratch, shade
@@ -242,7 +243,7 @@ def _legs(s: int, points: NumbaPoints, outgoing: bool, surface: NumbaSurface, op
     legs = scratch(len(points.x_m))
     geometry(legs, s, surface, points, 0, len(points.x_m), optics, field, outgoing)
     if optics.sectors:
-        shade(legs, s, surface, points, 0, len(points.x_m), field)
+        shade(legs, s, surface, points, int64(0), len(points.x_m), field)
     return legs
 
 

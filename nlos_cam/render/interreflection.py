@@ -10,7 +10,8 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
-from nlos_cam.render.geometry import contact_m2, softened
+from nlos_cam.kernels import inner
+from nlos_cam.render.geometry import contact_m2, softened_leg
 from nlos_cam.render.job import PatchArrays, TransportJob
 from nlos_cam.render.visibility import HeightField, occluded, segment_blocked, visible
 
@@ -42,11 +43,11 @@ def form_factor(
         return 0.0
     # Receiving area x cosine / (solid angle x d^2), with the strength as albedo x area; the sender's cosine is part of
     # the rendering equation only. near_m limits 1 / d^2 at contact as in S2.
-    factor = strength * cos_in / length / ((np.pi if lambertian else 2 * np.pi) * (softened(squared, soft, near_m)))
+    factor = strength * cos_in / length / ((np.pi if lambertian else 2 * np.pi) * softened_leg(squared, soft, near_m))
     return factor * cos_out / length if lambertian else factor
 
 
-@numba.njit(cache=True)
+@inner()
 def _between_patches(
     a: int, b: int, patches: PatchArrays, field: HeightField, near_m: float, lambertian: bool
 ) -> float:
@@ -100,7 +101,7 @@ def patch_to_wall(
     return there, back
 
 
-@numba.njit(cache=True)
+@inner()
 def _add(target: Float32, at: int, weight: float, source: Float32) -> None:
     """Add a histogram to another from bin `at` on, scaled."""
     start, scale = max(at, 0), np.float32(weight)

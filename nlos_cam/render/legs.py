@@ -20,6 +20,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from nlos_cam.kernels import inner
 from nlos_cam.render.visibility import HeightField, blocked
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -134,7 +135,7 @@ def geometry(
         legs.sector[i] = np.int32(face * faces + np.floor(inside))
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=FAST)
 def shade(
     legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, count: int, field: HeightField
 ) -> None:

@@ -12,12 +12,13 @@ from nlos_calibration.arrays import Float64, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
+from nlos_cam.kernels import inner
 from nlos_cam.render.geometry import Beams, Relay
 from nlos_cam.render.patches import slope_along
 from nlos_cam.render.visibility import HeightField
 
 
-@numba.njit(cache=True)
+@inner()
 def _entry(start: float, direction: float, low: float, high: float) -> tuple[float, float]:
     """Return the ray parameters at which a ray enters and leaves the slab low <= coordinate <= high."""
     # Slab test (Kay and Kajiya 1986): start + t direction = low or high. A box is the intersection of slabs, so the ray
@@ -28,7 +29,7 @@ def _entry(start: float, direction: float, low: float, high: float) -> tuple[flo
     return min(a, b), max(a, b)
 
 
-@numba.njit(cache=True)
+@inner()
 def _first_hit(
     field: HeightField, slope: Float64, start: Float64, direction: Float64, length: float
 ) -> tuple[float, float, int, int]:

@@ -63,7 +63,7 @@ def make_patches(depth: Float64, box: ObjectBox, albedo: Float64, jump_m: float 
     """Return the patches of a depth map (rows, columns), NaN for background, with its cells' albedo (rows, columns)."""
     x_m, y_m = cell_centers_m(box, len(depth))
     pitch_x, pitch_y = cell_pitch_m(box, depth.shape)
-    row, column = np.nonzero(~np.isnan(depth))
+    row, column = (np.ascontiguousarray(index) for index in np.nonzero(~np.isnan(depth)))  # as those of `clustered`
     slope_x = slope_along(depth, 1, pitch_x, jump_m)[row, column]
     slope_y = -slope_along(depth, 0, pitch_y, jump_m)[row, column]  # rows run along -y
     # The surface z(x, y) has tangents (1, 0, zx) and (0, 1, zy). Their cross product (-zx, -zy, 1) has the length of

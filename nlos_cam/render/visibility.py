@@ -18,6 +18,7 @@ from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
+from nlos_cam.kernels import inner
 from nlos_cam.objects import cell_centers_m
 from nlos_cam.render.patches import cell_pitch_m
 
@@ -79,7 +80,7 @@ def bias_m(field: HeightField) -> float:
     return BIAS_CELLS * max(field.pitch_x_m, field.pitch_y_m)
 
 
-@numba.njit(cache=True)
+@inner()
 def _depth(field: HeightField, along: int, across: int, along_columns: bool) -> float:
     """Return the depth of a cell, given along and across the walk; NaN beyond the surface's ends across it."""
     first = field.first_row if along_columns else field.first_column
@@ -89,7 +90,7 @@ def _depth(field: HeightField, along: int, across: int, along_columns: bool) -> 
     return field.depth_m[across, along] if along_columns else field.depth_m[along, across]
 
 
-@numba.njit(cache=True)
+@inner()
 def _between(field: HeightField, along: int, across: float, along_columns: bool) -> float:
     """Return the depth between two neighbors across the walk, interpolated; the nearer decides if one is background."""
     low = int(np.floor(across))
@@ -100,7 +101,7 @@ def _between(field: HeightField, along: int, across: float, along_columns: bool)
     return near + share * (far - near)
 
 
-@numba.njit(cache=True)
+@inner()
 def _steps(field: HeightField, start: int, forward: bool, along_columns: bool) -> int:
     """Return the number of steps along an axis before the walk leaves the surface."""
     first = field.first_column if along_columns else field.first_row
@@ -158,7 +159,7 @@ def segment_blocked(
     return False
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+@inner(error_model="numpy", fastmath={"contract"})
 def _meet(
     row: Float32,
     offset: int,
@@ -193,7 +194,7 @@ def _meet(
         least[c], most[c] = smallest, largest
 
 
-@numba.njit(cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _line(cells: Float32, margin: int, start: int, step: int, steps: int, rise_m: Float32, sectors: int) -> Float32:
     """Return bounds (sectors, 4, n) of the horizons of n neighbors on a line: low, high, first and last step to walk.
 
@@ -223,7 +224,7 @@ def _line(cells: Float32, margin: int, start: int, step: int, steps: int, rise_m
     return bounds
 
 
-@numba.njit(cache=True)
+@inner()
 def _side_by_side(field: HeightField, rows: Int64, columns: Int64, margin: int) -> tuple[Float32, Int64]:
     """Return depths (2, n, n + 2 margin), inf for background, and the patch in each cell (2, n, n), -1 for none.
 

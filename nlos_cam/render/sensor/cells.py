@@ -15,6 +15,7 @@ from nlos_calibration.arrays import Float32, Int32, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.frames import NO_SAMPLE, SATURATED, reduce_cell
+from nlos_cam.kernels import inner
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, MAX_CONFIDENCE
 
 QUANTILES = 1 << 16
@@ -74,7 +75,7 @@ def expose_cells(
     return depth, intensity
 
 
-@numba.njit(cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _pixels(
     start: int, pixels: int, optics: Any, echoes: Any, cell: Int32, light_deviates: Float32, range_deviates: Float32,
     noisy: tuple[bool, bool], bias_m: Float32, chain: Any, depth_m: Float32, counts: NDArray[np.uint8],

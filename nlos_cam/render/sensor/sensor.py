@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, Frame, LidarMaps, maps_from_frame
+from nlos_cam.kernels import inner
 from nlos_cam.render.echoes import peak_share
 from nlos_cam.render.effects import Effect, included
 from nlos_cam.render.geometry import Beams, cast
@@ -72,7 +73,7 @@ class CellEchoes(NamedTuple):
     path_m: Float32
 
 
-@numba.njit(cache=True)
+@inner()
 def compete(optics: PixelOptics, pixel: int, echoes: CellEchoes, cell: int) -> tuple[float, float, float, float]:
     """Return intensity, surety and length of the stronger of direct return and cell's echo (S5), and the second."""
     own, peak, runner_up = optics.direct[pixel], echoes.peak[cell], echoes.runner_up[cell]
@@ -81,25 +82,25 @@ def compete(optics: PixelOptics, pixel: int, echoes: CellEchoes, cell: int) -> t
     return own, optics.surety[pixel], optics.length_m[pixel], max(peak, runner_up)
 
 
-@numba.njit(cache=True)
+@inner()
 def noise_counts(light_counts: float, chain: Chain) -> float:
     """Return the standard deviation of shot and read noise for an amount of light, ambient light included."""
     return np.sqrt(chain.read_variance + chain.shot_variance * light_counts)
 
 
-@numba.njit(cache=True)
+@inner()
 def saturate(light_counts: float, chain: Chain) -> float:
     """Return the light cut at full scale together with the ambient light, of which the mean is then subtracted."""
     return min(light_counts, SATURATED) - chain.ambient_counts
 
 
-@numba.njit(cache=True)
+@inner()
 def quantise(value: float, most: int) -> int:
     """Return the nearest whole number from 0 to `most`; 0 for NaN."""
     return int(np.floor(min(value, most) + 0.5)) if value > 0 else 0
 
 
-@numba.njit(cache=True)
+@inner()
 def sure(counts: float, chain: Chain) -> float:
     """Return from 0 to 1 how far a signal stands above the noise, dimmed by the noise that ambient light adds."""
     if chain.ambient_counts > 0:
@@ -110,11 +111,15 @@ def sure(counts: float, chain: Chain) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
+def _fill_surety(surety: Float64, intensity: Float32, chain: Chain) -> None:
+    for i in range(intensity.size):
+        surety[i] = sure(chain.gain * intensity[i], chain)
+
+
 def signal_surety(intensity: Float32, chain: Chain) -> Float64:
     """Return `sure` of intensities (n,), in units of I0."""
     surety = np.empty(intensity.size)
-    for i in range(intensity.size):
-        surety[i] = sure(chain.gain * intensity[i], chain)
+    _fill_surety(surety, intensity, chain)
     return surety
 
 
@@ -127,11 +132,12 @@ def expose(
     range_deviates: Float32,
     bias_m: Float32,
     chain: Chain,
-) -> tuple[NDArray[np.uint16], UInt8, UInt8]:
-    """Return depth, IR and confidence (n,) of n pixels, each with its map cell; empty deviates are no noise."""
-    pixels = optics.direct.size
-    z16, ir, confidence = np.zeros(pixels, np.uint16), np.zeros(pixels, np.uint8), np.zeros(pixels, np.uint8)
-    for i in range(pixels):
+    z16: NDArray[np.uint16],
+    ir: UInt8,
+    confidence: UInt8,
+) -> None:
+    """Fill in depth, IR and confidence (n,) of n pixels, each with its map cell; empty deviates are no noise."""
+    for i in range(z16.size):
         intensity, surety, length_m, second = compete(optics, i, echoes, cell[i])
         if intensity <= 0:
             continue
@@ -153,7 +159,6 @@ def expose(
         if range_deviates.size:
             depth_m += range_deviates[i] * (chain.range_noise_m + chain.range_noise_per_m * depth_m)
         z16[i] = quantise(depth_m / DEPTH_UNIT_M, FARTHEST)
-    return z16, ir, confidence
 
 
 NO_DEVIATES = np.zeros(0, np.float32)
@@ -205,8 +210,10 @@ class Sensor:
         light, ranges = (self._deviates(generator, wanted=wanted) for wanted in (self._lights, self._ranges))
         optics = self._echoes_only if multi.direct_included else self._optics
         echoes, bias_m = _echoes(multi, self._chain), self._bias.at_m(celsius)
-        z16, ir, confidence = expose(optics, echoes, cell, light, ranges, bias_m, self._chain)
-        return SensedImages(z16.reshape(shape), ir.reshape(shape), confidence.reshape(shape))
+        z16, ir, confidence = np.zeros(shape, np.uint16), np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+        images = z16.ravel(), ir.ravel(), confidence.ravel()  # views
+        expose(optics, echoes, cell, light, ranges, bias_m, self._chain, *images)
+        return SensedImages(z16, ir, confidence)
 
     def maps(self, multi: MultiBounce, generator: np.random.Generator) -> LidarMaps:
         """Return the maps of one exposure of the warm device: `expose` and the reduction of frames, in less time.
