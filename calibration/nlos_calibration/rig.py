@@ -24,6 +24,8 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 R = TypeVar("R", bound=BaseModel)
 TOML_LIMIT = 1 << 20
 """Bound on a file's bytes: a record has some kB."""
+DEEP_KEY = re.compile(r"(?<![^\s.=,#{\[])(?:[^\s.=,#]+[ \t]*\.[ \t]*){100}")
+"""Key of a hundred parts: tomllib takes minutes for some thousands."""
 KINDS = {"schema_version": "wall record", "task": "training recipe", "lidar": "rig", "rig": "scene"}
 """Kind of a TOML file by a field of it, in this order: a wall record has a rig too."""
 WORDING = {
@@ -207,8 +209,10 @@ def read_toml(source: Traversable) -> dict[str, Any]:
         content = file.read(TOML_LIMIT + 1)
     if len(content) > TOML_LIMIT:
         raise tomllib.TOMLDecodeError(f"it is longer than {TOML_LIMIT >> 20} MiB")
+    if DEEP_KEY.search(text := content.decode()):
+        raise tomllib.TOMLDecodeError("it is nested too deeply")
     try:
-        return tomllib.loads(content.decode())
+        return tomllib.loads(text)
     except RecursionError as error:
         raise tomllib.TOMLDecodeError("it is nested too deeply") from error
 

@@ -7,6 +7,7 @@ import logging
 import math
 import os
 import platform
+import re
 import shutil
 import tomllib
 from collections.abc import Callable, Generator, Iterable, Mapping
@@ -31,6 +32,8 @@ TRIES = 5
 DIGEST_DIGITS = 16
 TEXT_LIMIT, TENSOR_LIMIT, ARRAYS_LIMIT = 1 << 20, 4 << 30, 2 << 30
 """Bounds in bytes of a text file (TOML, JSON), of a file of tensors, and of the arrays unpacked from one .npz file."""
+DEEP_KEY = re.compile(r"(?<![^\s.=,#{\[])(?:[^\s.=,#]+[ \t]*\.[ \t]*){100}")
+"""Key of a hundred parts in TOML: tomllib takes minutes for some thousands."""
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -253,8 +256,10 @@ def read_bounded(path: Path, limit: int) -> bytes:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file. Raises OSError, UnicodeDecodeError or TOMLDecodeError."""
+    if DEEP_KEY.search(text := read_bounded(path, TEXT_LIMIT).decode()):
+        raise tomllib.TOMLDecodeError("it is nested too deeply")
     try:
-        return tomllib.loads(read_bounded(path, TEXT_LIMIT).decode())
+        return tomllib.loads(text)
     except RecursionError as error:
         raise tomllib.TOMLDecodeError(describe(error)) from error
 

@@ -12,7 +12,7 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from nlos_calibration import load_rig, load_wall
-from nlos_models import load_recipe, read_arrays
+from nlos_models import load_recipe, read_arrays, read_toml
 
 from nlos_cam.errors import NlosCamError, RecordingError
 
@@ -164,9 +164,10 @@ def _frames(arrays: Any) -> dict[str, str]:
 def describe_toml(path: Path, verify: bool) -> Description | None:
     """Describe a wall record, scene, rig, recipe or settings file, by its keys."""
     del verify  # it is always read whole
+    _text(path)
     try:
-        keys = tomllib.loads(_text(path))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        keys = read_toml(path)
+    except tomllib.TOMLDecodeError as error:
         raise RecordingError(f"{path} is not TOML ({error}): correct it, or write it again") from error
     quoted, checked = shlex.quote(str(path)), "all fields"
     if {"created", "verdict"} & set(keys):

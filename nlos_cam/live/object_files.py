@@ -59,10 +59,10 @@ def export_objects(
 
     Setting `stop` ends it early and keeps the files so far. Raises RecordingError for any other file.
     """
-    arrays = _read(result)
+    arrays, box = _read(result)
     depth_m, uncertainty_m, numbers = (arrays[name] for name in ("depth_m", "uncertainty_m", "frame_number"))
     with atomic_directory(out) as part:
-        files = ObjectFiles(part, _box(arrays, depth_m.shape[1:]), formats, every)
+        files = ObjectFiles(part, box, formats, every)
         for k, number in enumerate(numbers):
             if stop.is_set():
                 break
@@ -72,18 +72,40 @@ def export_objects(
     return files.written
 
 
-FIELDS = "depth_m", "uncertainty_m", "frame_number", "origin_m", "pitch_m", "z_near_m", "z_far_m"
+DIMENSIONS = {
+    "depth_m": 3,
+    "uncertainty_m": 3,
+    "frame_number": 1,
+    "origin_m": 1,
+    "pitch_m": 1,
+    "z_near_m": 0,
+    "z_far_m": 0,
+}
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> tuple[dict[str, Any], ObjectBox]:
+    """Return a replay's arrays and their object box."""
     try:
-        return read_arrays(path, FIELDS)
+        arrays = read_arrays(path, DIMENSIONS)
+        _check(arrays)
+        return arrays, _box(arrays, arrays["depth_m"].shape[1:])
     except FileNotFoundError as error:
         raise RecordingError(f"{path} does not exist: give the reconstruction.npz of a replay") from error
     except (OSError, ValueError) as error:
         raise RecordingError(
             f"{path} is not the reconstruction.npz of a replay: make one with `nlos-cam replay F.bag`"
         ) from error
+
+
+def _check(arrays: dict[str, Any]) -> None:
+    """Raise ValueError for arrays that are not numbers, or whose shapes contradict each other."""
+    kinds = {arrays[name].dtype.kind for name in DIMENSIONS}
+    if kinds - set("fiu") or any(arrays[name].ndim != count for name, count in DIMENSIONS.items()):
+        raise ValueError("arrays of other types or dimensions")
+    shape = arrays["depth_m"].shape
+    shapes = {"uncertainty_m": shape, "frame_number": shape[:1], "origin_m": (2,), "pitch_m": (2,)}
+    if 0 in shape[1:] or any(arrays[name].shape != wanted for name, wanted in shapes.items()):
+        raise ValueError("arrays of other shapes")
 
 
 def _box(arrays: dict[str, Any], shape: tuple[int, ...]) -> ObjectBox:

@@ -73,11 +73,12 @@ def judge(action: Callable[[], None], memory_bytes: int = MEMORY_BYTES, timeout_
         try:
             pages, resident = map(int, Path("/proc/self/statm").read_text(encoding="ascii").split()[:2])
             limit = max(memory_bytes + (pages - resident) * resource.getpagesize(), memory_bytes // 4)
-            resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+            resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
             seconds = max(int(timeout_s), 1)
             resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
             before = set(sys.modules)
             kind, details = _end_of(action)
+            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY,) * 2)  # the answer needs some too
             os.write(write_end, json.dumps([kind, details, sorted(set(sys.modules) - before)]).encode()[:ANSWER_BYTES])
         finally:
             os._exit(0)

@@ -147,7 +147,15 @@ def trial(random: Random) -> Row:
         command = ["capture", "--camera", CAMERA, "--seconds", str(100 * LONGEST_S), "--out", str(path)]
         kill(Forked(command, folder, folder.with_name("said")), path, after_s)
         found = in_fork(partial(_examined, path, after_s))
-    return {**asdict(found), "wrong": "" if found.good else "not every chunk, or another frame"}
+    if not found.good:
+        return {**asdict(found), "wrong": "not every chunk, or another frame"}
+    frames = sum(found.frames_played.values())
+    return {
+        "after_s": round(after_s, 2),
+        "file_bytes": found.file_bytes,
+        "chunks": found.chunks_on_disk,
+        "frames": frames,
+    }
 
 
 def _examined(path: Path, after_s: float) -> Kill:

@@ -315,12 +315,12 @@ class Results:
                 row = trial(random.Random(f"{self._seed} {name} {kind} {len(rows)}"))  # noqa: S311
             except (OSError, RuntimeError, subprocess.SubprocessError) as error:  # a process ended, or never does
                 row = {"wrong": f"{error!r:.300}"}
-            rows.append(row)
+            rows.append({key: value for key, value in row.items() if value != ""})
             print(name, kind, len(rows), rows[-1], flush=True)
-            self._path.write_text(json.dumps(self.facts, indent=1) + "\n", encoding="utf-8")
+            self._path.write_text(json.dumps(self.facts, separators=(",", ":")) + "\n", encoding="utf-8")
 
     @property
     def findings(self) -> list[Row]:
         """Rows with something wrong."""
         tables = [kinds for kinds in self.facts.values() if isinstance(kinds, dict)]
-        return [row for kinds in tables for rows in kinds.values() for row in rows if row["wrong"]]
+        return [row for kinds in tables for rows in kinds.values() for row in rows if "wrong" in row]

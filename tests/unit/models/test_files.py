@@ -6,12 +6,14 @@ import signal
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from tomllib import TOMLDecodeError
 from typing import Any
 from zipfile import ZipFile
 
 import nlos_models.files
 import numpy as np
 import pytest
+from nlos_calibration import read_toml as read_record
 from nlos_models.errors import FileBusyError, OutputExistsError
 from nlos_models.files import (
     CHECKSUMS,
@@ -23,6 +25,7 @@ from nlos_models.files import (
     read_arrays,
     read_bounded,
     read_checked,
+    read_toml,
     reservations,
     write_checked,
 )
@@ -254,3 +257,10 @@ def test_read_arrays_returns_what_was_saved_within_its_limit(tmp_path: Path) -> 
     path.write_bytes(b"no archive")
     with pytest.raises(ValueError, match="zip"):
         read_arrays(path)
+
+
+@pytest.mark.parametrize("read", [read_toml, read_record])
+def test_key_of_many_parts_is_refused_at_once(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    (path := tmp_path / "a.toml").write_text(f"{'a.' * 20_000}a = 1\n")
+    with pytest.raises(TOMLDecodeError, match="too deeply"):
+        read(path)
