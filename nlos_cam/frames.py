@@ -131,7 +131,7 @@ def reduce_cell(
 
     `samples_m` and `middle_m` show the bits of `bits` and `middle` (2,), which is scratch memory, as depths.
     """
-    middle[0], middle[1] = _two_from(bits, (valid - np.int32(1)) >> 1)
+    middle[0], middle[1] = _two_from(bits, np.int32((valid - np.int32(1)) >> 1))
     depth = middle_m[0] if valid % 2 else (middle_m[0] + middle_m[1]) / np.float32(2.0)
     mean = _mean_near(bits, samples_m, counts, depth, np.float32(WINNER_SPREAD_M))
     # the two middle samples may be of two echoes, with no sample near their mean: take all valid ones then

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import onnx
 import torch
+from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
@@ -145,7 +146,7 @@ KINDS = {"F16": "<f2", "F32": "<f4"}
 class _StoredTensor(NamedTuple):
     """Tensor in a safetensors file, and its place there in bytes."""
 
-    values: np.ndarray
+    values: NDArray[Any]
     location: str
     offset: int
     length: int
@@ -203,7 +204,7 @@ def _linked_graph(
     return model.SerializeToString()
 
 
-def _key(values: np.ndarray) -> tuple[tuple[int, ...], bytes]:
+def _key(values: NDArray[Any]) -> tuple[tuple[int, ...], bytes]:
     return values.shape, np.ascontiguousarray(values, np.float32).tobytes()
 
 
@@ -225,7 +226,7 @@ def _external(name: str, tensor: _StoredTensor) -> TensorProto:
 
 
 def _linked(
-    name: str, exported: np.ndarray, stored: Mapping[str, _StoredTensor]
+    name: str, exported: NDArray[Any], stored: Mapping[str, _StoredTensor]
 ) -> tuple[list[TensorProto], list[onnx.NodeProto]] | None:
     """Return the initializers and nodes that make an exported weight from its stored float16; None for small ones.
 

@@ -132,7 +132,7 @@ def plates(generator: Generator) -> Float64:
 
 def rods(generator: Generator) -> Float64:
     """Build a chain of two to seven thin rods; some branch off."""
-    width, ends, parts = generator.uniform(0.05, 0.13), [np.zeros(3)], list[Float64]()
+    width, ends, parts = generator.uniform(0.05, 0.13), list[Float64]([np.zeros(3)]), list[Float64]()
     for _ in range(int(generator.integers(2, 8))):
         length, turn = generator.uniform(0.3, 1.0), _turn(generator)
         start = ends[-1] if generator.random() < 0.6 else ends[int(generator.integers(len(ends)))]

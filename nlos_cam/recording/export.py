@@ -106,7 +106,7 @@ class PointSink:
     def __init__(self, folder: Path, rays: Float64, unit_m: float, limit: int | None = None) -> None:
         self._folder, self._rays, self._unit_m, self._limit = folder / POINTS, rays, unit_m, limit
         self._folder.mkdir()
-        self._pairing = FrameSynchronizer(rays.shape[:2])
+        self._pairing = FrameSynchronizer((rays.shape[0], rays.shape[1]))
         self.written = 0
 
     def add(self, sample: Sample) -> None:

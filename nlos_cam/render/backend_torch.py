@@ -7,11 +7,12 @@ legs at a time.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from nlos_calibration.arrays import Float32, Float64
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool1d, embedding_bag, pad
 
@@ -78,7 +79,7 @@ def lay_out(jobs: Sequence[TransportJob], device: torch.device) -> tuple[TorchFi
     return shared, TorchSites(*together)
 
 
-def _sites(job: TransportJob, index: int, fields: TorchFields, size: int) -> tuple[np.ndarray, ...]:
+def _sites(job: TransportJob, index: int, fields: TorchFields, size: int) -> tuple[NDArray[Any], ...]:
     """Return the columns of one object's sites: depth, low, high, start and across."""
     row, column = job.patches.row, job.patches.column
     free = np.zeros((len(row), FACES * fields.sectors), np.float32)

@@ -74,7 +74,9 @@ def nodes(job: TransportJob, brdf: Brdf) -> Iterator[tuple[Float64, Float64]]:
 
 
 def _lines(laser_spot_m: Float64, count: int) -> list[Float64]:
-    return [np.unique(np.quantile(laser_spot_m[:, axis], np.linspace(0, 1, count))) for axis in (0, 1)]
+    return [
+        np.unique(np.quantile(laser_spot_m[:, axis], np.linspace(0, 1, count))).astype(np.float64) for axis in (0, 1)
+    ]
 
 
 def node_count(job: TransportJob, brdf: Brdf) -> int:

@@ -379,7 +379,7 @@ class BeamRates:
         )
         fall = 2 * beams.length_m[chosen] * softened_slope(squared, soft, near_m) / softened(squared, soft, near_m)
         direct = beams.direct[chosen] * (cosine[:, chosen] / beams.cos_incidence[chosen] - fall * longer[:, chosen])
-        return cls(spot, longer, cosine, direct)
+        return cls(spot, longer, np.asarray(cosine, np.float64), direct)
 
 
 @dataclass(frozen=True)

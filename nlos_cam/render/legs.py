@@ -10,7 +10,7 @@ without a fused multiply-add the compiler splits the same operations.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numba
 import numpy as np
@@ -228,4 +228,4 @@ def _add_rows(
     return types.void(*columns), generate
 
 
-add_rows: Callable[..., None] = intrinsic(_add_rows)
+add_rows = cast("Callable[..., None]", intrinsic(_add_rows))

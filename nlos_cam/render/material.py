@@ -98,7 +98,7 @@ class Surface:
         """True if the albedo has three channels."""
         return np.ndim(self.albedo) in {1, 3}
 
-    def over(self, shape: tuple[int, int]) -> NDArray[np.float64]:
+    def over(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Return the albedo (rows, columns, channels) of a depth map's cells. Raises SceneError if shapes disagree."""
         albedo = np.asarray(self.albedo, np.float64)
         if not self.colored:

@@ -75,7 +75,7 @@ def make_patches(depth: Float64, box: ObjectBox, albedo: Float64, jump_m: float 
     return Patches(point, normal, beta, albedo[row, column], row, column, pitch_x * pitch_y, diagonal_m)
 
 
-def cell_pitch_m(box: ObjectBox, shape: tuple[int, int]) -> tuple[float, float]:
+def cell_pitch_m(box: ObjectBox, shape: tuple[int, ...]) -> tuple[float, float]:
     """Return width and height of a cell of a depth map (rows, columns) over a box."""
     return (box.x_max_m - box.x_min_m) / shape[1], (box.y_max_m - box.y_min_m) / shape[0]
 

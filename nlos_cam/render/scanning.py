@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos_cam.frames import MAP_ROWS
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
@@ -57,7 +59,7 @@ def slices(verdict: Effect, setting: Accuracy) -> int:
 def joined(parts: list[Rendering], verdict: Effect) -> Rendering:
     """Return renderings of some rows each as one of all rows."""
 
-    def stacked(name: str, of: Callable[[Rendering], object] = lambda part: part) -> np.ndarray:
+    def stacked(name: str, of: Callable[[Rendering], object] = lambda part: part) -> NDArray[Any]:
         return np.concatenate([getattr(of(part), name) for part in parts])
 
     multi = {name: stacked(name, lambda part: part.multi) for name in ("peak", "runner_up", "path_m")}

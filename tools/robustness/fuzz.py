@@ -98,7 +98,7 @@ def judge(action: Callable[[], None], memory_bytes: int = MEMORY_BYTES, timeout_
 
 
 def _stands_still(pid: int, answer: int, wall_s: float) -> bool:
-    """Wait for a process's answer; return True where it spends no processor time for so long on the clock."""
+    """Wait for a process's answer; return True where it spends no processor time for `wall_s` on the clock."""
     spent_s = -STILL_S
     while not select.select([answer], [], [], wall_s)[0]:
         ticks = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[11:13]

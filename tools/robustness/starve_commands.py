@@ -43,7 +43,7 @@ PROGRESS = "...", " s", "%"
 
 @contextmanager
 def small_disk(kib: int) -> Generator[Path]:
-    """Yield a folder on a file system of its own with so many KiB."""
+    """Yield a folder on a file system of its own of `kib` KiB."""
     with tempfile.TemporaryDirectory() as name:
         subprocess.run([MOUNT, "-t", "tmpfs", "-o", f"size={kib}k", "none", name], check=True)
         try:
