@@ -24,7 +24,7 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 R = TypeVar("R", bound=BaseModel)
 TOML_LIMIT = 1 << 20
 """Bound on a file's bytes: a record has some kB."""
-DEEP_KEY = re.compile(r"(?<![^\s.=,#{\[])(?:[^\s.=,#]+[ \t]*\.[ \t]*){100}")
+DEEP_KEY = re.compile(r"(?<![^\s.=,#{}\[\]])(?:[^\s.=,#{}\[\]]++[ \t]*+\.[ \t]*+){100}")
 """Key of a hundred parts: tomllib takes minutes for some thousands."""
 KINDS = {"schema_version": "wall record", "task": "training recipe", "lidar": "rig", "rig": "scene"}
 """Kind of a TOML file by a field of it, in this order: a wall record has a rig too."""

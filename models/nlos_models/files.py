@@ -32,7 +32,7 @@ TRIES = 5
 DIGEST_DIGITS = 16
 TEXT_LIMIT, TENSOR_LIMIT, ARRAYS_LIMIT = 1 << 20, 4 << 30, 2 << 30
 """Bounds in bytes of a text file (TOML, JSON), of a file of tensors, and of the arrays unpacked from one .npz file."""
-DEEP_KEY = re.compile(r"(?<![^\s.=,#{\[])(?:[^\s.=,#]+[ \t]*\.[ \t]*){100}")
+DEEP_KEY = re.compile(r"(?<![^\s.=,#{}\[\]])(?:[^\s.=,#{}\[\]]++[ \t]*+\.[ \t]*+){100}")
 """Key of a hundred parts in TOML: tomllib takes minutes for some thousands."""
 
 T = TypeVar("T")
