@@ -155,8 +155,7 @@ def draw_quality(path: Path, sets: Mapping[str, tuple[Predictions, Float64]]) ->
     for axis, (name, (predicted, iou)) in zip(
         figure.subplots(1, len(sets), squeeze=False)[0], sets.items(), strict=True
     ):
-        lengths = [(predicted.iou - predicted.low).clip(0), (predicted.high - predicted.iou).clip(0)]
-        axis.errorbar(predicted.iou, iou, xerr=lengths, fmt="none", ecolor="tab:blue", alpha=0.25)
+        axis.hlines(iou, predicted.low, predicted.high, colors="tab:blue", alpha=0.25)
         for chosen, color, label in (
             (~predicted.trusted, "tab:blue", "estimate"),
             (predicted.trusted, "tab:green", "shown in green"),

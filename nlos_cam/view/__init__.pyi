@@ -2,6 +2,7 @@ __all__ = [
     "LOOPBACK",
     "MAX_UNCERTAINTY_M",
     "PREFERRED_PORT",
+    "SESSION_MARK",
     "SESSION_SUFFIX",
     "Assessment",
     "Controls",
@@ -16,13 +17,16 @@ __all__ = [
     "Viewers",
     "WebViewer",
     "assess",
+    "element",
     "exposed",
+    "unpack",
 ]
 
 from .assessment import Assessment, assess
 from .images import MAX_UNCERTAINTY_M
+from .messages import unpack
 from .server import LOOPBACK, exposed
-from .session_file import SESSION_SUFFIX, SessionFile
+from .session_file import SESSION_MARK, SESSION_SUFFIX, SessionFile, element
 from .video import Still, VideoFile
 from .viewer import Controls, Moment, NullViewer, Viewer, Viewers
 from .web import PREFERRED_PORT, PlaybackViewer, RecordedView, WebViewer

@@ -26,8 +26,7 @@ from nlos_cam.cli.main import build_app, main
 from nlos_cam.dataset import build
 from nlos_cam.evaluate import machine
 from nlos_cam.recording import load_sidecar, verify
-from nlos_cam.view.messages import unpack
-from nlos_cam.view.session_file import SESSION_MARK, element
+from nlos_cam.view import SESSION_MARK, element, unpack
 
 T = TypeVar("T")
 DOCS = Path(__file__).parents[2] / "docs"

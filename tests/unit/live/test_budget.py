@@ -10,7 +10,7 @@ import pytest
 from fake_wall import RIG
 from hypothesis import given
 from hypothesis import strategies as st
-from nlos_models.checkpoint import shipped_folder
+from nlos_models.records import shipped_folder
 from small_frames import FrameCamera, sheet_network
 
 from nlos_cam.errors import BudgetError, RecordingError
