@@ -1,16 +1,15 @@
 """Frames of a camera, the maps that the networks take as input, and running means of maps, all in SI units."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import ceil
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
 from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float32, Int32
 from numpy.typing import NDArray
-
-from nlos_cam.kernels import inner
 
 MAP_ROWS, MAP_COLUMNS = 64, 80
 OBJECT_PIXELS = 64
@@ -22,6 +21,19 @@ MAX_SATURATED = 0.001
 """Share of saturated infrared pixels above which depth is unreliable: the L515 under-estimates it there."""
 
 Real = float | np.float32
+Kernel = TypeVar("Kernel", bound=Callable[..., Any])
+int64: Any = np.int64
+"""Cast of indices and constants to one type: a compiled function is compiled for each type that it is called with."""
+
+
+def inner(**options: Any) -> Callable[[Kernel], Kernel]:
+    """Return a decorator for functions that only compiled functions call; options as for `numba.njit`.
+
+    Such a function is compiled on its first use, and cached. Beside each other function numba compiles two more, which
+    convert the arguments of calls from Python and from C. Without them the first run on a machine compiles less.
+    """
+    compile_function: Any = numba.njit
+    return compile_function(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
 @dataclass(frozen=True)

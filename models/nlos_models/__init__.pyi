@@ -3,6 +3,7 @@ __all__ = [
     "BLACK_V",
     "CHECKSUMS",
     "DISK_ERRORS",
+    "ENCODER",
     "GOOD_IOU",
     "MIN_V",
     "SIMULATION_ONLY",
@@ -152,6 +153,7 @@ from .pipeline import SMALLEST_SPREAD, Preprocess, channel_statistics, cut_silho
 from .quality import GOOD_IOU, QualityRecord, quality_features, quality_watches, write_quality
 from .recipe import SIMULATION_ONLY, Recipe, load_recipe, packaged_recipes
 from .records import (
+    ENCODER,
     CheckpointRecord,
     DoubtRecord,
     checksum_of_watched,

@@ -14,10 +14,10 @@ from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError
 from nlos_models.files import TENSOR_LIMIT, describe, read_checked, write_checked
 from nlos_models.pipeline import RemappingNetwork, new_pipeline, new_vae
-from nlos_models.records import DIRECT, RECORD, CheckpointRecord, load_record, weights_folder
+from nlos_models.records import DIRECT, ENCODER, RECORD, CheckpointRecord, load_record, weights_folder
 from nlos_models.vae import Encoder, ResVae
 
-PIPELINE_PARTS, ENCODER = ("compressor", "preprocess", "decoder"), "encoder.safetensors"
+PIPELINE_PARTS = "compressor", "preprocess", "decoder"
 FULL = frozenset({"mean", "median", "spread", "bare_depth_m", "bare_intensity"})
 """Tensors that stay in float32."""
 
@@ -80,8 +80,8 @@ def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
     record = load_record(folder)
     if not (folder / ENCODER).exists() and folder == weights_folder(None):
         raise CheckpointError(
-            "the encoder of the paper's weights (21 MB) does not come with them, since only training needs it: make it "
-            "again with `nlos-cam train vae --recipe vae-encoder --out DIR`, and give --vae DIR"
+            "the encoder of the paper's weights (21 MB) is not in the installed package: train from a clone, or make "
+            "it again with `nlos-cam train vae --recipe vae-encoder --out DIR`, and give --vae DIR"
         )
     vae = new_vae(color=record.color)
     for name, module in (("encoder", vae.encoder), ("decoder", vae.decoder)):

@@ -15,6 +15,8 @@ from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
 RECORD = "checkpoint.json"
 DIRECT, SHIPPED = "direct", "paper"
 """File with a direct network's tensors, less its ending; name of the weights that come with the package."""
+ENCODER = "encoder.safetensors"
+"""File that only training reads: an installed package does not have it."""
 DOUBT, DOUBT_RECORD = "doubt", "doubt.json"
 WATCHED = "compressor.safetensors", "preprocess.safetensors", "decoder.safetensors"
 

@@ -16,7 +16,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int32
 from numpy.typing import NDArray
 
-from nlos_cam.kernels import inner, int64
+from nlos_cam.frames import inner, int64
 from nlos_cam.render.brdf_table import nodes, scattering
 from nlos_cam.render.echoes import MultiBounce, strongest, strongest_between
 from nlos_cam.render.interreflection import add_interreflection

@@ -9,7 +9,7 @@ from nlos_calibration import DeviceConstants, Intrinsics, Rig
 from nlos_calibration.arrays import Float64, Mask
 from numpy.typing import NDArray
 
-from nlos_cam.kernels import inner
+from nlos_cam.frames import inner
 
 NEAR_DIAGONALS = 4
 """Near contact begins at this many diagonals of the larger cell."""

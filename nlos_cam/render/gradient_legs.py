@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int32, Int64, Mask
 
-from nlos_cam.kernels import int64
+from nlos_cam.frames import int64
 from nlos_cam.render.geometry import NEAR_DIAGONALS, softened, solid_angle
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.legs import FAST, NumbaLegs, NumbaOptics, NumbaPoints, NumbaSurface, geometry, scratch, shade

@@ -10,7 +10,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
-from nlos_cam.kernels import inner
+from nlos_cam.frames import inner
 from nlos_cam.render.geometry import contact_m2, softened_leg
 from nlos_cam.render.job import PatchArrays, TransportJob
 from nlos_cam.render.visibility import HeightField, occluded, segment_blocked, visible

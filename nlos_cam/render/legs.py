@@ -20,7 +20,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from nlos_cam.kernels import inner
+from nlos_cam.frames import inner
 from nlos_cam.render.visibility import HeightField, blocked
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}

@@ -12,7 +12,7 @@ from nlos_calibration.arrays import Float64, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.kernels import inner
+from nlos_cam.frames import inner
 from nlos_cam.render.geometry import Beams, Relay
 from nlos_cam.render.patches import slope_along
 from nlos_cam.render.visibility import HeightField

@@ -18,7 +18,7 @@ from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
-from nlos_cam.kernels import inner
+from nlos_cam.frames import inner
 from nlos_cam.objects import cell_centers_m
 from nlos_cam.render.patches import cell_pitch_m
 

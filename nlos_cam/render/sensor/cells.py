@@ -14,8 +14,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Int32, Int64
 from numpy.typing import NDArray
 
-from nlos_cam.frames import NO_SAMPLE, SATURATED, reduce_cell
-from nlos_cam.kernels import inner
+from nlos_cam.frames import NO_SAMPLE, SATURATED, inner, reduce_cell
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, MAX_CONFIDENCE
 
 QUANTILES = 1 << 16

@@ -22,8 +22,7 @@ from nlos_calibration.arrays import Float32, Float64, UInt8
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, Frame, LidarMaps, maps_from_frame
-from nlos_cam.kernels import inner
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, Frame, LidarMaps, inner, maps_from_frame
 from nlos_cam.render.echoes import peak_share
 from nlos_cam.render.effects import Effect, included
 from nlos_cam.render.geometry import Beams, cast
