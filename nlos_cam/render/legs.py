@@ -154,7 +154,7 @@ def shade(
         if z >= legs.major[i] * low[sector]:
             u = (points.x_m[start + i] - surface.x_m[s]) / field.pitch_x_m
             v = (surface.y_m[s] - points.y_m[start + i]) / field.pitch_y_m
-            first, last = surface.walk[s, sector]
+            first, last = surface.walk[s, sector, 0], surface.walk[s, sector, 1]
             if not blocked(field, surface.row[s], surface.column[s], z, u, v, first, last):
                 continue
         legs.weight[i] = 0
