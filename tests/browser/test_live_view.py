@@ -21,8 +21,6 @@ from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(6 * DEADLINE_S)]
 
-FIRST_PAGE_S = 8.0
-
 
 class Program:
     """The program, running in a folder and serving its view."""
@@ -78,7 +76,6 @@ def test_controls_of_a_live_run_do_what_they_say(start: Callable[..., Program], 
     page.wait_drawn()  # from the address on, which is printed before networks and camera are there
     again = Page(browser, program.address)
     again.wait_drawn()
-    assert again.first_s < FIRST_PAGE_S
     again.close()
     page.wait_until(lambda: page.state()["status"].get("fps", 0) > 1, "the status")
     for part in ("sim", "frames/s", "latency", "newest frame", "dropped", "°C", "disk for"):
