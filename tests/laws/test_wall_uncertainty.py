@@ -4,19 +4,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from wall import Setting, trial
+from wall_trials import Setting, trial
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wall.SIZE", (80, 60))
-
-
 def outcomes(count: int, **setting: Any) -> list[dict[str, Any]]:
     tried = [trial(Setting(**setting), np.random.default_rng([7, n])) for n in range(count)]
-    return [one for one in tried if not one["refused"]]
+    return [one for one in tried if one]
 
 
 def inside(count: int, at_least: int, **setting: Any) -> Any:

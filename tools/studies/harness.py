@@ -69,19 +69,6 @@ def fingerprint(settings: Sequence[Any], seeds: int, key: str = "") -> str:
     return hashlib.sha256(repr([state, list(settings), seeds, key]).encode()).hexdigest()[:16]
 
 
-def percentiles(values: Iterable[float]) -> dict[str, float] | None:
-    """Return median, 95th percentile and maximum of values; None without any."""
-    values = list(values)
-    parts = ("p50", 50), ("p95", 95), ("max", 100)
-    return {name: float(np.percentile(values, at)) for name, at in parts} if values else None
-
-
-def coverage(inside: Iterable[Sequence[bool]], names: Sequence[str]) -> dict[str, float] | None:
-    """Return the share of records whose truth lies in the stated interval, by quantity; None without records."""
-    rows = np.array(list(inside), float).reshape(-1, len(names))
-    return dict(zip(names, rows.mean(axis=0).tolist(), strict=True)) if len(rows) else None
-
-
 def wilson(count: int, of: int) -> dict[str, Any]:
     """Return a share and its 95 % interval by Wilson's score."""
     z, share = 1.96, count / of
@@ -93,11 +80,6 @@ def wilson(count: int, of: int) -> dict[str, Any]:
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     return "\n".join(f"| {' | '.join(cells)} |" for cells in [head, ["---"] * len(head), *rows])
-
-
-def joined(values: Mapping[str, float] | None, form: str = "{:.3f}", between: str = " / ") -> str:
-    """Format the values of a cell; an empty cell where there are none."""
-    return between.join(form.format(value) for value in values.values()) if values else ""
 
 
 def difference(figure: Mapping[str, float | None]) -> str:
@@ -119,19 +101,6 @@ def save(name: str, figure: Figure, folder: Path | None = None, dpi: int = 100) 
     path = (folder or DOCS) / "images" / f"{name}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=dpi)
-
-
-def draw_coverage(axis: Any, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
-    """Draw the coverage of the stated 95 % intervals, one line per row of a table."""
-    rows = [row for row in rows if row["inside_95"]]
-    for name, marker in zip(names, "osv^", strict=False):
-        axis.plot([100 * row["inside_95"][name] for row in rows], range(len(rows)), marker, label=name)
-    axis.axvspan(93, 97, color="0.9")
-    axis.axvline(95, color="0.6", lw=1)
-    axis.set_yticks(range(len(rows)), [row["name"] for row in rows], fontsize=8)
-    axis.set(xlabel="truth inside the stated 95 % interval, %", xlim=(85, 101))
-    axis.invert_yaxis()
-    axis.legend(fontsize=8)
 
 
 def named(text: str) -> tuple[str, Path]:
