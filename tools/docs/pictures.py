@@ -110,12 +110,6 @@ def variations(category: str, box: ObjectBox) -> list[Float32]:
     return [image_from_depth(orthographic_depth(triangles, box), box) for triangles in placed]
 
 
-def benchmark_depths(box: ObjectBox) -> dict[str, list[Float32]]:
-    """Return images of the test set by category."""
-    objects = benchmark_objects(box)
-    return {n: [image_from_depth(thing.depth_m, box) for thing in objects if thing.category == n] for n in CATEGORIES}
-
-
 def draw_sheet(path: Path, images: dict[str, list[Float32]]) -> Figure:
     """Draw one line per category with its name, two categories side by side."""
     wide, lines = max(len(row) for row in images.values()), -(-len(images) // SIDE_BY_SIDE)
@@ -133,10 +127,9 @@ def draw_sheet(path: Path, images: dict[str, list[Float32]]) -> Figure:
 
 
 def objects(out: Path) -> None:
-    """Draw the sheets of training's and of the test set's objects."""
+    """Draw the sheet of training's objects."""
     box = object_box(load_rig("paper-rig"))
     draw_sheet(out / "objects.webp", {name: variations(name, box) for name in CATEGORIES})
-    draw_sheet(out / "test_objects.webp", benchmark_depths(box))
 
 
 class Unhurried:

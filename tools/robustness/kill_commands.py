@@ -1,9 +1,9 @@
 """Commands killed at random moments, and pairs of them started at once on one output: docs/kill_commands.json.
 
 `kill_commands.py [--kills N] [--races N] [--seed S] [--only NAME] [--out FILE]`. After each kill the same command runs
-again: it has to end well, nothing half-written may be accepted, and nothing may be left over, no process either. Of two
-commands on one output one has to win, and the other to name the reason in a line. A second call resumes. Exits with 1
-after a finding.
+again: it has to end well and keep finished parts, nothing half-written may be accepted, and nothing may be left over,
+no process either. Of two commands on one output one has to win, and the other to name the reason in a line. A second
+call resumes. Exits with 1 after a finding.
 """
 
 import json
@@ -28,6 +28,7 @@ from trials import (
     duration_s,
     empty_folder,
     finish,
+    finished_parts,
     in_fork,
     inputs_of,
     leftovers,
@@ -62,12 +63,14 @@ def kill_once(command: Command, inputs: Path, random: Random) -> Row:
             if not was_killed:
                 after_s *= EARLIER
                 continue
-            wrong, parts = survivors(children), len(leftovers(folder))
+            wrong, parts, done = survivors(children), len(leftovers(folder)), finished_parts(command, folder)
             if output.exists() and command.is_atomic:
                 wrong = wrong or problem_of(command, folder, inputs)
             again = finish(command, folder, inputs, *([command.again] if output.exists() and command.again else []))
             if again.poll():
                 wrong = wrong or f"the next run ends with {again.poll()}: {again.said[-300:]}"
+            if lost := done.items() - finished_parts(command, folder).items():
+                wrong = wrong or f"the next run made again: {', '.join(sorted(dict(lost)))}"
             wrong = wrong or problem_of(command, folder, inputs) or ", ".join(leftovers(folder))
     return {"after_s": round(after_s, 3), "parts_left": parts, "wrong": wrong}
 

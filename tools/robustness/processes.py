@@ -1,6 +1,5 @@
 """Processes on Linux as /proc lists them, and their memory over time."""
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -54,15 +53,6 @@ def children_of(pid: int) -> list[int]:
     """Return the children of a process."""
     tasks = Path(f"/proc/{pid}/task").glob("*/children")
     return [int(child) for task in tasks for child in task.read_text(encoding="utf-8").split()]
-
-
-def runs(pid: int) -> bool:
-    """Return whether a process exists."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 def session_of(pid: int) -> int | None:

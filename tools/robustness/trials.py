@@ -19,11 +19,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from kill_builds import differing
+import numpy as np
 from noise_recordings import record
 
 from nlos_cam.cli.main import build_app, main
-from nlos_cam.dataset import build
+from nlos_cam.dataset import REQUIRED_ARRAYS, SHARD_PATTERN, build, open_dataset
 from nlos_cam.evaluate import machine
 from nlos_cam.recording import load_sidecar, verify
 from nlos_cam.view import SESSION_MARK, element, unpack
@@ -45,7 +45,7 @@ learning_rate = 1e-3
 direct = {features = 4, width = 8, blocks = 1, token = 4, mixers = 1}
 """
 SCENE = 'name = "a"\nrig = "paper-rig"\n[object]\ncategory = "cup"\nsize_m = 0.1\n[motion]\nposes = 1\nturn_deg = 9\n'
-BUILD = "dataset build --count 12 --workers 1 --accuracy draft --out"
+BUILD = "dataset build --count 12 --workers 2 --accuracy draft --out"
 TRAIN = "train direct --recipe {inputs}/small.toml --dataset {inputs}/data --held-out {inputs}/data --out"
 
 Row = dict[str, Any]
@@ -64,6 +64,8 @@ class Command:
     """Called with the output and the folder of inputs; raises any error where the output is not whole."""
     again: str = "--overwrite"
     """Option of the run after the kill."""
+    keeps: str = ""
+    """Pattern of finished parts of the output, which the run after the kill must not make again."""
     is_atomic: bool = True
     """The output has its name only when it is whole."""
     other: str = ""
@@ -92,6 +94,18 @@ def check_session(content: bytes) -> int:
     if SESSION_MARK not in content[:1000] or not messages:
         raise ValueError("no saved session")
     return len(messages)
+
+
+def differing(one: Path, other: Path) -> list[str]:
+    """Return the arrays of two datasets that differ in any bit."""
+    left, right = open_dataset(one), open_dataset(other)
+    return [name for name in REQUIRED_ARRAYS if not _same(left.column(name), right.column(name))]
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    if one.dtype == object:
+        return one.tolist() == other.tolist()
+    return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
 
 
 def _dataset(path: Path, inputs: Path) -> None:
@@ -128,7 +142,13 @@ COMMANDS = {
         "render cup --accuracy draft --out {folder}/a.npz", "a.npz", lambda path, _: path.read_bytes()[0]
     ),
     "dataset build": Command(
-        f"{BUILD} {{folder}}/data", "data", _dataset, again="", is_atomic=False, both_may_win=True
+        f"{BUILD} {{folder}}/data",
+        "data",
+        _dataset,
+        again="",
+        keeps=SHARD_PATTERN,
+        is_atomic=False,
+        both_may_win=True,
     ),
     "train": Command(f"{TRAIN} {{folder}}/run", "run", _run, again="", is_atomic=False, both_may_win=True),
     "cache": Command(
@@ -255,6 +275,12 @@ def problem_of(command: Command, folder: Path, inputs: Path) -> str:
         return ""
 
     return in_fork(problem)
+
+
+def finished_parts(command: Command, folder: Path) -> dict[str, int]:
+    """Return the time of the last change of each finished part of an output, in ns."""
+    output = folder / command.output
+    return {path.name: path.stat().st_mtime_ns for path in output.glob(command.keeps)} if command.keeps else {}
 
 
 def leftovers(folder: Path) -> list[str]:

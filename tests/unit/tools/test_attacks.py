@@ -1,5 +1,6 @@
 """Attacks of tools/robustness: they notice what they look for."""
 
+import os
 import struct
 import subprocess
 from collections.abc import Callable
@@ -7,8 +8,13 @@ from pathlib import Path
 from random import Random
 from types import ModuleType
 
+import numpy as np
 import pytest
+from fake_farm import samples_of
+from nlos_calibration.rig import load_rig
 
+from nlos_cam.dataset import DatasetPlan
+from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.view.messages import pack
 from nlos_cam.view.session_file import element, page_html
 
@@ -88,6 +94,35 @@ def test_session_that_does_not_play_is_noticed(tool: Tool) -> None:
             trials.check_session(bad)
     with pytest.raises(struct.error):
         trials.check_session(whole.replace(element(messages[0]), element(b"bad")))
+
+
+def dataset(folder: Path, harm: str = "") -> Path:
+    """Store a dataset of three objects, one of whose arrays is harmed by a bit or, where it holds text, reversed."""
+    folder.mkdir()
+    samples = samples_of(range(3))
+    if harm == "category":
+        samples = {**samples, harm: samples[harm][::-1]}
+    elif harm:
+        values = samples[harm].copy()
+        values.reshape(-1).view(np.uint8)[-1] ^= 1
+        samples = {**samples, harm: values}
+    store(shard_path(folder, 0), samples, DatasetPlan(load_rig("paper-rig"), 0).provenance, "")
+    return folder
+
+
+@pytest.mark.parametrize("harm", ["", "depth_m", "intensity", "image", "object_depth_m", "scene", "category"])
+def test_one_bit_in_a_dataset_makes_a_difference(tool: Tool, tmp_path: Path, harm: str) -> None:
+    found = tool("trials").differing(dataset(tmp_path / "one"), dataset(tmp_path / "other", harm))
+    assert found == ([harm] if harm else [])
+
+
+def test_finished_part_that_is_made_again_is_noticed(tool: Tool, tmp_path: Path) -> None:
+    trials, path = tool("trials"), dataset(tmp_path / "data") / "shard-000000000.h5"
+    before = trials.finished_parts(trials.COMMANDS["dataset build"], tmp_path)
+    assert list(before) == [path.name]
+    os.utime(path, ns=(0, 0))
+    assert trials.finished_parts(trials.COMMANDS["dataset build"], tmp_path) != before
+    assert trials.finished_parts(trials.COMMANDS["export"], tmp_path) == {}
 
 
 def test_processes_of_a_killed_command_that_run_on_are_noticed(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
