@@ -21,17 +21,15 @@ def needs_browser() -> None:
 
 
 class Page:
-    """Page at an address, opened; `first_s` is the time until it had drawn a first moment, once `wait_drawn` did."""
+    """Page at an address, opened."""
 
     def __init__(self, browser: Any, address: str, size: tuple[int, int] = (1280, 800)) -> None:
         self.hosts: set[str | None] = set()
         """Hosts from which it fetched."""
         self.errors: list[str] = []
-        self.first_s = 0.0
         self.page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         self.page.on("request", lambda request: self.hosts.add(urlsplit(request.url).hostname))
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self._start_s = time.monotonic()
         self.page.goto(address, wait_until="commit", timeout=1e3 * DEADLINE_S)
 
     def state(self) -> dict[str, Any]:
@@ -39,9 +37,8 @@ class Page:
         return self.page.evaluate("window.nlos ? nlos.state() : {}")
 
     def wait_drawn(self) -> None:
-        """Wait for a drawn moment, and note the time since the page was opened."""
+        """Wait for a drawn moment."""
         self.wait_until(lambda: self.state().get("shown", 0) > 0, "a drawn moment")
-        self.first_s = time.monotonic() - self._start_s
 
     def wait_until(self, holds: Callable[[], bool], purpose: str) -> None:
         deadline_s = time.monotonic() + DEADLINE_S
