@@ -2,7 +2,7 @@
 
 python tools/studies/renderer.py tradeoff     docs/renderer.json, docs/images/tradeoff.png, table of docs/accuracy.md
 python tools/studies/renderer.py glossy       docs/glossy.json: rank against error, time over a Lambertian object's
-python tools/studies/renderer.py soak [--scenes 1000000]  docs/soak.json: random scenes against the reference
+python tools/studies/renderer.py soak [--scenes 1000000]  docs/renderer_soak.json: random scenes against the reference
 python tools/studies/renderer.py cuda [--backend torch] [--objects 64] [--batch 1 4 16 64]: one line of JSON
 """
 
@@ -180,7 +180,7 @@ def soak(options: argparse.Namespace) -> None:
         part = store.with_suffix(".part")  # replaced whole: an interrupted run leaves the last one
         part.write_text(json.dumps(done), encoding="utf-8")
         part.replace(store)
-    harness.write("soak", {"machine": machine(), **done})
+    harness.write("renderer_soak", {"machine": machine(), **done})
     print(json.dumps(done))
 
 
