@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from io import BytesIO
 from itertools import pairwise
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from nlos_models import FileBusyError, claim, describe
 from numpy.typing import NDArray
 
+from nlos_cam.dataset.hdf5 import read_array, read_text
 from nlos_cam.dataset.plan import SCENE_COLUMNS, DatasetPlan
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
@@ -24,8 +24,6 @@ from nlos_cam.files import atomic_file
 
 SHARD_PATTERN, PART_PATTERN = "shard-*.h5", "*shard-*.part"
 REQUIRED_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category", "scene")
-MAX_ARRAY_BYTES, MAX_CHUNK_BYTES, MAX_RATIO = 1 << 30, 1 << 26, 1100
-"""Bounds on what an array may declare, in bytes and as a multiple of its file: gzip packs at most 1032 to 1."""
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """No space left, a quota reached, or a limit on the size of files."""
 
@@ -68,8 +66,8 @@ def shards_of(folder: Path) -> list[Shard]:
 def read_head(path: Path) -> Shard:
     """Return the head of a shard. Raises RecordingError where it cannot be read."""
     with open_shard(path) as file:
-        plan, seeds = str(file.attrs["plan"]), _checked(path, "seed", file)
-        if file.attrs.get("plan_sha256", "") != _digest(plan.encode()):
+        plan, seeds = read_text(file, "plan"), _checked(path, "seed", file)
+        if read_text(file, "plan_sha256", "") != _digest(plan.encode()):
             raise _damaged(path, "the checksum of its plan is missing or differs")
         consecutive = seeds.ndim == 1 and len(seeds) and (np.diff(seeds) == 1).all()
         if not consecutive or shard_path(path.parent, seeds[0]) != path:
@@ -80,7 +78,7 @@ def read_head(path: Path) -> Shard:
 def shard_origin(path: Path) -> tuple[str, str]:
     """Return the version of nlos-cam and the command that made a shard; "unknown" as far as it does not say."""
     with open_shard(path) as file:
-        return str(file.attrs.get("package_version", "unknown")), str(file.attrs.get("command", "unknown"))
+        return read_text(file, "package_version", "unknown"), read_text(file, "command", "unknown")
 
 
 def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
@@ -150,7 +148,7 @@ def open_shard(path: Path) -> Generator[h5py.File]:
     try:
         with h5py.File(path) as file:
             yield file
-    except RecordingError:
+    except (RecordingError, MemoryError):
         raise
     except Exception as error:  # h5py raises almost anything for damage
         raise _damaged(path, f"cannot be read as a shard: {describe(error)}") from error
@@ -158,17 +156,11 @@ def open_shard(path: Path) -> Generator[h5py.File]:
 
 def _checked(path: Path, name: str, file: h5py.File) -> NDArray[Any]:
     """Return an array of a shard whose checksum, size and storage have been verified."""
-    stored = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
-    if not isinstance(stored, h5py.Dataset) or stored.external or stored.is_virtual:
-        raise _damaged(path, f"{name} is not an array of this file")
-    is_text = bool(h5py.check_string_dtype(stored.dtype))
-    chunk_bytes = prod(stored.chunks or ()) * stored.dtype.itemsize
-    if stored.nbytes > min(MAX_ARRAY_BYTES, MAX_RATIO * path.stat().st_size) or chunk_bytes > MAX_CHUNK_BYTES:
-        raise _damaged(path, f"{name} declares {stored.nbytes} bytes, in chunks of {chunk_bytes}")
-    if not is_text and stored.dtype.kind not in "fiu":
-        raise _damaged(path, f"{name} does not hold numbers")
-    values = np.asarray(stored.asstr()[:] if is_text else stored[:])
-    if stored.attrs.get("sha256", "") != content_checksum(values):
+    try:
+        values = read_array(file, name)
+    except ValueError as error:
+        raise _damaged(path, describe(error)) from error
+    if read_text(file[name], "sha256", "") != content_checksum(values):
         raise _damaged(path, f"the checksum of {name} is missing or differs")
     return values
 
