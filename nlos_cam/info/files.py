@@ -12,7 +12,7 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from nlos_calibration import load_rig, load_wall
-from nlos_models import load_recipe, read_arrays, read_toml
+from nlos_models import load_recipe, read_arrays, read_bounded, read_toml
 
 from nlos_cam.errors import NlosCamError, RecordingError
 
@@ -164,9 +164,10 @@ def _frames(arrays: Any) -> dict[str, str]:
 def describe_toml(path: Path, verify: bool) -> Description | None:
     """Describe a wall record, scene, rig, recipe or settings file, by its keys."""
     del verify  # it is always read whole
-    _text(path)
     try:
         keys = read_toml(path)
+    except UnicodeDecodeError as error:
+        raise _binary(path) from error
     except tomllib.TOMLDecodeError as error:
         raise RecordingError(f"{path} is not TOML ({error}): correct it, or write it again") from error
     quoted, checked = shlex.quote(str(path)), "all fields"
@@ -215,13 +216,15 @@ def _pose(rig: Any) -> dict[str, str]:
 
 
 def _text(path: Path) -> str:
-    """Return a file's text. Raises RecordingError for a binary file or one too long for a record."""
-    if path.stat().st_size > MAX_TEXT_BYTES:
-        raise RecordingError(f"{path} has {path.stat().st_size >> 20} MiB, too many for a record: check the name")
+    """Return a file's text. Raises RecordingError for a binary file, and OSError for one too long for a record."""
     try:
-        return path.read_text(encoding="utf-8")
+        return read_bounded(path, MAX_TEXT_BYTES).decode()
     except UnicodeDecodeError as error:
-        raise RecordingError(f"{path} is a binary file, not a {path.suffix} file: check the name") from error
+        raise _binary(path) from error
+
+
+def _binary(path: Path) -> RecordingError:
+    return RecordingError(f"{path} is a binary file, not a {path.suffix} file: check the name")
 
 
 JSON_KINDS = {
