@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
@@ -18,7 +18,7 @@ from nlos_cam import dataset as data_sets
 from nlos_cam import objects as shapes
 from nlos_cam.cli.common import PAPER_RIG, Json, finish, interrupted_by_signals, progress, say, stop_on_signals, tracked
 from nlos_cam.errors import SceneError
-from nlos_cam.files import cache_folder, claim
+from nlos_cam.files import cache_folder
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -206,11 +206,10 @@ def direct(
     if run.devices > 1:
         raise SceneError(f"a direct network trains in one process, got --devices {run.devices}: drop it")
     fabric = run.fabric(recipe)
-    store = store or run.out / "packed"
-    store.mkdir(parents=True, exist_ok=True)
-    with claim(store, inside=True):
+    with ExitStack() as held:
         with tracked("packing maps") as on_progress:
-            source = data_sets.PackedMaps(data, store, on_progress)
+            packed = data_sets.open_packed_maps(data, store or run.out / "packed", on_progress)
+            source = held.enter_context(packed)
         held_out = models.first_of(data_sets.open_dataset(held_out_data).arrays(), recipe.held_out)
         recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
         rig = source.plan.rig

@@ -29,6 +29,7 @@ __all__ = [
     "measured_bare_wall",
     "objects_from_folder",
     "open_dataset",
+    "open_packed_maps",
     "procedural_images",
     "quality_set",
     "ray_farm",
@@ -48,7 +49,7 @@ from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, BuildReport, build_d
 from .doubt_samples import EMPTY, ORDINARY, check_doubt_data, doubt_sets, quality_set, samples_on_disk
 from .labelled import FRAMES_PER_RECORDING, label_recordings, list_recordings, read_labelled, write_shards
 from .outliers import HELD_OUT_OUTLIERS, SHAPE_OUTLIERS, TRAINING_OUTLIERS, Stimulus, draw_outlier
-from .packed import PackedMaps
+from .packed import PackedMaps, open_packed_maps
 from .plan import DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset

@@ -7,7 +7,8 @@ every epoch, so that an interrupted run sees the same batches again.
 import hashlib
 import json
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from nlos_cam.dataset.reader import MAP_CHANNELS, open_dataset
 from nlos_cam.dataset.samples import OnProgress, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, read_arrays, read_head
 from nlos_cam.errors import RecordingError, SceneError
-from nlos_cam.files import atomic_file
+from nlos_cam.files import atomic_file, claim
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 
 INDEX, MAPS, IMAGES, CELLS = "index.json", "maps.f16", "images.f16", "cells.npz"
@@ -51,14 +52,16 @@ class PackedMaps:
     """Normalised maps and images of one or more datasets of one rig, in a folder that is theirs alone."""
 
     def __init__(self, datasets: Sequence[Path], store: Path, on_progress: OnProgress = ignore) -> None:
-        """Open or make the store. Raises RecordingError for no dataset, SceneError for datasets of two rigs."""
+        """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
+
+        Raises RecordingError for no dataset, SceneError for datasets of two rigs.
+        """
         opened = [open_dataset(folder) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
         """Of the first dataset."""
         if others := [one.folder for one in opened if one.plan.rig != self.plan.rig]:
             raise SceneError(f"{others[0]} and {datasets[0]} were rendered for different rigs: give datasets of one")
         self._datasets, self._store, self.normal = list(datasets), store, CellNormal()
-        store.mkdir(parents=True, exist_ok=True)
         self._index = _read_index(store)
         if not (store / CELLS).exists():
             some = [read_arrays(shard, MAP_CHANNELS[:2]) for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
@@ -126,3 +129,14 @@ class PackedMaps:
         for start in range(0, count - batch + 1, batch):
             rows = np.sort(order[start : start + batch])
             yield NormalBatch(*(torch.from_numpy(file[rows]) for file in files))
+
+
+@contextmanager
+def open_packed_maps(datasets: Sequence[Path], store: Path, on_progress: OnProgress = ignore) -> Generator[PackedMaps]:
+    """Open or make a store, and hold the right to write it until the end of the block.
+
+    Raises FileBusyError while another process holds it, and the errors of PackedMaps.
+    """
+    store.mkdir(parents=True, exist_ok=True)
+    with claim(store, inside=True):
+        yield PackedMaps(datasets, store, on_progress)

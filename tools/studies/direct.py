@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from nlos_calibration import rig_named
 from nlos_models import DirectNetwork, MapSet, Recipe, Running, first_of, load_network, load_recipe, run, train_direct
 
-from nlos_cam.dataset import PackedMaps, open_dataset
+from nlos_cam.dataset import PackedMaps, open_dataset, open_packed_maps
 from nlos_cam.evaluate import TARGETS, advantage, format_interval, over_objects, per_object, plain, rendered_objects
 
 RECIPE = harness.ROOT / "models" / "recipes" / "paper-rig-direct.toml"
@@ -153,8 +153,13 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
 
 def main(chosen: Namespace) -> None:
     """Train the variants and write the tables after each."""
-    source, base = PackedMaps(chosen.dataset, chosen.store), load_recipe(RECIPE)
-    rig = rig_named("paper-rig")
+    with open_packed_maps(chosen.dataset, chosen.store) as source:
+        compare(chosen, source)
+
+
+def compare(chosen: Namespace, source: PackedMaps) -> None:
+    """Train the variants on packed maps and write the tables after each."""
+    base, rig = load_recipe(RECIPE), rig_named("paper-rig")
     sets = {
         "kinds": rendered_objects(rig).maps,
         "unseen": rendered_objects(rig, test="unseen").maps,

@@ -7,8 +7,9 @@ import pytest
 import torch
 from fake_farm import samples_of
 from nlos_calibration.rig import load_rig
+from nlos_models import FileBusyError
 
-from nlos_cam.dataset.packed import CELLS, IMAGES, INDEX, MAPS, PackedMaps
+from nlos_cam.dataset.packed import CELLS, IMAGES, INDEX, MAPS, PackedMaps, open_packed_maps
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
@@ -40,14 +41,15 @@ def _epoch(packed: PackedMaps, seed: int, batch: int = 2) -> tuple[np.ndarray, n
 
 def test_packed_maps_are_the_datasets_normalised(tmp_path: Path) -> None:
     folders = [_add(tmp_path / "a", 0), _add(tmp_path / "b", 20)]
-    packed = PackedMaps(folders, tmp_path / "store")
-    assert len(packed) == 2 * SHARD
-    wanted = dict[bytes, np.ndarray]()
-    for first in (0, 20):
-        samples = _samples(first)
-        normal = packed.normal(*(torch.from_numpy(samples[name]) for name in ("depth_m", "intensity")))
-        wanted |= {image.tobytes(): one for image, one in zip(samples["image"], normal.half().numpy(), strict=True)}
-    maps, images = _epoch(packed, 1)
+    with open_packed_maps(folders, tmp_path / "store") as packed:
+        assert len(packed) == 2 * SHARD
+        wanted = dict[bytes, np.ndarray]()
+        for first in (0, 20):
+            samples = _samples(first)
+            normal = packed.normal(*(torch.from_numpy(samples[name]) for name in ("depth_m", "intensity")))
+            normal = normal.half().numpy()
+            wanted |= {image.tobytes(): one for image, one in zip(samples["image"], normal, strict=True)}
+        maps, images = _epoch(packed, 1)
     assert len({image.tobytes() for image in images}) == 2 * SHARD
     for image, one in zip(images, maps, strict=True):
         np.testing.assert_array_equal(one, wanted[image.tobytes()])
@@ -55,33 +57,44 @@ def test_packed_maps_are_the_datasets_normalised(tmp_path: Path) -> None:
 
 def test_new_shards_enter_new_epochs_and_an_epoch_can_be_seen_again(tmp_path: Path) -> None:
     folder = _add(tmp_path / "a", 0)
-    packed = PackedMaps([folder], tmp_path / "store")
-    first = _epoch(packed, 1)
-    _add(folder, 5)
-    assert len(_epoch(packed, 2)[0]) == 10
+    with open_packed_maps([folder], tmp_path / "store") as packed:
+        first = _epoch(packed, 1)
+        _add(folder, 5)
+        assert len(_epoch(packed, 2)[0]) == 10
     with (tmp_path / "store" / MAPS).open("ab") as file:
         file.write(b"left by an interruption")
-    again = PackedMaps([folder], tmp_path / "store")
-    assert (len(again), again.digest) == (10, packed.digest)
-    for one, other in zip(_epoch(again, 1), first, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert len(_epoch(again, 3)[0]) == 10
+    with open_packed_maps([folder], tmp_path / "store") as again:
+        assert (len(again), again.digest) == (10, packed.digest)
+        for one, other in zip(_epoch(again, 1), first, strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert len(_epoch(again, 3)[0]) == 10
+
+
+def test_open_packed_maps_refuses_a_store_in_use(tmp_path: Path) -> None:
+    folder, store_folder = _add(tmp_path / "a", 0), tmp_path / "store"
+    with open_packed_maps([folder], store_folder), pytest.raises(FileBusyError, match="store is being written"):
+        open_packed_maps([folder], store_folder).__enter__()
+    with pytest.raises(ZeroDivisionError), open_packed_maps([folder], store_folder):
+        raise ZeroDivisionError
+    with open_packed_maps([folder], store_folder) as packed:  # free again after an error
+        assert len(packed) == SHARD
 
 
 @pytest.mark.parametrize("name", [CELLS, INDEX, MAPS, IMAGES])
 def test_damaged_store_is_refused(tmp_path: Path, name: str) -> None:
     folder = _add(tmp_path / "a", 0)
-    PackedMaps([folder], tmp_path / "store")
-    file = tmp_path / "store" / name
+    with open_packed_maps([folder], tmp_path / "store"):
+        file = tmp_path / "store" / name
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     with pytest.raises(RecordingError, match=f"{name} is damaged"):
-        PackedMaps([folder], tmp_path / "store")
+        open_packed_maps([folder], tmp_path / "store").__enter__()
 
 
 def test_datasets_of_two_rigs_and_too_few_objects_are_refused(tmp_path: Path) -> None:
-    folder = _add(tmp_path / "a", 0)
+    folder, store_folder = _add(tmp_path / "a", 0), tmp_path / "store"
     other = DatasetPlan(PLAN.rig.model_copy(update={"name": "bench"}), 0)
     with pytest.raises(SceneError, match="different rigs"):
-        PackedMaps([folder, _add(tmp_path / "b", 0, other)], tmp_path / "store")
-    with pytest.raises(RecordingError, match="fewer than a batch of 64"):
-        next(PackedMaps([folder], tmp_path / "store").batches(64, torch.Generator()))
+        open_packed_maps([folder, _add(tmp_path / "b", 0, other)], store_folder).__enter__()
+    few = pytest.raises(RecordingError, match="fewer than a batch of 64")
+    with open_packed_maps([folder], store_folder) as packed, few:
+        next(packed.batches(64, torch.Generator()))
