@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
+from small_frames import ListViewer, sheet_network
 
 from nlos_cam.camera import Recording, session
 from nlos_cam.camera.simulated import SimulatedCamera
@@ -33,10 +34,6 @@ FOREVER = 10**9
 PLENTY = 100_000
 
 Make = Callable[..., SimulatedCamera]
-
-
-def network(*_: np.ndarray) -> np.ndarray:
-    return np.full((1, 64, 64), 0.5, np.float32)
 
 
 @pytest.fixture
@@ -75,14 +72,6 @@ class Until:
                 return
 
 
-class ListViewer(NullViewer):
-    def __init__(self) -> None:
-        self.moments: list[Moment] = []
-
-    def show(self, moment: Moment) -> None:
-        self.moments.append(moment)
-
-
 def instant_of(frame: Frame) -> int:
     return int(frame.truth_depth_m[0, 0])
 
@@ -90,7 +79,7 @@ def instant_of(frame: Frame) -> int:
 def live(camera: SimulatedCamera, last: int = LAST, **options: Any) -> tuple[list[Moment], RunReport]:
     viewer = ListViewer()
     with camera:
-        processing = Pipeline(CalibratedRig(RIG), network)
+        processing = Pipeline(CalibratedRig(RIG), sheet_network)
         report = run_live(Until(camera, last), processing, viewer, stop=Event(), **options)  # type: ignore[arg-type]
     moments = [moment for moment in viewer.moments if moment.verdict != Verdict.STALLED]  # the last one, shown again
     assert report.frames == len(moments)
@@ -211,7 +200,7 @@ def test_stopping_ends_a_wait_for_a_lost_device(camera: Make, monkeypatch: pytes
     timer = Timer(1.0, stop.set)
     timer.start()
     with gone:
-        report = run_live(gone, Pipeline(CalibratedRig(RIG), network), NullViewer(), stop=stop)
+        report = run_live(gone, Pipeline(CalibratedRig(RIG), sheet_network), NullViewer(), stop=stop)
     assert report.frames == 5
     timer.join()
 

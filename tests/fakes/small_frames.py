@@ -10,6 +10,7 @@ from fake_wall import SERIAL, SMALL
 
 from nlos_cam.frames import Frame
 from nlos_cam.reconstruct.network import Reconstruction
+from nlos_cam.view.viewer import Moment, NullViewer
 
 NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})
 
@@ -57,3 +58,13 @@ class FrameCamera:
             self._on_frame(number)
             yield self._make(number)
             number += 1
+
+
+class ListViewer(NullViewer):
+    """Viewer that keeps every moment."""
+
+    def __init__(self) -> None:
+        self.moments: list[Moment] = []
+
+    def show(self, moment: Moment) -> None:
+        self.moments.append(moment)

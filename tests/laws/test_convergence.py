@@ -89,7 +89,6 @@ Case = tuple[Scene, np.ndarray, np.ndarray]
 
 @pytest.fixture(scope="module", params=[3, 20_000_009])
 def case(request: pytest.FixtureRequest) -> Case:
-    assert RIG.object_box is not None
     scene = Scene(RIG, object_depth(request.param, RIG.object_box)[1])
     chosen = np.arange(5120)
     chosen = chosen[three_bounce(scene, "draft").any(1)]

@@ -82,7 +82,6 @@ def test_drift_check_measures_a_knock_beside_an_object(pose: WallPose, shift: Wa
     hide = [multipath(stream.places, share, 5)] if share else []
     assert stream.show(pose, 40, *hide) is None
     told = stream.show(stream.moved(*shift), TOLD_FRAMES, *hide)
-    assert told is not None
     assert told > 3 or share  # a frame or two are no news
     assert_right(stream, shift)
 

@@ -123,7 +123,6 @@ def test_path_on_the_edge_of_a_bin_is_kept(implementation: Any) -> None:
     depth, one = _grid(), replace(FEW, relay_columns=1, relay_rows=1)
     depth[3, 3] = 0.25
     job = prepare(Scene(OPEN, depth), one, ["three-bounce"]).job
-    assert job is not None
     cell = np.array([job.relay.x_m[0], job.relay.y_m[0], 0])
     point = job.patches.point_m[0]
     path = job.length_m + np.linalg.norm(job.laser_spot_m - point, axis=1) + np.linalg.norm(cell - point)

@@ -29,7 +29,6 @@ NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA devic
 
 
 def _object(seed: int = 5, size: int = 32) -> np.ndarray:
-    assert RIG.object_box is not None
     return object_depth(seed, RIG.object_box)[1][:: 64 // size, :: 64 // size].copy()
 
 

@@ -40,9 +40,7 @@ def _rough(seed: int, low_m: float = 0.15, high_m: float = 0.35) -> np.ndarray:
 
 
 def _job(scene: Scene, accuracy: Accuracy = COARSE) -> TransportJob:
-    job = prepare(scene, accuracy, ALL_BUT_MORE).job
-    assert job is not None
-    return job
+    return prepare(scene, accuracy, ALL_BUT_MORE).job
 
 
 def _arrived(implementation: Any, job: TransportJob) -> np.ndarray:

@@ -16,9 +16,7 @@ ENTERED = OccluderRecord(source="entered", x_m=0.2, gap_m=0.1)
 
 def pixels(picture: Picture) -> np.ndarray:
     """Return the picture's pixels (height, width, 3), blue first."""
-    drawn = picture.png
-    assert drawn is not None
-    return cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR).astype(int)
+    return cv2.imdecode(np.frombuffer(picture.png, np.uint8), cv2.IMREAD_COLOR).astype(int)
 
 
 def share_like(image: np.ndarray, blue: int, green: int, red: int) -> float:

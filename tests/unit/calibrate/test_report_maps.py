@@ -5,7 +5,6 @@ import cv2
 import numpy as np
 import pytest
 from nlos_calibration.noise import depth_noise_m
-from nlos_calibration.reference import BareWall
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import MeasuredWall
 
@@ -20,21 +19,15 @@ def wall(measured: Callable[..., MeasuredWall]) -> MeasuredWall:
     return measured()
 
 
-def reference_of(wall: MeasuredWall) -> BareWall:
-    assert wall.reference is not None
-    return wall.reference
-
-
 def decoded(picture: Picture) -> np.ndarray:
     """Return the picture's pixels (height, width, 3), red first."""
-    assert picture.png is not None
     return cv2.imdecode(np.frombuffer(picture.png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
 
 
 def maps(wall: MeasuredWall, **changes: np.ndarray) -> list[Picture]:
     """Return residual, spread, noise and infrared of a wall some of whose maps are others."""
     typed = {name: values if values.dtype == bool else values.astype(np.float32) for name, values in changes.items()}
-    return wall_maps(wall.record, replace(reference_of(wall), **typed))
+    return wall_maps(wall.record, replace(wall.reference, **typed))
 
 
 def red_and_blue(picture: Picture) -> tuple[float, float]:
@@ -60,7 +53,7 @@ def test_wall_maps_of_an_exact_plane_are_pale(wall: MeasuredWall) -> None:
 def test_residual_map_is_red_behind_the_plane_else_blue(
     wall: MeasuredWall, bump_m: float, color: int, other: int
 ) -> None:
-    depth_m = reference_of(wall).depth_m.copy()
+    depth_m = wall.reference.depth_m.copy()
     depth_m[:, 16:32] += bump_m
     drawn = red_and_blue(maps(wall, depth_m=depth_m)[0])
     assert 0.1 < drawn[color] < 0.3
@@ -69,7 +62,7 @@ def test_residual_map_is_red_behind_the_plane_else_blue(
 
 @pytest.mark.slow
 def test_residual_map_stripes_what_was_left_out(wall: MeasuredWall) -> None:
-    depth_m, inliers = reference_of(wall).depth_m.copy(), reference_of(wall).inliers.copy()
+    depth_m, inliers = wall.reference.depth_m.copy(), wall.reference.inliers.copy()
     depth_m[:, 16:32] += 0.01
     inliers[:, 16:32] = False
     depth_m[:12] = np.nan
@@ -85,14 +78,14 @@ def test_residual_map_stripes_what_was_left_out(wall: MeasuredWall) -> None:
 
 @pytest.mark.slow
 def test_spread_map_separates_ripples_from_noise(wall: MeasuredWall) -> None:
-    rippled_m = reference_of(wall).depth_m + 0.002 * np.sin(np.arange(64) / 4.0)
+    rippled_m = wall.reference.depth_m + 0.002 * np.sin(np.arange(64) / 4.0)
     spread = maps(wall, depth_m=rippled_m)[1]
     assert 0.8 < float(spread.caption.split(" mm RMS")[0].rsplit(" ", 1)[1]) < 1.45
     assert "60 frames" in spread.caption
 
 
 def test_wall_maps_without_data_have_no_picture(wall: MeasuredWall) -> None:
-    nothing = np.full_like(reference_of(wall).depth_m, np.nan)
+    nothing = np.full_like(wall.reference.depth_m, np.nan)
     shown = maps(wall, depth_m=nothing, depth_std_m=nothing, ir=nothing, inliers=np.zeros(nothing.shape, bool))
     assert [picture.png for picture in shown] == [None] * 4
     assert all(picture.caption.endswith(".") for picture in shown)
@@ -109,7 +102,7 @@ def test_residual_map_of_refused_depth_names_the_boards_plane(wall: MeasuredWall
 
 @pytest.mark.slow
 def test_infrared_map_draws_saturation_if_any(wall: MeasuredWall) -> None:
-    bare, share = maps(wall)[3], np.zeros_like(reference_of(wall).saturated)
+    bare, share = maps(wall)[3], np.zeros_like(wall.reference.saturated)
     assert "48 of 255" in bare.caption
     share[:, :16], share[:, :8] = 0.1, 0.9
     blinded = maps(wall, saturated=share)[3]
@@ -122,7 +115,6 @@ def test_infrared_map_draws_saturation_if_any(wall: MeasuredWall) -> None:
 
 def seen(wall: MeasuredWall, depth_m: np.ndarray, **others: object) -> np.ndarray:
     """Return the residual of another depth against the wall's record, with other fields."""
-    assert wall.reference is not None
     reference = replace(wall.reference, depth_m=depth_m.astype(np.float32))
     return residual_m(wall.record.model_copy(update=others), reference)
 
@@ -132,7 +124,7 @@ def test_residual_is_the_height_above_the_plane(
     measured: Callable[..., MeasuredWall], distance_m: float, yaw_deg: float, pitch_deg: float
 ) -> None:
     wall = measured(distance_m, yaw_deg, pitch_deg)
-    reference, part, moved = reference_of(wall), np.s_[10:20, 10:20], np.array(wall.record.wall_from_lidar)
+    reference, part, moved = wall.reference, np.s_[10:20, 10:20], np.array(wall.record.wall_from_lidar)
     depth_m, near = reference.depth_m.astype(np.float64), reference.depth_m < 2.0
     for bump_m in (0.0, 0.004, -0.004):
         moved[2, 3] = wall.record.distance_m + bump_m
@@ -146,7 +138,7 @@ def test_residual_is_the_height_above_the_plane(
 @pytest.mark.parametrize("cause", ["depth", "origin"])
 @pytest.mark.parametrize("offset_m", [0.0045, -0.0045])
 def test_residual_allows_for_the_range_offset(wall: MeasuredWall, offset_m: float, cause: str) -> None:
-    reference = reference_of(wall)
+    reference = wall.reference
     depth_m = reference.depth_m.astype(np.float64) - offset_m
     if cause == "origin":
         meeting = np.array(wall.record.wall_from_lidar)
@@ -160,10 +152,10 @@ def test_residual_allows_for_the_range_offset(wall: MeasuredWall, offset_m: floa
 
 def test_residual_of_noise_has_the_expected_spread(measured: Callable[..., MeasuredWall]) -> None:
     wall = measured(width=160)
-    depth_m = reference_of(wall).depth_m.astype(np.float64)
-    noise_m = depth_noise_m(depth_m) / np.sqrt(reference_of(wall).frames)
+    depth_m = wall.reference.depth_m.astype(np.float64)
+    noise_m = depth_noise_m(depth_m) / np.sqrt(wall.reference.frames)
     off_m = seen(wall, depth_m + noise_m * np.random.default_rng(0).standard_normal(depth_m.shape))
-    sigmas = off_m / expected_std_m(wall.record, reference_of(wall))
+    sigmas = off_m / expected_std_m(wall.record, wall.reference)
     assert sigmas.std() == pytest.approx(1.0, abs=0.02)
     assert [sigmas[:, :40].std(), sigmas[:, -40:].std()] == pytest.approx([1.0, 1.0], abs=0.04)
 

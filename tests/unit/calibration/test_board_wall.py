@@ -105,7 +105,6 @@ def test_wall_with_board_combines_planes_that_agree(depth: WallFit) -> None:
     assert (fit.distance_m, fit.facing_deg) == pytest.approx((0.2, 45.0), abs=0.02)
     assert fit.distance_std_m <= depth.distance_std_m
     assert record.disagreement_m == pytest.approx(record.distance_m - depth.distance_m)
-    assert record.disagreement_sigmas is not None
     assert record.disagreement_sigmas < 4.0
     np.testing.assert_allclose(fit.wall_from_lidar[2, 3], fit.distance_m)
 

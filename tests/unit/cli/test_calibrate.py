@@ -374,4 +374,3 @@ def test_board_keeps_a_file_and_prints_how_to_print(tmp_path: Path, capsys: pyte
     shown = capsys.readouterr().out
     for part in ("6 x 9", "30 mm", "a4", "100 %", "board.pdf"):
         assert part in shown
-    assert main(["board", "--paper", "napkin", "--out", str(out)]) == 2

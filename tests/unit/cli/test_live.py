@@ -168,7 +168,6 @@ def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) 
     assert run(*REPLAY)[0] == 1
     assert run(*REPLAY, "--overwrite", "--reader", "sdk")[0] == 0
     assert opened.calls == [("bag:run.bag", {"reader": "plain"}), ("bag:run.bag", {"reader": "sdk"})]
-    assert main(["replay", "run.bag", "--reader", "quick"]) == 2
 
 
 @pytest.mark.parametrize("command", [RECORDED, REPLAY])
@@ -194,13 +193,10 @@ def test_interrupt_while_a_camera_opens_begins_no_run(opened: Opened, run: Run, 
 
 def test_live_budget_reports_whether_it_was_kept(opened: Opened, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.live.setting_loader", lambda *_: lambda _: opened.network)
-    arguments = [*RECORDED, "--budget-ms", "100000"]
-    code, report, printed = run(*arguments)
+    code, report, printed = run(*RECORDED, "--budget-ms", "100000")
     assert code == 0
     assert report["budget"]["kept"]
     assert "100000 ms" in printed
-    assert main([*arguments, "--average", "4"]) == 2
-    assert len(opened.calls) == 1
 
 
 @pytest.mark.usefixtures("walled")
@@ -222,7 +218,6 @@ def test_average_is_over_as_many_frames_as_asked(walled: Opened) -> None:
     assert main([*WALLED, "wall.toml", "--average", "20"]) == 0
     mean_m = np.mean([wall_frame(number).depth_m for number in range(6, 26)], axis=0)
     np.testing.assert_allclose(walled.network.given[25], mean_m, atol=1e-6)  # NaN where NaN
-    assert main([*WALLED, "wall.toml", "--average", "0"]) == 2
 
 
 def test_weights_of_difference_maps_need_a_wall(walled: Opened, run: Run) -> None:

@@ -214,7 +214,6 @@ def leaves(app: typer.Typer, path: str = "") -> list[tuple[str, object]]:
     commands = app.registered_commands
     found = [(f"{path} {c.name or getattr(c.callback, '__name__', None)}".strip(), c.callback) for c in commands]
     for group in app.registered_groups:
-        assert group.typer_instance is not None
         found += leaves(group.typer_instance, f"{path} {group.name}".strip())
     return found
 

@@ -118,7 +118,6 @@ def test_train_vae_answers_with_folder_and_figures(go: Go, tmp_path: Path) -> No
 def test_train_follows_shared_options(go: Go, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiled: list[object] = []
     monkeypatch.setattr(train, "compile_network", lambda network: compiled.append(network) or network)
-    assert main(["train", "vae", "--recipe", "vae.toml"]) == 2  # without --out
     assert go("vae", "--budget", "0.5", "--objects", "6", "--compile")[0] == 0
     assert len(compiled) == 1
     recipe = load_record(tmp_path / "out").vae_recipe
@@ -223,7 +222,6 @@ def test_train_transfer_reports_both_figures_and_keeps_decoder(go: Go, folder: P
     [
         ("vae", ["--accelerator", "cuda", "--devices", "4"], 1, "4 GPUs"),
         ("vae", ["--devices", "3"], 4, "3 processes"),
-        ("vae", ["--recipe", "none.toml"], 4, "none.toml"),
         ("transfer", ["--recipe", "vae.toml"], 1, "'vae'"),
         ("transfer", ["--weights", "none"], 4, "none"),
         ("two", ["--vae", "none"], 4, "none"),
@@ -231,7 +229,6 @@ def test_train_transfer_reports_both_figures_and_keeps_decoder(go: Go, folder: P
         ("two", ["--weights", "w"], 1, "--weights"),
         ("joint", ["--weights", "w", "--vae", "v"], 1, "--vae"),
         ("transfer", ["--objects", "9"], 1, "9"),
-        ("vae", ["--budget", "2"], 2, ""),
     ],
 )
 def test_train_refuses_options_that_do_not_fit(
@@ -243,7 +240,7 @@ def test_train_refuses_options_that_do_not_fit(
     start = ["--weights", "two"] if recipe == "transfer" and "--weights" not in options else []
     ended, answer = go(recipe, *start, *options)
     assert ended == code
-    assert not words or words in answer["error"]["message"]
+    assert words in answer["error"]["message"]
     assert not (tmp_path / "out").exists()
 
 

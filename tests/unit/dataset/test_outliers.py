@@ -34,18 +34,13 @@ def made(name: str, seed: int) -> Stimulus:
     return draw_outlier({**TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}[name], np.random.default_rng(seed), PLAIN)
 
 
-def depth_of(stimulus: Stimulus) -> np.ndarray:
-    assert stimulus.depth_m is not None
-    return stimulus.depth_m
-
-
 def width_m(depth_m: np.ndarray) -> float:
     rows, columns = np.nonzero(np.isfinite(depth_m))
     return float(max(np.ptp(rows), np.ptp(columns)) + 1) * 0.25 / 64
 
 
 def touches_edge(stimulus: Stimulus) -> bool:
-    seen = np.isfinite(depth_of(stimulus))
+    seen = np.isfinite(stimulus.depth_m)
     return bool(seen[[0, -1]].any() or seen[:, [0, -1]].any())
 
 
@@ -53,8 +48,8 @@ def touches_edge(stimulus: Stimulus) -> bool:
 def test_outlier_shows_surface_before_wall_and_repeats_by_seed(name: str) -> None:
     for seed in SEEDS:
         one, again = made(name, seed), made(name, seed)
-        np.testing.assert_array_equal(depth_of(one), depth_of(again))
-        surface_m = depth_of(one)[np.isfinite(depth_of(one))]
+        np.testing.assert_array_equal(one.depth_m, again.depth_m)
+        surface_m = one.depth_m[np.isfinite(one.depth_m)]
         assert surface_m.size >= MIN_PIXELS
         assert surface_m.min() > 0.0
         assert one.scene.rig == one.rig
@@ -69,17 +64,17 @@ def test_outlier_kinds_to_learn_and_to_judge_differ() -> None:
 
 
 OUTSIDE: dict[str, Callable[[Stimulus], bool]] = {
-    "small": lambda s: width_m(depth_of(s)) < 0.5 * 0.25,
+    "small": lambda s: width_m(s.depth_m) < 0.5 * 0.25,
     "large": touches_edge,
-    "far": lambda s: float(np.nanmin(depth_of(s))) > BOX.z_near_m + 0.119,
-    "near": lambda s: float(np.nanmin(depth_of(s))) < BOX.z_near_m,
+    "far": lambda s: float(np.nanmin(s.depth_m)) > BOX.z_near_m + 0.119,
+    "near": lambda s: float(np.nanmin(s.depth_m)) < BOX.z_near_m,
     "dim": lambda s: float(np.max(s.surface.albedo)) <= 0.4,
     "two tone": lambda s: len(np.unique(s.surface.albedo)) == 2,
     "glossy": lambda s: s.surface.brdf is not None,
     "other rig": lambda s: abs(s.rig.lidar.distance_m - RIG.lidar.distance_m) >= 0.015,
     "other sensor": lambda s: not 0.65 < s.sensor.bare_wall_counts / 48.0 < 1.6,
     "half out": touches_edge,
-    "noise sheet": lambda s: float(np.nanstd(depth_of(s))) > 0.07,
+    "noise sheet": lambda s: float(np.nanstd(s.depth_m)) > 0.07,
 }
 
 
@@ -104,7 +99,7 @@ def test_outlier_without_surface_is_drawn_again() -> None:
         seen = ordinary(generator, stimulus)
         return stimulus if len(tries) < 3 else seen
 
-    assert np.isfinite(depth_of(draw_outlier(shy, np.random.default_rng(0), PLAIN))).any()
+    assert np.isfinite(draw_outlier(shy, np.random.default_rng(0), PLAIN).depth_m).any()
     assert len(tries) == 3
 
 

@@ -87,7 +87,6 @@ def test_session_is_saved_between_two_commands(control: RunControl, tmp_path: Pa
 
 def test_average_and_setting_change_the_pipeline(control: RunControl) -> None:
     pipeline = control._pipeline
-    assert pipeline is not None
     control.run("average", {"frames": 4})
     assert pipeline.average == control.status()["control"]["average"] == 4
     other: Any = object()
@@ -196,10 +195,8 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     threads[0].join()
     assert "reference of 8 frames" in told[0]
     (bench,) = benches
-    assert bench.reference is not None
     assert bench.rig is RIG
     measured = load_measured(next(tmp_path.glob("bench-*.toml")))
-    assert measured.reference is not None
     np.testing.assert_array_equal(measured.reference.map_depth_m, bench.reference.map_depth_m)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fake_wall import SMALL, WallCamera, measured_wall
 from nlos_calibration.rig import load_rig
-from small_frames import FrameCamera, sheet_network, small_frame
+from small_frames import FrameCamera, ListViewer, sheet_network, small_frame
 
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
@@ -47,14 +47,6 @@ def test_pace_yields_frames_at_their_timestamps() -> None:
     assert waits_s == pytest.approx([0.0, PERIOD_S - 0.01, 3 * PERIOD_S - 0.01, 0.0])
     stop.set()
     assert list(pace([small_frame(0)], stop, lambda: 0.0)) == []
-
-
-class ListViewer(NullViewer):
-    def __init__(self) -> None:
-        self.moments: list[Moment] = []
-
-    def show(self, moment: Moment) -> None:
-        self.moments.append(moment)
 
 
 class Lockstep(ListViewer):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from nlos_models import doubt_network, records
-from nlos_models.doubt_network import CalibratedDoubt
 from nlos_models.errors import CheckpointError
 from nlos_models.inference import load_uncertainty_model
 from nlos_models.records import DoubtRecord
@@ -25,14 +24,8 @@ def record(tmp_path: Path, watched: Path) -> DoubtRecord:
     return untrained_doubt(tmp_path / "run", watched)
 
 
-def _load(folder: Path) -> tuple[CalibratedDoubt, DoubtRecord]:
-    loaded = doubt_network.load_doubt(folder)
-    assert loaded is not None
-    return loaded
-
-
 def test_saved_doubt_restores_with_watched_weights(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
-    network, found = _load(tmp_path / "run")
+    network, found = doubt_network.load_doubt(tmp_path / "run")
     assert found == record
     assert not network.training
     assert network.temperature.tolist() == [0.5, 2.0]
@@ -64,16 +57,17 @@ def test_load_doubt_refuses_other_weights_or_damaged_record(tmp_path: Path, name
 
 
 def test_save_doubt_refuses_weights_changed_since_training(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
+    network = doubt_network.load_doubt(tmp_path / "run")[0].network
     (watched / records.WATCHED[0]).write_bytes(b"another network")
     with pytest.raises(CheckpointError, match="watched"):
-        doubt_network.save_doubt(tmp_path / "other", _load(tmp_path / "run")[0].network, record, watched)
+        doubt_network.save_doubt(tmp_path / "other", network, record, watched)
 
 
 def test_saved_bare_wall_keeps_its_precision(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
-    network, wall_m = _load(tmp_path / "run")[0].network, 0.3 + 1e-4 * torch.rand(5, 64, 80)
+    network, wall_m = doubt_network.load_doubt(tmp_path / "run")[0].network, 0.3 + 1e-4 * torch.rand(5, 64, 80)
     network.learn_bare(wall_m, wall_m)
     doubt_network.save_doubt(tmp_path / "second", network, record, watched)
-    again = _load(tmp_path / "second")[0].network
+    again = doubt_network.load_doubt(tmp_path / "second")[0].network
     torch.testing.assert_close(again.bare_depth_m, wall_m.median(0).values, rtol=0, atol=0)
 
 
@@ -81,11 +75,9 @@ def test_saved_bare_wall_keeps_its_precision(tmp_path: Path, watched: Path, reco
 def test_doubter_onnx_equals_torch_and_is_exported_once(tmp_path: Path, record: DoubtRecord) -> None:
     folder, cache = tmp_path / "run", tmp_path / "cache"
     doubter = load_uncertainty_model(folder, cache)
-    assert doubter is not None
     (model,) = cache.glob("doubt-*.onnx")
     written_ns = model.stat().st_mtime_ns
     again = load_uncertainty_model(folder, cache)
-    assert again is not None
     assert again.record == doubter.record == record
     assert model.stat().st_mtime_ns == written_ns
     for count in (1, 5):
@@ -95,7 +87,7 @@ def test_doubter_onnx_equals_torch_and_is_exported_once(tmp_path: Path, record: 
         intensity = generator.uniform(0, 255, depth_m.shape).astype(np.float32)
         image = generator.uniform(0, 1, (count, 64, 64)).astype(np.float32)
         with torch.inference_mode():
-            theirs = _load(folder)[0](*(torch.from_numpy(a) for a in (depth_m, intensity, image)))
+            theirs = doubt_network.load_doubt(folder)[0](*(torch.from_numpy(a) for a in (depth_m, intensity, image)))
         for mine, its in zip(again(depth_m, intensity, image), theirs, strict=True):
             assert mine.shape == tuple(its.shape)
             np.testing.assert_allclose(mine, its, rtol=1e-3, atol=1e-5)

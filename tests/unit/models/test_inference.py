@@ -202,8 +202,6 @@ def test_shipped_graphs_equal_shipped_checkpoint_in_torch() -> None:
     assert both.mean() > 0
     np.testing.assert_allclose(mine[both], its[both], atol=1e-4)
     reference = load_doubt(shipped)
-    assert doubt is not None
-    assert reference is not None
     with torch.inference_mode():
         theirs = reference[0](*(torch.from_numpy(part) for part in (*maps, mine)))
     for said, wanted in zip(doubt(*maps, mine), theirs, strict=True):

@@ -87,7 +87,6 @@ def test_trust_needs_enough_frames_and_precision_in_both_shares() -> None:
     good = np.linspace(0, 1, 1000).astype(np.float32)
     generic = np.arange(1000) % 2 == 0
     above = trusted_above(good, good >= 0.5, generic)
-    assert above is not None
     assert 0.44 < above <= 0.5
     assert trusted_above(good[-10:], good[-10:] > 0, generic[-10:]) is None
     assert trusted_above(good, (good >= 0.5) & ~generic, generic) is None
@@ -105,8 +104,6 @@ def test_model_is_bound_to_its_uncertainty_network(tmp_path: Path) -> None:
     record = record_of(watches=quality.quality_watches(folder))
     quality.write_quality(folder, record)
     loaded = load_uncertainty_model(folder, tmp_path)
-    assert loaded is not None
-    assert loaded.quality is not None
     assert loaded.quality.record == record
     assert loaded.quality(*frames(2)).iou == pytest.approx(np.full((2, 3), 0.5))
     text = (folder / quality.QUALITY).read_text()

@@ -64,8 +64,6 @@ def test_compressor_start_lists_runs_of_weights_and_vae(weights: Path, tmp_path:
     save_vae(tmp_path / "other", SmallVae(), CheckpointRecord.of([OTHER_VAE], NAMED))
     start, runs = compressor_start(AGAIN, tmp_path / "other", weights)
     assert runs == [VAE, TWO, OTHER_VAE]
-    assert start.pipeline is not None
-    assert start.vae is not None
     assert not torch.equal(start.vae.decoder.output.weight, start.pipeline.decoder.output.weight)
     assert compressor_start(AGAIN, weights, weights)[1] == [TWO, VAE]
     start, runs = compressor_start(small_recipe(task="compressor", steps="one", **IMAGES_ALONE), None, None)

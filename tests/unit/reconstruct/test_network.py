@@ -70,7 +70,6 @@ def test_reconstruct_with_doubt_adds_uncertainty_and_a_stage() -> None:
     ticks, doubter = itertools.count(), FakeDoubter(lambda *_: (0.25, 0.5), error_v=0.1)
     found = reconstruct(some_maps(), RIG, half, lambda: float(next(ticks)), doubter)
     assert found.timings_s == {"network": 1.0, "doubt": 1.0}
-    assert found.doubt is not None
     assert (found.doubt.nothing, found.doubt.outside) == (0.25, 0.5)
     assert found.uncertainty_m is found.doubt.error_m
     assert [part.shape for part in doubter.asked[0]] == [(1, 64, 80), (1, 64, 80), (1, 64, 64)]

@@ -40,7 +40,6 @@ def _scene(size: int = 12, step_m: float = 0.01) -> Scene:
 
 def _job(scene: Scene, beams: int = 30, accuracy: Accuracy = SMALL) -> TransportJob:
     job = prepare(scene, accuracy, "auto").job
-    assert job is not None
     return job.select(np.arange(0, len(job.laser_spot_m), len(job.laser_spot_m) // beams))
 
 
@@ -134,7 +133,6 @@ def test_renderer_imports_torch_late() -> None:
 def _shading_job(depth: np.ndarray) -> TransportJob:
     accuracy = Accuracy("coarse", relay_columns=12, relay_rows=10)
     job = prepare(Scene(RIG, depth), accuracy, {"direct", "three-bounce", "self-occlusion", "tilt"}).job
-    assert job is not None
     return job.select(np.arange(0, len(job.laser_spot_m), 60))
 
 

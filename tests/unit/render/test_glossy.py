@@ -23,7 +23,6 @@ BRDF = phong(0.4, 0.6, 10)
 def _job(brdf: Brdf = BRDF) -> TransportJob:
     depth = np.random.default_rng(0).uniform(0.1, 0.3, (4, 4)).astype(np.float32)
     problem = prepare(Scene(load_rig("paper-rig"), depth, Surface(1.0, brdf)), COARSE, ("three-bounce", "tilt", "brdf"))
-    assert problem.job is not None
     return problem.job
 
 
@@ -53,7 +52,6 @@ def test_eigenfunctions_sum_to_the_brdf(brdf: Brdf) -> None:
 def test_rank_follows_the_error_and_the_lobe() -> None:
     def rank(error: float, brdf: Brdf = BRDF) -> int:
         found = glossy.glossy_basis(replace(JOB, accuracy=replace(COARSE, scatter_error=error)), brdf)
-        assert found is not None
         assert found.value.shape[1] == len(found.sign) == len(found.harmonic)
         return len(found.sign)
 

@@ -78,7 +78,6 @@ def test_pose_derivatives_are_the_differences_of_the_reference(radiometry: str, 
 def test_depth_derivatives_are_the_differences_of_the_reference(radiometry: Any) -> None:
     scene, found = bent_plate(radiometry=radiometry), gradients(radiometry=radiometry)
     depth = scene.object_depth_m
-    assert depth is not None
     beams, change = spread_beams(found), np.random.default_rng(2).normal(size=depth.shape)
     ahead, behind = (
         reference(prepare(replace(scene, object_depth_m=depth + sign * 1e-5 * change), COARSE, ECHOES), beams)[:, 0]
@@ -95,7 +94,6 @@ def test_derivative_over_a_path_is_the_difference_across_bin_edges() -> None:
     # strongest bin changes on the way, and its intensity is continuous there.
     scene, accuracy = bent_plate(0.05, cells=12), replace(COARSE, relay_columns=96, relay_rows=96)
     steps = np.linspace(-0.02, 0.02, 9)
-    assert scene.object_depth_m is not None
     problems = [prepare(replace(scene, object_depth_m=scene.object_depth_m + s), accuracy, ECHOES) for s in steps]
     beams = spread_beams(Gradients(problems[4]), 24)
     change = SceneVector(depth_m=np.ones(scene.object_depth_m.shape))
@@ -110,7 +108,6 @@ def test_derivative_over_a_path_is_the_difference_across_bin_edges() -> None:
 def test_albedo_times_its_derivative_is_the_intensity() -> None:
     found = Gradients(paper_scene().scene_at(0))
     sum_of_beams = found.pull(found.three_bounce.astype(np.float64))
-    assert sum_of_beams.albedo is not None
     share = sum_of_beams.albedo * found.image(found.echo_job.patches.albedo)
     assert share.sum() == pytest.approx(found.intensity[found.three_bounce].sum(), rel=1e-3)
     assert (share >= 0).all()

@@ -160,7 +160,6 @@ def test_sight_stops_beams_and_hides_relay_cells() -> None:
     depth = np.full((8, 8), 0.06, np.float32)
     stage = SceneFacts(Scene(OPEN, depth, Surface(0.5)), COARSE)
     sight, beams = stage.line_of_sight, stage.beams()
-    assert sight is not None
     assert sight.beam.size
     assert sight.hidden.any()
     free = np.nan_to_num(beams.length_m[sight.beam], nan=np.inf)
@@ -171,7 +170,6 @@ def test_sight_stops_beams_and_hides_relay_cells() -> None:
     ready = prepare(stage.scene, COARSE, "auto")
     np.testing.assert_allclose(ready.beams.length_m[sight.beam], sight.length_m)
     assert not ready.beams.on_wall[sight.beam].any()
-    assert ready.job is not None
     assert len(ready.job.relay.x_m) == (~sight.hidden).sum()
     white = prepare(Scene(OPEN, depth), COARSE, "auto").beams.direct[sight.beam]
     np.testing.assert_allclose(ready.beams.direct[sight.beam], 0.5 * white)
@@ -185,9 +183,7 @@ def job() -> TransportJob:
     at = np.linspace(-1, 1, 6)
     depth = (0.2 - 0.06 * (at[:, None] ** 2 + at**2)).astype(np.float32)
     scene = Scene(RIG, depth, radiometry="lambertian", jump_m=0.5)
-    job = prepare(scene, Accuracy("coarse", 8, 6), ["three-bounce", "tilt", "inter-reflection"]).job
-    assert job is not None
-    return job
+    return prepare(scene, Accuracy("coarse", 8, 6), ["three-bounce", "tilt", "inter-reflection"]).job
 
 
 @pytest.mark.parametrize("lambertian", [True, False])

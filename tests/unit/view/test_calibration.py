@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from measured_walls import HEIGHT, WIDTH, exact_wall
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
-from nlos_calibration.reference import BareWall
 from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.view.calibration import calibration_facts, outline_m, wall_pictures, wall_points_m
@@ -15,11 +14,6 @@ SHAPE = HEIGHT, WIDTH
 NOTHING = np.full(SHAPE, np.nan, np.float32)
 
 
-def reference_of(wall: MeasuredWall) -> BareWall:
-    assert wall.reference is not None
-    return wall.reference
-
-
 def with_record(wall: MeasuredWall, **fields: Any) -> MeasuredWall:
     return dataclasses.replace(wall, record=wall.record.model_copy(update=fields))
 
@@ -27,7 +21,7 @@ def with_record(wall: MeasuredWall, **fields: Any) -> MeasuredWall:
 def test_wall_outline_is_closed_finite_and_on_the_wall() -> None:
     wall = exact_wall()
     outline, extent = outline_m(wall), wall.record.rig.wall
-    points_m = wall_points_m(wall.record, reference_of(wall))[..., :2].reshape(-1, 2)
+    points_m = wall_points_m(wall.record, wall.reference)[..., :2].reshape(-1, 2)
     assert (points_m.min(axis=0) > outline.min(axis=0) - 0.01).all()
     assert (points_m.max(axis=0) < outline.max(axis=0) + 0.01).all()
     np.testing.assert_array_equal(outline[0], outline[-1])
@@ -57,11 +51,11 @@ def test_saturated_pixel_survives_thinning() -> None:
     shape = 480, 641
     saturated = np.zeros(shape, np.float32)
     saturated[301, 17] = 1.0
-    large = reference_of(exact_wall()).intrinsics.scaled(641, 480)
+    large = exact_wall().reference.intrinsics.scaled(641, 480)
     blank = np.full(shape, 0.3, np.float32)
     fields = {"depth_m": blank, "depth_std_m": blank, "ir": blank, "saturated": saturated}
     wall = exact_wall()
-    reference = dataclasses.replace(reference_of(wall), **fields, inliers=blank > 0, intrinsics=large)
+    reference = dataclasses.replace(wall.reference, **fields, inliers=blank > 0, intrinsics=large)
     picture = wall_pictures(dataclasses.replace(wall, reference=reference))["wall_saturated"][1]
     assert picture.shape == (240, 321, 3)
     assert np.argwhere((picture == SATURATED_RGB).all(axis=-1)).tolist() == [[150, 8]]

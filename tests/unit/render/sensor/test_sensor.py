@@ -37,7 +37,6 @@ def _generator(seed: int = 0) -> np.random.Generator:
 
 @pytest.fixture(scope="module")
 def rendering() -> Rendering:
-    assert RIG.object_box is not None
     return render(Scene(RIG, object_depth(3, RIG.object_box)[1]))
 
 
@@ -232,7 +231,6 @@ CHANGES = (
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("beams", [1, 2])
 def test_maps_without_noise_are_those_of_the_images_bit_for_bit(change: dict[str, float], beams: int) -> None:
-    assert RIG.object_box is not None
     scene = Scene(RIG, object_depth(3, RIG.object_box)[1])
     multi = render(scene, replace(STOPS["draft"], beams_per_cell=beams)).multi
     sensor = Sensor(RIG, QUIET.model_copy(update=change))
