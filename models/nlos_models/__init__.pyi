@@ -53,6 +53,7 @@ __all__ = [
     "first_of",
     "fit_quality",
     "foreground_rmse_mm",
+    "lacks_memory",
     "latent_error",
     "launch",
     "lift_edges",
@@ -110,7 +111,7 @@ from .direct_training import NormalBatch, NormalSource, train_direct
 from .distributed import Accelerator, launch, open_fabric
 from .doubt_network import load_doubt
 from .doubt_training import DoubtSet, QualitySet, fit_quality
-from .errors import FileBusyError, missing_extra, require
+from .errors import FileBusyError, lacks_memory, missing_extra, require
 from .export import Sample, TorchReconstructor, export_folder, network_export, quantize
 from .files import (
     CHECKSUMS,

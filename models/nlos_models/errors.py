@@ -14,6 +14,14 @@ import re
 from importlib import import_module
 from typing import Any
 
+OUT_OF_MEMORY = "failed to map", "bad_alloc", "allocate memory"
+"""Words of the errors of libraries that do not fit into the memory that is left, or of their work."""
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Return whether an error says that memory is short: Python's own, or one of a library in C++."""
+    return isinstance(error, MemoryError) or any(words in str(error) for words in OUT_OF_MEMORY)
+
 
 class ModelError(ValueError):
     """Root of the errors that this package raises on purpose."""

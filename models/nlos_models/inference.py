@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from nlos_models.arrays import Float32
-from nlos_models.errors import CheckpointError, MissingExtraError, require
+from nlos_models.errors import CheckpointError, MissingExtraError, lacks_memory, require
 from nlos_models.files import TENSOR_LIMIT, load_cached, read_checked
 from nlos_models.quality import DOUBT_FILES, QualityModel, load_quality_model
 from nlos_models.recipe import SIMULATION_ONLY
@@ -110,6 +110,8 @@ def open_session(model: Path | bytes, threads: int = 1, checksum: str = "") -> A
         source = model if isinstance(model, bytes) else str(model)  # by its path: it points into the weights beside it
         session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime's errors share no class below Exception
+        if lacks_memory(error):
+            raise MemoryError(str(error)) from error
         raise CheckpointError(f"{name} cannot be read as a network: export it again") from error
     if checksum and session.get_modelmeta().custom_metadata_map.get(CHECKSUM) != checksum:
         raise CheckpointError(f"{name} was made from other weights than those beside it: export it again")

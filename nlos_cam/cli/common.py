@@ -47,7 +47,7 @@ LINE_PERIOD_S = 10.0
 """Seconds between two lines of progress where stderr is no terminal."""
 NARROW_COLUMNS = 60
 
-stderr = Console(stderr=True, highlight=False)
+stderr = Console(stderr=True, highlight=False, emoji=False)
 _outputs = ExitStack()
 _reserved: list[Path] = []
 """Reserved output paths of the command that runs, and their reservations."""
@@ -73,8 +73,11 @@ def set_detail(*, verbose: bool = False, quiet: bool = False) -> None:
 
 def say_error(text: str) -> None:
     """Print an error in one line, also if quiet."""
-    stderr.quiet = False
-    stderr.print(f"[bold red]error:[/] {escape(' '.join(text.split()))}", soft_wrap=True)
+    stderr.quiet, line = False, " ".join(text.split())
+    try:
+        stderr.print(f"[bold red]error:[/] {escape(line)}", soft_wrap=True)
+    except (MemoryError, ImportError):  # too little memory is left for rich
+        os.write(2, f"error: {line}\n".encode())
 
 
 def say_interrupted(kept: str = "nothing was written") -> None:

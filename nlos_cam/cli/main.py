@@ -29,8 +29,8 @@ from nlos_cam.cli.plain_help import plain_help
 from nlos_cam.cli.usage import usage_lines, usage_reason
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError
 
-OUT_OF_MEMORY = "failed to map", "bad_alloc", "allocate memory"
-"""Words of the import error of a library that does not fit into the memory that is left."""
+MIN_ADDRESS_BYTES = 1 << 30
+"""Least limit of address space: below it, OpenCV's libraries may end the process by a signal while they are loaded."""
 
 
 class Command(NamedTuple):
@@ -159,6 +159,8 @@ def main(arguments: list[str]) -> int:
 
 def _run(command: str, arguments: list[str]) -> int:
     with interrupted_by_signals():
+        if command in COMMANDS:
+            _check_address_space()
         with stop_on_signals() as stop:  # an interrupted import can end in any error of any library
             app = build_app(None if COMPLETION in os.environ else command)
             tree = get_command(app)
@@ -181,9 +183,22 @@ def _split(arguments: list[str]) -> tuple[str, list[str]]:
     return command, [*before, *rest[:words], *(early if len(rest) >= words else []), *rest[words:]]
 
 
+def _check_address_space() -> None:
+    """Raise NlosCamError where the system's limit leaves too little for the libraries."""
+    with suppress(ImportError):  # Windows has no such limits
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_BYTES:
+            raise NlosCamError(
+                f"out of memory: the limit of address space is {limit >> 20} MiB, but {MIN_ADDRESS_BYTES >> 20} MiB "
+                "are needed: raise it (ulimit -v)"
+            )
+
+
 def _memory_error(error: MemoryError | ImportError) -> NlosCamError | None:
     """Return the lack of memory, also of a library while it is imported, as one of our errors; None for others."""
-    if isinstance(error, MemoryError) or any(words in str(error) for words in OUT_OF_MEMORY):
+    if models.lacks_memory(error):
         return NlosCamError("out of memory: close other programs, or raise the limit of this one")
     return None
 

@@ -168,7 +168,7 @@ def processes(workers: int) -> Farm:
 
 def _make_in_pool(plan: DatasetPlan, pieces: Sequence[range], workers: int) -> Pieces:
     others, broken = set(active_children()), False
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=begin_worker) as pool:
+    with _open_pool(workers) as pool:
         futures = {pool.submit(make_samples, plan, piece): piece for piece in pieces}
         children = set(active_children()) - others
         try:
@@ -185,3 +185,13 @@ def _make_in_pool(plan: DatasetPlan, pieces: Sequence[range], workers: int) -> P
     if broken:
         codes = [child.exitcode for child in children if child.exitcode not in (None, 0, -signal.SIGTERM)]
         raise BrokenProcessPool(f"code {codes[0]}" if codes else "code unknown")
+
+
+def _open_pool(workers: int) -> ProcessPoolExecutor:
+    """Return a pool of processes. Raises WorkersLostError where the system has no place for its locks."""
+    try:
+        return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=begin_worker)
+    except OSError as error:
+        raise WorkersLostError(
+            f"no worker can be started ({error.strerror}): they share locks in /dev/shm, so make that writable"
+        ) from error

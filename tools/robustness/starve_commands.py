@@ -37,8 +37,7 @@ AS_MIB = 300, 4000
 PAIRS = {"cache", "port"}
 """Commands for races alone."""
 NO_SHM = ["unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o ro,size=4k none /dev/shm && exec "$@"', "sh"]
-PROGRESS = "...", " s", "%"
-"""Ends of lines that report progress."""
+ROOT = Path(__file__).parents[2]
 
 
 @contextmanager
@@ -54,12 +53,13 @@ def small_disk(kib: int) -> Generator[Path]:
 
 def wrong_with(command: Command, folder: Path, inputs: Path, ended: subprocess.CompletedProcess[str]) -> str:
     """Return what is wrong with an end of a command; empty if nothing is."""
-    lines = [line for line in ended.stderr.splitlines() if line.strip() and not line.endswith(PROGRESS)]
+    said = [line for line in ended.stderr.splitlines() if line.strip()]
+    lines = said[next((at for at, line in enumerate(said) if line.startswith("error:")), 0) :]  # notes come before
     output = folder / command.output
     if ended.returncode not in EXIT_CODES:
-        return f"exit code {ended.returncode}: {ended.stderr[-300:]}"
+        return f"exit code {ended.returncode}: {ended.stderr}"
     if "Traceback" in ended.stderr or (ended.returncode and len(lines) > MAX_LINES):
-        return f"{len(lines)} lines: {ended.stderr[-600:]}"
+        return f"{len(lines)} lines: {ended.stderr}"
     if ended.returncode == 0 and (problem := problem_of(command, folder, inputs)):
         return problem
     if ended.returncode and command.is_atomic and output.exists() and (problem := problem_of(command, folder, inputs)):
@@ -78,8 +78,10 @@ def starve(command: Command, inputs: Path, way: str, random: Random) -> Row:
         line = [*NO_SHM, *line] if way == "no_shm" else line
         ended = subprocess.run(line, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
         said = ended.stderr.strip().splitlines()[-1:] if ended.returncode else []
-        wrong = wrong_with(command, folder, inputs, ended)
-    return {"amount": amount, "code": ended.returncode, "said": "".join(said)[-200:], "wrong": wrong}
+        row = {"said": "".join(said), "wrong": wrong_with(command, folder, inputs, ended)}
+    for place in (folder, inputs, ROOT):  # their names say nothing about the trial
+        row = {key: text.replace(f"{place}/", "").replace(str(place), "") for key, text in row.items()}
+    return {"amount": amount, "code": ended.returncode, **{key: text[-300:] for key, text in row.items()}}
 
 
 @cache

@@ -1,5 +1,6 @@
 """Dataset builds: equal shards for any workers, order or interruption; damaged shards are rebuilt, others refused."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -292,3 +293,12 @@ def test_worker_module_does_not_import_numpy() -> None:
     """BLAS counts the processors when numpy is imported, which must happen after `begin_worker`."""
     program = "import sys, nlos_cam.cli.main, nlos_cam.dataset.worker; raise SystemExit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_workers_without_shared_memory_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(dataset, "ProcessPoolExecutor", refuse)
+    with pytest.raises(WorkersLostError, match=r"Read-only file system.*/dev/shm"):
+        build_dataset(PLAN, COUNT, tmp_path, workers=1, on_progress=lambda *_: None)

@@ -1,0 +1,46 @@
+"""Commands where memory is short: one line, and never the blame of a file that is whole."""
+
+import resource
+
+import pytest
+from nlos_models import inference
+
+from nlos_cam.cli.common import say_error, stderr
+from nlos_cam.cli.main import MIN_ADDRESS_BYTES, main
+
+Capsys = pytest.CaptureFixture[str]
+
+
+def test_too_little_address_space_is_one_line_before_libraries_load(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capsys
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (MIN_ADDRESS_BYTES - 1, MIN_ADDRESS_BYTES))
+    assert main(["rigs"]) == 1
+    assert "1023 MiB" in capsys.readouterr().err
+    assert main(["--help"]) == 0
+
+
+@pytest.mark.parametrize("error", [MemoryError(), ImportError("no room")])
+def test_error_is_printed_without_rich_where_memory_is_short(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception
+) -> None:
+    def lack(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(stderr, "print", lack)
+    say_error("out of\nmemory")
+    assert capfd.readouterr().err == "error: out of memory\n"
+
+
+def test_error_keeps_colons_of_its_text(capsys: Capsys) -> None:
+    say_error("a:smile:b")
+    assert capsys.readouterr().err == "error: a:smile:b\n"
+
+
+def test_open_session_without_memory_does_not_blame_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lack(*_: object, **__: object) -> None:
+        raise RuntimeError("Exception during initialization: std::bad_alloc")
+
+    monkeypatch.setattr("onnxruntime.InferenceSession", lack)
+    with pytest.raises(MemoryError, match="bad_alloc"):
+        inference.open_session(b"")
