@@ -19,8 +19,10 @@ OUT_OF_MEMORY = "failed to map", "bad_alloc", "allocate memory"
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Return whether an error says that memory is short: Python's own, or one of a library in C++."""
-    return isinstance(error, MemoryError) or any(words in str(error) for words in OUT_OF_MEMORY)
+    """Return whether an error or its cause says that memory is short: Python's own, or one of a library in C++."""
+    if isinstance(error, MemoryError) or any(words in str(error) for words in OUT_OF_MEMORY):
+        return True
+    return error.__cause__ is not None and lacks_memory(error.__cause__)
 
 
 class ModelError(ValueError):

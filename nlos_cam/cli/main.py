@@ -142,17 +142,10 @@ def main(arguments: list[str]) -> int:
         return _report_usage(error, as_json=as_json)
     except (NlosCamError, CalibrationError, ModelError) as error:
         return _report(error, as_json=as_json)
-    except (MemoryError, ImportError) as error:
-        known: NlosCamError | ModelError | None = _memory_error(error)
-        if known is None and isinstance(error, ModuleNotFoundError):
-            known = models.missing_extra(error, f"nlos-cam {command}")
-        if known is None:
+    except Exception as error:
+        if (known := _known_error(error, command)) is None:
             raise
         return _report(known, as_json=as_json)
-    except OSError as error:
-        if error.errno not in models.DISK_ERRORS and error.filename is None:
-            raise
-        return _report(_file_error(error), as_json=as_json)
     finally:
         release_outputs()
 
@@ -196,10 +189,14 @@ def _check_address_space() -> None:
             )
 
 
-def _memory_error(error: MemoryError | ImportError) -> NlosCamError | None:
-    """Return the lack of memory, also of a library while it is imported, as one of our errors; None for others."""
-    if models.lacks_memory(error):
+def _known_error(error: Exception, command: str) -> NlosCamError | ModelError | None:
+    """Return a lack of memory, a missing extra or an error about a file as one of our errors; None for others."""
+    if models.lacks_memory(error):  # also of a library while it is imported or works
         return NlosCamError("out of memory: close other programs, or raise the limit of this one")
+    if isinstance(error, ModuleNotFoundError):
+        return models.missing_extra(error, f"nlos-cam {command}")
+    if isinstance(error, OSError) and (error.errno in models.DISK_ERRORS or error.filename is not None):
+        return _file_error(error)
     return None
 
 

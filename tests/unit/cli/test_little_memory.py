@@ -37,6 +37,16 @@ def test_error_keeps_colons_of_its_text(capsys: Capsys) -> None:
     assert capsys.readouterr().err == "error: a:smile:b\n"
 
 
+@pytest.mark.parametrize("reason", ["std::bad_alloc", "cannot allocate memory", ""])
+def test_lack_of_memory_in_a_library_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: Capsys, reason: str) -> None:
+    def lack(_: object) -> None:
+        raise RuntimeError(f"export failed\n{reason}") from (None if reason else MemoryError())
+
+    monkeypatch.setattr("nlos_cam.cli.main.build_app", lack)
+    assert main(["rigs"]) == 1
+    assert capsys.readouterr().err.startswith("error: out of memory: close")
+
+
 def test_open_session_without_memory_does_not_blame_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
     def lack(*_: object, **__: object) -> None:
         raise RuntimeError("Exception during initialization: std::bad_alloc")
