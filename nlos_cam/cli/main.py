@@ -29,8 +29,9 @@ from nlos_cam.cli.plain_help import plain_help
 from nlos_cam.cli.usage import usage_lines, usage_reason
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError
 
-MIN_ADDRESS_BYTES = 1 << 30
-"""Least limit of address space: below it, OpenCV's libraries may end the process by a signal while they are loaded."""
+MIN_ADDRESS_BYTES, TORCH_ADDRESS_BYTES = 1 << 30, 3 << 29
+"""Least limit of address space, also of `train`: below it, the libraries of OpenCV or torch may end the process by a
+signal while they are loaded."""
 
 
 class Command(NamedTuple):
@@ -153,7 +154,7 @@ def main(arguments: list[str]) -> int:
 def _run(command: str, arguments: list[str]) -> int:
     with interrupted_by_signals():
         if command in COMMANDS:
-            _check_address_space()
+            _check_address_space(TORCH_ADDRESS_BYTES if command == "train" else MIN_ADDRESS_BYTES)
         with stop_on_signals() as stop:  # an interrupted import can end in any error of any library
             app = build_app(None if COMPLETION in os.environ else command)
             tree = get_command(app)
@@ -176,16 +177,16 @@ def _split(arguments: list[str]) -> tuple[str, list[str]]:
     return command, [*before, *rest[:words], *(early if len(rest) >= words else []), *rest[words:]]
 
 
-def _check_address_space() -> None:
-    """Raise NlosCamError where the system's limit leaves too little for the libraries."""
+def _check_address_space(needed: int) -> None:
+    """Raise NlosCamError where the system's limit of address space is below `needed` bytes."""
     with suppress(ImportError):  # Windows has no such limits
         import resource
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_BYTES:
+        if limit != resource.RLIM_INFINITY and limit < needed:
             raise NlosCamError(
-                f"out of memory: the limit of address space is {limit >> 20} MiB, but {MIN_ADDRESS_BYTES >> 20} MiB "
-                "are needed: raise it (ulimit -v)"
+                f"out of memory: the limit of address space is {limit >> 20} MiB, but {needed >> 20} MiB are needed: "
+                "raise it (ulimit -v)"
             )
 
 

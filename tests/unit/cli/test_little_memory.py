@@ -6,18 +6,20 @@ import pytest
 from nlos_models import inference
 
 from nlos_cam.cli.common import say_error, stderr
-from nlos_cam.cli.main import MIN_ADDRESS_BYTES, main
+from nlos_cam.cli.main import MIN_ADDRESS_BYTES, TORCH_ADDRESS_BYTES, main
 
 Capsys = pytest.CaptureFixture[str]
 
 
+@pytest.mark.parametrize(("command", "needed"), [("rigs", MIN_ADDRESS_BYTES), ("train", TORCH_ADDRESS_BYTES)])
 def test_too_little_address_space_is_one_line_before_libraries_load(
-    monkeypatch: pytest.MonkeyPatch, capsys: Capsys
+    monkeypatch: pytest.MonkeyPatch, capsys: Capsys, command: str, needed: int
 ) -> None:
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (MIN_ADDRESS_BYTES - 1, MIN_ADDRESS_BYTES))
-    assert main(["rigs"]) == 1
-    assert "1023 MiB" in capsys.readouterr().err
-    assert main(["--help"]) == 0
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (needed - 1, needed))
+    assert main([command, "--help"]) == 1
+    assert f"is {(needed >> 20) - 1} MiB" in capsys.readouterr().err
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (needed, needed))
+    assert main([command, "--help"]) == 0
 
 
 @pytest.mark.parametrize("error", [MemoryError(), ImportError("no room")])
