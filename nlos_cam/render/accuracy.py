@@ -22,6 +22,8 @@ class Accuracy:
     """Table bins per bin of path length, a power of two; 0 is the brute-force reference."""
     object_stride: int = 1
     """Cells of the depth map, along each axis, that form one patch."""
+    finest_cells: int = 0
+    """Cells along a side of a depth map; finer maps join cells so that patches keep their size, and 0 joins none."""
     sectors: int = 16
     """Sectors per face of the horizon tables: affects time, not the result."""
     beams_per_cell: int = 1
@@ -36,6 +38,7 @@ class Accuracy:
             "relay_columns": (1, MAX_RELAY_CELLS),
             "relay_rows": (1, MAX_RELAY_CELLS),
             "object_stride": (1, 16),
+            "finest_cells": (0, 4096),
             "sectors": (1, 256),
             "beams_per_cell": (1, MAX_BEAMS_PER_CELL),
             "scatter_error": (1e-4, 1),
@@ -49,8 +52,10 @@ class Accuracy:
 
 
 STOPS = {
-    "draft": Accuracy("draft", 40, 32, sub_bins=4, object_stride=2, scatter_error=3e-2, tolerance=3e-2),
-    "standard": Accuracy("standard"),
+    "draft": Accuracy(
+        "draft", 40, 32, sub_bins=4, object_stride=2, finest_cells=64, scatter_error=3e-2, tolerance=3e-2
+    ),
+    "standard": Accuracy("standard", finest_cells=96),
     "fine": Accuracy("fine", sub_bins=64, scatter_error=1e-3, tolerance=1e-4),
     "reference": Accuracy("reference", sub_bins=0, tolerance=0.0),
 }

@@ -136,7 +136,7 @@ def _returned(
     patches: PatchArrays, s: int, cells: Cells, q: int, near_m: float, lambertian: bool
 ) -> tuple[float, float]:
     """Return the factors of S2 on the leg from a patch over a relay cell to the lidar, and d3."""
-    # Number by number: numba counts references to each array that is unpacked, which takes ten times the path's own time.
+    # Number by number: numba counts references to each array that is unpacked, ten times a path's own time.
     px, py, z = patches.point_m[s, 0], patches.point_m[s, 1], patches.point_m[s, 2]
     nx, ny, nz = patches.normal[s, 0], patches.normal[s, 1], patches.normal[s, 2]
     dx, dy = cells.x_m[q] - px, cells.y_m[q] - py

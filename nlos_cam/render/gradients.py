@@ -121,13 +121,14 @@ class Gradients:
     def __init__(
         self, scene: Scene | RenderProblem, accuracy: str | Accuracy = "standard", effects: Effects = "auto"
     ) -> None:
-        problem = scene if isinstance(scene, RenderProblem) else prepare(scene, accuracy_named(accuracy), effects)
+        each_cell = replace(accuracy_named(accuracy), finest_cells=0)
+        problem = scene if isinstance(scene, RenderProblem) else prepare(scene, each_cell, effects)
         self.problem, beams = problem, problem.beams
         if missing := sorted({effect.name for effect in problem.plan if effect.included} - COVERED):
             raise SceneError(f"no gradients of the effect {missing[0]}: leave it out with `effects`")
-        if problem.accuracy.object_stride > 1:
-            raise SceneError(f"no gradients at accuracy {problem.accuracy.name!r}: give one with object_stride 1")
-        job = problem.job
+        job, depth_m = problem.job, problem.scene.object_depth_m
+        if job is not None and depth_m is not None and len(job.field.depth_m) < len(depth_m):
+            raise SceneError(f"no gradients at accuracy {problem.accuracy.name!r}, which joins cells: choose fine")
         echoes = (no_echoes(len(beams.on_wall)) if job is None else _echoes(job).spread_over(beams.on_wall)).reshape(
             beams.shape
         )
@@ -375,21 +376,28 @@ class PoseFit:
     deviation: Float64
     """(6,); standard deviations by the Cramer-Rao bound with the prior."""
     cost: tuple[float, float]
-    """Mean squared residual, in units of the noise, before and after."""
+    """Mean robust loss (Cauchy's) of the residuals in units of the noise, before and after."""
     iterations: int
     problem: RenderProblem
     """Render problem with the motion applied."""
 
 
+OUTLIER = 3.0
+"""Residual in units of the noise from which on a beam counts less."""
+MAX_DAMPINGS = 12
+"""Tries of a step, each five times more cautious than the last."""
+
+
 def fit_pose(
     problem: RenderProblem, intensity: Float64, noise: Float64, body: Literal["lidar", "wall"] = "lidar", *,
-    prior: tuple[float, float] = (0.02, 0.02), min_margin: float = 0.01, model_error: float = 0.005, steps: int = 12,
+    prior: tuple[float, float] = (0.02, 0.02), min_margin: float = 0.01, model_error: float = 0.005, steps: int = 30,
 ) -> PoseFit:  # fmt: skip
     """Fit the pose of lidar or wall to the measured intensities (rows, columns) of a known object's echoes.
 
-    Levenberg and Marquardt's method; `prior` is the standard deviation of shift (m) and turn (rad) from the problem's
-    pose, `model_error` a relative error of the renderer. Used are the beams that three bounces win by `min_margin` in
-    the measured pose. The wall's motions within its plane change nothing but shadows: the prior alone decides them.
+    Robust least squares by Levenberg and Marquardt's method; `prior` is the standard deviation of shift (m) and turn
+    (rad) from the problem's pose, `model_error` a relative error of the renderer. Used are the beams that three bounces
+    win by `min_margin` in the measured pose. The wall's motions within its plane change nothing but shadows: the prior
+    alone decides them.
     """
     # The strongest echo is continuous in the pose even where the winner changes, so the residual is too.
     precision = np.repeat(np.array(prior) ** -2.0, 3)
@@ -401,23 +409,26 @@ def fit_pose(
         deviation = np.hypot(noise, model_error * at.intensity)[used]
         return (intensity - at.intensity)[used] / deviation, deviation, used
 
-    def mean_square(at: Gradients, shift: Float64) -> float:
+    def loss(at: Gradients, shift: Float64) -> float:
+        # Cauchy's: a beam whose strongest echo is the wall's in one pose and the object's in the other counts little.
         rest = residual(at)[0]
-        return float((rest**2).mean() + precision @ shift**2 / max(rest.size, 1)) if rest.size else np.inf
+        each = OUTLIER**2 * np.log1p((rest / OUTLIER) ** 2)
+        return float(each.mean() + precision @ shift**2 / rest.size) if rest.size else np.inf
 
-    first = cost = mean_square(now, motion)
+    first = cost = loss(now, motion)
     normal = np.diag(precision)
-    for _ in range(steps):
+    while iterations < steps:
         iterations += 1
         rest, deviation, used = residual(now)
+        weight = 1 / (1 + (rest / OUTLIER) ** 2)
         rates = now.jacobian(body)[0][used.ravel()].astype(np.float64) / deviation[:, None]
-        normal = rates.T @ rates + np.diag(precision)
-        downhill = rates.T @ rest - precision * motion
+        normal = rates.T @ (weight[:, None] * rates) + np.diag(precision)
+        downhill = rates.T @ (weight * rest) - precision * motion
         before = cost
-        for _trial in range(6):
+        for _ in range(MAX_DAMPINGS):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), downhill).astype(np.float64)
             following = Gradients(moved(now.problem, **{body: step}))
-            if (found := mean_square(following, motion + step)) < cost:
+            if (found := loss(following, motion + step)) < cost:
                 now, motion, cost, damping = following, motion + step, found, damping / 5
                 break
             damping *= 5

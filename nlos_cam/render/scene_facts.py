@@ -50,9 +50,13 @@ class SceneFacts:
 
     @property
     def stride(self) -> int:
-        """Stride of the accuracy if it divides the depth map; else 1."""
-        depth = self.scene.object_depth_m
-        return 1 if depth is None or len(depth) % self.accuracy.object_stride else self.accuracy.object_stride
+        """Cells along each axis that form one patch: as the accuracy has it if that divides the depth map; else 1."""
+        depth, accuracy = self.scene.object_depth_m, self.accuracy
+        if depth is None:
+            return 1
+        finer = len(depth) // accuracy.finest_cells if accuracy.finest_cells else 1
+        strides = accuracy.object_stride * max(finer, 1), accuracy.object_stride, 1
+        return next(stride for stride in strides if len(depth) % stride == 0)
 
     @cached_property
     def depth_m(self) -> Float64:

@@ -10,7 +10,8 @@ from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.renderer import render, three_bounce, transient
+from nlos_cam.render.backend_numba import histograms
+from nlos_cam.render.renderer import prepare, render, three_bounce, transient
 from nlos_cam.render.scene import Scene
 
 RIG = load_rig("paper-rig")
@@ -49,6 +50,22 @@ def _beams(per_cell: int) -> np.ndarray:
     found = transient(Scene(RIG, _hill(8)), coarse, effects=["three-bounce", "occluder", "tilt"])
     mean = found.reshape(64, per_cell, 80, per_cell, -1).mean((1, 3))
     return _blurred(mean.reshape(5120, -1))
+
+
+@pytest.mark.slow
+def test_finer_depth_maps_keep_the_size_of_patches_and_the_error() -> None:
+    scene = Scene(RIG, _hill(192), jump_m=0.5)
+    standard = replace(STOPS["standard"], relay_columns=40, relay_rows=32)
+    joined, apart = prepare(scene, standard).job, prepare(scene, replace(standard, finest_cells=0)).job
+    assert joined is not None
+    assert apart is not None
+    assert len(apart.patches.beta) == 192**2
+    assert len(joined.patches.beta) == 96**2
+    some = np.arange(0, len(apart.length_m), 40)
+    strongest, exact = (histograms(job.select(some)).max(1) for job in (joined, apart))
+    off = np.abs(strongest[exact > 0] / exact[exact > 0] - 1)
+    assert np.median(off) < 0.003
+    assert np.percentile(off, 99) < 0.01
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 python tools/studies/renderer.py tradeoff     docs/renderer.json, docs/images/tradeoff.png, table of docs/accuracy.md
 python tools/studies/renderer.py glossy       docs/glossy.json: rank against error, time over a Lambertian object's
+python tools/studies/renderer.py grids        docs/grids.json: finer depth maps, with and without joined cells
 python tools/studies/renderer.py soak [--scenes 1000000]  docs/renderer_soak.json: random scenes against the reference
 python tools/studies/renderer.py cuda [--backend torch] [--objects 64] [--batch 1 4 16 64]: one line of JSON
 """
@@ -29,7 +30,7 @@ from nlos_cam.evaluate import (
     render_settings,
 )
 from nlos_cam.files import cache_folder
-from nlos_cam.objects import object_box, object_depth
+from nlos_cam.objects import Pose, category_triangles, object_box, object_depth, orthographic_depth, place
 from nlos_cam.render import (
     STOPS,
     Accuracy,
@@ -110,6 +111,31 @@ SOAK_RIGS = [
 ]
 SHADE_EDGE = 1e-3
 """Light of a bin, relative to the beam's, that legs on the very edge of a shadow may add or take in float32."""
+
+
+def grids(_: argparse.Namespace) -> None:
+    """Measure time and error on finer depth maps of one airplane, with joined cells and with every cell a patch."""
+    empty, standard, rows = Scene(load_rig("paper-rig")), STOPS["standard"], list[dict[str, Any]]()
+    triangles = place(category_triangles("airplane", 20_000_003), Pose(), empty.box)
+    for cells in (64, 128, 256):
+        scene = replace(empty, object_depth_m=orthographic_depth(triangles, empty.box, cells))
+        whole = prepare(scene, STOPS["reference"]).job
+        if whole is None:
+            raise SystemExit("the airplane has no three-bounce light")
+        some = np.arange(0, len(whole.length_m), 60)
+        exact = backend_reference.histograms(whole.select(some))
+        for kind, accuracy in (("joined", standard), ("every cell", replace(standard, finest_cells=0))):
+            job = prepare(scene, accuracy).job
+            if job is None:
+                raise SystemExit("the airplane has no three-bounce light")
+            found = histograms(job.select(some))
+            off = np.abs(found.max(1) / exact.max(1) - 1)
+            near = np.abs(found.argmax(1) - exact.argmax(1)) <= 1
+            row: dict[str, Any] = {"cells": cells, "patches": kind, "count": len(job.patches.beta)}
+            row |= {"cpu_s": cpu_s(partial(render, scene, accuracy)), "within_1": float(near.mean())}
+            rows.append(row | {"error_median": float(np.median(off)), "error_p99": float(np.percentile(off, 99))})
+            print(rows[-1], flush=True)
+    harness.write("grids", {"machine": machine(), "rows": rows})
 
 
 def random_scene(generator: np.random.Generator) -> Scene:
@@ -238,7 +264,7 @@ def main() -> None:
     """Run the named measurement."""
     parser = harness.options(__doc__)
     commands = parser.add_subparsers(required=True)
-    for work in (tradeoff, glossy):
+    for work in (tradeoff, glossy, grids):
         commands.add_parser(work.__name__, help=work.__doc__).set_defaults(run=work)
     long = commands.add_parser("soak", help=soak.__doc__)
     long.set_defaults(run=soak)
