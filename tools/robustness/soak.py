@@ -68,11 +68,24 @@ def state_of(pid: int) -> tuple[float, int, int]:
     return int(status["VmRSS"].split()[0]) / 1024, int(status["Threads"]), descriptors
 
 
-def rows_of(log: Path, done: int) -> list[dict[str, str]]:
-    """Return the whole rows of the frame log after those already read."""
-    with log.open(encoding="utf-8", newline="") as file:
-        text = file.read()
-    return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))[done:]
+class FrameLog:
+    """Rows of a growing frame log, each read once."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._names, self._read = path, list[str](), 0
+
+    def rows(self) -> list[dict[str, str]]:
+        """Return the whole rows since the last call."""
+        with self._path.open("rb") as file:
+            file.seek(self._read)
+            whole = file.read().rpartition(b"\n")[0]
+        if not whole:
+            return []
+        self._read += len(whole) + 1
+        table = csv.DictReader(whole.decode().splitlines(), self._names or None)
+        rows = list(table)
+        self._names = list(table.fieldnames or ())
+        return rows
 
 
 def _column(rows: list[dict[str, str]], part: str) -> list[float]:
@@ -92,8 +105,9 @@ def draw(minutes: list[Minute], path: Path) -> None:
     names = "rss_mib", "threads", "descriptors", "latency_p99_ms", "frames"
     figure = Figure(figsize=(7, 8), layout="constrained")
     for axis, name in zip(figure.subplots(len(names), 1, sharex=True), names, strict=True):
-        axis.plot([each.minute for each in minutes], [getattr(each, name) for each in minutes])
-        axis.set(ylabel=name.replace("_", " "), ylim=(0, None))
+        values = [float(getattr(each, name)) for each in minutes]
+        axis.plot([each.minute for each in minutes], values)
+        axis.set(ylabel=name.replace("_", " "), ylim=(0, 1.15 * max(values) or 1))
     axis.set(xlabel="minutes")
     figure.savefig(path, dpi=110)
 
@@ -105,7 +119,7 @@ def main() -> int:
     parser.add_argument("--camera", default="sim")
     parser.add_argument("--out", type=Path, default=DOCS / "soak.json")
     chosen = parser.parse_args()
-    minutes, visits, stop, read = list[Minute](), list[int](), Event(), 0
+    minutes, visits, stop = list[Minute](), list[int](), Event()
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "frames.csv"
         seconds = MINUTE_S * chosen.minutes + MINUTE_S / 2
@@ -113,13 +127,12 @@ def main() -> int:
             address = run.wait_for_address(START_TIMEOUT_S)
             watcher = Thread(target=watch, args=(address, stop, visits), daemon=True)
             watcher.start()
+            frames, start_s = FrameLog(log), time.monotonic()
             for number in range(1, chosen.minutes + 1):
-                time.sleep(MINUTE_S)
+                time.sleep(max(start_s + MINUTE_S * number - time.monotonic(), 0))
                 if run.process.poll() is not None:
                     break
-                rows = rows_of(log, read)
-                read += len(rows)
-                minutes.append(summarize(number, state_of(run.process.pid), rows, len(visits)))
+                minutes.append(summarize(number, state_of(run.process.pid), frames.rows(), len(visits)))
                 facts = {"machine": machine(), "camera": chosen.camera, "minutes": list(map(asdict, minutes))}
                 chosen.out.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
                 draw(minutes, DOCS / "images" / f"{chosen.out.stem}.png")
