@@ -10,12 +10,13 @@ from nlos_calibration.noise import DepthMean
 from nlos_calibration.occluder import MIN_COLUMNS, find_occluder
 from nlos_calibration.rig import LidarPose, Occluder, PinholeRecord, load_rig
 from synthetic_scenes import Sheet, bench_depth
-from wall import NO_ECHO
 
 from nlos_cam.calibrate.synthetic import View, depth_statistics, view, with_outliers
-from nlos_cam.render import Sensor, SensorModel
+from nlos_cam.render import MultiBounce, Sensor, SensorModel
 
 Generator = np.random.Generator
+DARK = np.zeros((64, 80), np.float32)
+NO_ECHO = MultiBounce(DARK, DARK, np.full((64, 80), np.nan, np.float32))
 
 PAPER = load_rig("paper-rig")
 PINHOLE = PAPER.pinhole.scaled(96, 72)

@@ -25,7 +25,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from live_process import LiveProcess
-from soak import rows_of, state_of
+from soak import FrameLog, state_of
 
 from nlos_cam.evaluate import machine
 
@@ -174,7 +174,7 @@ def rest(seconds: float) -> Counter[str]:
 def look(run: LiveProcess, log: Path) -> dict[str, float]:
     """Return memory, threads and descriptors of the process, and its frames and drops so far."""
     rss_mib, threads, descriptors = state_of(run.process.pid)
-    rows = rows_of(log, 0)
+    rows = FrameLog(log).rows()
     dropped = float(next((value for name, value in rows[-1].items() if "dropped" in name), 0) or 0) if rows else 0.0
     state = {"rss_mib": round(rss_mib, 1), "threads": threads, "descriptors": descriptors}
     return state | {"frames": len(rows), "dropped": dropped}
@@ -200,7 +200,7 @@ def main() -> int:
         log = Path(folder) / "frames.csv"
         with LiveProcess([chosen.camera, "--log", str(log), "--json"]) as run:
             address = run.wait_for_address(START_TIMEOUT_S).partition("#")[0]
-            while not (log.exists() and len(rows_of(log, 0)) > 60) and run.process.poll() is None:
+            while not (log.exists() and len(FrameLog(log).rows()) > 60) and run.process.poll() is None:
                 time.sleep(1.0)
             for number, (name, attack) in enumerate(attacks.items()):
                 if number == 1:
