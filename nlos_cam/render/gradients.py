@@ -121,8 +121,10 @@ class Gradients:
     def __init__(
         self, scene: Scene | RenderProblem, accuracy: str | Accuracy = "standard", effects: Effects = "auto"
     ) -> None:
-        each_cell = replace(accuracy_named(accuracy), finest_cells=0)
-        problem = scene if isinstance(scene, RenderProblem) else prepare(scene, each_cell, effects)
+        if isinstance(scene, RenderProblem):
+            problem = scene
+        else:
+            problem = prepare(scene, replace(accuracy_named(accuracy), finest_cells=0), effects)
         self.problem, beams = problem, problem.beams
         if missing := sorted({effect.name for effect in problem.plan if effect.included} - COVERED):
             raise SceneError(f"no gradients of the effect {missing[0]}: leave it out with `effects`")

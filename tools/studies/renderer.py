@@ -19,6 +19,7 @@ import harness
 import numpy as np
 import torch
 from nlos_calibration import Occluder, load_rig
+from numpy.typing import NDArray
 
 from nlos_cam.evaluate import (
     as_table,
@@ -34,11 +35,13 @@ from nlos_cam.objects import Pose, category_triangles, object_box, object_depth,
 from nlos_cam.render import (
     STOPS,
     Accuracy,
+    EchoMaps,
     Scene,
     Surface,
     TransportJob,
     Work,
     accuracy_named,
+    agreement,
     backend_numba,
     backend_reference,
     device_named,
@@ -113,28 +116,36 @@ SHADE_EDGE = 1e-3
 """Light of a bin, relative to the beam's, that legs on the very edge of a shadow may add or take in float32."""
 
 
+def planned(scene: Scene, accuracy: Accuracy) -> TransportJob:
+    """Return the three-bounce transport of a scene. Raises SystemExit for none."""
+    if (job := prepare(scene, accuracy).job) is None:
+        raise SystemExit("the scene has no three-bounce light")
+    return job
+
+
+def echoes_of(histogram: NDArray[np.floating], bin_m: float) -> EchoMaps:
+    """Return the strongest bins of histograms (n, bins), to compare; half of the path stands for the depth."""
+    peak, path_m = histogram.max(1), (histogram.argmax(1) + 0.5) * bin_m
+    return EchoMaps(peak, path_m, path_m / 2)
+
+
 def grids(_: argparse.Namespace) -> None:
     """Measure time and error on finer depth maps of one airplane, with joined cells and with every cell a patch."""
     empty, standard, rows = Scene(load_rig("paper-rig")), STOPS["standard"], list[dict[str, Any]]()
     triangles = place(category_triangles("airplane", 20_000_003), Pose(), empty.box)
     for cells in (64, 128, 256):
         scene = replace(empty, object_depth_m=orthographic_depth(triangles, empty.box, cells))
-        whole = prepare(scene, STOPS["reference"]).job
-        if whole is None:
-            raise SystemExit("the airplane has no three-bounce light")
-        some = np.arange(0, len(whole.length_m), 60)
-        exact = backend_reference.histograms(whole.select(some))
+        job, bin_m = planned(scene, STOPS["reference"]), scene.rig.device.bin_m
+        some = np.arange(0, len(job.length_m), 60)
+        exact = echoes_of(backend_reference.histograms(job.select(some)), bin_m)
         for kind, accuracy in (("joined", standard), ("every cell", replace(standard, finest_cells=0))):
-            job = prepare(scene, accuracy).job
-            if job is None:
-                raise SystemExit("the airplane has no three-bounce light")
-            found = histograms(job.select(some))
-            off = np.abs(found.max(1) / exact.max(1) - 1)
-            near = np.abs(found.argmax(1) - exact.argmax(1)) <= 1
+            job = planned(scene, accuracy)
+            agreed = agreement(echoes_of(histograms(job.select(some)), bin_m), exact, bin_m)
             row: dict[str, Any] = {"cells": cells, "patches": kind, "count": len(job.patches.beta)}
-            row |= {"cpu_s": cpu_s(partial(render, scene, accuracy)), "within_1": float(near.mean())}
-            rows.append(row | {"error_median": float(np.median(off)), "error_p99": float(np.percentile(off, 99))})
-            print(rows[-1], flush=True)
+            row |= {"cpu_s": cpu_s(partial(render, scene, accuracy)), "within_1": agreed.bin_within_1}
+            row |= {"error_median": agreed.intensity_error_median, "error_p99": agreed.intensity_error_p99}
+            rows.append(row)
+            print(row, flush=True)
     harness.write("grids", {"machine": machine(), "rows": rows})
 
 
