@@ -17,15 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from nlos_calibration import load_rig, load_wall, reference
-from nlos_models import (
-    OnnxReconstructor,
-    checksum_of_watched,
-    checksums_of,
-    load_cached,
-    load_recipe,
-    load_record,
-    shipped_folder,
-)
+from nlos_models import checksums_of, load_cached, load_recipe, load_record, shipped_folder
 from noise_recordings import record
 from rosbags.rosbag1 import Reader
 
@@ -114,9 +106,8 @@ def read_recording(path: Path, folder: Path, random: np.random.Generator) -> Non
     _refuse(refused)
 
 
-def read_text(path: Path, folder: Path, random: np.random.Generator, load: Callable[[Path], Any]) -> None:
+def read_text(path: Path, _: Path, __: np.random.Generator, load: Callable[[Path], Any]) -> None:
     """Describe a file of any kind, and load it."""
-    del folder, random
     command("info", path)
     load(path)
 
@@ -126,17 +117,15 @@ def read_reference(path: Path) -> None:
     reference.load_reference(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
-def read_replayed(path: Path, folder: Path, random: np.random.Generator) -> None:
+def read_replayed(path: Path, folder: Path, _: np.random.Generator) -> None:
     """Describe and export the result of a replay."""
-    del random
     refused = command("info", path) is None
     refused += command("export", path, "--object", "ply,csv", "--out", folder / "object") is None
     _refuse(refused)
 
 
-def read_cache(path: Path, folder: Path, random: np.random.Generator, content: bytes) -> None:
+def read_cache(path: Path, _: Path, __: np.random.Generator, content: bytes) -> None:
     """Read a cached world whose file may be damaged: it has to be as made, and whole the next time."""
-    del folder, random
     entry, made = path.with_name("0123456789ab.npz"), list[int]()
 
     def make() -> bytes:
@@ -151,11 +140,10 @@ def read_cache(path: Path, folder: Path, random: np.random.Generator, content: b
             raise WrongResultError("another world came out of the cache, or the damage stayed")
 
 
-def read_shard(path: Path, folder: Path, random: np.random.Generator, whole: dict[str, Any]) -> None:
+def read_shard(path: Path, _: Path, __: np.random.Generator, whole: dict[str, Any]) -> None:
     """Read a dataset of one shard; any array that comes out has to be the original's."""
     from nlos_cam.dataset import open_dataset, shards
 
-    del folder, random
     command("info", path.parent)
     for head in shards.shards_of(path.parent):
         shards.check_arrays(head)
@@ -170,11 +158,10 @@ def is_listed(path: Path) -> bool:
     return hashlib.sha256(path.read_bytes()).hexdigest() == checksums_of(path.parent).get(path.name)
 
 
-def read_weights(path: Path, folder: Path, random: np.random.Generator) -> None:
+def read_weights(path: Path, _: Path, __: np.random.Generator) -> None:
     """Load networks from a folder of weights, whose checksum may have been made right."""
     from nlos_models import load_doubt, load_network
 
-    del folder, random
     command("info", path.parent)
     network, _ = load_network(path.parent)
     load_doubt(path.parent)
@@ -184,27 +171,17 @@ def read_weights(path: Path, folder: Path, random: np.random.Generator) -> None:
         raise WrongResultError("weights that are not finite were accepted")
 
 
-def read_graph(path: Path, folder: Path, random: np.random.Generator) -> None:
-    """Open an ONNX graph, whose checksum may have been made right."""
-    del folder, random
-    OnnxReconstructor(path, load_record(path.parent), 1, checksum_of_watched(path.parent))
-    if not is_listed(path):
-        raise WrongResultError("a changed graph was accepted")
-
-
-def read_state(path: Path, folder: Path, random: np.random.Generator) -> None:
+def read_state(path: Path, _: Path, __: np.random.Generator) -> None:
     """Read the last state of a training run."""
     from nlos_models import train
 
-    del folder, random
     train.read_last(path.parent, lambda _: None)
 
 
-def read_label(path: Path, folder: Path, random: np.random.Generator) -> None:
+def read_label(path: Path, _: Path, __: np.random.Generator) -> None:
     """Return the depth map of the hidden object that a file beside a recording describes."""
     from nlos_cam.dataset import labelled
 
-    del folder, random
     labelled._placed(path, "short", load_rig("paper-rig"))  # noqa: SLF001  what `dataset label` reads, without its rest
 
 
@@ -282,15 +259,11 @@ def make_inputs(home: Path, group: str) -> dict[str, Input]:
         place(name, source, partial(read_text, load=load))
     place("reconstruction.npz", home / "replayed" / "reconstruction.npz", read_replayed)
     entry = next((home / "worlds").iterdir())
-    made = partial(read_cache, content=entry.read_bytes())
-    place("world.npz", entry, made)
+    place("world.npz", entry, partial(read_cache, content=entry.read_bytes()))
     for name in ("checkpoint.json", "doubt.json"):
         place(name, weights / name, partial(read_text, load=lambda path: load_record(path.parent)), weights)
-    place(
-        "figures.json",
-        ROOT / "docs" / "figures.json",
-        partial(read_text, load=lambda path: command("info", path.parent)),
-    )
+    describe = partial(read_text, load=lambda path: command("info", path.parent))
+    place("figures.json", ROOT / "docs" / "figures.json", describe)
     return inputs
 
 

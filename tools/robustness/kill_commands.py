@@ -16,7 +16,7 @@ from http.client import HTTPConnection
 from pathlib import Path
 from random import Random
 
-from processes import children_of, session_of
+from live_process import children_of, session_of
 from trials import (
     COMMANDS,
     TIMEOUT_S,
@@ -42,8 +42,8 @@ from nlos_cam.cli.common import INTERRUPTED
 
 REASONS = "being written", "exists", "in use"
 """Words of the line in which the second of two commands says why it does not run."""
-NOT_KILLED, NOT_RACED = {"cache", "port", "capture"}, {"save session"}
-"""Commands of the other kind alone; kill_captures.py kills captures."""
+NOT_KILLED, NOT_RACED = {"cache", "port"}, {"save session"}
+"""Commands of the other kind alone."""
 GRACE_S, EARLIER = 120.0, 0.7
 """Time for a killed command's processes to end, here; factor of a moment that came after the command's end."""
 PAGE = Command("live sim:bare-wall", "", lambda path, _: path.stat())
@@ -52,7 +52,7 @@ SAVING_S = 2.0
 
 
 def kill_once(command: Command, inputs: Path, random: Random) -> Row:
-    """Kill a command at a random moment, run it again, and return what is wrong."""
+    """Kill a command at a random moment, run it again, and return the finding."""
     after_s, was_killed = random.uniform(0, duration_s(command, inputs)), False
     while not was_killed:
         with empty_folder() as folder:
@@ -84,7 +84,7 @@ def survivors(children: list[int]) -> str:
 
 
 def race_once(command: Command, inputs: Path, random: Random) -> Row:
-    """Start two commands on one output, and return the exit codes and what is wrong."""
+    """Start two commands on one output, and return the exit codes and the finding."""
     apart_s = random.uniform(0, 0.3 if command.endless else 0.6 * duration_s(command, inputs))
     with empty_folder() as folder, started(command, folder, inputs) as first:
         time.sleep(apart_s)

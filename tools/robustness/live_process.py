@@ -1,4 +1,4 @@
-"""Live run in a process of its own, as a person starts it."""
+"""Live run in a process of its own, as a person starts it; and processes on Linux as /proc lists them."""
 
 import os
 import re
@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from threading import Event, Thread
 from typing import Self
-
-from processes import session_of
 
 PROGRAM = "import sys; from nlos_cam.cli import run; print('begun', file=sys.stderr, flush=True); run()"
 ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+/")
@@ -83,3 +81,18 @@ class LiveProcess:
         """Return the running processes of its session, itself included."""
         pids = [int(each.name) for each in Path("/proc").iterdir() if each.name.isdigit()]
         return [pid for pid in pids if session_of(pid) == self.process.pid]
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the children of a process."""
+    tasks = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for task in tasks for child in task.read_text(encoding="utf-8").split()]
+
+
+def session_of(pid: int) -> int | None:
+    """Return the session of a process; None for one that has ended."""
+    try:
+        state, _, _, session = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[:4]
+    except OSError:
+        return None
+    return None if state == "Z" else int(session)

@@ -18,7 +18,6 @@ import h5py
 import lz4.frame
 import numpy as np
 import torch
-from corruption import WAYS
 
 from nlos_cam.recording import rosbag
 
@@ -26,21 +25,71 @@ Random = np.random.Generator
 NUMBERS = (0, 1, 2, 3, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 30_000, 1 << 20, 1 << 24, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 FLOATS = (0.0, -1.0, 1e-300, 1e30, 1e308, float("inf"), float("-inf"), float("nan"))
 TEXTS = ("", "nan", "-1", "1e999", "9" * 5000, "../../../evil", "/etc/passwd", "\x00", "\x1b[2J", "ä" * 300, "mono8")
-TYPES = [
-    "std_msgs/String",
-    "std_msgs/Float32",
-    "sensor_msgs/Image",
-    "sensor_msgs/CameraInfo",
-    "diagnostic_msgs/KeyValue",
-]
-TYPES += ["geometry_msgs/Transform", "realsense_msgs/StreamInfo", "sensor_msgs/PointCloud2", "evil_msgs/Unknown"]
+TYPES = ["std_msgs/String", "std_msgs/Float32", "sensor_msgs/Image", "sensor_msgs/CameraInfo"]
+TYPES += ["diagnostic_msgs/KeyValue", "geometry_msgs/Transform", "realsense_msgs/StreamInfo"]
+TYPES += ["sensor_msgs/PointCloud2", "evil_msgs/Unknown"]
 SENSORS = "0", "1", "99", "9" * 5000, "-1", "٣"
 DEPTH = 20_000
+LENGTH = re.compile(rb"(?s)....(?=(?:compression|conn|count|index_pos|op|size|topic|time)=)")
+"""The length of a record's field; what is 4 bytes before it may be the length of the record's header."""
+ABSURD = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0xFFFFFFF0)
 
 
 def pick(random: Random, values: Any) -> Any:
     """Return one of some values."""
     return values[int(random.integers(len(values)))]
+
+
+def _span(content: bytearray, random: Random, most: int = 1 << 18) -> slice:
+    start = int(random.integers(len(content)))
+    return slice(start, start + int(random.integers(1, most)))
+
+
+def cut(content: bytearray, random: Random) -> None:
+    """Lose the end."""
+    del content[int(random.integers(len(content))) :]
+
+
+def flip(content: bytearray, random: Random) -> None:
+    """Change some bytes."""
+    for at in random.integers(len(content), size=int(random.integers(1, 64))):
+        content[at] ^= int(random.integers(1, 256))
+
+
+def set_lengths(content: bytearray, random: Random) -> None:
+    """Put another number where a length is, or just before or after."""
+    places = [match.start() for match in LENGTH.finditer(content)]
+    for _ in range(int(random.integers(1, 4)) if places else 0):
+        at = int(random.choice(places)) + int(random.choice([-4, 0, 4, 8, 13]))
+        absurd = random.random() < 0.5
+        value = int(random.choice(ABSURD)) if absurd else int(random.integers(1 << 20))
+        content[at : at + 4] = value.to_bytes(4, "little")
+
+
+def zero(content: bytearray, random: Random) -> None:
+    """Blank a range."""
+    span = _span(content, random)
+    content[span] = bytes(len(content[span]))
+
+
+def remove(content: bytearray, random: Random) -> None:
+    """Lose a range."""
+    del content[_span(content, random)]
+
+
+def repeat(content: bytearray, random: Random) -> None:
+    """Write a range twice, the second time somewhere."""
+    at = int(random.integers(len(content)))
+    content[at:at] = content[_span(content, random, 1 << 21)]
+
+
+def swap(content: bytearray, random: Random) -> None:
+    """Exchange two ranges."""
+    first, second, third = sorted(int(at) for at in random.integers(len(content), size=3))
+    content[first:] = content[second:third] + content[first:second] + content[third:]
+
+
+WAYS: tuple[Callable[[bytearray, Random], None], ...] = (cut, flip, set_lengths, zero, remove, repeat, swap)
 
 
 @dataclass(frozen=True)
@@ -131,10 +180,8 @@ def change_topic(bag: Bag, random: Random) -> None:
     elif random.random() < 0.6:
         bag.topics[one] = topic.replace("sensor_0", f"sensor_{pick(random, SENSORS)}"), kind
     else:
-        bag.topics[one] = (
-            topic.replace("Depth_0", pick(random, ("../../x_0", "Infrared_0", "Depth_1", "x" * 300))),
-            kind,
-        )
+        stream = pick(random, ("../../x_0", "Infrared_0", "Depth_1", "x" * 300))
+        bag.topics[one] = topic.replace("Depth_0", stream), kind
 
 
 def share_topic(bag: Bag, random: Random) -> None:
@@ -241,10 +288,8 @@ def mutate_shard(content: bytes, random: Random) -> tuple[str, bytes]:
     """Change an HDF5 shard with the library; right checksums now and then."""
     memory = io.BytesIO(content)
     with h5py.File(memory, "r+") as file:
-        name, way = (
-            pick(random, list(file)),
-            pick(random, ("value", "shape", "type", "link", "gone", "attribute", "sum")),
-        )
+        name = pick(random, list(file))
+        way = pick(random, ("value", "shape", "type", "link", "gone", "attribute", "sum"))
         values, checksum = file[name][:], file[name].attrs["sha256"]
         if way in {"value", "sum"} and values.dtype.kind in "fiu":
             values.ravel()[int(random.integers(values.size))] = pick(random, (0, 1, 77))
@@ -256,10 +301,8 @@ def mutate_shard(content: bytes, random: Random) -> tuple[str, bytes]:
         else:
             del file[name]
             if way == "link":
-                link = pick(
-                    random, (h5py.ExternalLink("/etc/passwd", "/x"), h5py.SoftLink("/seed"), h5py.SoftLink("/no"))
-                )
-                file[name] = link
+                links = h5py.ExternalLink("/etc/passwd", "/x"), h5py.SoftLink("/seed"), h5py.SoftLink("/no")
+                file[name] = pick(random, links)
             elif way != "gone":
                 shape = (int(pick(random, NUMBERS)),) if way == "shape" else (3,)
                 kind = "f4" if way == "shape" else pick(random, ("c16", h5py.ref_dtype, h5py.string_dtype(), "i1"))
@@ -271,11 +314,8 @@ def mutate_shard(content: bytes, random: Random) -> tuple[str, bytes]:
 def mutate_tensors(content: bytes, random: Random) -> tuple[str, bytes]:
     """Change the header of a safetensors file with its length right again, or its tensors."""
     start = 8 + int.from_bytes(content[:8], "little")
-    header, data, way = (
-        json.loads(content[8:start]),
-        bytearray(content[start:]),
-        pick(random, ("header", "bits", "fill")),
-    )
+    header, data = json.loads(content[8:start]), bytearray(content[start:])
+    way = pick(random, ("header", "bits", "fill"))
     if way == "header":
         entry = header[pick(random, [name for name in header if name != "__metadata__"])]
         key = pick(random, list(entry))
@@ -298,41 +338,27 @@ def mutate_arrays(content: bytes, random: Random) -> tuple[str, bytes]:
     if way == "gone":
         del arrays[name]
     elif way == "value":
-        arrays[name] = (
-            np.full_like(values, pick(random, (0, 1, 7))) if values.dtype.kind in "fiu" else np.array("[" * 900)
-        )
+        is_number = values.dtype.kind in "fiu"
+        arrays[name] = np.full_like(values, pick(random, (0, 1, 7))) if is_number else np.array("[" * 900)
     elif way == "shape":
         arrays[name] = pick(random, (values.ravel(), values[None], np.zeros(0, values.dtype), np.zeros((3, 3))))
     elif way == "type":
         arrays[name] = np.array(pick(random, ("text", b"bytes", 5, [1j], [True])))
     np.savez(out, **({**arrays, name: np.array([{}], object)} if way == "object" else arrays))
     if way == "lie":
-        lying = out.getvalue().replace(b"'shape': (", b"'shape': (9999999, ", 1)
-        return way, lying
+        return way, out.getvalue().replace(b"'shape': (", b"'shape': (9999999, ", 1)
     return way, out.getvalue()
 
 
 def mutate_text(content: bytes, random: Random) -> tuple[str, bytes]:
     """Change TOML or JSON: values, names, lines, nesting, length."""
-    lines, way = (
-        content.decode().splitlines(),
-        pick(random, ("value", "value", "value", "gone", "twice", "nest", "long")),
-    )
+    lines, way = content.decode().splitlines(), pick(random, ("value",) * 3 + ("gone", "twice", "nest", "long"))
     at = int(random.integers(max(len(lines), 1)))
     start, mark, value = lines[at].partition(": " if content.startswith(b"{") else " = ")
     if way == "value" and mark:
-        texts = (
-            *map(str, (*NUMBERS, *FLOATS)),
-            '""',
-            "true",
-            "[]",
-            "{}",
-            "null",
-            '"' + "x" * 5000 + '"',
-            "[[[[]]]]",
-            "1e999",
-        )
-        lines[at] = start + mark + pick(random, texts) + ("," if value.endswith(",") else "")
+        texts = '""', "true", "[]", "{}", "null", '"' + "x" * 5000 + '"', "[[[[]]]]", "1e999"
+        new = pick(random, (*map(str, (*NUMBERS, *FLOATS)), *texts))
+        lines[at] = start + mark + new + ("," if value.endswith(",") else "")
     elif way == "gone":
         del lines[at]
     elif way == "twice":
@@ -371,17 +397,9 @@ def mutate_state(content: bytes, random: Random) -> tuple[str, bytes]:
     """Replace a run's state by another with its digest: other types, hostile pickles, other parts."""
     state = torch.load(io.BytesIO(content[32:]), weights_only=True)
     key = pick(random, list(state))
-    bad: tuple[Any, ...] = (
-        5,
-        None,
-        [],
-        "x",
-        {**state, key: pick(random, (None, 5, "x", [], {}))},
-        _Evil(),
-        {key: state[key]},
-    )
-    out = io.BytesIO()
-    chosen = int(random.integers(len(bad) + 1))
+    other = {**state, key: pick(random, (None, 5, "x", [], {}))}
+    bad: tuple[Any, ...] = (5, None, [], "x", other, _Evil(), {key: state[key]})
+    out, chosen = io.BytesIO(), int(random.integers(len(bad) + 1))
     if chosen < len(bad):
         torch.save(bad[chosen], out)
     else:

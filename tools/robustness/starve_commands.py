@@ -15,7 +15,6 @@ from functools import cache, partial
 from pathlib import Path
 from random import Random
 
-from processes import PROGRAM
 from trials import (
     COMMANDS,
     TIMEOUT_S,
@@ -36,6 +35,7 @@ MIN_KIB, MAX_SHARE = 16, 1.2
 AS_MIB = 300, 4000
 PAIRS = {"cache", "port"}
 """Commands for races alone."""
+PROGRAM = [sys.executable, "-c", "from nlos_cam.cli import run; run()"]
 NO_SHM = ["unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o ro,size=4k none /dev/shm && exec "$@"', "sh"]
 ROOT = Path(__file__).parents[2]
 
@@ -52,7 +52,7 @@ def small_disk(kib: int) -> Generator[Path]:
 
 
 def wrong_with(command: Command, folder: Path, inputs: Path, ended: subprocess.CompletedProcess[str]) -> str:
-    """Return what is wrong with an end of a command; empty if nothing is."""
+    """Return the finding about an end of a command; empty if there is none."""
     said = [line for line in ended.stderr.splitlines() if line.strip()]
     lines = said[next((at for at, line in enumerate(said) if line.startswith("error:")), 0) :]  # notes come before
     output = folder / command.output
@@ -68,7 +68,7 @@ def wrong_with(command: Command, folder: Path, inputs: Path, ended: subprocess.C
 
 
 def starve(command: Command, inputs: Path, way: str, random: Random) -> Row:
-    """Run a command with little of something; return its exit code, its last line and what is wrong."""
+    """Run a command with little of something; return its exit code, its last line and the finding."""
     low, high = {"disk_kib": (MIN_KIB, MAX_SHARE * need_kib(command, inputs)), "memory_mib": AS_MIB}.get(way, (0, 0))
     amount = random.randint(low, int(high))
     with small_disk(amount if way == "disk_kib" else 1 << 20) as folder:

@@ -46,6 +46,8 @@ direct = {features = 4, width = 8, blocks = 1, token = 4, mixers = 1}
 """
 SCENE = 'name = "a"\nrig = "paper-rig"\n[object]\ncategory = "cup"\nsize_m = 0.1\n[motion]\nposes = 1\nturn_deg = 9\n'
 BUILD = "dataset build --count 12 --workers 2 --accuracy draft --out"
+CACHE = "capture sim:{inputs}/scene.toml --frames 2 --out {folder}"
+SAVE = "live sim:bare-wall --no-view --seconds 2 --save-view"
 TRAIN = "train direct --recipe {inputs}/small.toml --dataset {inputs}/data --held-out {inputs}/data --out"
 
 Row = dict[str, Any]
@@ -73,6 +75,10 @@ class Command:
     both_may_win: bool = False
     endless: bool = False
     """The winner of a pair is ended by SIGTERM once the other has ended."""
+
+
+def _file(path: Path, _: Path) -> object:
+    return path.read_bytes()[0]
 
 
 def _folder(*names: str) -> Callable[[Path, Path], object]:
@@ -130,34 +136,17 @@ def _cached(path: Path, inputs: Path) -> None:
         raise ValueError(f"{count} entries in the cache")
 
 
+RESUMED: dict[str, Any] = {"again": "", "is_atomic": False, "both_may_win": True}
 COMMANDS = {
     "capture": Command("capture sim:bare-wall --frames 8 --out {folder}/a.bag", "a.bag", _capture, is_atomic=False),
     "export": Command("export {inputs}/noise.bag --out {folder}/out", "out", _folder("export.json", "depth.csv")),
     "repair": Command("repair {inputs}/noise.bag --out {folder}/a.bag", "a.bag", lambda path, _: verify(path)),
     "replay": Command("replay {inputs}/noise.bag --out {folder}/out", "out", _folder("report.md")),
-    "save session": Command(
-        "live sim:bare-wall --no-view --seconds 2 --save-view {folder}/a.html", "a.html", _session, is_atomic=False
-    ),
-    "render": Command(
-        "render cup --accuracy draft --out {folder}/a.npz", "a.npz", lambda path, _: path.read_bytes()[0]
-    ),
-    "dataset build": Command(
-        f"{BUILD} {{folder}}/data",
-        "data",
-        _dataset,
-        again="",
-        keeps=SHARD_PATTERN,
-        is_atomic=False,
-        both_may_win=True,
-    ),
-    "train": Command(f"{TRAIN} {{folder}}/run", "run", _run, again="", is_atomic=False, both_may_win=True),
-    "cache": Command(
-        "capture sim:{inputs}/scene.toml --frames 2 --out {folder}/a.bag",
-        ".",
-        _cached,
-        other="capture sim:{inputs}/scene.toml --frames 2 --out {folder}/b.bag",
-        both_may_win=True,
-    ),
+    "save session": Command(f"{SAVE} {{folder}}/a.html", "a.html", _session, is_atomic=False),
+    "render": Command("render cup --accuracy draft --out {folder}/a.npz", "a.npz", _file),
+    "dataset build": Command(f"{BUILD} {{folder}}/data", "data", _dataset, keeps=SHARD_PATTERN, **RESUMED),
+    "train": Command(f"{TRAIN} {{folder}}/run", "run", _run, **RESUMED),
+    "cache": Command(f"{CACHE}/a.bag", ".", _cached, other=f"{CACHE}/b.bag", both_may_win=True),
     "port": Command("live sim:bare-wall --view-port 18765", ".", lambda path, _: path.stat(), again="", endless=True),
 }
 

@@ -1,12 +1,15 @@
-"""Transfer to a bench: figures on the simulated bench and the paper's rig, and the learning curve over recordings.
+"""Transfer to a bench: its recordings, figures on it and on the paper's rig, and the learning curve over recordings.
 
+python tools/studies/transfer.py record DIR [--scene examples/bench.toml] [--frames 8]
 python tools/studies/transfer.py figures DIR [--weights W]      docs/transfer.json
 python tools/studies/transfer.py curve DIR RUNS --recipe models/recipes/paper-rig-transfer.toml [--weights W]
     [--scratch models/recipes/paper-rig-compressor-scratch.toml]  docs/transfer_curve.json and .png
 
-DIR holds the recordings of transfer_bench.py; one frame of each of 18 objects that no run trains on is judged. RUNS
-holds the trainings, which resume. With --scratch the same recordings also train a compressor from nothing, onto the
-latent of the weights' VAE.
+DIR holds the 54 test objects as labelled recordings of a simulated bench, for adaptation, validation and judging: of 8
+frames of 640 x 480 they take 0.4 GB and two minutes, and a second call resumes. Frames of a bench at rest differ by
+their noise alone, so that more of them would add little; a person's recordings of a few seconds have more. One frame of
+each of 18 objects that no run trains on is judged. RUNS holds the trainings, which resume. With --scratch the same
+recordings also train a compressor from nothing, onto the latent of the weights' VAE.
 """
 
 import argparse
@@ -14,6 +17,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import harness
@@ -23,22 +27,141 @@ from nlos_calibration import ObjectBox, load_rig
 from nlos_calibration.arrays import Float32
 from nlos_models import MapSet, Reconstructor, load_reconstructor, surface
 from numpy.typing import NDArray
-from transfer_bench import ADAPTATION, FRAMES, HELD_OUT, VALIDATION, part_of
 
+from nlos_cam.camera import FRAMES_PER_S, Recording, SimulatedCamera, World
 from nlos_cam.cli.common import tracked
 from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.dataset import list_recordings, read_labelled, write_shards
-from nlos_cam.errors import NlosCamError
+from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.evaluate import mm_per_v, over_objects, per_object, plain, reconstruct_all
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.objects import benchmark_objects, image_from_depth, object_box
-from nlos_cam.render import Scene, Sensor, SensorModel, render
+from nlos_cam.objects import CATEGORIES, BenchmarkObject, benchmark_objects, image_from_depth, object_box
+from nlos_cam.recording import CaptureSession, CaptureTarget, finalize, load_sidecar, sidecar_path, verify
+from nlos_cam.render import Scene, SceneFile, SensedImages, Sensor, SensorModel, load_scene, render
 
+SCENE = Path(__file__).parents[2] / "examples" / "bench.toml"
+ADAPTATION, VALIDATION, HELD_OUT = "adaptation", "validation", "held-out"
+"""30 objects, 6 for the training's schedule, and 18 for judging: no object is in two parts."""
+HELD_OUT_NUMBER, VALIDATION_NUMBER, VALIDATION_EVERY = 3, 2, 3
+"""Of each category's three objects, one is held out; of every third category, another is for validation."""
+FRAMES = 8
+BETWEEN_S = 30.0
+"""Time between starts of recordings, in which the object is changed and the lidar warms."""
 PARTS = ADAPTATION, VALIDATION, HELD_OUT
 COUNTS = 2, 5, 10, 20, 30
 FINISHED = "figures.json"
 OnProgress = Callable[[int, int], None]
+
+
+class HurriedClock:
+    """Clock that moves only by waiting, so that nothing has to wait."""
+
+    def __init__(self, start_s: float = 1e9) -> None:
+        self.time_s = start_s
+
+    def now(self) -> float:
+        return self.time_s
+
+    def wait(self, stop: Event, seconds: float) -> bool:
+        self.time_s += max(seconds, 0.0)
+        return stop.wait(0.0005)
+
+
+class Later(World):
+    """World at rest, seen by a camera that was switched on `since` frames ago."""
+
+    def __init__(self, scene: SceneFile, shown: Scene, since: int) -> None:
+        super().__init__(scene, [render(shown).multi], [shown.object_depth_m])
+        self._since = since
+
+    def images(self, number: int) -> SensedImages:
+        return super().images(self._since + number)
+
+    def celsius(self, number: int) -> Mapping[str, float]:
+        return super().celsius(self._since + number)
+
+
+@dataclass(frozen=True)
+class Take:
+    """Recording to be made: object, file, and frames since the device was switched on."""
+
+    thing: BenchmarkObject
+    path: Path
+    since: int
+
+    @property
+    def truth(self) -> Path:
+        """Path of the hidden depth: labels stay true when a generator of objects changes."""
+        return self.path.with_suffix(".npy")
+
+    @property
+    def is_whole(self) -> bool:
+        """True where the recording exists, of the object in its present shape."""
+        if not (self.path.is_file() and self.truth.is_file()):
+            return False
+        same = np.array_equal(np.load(self.truth), self.thing.depth_m, equal_nan=True)
+        try:
+            return same and load_sidecar(sidecar_path(self.path)).state == "complete"
+        except RecordingError:
+            return False
+
+
+def part_of(thing: BenchmarkObject) -> str:
+    """Return the part of an object."""
+    if thing.number == HELD_OUT_NUMBER:
+        return HELD_OUT
+    looked_at = sorted(CATEGORIES).index(thing.category) % VALIDATION_EVERY == 0
+    return VALIDATION if looked_at and thing.number == VALIDATION_NUMBER else ADAPTATION
+
+
+def takes(things: Sequence[BenchmarkObject], folder: Path) -> list[Take]:
+    """Return one take of each object, in order: F/adaptation/cup-1.bag, F/held-out/cup-3.bag, ..."""
+    apart = round(BETWEEN_S * FRAMES_PER_S)
+    return [Take(thing, folder / part_of(thing) / f"{thing.name}.bag", k * apart) for k, thing in enumerate(things)]
+
+
+def record(take: Take, scene: SceneFile, frames: int) -> None:
+    """Make one recording and its sidecar, and read it back. Raises the error that ended it, if one did."""
+    take.path.parent.mkdir(parents=True, exist_ok=True)
+    sidecar_path(take.path).unlink(missing_ok=True)  # until it is there, nothing is whole
+    np.save(take.truth, take.thing.depth_m)
+    bare = scene.bare
+    shown = Scene(scene.rig, take.thing.depth_m, bare.surface, scene.radiometry, scene.jump_m, bare.pulse_ns)
+    recording = Recording(take.path, frames=frames)
+    camera = SimulatedCamera(
+        f"sim:{scene.rig.name}", Later(scene, shown, take.since), clock=HurriedClock(), recording=recording
+    )
+    job = CaptureTarget(take.path, take.thing.name)
+    for made in CaptureSession(camera, recording, [job]).record(Event(), lambda _: None):
+        settled = finalize(made, verify)
+        if settled.error:
+            raise settled.error
+
+
+def record_all(
+    scene: SceneFile,
+    things: Sequence[BenchmarkObject],
+    folder: Path,
+    frames: int,
+    on_progress: OnProgress,
+) -> Iterator[Path]:
+    """Make the missing recordings in order; yield each when it exists."""
+    for done, take in enumerate(every := takes(things, folder)):
+        on_progress(done, len(every))
+        if not take.is_whole:
+            record(take, scene, frames)
+        yield take.path
+
+
+def record_bench(asked: argparse.Namespace) -> None:
+    """Record the test objects on a simulated bench."""
+    scene = load_scene(asked.scene)
+    things = benchmark_objects(object_box(scene.rig))
+    with tracked("recording the test objects") as on_progress:
+        made = list(record_all(scene, things, asked.folder, asked.frames, on_progress))
+    size_gb = sum(path.stat().st_size for path in made) / 1e9
+    print(f"{len(made)} recordings of {asked.frames} frames, {size_gb:.2f} GB: {asked.folder}")
 
 
 def judge(reconstructor: Reconstructor, maps: MapSet, box: ObjectBox) -> dict[str, Any]:
@@ -229,11 +352,14 @@ def main() -> None:
     """Run the named study."""
     parser = harness.options(__doc__)
     commands = parser.add_subparsers(required=True)
-    parts = {"figures": figures, "curve": run_curve}
-    for name, work in parts.items():
+    for name, work in {"record": record_bench, "figures": figures, "curve": run_curve}.items():
         part = commands.add_parser(name, help=work.__doc__)
         part.set_defaults(run=work)
         part.add_argument("folder", type=Path)
+        if work is record_bench:
+            part.add_argument("--scene", type=Path, default=SCENE)
+            part.add_argument("--frames", type=int, default=FRAMES)
+            continue
         if work is run_curve:
             part.add_argument("runs", type=Path)
             part.add_argument("--recipe", type=Path, required=True)

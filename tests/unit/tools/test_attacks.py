@@ -64,10 +64,6 @@ def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
     assert (facts["most_mib"], facts["bad"]) == ({"a.bag": 200, "b.h5": 300}, [{"input": "b.h5"}])
 
 
-def test_page_that_nobody_serves_is_not_served(tool: Tool) -> None:
-    assert tool("attack_view").page_ms("http://127.0.0.1:9/") is None
-
-
 def test_trials_resume_and_a_failed_one_is_a_finding(tool: Tool, tmp_path: Path) -> None:
     trials, drawn = tool("trials"), list[float]()
 

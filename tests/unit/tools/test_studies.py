@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
+from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import load_rig
-from nlos_models import checkpoint
-from nlos_models.data import MapSet
+from nlos_models import MapSet, checkpoint
 from small_maps import small_maps, untrained_weights, use_small_networks
 
 from nlos_cam.dataset import TEST_SEED, DatasetPlan
-from nlos_cam.evaluate.metrics import TARGETS
-from nlos_cam.evaluate.subjects import HeldOutObjects, seeded_objects
-from nlos_cam.objects.depth_map import object_box
+from nlos_cam.evaluate import TARGETS, HeldOutObjects, seeded_objects
+from nlos_cam.objects import object_box
 
 RIG = load_rig("paper-rig")
 Tool = Callable[[str], ModuleType]
@@ -176,22 +174,6 @@ def test_doubt_study_is_right_for_laplace_errors(tool: Tool, harness: ModuleType
     assert doubt.of_outliers([answer, answer], np.array([100, 0]))["cannot_be_seen"] == 1
     parts = {"reliability": rows, "coverage": covered, "surface": [{"expected": 0.5, "observed": 0.6}]}
     harness.save("reliability", doubt.draw({"test_objects": parts, "held_out_objects": parts}))
-
-
-@pytest.mark.slow
-def test_physics_check_scores_true_objects_lowest(
-    tool: Tool, run: Read, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    study = tool("physics_check")
-    monkeypatch.setattr(study, "benchmark_objects", lambda box: seeded_objects(20_000_000, 3, box))
-    monkeypatch.setattr(study, "load_reconstructor", lambda *_: plate)
-    table = run("physics_check", "physics_check", "--new", 2, "--outside", 0, "--out", tmp_path / "docs")
-    scores = table["scores"]
-    assert scores["the true object, standard"]["most"] < 0.1 < scores["test objects"]["median"]
-    ordinary = np.arange(200) / 200
-    threshold = study.least_threshold(ordinary)
-    assert study.flagged(ordinary, threshold) <= 0.01 < study.flagged(ordinary, threshold - 0.01)
-    assert study.told_apart(np.array([0.1, 0.2]), np.array([0.3, 0.4])) == 1.0
 
 
 def test_color_demonstration_passes_each_step_on_to_the_next(tool: Tool) -> None:

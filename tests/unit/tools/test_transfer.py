@@ -7,22 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.dataset.labelled import read_labelled
-from nlos_cam.objects.benchmark import BenchmarkObject
-from nlos_cam.objects.benchmark import benchmark_objects as fixed_set
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.recording.sidecar import load_sidecar
-from nlos_cam.render.renderer import MultiBounce
-from nlos_cam.render.scene_file import SceneFile, load_scene
+from nlos_cam.dataset import read_labelled
+from nlos_cam.objects import BenchmarkObject, object_box
+from nlos_cam.objects import benchmark_objects as fixed_set
+from nlos_cam.recording import load_sidecar
+from nlos_cam.render import MultiBounce, SceneFile, load_scene
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "bench.toml"
 
 
 @pytest.fixture(scope="module")
 def bench(tool: Callable[[str], ModuleType]) -> ModuleType:
-    return tool("transfer_bench")
+    return tool("transfer")
 
 
 @pytest.fixture(scope="module")
