@@ -27,6 +27,7 @@ DIRECT_SHARE, COMPRESSOR_SHARE, TIMING_SHARE = 0.5, 0.2, 0.15
 """Shares of the time for training each network, and at most for timing the direct one; the rest is for the first
 shards, evaluation and starts of processes."""
 TIMING_EPOCHS = 3
+KEPT_FIGURES = "silhouette_iou", "foreground_rmse_mm", "unseen", "recognised"
 SEED, HELD_OUT_SEED = 2_000_000, 10_000_000
 OBJECTS = 1_000_000
 """Upper limit of what is rendered; the time ends it earlier."""
@@ -160,9 +161,8 @@ def train_and_judge(chosen: Namespace) -> None:
     finish("objects", objects)
     left_s = min(COMPRESSOR_SHARE * budget_s, budget_s - (time.perf_counter() - start_s))
     if chosen.compressor and left_s > 0:
-        ready = recipe_with(
-            chosen.compressor, out / "compressor.toml", objects=objects, epochs=chosen.compressor_epochs
-        )
+        numbers = {"objects": objects, "epochs": chosen.compressor_epochs}
+        ready = recipe_with(chosen.compressor, out / "compressor.toml", **numbers)
         arguments = ["train", "compressor", "--recipe", str(ready), "--out", str(weights["compressor"]), *common]
         finish("compressor_s", go(out, "compressor", [*arguments, "--dataset", str(training)], lambda s: s > left_s))
     for name, folder in weights.items():
@@ -170,9 +170,7 @@ def train_and_judge(chosen: Namespace) -> None:
             judged = ["evaluate", "--weights", str(folder), "--out", str(out / f"{name}-figures"), "--no-nearest"]
             go(out, f"{name}-evaluate", [*judged, "--overwrite"])
             figures = json.loads((out / f"{name}-figures" / "figures.json").read_text(encoding="utf-8"))
-            finish(
-                name, {key: figures[key] for key in ("silhouette_iou", "foreground_rmse_mm", "unseen", "recognised")}
-            )
+            finish(name, {key: figures[key] for key in KEPT_FIGURES})
             kept = sorted(path.name for path in folder.iterdir() if path.suffix in {".safetensors", ".json", ".onnx"})
             finish(f"{name}_parts", [part.name for part in write_parts(folder, kept, out / f"{name}.zip")])
     finish("total_s", time.perf_counter() - start_s)

@@ -18,6 +18,7 @@ from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import MeasuredWall, new_wall_record
 from nlos_models import compressor, vae
+from noise_bags import make_all
 from rosbags.rosbag1 import Reader, Writer
 from view_streams import ASSETS, Streams
 
@@ -42,9 +43,9 @@ def tool() -> Iterator[Callable[[str], ModuleType]]:
 
 
 @pytest.fixture(scope="session")
-def noise_bags(tool: Callable[[str], ModuleType], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def noise_bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Forty frames of noise, recorded "packed" and "plain", and each of them "-unindexed" as a kill leaves it."""
-    return tool("noise_recordings").make_all(tmp_path_factory.mktemp("noise"))
+    return make_all(tmp_path_factory.mktemp("noise"))
 
 
 @pytest.fixture(scope="module")

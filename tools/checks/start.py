@@ -48,9 +48,8 @@ Await = Callable[["subprocess.Popen[bytes]", Path], None]
 """Returns when a program, whose folder is given, has shown its first result."""
 
 
-def ended(process: "subprocess.Popen[bytes]", folder: Path) -> None:
+def ended(process: "subprocess.Popen[bytes]", _folder: Path) -> None:
     """Read the output of a program to its end."""
-    del folder
     process.communicate(timeout=TIMEOUT_S)
 
 
@@ -61,9 +60,8 @@ def first_line(process: "subprocess.Popen[bytes]", folder: Path) -> None:
         time.sleep(POLL_S)
 
 
-def first_picture(process: "subprocess.Popen[bytes]", folder: Path) -> None:
+def first_picture(process: "subprocess.Popen[bytes]", _folder: Path) -> None:
     """Read the live page's stream as a browser does, until it has a reconstruction."""
-    del folder
     address = next((found[0].decode() for line in process.stderr or () if (found := ADDRESS.search(line))), "")
     connection = HTTPConnection(urlsplit(address).netloc, timeout=TIMEOUT_S)
     connection.request("GET", "/stream")
@@ -106,14 +104,13 @@ def programs() -> dict[str, Callable[[], Times]]:
     helps = [[name, *part, "--help"] for name in COMMANDS for part in parts[name]]
     calls = {" ".join(line): line for line in [["--version"], ["--help"], *helps, ["doctor"]]}
     live = ["-c", NLOS_CAM, "live", "sim", "--no-view", "--log", "first.jsonl"]
+    demo = ["-c", NLOS_CAM, "demo"]
     return {
         BARE: partial(timed, ["-c", "pass"]),
         NUMPY: partial(timed, ["-c", "import numpy"]),
         **{name: partial(timed, ["-c", NLOS_CAM, *line]) for name, line in calls.items()},
         "live --no-view, to its first result": partial(timed, live, first_line),
-        "demo with empty caches, to its first picture": partial(
-            timed, ["-c", NLOS_CAM, "demo"], first_picture, cold=True
-        ),
+        "demo with empty caches, to its first picture": partial(timed, demo, first_picture, cold=True),
     }
 
 

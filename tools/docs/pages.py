@@ -150,11 +150,8 @@ def gallery_page() -> str:
     return filled((DOCS / "gallery.md").read_text(encoding="utf-8"), tables)
 
 
-PAGES: dict[str, Callable[[], str]] = {
-    "commands": commands_page,
-    "comparison": comparison_page,
-    "gallery": gallery_page,
-}
+PAGES: dict[str, Callable[[], str]]
+PAGES = {"commands": commands_page, "comparison": comparison_page, "gallery": gallery_page}
 
 
 def main() -> int:

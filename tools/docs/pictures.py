@@ -22,22 +22,13 @@ from nlos_calibration.arrays import Float32, Float64
 from nlos_models import silhouette_iou
 from PIL import Image
 
+from nlos_cam import objects as shapes
 from nlos_cam.camera import FRAMES_PER_S, World, open_world, render_loop
 from nlos_cam.cli.common import tracked
 from nlos_cam.evaluate import SeededObject, Subject, as_map_set, echoes_of, reconstruct_all, sense, truth_of
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, Frame
 from nlos_cam.live import VIDEO, ReplayMedia, replay_recording
-from nlos_cam.objects import (
-    CATEGORIES,
-    benchmark_objects,
-    category_triangles,
-    image_from_depth,
-    object_box,
-    orthographic_depth,
-    place,
-    random_pose,
-)
 from nlos_cam.reconstruct import CalibratedRig, build_pipeline, load_networks, load_uncertainty
 from nlos_cam.render import load_scene
 
@@ -53,20 +44,20 @@ def unlike_training() -> list[SeededObject]:
     """Return shapes unlike any training object, and nothing at all."""
     y, x = (np.mgrid[:OBJECT_PIXELS, :OBJECT_PIXELS] - (OBJECT_PIXELS - 1) / 2) / OBJECT_PIXELS
     radius = np.hypot(x, y)
-    shapes = {
+    depths_m = {
         "a ring": np.where(abs(radius - 0.3) < 0.06, NEAR_M, np.nan),
         "two posts": np.where((abs(abs(x) - 0.25) < 0.06) & (abs(y) < 0.4), NEAR_M, np.nan),
         "a slanted plate": np.where(np.maximum(abs(x), abs(y)) < 0.35, (NEAR_M + FAR_M) / 2 + 0.15 * x, np.nan),
         "a wall of steps": np.where(abs(y) < 0.4, np.where(np.floor(8 * x) % 2 == 0, NEAR_M, FAR_M), np.nan),
         "nothing": np.full_like(x, np.nan),
     }
-    return [SeededObject(name, name, depth_m.astype(np.float32)) for name, depth_m in shapes.items()]
+    return [SeededObject(name, name, depth_m.astype(np.float32)) for name, depth_m in depths_m.items()]
 
 
 def reconstructed(subjects: Sequence[Subject]) -> tuple[Float32, Float32, Float64]:
     """Return the shipped networks' images of objects (n, 64, 64), the truth, and the silhouettes' IoU."""
     rig = load_rig("paper-rig")
-    truth = truth_of(subjects, object_box(rig))
+    truth = truth_of(subjects, shapes.object_box(rig))
     maps = as_map_set(sense(echoes_of(subjects, rig, lambda *_: None), rig), truth)
     image = reconstruct_all(load_networks(), maps)
     return image, truth, silhouette_iou(image, truth)
@@ -93,7 +84,7 @@ def draw_pairs(path: Path, rows: Sequence[tuple[str, Sequence[Subject], Float32,
 
 def failures(out: Path) -> None:
     """Draw the worst of the test objects, and shapes unlike training."""
-    fixed, others = benchmark_objects(object_box(load_rig("paper-rig"))), unlike_training()
+    fixed, others = shapes.benchmark_objects(shapes.object_box(load_rig("paper-rig"))), unlike_training()
     image, truth, iou = reconstructed(fixed)
     worst = np.argsort(iou, kind="stable")[:WORST]
     rows = [
@@ -105,9 +96,9 @@ def failures(out: Path) -> None:
 
 def variations(category: str, box: ObjectBox) -> list[Float32]:
     """Return images of a category as training has them, each with another seed and pose."""
-    poses = [random_pose(np.random.default_rng([k, *category.encode()]), box) for k in range(VARIATIONS)]
-    placed = [place(category_triangles(category, k), pose, box) for k, pose in enumerate(poses)]
-    return [image_from_depth(orthographic_depth(triangles, box), box) for triangles in placed]
+    poses = [shapes.random_pose(np.random.default_rng([k, *category.encode()]), box) for k in range(VARIATIONS)]
+    placed = [shapes.place(shapes.category_triangles(category, k), pose, box) for k, pose in enumerate(poses)]
+    return [shapes.image_from_depth(shapes.orthographic_depth(triangles, box), box) for triangles in placed]
 
 
 def draw_sheet(path: Path, images: dict[str, list[Float32]]) -> Figure:
@@ -128,8 +119,8 @@ def draw_sheet(path: Path, images: dict[str, list[Float32]]) -> Figure:
 
 def objects(out: Path) -> None:
     """Draw the sheet of training's objects."""
-    box = object_box(load_rig("paper-rig"))
-    draw_sheet(out / "objects.webp", {name: variations(name, box) for name in CATEGORIES})
+    box = shapes.object_box(load_rig("paper-rig"))
+    draw_sheet(out / "objects.webp", {name: variations(name, box) for name in shapes.CATEGORIES})
 
 
 class Unhurried:

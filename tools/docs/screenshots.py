@@ -30,24 +30,16 @@ FLAGS = [
 IMAGES = Path("docs/images")
 PROGRAM = [sys.executable, "-c", "from nlos_cam.cli import run; run()"]
 TIMEOUT_S = 180.0
+CUP = 'rig = "paper-rig"\n[object]\ncategory = "cup"\n'
+ASIDE = f"{CUP}size_m = 0.06\nx_m = 0.08\n"
+UNPLUG = '[[faults]]\nkind = "unplug"\nat_frame = 300\nframes = 900\n'
 SITUATIONS: dict[str, tuple[list[str], str, str]] = {
     "object": (["live", "sim"], "", "Object detected"),
     "nothing": (["live", "sim:{folder}/nothing.toml"], 'name = "empty"\nrig = "paper-rig"\n', "Nothing detected"),
-    "outside": (
-        ["live", "sim:{folder}/outside.toml"],
-        'name = "outside"\nrig = "paper-rig"\n[object]\ncategory = "cup"\nsize_m = 0.06\nx_m = 0.08\n',
-        "Shape not reliable",
-    ),
+    "outside": (["live", "sim:{folder}/outside.toml"], f'name = "outside"\n{ASIDE}', "Shape not reliable"),
     "calibrated": (["live", "sim", "--wall", "{folder}/wall.toml"], "", "Object detected"),
     "moved": (["live", "sim", "--wall", "{folder}/wall.toml"], "", "Wall or lidar have moved"),
-    "stalled": (
-        ["live", "sim:{folder}/stalled.toml"],
-        (
-            'name = "stalled"\nrig = "paper-rig"\n[object]\ncategory = "cup"\n'
-            '[[faults]]\nkind = "unplug"\nat_frame = 300\nframes = 900\n'
-        ),
-        "Camera stalled",
-    ),
+    "stalled": (["live", "sim:{folder}/stalled.toml"], f'name = "stalled"\n{CUP}{UNPLUG}', "Camera stalled"),
     "ended": (["live", "sim", "--seconds", "12"], "", "The run has ended"),
     "phone": (["live", "sim"], "", "Object detected"),
 }

@@ -27,9 +27,8 @@ def write_graphs() -> list[Path]:
 def write_worlds() -> list[Path]:
     """Render the loops of the packaged scenes, in two minutes on two cores; those of earlier renderings go."""
     WORLDS.mkdir(exist_ok=True)
-    loops = {
-        f"{scene.checksum}.npz": pack_loop(*render_loop(scene, _report)) for scene in (paper_scene(), bare_wall_scene())
-    }
+    scenes = paper_scene(), bare_wall_scene()
+    loops = {f"{scene.checksum}.npz": pack_loop(*render_loop(scene, _report)) for scene in scenes}
     for old in WORLDS.glob("*.npz"):
         old.unlink()
     for name, content in loops.items():

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import trimesh
 from nlos_calibration import load_rig, load_wall, reference
 from nlos_models import checksums_of, load_cached, load_recipe, load_record, shipped_folder
 from noise_recordings import record
@@ -106,7 +107,7 @@ def read_recording(path: Path, folder: Path, random: np.random.Generator) -> Non
     _refuse(refused)
 
 
-def read_text(path: Path, _: Path, __: np.random.Generator, load: Callable[[Path], Any]) -> None:
+def read_text(path: Path, _folder: Path, _random: np.random.Generator, load: Callable[[Path], Any]) -> None:
     """Describe a file of any kind, and load it."""
     command("info", path)
     load(path)
@@ -117,14 +118,14 @@ def read_reference(path: Path) -> None:
     reference.load_reference(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
-def read_replayed(path: Path, folder: Path, _: np.random.Generator) -> None:
+def read_replayed(path: Path, folder: Path, _random: np.random.Generator) -> None:
     """Describe and export the result of a replay."""
     refused = command("info", path) is None
     refused += command("export", path, "--object", "ply,csv", "--out", folder / "object") is None
     _refuse(refused)
 
 
-def read_cache(path: Path, _: Path, __: np.random.Generator, content: bytes) -> None:
+def read_cache(path: Path, _folder: Path, _random: np.random.Generator, content: bytes) -> None:
     """Read a cached world whose file may be damaged: it has to be as made, and whole the next time."""
     entry, made = path.with_name("0123456789ab.npz"), list[int]()
 
@@ -140,7 +141,7 @@ def read_cache(path: Path, _: Path, __: np.random.Generator, content: bytes) -> 
             raise WrongResultError("another world came out of the cache, or the damage stayed")
 
 
-def read_shard(path: Path, _: Path, __: np.random.Generator, whole: dict[str, Any]) -> None:
+def read_shard(path: Path, _folder: Path, _random: np.random.Generator, whole: dict[str, Any]) -> None:
     """Read a dataset of one shard; any array that comes out has to be the original's."""
     from nlos_cam.dataset import open_dataset, shards
 
@@ -158,7 +159,7 @@ def is_listed(path: Path) -> bool:
     return hashlib.sha256(path.read_bytes()).hexdigest() == checksums_of(path.parent).get(path.name)
 
 
-def read_weights(path: Path, _: Path, __: np.random.Generator) -> None:
+def read_weights(path: Path, _folder: Path, _random: np.random.Generator) -> None:
     """Load networks from a folder of weights, whose checksum may have been made right."""
     from nlos_models import load_doubt, load_network
 
@@ -171,14 +172,14 @@ def read_weights(path: Path, _: Path, __: np.random.Generator) -> None:
         raise WrongResultError("weights that are not finite were accepted")
 
 
-def read_state(path: Path, _: Path, __: np.random.Generator) -> None:
+def read_state(path: Path, _folder: Path, _random: np.random.Generator) -> None:
     """Read the last state of a training run."""
     from nlos_models import train
 
     train.read_last(path.parent, lambda _: None)
 
 
-def read_label(path: Path, _: Path, __: np.random.Generator) -> None:
+def read_label(path: Path, _folder: Path, _random: np.random.Generator) -> None:
     """Return the depth map of the hidden object that a file beside a recording describes."""
     from nlos_cam.dataset import labelled
 
@@ -204,10 +205,7 @@ def make_files(home: Path) -> None:
     mesh = SurfaceMesh(vertices_m, faces)
     for suffix in ("obj", "ply"):
         mesh.save(home / f"mesh.{suffix}")
-    triangles = np.concatenate([np.zeros((10, 1, 3)), vertices_m[faces]], axis=1).astype("<f4").reshape(10, 12)
-    rows = np.zeros(10, [("numbers", "<f4", 12), ("more", "<u2")])
-    rows["numbers"] = triangles
-    (home / "mesh.stl").write_bytes(bytes(80) + len(rows).to_bytes(4, "little") + rows.tobytes())
+    trimesh.Trimesh(vertices_m, faces).export(home / "mesh.stl")
     np.save(home / "depth.npy", np.full((16, 16), 0.3, np.float32))
     (home / DONE).touch()
 

@@ -16,27 +16,9 @@ from http.client import HTTPConnection
 from pathlib import Path
 from random import Random
 
+import trials
 from live_process import children_of, session_of
-from trials import (
-    COMMANDS,
-    TIMEOUT_S,
-    Command,
-    Forked,
-    Results,
-    Row,
-    check_session,
-    duration_s,
-    empty_folder,
-    finish,
-    finished_parts,
-    in_fork,
-    inputs_of,
-    leftovers,
-    load_program,
-    options,
-    problem_of,
-    started,
-)
+from trials import Command, Forked, Row
 
 from nlos_cam.cli.common import INTERRUPTED
 
@@ -53,25 +35,27 @@ SAVING_S = 2.0
 
 def kill_once(command: Command, inputs: Path, random: Random) -> Row:
     """Kill a command at a random moment, run it again, and return the finding."""
-    after_s, was_killed = random.uniform(0, duration_s(command, inputs)), False
+    after_s, was_killed = random.uniform(0, trials.duration_s(command, inputs)), False
     while not was_killed:
-        with empty_folder() as folder:
-            with started(command, folder, inputs) as process:
+        with trials.empty_folder() as folder:
+            with trials.started(command, folder, inputs) as process:
                 time.sleep(after_s)
                 children = children_of(process.pid) if process.poll() is None else []
             was_killed, output = process.wait() == -signal.SIGKILL, folder / command.output
             if not was_killed:
                 after_s *= EARLIER
                 continue
-            wrong, parts, done = survivors(children), len(leftovers(folder)), finished_parts(command, folder)
+            wrong, parts = survivors(children), len(trials.leftovers(folder))
+            done = trials.finished_parts(command, folder)
             if output.exists() and command.is_atomic:
-                wrong = wrong or problem_of(command, folder, inputs)
-            again = finish(command, folder, inputs, *([command.again] if output.exists() and command.again else []))
+                wrong = wrong or trials.problem_of(command, folder, inputs)
+            options = [command.again] if output.exists() and command.again else []
+            again = trials.finish(command, folder, inputs, *options)
             if again.poll():
                 wrong = wrong or f"the next run ends with {again.poll()}: {again.said[-300:]}"
-            if lost := done.items() - finished_parts(command, folder).items():
+            if lost := done.items() - trials.finished_parts(command, folder).items():
                 wrong = wrong or f"the next run made again: {', '.join(sorted(dict(lost)))}"
-            wrong = wrong or problem_of(command, folder, inputs) or ", ".join(leftovers(folder))
+            wrong = wrong or trials.problem_of(command, folder, inputs) or ", ".join(trials.leftovers(folder))
     return {"after_s": round(after_s, 3), "parts_left": parts, "wrong": wrong}
 
 
@@ -85,14 +69,14 @@ def survivors(children: list[int]) -> str:
 
 def race_once(command: Command, inputs: Path, random: Random) -> Row:
     """Start two commands on one output, and return the exit codes and the finding."""
-    apart_s = random.uniform(0, 0.3 if command.endless else 0.6 * duration_s(command, inputs))
-    with empty_folder() as folder, started(command, folder, inputs) as first:
+    apart_s = random.uniform(0, 0.3 if command.endless else 0.6 * trials.duration_s(command, inputs))
+    with trials.empty_folder() as folder, trials.started(command, folder, inputs) as first:
         time.sleep(apart_s)
-        with started(command, folder, inputs, name="second") as second:
+        with trials.started(command, folder, inputs, name="second") as second:
             if command.endless:
                 end_winner([first, second])
             codes = sorted(process.wait() for process in (first, second))
-            wrong = problem_of(command, folder, inputs) or ", ".join(leftovers(folder))
+            wrong = trials.problem_of(command, folder, inputs) or ", ".join(trials.leftovers(folder))
             wanted = [1, INTERRUPTED] if command.endless else [0, 1]
             if codes != wanted and not (command.both_may_win and codes == [0, 0]):
                 wrong = wrong or f"exit codes {codes}: {first.said[-300:]} {second.said[-300:]}"
@@ -104,7 +88,7 @@ def race_once(command: Command, inputs: Path, random: Random) -> Row:
 
 def end_winner(processes: list[Forked]) -> None:
     """Wait until one process has ended and the other serves its view, and end that."""
-    deadline_s = time.monotonic() + TIMEOUT_S
+    deadline_s = time.monotonic() + trials.TIMEOUT_S
     while time.monotonic() < deadline_s and all(process.poll() is None for process in processes):
         time.sleep(0.02)
     for process in processes:
@@ -115,7 +99,7 @@ def end_winner(processes: list[Forked]) -> None:
 
 def address_of(process: Forked) -> tuple[int, str]:
     """Return port and token of a live view, once it prints them. Raises TimeoutError."""
-    deadline_s = time.monotonic() + TIMEOUT_S
+    deadline_s = time.monotonic() + trials.TIMEOUT_S
     while time.monotonic() < deadline_s and process.poll() is None:
         if found := ADDRESS.search(process.said):
             return int(found[1]), found[2]
@@ -126,7 +110,7 @@ def address_of(process: Forked) -> tuple[int, str]:
 def ask(process: Forked, command: str) -> str:
     """Send a command as the page does, until it is accepted; return the answer."""
     port, token = address_of(process)
-    deadline_s = time.monotonic() + TIMEOUT_S
+    deadline_s = time.monotonic() + trials.TIMEOUT_S
     while time.monotonic() < deadline_s:
         connection = HTTPConnection("127.0.0.1", port, timeout=60.0)
         connection.request("POST", "/command", json.dumps({"command": command}), {"X-Token": token})
@@ -142,22 +126,22 @@ def ask(process: Forked, command: str) -> str:
 def kill_page(inputs: Path, random: Random) -> Row:
     """Kill a live run while its page saves a session; the file has to play, and the next run to save a whole one."""
     after_s, wrong = random.uniform(0, SAVING_S), ""
-    with empty_folder() as folder:
-        with started(PAGE, folder, inputs) as process:
+    with trials.empty_folder() as folder:
+        with trials.started(PAGE, folder, inputs) as process:
             ask(process, "save_session")
             time.sleep(after_s)
             children = children_of(process.pid)
         wrong = survivors(children)
         content = next(folder.glob("session-*.html")).read_bytes()
-        with started(PAGE, folder, inputs, name="next") as process:
+        with trials.started(PAGE, folder, inputs, name="next") as process:
             ask(process, "save_session")
             ask(process, "end_session")
             process.terminate()
             if (code := process.wait()) != INTERRUPTED:
                 wrong = wrong or f"the next run ends with {code}: {process.said[-300:]}"
         whole = max(folder.glob("session-*.html")).read_bytes()
-        wrong = wrong or in_fork(lambda: _unplayable(content, "of the killed run") or _unplayable(whole, "after it"))
-        wrong = wrong or ", ".join(leftovers(folder))
+        unplayable = trials.in_fork(lambda: _unplayable(content, "of the killed run") or _unplayable(whole, "after it"))
+        wrong = wrong or unplayable or ", ".join(trials.leftovers(folder))
     return {"after_s": round(after_s, 3), "bytes": len(content), "wrong": wrong}
 
 
@@ -165,7 +149,7 @@ def _unplayable(content: bytes, which: str) -> str:
     """Return why a session does not play; an empty one, of a run killed as it opened the file, is none at all."""
     try:
         if content:
-            check_session(content)
+            trials.check_session(content)
     except Exception as error:  # noqa: BLE001  any error is the finding
         return f"the session {which}: {error!r}"
     return ""
@@ -173,11 +157,11 @@ def _unplayable(content: bytes, which: str) -> str:
 
 def main() -> int:
     """Kill, race, write after each trial; return 1 after a finding."""
-    chosen = options(__doc__, "kill_commands.json", kills=30, races=50).parse_args()
-    load_program()
-    results = Results(chosen.out, chosen.seed)
-    with inputs_of(chosen) as inputs:
-        for name, command in COMMANDS.items():
+    chosen = trials.options(__doc__, "kill_commands.json", kills=30, races=50).parse_args()
+    trials.load_program()
+    results = trials.Results(chosen.out, chosen.seed)
+    with trials.inputs_of(chosen) as inputs:
+        for name, command in trials.COMMANDS.items():
             if chosen.only in name and name not in NOT_KILLED:
                 results.repeat(name, "kills", chosen.kills, partial(kill_once, command, inputs))
             if chosen.only in name and name not in NOT_RACED:

@@ -130,12 +130,11 @@ def main() -> int:
         visit_s = WATCHERS[chosen.watcher]
         options = ["--seconds", str(seconds), "--log", str(log), "--json"] + ["--no-view"] * (not visit_s)
         with LiveProcess([chosen.camera, *options]) as run:
+            while not log.exists() and run.process.poll() is None:
+                time.sleep(1.0)
             if visit_s:
                 address = run.wait_for_address(START_TIMEOUT_S)
                 Thread(target=watch, args=(address, stop, visits, visit_s), daemon=True).start()
-            else:
-                while not log.exists() and run.process.poll() is None:
-                    time.sleep(1.0)
             frames, start_s = FrameLog(log), time.monotonic()
             for number in range(1, chosen.minutes + 1):
                 time.sleep(max(start_s + MINUTE_S * number - time.monotonic(), 0))

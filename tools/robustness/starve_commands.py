@@ -15,19 +15,8 @@ from functools import cache, partial
 from pathlib import Path
 from random import Random
 
-from trials import (
-    COMMANDS,
-    TIMEOUT_S,
-    Command,
-    Results,
-    Row,
-    inputs_of,
-    leftovers,
-    line_of,
-    load_program,
-    options,
-    problem_of,
-)
+import trials
+from trials import Command, Row
 
 EXIT_CODES, MAX_LINES = {0, 1, 2, 3, 4}, 3
 MOUNT, UNMOUNT = "/bin/mount", "/bin/umount"
@@ -60,11 +49,10 @@ def wrong_with(command: Command, folder: Path, inputs: Path, ended: subprocess.C
         return f"exit code {ended.returncode}: {ended.stderr}"
     if "Traceback" in ended.stderr or (ended.returncode and len(lines) > MAX_LINES):
         return f"{len(lines)} lines: {ended.stderr}"
-    if ended.returncode == 0 and (problem := problem_of(command, folder, inputs)):
+    must_be_whole = ended.returncode == 0 or (command.is_atomic and output.exists())
+    if must_be_whole and (problem := trials.problem_of(command, folder, inputs)):
         return problem
-    if ended.returncode and command.is_atomic and output.exists() and (problem := problem_of(command, folder, inputs)):
-        return problem
-    return ", ".join(leftovers(folder))
+    return ", ".join(trials.leftovers(folder))
 
 
 def starve(command: Command, inputs: Path, way: str, random: Random) -> Row:
@@ -72,11 +60,11 @@ def starve(command: Command, inputs: Path, way: str, random: Random) -> Row:
     low, high = {"disk_kib": (MIN_KIB, MAX_SHARE * need_kib(command, inputs)), "memory_mib": AS_MIB}.get(way, (0, 0))
     amount = random.randint(low, int(high))
     with small_disk(amount if way == "disk_kib" else 1 << 20) as folder:
-        line = [*PROGRAM, *line_of(command.arguments, folder, inputs)]
+        line = [*PROGRAM, *trials.line_of(command.arguments, folder, inputs)]
         if way == "memory_mib":
             line = ["prlimit", f"--as={amount << 20}", *line]
         line = [*NO_SHM, *line] if way == "no_shm" else line
-        ended = subprocess.run(line, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+        ended = subprocess.run(line, capture_output=True, text=True, timeout=trials.TIMEOUT_S, check=False)
         said = ended.stderr.strip().splitlines()[-1:] if ended.returncode else []
         row = {"said": "".join(said), "wrong": wrong_with(command, folder, inputs, ended)}
     for place in (folder, inputs, ROOT):  # their names say nothing about the trial
@@ -88,18 +76,18 @@ def starve(command: Command, inputs: Path, way: str, random: Random) -> Row:
 def need_kib(command: Command, inputs: Path) -> int:
     """Return the size of everything that a command writes, in KiB."""
     with tempfile.TemporaryDirectory() as name:
-        line = [*PROGRAM, *line_of(command.arguments, Path(name), inputs)]
-        subprocess.run(line, check=True, capture_output=True, timeout=TIMEOUT_S)
+        line = [*PROGRAM, *trials.line_of(command.arguments, Path(name), inputs)]
+        subprocess.run(line, check=True, capture_output=True, timeout=trials.TIMEOUT_S)
         return sum(path.stat().st_size for path in Path(name).rglob("*") if path.is_file()) // 1024 + MIN_KIB
 
 
 def main() -> int:
     """Starve each command, write after each run; return 1 after a finding."""
-    chosen = options(__doc__, "starved.json", count=10).parse_args()
-    load_program()
-    results = Results(chosen.out, chosen.seed)
-    with inputs_of(chosen) as inputs:
-        for name, command in COMMANDS.items():
+    chosen = trials.options(__doc__, "starved.json", count=10).parse_args()
+    trials.load_program()
+    results = trials.Results(chosen.out, chosen.seed)
+    with trials.inputs_of(chosen) as inputs:
+        for name, command in trials.COMMANDS.items():
             for way, count in {"disk_kib": chosen.count, "memory_mib": chosen.count, "no_shm": 1}.items():
                 if chosen.only in name and name not in PAIRS:
                     results.repeat(name, way, count, partial(starve, command, inputs, way))

@@ -16,39 +16,27 @@ import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration.arrays import Float64
 
+from nlos_cam import render as renderer
 from nlos_cam.evaluate import machine
-from nlos_cam.render import (
-    STOPS,
-    Gradients,
-    SceneVector,
-    SensorModel,
-    depth_bound,
-    fit_pose,
-    intensity_noise,
-    moved,
-    paper_scene,
-    prepare,
-    render,
-)
 
 
 def cost(_: Any) -> dict[str, Any]:
     """Time the gradients of everything against a rendering, in turns in one process."""
-    scene = paper_scene().scene_at(0)
+    scene = renderer.paper_scene().scene_at(0)
     weights = np.random.default_rng(0).normal(size=(2, 64, 80))
-    render(scene)
-    found = Gradients(scene)
+    renderer.render(scene)
+    found = renderer.Gradients(scene)
     found.pull(*weights)
     seconds: list[list[float]] = []
     for _round in range(15):
         marks = [time.perf_counter()]
-        render(scene)
+        renderer.render(scene)
         marks.append(time.perf_counter())
-        found = Gradients(scene)
+        found = renderer.Gradients(scene)
         marks.append(time.perf_counter())
         found.pull(*weights)
         marks.append(time.perf_counter())
-        found.push(SceneVector(lidar=np.ones(6)))
+        found.push(renderer.SceneVector(lidar=np.ones(6)))
         marks.append(time.perf_counter())
         seconds.append(np.diff(marks).tolist())
     each = np.array(seconds)
@@ -65,14 +53,15 @@ def cost(_: Any) -> dict[str, Any]:
 
 def bound(_: Any) -> dict[str, Any]:
     """Bound the depth of the default object by its echoes, per cell and per 4 x 4 cells, and draw the maps."""
-    found = Gradients(paper_scene().scene_at(0))
+    found = renderer.Gradients(renderer.paper_scene().scene_at(0))
     prior_m, blocks, frames = 0.05, (1, 4), (1, 100, 10_000)
     figure = Figure(figsize=(11, 6.2), layout="constrained")
     axes = figure.subplots(2, 3)
     rows: list[dict[str, Any]] = []
     for block, line in zip(blocks, axes, strict=True):
         for count, axis in zip(frames, line, strict=True):
-            limit = depth_bound(found, intensity_noise(found, SensorModel(), count), prior_m, block)
+            noise = renderer.intensity_noise(found, renderer.SensorModel(), count)
+            limit = renderer.depth_bound(found, noise, prior_m, block)
             surface = ~np.isnan(limit.bound_m)
             cells = len(limit.modes_m)
             rows.append({
@@ -91,17 +80,18 @@ def bound(_: Any) -> dict[str, Any]:
 
 def pose(asked: Any) -> dict[str, Any]:
     """Displace lidar and wall by a few mm and 0.3 degrees, and fit the pose to noisy echoes of a finer rendering."""
-    scene, model, trials = paper_scene().scene_at(0), SensorModel(), []
-    nominal, finer = prepare(scene, STOPS["standard"]), replace(STOPS["fine"], relay_columns=160, relay_rows=128)
+    scene, model, trials = renderer.paper_scene().scene_at(0), renderer.SensorModel(), []
+    nominal = renderer.prepare(scene, renderer.STOPS["standard"])
+    finer = replace(renderer.STOPS["fine"], relay_columns=160, relay_rows=128)
     for body in ("lidar", "wall"):
         for trial in range(asked.trials):
             draw = np.random.default_rng([7, trial])
             truth = np.concatenate([draw.normal(size=3) * 0.003, draw.normal(size=3) * np.radians(0.3)])
-            bench = Gradients(moved(prepare(scene, finer), **{body: truth}))
-            noise = intensity_noise(bench, model, 30)
+            bench = renderer.Gradients(renderer.moved(renderer.prepare(scene, finer), **{body: truth}))
+            noise = renderer.intensity_noise(bench, model, 30)
             seen = bench.intensity + np.where(np.isfinite(noise), noise, 0) * draw.normal(size=noise.shape)
             start = time.perf_counter()
-            fit = fit_pose(nominal, seen, noise, body)
+            fit = renderer.fit_pose(nominal, seen, noise, body)
             off = fit.motion - truth
             trials.append({
                 "body": body, "trial": trial, "truth": truth.tolist(), "error": off.tolist(),

@@ -2,7 +2,6 @@
 
 python tools/studies/renderer.py tradeoff     docs/renderer.json, docs/images/tradeoff.png, table of docs/accuracy.md
 python tools/studies/renderer.py glossy       docs/glossy.json: rank against error, time over a Lambertian object's
-python tools/studies/renderer.py grids        docs/grids.json: finer depth maps, with and without joined cells
 python tools/studies/renderer.py soak [--scenes 1000000]  docs/renderer_soak.json: random scenes against the reference
 python tools/studies/renderer.py cuda [--backend torch] [--objects 64] [--batch 1 4 16 64]: one line of JSON
 """
@@ -10,7 +9,7 @@ python tools/studies/renderer.py cuda [--backend torch] [--objects 64] [--batch 
 import argparse
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -19,93 +18,67 @@ import harness
 import numpy as np
 import torch
 from nlos_calibration import Occluder, load_rig
-from numpy.typing import NDArray
 
-from nlos_cam.evaluate import (
-    as_table,
-    draw_renders,
-    machine,
-    measure_renders,
-    render_document,
-    render_facts,
-    render_settings,
-)
+from nlos_cam import evaluate
+from nlos_cam import render as renderer
 from nlos_cam.files import cache_folder
-from nlos_cam.objects import Pose, category_triangles, object_box, object_depth, orthographic_depth, place
-from nlos_cam.render import (
-    STOPS,
-    Accuracy,
-    EchoMaps,
-    Scene,
-    Surface,
-    TransportJob,
-    Work,
-    accuracy_named,
-    agreement,
-    backend_numba,
-    backend_reference,
-    device_named,
-    glossy_basis,
-    histograms,
-    histograms_of_all,
-    least_seconds,
-    paper_scene,
-    phong,
-    prepare,
-    render,
-    render_all,
-    retroreflective,
-)
+from nlos_cam.objects import object_box, object_depth
 
 
 def tradeoff(_: argparse.Namespace) -> None:
     """Measure accuracy against time on the default scene; most of the time goes to brute force."""
-    scene = paper_scene().scene_at(0)
-    size, rows = render_facts(scene), list(measure_renders(scene))
-    table = as_table(size, rows, len(render_settings(scene)))
+    scene = renderer.paper_scene().scene_at(0)
+    size, rows = evaluate.render_facts(scene), list(evaluate.measure_renders(scene))
+    table = evaluate.as_table(size, rows, len(evaluate.render_settings(scene)))
     harness.write("renderer", table)
     path = harness.DOCS / "images" / "tradeoff.png"
-    draw_renders(path, rows, f"airplane: {size.patches} patches, {size.beams_on_wall} beams")
-    print(render_document(table, "airplane").as_markdown())
+    evaluate.draw_renders(path, rows, f"airplane: {size.patches} patches, {size.beams_on_wall} beams")
+    print(evaluate.render_document(table, "airplane").as_markdown())
 
 
-def cpu_s(work: Work) -> float:
-    """Return the shortest of three processor times, which other programs disturb less than the clock."""
+def shortest_s(work: renderer.Work, repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
+    """Return the shortest of several times, after one run to warm up."""
     work()
-    return least_seconds(work, 3, time.process_time)
+    return renderer.least_seconds(work, repeats, clock)
+
+
+cpu_s = partial(shortest_s, repeats=3, clock=time.process_time)
+"""Shortest processor time, which other programs disturb less than the clock."""
 
 
 def glossy(_: argparse.Namespace) -> None:
     """Measure glossy objects: rank against error, and the time of a rendering over that of a Lambertian one."""
-    scene = paper_scene().scene_at(0)
+    scene = renderer.paper_scene().scene_at(0)
     kinds = {
-        "Phong, exponent 20": phong(0.5, 0.5, 20),
-        "Phong, exponent 80": phong(0.1, 0.9, 80),
-        "retroreflective, exponent 200": retroreflective(0.5, 0.5, 200),
+        "Phong, exponent 20": renderer.phong(0.5, 0.5, 20),
+        "Phong, exponent 80": renderer.phong(0.1, 0.9, 80),
+        "retroreflective, exponent 200": renderer.retroreflective(0.5, 0.5, 200),
     }
-    scenes = {name: replace(scene, surface=Surface(1.0, brdf)) for name, brdf in kinds.items()}
+    scenes = {name: replace(scene, surface=renderer.Surface(1.0, brdf)) for name, brdf in kinds.items()}
     rows: list[dict[str, Any]] = []
     for stop in ("draft", "standard"):
-        plain_s = cpu_s(partial(render, scene, stop))
+        plain_s = cpu_s(partial(renderer.render, scene, stop))
         for name, one in scenes.items():
-            if (job := prepare(one, STOPS[stop]).job) is None or job.brdf is None:
+            if (job := renderer.prepare(one, renderer.STOPS[stop]).job) is None or job.brdf is None:
                 raise SystemExit("the default scene has no three-bounce light")
-            functions, some = glossy_basis(job, job.brdf), job.select(np.arange(0, len(job.length_m), 400))
-            error = np.abs(histograms(some).max(1) / backend_reference.histograms(some).max(1) - 1)
-            seconds = cpu_s(partial(render, one, stop))
+            functions, some = renderer.glossy_basis(job, job.brdf), job.select(np.arange(0, len(job.length_m), 400))
+            error = np.abs(renderer.histograms(some).max(1) / renderer.backend_reference.histograms(some).max(1) - 1)
+            seconds = cpu_s(partial(renderer.render, one, stop))
             row = {"kind": name, "stop": stop, "rank": len(functions.sign) if functions else None, "cpu_s": seconds}
             row |= {"times_lambertian": seconds / plain_s, "peak_error_median": float(np.median(error))}
             rows.append(row | {"peak_error_max": float(error.max())})
             print(rows[-1], flush=True)
-    job = prepare(scenes["Phong, exponent 20"], STOPS["standard"]).job
+    job = renderer.prepare(scenes["Phong, exponent 20"], renderer.STOPS["standard"]).job
     ranks = [
         {"kind": name, "error": error, "rank": len(functions.sign) if functions else None}
         for name, brdf in kinds.items()
         for error in (0.1, 0.03, 0.01, 5e-3, 1e-3)
         if job
-        for functions in [glossy_basis(replace(job, accuracy=replace(STOPS["standard"], scatter_error=error)), brdf)]
+        for functions in [
+            renderer.glossy_basis(replace(job, accuracy=replace(renderer.STOPS["standard"], scatter_error=error)), brdf)
+        ]
     ]
-    harness.write("glossy", {"machine": machine(), "renderings": rows, "ranks": ranks})
+    harness.write("glossy", {"machine": evaluate.machine(), "renderings": rows, "ranks": ranks})
 
 
 SOAK_RIGS = [
@@ -116,40 +89,7 @@ SHADE_EDGE = 1e-3
 """Light of a bin, relative to the beam's, that legs on the very edge of a shadow may add or take in float32."""
 
 
-def planned(scene: Scene, accuracy: Accuracy) -> TransportJob:
-    """Return the three-bounce transport of a scene. Raises SystemExit for none."""
-    if (job := prepare(scene, accuracy).job) is None:
-        raise SystemExit("the scene has no three-bounce light")
-    return job
-
-
-def echoes_of(histogram: NDArray[np.floating], bin_m: float) -> EchoMaps:
-    """Return the strongest bins of histograms (n, bins), to compare; half of the path stands for the depth."""
-    peak, path_m = histogram.max(1), (histogram.argmax(1) + 0.5) * bin_m
-    return EchoMaps(peak, path_m, path_m / 2)
-
-
-def grids(_: argparse.Namespace) -> None:
-    """Measure time and error on finer depth maps of one airplane, with joined cells and with every cell a patch."""
-    empty, standard, rows = Scene(load_rig("paper-rig")), STOPS["standard"], list[dict[str, Any]]()
-    triangles = place(category_triangles("airplane", 20_000_003), Pose(), empty.box)
-    for cells in (64, 128, 256):
-        scene = replace(empty, object_depth_m=orthographic_depth(triangles, empty.box, cells))
-        job, bin_m = planned(scene, STOPS["reference"]), scene.rig.device.bin_m
-        some = np.arange(0, len(job.length_m), 60)
-        exact = echoes_of(backend_reference.histograms(job.select(some)), bin_m)
-        for kind, accuracy in (("joined", standard), ("every cell", replace(standard, finest_cells=0))):
-            job = planned(scene, accuracy)
-            agreed = agreement(echoes_of(histograms(job.select(some)), bin_m), exact, bin_m)
-            row: dict[str, Any] = {"cells": cells, "patches": kind, "count": len(job.patches.beta)}
-            row |= {"cpu_s": cpu_s(partial(render, scene, accuracy)), "within_1": agreed.bin_within_1}
-            row |= {"error_median": agreed.intensity_error_median, "error_p99": agreed.intensity_error_p99}
-            rows.append(row)
-            print(row, flush=True)
-    harness.write("grids", {"machine": machine(), "rows": rows})
-
-
-def random_scene(generator: np.random.Generator) -> Scene:
+def random_scene(generator: np.random.Generator) -> renderer.Scene:
     """Return a small scene: rough, smooth, spiked, cut by background or touching the wall, dark or white."""
     size = int(generator.choice([1, 2, 3, 5, 8]))
     y, x = np.mgrid[0:size, 0:size] / size
@@ -162,7 +102,9 @@ def random_scene(generator: np.random.Generator) -> Scene:
     albedo = generator.choice([0, 1, 0.5]) if generator.random() < 0.5 else generator.random((size, size))
     rig = SOAK_RIGS[generator.integers(len(SOAK_RIGS))]
     radiometry = ("paper", "lambertian")[generator.integers(2)]
-    return Scene(rig, depth.astype(np.float32), Surface(albedo), radiometry, jump_m=generator.choice([0.02, 1]))
+    return renderer.Scene(
+        rig, depth.astype(np.float32), renderer.Surface(albedo), radiometry, jump_m=generator.choice([0.02, 1])
+    )
 
 
 def soak_faults(seed: int) -> list[str]:
@@ -172,15 +114,15 @@ def soak_faults(seed: int) -> list[str]:
     or more within it, and at most the light to a sub-bin outside. A winner must be the strongest for some such light.
     """
     generator = np.random.default_rng([seed, 20])
-    accuracy = Accuracy("soak", 8, 6, sub_bins=int(generator.choice([1, 4, 8, 64])))
+    accuracy = renderer.Accuracy("soak", 8, 6, sub_bins=int(generator.choice([1, 4, 8, 64])))
     effects = "three-bounce", "direct", "line-of-sight", "occluder", "self-occlusion", "tilt"
-    job = prepare(random_scene(generator), accuracy, effects).job
+    job = renderer.prepare(random_scene(generator), accuracy, effects).job
     if job is None:
         return []
     job, fine = job.select(generator.integers(len(job.length_m), size=12)), 64
-    found, echo = histograms(job).astype(np.float64), backend_numba.echoes(job)
-    exact = replace(job, accuracy=STOPS["reference"], bin_m=job.bin_m / fine, bins=job.bins * fine)
-    below = np.pad(np.cumsum(backend_reference.histograms(exact), 1), [(0, 0), (1, 0)])
+    found, echo = renderer.histograms(job).astype(np.float64), renderer.backend_numba.echoes(job)
+    exact = replace(job, accuracy=renderer.STOPS["reference"], bin_m=job.bin_m / fine, bins=job.bins * fine)
+    below = np.pad(np.cumsum(renderer.backend_reference.histograms(exact), 1), [(0, 0), (1, 0)])
     at, moved = np.arange(job.bins) * fine, fine // accuracy.sub_bins + 1
 
     def light(start: Any, end: Any) -> Any:
@@ -217,47 +159,36 @@ def soak(options: argparse.Namespace) -> None:
         part = store.with_suffix(".part")  # replaced whole: an interrupted run leaves the last one
         part.write_text(json.dumps(done), encoding="utf-8")
         part.replace(store)
-    harness.write("renderer_soak", {"machine": machine(), **done})
+    harness.write("renderer_soak", {"machine": evaluate.machine(), **done})
     print(json.dumps(done))
 
 
-def jobs_of(scenes: Sequence[Scene], accuracy: str) -> Iterator[TransportJob]:
+def jobs_of(scenes: Sequence[renderer.Scene], accuracy: str) -> list[renderer.TransportJob]:
     """Plan scenes for the GPU."""
-    for scene in scenes:
-        if (job := prepare(scene, accuracy_named(accuracy)).job) is not None:
-            yield job
+    plans = [renderer.prepare(scene, renderer.accuracy_named(accuracy)) for scene in scenes]
+    return [plan.job for plan in plans if plan.job is not None]
 
 
-def deviation(jobs: Sequence[TransportJob], device: torch.device) -> float:
+def deviation(jobs: Sequence[renderer.TransportJob], device: torch.device) -> float:
     """Return the relative L1 deviation of some histograms from the numba renderer's."""
     some = [job.select(np.arange(0, len(job.laser_spot_m), 50)) for job in jobs]
-    pairs = zip(histograms_of_all(some, device), map(histograms, some), strict=True)
+    pairs = zip(renderer.histograms_of_all(some, device), map(renderer.histograms, some), strict=True)
     return max(float(np.abs(found - other).sum() / other.sum()) for found, other in pairs)
-
-
-def shortest(work: Callable[[], object], repeats: int) -> float:
-    """Return the shortest of several times, after one run to warm up."""
-    times = list[float]()
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times[1:])
 
 
 def bench_cuda(options: argparse.Namespace) -> None:
     """Measure objects a second by batch size."""
-    device, rig = device_named(options.backend), load_rig("paper-rig")
-    scenes = [Scene(rig, object_depth(seed, object_box(rig))[1]) for seed in range(options.objects)]
-    jobs = list(jobs_of(scenes, options.accuracy))
+    device, rig = renderer.device_named(options.backend), load_rig("paper-rig")
+    scenes = [renderer.Scene(rig, object_depth(seed, object_box(rig))[1]) for seed in range(options.objects)]
+    jobs = jobs_of(scenes, options.accuracy)
 
     def in_batches(size: int) -> None:
         for start in range(0, len(jobs), size):
-            histograms_of_all(jobs[start : start + size], device)
+            renderer.histograms_of_all(jobs[start : start + size], device)
 
-    rates = {size: len(jobs) / shortest(partial(in_batches, size), options.repeats) for size in options.batch}
-    planning_s = shortest(lambda: list(jobs_of(scenes, options.accuracy)), 1) / len(scenes)
-    whole_s = shortest(lambda: list(render_all(scenes, options.accuracy, backend=options.backend)), 1)
+    rates = {size: len(jobs) / shortest_s(partial(in_batches, size), options.repeats) for size in options.batch}
+    planning_s = shortest_s(lambda: jobs_of(scenes, options.accuracy), 1) / len(scenes)
+    whole_s = shortest_s(lambda: list(renderer.render_all(scenes, options.accuracy, backend=options.backend)), 1)
     result = {
         "device": torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
         "accuracy": options.accuracy,
@@ -275,7 +206,7 @@ def main() -> None:
     """Run the named measurement."""
     parser = harness.options(__doc__)
     commands = parser.add_subparsers(required=True)
-    for work in (tradeoff, glossy, grids):
+    for work in (tradeoff, glossy):
         commands.add_parser(work.__name__, help=work.__doc__).set_defaults(run=work)
     long = commands.add_parser("soak", help=soak.__doc__)
     long.set_defaults(run=soak)

@@ -320,9 +320,8 @@ def draw(points: Sequence[Point]) -> Figure:
         axis.axhline(start, color="grey", linestyle=":", label="before")
         for trainer in dict.fromkeys(point.trainer for point in points[1:]):
             own = [point for point in points if point.trainer == trainer]
-            value, low, high = np.array(
-                [[point.figures[metric][part] for part in ("value", "low", "high")] for point in own], float
-            ).T
+            ends = [[point.figures[metric][part] for part in ("value", "low", "high")] for point in own]
+            value, low, high = np.array(ends, float).T
             at = [point.recordings for point in own]
             axis.plot(at, value, marker="o", label=trainer)
             axis.fill_between(at, low, high, alpha=0.2)

@@ -39,18 +39,18 @@ def test_starved_command_that_ends_badly_is_noticed(
     tool: Tool, tmp_path: Path, code: int, said: str, wrong: str
 ) -> None:
     starve = tool("starve_commands")
-    found = starve.wrong_with(starve.COMMANDS["render"], tmp_path, tmp_path, ended(code, said))
+    found = starve.wrong_with(tool("trials").COMMANDS["render"], tmp_path, tmp_path, ended(code, said))
     assert wrong in found
     assert bool(found) == bool(wrong)
 
 
 def test_starved_command_that_leaves_parts_is_noticed(tool: Tool, tmp_path: Path) -> None:
-    starve = tool("starve_commands")
+    starve, render = tool("starve_commands"), tool("trials").COMMANDS["render"]
     (tmp_path / ".a.npz.part").mkdir()
-    assert ".a.npz.part" in starve.wrong_with(starve.COMMANDS["render"], tmp_path, tmp_path, ended(1, "error: full"))
+    assert ".a.npz.part" in starve.wrong_with(render, tmp_path, tmp_path, ended(1, "error: full"))
     (tmp_path / ".a.npz.part").rmdir()
     (tmp_path / "a.npz").touch()
-    assert "not whole" in starve.wrong_with(starve.COMMANDS["render"], tmp_path, tmp_path, ended(1, "error: full"))
+    assert "not whole" in starve.wrong_with(render, tmp_path, tmp_path, ended(1, "error: full"))
 
 
 def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
