@@ -1,4 +1,4 @@
-"""`nlos-cam live` and `nlos-cam replay`: options, messages and the report at the end."""
+"""`nlos-cam live`, `demo` and `replay`: options, messages and the report at the end."""
 
 from __future__ import annotations
 
@@ -55,6 +55,10 @@ LOSSES = {
     "failed": "whose processing failed",
 }
 """Reason of a lost frame in words, by its name in RunReport.counts."""
+EXPLANATION = (
+    "A simulated lidar looks at a wall, and an airplane flies around the corner, out of its sight. Of the light that "
+    "bounces wall, airplane, wall, two networks reconstruct it 30 times per second."
+)
 SLOW_DROPPED_SHARE, SLOW_MS = 0.05, 200.0
 """Share of dropped frames and median latency above which the summary warns."""
 
@@ -87,8 +91,20 @@ Every = Annotated[int, typer.Option("--every", min=1, help="With --object, only 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    app.command("live")(live)
-    app.command("replay")(replay)
+    for command in (demo, live, replay):
+        app.command(command.__name__)(command)
+
+
+def demo(
+    seconds: Seconds = None,
+    no_view: NoView = False,
+    view_port: ViewPort = None,
+    open_view: Open = False,
+    json: Json = False,
+) -> None:
+    """Show the live view of a simulated bench; no camera is needed. The same as `live sim`."""
+    say(EXPLANATION)
+    live("sim", seconds=seconds, no_view=no_view, view_port=view_port, open_view=open_view, json=json)
 
 
 def live(

@@ -44,7 +44,7 @@ class Command(NamedTuple):
 
 START, BENCH, RECORDINGS, SIMULATION = "Start here", "Bench", "Recordings", "Simulation and training"
 COMMANDS = {
-    "demo": Command("demo", START, "Show the live view of a simulated bench; no camera is needed."),
+    "demo": Command("live", START, "Show the live view of a simulated bench; no camera is needed."),
     "live": Command("live", START, "Reconstruct a camera's frames live and show them in a browser."),
     "doctor": Command("devices", START, "Explain why a camera is not found, and how to fix it."),
     "devices": Command("devices", START, "List cameras, real and simulated."),

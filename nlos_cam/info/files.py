@@ -4,7 +4,7 @@ import json
 import shlex
 import tomllib
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,15 @@ def count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def problem_of(check: Callable[[], object]) -> str:
+    """Return the error of a check in words; empty if it passes."""
+    try:
+        check()
+    except NlosCamError as error:
+        return str(error)
+    return ""
+
+
 def describe_bag(path: Path, verify: bool) -> Description:
     """Describe a recording from its index, or with `verify` from every message."""
     from nlos_cam.camera import FORMATS
@@ -66,7 +75,7 @@ def describe_bag(path: Path, verify: bool) -> Description:
         size = f"{info.intrinsics.width} x {info.intrinsics.height}"
         form = info.format or f"{info.encoding} (not readable)"
         facts[name] = f"{count(info.frames, 'frame')}, {info.frames_per_s} per second, {size}, {form}"
-    created = made_by = problem = ""
+    created = made_by = ""
     if sidecar_path(path).exists():
         try:
             sidecar = load_sidecar(sidecar_path(path))
@@ -74,11 +83,7 @@ def describe_bag(path: Path, verify: bool) -> Description:
             facts |= {"label": sidecar.label or "none", "camera": sidecar.camera, "state": sidecar.state}
         except (RecordingError, KeyError) as error:
             facts["sidecar"] = f"not readable: {error}"
-    if verify:
-        try:
-            bag.check()
-        except RecordingError as error:
-            problem = str(error)
+    problem = problem_of(bag.check) if verify else ""
     quoted = shlex.quote(str(path))
     is_lidar = all(stream in bag.streams and bag.streams[stream].format == form for stream, form in FORMATS.items())
     following = [f"nlos-cam export {quoted}"]
@@ -161,9 +166,8 @@ def _frames(arrays: Any) -> dict[str, str]:
     return {"frames": f"{len(numbers)}, numbers {numbers[0]} to {numbers[-1]}", "duration": f"{span_s:.1f} s"}
 
 
-def describe_toml(path: Path, verify: bool) -> Description | None:
+def describe_toml(path: Path, _verify: bool) -> Description | None:
     """Describe a wall record, scene, rig, recipe or settings file, by its keys."""
-    del verify  # it is always read whole
     try:
         keys = read_toml(path)
     except UnicodeDecodeError as error:
@@ -237,12 +241,17 @@ JSON_KINDS = {
 """Kinds of JSON files by a key that no other has."""
 
 
-def describe_json(path: Path, verify: bool) -> Description | None:
-    """Describe a sidecar, or one of the program's other JSON files."""
+def read_json(path: Path, text: str | bytes) -> Any:
+    """Return the content of a JSON file from its text. Raises RecordingError where it is none."""
     try:
-        keys = json.loads(_text(path))
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"{path} is not JSON ({error}): it is cut short or damaged; make it again") from error
+
+
+def describe_json(path: Path, verify: bool) -> Description | None:
+    """Describe a sidecar, or one of the program's other JSON files."""
+    keys = read_json(path, _text(path))
     if isinstance(keys, dict) and {"state", "started"} <= set(keys):
         return _sidecar(path, verify)
     kinds = [kind for key, kind in JSON_KINDS.items() if isinstance(keys, dict) and key in keys]
@@ -269,9 +278,8 @@ def _sidecar(path: Path, verify: bool) -> Description:
     return Description("sidecar of a recording", facts, created, made_by, problem, "all fields", following)
 
 
-def describe_page(path: Path, verify: bool) -> Description | None:
+def describe_page(path: Path, _verify: bool) -> Description | None:
     """Describe a saved view or a report."""
-    del verify
     with path.open("rb") as file:
         head = file.read(1 << 14)
         file.seek(max(path.stat().st_size - 64, 0))
@@ -285,9 +293,8 @@ def describe_page(path: Path, verify: bool) -> Description | None:
     return Description("report", {"title": title}, problem=problem, checked="head and end")
 
 
-def describe_rrd(path: Path, verify: bool) -> Description | None:
+def describe_rrd(path: Path, _verify: bool) -> Description | None:
     """Describe a saved view of an earlier version, which Rerun opens."""
-    del verify
     with path.open("rb") as file:
         if file.read(3) != b"RRF":
             return None
@@ -300,12 +307,7 @@ def describe_shard(path: Path, verify: bool) -> Description:
     from nlos_cam.dataset import check_arrays, read_head, shard_origin
 
     head = read_head(path)
-    problem = ""
-    if verify:
-        try:
-            check_arrays(head)
-        except NlosCamError as error:
-            problem = str(error)
+    problem = problem_of(lambda: check_arrays(head)) if verify else ""
     version, command = shard_origin(path)
     seeds = f"{len(head.seeds)}, seeds {head.seeds.start} to {head.seeds.stop - 1}"
     facts = {"objects": seeds, "rig": head.plan.rig.name}

@@ -2,15 +2,14 @@
 
 import csv
 import hashlib
-import json
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from nlos_models import CHECKSUMS, ENCODER, TEXT_LIMIT, checksums_of, load_record, read_bounded
 
-from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.info.files import Description, count, describe_npz
+from nlos_cam.errors import RecordingError
+from nlos_cam.info.files import Description, count, describe_npz, problem_of, read_json
 
 
 def describe_dataset(folder: Path, verify: bool) -> Description:
@@ -26,13 +25,7 @@ def describe_dataset(folder: Path, verify: bool) -> Description:
         "kind": "color" if plan.textures else "depth",
         "rig": plan.rig.name,
     }
-    problem = ""
-    if verify:
-        try:
-            for shard in shards:
-                check_arrays(shard)
-        except NlosCamError as error:
-            problem = str(error)
+    problem = problem_of(lambda: [check_arrays(shard) for shard in shards]) if verify else ""
     others = {shard.path.name for shard in shards if shard.provenance != shards[0].provenance}
     if others and not problem:
         facts["other plans"] = f"{count(len(others), 'shard')}, such as {min(others)}"
@@ -42,8 +35,8 @@ def describe_dataset(folder: Path, verify: bool) -> Description:
     return Description("dataset", facts, "", f"nlos-cam {version}: {command}", problem, checked, following)
 
 
-def describe_weights(folder: Path, verify: bool) -> Description:
-    """Describe weights from their record; their files have checksums."""
+def describe_weights(folder: Path, _verify: bool) -> Description:
+    """Describe weights from their record; the checksums of their files, some 50 MB, are always compared."""
     record, quoted = load_record(folder), shlex.quote(str(folder))
     facts = {
         "rig": f"{record.rig_name} {record.rig_checksum}",
@@ -54,7 +47,6 @@ def describe_weights(folder: Path, verify: bool) -> Description:
     }
     facts |= {name: f"{value:.3g}" for name, value in record.figures.items()}
     problem = _checksum_problem(folder)
-    del verify  # some 50 MB: always read
     following = [f"nlos-cam evaluate --weights {quoted}", f"nlos-cam live --camera sim --weights {quoted}"]
     return Description("weights", facts, "", "", problem, f"checksums in {CHECKSUMS}", following)
 
@@ -72,9 +64,8 @@ def _checksum_problem(folder: Path) -> str:
     return ""
 
 
-def describe_run(folder: Path, verify: bool) -> Description:
+def describe_run(folder: Path, _verify: bool) -> Description:
     """Describe a training run from its log."""
-    del verify
     with (folder / "log.csv").open(encoding="utf-8", newline="") as file:
         rows = [*csv.DictReader(file)]
     finished = (folder / "checkpoint.json").exists()
@@ -93,9 +84,8 @@ def describe_replay(folder: Path, verify: bool) -> Description:
     return Description("replay", found.facts, "", "nlos-cam replay", found.problem, found.checked, [*page, *found.next])
 
 
-def describe_export(folder: Path, verify: bool) -> Description:
+def describe_export(folder: Path, _verify: bool) -> Description:
     """Describe an export from its record."""
-    del verify
     record = _json(folder / "export.json")
     streams = record.get("streams", {})
     facts = {"recording": str(record.get("recording")), "every": f"{record.get('every', 1)}. frame"}
@@ -106,9 +96,8 @@ def describe_export(folder: Path, verify: bool) -> Description:
     return Description("export of a recording", facts, "", "nlos-cam export", "", "record")
 
 
-def describe_figures(folder: Path, verify: bool) -> Description:
+def describe_figures(folder: Path, _verify: bool) -> Description:
     """Describe an evaluation from its figures."""
-    del verify
     figures = _json(folder / "figures.json")
     facts = {name: str(figures[name]) for name in ("what", "objects", "weights", "rig", "runtime") if name in figures}
     if iou := figures.get("silhouette_iou"):
@@ -119,9 +108,8 @@ def describe_figures(folder: Path, verify: bool) -> Description:
     return Description("evaluation", facts, "", "nlos-cam evaluate", "", "JSON", following)
 
 
-def describe_tradeoff(folder: Path, verify: bool) -> Description:
+def describe_tradeoff(folder: Path, _verify: bool) -> Description:
     """Describe a trade-off from its table."""
-    del verify
     table = _json(folder / "tradeoff.json")
     facts = {"machine": str(table.get("machine")), "complete": "yes" if table.get("complete") else "no: interrupted"}
     following = [f"open {shlex.quote(str(folder / 'tradeoff.html'))}"]
@@ -130,10 +118,7 @@ def describe_tradeoff(folder: Path, verify: bool) -> Description:
 
 def _json(path: Path) -> Mapping[str, dict[str, float]]:
     """Return a JSON object. Raises RecordingError for anything else."""
-    try:
-        found = json.loads(read_bounded(path, TEXT_LIMIT))
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{path} is not JSON ({error}): it is cut short or damaged; make it again") from error
+    found = read_json(path, read_bounded(path, TEXT_LIMIT))
     if not isinstance(found, dict):
         raise RecordingError(f"{path} is not a JSON object: make it again")
     return found
