@@ -161,12 +161,6 @@ JSON_FIELDS = {
 """Fields of the record that --json prints."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(calibrate)
-    app.command()(board)
-
-
 def calibrate(
     camera: Camera = "sim",
     wall: Wall = False,

@@ -128,11 +128,6 @@ Wall = Annotated[Path | None, typer.Option("--wall", help="Wall record of `calib
 Out = Annotated[Path | None, typer.Option("--out", help="Recording to write (.bag).")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(capture)
-
-
 def capture(
     camera: Camera = "sim",
     seconds: Seconds = None,

@@ -189,11 +189,6 @@ def _fill(values: dict[str, Any], used: Mapping[str, Value]) -> None:
             say(f"{key} = {value} (from {source})")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("config")(config)
-
-
 def config(json: Json = False) -> None:
     """Show the settings of nlos-cam.toml and the environment, and the place that each comes from."""
     settings = read_settings()

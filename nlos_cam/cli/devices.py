@@ -20,12 +20,6 @@ VISIBLE = {True: "yes", False: "[red]no[/]", None: ""}
 """Cell for a camera that is listed, not listed, and not searched for."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(devices)
-    app.command()(doctor)
-
-
 def devices(json: Json = False) -> None:
     """List the cameras that librealsense and USB see, side by side, and the simulated cameras."""
     facts = diagnosis.gather_facts()

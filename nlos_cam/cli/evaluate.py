@@ -13,11 +13,6 @@ from nlos_cam import evaluate as measure
 from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("evaluate")(evaluate)
-
-
 def evaluate(
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the report, figures and pictures.")] = None,
     data: Annotated[

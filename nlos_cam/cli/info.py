@@ -15,11 +15,6 @@ from nlos_cam.errors import RecordingError
 UNITS = (1e9, "GB"), (1e6, "MB"), (1e3, "kB")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("info")(info)
-
-
 def info(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="File or folder that nlos-cam wrote or reads.")],
     verify: Annotated[bool, typer.Option("--verify", help="Read all of it, not its index or heads alone.")] = False,

@@ -7,18 +7,11 @@ from pathlib import Path
 
 import nlos_calibration as walls
 import nlos_models as models
-import typer
 
 from nlos_cam import camera as cameras
 from nlos_cam import objects as shapes
 from nlos_cam import render as renderer
 from nlos_cam.cli.common import Json, finish
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    for command in (scenes, objects, rigs, recipes):
-        app.command()(command)
 
 
 def scenes(json: Json = False) -> None:

@@ -89,12 +89,6 @@ Out = Annotated[Path | None, typer.Option("--out", help="Directory to write (def
 Every = Annotated[int, typer.Option("--every", min=1, help="With --object, only every Nth frame (default: 1).")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    for command in (demo, live, replay):
-        app.command(command.__name__)(command)
-
-
 def demo(
     seconds: Seconds = None,
     no_view: NoView = False,

@@ -35,7 +35,7 @@ signal while they are loaded."""
 
 
 class Command(NamedTuple):
-    """Row of the help page: the module of this package that registers the command, its group and its summary."""
+    """Row of the help page: the module of this package with the command's function, its group and its summary."""
 
     module: str
     group: str
@@ -73,7 +73,7 @@ SETTINGS = {"help_option_names": ["-h", "--help"]}
 EVERYWHERE = {"--json", "--verbose", "-v", "--quiet", "-q"}
 """Options that may also stand before the command."""
 GROUPS = {"dataset", "train", "tradeoff"}
-"""Commands with commands of their own."""
+"""Commands with commands of their own, which their modules register."""
 COMPLETION = "_NLOS_CAM_COMPLETE"
 """Environment variable that a shell sets when it asks for completions."""
 
@@ -103,9 +103,13 @@ def build_app(command: str | None = None) -> typer.Typer:
     """
     app = _empty_app()
     if command is None or command in COMMANDS:
-        rows = COMMANDS.values() if command is None else [COMMANDS[command]]
-        for module in dict.fromkeys(row.module for row in rows):
-            importlib.import_module(f"nlos_cam.cli.{module}").register(app)
+        for name, row in COMMANDS.items():
+            if command is None or row.module == COMMANDS[command].module:
+                module = importlib.import_module(f"nlos_cam.cli.{row.module}")
+                if name in GROUPS:
+                    module.register(app)
+                else:
+                    app.command(name)(getattr(module, name))
         _share_options(app)
         return app
     for name, row in COMMANDS.items():

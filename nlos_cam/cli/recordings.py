@@ -59,13 +59,7 @@ def object_formats(text: str) -> list[str]:
     return names
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command("repair")(repair_bag)
-    app.command("export")(export_bag)
-
-
-def repair_bag(bag: DamagedBag, out: NewBag = None, overwrite: Overwrite = False, json: Json = False) -> None:
+def repair(bag: DamagedBag, out: NewBag = None, overwrite: Overwrite = False, json: Json = False) -> None:
     """Write the undamaged part of a recording, with a new index, to a new file; the original is not changed."""
     if out is not None and out.suffix != ".bag":
         raise typer.BadParameter(f"--out {out}: the name of a recording must end in .bag")
@@ -91,7 +85,7 @@ def _format_repair(repaired: bags.RepairResult) -> str:
     return "\n".join([*lines, f"Wrote {repaired.out}"])
 
 
-def export_bag(
+def export(
     bag: AnyBag,
     out: Folder = None,
     form: As = "png",

@@ -178,12 +178,7 @@ def hidden_depth(hidden: str, rig: walls.Rig, options: dict[str, Any]) -> Float3
     return loaded.depth_m
 
 
-def register(app: typer.Typer) -> None:
-    """Add this command to the command line."""
-    app.command("render")(command)
-
-
-def command(
+def render(
     hidden: Object,
     out: Annotated[Path | None, typer.Option("--out", help="Output (.npz), with a picture (.png) beside it.")] = None,
     scene: Annotated[

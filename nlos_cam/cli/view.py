@@ -120,11 +120,6 @@ Seconds = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("view")(view)
-
-
 def view(
     file: ViewFile,
     wall: Wall = None,

@@ -44,19 +44,19 @@ def test_repair_json_reports_the_new_file(run: Run, noise_bags: dict[str, Path],
 def test_repair_prints_what_was_recovered_and_lost(
     capsys: pytest.CaptureFixture[str], noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recordings.repair_bag(noise_bags["packed"], tmp_path / "a.bag")
+    recordings.repair(noise_bags["packed"], tmp_path / "a.bag")
     shown = capsys.readouterr().out
     assert all(word in shown for word in ("40 depth", "40 infrared", "40 confidence", " 0 bytes"))
     content = bytearray(noise_bags["packed"].read_bytes())
     for at in range(1_000_000, len(content), 500_000):
         content[at] ^= 1
     (tmp_path / "bad.bag").write_bytes(content)
-    recordings.repair_bag(tmp_path / "bad.bag", tmp_path / "b.bag")
+    recordings.repair(tmp_path / "bad.bag", tmp_path / "b.bag")
     shown = capsys.readouterr().out
     assert " 0 bytes" not in shown
     assert str(tmp_path / "b.bag") in shown
     monkeypatch.setattr(recordings, "MAX_REPORTED", 1)  # much damage in few lines
-    recordings.repair_bag(tmp_path / "bad.bag", tmp_path / "c.bag")
+    recordings.repair(tmp_path / "bad.bag", tmp_path / "c.bag")
     assert 1 < len(capsys.readouterr().out.splitlines()) < len(shown.splitlines())
 
 
@@ -72,9 +72,9 @@ def test_repair_overwrites_with_the_option_but_not_its_input(
     assert run(bag, "--out", bag, "--overwrite")[0] == 1
     assert bag.read_bytes() == before == out.read_bytes()
     with pytest.raises(OutputExistsError):
-        recordings.repair_bag(bag, out)
+        recordings.repair(bag, out)
     with pytest.raises(typer.BadParameter, match=r"\.bag"):
-        recordings.repair_bag(bag, tmp_path / "a.txt")
+        recordings.repair(bag, tmp_path / "a.txt")
 
 
 def test_repair_interrupted_is_exit_code_130_without_output(
