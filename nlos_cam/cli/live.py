@@ -37,6 +37,7 @@ from nlos_cam.cli.view import (
     Open,
     SaveReplayView,
     SaveView,
+    Seconds,
     Stills,
     Video,
     ViewHost,
@@ -74,10 +75,6 @@ Tradeoff = Annotated[
 ]
 Wall = Annotated[Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall` (wall.toml).")]
 Weights = Annotated[Path | None, typer.Option("--weights", help="Folder of weights (default: the paper's).")]
-Seconds = Annotated[
-    float | None,
-    typer.Option("--seconds", min=0.1, help="Stop after this many seconds (default: run until Ctrl-C)."),
-]
 Average = Annotated[
     int, typer.Option("--average", min=1, max=1000, help="Number of frames to average; moving objects blur.")
 ]

@@ -76,19 +76,10 @@ class RunControl:
         self._recording: LiveRecording | None = None
         self._session: tuple[views.SessionFile, ExitStack] | None = None
         self._command = threading.Lock()
-        self._commands: dict[str, Callable[..., str]] = {
-            "record": self.record,
-            "stop_recording": self.stop_recording,
-            "snapshot": self.snapshot,
-            "save_session": self.save_session,
-            "end_session": self.end_session,
-            "pause": self.pause,
-            "resume": self.resume,
-            "take_reference": self.take_reference,
-            "average": self.average,
-            "setting": self.use_setting,
-            "option": self.set_option,
-        }
+        named = self.record, self.stop_recording, self.snapshot, self.save_session, self.end_session
+        named += self.pause, self.resume, self.take_reference, self.average
+        self._commands: dict[str, Callable[..., str]] = {command.__name__: command for command in named}
+        self._commands |= {"setting": self.use_setting, "option": self.set_option}
 
     # ---- the loop's side
 
@@ -239,11 +230,8 @@ class RunControl:
         _, pipeline = self._attached()
         if self._session:
             raise NlosCamError(f"{self._session[0].path} is being saved: end it first")
-        file, stack = (
-            views.SessionFile(self._file("session", ".html"), pipeline.bench.rig, pipeline.bench.measured),
-            ExitStack(),
-        )
-        stack.enter_context(file)
+        bench, stack = pipeline.bench, ExitStack()
+        file = stack.enter_context(views.SessionFile(self._file("session", ".html"), bench.rig, bench.measured))
         self._session = file, stack
         return f"saving the session to {file.path}"
 

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 
@@ -76,9 +76,7 @@ class ReplayMedia:
             self._viewers.append(view_package.VideoFile(folder / VIDEO, rig))
         if self._formats:
             self._objects = ObjectFiles(folder / OBJECT, object_box(rig), self._formats, self._every)
-        with ExitStack() as entered:
-            for viewer in self._viewers:
-                entered.enter_context(viewer)
+        with view_package.Viewers(self._viewers):
             yield
         if self._stills:
             moments = [moment_of(result) for result in self._stills.results()]
