@@ -46,26 +46,12 @@ def _hidden(facts: Facts, cameras: str) -> Finding:
     return failed(f"USB shows {cameras}, librealsense does not: {reasons}", next(iter(causes.values())).fix)
 
 
-CHECKS: dict[str, Callable[[Facts], Finding]] = {
-    "python": checks.python,
-    "system": checks.system,
-    "sdk": checks.sdk,
-    "sdk-version": checks.sdk_version,
-    "sdk-alone": checks.sdk_alone,
-    "libusb": checks.libusb,
-    "usb-camera": checks.usb_camera,
-    "recovery": checks.recovery,
-    "link": checks.link,
-    "container": checks.container,
-    "udev-rules": checks.udev_rules,
-    "permissions": checks.permissions,
-    "video-driver": checks.video_driver,
-    "hid-sensors": checks.hid_sensors,
-    "in-use": checks.in_use,
-    "sdk-camera": sdk_camera,
-    "firmware": checks.firmware,
-    "metadata": checks.metadata,
-}
+IN_ORDER: tuple[Callable[[Facts], Finding], ...] = (
+    *(checks.python, checks.system, checks.sdk, checks.sdk_version, checks.sdk_alone, checks.libusb),
+    *(checks.usb_camera, checks.recovery, checks.link, checks.container, checks.udev_rules, checks.permissions),
+    *(checks.video_driver, checks.hid_sensors, checks.in_use, sdk_camera, checks.firmware, checks.metadata),
+)
+CHECKS = {check.__name__.replace("_", "-"): check for check in IN_ORDER}
 """Every check by its name, in the order of the output."""
 
 
