@@ -9,14 +9,12 @@ from nlos_calibration.geometry import Intrinsics
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.recording.bag_messages import (
     ENCODINGS,
-    depth_unit_m,
     lens_of,
     metadata,
     parse,
     pixels,
     pose_of,
     sdk_name,
-    timestamp_s,
 )
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -35,16 +33,6 @@ def raw_image(version: str, tail: bytes, values: bytes = bytes(range(6))) -> mem
 
 def pinhole(width: int = 3, height: int = 2) -> Intrinsics:
     return Intrinsics(width, height, 1.0, 1.0, 1.0, 1.0)
-
-
-@pytest.mark.parametrize(("version", "tail"), [("0", b""), ("1", struct.pack("<f", 0.25))])
-def test_images_are_read_with_and_without_a_tail(version: str, tail: bytes) -> None:
-    raw = raw_image(version, tail)
-    image = parse(raw, IMAGE)
-    assert (image.header.seq, timestamp_s(image)) == (7, pytest.approx(12.345_678_901))
-    for size in ((3, 2), (64, 48)):  # a device may deliver another size than its profile declares
-        np.testing.assert_array_equal(pixels(image, "mono8", pinhole(*size)), [[0, 1, 2], [3, 4, 5]])
-    assert depth_unit_m(raw) == (0.25 if tail else None)
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,7 @@ import pytest
 from mutations import BAG_WAYS, Bag, Message, mutate_bag, read_bag, write_bag
 
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.recording.bag_reader import BagReader
-from nlos_cam.recording.export import ExportOptions, export_recording
-from nlos_cam.recording.playback import ReplayCamera
-from nlos_cam.recording.repair import repair_recording
+from nlos_cam.recording import BagReader, ExportOptions, ReplayCamera, export_recording, repair_recording
 from nlos_cam.recording.rosbag import MAGIC, pack_chunk_head, pack_file_header, pack_record
 
 OWN_TYPES = ("Depth_0/info/camera_info", "sensor_msgs/CameraInfo"), ("/device_0/info", "diagnostic_msgs/KeyValue")

@@ -4,6 +4,7 @@ import struct
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlos_cam.camera import open_camera
-from nlos_cam.camera.recorder import Recording
-from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.camera.streams import FORMATS
+from nlos_cam.camera import FORMATS, Recording, SimulatedCamera, open_camera
 from nlos_cam.errors import RecordingError, StreamMissingError
-from nlos_cam.recording.playback import ReplayCamera, verify
+from nlos_cam.recording import ReplayCamera, repair_recording, verify
 
 
 def write(path: Path, content: bytes) -> Path:
@@ -70,14 +68,15 @@ def test_replay_refuses_a_broken_file_in_one_line(
     assert ("nlos-cam repair" in str(raised.value)) == (content.startswith(b"#ROSBAG"))
 
 
-def test_replay_refuses_missing_paths_folders_and_pipes(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.bag", tmp_path):
-        with pytest.raises(RecordingError, match=str(path)):
-            ReplayCamera(path)
+@pytest.mark.parametrize("read", [ReplayCamera, lambda path: repair_recording(path, path.with_name("good.bag"))])
+def test_missing_paths_folders_and_pipes_are_refused(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    paths = [tmp_path / "none.bag", tmp_path]
     if sys.platform != "win32":  # pipes have names
         os.mkfifo(tmp_path / "pipe.bag")
-        with pytest.raises(RecordingError, match=r"pipe\.bag"):
-            ReplayCamera(tmp_path / "pipe.bag")
+        paths.append(tmp_path / "pipe.bag")
+    for path in paths:
+        with pytest.raises(RecordingError, match=str(path)):
+            read(path)
 
 
 def test_repair_command_in_the_error_is_quoted(tmp_path: Path, noise_bag: Path) -> None:
@@ -86,21 +85,16 @@ def test_repair_command_in_the_error_is_quoted(tmp_path: Path, noise_bag: Path) 
         ReplayCamera(path)
 
 
-def test_replay_gives_the_frames_before_damage(recorded: Any, tmp_path: Path) -> None:
-    path = recorded(tmp_path / "damaged.bag", frames=150)  # more than the SDK writes as one compressed chunk
-    assert verify(path).frames == 150
-    content = path.read_bytes()
-    where = content.rindex(b"compression=lz4") + 200
-    write(path, content[:where] + bytes(100) + content[where + 100 :])
+def test_replay_gives_the_frames_before_damage(damaged: Path) -> None:
     frames: list[int] = []
-    with ReplayCamera(path) as camera, pytest.raises(RecordingError, match=r"\d+\.\d s") as raised:
+    with ReplayCamera(damaged) as camera, pytest.raises(RecordingError, match=r"\d+\.\d s") as raised:
         frames.extend(frame.frame_number for frame in camera)
-    assert f"`nlos-cam repair {path} --out damaged-repaired.bag`" in str(raised.value)
+    assert f"`nlos-cam repair {damaged} --out damaged-repaired.bag`" in str(raised.value)
     assert frames == list(range(len(frames)))
     assert max(camera.arrived.values()) - len(frames) == camera.incomplete <= 1
     assert 0 < len(frames) < 150
     with pytest.raises(RecordingError, match=r"damaged\.bag"):
-        verify(path)
+        verify(damaged)
 
 
 def test_settings_are_those_at_the_time_of_the_frame(rewritten: Any) -> None:

@@ -61,19 +61,6 @@ def test_noise_is_none_where_too_little_is_valid(spoil: str) -> None:
     assert quality_of(frames).temporal_noise_mm is None
 
 
-def test_shares_are_exact() -> None:
-    frames = noisy(count=4)
-    for frame in frames:
-        ir, confidence = np.full(SHAPE, 254, np.uint8), np.full(SHAPE, 3, np.uint8)
-        ir[: frame.frame_number], confidence[:24] = 255, 15
-        frame.depth_m[:, :8] = np.nan
-        frames[frame.frame_number] = replace(frame, ir=ir, confidence=confidence)
-    found = quality_of(frames)
-    assert found.saturated_share == (0 + 1 + 2 + 3) / (4 * 48)
-    assert found.invalid_share == 8 / 64
-    assert found.confidence_mean == 9.0
-
-
 def test_jitter_is_the_spread_of_intervals() -> None:
     on_time = [frame for frame in noisy() if frame.frame_number % 7]  # some are missing
     assert quality_of(on_time).jitter_ms == pytest.approx(0.0, abs=1e-3)

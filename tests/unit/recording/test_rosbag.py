@@ -15,13 +15,10 @@ from nlos_cam.recording.rosbag import (
     Op,
     Source,
     check_bookkeeping,
-    message_key,
-    number,
     pack_chunk_info,
     pack_file_header,
     pack_index,
     pack_record,
-    parse_fields,
     read_connection,
     read_content,
     read_record,
@@ -103,29 +100,6 @@ def test_read_record_does_not_read_an_absurd_header() -> None:
     assert max(asked) == 4
 
 
-def test_bad_fields_and_unknown_operations_are_format_errors() -> None:
-    with pytest.raises(BagFormatError, match="'count'"):
-        number({}, "count")
-    with pytest.raises(BagFormatError, match="3"):
-        number({"count": b"123"}, "count")
-    with pytest.raises(BagFormatError, match="time"):
-        message_key(BagRecord(Op.MESSAGE, {"conn": bytes(4), "time": bytes(7)}, 0, 0))
-    with pytest.raises(BagFormatError):
-        read_record(reader(pack_record({"op": b"\x09"}, b"")), 0)
-    for header in (b"\x03\0\0\0abc", b"\xff\xff\xff\xffa=b", b"\x03\0\0\0a=bx", b"\x04\0\0\0a=b", b"\x03\0\0\0\xe4=b"):
-        with pytest.raises(BagFormatError):
-            parse_fields(header)
-
-
-def test_read_connection_keeps_its_description() -> None:
-    found = read_connection(*described(connection(latching=b"1")))
-    assert (found.number, found.topic, found.kind, found.md5sum) == (7, "/a", "std_msgs/String", b"0" * 32)
-    assert found.record == connection(latching=b"1")
-    assert found.is_like(read_connection(*described(connection())))
-    for other in (connection(topic=b"/b"), connection(md5sum=b"1" * 32)):
-        assert not found.is_like(read_connection(*described(other)))
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -154,29 +128,11 @@ def test_check_bookkeeping_refuses_impossible_lengths() -> None:
             check_bookkeeping(*described(pack_record({**fields, "op": bytes([op])}, data)))
 
 
-ONE, AFTER = message(0, 500), pack_index(0, bytes(12))
+ONE = message(0, 500)
 
 
 def content_of(content: bytes, expected_bytes: int = CHUNK_LIMIT) -> Content:
     return read_content(reader(content), 0, CHUNK_LIMIT, expected_bytes)
-
-
-def test_read_content_indexes_messages_by_connection_and_time() -> None:
-    five, two = connection(b"/5", 5), connection(b"/2", 2)
-    parts = [five, message(256, 0, 5), two, message(1, 7, 5), message(1, 7, 2), message(1, 7, 5)]
-    starts = [sum(map(len, parts[:i])) for i in range(len(parts))]
-    found = content_of(b"".join(parts))
-    assert {number: each.record for number, each in found.connections.items()} == {5: five, 2: two}
-    assert list(found.index) == [2, 5]
-    expected = [(1, 7, starts[3]), (1, 7, starts[5]), (256, 0, starts[1])]
-    assert list(struct.iter_unpack("<III", found.index[5])) == expected
-    assert (found.ending, found.why, found.bytes) == (Ending.WHOLE, "", sum(map(len, parts)))
-    assert read_content(reader(b"before" + ONE + ONE), 6, CHUNK_LIMIT, CHUNK_LIMIT) == content_of(ONE + ONE)
-
-
-def test_read_content_ends_at_expected_length_or_other_records() -> None:
-    assert content_of(ONE + ONE, len(ONE)).bytes == len(ONE)
-    assert content_of(ONE + ONE + AFTER).bytes == content_of(ONE + ONE + AFTER, 7).bytes == 2 * len(ONE)
 
 
 NO_TIME, NO_CONNECTION = (
@@ -199,11 +155,6 @@ def test_read_content_keeps_messages_before_damage(content: bytes, ending: Endin
     """Trusts a message only if what follows it is a record."""
     found = content_of(content)
     assert (found.ending, found.bytes, len(found.index[0])) == (ending, len(ONE), 12)
-
-
-def test_read_content_refuses_more_than_the_limit() -> None:
-    found = read_content(reader(ONE * 9), 0, 3 * len(ONE), CHUNK_LIMIT)
-    assert (found.ending, found.bytes) == (Ending.BROKEN, 2 * len(ONE))
 
 
 def test_set_up_records_finds_connections_and_first_messages() -> None:

@@ -22,7 +22,7 @@ from nlos_cam.recording.salvage import Scan, examine, find_chunk, scan_bag, unpa
 
 DESCRIPTION = {"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"string data"}
 CONNECTION = pack_record({"conn": bytes(4), "op": b"\x07", "topic": b"/topic"}, pack_record(DESCRIPTION, b"")[4:-4])
-SET_UP_S, FIRST_S = (0, 1), (0, 500)
+SET_UP_S = (0, 1)
 FIRST_CHUNK_AT = 4117
 MESSAGE = b"\x04\0\0\0op=\x02"
 Scanned = Callable[[bytes], Scan]

@@ -13,14 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera import intrinsics_of, load_sdk, sample_from_sdk
 from nlos_cam.camera.session import SampleQueue, read_settings
-from nlos_cam.camera.streams import intrinsics_of, sample_from_sdk
 from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording.bag_reader import BagReader
-from nlos_cam.recording.playback import ReplayCamera
-from nlos_cam.recording.sdk_playback import SdkReplayCamera
+from nlos_cam.recording import BagReader, ReplayCamera, SdkReplayCamera
 
 IMAGE, METADATA = "/image/data", "/image/metadata"
 Messages = Iterable[tuple[int, bytes]]
@@ -177,17 +174,6 @@ def test_lenses_and_poses_agree_with_librealsense(kind: str, request: pytest.Fix
             pose, extrinsics = bag.pose(stream, other), seen_from.get_extrinsics_to(camera)
             np.testing.assert_allclose(pose[:3, :3], np.reshape(extrinsics.rotation, (3, 3)).T, atol=1e-6)
             np.testing.assert_allclose(pose[:3, 3], extrinsics.translation, atol=1e-7)
-
-
-@pytest.fixture(scope="module")
-def damaged(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording whose index is whole, and whose last chunk is unreadable."""
-    path = recorded(tmp_path_factory.mktemp("damaged") / "damaged.bag", frames=150)  # several compressed chunks
-    content = bytearray(path.read_bytes())
-    where = content.rindex(b"compression=lz4") + 200
-    content[where : where + 100] = bytes(100)
-    path.write_bytes(content)
-    return path
 
 
 MESSAGE = r"nlos-cam repair"

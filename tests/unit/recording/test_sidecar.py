@@ -9,24 +9,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from nlos_calibration import Intrinsics, MeasuredWall, Rig, dump_toml, load_rig
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import Rig, dump_toml, load_rig
-from nlos_calibration.wall_record import MeasuredWall
 
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.playback import VerifyResult
-from nlos_cam.recording.quality import Quality
-from nlos_cam.recording.sidecar import (
+from nlos_cam.recording import (
     TEMPERATURE_INTERVAL_S,
     SidecarFile,
+    VerifyResult,
     load_measured_wall,
     load_sidecar,
     sidecar_path,
-    summary_of,
-    versions,
 )
+from nlos_cam.recording.quality import Quality
+from nlos_cam.recording.sidecar import summary_of, versions
 
 PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
 DARK = np.zeros((48, 64), np.uint8)
