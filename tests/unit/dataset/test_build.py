@@ -125,19 +125,6 @@ def test_build_raises_error_of_an_object(tmp_path: Path) -> None:
     assert len(_bytes(tmp_path)) == 1
 
 
-def test_build_cleans_up_partial_files_of_a_kill(tmp_path: Path, whole: Shards) -> None:
-    _build(tmp_path, count=10)
-    content = (tmp_path / "shard-000000040.h5").read_bytes()
-    (tmp_path / "shard-000000045.h5").unlink()
-    for number in (45, 50):
-        (left := tmp_path / f".shard-0000000{number}.h5.part").mkdir()
-        (left / "lock").touch()
-        (left / f"shard-0000000{number}.h5").write_bytes(content[:100])
-    assert len(open_dataset(tmp_path)) == 5
-    _build(tmp_path)
-    assert _bytes(tmp_path) == whole
-
-
 @pytest.mark.parametrize(
     ("name", "keep", "count", "made"),
     [*(("shard-000000045.h5", share, COUNT, 5) for share in (0.0, 0.3, 0.99)), (LAST, 0.0, 10, 0)],
@@ -199,13 +186,6 @@ def test_build_locks_its_folder_and_refuses_a_file(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("here")
     with pytest.raises(OutputExistsError, match="--out"):
         _build(tmp_path / "file")
-
-
-def test_build_refuses_a_folder_of_other_files_and_leaves_it_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.txt").write_text("precious", encoding="utf-8")
-    with pytest.raises(OutputExistsError, match="other files"):
-        _build(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
 def test_build_keeps_shards_when_disk_is_full(tmp_path: Path, whole: Shards, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,21 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import Rig, load_rig
+from nlos_calibration import Rig, load_rig
 
-from nlos_cam.dataset import doubt_samples
-from nlos_cam.dataset.doubt_samples import (
-    EMPTY,
-    ORDINARY,
-    SEEDS_PER_BENCH,
-    DoubtSamples,
-    _generator,
-    _stimulus,
-    make_samples,
-    samples_on_disk,
-)
-from nlos_cam.dataset.outliers import HELD_OUT_OUTLIERS, TRAINING_OUTLIERS
-from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.dataset import EMPTY, HELD_OUT_OUTLIERS, ORDINARY, TRAINING_OUTLIERS, doubt_samples, samples_on_disk
+from nlos_cam.dataset.doubt_samples import SEEDS_PER_BENCH, DoubtSamples, _generator, _stimulus, make_samples
+from nlos_cam.render import SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
 

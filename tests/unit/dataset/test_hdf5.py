@@ -71,10 +71,10 @@ def _plan_of_two_texts(path: Path) -> None:
 
 HARMS = {
     "chunk for each number": _declare(shape=(1 << 18,), dtype="f4", chunks=(1,), compression="gzip"),
-    "chunks that are absent": _declare(shape=(1 << 24,), dtype="f4", chunks=(1 << 20,), compression="gzip"),
+    "chunks that are absent": _declare(shape=(1 << 40,), dtype="f4", chunks=(1 << 20,), compression="gzip"),
     "plain chunks that are absent": _declare(shape=(1 << 24,), dtype="f4", chunks=(1 << 20,)),
     "numbers that are absent": _declare(shape=(1 << 24,), dtype="f4"),
-    "chunk beyond the array": _declare(shape=(1,), maxshape=(None,), dtype="f4", chunks=(1 << 24,)),
+    "chunk beyond the array": _declare(shape=(3,), maxshape=(None,), dtype="f4", chunks=(1 << 28,)),
     "other compression": _declare(data=np.zeros(1 << 24, "i1"), compression="lzf"),
     "texts in chunks": _declare(shape=(3,), dtype="S1000", chunks=(1,)),
     "bomb": _bomb,

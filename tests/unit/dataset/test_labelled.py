@@ -10,33 +10,23 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from nlos_calibration import ObjectBox, Rig, dump_toml, load_rig
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import CalibrationError
-from nlos_calibration.rig import ObjectBox, Rig, dump_toml, load_rig
-from nlos_models.data import MapSet
+from nlos_models import MapSet
 
-from nlos_cam.camera.recorder import Recording
-from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.dataset import DatasetPlan, build_dataset, open_dataset
+from nlos_cam.camera import Recording, SimulatedCamera
+from nlos_cam.dataset import DatasetPlan, build_dataset, open_dataset, read_labelled, write_shards
 from nlos_cam.dataset import labelled as labelled_shards
 from nlos_cam.dataset.build import SHARD
-from nlos_cam.dataset.labelled import (
-    RECORDED,
-    Labelled,
-    benchmark_depths,
-    list_recordings,
-    read_labelled,
-    spread,
-    truth_depth_m,
-    write_shards,
-)
+from nlos_cam.dataset.labelled import RECORDED, Labelled, benchmark_depths, spread, truth_depth_m
 from nlos_cam.dataset.shards import store
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError, SceneError
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.objects.benchmark import benchmark_objects as fixed_set
-from nlos_cam.objects.depth_map import cell_centers_m, image_from_depth, object_box
-from nlos_cam.recording.playback import ReplayCamera
-from nlos_cam.recording.sidecar import SidecarFile, WallFile, sidecar_path
+from nlos_cam.objects import benchmark_objects as fixed_set
+from nlos_cam.objects import cell_centers_m, image_from_depth, object_box
+from nlos_cam.recording import ReplayCamera, SidecarFile, sidecar_path
+from nlos_cam.recording.sidecar import WallFile
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -159,14 +149,6 @@ def test_read_labelled_skips_frames_without_return(
     else:
         with pytest.raises(RecordingError, match=r"dark\.bag"):
             read_labelled([path], known=known)
-
-
-def test_recordings_in_lists_bags_by_name(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="capture --label"):
-        list_recordings(tmp_path)
-    for name in ("b.bag", "a.bag", "a.json"):
-        (tmp_path / name).touch()
-    assert list_recordings(tmp_path) == [tmp_path / "a.bag", tmp_path / "b.bag"]
 
 
 def _truth(folder: Path, label: str = "mug", name: str = "F") -> np.ndarray:

@@ -4,25 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.dataset.outliers import (
-    HELD_OUT_OUTLIERS,
-    MIN_PIXELS,
-    SHAPE_OUTLIERS,
-    SLIGHT,
-    TRAINING_OUTLIERS,
-    WIDE,
-    BenchSpread,
-    Stimulus,
-    draw_outlier,
-    ordinary,
-    vary_bench,
-    vary_empty_bench,
-)
+from nlos_cam.dataset import HELD_OUT_OUTLIERS, SHAPE_OUTLIERS, TRAINING_OUTLIERS, Stimulus, draw_outlier
+from nlos_cam.dataset.outliers import MIN_PIXELS, SLIGHT, WIDE, BenchSpread, ordinary, vary_bench, vary_empty_bench
 from nlos_cam.dataset.plan import move_lidar
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.objects import object_box
+from nlos_cam.render import SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
 BOX = object_box(RIG)

@@ -7,17 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
-from nlos_models.recipe import SIMULATION_ONLY
+from nlos_calibration import load_rig
+from nlos_models import SIMULATION_ONLY
 from pydantic import ValidationError
 
 from nlos_cam.dataset.plan import FIRST_OBJECTS, SCENE_COLUMNS, DatasetPlan, Objects, RigSpread, scene_row
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.textures import TEXTURES
-from nlos_cam.render.material import Material
-from nlos_cam.render.scene_file import SceneFile
-from nlos_cam.render.sensor.model import SensorModel
+from nlos_cam.objects import CATEGORIES, TEXTURES
+from nlos_cam.render import Material, SceneFile, SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
 PLAN = DatasetPlan(RIG, 7)

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_farm import samples_of
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
 import nlos_cam
-from nlos_cam.dataset import ray_backend
-from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset import DatasetPlan, ray_backend
 from nlos_cam.dataset.ray_backend import PIECES_PER_CPU, RayFarm, make_piece
 from nlos_cam.errors import SceneError, WorkersLostError
 

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 from fake_farm import samples_of
-from nlos_calibration.rig import load_rig
-from nlos_models.data import MapBatch, MapSet
+from nlos_calibration import load_rig
+from nlos_models import MapBatch, MapSet
 
-from nlos_cam.dataset import reader
-from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset import DatasetPlan, reader
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _maps, _Window, open_dataset
 from nlos_cam.dataset.shards import Shard, shard_path, store
 from nlos_cam.errors import RecordingError, SceneError

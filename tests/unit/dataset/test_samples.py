@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset import samples as dataset_samples
 from nlos_cam.dataset.plan import DatasetPlan, Objects, RigSpread, scene_row
@@ -26,15 +26,8 @@ from nlos_cam.dataset.samples import (
 )
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
-from nlos_cam.objects.depth_map import image_from_depth
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.placement import object_depth
-from nlos_cam.objects.textures import TEXTURES, image_from_albedo, paint
-from nlos_cam.render.material import Surface
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.objects import CATEGORIES, TEXTURES, image_from_albedo, image_from_depth, object_depth, paint
+from nlos_cam.render import Scene, Sensor, SensorModel, Surface, render
 
 RIG = load_rig("paper-rig")
 PLAN = DatasetPlan(RIG, 0, accuracy="draft")

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 from nlos_models.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
@@ -16,9 +16,7 @@ from nlos_cam.dataset import DatasetPlan, RigSpread, training_maps
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, measured_bare_wall, read_maps, render_bare_wall
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.render import Scene, Sensor, render
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0)
 OTHER = replace(PLAN, rig=PLAN.rig.model_copy(update={"name": "other"}))
