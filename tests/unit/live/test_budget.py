@@ -10,29 +10,24 @@ import pytest
 from fake_wall import RIG
 from hypothesis import given
 from hypothesis import strategies as st
-from nlos_models.records import shipped_folder
+from nlos_models import shipped_folder
 from small_frames import FrameCamera, sheet_network
 
 from nlos_cam.errors import BudgetError, RecordingError
+from nlos_cam.live import SHIPPED, BudgetChoice, available_settings, choose_within_budget, pipeline_timer
 from nlos_cam.live.budget import (
     BUSY_SHARE,
     CALLS,
     HANDOVER_MS,
     PERIOD_MS,
-    SHIPPED,
-    BudgetChoice,
     Machine,
     Setting,
     Timing,
-    available_settings,
     choose,
-    choose_within_budget,
     keeping_pace,
     load_tradeoff,
-    pipeline_timer,
 )
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.pipeline import Pipeline
+from nlos_cam.reconstruct import CalibratedRig, Pipeline
 
 AS_MEASURED = Machine(slower=1.0, rest_ms=1.0)
 

@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 from fake_wall import SMALL, wall_frame
 from made_up_moments import RIG, Recorded, full_moment, moment
-from nlos_calibration.wall_record import load_measured
+from nlos_calibration import load_measured
 from small_frames import FrameCamera, sheet_network
 from view_streams import saved_moments
 
 from nlos_cam.errors import NlosCamError
-from nlos_cam.live.control import RunControl
-from nlos_cam.live.loop import run_live
+from nlos_cam.live import RunControl, run_live
 from nlos_cam.live.statistics import SLOW_FRAMES, PaceWatch
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.pipeline import Pipeline
-from nlos_cam.view.viewer import NullViewer
+from nlos_cam.reconstruct import CalibratedRig, Pipeline
+from nlos_cam.view import NullViewer
 
 
 @pytest.fixture

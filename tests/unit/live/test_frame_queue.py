@@ -1,6 +1,4 @@
-from itertools import count as count_up
 from threading import Event
-from typing import Any
 
 import pytest
 from small_frames import FrameCamera
@@ -29,20 +27,6 @@ def test_reader_yields_every_frame_or_drops_the_oldest(lossless: bool) -> None:
     assert reader.dropped == list(range(numbers[0]))
 
 
-def test_reader_raises_the_cameras_error_after_its_frames() -> None:
-    def fail_at_two(number: int) -> None:
-        if number == 2:
-            raise CameraLostError("unplugged")
-
-    seen = []
-    with (
-        pytest.raises(CameraLostError, match="unplugged"),
-        FrameReader(FrameCamera(None, fail_at_two), lossless=True, stop=Event()) as reader,
-    ):
-        seen.extend(arrival.frame.frame_number for arrival in reader)
-    assert seen == [0, 1]
-
-
 def test_reader_ends_with_the_stop_event_or_when_left() -> None:
     stop = Event()
     with FrameReader(FrameCamera(None), lossless=True, stop=stop) as reader:
@@ -68,32 +52,3 @@ def test_reader_closes_or_reports_a_source_that_hangs(monkeypatch: pytest.Monkey
         pass
     release.set()
     wait_for_end(reader)
-
-
-def test_reader_can_end_while_no_frame_arrives() -> None:
-    release, asked = Event(), count_up()
-    source = FrameCamera(None, lambda _: release.wait(60.0))
-    run: Any = {
-        "lossless": True,
-        "stop": Event(),
-        "should_stop": lambda: next(asked) > 2,
-        "abandon_source": release.set,
-    }
-    with FrameReader(source, **run) as reader:
-        assert list(reader) == []
-        release.set()
-
-
-def test_reader_calls_on_wait_while_no_frame_arrives() -> None:
-    release, waits = Event(), list[float | None]()
-
-    def on_wait() -> None:
-        waits.append(reader.newest_s)
-        release.set()
-
-    source = FrameCamera(4, lambda number: number == 3 and release.wait(60.0))
-    with FrameReader(source, lossless=True, stop=Event(), clock=lambda: 7.0, on_idle=on_wait) as reader:
-        assert numbers_of(reader) == [0, 1, 2, 3]
-    assert waits
-    assert waits[-1] == 7.0
-    assert FrameReader([], lossless=True, stop=Event()).newest_s is None

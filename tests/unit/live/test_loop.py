@@ -10,17 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_wall import SMALL, WallCamera, measured_wall
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 from small_frames import FrameCamera, ListViewer, sheet_network, small_frame
 
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
-from nlos_cam.live.loop import count_issues, describe_counts, pace, run_live, warm_up
+from nlos_cam.live.loop import pace, run_live, warm_up
 from nlos_cam.live.statistics import OUTSIDE_LATENCY, STALLED, RunReport
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.pipeline import Pipeline
-from nlos_cam.reconstruct.verdict import Verdict, frame_issues
-from nlos_cam.view.viewer import Moment, NullViewer
+from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict, frame_issues
+from nlos_cam.view import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
 PERIOD_S = 1 / 30
@@ -236,11 +234,3 @@ def frame_with(with_depth: int, at_255: int = 0) -> Frame:
 )
 def test_frame_issues_are_named(depths: int, saturated: int, names: list[str]) -> None:
     assert frame_issues(frame_with(depths, saturated)) == names
-
-
-def test_count_issues_passes_frames_on() -> None:
-    frames, seen = [frame_with(0), frame_with(PIXELS), frame_with(0, PIXELS), frame_with(9)], Counter[str]()
-    given = list(count_issues(frames, seen))
-    assert all(one is other for one, other in zip(frames, given, strict=True))
-    assert describe_counts({"out_of_order": 3, "blank": 1}) == "3 out of order, 1 blank"
-    assert seen == {"blank": 2, "saturated": 1, "half_invalid": 1}

@@ -8,8 +8,7 @@ import pytest
 from made_up_moments import RIG, Recorded, bump
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.live import ReplayMedia, export_objects, replay_recording
-from nlos_cam.live.object_files import OBJECT_FORMATS
+from nlos_cam.live import OBJECT_FORMATS, ReplayMedia, export_objects, replay_recording
 from nlos_cam.objects import image_from_depth, mesh_from_depth, object_box
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
 

@@ -7,17 +7,8 @@ from threading import Event, Thread
 
 import pytest
 
-from nlos_cam.live.realtime import (
-    DRAWING,
-    LOOP,
-    ORDINARY,
-    SWITCH_S,
-    TASKS,
-    drop_realtime_priority,
-    low_latency_interpreter,
-    realtime_priority,
-    yield_to_loop,
-)
+from nlos_cam.live import low_latency_interpreter, realtime_priority, yield_to_loop
+from nlos_cam.live.realtime import DRAWING, LOOP, ORDINARY, SWITCH_S, TASKS, drop_realtime_priority
 
 OTHER, ROUND_ROBIN = 0, 2
 

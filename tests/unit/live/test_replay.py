@@ -17,9 +17,7 @@ from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD
 from nlos_cam.live.replay import DIFFERENCE, REPORT, RESULT, SHEET, ReplayReport, replay_recording
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck
-from nlos_cam.reconstruct.pipeline import Pipeline
+from nlos_cam.reconstruct import CalibratedRig, PeriodicPhysicsCheck, Pipeline
 
 TEXT = "report.md"
 

@@ -14,21 +14,11 @@ from small_frames import NOTHING
 from view_streams import saved_moments
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.live.replay import REPORT, RESULT, SHEET, replay_recording
-from nlos_cam.live.replay_media import (
-    VIDEO,
-    VIEW,
-    FrameSampler,
-    ReplayMedia,
-    _limits,
-    _symmetric_limits,
-    draw_contact_sheet,
-    moment_of,
-)
-from nlos_cam.objects.depth_map import image_from_depth, object_box
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.pipeline import FrameResult, Pipeline
-from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.live import REPORT, VIDEO, ReplayMedia, replay_recording
+from nlos_cam.live.replay import RESULT, SHEET
+from nlos_cam.live.replay_media import VIEW, FrameSampler, draw_contact_sheet, moment_of
+from nlos_cam.objects import image_from_depth, object_box
+from nlos_cam.reconstruct import CalibratedRig, FrameResult, Pipeline, Verdict
 
 BENCH = CalibratedRig(RIG)
 FULL = full_moment(0)
@@ -129,15 +119,3 @@ def test_sheet_has_a_row_per_map_and_a_column_per_frame(titles: Callable[[list[F
     doubted = titles([replace(wall_step(3), verdict=Verdict.OUTSIDE, reconstruction=made)])
     assert doubted[0] == "frame 3\noutside the trained range"
     assert doubted[-1] == "uncertainty (mm)"
-
-
-def test_limits_of_a_sheet_span_its_values_or_leave_out_outliers() -> None:
-    images = [np.array([[np.nan, 2.0]], np.float32), np.array([[-1.0, 0.5]], np.float32)]
-    assert _limits(images) == (-1.0, 2.0)
-    assert _limits([np.full((2, 2), np.nan, np.float32)]) == (0.0, 1.0)
-    image = np.random.default_rng(0).normal(0.0, 1.0, (64, 80)).astype(np.float32)
-    image[:2] = -500.0
-    low, high = _symmetric_limits([image])
-    assert low == -high
-    assert 1.9 < high < 3.0
-    assert _symmetric_limits([]) == (-1.0, 1.0)

@@ -11,23 +11,20 @@ from small_frames import NOTHING, small_frame
 
 from nlos_cam.errors import NlosCamError, SceneError
 from nlos_cam.frames import maps_from_frame
+from nlos_cam.live import RunReport, RunStatistics
 from nlos_cam.live.statistics import (
     MAX_FAILED_IN_A_ROW,
     STALLED,
     STALLED_AFTER_S,
     QualityLog,
-    RunReport,
-    RunStatistics,
     StageTimes,
     StallWatch,
     WarningLog,
-    WarningSpan,
     camera_ms,
     percentiles_ms,
 )
-from nlos_cam.reconstruct.network import Doubt, Quality
-from nlos_cam.reconstruct.pipeline import FrameResult
-from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.reconstruct import FrameResult, Quality, Verdict
+from nlos_cam.reconstruct.network import Doubt
 
 
 @pytest.fixture
@@ -52,40 +49,11 @@ def reported(tally: RunStatistics, dropped_loop: int = 0, offset_s: float = 0.0,
     return tally.report(seen_through, reader)
 
 
-def tally_of(ages_s: list[float]) -> RunStatistics:
-    """Tally of 30 frames a second, each published this long after its timestamp."""
-    tally = RunStatistics()
-    for number, age_s in enumerate(ages_s):
-        stages_s = {"wait": 0.001, "network": 0.01 * (number + 1)}
-        tally.add(step_of(number, published_s=number / 30 + age_s, stages_s=stages_s), view_s=0.002)
-    return tally
-
-
 def test_report_of_a_run_without_frames_is_zero() -> None:
     report = reported(RunStatistics())
     assert (report.frames, report.fps, report.dropped, report.stages_ms, report.counts) == (0, 0.0, 0, {}, {})
     assert set(report.latency_ms.values()) == {0.0}
     assert RunStatistics().duration_s(1e9) == 0.0
-
-
-def test_report_gives_rate_latency_and_stages_of_the_frames() -> None:
-    report = reported(tally_of([0.005] * 31), offset_s=0.002)
-    assert report.frames == 31
-    assert report.fps == pytest.approx(30.0)
-    assert report.latency_ms == pytest.approx({"p50": 3.0, "p95": 3.0, "p99": 3.0}, abs=1e-6)
-    assert report.stages_ms == pytest.approx({"wait": 1.0, "network": 160.0, "view": 2.0})
-    assert tally_of([0.5, 0.1]).duration_s(4.5) == pytest.approx(4.0), "from the first result"
-
-
-def test_report_gives_delivery_of_steps_with_an_arrival() -> None:
-    tally = RunStatistics()
-    for number in range(9):
-        times = {"published_s": number / 30 + 0.012, "arrived_s": number / 30 + 0.007}
-        tally.add(step_of(number, **times), view_s=0.0)
-    report = reported(tally, offset_s=0.005)
-    assert report.stages_percentiles_ms["delivery"] == pytest.approx({"p50": 2.0, "p95": 2.0, "p99": 2.0}, abs=1e-6)
-    assert report.latency_ms["p99"] == pytest.approx(7.0, abs=1e-6)
-    assert "delivery" not in reported(tally_of([0.1])).stages_ms
 
 
 def test_report_counts_verdicts_warnings_issues_and_lost_frames() -> None:
@@ -114,17 +82,6 @@ def test_statistics_raise_after_many_failures_in_a_row() -> None:
         tally.fail(small_frame(1), SceneError("no object_box"), 1)
 
 
-def test_warning_log_reports_begin_end_and_frames_of_a_warning(begins: list[tuple[str, bool]]) -> None:
-    found = WarningLog(lambda *about: begins.append(about))
-    for step in (step_of(7), step_of(8, "hot"), step_of(9, "hot", "moved"), step_of(11, "moved"), step_of(12)):
-        found.add(step)
-    assert begins == [("hot", True), ("moved", True), ("hot", False), ("moved", False)]
-    assert found.spans == [WarningSpan("hot", 2, 8, 9), WarningSpan("moved", 2, 9, 11)]
-    found.add(step_of(20, "hot"))
-    assert begins[-1] == ("hot", True)
-    assert found.spans[0] == WarningSpan("hot", 3, 8, 20)
-
-
 def test_warning_log_ignores_numbers_in_a_warning(begins: list[tuple[str, bool]]) -> None:
     found = WarningLog(lambda *about: begins.append(about))
     for step in (step_of(1, "46.5 degrees"), step_of(2, "48 degrees"), step_of(3, "48 degrees", "48 mm"), step_of(4)):
@@ -146,16 +103,6 @@ def test_stage_times_replace_the_oldest_in_constant_memory() -> None:
         times.add({"maps": float(number)})
         assert times._columns["maps"].size == 10
     assert sorted(times.of("maps")) == [float(number) for number in range(25, 35)]
-
-
-def test_stage_times_hold_stages_that_only_some_frames_have() -> None:
-    times = StageTimes()
-    for stages_s in ({"maps": 1.0}, {"maps": 2.0, "doubt": 5.0}, {"doubt": 6.0}, {"latency": 1.7e9 + 0.0123}):
-        times.add(stages_s)
-    assert times.stages == ["maps", "doubt", "latency"]
-    assert (sorted(times.of("maps")), sorted(times.of("doubt"))) == ([1.0, 2.0], [5.0, 6.0])
-    assert times.of("latency")[0] - 1.7e9 == pytest.approx(0.0123, abs=1e-6)
-    assert times.of("unheard of").size == 0
 
 
 JUST_BEFORE_S = 0.999 * STALLED_AFTER_S
