@@ -8,11 +8,8 @@ import pytest
 from fake_librealsense import FakeContext, FakeDevice, FakeRecorder, FakeSdk, FakeSensor
 from fake_lidar import FakeFrame, FakeLidar, FakeProfile, NapClock
 
+from nlos_cam.camera import FORMATS, SoftwareLidar, find_streams, load_sdk
 from nlos_cam.camera.l515 import L515Camera
-from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import find_streams
-from nlos_cam.camera.simulated import SoftwareLidar
-from nlos_cam.camera.streams import FORMATS
 
 
 def public_methods(cls: type) -> set[str]:

@@ -11,7 +11,7 @@ import pytest
 from fake_librealsense import FakeSdk, FakeSensor
 from fake_lidar import FakeLidar, NapClock
 
-from nlos_cam.camera.l515 import NEAR_WALL, NOT_OFFERED, L515Camera, Options, connected
+from nlos_cam.camera.l515 import NEAR_WALL, L515Camera, Options, connected
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import CameraError, CameraNotFoundError
 
@@ -47,13 +47,6 @@ def test_camera_that_is_not_found_lists_what_is(
         fake_camera(*lidars, serial=serial)
 
 
-def test_serial_number_chooses_the_device(fake_camera: Make) -> None:
-    one, other = FakeLidar("f1"), FakeLidar("f2")
-    with fake_camera(one, other, serial="f2"):
-        assert other.opened
-    assert not one.opened
-
-
 @pytest.mark.parametrize(("usb", "size"), [("3.2", (640, 480)), ("2.1", (320, 240))])
 def test_usb_link_decides_the_resolution(
     fake_camera: Make, caplog: pytest.LogCaptureFixture, usb: str, size: tuple[int, int]
@@ -64,15 +57,6 @@ def test_usb_link_decides_the_resolution(
         assert [(profile.stream, profile.size) for profile in device.opened] == [(one, size) for one in FORMATS]
     assert ("USB 2.1" in caplog.text) == (usb == "2.1")
     assert usb == "2.1" or not caplog.records  # settings that take are not logged
-
-
-def test_near_wall_settings_follow_start_and_preset(fake_camera: Make) -> None:
-    device, clock = FakeLidar(), NapClock()
-    with fake_camera(device, clock=clock):
-        did = device.did
-        assert did.index("start") < did.index("visual_preset") < min(did.index(name) for name in NEAR_WALL)
-    assert clock.naps == [0.5, 0.5]
-    assert device.options["visual_preset"] == 5.0
 
 
 def test_settings_that_do_not_take_are_logged_once(fake_camera: Make, caplog: pytest.LogCaptureFixture) -> None:
@@ -227,17 +211,6 @@ def test_option_is_set_to_the_nearest_value_in_range(
     assert bool(difference) == (wanted != value)
     assert not difference or (f"{wanted:g}" in difference and f"{value:g}" in difference)
     assert lidar.options["min_distance"] == options.get("min_distance") == value
-
-
-def test_option_that_is_missing_or_refused_is_reported(lidar: FakeLidar, options: Options) -> None:
-    assert options.put("alternate_ir", 1.0) == NOT_OFFERED
-    assert options.get("alternate_ir") is options.limits("alternate_ir") is None
-    assert "alternate_ir" not in lidar.did
-    lidar.refused = {"laser_power"}
-    assert "out of range" in options.put("laser_power", 50.0)
-    lidar.unplug()
-    assert options.limits("laser_power") is options.get("laser_power") is None
-    assert "failed to set power state" in options.put("laser_power", 50.0)
 
 
 def test_options_are_changed_while_the_camera_runs(fake_camera: Make) -> None:

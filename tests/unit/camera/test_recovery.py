@@ -98,12 +98,3 @@ def test_bus_that_cannot_be_listed_counts_as_unplugged(caplog: pytest.LogCapture
     device.recover()
     assert device.counts == {"replugged": 1}
     assert "60 s" in caplog.text
-
-
-@pytest.mark.parametrize("there", [True, False])
-def test_recovery_does_nothing_for_a_camera_that_was_left(there: bool) -> None:
-    device = Device(there=lambda _: there)
-    device.left.set()
-    device.recover()
-    assert "start" not in device.did
-    assert not device.counts

@@ -61,18 +61,6 @@ def test_finish_counts_half_a_set_of_a_recording(lossless: bool) -> None:
     assert inbox.incomplete == int(lossless)
 
 
-def test_queue_counts_samples_of_another_shape() -> None:
-    inbox = SampleQueue(lossless=False)
-    inbox.expect((1, 1))
-    for number, shape in enumerate([(1, 1), (2, 1), (1, 1)]):
-        for stream in FORMATS:
-            inbox.put(Sample(stream, number, number / 30, np.zeros(shape)))
-    assert take_all(inbox) == [0, 2]
-    assert inbox.counts == {"wrong_size": 1}
-    inbox.counts["wrong_size"] = 9  # changes a copy
-    assert inbox.counts == {"wrong_size": 1}
-
-
 class Shy:
     """A sensor that lists an option that cannot be read."""
 
@@ -98,12 +86,6 @@ def test_find_streams_takes_the_sensor_with_most_streams() -> None:
     assert sensor is whole
     assert set(profiles) == set(FORMATS)
     assert find_streams(SimpleNamespace(query_sensors=list)) == (None, {})
-
-
-@pytest.mark.parametrize("size", [(1024, 768), (640, 480), (320, 240), (100, 100)])
-def test_find_streams_takes_profiles_of_the_size(size: tuple[int, int]) -> None:
-    _, profiles = find_streams(FakeDevice(FakeLidar(), 0), size)
-    assert {profile.size for profile in profiles.values()} == ({size} if size[0] > 100 else set())
 
 
 def session_of(lidar: FakeLidar) -> Session:
@@ -138,11 +120,6 @@ def test_look_ends_by_timeout_or_end_of_wait() -> None:
     assert while_preparing(look) == [None, None]
 
 
-def test_device_that_vanishes_while_preparing_is_an_error() -> None:
-    with pytest.raises(RuntimeError, match="vanished"):
-        while_preparing(lambda _, lidar: lidar.unplug())
-
-
 @pytest.mark.parametrize("clock_stands", [False, True])
 def test_set_from_before_the_settings_is_not_delivered(clock_stands: bool) -> None:
     """A clock that stands still holds no more than one set back."""
@@ -159,10 +136,3 @@ def test_set_from_before_the_settings_is_not_delivered(clock_stands: bool) -> No
     assert take_all(session.inbox) == [6, 7]
     assert clock_stands or session.inbox.incomplete == session.inbox.dropped == 0
     session.stop()
-
-
-def test_telemetry_of_a_stopped_session_is_empty() -> None:
-    session = session_of(FakeLidar(usb="2.1"))
-    assert session.telemetry()
-    session.stop()
-    assert session.telemetry() == {}

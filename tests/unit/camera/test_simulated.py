@@ -1,19 +1,17 @@
 from dataclasses import astuple
-from itertools import islice
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.camera.recorder import Recording
-from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera import Recording, load_sdk
 from nlos_cam.camera.session import read_settings
 from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MAX_LATE_FRAMES, SimulatedCamera, SoftwareLidar
 from nlos_cam.camera.streams import intrinsics_of, is_needed, stream_name
-from nlos_cam.recording.playback import ReplayCamera
+from nlos_cam.recording import ReplayCamera
 
 
 class JumpClock:
@@ -55,13 +53,6 @@ def numbers_recorded(path: Path, world: Any, gap_s: float, frames: int) -> list[
         return [frame.frame_number for frame in replayed]
 
 
-def test_frames_are_due_at_30_per_second_with_their_truth(noise_world: Any, hurried_clock: Any) -> None:
-    with SimulatedCamera("sim", noise_world(), clock=hurried_clock(1e9)) as camera:
-        for frame in islice(camera, 6):
-            assert frame.timestamp_s == pytest.approx(1e9 + frame.frame_number / 30, abs=1e-6)
-            np.testing.assert_array_equal(frame.truth_depth_m, noise_world().truth_depth_m(frame.frame_number))
-
-
 @pytest.mark.parametrize(("takes_s", "ahead_s"), [(0.001, EXPOSED_AHEAD_S), (0.012, 0.024)])
 def test_frames_are_exposed_late_but_in_time(
     noise_world: Any, hurried_clock: Any, takes_s: float, ahead_s: float
@@ -95,14 +86,6 @@ def test_telemetry_holds_the_temperatures_of_the_instant(noise_world: Any, noise
     with ReplayCamera(noise_bag) as replayed:  # a recording holds the first
         assert next(iter(replayed)).settings["ldd_temperature"] == 20.0
         assert replayed.telemetry("_temperature") == {"ldd_temperature": 20.0}
-
-
-def test_failing_world_fails_its_reader(noise_world: Any, hurried_clock: Any) -> None:
-    with (
-        pytest.raises(ZeroDivisionError, match="the world ended"),
-        SimulatedCamera("sim", noise_world(fails_at=3), clock=hurried_clock()) as camera,
-    ):
-        list(camera)
 
 
 def test_late_world_catches_up_or_drops_numbers(noise_world: Any, tmp_path: Path) -> None:
@@ -147,12 +130,3 @@ def test_software_lidar_looks_like_an_l515() -> None:
         same = profiles["depth"].get_extrinsics_to(profile)
         np.testing.assert_array_equal(np.reshape(same.rotation, (3, 3)), np.eye(3))
         np.testing.assert_array_equal(same.translation, np.zeros(3))
-
-
-@pytest.mark.parametrize(("other", "sizes"), [(False, [(640, 480)]), (True, [(640, 480), (320, 240)])])
-def test_software_lidar_has_another_size_on_request(other: bool, sizes: list[tuple[int, int]]) -> None:
-    [sensor] = SoftwareLidar(PINHOLE, load_sdk(), has_other_size=other).device.query_sensors()
-    videos = [profile.as_video_stream_profile() for profile in sensor.get_stream_profiles()]
-    assert sorted({(video.width(), video.height()) for video in videos}) == sorted(sizes)
-    assert len(videos) == 3 * len(sizes)
-    assert {(v.width(), v.height()) for v in videos if v.is_default()} == {(640, 480)}

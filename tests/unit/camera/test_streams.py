@@ -5,21 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from nlos_calibration.geometry import Intrinsics
+from nlos_calibration import Intrinsics
 
-from nlos_cam.camera.streams import (
-    CONSISTENT_SETS,
-    FORMATS,
-    FRAMES_PER_S,
-    LATE_NUMBERS,
-    MAX_GAP,
-    WAITING_SETS,
-    FrameSet,
-    FrameSynchronizer,
-    Sample,
-    StreamOffsets,
-    frame_in_si,
-)
+from nlos_cam.camera import FORMATS, FRAMES_PER_S, FrameSet, FrameSynchronizer, Sample, frame_in_si
+from nlos_cam.camera.streams import CONSISTENT_SETS, LATE_NUMBERS, MAX_GAP, WAITING_SETS
 
 STREAMS = tuple(FORMATS)
 SHAPE = (1, 1)
@@ -124,14 +113,6 @@ def test_pairing_puts_each_stream_in_its_place_once_in_time() -> None:
     assert len(paired(pairing, whole(2, late_s=0.01))) == 1
 
 
-def test_pairing_bounds_memory_when_a_stream_is_missing() -> None:
-    pairing = FrameSynchronizer()
-    assert paired(pairing, (sample("depth", number) for number in range(1000))) == []
-    assert pairing.incomplete == 1000 - WAITING_SETS
-    pairing.finish()
-    assert pairing.incomplete == 1000
-
-
 @pytest.mark.slow
 @given(st.lists(st.tuples(st.sampled_from(STREAMS), st.integers(0, 2**40)), max_size=300))
 def test_pairing_bounds_memory_and_delivers_despite_wild_numbers(wild: list[tuple[str, int]]) -> None:
@@ -230,27 +211,6 @@ def test_pairing_realigns_a_stream_that_lost_a_frame(stream: str, instant: int) 
     assert pairing.counts == {}
     numbers, times_s = (np.array([getattr(one, name) for one in found]) for name in ("number", "timestamp_s"))
     np.testing.assert_allclose(times_s - times_s[-1], (numbers - numbers[-1]) / FRAMES_PER_S, atol=1e-9)
-
-
-def test_pairing_realigns_two_streams() -> None:
-    pairing, lost = FrameSynchronizer(), {"infrared": 0, "confidence": 30}
-    found = [one for sample in counted_apart(range(90), lost) if (one := pairing.add(sample))]
-    assert len(found) >= 90 - 2 * (2 + CONSISTENT_SETS)
-    assert found[-1].timestamp_s == 89 / FRAMES_PER_S
-
-
-def test_alignment_shifts_numbers_only_after_repeated_lags() -> None:
-    alignment, late = StreamOffsets(FRAMES_PER_S), {"depth": 1.0, "infrared": 1.0 + 1 / FRAMES_PER_S}
-    for _ in range(10):
-        for times_s in (late, late, {"depth": 1.0, "infrared": 1.01}):
-            alignment.note(times_s)
-    sample = Sample("infrared", 7, 1.0, PIXELS)
-    assert alignment.add(sample) is sample
-    alignment = StreamOffsets(FRAMES_PER_S)
-    for _ in range(CONSISTENT_SETS + 1):
-        alignment.note({"depth": 1.0, "infrared": 1.0 + 2 / FRAMES_PER_S})
-    assert alignment.add(sample).number == 9
-    assert alignment.add(Sample("depth", 7, 1.0, PIXELS)).number == 7
 
 
 def test_frame_in_si_has_metres_levels_and_nan() -> None:
