@@ -19,6 +19,7 @@ __all__ = [
     "FileBusyError",
     "InMemory",
     "MapBatch",
+    "MapNoise",
     "MapSet",
     "MapSource",
     "NormalBatch",
@@ -106,7 +107,7 @@ __all__ = [
 
 from .checkpoint import load_encoder, load_network, load_pipeline, load_vae
 from .data import InMemory, MapBatch, MapSet, MapSource, as_batch, first_of, subtract_bare_wall
-from .direct import CellNormal, DirectNetwork
+from .direct import CellNormal, DirectNetwork, MapNoise
 from .direct_training import NormalBatch, NormalSource, train_direct
 from .distributed import Accelerator, launch, open_fabric
 from .doubt_network import load_doubt

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapSet, MapSource
-from nlos_models.direct import CellNormal, DirectNetwork, two_heads_error
+from nlos_models.direct import CellNormal, DirectNetwork, MapNoise, two_heads_error
 from nlos_models.recipe import Recipe
 from nlos_models.tasks import figures_of, in_two_phases, run
 from nlos_models.train import Running, Scores, fit
@@ -27,6 +27,8 @@ class NormalSource(Protocol):
     """Training maps, normalised and stored once; objects may be added while a run goes on."""
 
     normal: CellNormal
+    noise: MapNoise | None
+    """Noise to draw at each step, of expected maps; None for maps that have theirs."""
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterable[NormalBatch]:
         """Return all objects that are there, shuffled; the same generator returns the same ones again."""
@@ -50,6 +52,8 @@ def train_direct(
 
     def loss(batch: NormalBatch, _: float) -> Tensor:
         normal = batch.normal.float()
+        if source.noise:
+            normal = network.normal.add_noise(normal, source.noise)
         return two_heads_error(logits(normal + recipe.noise * torch.randn_like(normal)), batch.image)
 
     figures = fit(

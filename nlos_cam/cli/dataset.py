@@ -65,6 +65,12 @@ SpreadDeg = Annotated[
 GainSpread = Annotated[
     float, typer.Option("--gain-spread-percent", min=0, help="Largest change of the intensity gain, drawn per object.")
 ]
+Expected = Annotated[
+    bool,
+    typer.Option(
+        "--expected-maps", help="Store maps without a draw of noise: `train direct` draws it anew at each step."
+    ),
+]
 AccuracyName = Annotated[
     Literal["draft", "standard", "fine", "reference"], typer.Option("--accuracy", help="Accuracy of the renderer.")
 ]
@@ -105,6 +111,7 @@ def build(
     rig_spread_deg: SpreadDeg = 0.0,
     gain_spread_percent: GainSpread = 0.0,
     accuracy: AccuracyName = "standard",
+    expected_maps: Expected = False,
     workers: Workers = os.cpu_count() or 1,
     ray: RayAddress = None,
     json: Json = False,
@@ -120,6 +127,7 @@ def build(
         accuracy=renderer.accuracy_named(accuracy).name,
         spread=spread,
         textures=tuple(shapes.TEXTURES) if colour else (),
+        expected=expected_maps,
     )
     with progress(Rate()) as bar:
         checks, renders = (bar.add_task(name, total=None, visible=False) for name in ("checking shards", "rendering"))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from nlos_models import CellNormal, NormalBatch, read_bounded
+from nlos_models import CellNormal, MapNoise, NormalBatch, read_bounded
 from nlos_models import read_arrays as read_npz
 
 from nlos_cam.dataset.plan import DatasetPlan
@@ -48,6 +48,13 @@ def _damaged(store: Path, name: str) -> RecordingError:
     return RecordingError(f"{store / name} is damaged: delete {store}, the packed maps are then made again")
 
 
+def map_noise(plan: DatasetPlan) -> MapNoise:
+    """Return the noise of a map cell's intensity by the plan's sensor."""
+    sensor, pixels = plan.sensor, plan.rig.intrinsics.height * plan.rig.intrinsics.width
+    alive = (1 - sensor.dead_share) * pixels / (MAP_ROWS * MAP_COLUMNS)
+    return MapNoise(sensor.read_noise_counts**2, sensor.shot_noise**2, sensor.ambient_counts, alive)
+
+
 class PackedMaps:
     """Normalised maps and images of one or more datasets of one rig, in a folder that is theirs alone."""
 
@@ -61,6 +68,10 @@ class PackedMaps:
         """Of the first dataset."""
         if others := [one.folder for one in opened if one.plan.rig != self.plan.rig]:
             raise SceneError(f"{others[0]} and {datasets[0]} were rendered for different rigs: give datasets of one")
+        if others := [one.folder for one in opened if one.plan.expected != self.plan.expected]:
+            raise SceneError(f"of {others[0]} and {datasets[0]} one holds expected maps, without noise: give one kind")
+        self.noise: MapNoise | None = map_noise(self.plan) if self.plan.expected else None
+        """To be drawn at each step of training."""
         self._datasets, self._store, self.normal = list(datasets), store, CellNormal()
         self._index = _read_index(store)
         if not (store / CELLS).exists():

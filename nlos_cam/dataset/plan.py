@@ -131,6 +131,8 @@ class DatasetPlan:
     rendering_version: int = RENDERING_VERSION
     textures: tuple[str, ...] = ()
     """Textures of the objects; with any of them the dataset is in color, which is simulation only."""
+    expected: bool = False
+    """Hold expected maps, without the sensor's noise, which training a direct network draws anew at each step."""
 
     @classmethod
     def of_scene(cls, scene: SceneFile, first_seed: int, **others: Any) -> Self:
@@ -159,6 +161,8 @@ class DatasetPlan:
             facts["note"] = SIMULATION_ONLY
         else:
             del facts["textures"]  # older readers refuse unknown fields
+        if not self.expected:
+            del facts["expected"]  # likewise
         if not self.objects.share_generic:
             del facts["objects"]["share_generic"]  # and checksums of older plans stay
         return json.dumps({**facts, "rig_checksum": self.rig.checksum})
@@ -187,6 +191,8 @@ class DatasetPlan:
         self.spread.check(self.rig)
         if self.textures and self.material.albedo != 1:
             raise SceneError("the scene's object has an albedo, but in color its albedo comes from textures: remove it")
+        if self.expected and (self.textures or self.sensor.wall_texture):
+            raise SceneError("expected maps are neither in color nor of a wall_texture: drop --expected-maps")
         if np.ndim(self.material.albedo):
             raise SceneError("the scene's object has three albedos, but datasets hold one intensity: give one albedo")
 

@@ -66,10 +66,19 @@ def procedural_images(
     return np.stack(images)
 
 
-def sense_object(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard", exposure: int = 0) -> LidarMaps:
-    """Return the maps of one rendered scene, by the sensor model and the reduction of live frames."""
+def sense_object(
+    scene: Scene,
+    sensor: Sensor,
+    seed: int,
+    accuracy: str = "standard",
+    exposure: int = 0,
+    *,
+    expected: bool = False,
+) -> LidarMaps:
+    """Return the maps of one rendered scene, by the sensor model and the reduction of live frames, or expected ones."""
     echoes = render(scene, accuracy).multi
-    return sensor.maps(echoes, np.random.default_rng([seed, 1, exposure]))  # numpy: [seed, 1, 0] is [seed, 1]
+    generator = None if expected else np.random.default_rng([seed, 1, exposure])  # numpy: [seed, 1, 0] is [seed, 1]
+    return sensor.maps(echoes, generator)
 
 
 def sense_color(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard") -> LidarMaps:
@@ -122,7 +131,7 @@ def _sense(
     scene = Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, model.pulse_ns)
     sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]  frozen, so hashable
     if coat is None:
-        return sense_object(scene, sensor, seed, plan.accuracy)
+        return sense_object(scene, sensor, seed, plan.accuracy, expected=plan.expected)
     return sense_color(replace(scene, surface=Surface(coat.albedo, plan.material.brdf)), sensor, seed, plan.accuracy)
 
 

@@ -3,6 +3,7 @@
 The law is that of `sensor.expose` and the reduction of frames: without noise the maps are the same bits, with noise
 every pixel has its own two deviates. They come from a counter, so that a cell's noise depends on the seed and the cell
 alone, and are quantiles of the normal distribution, looked up: drawing them took a third of a dataset's time.
+Expected maps spread the deviates of a cell's pixels evenly over the distribution instead of drawing them.
 """
 
 from functools import lru_cache
@@ -21,6 +22,8 @@ QUANTILES = 1 << 16
 """Equally likely values of a deviate, up to 4.3 standard deviations."""
 GOLDEN, FIRST, SECOND = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 """Constants of SplitMix64 (Steele, Lea and Flood 2014): its outputs are mixed values of a counter."""
+GOLDEN_SHARE = 0.6180339887498949
+"""Multiples of the golden ratio's fraction are spread evenly, whatever their number."""
 
 
 @lru_cache(maxsize=1)
@@ -43,15 +46,23 @@ def draw_deviates(seed: np.uint64, first: int, count: int, quantiles: Float32, l
         ranges[i] = quantiles[(word >> np.uint64(32)) & np.uint64(QUANTILES - 1)]
 
 
+@numba.njit(cache=True, error_model="numpy")
+def spread_deviates(count: int, quantiles: Float32, light: Float32, ranges: Float32) -> None:
+    """Fill in two normal deviates for each of some pixels: evenly spread over the distribution, in two orders."""
+    for i in range(count):
+        light[i] = quantiles[np.int64((i + 0.5) / count * QUANTILES)]
+        ranges[i] = quantiles[np.int64((i + 0.5) * GOLDEN_SHARE % 1.0 * QUANTILES)]
+
+
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def expose_cells(
     optics: Any, echoes: Any, cell: Int32, starts: Int64, quantiles: Float32, seed: np.uint64, noisy: tuple[bool, bool],
-    bias_m: Float32, chain: Any,
+    bias_m: Float32, chain: Any, expected: bool,
 ) -> tuple[Float32, Float32]:  # fmt: skip
     """Return depth and intensity (n,) of n map cells, NaN and 0 without valid samples; of an even wall alone.
 
     Arguments are those of `sensor.expose`, with the pixels of each map cell in a row, from its place in `starts`
-    (n + 1,) on. `noisy` says whether light and range have noise.
+    (n + 1,) on. `noisy` says whether light and range have noise; `expected` spreads it in place of drawing it.
     """
     most = np.diff(starts).max()
     depth, intensity = np.full(starts.size - 1, np.nan, np.float32), np.zeros(starts.size - 1, np.float32)
@@ -60,7 +71,9 @@ def expose_cells(
     samples_m, middle_m = bits.view(np.float32), middle.view(np.float32)
     for k in range(depth.size):
         start, pixels = starts[k], starts[k + 1] - starts[k]
-        if noisy[0] or noisy[1]:
+        if expected:
+            spread_deviates(pixels, quantiles, light, ranges)
+        elif noisy[0] or noisy[1]:
             draw_deviates(seed, start, pixels, quantiles, light, ranges)
         _pixels(start, pixels, optics, echoes, cell, light, ranges, noisy, bias_m, chain, samples_m, counts)
         valid = np.int32(0)

@@ -214,20 +214,25 @@ class Sensor:
         expose(optics, echoes, cell, light, ranges, bias_m, self._chain, *images)
         return SensedImages(z16, ir, confidence)
 
-    def maps(self, multi: MultiBounce, generator: np.random.Generator) -> LidarMaps:
+    def maps(self, multi: MultiBounce, generator: np.random.Generator | None) -> LidarMaps:
         """Return the maps of one exposure of the warm device: `expose` and the reduction of frames, in less time.
 
-        The noise has the law of `expose`, not its deviates. A textured wall takes the long way.
+        The noise has the law of `expose`, not its deviates. A textured wall takes the long way. Without a generator the
+        maps are the expected ones, without a draw of noise. Raises SceneError for those of a textured wall.
         """
         if self._optics.texture.size:
+            if generator is None:
+                raise SceneError("expected maps are not available for a wall_texture: set it to 0, or draw the noise")
             return maps_from_frame(self.expose(multi, generator).frame(self.rig.pinhole))
         order, starts, optics = self._by_cell
         optics = optics._replace(direct=np.zeros_like(optics.direct)) if multi.direct_included else optics
         cell = cell_of_pixels((self.rig.intrinsics.height, self.rig.intrinsics.width), multi.peak.shape)[order]
-        seed, bias_m = generator.integers(1 << 64, dtype=np.uint64), self._bias.at_m(None)
+        seed = generator.integers(1 << 64, dtype=np.uint64) if generator else np.uint64(0)
+        bias_m = self._bias.at_m(None)
         noise = normal_quantiles(), seed, (self._lights, self._ranges)
         bias_m = bias_m[order] if bias_m.size else bias_m
-        found = expose_cells(optics, _echoes(multi, self._chain), cell, starts, *noise, bias_m, self._chain)
+        expected = generator is None
+        found = expose_cells(optics, _echoes(multi, self._chain), cell, starts, *noise, bias_m, self._chain, expected)
         depth_m, intensity = (column.reshape(MAP_ROWS, MAP_COLUMNS) for column in found)
         return LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
 

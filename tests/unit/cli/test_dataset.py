@@ -11,19 +11,16 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from fake_farm import FakeFarm, samples_of
-from nlos_calibration.rig import load_rig
-from nlos_models.recipe import SIMULATION_ONLY
+from fake_farm import FakeFarm
+from nlos_calibration import load_rig
+from nlos_models import SIMULATION_ONLY
 from rich.progress import Progress
 
 from nlos_cam.cli.dataset import Rate
 from nlos_cam.cli.main import main
-from nlos_cam.dataset import DatasetPlan, RigSpread, build, open_dataset
-from nlos_cam.dataset.shards import read_head
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.textures import TEXTURES
-from nlos_cam.recording.playback import ReplayCamera
-from nlos_cam.recording.sidecar import SidecarFile, sidecar_path
+from nlos_cam.dataset import DatasetPlan, RigSpread, build, open_dataset, read_head
+from nlos_cam.objects import CATEGORIES, TEXTURES
+from nlos_cam.recording import ReplayCamera, SidecarFile, sidecar_path
 
 Run = Callable[..., dict[str, Any]]
 
@@ -70,13 +67,23 @@ def test_build_reports_and_resumes(tmp_path: Path, built: Run) -> None:
 
 def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path) -> None:
     spread = ["--rig-spread-mm", "10", "--rig-spread-deg", "3", "--gain-spread-percent", "20"]
-    others = ["--without", "hat, boat", "--backgrounds", "0.25", "--accuracy", "draft", "--seed", "7"]
+    others = [
+        "--without",
+        "hat, boat",
+        "--backgrounds",
+        "0.25",
+        "--accuracy",
+        "draft",
+        "--seed",
+        "7",
+        "--expected-maps",
+    ]
     folder = tmp_path / "a b"
     assert _build(folder, *spread, *others, "--workers", "1") == 0
     plan = open_dataset(folder).plan
     assert plan.spread == RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
     assert set(CATEGORIES) - set(plan.objects.categories) == {"hat", "boat"}
-    assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed) == (0.25, "draft", 7)
+    assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed, plan.expected) == (0.25, "draft", 7, True)
     assert _command(folder).startswith(f"nlos-cam dataset build --out '{folder}' --count 4 --seed 7 ")
     assert " --without 'hat, boat' " in _command(folder)
     assert _command(folder).endswith(" --workers 1")
@@ -104,13 +111,6 @@ def test_build_reports_damaged_shard(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert shard.name in captured.err
     assert json.loads(captured.out)["damaged"] == [str(shard)]
     assert len(read_head(shard).seeds) == 4
-
-
-def test_build_keeps_finished_shards_at_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(build, "SHARD", 2)
-    monkeypatch.setattr(build, "processes", lambda _: FakeFarm(fails_after=1))
-    assert _build(tmp_path) == 130
-    assert open_dataset(tmp_path).arrays().image.tolist() == samples_of(range(2))["image"].tolist()
 
 
 def test_build_hides_meshes_of_folder(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Packed maps: as the datasets have them, normalised; they grow between epochs, and an epoch can be seen again."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from fake_farm import samples_of
 from nlos_calibration.rig import load_rig
 from nlos_models import FileBusyError
 
-from nlos_cam.dataset.packed import CELLS, IMAGES, INDEX, MAPS, PackedMaps, open_packed_maps
+from nlos_cam.dataset.packed import CELLS, IMAGES, INDEX, MAPS, PackedMaps, map_noise, open_packed_maps
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
@@ -88,6 +89,15 @@ def test_damaged_store_is_refused(tmp_path: Path, name: str) -> None:
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     with pytest.raises(RecordingError, match=f"{name} is damaged"):
         open_packed_maps([folder], tmp_path / "store").__enter__()
+
+
+def test_expected_maps_have_their_noise_to_be_drawn_and_are_not_mixed_with_others(tmp_path: Path) -> None:
+    plain, expected = _add(tmp_path / "a", 0), _add(tmp_path / "b", 20, replace(PLAN, expected=True))
+    for folder, wanted in ((plain, None), (expected, map_noise(PLAN))):
+        with open_packed_maps([folder], tmp_path / f"store of {folder.name}") as packed:
+            assert packed.noise == wanted
+    with pytest.raises(SceneError, match="give one kind"):
+        open_packed_maps([plain, expected], tmp_path / "store").__enter__()
 
 
 def test_datasets_of_two_rigs_and_too_few_objects_are_refused(tmp_path: Path) -> None:

@@ -56,6 +56,12 @@ def test_plan_without_generic_shapes_keeps_its_checksum() -> None:
     assert "share_generic" not in json.loads(PLAN.provenance)["objects"]
 
 
+def test_plan_of_expected_maps_says_so() -> None:
+    expected = replace(PLAN, expected=True)
+    assert DatasetPlan.from_provenance(expected.provenance) == expected
+    assert "expected" not in json.loads(PLAN.provenance)  # checksums of older plans stay
+
+
 def test_plan_of_older_version_has_defaults() -> None:
     facts = json.loads(PLAN.provenance)
     for name in ("objects", "spread", "radiometry", "jump_m", "material"):

@@ -8,11 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float32
+from nlos_models import CellNormal
 
 from nlos_cam.dataset import samples as dataset_samples
+from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.plan import DatasetPlan, Objects, RigSpread, scene_row
 from nlos_cam.dataset.samples import (
     Samples,
@@ -78,7 +81,7 @@ def test_sense_object_draws_noise_by_seed() -> None:
 def test_samples_are_rendered_with_pulse_and_radiometry_of_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Scene] = []
 
-    def sense(scene: Scene, *_: object) -> LidarMaps:
+    def sense(scene: Scene, *_: object, **_options: object) -> LidarMaps:
         seen.append(scene)
         blank = np.zeros((64, 80), np.float32)
         return LidarMaps(blank, blank, blank > 0)
@@ -86,6 +89,42 @@ def test_samples_are_rendered_with_pulse_and_radiometry_of_plan(monkeypatch: pyt
     monkeypatch.setattr(dataset_samples, "sense_object", sense)
     make_samples(replace(PLAN, sensor=SensorModel(pulse_ns=1.0), radiometry="lambertian", jump_m=0.5), [0])
     assert (seen[0].pulse_ns, seen[0].radiometry, seen[0].jump_m) == (1.0, "lambertian", 0.5)
+
+
+def test_expected_maps_with_drawn_noise_have_the_law_of_exposures() -> None:
+    """Means and deviations over exposures are those of expected maps to which the intensity's noise is added."""
+    echoes = render(Scene(RIG, SHAPE), "draft").multi
+    expected = NOISY.maps(echoes, None)
+    exposures = [NOISY.maps(echoes, np.random.default_rng(k)) for k in range(60)]
+    depth_m, intensity = (np.stack([getattr(one, name) for one in exposures]) for name in ("depth_m", "intensity"))
+    assert np.nanmedian(np.abs(np.mean(depth_m, 0) - expected.depth_m)) < 0.2e-3
+    assert np.median(np.abs(intensity.mean(0) - expected.intensity)) < 0.06
+    normal = CellNormal()  # of median 0 and spread 1
+    maps = normal(*(torch.from_numpy(values[None]) for values in (expected.depth_m, expected.intensity)))
+    torch.manual_seed(0)
+    drawn = normal.add_noise(maps.expand(60, -1, -1, -1), map_noise(PLAN))
+    assert torch.equal(drawn[:, 0], maps[:, 0].expand(60, -1, -1))
+    ratio = intensity.std(0) / torch.expm1(drawn[:, 1]).std(0, correction=0).numpy()
+    assert 0.97 < np.nanmedian(ratio) < 1.03
+
+
+def test_cells_without_a_return_have_no_noise() -> None:
+    assert not CellNormal().add_noise(torch.zeros(1, 2, 64, 80), map_noise(PLAN)).any()
+
+
+def test_expected_samples_differ_from_exposures_by_noise_alone() -> None:
+    exposed, expected = (make_samples(replace(PLAN, expected=one), [3]) for one in (False, True))
+    np.testing.assert_array_equal(exposed["image"], expected["image"])
+    assert 0 < np.abs(exposed["intensity"] - expected["intensity"]).max() < 3
+
+
+def test_expected_maps_of_textured_walls_and_in_color_are_refused() -> None:
+    textured = Sensor(RIG, SensorModel(wall_texture=0.1))
+    with pytest.raises(SceneError, match="expected maps"):
+        textured.maps(render(Scene(RIG, SHAPE), "draft").multi, None)
+    for plan in (replace(COLOR, expected=True), replace(PLAN, sensor=SensorModel(wall_texture=0.1), expected=True)):
+        with pytest.raises(SceneError, match="drop --expected-maps"):
+            plan.check()
 
 
 def test_hidden_object_draws_no_category_left_out() -> None:

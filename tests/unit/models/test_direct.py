@@ -10,7 +10,15 @@ import pytest
 import torch
 from nlos_models.checkpoint import load_network, load_pipeline, save_direct
 from nlos_models.data import InMemory, as_images
-from nlos_models.direct import CLIP, CellNormal, DirectNetwork, MirrorLinear, image_from_logits, two_heads_error
+from nlos_models.direct import (
+    CLIP,
+    CellNormal,
+    DirectNetwork,
+    MapNoise,
+    MirrorLinear,
+    image_from_logits,
+    two_heads_error,
+)
 from nlos_models.direct_training import NormalBatch, train_direct, transfer_direct
 from nlos_models.distributed import open_fabric
 from nlos_models.errors import CheckpointError
@@ -54,6 +62,7 @@ class Source:
 
     def __init__(self) -> None:
         self.maps, self.normal = small_maps(12, 0), CellNormal()
+        self.noise: MapNoise | None = None
         depth_m, intensity = (torch.from_numpy(values) for values in (self.maps.depth_m, self.maps.intensity))
         self.normal.learn(depth_m, intensity)
         self.batch = NormalBatch(self.normal(depth_m, intensity).half(), torch.from_numpy(self.maps.image))
