@@ -63,7 +63,7 @@ class PackedMaps:
 
         Raises RecordingError for no dataset, SceneError for datasets of two rigs.
         """
-        opened = [open_dataset(folder) for folder in datasets]
+        opened = [open_dataset(folder, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
         """Of the first dataset."""
         if others := [one.folder for one in opened if one.plan.rig != self.plan.rig]:

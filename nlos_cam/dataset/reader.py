@@ -101,10 +101,10 @@ class _Window:
         return MapSet(*arrays)
 
 
-def open_dataset(folder: Path, *, color: bool = False) -> Dataset:
-    """Open a folder's dataset, of depth or in color.
+def open_dataset(folder: Path, *, color: bool = False, expected: bool = False) -> Dataset:
+    """Open a folder's dataset, of depth or in color; one of expected maps only where `expected` maps will do.
 
-    Raises RecordingError where there is none, one of the other kind, or shards of two datasets.
+    Raises RecordingError where there is none, one of another kind, or shards of two datasets.
     """
     if not (shards := shards_of(folder)):
         raise RecordingError(f"no dataset in {folder}: it holds no shard-*.h5; make one with `nlos-cam dataset build`")
@@ -114,6 +114,11 @@ def open_dataset(folder: Path, *, color: bool = False) -> Dataset:
             raise RecordingError(f"{shard.path} is of another dataset than {shards[0].path.name}: remove one of them")
     if plan.textures and not color:
         raise RecordingError(f"{folder} holds a dataset in color ({SIMULATION_ONLY}): give one of depth")
+    if plan.expected and not expected:
+        raise RecordingError(
+            f"{folder} holds expected maps, to which only `train direct --dataset` adds noise: "
+            "make them without --expected-maps"
+        )
     if color and not plan.textures:
         raise RecordingError(
             f"{folder} holds a dataset of depth: make one in color with `nlos-cam dataset build --colour`"

@@ -90,8 +90,6 @@ def read_maps(recipe: Recipe, data: Path, held_out_data: Path, wall: Path | None
         raise SceneError(f"--dataset and --held-out are the same folder ({data}): hold out different objects")
     training, other = (open_dataset(folder, color=recipe.colour) for folder in (data, held_out_data))
     plan, count = training.plan, len(training)
-    if plan.expected:
-        raise SceneError(f"{data} holds expected maps, whose noise only `train direct` draws: drop --expected-maps")
     if count < recipe.objects:
         raise SceneError(
             f"{data} holds {count} objects, the recipe needs {recipe.objects}: build more, or lower --objects"

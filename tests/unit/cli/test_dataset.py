@@ -53,7 +53,7 @@ def built(capsys: pytest.CaptureFixture[str]) -> Run:
 
 
 def _command(folder: Path) -> str:
-    with h5py.File(open_dataset(folder).shards[0].path) as file:
+    with h5py.File(open_dataset(folder, expected=True).shards[0].path) as file:
         return str(file.attrs["command"])
 
 
@@ -80,7 +80,7 @@ def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path) -> Non
     ]
     folder = tmp_path / "a b"
     assert _build(folder, *spread, *others, "--workers", "1") == 0
-    plan = open_dataset(folder).plan
+    plan = open_dataset(folder, expected=True).plan
     assert plan.spread == RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
     assert set(CATEGORIES) - set(plan.objects.categories) == {"hat", "boat"}
     assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed, plan.expected) == (0.25, "draft", 7, True)

@@ -1,6 +1,7 @@
 """Dataset reader: equal samples in memory and streamed; an epoch depends on seed and epoch alone."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,13 @@ def test_reader_names_damaged_shard(folder: Path, tmp_path: Path, way: str) -> N
     with pytest.raises(RecordingError, match=r"shard-000000050\.h5") as caught:
         list(getattr(open_dataset(tmp_path), way)(*((0, 0, 4) if way == "batches" else ())))
     assert "\n" not in str(caught.value)
+
+
+def test_reader_refuses_expected_maps_unless_they_will_do(tmp_path: Path) -> None:
+    store(shard_path(tmp_path, 40), samples_of([40]), replace(PLAN, expected=True).provenance, "")
+    with pytest.raises(RecordingError, match="without --expected-maps"):
+        open_dataset(tmp_path)
+    assert open_dataset(tmp_path, expected=True).plan.expected
 
 
 def test_reader_refuses_no_dataset_and_shards_of_two(folder: Path, tmp_path: Path) -> None:

@@ -28,8 +28,7 @@ WALL = Path("wall.toml")
 def _datasets(monkeypatch: pytest.MonkeyPatch) -> None:
     def opened(of: Path, *, color: bool) -> SmallDataset:
         assert not color
-        plan = replace(OTHER if "rig" in of.name else PLAN, expected="expected" in of.name)
-        return SmallDataset(small_maps(6, len(of.name)), plan)
+        return SmallDataset(small_maps(6, len(of.name)), OTHER if "rig" in of.name else PLAN)
 
     monkeypatch.setattr(training_maps, "open_dataset", opened)
 
@@ -67,11 +66,6 @@ def test_digest_depends_on_objects_and_rig() -> None:
 def test_read_maps_refuses_what_does_not_fit(held_out: str, wall: Path | None, stream: bool, word: str) -> None:
     with pytest.raises(SceneError, match=word):
         _read("data", held_out, wall, stream=stream)
-
-
-def test_read_maps_refuses_expected_maps_whose_noise_nobody_would_draw() -> None:
-    with pytest.raises(SceneError, match="only `train direct`"):
-        _read("expected")
 
 
 def test_rendered_bare_wall_cancels_a_frame_of_bare_wall() -> None:
