@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from fake_librealsense import FakeSdk
 from fake_lidar import FakeLidar, NapClock
-from nlos_calibration.rig import Rig, load_rig
+from nlos_calibration import Rig, load_rig
 
-from nlos_cam.camera import Recording
+from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.camera.l515 import L515Camera
-from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.render.sensor.sensor import SensedImages
+from nlos_cam.render import SensedImages
 
 
 @pytest.fixture(autouse=True)

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 from fake_wall import RIG, write_wall
-from nlos_calibration.reference import BareWallStatistics
-from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_record import load_measured
+from nlos_calibration import BareWallStatistics, load_measured, wall_depth
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
-from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct import CalibratedRig
 
 FRAMES = 30
 

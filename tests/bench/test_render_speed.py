@@ -3,8 +3,7 @@
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene_file import paper_scene
+from nlos_cam.render import paper_scene, render
 
 
 @pytest.mark.bench

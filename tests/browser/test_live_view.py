@@ -14,10 +14,9 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from browser_page import DEADLINE_S, Page, needs_browser
-from nlos_calibration.wall_record import load_measured
+from nlos_calibration import load_measured
 
-from nlos_cam.recording.playback import verify
-from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
+from nlos_cam.recording import load_sidecar, sidecar_path, verify
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(6 * DEADLINE_S)]
 

@@ -15,10 +15,9 @@ from made_up_moments import RIG, full_moment
 from measured_walls import exact_wall
 from view_streams import ask
 
-from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.reconstruct import Verdict
+from nlos_cam.view import PlaybackViewer, RecordedView, SessionFile, WebViewer
 from nlos_cam.view.server import MAX_STREAMS
-from nlos_cam.view.session_file import SessionFile
-from nlos_cam.view.web import PlaybackViewer, RecordedView, WebViewer
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(6 * DEADLINE_S)]
 

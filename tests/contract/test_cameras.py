@@ -12,11 +12,10 @@ import pytest
 from fake_librealsense import FakeSdk
 from fake_lidar import FakeLidar
 
-from nlos_cam.camera import Camera, Recording, connected, load_sdk, open_camera, shared_context
-from nlos_cam.camera.simulated_world import World, open_world
+from nlos_cam.camera import Camera, Recording, World, connected, load_sdk, open_camera, open_world, shared_context
 from nlos_cam.errors import CameraError, NlosCamError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.playback import verify
+from nlos_cam.recording import verify
 
 FAKE_L515 = "l515:fake"
 RECORDED = 12

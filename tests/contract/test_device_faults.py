@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlos_cam.camera import simulated
-from nlos_cam.camera.simulated import SimulatedCamera, SoftwareLidar
-from nlos_cam.camera.streams import FORMATS
+from nlos_cam.camera import FORMATS, SimulatedCamera, SoftwareLidar, simulated
 from nlos_cam.errors import CameraError
 from nlos_cam.frames import Frame
 

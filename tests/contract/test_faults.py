@@ -8,24 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 from small_frames import ListViewer, sheet_network
 
-from nlos_cam.camera import Recording, session
-from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera import Recording, SimulatedCamera, session
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
-from nlos_cam.live import frame_queue
-from nlos_cam.live.loop import run_live
-from nlos_cam.live.statistics import RunReport
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.pipeline import Pipeline
-from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.recording.playback import ReplayCamera
-from nlos_cam.recording.sdk_playback import SdkReplayCamera
-from nlos_cam.render.scene_file import Fault
-from nlos_cam.render.sensor.sensor import SensedImages
-from nlos_cam.view.viewer import Moment, NullViewer
+from nlos_cam.live import RunReport, frame_queue, run_live
+from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict
+from nlos_cam.recording import ReplayCamera, SdkReplayCamera
+from nlos_cam.render import Fault, SensedImages
+from nlos_cam.view import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
 LAST = 30

@@ -2,18 +2,15 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import tomli_w
-from nlos_calibration.rig import load_rig
+from small_frames import SheetNetwork
 
 from nlos_cam.camera import open_camera
 from nlos_cam.cli.main import main
 
-RIG = load_rig("paper-rig")
 PASSING = [
     {"kind": "duplicate", "at_frame": 10, "frames": 3},
     {"kind": "wrong_size", "at_frame": 15},
@@ -21,13 +18,6 @@ PASSING = [
     {"kind": "unplug", "at_frame": 40, "frames": 30},
 ]
 LASTING = [{"kind": "duplicate", "at_frame": 10}, {"kind": "unplug", "at_frame": 20, "frames": 1_000_000}]
-
-
-class FakeNetwork:
-    runtime, record = "nothing at all", SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
-
-    def __call__(self, *_: np.ndarray) -> np.ndarray:
-        return np.full((1, 64, 64), 0.5, np.float32)
 
 
 @pytest.fixture
@@ -40,7 +30,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
         return camera
 
     monkeypatch.setattr("nlos_cam.camera.open_camera", opened)
-    monkeypatch.setattr("nlos_cam.reconstruct.load_networks", lambda *_: FakeNetwork())
+    monkeypatch.setattr("nlos_cam.reconstruct.load_networks", lambda *_: SheetNetwork())
     monkeypatch.setattr("nlos_cam.reconstruct.load_uncertainty", lambda *_: None)
 
 

@@ -8,15 +8,14 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 from small_frames import FrameCamera, sheet_network
 
 from nlos_cam.frames import Frame
-from nlos_cam.live.loop import run_live
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.pipeline import Pipeline
+from nlos_cam.live import run_live
+from nlos_cam.reconstruct import CalibratedRig, Pipeline
+from nlos_cam.view import WebViewer
 from nlos_cam.view.server import Send
-from nlos_cam.view.web import WebViewer
 
 RIG = load_rig("paper-rig")
 MAX_WAITING_FRAMES = 100

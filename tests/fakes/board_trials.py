@@ -9,18 +9,14 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
+from nlos_calibration import BOARDS, INTERVAL_STDS, Board, Corners, Intrinsics, find_corners, load_rig, measures_of
 from nlos_calibration.arrays import Float64, UInt8
-from nlos_calibration.board import BOARDS, Board, Corners, find_corners
 from nlos_calibration.board_pose import BoardFit, PrintErrors
 from nlos_calibration.board_wall import BoardView, CameraErrors, fit_in_lidar
 from nlos_calibration.errors import BoardRefusedError
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.intervals import INTERVAL_STDS
-from nlos_calibration.rig import load_rig
-from nlos_calibration.wall import measures_of
 from synthetic_scenes import Illumination, Placement, at_near_edge, clean_infrared, corners_px, infrared_frames
 
-from nlos_cam.calibrate.synthetic import View, view
+from nlos_cam.calibrate import View, view
 
 Generator = np.random.Generator
 
@@ -109,9 +105,7 @@ def bench_at(distance_m: float, yaw_deg: float, pitch_deg: float = 0.0, **light:
     return BoardBench(A4, seen, at_near_edge(A4, seen), Illumination(**light))
 
 
-def random_bench(
-    generator: Generator, printed: PrintErrors, light: Illumination | None = None, camera: ColorCamera | None = None
-) -> BoardBench:
+def random_bench(generator: Generator, printed: PrintErrors, light: Illumination | None = None) -> BoardBench:
     """Return a bench inside the paper's ranges, with a board hung by hand and a printer's errors."""
     seen = view(generator.uniform(0.15, 0.30), generator.uniform(15, 75), generator.uniform(-10, 10), LIDAR)
     near = at_near_edge(A4, seen)
@@ -120,7 +114,7 @@ def random_bench(
         float(np.exp(std * generator.standard_normal())) for std in (printed.scale_std, printed.stretch_std)
     )
     placed = Placement(float(x_m), float(y_m), float(turn_rad), scale, stretch)
-    return BoardBench(A4, seen, placed, light or Illumination(), camera)
+    return BoardBench(A4, seen, placed, light or Illumination())
 
 
 def random_camera(generator: Generator, errors: CameraErrors) -> ColorCamera:

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
+from nlos_models import DoubtRecord, Recipe
 from nlos_models.inference import UncertaintyEstimate
-from nlos_models.recipe import Recipe
-from nlos_models.records import DoubtRecord
 
 RECIPE = Recipe(task="doubt", objects=8, outliers=4, empties=4, held_out=4, epochs=1, batch=4, learning_rate=1e-3)
 Says = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[float, float]]

@@ -45,10 +45,9 @@ def wall_frame(number: int, nearer_m: float = 0.0) -> Frame:
     return Frame(depth_m, ir, ir, number / 30, number, SMALL, {"laser_power": 40.0})
 
 
-def bare_wall(frames: int = 20) -> BareWall:
+def bare_wall() -> BareWall:
     statistics = BareWallStatistics(SMALL)
-    for number in range(frames):
-        frame = wall_frame(number)
+    for frame in map(wall_frame, range(20)):
         maps = maps_from_frame(frame)
         statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
     statistics.add_temperatures({"ldd_temperature": 40.0})

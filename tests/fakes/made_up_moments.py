@@ -4,15 +4,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 from small_frames import FrameCamera
 
 from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.objects.depth_map import object_box
+from nlos_cam.objects import object_box
+from nlos_cam.reconstruct import PhysicsCheckResult, Verdict
 from nlos_cam.reconstruct.network import Reconstruction, box_pose
-from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
-from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.view.viewer import Moment
+from nlos_cam.view import Moment
 
 RIG = load_rig("paper-rig")
 NOTHING = np.full((64, 64), np.nan, np.float32)

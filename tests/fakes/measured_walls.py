@@ -57,11 +57,12 @@ def exact_wall(**fields: Any) -> MeasuredWall:
     )
     if "reference" in fields:
         return MeasuredWall(record, fields["reference"])
-    return MeasuredWall(record, _reference(rig.wall_from_lidar, small, fields))
+    return MeasuredWall(record, exact_reference(rig.wall_from_lidar, small, fields))
 
 
-def _reference(pose: np.ndarray, intrinsics: Intrinsics, fields: dict[str, Any]) -> BareWall:
-    shape, cells = (HEIGHT, WIDTH), (64, 80)
+def exact_reference(pose: np.ndarray, intrinsics: Intrinsics, fields: dict[str, Any]) -> BareWall:
+    """Reference of a wall at a pose, to the last bit; `fields` replace its own."""
+    shape, cells = (intrinsics.height, intrinsics.width), (64, 80)
     exact: dict[str, Any] = {
         "depth_m": wall_depth(pose, intrinsics).astype(np.float32),
         "depth_std_m": np.full(shape, 0.0005, np.float32),
@@ -74,4 +75,4 @@ def _reference(pose: np.ndarray, intrinsics: Intrinsics, fields: dict[str, Any])
         "map_intensity": np.full(cells, 40, np.float32),
         "map_intensity_std": np.ones(cells, np.float32),
     }
-    return BareWall(**(exact | fields), frames=30, intrinsics=intrinsics)
+    return BareWall(**({"frames": 30, "intrinsics": intrinsics} | exact | fields))

@@ -3,15 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from nlos_calibration import INTERVAL_STDS, DepthMean, Intrinsics, LidarPose, Occluder, PinholeRecord, load_rig
 from nlos_calibration.errors import OccluderRefusedError
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.intervals import INTERVAL_STDS
-from nlos_calibration.noise import DepthMean
 from nlos_calibration.occluder import MIN_COLUMNS, find_occluder
-from nlos_calibration.rig import LidarPose, Occluder, PinholeRecord, load_rig
 from synthetic_scenes import Sheet, bench_depth
 
-from nlos_cam.calibrate.synthetic import View, depth_statistics, view, with_outliers
+from nlos_cam.calibrate import View, depth_statistics, view, with_outliers
 from nlos_cam.render import MultiBounce, Sensor, SensorModel
 
 Generator = np.random.Generator

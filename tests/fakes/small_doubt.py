@@ -12,10 +12,10 @@ from nlos_models.records import WATCHED, DoubtRecord, checksum_of_watched
 DARK_V = 0.3
 
 
-def watched_weights(folder: Path, seed: int = 0) -> Path:
+def watched_weights(folder: Path) -> Path:
     """Write files of random bytes named like a pipeline's."""
     folder.mkdir()
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     for name in (*WATCHED, "checkpoint.json"):
         (folder / name).write_bytes(generator.bytes(64))
     return folder

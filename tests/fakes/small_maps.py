@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nlos_models import checkpoint
+from nlos_models import Recipe, checkpoint
 from nlos_models import pipeline as networks
 from nlos_models.arrays import Float16
 from nlos_models.data import MapBatch, MapSet, map_batches
 from nlos_models.pipeline import RemappingNetwork
-from nlos_models.recipe import Recipe
 from torch import Tensor, nn
 from torch.nn import functional
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import torch
 from lightning_fabric import Fabric
-from nlos_models import train
-from nlos_models.recipe import Recipe
+from nlos_models import Recipe, train
 from nlos_models.train import Running, fit
 from torch import Tensor, nn
 

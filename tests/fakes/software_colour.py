@@ -5,13 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration.geometry import Intrinsics
+from nlos_calibration import Intrinsics
 from numpy.typing import NDArray
 
-from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.simulated import SoftwareLidar
-from nlos_cam.camera.streams import FRAMES_PER_S
-from nlos_cam.render.sensor.sensor import SensedImages
+from nlos_cam.camera import FRAMES_PER_S, SoftwareLidar, load_sdk
+from nlos_cam.render import SensedImages
 
 
 class SoftwareSdk:

@@ -7,11 +7,7 @@ import numba
 import numpy as np
 import pytest
 
-from nlos_cam.render import renderer
-from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.effects import Effects
-from nlos_cam.render.job import TransportJob
-from nlos_cam.render.scene import Scene
+from nlos_cam.render import Accuracy, Effects, Scene, TransportJob, renderer
 
 IMPLEMENTATIONS = ("cpu", "reference")
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from board_trials import FLAT, BoardBench, bench_at, coverage, random_bench
-from nlos_calibration.board import find_corners
-from nlos_calibration.board_pose import PrintErrors, fit_board
+from nlos_calibration import PrintErrors, find_corners, fit_board
 
 
 def assert_measured(bench: BoardBench, frames: int = 10, within_mm: float = 1.0, within_deg: float = 0.2) -> None:

@@ -19,21 +19,17 @@ from board_trials import (
     random_bench,
     random_camera,
 )
+from nlos_calibration import DepthMean, WallFit, fit_wall, load_rig
 from nlos_calibration.board_pose import BoardFit, PrintErrors
 from nlos_calibration.board_wall import EXACT, CameraErrors, wall_with_board
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.noise import DepthMean
-from nlos_calibration.rig import load_rig
-from nlos_calibration.wall import WallFit, fit_wall
 from software_colour import SoftwareColour, record_with_colour
 from synthetic_scenes import at_near_edge
 
-from nlos_cam.calibrate.color_view import capture_color_view
+from nlos_cam.calibrate import capture_color_view
 from nlos_cam.calibrate.synthetic import View, depth_frame
-from nlos_cam.camera import open_camera
-from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.simulated import SoftwareLidar
-from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
+from nlos_cam.camera import SoftwareLidar, load_sdk, open_camera
+from nlos_cam.render import DEPTH_UNIT_M, SensedImages
 
 
 def recorded(path: Path, frames: int = 4) -> Path:

@@ -6,13 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.backend_numba import histograms
-from nlos_cam.render.renderer import prepare, render, three_bounce, transient
-from nlos_cam.render.scene import Scene
+from nlos_cam.objects import object_depth
+from nlos_cam.render import STOPS, Accuracy, Scene, histograms, prepare, render, three_bounce, transient
 
 RIG = load_rig("paper-rig")
 SOME = np.arange(5120)[::23]

@@ -4,21 +4,16 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
-from nlos_models.inference import load_reconstructor, load_uncertainty_model
+from nlos_calibration import load_rig
+from nlos_models import load_reconstructor, load_uncertainty_model
 
 from nlos_cam.dataset.outliers import TRAINING_OUTLIERS, Stimulus, draw_outlier, ordinary, vary_empty_bench
-from nlos_cam.evaluate.subjects import echoes_of, sense
+from nlos_cam.evaluate import echoes_of, sense
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.objects.benchmark import benchmark_objects
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.pipeline import Arrival, FrameResult, Pipeline
-from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.render.renderer import render
-from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.render.sensor.sensor import Sensor
+from nlos_cam.objects import benchmark_objects, object_box
+from nlos_cam.reconstruct import Arrival, CalibratedRig, FrameResult, Pipeline, Verdict
+from nlos_cam.render import Sensor, SensorModel, render
 
 pytestmark = pytest.mark.slow
 

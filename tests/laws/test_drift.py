@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
+from nlos_calibration import TOLERANCE_DEG, TOLERANCE_M, Intrinsics, wall_depth
 from nlos_calibration.drift import BLIND_FRAMES, WINDOW_FRAMES, DriftCheck
-from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M, wall_depth
 from synthetic_scenes import (
     PINHOLE,
     SMALL,

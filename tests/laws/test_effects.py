@@ -7,15 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration.rig import Occluder, load_rig
+from nlos_calibration import Occluder, load_rig
 
-from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.effects import EFFECTS, included
+from nlos_cam.render import EFFECTS, STOPS, Accuracy, Scene, Surface, included, phong, transient
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
-from nlos_cam.render.material import Surface, phong
 from nlos_cam.render.planning import plan
-from nlos_cam.render.renderer import transient
-from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_facts import SceneFacts
 
 pytestmark = pytest.mark.slow

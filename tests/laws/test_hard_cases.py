@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration.rig import LidarPose, Rig, load_rig
+from nlos_calibration import LidarPose, Rig, load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.render import EFFECTS, Accuracy, Rendering, Scene, Surface, prepare
 from nlos_cam.render.echoes import strongest
-from nlos_cam.render.effects import EFFECTS
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
-from nlos_cam.render.material import Surface
-from nlos_cam.render.planning import prepare
-from nlos_cam.render.renderer import Rendering
-from nlos_cam.render.scene import Scene
 
 pytestmark = pytest.mark.slow
 RIG = load_rig("paper-rig")

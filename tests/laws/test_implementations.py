@@ -6,16 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from nlos_calibration.rig import Occluder, Rig, load_rig
+from nlos_calibration import Occluder, Rig, load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.depth_map import cell_centers_m, object_box
-from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.effects import EFFECTS
-from nlos_cam.render.material import Material, Surface
-from nlos_cam.render.renderer import render, render_all, three_bounce
-from nlos_cam.render.scene import Scene
+from nlos_cam.objects import cell_centers_m, object_box, object_depth
+from nlos_cam.render import EFFECTS, Accuracy, Material, Scene, Surface, render, render_all, three_bounce
 
 pytestmark = pytest.mark.slow
 RIG = load_rig("paper-rig")

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration.rig import LidarPose, load_rig
+from nlos_calibration import LidarPose, load_rig
 
-from nlos_cam.objects.placement import object_depth
+from nlos_cam.objects import object_depth
+from nlos_cam.render import Scene, render, three_bounce, transient
 from nlos_cam.render.echoes import pulse_bins, with_pulse
 from nlos_cam.render.geometry import NEAR_DIAGONALS, cast, contact_m2, softened
 from nlos_cam.render.material import Brdf, Surface, phong, retroreflective
-from nlos_cam.render.renderer import render, three_bounce, transient
-from nlos_cam.render.scene import Scene
 
 RIG = load_rig("paper-rig")
 SEEDS = (3, 20_000_001, 20_000_009)

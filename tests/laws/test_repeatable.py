@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.effects import EFFECTS
-from nlos_cam.render.material import Surface, phong
-from nlos_cam.render.renderer import render, render_all
-from nlos_cam.render.scene import Scene
+from nlos_cam.render import EFFECTS, STOPS, Accuracy, Scene, Surface, phong, render, render_all
 
 pytestmark = pytest.mark.slow
 RIG = load_rig("paper-rig")

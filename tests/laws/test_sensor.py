@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration.rig import Rig, load_rig
+from nlos_calibration import Rig, load_rig
 
 from nlos_cam.frames import SATURATED
-from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.geometry import cast
-from nlos_cam.render.renderer import MultiBounce, Rendering, render
-from nlos_cam.render.scene import Scene
+from nlos_cam.objects import object_depth
+from nlos_cam.render import MultiBounce, Rendering, Scene, SensedImages, Sensor, cast, render
 from nlos_cam.render.sensor.bias import PATCHES_SEED, RIPPLES_SEED, WAVES, ripples, smooth_patches, texture
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MAX_CONFIDENCE, SensorModel, WarmUp
-from nlos_cam.render.sensor.sensor import SensedImages, Sensor
 
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 RICH = SensorModel(ambient_counts=40, read_noise_counts=1.5, dead_share=0)

@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.effects import EFFECTS
+from nlos_cam.render import EFFECTS, Accuracy, Radiometry, Scene, Surface, TransportJob, phong, prepare
 from nlos_cam.render.geometry import Relay
-from nlos_cam.render.job import TransportJob
-from nlos_cam.render.material import Surface, phong
-from nlos_cam.render.planning import prepare
-from nlos_cam.render.scene import Radiometry, Scene
 
 RIG = load_rig("paper-rig")
 OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})

@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nlos_calibration import WallFit, fit_wall, load_rig, wall_depth
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import angles_from_normal, wall_from_plane
 from nlos_calibration.plane import fit_depth
-from nlos_calibration.rig import load_rig
-from nlos_calibration.wall import WallFit, fit_wall, wall_depth
 from numpy.typing import NDArray
 
-from nlos_cam.calibrate.synthetic import View, depth_statistics, view
+from nlos_cam.calibrate import View, depth_statistics, view
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 LONGEST_DEPTH_M = 4.0

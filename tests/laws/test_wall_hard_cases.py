@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
+from nlos_calibration import WallFit, fit_wall, load_rig
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
-from nlos_calibration.rig import load_rig
-from nlos_calibration.wall import WallFit, fit_wall
 
-from nlos_cam.calibrate.synthetic import (
+from nlos_cam.calibrate import (
     View,
     bent,
     curved,

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fake_bench import Bench
 from hypothesis import settings
+from measured_walls import exact_reference
 from nlos_calibration.arrays import Float32
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.noise import depth_noise_m
-from nlos_calibration.reference import BareWall
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import MeasuredWall, new_wall_record
@@ -46,6 +47,12 @@ def tool() -> Iterator[Callable[[str], ModuleType]]:
 def noise_bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Forty frames of noise, recorded "packed" and "plain", and each of them "-unindexed" as a kill leaves it."""
     return make_all(tmp_path_factory.mktemp("noise"))
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    """An L515 on a healthy host."""
+    return Bench(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -123,24 +130,11 @@ def fitted_wall(
     depth_m = wall_depth(pose, pinhole)
     depth_m[depth_m > 9.0] = np.nan
     fit = fit_wall(depth_m, pinhole, np.random.default_rng(0))
-    blank, cells = np.zeros(depth_m.shape, np.float32), np.zeros((64, 80), np.float32)
-    reference = BareWall(
-        depth_m=depth_m.astype(np.float32),
-        depth_std_m=depth_noise_m(depth_m).astype(np.float32),
-        ir=blank + np.float32(48.0),
-        ir_std=blank,
-        saturated=blank,
-        inliers=np.isfinite(depth_m),
-        map_depth_m=cells,
-        map_depth_std_m=cells,
-        map_intensity=cells,
-        map_intensity_std=cells,
-        frames=60,
-        intrinsics=pinhole,
-    )
+    seen = {"depth_m": depth_m.astype(np.float32), "depth_std_m": depth_noise_m(depth_m).astype(np.float32)}
+    seen |= {"ir": np.full(depth_m.shape, 48, np.float32), "inliers": np.isfinite(depth_m), "frames": 60}
     fields = {"noise_scale": 1.0, **others}
     record = new_wall_record(fit, pinhole, camera="l515:f0246262", frames=60, created=date(2026, 1, 31), others=fields)
-    return MeasuredWall(record, reference)
+    return MeasuredWall(record, exact_reference(pose, pinhole, seen))
 
 
 @pytest.fixture(scope="session")

@@ -9,15 +9,12 @@ from typing import Any
 
 import pytest
 import trimesh
-from nlos_calibration.rig import load_rig
-from nlos_calibration.wall_record import load_measured
+from nlos_calibration import load_measured, load_rig
 
-from nlos_cam.camera import Recording
-from nlos_cam.camera.simulated import SimulatedCamera
-from nlos_cam.camera.simulated_world import open_world
+from nlos_cam.camera import Recording, SimulatedCamera, open_world
 from nlos_cam.dataset import DatasetPlan, build_dataset
 from nlos_cam.dataset.samples import Samples, make_samples
-from nlos_cam.render.scene_file import load_scene
+from nlos_cam.render import load_scene
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCENE = 'name = "still"\nrig = "paper-rig"\nobject = { category = "cup", seed = 4, size_m = 0.17 }\n'

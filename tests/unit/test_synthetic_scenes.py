@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 import synthetic_scenes as scenes
-from nlos_calibration.board import BOARDS
-from nlos_calibration.reference import BareWallStatistics
-from nlos_calibration.rig import LidarPose, Occluder, load_rig
-from nlos_calibration.wall import wall_depth
+from nlos_calibration import BOARDS, BareWallStatistics, LidarPose, Occluder, load_rig, wall_depth
 
 from nlos_cam.calibrate import synthetic
-from nlos_cam.render.geometry import cast
+from nlos_cam.render import cast
 
 RIG, PAPER = load_rig("bare-wall"), load_rig("paper-rig")
 PINHOLE, A4 = RIG.pinhole, BOARDS["a4"]

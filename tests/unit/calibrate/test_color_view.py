@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from fake_librealsense import FakeSdk
 from fake_lidar import COLOUR_FROM_DEPTH, LENS, FakeLidar
-from nlos_calibration.board import Corners
+from nlos_calibration import Corners, Intrinsics
 from nlos_calibration.board_wall import BoardView, CameraErrors, undistorted
-from nlos_calibration.geometry import Intrinsics
 from software_colour import SoftwareColour, SoftwareSdk, record_with_colour
 
 from nlos_cam.calibrate.color_view import SETTLING_FRAMES, TO_GRAY, capture_color_view
-from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.simulated import SoftwareLidar
+from nlos_cam.camera import SoftwareLidar, load_sdk
 from nlos_cam.errors import (
     CameraError,
     CameraLostError,
@@ -25,8 +23,8 @@ from nlos_cam.errors import (
     RecordingError,
     StreamMissingError,
 )
-from nlos_cam.recording.bag_reader import BagReader
-from nlos_cam.render.sensor.sensor import SensedImages
+from nlos_cam.recording import BagReader
+from nlos_cam.render import SensedImages
 
 SMALL = Intrinsics(64, 48, 60.0, 61.0, 33.0, 22.0)
 FLAT = SensedImages(np.full((48, 64), 800, np.uint16), np.full((48, 64), 48, np.uint8), np.full((48, 64), 15, np.uint8))

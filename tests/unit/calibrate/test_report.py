@@ -6,8 +6,7 @@ from html import unescape
 import numpy as np
 import pytest
 from measured_walls import BOARD
-from nlos_calibration.summary import wall_facts
-from nlos_calibration.wall_record import MeasuredWall, OccluderRecord, WallRecord
+from nlos_calibration import MeasuredWall, OccluderRecord, WallRecord, wall_facts
 from page_reader import PageReader, read_page
 
 from nlos_cam.calibrate import report

@@ -3,8 +3,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
-from nlos_calibration.rig import Extent
-from nlos_calibration.wall_record import MeasuredWall, OccluderRecord, WallRecord
+from nlos_calibration import Extent, MeasuredWall, OccluderRecord, WallRecord
 
 from nlos_cam.calibrate.report_drawings import _facing, bench_picture, drawn_limits, footprint_picture
 from nlos_cam.report import Picture

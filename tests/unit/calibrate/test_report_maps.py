@@ -4,9 +4,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from nlos_calibration.noise import depth_noise_m
-from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_record import MeasuredWall
+from nlos_calibration import MeasuredWall, depth_noise_m, wall_depth
 
 from nlos_cam.calibrate.report_maps import block_majority, block_side, expected_std_m, in_blocks, residual_m, wall_maps
 from nlos_cam.report import Picture, figure_of, png

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 from board_trials import CALIBRATION, ColorCamera, bench_at, through_lens
+from nlos_calibration import BOARDS, Corners, Light, PrintErrors, load_rig, normal_from_angles
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import BOARDS, Corners, Light
-from nlos_calibration.board_pose import PrintErrors
 from nlos_calibration.board_wall import (
     AGREE_SIGMAS,
     EXACT,
@@ -22,12 +21,10 @@ from nlos_calibration.board_wall import (
     wall_with_board,
 )
 from nlos_calibration.errors import BoardRefusedError, WallRefusedError
-from nlos_calibration.geometry import normal_from_angles
-from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallFit, WallMeasures, fit_wall, measures_of
 from synthetic_scenes import at_near_edge, clean_infrared, corners_px, infrared_frames
 
-from nlos_cam.calibrate.synthetic import View, depth_statistics
+from nlos_cam.calibrate import View, depth_statistics
 
 RIG = load_rig("bare-wall")
 PINHOLE, A4 = RIG.pinhole, BOARDS["a4"]

@@ -2,18 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from nlos_calibration.drift import (
-    MIN_FRAMES,
-    MIN_PIXELS,
-    TOLERANCE_C,
-    WINDOW_FRAMES,
-    Drift,
-    DriftCheck,
-    DriftWindow,
-    settings_changed,
-)
+from nlos_calibration import WINDOW_FRAMES, BareWall, Drift, DriftCheck, settings_changed
+from nlos_calibration.drift import MIN_FRAMES, MIN_PIXELS, TOLERANCE_C, DriftWindow
 from nlos_calibration.errors import CalibrationError
-from nlos_calibration.reference import BareWall
 from nlos_calibration.wall_tracker import WallObservation
 from synthetic_scenes import SMALL, WallPose, reference_of_wall, wall_from_lidar
 

@@ -2,13 +2,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from nlos_calibration import MeanNoise, depth_noise_m, load_rig
 from nlos_calibration.arrays import Float64
 from nlos_calibration.flatness import Flatness, Ripples, flatness, ripples
-from nlos_calibration.noise import MeanNoise, depth_noise_m
 from nlos_calibration.plane import PlaneFit, fit_depth
-from nlos_calibration.rig import load_rig
 
-from nlos_cam.calibrate.synthetic import view
+from nlos_cam.calibrate import view
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 RAYS = PINHOLE.rays()

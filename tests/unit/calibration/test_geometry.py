@@ -1,12 +1,7 @@
 import numpy as np
 import pytest
-from nlos_calibration.geometry import (
-    Intrinsics,
-    angles_from_normal,
-    facing_angle_rad,
-    normal_from_angles,
-    wall_from_plane,
-)
+from nlos_calibration import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
+from nlos_calibration.geometry import angles_from_normal
 
 ANGLES = [(yaw, pitch) for yaw in (-1.2, -0.3, 0.0, 0.8, 1.3) for pitch in (-1.0, 0.0, 0.4)]
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 318.0, 241.0)

@@ -1,13 +1,12 @@
 import numpy as np
 import pytest
+from nlos_calibration import MeanNoise, depth_noise_m, load_rig
 from nlos_calibration.errors import OccluderRefusedError
-from nlos_calibration.noise import MeanNoise, depth_noise_m
 from nlos_calibration.occluder import MAX_BEHIND, Edge, OccluderFit, find_edge, find_occluder
-from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
 from synthetic_scenes import Sheet, ball, bench_depth
 
-from nlos_cam.calibrate.synthetic import View, view
+from nlos_cam.calibrate import View, view
 
 PAPER = load_rig("paper-rig")
 PINHOLE = PAPER.pinhole.scaled(160, 120)

@@ -1,12 +1,9 @@
 import numpy as np
 import pytest
+from nlos_calibration import WallFit, depth_noise_m, fit_wall, load_rig, normal_from_angles, wall_depth, wall_from_plane
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError
-from nlos_calibration.geometry import normal_from_angles, wall_from_plane
-from nlos_calibration.noise import depth_noise_m
 from nlos_calibration.range_offset import TAPE_STD_M, FitWith, fit_with_tape_distance
-from nlos_calibration.rig import load_rig
-from nlos_calibration.wall import WallFit, fit_wall, wall_depth
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 

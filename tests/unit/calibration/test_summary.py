@@ -4,9 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from measured_walls import BOARD, exact_wall
-from nlos_calibration.intervals import INTERVAL_STDS
-from nlos_calibration.rig import OccluderRecord
-from nlos_calibration.summary import wall_facts, with_degrees, with_mm
+from nlos_calibration import INTERVAL_STDS, OccluderRecord, wall_facts, with_degrees, with_mm
 
 RECORD = exact_wall().record
 OFFSET = {"range_offset_m": -0.0045, "range_offset_std_m": 0.0005, "range_offset_cause": "depth"}

@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
-from nlos_models.data import MapSet
+from nlos_calibration import load_rig
+from nlos_models import MapSet
 from small_maps import SmallDataset
 
 from nlos_cam.cli.main import main
 from nlos_cam.dataset import HELD_OUT_SEED, TRAINING_SEED, DatasetPlan, procedural_images
-from nlos_cam.evaluate import baselines, report, subjects
-from nlos_cam.evaluate.metrics import TARGETS
-from nlos_cam.objects.benchmark import benchmark_objects
+from nlos_cam.evaluate import TARGETS, baselines, report, subjects
+from nlos_cam.objects import benchmark_objects
 
 RIG = load_rig("paper-rig")
 STORED = ["--dataset", "held-out", "--training", "held-out"]

@@ -10,17 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.recipe import Recipe
+from nlos_models import CheckpointRecord, Recipe
 
 from nlos_cam import evaluate
 from nlos_cam.cli.main import main
-from nlos_cam.evaluate import runtime_tradeoff
-from nlos_cam.evaluate.render_tradeoff import RenderRow, measure_renders, render_settings
-from nlos_cam.render.accuracy import STOPS
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene import Scene
-from nlos_cam.render.scene_file import paper_scene
+from nlos_cam.evaluate import RenderRow, measure_renders, render_settings, runtime_tradeoff
+from nlos_cam.render import STOPS, Scene, paper_scene, render
 
 SMALL = {name: replace(stop, relay_columns=8, relay_rows=4) for name, stop in STOPS.items()}
 FIRST = 6  # measured rows: the accuracy stops, and two of the ingredients

@@ -11,22 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nlos_calibration.rig import load_rig
-from nlos_models import checkpoint, runs, tasks, train
+from nlos_calibration import load_rig
+from nlos_models import checkpoint, export_folder, load_doubt, load_pipeline, load_record, runs, tasks, train
 from nlos_models.arrays import Float16
-from nlos_models.checkpoint import load_pipeline, load_record
-from nlos_models.doubt_network import load_doubt
-from nlos_models.export import export_folder
 from safetensors.torch import load_file, save_file
 from small_maps import SmallDataset, small_images, small_maps, untrained_weights, use_small_networks
 
 from nlos_cam.cli import train as command
 from nlos_cam.cli.main import main
-from nlos_cam.dataset import DatasetPlan, doubt_samples, training_maps
+from nlos_cam.dataset import TRAINING_OUTLIERS, DatasetPlan, doubt_samples, training_maps
 from nlos_cam.dataset.doubt_samples import EMPTY, ORDINARY, DoubtSamples
-from nlos_cam.dataset.outliers import TRAINING_OUTLIERS
 from nlos_cam.files import claim
-from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects import CATEGORIES
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

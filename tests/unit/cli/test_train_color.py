@@ -7,12 +7,9 @@ from typing import Any
 
 import pytest
 import torch
-from nlos_calibration.rig import load_rig
-from nlos_models.checkpoint import load_encoder, load_pipeline, load_record, load_vae
+from nlos_calibration import load_rig
+from nlos_models import SIMULATION_ONLY, load_encoder, load_pipeline, load_reconstructor, load_record, load_vae, run
 from nlos_models.errors import CheckpointError
-from nlos_models.inference import load_reconstructor
-from nlos_models.recipe import SIMULATION_ONLY
-from nlos_models.tasks import run
 from small_run import log_rows
 
 from nlos_cam.cli.main import main
@@ -20,7 +17,7 @@ from nlos_cam.dataset import DatasetPlan, open_dataset
 from nlos_cam.dataset.samples import make_samples
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.errors import RecordingError
-from nlos_cam.objects.textures import TEXTURES
+from nlos_cam.objects import TEXTURES
 
 pytestmark = [pytest.mark.usefixtures("narrow_networks", "one_thread"), pytest.mark.slow]
 

@@ -7,22 +7,19 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
-import numpy as np
 import pytest
 import typer
 from made_up_moments import RIG, Recorded, full_moment
-from small_frames import sheet_network
+from small_frames import SheetNetwork
 from view_streams import EVERYWHERE, ask
 
 from nlos_cam.cli.main import main
 from nlos_cam.cli.view import announce_view, opened_in_browser, saving, viewer_of
 from nlos_cam.errors import NlosCamError
-from nlos_cam.live.control import RunControl
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.view.session_file import SessionFile
-from nlos_cam.view.viewer import NullViewer
+from nlos_cam.live import RunControl
+from nlos_cam.reconstruct import CalibratedRig
+from nlos_cam.view import NullViewer, SessionFile
 
 BENCH = CalibratedRig(RIG)
 
@@ -62,18 +59,8 @@ def test_saving_adds_a_file_to_another_viewer(tmp_path: Path) -> None:
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    record = SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
-
-    class FakeNetwork:
-        runtime = "nothing at all"
-
-        def __call__(self, *_: np.ndarray) -> np.ndarray:
-            return sheet_network()
-
-    network: Any = FakeNetwork()
-    network.record = record
     monkeypatch.setattr("nlos_cam.camera.open_camera", lambda *_, **__: Recorded(12))
-    monkeypatch.setattr("nlos_cam.reconstruct.load_networks", lambda *_: network)
+    monkeypatch.setattr("nlos_cam.reconstruct.load_networks", lambda *_: SheetNetwork())
     monkeypatch.setattr("nlos_cam.reconstruct.load_uncertainty", lambda *_: None)
     monkeypatch.chdir(tmp_path)
 

@@ -1,16 +1,10 @@
 import errno
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import usb.core
-from fake_bench import Bench, fake_device
-
-
-@pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path)
+from fake_bench import fake_device
 
 
 @pytest.fixture

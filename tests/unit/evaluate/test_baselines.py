@@ -6,15 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import LidarPose, load_rig
-from nlos_models.data import MapSet
+from nlos_calibration import LidarPose, load_rig
+from nlos_models import MapSet
 
 from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan, Objects, procedural_images
 from nlos_cam.evaluate import baselines
 from nlos_cam.evaluate.baselines import answers_with_nearest, mean_image, training_maps, trivial_answers
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.objects.generators import CATEGORIES
-from nlos_cam.objects.placement import object_depth
+from nlos_cam.objects import CATEGORIES, object_box, object_depth
 
 RIG = load_rig("paper-rig")
 

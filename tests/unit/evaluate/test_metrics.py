@@ -4,28 +4,24 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
 from nlos_cam.dataset import procedural_images
+from nlos_cam.evaluate import TARGETS, advantage, judge, over_objects, per_object
 from nlos_cam.evaluate.metrics import (
-    TARGETS,
     Predictions,
-    advantage,
     curve,
     detail_per_cm,
     error_by_zone,
     interval,
-    judge,
     meets,
-    over_objects,
     per_category,
-    per_object,
     quality_figures,
     rank_correlation,
     surface_cm2,
     targets_met,
 )
-from nlos_cam.objects.depth_map import depth_from_image, object_box
+from nlos_cam.objects import depth_from_image, object_box
 
 BOX = object_box(load_rig("paper-rig"))
 PITCH_CM = 25 / 64

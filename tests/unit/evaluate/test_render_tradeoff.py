@@ -8,26 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.evaluate.render_tradeoff import (
-    REPEATS,
-    Part,
-    RenderFacts,
+from nlos_cam.evaluate import (
     RenderRow,
     as_table,
     draw_renders,
     machine,
     measure_renders,
-    pareto_front,
     render_document,
     render_facts,
     render_settings,
 )
-from nlos_cam.render.accuracy import STOPS
-from nlos_cam.render.accuracy_search import Agreement, Work
-from nlos_cam.render.scene import Scene
+from nlos_cam.evaluate.render_tradeoff import REPEATS, Part, RenderFacts, pareto_front
+from nlos_cam.render import STOPS, Agreement, Scene, Work
 
 RIG = load_rig("paper-rig")
 SMALL = {name: replace(stop, relay_columns=12, relay_rows=8) for name, stop in STOPS.items()}

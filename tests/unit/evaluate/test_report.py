@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 from page_reader import read_page
 
 from nlos_cam.dataset import procedural_images
-from nlos_cam.evaluate import report
-from nlos_cam.evaluate.figures import LABELS
+from nlos_cam.evaluate import LABELS, report
 from nlos_cam.evaluate.metrics import TARGETS, Interval, Predictions
 from nlos_cam.evaluate.report import Evaluation, Unseen, as_figures, document, format_interval, write_report
 from nlos_cam.objects import object_box, object_depth

@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_calibration.rig import load_rig
-from nlos_models import checkpoint
+from nlos_calibration import load_rig
+from nlos_models import checkpoint, load_doubt
 from nlos_models.compressor import Compressor
-from nlos_models.doubt_network import load_doubt
 from nlos_models.vae import ResVae
 from small_doubt import small_doubt_set, untrained_doubt, watched_weights
 from small_maps import (

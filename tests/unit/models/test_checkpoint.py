@@ -7,12 +7,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from nlos_models import checkpoint
+from nlos_models import CHECKSUMS, SIMULATION_ONLY, checkpoint
 from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
-from nlos_models.files import CHECKSUMS
 from nlos_models.pipeline import RemappingNetwork, new_vae
-from nlos_models.recipe import SIMULATION_ONLY
 from nlos_models.vae import Decoder, ResVae
 from safetensors.torch import load_file, save_file
 from small_run import small_recipe, state_of

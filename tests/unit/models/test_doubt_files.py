@@ -5,10 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models import doubt_network, records
+from nlos_models import DoubtRecord, doubt_network, load_uncertainty_model, records
 from nlos_models.errors import CheckpointError
-from nlos_models.inference import load_uncertainty_model
-from nlos_models.records import DoubtRecord
 from small_doubt import untrained_doubt, watched_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")

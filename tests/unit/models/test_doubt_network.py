@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 from fake_doubter import RECIPE
-from nlos_models import doubt_training
+from nlos_models import Running, doubt_training
 from nlos_models.doubt_network import MAX_ERROR_V, MIN_ERROR_V, CalibratedDoubt, DoubtNetwork, DoubtOutput
-from nlos_models.train import Running
 from small_doubt import DARK_V, small_doubt_set
 from small_maps import hard_maps
 

@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from nlos_models import checkpoint
+from nlos_models import checkpoint, shipped_folder
 from nlos_models.compressor import Bottleneck, Compressor, InvertedResidual, ResNet50
 from nlos_models.pipeline import CHANNELS, COLOR_OUTPUTS, new_vae
-from nlos_models.records import shipped_folder
 from nlos_models.vae import LATENT, LOG_VARIANCE_LIMIT, Encoder, ResBlock, ResVae
 from safetensors.torch import load_file
 from torch import nn

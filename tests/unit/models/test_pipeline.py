@@ -3,22 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from nlos_models import MIN_V, Preprocess, channel_statistics, cut_silhouette, lift_edges, split_and_stack
 from nlos_models.compressor import Compressor, ResNet50
 from nlos_models.data import flip_some
-from nlos_models.metrics import MIN_V
-from nlos_models.pipeline import (
-    KEPT_SHARE,
-    WINDOW,
-    Preprocess,
-    RemappingNetwork,
-    channel_statistics,
-    cut_silhouette,
-    lift_edges,
-    new_pipeline,
-    new_vae,
-    split_and_stack,
-    stacked_channels,
-)
+from nlos_models.pipeline import KEPT_SHARE, WINDOW, RemappingNetwork, new_pipeline, new_vae, stacked_channels
 from small_maps import HARD_MAPS, hard_maps
 from torch import Tensor
 

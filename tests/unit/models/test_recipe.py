@@ -4,16 +4,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from nlos_models import Recipe, load_recipe, packaged_recipes
 from nlos_models.errors import ModelError, RecipeError
-from nlos_models.recipe import (
-    PLATEAU_PATIENCE,
-    SMALLEST_RATE,
-    Recipe,
-    has_ended,
-    load_recipe,
-    packaged_recipes,
-    schedule_of,
-)
+from nlos_models.recipe import PLATEAU_PATIENCE, SMALLEST_RATE, has_ended, schedule_of
 from small_run import small_recipe
 from torch import nn
 

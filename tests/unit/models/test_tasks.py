@@ -6,12 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models import tasks, train
+from nlos_models import Recipe, Running, Scores, tasks, train
 from nlos_models.data import InMemory, map_batches
 from nlos_models.errors import TrainingError
 from nlos_models.pipeline import RemappingNetwork, channel_statistics, split_and_stack
-from nlos_models.recipe import Recipe
-from nlos_models.train import Running, Scores
 from small_maps import SmallCompressor, SmallVae, small_images, small_maps, use_small_networks
 from small_run import Stopped, changed_tensors, log_rows, small_recipe, state_of, stop_halfway
 from torch import Tensor

@@ -7,15 +7,10 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration.rig import ObjectBox, load_rig
+from nlos_calibration import ObjectBox, load_rig
 
-from nlos_cam.objects.depth_map import (
-    cell_centers_m,
-    depth_from_image,
-    image_from_depth,
-    orthographic_depth,
-    share_outside,
-)
+from nlos_cam.objects import cell_centers_m, depth_from_image, image_from_depth, orthographic_depth
+from nlos_cam.objects.depth_map import share_outside
 
 BOX = ObjectBox(x_min_m=0.0, x_max_m=0.64, y_min_m=-0.32, y_max_m=0.32, z_near_m=0.1, z_far_m=0.6)
 X, Y = np.meshgrid(*cell_centers_m(BOX))

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float64
-from nlos_calibration.rig import load_rig
 from numpy.typing import NDArray
 
-from nlos_cam.objects.depth_map import object_box, orthographic_depth
+from nlos_cam.objects import category_triangles, object_box, orthographic_depth, place, random_pose
 from nlos_cam.objects.generators import CATEGORIES, Category, Setting, category
-from nlos_cam.objects.placement import category_triangles, place, random_pose
 from nlos_cam.objects.primitives import box
-from nlos_cam.render.scene_file import paper_scene
+from nlos_cam.render import paper_scene
 
 View = Callable[..., NDArray[np.float32]]
 

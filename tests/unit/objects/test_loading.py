@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects import Pose, category_triangles, load_object, object_box, orthographic_depth, place
-from nlos_cam.objects.generators import find_category
+from nlos_cam.objects import Pose, category_triangles, find_category, load_object, object_box, orthographic_depth, place
 
 BOX = object_box(load_rig("paper-rig"))
 POSE = Pose(size_m=0.15, tilt_y_rad=0.3)

@@ -12,15 +12,13 @@ import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from nlos_calibration.rig import ObjectBox, load_rig
+from nlos_calibration import ObjectBox, load_rig
 from trimesh.exchange.ply import export_ply
 
 from nlos_cam.errors import SceneError
+from nlos_cam.objects import Pose, object_box, random_pose
 from nlos_cam.objects import meshes as files
-from nlos_cam.objects import meshes as mesh_folder
-from nlos_cam.objects.depth_map import object_box
 from nlos_cam.objects.meshes import POSES, MeshFile, folder_objects, mesh_depth, plain, read_depth_map, read_mesh
-from nlos_cam.objects.placement import Pose, random_pose
 
 SOLID = trimesh.creation.torus(0.3, 0.1, major_sections=9, minor_sections=5)
 EXPORTS = {
@@ -379,7 +377,7 @@ def test_mesh_depth_draws_another_pose_for_an_edge_on_sheet(monkeypatch: pytest.
         poses.append(Pose() if not poses else random_pose(generator, box))
         return poses[-1]
 
-    monkeypatch.setattr(mesh_folder, "random_pose", first_along_the_sight)
+    monkeypatch.setattr(files, "random_pose", first_along_the_sight)
     lying = np.array([[[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[1, 0, 0], [1, 0, 1], [0, 0, 1]]], np.float64)
     _, depth_m = mesh_depth(3, ["sheet"], BOX, read=lambda name: MeshFile(Path(name), "", lying))
     assert 1 < len(poses) <= POSES

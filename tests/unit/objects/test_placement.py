@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
+from nlos_calibration import ObjectBox, load_rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import ObjectBox, load_rig
 
 from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.benchmark import BenchmarkObject, benchmark_objects
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.objects.generators import CATEGORIES
+from nlos_cam.objects import CATEGORIES, BenchmarkObject, benchmark_objects, object_box
 from nlos_cam.objects.placement import (
     POSE_UNITS,
     Pose,
@@ -54,7 +52,6 @@ def test_deep_mesh_is_flattened_and_fit_reports_it() -> None:
     shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
     flattened = fit_in_box(CUP, Pose(size_m=0.2), shallow)
     assert flattened.depth_m == inside.depth_m > flattened.room_m == pytest.approx(0.03)
-    shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
     deep, flat = _points(Pose()), _points(Pose(), shallow)
     assert flat[:, 2].max() == pytest.approx(shallow.z_far_m)
     np.testing.assert_allclose(flat[:, :2], deep[:, :2])

@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
-from nlos_models.metrics import BLACK_V
+from nlos_calibration import load_rig
+from nlos_models import BLACK_V
 from nlos_models.pipeline import KEPT_SHARE
 
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.objects.placement import object_depth
-from nlos_cam.objects.textures import TEXTURES, image_from_albedo, paint
-from nlos_cam.render.material import Surface
+from nlos_cam.objects import TEXTURES, image_from_albedo, object_box, object_depth, paint
+from nlos_cam.render import Surface
 
 BOX = object_box(load_rig("paper-rig"))
 

@@ -5,29 +5,24 @@ from threading import Event
 import numpy as np
 import pytest
 from fake_wall import WallCamera
+from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.rig import load_rig
 from small_frames import sheet_network
 
 from nlos_cam.frames import LidarMaps
-from nlos_cam.live.loop import run_live
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.objects.placement import object_depth
-from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.physics_check import (
-    Expected,
+from nlos_cam.live import run_live
+from nlos_cam.objects import object_box, object_depth
+from nlos_cam.reconstruct import (
+    CalibratedRig,
     PeriodicPhysicsCheck,
+    Pipeline,
     check_reconstruction,
     describe_failure,
-    explain,
-    fit_gain,
     log_warning,
-    mean_cost,
 )
-from nlos_cam.reconstruct.pipeline import Pipeline
-from nlos_cam.render.renderer import render
-from nlos_cam.render.scene import Scene
-from nlos_cam.view.viewer import Moment, NullViewer
+from nlos_cam.reconstruct.physics_check import Expected, explain, fit_gain, mean_cost
+from nlos_cam.render import Scene, render
+from nlos_cam.view import Moment, NullViewer
 
 SHAPE = 64, 80
 GAIN = 1e5

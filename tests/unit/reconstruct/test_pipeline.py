@@ -14,11 +14,10 @@ from nlos_calibration.errors import CalibrationError
 from small_frames import sheet_network
 
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.live.frame_queue import FrameReader
+from nlos_cam.live import FrameReader
 from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD, iterate_batched, iterate_results, with_telemetry
+from nlos_cam.reconstruct import Clock, FrameConditions, PeriodicPhysicsCheck, PhysicsCheckResult, Verdict
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
-from nlos_cam.reconstruct.network import Clock
-from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
 from nlos_cam.reconstruct.pipeline import (
     FrameResult,
     Pipeline,
@@ -27,7 +26,6 @@ from nlos_cam.reconstruct.pipeline import (
     frame_conditions,
     load_networks,
 )
-from nlos_cam.reconstruct.verdict import FrameConditions, Verdict
 
 
 def all_steps(

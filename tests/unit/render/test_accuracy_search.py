@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.accuracy import STOPS
+from nlos_cam.render import STOPS, Scene, Surface, prepare, render, three_bounce
 from nlos_cam.render.accuracy_search import (
     AccuracyChoice,
     EchoMaps,
@@ -23,10 +23,6 @@ from nlos_cam.render.accuracy_search import (
     predict,
     relative_error,
 )
-from nlos_cam.render.material import Surface
-from nlos_cam.render.planning import prepare
-from nlos_cam.render.renderer import render, three_bounce
-from nlos_cam.render.scene import Scene
 
 RIG = load_rig("paper-rig")
 SMALL = tuple(

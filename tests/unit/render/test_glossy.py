@@ -4,16 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.render import backend_numba, glossy
-from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.render import Accuracy, Scene, TransportJob, backend_numba, glossy, prepare
 from nlos_cam.render.brdf_table import scattered
 from nlos_cam.render.echoes import strongest
-from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Brdf, Surface, phong, retroreflective
-from nlos_cam.render.planning import prepare
-from nlos_cam.render.scene import Scene
 
 pytestmark = pytest.mark.slow
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)

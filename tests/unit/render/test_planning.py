@@ -7,18 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.objects.placement import object_depth
+from nlos_cam.objects import object_box, object_depth
+from nlos_cam.render import Radiometry, Scene, Surface, phong
 from nlos_cam.render.accuracy import MAX_BEAMS_PER_CELL, MAX_RELAY_CELLS, STOPS, Accuracy, accuracy_named
 from nlos_cam.render.effects import EFFECTS, decide, included
 from nlos_cam.render.energy_survey import CAUTION, EnergySurvey
 from nlos_cam.render.geometry import NO_OCCLUDER, SPEED_OF_LIGHT_M_PER_S
-from nlos_cam.render.material import Surface, phong
 from nlos_cam.render.planning import RenderProblem, plan, prepare
-from nlos_cam.render.scene import Radiometry, Scene
 from nlos_cam.render.scene_facts import SceneFacts
 
 RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")

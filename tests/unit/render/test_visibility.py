@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import ObjectBox, load_rig
+from nlos_calibration import ObjectBox, load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects.depth_map import cell_centers_m, object_box
-from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.accuracy import Accuracy
+from nlos_cam.objects import cell_centers_m, object_box, object_depth
+from nlos_cam.render import Accuracy, Scene, Surface, TransportJob, prepare, three_bounce
 from nlos_cam.render.interreflection import (
     WALL_CELLS,
     form_factor,
@@ -16,12 +15,7 @@ from nlos_cam.render.interreflection import (
     wall_cells,
     wall_factors,
 )
-from nlos_cam.render.job import TransportJob
 from nlos_cam.render.line_of_sight import first_hits
-from nlos_cam.render.material import Surface
-from nlos_cam.render.planning import prepare
-from nlos_cam.render.renderer import three_bounce
-from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_facts import SceneFacts
 from nlos_cam.render.visibility import FACES, HeightField, blocked, height_field, horizon_table, visible
 from nlos_cam.render.visibility import segment_blocked as between

@@ -44,8 +44,3 @@ def test_stale_page_fails_the_check_until_written(
         monkeypatch.setattr("sys.argv", ["pages.py", "commands", *arguments])
         assert commands.main() == code
     assert "out of date" in capsys.readouterr().out
-
-
-def figures(value: float) -> dict[str, dict[str, float]]:
-    names = "silhouette_iou", "accuracy_mean_abs", "accuracy_within_2_percent", "foreground_rmse_mm"
-    return {name: {"value": value, "low": value - 0.1, "high": value + 0.1} for name in names}

@@ -4,8 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 from measured_walls import HEIGHT, WIDTH, exact_wall
-from nlos_calibration.geometry import normal_from_angles, wall_from_plane
-from nlos_calibration.wall_record import MeasuredWall
+from nlos_calibration import MeasuredWall, normal_from_angles, wall_from_plane
 
 from nlos_cam.view.calibration import calibration_facts, outline_m, wall_pictures, wall_points_m
 from nlos_cam.view.images import BACKGROUND_RGB, SATURATED_RGB

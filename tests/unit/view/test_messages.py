@@ -9,16 +9,9 @@ from made_up_moments import NOTHING, RIG, bump, full_moment, moment
 from measured_walls import exact_wall
 from view_streams import messages_in
 
-from nlos_cam.objects.depth_map import object_box
-from nlos_cam.view.messages import (
-    ERROR_STEP_M,
-    MomentPacker,
-    bench_message,
-    depth_bytes,
-    pack,
-    signed_bytes,
-    unpack,
-)
+from nlos_cam.objects import object_box
+from nlos_cam.view import unpack
+from nlos_cam.view.messages import ERROR_STEP_M, MomentPacker, bench_message, depth_bytes, pack, signed_bytes
 
 BOX = object_box(RIG)
 

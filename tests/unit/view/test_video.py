@@ -8,7 +8,8 @@ from made_up_moments import NOTHING, RIG, full_moment, moment
 from PIL import Image
 
 from nlos_cam.errors import NlosCamError
-from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.reconstruct import Verdict
+from nlos_cam.view import Still, VideoFile
 from nlos_cam.view.images import BACKGROUND_RGB
 from nlos_cam.view.video import (
     FRAMES_PER_S,
@@ -21,8 +22,6 @@ from nlos_cam.view.video import (
     RIGHT_AT,
     SMALL,
     WIDTH,
-    Still,
-    VideoFile,
     _fitted,
 )
 

@@ -4,14 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
-from nlos_cam.render.effects import included
-from nlos_cam.render.renderer import MultiBounce
+from nlos_cam.render import MultiBounce, SensedImages, Sensor, included, sensor_effects
 from nlos_cam.render.sensor.bias import BIASES
-from nlos_cam.render.sensor.effects import sensor_effects
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, SensorModel, WarmUp
-from nlos_cam.render.sensor.sensor import SensedImages, Sensor
 
 WIDTH, HEIGHT = 160, 128
 FULL = load_rig("bare-wall")
