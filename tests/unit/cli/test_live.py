@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
-from fake_wall import RIG, WallCamera, bare_wall, wall_frame, write_wall
-from small_frames import FrameCamera, small_frame
+from fake_wall import WallCamera, bare_wall, wall_frame, write_wall
+from small_frames import FrameCamera, SheetNetwork, small_frame
 
 from nlos_cam.cli.live import summary
 from nlos_cam.cli.main import main
@@ -25,21 +24,6 @@ RECORDED, REPLAY = ["live", "--camera", "bag:fake", "--no-view"], ["replay", "ru
 SIMULATED, WALLED = ["live", "--camera", "sim", "--no-view"], [*REPLAY, "--overwrite", "--wall"]
 
 
-class FakeNetwork:
-    """Network that shows a sheet, and keeps the depth maps that it is given."""
-
-    runtime = "nothing at all"
-
-    def __init__(self) -> None:
-        self.given: list[np.ndarray] = []
-        self.record = SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
-
-    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
-        assert depth_m.shape == intensity.shape == (len(depth_m), 64, 80)
-        self.given.extend(depth_m)
-        return np.full((len(depth_m), 64, 64), 0.5, np.float32)
-
-
 class Opened:
     """Opener of `camera`, or of one with `count` frames that calls `on_frame` before each; keeps the calls."""
 
@@ -49,7 +33,7 @@ class Opened:
         self.on_open: Callable[[], None] = lambda: None
         self.count: int | None = 20
         self.camera: WallCamera | None = None
-        self.network, self.doubter = FakeNetwork(), FakeDoubter()
+        self.network, self.doubter = SheetNetwork(), FakeDoubter()
 
     def __call__(self, uri: str, **options: Any) -> FrameCamera | WallCamera:
         self.calls.append((uri, options))
