@@ -67,18 +67,8 @@ def test_build_reports_and_resumes(tmp_path: Path, built: Run) -> None:
 
 def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path) -> None:
     spread = ["--rig-spread-mm", "10", "--rig-spread-deg", "3", "--gain-spread-percent", "20"]
-    others = [
-        "--without",
-        "hat, boat",
-        "--backgrounds",
-        "0.25",
-        "--accuracy",
-        "draft",
-        "--seed",
-        "7",
-        "--expected-maps",
-    ]
-    folder = tmp_path / "a b"
+    others = ["--without", "hat, boat", "--backgrounds", "0.25", "--accuracy", "draft", "--seed", "7"]
+    others, folder = [*others, "--expected-maps"], tmp_path / "a b"
     assert _build(folder, *spread, *others, "--workers", "1") == 0
     plan = open_dataset(folder, expected=True).plan
     assert plan.spread == RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)

@@ -39,10 +39,14 @@ def test_error_keeps_colons_of_its_text(capsys: Capsys) -> None:
     assert capsys.readouterr().err == "error: a:smile:b\n"
 
 
-@pytest.mark.parametrize("reason", ["std::bad_alloc", "cannot allocate memory", ""])
-def test_lack_of_memory_in_a_library_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: Capsys, reason: str) -> None:
+NO_MAP = ImportError("a.so: failed to map segment from shared object")
+FAILED = [RuntimeError(f"export failed\n{reason}") for reason in ("std::bad_alloc", "cannot allocate memory")]
+
+
+@pytest.mark.parametrize("error", [*FAILED, NO_MAP, MemoryError(), RuntimeError("of one")], ids=str)
+def test_lack_of_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: Capsys, error: Exception) -> None:
     def lack(_: object) -> None:
-        raise RuntimeError(f"export failed\n{reason}") from (None if reason else MemoryError())
+        raise error from (MemoryError() if str(error) == "of one" else None)
 
     monkeypatch.setattr("nlos_cam.cli.main.build_app", lack)
     assert main(["rigs"]) == 1

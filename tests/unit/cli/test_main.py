@@ -355,12 +355,3 @@ def test_interruption_that_python_ignores_is_raised_again() -> None:
     with pytest.raises(KeyboardInterrupt, match="kept"):
         lose_a_signal()
     assert sys.unraisablehook is hook
-
-
-@pytest.mark.parametrize("error", [MemoryError(), ImportError("a.so: failed to map segment from shared object")])
-def test_lack_of_memory_is_one_line(
-    does: Callable[[Act | BaseException], None], capsys: Capsys, error: Exception
-) -> None:
-    does(error)
-    assert main(["act"]) == 1
-    assert "out of memory" in capsys.readouterr().err

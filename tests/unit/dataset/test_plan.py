@@ -31,6 +31,7 @@ CHANGES: dict[str, Any] = {
     "material": Material(kind="phong"),
     "rendering_version": 1,
     "textures": tuple(TEXTURES),
+    "expected": True,
 }
 
 
@@ -43,23 +44,14 @@ def test_plan_survives_json_and_names_the_field_that_differs(name: str) -> None:
     assert "somewhere" not in other.provenance  # the folder of meshes differs between machines
 
 
-def test_plan_with_textures_is_noted_as_simulation_only() -> None:
-    in_color = replace(PLAN, textures=tuple(TEXTURES))
-    assert json.loads(in_color.provenance)["note"] == SIMULATION_ONLY
-    assert not {"textures", "note"} & json.loads(PLAN.provenance).keys()
-
-
-def test_plan_without_generic_shapes_keeps_its_checksum() -> None:
-    mixed = replace(PLAN, objects=Objects(share_generic=0.5))
+def test_plan_writes_later_fields_only_where_they_are_used() -> None:
+    """Checksums of older plans stay."""
+    mixed, plain = replace(PLAN, objects=Objects(share_generic=0.5)), json.loads(PLAN.provenance)
+    assert json.loads(replace(PLAN, textures=tuple(TEXTURES)).provenance)["note"] == SIMULATION_ONLY
     assert json.loads(mixed.provenance)["objects"]["share_generic"] == 0.5
     assert DatasetPlan.from_provenance(mixed.provenance) == mixed
-    assert "share_generic" not in json.loads(PLAN.provenance)["objects"]
-
-
-def test_plan_of_expected_maps_says_so() -> None:
-    expected = replace(PLAN, expected=True)
-    assert DatasetPlan.from_provenance(expected.provenance) == expected
-    assert "expected" not in json.loads(PLAN.provenance)  # checksums of older plans stay
+    assert not {"textures", "note", "expected"} & plain.keys()
+    assert "share_generic" not in plain["objects"]
 
 
 def test_plan_of_older_version_has_defaults() -> None:

@@ -2,24 +2,19 @@ import csv
 import json
 import logging
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
+import made_up_moments
 import pytest
-from small_frames import NOTHING
 
-from nlos_cam.frames import Frame
-from nlos_cam.live.frame_log import FrameLog
-from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.view.viewer import Moment
+from nlos_cam.live import FrameLog
+from nlos_cam.reconstruct import Verdict
+from nlos_cam.view import Moment
 
 
 def moment(number: int, **others: Any) -> Moment:
-    blank: Any = np.zeros((2, 2))
-    frame = Frame(blank, blank, blank, number / 30, number, SimpleNamespace())  # type: ignore[arg-type]
-    given: Any = {"stages_s": {"queue": 0.001, "network": 0.0042}, "dropped": 3, **others}
-    return Moment(frame, NOTHING, number / 30 + 0.01, 0.01, **given)
+    given = {"stages_s": {"queue": 0.001, "network": 0.0042}, "dropped": 3, **others}
+    return made_up_moments.moment(number, latency_s=0.01, **given)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".jsonl"])

@@ -64,17 +64,10 @@ def test_export_refuses_other_files(tmp_path: Path, content: bytes) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["reconstruction.npz"]
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("depth_m", "text"),
-        ("depth_m", 1.0),
-        ("pitch_m", [0.1]),
-        ("z_far_m", 0.0),
-        ("frame_number", [1, 2]),
-        ("z_near_m", [[]]),
-    ],
-)
+BAD = {"pitch_m": [0.1], "z_far_m": 0.0, "frame_number": [1, 2], "z_near_m": [[]]}
+
+
+@pytest.mark.parametrize(("name", "value"), [("depth_m", "text"), ("depth_m", 1.0), *BAD.items()])
 def test_export_refuses_arrays_that_contradict(replay: Path, tmp_path: Path, name: str, value: object) -> None:
     with np.load(replay / "reconstruction.npz") as file:
         np.savez(tmp_path / "bad.npz", **{**file, name: np.array(value)})

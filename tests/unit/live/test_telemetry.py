@@ -66,17 +66,9 @@ def test_telemetry_of_a_camera_reads_temperatures_only(
 
 def write_sidecar(path: Path) -> None:
     series = [Temperatures(time_s=10.0 * k, celsius={"ldd_temperature": 40.0 + k}) for k in range(4)]
-    sidecar = Sidecar(
-        label=None,
-        camera="l515",
-        state="complete",
-        started=datetime(2026, 1, 2, tzinfo=UTC),
-        device={},
-        versions={},
-        intrinsics=vars(SMALL),
-        settings={},
-        temperatures=series,
-    )
+    facts: dict[str, Any] = {"label": None, "camera": "l515", "state": "complete", "intrinsics": vars(SMALL)}
+    facts |= {"device": {}, "versions": {}, "settings": {}, "started": datetime(2026, 1, 2, tzinfo=UTC)}
+    sidecar = Sidecar(**facts, temperatures=series)
     path.write_text(sidecar.model_dump_json())
 
 

@@ -4,19 +4,8 @@ from pathlib import Path
 
 from page_reader import read_page
 
-from nlos_cam.report import (
-    Banner,
-    Bullets,
-    Commands,
-    Document,
-    Facts,
-    Picture,
-    Section,
-    Table,
-    figure_of,
-    png,
-    write_document,
-)
+from nlos_cam.report import Banner, Bullets, Commands, Document, Facts, Picture, Section, Table, figure_of, png
+from nlos_cam.report.document import write_document
 
 HOSTILE = "<img src=http://evil/x onerror=alert(1)> & \"'$body"
 PICTURE = Picture("picture", "caption", png(figure_of(1.0, 1.0)), "some.png")
