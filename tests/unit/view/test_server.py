@@ -13,7 +13,13 @@ from nlos_cam.errors import NlosCamError
 from nlos_cam.view.server import LOOPBACK, Served, ViewServer, address_of, exposed, is_loopback, names_of, resolved
 
 
+def status_of(address: str, path: str, **options: Any) -> int:
+    with closing(ask(address, path, **options)) as answer:
+        return answer.status
+
+
 def test_server_sends_whole_files_and_forbids_other_origins(server: ViewServer) -> None:
+    assert urlsplit(server.address).hostname == server._server.server_address[0] == LOOPBACK
     for path, (kind, content) in ASSETS.items():
         with closing(ask(server.address, path + "?renderer=webgl")) as answer:
             assert answer.status == 200
@@ -54,24 +60,16 @@ def test_server_replaces_a_busy_port_unless_it_is_exact(server: ViewServer, stre
     busy = urlsplit(server.address).port or 0
     with pytest.raises(NlosCamError, match=rf"http://127.0.0.1:{busy}/ .* --view-port"):
         ViewServer(Served(ASSETS, streams), busy, exact=True)
-    other = ViewServer(Served(ASSETS, streams), busy)
-    try:
+    with closing(ViewServer(Served(ASSETS, streams), busy)) as other:
         assert other.address != server.address
-        with closing(ask(other.address, "/")) as answer:
-            assert answer.status == 200
-    finally:
-        other.close()
+        assert status_of(other.address, "/") == 200
 
 
 def test_server_on_all_addresses_refuses_other_names(streams: Streams) -> None:
-    everywhere = ViewServer(Served(ASSETS, streams), 0, host=EVERYWHERE)
-    try:
+    with closing(ViewServer(Served(ASSETS, streams), 0, host=EVERYWHERE)) as everywhere:
         assert urlsplit(everywhere.address).hostname == LOOPBACK
         for host, status in (("192.168.3.4:9090", 200), ("evil.example", 403)):
-            with closing(ask(everywhere.address, "/", host=host)) as answer:
-                assert answer.status == status
-    finally:
-        everywhere.close()
+            assert status_of(everywhere.address, "/", host=host) == status
 
 
 def test_server_refuses_hosts_that_are_not_this_machine(streams: Streams) -> None:
@@ -87,12 +85,7 @@ def test_server_refuses_hosts_that_are_not_this_machine(streams: Streams) -> Non
     [("GET", "/../secret", 404), ("POST", "/", 404), *((name, "/", 501) for name in ("PUT", "DELETE", "OPTIONS"))],
 )
 def test_server_refuses_other_paths_and_methods(server: ViewServer, method: str, path: str, status: int) -> None:
-    with closing(ask(server.address, path, method=method)) as answer:
-        assert answer.status == status
-
-
-def test_server_listens_on_the_loopback_only(server: ViewServer) -> None:
-    assert urlsplit(server.address).hostname == server._server.server_address[0] == LOOPBACK
+    assert status_of(server.address, path, method=method) == status
 
 
 def test_stream_lasts_until_it_is_ended(server: ViewServer, streams: Streams) -> None:
@@ -123,8 +116,7 @@ def test_server_answers_to_loopback_names_only(server: ViewServer, host: str, pa
         assert answer.status == status
         assert (answer.read() == ASSETS[path][1]) == (status == 200)
     if status == 403:
-        with closing(ask(server.address, "/stream", host=host)) as answer:
-            assert answer.status == status
+        assert status_of(server.address, "/stream", host=host) == status
 
 
 def test_server_limits_streams_and_reuses_their_room(streams: Streams) -> None:
@@ -133,17 +125,14 @@ def test_server_limits_streams_and_reuses_their_room(streams: Streams) -> None:
     with closing(ask(server.address, "/stream")) as refused:
         assert refused.status == 503
         assert b"2 browsers" in refused.read()
-    with closing(ask(server.address, "/")) as page:
-        assert page.status == 200
+    assert status_of(server.address, "/") == 200
     streams.end.set()
     for answer in watching:
         answer.read()
         answer.close()
     streams.end.clear()
-    status = 503
-    while status != 200:  # a stream's thread ends after the browser has seen its end
-        with closing(ask(server.address, "/stream")) as again:
-            status = again.status
+    while status_of(server.address, "/stream") != 200:  # a stream's thread ends after the browser has seen its end
+        pass
     streams.end.set()
     server.close()
 
@@ -168,29 +157,15 @@ def test_names_of_a_host_are_this_machines(asked: str, address: str, known: list
     assert not any(map(is_known, unknown))
 
 
-@pytest.mark.parametrize(("host", "loopback"), [("127.0.0.1", True), ("localhost", True), (EVERYWHERE, False)])
-def test_resolved_host_is_the_loopback_or_not(host: str, loopback: bool) -> None:
-    family, address = resolved(host)
-    assert family in {socket.AF_INET, socket.AF_INET6}
-    assert is_loopback(address) == loopback
-
-
-@pytest.mark.parametrize(
-    ("host", "address"),
-    [
-        ("127.0.0.1", "http://127.0.0.1:7/"),
-        (EVERYWHERE, "http://127.0.0.1:7/"),
-        ("::", "http://[::1]:7/"),
-        ("::1", "http://[::1]:7/"),
-    ],
-)
-def test_address_of_a_host_can_be_opened_on_this_machine(host: str, address: str) -> None:
-    assert address_of(host, 7) == address
-
-
-def test_exposed_warns_of_hosts_that_others_can_reach() -> None:
-    assert exposed("127.0.0.1", 9090) == exposed("localhost", 9090) == ""
-    assert "9090" in exposed(EVERYWHERE, 9090)
+def test_loopback_is_told_from_hosts_that_others_can_reach() -> None:
+    for host, loopback in (("127.0.0.1", True), ("localhost", True), (EVERYWHERE, False)):
+        family, address = resolved(host)
+        assert family in {socket.AF_INET, socket.AF_INET6}
+        assert is_loopback(address) == loopback
+        assert ("9090" in exposed(host, 9090)) == bool(exposed(host, 9090)) == (not loopback)
+    for host in ("127.0.0.1", EVERYWHERE):
+        assert address_of(host, 7) == "http://127.0.0.1:7/"
+    assert address_of("::", 7) == address_of("::1", 7) == "http://[::1]:7/"
     note = exposed("192.0.2.7", 8000)
     assert all(text in note for text in ("192.0.2.7", "8000", "password"))
     assert "\n" not in note
@@ -202,10 +177,9 @@ CROSS_SITE = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "cors"}
 @pytest.mark.parametrize("headers", [CROSS_SITE, {"Origin": "http://evil.example"}, {"Origin": "null"}])
 def test_server_refuses_pages_of_other_sites(server: ViewServer, headers: dict[str, str]) -> None:
     for path in ("/stream", "/file.wasm"):
-        with closing(ask(server.address, path, **headers)) as answer:
-            assert answer.status == 403
-    with closing(ask(server.address, "/", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate")) as answer:
-        assert answer.status == 200, "a person may follow a link to the page"
+        assert status_of(server.address, path, **headers) == 403
+    followed = status_of(server.address, "/", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate")
+    assert followed == 200, "a person may follow a link to the page"
 
 
 def commanded(name: str, arguments: Mapping[str, Any]) -> str:
@@ -229,33 +203,27 @@ def commanded(name: str, arguments: Mapping[str, Any]) -> str:
 def test_command_needs_the_token_and_answers_in_words(
     streams: Streams, body: str, headers: dict[str, str], status: int, text: str
 ) -> None:
-    server = ViewServer(Served(ASSETS, streams, commanded, "secret"), 0)
-    try:
-        with closing(
-            ask(server.address, "/command", method="POST", body=body, **{"X_Token": "secret", **headers})
-        ) as answer:
-            assert answer.status == status
-            assert text in answer.read().decode()
-    finally:
-        server.close()
+    headers = {"X_Token": "secret", **headers}
+    with (
+        closing(ViewServer(Served(ASSETS, streams, commanded, "secret"), 0)) as server,
+        closing(ask(server.address, "/command", method="POST", body=body, **headers)) as answer,
+    ):
+        assert answer.status == status
+        assert text in answer.read().decode()
 
 
 def test_slow_requests_end_and_never_lock_others_out(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.view.server.TIMEOUT_S", 0.5)
     monkeypatch.setattr("nlos_cam.view.server.MAX_CONNECTIONS", 4)
-    server = ViewServer(Served(ASSETS, streams), 0)
-    place = urlsplit(server.address)
-    slow = [socket.create_connection((place.hostname, place.port)) for _ in range(8)]
-    try:
+    with closing(ViewServer(Served(ASSETS, streams), 0)) as server:
+        place = urlsplit(server.address)
+        slow = [socket.create_connection((place.hostname, place.port)) for _ in range(8)]
         for connection in slow:
             with suppress(OSError):
                 connection.sendall(b"G")
-        with closing(ask(server.address, "/")) as answer:
-            assert answer.status == 200
+        assert status_of(server.address, "/") == 200
         while slow:  # each ends although it sends a byte now and then; the test's own limit ends a wait in vain
             slow = [connection for connection in slow if drips(connection)]
-    finally:
-        server.close()
 
 
 def drips(connection: socket.socket) -> bool:

@@ -3,7 +3,7 @@ from typing import Self
 import pytest
 from made_up_moments import moment
 
-from nlos_cam.view.viewer import Moment, NullViewer, Viewer, Viewers
+from nlos_cam.view.viewer import Moment, Viewers
 
 
 class Noting:
@@ -24,14 +24,6 @@ class Noting:
 
     def show(self, shown: Moment) -> None:
         self.noted.append(f"frame {shown.frame.frame_number}")
-
-
-def test_null_viewer_is_a_viewer_without_address() -> None:
-    viewer: Viewer = NullViewer()
-    with viewer as entered:
-        assert entered is viewer
-        assert entered.address is None
-        entered.show(None)  # type: ignore[arg-type]
 
 
 def test_viewers_all_see_every_moment() -> None:
