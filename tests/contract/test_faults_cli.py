@@ -70,10 +70,3 @@ def test_live_ends_with_counts_when_the_device_stays_away(tmp_path: Path, capsys
     [seen] = [place for place, line in enumerate(lines) if "1 duplicate" in line]
     [failed] = [place for place, line in enumerate(lines) if line.startswith("error:")]
     assert seen < failed == len(lines) - 1
-
-
-def test_unknown_fault_is_an_error_of_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(tmp_path, [{"kind": "explode", "at_frame": 1}]) == 4
-    [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
-    assert "faults.0.kind" in line
-    assert "explode" in line

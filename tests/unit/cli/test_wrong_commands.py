@@ -16,6 +16,7 @@ SCENES = {
     "wall.toml": "schema_version = 3\nframes = 60\n",
     "rig.toml": 'name = "mine"\n[lidar]\ndistance_m = -1.0\n',
     "recipe.toml": 'task = "vae"\nbatch = "many"\n',
+    "faults.toml": 'name = "wall"\nrig = "bare-wall"\n[[faults]]\nkind = "explode"\nat_frame = 1\n',
     "empty.toml": "",
     "broken.toml": "name = \n",
     "long.toml": 'name = "cup"\nrig = "paper-rig"\n[object]\ncategory = "cup"\n[motion]\nposes = 1000000000\n',
@@ -151,6 +152,7 @@ live sim:none.toml | none.toml
 live sim:binary.toml | binary
 live sim:empty.toml | name
 live sim:broken.toml | broken.toml
+live sim:faults.toml | faults.0.kind
 live sim:long.toml | poses
 live sim:wide.toml | pulse_ns
 live sim:wall.toml | wall record
