@@ -87,31 +87,12 @@ class FakeUsb(IBackend):
 
 def fake_device(product: int = 0x0B64, serial: str = "00000000F0246262", **changes: Any) -> SimpleNamespace:
     """Make an L515 with firmware 1.5.8 on USB 3, except for the changes; `shut` is raised on opening."""
-    values = {
-        "bLength": 18,
-        "bDescriptorType": 1,
-        "bMaxPacketSize0": 9,
-        "bNumConfigurations": 1,
-        "bDeviceClass": 0xEF,
-        "bDeviceSubClass": 2,
-        "bDeviceProtocol": 1,
-        "idVendor": 0x8086,
-        "idProduct": product,
-        "bcdUSB": 0x0320,
-        "bcdDevice": 0x1058,
-        "speed": 4,
-        "iManufacturer": 1,
-        "iProduct": 2,
-        "iSerialNumber": 3,
-        "bus": 2,
-        "address": 3,
-        "port_number": 1,
-        "port_numbers": (1,),
-        "strings": {1: "Intel(R) RealSense(TM) Camera", 2: "Intel(R) RealSense(TM) 515", 3: serial},
-        "classes": L515_CLASSES,
-        "shut": None,
-        "hides": None,
-    }
+    values: dict[str, Any] = {"bLength": 18, "bDescriptorType": 1, "bMaxPacketSize0": 9, "bNumConfigurations": 1}
+    values |= {"bDeviceClass": 0xEF, "bDeviceSubClass": 2, "bDeviceProtocol": 1, "classes": L515_CLASSES}
+    values |= {"idVendor": 0x8086, "idProduct": product, "bcdUSB": 0x0320, "bcdDevice": 0x1058, "speed": 4}
+    values |= {"bus": 2, "address": 3, "port_number": 1, "port_numbers": (1,), "shut": None, "hides": None}
+    strings = "Intel(R) RealSense(TM) Camera", "Intel(R) RealSense(TM) 515", serial
+    values |= {"iManufacturer": 1, "iProduct": 2, "iSerialNumber": 3, "strings": dict(enumerate(strings, start=1))}
     return SimpleNamespace(**values | changes)
 
 
