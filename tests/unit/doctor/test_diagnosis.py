@@ -28,16 +28,8 @@ devices = st.builds(
     speed=st.none() | st.integers(-1, 9), firmware=words, serial=words, product=words,
     interfaces=st.tuples(words), error=words, denied=st.booleans(),
 )  # fmt: skip
-cameras = st.builds(
-    KernelCamera,
-    words,
-    st.sampled_from([0x0B64, 0x0B55]),
-    words,
-    words,
-    st.tuples(words),
-    st.just(()),
-    st.tuples(words),
-)
+ids, texts = st.sampled_from([0x0B64, 0x0B55]), st.tuples(words)
+cameras = st.builds(KernelCamera, words, ids, words, words, texts, st.just(()), texts)
 hosts = st.builds(
     Host,
     st.builds(Platform, words, words, st.tuples(st.integers(2, 4), st.integers(0, 20)), st.booleans(), st.booleans()),

@@ -10,42 +10,29 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nlos_cam.doctor.host import (
-    MODULES,
-    Holder,
-    Host,
-    Platform,
-    find_holders,
-    kernel_cameras,
-    list_folder,
-    open_node,
-    path_exists,
-    read_host,
-    read_text,
-    this_platform,
-)
+from nlos_cam.doctor import host
 
-LINUX = Platform("linux", "x86_64", (3, 11))
+LINUX = host.Platform("linux", "x86_64", (3, 11))
 READ = (".dockerenv", "proc/modules", "proc/1/cgroup", "proc/1/environ", "proc/version", "proc/sys/kernel/osrelease")
 ODD = (*READ, "sys/bus/usb/devices/2-1", "sys/bus/usb/devices/2-1/idVendor", "proc/77/fd", "etc/udev/rules.d/a.rules")
 HOLDS = "import sys; file = open(sys.argv[1]); print('open', flush=True); sys.stdin.read()"
 UNLISTED = "proc/43/fd", "stands for a folder that may not be listed"
 
 
-def look(root: Path) -> Host:
-    return read_host(root, LINUX, lambda _: None)
+def look(root: Path) -> host.Host:
+    return host.read_host(root, LINUX, lambda _: None)
 
 
 def test_this_host_and_platform_can_be_read(tmp_path: Path) -> None:
-    found = this_platform()
+    found = host.this_platform()
     assert found.python == sys.version_info[:2]
     assert (found.system, found.machine) == (platform.system().lower(), platform.machine().lower())
     assert found.is_root == (os.geteuid() == 0)
     assert found.is_musl == (platform.libc_ver()[0] == "")
-    assert set(read_host().modules) == set(MODULES)
+    assert set(host.read_host().modules) == set(host.MODULES)
     (tmp_path / ".dockerenv").touch()
-    mac = Platform("darwin", "arm64", (3, 11))
-    assert read_host(tmp_path, mac) == Host(mac)  # only Linux is searched
+    mac = host.Platform("darwin", "arm64", (3, 11))
+    assert host.read_host(tmp_path, mac) == host.Host(mac)  # only Linux is searched
 
 
 @pytest.mark.parametrize(
@@ -117,12 +104,12 @@ def test_every_node_is_opened_and_refusals_are_kept(bench: Any) -> None:
 def test_open_node_opens_and_closes_the_file(tmp_path: Path) -> None:
     (tmp_path / "node").touch()
     before = set(Path("/proc/self/fd").iterdir())
-    open_node(str(tmp_path / "node"))
+    host.open_node(str(tmp_path / "node"))
     assert set(Path("/proc/self/fd").iterdir()) == before
     with pytest.raises(IsADirectoryError):
-        open_node(str(tmp_path))
+        host.open_node(str(tmp_path))
     with pytest.raises(FileNotFoundError):
-        open_node(str(tmp_path / "absent"))
+        host.open_node(str(tmp_path / "absent"))
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -141,34 +128,34 @@ def test_kernel_cameras_hold_what_hangs_on_each_port(bench: Any, tmp_path: Path)
     assert bench.linux.root == tmp_path
     bench.linux.plug("2-2", product="0b07", address=5)  # no L515
     bench.linux.write("sys/bus/usb/devices/2-3/idVendor", "not a number")
-    [found] = kernel_cameras(tmp_path)
+    [found] = host.kernel_cameras(tmp_path)
     assert (found.port, found.product_id, found.serial) == ("2-1", 0x0B64, "00000000F0246262")
     assert found.nodes == ("/dev/bus/usb/002/003", "/dev/video30", "/dev/video31")
     assert found.hid_sensors == ("accel_3d", "gyro_3d")
     assert found.hid_devices == ("0003:8086:0B64.3 (hid-sensor-hub)",)
     bench.linux.plug("2-1.4", address=7, hid=0, video=1)  # behind a hub whose name begins like the other's
-    one, other = kernel_cameras(tmp_path)
+    one, other = host.kernel_cameras(tmp_path)
     assert (one.port, len(one.hid_sensors), len(one.video_nodes)) == ("2-1", 2, 2)
     assert (other.port, other.hid_sensors, other.video_nodes) == ("2-1.4", (), ("/dev/video70",))
 
 
 def test_odd_files_are_empty_and_odd_folders_hold_nothing(tmp_path: Path) -> None:
-    assert kernel_cameras(tmp_path) == ()
-    assert find_holders(["/dev/video0"], tmp_path) == ([], 0)
+    assert host.kernel_cameras(tmp_path) == ()
+    assert host.find_holders(["/dev/video0"], tmp_path) == ([], 0)
     (tmp_path / "binary").write_bytes(b"\xff\xfe 1 ")
-    assert read_text(tmp_path / "binary").endswith("1")
-    assert read_text(tmp_path) == read_text(tmp_path / "absent") == read_text(Path("nul\0byte")) == ""
-    assert list_folder(tmp_path / "binary") == list_folder(tmp_path / "absent") == []
+    assert host.read_text(tmp_path / "binary").endswith("1")
+    assert host.read_text(tmp_path) == host.read_text(tmp_path / "absent") == host.read_text(Path("nul\0byte")) == ""
+    assert host.list_folder(tmp_path / "binary") == host.list_folder(tmp_path / "absent") == []
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    assert not path_exists(tmp_path / "loop")
+    assert not host.path_exists(tmp_path / "loop")
 
 
 def test_process_that_holds_a_node_is_named(bench: Any, tmp_path: Path) -> None:
     bench.linux.process(41, "realsense-viewer", "/dev/null", "/dev/video30", "/dev/video31")
     bench.linux.process(42, "bash", "/dev/tty")
     bench.linux.write(*UNLISTED)
-    found, closed = find_holders(["/dev/video30", "/dev/bus/usb/002/003"], tmp_path)
-    assert (found, closed) == ([Holder(41, "realsense-viewer", "/dev/video30")], 1)
+    found, closed = host.find_holders(["/dev/video30", "/dev/bus/usb/002/003"], tmp_path)
+    assert (found, closed) == ([host.Holder(41, "realsense-viewer", "/dev/video30")], 1)
 
 
 def test_real_process_that_has_a_file_open_is_found(tmp_path: Path) -> None:
@@ -178,8 +165,8 @@ def test_real_process_that_has_a_file_open_is_found(tmp_path: Path) -> None:
         assert other.stdout
         other.stdout.readline()
         with held.open():  # ours is left out
-            found, _ = find_holders([str(held)])
+            found, _ = host.find_holders([str(held)])
         other.communicate(b"")
     assert [(one.pid, one.node) for one in found] == [(other.pid, str(held))]
     assert found[0].name.startswith("python")
-    assert find_holders([str(held)])[0] == []
+    assert host.find_holders([str(held)])[0] == []

@@ -4,23 +4,7 @@ import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
 
-from nlos_cam.objects.primitives import (
-    arch,
-    at,
-    bar,
-    box,
-    disc,
-    ellipsoid,
-    frame,
-    joined,
-    knob,
-    lathe,
-    pierced,
-    ring,
-    slab,
-    tipped,
-    turned,
-)
+from nlos_cam.objects import primitives as solids
 
 
 def _middle(solid: Float64) -> np.ndarray:
@@ -35,14 +19,14 @@ def _area(solid: Float64) -> float:
 @pytest.mark.parametrize(
     ("solid", "extents"),
     [
-        (box(0.1, 0.2, 0.3), [0.1, 0.2, 0.3]),
-        (ellipsoid(0.1, 0.2, 0.3), [0.2, 0.4, 0.6]),
-        (knob(0.1, 0.3), [0.2, 0.2, 0.6]),
-        (ring(0.2, 0.05), [0.5, 0.5, 0.1]),
-        (disc(0.2, 0.05), [0.4, 0.4, 0.05]),
-        (frame(0.5, 0.4, 0.1, 0.05), [0.5, 0.4, 0.05]),
-        (pierced(0.5, 0.4, 0.1, 0.05), [0.5, 0.4, 0.05]),
-        (at(slab([(0, 0), (0.4, 0), (0.4, 0.3), (0, 0.3)], 0.1), -0.2, -0.15), [0.4, 0.3, 0.1]),
+        (solids.box(0.1, 0.2, 0.3), [0.1, 0.2, 0.3]),
+        (solids.ellipsoid(0.1, 0.2, 0.3), [0.2, 0.4, 0.6]),
+        (solids.knob(0.1, 0.3), [0.2, 0.2, 0.6]),
+        (solids.ring(0.2, 0.05), [0.5, 0.5, 0.1]),
+        (solids.disc(0.2, 0.05), [0.4, 0.4, 0.05]),
+        (solids.frame(0.5, 0.4, 0.1, 0.05), [0.5, 0.4, 0.05]),
+        (solids.pierced(0.5, 0.4, 0.1, 0.05), [0.5, 0.4, 0.05]),
+        (solids.at(solids.slab([(0, 0), (0.4, 0), (0.4, 0.3), (0, 0.3)], 0.1), -0.2, -0.15), [0.4, 0.3, 0.1]),
     ],
 )
 def test_solid_has_its_size_and_is_centered(solid: Float64, extents: list[float]) -> None:
@@ -51,21 +35,21 @@ def test_solid_has_its_size_and_is_centered(solid: Float64, extents: list[float]
 
 
 def test_lathe_turns_about_y_and_frame_is_open() -> None:
-    x, y, z = lathe([(0, -0.2), (0.3, -0.2), (0.1, 0.5), (0, 0.5)]).reshape(-1, 3).T
+    x, y, z = solids.lathe([(0, -0.2), (0.3, -0.2), (0.1, 0.5), (0, 0.5)]).reshape(-1, 3).T
     assert (y.min(), y.max()) == (pytest.approx(-0.2), pytest.approx(0.5))
     radius = np.hypot(x, z)
     assert radius[np.isclose(y, -0.2)].max() == pytest.approx(0.3)
     assert radius[np.isclose(y, 0.5)].max() == pytest.approx(0.1)
-    x, y, _ = frame(0.6, 0.4, 0.1, 0.2).reshape(-1, 3).T
+    x, y, _ = solids.frame(0.6, 0.4, 0.1, 0.2).reshape(-1, 3).T
     assert ((np.abs(x) > 0.2 - 1e-9) | (np.abs(y) > 0.1 - 1e-9)).all()
 
 
 @pytest.mark.parametrize("angle", [90.0, 180.0, 270.0])
 def test_arch_is_part_of_a_ring_from_the_x_axis_on(angle: float) -> None:
-    part = arch(0.4, 0.05, angle)
-    assert _area(part) == pytest.approx(_area(ring(0.4, 0.05)) * angle / 360, rel=0.01)
+    part = solids.arch(0.4, 0.05, angle)
+    assert _area(part) == pytest.approx(_area(solids.ring(0.4, 0.05)) * angle / 360, rel=0.01)
     assert part[..., 0].max() == pytest.approx(0.45)
-    assert arch(0.4, 0.05, 180)[..., 1].min() == pytest.approx(0, abs=1e-9)
+    assert solids.arch(0.4, 0.05, 180)[..., 1].min() == pytest.approx(0, abs=1e-9)
     x, y, z = part.reshape(-1, 3).T
     np.testing.assert_allclose(np.hypot(np.hypot(x, y) - 0.4, z), 0.05)
 
@@ -73,14 +57,14 @@ def test_arch_is_part_of_a_ring_from_the_x_axis_on(angle: float) -> None:
 @pytest.mark.parametrize(
     "solid",
     [
-        box(1, 2, 3),
-        ellipsoid(0.1, 0.2, 0.3),
-        ring(0.3, 0.1),
-        disc(0.3, 0.1),
-        pierced(0.5, 0.4, 0.1, 0.05),
-        slab([(0, 0), (0.4, 0), (0.5, 0.2), (0.4, 0.3), (0, 0.3)], 0.1),
-        lathe([(0, 0), (0.3, 0), (0.2, 0.5), (0, 0.5)]),
-        bar((0, 0), (1, 1), 0.1, 0.2),
+        solids.box(1, 2, 3),
+        solids.ellipsoid(0.1, 0.2, 0.3),
+        solids.ring(0.3, 0.1),
+        solids.disc(0.3, 0.1),
+        solids.pierced(0.5, 0.4, 0.1, 0.05),
+        solids.slab([(0, 0), (0.4, 0), (0.5, 0.2), (0.4, 0.3), (0, 0.3)], 0.1),
+        solids.lathe([(0, 0), (0.3, 0), (0.2, 0.5), (0, 0.5)]),
+        solids.bar((0, 0), (1, 1), 0.1, 0.2),
     ],
 )
 def test_solid_is_closed(solid: Float64) -> None:
@@ -95,14 +79,16 @@ def test_solid_is_closed(solid: Float64) -> None:
 
 
 def test_solids_move_turn_tip_and_join() -> None:
-    np.testing.assert_allclose(_middle(at(box(1, 1, 1), 1, 2, 3)), [1, 2, 3])
-    np.testing.assert_allclose(_middle(bar((0.1, 0.2), (0.4, 0.6), 0.06, 0.1)), [0.25, 0.4, 0], atol=1e-12)
-    np.testing.assert_allclose(_middle(turned(at(box(1, 1, 1), x=2), (0, 0, 1), 90)), [0, 2, 0], atol=1e-12)
-    there_and_back = turned(turned(box(1, 2, 3), (1, 0, 0), 35), (1, 0, 0), -35)
-    np.testing.assert_allclose(there_and_back, box(1, 2, 3), atol=1e-12)
-    top = tipped(at(box(0.1, 0.1, 0.1), y=1), 30)  # the top tips towards the wall
+    np.testing.assert_allclose(_middle(solids.at(solids.box(1, 1, 1), 1, 2, 3)), [1, 2, 3])
+    np.testing.assert_allclose(_middle(solids.bar((0.1, 0.2), (0.4, 0.6), 0.06, 0.1)), [0.25, 0.4, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        _middle(solids.turned(solids.at(solids.box(1, 1, 1), x=2), (0, 0, 1), 90)), [0, 2, 0], atol=1e-12
+    )
+    there_and_back = solids.turned(solids.turned(solids.box(1, 2, 3), (1, 0, 0), 35), (1, 0, 0), -35)
+    np.testing.assert_allclose(there_and_back, solids.box(1, 2, 3), atol=1e-12)
+    top = solids.tipped(solids.at(solids.box(0.1, 0.1, 0.1), y=1), 30)  # the top tips towards the wall
     np.testing.assert_allclose(_middle(top), [0, np.cos(np.radians(30)), -0.5], atol=1e-12)
-    parts = box(1, 1, 1), at(ellipsoid(1, 1, 1), 5), ring(1, 0.1)
-    solid = joined(*parts)
+    parts = solids.box(1, 1, 1), solids.at(solids.ellipsoid(1, 1, 1), 5), solids.ring(1, 0.1)
+    solid = solids.joined(*parts)
     assert len(solid) == sum(len(part) for part in parts)
     assert solid[..., 0].max() == pytest.approx(6, abs=0.01)
