@@ -7,20 +7,8 @@ import pytest
 from nlos_calibration import load_rig
 
 from nlos_cam.dataset import procedural_images
-from nlos_cam.evaluate import TARGETS, advantage, judge, over_objects, per_object
-from nlos_cam.evaluate.metrics import (
-    Predictions,
-    curve,
-    detail_per_cm,
-    error_by_zone,
-    interval,
-    meets,
-    per_category,
-    quality_figures,
-    rank_correlation,
-    surface_cm2,
-    targets_met,
-)
+from nlos_cam.evaluate import TARGETS, advantage, judge, metrics, over_objects, per_object
+from nlos_cam.evaluate.metrics import detail_per_cm, error_by_zone, interval, meets, rank_correlation, surface_cm2
 from nlos_cam.objects import depth_from_image, object_box
 
 BOX = object_box(load_rig("paper-rig"))
@@ -38,7 +26,7 @@ def test_judge_scores_perfect_image_without_uncertainty(images: np.ndarray) -> N
     figures = judge(images, images, BOX)
     assert {name: figure.value for name, figure in figures.items()} == PERFECT
     assert all(figure.low == figure.value == figure.high for figure in figures.values())
-    assert all(bar["met"] for bar in targets_met(figures).values())
+    assert all(bar["met"] for bar in metrics.targets_met(figures).values())
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -77,7 +65,7 @@ def test_interval_covers_the_truth_at_its_confidence() -> None:
 def test_categories_average_to_the_whole(images: np.ndarray) -> None:
     categories = ["cup"] * 2 + ["hat"] * 7 + ["car"] * 3
     values = per_object(0.9 * np.roll(images, 3, axis=2), images, BOX)
-    by, whole = per_category(values, categories), over_objects(values)
+    by, whole = metrics.per_category(values, categories), over_objects(values)
     assert list(by) == ["cup", "hat", "car"]
     for name in TARGETS:
         weighed = sum(categories.count(category) * by[category][name].value for category in by) / len(images)
@@ -128,11 +116,11 @@ def test_detail_grows_with_holes_and_steps_not_slopes() -> None:
 
 def test_curve_bins_every_object_once_and_follows_error() -> None:
     like = np.random.default_rng(0).random(54)
-    bins = curve(like, 10 * like)
+    bins = metrics.curve(like, 10 * like)
     assert sum(one.objects for one in bins) == 54
     assert all(one.high <= following.low for one, following in pairwise(bins))
     assert all(10 * one.low <= one.error.value <= 10 * one.high for one in bins)
-    assert len(curve(like[:2], like[:2])) == 2
+    assert len(metrics.curve(like[:2], like[:2])) == 2
 
 
 def test_rank_correlation_is_of_order_alone() -> None:
@@ -169,14 +157,14 @@ def test_zones_of_perfect_image_and_of_empty_truth() -> None:
 
 def test_quality_figures_of_exact_and_of_blind_predictions() -> None:
     iou = np.linspace(0.4, 0.95, 50)
-    exact = Predictions(iou - 0.05, iou, iou + 0.05, np.full(50, 10.0), iou >= 0.8)
-    found = quality_figures(exact, iou)
+    exact = metrics.Predictions(iou - 0.05, iou, iou + 0.05, np.full(50, 10.0), iou >= 0.8)
+    found = metrics.quality_figures(exact, iou)
     assert found["correlation"] == pytest.approx(1)
     assert (found["mean_error"], found["bias"]) == pytest.approx((0, 0))
     assert found["within_80_percent_interval"] == found["trusted_good"] == 1
     assert found["trusted_objects"] == (iou >= 0.8).sum()
-    blind = Predictions(iou * 0 + 0.9, iou * 0 + 0.95, iou * 0 + 1, iou, np.zeros(50, bool))
-    found = quality_figures(blind, iou)
+    blind = metrics.Predictions(iou * 0 + 0.9, iou * 0 + 0.95, iou * 0 + 1, iou, np.zeros(50, bool))
+    found = metrics.quality_figures(blind, iou)
     assert found["correlation"] is None
     assert found["trusted_good"] is None
     assert found["bias"] > 0.2

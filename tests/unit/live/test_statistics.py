@@ -11,18 +11,8 @@ from small_frames import NOTHING, small_frame
 
 from nlos_cam.errors import NlosCamError, SceneError
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.live import RunReport, RunStatistics
-from nlos_cam.live.statistics import (
-    MAX_FAILED_IN_A_ROW,
-    STALLED,
-    STALLED_AFTER_S,
-    QualityLog,
-    StageTimes,
-    StallWatch,
-    WarningLog,
-    camera_ms,
-    percentiles_ms,
-)
+from nlos_cam.live import RunReport, RunStatistics, statistics
+from nlos_cam.live.statistics import MAX_FAILED_IN_A_ROW, STALLED, STALLED_AFTER_S, QualityLog, StallWatch, WarningLog
 from nlos_cam.reconstruct import FrameResult, Quality, Verdict
 from nlos_cam.reconstruct.network import Doubt
 
@@ -92,13 +82,13 @@ def test_warning_log_ignores_numbers_in_a_warning(begins: list[tuple[str, bool]]
 
 @given(st.lists(st.floats(0.0, 10.0), max_size=50))
 def test_percentiles_rise_and_lie_among_the_times(seconds: list[float]) -> None:
-    found = percentiles_ms(np.array(seconds))
+    found = statistics.percentiles_ms(np.array(seconds))
     assert 0.0 <= found["p50"] <= found["p95"] <= found["p99"]
     assert found["p99"] <= 1e3 * max(seconds, default=0.0) * (1 + 1e-12)
 
 
 def test_stage_times_replace_the_oldest_in_constant_memory() -> None:
-    times = StageTimes(remembered=10)
+    times = statistics.StageTimes(remembered=10)
     for number in range(35):
         times.add({"maps": float(number)})
         assert times._columns["maps"].size == 10
@@ -151,5 +141,5 @@ def test_predicted_quality_is_summarised_over_detected_objects_alone() -> None:
 
 
 def test_only_a_simulated_camera_has_computing_time() -> None:
-    assert camera_ms(SimpleNamespace()) == {}  # type: ignore[arg-type]
-    assert camera_ms(SimpleNamespace(exposures_s=[0.004] * 9))["p99"] == pytest.approx(4)  # type: ignore[arg-type]
+    assert statistics.camera_ms(SimpleNamespace()) == {}  # type: ignore[arg-type]
+    assert statistics.camera_ms(SimpleNamespace(exposures_s=[0.004] * 9))["p99"] == pytest.approx(4)  # type: ignore[arg-type]

@@ -7,15 +7,7 @@ import pytest
 from nlos_calibration.geometry import Intrinsics
 
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.recording.bag_messages import (
-    ENCODINGS,
-    lens_of,
-    metadata,
-    parse,
-    pixels,
-    pose_of,
-    sdk_name,
-)
+from nlos_cam.recording.bag_messages import ENCODINGS, lens_of, metadata, parse, pixels, pose_of, sdk_name
 
 IMAGE = "sensor_msgs/msg/Image"
 

@@ -4,27 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlos_cam.recording.rosbag import (
-    CHUNK_LIMIT,
-    HEADER_LIMIT,
-    BagCutError,
-    BagFormatError,
-    BagRecord,
-    Content,
-    Ending,
-    Op,
-    Source,
-    check_bookkeeping,
-    pack_chunk_info,
-    pack_file_header,
-    pack_index,
-    pack_record,
-    read_connection,
-    read_content,
-    read_record,
-    reader,
-    set_up_records,
-)
+from nlos_cam.recording import rosbag
+from nlos_cam.recording.rosbag import BagFormatError, Ending, Op, pack_record, read_connection, read_record, reader
 
 NAMES = st.text(st.characters(codec="ascii", exclude_characters="="), min_size=1, max_size=9)
 FIELDS = st.dictionaries(NAMES.filter(lambda name: name != "op"), st.binary(max_size=30), max_size=5)
@@ -46,7 +27,7 @@ def message(seconds: int, nanoseconds: int, conn: int = 0) -> bytes:
     return pack_record(fields, bytes(50))
 
 
-def described(content: bytes) -> tuple[Source, BagRecord]:
+def described(content: bytes) -> tuple[rosbag.Source, rosbag.BagRecord]:
     return reader(content), read_record(reader(content), 0)
 
 
@@ -63,7 +44,7 @@ def test_read_record_returns_what_was_packed(fields: dict[str, bytes], op: Op, d
 def test_read_record_of_random_bytes_raises_only_format_errors(content: bytes) -> None:
     try:
         read, record = described(content)
-        check_bookkeeping(read, record)
+        rosbag.check_bookkeeping(read, record)
         found = read_connection(read, record)
     except BagFormatError:
         return
@@ -84,7 +65,7 @@ def test_read_connection_keeps_or_refuses_a_changed_byte(at: int, value: int) ->
 @given(st.integers(0, 300))
 def test_read_record_reports_a_cut_header(length: int) -> None:
     content = pack_record({"op": b"\x02", "name": b"x" * 300}, b"")
-    with pytest.raises(BagCutError):
+    with pytest.raises(rosbag.BagCutError):
         read_record(reader(content[:length]), 0)
 
 
@@ -93,7 +74,7 @@ def test_read_record_does_not_read_an_absurd_header() -> None:
 
     def read(at: int, count: int) -> bytes:
         asked.append(count)
-        return struct.pack("<I", HEADER_LIMIT + 1)[at : at + count]
+        return struct.pack("<I", rosbag.HEADER_LIMIT + 1)[at : at + count]
 
     with pytest.raises(BagFormatError, match="65537"):
         read_record(read, 0)
@@ -110,7 +91,7 @@ def test_read_record_does_not_read_an_absurd_header() -> None:
         connection(callerid=b"\xff"),
         connection()[:-1],
         pack_record({"conn": bytes(4), "op": b"\x07", "topic": b"/a"}, packed({"type": b"a/b", "md5sum": b""})),
-        pack_record({"conn": bytes(4), "op": b"\x07", "topic": b"/a"}, bytes(HEADER_LIMIT + 1)),
+        pack_record({"conn": bytes(4), "op": b"\x07", "topic": b"/a"}, bytes(rosbag.HEADER_LIMIT + 1)),
     ],
 )
 def test_read_connection_refuses_malformed_records(content: bytes) -> None:
@@ -119,20 +100,20 @@ def test_read_connection_refuses_malformed_records(content: bytes) -> None:
 
 
 def test_check_bookkeeping_refuses_impossible_lengths() -> None:
-    index, info = pack_index(3, bytes(24)), pack_chunk_info(4117, {3: bytes(24), 5: bytes(12)})
-    for whole in (index, info, pack_file_header(1, 2, 3)):
-        check_bookkeeping(*described(whole))
+    index, info = rosbag.pack_index(3, bytes(24)), rosbag.pack_chunk_info(4117, {3: bytes(24), 5: bytes(12)})
+    for whole in (index, info, rosbag.pack_file_header(1, 2, 3)):
+        rosbag.check_bookkeeping(*described(whole))
     fields = {"count": bytes([9, 0, 0, 0]), "conn": bytes(4)}
-    for op, data in ((4, bytes(24)), (6, bytes(24)), (3, b"data"), (3, bytes(HEADER_LIMIT + 1))):
+    for op, data in ((4, bytes(24)), (6, bytes(24)), (3, b"data"), (3, bytes(rosbag.HEADER_LIMIT + 1))):
         with pytest.raises(BagFormatError):
-            check_bookkeeping(*described(pack_record({**fields, "op": bytes([op])}, data)))
+            rosbag.check_bookkeeping(*described(pack_record({**fields, "op": bytes([op])}, data)))
 
 
 ONE = message(0, 500)
 
 
-def content_of(content: bytes, expected_bytes: int = CHUNK_LIMIT) -> Content:
-    return read_content(reader(content), 0, CHUNK_LIMIT, expected_bytes)
+def content_of(content: bytes, expected_bytes: int = rosbag.CHUNK_LIMIT) -> rosbag.Content:
+    return rosbag.read_content(reader(content), 0, rosbag.CHUNK_LIMIT, expected_bytes)
 
 
 NO_TIME, NO_CONNECTION = (
@@ -160,6 +141,6 @@ def test_read_content_keeps_messages_before_damage(content: bytes, ending: Endin
 def test_set_up_records_finds_connections_and_first_messages() -> None:
     first, second = connection(b"/1", 1), connection(b"/2", 2)
     content = first + message(0, 1, 1) + message(0, 2, 1) + second + message(0, 1, 2)
-    found = list(set_up_records(reader(content + b"damage")))
+    found = list(rosbag.set_up_records(reader(content + b"damage")))
     assert [record.op for _, record in found] == [Op.CONNECTION, Op.MESSAGE, Op.CONNECTION, Op.MESSAGE]
     assert (found[0][0], found[-1][1].end) == (0, len(content))

@@ -7,17 +7,8 @@ import lz4.frame
 import numpy as np
 import pytest
 
-from nlos_cam.recording.rosbag import (
-    BagFormatError,
-    BagRecord,
-    Ending,
-    Op,
-    pack_chunk_head,
-    pack_index,
-    pack_record,
-    read_record,
-    reader,
-)
+from nlos_cam.recording import rosbag
+from nlos_cam.recording.rosbag import Ending, Op, pack_index, pack_record, read_record, reader
 from nlos_cam.recording.salvage import Scan, examine, find_chunk, scan_bag, unpack
 
 DESCRIPTION = {"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"string data"}
@@ -46,7 +37,7 @@ compressions = pytest.mark.parametrize("compression", DATA)
 
 def examined(data: bytes, compression: str = "lz4", size: int = len(CONTENT), length: int | None = None) -> tuple:
     """Examine a chunk of that data; returns what was found and the file that it is in."""
-    file = pack_chunk_head(compression, size, len(data) if length is None else length) + data
+    file = rosbag.pack_chunk_head(compression, size, len(data) if length is None else length) + data
     found = find_chunk(reader(file), 0)
     assert found
     return examine(reader(file), 0, found, len(file)), file
@@ -100,11 +91,11 @@ def test_unpack_refuses_a_bomb(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_find_chunk_refuses_other_records_and_compressions() -> None:
     assert find_chunk(reader(CONNECTION + CONNECTION), 0) is None
     assert find_chunk(reader(AFTER), 0) is None
-    with pytest.raises(BagFormatError):
+    with pytest.raises(rosbag.BagFormatError):
         find_chunk(reader(b"no record at all"), 0)
     found, _ = examined(CONTENT, "zstd")
     assert (found.chunk, found.ending, "zstd" in found.why) == (None, Ending.BROKEN, True)
-    assert examine(reader(b""), 0, BagRecord(Op.CHUNK, {}, 0, 0), 0).chunk is None
+    assert examine(reader(b""), 0, rosbag.BagRecord(Op.CHUNK, {}, 0, 0), 0).chunk is None
 
 
 @pytest.fixture(params=["packed", "plain"])
