@@ -166,11 +166,7 @@ def test_long_stall_restarts_the_streams(camera: Make, hurried_clock: Any) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "words", "counts"),
-    [
-        ("unplug", "unplugged", {}),
-        ("stall", "3 restarts", {"restarted": 3, "reset": 1}),
-    ],
+    ("kind", "words", "counts"), [("unplug", "unplugged", {}), ("stall", "3 restarts", {"restarted": 3, "reset": 1})]
 )
 def test_device_that_stays_away_ends_the_run_with_its_counts(
     camera: Make, kind: Any, words: str, counts: dict[str, int]

@@ -1,6 +1,7 @@
 """Untrained doubt network on disk beside random bytes as its pipeline's weights, and small training sets."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,15 +29,9 @@ def untrained_doubt(folder: Path, watched: Path, seed: int = 0) -> DoubtRecord:
     with torch.no_grad():
         for _ in range(3):
             network.train()(torch.rand(4, 64, 80), 40 * torch.rand(4, 64, 80), torch.rand(4, 64, 64))
-    record = DoubtRecord(
-        watches=checksum_of_watched(watched),
-        recipe=RECIPE,
-        learnt=["small"],
-        temperatures=(0.5, 2.0),
-        error_scale=1.5,
-        nothing_above=0.4,
-        outside_above=0.3,
-    )
+    facts: dict[str, Any] = {"watches": checksum_of_watched(watched), "recipe": RECIPE, "learnt": ["small"]}
+    facts |= {"temperatures": (0.5, 2.0), "error_scale": 1.5, "nothing_above": 0.4, "outside_above": 0.3}
+    record = DoubtRecord(**facts)
     save_doubt(folder, network.eval(), record, watched)
     return record
 

@@ -12,17 +12,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from nlos_calibration import (
-    BareWall,
-    Board,
-    DriftCheck,
-    Intrinsics,
-    depth_noise_m,
-    load_rig,
-    wall_depth,
-    watched_pixels,
-)
+from nlos_calibration import BareWall, Board, DriftCheck, Intrinsics, depth_noise_m, load_rig, wall_depth
 from nlos_calibration.arrays import Float64
+from nlos_calibration.wall_tracker import watched_pixels
 from numpy.typing import NDArray
 
 from nlos_cam.calibrate import View, view

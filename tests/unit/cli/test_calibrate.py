@@ -11,18 +11,13 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
-from nlos_calibration.board import BOARDS, Board
+from nlos_calibration import BOARDS, Board, Occluder, OccluderRecord, load_measured, load_rig, load_wall, wall_depth
 from nlos_calibration.errors import CalibrationError, WallRefusedError
-from nlos_calibration.rig import Occluder, OccluderRecord, load_rig
-from nlos_calibration.wall import wall_depth
-from nlos_calibration.wall_record import load_measured, load_wall
 from rich.console import Console
 from synthetic_scenes import at_near_edge, clean_infrared, infrared_frames
 
-from nlos_cam.calibrate.measure import FrameFit, fit_frame
-from nlos_cam.calibrate.synthetic import View
-from nlos_cam.camera import Recording
-from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.calibrate import FrameFit, View, fit_frame
+from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.cli.calibrate import EVERY, gauge, panel, until_enter, watch_wall
 from nlos_cam.cli.common import release_outputs
 from nlos_cam.cli.main import build_app, main
@@ -30,21 +25,20 @@ from nlos_cam.errors import OutputExistsError
 from nlos_cam.frames import Frame
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
 
+Capsys = pytest.CaptureFixture[str]
 RIG = load_rig("bare-wall")
-A4, FRAMES = BOARDS["a4"], 8
-INTRINSICS = RIG.pinhole.scaled(160, 120)
-DEPTH_M = wall_depth(RIG.wall_from_lidar, INTRINSICS)
+A4 = BOARDS["a4"]
 Call = Callable[..., Any]
 
 
 class FakeCamera:
     """A camera of 10 frames of the bare wall; `scale` moves the wall, `patch` puts part of the view behind it."""
 
-    intrinsics = INTRINSICS
+    intrinsics = RIG.pinhole.scaled(160, 120)
     identity: ClassVar = {"name": "L515", "serial": "f0246262", "firmware": "1.5.8.1"}
     incomplete = dropped = taken = 0
 
-    def __init__(self, uri: str, scale: float, patch: float, frames: int) -> None:
+    def __init__(self, uri: str = "sim", scale: float = 1.0, patch: float = 1.0, frames: int = 10) -> None:
         self.uri, self.frames = uri, frames
         depth_m = scale * wall_depth(RIG.wall_from_lidar, self.intrinsics)
         depth_m[40:80, 40:100] *= patch
@@ -74,12 +68,12 @@ def out(tmp_path: Path) -> Path:
 def call(monkeypatch: pytest.MonkeyPatch, out: Path) -> Call:
     """Run `nlos-cam calibrate --out wall.toml` on a fake camera; returns that camera."""
 
-    def run(*arguments: str, scale: float = 1.0, patch: float = 1.0, frames: int = 10) -> FakeCamera | None:
+    def run(*arguments: str, **wall: Any) -> FakeCamera | None:
         opened: list[FakeCamera] = []
 
         def open_fake(uri: str, *, on_progress: Callable[[int, int], None]) -> FakeCamera:
             on_progress(1, 1)
-            opened.append(FakeCamera(uri, scale, patch, frames))
+            opened.append(FakeCamera(uri, **wall))
             return opened[0]
 
         monkeypatch.setattr("nlos_cam.camera.open_camera", open_fake)
@@ -96,11 +90,16 @@ def call(monkeypatch: pytest.MonkeyPatch, out: Path) -> Call:
 WALL = "--wall", "--camera", "sim:bare-wall"
 
 
-def json_of(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+def json_of(capsys: Capsys) -> dict[str, Any]:
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
-def test_calibrate_json_is_what_the_record_holds(call: Call, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def assert_shown(capsys: Capsys, *parts: str) -> None:
+    shown = capsys.readouterr().out
+    assert not [part for part in parts if part not in shown]
+
+
+def test_calibrate_json_is_what_the_record_holds(call: Call, out: Path, capsys: Capsys) -> None:
     call(*WALL, "--json")
     result, record = json_of(capsys), load_wall(out)
     assert result.pop("out") == str(out)
@@ -113,7 +112,7 @@ def test_calibrate_json_is_what_the_record_holds(call: Call, out: Path, capsys: 
     assert abs((record.created - datetime.now().astimezone().date()).days) <= 1
 
 
-def test_calibrate_writes_device_and_reference(call: Call, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_writes_device_and_reference(call: Call, out: Path, capsys: Capsys) -> None:
     camera = call("--wall", "--camera", "l515")
     record, reference = load_wall(out), load_measured(out).reference
     assert (record.serial, record.firmware, record.settings) == ("f0246262", "1.5.8.1", {"laser_power": 80.0})
@@ -122,13 +121,11 @@ def test_calibrate_writes_device_and_reference(call: Call, out: Path, capsys: py
     assert (reference.frames, reference.settings) == (10, {"laser_power": 80.0})
     np.testing.assert_allclose(reference.depth_m, camera.depth_m, rtol=1e-6)
     assert reference.inliers.mean() == pytest.approx(record.inlier_fraction)
-    shown = capsys.readouterr().out
-    for part in ("200.00 ± 0.0", "45.00", " mm RMS", "Verdict: good", "wall.npz", "open wall.html"):
-        assert part in shown
+    assert_shown(capsys, "200.00 ± 0.0", "45.00", " mm RMS", "Verdict: good", "wall.npz", "open wall.html")
 
 
 @pytest.mark.slow
-def test_calibrate_finds_the_occluder_on_a_simulated_bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_finds_the_occluder_on_a_simulated_bench(tmp_path: Path, capsys: Capsys) -> None:
     wall, bench, scene = tmp_path / "wall.toml", tmp_path / "bench.toml", tmp_path / "empty.toml"
     scene.write_text('name = "empty bench"\nrig = "paper-rig"\n', encoding="utf-8")
     assert main(["calibrate", *WALL, "--frames", "20", "--out", str(wall)]) == 0
@@ -144,22 +141,18 @@ def test_calibrate_finds_the_occluder_on_a_simulated_bench(tmp_path: Path, capsy
     assert main([*run, "--overwrite"]) == 0
 
 
-def test_calibrate_takes_frames_and_the_entered_occluder(
-    call: Call, out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_takes_frames_and_the_entered_occluder(call: Call, out: Path, capsys: Capsys) -> None:
     camera = call("--wall", "--bag", "run.bag", "--frames", "3", "--occluder-x-m", "0.25", "--occluder-gap-m", "0.08")
     record = load_wall(out)
     assert camera.uri == "bag:run.bag"
     assert camera.taken == record.frames == 3
     assert record.rig.occluder == Occluder(x_m=0.25, z_min_m=0.08)
     assert record.occluder == OccluderRecord(source="entered", x_m=0.25, gap_m=0.08)
-    shown = capsys.readouterr().out
-    for part in ("250.0 mm", "80.0 mm", "entered"):
-        assert part in shown
+    assert_shown(capsys, "250.0 mm", "80.0 mm", "entered")
 
 
 def test_calibrate_measures_after_watching(
-    call: Call, out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    call: Call, out: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.stdin", StringIO("\n"))
     call("--wall", "--watch", "--camera", "sim")
@@ -167,9 +160,7 @@ def test_calibrate_measures_after_watching(
     assert load_wall(out).frames == 10
 
 
-def test_calibrate_moves_by_tape_and_reports_out_of_range(
-    call: Call, out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_moves_by_tape_and_reports_out_of_range(call: Call, out: Path, capsys: Capsys) -> None:
     call(*WALL, "--tape-m", "0.203")
     record = load_wall(out)
     assert record.distance_m == record.rig.lidar.distance_m == pytest.approx(0.203, abs=2e-6)
@@ -213,7 +204,7 @@ def test_calibrate_keeps_existing_files_unless_asked(call: Call, out: Path, name
 
 def test_calibrate_without_out_writes_a_dated_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("nlos_cam.camera.open_camera", lambda uri, **_: FakeCamera(uri, 1.0, 1.0, 10))
+    monkeypatch.setattr("nlos_cam.camera.open_camera", lambda *_, **__: FakeCamera())
     monkeypatch.setattr("nlos_cam.calibrate.files.report_html", lambda *_: "")
     assert main(["calibrate", *WALL]) == 0
     (path,) = tmp_path.glob("wall-*.toml")
@@ -257,7 +248,7 @@ def record(tmp_path: Path, hurried_clock: Any) -> Callable[..., Path]:
     return made
 
 
-def calibrated(capsys: pytest.CaptureFixture[str], bag: Path, *further: str) -> dict[str, Any]:
+def calibrated(capsys: Capsys, bag: Path, *further: str) -> dict[str, Any]:
     out = bag.with_name("wall.toml")
     assert main(["calibrate", "--wall", "--board", "--bag", str(bag), "--out", str(out), "--json", *further]) == 0
     result = json_of(capsys)
@@ -269,7 +260,7 @@ Record = Callable[..., Path]
 
 
 @pytest.mark.slow
-def test_calibrate_board_uses_depth_and_board(record: Record, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_board_uses_depth_and_board(record: Record, capsys: Capsys) -> None:
     bag = record()
     result = calibrated(capsys, bag)
     board = result["board"]
@@ -279,13 +270,11 @@ def test_calibrate_board_uses_depth_and_board(record: Record, capsys: pytest.Cap
     assert board["distance_m"] == pytest.approx(0.2, abs=3 * board["distance_std_m"])
     assert abs(board["disagreement_m"]) < 0.002
     assert main(["calibrate", "--wall", "--board", "--bag", str(bag), "--out", str(bag.with_name("w.toml"))]) == 0
-    shown = capsys.readouterr().out
-    for part in ("printed board", f"{board['corners']} corners", "used: both"):
-        assert part in shown
+    assert_shown(capsys, "printed board", f"{board['corners']} corners", "used: both")
 
 
 @pytest.mark.slow
-def test_calibrate_board_replaces_depth_that_is_refused(record: Record, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_board_replaces_depth_that_is_refused(record: Record, capsys: Capsys) -> None:
     bag = record(step_m=0.05)
     assert main(["calibrate", "--wall", "--bag", str(bag), "--out", str(bag.with_name("w.toml"))]) == 1
     result = calibrated(capsys, bag, "--square-mm", "30")
@@ -295,9 +284,7 @@ def test_calibrate_board_replaces_depth_that_is_refused(record: Record, capsys: 
     assert result["distance_m"] == pytest.approx(0.2, abs=3 * result["distance_std_m"])
 
 
-def test_calibrate_board_refuses_a_recording_without_one(
-    noise_bag: Path, out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_board_refuses_a_recording_without_one(noise_bag: Path, out: Path, capsys: Capsys) -> None:
     arguments = ["--wall", "--board", "--paper", "a3", "--bag", str(noise_bag), "--out", str(out), "--json"]
     assert main(["calibrate", *arguments]) == 1
     error = json_of(capsys)["error"]
@@ -306,16 +293,10 @@ def test_calibrate_board_refuses_a_recording_without_one(
     assert not out.exists()
 
 
-def frames(count: int) -> Iterator[Frame]:
-    counts = np.full(DEPTH_M.shape, 48, np.uint8)
-    for number in range(count):
-        yield Frame(DEPTH_M.astype(np.float32), counts, counts, number / 30, number, INTRINSICS)
-
-
 @pytest.mark.parametrize(
     ("found", "parts"),
     [
-        (lambda: fit_frame(next(frames(1))), ("200.0 mm", "45.00°", "good", "●")),
+        (lambda: fit_frame(next(iter(FakeCamera()))), ("200.0 mm", "45.00°", "good", "●")),
         (lambda: FrameFit(None, "the wall [so to say] is not flat", 0.25), ("the wall [so to say] is not", "25.0%")),
     ],
 )
@@ -332,11 +313,10 @@ def test_watch_ends_with_the_camera_or_on_request() -> None:
         asked.append(1)
         return len(asked) == 2 * EVERY
 
-    camera: Any = frames(100)
-    last = watch_wall(camera, stop)
+    last = watch_wall(FakeCamera(frames=100), stop)  # type: ignore[arg-type]
     assert last.fit is not None
     assert len(asked) == 2 * EVERY
-    assert watch_wall(frames(0), lambda: False) is None  # type: ignore[arg-type]
+    assert watch_wall(FakeCamera(frames=0), lambda: False) is None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("typed", ["\n", ""])
@@ -355,7 +335,7 @@ def test_gauge_points_to_where_a_value_lies() -> None:
     assert len({len(gauge(value, 0.15, 0.3)) for value in (0.0, 0.2, 1.0)}) == 1
 
 
-def test_board_json_is_the_board_that_was_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_board_json_is_the_board_that_was_printed(tmp_path: Path, capsys: Capsys) -> None:
     out = tmp_path / "board.pdf"
     for paper, board in BOARDS.items():
         assert main(["board", "--out", str(out), "--paper", paper, "--json", "--overwrite"]) == 0
@@ -365,12 +345,10 @@ def test_board_json_is_the_board_that_was_printed(tmp_path: Path, capsys: pytest
         assert Board.model_validate(result) == board
 
 
-def test_board_keeps_a_file_and_prints_how_to_print(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_board_keeps_a_file_and_prints_how_to_print(tmp_path: Path, capsys: Capsys) -> None:
     out = tmp_path / "board.pdf"
     out.write_text("mine", encoding="utf-8")
     assert main(["board", "--out", str(out)]) == 1
     assert out.read_text(encoding="utf-8") == "mine"
     assert main(["board", "--out", str(out), "--overwrite"]) == 0
-    shown = capsys.readouterr().out
-    for part in ("6 x 9", "30 mm", "a4", "100 %", "board.pdf"):
-        assert part in shown
+    assert_shown(capsys, "6 x 9", "30 mm", "a4", "100 %", "board.pdf")

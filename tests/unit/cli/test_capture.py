@@ -10,18 +10,16 @@ from typing import Any
 
 import pytest
 
-from nlos_cam.camera import Recording
-from nlos_cam.camera.simulated import SimulatedCamera
+from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.cli import capture
 from nlos_cam.cli.capture import final_error, format_take, result_of
 from nlos_cam.cli.common import release_outputs
 from nlos_cam.cli.main import build_app, main
 from nlos_cam.errors import CameraLostError, DiskFullError, OutputExistsError
-from nlos_cam.recording.capture import CaptureResult, CaptureTarget
-from nlos_cam.recording.playback import VerifyResult, verify
+from nlos_cam.recording import CaptureResult, CaptureTarget, VerifyResult, load_sidecar, verify
 from nlos_cam.recording.quality import Quality
-from nlos_cam.recording.sidecar import load_sidecar
 
+Patch = pytest.MonkeyPatch
 PROGRAM = """
 import sys
 from nlos_cam.cli.main import build_app
@@ -38,9 +36,7 @@ def run_app(*arguments: str) -> int:
 
 
 @pytest.fixture
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], noise_world: Any, hurried_clock: Any
-) -> Run:
+def run(monkeypatch: Patch, capsys: pytest.CaptureFixture[str], noise_world: Any, hurried_clock: Any) -> Run:
     """Run `capture --json` on a NoiseWorld; returns the last line of stdout, and the exit code as "exit"."""
 
     def open_noise(uri: str, *, on_progress: Any, recording: Recording) -> SimulatedCamera:
@@ -56,7 +52,7 @@ def run(
 
 
 @pytest.fixture
-def lines(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def lines(monkeypatch: Patch) -> list[str]:
     """Collect what the command prints for a person."""
     found: list[str] = []
     monkeypatch.setattr(capture, "say", lambda text, **_: found.append(text))
@@ -68,7 +64,7 @@ def out(tmp_path: Path) -> str:
     return str(tmp_path / "a.bag")
 
 
-def test_capture_json_reports_the_file(run: Run, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_capture_json_reports_the_file(run: Run, tmp_path: Path, out: str, monkeypatch: Patch) -> None:
     found = run("--frames", "9", "--label", "a cup", "--out", out)
     assert (found["frames"], found["dropped"], found["seconds"], found["out"]) == (9, 0, 0.267, out)
     assert (found["exit"], found["state"], found["sidecar"]) == (0, "complete", str(tmp_path / "a.json"))
@@ -94,7 +90,7 @@ def test_capture_numbers_and_labels_takes(run: Run, tmp_path: Path, out: str) ->
 
 
 @pytest.mark.slow
-def test_capture_pauses_between_takes(run: Run, out: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_capture_pauses_between_takes(run: Run, out: str, monkeypatch: Patch) -> None:
     paused: list[float | None] = []
     monkeypatch.setattr(capture, "_pause", lambda _bar, _stop, pause_s, _text: paused.append(pause_s))
     run("--takes", "3", "--frames", "2", "--pause-s", "7", "--out", out)
@@ -102,9 +98,7 @@ def test_capture_pauses_between_takes(run: Run, out: str, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("answer", ["\n", KeyboardInterrupt])
-def test_capture_asks_at_a_terminal_before_each_take(
-    run: Run, out: str, monkeypatch: pytest.MonkeyPatch, answer: Any
-) -> None:
+def test_capture_asks_at_a_terminal_before_each_take(run: Run, out: str, monkeypatch: Patch, answer: Any) -> None:
     def readline() -> str:
         if answer is KeyboardInterrupt:
             signal.raise_signal(signal.SIGINT)
@@ -128,9 +122,7 @@ def test_capture_overwrites_only_with_the_option(run: Run, tmp_path: Path, out: 
     assert load_sidecar(precious.with_suffix(".json")).state == "complete"
 
 
-def test_capture_checks_disk_space_before_writing(
-    run: Run, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_capture_checks_disk_space_before_writing(run: Run, tmp_path: Path, out: str, monkeypatch: Patch) -> None:
     monkeypatch.setattr("nlos_cam.camera.free_bytes", lambda _: 210_000_000)
     with pytest.raises(DiskFullError, match=r"1000 .*64 x 48"):
         run("--takes", "2", "--frames", "500", "--out", out)
@@ -139,7 +131,7 @@ def test_capture_checks_disk_space_before_writing(
 
 
 def test_capture_without_a_limit_reports_remaining_time(
-    run: Run, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch, lines: list[str]
+    run: Run, tmp_path: Path, out: str, monkeypatch: Patch, lines: list[str]
 ) -> None:
     beside = SimpleNamespace(path=tmp_path / "a.json")
     ended = CaptureResult(CaptureTarget(Path(out)), "interrupted", 0, Quality(), beside)  # before the first frame
@@ -150,7 +142,7 @@ def test_capture_without_a_limit_reports_remaining_time(
 
 
 def test_capture_reports_damage_and_gaps(
-    run: Run, tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch, lines: list[str]
+    run: Run, tmp_path: Path, out: str, monkeypatch: Patch, lines: list[str]
 ) -> None:
     monkeypatch.setattr("nlos_cam.recording.verify", lambda *_, **__: VerifyResult(3, 0, 0.1, {}))
     found = run("--frames", "5", "--out", out)
@@ -162,9 +154,7 @@ def test_capture_reports_damage_and_gaps(
     assert "2 frames" in lines[0]
 
 
-def test_capture_interrupted_while_reading_back_loses_nothing(
-    run: Run, out: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_capture_interrupted_while_reading_back_loses_nothing(run: Run, out: str, monkeypatch: Patch) -> None:
     def interrupted(path: Path, on_frame: Callable[[], None]) -> VerifyResult:
         return verify(path, lambda: (on_frame(), signal.raise_signal(signal.SIGINT))[0])
 
@@ -213,19 +203,10 @@ def take(path: str, **changes: Any) -> CaptureResult:
 
 
 def test_result_holds_the_fields_of_one_take(out: str) -> None:
-    assert result_of([take(out, target=CaptureTarget(Path(out), "a cup"))], several=False) == {
-        "frames": 30,
-        "dropped": 1,
-        "seconds": 1.0,
-        "out": out,
-        "state": "complete",
-        "streams": STREAMS,
-        "saturated_share": 0.001,
-        "invalid_share": 0.25,
-        "temporal_noise_mm": 1.234,
-        "sidecar": "a.json",
-        "label": "a cup",
-    }
+    found = result_of([take(out, target=CaptureTarget(Path(out), "a cup"))], several=False)
+    shares = {"saturated_share": 0.001, "invalid_share": 0.25, "temporal_noise_mm": 1.234}
+    named = {"out": out, "state": "complete", "streams": STREAMS, "sidecar": "a.json", "label": "a cup"}
+    assert found == {"frames": 30, "dropped": 1, "seconds": 1.0, **shares, **named}
 
 
 def test_result_of_several_takes_has_totals(out: str) -> None:
@@ -262,7 +243,7 @@ def test_lines_at_the_terminal_hold_the_figures(out: str) -> None:
 
 @pytest.mark.parametrize("takes", [1, 3])
 def test_capture_interrupted_before_start_has_the_same_fields(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, takes: int
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Patch, takes: int
 ) -> None:
     monkeypatch.setattr("nlos_cam.camera.open_camera", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     several = ["--takes", str(takes), "--frames", "2"] if takes > 1 else []

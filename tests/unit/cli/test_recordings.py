@@ -12,14 +12,15 @@ import typer
 from nlos_cam.cli import recordings
 from nlos_cam.cli.main import main
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.recording.playback import verify
-from nlos_cam.recording.repair import repair_recording
+from nlos_cam.recording import repair_recording, verify
+
+Capsys = pytest.CaptureFixture[str]
 
 Run = Callable[..., tuple[int, dict[str, Any], str]]
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
+def run(capsys: Capsys) -> Run:
     """Run `nlos-cam repair --json`; returns the exit code, the last line of stdout, and stderr."""
 
     def call(*arguments: Path | str) -> tuple[int, dict[str, Any], str]:
@@ -42,7 +43,7 @@ def test_repair_json_reports_the_new_file(run: Run, noise_bags: dict[str, Path],
 
 
 def test_repair_prints_what_was_recovered_and_lost(
-    capsys: pytest.CaptureFixture[str], noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    capsys: Capsys, noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recordings.repair(noise_bags["packed"], tmp_path / "a.bag")
     shown = capsys.readouterr().out
@@ -96,9 +97,7 @@ def test_repair_interrupted_is_exit_code_130_without_output(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_export_json_reports_what_was_written(
-    noise_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_json_reports_what_was_written(noise_bag: Path, tmp_path: Path, capsys: Capsys) -> None:
     out = tmp_path / "out"
     assert main(["export", str(noise_bag), "--out", str(out), "--ply", "--every", "10", "--json"]) == 0
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -115,9 +114,7 @@ def test_export_overwrites_only_with_the_option(noise_bag: Path, tmp_path: Path)
     assert (tmp_path / "depth.csv").read_text() != "precious"
 
 
-def test_export_of_wrong_streams_or_damage_is_exit_code_4(
-    noise_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_of_wrong_streams_or_damage_is_exit_code_4(noise_bag: Path, tmp_path: Path, capsys: Capsys) -> None:
     out = ["--out", str(tmp_path / "out")]
     assert main(["export", str(noise_bag), "--streams", "color", *out]) == 4
     assert "color" in capsys.readouterr().err
@@ -130,7 +127,7 @@ def test_export_of_wrong_streams_or_damage_is_exit_code_4(
     assert "nlos-cam repair" in capsys.readouterr().err
 
 
-def test_export_writes_hidden_surfaces_of_a_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_writes_hidden_surfaces_of_a_replay(tmp_path: Path, capsys: Capsys) -> None:
     depth_m = np.full((2, 64, 64), np.nan, np.float32)
     depth_m[0, 8:20, 8:20] = 0.2
     box = {"origin_m": [0.3, 0.1], "pitch_m": [0.004, -0.004], "z_near_m": 0.12, "z_far_m": 0.4}

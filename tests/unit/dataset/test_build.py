@@ -19,20 +19,14 @@ import pytest
 from fake_farm import FakeFarm, samples_of
 from nlos_calibration.rig import load_rig
 
+from nlos_cam import errors
 from nlos_cam.dataset import BuildReport, DatasetPlan, build_dataset, open_dataset, worker
 from nlos_cam.dataset import build as dataset
 from nlos_cam.dataset.build import processes
 from nlos_cam.dataset.samples import make_samples
 from nlos_cam.dataset.shards import SHARD_PATTERN, only_builder, store
-from nlos_cam.errors import (
-    DiskFullError,
-    FolderBusyError,
-    OutputExistsError,
-    RecordingError,
-    SceneError,
-    WorkersLostError,
-)
 
+Patch = pytest.MonkeyPatch
 PLAN = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft")
 COUNT, LAST = 23, "shard-000000060.h5"  # the last shard holds three objects, the others five
 BLAS = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
@@ -57,7 +51,7 @@ Shards = dict[str, bytes]
 
 @pytest.fixture(autouse=True, scope="module")
 def _small_shards() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
+    with Patch.context() as patch:
         patch.setattr(dataset, "SHARD", 5)
         patch.setattr(dataset, "PIECE", 2)
         yield
@@ -118,8 +112,8 @@ def test_interrupted_build_resumes(tmp_path: Path, whole: Shards, after: int, or
 
 
 def test_build_raises_error_of_an_object(tmp_path: Path) -> None:
-    farm = FakeFarm(fails_after=4, error=SceneError("cup.stl shows nothing"))
-    with pytest.raises(SceneError, match=r"cup\.stl"):
+    farm = FakeFarm(fails_after=4, error=errors.SceneError("cup.stl shows nothing"))
+    with pytest.raises(errors.SceneError, match=r"cup\.stl"):
         _build(tmp_path, farm)
     assert farm.closed
     assert len(_bytes(tmp_path)) == 1
@@ -157,14 +151,12 @@ def test_build_grows_dataset_to_count(tmp_path: Path, whole: Shards, first: int)
     assert _bytes(tmp_path) == whole
 
 
-def test_build_refuses_other_plan_and_shard_size(
-    finished: Path, whole: Shards, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_build_refuses_other_plan_and_shard_size(finished: Path, whole: Shards, monkeypatch: Patch) -> None:
     other = replace(PLAN, accuracy="fine", rig=PLAN.rig.model_copy(update={"name": "other"}))
-    with pytest.raises(RecordingError, match=r"rig.*accuracy"):
+    with pytest.raises(errors.RecordingError, match=r"rig.*accuracy"):
         _build(finished, plan=other)
     monkeypatch.setattr(dataset, "SHARD", 4)
-    with pytest.raises(RecordingError, match=r"shard-000000040\.h5"):
+    with pytest.raises(errors.RecordingError, match=r"shard-000000040\.h5"):
         _build(finished)
     assert _bytes(finished) == whole
 
@@ -173,32 +165,32 @@ def test_build_refuses_shard_of_newer_program(tmp_path: Path) -> None:
     newer = PLAN.provenance.replace('{"rig"', '{"lens": 1, "rig"', 1)
     store(tmp_path / "shard-000000040.h5", samples_of(range(40, 45)), newer, "")
     before = _bytes(tmp_path)
-    with pytest.raises(RecordingError, match="lens"):
+    with pytest.raises(errors.RecordingError, match="lens"):
         _build(tmp_path)
     assert _bytes(tmp_path) == before
 
 
 def test_build_locks_its_folder_and_refuses_a_file(tmp_path: Path) -> None:
-    with only_builder(tmp_path), pytest.raises(FolderBusyError, match=str(os.getpid())):
+    with only_builder(tmp_path), pytest.raises(errors.FolderBusyError, match=str(os.getpid())):
         _build(tmp_path)
     _build(tmp_path)
     assert {path.suffix for path in tmp_path.iterdir()} == {".h5"}
     (tmp_path / "file").write_text("here")
-    with pytest.raises(OutputExistsError, match="--out"):
+    with pytest.raises(errors.OutputExistsError, match="--out"):
         _build(tmp_path / "file")
 
 
-def test_build_keeps_shards_when_disk_is_full(tmp_path: Path, whole: Shards, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_build_keeps_shards_when_disk_is_full(tmp_path: Path, whole: Shards, monkeypatch: Patch) -> None:
     stores, farm = list[Path](), FakeFarm()
 
     def full(path: Path, *others: Any) -> None:
         stores.append(path)
         if len(stores) == 3:
-            raise DiskFullError(str(path))
+            raise errors.DiskFullError(str(path))
         store(path, *others)
 
     monkeypatch.setattr(dataset, "store", full)
-    with pytest.raises(DiskFullError):
+    with pytest.raises(errors.DiskFullError):
         _build(tmp_path, farm)
     assert farm.closed
     assert len(list(tmp_path.glob(SHARD_PATTERN))) == 2
@@ -224,13 +216,11 @@ class InThisProcess(Executor):
         return future
 
 
-def test_processes_replace_killed_workers_or_give_up(
-    tmp_path: Path, whole: Shards, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_processes_replace_killed_workers_or_give_up(tmp_path: Path, whole: Shards, monkeypatch: Patch) -> None:
     monkeypatch.setattr(dataset, "ProcessPoolExecutor", InThisProcess)
     monkeypatch.setattr(dataset, "make_samples", lambda _, piece: samples_of(piece))
     InThisProcess.dies_after = [7, 0, 1, 4, 100]
-    with pytest.raises(WorkersLostError, match="--workers"):  # the second pool makes nothing
+    with pytest.raises(errors.WorkersLostError, match="--workers"):  # the second pool makes nothing
         _build(tmp_path, processes(2))
     assert 0 < len(_bytes(tmp_path)) <= 2
     _build(tmp_path, processes(2))
@@ -254,7 +244,7 @@ def test_worker_ends_with_killed_parent() -> None:
         assert parent.stdout.read() == ""  # end of file: the worker held this pipe open, and ended
 
 
-def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: Patch) -> None:
     monkeypatch.setattr(worker, "parent_process", lambda: None)
     for name in BLAS:
         monkeypatch.setenv(name, "2")
@@ -275,10 +265,10 @@ def test_worker_module_does_not_import_numpy() -> None:
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
-def test_workers_without_shared_memory_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_without_shared_memory_are_one_line(tmp_path: Path, monkeypatch: Patch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 
     monkeypatch.setattr(dataset, "ProcessPoolExecutor", refuse)
-    with pytest.raises(WorkersLostError, match=r"Read-only file system.*/dev/shm"):
+    with pytest.raises(errors.WorkersLostError, match=r"Read-only file system.*/dev/shm"):
         build_dataset(PLAN, COUNT, tmp_path, workers=1, on_progress=lambda *_: None)

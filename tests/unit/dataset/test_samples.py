@@ -14,19 +14,11 @@ from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float32
 from nlos_models import CellNormal
 
+from nlos_cam.dataset import objects_from_folder, procedural_images
 from nlos_cam.dataset import samples as dataset_samples
 from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.plan import DatasetPlan, Objects, RigSpread, scene_row
-from nlos_cam.dataset.samples import (
-    Samples,
-    hidden_object,
-    join_samples,
-    make_samples,
-    objects_from_folder,
-    procedural_images,
-    sense_color,
-    sense_object,
-)
+from nlos_cam.dataset.samples import Samples, hidden_object, join_samples, make_samples, sense_color, sense_object
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import CATEGORIES, TEXTURES, image_from_albedo, image_from_depth, object_depth, paint

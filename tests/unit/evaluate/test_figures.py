@@ -8,26 +8,14 @@ import pytest
 from matplotlib import colormaps
 
 from nlos_cam.evaluate import figures as evaluate_pictures
-from nlos_cam.evaluate.figures import (
-    BLOCK,
-    DIFFERENCE,
-    HEAD,
-    ROWS,
-    TILE,
-    VALUE,
-    _figure,
-    draw_categories,
-    draw_gallery,
-    draw_sheet,
-    mosaic,
-)
+from nlos_cam.evaluate.figures import BLOCK, DIFFERENCE, HEAD, ROWS, TILE, VALUE, draw_gallery, draw_sheet
 from nlos_cam.evaluate.metrics import TARGETS, over_objects
 
 
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The figures that are drawn."""
-    made, original = list[Any](), _figure
+    made, original = list[Any](), evaluate_pictures._figure
 
     def kept(size: tuple[float, float]) -> Any:
         made.append(original(size))
@@ -47,7 +35,7 @@ def _titles(figure: Any) -> list[str]:
 
 def test_mosaic_shows_truth_reconstruction_and_difference() -> None:
     truth, image = _images(5), _images(5)[::-1].copy()
-    canvas = mosaic(image, truth, columns=3)
+    canvas = evaluate_pictures.mosaic(image, truth, columns=3)
     assert canvas.shape == (2 * BLOCK, 3 * TILE, 3)
     for k in range(5):
         top, left = k // 3 * BLOCK + HEAD, k % 3 * TILE
@@ -71,12 +59,12 @@ def test_sheet_names_up_to_54_objects_from_first_to_last(tmp_path: Path, figures
 def test_categories_are_drawn_from_worst_to_best(tmp_path: Path, figures: list[Any]) -> None:
     levels = {"cup": 0.9, "hat": 0.5}
     by = {kind: over_objects({name: np.array([level] * 2) for name in TARGETS}) for kind, level in levels.items()}
-    draw_categories(tmp_path / "categories.png", by, by["cup"])
+    evaluate_pictures.draw_categories(tmp_path / "categories.png", by, by["cup"])
     axis = figures[0].axes[0]
     assert [label.get_text() for label in axis.get_yticklabels()] == ["hat", "cup"]
     assert [text.get_text().count("0.9") for text in axis.get_legend().texts] == [1, 1]  # the estimate and the bar
     nothing = {"cup": over_objects({name: np.array([np.nan]) for name in TARGETS})}
-    draw_categories(tmp_path / "empty.png", nothing, nothing["cup"])
+    evaluate_pictures.draw_categories(tmp_path / "empty.png", nothing, nothing["cup"])
     assert (tmp_path / "empty.png").read_bytes().startswith(b"\x89PNG")
 
 

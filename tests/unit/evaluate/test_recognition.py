@@ -4,15 +4,8 @@ import numpy as np
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.evaluate.recognition import recognise, recognised
-from nlos_cam.objects import (
-    CATEGORIES,
-    Pose,
-    category_triangles,
-    image_from_depth,
-    object_box,
-    orthographic_depth,
-    place,
-)
+from nlos_cam.objects import CATEGORIES, category_triangles, image_from_depth, object_box, orthographic_depth
+from nlos_cam.objects.placement import Pose, place
 
 BOX = object_box(load_rig("paper-rig"))
 

@@ -11,17 +11,8 @@ import pytest
 from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.evaluate import (
-    RenderRow,
-    as_table,
-    draw_renders,
-    machine,
-    measure_renders,
-    render_document,
-    render_facts,
-    render_settings,
-)
-from nlos_cam.evaluate.render_tradeoff import REPEATS, Part, RenderFacts, pareto_front
+from nlos_cam.evaluate import RenderRow, as_table, measure_renders, render_document, render_facts, render_settings
+from nlos_cam.evaluate.render_tradeoff import REPEATS, Part, RenderFacts, draw_renders, machine, pareto_front
 from nlos_cam.render import STOPS, Agreement, Scene, Work
 
 RIG = load_rig("paper-rig")
@@ -122,16 +113,10 @@ def _row(name: str, seconds: float, error: float, part: Part = "sub_bins") -> Re
 
 
 def test_pareto_front_holds_the_undominated_rows() -> None:
-    rows = [
-        _row("slow and exact", 9, 0.0, "stop"),
-        _row("quick", 1, 0.1),
-        _row("beaten", 3, 0.1),
-        _row("beaten in both", 4, 0.2),
-        _row("middling", 2, 0.05),
-        _row("tie in time, worse", 2, 0.06),
-        _row("another truth", 0.1, 0.0, "beams_per_cell"),
-        _row("map alone", 0.1, 0.0, "effect left out"),
-    ]
+    best = [_row("slow and exact", 9, 0.0, "stop"), _row("quick", 1, 0.1), _row("middling", 2, 0.05)]
+    beaten = [_row("beaten", 3, 0.1), _row("beaten in both", 4, 0.2), _row("tie in time, worse", 2, 0.06)]
+    others = [_row("another truth", 0.1, 0.0, "beams_per_cell"), _row("map alone", 0.1, 0.0, "effect left out")]
+    rows = [*best, *beaten, *others]
     assert [row.name for row in pareto_front(rows)] == ["quick", "middling", "slow and exact"]
     assert pareto_front([]) == []
 

@@ -6,35 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from nlos_models.checkpoint import CheckpointRecord
-from nlos_models.recipe import Recipe
+from nlos_models import CheckpointRecord, Recipe
 from small_maps import SmallDataset, small_maps
 
 from nlos_cam.camera.simulated_world import World
 from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan, procedural_images
 from nlos_cam.errors import SceneError
-from nlos_cam.evaluate import baselines
-from nlos_cam.evaluate.subjects import (
-    QUIET,
-    HeldOutObjects,
-    as_map_set,
-    baseline_answers,
-    echoes_of,
-    notes_about,
-    reconstruct_all,
-    rendered_objects,
-    rig_of,
-    seeded_objects,
-    sense,
-    truth_of,
-)
+from nlos_cam.evaluate import QUIET, HeldOutObjects, as_map_set, baseline_answers, baselines, echoes_of, reconstruct_all
+from nlos_cam.evaluate.subjects import notes_about, rendered_objects, rig_of, seeded_objects, sense, truth_of
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.objects import CATEGORIES, unseen_objects
-from nlos_cam.objects.benchmark import benchmark_objects as fixed_set
-from nlos_cam.objects.depth_map import image_from_depth, object_box
-from nlos_cam.objects.placement import object_depth
-from nlos_cam.render.renderer import MultiBounce
-from nlos_cam.render.scene_file import SceneFile
+from nlos_cam.objects import CATEGORIES, benchmark_objects, image_from_depth, object_box, object_depth, unseen_objects
+from nlos_cam.render import MultiBounce, SceneFile
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -63,7 +45,7 @@ def test_seeded_objects_are_those_of_their_seeds() -> None:
 
 
 def test_test_set_has_54_visible_objects_of_18_categories() -> None:
-    subjects = fixed_set(BOX)
+    subjects = benchmark_objects(BOX)
     truth = truth_of(subjects, BOX)
     assert truth.shape == (54, 64, 64)
     assert len({subject.name for subject in subjects}) == 54
@@ -109,7 +91,7 @@ def test_fresh_objects_are_those_of_test_seeds() -> None:
 
 
 def test_second_set_is_of_other_kinds_in_the_same_poses() -> None:
-    kinds, unseen = fixed_set(BOX), unseen_objects(BOX)
+    kinds, unseen = benchmark_objects(BOX), unseen_objects(BOX)
     assert [one.pose for one in unseen] == [one.pose for one in kinds]
     names = {one.category for one in unseen}
     assert (len(unseen), len(names), names & CATEGORIES.keys()) == (54, 18, set())

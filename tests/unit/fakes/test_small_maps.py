@@ -4,22 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import small_maps as small
 import torch
 from nlos_calibration import load_rig
 from nlos_models import checkpoint, load_doubt
 from nlos_models.compressor import Compressor
 from nlos_models.vae import ResVae
 from small_doubt import small_doubt_set, untrained_doubt, watched_weights
-from small_maps import (
-    HARD_MAPS,
-    SmallCompressor,
-    SmallVae,
-    hard_maps,
-    small_images,
-    small_maps,
-    untrained_weights,
-    use_small_networks,
-)
 from torch import nn
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -32,20 +23,20 @@ def _shapes(vae: nn.Module, compressor: nn.Module) -> list[torch.Size]:
 
 @torch.no_grad()
 def test_small_networks_have_shapes_and_parts_of_real_ones() -> None:
-    assert _shapes(SmallVae(), SmallCompressor()) == _shapes(ResVae(), Compressor())
-    for compressor in (SmallCompressor(0.25, 0.5), Compressor(0.25, 0.5)):
+    assert _shapes(small.SmallVae(), small.SmallCompressor()) == _shapes(ResVae(), Compressor())
+    for compressor in (small.SmallCompressor(0.25, 0.5), Compressor(0.25, 0.5)):
         dropout, linear = compressor.classifier
         assert isinstance(compressor.features, nn.Module)
         assert (dropout.p, linear.out_features) == (0.25, 256)
-    for vae in (SmallVae(), ResVae()):
+    for vae in (small.SmallVae(), ResVae()):
         assert any(isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d) for part in vae.decoder.modules())
         assert vae.decoder.output.weight.requires_grad
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_small_maps_show_their_images_and_nothing_else(seed: int) -> None:
-    maps = small_maps(3, seed)
-    np.testing.assert_array_equal(maps.image, small_images(3, seed))
+    maps = small.small_maps(3, seed)
+    np.testing.assert_array_equal(maps.image, small.small_images(3, seed))
     np.testing.assert_array_equal(~np.isnan(maps.depth_m[:, :, 8:-8]), maps.image > 0)
     assert not maps.intensity[np.isnan(maps.depth_m)].any()
 
@@ -56,8 +47,8 @@ def test_untrained_weights_load_and_differ_by_seed(tmp_path: Path, monkeypatch: 
     watched = watched_weights(tmp_path / "watched")
     for seed in (0, 1):
         untrained_doubt(tmp_path / f"doubt{seed}", watched, seed)
-        untrained_weights(tmp_path / str(seed), rig=rig, seed=seed, steps=steps, maps="difference maps")
-    use_small_networks(monkeypatch, checkpoint)
+        small.untrained_weights(tmp_path / str(seed), rig=rig, seed=seed, steps=steps, maps="difference maps")
+    small.use_small_networks(monkeypatch, checkpoint)
     (one, record), (other, _) = (checkpoint.load_pipeline(tmp_path / name) for name in "01")
     assert (record.rig_checksum, record.input) == (rig.checksum, "difference maps")
     assert record.compressor_recipe.steps == steps
@@ -73,7 +64,7 @@ def test_untrained_weights_load_and_differ_by_seed(tmp_path: Path, monkeypatch: 
 
 @pytest.mark.parametrize("channels", [(), (3,)])
 def test_hard_maps_have_the_named_extremes(channels: tuple[int, ...]) -> None:
-    depth, intensity = zip(*(hard_maps(name, channels) for name in HARD_MAPS), strict=True)
+    depth, intensity = zip(*(small.hard_maps(name, channels) for name in small.HARD_MAPS), strict=True)
     assert [float(d.isnan().float().mean()) for d in depth] == [0, 0, 0, 0.5, 1]
     assert [float(i.max()) for i in intensity] == [10, 0, 255, 10, 10]
     assert {i.shape for i in intensity} == {(1, *channels, 64, 80)}

@@ -94,10 +94,8 @@ def test_warm_up_runs_the_pipeline_without_taking_a_frame() -> None:
 
 def test_run_live_warns_while_the_lidar_is_moved(tmp_path: Path) -> None:
     begins, viewer, clock = list[tuple[str, bool]](), ListViewer(), count_up(1.0)
-    camera, method = (
-        WallCamera(150, moved=range(30, 80)),
-        Pipeline(CalibratedRig(RIG, measured_wall(tmp_path)), sheet_network),
-    )
+    camera, bench = WallCamera(150, moved=range(30, 80)), CalibratedRig(RIG, measured_wall(tmp_path))
+    method = Pipeline(bench, sheet_network)
     run: Any = {"stop": Event(), "recorded": True, "clock": lambda: next(clock)}  # the recording is never ahead of it
     report = run_live(camera, method, viewer, **run, on_warning=lambda *about: begins.append(about))
     [(warning, frames)] = report.warnings.items()
@@ -213,14 +211,6 @@ def test_run_live_shows_a_stall_with_the_last_moment() -> None:
 PIXELS = 80 * 64
 
 
-def frame_with(with_depth: int, at_255: int = 0) -> Frame:
-    """Frame in which this many pixels have a depth, and this many are saturated."""
-    depth_m, ir = np.full(PIXELS, np.nan, np.float32), np.full(PIXELS, 254, np.uint8)
-    depth_m[:with_depth], ir[:at_255] = 0.3, 255
-    shape = 64, 80
-    return Frame(depth_m.reshape(shape), ir.reshape(shape), ir.reshape(shape), 0.0, 0, SMALL)
-
-
 @pytest.mark.parametrize(
     ("depths", "saturated", "names"),
     [
@@ -233,4 +223,9 @@ def frame_with(with_depth: int, at_255: int = 0) -> Frame:
     ],
 )
 def test_frame_issues_are_named(depths: int, saturated: int, names: list[str]) -> None:
-    assert frame_issues(frame_with(depths, saturated)) == names
+    """Of a frame in which so many pixels have a depth, and so many are at 255."""
+    frame = small_frame(0)
+    frame.depth_m.ravel()[depths:] = np.nan
+    frame.ir[:] = 254
+    frame.ir.ravel()[:saturated] = 255
+    assert frame_issues(frame) == names

@@ -34,18 +34,15 @@ def noise_frame(number: int) -> Frame:
 
 def replayed(out: Path, count: int = 2, **options: Any) -> ReplayReport:
     """Replay `count` frames of noise without a wall; the camera counts duplicates."""
-    camera, pipeline = (
-        FrameCamera(count, make=noise_frame),
-        options.pop("pipeline", Pipeline(CalibratedRig(RIG), network)),
-    )
+    camera = FrameCamera(count, make=noise_frame)
+    pipeline = options.pop("pipeline", Pipeline(CalibratedRig(RIG), network))
     camera.counts.update(duplicate=2, out_of_order=1)
     return replay_recording(camera, pipeline, out, **{"stop": Event(), **options})
 
 
 def replayed_wall(tmp_path: Path, camera: WallCamera, out: str = "out") -> Path:
-    replay_recording(
-        camera, Pipeline(CalibratedRig(RIG, measured_wall(tmp_path)), network), tmp_path / out, stop=Event()
-    )
+    pipeline = Pipeline(CalibratedRig(RIG, measured_wall(tmp_path)), network)
+    replay_recording(camera, pipeline, tmp_path / out, stop=Event())
     return tmp_path / out
 
 

@@ -83,8 +83,7 @@ def test_whole_recording_stays_whole_when_written_again(crafted: Callable[[Chang
 
 @pytest.mark.parametrize("kind", ["std_msgs/String", "sensor_msgs/CameraInfo", "diagnostic_msgs/KeyValue"])
 @pytest.mark.parametrize(
-    "ending",
-    ["Depth_0/info", "Depth_0/info/camera_info", "Depth_0/image/data", "Depth_Units/value", "/device_0/info"],
+    "ending", ["Depth_0/info", "Depth_0/info/camera_info", "Depth_0/image/data", "Depth_Units/value", "/device_0/info"]
 )
 def test_message_of_another_type_is_refused_in_a_line(
     crafted: Callable[[Change], Path], ending: str, kind: str
@@ -127,9 +126,7 @@ def test_sensor_of_five_thousand_digits_is_no_stream(crafted: Callable[[Change],
         pytest.fail("played")
 
 
-def test_index_that_lists_messages_again_and_again_is_refused(
-    crafted: Callable[[Change], Path],
-) -> None:
+def test_index_that_lists_messages_again_and_again_is_refused(crafted: Callable[[Change], Path]) -> None:
     path = crafted(lambda _: None)
     bag = read_bag(path.read_bytes())
 

@@ -10,25 +10,13 @@ from PIL import Image
 from nlos_cam.errors import NlosCamError
 from nlos_cam.reconstruct import Verdict
 from nlos_cam.view import Still, VideoFile
+from nlos_cam.view import video as layout
 from nlos_cam.view.images import BACKGROUND_RGB
-from nlos_cam.view.video import (
-    FRAMES_PER_S,
-    HEIGHT,
-    LARGE,
-    LARGE_AT,
-    LIDAR_WIDTH,
-    LOWER,
-    MIDDLE_AT,
-    RIGHT_AT,
-    SMALL,
-    WIDTH,
-    _fitted,
-)
 
 
 def read(path: Path) -> list[np.ndarray]:
     video, frames = cv2.VideoCapture(str(path)), []
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(FRAMES_PER_S)
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(layout.FRAMES_PER_S)
     while (got := video.read())[0]:
         frames.append(got[1][..., ::-1])
     return frames
@@ -41,7 +29,7 @@ def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixt
             film.show(full_moment(number))
     frames = read(path)
     assert len(frames) == film.filmed == 10
-    assert {frame.shape for frame in frames} == {(HEIGHT, WIDTH, 3)}
+    assert {frame.shape for frame in frames} == {(layout.HEIGHT, layout.WIDTH, 3)}
     expected = Still(RIG, full_moment(0)).rgb(full_moment(0)).astype(int)
     assert np.abs(frames[0] - expected).mean() < 6.0
     assert (np.abs(frames[0].astype(int) - frames[-1]).max(axis=-1) > 60).mean() > 0.005, "it moves"
@@ -61,11 +49,11 @@ def test_film_refuses_a_missing_codec(tmp_path: Path, monkeypatch: pytest.Monkey
 Picture = np.ndarray
 PANELS = {
     "banner": ((20, 20), (880, 96)),
-    "reconstruction": (LARGE_AT, (LARGE, LARGE)),
-    "uncertainty": (MIDDLE_AT, (SMALL, SMALL)),
-    "truth": ((MIDDLE_AT[0], MIDDLE_AT[1] + LOWER), (SMALL, SMALL)),
-    "depth": (RIGHT_AT, (LIDAR_WIDTH, SMALL)),
-    "infrared": ((RIGHT_AT[0], RIGHT_AT[1] + LOWER), (LIDAR_WIDTH, SMALL)),
+    "reconstruction": (layout.LARGE_AT, (layout.LARGE, layout.LARGE)),
+    "uncertainty": (layout.MIDDLE_AT, (layout.SMALL, layout.SMALL)),
+    "truth": ((layout.MIDDLE_AT[0], layout.MIDDLE_AT[1] + layout.LOWER), (layout.SMALL, layout.SMALL)),
+    "depth": (layout.RIGHT_AT, (layout.LIDAR_WIDTH, layout.SMALL)),
+    "infrared": ((layout.RIGHT_AT[0], layout.RIGHT_AT[1] + layout.LOWER), (layout.LIDAR_WIDTH, layout.SMALL)),
     "footer": ((20, 690), (600, 25)),
 }
 
@@ -83,7 +71,7 @@ def test_still_shows_each_part_of_a_moment_in_its_panel() -> None:
     one = full_moment(0)
     still = Still(RIG, one)
     before = still.rgb(one)
-    assert before.shape == (HEIGHT, WIDTH, 3)
+    assert before.shape == (layout.HEIGHT, layout.WIDTH, 3)
     frame = one.frame
     for name, other in {
         "truth": replace(one, frame=replace(frame, truth_depth_m=NOTHING)),
@@ -122,12 +110,12 @@ def test_still_is_saved_as_png(tmp_path: Path) -> None:
     one = full_moment(0, size=(480, 640))
     Still(RIG, one).save(tmp_path / "still.png", one)
     with Image.open(tmp_path / "still.png") as image:
-        assert (image.format, image.size) == ("PNG", (WIDTH, HEIGHT))
+        assert (image.format, image.size) == ("PNG", (layout.WIDTH, layout.HEIGHT))
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(64, 64), (64, 80), (480, 640), (3, 1000), (1, 1)])
 def test_fitted_picture_is_whole_and_keeps_its_shape(rows: int, columns: int) -> None:
-    height, width, _ = _fitted(np.zeros((rows, columns, 3), np.uint8), 294, 232).shape
+    height, width, _ = layout._fitted(np.zeros((rows, columns, 3), np.uint8), 294, 232).shape
     assert width == 294 or height == 232
     assert width <= 294
     assert height <= 232

@@ -11,9 +11,8 @@ from measured_walls import exact_wall
 from view_streams import ask, messages
 
 from nlos_cam.errors import RecordingError
+from nlos_cam.view import PlaybackViewer, RecordedView, SessionFile, WebViewer
 from nlos_cam.view.messages import MomentPacker
-from nlos_cam.view.session_file import SessionFile
-from nlos_cam.view.web import PlaybackViewer, RecordedView, WebViewer
 
 
 @pytest.fixture
