@@ -1,9 +1,10 @@
 """One command for a GPU: renders, trains, evaluates, and writes the weights in parts of at most 16 MB.
 
 `python tools/gpu_run.py --out DIR [--minutes 25] [--workers N] [--accelerator cuda]` builds a dataset in the
-background, trains the direct network on its shards as they appear, then the paper's compressor, each for a share of the
-time, and evaluates both. `python tools/gpu_run.py --join DIR/direct.00 --out WEIGHTS` puts weights together again. The
-same command resumes an interrupted run. Every step's log is in DIR/NAME.log, times and figures in DIR/run.json.
+background, trains the direct network on its shards as they appear, then an encoder for the paper's decoder and the
+paper's compressor, each for a share of the time, and evaluates both networks. `python tools/gpu_run.py --join
+DIR/direct.00 --out WEIGHTS` puts weights together again. The same command resumes an interrupted run. Every step's log
+is in DIR/NAME.log, times and figures in DIR/run.json.
 """
 
 import json
@@ -17,15 +18,13 @@ import zipfile
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "models" / "recipes"
 PART_BYTES = 16 * 10**6
 DIRECT_SHARE, COMPRESSOR_SHARE, TIMING_SHARE = 0.5, 0.2, 0.15
-"""Shares of the time for training each network, and at most for timing the direct one; the rest is for the first
-shards, evaluation and starts of processes."""
+"""Shares of the time: for training each network, and at most for timing the direct one; the rest is for all else."""
 TIMING_EPOCHS = 3
 KEPT_FIGURES = "silhouette_iou", "foreground_rmse_mm", "unseen", "recognised"
 SEED, HELD_OUT_SEED = 2_000_000, 10_000_000
@@ -59,7 +58,7 @@ def rendering(out: Path, workers: int) -> Generator[Path]:
     """Build the training set in the background, from its first shards on; it ends with the block."""
     folder = out / "training"
     command = ["dataset", "build", "--out", str(folder), "--count", str(OBJECTS), "--seed", str(SEED)]
-    options = ["--accuracy", "draft", "--share-generic", "0.5", "--workers", str(workers)]
+    options = ["--accuracy", "draft", "--share-generic", "0.5", "--expected-maps", "--workers", str(workers)]
     with (out / "rendering.log").open("a", encoding="utf-8") as log:
         child = subprocess.Popen([*PROGRAM, *command, *options], stdout=log, stderr=log)
         try:
@@ -124,11 +123,6 @@ def join_parts(first: Path, out: Path) -> None:
     whole.unlink()
 
 
-def _has_timed(log: Path, limit_s: float, seconds: float) -> bool:
-    """Return True after TIMING_EPOCHS, or at the limit."""
-    return len(epoch_seconds(log)) >= TIMING_EPOCHS or seconds > limit_s
-
-
 def train_and_judge(chosen: Namespace) -> None:
     """Run all steps within the time."""
     out, start_s, budget_s = chosen.out, time.perf_counter(), 60 * chosen.minutes
@@ -151,20 +145,26 @@ def train_and_judge(chosen: Namespace) -> None:
         if not recipe.exists():  # an interrupted run keeps its schedule
             trial = recipe_with(chosen.recipe, out / "timing.toml", epochs=10000)
             arguments = ["train", "direct", "--recipe", str(trial), "--out", str(timing), *direct]
-            done = partial(_has_timed, timing / "log.csv", TIMING_SHARE * budget_s)
-            finish("timing_s", go(out, "timing", arguments, done))
+
+            def timed(s: float) -> bool:
+                return len(epoch_seconds(timing / "log.csv")) >= TIMING_EPOCHS or s > TIMING_SHARE * budget_s
+
+            finish("timing_s", go(out, "timing", arguments, timed))
             epochs = epochs_within(DIRECT_SHARE * budget_s, timing / "log.csv")
             recipe_with(chosen.recipe, recipe, epochs=epochs)
         arguments = ["train", "direct", "--recipe", str(recipe), "--out", str(weights["direct"]), *direct]
         finish("direct_s", go(out, "direct", arguments))
     objects = 100 * len(list(training.glob("shard-*.h5")))
     finish("objects", objects)
-    left_s = min(COMPRESSOR_SHARE * budget_s, budget_s - (time.perf_counter() - start_s))
-    if chosen.compressor and left_s > 0:
-        numbers = {"objects": objects, "epochs": chosen.compressor_epochs}
-        ready = recipe_with(chosen.compressor, out / "compressor.toml", **numbers)
-        arguments = ["train", "compressor", "--recipe", str(ready), "--out", str(weights["compressor"]), *common]
-        finish("compressor_s", go(out, "compressor", [*arguments, "--dataset", str(training)], lambda s: s > left_s))
+    end_s = time.perf_counter() + min(COMPRESSOR_SHARE * budget_s, budget_s - (time.perf_counter() - start_s))
+    encoder = ["train", "vae", "--recipe", str(chosen.encoder), "--out", str(out / "encoder")]
+    finish("encoder_s", go(out, "encoder", [*encoder, "--accelerator", chosen.accelerator]))
+    if (left_s := end_s - time.perf_counter()) > 0:
+        epochs = chosen.compressor_epochs
+        ready = recipe_with(chosen.compressor, out / "compressor.toml", objects=objects, epochs=epochs)
+        paper = ["train", "compressor", "--recipe", str(ready), "--vae", str(out / "encoder"), *common]
+        arguments = [*paper, "--dataset", str(training), "--out", str(weights["compressor"])]
+        finish("compressor_s", go(out, "compressor", arguments, lambda s: s > left_s))
     for name, folder in weights.items():
         if (folder / "checkpoint.json").exists():
             judged = ["evaluate", "--weights", str(folder), "--out", str(out / f"{name}-figures"), "--no-nearest"]
@@ -185,6 +185,7 @@ def options() -> ArgumentParser:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--accelerator", default="auto")
     parser.add_argument("--recipe", type=Path, default=RECIPES / "paper-rig-direct-gpu.toml")
+    parser.add_argument("--encoder", type=Path, default=RECIPES / "paper-rig-vae-encoder.toml")
     parser.add_argument("--compressor", type=Path, default=RECIPES / "paper-rig-compressor-gpu.toml")
     parser.add_argument("--compressor-epochs", type=int, default=20)
     parser.add_argument("--held-out", type=int, default=1000)

@@ -3,9 +3,9 @@ __all__ = [
     "BLACK_V",
     "CHECKSUMS",
     "DISK_ERRORS",
-    "ENCODER",
     "GOOD_IOU",
     "MIN_V",
+    "SHIPPED",
     "SIMULATION_ONLY",
     "SMALLER_IS_BETTER",
     "SMALLEST_SPREAD",
@@ -36,6 +36,7 @@ __all__ = [
     "TorchReconstructor",
     "TrainingRun",
     "UncertaintyModel",
+    "WithNoise",
     "accuracy_mean_abs",
     "accuracy_within_2_percent",
     "as_batch",
@@ -106,8 +107,8 @@ __all__ = [
 ]
 
 from .checkpoint import load_encoder, load_network, load_pipeline, load_vae
-from .data import InMemory, MapBatch, MapSet, MapSource, as_batch, first_of, subtract_bare_wall
-from .direct import CellNormal, DirectNetwork, MapNoise
+from .data import InMemory, MapBatch, MapNoise, MapSet, MapSource, WithNoise, as_batch, first_of, subtract_bare_wall
+from .direct import CellNormal, DirectNetwork
 from .direct_training import NormalBatch, NormalSource, train_direct
 from .distributed import Accelerator, launch, open_fabric
 from .doubt_network import load_doubt
@@ -155,7 +156,7 @@ from .pipeline import SMALLEST_SPREAD, Preprocess, channel_statistics, cut_silho
 from .quality import GOOD_IOU, QualityRecord, quality_features, quality_watches, write_quality
 from .recipe import SIMULATION_ONLY, Recipe, load_recipe, packaged_recipes
 from .records import (
-    ENCODER,
+    SHIPPED,
     CheckpointRecord,
     DoubtRecord,
     checksum_of_watched,

@@ -14,7 +14,7 @@ from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError
 from nlos_models.files import TENSOR_LIMIT, describe, read_checked, write_checked
 from nlos_models.pipeline import RemappingNetwork, new_pipeline, new_vae
-from nlos_models.records import DIRECT, ENCODER, RECORD, CheckpointRecord, load_record, weights_folder
+from nlos_models.records import DIRECT, ENCODER, PAPER, RECORD, CheckpointRecord, load_record, weights_folder
 from nlos_models.vae import Encoder, ResVae
 
 PIPELINE_PARTS = "compressor", "preprocess", "decoder"
@@ -61,7 +61,7 @@ def save_direct(folder: Path, network: DirectNetwork, record: CheckpointRecord) 
 
 
 def load_network(folder: Path | None = None) -> tuple[RemappingNetwork | DirectNetwork, CheckpointRecord]:
-    """Return the network from maps to images in a folder, of either kind, in eval mode, with its record.
+    """Return the network from maps to images in a folder (default: the direct one), in eval mode, with its record.
 
     Raises CheckpointError.
     """
@@ -74,14 +74,14 @@ def load_network(folder: Path | None = None) -> tuple[RemappingNetwork | DirectN
     return network.eval(), record
 
 
-def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
-    """Return a Res-VAE in eval mode, with its record. Raises CheckpointError unless all tensors fit."""
-    folder = weights_folder(folder)
+def load_vae(folder: Path | None = None) -> tuple[ResVae, CheckpointRecord]:
+    """Return a Res-VAE (default: the paper's) in eval mode, with its record. Raises CheckpointError."""
+    folder = weights_folder(folder, PAPER)
     record = load_record(folder)
-    if not (folder / ENCODER).exists() and folder == weights_folder(None):
+    if not (folder / ENCODER).exists() and folder == weights_folder(None, PAPER):
         raise CheckpointError(
-            "the encoder of the paper's weights (21 MB) is not in the installed package: train from a clone, or make "
-            "it again with `nlos-cam train vae --recipe vae-encoder --out DIR`, and give --vae DIR"
+            "the paper's weights come without their encoder (21 MB), which only training needs: make it again with "
+            "`nlos-cam train vae --recipe vae-encoder --out DIR`, and give --vae DIR"
         )
     vae = new_vae(color=record.color)
     for name, module in (("encoder", vae.encoder), ("decoder", vae.decoder)):
@@ -91,7 +91,7 @@ def load_vae(folder: Path) -> tuple[ResVae, CheckpointRecord]:
 
 def load_pipeline(folder: Path | None = None) -> tuple[RemappingNetwork, CheckpointRecord]:
     """Return a pipeline in eval mode (default: the paper's), with its record. Raises CheckpointError."""
-    return _load_pipeline(weights_folder(folder), PIPELINE_PARTS)
+    return _load_pipeline(weights_folder(folder, PAPER), PIPELINE_PARTS)
 
 
 def load_pipeline_partly(folder: Path) -> tuple[RemappingNetwork, CheckpointRecord, LoadReport]:
@@ -116,8 +116,8 @@ def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[RemappingNetwo
 
 
 def load_encoder(folder: Path | None = None) -> Encoder | None:
-    """Return the encoder beside a pipeline's weights, in eval mode, or None where they were trained without one."""
-    folder = weights_folder(folder)
+    """Return the encoder beside a pipeline's weights (default: the paper's), in eval mode, or None without one."""
+    folder = weights_folder(folder, PAPER)
     path = folder / ENCODER
     if not path.exists():
         return None

@@ -13,6 +13,8 @@ from nlos_models.arrays import Float16, Float32
 
 STATISTICS_OBJECTS = 10_000
 """Objects for the channels' mean and spread; their sampling error is far below the noise that training adds."""
+ROUNDING_VARIANCE = 1 / 12
+"""Of a pixel's whole counts, in counts squared."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,29 @@ def image_batches(images: Float16, batch: int, generator: torch.Generator) -> It
     for index in shuffled(len(images), batch, generator):
         chosen = as_images(images[index.numpy()])
         yield flip_some([chosen], torch.rand(len(index), generator=generator) < 0.5)[0]
+
+
+@dataclass(frozen=True)
+class MapNoise:
+    """Noise of a map cell's intensity, the mean over the cell's pixels, each of whole counts."""
+
+    read_variance: float
+    """Of a pixel, in counts squared."""
+    shot_variance: float
+    """Of a pixel, per count of light."""
+    ambient_counts: float
+    pixels: float
+    """Of a cell."""
+
+    def deviation(self, counts: Tensor) -> Tensor:
+        """Return the standard deviation of intensities, in counts."""
+        light = self.shot_variance * (counts + self.ambient_counts)
+        return ((self.read_variance + light + ROUNDING_VARIANCE) / self.pixels).sqrt()
+
+    def add(self, counts: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return intensities with noise drawn for each, in counts, none below 0."""
+        deviates = torch.randn(counts.shape, generator=generator, device=counts.device, dtype=counts.dtype)
+        return (counts + self.deviation(counts) * deviates).clamp(min=0)
 
 
 class MapBatch(NamedTuple):
@@ -123,6 +148,29 @@ class InMemory:
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
         """Yield one epoch."""
         return map_batches(self.maps, batch, generator)
+
+
+@dataclass(frozen=True)
+class WithNoise:
+    """Map source of expected maps, to whose batches the sensor's noise is added, in each epoch another draw."""
+
+    source: MapSource
+    noise: MapNoise
+
+    @property
+    def image(self) -> Float16 | Float32:
+        """All images (n, 64, 64)."""
+        return self.source.image
+
+    def first(self, count: int) -> MapSet:
+        """Return the first `count` objects, without noise."""
+        return self.source.first(count)
+
+    def batches(self, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
+        """Yield one epoch; a cell without a return keeps its intensity."""
+        for plain in self.source.batches(batch, generator):
+            drawn = self.noise.add(plain.intensity, generator)
+            yield plain._replace(intensity=torch.where(plain.depth_m.isnan(), plain.intensity, drawn))
 
 
 def first_of(maps: MapSet, count: int) -> MapSet:

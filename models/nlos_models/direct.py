@@ -6,12 +6,12 @@ layers are matrix products, which a CPU trains 14 times as fast as MobileNetV2's
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from nlos_models.data import MapNoise
 from nlos_models.metrics import MIN_V
 from nlos_models.recipe import DirectSize
 
@@ -24,31 +24,11 @@ KEPT_ABOVE = 0.44
 of it; the mean absolute error is least near 0.5. This value costs either of them little."""
 SMALLEST_SHARE = 0.3
 """Smallest spread of a cell, as a share of the median spread: quiet cells would otherwise show noise alone."""
-ROUNDING_VARIANCE = 1 / 12
-"""Of a pixel's whole counts, in counts squared."""
 PATCH, TOKEN = 4, 8
 """Cells of a patch's side, and pixels of an output token's side; patches are merged two by two."""
 SIDE_PATCHES = (ROWS // 2 // PATCH, COLUMNS // PATCH)
 SIDE_INPUTS = SIDE_PATCHES[0] * SIDE_PATCHES[1] // 4
 SIDE_TOKENS = (PIXELS // 2 // TOKEN, PIXELS // TOKEN)
-
-
-@dataclass(frozen=True)
-class MapNoise:
-    """Noise of a map cell's intensity, the mean over the cell's pixels, each of whole counts."""
-
-    read_variance: float
-    """Of a pixel, in counts squared."""
-    shot_variance: float
-    """Of a pixel, per count of light."""
-    ambient_counts: float
-    pixels: float
-    """Of a cell."""
-
-    def deviation(self, counts: Tensor) -> Tensor:
-        """Return the standard deviation of intensities, in counts."""
-        light = self.shot_variance * (counts + self.ambient_counts)
-        return ((self.read_variance + light + ROUNDING_VARIANCE) / self.pixels).sqrt()
 
 
 class MirrorLinear(nn.Module):
@@ -124,8 +104,7 @@ class CellNormal(nn.Module):
         """Draw the sensor's noise for the intensity of expected maps (n, 2, 64, 80), normalised as `forward` does."""
         depth, light = normal.unbind(1)
         counts = torch.expm1(light * self.spread[1] + self.median[1])
-        noisy = (counts + noise.deviation(counts) * torch.randn_like(counts)).clamp(min=0)
-        drawn = ((torch.log1p(noisy) - self.median[1]) / self.spread[1]).clamp(-CLIP, CLIP)
+        drawn = ((torch.log1p(noise.add(counts)) - self.median[1]) / self.spread[1]).clamp(-CLIP, CLIP)
         return torch.stack([depth, torch.where((depth == 0) & (light == 0), light, drawn)], dim=1)
 
 

@@ -1,4 +1,4 @@
-"""Training of the direct network, and its transfer to a bench: noise drawn anew at each step, two heads."""
+"""Training of the direct network, and its transfer to a bench: noise drawn at each step, two heads."""
 
 from collections.abc import Iterable
 from pathlib import Path

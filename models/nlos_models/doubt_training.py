@@ -194,6 +194,8 @@ def _sigmoid(logits: Float64) -> Float64:
 FOLDS = 6
 """Groups of kinds that are left out in turn."""
 WIDTH, STEPS, BATCH, RATE, DECAY, DROPOUT = 32, 1200, 256, 5e-3, 1e-2, 0.1
+MIN_SPREAD = 1e-4
+"""Of a figure that hardly differs between frames; it outlasts the rounding of the record."""
 MIN_TRUSTED = 20
 """Fewest frames of left-out kinds from which a share of good ones is estimated."""
 CONFIDENCE = 1.645
@@ -251,7 +253,7 @@ def fit_quality(samples: QualitySet, watches: str) -> QualityRecord:
 def _fit(samples: QualitySet, rows: Int64, watches: str) -> QualityRecord:
     """Return the model of some rows, without a threshold."""
     figures = samples.figures[rows]
-    means, spreads = figures.mean(0), figures.std(0) + np.float32(1e-6)
+    means, spreads = figures.mean(0), figures.std(0).clip(min=MIN_SPREAD)
     x = torch.from_numpy(normalised(figures, means, spreads))
     iou, error = torch.from_numpy(samples.iou[rows]), torch.from_numpy(samples.error_v[rows])
     generator = torch.Generator().manual_seed(0)

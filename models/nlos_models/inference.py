@@ -136,10 +136,10 @@ def load_reconstructor(folder: Path | None, cache: Path, threads: int = 1) -> Re
         return load_cached(cache / key, lambda model: OnnxReconstructor(model, record, threads), export)
 
 
-def load_uncertainty_model(folder: Path | None, cache: Path) -> UncertaintyModel | None:
+def load_uncertainty_model(folder: Path | None, cache: Path, *, quality: bool = True) -> UncertaintyModel | None:
     """Load the uncertainty network beside the weights in a folder (None: the shipped ones); None where there is none.
 
-    With it comes the quality model that watches it, if there is one.
+    With it comes the quality model that watches it, if there is one; without `quality` that file is not read.
 
     Without a valid graph it is exported as by `load_reconstructor`. Raises CheckpointError, MissingExtraError.
     """
@@ -151,7 +151,7 @@ def load_uncertainty_model(folder: Path | None, cache: Path) -> UncertaintyModel
     except CheckpointError as error:
         key, export = _exporter(error).doubt_export(folder)
         loaded = load_cached(cache / key, lambda model: OnnxUncertaintyModel(model, record), export)
-    loaded.quality = load_quality_model(folder)
+    loaded.quality = load_quality_model(folder) if quality else None
     return loaded
 
 

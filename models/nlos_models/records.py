@@ -13,10 +13,10 @@ from nlos_models.files import TEXT_LIMIT, read_checked
 from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
 
 RECORD = "checkpoint.json"
-DIRECT, SHIPPED = "direct", "paper"
-"""File with a direct network's tensors, less its ending; name of the weights that come with the package."""
+DIRECT, PAPER = SHIPPED = "direct", "paper"
+"""Names of the weights that come with the package, the default ones first; DIRECT.safetensors is a direct network."""
 ENCODER = "encoder.safetensors"
-"""File that only training reads: an installed package does not have it."""
+"""File that only training reads: the shipped weights come without it."""
 DOUBT, DOUBT_RECORD = "doubt", "doubt.json"
 WATCHED = "compressor.safetensors", "preprocess.safetensors", "decoder.safetensors"
 
@@ -90,14 +90,16 @@ def _any_in_color(*recipes: Recipe | None) -> bool:
     return any(recipe is not None and recipe.colour for recipe in recipes)
 
 
-def shipped_folder() -> Path:
-    """Return the folder of the weights that come with the package."""
-    return Path(str(resources.files("nlos_models") / "weights" / SHIPPED))
+def shipped_folder(name: str = DIRECT) -> Path:
+    """Return the folder of weights that come with the package; `name` is one of SHIPPED."""
+    return Path(str(resources.files("nlos_models") / "weights" / name))
 
 
-def weights_folder(weights: Path | None) -> Path:
-    """Return the folder of weights: the package's for None, and for SHIPPED unless a folder of that name is here."""
-    return shipped_folder() if weights is None or (str(weights) == SHIPPED and not weights.exists()) else weights
+def weights_folder(weights: Path | None, default: str = DIRECT) -> Path:
+    """Return the folder of weights: the package's for None, and for a name in SHIPPED unless a folder has that name."""
+    if weights is None:
+        return shipped_folder(default)
+    return shipped_folder(str(weights)) if str(weights) in SHIPPED and not weights.exists() else weights
 
 
 def load_record(folder: Path) -> CheckpointRecord:
@@ -105,6 +107,11 @@ def load_record(folder: Path) -> CheckpointRecord:
     try:
         return CheckpointRecord.model_validate_json(read_checked(folder / RECORD, TEXT_LIMIT))
     except OSError as error:
+        if folder == shipped_folder(PAPER):
+            raise CheckpointError(
+                "the paper's weights (27 MB) are in the repository, not in the installed package: install from a "
+                "clone, or name a folder of weights"
+            ) from error
         raise CheckpointError(
             f"no checkpoint in {folder} ({RECORD} cannot be read): name a folder of weights"
         ) from error

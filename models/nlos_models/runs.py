@@ -30,7 +30,9 @@ from nlos_models.files import claim
 from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
 from nlos_models.records import (
+    DIRECT,
     DOUBT_RECORD,
+    PAPER,
     RECORD,
     CheckpointRecord,
     DoubtRecord,
@@ -188,7 +190,7 @@ def _export(training: TrainingRun) -> None:
 def vae_start(recipe: Recipe, weights: Path | None) -> tuple[ResVae, list[Recipe]]:
     """Load the VAE that a recipe starts from (default: the paper's) and the runs that made it."""
     _check_same_color(recipe, weights)
-    folder = weights_folder(weights)
+    folder = weights_folder(weights, PAPER)
     if recipe.start == "decoder":
         torch.manual_seed(recipe.seed)
         vae, (pipeline, record) = new_vae(color=recipe.colour), load_pipeline(folder)
@@ -212,7 +214,7 @@ def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | No
     if not (encoder := load_encoder(weights)):
         if recipe.latent_weight:
             raise TrainingError(
-                f"{weights_folder(weights)} has no encoder to aim at: set latent_weight = 0 in the recipe"
+                f"{weights_folder(weights, PAPER)} has no encoder to aim at: set latent_weight = 0 in the recipe"
             )
         return Start(None, pipeline), runs
     vae = new_vae(color=recipe.colour)
@@ -223,17 +225,19 @@ def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | No
 def transfer_start(
     recipe: Recipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
 ) -> tuple[RemappingNetwork | DirectNetwork, list[Recipe]]:
-    """Load the networks that a transfer starts from (default: the paper's) and the runs that made them.
+    """Load the networks that a transfer starts from and the runs that made them.
 
-    If `partial`, only matching layers of the compressor are loaded, `on_report` is called with a summary of them, and
-    the others are initialised from the recipe's seed.
+    By default they are the paper's where the recipe aims at a latent, else the direct ones. If `partial`, only matching
+    layers of the compressor are loaded, `on_report` is called with a summary of them, and the others are initialised
+    from the recipe's seed.
     """
-    _check_fits(recipe, weights)
+    folder = weights_folder(weights, PAPER if recipe.latent_weight else DIRECT)
+    _check_fits(recipe, folder)
     if not partial:
-        network, record = load_network(weights)
+        network, record = load_network(folder)
         return network, record.runs
     torch.manual_seed(recipe.seed)
-    pipeline, record, report = load_pipeline_partly(weights_folder(weights))
+    pipeline, record, report = load_pipeline_partly(folder)
     on_report(f"compressor: {report}")
     return pipeline, record.runs
 
@@ -245,10 +249,12 @@ def _pipeline_start(recipe: Recipe, weights: Path | None) -> tuple[RemappingNetw
 
 
 def _check_fits(recipe: Recipe, folder: Path | None) -> None:
-    """Raise TrainingError unless weights and recipe agree in color, maps and the compressor's width."""
+    """Raise TrainingError unless weights and recipe agree in color, maps, latent and the compressor's width."""
     record, wrong = _check_same_color(recipe, folder), ""
     if record.input != recipe.maps:
         wrong = f"weights expect {record.input} but the recipe uses {recipe.maps}"
+    elif recipe.task == "transfer" and recipe.latent_weight and record.direct_recipe:
+        wrong = "weights are a direct network, without the latent that the recipe aims at"
     elif recipe.task == "compressor" and record.width != recipe.width:
         wrong = f"weights have width {record.width:g} but the recipe asks for {recipe.width:g}"
     if wrong:
@@ -257,11 +263,11 @@ def _check_fits(recipe: Recipe, folder: Path | None) -> None:
 
 def _check_same_color(recipe: Recipe, folder: Path | None) -> CheckpointRecord:
     """Return the weights' record; raise TrainingError unless weights and recipe are both of depth or both in color."""
-    record = load_record(weights_folder(folder))
+    record = load_record(weights_folder(folder, PAPER))
     if record.color != recipe.colour:
         holds, wants = (f"color ({SIMULATION_ONLY})" if color else "depth" for color in (record.color, recipe.colour))
         raise TrainingError(
-            f"{weights_folder(folder)} holds weights for {holds} but the recipe is for {wants}: name others "
+            f"{weights_folder(folder, PAPER)} holds weights for {holds} but the recipe is for {wants}: name others "
             "with --vae or --weights"
         )
     return record

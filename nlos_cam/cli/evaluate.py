@@ -21,7 +21,9 @@ def evaluate(
     training: Annotated[
         Path | None, typer.Option("--training", help="Training maps for the nearest neighbour (default: rendered).")
     ] = None,
-    weights: Annotated[Path | None, typer.Option("--weights", help="Folder of weights (default: the paper's).")] = None,
+    weights: Annotated[
+        Path | None, typer.Option("--weights", help="Folder of weights, paper, or direct (the default).")
+    ] = None,
     rig: Annotated[str | None, typer.Option("--rig", help="Rig by name or file (default: the weights' own).")] = None,
     wall: Annotated[
         Path | None, typer.Option("--wall", help="Bare wall for difference maps, wall.toml (default: rendered).")

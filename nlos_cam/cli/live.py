@@ -74,7 +74,7 @@ Tradeoff = Annotated[
     typer.Option("--tradeoff", help="Table of `tradeoff reconstruct` for --budget-ms (default: beside the weights)."),
 ]
 Wall = Annotated[Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall` (wall.toml).")]
-Weights = Annotated[Path | None, typer.Option("--weights", help="Folder of weights (default: the paper's).")]
+Weights = Annotated[Path | None, typer.Option("--weights", help="Folder of weights, paper, or direct (the default).")]
 Average = Annotated[
     int, typer.Option("--average", min=1, max=1000, help="Number of frames to average; moving objects blur.")
 ]

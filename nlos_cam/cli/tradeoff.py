@@ -64,7 +64,7 @@ def reconstruct(
     out: Out = None,
     weights: Annotated[
         list[Path] | None,
-        typer.Option("--weights", help="Folder of weights (default: the paper's); repeat to compare."),
+        typer.Option("--weights", help="Folder of weights, paper, or direct (the default); repeat to compare."),
     ] = None,
     count: Annotated[
         int | None, typer.Option("--count", min=1, help="Number of random objects, instead of the 54 test objects.")

@@ -222,7 +222,10 @@ def transfer(
     run: RunOptions,
     data: Maps,
     held_out_data: HeldOut,
-    weights: Weights = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option("--weights", help="Weights to fit (default: paper for a recipe with a latent, else direct)."),
+    ] = None,
     vae_folder: Annotated[
         Path | None, typer.Option("--vae", help="VAE whose encoder gives the target latents (default: the weights').")
     ] = None,
@@ -249,7 +252,7 @@ def doubt(
     data: Maps,
     held_out_data: HeldOut,
     weights: Annotated[
-        Path | None, typer.Option("--weights", help="Weights whose images are judged (default: the paper's).")
+        Path | None, typer.Option("--weights", help="Weights whose images are judged (default: direct).")
     ] = None,
 ) -> None:
     """Train the uncertainty ("doubt") network of trained weights; --out then holds a copy of these weights too."""
@@ -258,7 +261,8 @@ def doubt(
     pipeline = models.load_reconstructor(weights, cache_folder() / "onnx")
     datasets = data_sets.open_dataset(data), data_sets.open_dataset(held_out_data)
     data_sets.check_doubt_data(recipe, pipeline, *datasets)
-    about = models.record_doubt_run(recipe, run.out, watched, list(data_sets.TRAINING_OUTLIERS))
+    kinds = list(data_sets.outliers_beside(datasets[0].plan.objects.share_generic))
+    about = models.record_doubt_run(recipe, run.out, watched, kinds)
     with tracked("rendering empty benches and outliers") as on_progress:
         sets = data_sets.doubt_sets(recipe, pipeline, datasets, run.out / SAMPLES, on_progress)
     job = run.training(recipe, pipeline.record, about.watches)
@@ -278,8 +282,9 @@ def quality(
     json: Json = False,
 ) -> None:
     """Fit the model that predicts the outline's overlap and the depth error; judged on kinds left out of the fit."""
-    graphs = cache_folder() / "onnx"
-    pipeline, doubter = models.load_reconstructor(weights, graphs), models.load_uncertainty_model(weights, graphs)
+    weights, graphs = models.weights_folder(weights), cache_folder() / "onnx"
+    pipeline = models.load_reconstructor(weights, graphs)
+    doubter = models.load_uncertainty_model(weights, graphs, quality=False)  # an old or damaged one is replaced
     if doubter is None:
         raise SceneError(f"{weights} has no uncertainty network: train one with `train doubt`")
     with interrupted_by_signals(), tracked("reconstructing") as on_progress:

@@ -1,6 +1,7 @@
 __all__ = [
     "EMPTY",
     "FRAMES_PER_RECORDING",
+    "GENERIC",
     "HELD_OUT_OUTLIERS",
     "HELD_OUT_SEED",
     "ORDINARY",
@@ -30,6 +31,7 @@ __all__ = [
     "objects_from_folder",
     "open_dataset",
     "open_packed_maps",
+    "outliers_beside",
     "procedural_images",
     "quality_set",
     "ray_farm",
@@ -46,9 +48,16 @@ __all__ = [
 ]
 
 from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
-from .doubt_samples import EMPTY, ORDINARY, check_doubt_data, doubt_sets, quality_set, samples_on_disk
+from .doubt_samples import EMPTY, GENERIC, ORDINARY, check_doubt_data, doubt_sets, quality_set, samples_on_disk
 from .labelled import FRAMES_PER_RECORDING, label_recordings, list_recordings, read_labelled, write_shards
-from .outliers import HELD_OUT_OUTLIERS, SHAPE_OUTLIERS, TRAINING_OUTLIERS, Stimulus, draw_outlier
+from .outliers import (
+    HELD_OUT_OUTLIERS,
+    SHAPE_OUTLIERS,
+    TRAINING_OUTLIERS,
+    Stimulus,
+    draw_outlier,
+    outliers_beside,
+)
 from .packed import PackedMaps, open_packed_maps
 from .plan import DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm

@@ -30,7 +30,9 @@ from nlos_cam.dataset.outliers import (
     TRAINING_OUTLIERS,
     Stimulus,
     draw_outlier,
+    generic,
     ordinary,
+    outliers_beside,
     vary_bench,
     vary_empty_bench,
 )
@@ -42,7 +44,8 @@ from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
 from nlos_cam.render import Rendering, SensorModel, render
 
-EMPTY, ORDINARY = "empty", "ordinary"
+EMPTY, ORDINARY, GENERIC = "empty", "ordinary", "generic"
+USUAL = ORDINARY, GENERIC
 PIECE = 100
 """Samples in a file; a killed build loses at most as many."""
 BESIDE_M = 0.01
@@ -53,7 +56,7 @@ VERSION = 2
 """Raise it when a seed makes another sample."""
 _STREAM = 5
 """Seeds these random numbers apart from those of datasets."""
-KINDS = {ORDINARY: ordinary, **TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}
+KINDS = {ORDINARY: ordinary, GENERIC: generic, **TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}
 MIN_CELLS = 8
 """Training leaves out outliers that change fewer cells of the maps: they hardly differ from an empty bench."""
 HELD_OUT_SHARE = 0.15
@@ -73,7 +76,7 @@ class DoubtSamples:
     cells: NDArray[np.int32]
     """(n,); number of map cells whose strongest return is the object's: with none it is invisible."""
     kind: NDArray[np.str_]
-    """(n,); EMPTY, ORDINARY, or a kind of outlier."""
+    """(n,); EMPTY, ORDINARY, GENERIC, or a kind of outlier."""
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -113,7 +116,7 @@ def _stimulus(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Stimulus:
     bench_generator = _generator(kind, seed // SEEDS_PER_BENCH, 0)
     if kind == EMPTY:
         return Stimulus(*vary_empty_bench(rig, sensor, bench_generator))
-    slight = kind == ORDINARY or seed // SEEDS_PER_BENCH % 2
+    slight = kind in USUAL or seed // SEEDS_PER_BENCH % 2
     bench = vary_bench(rig, sensor, SLIGHT, bench_generator) if slight else (rig, sensor)
     return draw_outlier(KINDS[kind], _generator(kind, seed, 1), Stimulus(*bench))
 
@@ -169,20 +172,22 @@ def _pieces(counts: Mapping[str, int], first_seed: int) -> Iterator[tuple[str, r
             yield kind, range(start, min(start + PIECE, first_seed + count))
 
 
-def counts_of(recipe: Recipe) -> dict[str, int]:
-    """Return the number of samples to render of each kind.
+def counts_of(recipe: Recipe, share_generic: float = 0.0) -> dict[str, int]:
+    """Return the number of samples to render of each kind, for training objects with a share of generic shapes.
 
-    Benches that deviate slightly have as many ordinary objects as outliers, so that the deviation does not give
-    outliers away.
+    Benches that deviate slightly have as many usual objects as outliers, so that the deviation does not give outliers
+    away.
     """
-    per_kind = dict.fromkeys(TRAINING_OUTLIERS, recipe.outliers)
-    return {EMPTY: recipe.empties, ORDINARY: sum(per_kind.values()) // 2, **per_kind}
+    per_kind = dict.fromkeys(outliers_beside(share_generic), recipe.outliers)
+    usual = sum(per_kind.values()) // 2
+    shapes = {GENERIC: round(share_generic * usual)} if share_generic else {}
+    return {EMPTY: recipe.empties, ORDINARY: usual - sum(shapes.values()), **shapes, **per_kind}
 
 
 def _doubt_set(pipeline: Reconstructor, ordinary_maps: MapSet, samples: DoubtSamples) -> DoubtSet:
     """Return a dataset's maps of ordinary objects and the visible samples, with the pipeline's images of both."""
     nothing = samples.kind == EMPTY
-    outside = ~nothing & (samples.kind != ORDINARY)
+    outside = ~nothing & ~np.isin(samples.kind, USUAL)
     images = _images(pipeline, MapSet(samples.depth_m, samples.intensity, samples.image))
     drawn = DoubtSet(samples.depth_m, samples.intensity, images, samples.image, nothing, outside)
     drawn = drawn.where((samples.cells >= MIN_CELLS) | nothing)
@@ -205,7 +210,7 @@ def doubt_sets(
     on_progress: OnProgress = ignore,
 ) -> list[DoubtSet]:
     """Return the training set and the held-out set of an uncertainty network; rendered samples are kept in `folder`."""
-    counts = counts_of(recipe)
+    counts = counts_of(recipe, datasets[0].plan.objects.share_generic)
     held_out_counts = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
     sets: list[DoubtSet] = []
     for dataset, objects, kinds, seed in (

@@ -22,6 +22,7 @@ from nlos_cam.objects import (
     Pose,
     box_width_m,
     category_triangles,
+    generic_depth,
     object_box,
     orthographic_depth,
     panel,
@@ -76,6 +77,11 @@ def smooth_pattern(generator: Generator, across: int) -> Float32:
 def ordinary(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object like those of the training set."""
     return replace(stimulus, depth_m=draw_object(generator, stimulus.box))
+
+
+def generic(generator: Generator, stimulus: Stimulus) -> Stimulus:
+    """Add a generic shape, as in training sets with a share of them."""
+    return replace(stimulus, depth_m=generic_depth(int(generator.integers(2**31)), stimulus.box)[1])
 
 
 class BenchSpread(NamedTuple):
@@ -325,6 +331,8 @@ TRAINING_OUTLIERS = _by_name(
     *(warped, inside_out, cut_out, scrambled),
 )
 HELD_OUT_OUTLIERS = _by_name(panels, noise_sheet, bars, rings, glossy, two_tone)
+COVERED_BY_GENERIC = frozenset(_by_name(several, blobs, posts, tilted, plates, warped, inside_out, cut_out, scrambled))
+"""Training outliers that are ordinary to weights that saw generic shapes: several, turned any way, of any outline."""
 SHAPE_OUTLIERS = frozenset(
     _by_name(blobs, posts, plates, warped, inside_out, cut_out, scrambled, panels, noise_sheet, bars, rings)
 )
@@ -338,3 +346,9 @@ def draw_outlier(kind: OutlierKind, generator: Generator, stimulus: Stimulus) ->
         drawn = kind(generator, stimulus)
         if drawn.depth_m is not None and np.isfinite(drawn.depth_m).sum() >= MIN_PIXELS:
             return drawn
+
+
+def outliers_beside(share_generic: float) -> Mapping[str, OutlierKind]:
+    """Return the training outliers for weights whose training objects had a share of generic shapes."""
+    left_out = COVERED_BY_GENERIC if share_generic else frozenset[str]()
+    return {name: kind for name, kind in TRAINING_OUTLIERS.items() if name not in left_out}

@@ -116,8 +116,8 @@ def open_dataset(folder: Path, *, color: bool = False, expected: bool = False) -
         raise RecordingError(f"{folder} holds a dataset in color ({SIMULATION_ONLY}): give one of depth")
     if plan.expected and not expected:
         raise RecordingError(
-            f"{folder} holds expected maps, to which only `train direct --dataset` adds noise: "
-            "make them without --expected-maps"
+            f"{folder} holds expected maps, to which only training on raw maps adds noise: make them without "
+            "--expected-maps"
         )
     if color and not plan.textures:
         raise RecordingError(

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from nlos_calibration import Moments, load_measured
 from nlos_calibration.arrays import Float16, Float32
-from nlos_models import InMemory, MapBatch, MapSet, MapSource, Recipe, first_of, subtract_bare_wall
+from nlos_models import InMemory, MapBatch, MapSet, MapSource, Recipe, WithNoise, first_of, subtract_bare_wall
 
+from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
 from nlos_cam.errors import SceneError
@@ -82,13 +83,15 @@ def _subtract(batch: MapBatch, bare: BareMaps) -> MapBatch:
 def read_maps(recipe: Recipe, data: Path, held_out_data: Path, wall: Path | None, *, stream: bool = False) -> MapSplit:
     """Return the maps of a recipe. Raises SceneError where they are too few, of two rigs, or not held out.
 
-    A stream reads a whole dataset and keeps only a few shards in memory.
+    To expected maps the sensor's noise is added, in each epoch another draw. A stream reads a whole dataset and keeps a
+    few shards in memory.
     """
     if wall and recipe.maps == "raw maps":
         raise SceneError(f"--wall {wall} only applies to difference maps; this recipe uses raw maps")
     if data.resolve() == held_out_data.resolve():
         raise SceneError(f"--dataset and --held-out are the same folder ({data}): hold out different objects")
-    training, other = (open_dataset(folder, color=recipe.colour) for folder in (data, held_out_data))
+    training = open_dataset(data, color=recipe.colour, expected=recipe.maps == "raw maps")
+    other = open_dataset(held_out_data, color=recipe.colour)
     plan, count = training.plan, len(training)
     if count < recipe.objects:
         raise SceneError(
@@ -104,10 +107,13 @@ def read_maps(recipe: Recipe, data: Path, held_out_data: Path, wall: Path | None
     held_out = first_of(other.arrays(), recipe.held_out)
     if bare:
         held_out = subtract_bare_wall(held_out, *bare)
+    source: MapSource
     if stream:
-        return MapSplit(Streamed(training, training.column("image"), bare), held_out, plan)
-    maps = first_of(training.arrays(), recipe.objects)
-    return MapSplit(InMemory(subtract_bare_wall(maps, *bare) if bare else maps), held_out, plan)
+        source = Streamed(training, training.column("image"), bare)
+    else:
+        maps = first_of(training.arrays(), recipe.objects)
+        source = InMemory(subtract_bare_wall(maps, *bare) if bare else maps)
+    return MapSplit(WithNoise(source, map_noise(plan)) if plan.expected else source, held_out, plan)
 
 
 def measured_bare_wall(path: Path) -> BareMaps:

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from nlos_models import CHECKSUMS, ENCODER, TEXT_LIMIT, checksums_of, load_record, read_bounded
+from nlos_models import CHECKSUMS, TEXT_LIMIT, checksums_of, load_record, read_bounded
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.info.files import Description, count, describe_npz, problem_of, read_json
@@ -55,8 +55,6 @@ def _checksum_problem(folder: Path) -> str:
     """Return the first file that is missing or differs from its checksum; empty if none does."""
     for name, digest in checksums_of(folder).items():
         file = folder / name
-        if not file.exists() and name == ENCODER:
-            continue
         if not file.exists():
             return f"{file} is missing: copy the weights again"
         if hashlib.sha256(file.read_bytes()).hexdigest() != digest:

@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from nlos_models import export_folder, shipped_folder
+from nlos_models import SHIPPED, export_folder, shipped_folder
 
 from nlos_cam.camera import WORLDS, Recording, SimulatedCamera, World, pack_loop, read_packaged, render_loop
 from nlos_cam.recording import SAMPLE
@@ -21,7 +21,7 @@ EVERY, WIDTH, HEIGHT = 12, 320, 240
 
 def write_graphs() -> list[Path]:
     """Export the shipped weights as ONNX graphs that point into their tensors; takes the extra "train"."""
-    return export_folder(shipped_folder())
+    return [path for name in SHIPPED for path in export_folder(shipped_folder(name))]
 
 
 def write_worlds() -> list[Path]:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import (
     EMPTY,
+    GENERIC,
     HELD_OUT_OUTLIERS,
     ORDINARY,
     SHAPE_OUTLIERS,
@@ -61,7 +62,7 @@ class Pipeline:
     """Pipeline of `live` for single frames, without a memory."""
 
     def __init__(self, rig: Rig, network: Reconstructor, doubter: UncertaintyModel) -> None:
-        self.rig, self.limits = rig, verdict_limits(doubter)
+        self.rig, self.limits, self.learnt = rig, verdict_limits(doubter), doubter.record.learnt
         self._network, self._doubter = network, doubter
 
     def answer(self, depth_m: NDArray[np.float32], intensity: NDArray[np.float32]) -> Answer:
@@ -159,7 +160,7 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
     usual = open_dataset(held_out).arrays()
     answers = [pipeline.answer(*pair) for pair in zip(usual.depth_m[start:], usual.intensity[start:], strict=True)]
     result["held_out_objects"] = of_objects(answers, usual.image[start:], rig)
-    for kind in (EMPTY, ORDINARY, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS):
+    for kind in (EMPTY, ORDINARY, GENERIC, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS):
         wanted = {kind: empty if kind == EMPTY else math.ceil(count * FEWER.get(kind, 1.0))}
         with tracked(f"rendering {kind}") as on_progress:
             made = samples_on_disk(
@@ -175,10 +176,10 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
         if kind == EMPTY:
             false = harness.wilson(sum(one.shows for one in answers), len(answers))
             result["empty"] = {"false_objects": false, "verdicts": verdicts_of(answers)}
-        elif kind == ORDINARY:
-            result["ordinary_on_slightly_other_benches"] = of_objects(answers, made.image, rig)
+        elif kind in {ORDINARY, GENERIC}:
+            result[f"{kind}_on_slightly_other_benches"] = of_objects(answers, made.image, rig)
         else:
-            sort = "learnt" if kind in TRAINING_OUTLIERS else "never_learnt"
+            sort = "learnt" if kind in pipeline.learnt else "never_learnt"
             result.setdefault(sort, {})[kind] = of_outliers(answers, made.cells)
     return result | flagged_by_sort(result["learnt"], result["never_learnt"])
 

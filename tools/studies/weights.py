@@ -307,7 +307,7 @@ def main() -> None:
     for work in (limits, rigs, unseen):
         parts[work.__name__].set_defaults(run=work)
         parts[work.__name__].add_argument("--out", type=Path, help="folder of the results (default: docs)")
-    parts["limits"].add_argument("--weights", type=Path, default=shipped_folder())
+    parts["limits"].add_argument("--weights", type=Path, default=shipped_folder("paper"))
     parts["limits"].add_argument("--frames", type=int, nargs="*", default=list(FRAMES))
     parts["rigs"].add_argument("--weights", type=harness.named, action="append", default=[])
     parts["rigs"].add_argument("--rig", default="paper-rig")

@@ -12,9 +12,22 @@ import numpy as np
 import pytest
 import torch
 from nlos_calibration import load_rig
-from nlos_models import checkpoint, export_folder, load_doubt, load_pipeline, load_record, runs, tasks, train
+from nlos_models import (
+    QualitySet,
+    checkpoint,
+    export_folder,
+    load_doubt,
+    load_pipeline,
+    load_record,
+    load_uncertainty_model,
+    runs,
+    tasks,
+    train,
+)
 from nlos_models.arrays import Float16
+from nlos_models.quality import FEATURES
 from safetensors.torch import load_file, save_file
+from small_doubt import untrained_doubt, watched_weights
 from small_maps import SmallDataset, small_images, small_maps, untrained_weights, use_small_networks
 
 from nlos_cam.cli import train as command
@@ -278,6 +291,26 @@ def test_train_doubt_ignores_invisible_outliers(go: Go, folder: Path, monkeypatc
     assert training.nothing.sum() == 14
     assert (~training.nothing & ~training.outside).sum() == 8 + ((every.kind == ORDINARY) & visible).sum()
     assert training.outside.sum() == (outliers & visible).sum() < outliers.sum()
+
+
+def test_train_quality_replaces_a_damaged_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    untrained_doubt(weights := tmp_path / "run", watched_weights(tmp_path / "watched"))
+    (weights / "quality.json").write_text("{", encoding="utf-8")
+    figures = np.random.default_rng(0).standard_normal((120, FEATURES)).astype(np.float32)
+    iou = 1 / (1 + np.exp(-figures[:, 0]))
+    kinds = np.array(["cup", "bowl", "rods", "blobs"] * 30)
+    known = QualitySet(figures, iou, 0.2 - 0.1 * iou, kinds, np.arange(120) % 4 > 1)
+    monkeypatch.setattr("nlos_models.load_reconstructor", lambda *_: None)
+    monkeypatch.setattr("nlos_cam.dataset.open_dataset", lambda *_, **__: None)
+    monkeypatch.setattr("nlos_cam.dataset.quality_set", lambda *_: known)
+    monkeypatch.setattr("nlos_models.doubt_training.STEPS", 20)
+    asked = ["train", "quality", "--weights", str(weights), "--dataset", str(tmp_path), "--json"]
+    assert main(asked) == 0
+    answer = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (answer["weights"], answer["objects"]) == (str(weights), 120)
+    assert load_uncertainty_model(weights, tmp_path).quality.record.objects == 120
 
 
 def test_train_direct_refuses_a_store_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,9 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nlos_calibration import Rig, load_rig
+from small_run import small_recipe
 
-from nlos_cam.dataset import EMPTY, HELD_OUT_OUTLIERS, ORDINARY, TRAINING_OUTLIERS, doubt_samples, samples_on_disk
-from nlos_cam.dataset.doubt_samples import SEEDS_PER_BENCH, DoubtSamples, _generator, _stimulus, make_samples
+from nlos_cam.dataset import (
+    EMPTY,
+    GENERIC,
+    HELD_OUT_OUTLIERS,
+    ORDINARY,
+    TRAINING_OUTLIERS,
+    doubt_samples,
+    samples_on_disk,
+)
+from nlos_cam.dataset.doubt_samples import SEEDS_PER_BENCH, DoubtSamples, _generator, _stimulus, counts_of, make_samples
 from nlos_cam.render import SensorModel
 
 RIG, SENSOR = load_rig("paper-rig"), SensorModel()
@@ -43,6 +52,18 @@ def test_ordinary_and_half_of_outlier_benches_lie_slightly_off() -> None:
     assert [rig == RIG for rig in plates] == [True, True, False]
     assert RIG not in ordinary
     assert ordinary[0] == ordinary[1] != ordinary[2]
+
+
+def test_usual_objects_are_as_many_as_outliers_with_generic_shapes_by_their_share() -> None:
+    recipe = small_recipe(task="doubt", outliers=20, empties=9)
+    for share, kinds in ((0.0, 17), (0.25, 8)):
+        counts = counts_of(recipe, share)
+        assert counts[EMPTY] == 9
+        assert sum(counts.values()) == 9 + kinds * 20 + kinds * 10
+        assert counts.get(GENERIC, 0) == share * kinds * 10
+    one, same = (make_samples(GENERIC, [SEEDS_PER_BENCH], RIG, SENSOR) for _ in range(2))
+    np.testing.assert_array_equal(one.depth_m, same.depth_m)
+    assert _stimulus(GENERIC, 0, RIG, SENSOR).rig != RIG
 
 
 def test_kinds_share_no_bench_and_no_noise() -> None:

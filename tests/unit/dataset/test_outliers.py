@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from nlos_calibration import load_rig
 
-from nlos_cam.dataset import HELD_OUT_OUTLIERS, SHAPE_OUTLIERS, TRAINING_OUTLIERS, Stimulus, draw_outlier
+from nlos_cam.dataset import (
+    HELD_OUT_OUTLIERS,
+    SHAPE_OUTLIERS,
+    TRAINING_OUTLIERS,
+    Stimulus,
+    draw_outlier,
+    outliers_beside,
+)
 from nlos_cam.dataset.outliers import MIN_PIXELS, SLIGHT, WIDE, BenchSpread, ordinary, vary_bench, vary_empty_bench
 from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.objects import object_box
@@ -49,6 +56,13 @@ def test_outlier_kinds_to_learn_and_to_judge_differ() -> None:
         assert set(kinds) & SHAPE_OUTLIERS
         assert set(kinds) - SHAPE_OUTLIERS
     assert {*TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS} > SHAPE_OUTLIERS
+
+
+def test_shapes_are_no_outliers_to_weights_that_saw_generic_ones() -> None:
+    assert outliers_beside(0.0) == TRAINING_OUTLIERS
+    learnt = set(outliers_beside(0.5))
+    assert not learnt & (SHAPE_OUTLIERS | {"several", "tilted"})
+    assert learnt == {"small", "large", "far", "near", "half out", "dim", "other rig", "other sensor"}
 
 
 OUTSIDE: dict[str, Callable[[Stimulus], bool]] = {

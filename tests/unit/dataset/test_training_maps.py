@@ -13,6 +13,7 @@ from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
 
 from nlos_cam.dataset import DatasetPlan, RigSpread, training_maps
+from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, measured_bare_wall, read_maps, render_bare_wall
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import maps_from_frame
@@ -26,9 +27,10 @@ WALL = Path("wall.toml")
 
 @pytest.fixture(autouse=True)
 def _datasets(monkeypatch: pytest.MonkeyPatch) -> None:
-    def opened(of: Path, *, color: bool) -> SmallDataset:
+    def opened(of: Path, *, color: bool, expected: bool = False) -> SmallDataset:
         assert not color
-        return SmallDataset(small_maps(6, len(of.name)), OTHER if "rig" in of.name else PLAN)
+        plan = replace(PLAN, expected=True) if expected and of.name == "expected" else PLAN
+        return SmallDataset(small_maps(6, len(of.name)), OTHER if "rig" in of.name else plan)
 
     monkeypatch.setattr(training_maps, "open_dataset", opened)
 
@@ -45,6 +47,26 @@ def test_read_maps_takes_first_objects_of_recipe() -> None:
     np.testing.assert_array_equal(maps.held_out.image, small_maps(6, 5).image[:2])
     assert maps.limit_recipe(RECIPE) == RECIPE
     assert _read(held_out=400).limit_recipe(RECIPE).held_out == 6  # all that there are
+
+
+@pytest.mark.parametrize("stream", [False, True])
+def test_expected_maps_get_noise_anew_in_each_epoch(stream: bool) -> None:
+    """Of its stated deviation, in the intensity alone; the same generator draws the same again."""
+    one, other, same = (
+        next(iter(_read("expected", stream=stream, objects=6).training.batches(6, torch.Generator().manual_seed(seed))))
+        for seed in (1, 2, 1)
+    )
+    assert all(torch.equal(mine, its) for mine, its in zip(one[1:], same[1:], strict=True))
+    plain = next(
+        iter(_read("expecte*", stream=stream, objects=6).training.batches(6, torch.Generator().manual_seed(1)))
+    )
+    assert torch.equal(one.row, plain.row)
+    torch.testing.assert_close(one.depth_m, plain.depth_m, equal_nan=True, rtol=0, atol=0)
+    bright = plain.intensity > 10  # no noise is cut off at 0
+    off = (one.intensity - plain.intensity)[bright] / map_noise(PLAN).deviation(plain.intensity[bright])
+    assert abs(float(off.mean())) < 0.05
+    assert 0.95 < float(off.std()) < 1.05
+    assert not torch.equal(one.intensity, other.intensity)
 
 
 def test_digest_depends_on_objects_and_rig() -> None:

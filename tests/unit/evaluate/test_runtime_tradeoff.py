@@ -13,24 +13,9 @@ from nlos_calibration.rig import load_rig
 from page_reader import read_page
 
 from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
-from nlos_cam.evaluate import runtime_tradeoff
+from nlos_cam.evaluate import RuntimeRow, measure_runtimes, runtime_facts, runtime_settings, runtime_tradeoff, runtimes
 from nlos_cam.evaluate.metrics import Interval
-from nlos_cam.evaluate.runtime_tradeoff import (
-    MIN_CALLS,
-    RuntimeBench,
-    RuntimeRow,
-    RuntimeSetting,
-    calibration,
-    draw_runtimes,
-    losses,
-    measure_runtimes,
-    pareto_front,
-    recommended,
-    runtime_document,
-    runtime_facts,
-    runtime_settings,
-    runtimes,
-)
+from nlos_cam.evaluate.runtime_tradeoff import RuntimeBench, RuntimeSetting, pareto_front, recommended, runtime_document
 from nlos_cam.evaluate.subjects import seeded_objects
 from nlos_cam.objects.depth_map import object_box
 
@@ -61,7 +46,7 @@ def test_recommended_is_fastest_setting_without_loss() -> None:
 
 def test_loss_is_positive_where_any_metric_is_worse() -> None:
     worse = {**ROWS[0].figures, "silhouette_iou": Interval(0.7, 0, 1), "foreground_rmse_mm": Interval(25.0, 0, 50)}
-    lost = losses(replace(ROWS[0], figures=worse), ROWS[0])
+    lost = runtime_tradeoff.losses(replace(ROWS[0], figures=worse), ROWS[0])
     assert lost["silhouette_iou"] == pytest.approx(0.1)
     assert lost["foreground_rmse_mm"] == pytest.approx(5)
     assert lost["accuracy_mean_abs"] == 0
@@ -86,7 +71,9 @@ def test_settings_combine_weights_runtimes_and_threads_once() -> None:
 
 @pytest.mark.slow
 def test_mirrored_runtime_answers_mirrored_maps_with_the_mirrored_image(tmp_path: Path) -> None:
-    network = runtimes(None, RIG, BOX, tmp_path)["ONNX Runtime float32, mirrored"](1)
+    """Of the paper's pipeline; a direct network does so by itself, and has no such runtime."""
+    assert not [name for name in runtimes(None, RIG, BOX, tmp_path) if "mirrored" in name]
+    network = runtimes(Path("paper"), RIG, BOX, tmp_path)["ONNX Runtime float32, mirrored"](1)
     generator = np.random.default_rng(0)
     depth_m, intensity = (generator.uniform(0.3, 0.5, (1, 64, 80)).astype(np.float32) for _ in range(2))
     image = network(depth_m, intensity)
@@ -106,7 +93,7 @@ def test_measure_takes_median_and_restores_threads() -> None:
     asked = [RuntimeSetting("plate", "mine", "any", 2, 1), RuntimeSetting("plate", "mine", "any", 1, 2)]
     rows = list(measure_runtimes(asked, {"mine": {"any": lambda _: plate}}, bench, lambda: next(seconds)))  # type: ignore[dict-item]
     assert torch.get_num_threads() == before
-    assert [threads.count(count) for count in (1, 2)] == [1 + MIN_CALLS] * 2
+    assert [threads.count(count) for count in (1, 2)] == [1 + runtime_tradeoff.MIN_CALLS] * 2
     assert [row.milliseconds for row in rows] == pytest.approx([3, 3])
     assert 0 < rows[0].figures["silhouette_iou"].value < 1
     assert rows[1].wait_ms == pytest.approx(2 * rows[0].wait_ms)
@@ -120,7 +107,7 @@ def test_calibration_uses_training_objects_alone(monkeypatch: pytest.MonkeyPatch
         return seeded_objects(first_seed, 2, box)
 
     monkeypatch.setattr(runtime_tradeoff, "seeded_objects", kept)
-    shapes = [(depth.shape, intensity.shape) for depth, intensity in calibration(RIG, BOX)]
+    shapes = [(depth.shape, intensity.shape) for depth, intensity in runtime_tradeoff.calibration(RIG, BOX)]
     assert shapes == [((1, 64, 80), (1, 64, 80))] * 2
     first_seed, count = asked[0]
     assert TRAINING_SEED <= first_seed < first_seed + count < HELD_OUT_SEED
@@ -136,7 +123,7 @@ def test_table_and_plot_show_measured_rows(tmp_path: Path, measured: int) -> Non
     assert all(row["name"] in page.text for row in table["settings"])
     if measured:
         assert table["recommended"]["name"] == ("quick" if measured > 1 else "exact")
-        draw_runtimes(tmp_path / "plot.png", ROWS[:measured])
+        runtime_tradeoff.draw_runtimes(tmp_path / "plot.png", ROWS[:measured])
         assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     else:
         assert table["recommended"] is None

@@ -9,7 +9,7 @@ import onnx
 import pytest
 import torch
 from nlos_models import checkpoint, errors, export, inference, records
-from nlos_models.checkpoint import load_pipeline, save_pipeline
+from nlos_models.checkpoint import load_network, load_pipeline, save_pipeline
 from nlos_models.compressor import Compressor
 from nlos_models.doubt_network import load_doubt
 from nlos_models.errors import CheckpointError, MissingExtraError, ModelError
@@ -17,7 +17,7 @@ from nlos_models.export import TorchReconstructor, quantize
 from nlos_models.inference import OnnxReconstructor, Reconstructor, load_reconstructor, load_uncertainty_model
 from nlos_models.metrics import MIN_V
 from nlos_models.pipeline import RemappingNetwork, split_and_stack
-from nlos_models.records import CheckpointRecord, checksum_of_watched, shipped_folder, weights_folder
+from nlos_models.records import SHIPPED, CheckpointRecord, checksum_of_watched, shipped_folder, weights_folder
 from nlos_models.vae import Decoder
 from onnx import TensorProto, helper, numpy_helper
 from small_maps import HARD_MAPS, hard_maps
@@ -191,12 +191,13 @@ def test_linked_graphs_equal_full_exports_bit_for_bit(folders: tuple[Path, Path]
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_gpu")
-def test_shipped_graphs_equal_shipped_checkpoint_in_torch() -> None:
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_graphs_equal_shipped_checkpoint_in_torch(name: str) -> None:
     """The images to within 1e-4, and at most a handful of pixels on the other side of the silhouette's threshold."""
-    shipped, maps = shipped_folder(), shipped_maps()
-    network, doubt = load_reconstructor(None, Path("unused")), load_uncertainty_model(None, Path("unused"))
+    shipped, maps = shipped_folder(name), shipped_maps()
+    network, doubt = load_reconstructor(shipped, Path("unused")), load_uncertainty_model(shipped, Path("unused"))
     assert isinstance(network, OnnxReconstructor)
-    mine, its = network(*maps), TorchReconstructor(*load_pipeline(), "cpu")(*maps)
+    mine, its = network(*maps), TorchReconstructor(*load_network(shipped), "cpu")(*maps)
     both = (mine > 0) & (its > 0)
     assert ((mine > 0) != (its > 0)).sum((1, 2)).max() <= HANDFUL
     assert both.mean() > 0
@@ -242,21 +243,24 @@ def shipped_maps() -> tuple[np.ndarray, np.ndarray]:
     return depth_m, np.stack([10 + 30 * np.roll(patch, 6 * k, 1) for k in range(3)]).astype(np.float32)
 
 
-def test_package_without_encoder_names_the_recipe_that_makes_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for path in shipped_folder().glob("*.*"):
-        if path.name != "encoder.safetensors":
-            (tmp_path / path.name).symlink_to(path)
-    monkeypatch.setattr(records, "shipped_folder", lambda: tmp_path)
+def test_paper_weights_without_encoder_name_the_recipe_that_makes_one() -> None:
     with pytest.raises(CheckpointError, match=r"encoder.*train vae --recipe vae-encoder"):
-        checkpoint.load_vae(tmp_path)
+        checkpoint.load_vae()
     assert checkpoint.load_encoder() is None
+
+
+def test_paper_weights_are_named_where_a_package_has_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records, "shipped_folder", lambda name="direct": tmp_path / name)
+    with pytest.raises(CheckpointError, match="from a clone"):
+        load_reconstructor(Path("paper"), tmp_path)
+    with pytest.raises(CheckpointError, match="no checkpoint in"):
+        load_reconstructor(tmp_path / "other", tmp_path)
 
 
 def test_weights_by_name_give_way_to_a_folder_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    assert weights_folder(None) == shipped_folder() == weights_folder(Path("direct"))
     name = Path("paper")
-    assert weights_folder(name) == weights_folder(None) == shipped_folder()
+    assert weights_folder(name) == weights_folder(None, "paper") == shipped_folder("paper")
     name.mkdir()
     assert (weights_folder(name), weights_folder(tmp_path / "other")) == (name, tmp_path / "other")

@@ -161,7 +161,7 @@ def test_vae_trains_in_bfloat16() -> None:
 def test_shipped_weights_load_bit_for_bit_with_record() -> None:
     loaded, record = checkpoint.load_pipeline()
     for part in ("compressor", "preprocess", "decoder"):
-        stored, tensors = load_file(shipped_folder() / f"{part}.safetensors"), getattr(loaded, part).state_dict()
+        stored, tensors = load_file(shipped_folder("paper") / f"{part}.safetensors"), getattr(loaded, part).state_dict()
         assert tensors.keys() == stored.keys()
         for name, tensor in stored.items():
             assert torch.equal(tensors[name], tensor.to(tensors[name].dtype)), name

@@ -56,6 +56,14 @@ def test_one_frame_has_the_figures_that_it_has_among_others() -> None:
     np.testing.assert_allclose(alone[0], quality_features(images, said)[1], rtol=1e-4, atol=1e-5)
 
 
+def test_figure_that_never_differs_leaves_a_model_that_loads() -> None:
+    samples = known_objects(60)
+    samples.figures[:, 5] = 1.0
+    record = QualityRecord.model_validate_json(fit_quality(samples, "0" * 12).model_dump_json())
+    assert min(record.spreads) > 0
+    assert np.isfinite(QualityModel(record).outputs(samples.figures)).all()
+
+
 def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> None:
     kinds = [*KINDS, "carved blobs", "cup"]
     judged = list[int]()
@@ -110,7 +118,8 @@ def test_model_is_bound_to_its_uncertainty_network(tmp_path: Path) -> None:
     for spoiled, reason in ((text[:-9], "damaged"), (text.replace(record.watches, "0" * 12), "damaged")):
         (folder / quality.QUALITY).write_text(spoiled)
         with pytest.raises(CheckpointError, match=reason):
-            quality.load_quality_model(folder)
+            load_uncertainty_model(folder, tmp_path)
+        assert load_uncertainty_model(folder, tmp_path, quality=False).quality is None  # to fit it again
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,14 @@
 """Training runs: the weights and earlier runs that they start from, and outputs that are not overwritten."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint, runs
-from nlos_models.checkpoint import CheckpointRecord, save_pipeline, save_vae
+from nlos_models.checkpoint import CheckpointRecord, save_direct, save_pipeline, save_vae
+from nlos_models.direct import DirectNetwork
 from nlos_models.errors import OutputExistsError, TrainingError
 from nlos_models.files import CHECKSUMS
 from nlos_models.pipeline import RemappingNetwork
@@ -105,6 +107,21 @@ def test_joint_start_needs_encoder_for_latent_loss(weights: Path) -> None:
     with pytest.raises(TrainingError, match="encoder"):
         _start(JOINT, weights)
     _start(JOINT.model_copy(update=IMAGES_ALONE), weights)
+
+
+def test_transfer_starts_by_default_from_weights_that_its_loss_fits(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = {"features": 8, "width": 8, "blocks": 1, "token": 8, "mixers": 1}
+    straight = small_recipe(task="direct", direct=size)
+    save_direct(tmp_path / "direct", DirectNetwork(straight.direct), CheckpointRecord.of([straight], NAMED))
+    shipped = {"paper": weights, "direct": tmp_path / "direct"}
+    monkeypatch.setattr(runs, "weights_folder", lambda given, default: given or shipped[default])
+    start = partial(transfer_start, partial=False, on_report=pytest.fail)
+    assert start(TRANSFER, None)[1] == [VAE, TWO]
+    assert start(TRANSFER.model_copy(update=IMAGES_ALONE), None)[1] == [straight]
+    with pytest.raises(TrainingError, match="latent"):
+        start(TRANSFER, shipped["direct"])
 
 
 def test_partial_start_fills_missing_tensors_by_seed(weights: Path) -> None:

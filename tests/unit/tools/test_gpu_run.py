@@ -25,6 +25,27 @@ blocks = 1
 token = 8
 mixers = 1
 """
+ENCODER = """
+task = "vae"
+start = "decoder"
+objects = 16
+held_out = 4
+epochs = 1
+batch = 16
+learning_rate = 1e-3
+schedule = "one-cycle"
+"""
+COMPRESSOR = """
+task = "compressor"
+objects = 64
+held_out = 20
+epochs = 1
+batch = 16
+learning_rate = 1e-3
+schedule = "one-cycle"
+image_weight = 1.0
+width = 0.1
+"""
 
 
 @pytest.fixture
@@ -69,12 +90,15 @@ def test_whole_run_in_the_small(gpu: ModuleType, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(gpu, "DIRECT_SHARE", 1e-9)  # two epochs
     monkeypatch.setattr(gpu, "TIMING_SHARE", 1.0)
     (tmp_path / "small.toml").write_text(SMALL, encoding="utf-8")
+    (tmp_path / "encoder.toml").write_text(ENCODER, encoding="utf-8")
+    (tmp_path / "compressor.toml").write_text(COMPRESSOR, encoding="utf-8")
     arguments = ["--out", str(tmp_path / "out"), "--minutes", "20", "--workers", "1", "--accelerator", "cpu"]
     small = ["--recipe", str(tmp_path / "small.toml"), "--held-out", "20", "--first-objects", "100"]
-    chosen = gpu.options().parse_args([*arguments, *small])
-    chosen.compressor = None
+    paper = ["--encoder", str(tmp_path / "encoder.toml"), "--compressor", str(tmp_path / "compressor.toml")]
+    chosen = gpu.options().parse_args([*arguments, *small, *paper, "--compressor-epochs", "1"])
     gpu.train_and_judge(chosen)
     facts = json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))
     assert facts["objects"] >= 100
-    assert 0 <= facts["direct"]["unseen"]["silhouette_iou"]["value"] <= 1
-    assert facts["direct_parts"] == ["direct.00"]
+    for name in ("direct", "compressor"):
+        assert 0 <= facts[name]["unseen"]["silhouette_iou"]["value"] <= 1
+        assert facts[f"{name}_parts"][0] == f"{name}.00"
