@@ -24,6 +24,10 @@ KEPT_ABOVE = 0.44
 of it; the mean absolute error is least near 0.5. This value costs either of them little."""
 SMALLEST_SHARE = 0.3
 """Smallest spread of a cell, as a share of the median spread: quiet cells would otherwise show noise alone."""
+MIN_LIGHT_SPREAD = 0.08
+"""Of the log intensity: the reflectance of a real wall varies by some percent, which the renderer's does not."""
+GAIN_COLUMNS = 4
+"""Every so many columns give cells that tell a frame's gain; all rows, so that mirrored maps have the same gain."""
 PATCH, TOKEN = 4, 8
 """Cells of a patch's side, and pixels of an output token's side; patches are merged two by two."""
 SIDE_PATCHES = (ROWS // 2 // PATCH, COLUMNS // PATCH)
@@ -67,7 +71,11 @@ class Residual(nn.Module):
 
 
 class CellNormal(nn.Module):
-    """Normalisation of each cell's depth and log intensity by median and spread over the training set, clipped."""
+    """Normalisation of each cell's depth and log intensity by median and spread over the training set, clipped.
+
+    The frame's own gain is taken out of the intensity: the median ratio to the training set's medians over the quieter
+    half of the cells, which hardly any object changes.
+    """
 
     median: Tensor
     spread: Tensor
@@ -82,7 +90,7 @@ class CellNormal(nn.Module):
         for channel, values in enumerate(_channels(depth_m, intensity).unbind(1)):
             median = values.nanmedian(0).values.nan_to_num()
             spread = (values - median).square().nanmean(0).sqrt().nan_to_num()
-            spread = spread.clamp(min=SMALLEST_SHARE * float(spread.median()))
+            spread = spread.clamp(min=max(SMALLEST_SHARE * float(spread.median()), channel * MIN_LIGHT_SPREAD))
             self.median[channel] = (median + median.flip(0)) / 2
             self.spread[channel] = (spread + spread.flip(0)) / 2
 
@@ -97,8 +105,23 @@ class CellNormal(nn.Module):
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
         """Map maps (n, 64, 80) to (n, 2, 64, 80); a cell without a return is 0 in both channels."""
-        normal = (_channels(depth_m, intensity) - self.median) / self.spread
+        off = _channels(depth_m, intensity) - self.median
+        gain = self.log_gain(off[:, 1])
+        normal = (off - torch.stack([torch.zeros_like(gain), gain], dim=1)[:, :, None, None]) / self.spread
         return torch.where(torch.isnan(normal), 0.0, normal.clamp(-CLIP, CLIP))
+
+    def log_gain(self, light: Tensor) -> Tensor:
+        """Return the logarithm of each frame's gain (n,), of log intensities (n, 64, 80) less the medians; 0 for none.
+
+        Medians are taken by sorting, which every runtime can do, with cells that do not count at the end.
+        """
+        some, spread = light[..., ::GAIN_COLUMNS], self.spread[1, :, ::GAIN_COLUMNS]
+        quieter = spread <= spread.flatten().sort().values[(spread.numel() - 1) // 2]
+        counts = quieter & ~torch.isnan(some)
+        ordered = torch.where(counts, some, torch.inf).flatten(1).sort(dim=1).values
+        number = counts.flatten(1).sum(dim=1, keepdim=True)
+        middle = ordered.gather(1, ((number - 1) // 2).clamp(min=0))
+        return torch.where(number > 0, middle, 0.0)[:, 0]
 
     def add_noise(self, normal: Tensor, noise: MapNoise) -> Tensor:
         """Draw the sensor's noise for the intensity of expected maps (n, 2, 64, 80), normalised as `forward` does."""

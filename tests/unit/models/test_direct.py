@@ -12,6 +12,7 @@ from nlos_models.checkpoint import load_network, load_pipeline, save_direct
 from nlos_models.data import InMemory, as_images
 from nlos_models.direct import (
     CLIP,
+    MIN_LIGHT_SPREAD,
     CellNormal,
     DirectNetwork,
     MapNoise,
@@ -174,6 +175,18 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
     assert not inline  # no matrix is stored twice, the transposed ones included
     with pytest.raises(CheckpointError, match="direct network"):
         load_pipeline(weights)
+
+
+def test_gain_of_a_frame_changes_nothing_and_frames_without_returns_have_none() -> None:
+    maps, normal = small_maps(40, 0), CellNormal()
+    depth_m, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
+    normal.learn(depth_m, intensity)
+    assert float(normal.spread[1].min()) >= MIN_LIGHT_SPREAD - 1e-6
+    for gain in (-1.0, 0.05, 0.7):
+        brighter = torch.expm1(torch.log1p(intensity) + gain)
+        torch.testing.assert_close(normal(depth_m, brighter), normal(depth_m, intensity), atol=1e-3, rtol=0)
+    nothing = normal(torch.full_like(depth_m, torch.nan), intensity)
+    assert not nothing.any()
 
 
 def test_shift_follows_another_bench_and_nothing_else() -> None:
