@@ -14,7 +14,16 @@ from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError
 from nlos_models.files import TENSOR_LIMIT, describe, read_checked, write_checked
 from nlos_models.pipeline import RemappingNetwork, new_pipeline, new_vae
-from nlos_models.records import DIRECT, ENCODER, PAPER, RECORD, CheckpointRecord, load_record, weights_folder
+from nlos_models.records import (
+    DIRECT,
+    ENCODER,
+    PAPER,
+    RECORD,
+    CheckpointRecord,
+    load_record,
+    shipped_folder,
+    weights_folder,
+)
 from nlos_models.vae import Encoder, ResVae
 
 PIPELINE_PARTS = "compressor", "preprocess", "decoder"
@@ -78,7 +87,7 @@ def load_vae(folder: Path | None = None) -> tuple[ResVae, CheckpointRecord]:
     """Return a Res-VAE (default: the paper's) in eval mode, with its record. Raises CheckpointError."""
     folder = weights_folder(folder, PAPER)
     record = load_record(folder)
-    if not (folder / ENCODER).exists() and folder == weights_folder(None, PAPER):
+    if not (folder / ENCODER).exists() and folder == shipped_folder(PAPER):
         raise CheckpointError(
             "the paper's weights come without their encoder (21 MB), which only training needs: make it again with "
             "`nlos-cam train vae --recipe vae-encoder --out DIR`, and give --vae DIR"
