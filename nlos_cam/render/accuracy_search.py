@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.backend_numba import BEAM_TILE
 from nlos_cam.render.echoes import strongest, with_pulse
 from nlos_cam.render.effects import Effects, Plan
 from nlos_cam.render.geometry import cast
+from nlos_cam.render.legs import BEAM_TILE
 from nlos_cam.render.planning import prepare
 from nlos_cam.render.renderer import Rendering, beam_histograms, render
 from nlos_cam.render.scene import Scene

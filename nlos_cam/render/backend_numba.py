@@ -9,11 +9,13 @@ its sub-bin, and rounding to the nearest shift puts a bin's edge in the middle o
 numba's cache depends on this file alone: after a change of a kernel that is imported here, delete __pycache__.
 """
 
+from functools import lru_cache
+from math import ceil, sqrt
 from typing import NamedTuple
 
 import numba
 import numpy as np
-from nlos_calibration.arrays import Float32, Float64, Int32
+from nlos_calibration.arrays import Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.frames import inner, int64
@@ -22,24 +24,27 @@ from nlos_cam.render.echoes import MultiBounce, strongest, strongest_between
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.legs import (
+    BEAM_TILE,
+    DARK,
     FAST,
+    RELAY_TILE,
     WINDOW,
     NumbaLegs,
     NumbaOptics,
     NumbaPoints,
     NumbaSurface,
     add_rows,
-    geometry,
+    fill,
+    judge,
     scratch,
-    shade,
 )
 from nlos_cam.render.visibility import HeightField, horizon_table
 
 LANES = 16
 """Bins by which the rows of tables are padded: whole widest vectors."""
-BEAM_TILE = 64
-"""Beams of a thread that go together: their windows of bins and their legs to some patches fit in the first cache."""
-PATCH_BLOCK = 16
+COUNTERS = 4
+"""Histograms of a patch that are counted at once, by turns."""
+PATCH_BLOCK = 8
 """Patches whose legs are computed before their rows are added."""
 
 
@@ -58,64 +63,57 @@ class NumbaTables(NamedTuple):
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def returns(
-    legs: NumbaLegs, s: int, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField
-) -> np.float32:
-    """Fill in B(s, q) of S2 for one patch with d3 + d4 in sub-bins as the length, and return the shortest."""
-    cells = len(relay.x_m)
+    verdict: int, legs: NumbaLegs, s: int, start: int, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics,
+    field: HeightField,
+) -> int:  # fmt: skip
+    """Fill in B(s, q) of S2 for a patch and the cells of a tile, with d3 + d4 in sub-bins as the length.
+
+    Return the number of legs, 0 for a tile without light.
+    """
+    count = 0 if verdict == DARK else min(relay.tile, len(relay.x_m) - start)
     # Wall to lidar in the points' weights, patch to wall in the legs.
-    geometry(legs, s, surface, relay, 0, cells, optics, field, True)
-    if optics.sectors:
-        shade(legs, s, surface, relay, int64(0), cells, field)
-    shortest = np.float32(np.inf)
-    for q in range(cells):
-        legs.length_m[q] = (legs.length_m[q] + relay.length_m[q]) * optics.inverse_bin
-        shortest = min(shortest, legs.length_m[q])
-    return shortest
+    if count:
+        fill(legs, s, surface, relay, start, count, verdict, optics, field, True)
+    for i in range(count):
+        legs.length_m[i] = (legs.length_m[i] + relay.length_m[start + i]) * optics.inverse_bin
+    return count
 
 
 @inner(error_model="numpy", fastmath=FAST)
 def _count(
-    s: int,
-    surface: NumbaSurface,
-    relay: NumbaPoints,
-    optics: NumbaOptics,
-    field: HeightField,
-    factor: Float32,
-    per_bin: int,
-    histogram: Float32,
-) -> int:
-    """Count B over d3 + d4 of one patch in sub-bins, and return the bin at which they start."""
-    cells = len(relay.x_m)
-    legs = scratch(cells)
-    # The table starts at the first bin that any path of this patch falls into: its rows then need the spread only.
-    first = int(returns(legs, s, surface, relay, optics, field)) // per_bin
-    if len(factor):
-        for q in range(cells):
-            legs.weight[q] *= factor[s, q]
-    start = np.float32(first * per_bin)
-    for q in range(cells):
-        legs.sector[q] = np.int32(legs.length_m[q] - start)  # not negative: first is this patch's own floor
-    for q in range(cells):
-        histogram[legs.sector[q]] += legs.weight[q]
-    return first
+    s: int, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField, factor: Float32,
+    start: np.float32, histogram: Float32,
+) -> None:  # fmt: skip
+    """Count B over d3 + d4 of one patch in sub-bins, from the sub-bin `start` on."""
+    # Neighboring cells often share a sub-bin, and each sum there would wait for the one before.
+    lanes = np.zeros((COUNTERS, len(histogram)), np.float32)
+    legs, verdicts = scratch(relay.tile), judge(s, s + 1, surface, relay.bounds_m, optics, field)[0]
+    for tile in range(len(verdicts)):
+        count = returns(verdicts[tile], legs, s, tile * relay.tile, surface, relay, optics, field)
+        if len(factor):
+            for i in range(count):
+                legs.weight[i] *= factor[s, tile * relay.tile + i]
+        for i in range(count):
+            legs.sector[i] = np.int32(legs.length_m[i] - start)
+        for i in range(count):
+            lanes[i % COUNTERS, legs.sector[i]] += legs.weight[i]
+    for lane in range(COUNTERS):
+        histogram += lanes[lane]
 
 
 @numba.njit(cache=True, parallel=True)
 def sub_bins(
-    surface: NumbaSurface,
-    relay: NumbaPoints,
-    optics: NumbaOptics,
-    field: HeightField,
-    factor: Float32,
-    per_bin: int,
-    width: int,
-) -> tuple[Int32, Float32]:
-    """Return histograms (n, width * per_bin) of B over d3 + d4 in sub-bins, and the bin (n,) at which each starts."""
-    patches = len(surface.x_m)
-    first, histogram = np.zeros(patches, np.int32), np.zeros((patches, width * per_bin), np.float32)
-    for s in numba.prange(patches):
-        first[s] = _count(int64(s), surface, relay, optics, field, factor, per_bin, histogram[s])
-    return first, histogram
+    surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField, factor: Float32,
+    first: Int32, per_bin: int, width: int,
+) -> Float32:  # fmt: skip
+    """Return histograms (n, width * per_bin) of B over d3 + d4 in sub-bins, each from a bin (n,) on.
+
+    A BRDF's `factor` (n, m) is in the order of the tiles, or empty.
+    """
+    histogram = np.zeros((len(first), width * per_bin), np.float32)
+    for s in numba.prange(len(first)):
+        _count(int64(s), surface, relay, optics, field, factor, np.float32(first[s] * per_bin), histogram[s])
+    return histogram
 
 
 @numba.njit(cache=True, parallel=True)
@@ -162,19 +160,23 @@ def ends(
     return near, spread + table.width + 3
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _place(
-    legs: NumbaLegs, length_m: Float32, begin: Float32, strength: np.float32, first: np.float32, table: NumbaTables,
-    inverse_bin: np.float32, weight: Float32, row: Float32, ahead: Float32,
+    legs: NumbaLegs, s: int, start: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics,
+    field: HeightField, verdict: int, begin: Float32, table: NumbaTables,
+    to: tuple[Float32, Float32, Float32],
 ) -> tuple[np.float32, np.float32]:  # fmt: skip
-    """Fill in each leg's weight, row of the patch's table, and bin of the row at which the beam's window begins.
+    """Fill in each leg's weight, row of the patch's table, and bin of the row at which the beam's window begins (`to`).
 
     Return the sum of the weights and the smallest of those bins. All numbers are whole, and exact in float32.
     """
-    total, least = np.float32(0), np.float32(np.inf)
+    total, least, count = np.float32(0), np.float32(np.inf), len(begin)
+    weight, row, ahead = to
+    fill(legs, s, surface, feet, start, count, verdict, optics, field, False)
+    strength, first, length_m = surface.strength[s], np.float32(table.first[s]), feet.length_m[start : start + count]
     per_bin, whole, stride = np.float32(table.per_bin), np.float32(1 / table.per_bin), np.float32(WINDOW + table.width)
-    for i in range(len(begin)):
-        shift = np.floor((legs.length_m[i] + length_m[i]) * inverse_bin + np.float32(0.5))
+    for i in range(count):
+        shift = np.floor((legs.length_m[i] + length_m[i]) * optics.inverse_bin + np.float32(0.5))
         bins = np.floor(shift * whole)
         weight[i] = legs.weight[i] * strength
         row[i] = (shift - bins * per_bin) * stride
@@ -182,6 +184,23 @@ def _place(
         total += weight[i]
         least = min(least, ahead[i])
     return total, least
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
+def _add_block(
+    used: int, table: NumbaTables, row: Float32, ahead: Float32, base: Int64, weights: Float32, offsets: Int32,
+    sums: Float32,
+) -> None:  # fmt: skip
+    """Add the rows of some patches, placed by `_place`, to the windows (count, windows * WINDOW) of a tile's beams."""
+    count, bins, width = sums.shape[0], sums.shape[1], np.float32(table.width)
+    every, offset = sums.ravel(), offsets.reshape(PATCH_BLOCK, count)
+    for window in range(0, bins, WINDOW):
+        for j in range(used):
+            for i in range(count):
+                at = min(max(ahead[j, i] + np.float32(window), np.float32(-WINDOW)), width)
+                offset[j, i] = np.int32(row[j, i] + at)
+        for i in range(count):
+            add_rows(every, i * bins + window, table.rows, base, offsets, weights, i, count, used)
 
 
 @inner(error_model="numpy", fastmath=FAST)
@@ -196,18 +215,16 @@ def _add_tile(
     # Legs of some patches first, then the rows of each beam: rows and windows stay in the first cache
     legs, bound = scratch(count), np.zeros(count, np.float32)
     weights, offsets = np.empty(PATCH_BLOCK * count, np.float32), np.empty(PATCH_BLOCK * count, np.int32)
-    weight, offset = weights.reshape(PATCH_BLOCK, count), offsets.reshape(PATCH_BLOCK, count)
+    weight = weights.reshape(PATCH_BLOCK, count)
     row, ahead = np.empty((PATCH_BLOCK, count), np.float32), np.empty((PATCH_BLOCK, count), np.float32)
-    every, base, used = sums.ravel(), np.empty(PATCH_BLOCK, np.int64), 0
-    bins, width, length_m = sums.shape[1], np.float32(table.width), feet.length_m[start : start + count]
+    base, used, bins = np.empty(PATCH_BLOCK, np.int64), 0, sums.shape[1]
+    tile = feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
+    verdicts = judge(int64(0), len(table.first), surface, tile, optics, field)
     for s in range(len(table.first)):
-        geometry(legs, s, surface, feet, start, count, optics, field, False)
-        if optics.sectors:
-            shade(legs, s, surface, feet, start, count, field)
-        strength, first = surface.strength[s], np.float32(table.first[s])
-        total, least = _place(
-            legs, length_m, begin, strength, first, table, optics.inverse_bin, weight[used], row[used], ahead[used]
-        )
+        total, least, verdict = np.float32(0), np.float32(0), verdicts[s, 0]
+        if verdict != DARK:
+            to = weight[used], row[used], ahead[used]
+            total, least = _place(legs, s, start, feet, surface, optics, field, verdict, begin, table, to)
         if total > 0:
             # h(k) = sum_s A(p, s) T_s(k - at_s): beyond the window each T_s is at most its largest value from there.
             largest = table.rest[s, min(max(int(least) + bins, 0), table.width)]
@@ -217,13 +234,7 @@ def _add_tile(
             used += 1
         if used < PATCH_BLOCK and s + 1 < len(table.first):
             continue
-        for window in range(0, bins, WINDOW):
-            for j in range(used):
-                for i in range(count):
-                    at = min(max(ahead[j, i] + np.float32(window), np.float32(-WINDOW)), width)
-                    offset[j, i] = np.int32(row[j, i] + at)
-            for i in range(count):
-                add_rows(every, i * bins + window, table.rows, base, offsets, weights, i, count, used)
+        _add_block(used, table, row, ahead, base, weights, offsets, sums)
         used = 0
     return bound
 
@@ -245,18 +256,21 @@ def _sum_tile(
 
 @numba.njit(cache=True, parallel=True)
 def shift_and_add(
-    feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField, table: NumbaTables, bins: int
-) -> Float32:
-    """Return histograms (n, bins) of beams: the sum of every patch's table, times A, shifted by d1 + d2."""
-    beams = len(feet.x_m)
-    histogram = np.zeros((beams, bins), np.float32)
-    for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
-        start = tile * BEAM_TILE
-        begin, sums, _ = _sum_tile(start, feet, surface, optics, field, table, bins)
+    tiles: Int64, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField,
+    table: NumbaTables, bins: int,
+) -> Float32:  # fmt: skip
+    """Return histograms (k * BEAM_TILE, bins) of the beams of k tiles.
+
+    They are the sum of every patch's table, times A, shifted by d1 + d2. Beams are summed by whole tiles, so that their
+    bits do not depend on which are asked for.
+    """
+    histogram = np.zeros((len(tiles) * BEAM_TILE, bins), np.float32)
+    for k in numba.prange(len(tiles)):
+        begin, sums, _ = _sum_tile(tiles[k] * BEAM_TILE, feet, surface, optics, field, table, bins)
         for i in range(len(begin)):
             first = int(begin[i])
-            for k in range(max(-first, 0), min(sums.shape[1], bins - first)):
-                histogram[start + i, first + k] = sums[i, k]
+            for j in range(max(-first, 0), min(sums.shape[1], bins - first)):
+                histogram[k * BEAM_TILE + i, first + j] = sums[i, j]
     return histogram
 
 
@@ -279,7 +293,7 @@ def _strongest_in_window(
             best = strongest_between(sums[i], max(-first, 0), min(WINDOW, bins - first))
             winner[start + i], peak[start + i], second[start + i] = best[0] + first, best[1], best[2]
             sure[start + i] = bound[i] * ROUNDED <= best[2]
-    return winner, peak, second, sure
+    return winner[feet.place], peak[feet.place], second[feet.place], sure[feet.place]
 
 
 ROUNDED = np.float32(1.001)
@@ -323,8 +337,9 @@ def echoes(job: TransportJob) -> MultiBounce:
     path = np.where(peak > 0, (winner + 0.5) * job.bin_m, np.nan).astype(np.float32)
     found = MultiBounce(peak, second, path)
     if (unsure := np.flatnonzero(~sure)).size:
-        some = numba_job.feet((~sure).astype(np.float64))
-        rest = strongest(shift_and_add(some, *numba_job.sites, table, job.bins), job.bin_m)
+        tiles, which = np.unique(every.place[unsure] // BEAM_TILE, return_inverse=True)
+        whole = shift_and_add(tiles.astype(np.int64), every, *numba_job.sites, table, job.bins)
+        rest = strongest(whole[which * BEAM_TILE + every.place[unsure] % BEAM_TILE], job.bin_m)
         found.peak[unsure], found.runner_up[unsure], found.path_m[unsure] = rest.peak, rest.runner_up, rest.path_m
     return found
 
@@ -332,21 +347,22 @@ def echoes(job: TransportJob) -> MultiBounce:
 class NumbaJob:
     """Job in float32, with everything that does not depend on the BRDF computed once."""
 
-    def __init__(self, job: TransportJob) -> None:
+    def __init__(self, job: TransportJob, *, tiled: bool = True) -> None:
         patches, relay = job.patches, job.relay
-        self.job, accuracy = job, job.accuracy
+        self.job, accuracy, self._tiled = job, job.accuracy, tiled
         geometry = *_columns(patches.point_m), *_columns(patches.normal), _single(job.soft_patch_m2)
         low, high, walk = horizons(job)
-        shaded = high.max(1) * reach_cells(job) > patches.point_m[:, 2] if job.field.shades else np.empty(0, np.bool_)
-        sites = patches.row, patches.column, low, high, walk, shaded
+        highest = high.max(1, initial=0)
+        shaded = highest * reach_cells(job) > patches.point_m[:, 2] if job.field.shades else np.empty(0, np.bool_)
+        sites = patches.row, patches.column, low, high, walk, highest, shaded
         self.surface = NumbaSurface(*geometry, _single(job.strength), *sites)
         columns = relay.x_m, relay.y_m, relay.length_m, job.relay_weight
-        self.relay = _points(columns, job.soft_wall_m2)
+        self.relay = _points(columns, job.soft_wall_m2, RELAY_TILE, tiled=tiled)
         edge_x, edge_z = job.edge_m
         edge = np.float32(edge_x), np.float32(edge_z), np.float32(job.near_m**2)
         sectors = accuracy.sectors if job.field.shades else 0
         self.optics = NumbaOptics(*edge, job.lambertian, np.float32(accuracy.sub_bins / job.bin_m), sectors)
-        self.width = table_width(job)
+        self.first, self.width = table_bins(job)
 
     @property
     def sites(self) -> tuple[NumbaSurface, NumbaOptics, HeightField]:
@@ -357,18 +373,23 @@ class NumbaJob:
         """Return the beams with a weight (n,) above 0."""
         some, job = np.flatnonzero(share), self.job
         x, y, _ = job.laser_spot_m[some].T
-        return _points((x, y, job.length_m[some], job.beam_weight[some] * share[some]), 0.0)
+        return _points(
+            (x, y, job.length_m[some], job.beam_weight[some] * share[some]), 0.0, BEAM_TILE, tiled=self._tiled
+        )
 
     def tables(self, factor: Float32) -> NumbaTables:
         """Return the patches' tables, with a BRDF's factor (n, m) or an empty one."""
         job, per_bin = self.job, self.job.accuracy.sub_bins
-        first, fine = sub_bins(self.surface, self.relay, self.optics, job.field, factor, per_bin, self.width)
-        return tables(first, add_interreflection(job, first, fine) if job.more_bounces else fine, per_bin)
+        if factor.size:
+            factor = factor[:, np.argsort(self.relay.place)]
+        fine = sub_bins(self.surface, self.relay, *self.sites[1:], factor, self.first, per_bin, self.width)
+        return tables(self.first, add_interreflection(job, self.first, fine) if job.more_bounces else fine, per_bin)
 
     def histograms(self, factor: Float32, share: Float64) -> Float32:
         """Return histograms (n, bins) of the beams, each with a weight (n,)."""
         bins = self.job.bins
-        found = shift_and_add(self.feet(share), *self.sites, self.tables(factor), bins)
+        feet = self.feet(share)
+        found = shift_and_add(np.arange(len(feet.bounds_m)), feet, *self.sites, self.tables(factor), bins)[feet.place]
         if len(found) == len(share):
             return found
         histogram = np.zeros((len(share), bins), np.float32)
@@ -380,9 +401,34 @@ def _single(column: Float64) -> Float32:
     return np.ascontiguousarray(column, np.float32)
 
 
-def _points(columns: tuple[Float64, Float64, Float64, Float64], soft_m2: float) -> NumbaPoints:
-    x, y, length, weight = (_single(column) for column in columns)
-    return NumbaPoints(x, y, length, weight, np.float32(soft_m2))
+def _points(
+    columns: tuple[Float64, Float64, Float64, Float64], soft_m2: float, tile: int, *, tiled: bool
+) -> NumbaPoints:
+    """Return points (n,) of the wall, in the order of compact tiles or in their own."""
+    x, y, *others = (_single(column) for column in columns)
+    order, place, bounds_m = _tiles(x.tobytes(), y.tobytes(), tile, tiled=tiled)
+    length, weight = (column[order] for column in others)
+    return NumbaPoints(x[order], y[order], length, weight, np.float32(soft_m2), place, bounds_m, tile)
+
+
+@lru_cache(maxsize=8)
+def _tiles(x: bytes, y: bytes, size: int, *, tiled: bool) -> tuple[Int32, Int32, Float32]:
+    """Return the order of points in tiles, each point's place in it, and the tiles' bounds; kept, as rigs come again.
+
+    Points are sorted along x, cut into strips, and sorted along y in each: whole tiles that are nearly square.
+    """
+    at_x, at_y = np.frombuffer(x, np.float32), np.frombuffer(y, np.float32)
+    count = len(at_x)
+    order, tiles = np.arange(count), -(-count // size)
+    if tiled and tiles:
+        order, strip = np.argsort(at_x, kind="stable"), size * ceil(sqrt(tiles))
+        strips = (order[begin : begin + strip] for begin in range(0, count, strip))
+        order = np.concatenate([one[np.argsort(at_y[one], kind="stable")] for one in strips])
+    ends = [slice(begin, begin + size) for begin in range(0, count, size)]
+    bounds = [[f(axis[order[end]]) for axis in (at_x, at_y) for f in (np.min, np.max)] for end in ends]
+    place = np.empty(count, np.int32)
+    place[order] = np.arange(count)
+    return order.astype(np.int32), place, np.array(bounds, np.float32).reshape(-1, 4)
 
 
 def _columns(points: Float64) -> tuple[Float32, Float32, Float32]:
@@ -408,15 +454,14 @@ def reach_cells(job: TransportJob) -> Float64:
     return np.maximum(across, along)
 
 
-def table_width(job: TransportJob) -> int:
-    """Return the bins from the shortest to the longest d3 + d4 of any patch, in whole vectors.
+def table_bins(job: TransportJob) -> tuple[Int32, int]:
+    """Return the bin (n,) before every d3 + d4 of each patch, and the bins from there to the longest of any patch.
 
-    d3 + d4 is convex over the wall: longest at a corner of the relay, and never shorter than the straight line to the
-    mirror image of the lidar behind the wall.
+    The bins are whole vectors. d3 + d4 is convex over the wall: longest at a corner of the relay, and never shorter
+    than the straight line to the mirror image of the lidar behind the wall (Heron).
     """
     x, y, z = job.patches.point_m.T
     relay, lidar = job.relay, job.lidar_m
-    # A convex function is largest at a corner of a rectangle; the shortest way is by the mirror image (Heron).
     longest = np.zeros_like(x)
     for corner_x in (relay.x_m.min(), relay.x_m.max()):
         for corner_y in (relay.y_m.min(), relay.y_m.max()):
@@ -424,4 +469,6 @@ def table_width(job: TransportJob) -> int:
             longest = np.maximum(longest, d3 + np.linalg.norm([corner_x - lidar[0], corner_y - lidar[1], lidar[2]]))
     shortest = np.sqrt((x - lidar[0]) ** 2 + (y - lidar[1]) ** 2 + (z + lidar[2]) ** 2)
     bins = int((longest - shortest).max() / job.bin_m) + 3
-    return (bins + LANES - 1) // LANES * LANES
+    # A hundredth of a bin is far more than the rounding of float32.
+    first = np.maximum(np.floor(shortest / job.bin_m - 0.01), 0).astype(np.int32)
+    return first, (bins + LANES - 1) // LANES * LANES

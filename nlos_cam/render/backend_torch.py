@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d, embedding_bag, pad
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.backend_numba import horizons, table_width
+from nlos_cam.render.backend_numba import horizons, table_bins
 from nlos_cam.render.brdf_table import nodes
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
@@ -315,7 +315,7 @@ class _Batch:
         self.optics = TorchOptics(
             job.edge_m, bool(near), job.near_m**2, job.soft_wall_m2, job.lambertian, fields, self.chunk
         )
-        self.per_bin, self.width = job.accuracy.sub_bins, max(map(table_width, jobs))
+        self.per_bin, self.width = job.accuracy.sub_bins, max(table_bins(one)[1] for one in jobs)
         self.per_m = self.per_bin / job.bin_m
 
     def histograms(self) -> list[Float32]:

@@ -20,15 +20,17 @@ from nlos_cam.render.brdf_table import scattered
 from nlos_cam.render.echoes import MultiBounce, strongest
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.legs import (
+    BEAM_TILE,
+    DARK,
     FAST,
     WINDOW,
     NumbaOptics,
     NumbaPoints,
     NumbaSurface,
     add_rows,
-    geometry,
+    fill,
+    judge,
     scratch,
-    shade,
 )
 from nlos_cam.render.material import Brdf
 from nlos_cam.render.visibility import HeightField
@@ -42,7 +44,6 @@ PROBES = 4096
 MAX_RANK = 2048
 TABLE_BYTES = 1 << 24
 """Memory for the tables of the patches whose rows are added together."""
-BEAM_TILE = 64
 
 
 class Basis(NamedTuple):
@@ -166,19 +167,21 @@ def _patch_rows(
     start: np.float32, per_bin: int, rows: Float32,
 ) -> None:  # fmt: skip
     """Fill in the tables (per_bin, R, WINDOW + width) of one patch, from the sub-bin `start` on."""
-    rank, width, legs = rows.shape[1], rows.shape[2] - WINDOW, scratch(len(relay.x_m))
+    rank, width, legs = rows.shape[1], rows.shape[2] - WINDOW, scratch(relay.tile)
     harmonics = np.zeros(2 + functions.harmonic.max() // 2 * 2, np.float32)
     values, total = np.empty(rank, np.float32), np.zeros((width * per_bin + 1, rank))
-    returns(legs, s, surface, relay, optics, field)
     x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
     nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
-    for q in range(len(relay.x_m)):
-        at, weight = int(legs.length_m[q] - start), legs.weight[q]
-        if weight > 0 and at < width * per_bin:
-            _evaluate(functions, relay.x_m[q] - x, relay.y_m[q] - y, -z, nx, ny, nz, harmonics, values)
-            line = total[at + 1]
-            for r in range(rank):
-                line[r] += weight * values[r]
+    verdicts = judge(s, s + 1, surface, relay.bounds_m, optics, field)[0]
+    for tile in range(len(verdicts)):
+        count = returns(verdicts[tile], legs, s, tile * relay.tile, surface, relay, optics, field)
+        for i in range(count):
+            at, weight, q = int(legs.length_m[i] - start), legs.weight[i], tile * relay.tile + i
+            if weight > 0 and at < width * per_bin:
+                _evaluate(functions, relay.x_m[q] - x, relay.y_m[q] - y, -z, nx, ny, nz, harmonics, values)
+                line = total[at + 1]
+                for r in range(rank):
+                    line[r] += weight * values[r]
     for k in range(width * per_bin):
         for r in range(rank):
             total[k + 1, r] += total[k, r]
@@ -227,13 +230,15 @@ def _add_tile(
     """Add the tables of the patches from one on to the windows of some beams, and to their bounds."""
     bins, per_bin, rank, span = sums.shape[1], table.per_bin, rows.shape[2], rows.shape[3]
     flat, every, width = rows.ravel(), sums.ravel(), span - WINDOW
+    tile = feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
+    verdicts = judge(patch, patch + len(rows), surface, tile, optics, field)
     legs, harmonics = scratch(size), np.zeros(2 + functions.harmonic.max() // 2 * 2, np.float32)
     weight, offset, base = np.empty(rank, np.float32), np.empty(rank, np.int32), np.arange(rank) * span
     for j in range(len(rows)):
         s = patch + j
-        geometry(legs, s, surface, feet, start, size, optics, field, False)
-        if optics.sectors:
-            shade(legs, s, surface, feet, start, size, field)
+        if verdicts[j, 0] == DARK:
+            continue
+        fill(legs, s, surface, feet, start, size, verdicts[j, 0], optics, field, False)
         x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
         nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
         for i in range(size):
@@ -288,6 +293,7 @@ def _sums(
         _rows(patch, surface, numba_job.relay, optics, field, functions, table.first, table.per_bin, rows)
         _add(patch, feet, surface, optics, field, functions, table, begin, rows, sums, bound)
     # A truncated series may fall below 0 by its error where there is no light.
+    begin, sums, bound = begin[feet.place], sums[feet.place], bound[feet.place]
     return begin.astype(np.int64), np.maximum(sums, 0), bound * np.float32(functions.largest)
 
 

@@ -15,10 +15,9 @@ import numba
 import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int32, Int64, Mask
 
-from nlos_cam.frames import int64
 from nlos_cam.render.geometry import NEAR_DIAGONALS, softened, solid_angle
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.legs import FAST, NumbaLegs, NumbaOptics, NumbaPoints, NumbaSurface, geometry, scratch, shade
+from nlos_cam.render.legs import FAST, NumbaLegs, NumbaOptics, NumbaPoints, NumbaSurface, fill_all, scratch
 from nlos_cam.render.planning import RenderProblem
 from nlos_cam.render.visibility import HeightField
 
@@ -241,9 +240,7 @@ def _legs(s: int, points: NumbaPoints, outgoing: bool, surface: NumbaSurface, op
           field: HeightField) -> NumbaLegs:  # fmt: skip
     """Return the legs between patch `s` and all points, with their shadows."""
     legs = scratch(len(points.x_m))
-    geometry(legs, s, surface, points, 0, len(points.x_m), optics, field, outgoing)
-    if optics.sectors:
-        shade(legs, s, surface, points, int64(0), len(points.x_m), field)
+    fill_all(legs, s, surface, points, optics, field, outgoing)
     return legs
 
 

@@ -265,7 +265,7 @@ class Gradients:
     @cached_property
     def _legs(self) -> tuple[NumbaPoints, NumbaSurface, NumbaPoints, NumbaOptics, HeightField]:
         """Arguments of the kernels: beams, patches, relay cells, optics, depth map."""
-        single = NumbaJob(self.echo_job)
+        single = NumbaJob(self.echo_job, tiled=False)
         surface, optics, field = single.sites
         return single.feet(np.ones(len(self._peak))), surface, single.relay, optics, field
 

@@ -20,10 +20,18 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from nlos_cam.frames import inner
+from nlos_cam.frames import inner, int64
 from nlos_cam.render.visibility import HeightField, blocked
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
+BEAM_TILE = 128
+"""Beams of a thread that go together: their windows of bins and their legs to some patches fit in the first cache."""
+RELAY_TILE = 256
+"""Relay cells that go together."""
+FREE, MIXED, DARK = 0, 1, 2
+"""Verdicts on the legs from a patch to a tile past the object: free, some may be blocked, none carries light."""
+CUT = 4
+"""Added to a verdict where the occluder's edge may block some legs."""
 
 
 class NumbaSurface(NamedTuple):
@@ -46,18 +54,26 @@ class NumbaSurface(NamedTuple):
     high: Float32
     walk: NDArray[np.uint8]
     """(n, FACES * sectors, 2); first and last step of a walk between the bounds."""
+    highest: Float32
+    """(n,); largest upper bound of any sector."""
     shaded: Mask
     """(n,); True if some leg may be blocked."""
 
 
 class NumbaPoints(NamedTuple):
-    """Points of the wall, laser spots or relay cells, with the leg from each to the lidar."""
+    """Points of the wall, laser spots or relay cells, with the leg from each to the lidar, in the order of tiles."""
 
     x_m: Float32
     y_m: Float32
     length_m: Float32
     weight: Float32
     soft_m2: np.float32
+    place: Int32
+    """(n,); place of each point here, in the order in which they were given."""
+    bounds_m: Float32
+    """(tiles, 4); smallest and largest x, smallest and largest y, of each tile."""
+    tile: int
+    """Points of a tile."""
 
 
 class NumbaOptics(NamedTuple):
@@ -94,70 +110,198 @@ def geometry(
     start: int,
     count: int,
     optics: NumbaOptics,
-    field: HeightField,
     outgoing: bool,
 ) -> None:
-    """Fill in the legs from patch s to points: weight without visibility, and length, vector by vector.
+    """Fill in the legs from patch s to points: weight before anything stands between, and length, vector by vector.
 
     Towards the lidar (`outgoing`) the weight has the wall's cosine, from it the patch's; in Lambertian radiometry both.
     """
     x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
     nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
     soft = points.soft_m2 if outgoing else surface.soft_m2[s]
-    to_edge, nothing, one, two = optics.edge_x_m - x, np.float32(0), np.float32(1), np.float32(2)
-    inverse_x, inverse_y = np.float32(1 / field.pitch_x_m), np.float32(-1 / field.pitch_y_m)
-    half, last, faces = np.float32(optics.sectors / 2), np.float32(optics.sectors - 1), np.float32(optics.sectors)
-    end = start + count
+    nothing, one, end = np.float32(0), np.float32(1), start + count
     at_x, at_y, light = points.x_m[start:end], points.y_m[start:end], points.weight[start:end]
     for i in range(count):
         dx, dy = at_x[i] - x, at_y[i] - y
         squared = dx * dx + dy * dy + z * z
         length = np.sqrt(squared)
         facing = nx * dx + ny * dy - nz * z
-        # The leg runs from the patch at height z to the wall at 0. It crosses the edge's plane at the share to_edge /
-        # dx, at height z (1 - to_edge / dx), if patch and point lie on both sides of it.
-        cut = (to_edge * (optics.edge_x_m - at_x[i]) < nothing) & (z * (one - to_edge / dx) >= optics.edge_z_m)
         # Near contact as in `geometry.softened`, without its branch.
         ramp = max(one - squared / optics.near_m2, nothing)
         cosine = z if outgoing else facing
         if optics.lambertian:
             cosine = z * facing / length
         weight = light[i] * cosine / (length * (squared + soft * ramp * ramp))
-        legs.weight[i] = weight if (facing > nothing) & (not cut) else nothing
+        legs.weight[i] = weight if facing > nothing else nothing
         legs.length_m[i] = length
-        # Sector of the horizon tables: the face by the major axis and its sign, then the tilt -1 to 1 in equal parts.
-        u, v = dx * inverse_x, dy * inverse_y
-        along_columns = abs(u) >= abs(v)
-        major, minor = (u if along_columns else v), (v if along_columns else u)
-        legs.major[i] = abs(major)
-        inside = min((minor / max(abs(major), np.float32(1e-20)) + one) * half, last)
-        face = (nothing if along_columns else two) + (nothing if major >= nothing else one)
-        legs.sector[i] = np.int32(face * faces + np.floor(inside))
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
+def past_edge(x: np.float32, z: np.float32, bounds_m: Float32, edge_x: np.float32, edge_z: np.float32) -> int:
+    """Return FREE, CUT or DARK for the legs from a patch to a tile (4,) past the occluder's edge."""
+    first, last = (x - edge_x) * (bounds_m[0] - edge_x) < 0, (x - edge_x) * (bounds_m[1] - edge_x) < 0
+    # Between both ends the height at which a leg crosses the edge's plane is monotone.
+    to_edge, one = edge_x - x, np.float32(1)
+    low, high = z * (one - to_edge / (bounds_m[0] - x)), z * (one - to_edge / (bounds_m[1] - x))
+    if not (first or last) or (first and last and max(low, high) < edge_z - BACK_M):
+        return FREE
+    return DARK if first and last and min(low, high) > edge_z + BACK_M else CUT
+
+
+@inner(error_model="numpy", fastmath=FAST)
+def cut(
+    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, begin: int, count: int,
+    optics: NumbaOptics,
+) -> None:  # fmt: skip
+    """Set the weight of legs that the occluder's edge cuts to 0; leg i goes to point start + i."""
+    x, z, edge_x, edge_z = surface.x_m[s], surface.z_m[s], optics.edge_x_m, optics.edge_z_m
+    to_edge, one = edge_x - x, np.float32(1)
+    at_x, weights = points.x_m[start + begin : start + begin + count], legs.weight[begin : begin + count]
+    for i in range(count):
+        # The leg runs from the patch at height z to the wall at 0. It crosses the edge's plane at the share to_edge /
+        # dx, at height z (1 - to_edge / dx), if patch and point lie on both sides of it.
+        beyond = to_edge * (edge_x - at_x[i]) < 0
+        weights[i] = np.float32(0) if beyond & (z * (one - to_edge / (at_x[i] - x)) >= edge_z) else weights[i]
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
+def past_object(s: int, surface: NumbaSurface, bounds_m: Float32, optics: NumbaOptics, field: HeightField) -> int:
+    """Return FREE, MIXED or DARK for the legs from patch s to a tile (4,) past the rest of the object.
+
+    What holds at the tile's corners holds inside.
+    """
+    x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
+    left, right, below, above = bounds_m[0] - x, bounds_m[1] - x, bounds_m[2] - y, bounds_m[3] - y
+    nx, ny, nothing, one = surface.normal_x[s], surface.normal_y[s], np.float32(0), np.float32(1)
+    # Facing is linear over the tile.
+    if max(nx * left, nx * right) + max(ny * below, ny * above) - surface.normal_z[s] * z < -BACK_M:
+        return DARK
+    if optics.sectors == 0 or not surface.shaded[s]:
+        return FREE
+    inverse_x, inverse_y = np.float32(1 / field.pitch_x_m), np.float32(1 / field.pitch_y_m)
+    u_low, u_high, v_low, v_high = left * inverse_x, right * inverse_x, -above * inverse_y, -below * inverse_y
+    near_u, near_v = max(u_low, -u_high, nothing), max(v_low, -v_high, nothing)
+    far_u, far_v = max(-u_low, u_high), max(-v_low, v_high)
+    if z >= max(far_u, far_v) * surface.highest[s] * (one + SLACK):
+        return FREE
+    along_columns = near_u > far_v
+    if not along_columns and near_v <= far_u:  # the tile meets several faces
+        return MIXED
+    major_low, major_high = (near_u, far_u) if along_columns else (near_v, far_v)
+    low, high = (v_low, v_high) if along_columns else (u_low, u_high)
+    # The tilt is the quotient of both axes: largest and smallest at corners. A sector more covers rounding.
+    least = low / (major_high if low >= 0 else major_low)
+    most = high / (major_low if high >= 0 else major_high)
+    half, face = np.float32(optics.sectors / 2), 0 if along_columns else 2
+    face += 0 if (u_high if along_columns else v_high) > 0 else 1
+    first = face * optics.sectors + max(int(np.floor((least + one) * half)) - 1, 0)
+    last = face * optics.sectors + min(int(np.floor((most + one) * half)) + 1, optics.sectors - 1)
+    highest, lowest = nothing, np.float32(np.inf)
+    for sector in range(first, last + 1):
+        highest, lowest = max(highest, surface.high[s, sector]), min(lowest, surface.low[s, sector])
+    if z >= major_high * highest * (one + SLACK):
+        return FREE
+    return DARK if z < major_low * lowest * (one - SLACK) else MIXED
+
+
+@inner(error_model="numpy", fastmath=FAST)
+def judge(
+    begin: int, end: int, surface: NumbaSurface, bounds_m: Float32, optics: NumbaOptics, field: HeightField
+) -> NDArray[np.int8]:
+    """Return verdicts (end - begin, tiles) on the legs from some patches to tiles (tiles, 4)."""
+    verdicts = np.empty((end - begin, len(bounds_m)), np.int8)
+    for s in range(begin, end):
+        for tile in range(len(bounds_m)):
+            bounds = bounds_m[tile]
+            by_edge = past_edge(surface.x_m[s], surface.z_m[s], bounds, optics.edge_x_m, optics.edge_z_m)
+            by_object = past_object(s, surface, bounds, optics, field)
+            dark = DARK in (by_edge, by_object)
+            verdicts[s - begin, tile] = DARK if dark else by_edge + by_object
+    return verdicts
+
+
+BACK_M = np.float32(1e-5)
+"""Height, above the rounding of float32, by which a tile lies behind a patch's plane before its legs are left out."""
+SLACK = np.float32(1e-5)
+"""Relative widening of the verdicts, above the rounding of float32."""
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
+def fill(
+    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, count: int, verdict: int,
+    optics: NumbaOptics, field: HeightField, outgoing: bool,
+) -> None:  # fmt: skip
+    """Fill in the legs from patch s to the points of a tile of that verdict, from `start` on."""
+    geometry(legs, s, surface, points, start, count, optics, outgoing)
+    if verdict != FREE:
+        block(verdict, legs, s, surface, points, start, int64(0), count, optics, field)
+
+
+@inner(error_model="numpy", fastmath=FAST)
+def fill_all(
+    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, optics: NumbaOptics, field: HeightField,
+    outgoing: bool,
+) -> None:  # fmt: skip
+    """Fill in the legs from patch s to all points, with the lengths of legs that carry no light too."""
+    geometry(legs, s, surface, points, 0, len(points.x_m), optics, outgoing)
+    verdicts = judge(s, s + 1, surface, points.bounds_m, optics, field)[0]
+    for tile in range(len(verdicts)):
+        begin, count = tile * points.tile, min(points.tile, len(points.x_m) - tile * points.tile)
+        if verdicts[tile] == DARK:
+            legs.weight[begin : begin + count] = 0
+        elif verdicts[tile] != FREE:
+            block(verdicts[tile], legs, s, surface, points, int64(0), begin, count, optics, field)
+
+
+@inner(error_model="numpy", fastmath=FAST)
+def block(
+    verdict: int, legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, begin: int,
+    count: int, optics: NumbaOptics, field: HeightField,
+) -> None:  # fmt: skip
+    """Set the weight of blocked legs to 0, for some legs from `begin` on; leg i goes to point start + i."""
+    if verdict >= CUT:
+        cut(legs, s, surface, points, start, begin, count, optics)
+    if verdict != CUT:
+        shade(legs, s, surface, points, start, begin, count, optics, field)
 
 
 @inner(error_model="numpy", fastmath=FAST)
 def shade(
-    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, count: int, field: HeightField
-) -> None:
-    """Set the weight of legs that the object blocks to 0."""
-    z, high, low = surface.z_m[s], surface.high[s], surface.low[s]
-    if not surface.shaded[s]:
-        return
+    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, begin: int, count: int,
+    optics: NumbaOptics, field: HeightField,
+) -> None:  # fmt: skip
+    """Set the weight of blocked legs to 0, for some legs from `begin` on; leg i goes to point start + i."""
+    x, y, z, high, low = surface.x_m[s], surface.y_m[s], surface.z_m[s], surface.high[s], surface.low[s]
+    nothing, one, two = np.float32(0), np.float32(1), np.float32(2)
+    inverse_x, inverse_y = np.float32(1 / field.pitch_x_m), np.float32(-1 / field.pitch_y_m)
+    half, last, faces = np.float32(optics.sectors / 2), np.float32(optics.sectors - 1), np.float32(optics.sectors)
+    at_x, at_y = points.x_m[start + begin : start + begin + count], points.y_m[start + begin : start + begin + count]
+    majors, sectors = legs.major[begin : begin + count], legs.sector[begin : begin + count]
+    weights = legs.weight[begin : begin + count]
+    for i in range(count):
+        # Sector of the horizon tables: the face by the major axis and its sign, then the tilt -1 to 1 in equal parts.
+        u, v = (at_x[i] - x) * inverse_x, (at_y[i] - y) * inverse_y
+        along_columns = abs(u) >= abs(v)
+        major, minor = (u if along_columns else v), (v if along_columns else u)
+        majors[i] = abs(major)
+        inside = min((minor / max(abs(major), np.float32(1e-20)) + one) * half, last)
+        face = (nothing if along_columns else two) + (nothing if major >= nothing else one)
+        sectors[i] = np.int32(face * faces + np.floor(inside))
     # Free above the upper bound of the horizon, blocked below the lower one; in between the leg is walked. The legs
     # that are not free are listed without a branch, which would be mispredicted.
     listed = 0
     for i in range(count):
         legs.todo[listed] = i
-        listed += int((z < legs.major[i] * high[np.uint32(legs.sector[i])]) & (legs.weight[i] != 0))
+        listed += int((z < majors[i] * high[np.uint32(sectors[i])]) & (weights[i] != 0))
     for i in legs.todo[:listed]:
-        sector = legs.sector[i]
-        if z >= legs.major[i] * low[sector]:
-            u = (points.x_m[start + i] - surface.x_m[s]) / field.pitch_x_m
-            v = (surface.y_m[s] - points.y_m[start + i]) / field.pitch_y_m
-            first, last = surface.walk[s, sector, 0], surface.walk[s, sector, 1]
-            if not blocked(field, surface.row[s], surface.column[s], z, u, v, first, last):
+        sector = sectors[i]
+        if z >= majors[i] * low[sector]:
+            u = (at_x[i] - surface.x_m[s]) / field.pitch_x_m
+            v = (surface.y_m[s] - at_y[i]) / field.pitch_y_m
+            steps = surface.walk[s, sector]
+            if not blocked(field, surface.row[s], surface.column[s], z, u, v, steps[0], steps[1]):
                 continue
-        legs.weight[i] = 0
+        weights[i] = 0
 
 
 @numba.njit(cache=True, inline="always")

@@ -69,10 +69,13 @@ def expose_cells(
     light, ranges = np.empty(most, np.float32), np.empty(most, np.float32)
     bits, counts, middle = np.empty(most, np.int32), np.empty(most, np.uint8), np.empty(2, np.int32)
     samples_m, middle_m = bits.view(np.float32), middle.view(np.float32)
+    spread = 0  # pixels over which the deviates are spread already
     for k in range(depth.size):
         start, pixels = starts[k], starts[k + 1] - starts[k]
         if expected:
-            spread_deviates(pixels, quantiles, light, ranges)
+            if pixels != spread:
+                spread_deviates(pixels, quantiles, light, ranges)
+                spread = pixels
         elif noisy[0] or noisy[1]:
             draw_deviates(seed, start, pixels, quantiles, light, ranges)
         _pixels(start, pixels, optics, echoes, cell, light, ranges, noisy, bias_m, chain, samples_m, counts)
