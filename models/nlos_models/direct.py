@@ -24,7 +24,7 @@ KEPT_ABOVE = 0.44
 of it; the mean absolute error is least near 0.5. This value costs either of them little."""
 SMALLEST_SHARE = 0.3
 """Smallest spread of a cell, as a share of the median spread: quiet cells would otherwise show noise alone."""
-MIN_LIGHT_SPREAD = 0.08
+MIN_LIGHT_SPREAD = 0.04
 """Of the log intensity: the reflectance of a real wall varies by some percent, which the renderer's does not."""
 GAIN_COLUMNS = 4
 """Every so many columns give cells that tell a frame's gain; all rows, so that mirrored maps have the same gain."""
@@ -123,12 +123,25 @@ class CellNormal(nn.Module):
         middle = ordered.gather(1, ((number - 1) // 2).clamp(min=0))
         return torch.where(number > 0, middle, 0.0)[:, 0]
 
-    def add_noise(self, normal: Tensor, noise: MapNoise) -> Tensor:
-        """Draw the sensor's noise for the intensity of expected maps (n, 2, 64, 80), normalised as `forward` does."""
+    def vary(
+        self, normal: Tensor, noise: MapNoise | None, log_reflectance: Tensor | None, offset_m: Tensor | None
+    ) -> Tensor:
+        """Return the maps (n, 2, 64, 80), normalised as `forward` does, as another bench or moment would give them.
+
+        Noise is the sensor's, drawn for the intensity of expected maps; the logarithm of the wall's reflectance
+        (n, 64, 80) adds to that of the light, and a range offset (n,) to all depths.
+        """
         depth, light = normal.unbind(1)
+        returns = (depth != 0) | (light != 0)
         counts = torch.expm1(light * self.spread[1] + self.median[1])
-        drawn = ((torch.log1p(noise.add(counts)) - self.median[1]) / self.spread[1]).clamp(-CLIP, CLIP)
-        return torch.stack([depth, torch.where((depth == 0) & (light == 0), light, drawn)], dim=1)
+        if log_reflectance is not None:
+            counts = counts * log_reflectance.exp()
+        if noise is not None:
+            counts = noise.add(counts)
+        if offset_m is not None:
+            depth = depth + offset_m[:, None, None] / self.spread[0]
+        varied = torch.stack([depth, (torch.log1p(counts) - self.median[1]) / self.spread[1]], dim=1)
+        return torch.where(returns[:, None], varied.clamp(-CLIP, CLIP), normal)
 
 
 def _channels(depth_m: Tensor, intensity: Tensor) -> Tensor:

@@ -6,12 +6,16 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapSet, MapSource
-from nlos_models.direct import CellNormal, DirectNetwork, MapNoise, two_heads_error
+from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapNoise, MapSet, MapSource
+from nlos_models.direct import COLUMNS, ROWS, CellNormal, DirectNetwork, two_heads_error
 from nlos_models.recipe import Recipe
 from nlos_models.tasks import figures_of, in_two_phases, run
 from nlos_models.train import Running, Scores, fit
+
+STAINS = 9, 11
+"""Knots of a wall's stains along each axis of the maps."""
 
 
 class NormalBatch(NamedTuple):
@@ -51,9 +55,7 @@ def train_direct(
     logits = running.maybe_compile(network.logits)
 
     def loss(batch: NormalBatch, _: float) -> Tensor:
-        normal = batch.normal.float()
-        if source.noise:
-            normal = network.normal.add_noise(normal, source.noise)
+        normal = _varied(recipe, network.normal, batch.normal.float(), source.noise)
         return two_heads_error(logits(normal + recipe.noise * torch.randn_like(normal)), batch.image)
 
     figures = fit(
@@ -110,6 +112,27 @@ def transfer_direct(
 
     figures = in_two_phases(recipe, len(maps.image), folder, running or Running(), fit_phase)
     return network.cpu().eval(), figures
+
+
+def _varied(recipe: Recipe, cells: CellNormal, normal: Tensor, noise: MapNoise | None) -> Tensor:
+    """Return normalised maps (n, 2, 64, 80) with noise, and on walls and with range offsets as the recipe has them."""
+    reflectance = offset_m = None
+    if recipe.wall_texture:
+        strength = recipe.wall_texture * torch.rand(len(normal), 1, 1, device=normal.device)
+        reflectance = strength * _stains(len(normal), normal.device)
+    if recipe.range_offset_m:
+        offset_m = recipe.range_offset_m * torch.randn(len(normal), device=normal.device)
+    if noise is None and reflectance is None and offset_m is None:
+        return normal
+    return cells.vary(normal, noise, reflectance, offset_m)
+
+
+def _stains(count: int, device: torch.device) -> Tensor:
+    """Return patterns (count, 64, 80) of mean 0 and variance 1: half stains of some cells, half grain."""
+    coarse = torch.randn(count, 1, *STAINS, device=device)
+    stains = functional.interpolate(coarse, (ROWS, COLUMNS), mode="bilinear", align_corners=True)[:, 0]
+    stains = stains / stains.std((1, 2), keepdim=True)
+    return (stains + torch.randn_like(stains)) * 0.5**0.5
 
 
 def repeat(source: NormalSource, batch: int, steps: int, generator: torch.Generator) -> Iterable[NormalBatch]:

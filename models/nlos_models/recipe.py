@@ -82,6 +82,10 @@ class Recipe(BaseModel):
     """Weight of a surface pixel in an image's error, relative to a background pixel (`vae.image_error`)."""
     noise: float = Field(default=0.0, ge=0)
     """Direct network: standard deviation of the noise added to normalised maps."""
+    wall_texture: float = Field(default=0.0, ge=0, le=0.5)
+    """Direct network: each sample's wall has a reflectance whose logarithm varies by up to this standard deviation."""
+    range_offset_m: float = Field(default=0.0, ge=0, le=0.1)
+    """Direct network: standard deviation of the range offset of each sample's lidar."""
     direct: DirectSize = DirectSize()
     """Size of a direct network."""
     image_loss: ImageLoss = "squared"

@@ -95,15 +95,16 @@ def test_expected_maps_with_drawn_noise_have_the_law_of_exposures() -> None:
     normal.median[1] = torch.from_numpy(np.log1p(expected.intensity))
     maps = normal(*(torch.from_numpy(values[None]) for values in (expected.depth_m, expected.intensity)))
     torch.manual_seed(0)
-    drawn = normal.add_noise(maps.expand(60, -1, -1, -1), map_noise(PLAN))
+    drawn = normal.vary(maps.expand(60, -1, -1, -1), map_noise(PLAN), None, None)
     assert torch.equal(drawn[:, 0], maps[:, 0].expand(60, -1, -1))
     counts = torch.expm1(drawn[:, 1] + normal.median[1])
     ratio = intensity.std(0) / counts.std(0, correction=0).numpy()
     assert 0.97 < np.nanmedian(ratio) < 1.03
 
 
-def test_cells_without_a_return_have_no_noise() -> None:
-    assert not CellNormal().add_noise(torch.zeros(1, 2, 64, 80), map_noise(PLAN)).any()
+def test_cells_without_a_return_do_not_vary() -> None:
+    reflectance, offset_m = torch.ones(1, 64, 80), torch.ones(1)
+    assert not CellNormal().vary(torch.zeros(1, 2, 64, 80), map_noise(PLAN), reflectance, offset_m).any()
 
 
 def test_expected_samples_differ_from_exposures_by_noise_alone() -> None:

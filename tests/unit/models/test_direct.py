@@ -20,7 +20,7 @@ from nlos_models.direct import (
     image_from_logits,
     two_heads_error,
 )
-from nlos_models.direct_training import NormalBatch, train_direct, transfer_direct
+from nlos_models.direct_training import NormalBatch, _stains, train_direct, transfer_direct
 from nlos_models.distributed import open_fabric
 from nlos_models.errors import CheckpointError
 from nlos_models.export import export_folder
@@ -180,7 +180,7 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
 def test_gain_of_a_frame_changes_nothing_and_frames_without_returns_have_none() -> None:
     normal, generator = CellNormal(), torch.Generator().manual_seed(0)
     depth_m = 0.3 + 0.01 * torch.randn(30, 64, 80, generator=generator)
-    busy = torch.linspace(0, 0.5, 80) * torch.randn(30, 64, 80, generator=generator)  # columns differ more and more
+    busy = torch.linspace(0, 0.2, 80) * torch.randn(30, 64, 80, generator=generator)  # columns differ more and more
     intensity = 20 * torch.exp(busy)
     normal.learn(depth_m, intensity)
     assert float(normal.spread[1].min()) == pytest.approx(MIN_LIGHT_SPREAD)
@@ -188,6 +188,35 @@ def test_gain_of_a_frame_changes_nothing_and_frames_without_returns_have_none() 
         brighter = torch.expm1(torch.log1p(intensity) + gain)
         torch.testing.assert_close(normal(depth_m, brighter), normal(depth_m, intensity), atol=1e-3, rtol=0)
     assert not normal(torch.full_like(depth_m, torch.nan), intensity).any()
+
+
+def test_varied_maps_are_those_of_another_wall_and_range() -> None:
+    """Stains and an offset on normalised maps are what they would be on the maps themselves."""
+    maps, normal = small_maps(40, 0), CellNormal()
+    depth_m, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
+    normal.learn(depth_m, intensity)
+    reflectance, offset_m = _stains(40, torch.device("cpu")) * 0.05, torch.linspace(-3e-3, 3e-3, 40)
+    reflectance -= normal.log_gain(reflectance.expand(40, 64, 80))[:, None, None]  # a frame's gain is taken out
+    measured = normal(depth_m + offset_m[:, None, None], torch.expm1(torch.log1p(intensity)) * reflectance.exp())
+    varied = normal.vary(normal(depth_m, intensity), None, reflectance, offset_m)
+    assert float((measured - varied).abs().median()) < 0.02
+    torch.testing.assert_close(normal.vary(varied, None, None, None), varied, atol=1e-4, rtol=0)
+
+
+def test_stains_have_mean_0_and_variance_1() -> None:
+    patterns = _stains(200, torch.device("cpu"))
+    assert float(patterns.mean()) == pytest.approx(0, abs=0.03)
+    assert float(patterns.var()) == pytest.approx(1, abs=0.05)
+    neighbours = (patterns[..., 1:] * patterns[..., :-1]).mean()
+    assert 0.4 < float(neighbours) < 0.6  # half stains, half grain
+
+
+def test_recipe_varies_the_bench(tmp_path: Path) -> None:
+    plain, varied = (
+        train_direct(_recipe(wall_texture=texture, range_offset_m=texture), Source(), small_maps(4, 1), tmp_path / name)
+        for name, texture in (("plain", 0.0), ("varied", 0.05))
+    )
+    assert changed_tensors(plain[0].state_dict(), varied[0].state_dict())
 
 
 def test_shift_follows_another_bench_and_nothing_else() -> None:
