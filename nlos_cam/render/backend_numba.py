@@ -446,11 +446,12 @@ def horizons(job: TransportJob) -> tuple[Float32, Float32, NDArray[np.uint8]]:
 
 def reach_cells(job: TransportJob) -> Float64:
     """Return the longest leg (n,) from each patch along an axis to a beam's spot or a relay cell, in cells."""
-    point, field = job.patches.point_m, job.field
-    x = np.concatenate([job.laser_spot_m[:, 0], job.relay.x_m])
-    y = np.concatenate([job.laser_spot_m[:, 1], job.relay.y_m])
-    across = np.maximum(x.max() - point[:, 0], point[:, 0] - x.min()) / field.pitch_x_m
-    along = np.maximum(y.max() - point[:, 1], point[:, 1] - y.min()) / field.pitch_y_m
+    point, field, relay = job.patches.point_m, job.field, job.relay
+    columns = (job.laser_spot_m[:, 0], relay.x_m), (job.laser_spot_m[:, 1], relay.y_m)
+    low = [min(one.min() for one in axis) for axis in columns]
+    high = [max(one.max() for one in axis) for axis in columns]
+    across = np.maximum(high[0] - point[:, 0], point[:, 0] - low[0]) / field.pitch_x_m
+    along = np.maximum(high[1] - point[:, 1], point[:, 1] - low[1]) / field.pitch_y_m
     return np.maximum(across, along)
 
 

@@ -1,7 +1,7 @@
 """Geometry of the first and last leg: laser spots and direct returns (S1), near contact, cells of the relay wall."""
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -89,10 +89,25 @@ class Beams:
             self, laser_spot_m=foot, length_m=length, cos_incidence=incidence, on_wall=on_wall, direct=direct
         )
 
+    @cached_property
+    def lit(self) -> tuple[Float64, Float64, Float64]:
+        """Laser spots (k, 3), d1 (k,) and cos t1 (k,) of the beams that light the wall."""
+        return self.laser_spot_m[self.on_wall], self.length_m[self.on_wall], self.cos_incidence[self.on_wall]
+
+    @cached_property
+    def outermost(self) -> tuple[Float64, Float64]:
+        """Laser spots (k, 3) and d1 (k,) of the lit beams at the ends of each row and column of the image."""
+        number, lit = np.arange(len(self.on_wall)).reshape(self.shape), self.on_wall.reshape(self.shape)
+        ends = [np.where(lit, number, empty) for empty in (len(self.on_wall), -1)]
+        chosen = np.concatenate([ends[0].min(0), ends[0].min(1), ends[1].max(0), ends[1].max(1)])
+        chosen = np.unique(chosen[(chosen >= 0) & (chosen < len(self.on_wall))])
+        return self.laser_spot_m[chosen], self.length_m[chosen]
+
     def rows(self, start: int, end: int) -> "Beams":
         """Return the beams of the rows [start, end) of the image."""
-        kept, columns = slice(start * self.shape[1], end * self.shape[1]), vars(self)
-        parts = {name: columns[name][kept] for name in columns if name not in {"shape", "lidar_m"}}
+        kept = slice(start * self.shape[1], end * self.shape[1])
+        parts = {one.name: getattr(self, one.name) for one in fields(self)}
+        parts = {name: column[kept] for name, column in parts.items() if name not in {"shape", "lidar_m"}}
         return Beams(shape=(end - start, self.shape[1]), lidar_m=self.lidar_m, **parts)
 
     def without_direct(self) -> "Beams":

@@ -51,12 +51,13 @@ class Patches:
 
 def slope_along(depth: Float64, axis: int, pitch_m: float, jump_m: float = JUMP_M) -> Float64:
     """Return the forward difference along an axis; backward at an edge or a jump; 0 without neighbors."""
-    padding = [(1, 1) if a == axis else (0, 0) for a in range(2)]
-    step = np.diff(np.pad(depth, padding, constant_values=np.nan), axis=axis)
-    step = np.where(np.abs(step) <= jump_m, step, np.nan)
-    forward = np.take(step, range(1, step.shape[axis]), axis)
-    backward = np.take(step, range(step.shape[axis] - 1), axis)
-    return np.nan_to_num(np.where(np.isnan(forward), backward, forward), nan=0.0) / pitch_m
+    step, slope = np.diff(depth, axis=axis), np.zeros_like(depth)
+    near = np.abs(step) <= jump_m  # not of NaN
+    before, after = (np.moveaxis(slope, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))  # views
+    step, near = np.moveaxis(step, axis, 0), np.moveaxis(near, axis, 0)
+    after[near] = step[near]
+    before[near] = step[near]
+    return slope / pitch_m
 
 
 def make_patches(depth: Float64, box: ObjectBox, albedo: Float64, jump_m: float = JUMP_M) -> Patches:

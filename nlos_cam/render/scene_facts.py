@@ -127,11 +127,11 @@ class SceneFacts:
         self, beams: Beams, patches: Patches, relay: Relay, edge_m: tuple[float, float], field: HeightField
     ) -> TransportJob:
         """Return the transport of all beams that light the wall over the patches to the relay cells."""
-        lit, device, wall = beams.on_wall, self.rig.device, self.rig.wall
+        (spots, length, cosine), device, wall = beams.lit, self.rig.device, self.rig.wall
         return TransportJob(
-            laser_spot_m=beams.laser_spot_m[lit],
-            length_m=beams.length_m[lit],
-            cos_incidence=beams.cos_incidence[lit],
+            laser_spot_m=spots,
+            length_m=length,
+            cos_incidence=cosine,
             patches=patches,
             relay=relay,
             lidar_m=beams.lidar_m,
@@ -142,7 +142,7 @@ class SceneFacts:
             bin_m=device.bin_m,
             bins=bins_of(beams, patches, relay, device),
             accuracy=self.accuracy,
-            map_spots_m=beams.laser_spot_m[lit],
+            map_spots_m=spots,
             wall_m=(wall.x_min_m, wall.x_max_m, wall.y_min_m, wall.y_max_m),
         )
 
@@ -152,7 +152,8 @@ def bins_of(beams: Beams, patches: Patches, relay: Relay, device: DeviceConstant
     # The distance to a fixed point is a convex function, and so is a sum of two: over a box of patches or a rectangle
     # of relay cells it is largest at a corner. The far corners (largest z) suffice, as the wall lies at z = 0.
     x, y, z = ((column.min(), column.max()) for column in patches.point_m.T)
-    spots, length = beams.laser_spot_m[beams.on_wall], beams.length_m[beams.on_wall]
+    # d1 + d2 is convex over the wall as well: longest for a beam at the edge of the map.
+    spots, length = beams.outermost
     ends = [(a, b) for a in (relay.x_m.min(), relay.x_m.max()) for b in (relay.y_m.min(), relay.y_m.max())]
     there, back = 0.0, np.zeros(len(ends))
     for corner_x, corner_y in ((a, b) for a in x for b in y):

@@ -193,6 +193,7 @@ class Sensor:
         dead_share = model.dead_share if included(verdicts, "dead pixels") else 0.0
         self._optics = _optics(direct, self._chain, dead_share, reflectance)
         self._echoes_only = self._optics._replace(direct=np.zeros_like(self._optics.direct))
+        self._kept_cells: tuple[tuple[int, ...], NDArray[np.int32]] = (), np.empty(0, np.int32)
         self._bias = DepthBias(shape, model, verdicts)
         self._lights = included(verdicts, "shot noise") or included(verdicts, "read noise")
         self._ranges = included(verdicts, "range noise")
@@ -226,7 +227,7 @@ class Sensor:
             return maps_from_frame(self.expose(multi, generator).frame(self.rig.pinhole))
         order, starts, optics = self._by_cell
         optics = optics._replace(direct=np.zeros_like(optics.direct)) if multi.direct_included else optics
-        cell = cell_of_pixels((self.rig.intrinsics.height, self.rig.intrinsics.width), multi.peak.shape)[order]
+        cell = self._echo_cells(multi.peak.shape)
         seed = generator.integers(1 << 64, dtype=np.uint64) if generator else np.uint64(0)
         bias_m = self._bias.at_m(None)
         noise = normal_quantiles(), seed, (self._lights, self._ranges)
@@ -243,6 +244,13 @@ class Sensor:
         order = np.argsort(cell, kind="stable")
         starts = np.searchsorted(cell[order], np.arange(MAP_ROWS * MAP_COLUMNS + 1))
         return order, starts, PixelOptics._make(c[order] if c.size else c for c in self._optics)
+
+    def _echo_cells(self, maps: tuple[int, ...]) -> NDArray[np.int32]:
+        """Return the cell of an echo map for each pixel in the order of `_by_cell`; the last map's are kept."""
+        if self._kept_cells[0] != maps:
+            shape = self.rig.intrinsics.height, self.rig.intrinsics.width
+            self._kept_cells = maps, cell_of_pixels(shape, (maps[0], maps[1]))[self._by_cell[0]]
+        return self._kept_cells[1]
 
     def _deviates(self, generator: np.random.Generator, *, wanted: bool) -> Float32:
         """Return one normal deviate per pixel, or none: noise that is left out is not drawn."""
