@@ -1,12 +1,17 @@
 """Visibility: self-occlusion, line of sight from the lidar, and form factors of inter-reflection."""
 
+from typing import Any
+
+import numba
 import numpy as np
 import pytest
-from nlos_calibration import ObjectBox, load_rig
+from nlos_calibration import ObjectBox, Occluder, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import cell_centers_m, object_box, object_depth
 from nlos_cam.render import Accuracy, Scene, Surface, TransportJob, prepare, three_bounce
+from nlos_cam.render.backend_numba import NumbaJob
+from nlos_cam.render.energy_survey import occluded
 from nlos_cam.render.interreflection import (
     WALL_CELLS,
     form_factor,
@@ -15,6 +20,7 @@ from nlos_cam.render.interreflection import (
     wall_cells,
     wall_factors,
 )
+from nlos_cam.render.legs import DARK, FREE, NumbaOptics, NumbaSurface, judge
 from nlos_cam.render.line_of_sight import first_hits
 from nlos_cam.render.scene_facts import SceneFacts
 from nlos_cam.render.visibility import FACES, HeightField, blocked, height_field, horizon_table, visible
@@ -218,3 +224,42 @@ def test_brute_force_refuses_too_many_interreflections() -> None:
     scene = Scene(RIG, np.full((32, 32), 0.2, np.float32), radiometry="lambertian")
     with pytest.raises(SceneError, match="inter-reflection"):
         three_bounce(scene, Accuracy("own", 3, 3, sub_bins=0), effects=MORE, chosen=SOME)
+
+
+@numba.njit(cache=True)
+def _verdicts(surface: NumbaSurface, bounds_m: Any, optics: NumbaOptics, field: HeightField) -> Any:
+    return judge(0, len(surface.x_m), surface, bounds_m, optics, field)
+
+
+@pytest.mark.parametrize("surface", ["wave", "rough", "object"])
+@pytest.mark.parametrize("edge", [None, Occluder(x_m=0.43, z_min_m=0.1)])
+def test_verdict_on_a_tile_holds_for_each_leg(surface: str, edge: Occluder | None) -> None:
+    """No leg to a free tile is blocked, and no leg to a dark one carries light; either verdict is common."""
+    generator, (y, x) = np.random.default_rng(3), np.mgrid[0:32, 0:32] / 32
+    depth = {
+        "wave": 0.25 + 0.06 * np.sin(20 * x) * np.cos(9 * y),
+        "rough": generator.uniform(0.2, 0.3, (32, 32)),
+        "object": object_depth(0, BOX, ("airplane",))[1],
+    }[surface]
+    rig = RIG.model_copy(update={"occluder": edge})
+    job = prepare(Scene(rig, depth.astype(np.float32)), Accuracy("some", 40, 32), EFFECTS).job
+    assert job is not None
+    single, where = NumbaJob(job), job.patches
+    for points in (single.relay, single.feet(np.ones(len(job.laser_spot_m)))):
+        verdicts, each = _verdicts(single.surface, points.bounds_m, *single.sites[1:]), points.tile
+        for s in range(0, len(where.row), 41):
+            point, normal = where.point_m[s], where.normal[s]
+            place = np.repeat(np.arange(len(points.bounds_m)), each)[: len(points.x_m)]
+            for tile in np.flatnonzero((verdicts[s] == FREE) | (verdicts[s] == DARK)):
+                for px, py in np.stack([points.x_m, points.y_m], 1)[place == tile][::7].astype(float):
+                    facing = normal @ (np.array([px, py, 0.0]) - point)
+                    seen = visible(job.field, where.row[s], where.column[s], point, px, py)
+                    passes = seen and not occluded(point[0], point[2], px, 0.0, *job.edge_m)
+                    if facing > 1e-5:  # legs to the back of a patch carry no light in a free tile either
+                        assert passes == (verdicts[s, tile] == FREE)
+        assert (verdicts == DARK).mean() > 0.02
+        if surface != "rough" and edge is None:
+            assert (verdicts == FREE).mean() > 0.05
+
+
+EFFECTS = "direct", "three-bounce", "line-of-sight", "occluder", "self-occlusion", "tilt"
