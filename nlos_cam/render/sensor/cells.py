@@ -8,7 +8,7 @@ Expected maps spread the deviates of a cell's pixels evenly over the distributio
 
 from functools import lru_cache
 from statistics import NormalDist
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -54,31 +54,62 @@ def spread_deviates(count: int, quantiles: Float32, light: Float32, ranges: Floa
         ranges[i] = quantiles[np.int64((i + 0.5) * GOLDEN_SHARE % 1.0 * QUANTILES)]
 
 
+class PixelOrder(NamedTuple):
+    """Pixels in the order of their map cells, and in each of the echoes' cells: runs of pixels see the same echo."""
+
+    pixel: Int64
+    """(p,)."""
+    start: Int64
+    """(n + 1,); place in `pixel` at which each map cell begins."""
+    first_run: Int64
+    """(n + 1,); run with which each map cell begins."""
+    run_start: Int64
+    """(r + 1,); place in `pixel` at which each run begins."""
+    run_echo: Int64
+    """(r,); flat index of a run's echo."""
+
+    @classmethod
+    def of(cls, cell: Int32, echo: Int32) -> "PixelOrder":
+        """Return the order of pixels (p,) with their map cells and the cells of their echoes."""
+        pixel = np.lexsort((echo, cell))
+        cells, echoes = cell[pixel], echo[pixel]
+        begins = np.flatnonzero(np.diff(cells, prepend=-1) | np.diff(echoes, prepend=-1))
+        numbers = np.arange(cell.max() + 2)
+        run_start = np.append(begins, pixel.size)
+        first_run = np.searchsorted(cells[begins], numbers)
+        return cls(pixel, np.searchsorted(cells, numbers), first_run, run_start, echoes[begins].astype(np.int64))
+
+
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def expose_cells(
-    optics: Any, echoes: Any, cell: Int32, starts: Int64, quantiles: Float32, seed: np.uint64, noisy: tuple[bool, bool],
+    optics: Any, echoes: Any, order: PixelOrder, quantiles: Float32, seed: np.uint64, noisy: tuple[bool, bool],
     bias_m: Float32, chain: Any, expected: bool,
 ) -> tuple[Float32, Float32]:  # fmt: skip
     """Return depth and intensity (n,) of n map cells, NaN and 0 without valid samples; of an even wall alone.
 
-    Arguments are those of `sensor.expose`, with the pixels of each map cell in a row, from its place in `starts`
-    (n + 1,) on. `noisy` says whether light and range have noise; `expected` spreads it in place of drawing it.
+    Arguments are those of `sensor.expose`, with the pixels in that order. `noisy` says whether light and range have
+    noise; `expected` spreads it in place of drawing it.
     """
-    most = np.diff(starts).max()
-    depth, intensity = np.full(starts.size - 1, np.nan, np.float32), np.zeros(starts.size - 1, np.float32)
+    cells, most = order.start.size - 1, np.diff(order.start).max()
+    depth, intensity = np.full(cells, np.nan, np.float32), np.zeros(cells, np.float32)
     light, ranges = np.empty(most, np.float32), np.empty(most, np.float32)
     bits, counts, middle = np.empty(most, np.int32), np.empty(most, np.uint8), np.empty(2, np.int32)
     samples_m, middle_m = bits.view(np.float32), middle.view(np.float32)
     spread = 0  # pixels over which the deviates are spread already
-    for k in range(depth.size):
-        start, pixels = starts[k], starts[k + 1] - starts[k]
+    for k in range(cells):
+        start, pixels = order.start[k], order.start[k + 1] - order.start[k]
         if expected:
             if pixels != spread:
                 spread_deviates(pixels, quantiles, light, ranges)
                 spread = pixels
         elif noisy[0] or noisy[1]:
             draw_deviates(seed, start, pixels, quantiles, light, ranges)
-        _pixels(start, pixels, optics, echoes, cell, light, ranges, noisy, bias_m, chain, samples_m, counts)
+        for run in range(order.first_run[k], order.first_run[k + 1]):
+            begin, end, c = order.run_start[run], order.run_start[run + 1], order.run_echo[run]
+            some = slice(begin - start, end - start)
+            echo = echoes.peak[c], echoes.runner_up[c], echoes.surety[c], echoes.path_m[c]
+            _light(begin, optics, echo, light[some], noisy[0], chain, counts[some])
+            _range(begin, optics, echo, ranges[some], noisy[1], bias_m, chain, samples_m[some])
         valid = np.int32(0)
         for i in range(pixels):
             is_return = bits[i] > 0
@@ -90,34 +121,50 @@ def expose_cells(
     return depth, intensity
 
 
+# Two loops over few arrays each: the compiler turns no loop into vector operations that has more pairs of arrays than
+# it is willing to check for overlap.
+
+
 @inner(error_model="numpy")
-def _pixels(
-    start: int, pixels: int, optics: Any, echoes: Any, cell: Int32, light_deviates: Float32, range_deviates: Float32,
-    noisy: tuple[bool, bool], bias_m: Float32, chain: Any, depth_m: Float32, counts: NDArray[np.uint8],
+def _light(
+    start: int, optics: Any, echo: tuple[Any, Any, Any, Any], deviates: Float32, noisy: bool, chain: Any,
+    counts: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """Fill in depth, 0 for none, and counts of some pixels: the chain of `sensor.expose` without branches."""
-    biased, dying = bias_m.size > 0, optics.dead.size > 0
-    for k in range(pixels):
-        i = start + k
-        c = np.uint32(cell[i])
-        own, peak, runner_up = optics.direct[i], echoes.peak[c], echoes.runner_up[c]
-        wins = peak > own
-        intensity = peak if wins else own
-        surety = echoes.surety[c] if wins else optics.surety[i]
-        length_m = echoes.path_m[c] / 2 if wins else optics.length_m[i]
-        second = max(min(own, peak), runner_up)
+    """Fill in the counts of some pixels that see one echo: the light of `sensor.expose`, without branches."""
+    peak, direct = echo[0], optics.direct[start : start + counts.size]
+    for k in range(counts.size):
+        intensity = max(peak, direct[k])
         light = chain.gain * intensity + chain.ambient_counts
-        if noisy[0]:
-            light += light_deviates[k] * np.sqrt(chain.read_variance + chain.shot_variance * light)
+        if noisy:
+            light += deviates[k] * np.sqrt(chain.read_variance + chain.shot_variance * light)
         light = min(light, SATURATED) - chain.ambient_counts
         counts[k] = np.uint8(np.int32(max(light, 0.0) + 0.5)) if intensity > 0 else np.uint8(0)
+
+
+@inner(error_model="numpy")
+def _range(
+    start: int, optics: Any, echo: tuple[Any, Any, Any, Any], deviates: Float32, noisy: bool, bias_m: Float32,
+    chain: Any, depth_m: Float32,
+) -> None:  # fmt: skip
+    """Fill in the depth of some pixels that see one echo, 0 for none: the range of `sensor.expose`, likewise."""
+    biased, dying, end = bias_m.size > 0, optics.dead.size > 0, start + depth_m.size
+    direct, sureties = optics.direct[start:end], optics.surety[start:end]
+    lengths_m, cos_axis = optics.length_m[start:end], optics.cos_axis[start:end]
+    off_m, dead = bias_m[start:end], optics.dead[start:end]  # empty where there is none
+    peak, runner_up, echo_surety, half_m = echo[0], echo[1], echo[2], echo[3] / 2
+    for k in range(depth_m.size):
+        own, own_surety, own_m = direct[k], sureties[k], lengths_m[k]  # loads outside of choices
+        wins = peak > own
+        intensity = peak if wins else own
+        surety, length_m = echo_surety if wins else own_surety, half_m if wins else own_m
+        second = max(min(own, peak), runner_up)
         sure = MAX_CONFIDENCE * (surety * (0.5 + 0.5 * (1 - second / intensity))) + 0.5 >= 1
-        depth = np.float64(length_m * optics.cos_axis[i])
+        depth = np.float64(length_m * cos_axis[k])
         if biased:
-            depth += bias_m[i]
-        if noisy[1]:
-            depth += range_deviates[k] * (chain.range_noise_m + chain.range_noise_per_m * depth)
+            depth += off_m[k]
+        if noisy:
+            depth += deviates[k] * (chain.range_noise_m + chain.range_noise_per_m * depth)
         units = np.floor(min(depth / DEPTH_UNIT_M, FARTHEST) + 0.5)
-        alive = not optics.dead[i] if dying else True
+        alive = not dead[k] if dying else True
         returns = (intensity > 0) & sure & (units >= 1) & alive
         depth_m[k] = np.float32(units) * np.float32(DEPTH_UNIT_M) if returns else np.float32(0)

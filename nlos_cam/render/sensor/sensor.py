@@ -12,7 +12,7 @@ belong to the renderer.
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numba
@@ -29,7 +29,7 @@ from nlos_cam.render.geometry import Beams, cast
 from nlos_cam.render.renderer import MultiBounce
 from nlos_cam.render.scene import Radiometry
 from nlos_cam.render.sensor.bias import DepthBias, texture
-from nlos_cam.render.sensor.cells import expose_cells, normal_quantiles
+from nlos_cam.render.sensor.cells import PixelOrder, expose_cells, normal_quantiles
 from nlos_cam.render.sensor.effects import sensor_effects
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, MAX_CONFIDENCE, SURE_COUNTS, SensorModel
 
@@ -193,7 +193,7 @@ class Sensor:
         dead_share = model.dead_share if included(verdicts, "dead pixels") else 0.0
         self._optics = _optics(direct, self._chain, dead_share, reflectance)
         self._echoes_only = self._optics._replace(direct=np.zeros_like(self._optics.direct))
-        self._kept_cells: tuple[tuple[int, ...], NDArray[np.int32]] = (), np.empty(0, np.int32)
+        self._ordered: tuple[tuple[int, ...], PixelOrder, PixelOptics] | None = None
         self._bias = DepthBias(shape, model, verdicts)
         self._lights = included(verdicts, "shot noise") or included(verdicts, "read noise")
         self._ranges = included(verdicts, "range noise")
@@ -225,32 +225,25 @@ class Sensor:
             if generator is None:
                 raise SceneError("expected maps are not available for a wall_texture: set it to 0, or draw the noise")
             return maps_from_frame(self.expose(multi, generator).frame(self.rig.pinhole))
-        order, starts, optics = self._by_cell
+        order, optics = self._in_order(multi.peak.shape)
         optics = optics._replace(direct=np.zeros_like(optics.direct)) if multi.direct_included else optics
-        cell = self._echo_cells(multi.peak.shape)
         seed = generator.integers(1 << 64, dtype=np.uint64) if generator else np.uint64(0)
         bias_m = self._bias.at_m(None)
         noise = normal_quantiles(), seed, (self._lights, self._ranges)
-        bias_m = bias_m[order] if bias_m.size else bias_m
+        bias_m = bias_m[order.pixel] if bias_m.size else bias_m
         expected = generator is None
-        found = expose_cells(optics, _echoes(multi, self._chain), cell, starts, *noise, bias_m, self._chain, expected)
+        found = expose_cells(optics, _echoes(multi, self._chain), order, *noise, bias_m, self._chain, expected)
         depth_m, intensity = (column.reshape(MAP_ROWS, MAP_COLUMNS) for column in found)
         return LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
 
-    @cached_property
-    def _by_cell(self) -> tuple[NDArray[np.int64], NDArray[np.int64], PixelOptics]:
-        """Pixels in the order of their map cells, where each cell starts, and the optics in that order."""
-        cell = cell_of_pixels((self.rig.intrinsics.height, self.rig.intrinsics.width), (MAP_ROWS, MAP_COLUMNS))
-        order = np.argsort(cell, kind="stable")
-        starts = np.searchsorted(cell[order], np.arange(MAP_ROWS * MAP_COLUMNS + 1))
-        return order, starts, PixelOptics._make(c[order] if c.size else c for c in self._optics)
-
-    def _echo_cells(self, maps: tuple[int, ...]) -> NDArray[np.int32]:
-        """Return the cell of an echo map for each pixel in the order of `_by_cell`; the last map's are kept."""
-        if self._kept_cells[0] != maps:
-            shape = self.rig.intrinsics.height, self.rig.intrinsics.width
-            self._kept_cells = maps, cell_of_pixels(shape, (maps[0], maps[1]))[self._by_cell[0]]
-        return self._kept_cells[1]
+    def _in_order(self, echoes: tuple[int, ...]) -> tuple[PixelOrder, PixelOptics]:
+        """Return the order of the pixels for echo maps of that shape, with the optics in it; the last is kept."""
+        if self._ordered is None or self._ordered[0] != echoes:
+            image = self.rig.intrinsics.height, self.rig.intrinsics.width
+            maps = (MAP_ROWS, MAP_COLUMNS), (echoes[0], echoes[1])
+            order = PixelOrder.of(*(cell_of_pixels(image, shape) for shape in maps))
+            self._ordered = echoes, order, PixelOptics._make(c[order.pixel] if c.size else c for c in self._optics)
+        return self._ordered[1:]
 
     def _deviates(self, generator: np.random.Generator, *, wanted: bool) -> Float32:
         """Return one normal deviate per pixel, or none: noise that is left out is not drawn."""
