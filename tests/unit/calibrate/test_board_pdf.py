@@ -23,7 +23,7 @@ def page(request: pytest.FixtureRequest) -> tuple[Paper, np.ndarray]:
     return request.param, np.asarray(canvas.buffer_rgba())[..., 0].copy()
 
 
-def test_board_sheet_corners_are_detected_where_drawn(page: tuple[Paper, np.ndarray]) -> None:
+def test_board_sheet_has_corners_where_drawn_and_a_scale_bar_of_100_mm(page: tuple[Paper, np.ndarray]) -> None:
     paper, dots = page
     board, (left_mm, top_mm) = BOARDS[paper], pattern_origin_mm(paper)
     pixels, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(dots)
@@ -31,10 +31,6 @@ def test_board_sheet_corners_are_detected_where_drawn(page: tuple[Paper, np.ndar
     assert len(ids) == len(board.corners_m)
     expected = (board.corners_m[ids.ravel(), :2] * 1e3 + [left_mm, top_mm]) * PIXELS_PER_MM - 0.5
     np.testing.assert_allclose(pixels, expected, atol=0.6)  # 0.06 mm
-
-
-def test_board_sheet_scale_bar_measures_100_mm(page: tuple[Paper, np.ndarray]) -> None:
-    paper, dots = page
     (_, top_mm, _, height_mm), *_ = bar_mm(paper)
     black = np.flatnonzero(dots[int((top_mm + height_mm / 2.0) * PIXELS_PER_MM)] < 128)
     assert len(black) == black[-1] - black[0] + 1

@@ -157,16 +157,13 @@ def fake(brightness: Callable[[int], int] = lambda _: 100, **how: Any) -> FakeLi
     return lidar
 
 
-def test_color_view_waits_for_a_live_cameras_exposure() -> None:
+def test_color_view_waits_for_a_live_cameras_exposure_and_takes_the_size_that_usb_offers() -> None:
     lidar = fake(lambda number: 100 if number >= SETTLING_FRAMES else 200)
     view = capture_color_view("l515", 3, sdk=FakeSdk(lidar))
     np.testing.assert_array_equal(view.image, np.full((720, 1280), 100.0))
     np.testing.assert_array_equal(view.distortion, LENS)
     np.testing.assert_allclose(view.lidar_from_camera, LIDAR_FROM_COLOUR, atol=1e-12)
     assert lidar.did == ["start", "stop", "close"]
-
-
-def test_color_view_on_usb_2_takes_the_size_offered() -> None:
     view = capture_color_view("l515:f0246262", 1, sdk=FakeSdk(fake(usb="2.1")))
     assert (view.intrinsics.width, view.intrinsics.height) == (640, 480)
 

@@ -5,8 +5,7 @@ from datetime import date
 
 import numpy as np
 import pytest
-from nlos_calibration.board import BOARDS
-from nlos_calibration.errors import BoardRefusedError, CalibrationError, OccluderRefusedError, WallRefusedError
+from nlos_calibration.errors import CalibrationError, OccluderRefusedError, WallRefusedError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.reference import BareWallStatistics
 from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
@@ -18,7 +17,6 @@ from nlos_cam.calibrate.measure import (
     CaptureStatistics,
     collect_statistics,
     fit_frame,
-    measure_by_board,
     measure_by_depth,
     measure_occluder,
 )
@@ -108,24 +106,6 @@ def bare(seen: CaptureStatistics) -> MeasuredWall:
     return measured(seen)
 
 
-def test_measure_by_depth_measures_the_wall_and_the_tapes_offset(seen: CaptureStatistics) -> None:
-    fit, facts = measure_by_depth(seen)
-    assert facts == {}
-    assert fit.distance_m == pytest.approx(0.2, abs=4 * fit.distance_std_m)
-    fit, facts = measure_by_depth(seen, 0.204)
-    assert fit.distance_m == pytest.approx(0.204, abs=1e-5)
-    assert facts["range_offset_m"] == pytest.approx(0.004 * np.sqrt(2.0), abs=2e-5)
-
-
-def test_measure_refuses_wrong_tape_no_depth_and_no_board(seen: CaptureStatistics) -> None:
-    with pytest.raises(CalibrationError, match="300"):
-        measure_by_depth(seen, 0.3)
-    with pytest.raises(WallRefusedError):
-        measure_by_depth(CaptureStatistics("sim", BareWallStatistics(INTRINSICS), INTRINSICS, "", "", {}))
-    with pytest.raises(BoardRefusedError):
-        measure_by_board(seen, BOARDS["a4"], None)
-
-
 @pytest.mark.parametrize(("x_m", "gap_m"), [(0.2, 0.1), (0.22, 0.08), (0.19, 0.11)])
 def test_measure_occluder_finds_it_beside_the_known_wall(bare: MeasuredWall, x_m: float, gap_m: float) -> None:
     seen = bench_seen(occluder=Occluder(x_m=x_m, z_min_m=gap_m))
@@ -175,7 +155,7 @@ def test_measure_occluder_notices_another_camera_and_settings(bare: MeasuredWall
         measure_occluder(seen, bare)
 
 
-def frame_of(rig: Rig, width: int = 640, height: int = 480) -> Frame:
+def frame_of(rig: Rig, width: int, height: int) -> Frame:
     intrinsics = rig.pinhole.scaled(width, height)
     depth_m = wall_depth(rig.wall_from_lidar, intrinsics)
     depth_m[depth_m > 5.0] = np.nan
@@ -196,7 +176,7 @@ def test_fit_frame_measures_the_wall_in_one_thinned_frame(
 
 
 def test_fit_frame_reports_refusal_and_saturation() -> None:
-    frame = frame_of(RIG)
+    frame = frame_of(RIG, 640, 480)
     seen = fit_frame(replace(frame, depth_m=np.full_like(frame.depth_m, np.nan), ir=np.full_like(frame.ir, 255)))
     assert seen.fit is None
     assert "0.0%" in seen.refusal

@@ -2,14 +2,19 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
+from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_wall import bare_wall
 from measured_walls import BOARD
 from nlos_calibration import MeasuredWall, OccluderRecord, WallRecord, wall_facts
+from nlos_calibration.wall_record import load_measured
 from page_reader import PageReader, read_page
 
 from nlos_cam.calibrate import report
+from nlos_cam.calibrate.files import WallFiles, write_record
+from nlos_cam.errors import OutputExistsError
 
 Measured = Callable[..., MeasuredWall]
 
@@ -153,3 +158,42 @@ def test_report_commands_can_be_pasted(measured: Measured, camera: str, record_f
     html = unescape(report.usage(record, record_file))
     assert f"nlos-cam {live}\n" in html
     assert all(words in html for words in ("render cup --rig", "wall.npz", "ab" * 32, record.rig.checksum))
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> WallFiles:
+    return WallFiles.beside(tmp_path / "wall.toml", overwrite=False)
+
+
+@pytest.mark.slow
+def test_written_wall_files_belong_together(
+    files: WallFiles, measured: Measured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall = bare_wall()
+    record = write_record(files, measured().record, wall)
+    loaded = load_measured(files.record)
+    assert loaded.record == record
+    np.testing.assert_array_equal(loaded.reference.depth_m, wall.depth_m)
+    assert files.report.read_text(encoding="utf-8") == report.report_html(loaded, "wall.toml")
+    before = {path.name: path.read_bytes() for path in files.record.parent.iterdir()}
+    assert set(before) == {"wall.toml", "wall.npz", "wall.html"}
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nlos_cam.calibrate.files.report_html", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_record(files, record, replace(wall, depth_m=wall.depth_m + np.float32(0.1)))
+    assert {path.name: path.read_bytes() for path in files.record.parent.iterdir()} == before
+
+
+def test_written_wall_without_a_reference_names_none(files: WallFiles, measured: Measured) -> None:
+    assert write_record(files, measured().record, None).reference == ""
+    assert not files.reference.exists()
+    assert load_measured(files.record).reference is None
+
+
+def test_wall_file_may_not_be_named_as_its_reference_or_report(tmp_path: Path) -> None:
+    for name in ("wall.npz", "wall.html"):
+        with pytest.raises(OutputExistsError, match=r"wall\.toml"):
+            WallFiles.beside(tmp_path / name, overwrite=True)

@@ -1,22 +1,35 @@
+from dataclasses import replace
+from typing import Any
+
+import cv2
 import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board import BOARDS, MIN_CORNERS, Board, find_corners
+from nlos_calibration.board import BOARDS, MIN_CORNERS, Board, Corners, find_corners
+from nlos_calibration.board_pose import CornerObservations, PrintErrors, _linear, fit_board, refine_pose, solve_pose
 from nlos_calibration.errors import BoardRefusedError
+from nlos_calibration.geometry import Intrinsics, normal_from_angles
 from nlos_calibration.rig import load_rig
+from nlos_calibration.wall import WallMeasures, measures_of
 from pydantic import ValidationError
 from synthetic_scenes import Illumination, at_near_edge, clean_infrared, corners_px, infrared_frames
 
-from nlos_cam.calibrate.synthetic import View
+from nlos_cam.calibrate import View
 
-SMALL = {"squares_x": 4, "squares_y": 5, "square_mm": 20.0, "marker_mm": 15.0}
+CAMERA = np.array([[457.0, 0.0, 319.5], [0.0, 461.0, 239.5], [0.0, 0.0, 1.0]])
+PRINT_STD = np.array([0.0035, 0.0003, 0.0003])
+TRUE = np.array([0.1, 0.7, 0.05, -0.11, -0.13, 0.30, 0.004, 0.0005, -0.0003])
+"""Parameters of an oblique pose of a stretched and bowed print."""
 A4 = BOARDS["a4"]
-PINHOLE = load_rig("bare-wall").pinhole
+PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)
+NORMAL, DISTANCE_M = normal_from_angles(np.radians(45.0), np.radians(5.0)), 0.2
+SMALL = {"squares_x": 4, "squares_y": 5, "square_mm": 20.0, "marker_mm": 15.0}
+RIG = load_rig("bare-wall")
 
 
 def of_bench(**light: float) -> tuple[Float64, Float64]:
     """A noiseless view at 0.2 m and 45 degrees, and where its corners are."""
-    seen = View(load_rig("bare-wall").wall_from_lidar, PINHOLE)
+    seen = View(RIG.wall_from_lidar, RIG.pinhole)
     placed = at_near_edge(A4, seen)
     return clean_infrared(A4, seen, placed, Illumination(**light)), corners_px(A4, seen, placed)
 
@@ -25,16 +38,11 @@ def mean_of(clean: Float64, frames: int = 30) -> Float64:
     return infrared_frames(clean, np.random.default_rng(1), frames).mean(axis=0)
 
 
-@pytest.fixture(scope="module")
-def clean() -> Float64:
-    return of_bench()[0]
-
-
 def test_measured_board_is_the_same_board_scaled() -> None:
-    board = BOARDS["a4"].measured(29.1)
-    np.testing.assert_allclose(board.corners_m, 0.97 * BOARDS["a4"].corners_m, atol=1e-8)
+    board = A4.measured(29.1)
+    np.testing.assert_allclose(board.corners_m, 0.97 * A4.corners_m, atol=1e-8)
     assert board.marker_mm / board.square_mm == pytest.approx(0.75)
-    np.testing.assert_array_equal(board.pattern(32), BOARDS["a4"].pattern(32))
+    np.testing.assert_array_equal(board.pattern(32), A4.pattern(32))
 
 
 @pytest.mark.parametrize(
@@ -78,7 +86,8 @@ def test_find_corners_without_a_board_advises_on_the_light(value: int) -> None:
         find_corners(blank, A4, "colour")
 
 
-def test_find_corners_refuses_mirrored_hidden_and_other_boards(clean: Float64) -> None:
+def test_find_corners_refuses_mirrored_hidden_and_other_boards() -> None:
+    clean, _ = of_bench()
     mirrored = clean[:, ::-1] + np.random.default_rng(0).normal(0.0, 0.1, clean.shape)
     with pytest.raises(BoardRefusedError, match="mirrored"):
         find_corners(mirrored, A4)
@@ -88,3 +97,168 @@ def test_find_corners_refuses_mirrored_hidden_and_other_boards(clean: Float64) -
         find_corners(hidden, A4)
     with pytest.raises(BoardRefusedError):
         find_corners(clean, BOARDS["a3"].model_copy(update={"dictionary": "DICT_4X4_250", "squares_x": 5}))
+
+
+def seen_of(parameters: Float64, sigma_px: float, generator: np.random.Generator) -> CornerObservations:
+    drawn = CornerObservations(
+        A4.corners_m,
+        np.zeros((len(A4.corners_m), 2)),
+        CAMERA,
+        np.array(A4.size_mm) * 1e-3,
+        PRINT_STD,
+        max(sigma_px, 1e-3) ** 2,
+    )
+    pixels = -_linear(drawn, parameters)[1][:-3].reshape(-1, 2) * np.sqrt(drawn.variance_px2)
+    return replace(drawn, pixels=pixels + sigma_px * generator.standard_normal(pixels.shape))
+
+
+def projected(points_m: Float64, distance_m: float = DISTANCE_M, normal: Float64 = NORMAL) -> Float64:
+    """Return the pixels of points (n, 3) of a board on the wall (z points into the wall)."""
+    right = np.cross([0.0, 1.0, 0.0], -normal)
+    right /= np.linalg.norm(right)
+    down = np.cross(-normal, right)
+    middle_m = 0.8 * distance_m / -normal[2] * np.array([0.0, 0.0, 1.0])
+    middle_m -= (middle_m @ normal + distance_m) * normal
+    x_m, y_m, z_m = (points_m - [0.09, 0.135, 0.0]).T
+    at = middle_m + np.outer(x_m, right) + np.outer(y_m, down) - np.outer(z_m, normal)
+    return np.column_stack(
+        [at[:, 0] / at[:, 2] * PINHOLE.fx + PINHOLE.ppx, at[:, 1] / at[:, 2] * PINHOLE.fy + PINHOLE.ppy]
+    )
+
+
+def corners(points_m: Float64 | None = None, sigma_px: float = 0.05, seed: int = 0, **where: float) -> Corners:
+    pixels = projected(A4.corners_m if points_m is None else points_m, **where)
+    return Corners(
+        np.arange(len(pixels)), pixels + sigma_px * np.random.default_rng(seed).standard_normal(pixels.shape)
+    )
+
+
+def bowed(height_m: float) -> Float64:
+    across = 2.0 * A4.corners_m[:, 0] / 0.18 - 1.0
+    return A4.corners_m - np.outer(height_m * (1.0 - across**2), [0.0, 0.0, 1.0])
+
+
+def measures(found: Corners, board: Board = A4, **fit: Any) -> WallMeasures:
+    plane = fit_board(found, board, PINHOLE, **fit)
+    return measures_of(plane.slopes, plane.covariance)
+
+
+def test_solve_pose_finds_stretch_and_bow() -> None:
+    pose = solve_pose(seen_of(TRUE, 0.02, np.random.default_rng(0)))
+    assert (np.abs(pose.parameters[6:] - TRUE[6:]) < [5e-4, 1e-4, 1e-4]).all()
+
+
+def test_board_pose_slopes_and_covariance_are_those_of_its_plane() -> None:
+    pose = refine_pose(seen_of(TRUE, 0.1, np.random.default_rng(0)), TRUE)
+    slopes, covariance = pose.slopes()
+    corner_m = cv2.Rodrigues(pose.parameters[:3])[0] @ [0.1, 0.2, 0.0] + pose.parameters[3:6]
+    assert slopes @ corner_m == pytest.approx(1.0)  # points p of the plane have slopes . p = 1
+    step, by_pose = 1e-7, np.zeros((3, 6))
+    for k in range(6):
+        by_pose[:, k] = (replace(pose, parameters=pose.parameters + step * np.eye(9)[k]).slopes()[0] - slopes) / step
+    np.testing.assert_allclose(covariance, by_pose @ pose.covariance[:6, :6] @ by_pose.T, rtol=1e-4, atol=1e-8)
+
+
+def test_solve_pose_refuses_an_ambiguous_pose() -> None:
+    far = np.array([0.0, 0.35, 0.0, -0.09, -0.135, 4.0, 0.0, 0.0, 0.0])
+    with pytest.raises(BoardRefusedError, match=r"\d+ degrees"):
+        solve_pose(seen_of(far, 0.5, np.random.default_rng(0)))
+
+
+def test_fit_board_of_exact_corners_is_exact() -> None:
+    fit = fit_board(corners(sigma_px=0.0), A4, PINHOLE)
+    np.testing.assert_allclose(fit.slopes, -NORMAL / DISTANCE_M, rtol=1e-6)
+    assert fit.corners == 40
+    assert fit.residual_px < 1e-6
+    assert (fit.stretch, fit.bow_m) == pytest.approx((0.0, 0.0), abs=1e-7)
+
+
+def test_fit_board_covariance_grows_with_the_residuals() -> None:
+    quiet, loud = (
+        fit_board(corners(sigma_px=sigma), A4, PINHOLE, PrintErrors(1e-9, 1e-9, 1e-9)) for sigma in (0.05, 0.2)
+    )
+    assert loud.residual_px == pytest.approx(0.2, rel=0.3)
+    np.testing.assert_allclose(loud.covariance, 16.0 * quiet.covariance, rtol=0.3, atol=1e-7)
+
+
+def test_fit_board_leaves_out_corners_far_off() -> None:
+    found = corners()
+    found.pixels[[3, 17, 30]] += [[4.0, 1.0], [-2.0, 2.0], [20.0, -30.0]]
+    assert fit_board(found, A4, PINHOLE).corners == 37
+    wall = measures(found)
+    assert wall.distance_m == pytest.approx(DISTANCE_M, abs=4 * wall.distance_std_m)
+    assert wall.yaw_deg == pytest.approx(45.0, abs=4 * wall.yaw_std_deg)
+
+
+@pytest.mark.parametrize("scale", [0.97, 1.03])
+def test_fit_board_of_a_scaled_print_shifts_only_the_distance(scale: float) -> None:
+    found = corners(scale * A4.corners_m)
+    wall = measures(found)
+    assert wall.distance_m == pytest.approx(DISTANCE_M / scale, rel=0.01)
+    assert wall.yaw_deg == pytest.approx(45.0, abs=0.2)
+    assert measures(found, A4.measured(30.0 * scale)).distance_m == pytest.approx(DISTANCE_M, rel=0.003)
+
+
+def test_fit_board_scale_uncertainty_is_one_of_the_distance() -> None:
+    exact, ruled = (measures(corners(), printed=PrintErrors(scale_std=std)) for std in (0.0, 0.01))
+    assert ruled.distance_std_m == pytest.approx(np.hypot(exact.distance_std_m, 0.01 * exact.distance_m))
+    assert ruled.yaw_std_deg == pytest.approx(exact.yaw_std_deg)
+
+
+def test_fit_board_covariance_holds_the_focal_length_error() -> None:
+    exact, unsure = (fit_board(corners(sigma_px=0.0), A4, PINHOLE, focal_std=std) for std in (0.0, 1e-4))
+    longer = replace(PINHOLE, fx=PINHOLE.fx * 1.0001, fy=PINHOLE.fy * 1.0001)
+    change = fit_board(corners(sigma_px=0.0), A4, longer).slopes - exact.slopes
+    np.testing.assert_allclose(unsure.covariance - exact.covariance, np.outer(change, change), rtol=0.02, atol=1e-11)
+    assert np.linalg.norm(change) > 1e-5
+
+
+@pytest.mark.parametrize(
+    "points_m",
+    [
+        A4.corners_m * [1.03, 1.0, 1.0],
+        A4.corners_m @ np.array([[1.0, 0.0, 0.0], [0.02, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        bowed(0.004),
+        bowed(0.03),
+        A4.corners_m + np.random.default_rng(0).normal(0.0, 0.0015, (40, 1)) * [0.0, 0.0, 1.0],
+    ],
+    ids=["stretched", "skewed", "bowed", "rolled", "crumpled"],
+)
+def test_fit_board_refuses_a_print_out_of_shape(points_m: Float64) -> None:
+    with pytest.raises(BoardRefusedError):
+        fit_board(corners(points_m, sigma_px=0.03), A4, PINHOLE)
+
+
+def test_fit_board_refuses_wrong_intrinsics_and_weak_views() -> None:
+    """Another camera's intrinsics; corners in a line; a board seen edge on; a tiny board far away."""
+    found = corners()
+    with pytest.raises(BoardRefusedError):
+        fit_board(found, A4, Intrinsics(640, 480, 457.0, 520.0, 300.0, 200.0))
+    column = found.ids % 5 == 2
+    tiny = A4.measured(1.0)
+    far = projected(tiny.corners_m + np.array([0.0875, 0.131, 0.0]), 0.4, normal_from_angles(0.5, 0.0))
+    edge_on = projected(A4.corners_m, 0.02, normal_from_angles(np.radians(89.0), 0.0))
+    noise = np.random.default_rng(0).standard_normal(edge_on.shape)
+    for board, weak in (
+        (A4, Corners(found.ids[column], found.pixels[column])),
+        (A4, Corners(found.ids, edge_on + 0.2 * noise)),
+        (tiny, Corners(found.ids, far + 0.05 * noise)),
+    ):
+        with pytest.raises(BoardRefusedError):
+            fit_board(weak, board, PINHOLE)
+
+
+@pytest.mark.parametrize("kind", ["scattered", "in a line", "mirrored", "in a heap"])
+def test_fit_board_refuses_random_corners_of_any_number(kind: str) -> None:
+    generator = np.random.default_rng(0)
+    for count in range(8, 41):
+        ids = np.sort(generator.choice(40, count, replace=False))
+        x_m, y_m, _ = A4.corners_m[ids].T
+        pixels = {
+            "scattered": generator.uniform(0.0, 480.0, (count, 2)),
+            "in a line": np.column_stack([2000.0 * x_m, np.full(count, 50.0)]),
+            "mirrored": np.column_stack([400.0 - 1500.0 * x_m, 1500.0 * y_m]),
+            "in a heap": np.full((count, 2), 100.0),
+        }[kind]
+        with pytest.raises(BoardRefusedError):
+            fit_board(Corners(ids, pixels + generator.normal(0.0, 0.05, (count, 2))), A4, PINHOLE)

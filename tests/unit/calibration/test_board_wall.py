@@ -35,15 +35,6 @@ POSE[:3, 3] = [0.02, -0.014, 0.007]
 NO_PRINT = PrintErrors(0.0, 1e-9, 1e-9)
 
 
-@pytest.fixture
-def corners() -> Corners:
-    """Exact corners of a board on a wall at 0.25 m, as a color camera without calibration errors sees them."""
-    bench = bench_at(0.25, 40.0, 5.0)
-    straight = corners_px(A4, ColorCamera().view(bench.seen), bench.placed)
-    inside = np.flatnonzero(((straight > 0.0) & (straight < [1280.0, 720.0])).all(axis=1))
-    return Corners(inside, through_lens(straight[inside]))
-
-
 def moved(slopes: Float64) -> Float64:
     return plane_in_lidar(slopes, np.zeros((3, 3)), POSE, EXACT)[0]
 
@@ -67,7 +58,13 @@ def test_plane_in_lidar_between_camera_and_lidar_is_refused() -> None:
         plane_in_lidar(SLOPES, np.zeros((3, 3)), behind, EXACT)
 
 
-def test_fit_in_lidar_of_exact_corners_needs_lens_and_pose(corners: Corners) -> None:
+def test_fit_in_lidar_of_exact_corners_needs_lens_and_pose() -> None:
+    """Of a board on a wall at 0.25 m, as a color camera without calibration errors sees it."""
+    bench = bench_at(0.25, 40.0, 5.0)
+    straight = corners_px(A4, ColorCamera().view(bench.seen), bench.placed)
+    inside = np.flatnonzero(((straight > 0.0) & (straight < [1280.0, 720.0])).all(axis=1))
+    corners = Corners(inside, through_lens(straight[inside]))
+
     def found(**change: Any) -> WallMeasures:
         fit = fit_in_lidar(corners, A4, replace(CALIBRATION, **change), NO_PRINT)
         return measures_of(fit.slopes, fit.covariance)
@@ -95,7 +92,7 @@ def depth() -> WallFit:
     return fit_wall(mean.mean_m(), PINHOLE, np.random.default_rng(0), mean.noise())
 
 
-def test_wall_with_board_combines_planes_that_agree(depth: WallFit) -> None:
+def test_wall_with_board_combines_planes_that_agree_and_keeps_a_doubt_of_the_depth(depth: WallFit) -> None:
     fit, record = wall_with_board(depth, infrared(), A4, measured=False)
     assert isinstance(fit, WallFit)
     assert (fit.verdict, record.used, record.causes, record.depth_refused) == ("good", "both", (), "")
@@ -104,6 +101,9 @@ def test_wall_with_board_combines_planes_that_agree(depth: WallFit) -> None:
     assert record.disagreement_m == pytest.approx(record.distance_m - depth.distance_m)
     assert record.disagreement_sigmas < 4.0
     np.testing.assert_allclose(fit.wall_from_lidar[2, 3], fit.distance_m)
+    doubted = replace(depth, verdict="doubtful", advice="half of the view differs")
+    fit, _ = wall_with_board(doubted, infrared(), A4, measured=False)
+    assert (fit.verdict, fit.advice) == ("doubtful", "half of the view differs")
 
 
 @pytest.mark.parametrize(("measured", "used"), [(False, "depth"), (True, "board")])
@@ -138,12 +138,6 @@ def test_wall_with_board_doubts_a_board_without_depth() -> None:
     np.testing.assert_allclose(fit.wall_from_lidar, RIG.wall_from_lidar, atol=3e-3)
 
 
-def test_wall_with_board_keeps_the_doubt_of_the_depth(depth: WallFit) -> None:
-    doubted = replace(depth, verdict="doubtful", advice="half of the view differs")
-    fit, _ = wall_with_board(doubted, infrared(), A4, measured=False)
-    assert (fit.verdict, fit.advice) == ("doubtful", "half of the view differs")
-
-
 def test_wall_with_board_out_of_range_gives_advice() -> None:
     """Squares measured as 60 mm put the same board at twice the distance."""
     fit, _ = wall_with_board(WallRefusedError("none"), infrared(), A4.measured(60.0), measured=True)
@@ -170,12 +164,16 @@ def shaken(of: UncertainPlane, generator: np.random.Generator) -> UncertainPlane
     return UncertainPlane(generator.multivariate_normal(of.slopes, of.covariance), of.covariance)
 
 
-def test_combine_of_equal_planes_halves_the_covariance() -> None:
+def test_combine_of_equal_planes_halves_the_covariance_and_keeps_an_exact_plane() -> None:
     both = combine(plane(0.2), plane(0.2), measured=False)
     assert (both.used, both.causes) == ("both", ())
     np.testing.assert_allclose(both.plane.slopes, plane(0.2).slopes)
     np.testing.assert_allclose(both.plane.covariance, 0.5 * plane(0.2).covariance)
     assert both.disagreement.sigmas == pytest.approx(0.0, abs=1e-9)
+    exact = UncertainPlane(plane(0.2).slopes, np.zeros((3, 3)))
+    both = combine(exact, plane(0.2001), measured=False)
+    np.testing.assert_allclose(both.plane.slopes, exact.slopes)
+    np.testing.assert_allclose(both.plane.covariance, 0.0, atol=1e-15)
 
 
 def test_combine_takes_each_quantity_from_the_better_plane() -> None:
@@ -186,13 +184,6 @@ def test_combine_takes_each_quantity_from_the_better_plane() -> None:
     assert both.plane.normal @ board.normal == pytest.approx(1.0, abs=1e-7)
     for one in (depth, board):
         assert (np.linalg.eigvalsh(one.covariance - both.plane.covariance) > -1e-9).all()
-
-
-def test_combine_keeps_an_exact_plane() -> None:
-    exact = UncertainPlane(plane(0.2).slopes, np.zeros((3, 3)))
-    both = combine(exact, plane(0.2001), measured=False)
-    np.testing.assert_allclose(both.plane.slopes, exact.slopes)
-    np.testing.assert_allclose(both.plane.covariance, 0.0, atol=1e-15)
 
 
 def test_disagreement_has_distance_angle_and_sigmas() -> None:
@@ -208,20 +199,16 @@ def test_disagreement_has_distance_angle_and_sigmas() -> None:
     assert turned.distance_sigmas < 0.1
 
 
-def test_disagreement_by_chance_is_rare() -> None:
+def test_combine_rarely_disagrees_by_chance_and_holds_the_truth_as_often_as_stated() -> None:
     generator, depth, board = np.random.default_rng(0), plane(0.2), plane(0.2, std_m=5e-4, std_deg=0.05)
-    sigmas = [disagreement(shaken(depth, generator), shaken(board, generator)).sigmas for _ in range(1000)]
+    sigmas, inside = list[float](), list[bool]()
+    for _ in range(1000):
+        both = combine(shaken(depth, generator), shaken(board, generator), measured=False)
+        sigmas.append(both.disagreement.sigmas)
+        off = both.plane.slopes - depth.slopes
+        inside.append(off @ np.linalg.solve(both.plane.covariance, off) < 7.815)  # 95 % of a chi-square of three
     assert np.mean(np.square(sigmas)) == pytest.approx(3.0, rel=0.1)
     assert np.mean(np.array(sigmas) > AGREE_SIGMAS) < 0.004
-
-
-def test_combine_interval_holds_the_truth_as_often_as_stated() -> None:
-    generator, depth, board = np.random.default_rng(1), plane(0.2), plane(0.2, std_m=2e-4, std_deg=0.05)
-    inside = []
-    for _ in range(1000):
-        both = combine(shaken(depth, generator), shaken(board, generator), measured=False).plane
-        off = both.slopes - depth.slopes
-        inside.append(off @ np.linalg.solve(both.covariance, off) < 7.815)  # 95 % of a chi-square of three
     assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
 
 

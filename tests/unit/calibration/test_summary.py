@@ -41,6 +41,8 @@ def test_facts_hold_quantities_with_intervals() -> None:
     assert facts["pitch"] == "+0.00 ± 0.04°"
     assert facts["measured on"] == "2026-11-22"
     assert facts["temperature"] == "41.7 °C"
+    assert facts["depth"] == "refused"
+    assert values(residual_m=0.0001)["residual"] == "0.10 mm RMS"
     assert values(facing_std_deg=None)["facing angle"] == "45.00°"
     for name in ("range offset", "printed board", "view on the wall", "occluder's tilt"):
         assert name not in facts
@@ -62,11 +64,6 @@ def test_facts_hold_offset_board_occluder_and_footprint() -> None:
     assert facts["temperature"] == "35.5 to 40.0 °C"
     entered = OccluderRecord(source="entered", x_m=0.21, gap_m=0.09)
     assert values(occluder=entered)["occluder's gap (entered)"] == "90.0 mm"
-
-
-def test_facts_of_refused_depth_have_no_residual() -> None:
-    assert values()["depth"] == "refused"
-    assert values(residual_m=0.0001)["residual"] == "0.10 mm RMS"
 
 
 @pytest.mark.parametrize(

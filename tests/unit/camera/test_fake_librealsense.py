@@ -12,15 +12,6 @@ from nlos_cam.camera import FORMATS, SoftwareLidar, find_streams, load_sdk
 from nlos_cam.camera.l515 import L515Camera
 
 
-def public_methods(cls: type) -> set[str]:
-    return {name for name, _ in inspect.getmembers(cls, inspect.isfunction) if not name.startswith("_")}
-
-
-def depth_sensor(lidar: FakeLidar) -> FakeSensor:
-    [sensor] = FakeContext([lidar]).query_devices()[0].query_sensors()
-    return sensor
-
-
 @pytest.mark.parametrize(
     ("fake", "real"),
     [
@@ -33,7 +24,8 @@ def depth_sensor(lidar: FakeLidar) -> FakeSensor:
     ],
 )
 def test_every_method_of_a_fake_is_one_of_the_sdk(fake: type, real: str) -> None:
-    assert public_methods(fake) <= set(dir(getattr(load_sdk(), real)))
+    methods = {name for name, _ in inspect.getmembers(fake, inspect.isfunction) if not name.startswith("_")}
+    assert methods <= set(dir(getattr(load_sdk(), real)))
 
 
 def test_every_name_that_a_camera_uses_is_one_of_the_sdk() -> None:
@@ -72,7 +64,8 @@ def test_handle_fails_once_its_lidar_was_unplugged() -> None:
     for call in (*calls, device.query_sensors, device.hardware_reset):
         with pytest.raises(RuntimeError):
             call()
-    assert depth_sensor(lidar).get_option(option.depth_units) > 0
+    [sensor] = FakeContext([lidar]).query_devices()[0].query_sensors()
+    assert sensor.get_option(option.depth_units) > 0
 
 
 def test_color_camera_is_described_as_the_sdk_does() -> None:

@@ -1,7 +1,7 @@
 """The L515's logic on a fake SDK; tests/hardware holds what only a device can show."""
 
 from collections.abc import Callable
-from itertools import islice
+from itertools import islice, pairwise
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
@@ -12,8 +12,10 @@ from fake_librealsense import FakeSdk, FakeSensor
 from fake_lidar import FakeLidar, NapClock
 
 from nlos_cam.camera.l515 import NEAR_WALL, L515Camera, Options, connected
+from nlos_cam.camera.laser_power import STRIDES, PowerLimits, turn_down, weaker
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.errors import CameraError, CameraNotFoundError
+from nlos_cam.frames import MAX_SATURATED
 
 Make = Callable[..., Any]
 ENDLESS = (10**6,)
@@ -77,23 +79,17 @@ def test_settings_that_do_not_take_are_logged_once(fake_camera: Make, caplog: py
         assert word in record.message
 
 
-@pytest.mark.parametrize("share", [None, "f2"])
-def test_device_that_cannot_be_asked_is_reported(share: str | None) -> None:
-    def broken(device: Any) -> Any:
-        def fail(_: str) -> bool:
-            raise RuntimeError("no such luck")
-
-        device.supports = fail
-        return device
+def test_device_that_cannot_be_asked_is_reported_but_hides_no_other() -> None:
+    def fail(_: str) -> bool:
+        raise RuntimeError("no such luck")
 
     sdk = FakeSdk(FakeLidar("f1"), FakeLidar("f2"))
-    one, other = sdk.context().query_devices()
-    if share:  # it does not hide another
-        [(_, info)] = connected(sdk, SimpleNamespace(query_devices=lambda: [broken(one), other]))
-        assert info.serial == share
-    else:
-        with pytest.raises(CameraError, match="no such luck"):
-            connected(sdk, SimpleNamespace(query_devices=lambda: [broken(one)]))
+    broken, other = sdk.context().query_devices()
+    broken.supports = fail
+    [(_, info)] = connected(sdk, SimpleNamespace(query_devices=lambda: [broken, other]))
+    assert info.serial == "f2"
+    with pytest.raises(CameraError, match="no such luck"):
+        connected(sdk, SimpleNamespace(query_devices=lambda: [broken]))
 
 
 def test_setting_that_takes_late_is_set_once_more(fake_camera: Make) -> None:
@@ -190,22 +186,12 @@ def test_device_that_vanishes_during_set_up_is_an_error(fake_camera: Make) -> No
         fake_camera(lidar, clock=HookClock(lambda _: lidar.unplug())).__enter__()
 
 
-@pytest.fixture
-def lidar() -> FakeLidar:
-    return FakeLidar(laser_power=93.0)
-
-
-@pytest.fixture
-def options(lidar: FakeLidar) -> Options:
-    return Options(FakeSensor(lidar, 0), FakeSdk())
-
-
 @pytest.mark.parametrize(
     ("wanted", "value"), [(0.0, 190.0), (194.0, 190.0), (197.0, 200.0), (9000.0, 6000.0), (200.0, 200.0)]
 )
-def test_option_is_set_to_the_nearest_value_in_range(
-    lidar: FakeLidar, options: Options, wanted: float, value: float
-) -> None:
+def test_option_is_set_to_the_nearest_value_in_range(wanted: float, value: float) -> None:
+    lidar = FakeLidar(laser_power=93.0)
+    options = Options(FakeSensor(lidar, 0), FakeSdk())
     lidar.ranges["min_distance"] = (190.0, 6000.0, 10.0)
     difference = options.put("min_distance", wanted)
     assert bool(difference) == (wanted != value)
@@ -234,3 +220,34 @@ def test_options_are_changed_while_the_camera_runs(fake_camera: Make) -> None:
             camera.set_option("noise_filtering", 1.0)
         with pytest.raises(CameraError, match="choose from"):
             camera.set_option("visual_preset", 1.0)
+
+
+@pytest.mark.parametrize("range_", [(0, 100, 1), (5, 95, 5), (0, 100, 30), (1, 3, 1), (0, 1, 0.01)])
+@pytest.mark.parametrize("part", [0.0, 0.15, 0.5, 0.77, 1.0, 2.0])
+def test_turn_down_falls_above_darkness_as_far_as_needed(range_: tuple[float, float, float], part: float) -> None:
+    limits = PowerLimits(*range_)
+    threshold, tried = limits.min + part * (limits.max - limits.min), [limits.max]
+    settled = turn_down(
+        limits.max, limits, lambda: 0.5 if tried[-1] > threshold else 0.0, lambda power: not tried.append(power)
+    )
+    assert settled.power == tried[-1]
+    assert len(tried) <= STRIDES + 2
+    assert all(lower < higher for higher, lower in pairwise(tried))
+    assert min(tried) >= max(limits.min, min(limits.step, limits.max))
+    assert min(tried) > 0
+    assert all(power > threshold for power in tried[:-1])
+    assert settled.saturated == (0.5 if settled.power > threshold else 0.0)
+    assert settled.power <= threshold or not list(weaker(settled.power, limits))
+
+
+@pytest.mark.parametrize("share", [0.0, MAX_SATURATED, None])
+def test_turn_down_leaves_a_good_or_missing_image_alone(share: float | None) -> None:
+    settled = turn_down(93, PowerLimits(0, 100, 1), lambda: share, lambda _: pytest.fail("was set"))
+    assert (settled.power, settled.saturated) == (93, share)
+
+
+def test_turn_down_ends_where_a_power_does_not_take() -> None:
+    put: list[float] = []
+    settled = turn_down(93, PowerLimits(0, 100, 1), lambda: 0.5, put.append)
+    assert put == [83]
+    assert (settled.power, settled.saturated) == (93, 0.5)

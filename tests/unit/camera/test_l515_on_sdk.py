@@ -1,10 +1,10 @@
 """The L515's camera on librealsense itself: a software device with an L515's options, delivering from a thread."""
 
 import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from fake_lidar import NapClock
 from nlos_calibration.rig import load_rig
 from software_colour import SoftwareSdk
@@ -67,24 +67,13 @@ class Delivering(L515Camera):
             self.thread.join(5.0)
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, dict[str, float], dict[str, str]]:
-    path = tmp_path_factory.mktemp("l515") / "wall.bag"
-    recording = Recording(path, frames=20)
+def test_settings_take_on_librealsense_before_its_recording_which_is_whole(tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "wall.bag", frames=20)
     with Delivering(Desk(), recording) as camera:
-        frames = list(camera)
-    return recording, dict(frames[-1].settings), dict(camera.differences)
-
-
-def test_settings_take_on_librealsense(recorded: Any) -> None:
-    _, settings, differences = recorded
-    assert set(differences) == {"global_time_enabled"}
+        settings = list(camera)[-1].settings
+    assert set(camera.differences) == {"global_time_enabled"}
     wanted = NEAR_WALL | {"visual_preset": PRESET["visual_preset"], "laser_power": 60.0}
     assert {name: settings[name] for name in wanted} == wanted
-
-
-def test_recording_on_a_running_sensor_is_whole_and_settled(recorded: Any) -> None:
-    recording, settings, _ = recorded
     found = verify(recording.path)
     assert found.frames >= recording.sets == 20
     assert found.dropped == 0

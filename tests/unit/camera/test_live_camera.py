@@ -1,6 +1,7 @@
-"""LiveCamera over an L515's faults, on a fake SDK that delivers from its own thread, and their recordings."""
+"""LiveCamera over an L515's faults, on a fake SDK with its own thread, their recordings, and the stages of recovery."""
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from itertools import islice, pairwise
 from pathlib import Path
@@ -9,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_lidar import FakeLidar
+from fake_lidar import FakeLidar, NapClock
 
 from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.camera.l515 import NEAR_WALL, L515Camera
+from nlos_cam.camera.recovery import BACK_OFF_S, Hooks, Recovery
 from nlos_cam.errors import CameraError, CameraLostError
 from nlos_cam.frames import Frame
 from nlos_cam.recording import verify
@@ -54,16 +56,13 @@ def test_frames_are_in_metres_and_levels_and_none_is_early(fake_camera: Make) ->
     assert frames[0].truth_depth_m is None
 
 
-def test_device_without_a_stream_or_unit_is_an_error(fake_camera: Make) -> None:
+def test_device_without_a_stream_or_unit_or_that_does_not_start_is_an_error(fake_camera: Make) -> None:
     with pytest.raises(CameraError, match=r"confidence.*640 x 480"):
         fake_camera(FakeLidar(streams=("depth", "infrared")))
     device = FakeLidar()
     del device.options["depth_units"]
     with pytest.raises(CameraError, match="depth unit"):
         fake_camera(device)
-
-
-def test_device_that_does_not_start_is_left_closed(fake_camera: Make) -> None:
     device = FakeLidar()
     device.start_error = RuntimeError("failed to set power state")
     with pytest.raises(CameraError, match="failed to set power state"):
@@ -208,13 +207,10 @@ def test_leaving_ends_a_recovery_and_may_be_repeated(fake_camera: Make) -> None:
     assert lidar.did.count("stop") == lidar.did.count("close") == 1
 
 
-FAULTS = [Fault(kind=kind, at_frame=15, frames=2000) for kind in ("unplug", "stall")]
-
-
 @pytest.mark.parametrize("optional", [True, False])
-@pytest.mark.parametrize("fault", FAULTS, ids=["unplug", "stall"])
+@pytest.mark.parametrize("kind", ["unplug", "stall"])
 def test_recording_of_a_lost_device_ends_whole(
-    noise_world: Make, hurried_clock: Any, fault: Fault, optional: bool, tmp_path: Path, caplog: Any
+    noise_world: Make, hurried_clock: Any, kind: Any, optional: bool, tmp_path: Path, caplog: Any
 ) -> None:
     class Impatient(hurried_clock):
         """Waits for the next frame of its world only; any longer wait lasts until the fault is over."""
@@ -222,7 +218,7 @@ def test_recording_of_a_lost_device_ends_whole(
         def wait(self, stop: Event, seconds: float) -> bool:
             return super().wait(stop, seconds if seconds < 0.2 else 100.0)
 
-    recording = Recording(tmp_path / "run.bag", optional=optional)
+    recording, fault = Recording(tmp_path / "run.bag", optional=optional), Fault(kind=kind, at_frame=15, frames=2000)
     simulated = SimulatedCamera("sim", noise_world(), clock=Impatient(), recording=recording, faults=[fault])
     simulated.silence_s, simulated.replug_s = 0.5, 1000.0
     if optional:  # the camera goes on
@@ -250,9 +246,86 @@ def test_recording_without_a_frame_restarts_with_the_streams(fake_camera: Make, 
     assert [did for did in lidar.did if did in {"start", "record", "stop"}] == ["start", "record", "stop"] * 3
 
 
-def test_recording_starts_when_the_settings_hold(fake_camera: Make, tmp_path: Path) -> None:
-    lidar = FakeLidar(usb="2.1", runs=(ENDLESS,), laser_power=93.0)
-    lidar.saturated_share = lambda power: 0.3 if power > 60 else 0.0
-    with fake_camera(lidar, recording=Recording(tmp_path / "run.bag", frames=5)) as camera:
-        assert len(list(camera)) == 5
-    assert lidar.did.index("record") > max(at for at, did in enumerate(lidar.did) if did in lidar.options)
+class Device:
+    """A device that is there at some times, whose starts fail, and its recovery."""
+
+    def __init__(self, there: Callable[[float], bool] = lambda _: True, failing: tuple[str, ...] = ()) -> None:
+        self.clock, self.left, self.counts, self.did = NapClock(), Event(), Counter[str](), list[str]()
+        self.zero_s, self.there, self.failing = self.clock.now(), there, list(failing)
+        stop, reset = (lambda: self.did.append("stop")), (lambda: self.did.append("reset"))
+        hooks = Hooks(self.start, stop, self.is_connected, lambda: "device" if self.is_connected() else None, reset)
+        self.recovery = Recovery("l515", hooks, self.clock, self.left, self.counts)
+
+    @property
+    def passed_s(self) -> float:
+        return self.clock.now() - self.zero_s
+
+    def is_connected(self) -> bool:
+        return self.there(self.passed_s)
+
+    def start(self, device: Any) -> None:
+        assert device == "device"
+        if self.failing:
+            raise RuntimeError(self.failing.pop(0))
+        self.did.append("start")
+
+    def recover(self, times: int = 1) -> None:
+        for _ in range(times):
+            self.recovery.recover("l515 gave no whole frame", replug_s=60.0)
+
+
+def test_recovery_restarts_with_back_off_then_resets_then_ends() -> None:
+    device = Device()
+    device.recover(4)
+    with pytest.raises(CameraLostError, match=r"3 restarts.*reset"):
+        device.recover()
+    assert device.did == ["stop", "start"] * 3 + ["stop", "stop", "reset", "start", "stop"]
+    assert tuple(nap for nap in device.clock.naps if nap >= 0.5) == BACK_OFF_S
+    assert device.counts == {"restarted": 3, "reset": 1}
+
+
+def test_failed_restart_is_followed_by_the_next_at_once_and_by_a_reset_if_intrinsics_are_lost() -> None:
+    device = Device(failing=("busy", "busy"))
+    device.recover()
+    assert device.counts == {"restarted": 3}
+    assert device.did == ["stop", "start"]
+    with pytest.raises(CameraLostError, match="failed to set power state"):
+        Device(failing=("failed to set power state",) * 200).recover()
+    device = Device(failing=("intrinsics for resolution 640,480 doesn't exist",))
+    device.recover()
+    assert device.counts == {"restarted": 1, "reset": 1}
+
+
+def test_reset_waits_until_the_device_was_gone_and_is_back() -> None:
+    """An L515 is still listed for a moment, and needs about 12 s."""
+    device = Device(there=lambda now_s: not 1.0 < now_s < 12.0)
+    assert device.recovery.reset()
+    assert device.did == ["stop", "reset", "start"]
+    assert 12.0 <= device.passed_s < 12.5
+    gone = Device(there=lambda now_s: now_s < 5.0)
+    with pytest.raises(CameraLostError):
+        gone.recover(4)
+    assert gone.counts["reset"] == 1
+
+
+@pytest.mark.parametrize(("back_s", "failing"), [(40.0, ()), (2.0, ("not yet", "not yet"))])
+def test_unplugged_device_is_started_when_it_is_back(back_s: float, failing: tuple[str, ...]) -> None:
+    device = Device(there=lambda now_s: now_s > back_s, failing=failing)
+    device.recover()
+    assert device.counts == {"replugged": 1}
+    assert device.did.count("start") == 1
+    assert failing or device.passed_s == pytest.approx(back_s, abs=0.5)
+
+
+def test_bus_that_cannot_be_listed_counts_as_unplugged(caplog: pytest.LogCaptureFixture) -> None:
+    listings = [CameraError("librealsense cannot list its devices")]
+
+    def there(_: float) -> bool:
+        if listings:
+            raise listings.pop()
+        return True
+
+    device = Device(there)
+    device.recover()
+    assert device.counts == {"replugged": 1}
+    assert "60 s" in caplog.text

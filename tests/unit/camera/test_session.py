@@ -1,5 +1,4 @@
 import time
-from collections.abc import Callable
 from threading import Thread, Timer
 from types import SimpleNamespace
 from typing import Any
@@ -92,32 +91,22 @@ def session_of(lidar: FakeLidar) -> Session:
     return Session(*find_streams(FakeDevice(lidar, 0)), SampleQueue(lossless=False))
 
 
-def while_preparing(act: Callable[[Session, FakeLidar], Any]) -> Any:
-    """Return what `act` gives while a session prepares its sensor, of which no frame is delivered."""
-    lidar, given = FakeLidar(usb="2.1"), list[Any]()
+def test_look_returns_the_next_set_while_preparing_or_none_by_timeout_or_end() -> None:
+    lidar, found = FakeLidar(usb="2.1"), list[Any]()
     session = session_of(lidar)
-    session.start(lambda _: given.append(act(session, lidar)))
-    session.stop()
-    assert session.inbox.arrived.total() == 0
-    return given[0]
 
-
-def test_look_returns_the_next_set_while_preparing() -> None:
-    def look(session: Session, lidar: FakeLidar) -> int:
+    def prepare(_: object) -> None:
         lidar.deliver(range(1, 4))
         Timer(0.1, lidar.deliver, [range(4, 5)]).start()
-        return session.look(30.0).number
-
-    assert while_preparing(look) == 4
-
-
-def test_look_ends_by_timeout_or_end_of_wait() -> None:
-    def look(session: Session, _: FakeLidar) -> list[Any]:
-        nothing = session.look(0.01)
+        found.append(session.look(30.0).number)
+        found.append(session.look(0.01))
         Timer(0.1, session.end_wait).start()
-        return [nothing, session.look(10_000.0)]
+        found.append(session.look(10_000.0))
 
-    assert while_preparing(look) == [None, None]
+    session.start(prepare)
+    session.stop()
+    assert found == [4, None, None]
+    assert session.inbox.arrived.total() == 0  # none of these is delivered
 
 
 @pytest.mark.parametrize("clock_stands", [False, True])

@@ -1,3 +1,4 @@
+import time
 from dataclasses import astuple
 from pathlib import Path
 from threading import Event
@@ -5,13 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from nlos_calibration import load_rig
 
-from nlos_cam.camera import Recording, load_sdk
+from nlos_cam.camera import FORMATS, Recording, load_sdk
+from nlos_cam.camera.fault_injection import Delivery, FaultyDevice
+from nlos_cam.camera.protocol import WallClock
 from nlos_cam.camera.session import read_settings
 from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MAX_LATE_FRAMES, SimulatedCamera, SoftwareLidar
 from nlos_cam.camera.streams import intrinsics_of, is_needed, stream_name
 from nlos_cam.recording import ReplayCamera
+from nlos_cam.render import Fault, SensedImages
 
 
 class JumpClock:
@@ -106,27 +112,73 @@ def test_native_threads_do_not_pile_up(noise_world: Any, hurried_clock: Any) -> 
     assert [run() for _ in range(20)][-1] < before + 10
 
 
-PINHOLE = load_rig("paper-rig").pinhole
-CELSIUS = {"ldd_temperature": 41.5, "apd_temperature": 36.25}
-
-
 def test_software_lidar_looks_like_an_l515() -> None:
-    sdk = load_sdk()
-    info, lidar = sdk.camera_info, SoftwareLidar(PINHOLE, sdk, celsius=CELSIUS)
+    sdk, pinhole, celsius = (
+        load_sdk(),
+        load_rig("paper-rig").pinhole,
+        {"ldd_temperature": 41.5, "apd_temperature": 36.25},
+    )
+    info, lidar = sdk.camera_info, SoftwareLidar(pinhole, sdk, celsius=celsius)
     names = [lidar.device.get_info(key) for key in (info.name, info.serial_number, info.product_line)]
     assert names == ["Simulated L515", "simulated", "L500"]
     [sensor] = lidar.device.query_sensors()
     assert sensor.get_info(info.name) == "L500 Depth Sensor"
     assert sensor.as_depth_sensor().get_depth_scale() == pytest.approx(0.00025)
-    assert read_settings(sensor, "_temperature") == CELSIUS
-    [cold] = SoftwareLidar(PINHOLE, sdk).device.query_sensors()
+    assert read_settings(sensor, "_temperature") == celsius
+    [cold] = SoftwareLidar(pinhole, sdk).device.query_sensors()
     assert read_settings(cold, "_temperature") == {}
     profiles = {stream_name(profile): profile for profile in sensor.get_stream_profiles()}
     assert set(profiles) == {"depth", "infrared", "confidence"}
     for profile in profiles.values():
         assert is_needed(profile)
         assert profile.fps() == 30
-        np.testing.assert_allclose(astuple(intrinsics_of(profile)), astuple(PINHOLE), rtol=1e-6)
+        np.testing.assert_allclose(astuple(intrinsics_of(profile)), astuple(pinhole), rtol=1e-6)
         same = profiles["depth"].get_extrinsics_to(profile)
         np.testing.assert_array_equal(np.reshape(same.rotation, (3, 3)), np.eye(3))
         np.testing.assert_array_equal(same.translation, np.zeros(3))
+
+
+def test_wall_clock_never_goes_back_and_waits_until_stopped() -> None:
+    clock, stop = WallClock(), Event()
+    before = time.time()
+    times = [clock.now() for _ in range(100)]
+    assert times == sorted(times)
+    assert before - 1.0 < times[0] < time.time() + 1.0
+    assert not clock.wait(stop, -1.0)
+    stop.set()
+    assert clock.wait(stop, 60.0)
+
+
+def images(instant: int) -> SensedImages:
+    """Make images of 4 x 6 pixels that hold their instant."""
+    return SensedImages(
+        np.full((4, 6), 1000 + instant, np.uint16), np.full((4, 6), 100, np.uint8), np.full((4, 6), 9, np.uint8)
+    )
+
+
+def handed(*faults: Fault, until: int) -> list[Delivery]:
+    device = FaultyDevice(faults)
+    return [found for instant in range(until) for found in device.deliver(instant, 1e9, images(instant))]
+
+
+@given(st.integers(0, 1000))
+def test_device_without_faults_changes_nothing(instant: int) -> None:
+    seen = images(instant)
+    [delivery] = FaultyDevice().deliver(instant, 1e9, seen)
+    assert delivery.images is seen
+    assert (delivery.number, delivery.instant, delivery.timestamp_s) == (instant, instant, 1e9)
+    assert delivery.streams == tuple(FORMATS)
+
+
+def test_image_faults_spoil_images_as_named_and_add_up() -> None:
+    def spoiled(*kinds: Any) -> SensedImages:
+        return handed(*(Fault(kind=kind, at_frame=0) for kind in kinds), until=1)[0].images
+
+    black = spoiled("all_zero")
+    assert not any(image.any() for image in (black.depth_z16, black.ir, black.confidence))
+    assert (spoiled("saturated").ir == 255).all()
+    assert np.count_nonzero(spoiled("half_invalid").depth_z16) == 12
+    assert spoiled("wrong_size").depth_z16.shape == spoiled("wrong_size").ir.shape == (2, 3)
+    assert [each.images.ir.max() for each in handed(Fault(kind="saturated", at_frame=1), until=3)] == [100, 255, 100]
+    both = spoiled("half_invalid", "saturated")
+    assert (np.count_nonzero(both.depth_z16), both.ir.min()) == (12, 255)

@@ -34,19 +34,15 @@ def _equal(one: SensedImages, other: SensedImages) -> bool:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("world")
-
-
-@pytest.fixture(scope="module")
-def scene(folder: Path) -> Path:
-    (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
-    return folder / "scene.toml"
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("world") / "scene.toml"
+    path.write_text(SCENE, encoding="utf-8")
+    return path
 
 
 @pytest.fixture(autouse=True)
-def _cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NLOS_CAM_CACHE", str(folder / "cache"))
+def _cache(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NLOS_CAM_CACHE", str(scene.with_name("cache")))
 
 
 @pytest.fixture
@@ -54,28 +50,23 @@ def world(scene: Path) -> World:
     return open_world(str(scene))
 
 
-def test_world_frame_is_bit_identical_by_number(world: World) -> None:
-    later = world.images(7)
+def test_world_frame_is_bit_identical_by_number_and_repeats_the_loop_with_other_noise(world: World) -> None:
+    first, second, again, later = (world.images(number) for number in (0, 1, 2, 7))
     assert _equal(world.images(7), later)
-    assert not _equal(world.images(0), world.images(1))
+    assert not _equal(first, second)
     assert world.celsius(0) == world.celsius(1_000_000)
-
-
-def test_world_loop_repeats_with_other_noise(world: World) -> None:
-    first, again = world.images(0), world.images(2)
     assert not _equal(first, again)
     np.testing.assert_array_equal(first.confidence, again.confidence)
     both = (first.depth_z16 > 0) & (again.depth_z16 > 0)
     difference = first.depth_z16[both].astype(int) - again.depth_z16[both].astype(int)
     assert np.abs(difference).max() * 0.00025 < 0.05
-    assert not np.array_equal(world.images(1).confidence, first.confidence)
+    assert not np.array_equal(second.confidence, first.confidence)
 
 
 def test_world_truth_is_the_object_at_half_the_scan(world: World) -> None:
     for number in range(4):
-        truth = world.truth_depth_m(number)
         expected = world.scene.scene_at(number % 2 + 0.5).object_depth_m
-        np.testing.assert_array_equal(truth, expected)
+        np.testing.assert_array_equal(world.truth_depth_m(number), expected)
 
 
 @pytest.mark.slow
@@ -107,11 +98,6 @@ def warming(tmp_path: Path) -> World:
     return open_world(str(tmp_path / "warming.toml"))
 
 
-def _depth_m(world: World, number: int) -> float:
-    depth_m = world.images(number).frame(world.rig.pinhole).depth_m
-    return float(np.nanmean(depth_m))
-
-
 def test_world_warms_by_the_frame_number_beyond_the_loop(warming: World) -> None:
     assert warming.scene.poses == 1
     after = [warming.celsius(round(30 * 60 * minutes)) for minutes in (0, 10, 100)]
@@ -125,7 +111,8 @@ def test_world_warms_by_the_frame_number_beyond_the_loop(warming: World) -> None
 
 
 def test_world_depth_drifts_with_its_temperature(warming: World) -> None:
-    cold_m, later_m, warm_m = (_depth_m(warming, number) for number in (0, 18_000, 180_000))
+    frames = [warming.images(number).frame(warming.rig.pinhole) for number in (0, 18_000, 180_000)]
+    cold_m, later_m, warm_m = (float(np.nanmean(frame.depth_m)) for frame in frames)
     reported = warming.celsius(18_000)["ldd_temperature"]
     assert warm_m - cold_m == pytest.approx(0.0005 * 20, abs=2e-5)
     assert later_m - warm_m == pytest.approx(0.0005 * (reported - 45), abs=2e-5)
@@ -143,14 +130,14 @@ def test_world_with_a_wide_pulse_survives_the_cache(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "scene", [pytest.param(paper_scene(), marks=pytest.mark.slow), bare_wall_scene()], ids=["paper", "bare-wall"]
+    "shipped", [pytest.param(paper_scene(), marks=pytest.mark.slow), bare_wall_scene()], ids=["paper", "bare-wall"]
 )
-def test_packaged_loop_equals_the_renderers(scene: SceneFile) -> None:
+def test_packaged_loop_equals_the_renderers(shipped: SceneFile) -> None:
     """On the processor that rendered it bit for bit; others may contract sums differently."""
-    packaged = read_packaged(scene)
-    assert [len(part) for part in packaged] == [scene.poses, scene.poses]
-    number = scene.poses // 2
-    (rendered,), (truth_m,) = render_loop(scene, poses=[number])
+    packaged = read_packaged(shipped)
+    assert [len(part) for part in packaged] == [shipped.poses, shipped.poses]
+    number = shipped.poses // 2
+    (rendered,), (truth_m,) = render_loop(shipped, poses=[number])
     echoes = packaged[0][number]
     np.testing.assert_array_equal(packaged[1][number], truth_m)
     np.testing.assert_allclose(echoes.peak, rendered.peak, rtol=1e-4)

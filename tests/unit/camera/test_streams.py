@@ -1,5 +1,8 @@
+"""Samples of the streams become sets, and sets become frames whose numbers and times rise."""
+
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,6 +12,8 @@ from nlos_calibration import Intrinsics
 
 from nlos_cam.camera import FORMATS, FRAMES_PER_S, FrameSet, FrameSynchronizer, Sample, frame_in_si
 from nlos_cam.camera.streams import CONSISTENT_SETS, LATE_NUMBERS, MAX_GAP, WAITING_SETS
+from nlos_cam.camera.timestamps import STEP_BACK, WRAP_PERIOD_S, ClockUnwrap, Continuity
+from nlos_cam.frames import Frame
 
 STREAMS = tuple(FORMATS)
 SHAPE = (1, 1)
@@ -126,13 +131,43 @@ def test_pairing_bounds_memory_and_delivers_despite_wild_numbers(wild: list[tupl
     assert set(numbers_of(found)) >= set(range(1000, 1100))
 
 
-@pytest.mark.parametrize("late", [1, LATE_NUMBERS])
-def test_pairing_counts_a_late_number_as_out_of_order(late: int) -> None:
-    pairing = FrameSynchronizer()
-    paired(pairing, whole(0, 100))
-    assert paired(pairing, whole(100 - late)) == []
-    assert pairing.counts == {"out_of_order": 1}
-    assert pairing.dropped == 99
+def of_another_shape(number: int, *streams: str) -> list[Sample]:
+    return [sample(stream, number, shape=(2, 1) if stream in streams else SHAPE) for stream in STREAMS]
+
+
+@pytest.mark.parametrize(
+    ("samples", "numbers", "counts", "incomplete", "dropped"),
+    [
+        *((whole(0, 100, 100 - late), [0, 100], {"out_of_order": 1}, 0, 99) for late in (1, LATE_NUMBERS)),
+        *(
+            ([*whole(1), *of_another_shape(2, *streams), *whole(3)], [1, 3], {"wrong_size": 1}, 1, 0)
+            for streams in (STREAMS, ("depth",))
+        ),
+        *((whole(0, 1 + gap), [0, 1 + gap], {}, 0, gap) for gap in (0, 1, 7, MAX_GAP - 1)),
+        *(
+            (
+                [*whole(4999, 5000), sample("depth", 5001), *whole(n, n + 1)],
+                [4999, 5000, n, n + 1],
+                {"renumbered": 1},
+                1,
+                0,
+            )
+            for n in (10_000_000, 5000 + MAX_GAP + 1, 5000 - LATE_NUMBERS - 1, 0)
+        ),
+        ([*whole(0, 1), sample("depth", 10_000_000), *whole(2)], [0, 1, 2], {"stray": 1}, 0, 0),
+        *(
+            ([*whole(0, 1, 8), *whole(9, 10, late_s=pause_s)], [0, 1, 8, 9, 10], counts, 0, 6)
+            for pause_s, counts in ((0.1, {}), (0.2, {"stalled": 1}), (5.0, {"stalled": 1}))
+        ),
+    ],
+)
+def test_pairing_counts_late_odd_missing_renumbered_stray_and_paused_sets(
+    samples: list[Sample], numbers: list[int], counts: dict[str, int], incomplete: int, dropped: int
+) -> None:
+    pairing = FrameSynchronizer(SHAPE)
+    assert numbers_of(paired(pairing, samples)) == numbers
+    pairing.finish()
+    assert (pairing.counts, pairing.incomplete, pairing.dropped) == (counts, incomplete, dropped)
 
 
 @pytest.mark.parametrize("copies", [1, 2])
@@ -147,48 +182,6 @@ def test_pairing_counts_repeats_in_frames(copies: int, streams: tuple[str, ...],
     found = paired(pairing, [*samples, *repeated, sample("confidence", 6), *whole(7)])
     assert numbers_of(found) == [4, 5, 6, 7]
     assert pairing.counts == {"duplicate": copies}
-
-
-@pytest.mark.parametrize("streams", [STREAMS, ("depth",)])
-def test_pairing_counts_another_shape_in_frames(streams: tuple[str, ...]) -> None:
-    pairing = FrameSynchronizer(SHAPE)
-    odd = [sample(stream, 2, shape=(2, 1) if stream in streams else SHAPE) for stream in STREAMS]
-    assert numbers_of(paired(pairing, [*whole(1), *odd, *whole(3)])) == [1, 3]
-    assert pairing.counts == {"wrong_size": 1}
-    assert (pairing.incomplete, pairing.dropped) == (1, 0)
-
-
-@pytest.mark.parametrize("gap", [0, 1, 7, MAX_GAP - 1])
-def test_pairing_counts_a_gap_as_dropped(gap: int) -> None:
-    pairing = FrameSynchronizer()
-    paired(pairing, whole(0, 1 + gap))
-    assert pairing.dropped == gap
-    assert not pairing.counts
-
-
-@pytest.mark.parametrize("number", [10_000_000, 5000 + MAX_GAP + 1, 5000 - LATE_NUMBERS - 1, 0])
-def test_pairing_takes_a_restarted_count_for_no_gap(number: int) -> None:
-    pairing = FrameSynchronizer()
-    samples = [*whole(4999, 5000), sample("depth", 5001), *whole(number, number + 1)]
-    assert numbers_of(paired(pairing, samples)) == [4999, 5000, number, number + 1]
-    assert pairing.counts == {"renumbered": 1}
-    assert (pairing.incomplete, pairing.dropped) == (1, 0)
-
-
-def test_pairing_counts_a_stray_sample_and_goes_on() -> None:
-    pairing = FrameSynchronizer()
-    assert numbers_of(paired(pairing, [*whole(0, 1), sample("depth", 10_000_000), *whole(2)])) == [0, 1, 2]
-    pairing.finish()
-    assert pairing.counts == {"stray": 1}
-    assert (pairing.incomplete, pairing.dropped) == (0, 0)
-
-
-@pytest.mark.parametrize(("pause_s", "stalled"), [(0.1, 0), (0.2, 1), (5.0, 1)])
-def test_pairing_counts_a_pause_that_numbers_hide(pause_s: float, stalled: int) -> None:
-    pairing = FrameSynchronizer()
-    paired(pairing, [*whole(0, 1, 8), *whole(9, 10, late_s=pause_s)])
-    assert pairing.counts["stalled"] == stalled
-    assert pairing.dropped == 6
 
 
 def counted_apart(instants: range, lost: dict[str, int]) -> Iterator[Sample]:
@@ -224,3 +217,97 @@ def test_frame_in_si_has_metres_levels_and_nan() -> None:
     assert frame.ir is ir
     assert (frame.frame_number, frame.timestamp_s, frame.intrinsics) == (9, 1.5, pinhole)
     assert (frame.settings, frame.truth_depth_m) == (settings, truth_m)
+
+
+STEP_BACK_S = STEP_BACK * WRAP_PERIOD_S
+
+
+def unwrapped(timestamps_s: list[float], period_s: float = WRAP_PERIOD_S) -> list[float]:
+    clock = ClockUnwrap(period_s)
+    return [clock.add(timestamp_s) for timestamp_s in timestamps_s]
+
+
+@given(
+    first_s=st.floats(0.0, WRAP_PERIOD_S),
+    gaps_s=st.lists(st.floats(-STEP_BACK_S / 2, WRAP_PERIOD_S - 2 * STEP_BACK_S), max_size=20),
+)
+def test_unwrap_gives_the_times_of_a_clock_without_wraps(first_s: float, gaps_s: list[float]) -> None:
+    true_s = [first_s]
+    for gap_s in gaps_s:
+        true_s.append(max(max(true_s) + gap_s, first_s))
+    found_s = unwrapped([each_s % WRAP_PERIOD_S for each_s in true_s])
+    offset_s = first_s - first_s % WRAP_PERIOD_S
+    assert all(abs(found - true + offset_s) < 1e-6 for found, true in zip(found_s, true_s, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("stamps_s", "period_s", "expected_s"),
+    [
+        ([0.1, 1 / 3, 5.0, 5.0, 1.7e9], WRAP_PERIOD_S, [0.1, 1 / 3, 5.0, 5.0, 1.7e9]),
+        ([100.0, 99.9, 100.1, 41.0], WRAP_PERIOD_S, [100.0, 99.9, 100.1, 41.0]),
+        ([WRAP_PERIOD_S - 0.001, 0.001] * 2, WRAP_PERIOD_S, [WRAP_PERIOD_S - 0.001, WRAP_PERIOD_S + 0.001] * 2),
+        ([90.0, 20.0, 85.0, 10.0], 100.0, [90.0, 120.0, 185.0, 210.0]),
+    ],
+    ids=["rising", "small steps back", "streams beside a wrap", "two wraps"],
+)
+def test_unwrap_adds_a_period_at_each_wrap(stamps_s: list[float], period_s: float, expected_s: list[float]) -> None:
+    assert unwrapped(stamps_s, period_s) == expected_s
+
+
+def frame(number: int, timestamp_s: float) -> Frame:
+    nothing = np.zeros((1, 1), np.uint8)
+    pinhole = Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0)
+    return Frame(nothing.astype(np.float32), nothing, nothing, timestamp_s, number, pinhole)
+
+
+def passed_on(continuity: Continuity, numbers: range, zero_s: float, arrived_s: float) -> list[Frame]:
+    """Add a run at 30 frames/s whose number 0 is of `zero_s` (device clock); its first came at `arrived_s` (ours)."""
+    return [
+        continuity.add(frame(number, zero_s + number / 30), arrived_s + (number - numbers[0]) / 30)
+        for number in numbers
+    ]
+
+
+def test_continuity_passes_a_first_run_on_unchanged() -> None:
+    given = frame(7, 1.5)
+    assert Continuity().add(given, arrived_s=99.0) is given
+    continuity = Continuity()
+    continuity.restart(counted=0)  # after a run without frames
+    assert continuity.add(frame(4, 2.0), arrived_s=0.0).frame_number == 4
+
+
+@pytest.mark.parametrize("zero_s", [1009.0, 0.0, 500_000.0], ids=["host's clock", "restarted", "jumped"])
+def test_numbers_and_seconds_rise_together_over_an_outage(zero_s: float) -> None:
+    """The second run starts nine seconds after the first, whatever the device's clock says."""
+    continuity = Continuity()
+    before = passed_on(continuity, range(30), zero_s=1000.0, arrived_s=50.0)
+    continuity.restart(counted=0)
+    after = passed_on(continuity, range(30), zero_s, arrived_s=59.0)
+    for one, next_one in pairwise(before + after):
+        later = next_one.frame_number - one.frame_number
+        assert later > 0
+        assert (next_one.timestamp_s - one.timestamp_s) * 30 == pytest.approx(later, abs=0.01)
+    assert after[0].timestamp_s - before[0].timestamp_s == pytest.approx(9.0)
+    assert continuity.missed == after[0].frame_number - before[-1].frame_number - 1 == 240
+
+
+def test_continuity_counts_missed_numbers_once() -> None:
+    continuity = Continuity()
+    passed_on(continuity, range(1), zero_s=0.0, arrived_s=0.0)
+    continuity.restart(counted=20)
+    continuity.restart(counted=5)
+    passed_on(continuity, range(1), zero_s=1.0, arrived_s=1.0)
+    assert continuity.missed == 29 - 25
+
+
+@pytest.mark.parametrize(
+    ("device_s", "arrived_s", "number", "timestamp_s"),
+    [(0.0, 4 / 30, 5, 10 + 5 / 30), (19.3, 9.0, 279, 19.3)],
+    ids=["the next run follows at once", "the device's clock agrees with the host's"],
+)
+def test_continuity_splices_the_next_run(device_s: float, arrived_s: float, number: int, timestamp_s: float) -> None:
+    continuity = Continuity()
+    passed_on(continuity, range(5), zero_s=10.0, arrived_s=0.0)
+    continuity.restart(counted=0)
+    found = continuity.add(frame(0, device_s), arrived_s)
+    assert (found.frame_number, found.timestamp_s) == (number, pytest.approx(timestamp_s))

@@ -4,16 +4,21 @@ import tracemalloc
 from collections.abc import Callable, Iterable
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from nlos_calibration.geometry import Intrinsics
 from rosbags.rosbag1 import Reader
 
+from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording import BagReader, verify
+from nlos_cam.recording.bag_messages import ENCODINGS, lens_of, metadata, parse, pixels, pose_of, sdk_name
 from nlos_cam.recording.rosbag import CHUNK_LIMIT
 
 
@@ -32,10 +37,6 @@ def contents(bag: BagReader) -> dict[str, list[tuple[int, bytes]]]:
 def changed(source: Path, target: Path, edit: Callable[[bytes], bytes]) -> Path:
     target.write_bytes(edit(source.read_bytes()))
     return target
-
-
-def version_of(bag: BagReader) -> Any:
-    return bag.read("/file_version", bag.entries["/file_version"][0])
 
 
 def test_reader_reads_the_messages_that_rosbags_reads(bag: BagReader) -> None:
@@ -87,7 +88,7 @@ def test_reader_keeps_no_file_open_and_reports_its_loss(noise_bag: Path, tmp_pat
     path.unlink()
     bag._chunk_pos = -1
     with pytest.raises(RecordingError, match="No such file"):
-        version_of(bag)
+        bag.read("/file_version", bag.entries["/file_version"][0])
 
 
 def test_frames_come_in_recorded_order_and_by_index(bag: BagReader) -> None:
@@ -255,3 +256,85 @@ def test_reader_does_not_allocate_an_absurd_size(
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert peak < 2 * CHUNK_LIMIT
+
+
+def parsed_image(values: bytes = bytes(range(6))) -> Any:
+    """An image of 3 x 2 as librealsense writes it: the version of the format stands where ROS has the frame_id."""
+    header = struct.pack("<IIII", 7, 12, 345_678_901, 1) + b"0" + struct.pack("<III", 2, 3, 5)
+    raw = header + b"mono8\0" + struct.pack("<II", 3, len(values)) + values
+    return parse(memoryview(raw), "sensor_msgs/msg/Image")
+
+
+PINHOLE = Intrinsics(3, 2, 1.0, 1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    "changed", [{"width": 2}, {"width": 4}, {"height": 3}, {"width": 6, "step": 6}, {"encoding": "8UC1"}, {"step": 4}]
+)
+def test_pixels_refuses_an_image_that_contradicts_itself(changed: dict[str, object]) -> None:
+    image = parsed_image()
+    vars(image).update(changed)
+    with pytest.raises(ValueError, match=r"image|reshape"):
+        pixels(image, "mono8", PINHOLE)
+
+
+def test_pixels_skips_padding_of_rows() -> None:
+    image = parsed_image(bytes(range(10)))
+    image.step = 5
+    np.testing.assert_array_equal(pixels(image, "mono8", PINHOLE), [[0, 1, 2], [5, 6, 7]])
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_encodings_are_formats_of_the_sdk(encoding: str) -> None:
+    found = ENCODINGS[encoding]
+    assert found.sdk_format in load_sdk().format.__members__
+    bytes_per_pixel = found.channels * np.dtype(found.dtype).itemsize
+    values = np.arange(6 * bytes_per_pixel, dtype=np.uint8)
+    image = SimpleNamespace(encoding=encoding, width=3, height=2, step=3 * bytes_per_pixel, data=values)
+    result = pixels(image, encoding, PINHOLE)
+    assert result.shape == ((2, 3) if found.channels == 1 else (2, 3, found.channels))
+    assert result.tobytes() == values.tobytes()
+
+
+def test_sdk_name_gives_names_of_the_sdk() -> None:
+    for recorded, enumeration in (
+        ("Depth Units", "option"),
+        ("Min_Distance", "option"),
+        ("Hardware Clock", "timestamp_domain"),
+        ("Frame Laser Power", "frame_metadata_value"),
+        ("Brown Conrady", "distortion"),
+    ):
+        assert sdk_name(recorded) in getattr(load_sdk(), enumeration).__members__
+    assert sdk_name("Auto-Exposure Mode") == "auto_exposure_mode"
+
+
+def test_metadata_and_lens_are_parsed() -> None:
+    pairs = {"system_time": "15.25", "timestamp_domain": "System Time", "Frame Counter": "169"}
+    found = metadata([SimpleNamespace(key=key, value=value) for key, value in pairs.items()])
+    assert (found.domain, found.values) == ("system_time", {"system_time": 15.25, "frame_counter": 169.0})
+    assert not metadata([]).domain
+    model, coefficients = lens_of(SimpleNamespace(distortion_model="Brown Conrady", D=[0.1, 0.2, 0.3, 0.4, 0.5]))
+    assert (model, list(coefficients)) == ("brown_conrady", [0.1, 0.2, 0.3, 0.4, 0.5])
+
+
+SHIFT_M = 0.1, 0.2, -0.3
+
+
+def transform(*quaternion: float) -> SimpleNamespace:
+    rotation, shift = (SimpleNamespace(**dict(zip("xyzw", values, strict=False))) for values in (quaternion, SHIFT_M))
+    return SimpleNamespace(rotation=rotation, translation=shift)
+
+
+def test_pose_of_accepts_either_sign_of_a_quaternion() -> None:
+    axis, angle = np.array([0.6, 0.0, -0.8]), 0.7
+    expected = np.eye(4)
+    expected[:3, :3], expected[:3, 3] = cv2.Rodrigues(axis * angle)[0], SHIFT_M
+    quaternion = np.append(np.sin(angle / 2) * axis, np.cos(angle / 2))
+    for sign in (1.0, -1.0):
+        np.testing.assert_allclose(pose_of(transform(*(sign * quaternion))), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0), (float("nan"), 0.0, 0.0, 1.0)])
+def test_pose_of_refuses_a_quaternion_not_of_unit_length(quaternion: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="quaternion"):
+        pose_of(transform(*quaternion))

@@ -104,12 +104,6 @@ def test_interrupted_take_keeps_frames_and_is_the_last(run: Run, tmp_path: Path)
     assert not (tmp_path / "1.bag").exists()
 
 
-def test_take_interrupted_while_read_back_is_kept(run: Run) -> None:
-    (take,) = run(frames=4, read_back=lambda _: None)
-    assert (take.state, saved_state(take), take.verified, take.error) == ("interrupted", "interrupted", None, None)
-    assert verify(take.target.path).frames == 4
-
-
 def test_take_of_a_vanishing_camera_is_whole(run: Run, world: Any) -> None:
     world.vanishes_at = 8
     (take,) = run(count=2, frames=500)
@@ -118,23 +112,19 @@ def test_take_of_a_vanishing_camera_is_whole(run: Run, world: Any) -> None:
     assert take.verified.frames == 8
 
 
-def test_take_without_a_frame_leaves_no_file(session: Any, world: Any, tmp_path: Path) -> None:
+def test_take_without_a_frame_or_a_start_leaves_no_file(session: Any, world: Any, tmp_path: Path) -> None:
+    def fail(_: Any) -> None:
+        raise CameraLostError("sim does not start: replug it")
+
+    takes, camera = session()
+    camera._prepare = fail
+    with pytest.raises(CameraLostError, match="does not start"):
+        list(takes.record(Event(), print))
+    assert list(tmp_path.iterdir()) == []
     takes, _ = session()
     world.vanishes_at = 0
     (take,) = [finalize(take, verify) for take in takes.record(Event(), print)]
     assert (take.state, take.sets, take.verified) == ("lost", 0, None)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_camera_that_does_not_start_leaves_no_file(session: Any, tmp_path: Path) -> None:
-    takes, camera = session()
-
-    def fail(_: Any) -> None:
-        raise CameraLostError("sim does not start: replug it")
-
-    camera._prepare = fail
-    with pytest.raises(CameraLostError, match="does not start"):
-        list(takes.record(Event(), print))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -168,6 +158,17 @@ def test_take_whose_file_cannot_be_closed_is_not_read_back(run: Run, monkeypatch
     assert (summary.frames, summary.frames_seen) == (None, 4)
 
 
+def test_take_whose_reading_back_fails_is_damaged_and_if_interrupted_kept(run: Run) -> None:
+    def read_back(path: Path) -> VerifyResult:
+        raise RecordingError(f"{path} is cut short")
+
+    (take,) = run(frames=5, read_back=read_back)
+    assert (take.state, str(take.error)) == ("damaged", f"{take.target.path} is cut short")
+    (take,) = run(frames=4, read_back=lambda _: None)
+    assert (take.state, saved_state(take), take.verified, take.error) == ("interrupted", "interrupted", None, None)
+    assert verify(take.target.path).frames == 4
+
+
 @pytest.mark.slow
 def test_take_with_missing_frames_in_its_file_is_damaged(run: Run) -> None:
     (take,) = run(frames=5, read_back=lambda _: VerifyResult(3, 0, 0.1, {}))
@@ -179,14 +180,6 @@ def test_take_with_missing_frames_in_its_file_is_damaged(run: Run) -> None:
         assert take.state == state
     takes = run(count=2, frames=5, read_back=lambda _: VerifyResult(4, 0, 0.1, {}))
     assert [take.state for take in takes] == ["damaged", "complete"]  # a first set may have been on its way
-
-
-def test_take_that_cannot_be_read_back_is_damaged(run: Run) -> None:
-    def read_back(path: Path) -> VerifyResult:
-        raise RecordingError(f"{path} is cut short")
-
-    (take,) = run(frames=5, read_back=read_back)
-    assert (take.state, str(take.error)) == ("damaged", f"{take.target.path} is cut short")
 
 
 def test_closing_between_takes_stops_the_camera(session: Any, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from nlos_cam.recording import BagReader, ExportOptions, ReplayCamera, export_re
 from nlos_cam.recording.rosbag import MAGIC, pack_chunk_head, pack_file_header, pack_record
 
 OWN_TYPES = ("Depth_0/info/camera_info", "sensor_msgs/CameraInfo"), ("/device_0/info", "diagnostic_msgs/KeyValue")
+HUGE = struct.pack("<II", 30_000, 30_000)
 Change = Callable[[Bag], None]
 
 
@@ -59,22 +60,9 @@ def line_of(act: Callable[[], object]) -> str:
     return ""
 
 
-def with_type(bag: Bag, ending: str, kind: str) -> None:
-    number = topic(bag, ending)
-    bag.topics[number] = bag.topics[number][0], kind
-
-
 def with_data(bag: Bag, ending: str, change: Callable[[bytes], bytes]) -> None:
     number = topic(bag, ending)
     bag.messages = [replace(m, data=change(m.data)) if m.connection == number else m for m in bag.messages]
-
-
-def huge_camera(data: bytes) -> bytes:
-    return data[:16] + struct.pack("<II", 30_000, 30_000) + data[24:]
-
-
-def pair(key: str, value: str) -> bytes:
-    return b"".join(len(text).to_bytes(4, "little") + text.encode() for text in (key, value))
 
 
 def test_whole_recording_stays_whole_when_written_again(crafted: Callable[[Change], Path]) -> None:
@@ -88,7 +76,11 @@ def test_whole_recording_stays_whole_when_written_again(crafted: Callable[[Chang
 def test_message_of_another_type_is_refused_in_a_line(
     crafted: Callable[[Change], Path], ending: str, kind: str
 ) -> None:
-    path = crafted(lambda bag: with_type(bag, ending, kind))
+    def change(bag: Bag) -> None:
+        number = topic(bag, ending)
+        bag.topics[number] = bag.topics[number][0], kind
+
+    path = crafted(change)
     if (ending, kind) in OWN_TYPES:
         use(path)
         return
@@ -100,7 +92,7 @@ def test_message_of_another_type_is_refused_in_a_line(
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        (lambda bag: with_data(bag, "Depth_0/info/camera_info", huge_camera), "30000 x 30000"),
+        (lambda bag: with_data(bag, "Depth_0/info/camera_info", lambda d: d[:16] + HUGE + d[24:]), "30000 x 30000"),
         (lambda bag: with_data(bag, "Depth_0/image/data", lambda data: data[:-9]), "sequence length"),
         (lambda bag: bag.topics.update({999: bag.topics[topic(bag, "Depth_0/image/data")]}), ""),
         (lambda bag: bag.topics.update(dict.fromkeys(range(500, 20_000), ("/x", "std_msgs/String"))), "topics"),
@@ -161,8 +153,9 @@ def test_export_ignores_a_sidecar_that_is_none(crafted: Callable[[Change], Path]
 
 
 def test_texts_of_a_device_are_printable_and_bounded(crafted: Callable[[Change], Path]) -> None:
-    text = "\x1b[2Jname\n" + "x" * 10_000
-    path = crafted(lambda bag: with_data(bag, "/device_0/info", lambda _: pair("Name", text)))
+    text = b"\x1b[2Jname\n" + b"x" * 10_000
+    pair = b"\4\0\0\0Name" + struct.pack("<I", len(text)) + text
+    path = crafted(lambda bag: with_data(bag, "/device_0/info", lambda _: pair))
     (value,) = BagReader(path).device.values()
     assert value.isprintable()
     assert len(value) <= 200

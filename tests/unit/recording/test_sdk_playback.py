@@ -180,14 +180,10 @@ MESSAGE = r"nlos-cam repair"
 LOAD = "nlos_cam.recording.sdk_playback.load_sdk"
 
 
-@pytest.fixture
-def untouched_sdk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fail a test that gives a file to librealsense."""
+def test_sdk_is_never_given_a_damaged_or_cut_file(
+    damaged: Path, noise_bag_uncompressed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(LOAD, lambda: SimpleNamespace(context=lambda: pytest.fail("the SDK was given the file")))
-
-
-@pytest.mark.usefixtures("untouched_sdk")
-def test_sdk_is_never_given_a_damaged_or_cut_file(damaged: Path, noise_bag_uncompressed: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=rf"\d+\.\d s .*{MESSAGE}"):
         SdkReplayCamera(damaged)
     content, path = bytearray(noise_bag_uncompressed.read_bytes()), tmp_path / "damaged.bag"

@@ -2,7 +2,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from nlos_calibration.errors import RecordFileError
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording import TEMPERATURE_INTERVAL_S, SidecarFile, VerifyResult, load_sidecar, sidecar_path
-from nlos_cam.recording.quality import Quality
+from nlos_cam.recording.quality import MIN_PAIRS, Quality, QualityMeter
 from nlos_cam.recording.sidecar import load_measured_wall, summary_of, versions
 
 PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
@@ -60,14 +60,6 @@ def test_sidecar_exists_from_the_start_of_a_recording(path: Path) -> None:
     assert (fields["label"], fields["camera"], fields["started"][-1]) == ("a cup", "l515", "Z")
 
 
-def test_sidecar_takes_settings_from_the_first_frame(path: Path) -> None:
-    sidecar = SidecarFile(path, Warm())
-    sidecar.on_frame(frame(5.0, laser_power=31.0))
-    sidecar.on_frame(frame(5.1, laser_power=99.0))
-    sidecar.finish("complete", summary_of(READ, SEEN, {}))
-    assert load_sidecar(path).settings == {"laser_power": 31.0}
-
-
 def test_sidecar_samples_temperatures_over_device_time(path: Path) -> None:
     sidecar = SidecarFile(path, Warm())
     for number in range(900):
@@ -97,10 +89,13 @@ def test_sidecar_thins_a_long_series_evenly(path: Path, monkeypatch: pytest.Monk
     assert len(set(np.diff(times).tolist())) == 1
 
 
-def test_sidecar_ends_with_a_state_and_a_summary(path: Path) -> None:
-    SidecarFile(path, Warm()).finish("lost", expected := summary_of(READ, SEEN, {"restarted": 1}))
+def test_sidecar_ends_with_the_first_frames_settings_a_state_and_a_summary(path: Path) -> None:
+    sidecar = SidecarFile(path, Warm())
+    sidecar.on_frame(frame(5.0, laser_power=31.0))
+    sidecar.on_frame(frame(5.1, laser_power=99.0))
+    sidecar.finish("lost", expected := summary_of(READ, SEEN, {"restarted": 1}))
     found = load_sidecar(path)
-    assert (found.state, found.summary) == ("lost", expected)
+    assert (found.state, found.summary, found.settings) == ("lost", expected, {"laser_power": 31.0})
     assert (expected.frames, expected.dropped, expected.frames_per_s) == (9, 2, 16.0)
     assert (expected.saturated_share, expected.temporal_noise_mm, expected.events) == (0.25, 1.5, {"restarted": 1})
 
@@ -170,8 +165,74 @@ def test_load_sidecar_refuses_other_files_in_one_line(path: Path, content: bytes
     assert sidecar_path(path.with_suffix(".bag")) == path
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(RecordingError, match=r"a\.json") as raised:
-        load_sidecar(path)
-    assert "\n" not in str(raised.value)
-    with pytest.raises(RecordingError, match=path.parent.name):
-        load_sidecar(path.parent)
+    for other in (path, path.parent):
+        with pytest.raises(RecordingError, match=other.name) as raised:
+            load_sidecar(other)
+        assert "\n" not in str(raised.value)
+
+
+FRAMES = 60
+
+
+def noisy(sigma_mm: float = 1.0, count: int = FRAMES, seed: int = 0) -> list[Frame]:
+    """Make frames of a flat scene at 0.3 m with Gaussian noise in depth."""
+    generator = np.random.default_rng(seed)
+    depth_m = (0.3 + generator.normal(0.0, sigma_mm / 1e3, (count, 48, 64))).astype(np.float32)
+    return [Frame(depth_m[number], DARK, DARK, 1e9 + number / 30, number, PINHOLE) for number in range(count)]
+
+
+def quality_of(frames: list[Frame]) -> Quality:
+    meter = QualityMeter()
+    for frame in frames:
+        meter.add(frame)
+    return meter.quality()
+
+
+@pytest.mark.parametrize("sigma_mm", [0.0, 0.3, 1.0, 8.0])
+def test_noise_is_the_known_standard_deviation(sigma_mm: float) -> None:
+    assert quality_of(noisy(sigma_mm)).temporal_noise_mm == pytest.approx(sigma_mm, rel=0.04, abs=0.0)
+
+
+@pytest.mark.parametrize("change", ["push", "drift"])
+def test_noise_ignores_a_push_and_a_slow_drift(change: str) -> None:
+    frames = noisy()
+    for frame in frames:
+        number = frame.frame_number
+        frame.depth_m[:] += np.float32((0.1 if number > 30 else 0.0) if change == "push" else 0.0005 * number)
+    assert quality_of(frames).temporal_noise_mm == pytest.approx(quality_of(noisy()).temporal_noise_mm, rel=0.02)
+
+
+@pytest.mark.parametrize(("spoil", "tolerance"), [("moves", 0.1), ("invalid", 0.04)])
+def test_noise_ignores_moving_and_invalid_parts(spoil: str, tolerance: float) -> None:
+    frames = noisy()
+    for frame in frames:
+        odd = frame.frame_number % 2
+        if spoil == "moves":
+            frame.depth_m[:, : 4 * (1 + odd)] += np.float32(0.2)
+        else:
+            frame.depth_m[:10] = frame.depth_m[10 + odd] = np.nan  # never valid; never twice in a row
+    assert quality_of(frames).temporal_noise_mm == pytest.approx(1.0, rel=tolerance)
+
+
+@pytest.mark.parametrize("spoil", ["too few", "all invalid", "nothing twice"])
+def test_noise_is_none_where_too_little_is_valid(spoil: str) -> None:
+    frames = noisy(count=MIN_PAIRS if spoil == "too few" else FRAMES)
+    for frame in frames:
+        if spoil == "all invalid" or (spoil == "nothing twice" and frame.frame_number % 2):
+            frame.depth_m[:] = np.nan
+    assert quality_of(frames).temporal_noise_mm is None
+
+
+def test_jitter_is_the_spread_of_intervals() -> None:
+    on_time = [frame for frame in noisy() if frame.frame_number % 7]  # some are missing
+    assert quality_of(on_time).jitter_ms == pytest.approx(0.0, abs=1e-3)
+    late = [replace(frame, timestamp_s=frame.timestamp_s + 0.002 * (frame.frame_number % 2)) for frame in noisy()]
+    assert quality_of(late).jitter_ms == pytest.approx(2.0, rel=0.01)
+
+
+def test_quality_of_no_frame_and_of_one_has_no_spread() -> None:
+    assert astuple(quality_of([])) == (0, None, None, None, None, None)
+    found = quality_of(noisy(count=1))
+    assert (found.frames_seen, found.saturated_share, found.invalid_share) == (1, 0.0, 0.0)
+    assert found.temporal_noise_mm is None
+    assert found.jitter_ms is None

@@ -1,0 +1,245 @@
+"""Files of rigs, measured walls and their references: read as written, or refused with the field at fault."""
+
+import hashlib
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from nlos_calibration.errors import RecordFileError
+from nlos_calibration.geometry import Intrinsics, normal_from_angles, wall_from_plane
+from nlos_calibration.occluder import OccluderFit
+from nlos_calibration.reference import BareWall, BareWallStatistics, Moments, load_reference, save_reference
+from nlos_calibration.rig import ObjectBox, Occluder, dump_toml, load_rig
+from nlos_calibration.wall import fit_wall, wall_depth
+from nlos_calibration.wall_record import VERSION, WallRecord, load_measured, load_wall, new_wall_record, with_occluder
+
+PINHOLE = Intrinsics(160, 120, 114.0, 115.0, 80.5, 59.0)
+EXAMPLE = Path(__file__).parents[3] / "calibration/records/wall.toml"
+SMALL = Intrinsics(16, 12, 11.4, 11.5, 7.5, 5.5)
+SHAPE, CELLS, FRAMES = (12, 16), (64, 80), 20
+
+
+@pytest.fixture
+def record() -> WallRecord:
+    pose = wall_from_plane(normal_from_angles(np.radians(40.0), np.radians(3.0)), 0.21)
+    fit = fit_wall(wall_depth(pose, PINHOLE), PINHOLE, np.random.default_rng(0))
+    return new_wall_record(fit, PINHOLE, camera="l515:f0246262", frames=60, created=date(2026, 1, 31))
+
+
+def written(folder: Path, record: WallRecord) -> Path:
+    path = folder / "wall.toml"
+    path.write_text(dump_toml(record), encoding="utf-8")
+    return path
+
+
+def test_paper_rig_is_that_of_the_paper_and_bare_wall_without_its_bench() -> None:
+    rig, bare = load_rig("paper-rig"), load_rig("bare-wall")
+    assert rig.wall_from_lidar[2, 3] == 0.2
+    assert rig.facing_deg == pytest.approx(45.0)
+    assert (rig.occluder.x_m, rig.occluder.z_min_m) == (0.2, 0.1)
+    rays = rig.pinhole.scaled(2, 2)
+    width_deg, height_deg = (2 * np.degrees(np.arctan(1 / f)) for f in (rays.fx, rays.fy))
+    assert (width_deg, height_deg) == (pytest.approx(70.0, abs=1e-3), pytest.approx(55.0, abs=1e-3))
+    assert bare.occluder is bare.object_box is None
+    np.testing.assert_array_equal(bare.wall_from_lidar, rig.wall_from_lidar)
+
+
+@pytest.mark.parametrize("name", ["paper-rig", "bare-wall"])
+def test_rig_and_its_checksum_survive_a_file(tmp_path: Path, name: str) -> None:
+    rig = load_rig(name)
+    (tmp_path / "rig.toml").write_text(dump_toml(rig), encoding="utf-8")
+    again = load_rig(tmp_path / "rig.toml")
+    assert (again, again.checksum) == (rig, rig.checksum)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("distance_m = 0.2", "distance_m = -0.2", r"lidar.distance_m: .*\(got "),
+        ("yaw_deg = 45.0", "yaw_degrees = 45.0", "lidar.yaw_deg: is missing"),
+        ("x_max_m = 0.575", "x_max_m = 0.1", r"object_box: .*x_min_m < x_max_m .*\(got .*x_max_m = 0.1"),
+        ("z_far_m = 0.4", "z_far_m = 0.1", r"object_box: .*z_near_m < z_far_m \(got z_near_m = .*, z_far_m = 0.1\)"),
+        ('name = "paper-rig"', 'name = "paper-rig"\nroof = 1', r"roof: .*\(got "),
+    ],
+)
+def test_rig_file_error_names_the_field(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = dump_toml(load_rig("paper-rig"))
+    assert old in text
+    path = tmp_path / "rig.toml"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(RecordFileError, match=message):
+        load_rig(path)
+
+
+@pytest.mark.parametrize("name", ["no-such-rig", "."])
+def test_rig_that_does_not_exist_is_refused(name: str) -> None:
+    with pytest.raises(RecordFileError):
+        load_rig(name)
+
+
+def test_wall_record_survives_a_file(tmp_path: Path, record: WallRecord) -> None:
+    others = {
+        "serial": "f0246262",
+        "firmware": "1.5.8.1",
+        "settings": {"laser_power": 80.0},
+        "reference": "wall.npz",
+        "reference_sha256": "0" * 64,
+        "range_offset_m": -0.0045,
+        "range_offset_std_m": 0.0005,
+    }
+    box = ObjectBox(x_min_m=0.3, x_max_m=0.5, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.15, z_far_m=0.3)
+    rig = record.rig.model_copy(update={"occluder": Occluder(x_m=0.25, z_min_m=0.08), "object_box": box})
+    for one in (record, record.model_copy(update=others), record.model_copy(update={"rig": rig})):
+        assert load_wall(written(tmp_path, one)) == one
+
+
+def test_wall_record_rig_is_the_papers_as_measured(record: WallRecord) -> None:
+    paper = load_rig("paper-rig")
+    assert record.rig.pinhole == PINHOLE
+    np.testing.assert_allclose(record.rig.wall_from_lidar, record.wall_from_lidar, atol=1e-9)
+    assert (record.rig.occluder, record.rig.object_box) == (paper.occluder, paper.object_box)
+    moved = paper.model_copy(update={"lidar": paper.lidar.model_copy(update={"distance_m": 0.201})})
+    assert len({record.rig.checksum, paper.checksum, moved.checksum}) == 3
+
+
+def test_with_occluder_doubts_a_sheet_too_near_or_beside_an_object_until_measured_again(record: WallRecord) -> None:
+    fit = OccluderFit(0.2, 1e-4, 0.03, 1e-3, 0.0, 0.1, 0.0, 0.0, 1e-4, np.zeros((2, 2), np.bool_), ("a stray",))
+    first = with_occluder(record.model_copy(update={"verdict": "doubtful", "advice": "average more frames"}), fit)
+    assert first.verdict == "doubtful"
+    assert first.advice.startswith("average more frames; ")
+    assert "0.030 m" in first.advice
+    good = replace(fit, gap_m=0.1)
+    again = with_occluder(first, good)
+    assert (again.advice, again.warnings) == ("average more frames", ("a stray",))
+    polluted = with_occluder(record, replace(good, doubt="an object seems to be hidden"))
+    assert polluted.verdict == "doubtful"
+    assert "do not use" in polluted.advice
+    assert with_occluder(polluted, good).verdict == with_occluder(record, good).verdict == "good"
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_load_wall_makes_an_old_version_the_newest(tmp_path: Path, version: int) -> None:
+    old = load_wall(Path(__file__).parent / f"wall_v{version}.toml")
+    assert (round(old.distance_m, 6), old.frames, old.verdict) == (0.2, 60, "good")
+    assert (old.temperatures_c, old.footprint_share, old.occluder) == ({}, None, None)
+    if version == 1:
+        assert old.distance_std_m is old.range_offset_std_m is old.noise_scale is None
+        assert (old.serial, old.settings, old.reference, old.range_offset_m) == ("", {}, "", 0.0)
+    else:
+        assert old.noise_scale == 1.0023135540076475
+    assert old.schema_version == VERSION
+    path = written(tmp_path, old)
+    assert f"schema_version = {VERSION}" in path.read_text(encoding="utf-8")
+    assert load_wall(path) == old
+
+
+MATRIX_END = "0.0,\n        0.0,\n        0.0,\n        "
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("schema_version = 3", "schema_version = 4", "3.*got 4"),
+        ("schema_version = 3", "schema_version = 0", "schema_version: .*got 0"),
+        ('reference_sha256 = ""', 'reference_sha256 = "abc"', "reference_sha256: .*got 'abc'"),
+        ("frames = 60", "frames = 60\nmood = 1", "mood: .*got 1"),
+        ("pitch_deg = ", "pitch_deg = 1", r"rig\.lidar"),
+        ("\ndistance_m = 0.2", "\ndistance_m = 0.3", r"rig\.lidar"),
+        (f"{MATRIX_END}1.0", f"{MATRIX_END}2.0", "pose"),
+    ],
+)
+def test_load_wall_error_names_field_and_value(
+    tmp_path: Path, record: WallRecord, old: str, new: str, problem: str
+) -> None:
+    path = written(tmp_path, record)
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(RecordFileError, match=problem) as caught:
+        load_wall(path)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == 4
+
+
+@pytest.mark.parametrize("content", [b"", b"frames = ", b"\x00\xff", b"distance_m = 0.2"])
+def test_load_wall_of_another_kind_of_file_or_of_none_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "wall.toml"
+    path.write_bytes(content)
+    for read, word in ((path, r"wall\.toml"), (tmp_path / "none.toml", "calibrate --wall"), (tmp_path, tmp_path.name)):
+        with pytest.raises(RecordFileError, match=word):
+            load_wall(read)
+
+
+def test_load_wall_reads_the_worked_example() -> None:
+    example = load_wall(EXAMPLE)
+    assert example.verdict == "good"
+    assert example.distance_m == pytest.approx(0.2, abs=1e-3)
+    assert example.facing_deg == pytest.approx(45.0, abs=0.2)
+
+
+@pytest.fixture
+def wall() -> BareWall:
+    generator = np.random.default_rng(0)
+    statistics = BareWallStatistics(SMALL)
+    for _ in range(FRAMES):
+        depth_m = (0.2 + 0.001 * generator.standard_normal(SHAPE)).astype(np.float32)
+        ir = generator.integers(40, 50, SHAPE).astype(np.uint8)
+        ir[0, 0], depth_m[0, 1] = 255, np.nan
+        statistics.add(depth_m, ir, np.full(CELLS, 0.2, np.float32), np.full(CELLS, 45, np.float32))
+    for celsius in (30.0, 32.0):
+        statistics.add_temperatures({"ldd_temperature": celsius})
+    statistics.add_temperatures({})
+    return statistics.reference(np.ones(SHAPE, np.bool_), serial="f1", settings={"laser_power": 40.0})
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e3), st.integers(2, 40))
+def test_moments_are_those_of_all_samples_together(offset: float, scale: float, count: int) -> None:
+    samples = offset + scale * np.random.default_rng(count).standard_normal((count, 3, 2))
+    moments = Moments((3, 2))
+    for values in samples:
+        moments.add(values)
+    np.testing.assert_allclose(moments.mean(), samples.mean(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(moments.spread(), samples.std(axis=0, ddof=1), rtol=1e-6)
+
+
+def test_moments_leave_out_nan() -> None:
+    moments = Moments((1, 2))
+    for values in ([1.0, np.nan], [3.0, np.nan], [np.nan, 5.0]):
+        moments.add(np.array([values]))
+    np.testing.assert_array_equal(moments.mean(), [[2.0, 5.0]])
+    np.testing.assert_array_equal(moments.spread(), [[np.sqrt(2.0), np.nan]])
+
+
+def test_reference_holds_means_saturation_and_temperatures_and_survives_a_file(tmp_path: Path, wall: BareWall) -> None:
+    assert wall.frames == FRAMES
+    assert wall.saturated[0, 0] == wall.saturated.sum() == 1.0
+    assert np.isnan(wall.depth_m[0, 1])
+    assert abs(np.nanmean(wall.depth_m) - 0.2) < 3 * 0.001 / np.sqrt(FRAMES * wall.depth_m.size)
+    assert wall.celsius == {"ldd_temperature": 31.0}
+    assert wall.celsius_span == {"ldd_temperature": 2.0}
+    path = tmp_path / "wall.npz"
+    read = load_reference(path, save_reference(path, wall))
+    for name, value in vars(wall).items():
+        np.testing.assert_equal(getattr(read, name), value)
+
+
+def test_load_measured_needs_the_very_reference_that_its_record_names(
+    tmp_path: Path, record: WallRecord, wall: BareWall
+) -> None:
+    assert load_measured(written(tmp_path, record)).reference is None
+    beside = tmp_path / "wall.npz"
+    named = {"reference": "wall.npz", "reference_sha256": save_reference(beside, wall)}
+    path = written(tmp_path, record.model_copy(update=named))
+    assert load_measured(path).reference.frames == wall.frames
+    beside.write_bytes(beside.read_bytes() + b"!")
+    for _ in range(2):  # another checksum, then no file
+        with pytest.raises(RecordFileError, match=r"wall\.npz"):
+            load_measured(path)
+        beside.unlink(missing_ok=True)
+    np.savez(beside, depth_m=np.zeros(3))  # of another kind
+    with pytest.raises(RecordFileError, match=r"wall\.npz"):
+        load_reference(beside, hashlib.sha256(beside.read_bytes()).hexdigest())
