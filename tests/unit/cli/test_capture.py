@@ -83,8 +83,7 @@ def test_capture_numbers_and_labels_takes(run: Run, tmp_path: Path, out: str) ->
     for number, (take, label) in enumerate(zip(found["takes"], labels[1::2], strict=True), start=1):
         path = tmp_path / f"a-0{number}.bag"
         assert (take["out"], take["label"], take["frames"]) == (str(path), label, 4)
-        assert verify(path).frames == 4
-        assert load_sidecar(path.with_suffix(".json")).label == label
+        assert (verify(path).frames, load_sidecar(path.with_suffix(".json")).label) == (4, label)
     found = run("--takes", "2", "--frames", "2", "--label", "cup", "--out", str(tmp_path / "b.bag"))
     assert [take["label"] for take in found["takes"]] == ["cup", "cup"]
 
@@ -202,14 +201,11 @@ def take(path: str, **changes: Any) -> CaptureResult:
     return CaptureResult(**values | {"sidecar": SimpleNamespace(path=Path("a.json"))} | changes)
 
 
-def test_result_holds_the_fields_of_one_take(out: str) -> None:
+def test_result_holds_the_fields_of_one_take_and_totals_of_several(out: str) -> None:
     found = result_of([take(out, target=CaptureTarget(Path(out), "a cup"))], several=False)
     shares = {"saturated_share": 0.001, "invalid_share": 0.25, "temporal_noise_mm": 1.234}
     named = {"out": out, "state": "complete", "streams": STREAMS, "sidecar": "a.json", "label": "a cup"}
     assert found == {"frames": 30, "dropped": 1, "seconds": 1.0, **shares, **named}
-
-
-def test_result_of_several_takes_has_totals(out: str) -> None:
     found = result_of([take(out), take(out)], several=True)
     assert [one["frames"] for one in found["takes"]] == [30, 30]
     assert (found["frames"], found["dropped"], found["seconds"]) == (60, 2, 2.0)

@@ -81,16 +81,11 @@ def test_paths_of_the_users_file_are_relative_to_it(folders: tuple[Path, Path]) 
     assert settings["camera"].value == f"sim:{folders[1] / 'scene.toml'}"
 
 
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [
-        ('camrea = "sim"', "Did you mean 'camera'"),
-        ("view_port = 0", "65535"),
-        ('view_port = "9090"', "whole number"),
-        ("camera = 3", "text"),
-        ("camera = ", "TOML"),
-    ],
-)
+WRONG = {'camrea = "sim"': "Did you mean 'camera'", "camera = 3": "text", "camera = ": "TOML"}
+WRONG |= {"view_port = 0": "65535", 'view_port = "9090"': "whole number"}
+
+
+@pytest.mark.parametrize(("text", "word"), WRONG.items())
 def test_wrong_file_is_refused_with_its_name(folders: tuple[Path, Path], text: str, word: str) -> None:
     (folders[0] / FILE).write_text(text, encoding="utf-8")
     with pytest.raises(RecordingError, match=word) as caught:

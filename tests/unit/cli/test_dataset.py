@@ -85,11 +85,14 @@ def test_build_in_color_is_noted_as_simulation_only(tmp_path: Path, built: Run) 
     assert "textures" in built(tmp_path, code=4)["error"]["message"]
 
 
-def test_build_takes_rig_and_sensor_of_scene(tmp_path: Path) -> None:
+def test_build_takes_rig_and_sensor_of_scene_and_hides_meshes_of_folder(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text('name = "s"\nrig = "paper-rig"\n[sensor]\nambient_counts = 20.0\n', encoding="utf-8")
-    assert _build(tmp_path / "d", "--scene", str(scene)) == 0
-    assert open_dataset(tmp_path / "d").plan.sensor.ambient_counts == 20
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.stl")
+    assert _build(tmp_path / "d", "--scene", str(scene), "--objects", str(tmp_path)) == 0
+    plan = open_dataset(tmp_path / "d").plan
+    assert plan.sensor.ambient_counts == 20
+    assert [name for name, _ in plan.objects.meshes] == ["cube.stl"]
 
 
 def test_build_reports_damaged_shard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,12 +104,6 @@ def test_build_reports_damaged_shard(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert shard.name in captured.err
     assert json.loads(captured.out)["damaged"] == [str(shard)]
     assert len(read_head(shard).seeds) == 4
-
-
-def test_build_hides_meshes_of_folder(tmp_path: Path) -> None:
-    trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.stl")
-    assert _build(tmp_path / "d", "--objects", str(tmp_path)) == 0
-    assert [name for name, _ in open_dataset(tmp_path / "d").plan.objects.meshes] == ["cube.stl"]
 
 
 def test_build_without_ray_names_the_extra(tmp_path: Path, built: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,10 @@
-"""`evaluate` writes report, figures and pictures of weights on the test set, on seeded objects or on a dataset."""
+"""`evaluate` judges weights on objects or a dataset; `tradeoff` measures settings, and keeps its rows at Ctrl-C."""
 
 import json
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,15 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration import load_rig
-from nlos_models import MapSet
+from nlos_models import CheckpointRecord, MapSet, Recipe
 from small_maps import SmallDataset
 
+from nlos_cam import evaluate
 from nlos_cam.cli.main import main
 from nlos_cam.dataset import HELD_OUT_SEED, TRAINING_SEED, DatasetPlan, procedural_images
-from nlos_cam.evaluate import TARGETS, baselines, report, subjects
+from nlos_cam.evaluate import TARGETS, baselines, measure_renders, render_settings, report, runtime_tradeoff, subjects
 from nlos_cam.objects import benchmark_objects
+from nlos_cam.render import STOPS, Scene, paper_scene, render
 
 RIG = load_rig("paper-rig")
+Patch, Run = pytest.MonkeyPatch, Callable[..., Any]
 STORED = ["--dataset", "held-out", "--training", "held-out"]
 
 
@@ -59,7 +65,7 @@ class Stored(SmallDataset):
 
 
 @pytest.fixture(autouse=True)
-def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
+def guessing(monkeypatch: Patch) -> list[DatasetPlan]:
     """A guesser as weights, a dataset, and training objects that are not rendered; their plans are kept."""
     asked: list[DatasetPlan] = []
 
@@ -75,7 +81,7 @@ def guessing(monkeypatch: pytest.MonkeyPatch) -> list[DatasetPlan]:
 
 
 @pytest.fixture
-def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+def judge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
     def call(*options: str, code: int = 0) -> Any:
         assert main(["evaluate", "--out", str(tmp_path / "figures"), *options, "--json"]) == code
         return json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -83,10 +89,8 @@ def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Any
     return call
 
 
-def test_evaluate_writes_figures_of_dataset_beside_baselines(
-    tmp_path: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    result, out = run(*STORED), tmp_path / "figures"
+def test_evaluate_writes_figures_of_dataset_beside_baselines(tmp_path: Path, judge: Run, monkeypatch: Patch) -> None:
+    result, out = judge(*STORED), tmp_path / "figures"
     assert {*TARGETS, "baselines", "per_category", "objects", "seconds", "out"} < set(result)
     assert (result["objects"], result["training_objects"]) == (3, 3)
     assert set(result["baselines"]) == {"all_background", "mean_object", "nearest_neighbour"}
@@ -96,29 +100,24 @@ def test_evaluate_writes_figures_of_dataset_beside_baselines(
     assert ["cup" in note for note in result["notes"]] == [True]
     assert json.loads((out / "figures.json").read_text("utf-8")) == {k: v for k, v in result.items() if k != "out"}
     assert "\nhat 1," in (out / "objects.csv").read_text("utf-8")
-    assert run(*STORED, code=1)["error"]["type"] == "OutputExistsError"
+    assert judge(*STORED, code=1)["error"]["type"] == "OutputExistsError"
     monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
-    run(*STORED, "--overwrite")
+    judge(*STORED, "--overwrite")
 
 
 @pytest.mark.slow
-def test_evaluate_uses_test_set_without_dataset(
-    run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, guessing: list[DatasetPlan]
-) -> None:
+def test_evaluate_uses_test_set_without_dataset(judge: Run, monkeypatch: Patch, guessing: list[DatasetPlan]) -> None:
     monkeypatch.setattr(subjects, "benchmark_objects", lambda box: benchmark_objects(box)[:2])
-    result = run()
+    result = judge()
     assert (result["objects"], result["rig"], guessing[0].rig) == (2, RIG.name, RIG)
     assert list(result["per_category"]) == [benchmark_objects(DatasetPlan(RIG, 0).box)[0].category]
     assert "nearest_neighbour" in result["baselines"]
 
 
-def test_evaluate_count_uses_seeded_objects(
-    run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, guessing: list[DatasetPlan]
-) -> None:
+def test_evaluate_count_uses_seeded_objects(judge: Run, monkeypatch: Patch, guessing: list[DatasetPlan]) -> None:
     monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
-    result = run("--count", "1", "--no-nearest")
-    assert result["objects"] == 1
-    assert set(result["baselines"]) == {"all_background", "mean_object"}
+    result = judge("--count", "1", "--no-nearest")
+    assert (result["objects"], set(result["baselines"])) == (1, {"all_background", "mean_object"})
     assert result["advantage_over_nearest_neighbour"] is None
     assert not guessing
 
@@ -128,19 +127,151 @@ def test_evaluate_count_uses_seeded_objects(
     [("raw maps", [], 0), ("difference maps", [], 0.25), ("difference maps", ["--wall", "wall.toml"], 0.5)],
 )
 def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
-    run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, maps: str, options: list[str], wall_m: float
+    judge: Run, monkeypatch: Patch, maps: str, options: list[str], wall_m: float
 ) -> None:
     network, blank = Guesser(maps), np.zeros((64, 80), np.float32)
     monkeypatch.setattr(report, "load_reconstructor", lambda *_: network)
     monkeypatch.setattr(subjects, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank))
     monkeypatch.setattr(subjects, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank))
     monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
-    result, raw = run(*STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
+    result, raw = judge(*STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
     np.testing.assert_allclose(np.concatenate(network.seen), raw.depth_m - wall_m, atol=1e-6)
     assert result["input"] == maps
     assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1
 
 
-def test_evaluate_refuses_wall_for_weights_of_raw_maps(tmp_path: Path, run: Callable[..., Any]) -> None:
-    assert "--wall" in run(*STORED, "--wall", "wall.toml", code=1)["error"]["message"]
+def test_evaluate_refuses_wall_for_weights_of_raw_maps(tmp_path: Path, judge: Run) -> None:
+    assert "--wall" in judge(*STORED, "--wall", "wall.toml", code=1)["error"]["message"]
     assert not list(tmp_path.iterdir())
+
+
+SMALL = {name: replace(stop, relay_columns=8, relay_rows=4) for name, stop in STOPS.items()}
+FIRST = 6  # measured rows: the accuracy stops, and two of the ingredients
+FILES = {"tradeoff.html", "tradeoff.json", "tradeoff.md", "tradeoff.png"}
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: Patch) -> list[Scene]:
+    """A thirty-second part of the patches and of the relay wall; the scenes asked for are kept."""
+    asked: list[Scene] = []
+
+    def shrunk(scene: Scene) -> Scene:
+        depth = np.full((16, 16), np.nan, np.float32)
+        depth[4:12, 4:12] = scene.object_depth_m[24:40:2, 24:40:2]
+        return replace(scene, object_depth_m=depth)
+
+    def measured(scene: Scene) -> Iterator[evaluate.RenderRow]:
+        asked.append(scene)
+        return islice(measure_renders(shrunk(scene), SMALL, lambda work, _: (work(), 0.5)[1]), FIRST)
+
+    monkeypatch.setattr("nlos_cam.evaluate.measure_renders", measured)
+    settings = lambda scene: render_settings(shrunk(scene), SMALL)[:FIRST]  # noqa: E731
+    monkeypatch.setattr("nlos_cam.evaluate.render_settings", settings)
+    return asked
+
+
+@pytest.fixture
+def plates(monkeypatch: Patch) -> None:
+    """Two runtimes that answer with a plate, for any weights."""
+
+    def plate(depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+        assert depth_m.shape == intensity.shape
+        return np.full((1, 64, 64), 0.5, np.float32)
+
+    made = {name: lambda _: plate for name in ("torch float32, cpu", "ONNX Runtime float32")}
+    monkeypatch.setattr("nlos_cam.evaluate.runtimes", lambda *_: made)
+    monkeypatch.setattr(runtime_tradeoff, "MIN_CALLS", 2)
+
+
+@pytest.fixture
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    def call(name: str, *options: str, code: int = 0) -> dict[str, Any]:
+        assert main(["tradeoff", name, *options, "--out", str(tmp_path / "cost"), "--json"]) == code
+        return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+    return call
+
+
+def _assert_written(out: Path, result: dict[str, Any]) -> None:
+    assert result["out"] == str(out)
+    assert {path.name for path in out.iterdir()} == FILES
+    assert json.loads((out / "tradeoff.json").read_text()) == {k: v for k, v in result.items() if k != "out"}
+
+
+def test_tradeoff_render_writes_table_and_plot(tmp_path: Path, run: Run, small: list[Scene]) -> None:
+    result = run("render")
+    _assert_written(tmp_path / "cost", result)
+    assert result["complete"]
+    assert {stop["name"] for stop in result["stops"]} == set(STOPS)
+    assert result["patches"] == np.isfinite(paper_scene().scene_at(0).object_depth_m).sum()
+    np.testing.assert_array_equal(small[0].object_depth_m, paper_scene().scene_at(0).object_depth_m)
+
+
+@pytest.mark.usefixtures("plates")
+def test_tradeoff_reconstruct_writes_table_and_plot(tmp_path: Path, run: Run) -> None:
+    result = run("reconstruct", "--count", "1")
+    _assert_written(tmp_path / "cost", result)
+    assert (result["complete"], result["objects"], len(result["settings"])) == (True, 1, 6)
+    assert result["recommended"]["name"] in {row["name"] for row in result["settings"]}
+
+
+@pytest.mark.slow
+def test_tradeoff_render_uses_object_that_render_renders(tmp_path: Path, run: Run, small: list[Scene]) -> None:
+    thing = ["--object", "bowl", "--seed", "4"]
+    run("render", *thing)
+    assert main(["render", "bowl", *thing[2:], "--accuracy", "draft", "--out", str(tmp_path / "maps.npz")]) == 0
+    with np.load(tmp_path / "maps.npz") as file:
+        np.testing.assert_array_equal(small[0].object_depth_m, file["object_depth_m"])
+        np.testing.assert_array_equal(render(small[0], "draft").depth_m, file["depth_m"])
+
+
+@pytest.mark.usefixtures("plates")
+@pytest.mark.parametrize(
+    ("name", "number", "rows"),
+    [
+        pytest.param("render", signal.SIGINT, 3, marks=pytest.mark.slow),
+        pytest.param("render", signal.SIGTERM, 3, marks=pytest.mark.slow),
+        ("render", signal.SIGINT, 0),
+        ("reconstruct", signal.SIGINT, 2),
+    ],
+)
+def test_tradeoff_keeps_rows_measured_before_signal(
+    tmp_path: Path, run: Run, monkeypatch: Patch, name: str, number: signal.Signals, rows: int
+) -> None:
+    measure = "measure_renders" if name == "render" else "measure_runtimes"
+    whole = getattr(evaluate, measure)
+
+    def cut_short(*arguments: Any) -> Iterator[Any]:
+        for at, row in enumerate(whole(*arguments)):
+            if at == rows:
+                signal.raise_signal(number)
+            yield row
+
+    monkeypatch.setattr(f"nlos_cam.evaluate.{measure}", cut_short)
+    before = signal.getsignal(number)
+    result = run(name, *(["--count", "1"] if name == "reconstruct" else []), code=130)
+    assert signal.getsignal(number) == before
+    if rows:
+        _assert_written(tmp_path / "cost", result)
+        assert (result["complete"], len(result.get("stops", result.get("settings")))) == (False, rows)
+    else:
+        assert result["out"] is None
+        assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_tradeoff_overwrites_only_on_demand(tmp_path: Path, run: Run) -> None:
+    (tmp_path / "cost").mkdir()
+    (precious := tmp_path / "cost" / "tradeoff.md").write_text("precious")
+    assert run("render", code=1)["error"]["type"] == "OutputExistsError"
+    assert precious.read_text() == "precious"
+    run("render", "--overwrite")
+    assert precious.read_text() != "precious"
+
+
+def test_tradeoff_refuses_color_weights_before_rendering(tmp_path: Path, run: Run) -> None:
+    recipe = Recipe(task="vae", colour=True, objects=2, held_out=1, epochs=1, batch=2, learning_rate=1e-3)
+    record = CheckpointRecord.of([recipe], ("paper-rig", "0"))
+    (tmp_path / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
+    assert str(tmp_path) in run("reconstruct", "--weights", str(tmp_path), code=4)["error"]["message"]
+    assert not (tmp_path / "cost").exists()

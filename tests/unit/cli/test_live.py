@@ -1,23 +1,35 @@
 import json
 import os
+import re
 import signal
+import socket
 import threading
+import webbrowser
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import typer
 from fake_doubter import FakeDoubter
 from fake_wall import WallCamera, bare_wall, wall_frame, write_wall
+from made_up_moments import RIG, Recorded, full_moment
 from small_frames import FrameCamera, SheetNetwork, small_frame
+from view_streams import EVERYWHERE, ask
 
 from nlos_cam.cli.live import summary
 from nlos_cam.cli.main import main
+from nlos_cam.cli.view import announce_view, opened_in_browser, viewer_of
+from nlos_cam.errors import NlosCamError
+from nlos_cam.live import RunControl
 from nlos_cam.live.statistics import RunReport
 from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.view import NullViewer, SessionFile
 
 TIMES = {"p50": 1.04, "p95": 2.0, "p99": 3.06}
 RECORDED, REPLAY = ["live", "--camera", "bag:fake", "--no-view"], ["replay", "run.bag", "--out", "out"]
@@ -32,7 +44,7 @@ class Opened:
         self.on_frame: Callable[[int], object] = lambda _: None
         self.on_open: Callable[[], None] = lambda: None
         self.count: int | None = 20
-        self.camera: WallCamera | None = None
+        self.camera: Recorded | WallCamera | None = None
         self.network, self.doubter = SheetNetwork(), FakeDoubter()
 
     def __call__(self, uri: str, **options: Any) -> FrameCamera | WallCamera:
@@ -69,19 +81,18 @@ def walled(opened: Opened, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> O
     return opened
 
 
-Run = Callable[..., tuple[int, dict[str, Any], str]]
+Run = Callable[..., tuple[dict[str, Any], str]]
 
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Exit code of a command with --json, the object that ends stdout, and stderr on one line."""
+    """Run a command with --json, assert its exit code, and return what ends stdout, and stderr on one line."""
 
-    def run(*arguments: str) -> tuple[int, dict[str, Any], str]:
+    def run(*arguments: str, code: int = 0) -> tuple[dict[str, Any], str]:
         capsys.readouterr()
-        code = main([*arguments, "--json"])
+        assert main([*arguments, "--json"]) == code
         captured = capsys.readouterr()
-        lines = captured.out.splitlines() or ["{}"]
-        return code, json.loads(lines[-1]), captured.err.replace("\n", " ")
+        return json.loads((captured.out.splitlines() or ["{}"])[-1]), captured.err.replace("\n", " ")
 
     return run
 
@@ -89,8 +100,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 @pytest.mark.usefixtures("opened")
 def test_live_json_and_log_have_their_fields(run: Run) -> None:
     arguments = [*RECORDED, "--log", "log.csv"]
-    code, report, _ = run(*arguments)
-    assert code == 0
+    report, _ = run(*arguments)
     fields = ("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings")
     assert set(report) == {*fields, "stages_percentiles_ms", "verdicts", "stalled_s", "quality", "camera_ms"}
     assert (report["frames"], report["dropped"]) == (20, 0)
@@ -100,65 +110,76 @@ def test_live_json_and_log_have_their_fields(run: Run) -> None:
     header, *lines = Path("log.csv").read_text(encoding="utf-8").splitlines()
     assert [int(line.split(",")[0]) for line in lines] == list(range(20))
     assert {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"} <= set(header.split(","))
-    assert run(*arguments)[0] == 1
+    run(*arguments, code=1)
 
 
 def test_live_ends_with_a_live_camera_or_after_its_seconds(opened: Opened, run: Run) -> None:
-    code, report, _ = run(*SIMULATED)
-    assert (code, report["frames"] + report["dropped"]) == (0, 20)
+    report, _ = run(*SIMULATED)
+    assert report["frames"] + report["dropped"] == 20
     opened.on_frame = lambda number: threading.Event().wait(0.05 if number else 0.0)
-    code, report, _ = run(*SIMULATED, "--seconds", "0.2")
-    assert code == 0
+    report, _ = run(*SIMULATED, "--seconds", "0.2")
     assert report["frames"] < 20
     assert [uri for uri, _ in opened.calls] == ["sim", "sim"]
 
 
 @pytest.mark.usefixtures("opened")
 def test_live_prints_the_address_of_its_view(run: Run) -> None:
-    code, _, printed = run("live", "--camera", "bag:fake")
-    assert code == 0
+    _, printed = run("live", "--camera", "bag:fake")
     assert "http://127.0.0.1:" in printed
+
+
+def test_live_saves_its_view_and_overwrites_only_when_asked(opened: Opened, run: Run) -> None:
+    opened.camera = Recorded(12)
+    arguments = [*RECORDED, "--save-view", "view.html"]
+    assert "open view.html" in run(*arguments)[1]
+    assert Path("view.html").stat().st_size > 10_000
+    run(*arguments, code=1)
+    run(*arguments, "--overwrite")
+
+
+@pytest.mark.slow
+def test_replay_saves_view_stills_and_video(opened: Opened, run: Run) -> None:
+    opened.camera = Recorded(12)
+    run(*REPLAY, "--save-view", "--stills", "2", "--video")
+    assert {"view.html", "replay.webm", "still-000000.png"} < {file.name for file in Path("out").iterdir()}
 
 
 def test_live_record_overwrites_only_when_asked(opened: Opened, tmp_path: Path, run: Run) -> None:
     bag = tmp_path / "run.bag"
     arguments = [*SIMULATED, "--record", str(bag)]
-    assert run(*arguments)[0] == 0
+    run(*arguments)
     assert opened.calls[-1][1]["recording"].path == bag
     bag.write_text("mine")
-    code, refused, _ = run(*arguments)
-    assert (code, refused["error"]["type"]) == (1, "OutputExistsError")
-    assert run(*arguments, "--overwrite")[0] == 0
+    refused, _ = run(*arguments, code=1)
+    assert refused["error"]["type"] == "OutputExistsError"
+    run(*arguments, "--overwrite")
 
 
 @pytest.mark.usefixtures("opened")
 def test_replay_on_a_wall_notes_that_the_rig_differs(tmp_path: Path, run: Run) -> None:
     write_wall(tmp_path / "wall.toml")
-    code, _, printed = run(*WALLED, "wall.toml")
-    assert code == 0
+    _, printed = run(*WALLED, "wall.toml")
     assert "training rig" in printed
     with np.load(tmp_path / "out" / "reconstruction.npz") as file:
         assert str(file["rig_name"]) == "measured"
-    code, refused, _ = run(*WALLED, "none.toml")
-    assert (code, refused["error"]["type"]) == (4, "RecordFileError")
+    refused, _ = run(*WALLED, "none.toml", code=4)
+    assert refused["error"]["type"] == "RecordFileError"
 
 
 def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) -> None:
-    code, report, printed = run(*REPLAY)
-    assert code == 0
+    report, printed = run(*REPLAY)
     assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts", "quality"}
     assert (report["frames"], report["out"]) == (20, "out")
     assert "training rig" not in printed
-    assert run(*REPLAY)[0] == 1
-    assert run(*REPLAY, "--overwrite", "--reader", "sdk")[0] == 0
+    run(*REPLAY, code=1)
+    run(*REPLAY, "--overwrite", "--reader", "sdk")
     assert opened.calls == [("bag:run.bag", {"reader": "plain"}), ("bag:run.bag", {"reader": "sdk"})]
 
 
 @pytest.mark.parametrize("command", [RECORDED, REPLAY])
 def test_interrupted_command_keeps_its_results(opened: Opened, run: Run, command: list[str]) -> None:
     opened.interrupt_at(10)
-    code, report, _ = run(*command)
-    assert code == 130
+    report, _ = run(*command, code=130)
     if command is REPLAY:
         with np.load("out/reconstruction.npz") as file:
             assert len(file["depth_m"]) == report["frames"]
@@ -172,13 +193,12 @@ def test_interrupt_while_a_camera_opens_begins_no_run(opened: Opened, run: Run, 
             signal.raise_signal(signal.SIGINT)
 
     opened.on_open = swallow
-    assert run(*command)[:2] == (130, {})
+    assert run(*command, code=130)[0] == {}
 
 
 def test_live_budget_reports_whether_it_was_kept(opened: Opened, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.live.setting_loader", lambda *_: lambda _: opened.network)
-    code, report, printed = run(*RECORDED, "--budget-ms", "100000")
-    assert code == 0
+    report, printed = run(*RECORDED, "--budget-ms", "100000")
     assert report["budget"]["kept"]
     assert "100000 ms" in printed
 
@@ -189,8 +209,7 @@ def test_command_prints_begin_and_end_of_a_warning_once(
     run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
     monkeypatch.setattr("nlos_cam.live.frame_queue.QUEUE_FRAMES", 1000)
-    code, report, printed = run(*command, "--wall", "wall.toml")
-    assert code == 0
+    report, printed = run(*command, "--wall", "wall.toml")
     [(warning, frames)] = report["warnings"].items()
     assert 0 < frames < 100
     assert printed.count("drifted") == 2
@@ -206,10 +225,9 @@ def test_average_is_over_as_many_frames_as_asked(walled: Opened) -> None:
 
 def test_weights_of_difference_maps_need_a_wall(walled: Opened, run: Run) -> None:
     walled.camera, walled.network.record.input = WallCamera(21), "difference maps"
-    assert run(*WALLED, "wall.toml")[0] == 0
+    run(*WALLED, "wall.toml")
     assert abs(np.nanmean(walled.network.given[20])) < 1e-3
-    code, refused, _ = run(*SIMULATED)
-    assert code == 1
+    refused, _ = run(*SIMULATED, code=1)
     assert "--wall" in refused["error"]["message"]
 
 
@@ -235,3 +253,88 @@ def test_summary_has_a_sentence_per_fact_and_stages_if_verbose() -> None:
     ]
     stages_lines = [line.split() for line in summary(plain, verbose=True).splitlines()[3:]]
     assert stages_lines == [[name, "1.0", "3.1"] for name in ("delivery", "network", "wait")]
+
+
+def test_view_serves_a_saved_view_until_interrupted_or_for_its_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetched: list[bytes] = []
+
+    def fetch_and_interrupt(text: str) -> None:
+        with closing(ask(re.search(r"http://\S+", text)[0], "/")) as answer:  # type: ignore[index]
+            fetched.append(answer.read())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with SessionFile(saved := tmp_path / "view.html", RIG) as view:
+        view.show(full_moment(0))
+    assert main(["view", str(saved), "--seconds", "0.1"]) == 0
+    monkeypatch.setattr("nlos_cam.cli.view.say", fetch_and_interrupt)
+    assert main(["view", str(saved)]) == 130
+    assert fetched == [saved.read_bytes()]
+
+
+@pytest.fixture
+def printed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    lines: list[str] = []
+    monkeypatch.setattr("nlos_cam.cli.view.say", lambda text, **_: lines.append(text))
+    return lines
+
+
+def serve(*, no_view: bool = False, host: str | None = None, port: int | None = None, open_it: bool = False) -> None:
+    """Serve a view with these options, print where, and end it."""
+    with viewer_of(RunControl(), no_view=no_view, host=host, port=port) as viewer:
+        announce_view(viewer, host=host, port=port, open_it=open_it)
+
+
+def test_no_view_serves_nothing_and_refuses_an_address(printed: list[str]) -> None:
+    serve(no_view=True, open_it=True)
+    [line] = printed
+    assert "http" not in line
+    assert isinstance(viewer_of(RunControl(), no_view=True), NullViewer)
+    for place in ({"host": "127.0.0.1"}, {"port": 9090}):
+        with pytest.raises(typer.BadParameter, match="--no-view"):
+            viewer_of(RunControl(), no_view=True, **place)
+
+
+def test_view_moves_from_a_taken_port_unless_asked_for(printed: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        for module in ("nlos_cam.view", "nlos_cam.view.web"):
+            monkeypatch.setattr(f"{module}.PREFERRED_PORT", port)
+        serve()
+        [line] = printed
+        assert f"{port} is taken" in line
+        assert f"127.0.0.1:{port}/" not in line
+        with pytest.raises(NlosCamError, match="--view-port"):
+            serve(port=port)
+
+
+def test_view_on_all_addresses_notes_who_can_see_it(printed: list[str]) -> None:
+    serve(host=EVERYWHERE)
+    line, note = printed
+    assert "http://127.0.0.1:" in line
+    assert "anyone" in note
+
+
+@pytest.mark.parametrize("opens", [True, False])
+def test_view_opens_a_browser_or_notes_that_it_cannot(
+    printed: list[str], monkeypatch: pytest.MonkeyPatch, opens: bool
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("nlos_cam.cli.view.opened_in_browser", lambda address: asked.append(address) or opens)
+    serve(open_it=True)
+    assert asked[0].startswith("http://127.0.0.1:")
+    assert ["browser" in line for line in printed[1:]] == [True] * (not opens)
+
+
+def test_opened_in_browser_only_with_a_desktop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.cli.view.sys", SimpleNamespace(platform="linux"))
+    for desktop, answer, opened in (
+        ({}, {"return_value": True}, False),
+        ({"DISPLAY": ":0"}, {"return_value": True}, True),
+        ({"DISPLAY": ":0"}, {"return_value": False}, False),
+        ({"BROWSER": "lynx"}, {"side_effect": webbrowser.Error("no runnable browser")}, False),
+    ):
+        monkeypatch.setattr("nlos_cam.cli.view.os.environ", desktop)
+        monkeypatch.setattr("nlos_cam.cli.view.webbrowser.open", Mock(**answer))
+        assert opened_in_browser("http://127.0.0.1:9090/") == opened

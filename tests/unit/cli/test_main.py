@@ -4,6 +4,7 @@ import errno
 import inspect
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from typing import Any
 import pytest
 import typer
 from nlos_calibration.errors import CalibrationError, RecordFileError, WallRefusedError
+from nlos_models import inference
 from nlos_models.errors import CheckpointError, ModelError, RecipeError
 from rich.table import Table
 from typer.main import get_command
@@ -26,8 +28,19 @@ from typer.main import get_command
 from nlos_cam import errors
 from nlos_cam.cli import main as module
 from nlos_cam.cli import run
-from nlos_cam.cli.common import Json, exit_interrupted, finish, interrupted_by_signals, output_path, progress, say, show
-from nlos_cam.cli.main import COMMANDS, _share_options, build_app, main
+from nlos_cam.cli.common import (
+    Json,
+    exit_interrupted,
+    finish,
+    interrupted_by_signals,
+    output_path,
+    progress,
+    say,
+    say_error,
+    show,
+    stderr,
+)
+from nlos_cam.cli.main import COMMANDS, MIN_ADDRESS_BYTES, TORCH_ADDRESS_BYTES, _share_options, build_app, main
 from nlos_cam.cli.plain_help import plain_help, range_text
 
 CODES = {
@@ -129,20 +142,17 @@ def _inner_block() -> None:
         signal.raise_signal(signal.SIGINT)
 
 
-def test_interrupted_command_says_once_what_it_kept(does: Does, capsys: Capsys) -> None:
-    does(_inner_block)
+@pytest.mark.parametrize("act", [_inner_block, lambda: exit_interrupted("two rows are kept")])
+def test_interrupted_command_says_once_what_it_kept(does: Does, capsys: Capsys, act: Act) -> None:
+    does(act)
     assert main(["act"]) == 130
     assert capsys.readouterr().err == "interrupted: two rows are kept\n"
-    does(lambda: exit_interrupted("one row is kept"))
-    assert main(["act"]) == 130
-    assert capsys.readouterr().err == "interrupted: one row is kept\n"
 
 
 def test_progress_prints_lines_where_stderr_is_no_terminal(capsys: Capsys) -> None:
     with progress(period_s=0.001) as bar:
         bar.add_task("hidden", visible=False)
-        task = bar.add_task("rendering", total=4)
-        bar.update(task, completed=3)
+        bar.update(bar.add_task("rendering", total=4), completed=3)
         while "rendering" not in (shown := capsys.readouterr().err):
             time.sleep(0.001)
     assert set(shown.splitlines()) == {"rendering: 3/4, 0 s"}
@@ -222,8 +232,7 @@ def test_help_names_every_command_and_all_take_json(capsys: Capsys) -> None:
     assert main(["--help"]) == 0
     shown = capsys.readouterr().out
     named = "devices doctor capture calibrate live replay render dataset train evaluate tradeoff"
-    for name in {*named.split(), *COMMANDS}:
-        assert name in shown
+    assert not [name for name in {*named.split(), *COMMANDS} if name not in shown]
     commands = leaves(build_app())
     assert len(commands) >= 10
     for name, callback in commands:
@@ -237,10 +246,9 @@ def test_command_table_names_the_right_module(command: str) -> None:
     assert names <= {name for name, _ in leaves(build_app())}
 
 
-@pytest.mark.parametrize("option", ["--version", "-V"])
-def test_version_is_that_of_the_package(capsys: Capsys, option: str) -> None:
-    assert main([option]) == 0
-    assert capsys.readouterr().out == f"nlos-cam {version('nlos-cam')}\n"
+def test_version_is_that_of_the_package(capsys: Capsys) -> None:
+    assert main(["--version"]) == main(["-V"]) == 0
+    assert capsys.readouterr().out == 2 * f"nlos-cam {version('nlos-cam')}\n"
 
 
 def test_option_help_has_placeholders_and_ranges_in_words(capsys: Capsys) -> None:
@@ -253,26 +261,10 @@ def test_option_help_has_placeholders_and_ranges_in_words(capsys: Capsys) -> Non
     assert not {"<bool>", "<=", ">="} & {*capsys.readouterr().out.replace("[", " ").split()}
 
 
-@pytest.mark.parametrize(
-    ("bounds", "text"),
-    [
-        ((1, 65535), "1 to 65535"),
-        ((0.1, None), "at least 0.1"),
-        ((1 / 30, 1e9), ""),
-        ((0, None), ""),
-        ((None, 5), "at most 5"),
-    ],
-)
-def test_range_in_words_leaves_out_bounds_against_nonsense(bounds: tuple[Any, Any], text: str) -> None:
-    assert range_text(*bounds) == text
-
-
-@pytest.mark.parametrize("overwrite", [False, True])
-def test_output_path_refuses_file_in_place_of_folder(tmp_path: Path, *, overwrite: bool) -> None:
-    (out := tmp_path / "figures").write_text("mine", encoding="utf-8")
-    with pytest.raises(errors.OutputExistsError, match="figures"):
-        output_path(out, "figures", "", overwrite=overwrite)
-    assert out.read_text(encoding="utf-8") == "mine"
+def test_range_in_words_leaves_out_bounds_against_nonsense() -> None:
+    texts = {(1, 65535): "1 to 65535", (0.1, None): "at least 0.1", (None, 5): "at most 5"}
+    texts |= dict.fromkeys([(1 / 30, 1e9), (0, None)], "")
+    assert {bounds: range_text(*bounds) for bounds in texts} == texts
 
 
 def test_output_path_refuses_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,7 +291,8 @@ def test_printed_text_is_literal_unless_marked(capsys: Capsys) -> None:
     finish({}, as_json=False, text="wrote runs/[bold]x")
     finish({}, as_json=False, text="[bold]good[/]", marked=True)
     say("kept in [red]")
-    assert capsys.readouterr() == ("wrote runs/[bold]x\ngood\n", "kept in [red]\n")
+    say_error("a:smile:b")
+    assert capsys.readouterr() == ("wrote runs/[bold]x\ngood\n", "kept in [red]\nerror: a:smile:b\n")
 
 
 HEAVY = {"torch", "numba", "cv2", "onnxruntime", "rerun", "matplotlib", "h5py", "numpy"}
@@ -355,3 +348,49 @@ def test_interruption_that_python_ignores_is_raised_again() -> None:
     with pytest.raises(KeyboardInterrupt, match="kept"):
         lose_a_signal()
     assert sys.unraisablehook is hook
+
+
+@pytest.mark.parametrize(("command", "needed"), [("rigs", MIN_ADDRESS_BYTES), ("train", TORCH_ADDRESS_BYTES)])
+def test_too_little_address_space_is_one_line_before_libraries_load(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capsys, command: str, needed: int
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (needed - 1, needed))
+    assert main([command, "--help"]) == 1
+    assert f"is {(needed >> 20) - 1} MiB" in capsys.readouterr().err
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (needed, needed))
+    assert main([command, "--help"]) == 0
+
+
+@pytest.mark.parametrize("error", [MemoryError(), ImportError("no room")])
+def test_error_is_printed_without_rich_where_memory_is_short(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception
+) -> None:
+    def lack(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(stderr, "print", lack)
+    say_error("out of\nmemory")
+    assert capfd.readouterr().err == "error: out of memory\n"
+
+
+NO_MAP = ImportError("a.so: failed to map segment from shared object")
+FAILED = [RuntimeError(f"export failed\n{reason}") for reason in ("std::bad_alloc", "cannot allocate memory")]
+
+
+@pytest.mark.parametrize("error", [*FAILED, NO_MAP, MemoryError(), RuntimeError("of one")], ids=str)
+def test_lack_of_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: Capsys, error: Exception) -> None:
+    def lack(_: object) -> None:
+        raise error from (MemoryError() if str(error) == "of one" else None)
+
+    monkeypatch.setattr("nlos_cam.cli.main.build_app", lack)
+    assert main(["rigs"]) == 1
+    assert capsys.readouterr().err.startswith("error: out of memory: close")
+
+
+def test_open_session_without_memory_does_not_blame_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lack(*_: object, **__: object) -> None:
+        raise RuntimeError("Exception during initialization: std::bad_alloc")
+
+    monkeypatch.setattr("onnxruntime.InferenceSession", lack)
+    with pytest.raises(MemoryError, match="bad_alloc"):
+        inference.open_session(b"")

@@ -1,3 +1,5 @@
+"""`repair`, `export` and `info` of files: outputs kept safe, damage is exit code 4, facts and next commands."""
+
 import json
 import os
 import signal
@@ -7,35 +9,31 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
 
 from nlos_cam.cli import recordings
+from nlos_cam.cli.info import _format_size
 from nlos_cam.cli.main import main
-from nlos_cam.errors import OutputExistsError
 from nlos_cam.recording import repair_recording, verify
 
 Capsys = pytest.CaptureFixture[str]
 
-Run = Callable[..., tuple[int, dict[str, Any], str]]
+Run = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture
 def run(capsys: Capsys) -> Run:
-    """Run `nlos-cam repair --json`; returns the exit code, the last line of stdout, and stderr."""
+    """Run a command with --json, assert its exit code, and return the last line of stdout."""
 
-    def call(*arguments: Path | str) -> tuple[int, dict[str, Any], str]:
-        code = main(["repair", *map(str, arguments), "--json"])
-        captured = capsys.readouterr()
-        lines = captured.out.splitlines()
-        return code, json.loads(lines[-1]) if lines else {}, captured.err
+    def call(*arguments: Path | str, code: int = 0) -> dict[str, Any]:
+        assert main([*map(str, arguments), "--json"]) == code
+        return json.loads((capsys.readouterr().out.splitlines() or ["{}"])[-1])
 
     return call
 
 
 def test_repair_json_reports_the_new_file(run: Run, noise_bags: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "good.bag"
-    code, found, _ = run(noise_bags["packed-unindexed"], "--out", out)
-    assert code == 0
+    found = run("repair", noise_bags["packed-unindexed"], "--out", out)
     assert set(found) == {"recovered_frames", "chunks", "damaged", "out"}
     assert found["recovered_frames"] == verify(out).streams
     assert (found["damaged"], found["out"]) == (1, str(out))
@@ -66,41 +64,33 @@ def test_repair_overwrites_with_the_option_but_not_its_input(
 ) -> None:
     out, bag = tmp_path / "a.bag", noise_bags["plain"]
     out.write_bytes(b"mine")
-    code, found, _ = run(bag, "--out", out)
-    assert (code, found["error"]["type"], out.read_bytes()) == (1, "OutputExistsError", b"mine")
-    assert run(bag, "--out", out, "--overwrite")[0] == 0
+    error = run("repair", bag, "--out", out, code=1)["error"]
+    assert (error["type"], out.read_bytes()) == ("OutputExistsError", b"mine")
+    run("repair", bag, "--out", out, "--overwrite")
     before = bag.read_bytes()
-    assert run(bag, "--out", bag, "--overwrite")[0] == 1
+    run("repair", bag, "--out", bag, "--overwrite", code=1)
     assert bag.read_bytes() == before == out.read_bytes()
-    with pytest.raises(OutputExistsError):
-        recordings.repair(bag, out)
-    with pytest.raises(typer.BadParameter, match=r"\.bag"):
-        recordings.repair(bag, tmp_path / "a.txt")
 
 
 def test_repair_interrupted_is_exit_code_130_without_output(
     run: Run, noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    repair = repair_recording
-
     def interrupted(path: Path, out: Path, report: Callable[[int, int], None]) -> Any:
         def once_half_way(done: int, total: int) -> None:
             report(done, total)
             if done > 0.7 * total:
                 os.kill(os.getpid(), signal.SIGINT)
 
-        return repair(path, out, once_half_way)
+        return repair_recording(path, out, once_half_way)
 
     monkeypatch.setattr("nlos_cam.recording.repair_recording", interrupted)
-    code, _, _ = run(noise_bags["plain"], "--out", tmp_path / "a.bag")
-    assert code == 130
+    run("repair", noise_bags["plain"], "--out", tmp_path / "a.bag", code=130)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_export_json_reports_what_was_written(noise_bag: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_export_json_reports_what_was_written(noise_bag: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "out"
-    assert main(["export", str(noise_bag), "--out", str(out), "--ply", "--every", "10", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    found = run("export", noise_bag, "--out", out, "--ply", "--every", "10")
     assert found == {"frames": {"depth": 2, "infrared": 2, "confidence": 2, "points": 2}, "out": str(out)}
     assert len(list((out / "points").glob("*.ply"))) == 2
 
@@ -140,3 +130,29 @@ def test_export_writes_hidden_surfaces_of_a_replay(tmp_path: Path, capsys: Capsy
     for formats, word in (("", "--object ply"), ("ply,fbx", "fbx")):
         assert main([*export, "--object", formats, "--overwrite"]) == 2
         assert word in capsys.readouterr().err
+
+
+def test_info_prints_facts_and_next_commands(noise_bag: Path, capsys: Capsys) -> None:
+    assert main(["info", str(noise_bag), "--verify"]) == 0
+    shown = capsys.readouterr().out
+    for words in ("recording of a lidar", "20 frames", "yes (checked: every message)", f"nlos-cam replay {noise_bag}"):
+        assert words in shown
+
+
+def test_info_of_damaged_or_unknown_file_is_exit_code_4(noise_bag: Path, tmp_path: Path, capsys: Capsys) -> None:
+    (cut := tmp_path / "cut.bag").write_bytes(noise_bag.read_bytes()[:9_000])
+    assert main(["info", str(cut), "--json"]) == 4
+    found = json.loads(capsys.readouterr().out)
+    assert not found["whole"]
+    assert "nlos-cam repair" in found["problem"]
+    (tmp_path / "notes.txt").write_text("")
+    for name in ("notes.txt", "nothing.bag"):
+        assert main(["info", str(tmp_path / name)]) == 4
+        captured = capsys.readouterr()
+        assert not captured.out
+        assert name in captured.err
+
+
+def test_sizes_have_one_unit_and_three_digits() -> None:
+    texts = {0: "0 bytes", 999: "999 bytes", 1_780_000: "1.78 MB", 48 * 10**9: "48 GB"}
+    assert {size: _format_size(size) for size in texts} == texts

@@ -53,7 +53,7 @@ RECIPES = {
     "doubt": 'task = "doubt"\noutliers = 7\nempties = 14\n' + BASE,
 }
 FIGURES = {"held_out_loss", "held_out_iou"}
-Answer = dict[str, Any]
+Answer, Patch = dict[str, Any], pytest.MonkeyPatch
 Go = Callable[..., tuple[int, Answer]]
 
 
@@ -124,7 +124,7 @@ def test_train_vae_answers_with_folder_and_figures(go: Go, tmp_path: Path) -> No
     assert len((tmp_path / "out" / "log.csv").read_text(encoding="utf-8").splitlines()) == 3
 
 
-def test_train_follows_shared_options(go: Go, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_train_follows_shared_options(go: Go, tmp_path: Path, monkeypatch: Patch) -> None:
     compiled: list[object] = []
     monkeypatch.setattr(train, "compile_network", lambda network: compiled.append(network) or network)
     assert go("vae", "--budget", "0.5", "--objects", "6", "--compile")[0] == 0
@@ -134,7 +134,7 @@ def test_train_follows_shared_options(go: Go, tmp_path: Path, monkeypatch: pytes
     assert "0.5" in recipe.deviations[-1]
 
 
-def test_train_vae_leaves_out_categories_of_recipe(go: Go, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_train_vae_leaves_out_categories_of_recipe(go: Go, folder: Path, monkeypatch: Patch) -> None:
     shown: list[set[str]] = []
 
     def images(
@@ -151,7 +151,7 @@ def test_train_vae_leaves_out_categories_of_recipe(go: Go, folder: Path, monkeyp
 
 
 def test_interrupted_train_exits_130_and_resumes_to_same_weights(
-    go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    go: Go, folder: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     stop, messages = Event(), list[str]()
     stop.set()
@@ -167,7 +167,7 @@ def test_interrupted_train_exits_130_and_resumes_to_same_weights(
 
 
 def test_train_compressor_uses_shipped_vae_and_streams(
-    go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exported: list[Path]
+    go: Go, folder: Path, tmp_path: Path, monkeypatch: Patch, exported: list[Path]
 ) -> None:
     monkeypatch.setattr(runs, "weights_folder", lambda *_: folder / "vae")
     assert go("two")[0] == 0
@@ -184,7 +184,7 @@ def test_train_compressor_uses_shipped_vae_and_streams(
 
 @pytest.mark.slow
 def test_joint_weights_keep_encoder_and_one_step_weights_have_none(
-    go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    go: Go, folder: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.setattr(runs, "export_folder", export_folder)
     assert go("joint", "--weights", folder / "two")[0] == 0
@@ -198,9 +198,7 @@ def test_joint_weights_keep_encoder_and_one_step_weights_have_none(
 
 
 @pytest.mark.slow
-def test_train_on_difference_maps_records_input(
-    go: Go, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_train_on_difference_maps_records_input(go: Go, folder: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     flat = np.zeros((64, 80), np.float32)
     monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (flat, flat + 3))
     assert go("difference", "--vae", folder / "vae")[0] == 0
@@ -242,7 +240,7 @@ def test_train_transfer_reports_both_figures_and_keeps_decoder(go: Go, folder: P
 )
 def test_train_refuses_options_that_do_not_fit(
     go: Go, folder: Path, recipe: str, options: list[str], code: int, words: str, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: Patch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.chdir(folder)
@@ -281,7 +279,7 @@ def test_train_doubt_refuses_other_maps_or_rig(
 
 
 @pytest.mark.slow
-def test_train_doubt_ignores_invisible_outliers(go: Go, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_train_doubt_ignores_invisible_outliers(go: Go, folder: Path, monkeypatch: Patch) -> None:
     sets = list[Any]()
     monkeypatch.setattr("nlos_models.run_doubt", lambda *every: sets.extend(every[-2:]) or {})
     assert go("doubt", "--weights", folder / "two")[0] == 0
@@ -294,7 +292,7 @@ def test_train_doubt_ignores_invisible_outliers(go: Go, folder: Path, monkeypatc
 
 
 def test_train_quality_replaces_a_damaged_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: Patch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     untrained_doubt(weights := tmp_path / "run", watched_weights(tmp_path / "watched"))
     (weights / "quality.json").write_text("{", encoding="utf-8")
@@ -306,8 +304,7 @@ def test_train_quality_replaces_a_damaged_model(
     monkeypatch.setattr("nlos_cam.dataset.open_dataset", lambda *_, **__: None)
     monkeypatch.setattr("nlos_cam.dataset.quality_set", lambda *_: known)
     monkeypatch.setattr("nlos_models.doubt_training.STEPS", 20)
-    asked = ["train", "quality", "--weights", str(weights), "--dataset", str(tmp_path), "--json"]
-    assert main(asked) == 0
+    assert main(["train", "quality", "--weights", str(weights), "--dataset", str(tmp_path), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (answer["weights"], answer["objects"]) == (str(weights), 120)
     assert load_uncertainty_model(weights, tmp_path).quality.record.objects == 120

@@ -1,4 +1,4 @@
-"""Dataset builds: equal shards for any workers, order or interruption; damaged shards are rebuilt, others refused."""
+"""Dataset builds: equal shards for any workers, order or interruption, in processes or by Ray; damage is rebuilt."""
 
 import errno
 import os
@@ -9,22 +9,28 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from importlib.util import find_spec
 from multiprocessing import active_children
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numba
 import numpy as np
 import pytest
 from fake_farm import FakeFarm, samples_of
-from nlos_calibration.rig import load_rig
+from nlos_calibration import load_rig
 
+import nlos_cam
 from nlos_cam import errors
-from nlos_cam.dataset import BuildReport, DatasetPlan, build_dataset, open_dataset, worker
+from nlos_cam.dataset import BuildReport, DatasetPlan, build_dataset, open_dataset, ray_backend, worker
 from nlos_cam.dataset import build as dataset
 from nlos_cam.dataset.build import processes
+from nlos_cam.dataset.ray_backend import PIECES_PER_CPU, RayFarm, make_piece
 from nlos_cam.dataset.samples import make_samples
 from nlos_cam.dataset.shards import SHARD_PATTERN, only_builder, store
+from nlos_cam.errors import SceneError, WorkersLostError
 
 Patch = pytest.MonkeyPatch
 PLAN = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft")
@@ -151,23 +157,21 @@ def test_build_grows_dataset_to_count(tmp_path: Path, whole: Shards, first: int)
     assert _bytes(tmp_path) == whole
 
 
-def test_build_refuses_other_plan_and_shard_size(finished: Path, whole: Shards, monkeypatch: Patch) -> None:
+def test_build_refuses_another_plan_shard_size_or_program(finished: Path, whole: Shards, monkeypatch: Patch) -> None:
     other = replace(PLAN, accuracy="fine", rig=PLAN.rig.model_copy(update={"name": "other"}))
     with pytest.raises(errors.RecordingError, match=r"rig.*accuracy"):
         _build(finished, plan=other)
-    monkeypatch.setattr(dataset, "SHARD", 4)
-    with pytest.raises(errors.RecordingError, match=r"shard-000000040\.h5"):
-        _build(finished)
+    with monkeypatch.context() as patch:
+        patch.setattr(dataset, "SHARD", 4)
+        with pytest.raises(errors.RecordingError, match=r"shard-000000040\.h5"):
+            _build(finished)
     assert _bytes(finished) == whole
-
-
-def test_build_refuses_shard_of_newer_program(tmp_path: Path) -> None:
     newer = PLAN.provenance.replace('{"rig"', '{"lens": 1, "rig"', 1)
-    store(tmp_path / "shard-000000040.h5", samples_of(range(40, 45)), newer, "")
-    before = _bytes(tmp_path)
+    store(finished / "shard-000000040.h5", samples_of(range(40, 45)), newer, "")
+    before = _bytes(finished)
     with pytest.raises(errors.RecordingError, match="lens"):
-        _build(tmp_path)
-    assert _bytes(tmp_path) == before
+        _build(finished)
+    assert _bytes(finished) == before
 
 
 def test_build_locks_its_folder_and_refuses_a_file(tmp_path: Path) -> None:
@@ -266,9 +270,109 @@ def test_worker_module_does_not_import_numpy() -> None:
 
 
 def test_workers_without_shared_memory_are_one_line(tmp_path: Path, monkeypatch: Patch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    monkeypatch.setattr(dataset, "ProcessPoolExecutor", refuse)
+    refusal = OSError(errno.EROFS, "Read-only file system")
+    monkeypatch.setattr(dataset, "ProcessPoolExecutor", Mock(side_effect=refusal))
     with pytest.raises(errors.WorkersLostError, match=r"Read-only file system.*/dev/shm"):
         build_dataset(PLAN, COUNT, tmp_path, workers=1, on_progress=lambda *_: None)
+
+
+PIECES = [range(k, k + 2) for k in range(0, 40, 2)]
+LOCAL = """
+import numpy as np
+from nlos_calibration import load_rig
+from nlos_cam.dataset import DatasetPlan, ray_farm
+from nlos_cam.dataset.samples import make_samples
+plan = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")
+made = dict(ray_farm("local")(plan, [range(0, 1), range(1, 3)]))
+for piece, samples in made.items():
+    for name, values in make_samples(plan, piece).items():
+        np.testing.assert_array_equal(samples[name], values)
+assert len(made) == 2
+"""
+
+
+class RayError(Exception):
+    cause: Exception | None = None
+
+
+class FakeRay:
+    """The part of Ray that the farm uses, in this process; results arrive last first."""
+
+    def __init__(self, fails: RayError | None = None) -> None:
+        self.exceptions = SimpleNamespace(RayError=RayError)
+        self.fails, self.running, self.most_waiting = fails, False, 0
+
+    def init(self, address: str, **_: object) -> None:
+        if address == "nowhere":
+            raise ConnectionError("could not\nfind any running Ray instance")
+        self.running = True
+
+    def shutdown(self) -> None:
+        self.running = False
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 2.0}
+
+    def remote(self, **options: object) -> Callable[..., Any]:
+        assert options == {"num_cpus": 1, "max_retries": ray_backend.MAX_RETRIES}
+        return lambda work: SimpleNamespace(remote=lambda *arguments: (work, arguments))
+
+    def wait(self, waiting: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
+        assert num_returns == 1
+        self.most_waiting = max(self.most_waiting, len(waiting))
+        return waiting[-1:], waiting[:-1]
+
+    def get(self, ready: tuple[Callable[..., Any], tuple[Any, ...]]) -> Any:
+        if self.fails:
+            raise self.fails
+        return ready[0](*ready[1])
+
+
+@pytest.fixture(autouse=True)
+def _nothing_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_backend, "make_samples", lambda _, piece: samples_of(piece))
+    monkeypatch.setattr(ray_backend, "use_one_thread", lambda: None)
+
+
+def test_ray_farm_makes_every_piece_once_and_leaves_cluster() -> None:
+    ray = FakeRay()
+    made = dict(RayFarm(ray, "auto")(PLAN, PIECES))
+    assert sorted(made, key=lambda piece: piece.start) == PIECES
+    for piece, samples in made.items():
+        np.testing.assert_array_equal(samples["depth_m"], samples_of(piece)["depth_m"])
+    assert ray.most_waiting == 2 * PIECES_PER_CPU
+    assert not ray.running
+    making = RayFarm(ray, "auto")(PLAN, PIECES)
+    next(making)
+    assert ray.running
+    making.close()
+    assert not ray.running
+
+
+def test_ray_farm_raises_error_of_missing_cluster_and_of_failed_or_lost_worker() -> None:
+    assert list(RayFarm(FakeRay(), "nowhere")(PLAN, [])) == []  # nothing to make needs no cluster
+    with pytest.raises(WorkersLostError, match="nowhere") as caught:
+        list(RayFarm(FakeRay(), "nowhere")(PLAN, PIECES))
+    assert "\n" not in str(caught.value)
+    failed = RayError("a long traceback")
+    failed.cause = SceneError("cup.stl is empty")
+    with pytest.raises(SceneError, match=r"^cup\.stl is empty$"):
+        list(RayFarm(FakeRay(failed), "auto")(PLAN, PIECES))
+    ray = FakeRay(RayError("the worker\ndied"))
+    with pytest.raises(WorkersLostError, match="the worker died"):
+        list(RayFarm(ray, "auto")(PLAN, PIECES))
+    assert not ray.running
+
+
+def test_ray_worker_of_another_version_is_refused() -> None:
+    assert make_piece(PLAN, range(1), nlos_cam.__version__).keys() == samples_of(range(1)).keys()
+    with pytest.raises(SceneError, match=rf"{nlos_cam.__version__}.*9\.9"):
+        make_piece(PLAN, range(1), "9.9")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray (the extra `many`)")
+def test_local_cluster_makes_equal_samples() -> None:
+    """Runs in a process of its own, since Ray leaves threads behind."""
+    done = subprocess.run([sys.executable, "-c", LOCAL], capture_output=True, text=True, check=False, timeout=280)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -1,11 +1,15 @@
-"""Shards whose declared sizes exceed the bytes they hold are refused, and refusing takes memory by the file's size."""
+"""Shards are read as written or refused by name, in memory by the file's size; one builder at a time holds a folder."""
 
 import os
+import re
 import resource
+import shutil
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -13,10 +17,11 @@ import pytest
 from fake_farm import samples_of
 from nlos_calibration import load_rig
 
-from nlos_cam.dataset import DatasetPlan, check_arrays, read_head
+import nlos_cam
 from nlos_cam.dataset.hdf5 import read_array
-from nlos_cam.dataset.shards import shard_path, store
-from nlos_cam.errors import RecordingError
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.shards import check_arrays, only_builder, read_arrays, read_head, shard_path, shards_of, store
+from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
 
 SEEDS = range(40, 43)
 PLAN = DatasetPlan(load_rig("paper-rig"), SEEDS.start)
@@ -25,10 +30,15 @@ MAX_GROWTH_MIB = 64
 TEXT_BYTES, ROWS = 60_000, 4000
 
 
+def _stored(folder: Path, seeds: range = SEEDS) -> Path:
+    path = shard_path(folder, seeds.start)
+    store(path, samples_of(seeds), PLAN.provenance, "nlos-cam dataset build")
+    return path
+
+
 @pytest.fixture
 def shard(tmp_path: Path) -> Path:
-    store(path := shard_path(tmp_path, SEEDS.start), samples_of(SEEDS), PLAN.provenance, "")
-    return path
+    return _stored(tmp_path)
 
 
 def _replace(file: h5py.File, name: str, **options: Any) -> h5py.Dataset:
@@ -69,6 +79,45 @@ def _plan_of_two_texts(path: Path) -> None:
         file.attrs["plan"] = np.array(["a", "b"], h5py.string_dtype())
 
 
+def _crafted(path: Path, harm: str) -> None:
+    """Change a shard consistently, as no accident does."""
+    other = path.with_name("other.h5")
+    shutil.copyfile(path, other)
+    with h5py.File(path, "a") as file:
+        image = file["image"][:]
+        if harm == "no checksum":
+            del file["image"].attrs["sha256"]
+            file["image"][:] = 0
+        elif harm == "no plan checksum":
+            del file.attrs["plan_sha256"]
+        elif harm == "external link":
+            del file["image"]
+            file["image"] = h5py.ExternalLink(other.name, "/image")
+        elif harm == "soft link":
+            file.move("image", "moved")
+            file["image"] = h5py.SoftLink("/moved")
+        elif harm == "external storage":
+            _replace(file, "image", shape=image.shape, dtype=image.dtype, external=[(str(other), 0, image.nbytes)])
+        elif harm == "virtual":
+            layout = h5py.VirtualLayout(image.shape, image.dtype)
+            layout[:] = h5py.VirtualSource(str(other), "image", image.shape)
+            checksum = file["image"].attrs["sha256"]
+            del file["image"]
+            file.create_virtual_dataset("image", layout).attrs["sha256"] = checksum
+        else:
+            _replace(file, "image", shape=(3,), dtype=h5py.ref_dtype)
+
+
+def _without_seeds(path: Path, other: str) -> None:
+    with h5py.File(path, "a") as file:
+        del file["seed"]
+        if other == "group":
+            file.create_group("seed")
+        else:
+            file["seed"] = np.dtype(int) if other == "type" else np.array(["a", "b"], h5py.string_dtype())
+
+
+CRAFTED = "no checksum", "no plan checksum", "external link", "soft link", "external storage", "virtual", "refs"
 HARMS = {
     "chunk for each number": _declare(shape=(1 << 18,), dtype="f4", chunks=(1,), compression="gzip"),
     "chunks that are absent": _declare(shape=(1 << 40,), dtype="f4", chunks=(1 << 20,), compression="gzip"),
@@ -80,6 +129,8 @@ HARMS = {
     "bomb": _bomb,
     "one text in all rows": _one_text_in_all_rows,
     "plan of two texts": _plan_of_two_texts,
+    **{harm: partial(_crafted, harm=harm) for harm in CRAFTED},
+    **{f"{other} instead of seeds": partial(_without_seeds, other=other) for other in ("group", "type", "words")},
 }
 
 
@@ -107,7 +158,7 @@ def _refuse(path: Path) -> None:
 
 
 @pytest.mark.parametrize("harm", HARMS)
-def test_shard_with_false_sizes_is_refused_within_little_memory(shard: Path, harm: str) -> None:
+def test_crafted_shard_is_refused_within_little_memory(shard: Path, harm: str) -> None:
     HARMS[harm](shard)
     assert shard.stat().st_size < 600_000
     assert _growth_mib(lambda: _refuse(shard)) < MAX_GROWTH_MIB
@@ -131,9 +182,88 @@ def test_read_array_returns_what_was_stored(
 
 
 def test_lack_of_memory_does_not_count_as_damage(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def lack(*_: object, **__: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(np, "empty", lack)
+    monkeypatch.setattr(np, "empty", Mock(side_effect=MemoryError))
     with pytest.raises(MemoryError):
         read_head(shard)
+
+
+def _assert_as_stored(path: Path) -> None:
+    head, samples = read_head(path), samples_of(SEEDS)
+    assert (head.seeds, head.plan) == (SEEDS, PLAN)
+    for values, found in zip(samples.values(), read_arrays(head, list(samples)), strict=True):
+        assert found.dtype == values.dtype
+        np.testing.assert_array_equal(found, values)
+
+
+def test_shard_is_read_as_stored_and_describes_itself(tmp_path: Path) -> None:
+    _assert_as_stored(path := _stored(tmp_path))
+    check_arrays(read_head(path))
+    assert [path.name for path in tmp_path.iterdir()] == ["shard-000000040.h5"]
+    with h5py.File(path) as file:
+        facts = dict(file.attrs)
+    assert (facts["first_seed"], facts["last_seed"]) == (40, 42)
+    assert (facts["package_version"], facts["command"]) == (nlos_cam.__version__, "nlos-cam dataset build")
+    assert PLAN.rig.checksum in facts["plan"]
+
+
+def test_shard_with_flipped_bit_is_damaged_or_unchanged(tmp_path: Path) -> None:
+    """A flip in padding or in a time stamp changes nothing that is read; any other flip is an error."""
+    path = _stored(tmp_path)
+    whole, refusals = path.read_bytes(), list[str]()
+    for place in np.random.default_rng(0).integers(0, len(whole), 100):
+        harmed = bytearray(whole)
+        harmed[place] ^= 1 << int(place) % 8
+        path.write_bytes(harmed)
+        try:
+            check_arrays(read_head(path))
+        except RecordingError as error:
+            refusals.append(str(error))
+        else:
+            _assert_as_stored(path)
+    assert len(refusals) > 15
+    assert all(refusal.startswith(f"{path} is damaged") for refusal in refusals)
+
+
+def test_shards_of_refuses_overlapping_and_renamed_shards(tmp_path: Path) -> None:
+    _stored(tmp_path)
+    other = _stored(tmp_path, range(42, 44))
+    with pytest.raises(RecordingError, match=r"shard-000000042\.h5.*shard-000000040\.h5"):
+        shards_of(tmp_path)
+    other.rename(shard_path(tmp_path, 50))
+    with pytest.raises(RecordingError, match=r"shard-000000050\.h5"):
+        shards_of(tmp_path)
+
+
+def _store_on_full_disk(folder: Path) -> int:
+    """Store in a child process whose files may not grow, since our own output may be a file; 0 for DiskFullError."""
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
+            _stored(folder)
+        except DiskFullError as error:
+            code = 0 if re.search(r"shard-000000040\.h5", str(error)) else 2
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def test_full_disk_and_ctrl_c_keep_the_earlier_shard_and_leave_no_partial_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = _stored(tmp_path)
+    before = path.read_bytes()
+    assert _store_on_full_disk(tmp_path) == 0
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        _stored(tmp_path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_lock_refuses_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refused = PermissionError(13, "Permission denied", str(tmp_path))
+    monkeypatch.setattr(Path, "mkdir", Mock(side_effect=refused))
+    with pytest.raises(OutputExistsError, match=str(tmp_path)), only_builder(tmp_path):
+        pass

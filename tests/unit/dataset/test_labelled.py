@@ -33,6 +33,7 @@ BOX = object_box(RIG)
 SLOPE = np.linspace(BOX.z_near_m, BOX.z_far_m, 4096, dtype=np.float32).reshape(64, 64)
 KNOWN = {"slope": SLOPE, "half": np.where(np.arange(64) < 32, np.float32(0.2), np.float32(np.nan)) + 0 * SLOPE}
 CUP = np.full((64, 64), 0.2, np.float32)
+BALL = trimesh.creation.icosphere(subdivisions=3)
 
 
 def known(_: ObjectBox) -> dict[str, Float32]:
@@ -85,16 +86,13 @@ def test_spread_chooses_frames_evenly(count: int, wanted: int) -> None:
     assert np.ptp(gaps) <= 2  # mirrored at both ends: neither end is left out
 
 
-@pytest.fixture
-def wall(measured: Callable[..., Any], tmp_path: Path) -> Callable[..., Path]:
-    def write(**fields: Any) -> Path:
+def test_read_labelled_corrects_maps_by_a_wall_record_of_their_resolution(
+    labelled: Label, measured: Callable[..., Any], tmp_path: Path
+) -> None:
+    def wall(**fields: Any) -> Path:
         (path := tmp_path / "wall.toml").write_text(dump_toml(measured(**fields).record), encoding="utf-8")
         return path
 
-    return write
-
-
-def test_read_labelled_corrects_maps_by_wall_record(labelled: Label, wall: Callable[..., Path]) -> None:
     path = labelled("a", wall=(RIG, WallFile(path="there/wall.toml", sha256="")))
     with pytest.raises(RecordingError, match=r"there/wall\.toml"):
         read_labelled([path], known=known)
@@ -103,11 +101,8 @@ def test_read_labelled_corrects_maps_by_wall_record(labelled: Label, wall: Calla
     assert corrected.rig.name == "measured"
     np.testing.assert_allclose(corrected.maps.depth_m, plain.maps.depth_m + 0.004, atol=1e-6)
     np.testing.assert_array_equal(corrected.maps.intensity, plain.maps.intensity)
-
-
-def test_read_labelled_refuses_wall_of_other_resolution(labelled: Label, wall: Callable[..., Path]) -> None:
     with pytest.raises(CalibrationError, match=r"80x60.*64x48"):
-        read_labelled([labelled("a")], known=known, wall=wall(width=80))
+        read_labelled([path], known=known, wall=wall(width=80))
 
 
 def test_read_labelled_uses_the_one_rig_of_the_sidecars(labelled: Label) -> None:
@@ -159,28 +154,21 @@ def _write_truth(folder: Path, text: str) -> None:
     (folder / "mug.truth.toml").write_text(text, encoding="utf-8")
 
 
-def _write_ball(path: Path) -> None:
-    trimesh.creation.icosphere(subdivisions=3).export(path)
-
-
-def test_truth_of_label_is_its_test_object() -> None:
+def test_truth_is_depth_map_of_recording_then_of_label_then_its_test_object(tmp_path: Path) -> None:
+    np.save(tmp_path / "cup-1.npy", of_label := np.where(np.eye(64) > 0, np.float32(0.3), np.float32(np.nan)))
+    np.testing.assert_array_equal(_truth(tmp_path, "cup-1"), of_label)
+    np.save(tmp_path / "F.npy", of_recording := np.full((64, 64), 0.25, np.float32))
+    np.testing.assert_array_equal(_truth(tmp_path, "cup-1"), of_recording)
+    np.testing.assert_array_equal(_truth(tmp_path, "cup-1", name="G"), of_label)
     assert _truth(Path("nowhere"), "cup-1") is CUP
     objects = benchmark_depths(BOX)
     assert list(objects) == [thing.name for thing in fixed_set(BOX)]
     np.testing.assert_array_equal(objects["cup-2"], next(o.depth_m for o in fixed_set(BOX) if o.name == "cup-2"))
 
 
-def test_truth_is_depth_map_of_recording_then_of_label(tmp_path: Path) -> None:
-    np.save(tmp_path / "cup-1.npy", of_label := np.where(np.eye(64) > 0, np.float32(0.3), np.float32(np.nan)))
-    np.testing.assert_array_equal(_truth(tmp_path, "cup-1"), of_label)
-    np.save(tmp_path / "F.npy", of_recording := np.full((64, 64), 0.25, np.float32))
-    np.testing.assert_array_equal(_truth(tmp_path, "cup-1"), of_recording)
-    np.testing.assert_array_equal(_truth(tmp_path, "cup-1", name="G"), of_label)
-
-
 @pytest.mark.parametrize("named", [True, False])
 def test_truth_of_mesh_stands_at_its_pose(tmp_path: Path, named: bool) -> None:
-    _write_ball(tmp_path / ("print.stl" if named else "mug.stl"))
+    BALL.export(tmp_path / ("print.stl" if named else "mug.stl"))
     file = 'file = "print.stl"\n' if named else ""
     _write_truth(tmp_path, f"{file}size_m = 0.1\nx_m = 0.05\ny_m = -0.03\nfront_m = 0.06\n")
     depth_m, (x_m, y_m) = _truth(tmp_path), cell_centers_m(BOX)
@@ -211,20 +199,17 @@ def test_truth_file_names_its_problem(tmp_path: Path, text: str, kind: type[Nlos
         _truth(tmp_path)
 
 
-def test_truth_that_is_missing_names_files_to_add(tmp_path: Path) -> None:
+def test_truth_is_refused_where_files_are_missing_doubled_elsewhere_or_of_another_size(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"mug\.truth\.toml.*mug\.npy"):
         _truth(tmp_path)
-    _write_ball(tmp_path / "mug.stl")
+    (tmp_path / "a").mkdir()
+    BALL.export(tmp_path / "a" / "mug.stl")
     with pytest.raises(RecordingError, match=r"mug\.stl.*mug\.truth\.toml"):
-        _truth(tmp_path)
-
-
-def test_truth_refuses_two_files_other_sizes_and_paths(tmp_path: Path) -> None:
+        _truth(tmp_path / "a")
     np.save(tmp_path / "mug.npy", np.full((32, 32), 0.2, np.float32))
     with pytest.raises(RecordingError, match=r"32, 32"):
         _truth(tmp_path)
     np.save(tmp_path / "mug.npy", CUP)
-    (tmp_path / "a").mkdir()
     for label in ("../mug", "a/mug"):
         with pytest.raises(RecordingError, match=label):
             _truth(tmp_path / "a", label)

@@ -1,19 +1,28 @@
-"""Outliers lie outside the range of training objects by their own measure; vary_bench rigs stay within their spread."""
+"""Outliers lie outside training's range, varied rigs within theirs; doubt samples are cached and follow their seeds."""
 
 from collections.abc import Callable
+from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from nlos_calibration import load_rig
+from small_run import small_recipe
 
 from nlos_cam.dataset import (
+    EMPTY,
+    GENERIC,
     HELD_OUT_OUTLIERS,
+    ORDINARY,
     SHAPE_OUTLIERS,
     TRAINING_OUTLIERS,
     Stimulus,
+    doubt_samples,
     draw_outlier,
     outliers_beside,
+    samples_on_disk,
 )
+from nlos_cam.dataset.doubt_samples import SEEDS_PER_BENCH, DoubtSamples, _generator, _stimulus, counts_of, make_samples
 from nlos_cam.dataset.outliers import MIN_PIXELS, SLIGHT, WIDE, BenchSpread, ordinary, vary_bench, vary_empty_bench
 from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.objects import object_box
@@ -50,15 +59,12 @@ def test_outlier_shows_surface_before_wall_and_repeats_by_seed(name: str) -> Non
         assert one.scene.rig == one.rig
 
 
-def test_outlier_kinds_to_learn_and_to_judge_differ() -> None:
+def test_outlier_kinds_to_learn_and_judge_differ_and_exclude_shapes_that_weights_saw() -> None:
     assert not set(TRAINING_OUTLIERS) & set(HELD_OUT_OUTLIERS)
     for kinds in (TRAINING_OUTLIERS, HELD_OUT_OUTLIERS):
         assert set(kinds) & SHAPE_OUTLIERS
         assert set(kinds) - SHAPE_OUTLIERS
     assert {*TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS} > SHAPE_OUTLIERS
-
-
-def test_shapes_are_no_outliers_to_weights_that_saw_generic_ones() -> None:
     assert outliers_beside(0.0) == TRAINING_OUTLIERS
     learnt = set(outliers_beside(0.5))
     assert not learnt & (SHAPE_OUTLIERS | {"several", "tilted"})
@@ -94,15 +100,9 @@ def test_ordinary_object_is_no_outlier() -> None:
 
 
 def test_outlier_without_surface_is_drawn_again() -> None:
-    tries = list[int]()
-
-    def shy(generator: np.random.Generator, stimulus: Stimulus) -> Stimulus:
-        tries.append(1)
-        seen = ordinary(generator, stimulus)
-        return stimulus if len(tries) < 3 else seen
-
+    shy = Mock(side_effect=[PLAIN, PLAIN, ordinary(np.random.default_rng(0), PLAIN)])
     assert np.isfinite(draw_outlier(shy, np.random.default_rng(0), PLAIN).depth_m).any()
-    assert len(tries) == 3
+    assert shy.call_count == 3
 
 
 def test_moved_rig_differs_in_lidar_pose_alone() -> None:
@@ -129,3 +129,71 @@ def test_varied_empty_benches_are_plain_wide_or_without_occluder() -> None:
     assert any(sensor == SENSOR for _, sensor in benches)
     assert any(abs(rig.lidar.distance_m - 0.2) > SLIGHT.place_m for rig, _ in benches)
     assert 5 < sum(rig.occluder is None for rig, _ in benches) < 50
+
+
+def test_sample_shows_its_object_or_an_empty_bench_and_depends_on_its_seed_alone() -> None:
+    empty, ordinary, plates = (make_samples(kind, range(2), RIG, SENSOR) for kind in (EMPTY, ORDINARY, "plates"))
+    assert not empty.image.any()
+    assert not empty.cells.any()
+    for shown in (ordinary, plates):
+        assert (shown.image > 0).any((1, 2)).all()
+        assert (shown.cells > 50).all()
+        assert ((np.abs(shown.depth_m - empty.depth_m[0]) > 0.02).sum((1, 2)) > 50).all()
+    alone = make_samples(ORDINARY, [1], RIG, SENSOR)
+    np.testing.assert_array_equal(alone.depth_m[0], ordinary.depth_m[1])
+    np.testing.assert_array_equal(alone.intensity[0], ordinary.intensity[1])
+
+
+def test_ordinary_and_half_of_outlier_benches_lie_slightly_off() -> None:
+    seeds = 0, SEEDS_PER_BENCH - 1, SEEDS_PER_BENCH
+    ordinary, plates = ([_stimulus(kind, seed, RIG, SENSOR).rig for seed in seeds] for kind in (ORDINARY, "plates"))
+    assert [rig == RIG for rig in plates] == [True, True, False]
+    assert RIG not in ordinary
+    assert ordinary[0] == ordinary[1] != ordinary[2]
+
+
+def test_usual_objects_are_as_many_as_outliers_with_generic_shapes_by_their_share() -> None:
+    recipe = small_recipe(task="doubt", outliers=20, empties=9)
+    for share, kinds in ((0.0, 17), (0.25, 8)):
+        counts = counts_of(recipe, share)
+        assert counts[EMPTY] == 9
+        assert sum(counts.values()) == 9 + kinds * 20 + kinds * 10
+        assert counts.get(GENERIC, 0) == share * kinds * 10
+    one, same = (make_samples(GENERIC, [SEEDS_PER_BENCH], RIG, SENSOR) for _ in range(2))
+    np.testing.assert_array_equal(one.depth_m, same.depth_m)
+    assert _stimulus(GENERIC, 0, RIG, SENSOR).rig != RIG
+
+
+def test_kinds_share_no_bench_and_no_noise() -> None:
+    """A shared bench would let a network tell outliers from ordinary objects."""
+    kinds = [EMPTY, ORDINARY, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS]
+    for of in range(3):
+        assert len({_generator(kind, 3, of).bytes(8) for kind in kinds}) == len(kinds)
+    slight = [_stimulus(kind, SEEDS_PER_BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)]
+    assert len({stimulus.rig.checksum for stimulus in slight}) == 3
+    assert len({stimulus.sensor.bare_wall_counts for stimulus in slight}) == 3
+
+
+def test_samples_on_disk_makes_only_missing_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = list[tuple[str, int]]()
+
+    def quick(kind: str, seeds: range, *_: object) -> DoubtSamples:
+        made.append((kind, seeds.start))
+        maps, images = np.zeros((len(seeds), 2, 2), np.float32), np.zeros((len(seeds), 2, 2), np.float16)
+        cells = np.array(seeds, np.int32)
+        return DoubtSamples(maps, maps, images, cells, np.array([kind] * len(seeds)))
+
+    monkeypatch.setattr(doubt_samples, "make_samples", quick)
+    first = samples_on_disk(tmp_path, {EMPTY: 150}, 7, RIG, SENSOR)
+    assert made == [(EMPTY, 7), (EMPTY, 107)]
+    told, asked = list[tuple[int, int]](), {EMPTY: 150, "far": 20}
+    both = samples_on_disk(tmp_path, asked, 7, RIG, SENSOR, on_progress=lambda *at: told.append(at))
+    assert made[2:] == [("far", 7)]
+    np.testing.assert_array_equal(both.cells[:150], first.cells)
+    assert both.kind.tolist() == [EMPTY] * 150 + ["far"] * 20
+    assert told == [(100, 170), (150, 170), (170, 170)]
+    assert both.where(both.kind == "far").cells.tolist() == list(range(7, 27))
+    damaged = next(tmp_path.glob("*-far-*.npz"))
+    damaged.write_bytes(damaged.read_bytes()[:-40])
+    samples_on_disk(tmp_path, asked, 7, RIG, SENSOR)
+    assert made[3:] == [("far", 7)]

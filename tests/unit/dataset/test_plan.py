@@ -44,18 +44,14 @@ def test_plan_survives_json_and_names_the_field_that_differs(name: str) -> None:
     assert "somewhere" not in other.provenance  # the folder of meshes differs between machines
 
 
-def test_plan_writes_later_fields_only_where_they_are_used() -> None:
+def test_plan_writes_later_fields_only_where_used_and_of_older_version_has_defaults() -> None:
     """Checksums of older plans stay."""
-    mixed, plain = replace(PLAN, objects=Objects(share_generic=0.5)), json.loads(PLAN.provenance)
+    mixed, facts = replace(PLAN, objects=Objects(share_generic=0.5)), json.loads(PLAN.provenance)
     assert json.loads(replace(PLAN, textures=tuple(TEXTURES)).provenance)["note"] == SIMULATION_ONLY
     assert json.loads(mixed.provenance)["objects"]["share_generic"] == 0.5
     assert DatasetPlan.from_provenance(mixed.provenance) == mixed
-    assert not {"textures", "note", "expected"} & plain.keys()
-    assert "share_generic" not in plain["objects"]
-
-
-def test_plan_of_older_version_has_defaults() -> None:
-    facts = json.loads(PLAN.provenance)
+    assert not {"textures", "note", "expected"} & facts.keys()
+    assert "share_generic" not in facts["objects"]
     for name in ("objects", "spread", "radiometry", "jump_m", "material"):
         del facts[name]
     for name in ("ripple_m", "warm_up", "range_offset_m"):
@@ -94,7 +90,7 @@ def test_plan_of_scene_takes_all_but_the_object() -> None:
     assert (plan.material, plan.objects) == (Material(kind="phong"), Objects())
 
 
-def test_spread_draws_rigs_uniformly_within_bounds() -> None:
+def test_spread_draws_rigs_by_seed_uniformly_within_bounds_and_none_keeps_the_rig() -> None:
     drawn = np.array([scene_row(*SPREAD.draw(RIG, SENSOR, seed)) for seed in range(300)])
     half = np.array([0.02, 5, 5, 0.02, 0.02, 0.3 * SENSOR.bare_wall_counts])
     share = (drawn - np.array(scene_row(RIG, SENSOR))) / half
@@ -103,9 +99,6 @@ def test_spread_draws_rigs_uniformly_within_bounds() -> None:
     assert share.min(0).max() < -0.95
     assert share.max(0).min() > 0.95
     assert np.abs(np.corrcoef(share.T) - np.eye(6)).max() < 0.25
-
-
-def test_spread_draws_by_seed_and_none_keeps_the_rig() -> None:
     assert SPREAD.draw(RIG, SENSOR, 5) == SPREAD.draw(RIG, SENSOR, 5)
     assert SPREAD.draw(RIG, SENSOR, 5) != SPREAD.draw(RIG, SENSOR, 6)
     assert RigSpread().draw(RIG, SENSOR, 5) == (RIG, SENSOR)

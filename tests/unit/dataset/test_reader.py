@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from nlos_models import MapBatch, MapSet
 
 from nlos_cam.dataset import DatasetPlan, reader
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _maps, _Window, open_dataset
-from nlos_cam.dataset.shards import Shard, shard_path, store
+from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.errors import RecordingError, SceneError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40)
@@ -72,15 +73,12 @@ def test_epoch_holds_samples_once_without_last_partial_batch(data: Dataset, batc
     assert set(every) <= set(range(COUNT))
 
 
-def test_batch_rows_are_samples_mirrored_at_random(data: Dataset) -> None:
+def test_batches_are_samples_mirrored_at_random_as_seed_and_epoch_determine(data: Dataset) -> None:
     batches = list(data.batches(1, 2, 4))
     for found in batches:
         assert found.depth_m.dtype == found.image.dtype == torch.float32
         _assert_as_stored(found)
     assert 0.2 < torch.cat([found.mirrored for found in batches]).float().mean() < 0.8
-
-
-def test_epoch_is_determined_by_seed_and_number(data: Dataset) -> None:
     for one, again in zip(data.batches(3, 1, 4), data.batches(3, 1, 4), strict=True):
         for here, there in zip(one, again, strict=True):
             torch.testing.assert_close(here, there, rtol=0, atol=0, equal_nan=True)
@@ -112,23 +110,18 @@ def test_samples_are_shuffled_within_buffer_and_shards_anywhere(data: Dataset) -
 
 
 def test_epoch_reads_each_shard_once_and_holds_two_buffers(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads, windows = list[Path](), list[_Window]()
-    original, original_take = _maps, _Window.take
-
-    def counted(shard: Shard) -> list[np.ndarray]:
-        reads.append(shard.path)
-        return original(shard)
+    read, held, original_take = Mock(wraps=_maps), list[int](), _Window.take
 
     def take(window: _Window, rows: np.ndarray) -> MapSet:
-        windows.append(window)
         found = original_take(window, rows)
-        assert len(window._held) <= 2 * reader.BUFFER
+        held.append(len(window._held))
         return found
 
-    monkeypatch.setattr(reader, "_maps", counted)
+    monkeypatch.setattr(reader, "_maps", read)
     monkeypatch.setattr(_Window, "take", take)
-    assert len(_rows(data, batch=1)) == COUNT == len(windows)
-    assert len(reads) == len(set(reads)) == len(data.shards)
+    assert len(_rows(data, batch=1)) == COUNT == len(held)
+    assert max(held) <= 2 * reader.BUFFER
+    assert read.call_count == len({call.args[0].path for call in read.call_args_list}) == len(data.shards)
 
 
 @pytest.mark.parametrize("way", ["arrays", "batches", "chunks"])
@@ -143,16 +136,15 @@ def test_reader_names_damaged_shard(folder: Path, tmp_path: Path, way: str) -> N
     assert "\n" not in str(caught.value)
 
 
-def test_reader_refuses_expected_maps_unless_they_will_do(tmp_path: Path) -> None:
+def test_reader_refuses_no_dataset_shards_of_two_and_expected_maps_unless_they_will_do(
+    tmp_path: Path, folder: Path
+) -> None:
+    with pytest.raises(RecordingError, match="nlos-cam dataset build"):
+        open_dataset(tmp_path)
     store(shard_path(tmp_path, 40), samples_of([40]), replace(PLAN, expected=True).provenance, "")
     with pytest.raises(RecordingError, match="without --expected-maps"):
         open_dataset(tmp_path)
     assert open_dataset(tmp_path, expected=True).plan.expected
-
-
-def test_reader_refuses_no_dataset_and_shards_of_two(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="nlos-cam dataset build"):
-        open_dataset(tmp_path)
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     other = DatasetPlan(PLAN.rig, 40, accuracy="fine")
     store(shard_path(tmp_path, 90), samples_of(range(90, 92)), other.provenance, "")

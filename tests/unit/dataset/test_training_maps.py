@@ -1,4 +1,4 @@
-"""Training maps of a recipe, in memory or streamed, and the bare wall that difference maps subtract."""
+"""Training maps of a recipe, in memory, streamed or packed, and the bare wall that difference maps subtract."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,15 +7,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from fake_farm import samples_of
 from nlos_calibration import load_rig
+from nlos_models import FileBusyError, MapBatch
 from nlos_models.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
 
 from nlos_cam.dataset import DatasetPlan, RigSpread, training_maps
-from nlos_cam.dataset.packed import map_noise
+from nlos_cam.dataset.packed import CELLS, IMAGES, INDEX, MAPS, PackedMaps, map_noise, open_packed_maps
+from nlos_cam.dataset.samples import Samples
+from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, measured_bare_wall, read_maps, render_bare_wall
-from nlos_cam.errors import SceneError
+from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.render import Scene, Sensor, render
 
@@ -52,14 +56,13 @@ def test_read_maps_takes_first_objects_of_recipe() -> None:
 @pytest.mark.parametrize("stream", [False, True])
 def test_expected_maps_get_noise_anew_in_each_epoch(stream: bool) -> None:
     """Of its stated deviation, in the intensity alone; the same generator draws the same again."""
-    one, other, same = (
-        next(iter(_read("expected", stream=stream, objects=6).training.batches(6, torch.Generator().manual_seed(seed))))
-        for seed in (1, 2, 1)
-    )
+
+    def first(data: str, seed: int) -> MapBatch:
+        batches = _read(data, stream=stream, objects=6).training.batches(6, torch.Generator().manual_seed(seed))
+        return next(iter(batches))
+
+    one, other, same, plain = first("expected", 1), first("expected", 2), first("expected", 1), first("expecte*", 1)
     assert all(torch.equal(mine, its) for mine, its in zip(one[1:], same[1:], strict=True))
-    plain = next(
-        iter(_read("expecte*", stream=stream, objects=6).training.batches(6, torch.Generator().manual_seed(1)))
-    )
     assert torch.equal(one.row, plain.row)
     torch.testing.assert_close(one.depth_m, plain.depth_m, equal_nan=True, rtol=0, atol=0)
     bright = plain.intensity > 10  # no noise is cut off at 0
@@ -90,7 +93,7 @@ def test_read_maps_refuses_what_does_not_fit(held_out: str, wall: Path | None, s
         _read("data", held_out, wall, stream=stream)
 
 
-def test_rendered_bare_wall_cancels_a_frame_of_bare_wall() -> None:
+def test_rendered_bare_wall_cancels_a_frame_of_bare_wall_of_the_one_rig() -> None:
     depth_m, intensity = render_bare_wall(PLAN, frames=8)
     images = Sensor(PLAN.rig, PLAN.sensor).expose(render(Scene(PLAN.rig)).multi, np.random.default_rng(99))
     maps = maps_from_frame(images.frame(PLAN.rig.pinhole))
@@ -99,9 +102,6 @@ def test_rendered_bare_wall_cancels_a_frame_of_bare_wall() -> None:
     assert abs(np.median((maps.depth_m - depth_m)[valid])) < 1e-3
     assert abs(np.median((maps.intensity - intensity)[valid])) < 0.05 * np.median(intensity[valid])
     assert np.median(depth_m[valid]) > 0.1
-
-
-def test_render_bare_wall_refuses_varying_rigs() -> None:
     with pytest.raises(SceneError, match="--wall"):
         render_bare_wall(replace(PLAN, spread=RigSpread(place_m=0.01)))
 
@@ -143,3 +143,92 @@ def test_streamed_maps_equal_maps_in_memory() -> None:
     np.testing.assert_array_equal(stream.first(6).depth_m, whole.depth_m[:6])
     assert len(stream.first(99).image) == 8
     assert isinstance(_read(stream=True, objects=6).training, Streamed)
+
+
+SHARD = 5
+
+
+def _samples(first: int) -> Samples:
+    """Return samples of five seeds with maps and images of full size, known from their seed."""
+    noise = np.random.default_rng([first, 1])
+    sizes = {"depth_m": (64, 80), "intensity": (64, 80), "image": (64, 64)}
+    arrays = {name: noise.random((SHARD, *size), np.float32) for name, size in sizes.items()}
+    arrays["depth_m"][:, 0, 0] = np.nan
+    return {**samples_of(range(first, first + SHARD)), **arrays, "image": arrays["image"].astype(np.float16)}
+
+
+def _add(folder: Path, first: int, plan: DatasetPlan = PLAN) -> Path:
+    folder.mkdir(exist_ok=True)
+    store(shard_path(folder, first), _samples(first), plan.provenance, "")
+    return folder
+
+
+def _epoch(packed: PackedMaps, seed: int, batch: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    parts = list(packed.batches(batch, torch.Generator().manual_seed(seed)))
+    return tuple(np.concatenate([part[k].numpy() for part in parts]) for k in (0, 1))
+
+
+def test_packed_maps_are_the_datasets_normalised(tmp_path: Path) -> None:
+    folders = [_add(tmp_path / "a", 0), _add(tmp_path / "b", 20)]
+    with open_packed_maps(folders, tmp_path / "store") as packed:
+        assert len(packed) == 2 * SHARD
+        wanted = dict[bytes, np.ndarray]()
+        for first in (0, 20):
+            samples = _samples(first)
+            normal = packed.normal(*(torch.from_numpy(samples[name]) for name in ("depth_m", "intensity")))
+            normal = normal.half().numpy()
+            wanted |= {image.tobytes(): one for image, one in zip(samples["image"], normal, strict=True)}
+        maps, images = _epoch(packed, 1)
+    assert len({image.tobytes() for image in images}) == 2 * SHARD
+    for image, one in zip(images, maps, strict=True):
+        np.testing.assert_array_equal(one, wanted[image.tobytes()])
+
+
+def test_new_shards_enter_new_epochs_and_an_epoch_can_be_seen_again(tmp_path: Path) -> None:
+    folder = _add(tmp_path / "a", 0)
+    with open_packed_maps([folder], tmp_path / "store") as packed:
+        first = _epoch(packed, 1)
+        _add(folder, 5)
+        assert len(_epoch(packed, 2)[0]) == 10
+    with (tmp_path / "store" / MAPS).open("ab") as file:
+        file.write(b"left by an interruption")
+    with open_packed_maps([folder], tmp_path / "store") as again:
+        assert (len(again), again.digest) == (10, packed.digest)
+        for one, other in zip(_epoch(again, 1), first, strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert len(_epoch(again, 3)[0]) == 10
+
+
+def test_open_packed_maps_refuses_a_store_in_use(tmp_path: Path) -> None:
+    folder, store_folder = _add(tmp_path / "a", 0), tmp_path / "store"
+    with open_packed_maps([folder], store_folder), pytest.raises(FileBusyError, match="store is being written"):
+        open_packed_maps([folder], store_folder).__enter__()
+    with pytest.raises(ZeroDivisionError), open_packed_maps([folder], store_folder):
+        raise ZeroDivisionError
+    with open_packed_maps([folder], store_folder) as packed:  # free again after an error
+        assert len(packed) == SHARD
+
+
+@pytest.mark.parametrize("name", [CELLS, INDEX, MAPS, IMAGES])
+def test_damaged_store_is_refused(tmp_path: Path, name: str) -> None:
+    folder = _add(tmp_path / "a", 0)
+    with open_packed_maps([folder], tmp_path / "store"):
+        file = tmp_path / "store" / name
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(RecordingError, match=f"{name} is damaged"):
+        open_packed_maps([folder], tmp_path / "store").__enter__()
+
+
+def test_expected_maps_have_their_noise_to_be_drawn_and_datasets_of_two_kinds_or_too_few_objects_are_refused(
+    tmp_path: Path,
+) -> None:
+    plain, expected = _add(tmp_path / "a", 0), _add(tmp_path / "b", 20, replace(PLAN, expected=True))
+    for folder, wanted in ((plain, None), (expected, map_noise(PLAN))):
+        with open_packed_maps([folder], tmp_path / f"store of {folder.name}") as packed:
+            assert packed.noise == wanted
+            with pytest.raises(RecordingError, match="fewer than a batch of 64"):
+                next(packed.batches(64, torch.Generator()))
+    other_rig = _add(tmp_path / "c", 0, OTHER)
+    for other, word in ((expected, "give one kind"), (other_rig, "different rigs")):
+        with pytest.raises(SceneError, match=word):
+            open_packed_maps([plain, other], tmp_path / "store").__enter__()

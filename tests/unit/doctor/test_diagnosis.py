@@ -1,16 +1,19 @@
 """Laws of every diagnosis; each cause is tested in test_checks.py."""
 
 from typing import Any, get_args
+from unittest.mock import Mock
 
+from fake_bench import fake_device
 from hypothesis import given
 from hypothesis import strategies as st
 
 from nlos_cam.camera.l515 import DeviceInfo
 from nlos_cam.doctor import Facts, diagnose
 from nlos_cam.doctor.diagnosis import CAUSES, CHECKS
-from nlos_cam.doctor.facts import Sdk, Status
+from nlos_cam.doctor.facts import Pair, Sdk, Status, gather_facts, match_devices, query_sdk
 from nlos_cam.doctor.host import MODULES, Holder, Host, KernelCamera, Node, Platform
 from nlos_cam.doctor.usb import UsbDevice, UsbScan
+from nlos_cam.errors import CameraError
 
 NAMES = (
     "python system sdk sdk-version sdk-alone libusb usb-camera recovery link container udev-rules permissions "
@@ -59,8 +62,8 @@ def test_diagnosis_of_any_facts_gives_each_fault_a_fix(facts: Facts) -> None:
         assert bool(check.fix) == (check.status in {"warning", "failed"}), check
 
 
-def test_only_the_hidden_one_of_two_cameras_is_missed(bench: Any, device: Any, fake_l515: Any) -> None:
-    bench.usb.devices.append(device(serial="00000000F0000001", port_numbers=(2,), address=4))
+def test_only_the_hidden_one_of_two_cameras_is_missed(bench: Any, fake_l515: Any) -> None:
+    bench.usb.devices.append(fake_device(serial="00000000F0000001", port_numbers=(2,), address=4))
     bench.linux.plug("2-2", address=4)
     check = bench.failed()["sdk-camera"]
     assert "f0000001" in check.detail
@@ -78,3 +81,68 @@ def test_several_causes_are_named_and_the_likeliest_fixed_first(bench: Any) -> N
     assert "sdk-version: " in check.detail
     assert "in-use: " in check.detail
     assert check.fix == bench.failed()["sdk-version"].fix
+
+
+def info(serial: str, name: str = "Intel RealSense L515", usb: str = "3.2") -> DeviceInfo:
+    return DeviceInfo(name, serial, "01.05.08.01", usb)
+
+
+def serials(pairs: list[Pair]) -> list[tuple[str | None, str | None]]:
+    return [(one.usb and one.usb.serial, one.sdk and one.sdk.serial) for one in pairs]
+
+
+def test_gather_asks_this_machine() -> None:
+    facts = gather_facts()
+    assert facts.sdk.load_error == ""
+    assert ("pyrealsense2", facts.sdk.version) in facts.sdk.packages
+
+
+def test_sdk_facts_hold_version_and_devices(bench: Any, fake_l515: Any) -> None:
+    bench.sdk_devices.append(fake_l515("9", name="Intel RealSense D435"))
+    sdk = bench.facts().sdk
+    assert sdk.version == "2.54.2.5684"
+    assert [one.serial for one in sdk.devices] == ["f0246262", "9"]
+    assert [one.serial for one in sdk.lidars] == ["f0246262"]
+    assert sdk.error == ""
+    bench.installed["PyRealSense2-beta"] = "2.56.0"
+    assert bench.facts().sdk.version == ""  # of two packages, none is known
+    assert len(bench.facts().sdk.packages) == 2
+
+
+def test_sdk_that_cannot_load_or_list_devices_keeps_the_error(bench: Any) -> None:
+    assert query_sdk(Mock(side_effect=CameraError("no such luck")), list).load_error == "no such luck"
+    bench.sdk_error = ImportError("No module named 'pyrealsense2'")
+    sdk = bench.facts().sdk
+    assert (sdk.load_error, sdk.error, sdk.devices) == (str(bench.sdk_error), str(bench.sdk_error), ())
+    bench.load_sdk = lambda: Mock(context=lambda: Mock(query_devices=Mock(side_effect=RuntimeError("no power state"))))
+    assert "no power state" in bench.facts().sdk.query_error
+
+
+def test_pair_matches_serials_whatever_their_zeros(bench: Any) -> None:
+    usb = bench.facts().usb.of_kind("camera")
+    assert serials(match_devices(usb, [])) == [("f0246262", None)]
+    assert serials(match_devices([], [info("f9")])) == [(None, "f9")]
+    assert serials(match_devices(usb, [info("f9")])) == [("f0246262", None), (None, "f9")]
+    bench.usb.devices = [fake_device(serial="00000000F1"), fake_device(serial="00000000F2", address=4)]
+    usb = bench.facts().usb.of_kind("camera")
+    assert serials(match_devices(usb, [info("f2"), info("00000000f1")])) == [("f1", "00000000f1"), ("f2", "f2")]
+    bench.put_on_usb(0x0B55)
+    assert [one.usb for one in bench.facts().pairs] == [None]  # one in recovery mode is no camera
+
+
+def test_pair_gives_the_last_device_to_a_camera_without_serial(bench: Any) -> None:
+    bench.usb.devices = [fake_device(serial="", port_numbers=None)]
+    usb = bench.facts().usb.of_kind("camera")
+    assert serials(match_devices(usb, [info("f1")])) == [("", "f1")]
+    assert serials(match_devices(usb, [])) == [("", None)]
+    assert serials(match_devices(usb, [info("f1"), info("f2")])) == [("", None), (None, "f1"), (None, "f2")]
+
+
+def test_pair_prefers_what_the_sdk_reports(bench: Any) -> None:
+    [both] = bench.facts().pairs
+    assert (both.name, both.serial, both.firmware) == ("Intel RealSense L515", "f0246262", "01.05.08.01")
+    assert (both.link, both.is_slow, both.label) == ("5 Gbit/s (USB 3)", False, "L515 f0246262 at 2-1")
+    alone = Pair(both.usb, None)
+    assert (alone.name, alone.serial, alone.firmware) == ("L515", "f0246262", "1.5.8")
+    seen = Pair(None, info("f1", usb="2.1"))
+    assert (seen.link, seen.is_slow, seen.label) == ("USB 2.1", True, "Intel RealSense L515 f1")

@@ -1,16 +1,30 @@
+"""What is read of a host: files and processes of Linux, udev rules, and USB, by the real pyusb on a fake bus."""
+
 import errno
+import inspect
 import os
 import platform
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import usb.backend
+import usb.core
+import usb.util
+from fake_bench import fake_device
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from usb.backend.libusb1 import _LibUSB
 
 from nlos_cam.doctor import host
+from nlos_cam.doctor.host import LIDARS, OTHERS
+from nlos_cam.doctor.udev import FILE_NAME, RELOAD, WRITE_AND_INSTALL, install_command, rules_text
+from nlos_cam.doctor.usb import SPEEDS, UsbDevice, firmware_of, scan_usb, sdk_serial
 
 LINUX = host.Platform("linux", "x86_64", (3, 11))
 READ = (".dockerenv", "proc/modules", "proc/1/cgroup", "proc/1/environ", "proc/version", "proc/sys/kernel/osrelease")
@@ -27,8 +41,7 @@ def test_this_host_and_platform_can_be_read(tmp_path: Path) -> None:
     found = host.this_platform()
     assert found.python == sys.version_info[:2]
     assert (found.system, found.machine) == (platform.system().lower(), platform.machine().lower())
-    assert found.is_root == (os.geteuid() == 0)
-    assert found.is_musl == (platform.libc_ver()[0] == "")
+    assert (found.is_root, found.is_musl) == (os.geteuid() == 0, platform.libc_ver()[0] == "")
     assert set(host.read_host().modules) == set(host.MODULES)
     (tmp_path / ".dockerenv").touch()
     mac = host.Platform("darwin", "arm64", (3, 11))
@@ -170,3 +183,143 @@ def test_real_process_that_has_a_file_open_is_found(tmp_path: Path) -> None:
     assert [(one.pid, one.node) for one in found] == [(other.pid, str(held))]
     assert found[0].name.startswith("python")
     assert host.find_holders([str(held)])[0] == []
+
+
+CLAUSE = re.compile(r'[A-Z]+(\{\w+\})?(==|:=|\+=)"[^"]*"')
+
+
+def lines() -> list[str]:
+    return [line for line in rules_text().splitlines() if line and not line.startswith("#")]
+
+
+@pytest.mark.parametrize("product_id", LIDARS)
+def test_rules_open_every_lidar_to_every_user(product_id: int) -> None:
+    [rule] = [line for line in lines() if f'"{product_id:04x}"' in line and line.startswith('SUBSYSTEMS=="usb"')]
+    assert 'ATTRS{idVendor}=="8086"' in rule
+    assert 'MODE:="0666"' in rule
+
+
+def test_rules_open_motion_sensors_and_are_well_formed() -> None:
+    sensors = [line for line in lines() if not line.startswith("SUBSYSTEMS")]
+    assert [line.split(",")[0] for line in sensors] == ['KERNEL=="iio*"', 'DRIVER=="hid_sensor*"']
+    assert all('ATTRS{idProduct}=="0b64"' in line and "chmod -R 0777 /sys/%p" in line for line in sensors)
+    for line in lines():
+        assert all(CLAUSE.fullmatch(clause) for clause in line.split(", ")), line
+    assert not LIDARS.keys() & OTHERS.keys()
+
+
+def test_commands_name_the_file_and_reload() -> None:
+    assert f"--write-udev {FILE_NAME}" in WRITE_AND_INSTALL
+    assert WRITE_AND_INSTALL.endswith(RELOAD)
+    assert "'my rules'" in install_command("my rules")
+    assert install_command("a").index("install") < install_command("a").index("udevadm")
+
+
+Scan = Callable[..., list[UsbDevice]]
+
+
+@pytest.fixture
+def seen(bench: Any, tmp_path: Path) -> Scan:
+    """Scan these devices, on a host that has only the healthy camera's files."""
+
+    def look(*devices: SimpleNamespace) -> list[UsbDevice]:
+        bench.usb.devices = list(devices)
+        found = scan_usb(bench.usb, tmp_path)
+        assert found.total == len(devices)
+        return list(found.devices)
+
+    return look
+
+
+def test_l515_has_every_field_that_usb_knows(seen: Scan) -> None:
+    [found, nowhere] = seen(fake_device(), fake_device(serial="", port_numbers=None))
+    assert (found.id, found.kind, found.meaning) == ("8086:0b64", "camera", "L515")
+    assert (found.bus, found.address, found.port) == (2, 3, "2-1")
+    assert (found.usb_type, found.link, found.is_slow) == ("3.2", SPEEDS[usb.util.SPEED_SUPER], False)
+    assert (found.firmware, found.serial, found.product) == ("1.5.8", "f0246262", "Intel(R) RealSense(TM) 515")
+    assert found.interfaces == ("hid", "video", "vendor")
+    assert (found.error, found.denied) == ("", False)
+    assert (found.label, nowhere.label) == ("L515 f0246262 at 2-1", "L515")
+
+
+def test_realsense_products_are_known(seen: Scan) -> None:
+    for product, kind, word in (
+        *((0x0B64, "camera", "L515"), (0x0B3D, "camera", "pre-production"), (0x0B0D, "camera", "L500")),
+        *((0x0B55, "recovery", "recovery"), (0x0ADC, "recovery", "USB 2"), (0x0B07, "other", "D435")),
+    ):
+        [found] = seen(fake_device(product), fake_device(0x1234), fake_device(idVendor=0x046D))  # strangers are counted
+        assert (found.kind, word in found.meaning) == (kind, True)
+
+
+def test_link_is_slow_by_speed_or_else_by_version(seen: Scan) -> None:
+    assert SPEEDS[usb.util.SPEED_HIGH] == "480 Mbit/s (USB 2)"
+    assert SPEEDS[usb.util.SPEED_SUPER] == "5 Gbit/s (USB 3)"
+    fast = (0x0320, 4), (0x0320, 5), (0x0320, 0), (0x0300, None)
+    slow = (0x0210, 3), (0x0210, 0), (0x0210, None)
+    for bcd_usb, speed in fast + slow:
+        [found] = seen(fake_device(bcdUSB=bcd_usb, speed=speed))
+        assert found.is_slow == ("USB 2" in found.link) == ((bcd_usb, speed) in slow)
+
+
+def test_firmware_and_serial_are_read_as_the_sdk_writes_them() -> None:
+    known = {0x1058: "1.5.8", 0x1052: "1.5.2", 0x1041: "1.4.1", 0x1099: "1.9.9"}
+    expected = known | dict.fromkeys((0x1158, 0x0058, 0x105A), "")
+    assert {number: firmware_of(number) for number in expected} == expected
+    for serial, written in {"00000000F0246262": "f0246262", "00000000f0140727": "f0140727", "": ""}.items():
+        assert sdk_serial(serial) == written == sdk_serial(written)
+
+
+def test_serial_comes_from_the_kernel_without_permission(seen: Scan) -> None:
+    [found] = seen(fake_device(shut=usb.core.USBError("Access denied", -3, errno.EACCES)))
+    assert found.denied
+    assert "Access denied" in found.error
+    assert (found.serial, found.product, found.firmware) == ("f0246262", "RealSense", "1.5.8")
+    assert "hid" in found.interfaces
+
+
+@pytest.mark.parametrize("refusal", [NotImplementedError("no driver"), usb.core.USBError("gone", -4, 19)])
+def test_other_refusals_are_no_lack_of_permission(seen: Scan, refusal: Exception) -> None:
+    """As by a driver of Windows, or of a device that left."""
+    [found] = seen(fake_device(shut=refusal, hides=refusal, port_numbers=None))
+    assert (found.error, found.denied) == (str(refusal), False)
+    assert (found.serial, found.interfaces, found.port) == ("", (), "")
+
+
+def test_broken_string_is_an_error_of_the_device(seen: Scan) -> None:
+    strings = {1: "", 2: "", 3: SimpleNamespace(encode=lambda _: b"\x00\xd8")}  # half a surrogate
+    [found] = seen(fake_device(strings=strings, port_numbers=()))
+    assert "surrogate" in found.error or "decode" in found.error
+
+
+def test_scan_closes_every_device_and_claims_none(bench: Any, tmp_path: Path) -> None:
+    bench.usb.devices = [fake_device(), fake_device(0x0B07, address=4)]
+    assert len(scan_usb(bench.usb, tmp_path).devices) == 2
+    assert (bench.usb.open_handles, bench.usb.meddled) == (0, [])
+    bench.usb.fails = usb.core.USBError("Input/Output Error", -1, 5)
+    assert "Input/Output Error" in scan_usb(bench.usb, tmp_path).error
+
+
+def test_scan_reports_a_missing_libusb_or_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in ("usb.core", "libusb_package"):
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, package, None)
+            assert package in scan_usb().error
+    monkeypatch.setattr("libusb_package.get_libusb1_backend", lambda: None)
+    for name in ("libusb1", "libusb0", "openusb"):
+        monkeypatch.setattr(f"usb.backend.{name}.get_backend", lambda: None)
+    assert scan_usb().error == "No backend available"
+
+
+def test_scan_of_the_real_bus_has_no_error() -> None:
+    found = scan_usb()
+    assert found.error == ""
+    assert len(found.devices) <= found.total
+
+
+def test_fake_bus_has_the_methods_of_the_real_one(bench: Any) -> None:
+    faked = [name for name in vars(type(bench.usb)) if not name.startswith("_")]
+    assert len(faked) == 10
+    for name in faked:
+        real = list(inspect.signature(getattr(_LibUSB, name)).parameters)
+        assert list(inspect.signature(getattr(type(bench.usb), name)).parameters) == real
+        assert hasattr(usb.backend.IBackend, name)

@@ -1,4 +1,4 @@
-"""Figures of an evaluation: every object is on the sheet, drawn in the colors of its values."""
+"""Figures of an evaluation: every object is on the sheet, in the colors of its values; and evaluations in color."""
 
 from pathlib import Path
 from typing import Any
@@ -6,22 +6,24 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib import colormaps
+from matplotlib.image import imread
+from nlos_calibration.rig import load_rig
+from nlos_models.recipe import SIMULATION_ONLY
 
+from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.samples import make_samples
 from nlos_cam.evaluate import figures as evaluate_pictures
+from nlos_cam.evaluate.color import color_baselines, draw_color_sheet, figures_of_color, painted_maps
 from nlos_cam.evaluate.figures import BLOCK, DIFFERENCE, HEAD, ROWS, TILE, VALUE, draw_gallery, draw_sheet
 from nlos_cam.evaluate.metrics import TARGETS, over_objects
+from nlos_cam.objects.textures import TEXTURES
 
 
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The figures that are drawn."""
     made, original = list[Any](), evaluate_pictures._figure
-
-    def kept(size: tuple[float, float]) -> Any:
-        made.append(original(size))
-        return made[-1]
-
-    monkeypatch.setattr(evaluate_pictures, "_figure", kept)
+    monkeypatch.setattr(evaluate_pictures, "_figure", lambda size: made.append(original(size)) or made[-1])
     return made
 
 
@@ -47,13 +49,30 @@ def test_mosaic_shows_truth_reconstruction_and_difference() -> None:
     assert (canvas[BLOCK:, 2 * TILE :] == 255).all()
 
 
-@pytest.mark.parametrize("count", [1, 4, pytest.param(54, marks=pytest.mark.slow), 130])
-def test_sheet_names_up_to_54_objects_from_first_to_last(tmp_path: Path, figures: list[Any], count: int) -> None:
-    draw_sheet(tmp_path / "sheet.png", _images(count), _images(count), [str(k) for k in range(count)])
+@pytest.mark.parametrize("count", [1, 4, 7, pytest.param(54, marks=pytest.mark.slow), 130])
+def test_sheet_names_up_to_54_objects_from_first_to_last_without_overlap(
+    tmp_path: Path, figures: list[Any], count: int
+) -> None:
+    names = [f"headphones {2_000_000_000 + k}" for k in range(count)]
+    draw_sheet(tmp_path / "sheet.png", _images(count), _images(count), names)
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
-    shown = [int(title) for title in _titles(figures[0])]
+    shown = [int(title.removeprefix("headphones ")) for title in _titles(figures[0])]
     assert (len(shown), shown[0], shown[-1]) == (min(count, 54), 0, count - 1)
     assert shown == sorted(set(shown))
+    axis, *bars = figures[0].axes
+    boxes = [text.get_window_extent() for text in axis.texts if text.get_text() not in ROWS]
+    assert not any(one.overlaps(other) for k, one in enumerate(boxes) for other in boxes[:k])
+    assert max(box.x1 for box in boxes) < min(bar.get_window_extent().x0 for bar in bars)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 20])
+def test_gallery_shows_the_worst_and_the_best_each_once(tmp_path: Path, figures: list[Any], count: int) -> None:
+    iou = np.random.default_rng(0).permutation(count) / 20
+    names = [f"hat {2_000_000_000 + k}" for k in range(count)]
+    draw_gallery(tmp_path / "gallery.png", _images(count), _images(count), names, iou)
+    order = [f"hat {k}: {iou[k]:.2f}" for k in np.argsort(iou)]
+    worst = min(6, -(-count // 2))
+    assert _titles(figures[0]) == [*order[:worst], *order[worst:][::-1][:6]]
 
 
 def test_categories_are_drawn_from_worst_to_best(tmp_path: Path, figures: list[Any]) -> None:
@@ -68,25 +87,50 @@ def test_categories_are_drawn_from_worst_to_best(tmp_path: Path, figures: list[A
     assert (tmp_path / "empty.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_gallery_shows_the_worst_and_the_best(tmp_path: Path, figures: list[Any]) -> None:
-    iou = np.random.default_rng(0).permutation(20) / 20
-    draw_gallery(tmp_path / "gallery.png", _images(20), _images(20), [str(k) for k in range(20)], iou)
-    order = [f"{k}: {iou[k]:.2f}" for k in np.argsort(iou)]
-    assert _titles(figures[0]) == [*order[:6], *order[::-1][:6]]
+TRUTH = np.zeros((2, 3, 64, 64), np.float32)
+TRUTH[:, :, 20:40, 20:40] = np.array([(1.0, 0.1, 0.1), (0.1, 1.0, 0.1)])[:, :, None, None]
+NOTHING = np.zeros_like(TRUTH)
+NO_VALUE = {"value": None, "low": None, "high": None}
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_gallery_of_few_objects_shows_each_once(tmp_path: Path, figures: list[Any], count: int) -> None:
-    names = [f"hat {2_000_000_000 + k}" for k in range(count)]
-    draw_gallery(tmp_path / "gallery.png", _images(count), _images(count), names, np.linspace(0, 1, count))
-    assert sorted(title.partition(":")[0] for title in _titles(figures[0])) == [f"hat {k}" for k in range(count)]
+def test_color_figures_score_truth_and_background_and_name_baselines_and_simulation() -> None:
+    perfect, nothing = (figures_of_color(image, TRUTH, {}, TRUTH) for image in (TRUTH, NOTHING))
+    assert perfect["silhouette_iou"] == perfect["accuracy_mean_abs"] == {"value": 1.0, "low": 1.0, "high": 1.0}
+    assert perfect["colour_error"] == {"value": 0.0, "low": 0.0, "high": 0.0}
+    assert (nothing["silhouette_iou"]["value"], nothing["colour_error"]) == (0.0, NO_VALUE)
+    figures = figures_of_color(TRUTH, TRUTH, {"other": NOTHING}, TRUTH)
+    assert (figures["note"], figures["objects"], figures["silhouette_iou"]["value"]) == (SIMULATION_ONLY, 2, 1.0)
+    assert set(figures["baselines"]) == {"other", "all_background", "mean_object", "mean_colour"}
+    assert set(figures["better_than"]) == {"mean_object", "mean_colour"}
+    assert figures["better_than"]["mean_object"]["root_mean_square_error"]["low"] > 0
+    assert all(
+        gain["value"] > 0 for name, gain in figures["better_than"]["mean_colour"].items() if name != "silhouette_iou"
+    )
 
 
-@pytest.mark.parametrize("count", [1, 7, pytest.param(54, marks=pytest.mark.slow)])
-def test_titles_of_a_sheet_do_not_overlap(tmp_path: Path, figures: list[Any], count: int) -> None:
-    names = [f"headphones {2_000_000_000 + k}" for k in range(count)]
-    draw_sheet(tmp_path / "sheet.png", _images(count), _images(count), names)
-    figure, (axis, *_) = figures[0], figures[0].axes
-    boxes = [text.get_window_extent() for text in axis.texts if text.get_text() not in ROWS]
-    assert not any(one.overlaps(other) for k, one in enumerate(boxes) for other in boxes[:k])
-    assert max(box.x1 for box in boxes) < min(bar.get_window_extent().x0 for bar in figure.axes[1:])
+def test_color_guesses_are_background_mean_object_and_mean_color() -> None:
+    guesses = color_baselines(TRUTH, TRUTH)
+    assert not guesses["all_background"].any()
+    np.testing.assert_allclose(guesses["mean_object"][1], TRUTH.mean(0))
+    expected = (TRUTH > 0) * np.array([0.55, 0.55, 0.1])[:, None, None]
+    np.testing.assert_allclose(guesses["mean_colour"], expected, rtol=1e-6)
+
+
+def test_painted_maps_match_dataset_samples() -> None:
+    plan = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft", textures=tuple(TEXTURES))
+    samples, seen = make_samples(plan, [40]), list[tuple[int, int]]()
+    maps = painted_maps([*samples["object_depth_m"]], plan.rig, 40, "draft", lambda *at: seen.append(at))
+    np.testing.assert_array_equal(maps.depth_m, samples["depth_m"])
+    np.testing.assert_array_equal(maps.intensity, samples["intensity"])
+    np.testing.assert_array_equal(maps.image.astype(np.float16), samples["image"])
+    assert seen == [(1, 1)]
+
+
+def test_color_sheet_shows_truth_reconstruction_and_difference(tmp_path: Path) -> None:
+    draw_color_sheet(tmp_path / "sheet.png", TRUTH[::-1], TRUTH)
+    pixels = imread(tmp_path / "sheet.png")[..., :3].reshape(-1, 3)
+    colors = (1.0, 0.1, 0.1), (0.1, 1.0, 0.1), (0.9, 0.9, 0.0)
+    red, green, yellow = ((np.abs(pixels - color) < 0.05).all(1).sum() for color in colors)
+    assert red > 100  # once as truth, once as reconstruction
+    assert abs(int(red) - int(green)) < 0.05 * red
+    assert yellow > 100  # their difference, twice

@@ -1,4 +1,4 @@
-"""Evaluation metrics, their confidence intervals, and the error by size, by detail and by place in the image."""
+"""Evaluation metrics, their confidence intervals, the error by size, detail and place, and recognised kinds."""
 
 from itertools import pairwise
 
@@ -9,7 +9,16 @@ from nlos_calibration import load_rig
 from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate import TARGETS, advantage, judge, metrics, over_objects, per_object
 from nlos_cam.evaluate.metrics import detail_per_cm, error_by_zone, interval, meets, rank_correlation, surface_cm2
-from nlos_cam.objects import depth_from_image, object_box
+from nlos_cam.evaluate.recognition import recognise, recognised
+from nlos_cam.objects import (
+    CATEGORIES,
+    category_triangles,
+    depth_from_image,
+    image_from_depth,
+    object_box,
+    orthographic_depth,
+)
+from nlos_cam.objects.placement import Pose, place
 
 BOX = object_box(load_rig("paper-rig"))
 PITCH_CM = 25 / 64
@@ -49,14 +58,11 @@ def test_interval_contains_its_mean_and_repeats() -> None:
         assert found.value == found.low == found.high == expected
 
 
-def test_interval_shrinks_with_root_of_object_count() -> None:
+def test_interval_covers_the_truth_at_its_confidence_and_shrinks_with_root_of_object_count() -> None:
     values = np.random.default_rng(2).normal(size=1600)
     wide, narrow = interval(values[:100]), interval(values)
     assert (wide.high - wide.low) / (narrow.high - narrow.low) == pytest.approx(4, rel=0.3)
     assert narrow.high - narrow.low == pytest.approx(2 * 1.96 / 40, rel=0.15)
-
-
-def test_interval_covers_the_truth_at_its_confidence() -> None:
     generator = np.random.default_rng(3)
     found = [interval(generator.exponential(1.0, 54)) for _ in range(150)]
     assert 0.86 < np.mean([one.low <= 1.0 <= one.high for one in found]) <= 1.0
@@ -140,7 +146,7 @@ def test_rank_correlation_is_of_order_alone() -> None:
     ("at", "zone"),
     [((20, 20), "core"), ((10, 20), "rim inside"), ((8, 20), "rim outside"), ((50, 50), "far background")],
 )
-def test_zones_locate_an_error(at: tuple[int, int], zone: str) -> None:
+def test_zones_locate_an_error_and_share_none_of_a_perfect_image(at: tuple[int, int], zone: str) -> None:
     truth = plate(20)
     image = truth.copy()
     image[0][at] += 0.2
@@ -148,9 +154,6 @@ def test_zones_locate_an_error(at: tuple[int, int], zone: str) -> None:
     assert zones[zone].share_of_error == pytest.approx(1)
     assert sum(one.share_of_pixels for one in zones.values()) == pytest.approx(1)
     assert zones["core"].share_of_pixels == pytest.approx(16**2 / 64**2)
-
-
-def test_zones_of_perfect_image_and_of_empty_truth() -> None:
     assert {zone.share_of_error for zone in error_by_zone(plate(9), plate(9)).values()} == {None}
     assert error_by_zone(plate(9), EMPTY)["far background"].share_of_error == pytest.approx(1)
 
@@ -168,3 +171,17 @@ def test_quality_figures_of_exact_and_of_blind_predictions() -> None:
     assert found["correlation"] is None
     assert found["trusted_good"] is None
     assert found["bias"] > 0.2
+
+
+def _images(pose: Pose, seed: int) -> np.ndarray:
+    shapes = (place(category_triangles(name, seed), pose, BOX) for name in CATEGORIES)
+    return np.stack([image_from_depth(orthographic_depth(shape, BOX), BOX) for shape in shapes])
+
+
+def test_kinds_are_recognised_in_any_place_and_size_but_not_as_another_or_without_surface() -> None:
+    kinds = list(CATEGORIES)
+    for pose in (Pose(size_m=0.2), Pose(size_m=0.12, x_m=0.05, y_m=-0.04), Pose(turn_z_rad=0.3, tilt_y_rad=0.2)):
+        assert recognised(_images(pose, 1000), kinds, BOX).mean() > 0.8
+    images = np.stack([np.zeros((64, 64), np.float32), _images(Pose(), 7)[list(CATEGORIES).index("cup")]])
+    assert recognise(images, BOX) == ["", "cup"]
+    np.testing.assert_array_equal(recognised(images, ["cup", "rocket"], BOX), [0, 0])

@@ -5,6 +5,7 @@ from dataclasses import replace
 from itertools import count as ticking
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -36,23 +37,17 @@ def _facts(rows: list[RuntimeRow], planned: int) -> dict[str, Any]:
     return json.loads(json.dumps(runtime_facts(rows, planned, 54, "a machine"), allow_nan=False))
 
 
-def test_recommended_is_fastest_setting_without_loss() -> None:
+def test_recommended_is_fastest_without_loss_in_any_metric_and_pareto_front_is_undominated() -> None:
     blind = replace(ROWS[1], figures={**ROWS[1].figures, "foreground_rmse_mm": Interval(None, None, None)})
     for rows, name in ((ROWS, "quick"), (ROWS[:1], "exact"), ([ROWS[0], blind], "exact")):
         pick = recommended(rows)
         assert pick.setting.name == name
     assert recommended([]) is None
-
-
-def test_loss_is_positive_where_any_metric_is_worse() -> None:
     worse = {**ROWS[0].figures, "silhouette_iou": Interval(0.7, 0, 1), "foreground_rmse_mm": Interval(25.0, 0, 50)}
     lost = runtime_tradeoff.losses(replace(ROWS[0], figures=worse), ROWS[0])
     assert lost["silhouette_iou"] == pytest.approx(0.1)
     assert lost["foreground_rmse_mm"] == pytest.approx(5)
     assert lost["accuracy_mean_abs"] == 0
-
-
-def test_pareto_front_has_no_row_both_slower_and_worse() -> None:
     assert [row.setting.name for row in pareto_front(ROWS)] == ["quicker", "quick", "exact"]
     assert [row.setting.name for row in pareto_front([*ROWS, _row("best", 1, 0.95)])] == ["best"]
 
@@ -100,16 +95,11 @@ def test_measure_takes_median_and_restores_threads() -> None:
 
 
 def test_calibration_uses_training_objects_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[int, int]] = []
-
-    def kept(first_seed: int, count: int, box: Any) -> Any:
-        asked.append((first_seed, count))
-        return seeded_objects(first_seed, 2, box)
-
-    monkeypatch.setattr(runtime_tradeoff, "seeded_objects", kept)
+    asked = Mock(side_effect=lambda first_seed, _, box: seeded_objects(first_seed, 2, box))
+    monkeypatch.setattr(runtime_tradeoff, "seeded_objects", asked)
     shapes = [(depth.shape, intensity.shape) for depth, intensity in runtime_tradeoff.calibration(RIG, BOX)]
     assert shapes == [((1, 64, 80), (1, 64, 80))] * 2
-    first_seed, count = asked[0]
+    first_seed, count, _ = asked.call_args.args
     assert TRAINING_SEED <= first_seed < first_seed + count < HELD_OUT_SEED
 
 

@@ -1,18 +1,21 @@
-"""Subjects of an evaluation: objects before the simulated sensor, as maps that the weights take, and notes on them."""
+"""Subjects of an evaluation before the simulated sensor, notes on them, and baselines that need no network."""
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from nlos_calibration.rig import load_rig
-from nlos_models import CheckpointRecord, Recipe
+from nlos_calibration import LidarPose, load_rig
+from nlos_models import CheckpointRecord, MapSet, Recipe
 from small_maps import SmallDataset, small_maps
 
 from nlos_cam.camera.simulated_world import World
-from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan, procedural_images
+from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan, Objects, procedural_images
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import QUIET, HeldOutObjects, as_map_set, baseline_answers, baselines, echoes_of, reconstruct_all
+from nlos_cam.evaluate.baselines import answers_with_nearest, mean_image, training_maps, trivial_answers
 from nlos_cam.evaluate.subjects import notes_about, rendered_objects, rig_of, seeded_objects, sense, truth_of
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects import CATEGORIES, benchmark_objects, image_from_depth, object_box, object_depth, unseen_objects
@@ -34,35 +37,27 @@ def echoes() -> list[MultiBounce]:
     return made
 
 
-def test_seeded_objects_are_those_of_their_seeds() -> None:
-    subjects = seeded_objects(TEST_SEED + 1, 2, BOX)
+def test_seeded_and_fresh_objects_are_those_of_their_seeds() -> None:
+    subjects = seeded_objects(TEST_SEED, 2, BOX)
     for k, subject in enumerate(subjects):
-        category, depth_m = object_depth(TEST_SEED + 1 + k, BOX)
+        category, depth_m = object_depth(TEST_SEED + k, BOX)
         assert subject.category == category
         assert category in subject.name
         np.testing.assert_array_equal(subject.depth_m, depth_m)
         np.testing.assert_array_equal(truth_of(subjects, BOX)[k], image_from_depth(depth_m, BOX))
+    judged = rendered_objects(RIG, 1)
+    np.testing.assert_array_equal(judged.maps.image, truth_of(subjects[:1], BOX))
+    assert judged.maps.depth_m.shape == (1, 64, 80)
+    assert (len(judged.names), judged.plan) == (1, PLAN)
 
 
-def test_test_set_has_54_visible_objects_of_18_categories() -> None:
-    subjects = benchmark_objects(BOX)
-    truth = truth_of(subjects, BOX)
-    assert truth.shape == (54, 64, 64)
-    assert len({subject.name for subject in subjects}) == 54
-    assert len({subject.category for subject in subjects}) == 18
-    assert (truth > 0).any((1, 2)).all()
-
-
-def test_sense_repeats_and_matches_simulated_camera(echoes: list[MultiBounce]) -> None:
+def test_sense_repeats_matches_simulated_camera_and_averages_noise_down_with_frames(echoes: list[MultiBounce]) -> None:
     first, second = sense(echoes, RIG), sense(echoes, RIG)
     world = World(SceneFile(name="any", rig=RIG), echoes, [None, None])
     for k in range(2):
         np.testing.assert_array_equal(first[k].depth_m, second[k].depth_m)
         frame = maps_from_frame(world.images(k).frame(RIG.pinhole))
         np.testing.assert_array_equal(first[k].intensity, frame.intensity)
-
-
-def test_sense_averages_noise_down_with_frames(echoes: list[MultiBounce]) -> None:
     quiet, mean = (sense(echoes[:1], RIG, QUIET, frames=frames)[0] for frames in (1, 3))
     np.testing.assert_allclose(quiet.depth_m, mean.depth_m, atol=1e-6)  # every frame without noise is alike
     np.testing.assert_allclose(quiet.intensity, mean.intensity, rtol=1e-6)
@@ -72,22 +67,10 @@ def test_sense_averages_noise_down_with_frames(echoes: list[MultiBounce]) -> Non
 
 
 def test_reconstruct_all_takes_one_object_at_a_time(echoes: list[MultiBounce]) -> None:
-    maps, batches = as_map_set(sense(echoes, RIG), np.zeros((2, 64, 64), np.float32)), list[int]()
-
-    def middle(depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
-        assert intensity.shape == depth_m.shape
-        batches.append(len(depth_m))
-        return np.nan_to_num(depth_m[:, :, 8:72])
-
-    np.testing.assert_array_equal(reconstruct_all(middle, maps), np.nan_to_num(maps.depth_m[:, :, 8:72]))  # type: ignore[arg-type]
-    assert batches == [1, 1]
-
-
-def test_fresh_objects_are_those_of_test_seeds() -> None:
-    judged = rendered_objects(RIG, 1)
-    np.testing.assert_array_equal(judged.maps.image, truth_of(seeded_objects(TEST_SEED, 1, BOX), BOX))
-    assert judged.maps.depth_m.shape == (1, 64, 80)
-    assert (len(judged.names), judged.plan) == (1, PLAN)
+    maps = as_map_set(sense(echoes, RIG), np.zeros((2, 64, 64), np.float32))
+    network = Mock(side_effect=lambda depth_m, _: np.nan_to_num(depth_m[:, :, 8:72]))
+    np.testing.assert_array_equal(reconstruct_all(network, maps), np.nan_to_num(maps.depth_m[:, :, 8:72]))
+    assert [part.shape for call in network.call_args_list for part in call.args] == [(1, 64, 80)] * 4
 
 
 def test_second_set_is_of_other_kinds_in_the_same_poses() -> None:
@@ -123,3 +106,90 @@ def test_notes_name_other_rigs_and_categories_left_out() -> None:
     assert ("paper-rig" in other_rig, "hat" in left_out, "car" in left_out) == (True, True, False)
     (other_training,) = notes_about(RECORD, JUDGED, training)
     assert "train" in other_training
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    return procedural_images(0, 12, object_box(RIG)).astype(np.float32)
+
+
+def _maps(images: np.ndarray, seed: int = 0) -> MapSet:
+    """Maps from which the image can be told apart, with holes and noise."""
+    generator = np.random.default_rng(seed)
+    wide = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8)))
+    depth = wide + 0.01 * generator.standard_normal(wide.shape).astype(np.float32)
+    depth[:, :5, :5] = np.nan
+    return MapSet(depth.astype(np.float32), 50 * wide, images)
+
+
+class Chunked(SimpleNamespace):
+    """Training maps in parts of some size."""
+
+    maps: MapSet
+    size: int
+
+    def __len__(self) -> int:
+        return len(self.maps.image)
+
+    def chunks(self) -> list[MapSet]:
+        arrays, parts = vars(self.maps).values(), range(0, len(self), self.size)
+        return [MapSet(*(array[start : start + self.size] for array in arrays)) for start in parts]
+
+
+def _guesses(sought: MapSet, training: MapSet, size: int = 12, **others: object) -> dict[str, np.ndarray]:
+    options = {"on_progress": lambda *_: None, **others}
+    return answers_with_nearest(sought, Chunked(maps=training, size=size), **options)  # type: ignore[arg-type]
+
+
+def test_baselines_answer_every_object(images: np.ndarray) -> None:
+    mean = mean_image(images.astype(np.float16))
+    np.testing.assert_allclose(mean, images.mean(0), atol=1e-3)
+    alone, guesses = trivial_answers(5, mean), _guesses(_maps(images[:5], seed=1), _maps(images))
+    assert set(alone) == {"all_background", "mean_object"}
+    assert set(guesses) == {*alone, "nearest_neighbour"}
+    for guess in (*alone.values(), *guesses.values()):
+        assert (guess.shape, guess.dtype) == ((5, 64, 64), np.float32)
+    assert not guesses["all_background"].any()
+    np.testing.assert_allclose(guesses["mean_object"][3], images.mean(0), atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [1, 5, 12])
+def test_nearest_neighbour_is_found_in_any_chunk(images: np.ndarray, size: int) -> None:
+    order, told = np.array([7, 2, 11, 0]), list[tuple[int, int]]()
+    sought = _maps(images[order], seed=1)
+    guesses = _guesses(sought, _maps(images), size, on_progress=lambda *at: told.append(at))
+    np.testing.assert_array_equal(guesses["nearest_neighbour"], images[order])
+    assert (len(told), told[-1]) == (-(-12 // size), (12, 12))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 0.0])
+def test_nearest_neighbour_weighs_channels_by_their_spread(images: np.ndarray, scale: float) -> None:
+    """A channel that never varies counts for nothing."""
+    faint = [replace(maps, intensity=scale * maps.intensity) for maps in (_maps(images[:4], seed=1), _maps(images))]
+    np.testing.assert_array_equal(_guesses(*faint)["nearest_neighbour"], images[:4])
+
+
+def test_training_maps_are_cached_by_what_determines_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[tuple[DatasetPlan, int, Path]] = []
+    shapes = {"images": np.zeros((2, 64, 64), np.float16)}
+    monkeypatch.setattr(baselines, "build_dataset", lambda *args, **_: built.append(args))
+    monkeypatch.setattr(baselines, "open_dataset", lambda folder: folder)
+    monkeypatch.setattr(baselines, "procedural_images", lambda *_: shapes["images"])
+    monkeypatch.setattr(baselines, "NEIGHBOURS", 7)
+    plan = DatasetPlan(RIG, TEST_SEED, objects=Objects(("cup",)))
+    elsewhere = RIG.model_copy(update={"lidar": LidarPose(distance_m=0.3, yaw_deg=45)})
+    for one in (plan, plan, replace(plan, rig=elsewhere), replace(plan, first_seed=5)):
+        training_maps(one, tmp_path, 1, lambda *_: None)
+    shapes["images"] = shapes["images"] + np.float16(0.5)
+    training_maps(plan, tmp_path, 1, lambda *_: None)
+    first, again, moved, other_seed, other_shapes = (folder for _, _, folder in built)
+    assert first == again == other_seed
+    assert len({first, moved, other_shapes}) == 3
+    assert first.parent.parent == tmp_path
+    assert built[0][1] == 7
+    assert (built[0][0].first_seed, built[0][0].objects) == (TRAINING_SEED, Objects())
+
+
+def test_objects_that_identify_the_cache_cover_all_categories() -> None:
+    seen = {object_depth(seed, object_box(RIG))[0] for seed in range(baselines.FINGERPRINT_OBJECTS)}
+    assert seen == set(CATEGORIES)

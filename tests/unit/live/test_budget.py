@@ -38,17 +38,8 @@ def setting(rmse_mm: float | None, ms: float, frames: int = 1, threads: int = 1,
     return Setting.model_validate({**fixed, **times, "foreground_rmse_mm": {"value": rmse_mm}, **others})
 
 
-some_settings = st.lists(
-    st.builds(
-        setting,
-        st.one_of(st.none(), st.floats(1.0, 99.0)),
-        st.floats(0.5, 60.0),
-        st.integers(1, 16),
-        st.integers(1, 4),
-    ),
-    min_size=1,
-    max_size=12,
-)
+rmses, times, counts = st.none() | st.floats(1.0, 99.0), st.floats(0.5, 60.0), (st.integers(1, 16), st.integers(1, 4))
+some_settings = st.lists(st.builds(setting, rmses, times, *counts), min_size=1, max_size=12)
 
 
 @given(some_settings, st.floats(0.2, 20.0), st.floats(1.0, 500.0))
@@ -130,12 +121,17 @@ def chosen(
     return choice, loaded
 
 
-@pytest.mark.parametrize(("budget_ms", "name"), [(7.0, "quick"), (15.0, "good"), (60.0, "mean")])
-def test_within_budget_takes_the_most_accurate_that_fits(budget_ms: float, name: str) -> None:
-    choice, loaded = chosen(budget_ms)
-    assert choice.setting.runtime == loaded[-1] == name
-    assert choice.expected_ms <= budget_ms
-    assert choice.best is MEAN
+def test_within_budget_takes_the_most_accurate_that_fits_and_names_its_error() -> None:
+    for budget_ms, name, texts in (
+        (7.0, "quick", ()),
+        (15.0, "good", ("15.0 mm", "3.0 mm", MEAN.name)),
+        (60.0, "mean", ("4 frames", "50 ms", "best")),
+    ):
+        choice, loaded = chosen(budget_ms)
+        assert choice.setting.runtime == loaded[-1] == name
+        assert choice.expected_ms <= budget_ms
+        assert choice.best is MEAN
+        assert all(text in choice.describe() for text in texts)
 
 
 def test_within_budget_measures_a_slow_machine() -> None:
@@ -151,12 +147,6 @@ def test_within_budget_gives_up_a_setting_slower_than_expected() -> None:
         chosen(15.0, surprises={"good": 99.0, "quick": 10.0})
 
 
-def test_choice_names_its_error_and_averaging() -> None:
-    good, mean = (chosen(budget_ms)[0].describe() for budget_ms in (15.0, 60.0))
-    assert all(text in good for text in ("15.0 mm", "3.0 mm", MEAN.name))
-    assert all(text in mean for text in ("4 frames", "50 ms", "best"))
-
-
 @pytest.mark.parametrize(("p95_ms", "kept"), [(9.9, True), (10.1, False)])
 def test_outcome_counts_averaging_towards_the_delay(p95_ms: float, kept: bool) -> None:
     report: Any = SimpleNamespace(latency_ms={"p95": p95_ms})
@@ -167,11 +157,8 @@ def test_outcome_counts_averaging_towards_the_delay(p95_ms: float, kept: bool) -
 
 
 def test_available_settings_leaves_out_what_cannot_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    elsewhere = [
-        setting(1.0, 1.0, threads=10_000),
-        setting(1.0, 1.0, weights="/no/such/folder"),
-        setting(1.0, 1.0, runtime="torch float32, cuda"),
-    ]
+    impossible = {"threads": 10_000, "weights": "/no/such/folder", "runtime": "torch float32, cuda"}
+    elsewhere = [setting(1.0, 1.0, **{name: value}) for name, value in impossible.items()]
     monkeypatch.setattr("nlos_cam.live.budget.load_tradeoff", lambda _: [*elsewhere, *ALL])
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     assert available_settings(None, None) == ALL

@@ -1,20 +1,31 @@
+import csv
+import json
+import logging
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import made_up_moments
 import numpy as np
 import pytest
+from fake_wall import SMALL, wall_frame
 from hypothesis import given
 from hypothesis import strategies as st
 from small_frames import NOTHING, small_frame
 
 from nlos_cam.errors import NlosCamError, SceneError
-from nlos_cam.frames import maps_from_frame
-from nlos_cam.live import RunReport, RunStatistics, statistics
+from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.live import FrameLog, RunReport, RunStatistics, statistics
 from nlos_cam.live.statistics import MAX_FAILED_IN_A_ROW, STALLED, STALLED_AFTER_S, QualityLog, StallWatch, WarningLog
+from nlos_cam.live.telemetry import Telemetry, telemetry_of
 from nlos_cam.reconstruct import FrameResult, Quality, Verdict
 from nlos_cam.reconstruct.network import Doubt
+from nlos_cam.recording.sidecar import Sidecar, Temperatures, sidecar_path
+from nlos_cam.view import Moment
 
 
 @pytest.fixture
@@ -54,8 +65,7 @@ def test_report_counts_verdicts_warnings_issues_and_lost_frames() -> None:
     tally.fail(small_frame(1), ZeroDivisionError("odd"), 1)
     report = reported(tally, 4, incomplete=2, dropped=3, counts=Counter(duplicate=1, stalled=0))
     lost = {"incomplete": 2, "dropped_camera": 3, "dropped_loop": 4, "failed": 1}
-    assert report.counts == {"duplicate": 1, **lost, "blank": 2}
-    assert report.dropped == 2 + 3 + 4 + 1
+    assert (report.counts, report.dropped) == ({"duplicate": 1, **lost, "blank": 2}, 2 + 3 + 4 + 1)
     assert report.verdicts == {"object seen": 2, "nothing there": 1, "wall moved": 1}
     assert list(report.verdicts) == [verdict.value for verdict in Verdict if verdict in passed]
     assert report.warnings == {"hot": 2}
@@ -123,8 +133,7 @@ def test_stall_watch_counts_a_stall_that_lasts_to_the_end(watch: StallWatch, beg
     watch.close(25.0)
     watch.close(99.0)
     assert [each for _, each in begins] == [True, False, True, False, True, False, True]
-    assert watch.stalls == 4
-    assert watch.stalled_s == pytest.approx(2.0 + 2.0 + 1.5 + 2.0)
+    assert (watch.stalls, watch.stalled_s) == (4, pytest.approx(2.0 + 2.0 + 1.5 + 2.0))
 
 
 def test_predicted_quality_is_summarised_over_detected_objects_alone() -> None:
@@ -143,3 +152,112 @@ def test_predicted_quality_is_summarised_over_detected_objects_alone() -> None:
 def test_only_a_simulated_camera_has_computing_time() -> None:
     assert statistics.camera_ms(SimpleNamespace()) == {}  # type: ignore[arg-type]
     assert statistics.camera_ms(SimpleNamespace(exposures_s=[0.004] * 9))["p99"] == pytest.approx(4)  # type: ignore[arg-type]
+
+
+FRAMES = [wall_frame(number) for number in range(1, 100, 10)]
+"""A third of a second apart."""
+
+
+class Asked:
+    """Telemetry that is warmer by a degree each time it is read."""
+
+    def __init__(self) -> None:
+        self.times_s: list[float] = []
+
+    def __call__(self, time_s: float) -> Mapping[str, float]:
+        self.times_s.append(time_s)
+        return {"ldd_temperature": 40.0 + len(self.times_s)}
+
+
+def camera(uri: str, **values: float) -> Any:
+    return SimpleNamespace(uri=uri, telemetry=lambda end: {name: values[name] for name in values if name.endswith(end)})
+
+
+def readings(telemetry: Telemetry, frames: list[Frame]) -> list[Mapping[str, float] | None]:
+    return [telemetry.at(frame) for frame in telemetry.watch(frames)]
+
+
+def test_telemetry_reads_periodically_by_the_frames_clock() -> None:
+    asked = Asked()
+    assert list(Telemetry(asked, every_s=1.0).watch(FRAMES)) == FRAMES
+    assert asked.times_s == pytest.approx([0.0, 1.0, 2.0, 3.0])
+    given = readings(Telemetry(Asked(), every_s=1.0), FRAMES)
+    assert [bool(celsius) for celsius in given] == [number % 3 == 0 for number in range(10)], "each reading once"
+    assert given[3] == {"ldd_temperature": 42.0}
+    late = Telemetry(Asked(), every_s=1.0)
+    ahead = list(late.watch(FRAMES))
+    assert [late.at(ahead[number]) for number in (2, 2, 9)] == [
+        {"ldd_temperature": 41.0},
+        None,
+        {"ldd_temperature": 44.0},  # frames between were dropped
+    ]
+
+
+def test_telemetry_of_a_camera_reads_temperatures_only() -> None:
+    warm = {"ldd_temperature": 41.0}
+    assert readings(telemetry_of(camera("l515", laser_power=40.0, **warm)), FRAMES[:1]) == [warm]
+    assert readings(telemetry_of(camera("sim")), FRAMES[:1]) == [None]
+    assert readings(telemetry_of(camera("bag:no-sidecar.bag", **warm)), FRAMES[:1]) == [warm]
+
+
+def test_telemetry_of_a_recording_reads_its_sidecar_and_warns_if_it_is_broken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bag = tmp_path / "wall.bag"
+    series = [Temperatures(time_s=10.0 * k, celsius={"ldd_temperature": 40.0 + k}) for k in range(4)]
+    facts: dict[str, Any] = {"label": None, "camera": "l515", "state": "complete", "intrinsics": vars(SMALL)}
+    facts |= {"device": {}, "versions": {}, "settings": {}, "started": datetime(2026, 1, 2, tzinfo=UTC)}
+    sidecar_path(bag).write_text(Sidecar(**facts, temperatures=series).model_dump_json())
+    telemetry = telemetry_of(camera(f"bag:{bag}", ldd_temperature=99.0))
+    frames = [wall_frame(300 * k) for k in range(5)]  # 10 s apart
+    given = [celsius and celsius["ldd_temperature"] for celsius in readings(telemetry, frames)]
+    assert given == [40.0, 41.0, 42.0, 43.0, 43.0]
+    sidecar_path(bag).write_text("{")
+    assert readings(telemetry_of(camera(f"bag:{bag}", ldd_temperature=39.0)), FRAMES[:2]) == [None, None]
+    assert "wall.json" in caplog.text
+
+
+def moment(number: int, **others: Any) -> Moment:
+    given = {"stages_s": {"queue": 0.001, "network": 0.0042}, "dropped": 3, **others}
+    return made_up_moments.moment(number, latency_s=0.01, **given)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
+def test_log_writes_a_line_for_each_frame_in_order(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"log{suffix}"
+    with FrameLog(path) as log:
+        log.add(moment(0, verdict=Verdict.SEEN, celsius={"a": 40.0, "b": 41.5}))
+        for number in range(1, 100):
+            log.add(moment(number))
+        assert len(path.read_text(encoding="utf-8").splitlines()) >= 31, "written while the run goes on"
+    written = path.read_text(encoding="utf-8").splitlines()
+    lines: list[Any] = [*csv.DictReader(written)] if suffix == ".csv" else [*map(json.loads, written)]
+    assert [int(line["frame_number"]) for line in lines] == list(range(100))
+    assert (float(lines[7]["latency_ms"]), float(lines[7]["network_ms"])) == (10.0, 4.2)
+    assert lines[0]["verdict"] == "object seen"
+    assert lines[1]["verdict"] in {None, ""}
+    assert float(lines[0]["celsius"]) == 41.5
+
+
+def test_log_keeps_its_columns_when_a_stage_comes_later(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    with FrameLog(path) as log:
+        log.add(moment(0))
+        log.add(moment(1, stages_s={"doubt": 1.0, "network": 0.005}))
+    first, second = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+    assert (first["network_ms"], second["network_ms"], second["queue_ms"]) == ("4.2", "5.0", "")
+
+
+def test_log_ends_on_a_full_disk_without_ending_the_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    class Full:
+        def write(self, _: str = "") -> int:
+            raise OSError(28, "No space left on device")
+
+        close = write
+
+    with caplog.at_level(logging.WARNING), FrameLog(tmp_path / "log.jsonl") as log:
+        real, log._file = log._file, Full()  # type: ignore[assignment]
+        for number in range(5):
+            log.add(moment(number))
+        real.close()
+    assert sum("frame 0 (No space left on device)" in line for line in caplog.messages) == 1

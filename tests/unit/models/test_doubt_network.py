@@ -1,4 +1,4 @@
-"""Uncertainty ("doubt") network: features, outputs in range, training with exact resume, loss and calibration."""
+"""Uncertainty ("doubt") network: features, training, calibration, predicted quality, and files beside the weights."""
 
 from pathlib import Path
 from typing import Any
@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 import torch
 from fake_doubter import RECIPE
-from nlos_models import Running, doubt_training
+from nlos_models import DoubtRecord, Running, doubt_network, doubt_training, load_uncertainty_model, quality, records
 from nlos_models.doubt_network import MAX_ERROR_V, MIN_ERROR_V, CalibratedDoubt, DoubtNetwork, DoubtOutput
-from small_doubt import DARK_V, small_doubt_set
+from nlos_models.doubt_training import QualitySet, families, fit_quality, left_out_folds, trusted_above
+from nlos_models.errors import CheckpointError
+from nlos_models.inference import UncertaintyEstimate
+from nlos_models.quality import QualityEstimate, QualityModel, QualityRecord, quality_features
+from small_doubt import DARK_V, small_doubt_set, untrained_doubt, watched_weights
 from small_maps import hard_maps
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -21,7 +25,7 @@ def network() -> DoubtNetwork:
     return DoubtNetwork().eval().requires_grad_(requires_grad=False)
 
 
-def test_bare_wall_is_median_of_cells_and_gives_zero_features(network: DoubtNetwork) -> None:
+def test_features_are_zero_at_the_median_bare_wall_and_mark_a_cell_without_return(network: DoubtNetwork) -> None:
     generator = torch.Generator().manual_seed(0)
     bare_m, counts = torch.rand(64, 80, generator=generator), 40 * torch.rand(64, 80, generator=generator)
     depth_m = bare_m.repeat(5, 1, 1)
@@ -29,12 +33,8 @@ def test_bare_wall_is_median_of_cells_and_gives_zero_features(network: DoubtNetw
     network.learn_bare(depth_m, counts.repeat(5, 1, 1))
     assert float(network.features(bare_m[None], counts[None]).abs().max()) == 0.0
     assert float(network.features(bare_m[None] + 0.05, counts[None] + 5)[:, :4].min()) > 0.4
-
-
-def test_cell_without_return_sets_its_own_feature_alone(network: DoubtNetwork) -> None:
-    depth_m, intensity = torch.full((1, 64, 80), 0.3), torch.full((1, 64, 80), 9.0)
-    depth_m[0, 3, 4] = torch.nan
-    assert network.features(depth_m, intensity)[0, :, 3, 4].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
+    bare_m[3, 4] = torch.nan
+    assert network.features(bare_m[None], counts[None] + 9)[0, :, 3, 4].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
 
 
 @pytest.mark.parametrize("name", ["all zero", "saturated", "half invalid", "all invalid"])
@@ -78,10 +78,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     return _train(folder, []), folder
 
 
-def _assert_same(one: DoubtNetwork, other: DoubtNetwork) -> None:
-    torch.testing.assert_close(one.state_dict(), other.state_dict())
-
-
 @pytest.mark.slow
 def test_doubt_network_learns_empty_unusual_and_uncertain(trained: Trained) -> None:
     fresh = small_doubt_set(64, 2)
@@ -98,7 +94,7 @@ def test_stopped_doubt_run_resumes_to_same_weights(trained: Trained, tmp_path: P
     steps = list[int]()
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path, steps, stop=lambda: len(steps) == 11)
-    _assert_same(_train(tmp_path, steps), trained[0])
+    torch.testing.assert_close(_train(tmp_path, steps).state_dict(), trained[0].state_dict())
     assert steps == list(range(1, 65))
 
 
@@ -116,28 +112,18 @@ def test_calibrated_limits_keep_their_false_alarm_rates(trained: Trained) -> Non
     assert fitted.error_scale > 0
 
 
-def test_doubt_loss_ignores_error_where_nothing_is_hidden() -> None:
-    some = small_doubt_set(8, 0)
-    batch = doubt_training.as_doubt_batch(some.where(some.nothing))
-    one, other = (torch.full((len(batch.made), 64, 64), value) for value in (-3.0, 1.0))
-    flat = torch.zeros(len(batch.made))
-    losses = [
-        float(doubt_training.doubt_loss(DoubtOutput(flat, flat, log_error, one), batch)) for log_error in (one, other)
-    ]
-    assert losses[0] == losses[1]
-
-
-def test_doubt_loss_is_least_at_mean_error() -> None:
+def test_doubt_loss_is_least_at_mean_error_and_ignores_it_where_nothing_is_hidden() -> None:
     some = small_doubt_set(64, 0)
-    batch = doubt_training.as_doubt_batch(some.where(~some.nothing))
-    shared = (batch.truth > 0) & (batch.made > 0)
-    mean = float((batch.made - batch.truth).abs()[shared].mean().log())
-    flat, pixels = torch.zeros(len(batch.made)), torch.zeros_like(batch.made)
-    losses = [
-        float(doubt_training.doubt_loss(DoubtOutput(flat, flat, pixels + log_error, pixels), batch))
-        for log_error in (mean, mean - 0.2, mean + 0.2)
-    ]
-    assert losses[0] < min(losses[1:])
+    there, empty = (doubt_training.as_doubt_batch(some.where(rows)) for rows in (~some.nothing, some.nothing))
+
+    def loss(batch: doubt_training.DoubtBatch, log_error: float) -> float:
+        flat, pixels = torch.zeros(len(batch.made)), torch.zeros_like(batch.made)
+        return float(doubt_training.doubt_loss(DoubtOutput(flat, flat, pixels + log_error, pixels), batch))
+
+    shared = (there.truth > 0) & (there.made > 0)
+    mean = float((there.made - there.truth).abs()[shared].mean().log())
+    assert loss(there, mean) < min(loss(there, mean - 0.2), loss(there, mean + 0.2))
+    assert loss(empty, -3.0) == loss(empty, 1.0)
 
 
 def test_doubt_batches_mirror_maps_with_their_images() -> None:
@@ -172,3 +158,200 @@ def test_shared_errors_are_of_pixels_in_both_images() -> None:
     shared, error = doubt_training.shared_errors(made, truth)
     assert shared.tolist() == [[[True, False], [False, False]]]
     assert error.tolist() == [0.25]
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> Path:
+    return watched_weights(tmp_path / "watched")
+
+
+@pytest.fixture
+def record(tmp_path: Path, watched: Path) -> DoubtRecord:
+    return untrained_doubt(tmp_path / "run", watched)
+
+
+def test_saved_doubt_restores_with_watched_weights(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
+    network, found = doubt_network.load_doubt(tmp_path / "run")
+    assert found == record
+    assert not network.training
+    assert network.temperature.tolist() == [0.5, 2.0]
+    assert float(network.error_scale) == 1.5
+    assert (tmp_path / "run" / "doubt.safetensors").stat().st_size < 700_000
+    for name in (*records.WATCHED, "checkpoint.json"):
+        assert (tmp_path / "run" / name).read_bytes() == (watched / name).read_bytes()
+
+
+def test_weights_without_doubt_network_load_none(tmp_path: Path, watched: Path) -> None:
+    assert doubt_network.load_doubt(watched) is None
+    assert load_uncertainty_model(watched, tmp_path) is None
+    with pytest.raises(CheckpointError, match="compressor"):
+        records.checksum_of_watched(tmp_path)
+
+
+@pytest.mark.usefixtures("record")
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        *((name, b"another") for name in records.WATCHED),
+        *((records.DOUBT_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
+    ],
+)
+def test_load_doubt_refuses_other_weights_or_damaged_record(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / "run" / name).write_bytes(content)
+    with pytest.raises(CheckpointError, match=records.DOUBT_RECORD):
+        doubt_network.load_doubt(tmp_path / "run")
+
+
+def test_saved_bare_wall_keeps_its_precision_and_watched_weights_may_not_change(
+    tmp_path: Path, watched: Path, record: DoubtRecord
+) -> None:
+    network, wall_m = doubt_network.load_doubt(tmp_path / "run")[0].network, 0.3 + 1e-4 * torch.rand(5, 64, 80)
+    network.learn_bare(wall_m, wall_m)
+    doubt_network.save_doubt(tmp_path / "second", network, record, watched)
+    again = doubt_network.load_doubt(tmp_path / "second")[0].network
+    torch.testing.assert_close(again.bare_depth_m, wall_m.median(0).values, rtol=0, atol=0)
+    (watched / records.WATCHED[0]).write_bytes(b"another network")
+    with pytest.raises(CheckpointError, match="watched"):
+        doubt_network.save_doubt(tmp_path / "other", network, record, watched)
+
+
+@pytest.mark.slow
+def test_doubter_onnx_equals_torch_and_is_exported_once(tmp_path: Path, record: DoubtRecord) -> None:
+    folder, cache = tmp_path / "run", tmp_path / "cache"
+    doubter = load_uncertainty_model(folder, cache)
+    (model,) = cache.glob("doubt-*.onnx")
+    written_ns = model.stat().st_mtime_ns
+    again = load_uncertainty_model(folder, cache)
+    assert again.record == doubter.record == record
+    assert model.stat().st_mtime_ns == written_ns
+    for count in (1, 5):
+        generator = np.random.default_rng(count)
+        depth_m = generator.uniform(0.2, 0.8, (count, 64, 80)).astype(np.float32)
+        depth_m[generator.random(depth_m.shape) < 0.1] = np.nan
+        intensity = generator.uniform(0, 255, depth_m.shape).astype(np.float32)
+        image = generator.uniform(0, 1, (count, 64, 64)).astype(np.float32)
+        with torch.inference_mode():
+            theirs = doubt_network.load_doubt(folder)[0](*(torch.from_numpy(a) for a in (depth_m, intensity, image)))
+        for mine, its in zip(again(depth_m, intensity, image), theirs, strict=True):
+            assert mine.shape == tuple(its.shape)
+            np.testing.assert_allclose(mine, its, rtol=1e-3, atol=1e-5)
+
+
+KINDS = ("cup", "bowl", "rods", "blobs", "carved rods", "blobs and rods")
+
+
+def frames(count: int, seed: int = 0) -> tuple[np.ndarray, UncertaintyEstimate]:
+    """Return images of rectangles, and an uncertainty that knows little of them."""
+    generator = np.random.default_rng(seed)
+    images = np.zeros((count, 64, 64), np.float32)
+    for image in images:
+        row, column = generator.integers(5, 30, 2)
+        image[row : row + 20, column : column + generator.integers(8, 30)] = generator.uniform(0.2, 0.9)
+    p, error = (generator.random(images.shape).astype(np.float32) for _ in range(2))
+    return images, UncertaintyEstimate(*(generator.random(count).astype(np.float32) for _ in range(2)), error, p)
+
+
+def known_objects(count: int, best: float = 1.0) -> QualitySet:
+    """Return objects whose IoU, up to `best`, is their first figure's, and whose error falls with it."""
+    generator = np.random.default_rng(1)
+    figures = generator.standard_normal((count, quality.FEATURES)).astype(np.float32)
+    iou = best / (1 + np.exp(-2 * figures[:, 0]))
+    kind = np.array([KINDS[k % len(KINDS)] for k in range(count)])
+    return QualitySet(figures, iou, (0.2 - 0.1 * iou).astype(np.float32), kind, np.arange(count) % len(KINDS) > 1)
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doubt_training, "STEPS", 150)
+    monkeypatch.setattr(doubt_training, "FOLDS", 2)
+
+
+def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite_without_a_surface() -> None:
+    images, said = frames(4)
+    turned = said._replace(error_v=said.error_v[:, ::-1], p_surface=said.p_surface[:, ::-1])
+    figures = quality_features(images, said)
+    assert figures.shape == (4, quality.FEATURES)
+    np.testing.assert_allclose(quality_features(images[:, ::-1], turned), figures, rtol=1e-4, atol=1e-4)
+    alone = quality_features(images[1:2], UncertaintyEstimate(*(part[1:2] for part in said)))
+    np.testing.assert_allclose(alone[0], figures[1], rtol=1e-4, atol=1e-5)
+    assert np.isfinite(quality_features(np.zeros_like(images), said)).all()
+
+
+def test_figure_that_never_differs_leaves_a_model_that_loads() -> None:
+    samples = known_objects(60)
+    samples.figures[:, 5] = 1.0
+    record = QualityRecord.model_validate_json(fit_quality(samples, "0" * 12).model_dump_json())
+    assert min(record.spreads) > 0
+    assert np.isfinite(QualityModel(record).outputs(samples.figures)).all()
+
+
+def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> None:
+    kinds = [*KINDS, "carved blobs", "cup"]
+    judged = list[int]()
+    for fitted, rows in left_out_folds(kinds):
+        judged += rows.tolist()
+        seen = set[str]().union(*(families(kinds[row]) for row in fitted))
+        assert not any(min(families(kinds[row])) in seen for row in rows)
+    assert sorted(judged) == list(range(len(kinds)))
+
+
+def test_fit_predicts_the_quality_of_kinds_that_it_never_saw() -> None:
+    record = fit_quality(samples := known_objects(600), "0" * 12)
+    assert record.figures["all_correlation"] > 0.8
+    found = QualityEstimate.of(QualityModel(record).outputs(samples.figures), record.trusted_above)
+    assert (np.diff(found.iou, axis=1) >= 0).all()
+    assert np.corrcoef(found.error_v, samples.error_v)[0, 1] > 0.3
+    assert record.figures["all_trusted_good"] >= quality.PRECISION
+    assert found.trusted.any()
+    assert (samples.iou[found.trusted] >= quality.GOOD_IOU).mean() >= quality.PRECISION
+
+
+def test_trust_needs_good_outlines_enough_frames_and_precision_in_both_shares() -> None:
+    good = np.linspace(0, 1, 1000).astype(np.float32)
+    generic = np.arange(1000) % 2 == 0
+    above = trusted_above(good, good >= 0.5, generic)
+    assert 0.44 < above <= 0.5
+    assert trusted_above(good[-10:], good[-10:] > 0, generic[-10:]) is None
+    assert trusted_above(good, (good >= 0.5) & ~generic, generic) is None
+    record = fit_quality(samples := known_objects(200, best=0.7), "0" * 12)
+    assert record.trusted_above is None
+    assert not QualityEstimate.of(QualityModel(record).outputs(samples.figures), None).trusted.any()
+
+
+def record_of(**values: object) -> QualityRecord:
+    plain = {"means": [0.0] * quality.FEATURES, "spreads": [1.0] * quality.FEATURES, "objects": 1, "watches": "?"}
+    layers = np.zeros((1, quality.FEATURES + 1, 5)).tolist()
+    return QualityRecord.model_validate({**plain, "layers": layers, **values})
+
+
+def test_model_is_bound_to_its_uncertainty_network(tmp_path: Path) -> None:
+    untrained_doubt(folder := tmp_path / "run", watched_weights(tmp_path / "watched"))
+    assert quality.load_quality_model(folder) is None
+    record = record_of(watches=quality.quality_watches(folder))
+    quality.write_quality(folder, record)
+    loaded = load_uncertainty_model(folder, tmp_path)
+    assert loaded.quality.record == record
+    assert loaded.quality(*frames(2)).iou == pytest.approx(np.full((2, 3), 0.5))
+    text = (folder / quality.QUALITY).read_text()
+    for spoiled, reason in ((text[:-9], "damaged"), (text.replace(record.watches, "0" * 12), "damaged")):
+        (folder / quality.QUALITY).write_text(spoiled)
+        with pytest.raises(CheckpointError, match=reason):
+            load_uncertainty_model(folder, tmp_path)
+        assert load_uncertainty_model(folder, tmp_path, quality=False).quality is None  # to fit it again
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"watches": "0" * 12}, "another uncertainty network"),
+        ({"layers": [[[0.0] * 5] * 3]}, "do not fit"),
+        ({"layers": []}, "do not fit"),
+        ({"layers": [[[0.0], [0.0, 1.0]]]}, "do not fit"),
+        ({"spreads": [0.0] * quality.FEATURES}, "do not fit"),
+    ],
+)
+def test_file_that_does_not_fit_is_refused(tmp_path: Path, values: dict[str, object], reason: str) -> None:
+    untrained_doubt(folder := tmp_path / "run", watched_weights(tmp_path / "watched"))
+    quality.write_quality(folder, record_of(**{"watches": quality.quality_watches(folder), **values}))
+    with pytest.raises(CheckpointError, match=reason):
+        quality.load_quality_model(folder)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from tomllib import TOMLDecodeError
 from typing import Any
+from unittest.mock import Mock
 from zipfile import ZipFile
 
 import nlos_models.files
@@ -33,20 +34,11 @@ from nlos_models.files import (
 FORK = multiprocessing.get_context("fork")
 
 
-def hold(path: Path, ready: Any, content: str = "half") -> None:
+def hold(path: Path, ready: Any) -> None:
     with claim(path) as folder:
-        (folder / "part").write_text(content, encoding="utf-8")
+        (folder / "part").write_text("half", encoding="utf-8")
         ready.set()
         threading.Event().wait(60)
-
-
-def killed_holder(path: Path) -> None:
-    ready = FORK.Event()
-    process = FORK.Process(target=hold, args=(path, ready))
-    process.start()
-    assert ready.wait(20)
-    os.kill(process.pid or 0, signal.SIGKILL)
-    process.join()
 
 
 def test_exclusive_write_refuses_a_file_that_appeared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,24 +81,24 @@ def test_reserved_path_is_written_by_its_process_alone(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_next_claim_in_a_folder_removes_what_a_killed_process_left(
+def test_next_claim_removes_what_a_killed_process_left_and_spares_a_living_writer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    killed_holder(tmp_path / "a")
+    ready = FORK.Event()
+    process = FORK.Process(target=hold, args=(tmp_path / "a", ready))
+    process.start()
+    assert ready.wait(20)
+    os.kill(process.pid or 0, signal.SIGKILL)
+    process.join()
     (tmp_path / ".mine.part").mkdir()  # somebody else's, without our lock
     assert (tmp_path / ".a.part" / "part").exists()
-    monkeypatch.setattr("nlos_models.files._swept", set())
-    with claim(tmp_path / "b"):
-        assert not (tmp_path / ".a.part").exists()
-    assert [path.name for path in tmp_path.iterdir()] == [".mine.part"]
-
-
-def test_sweep_spares_a_living_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with claim(tmp_path / "a") as folder:
+    with claim(tmp_path / "living") as folder:
         (folder / "part").write_bytes(b"1")
         monkeypatch.setattr("nlos_models.files._swept", set())
         with claim(tmp_path / "b"):
+            assert not (tmp_path / ".a.part").exists()
             assert (folder / "part").exists()
+    assert [path.name for path in tmp_path.iterdir()] == [".mine.part"]
 
 
 def race(path: Path, start: Any, results: Any, number: int) -> None:
@@ -160,14 +152,9 @@ def upper(content: bytes) -> str:
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "flip", "foreign", "unreadable"])
 def test_damaged_cache_entry_counts_as_absent(tmp_path: Path, damage: str) -> None:
-    entry, made = tmp_path / "cache" / "world.npz", list[int]()
-
-    def make() -> bytes:
-        made.append(1)
-        return b"content"
-
+    entry, make = tmp_path / "cache" / "world.npz", Mock(return_value=b"content")
     assert [load_cached(entry, upper, make) for _ in range(3)] == ["CONTENT"] * 3
-    assert len(made) == 1
+    make.assert_called_once()
     (file,) = entry.parent.iterdir()
     if damage == "foreign":
         load_cached(entry.with_name("other.npz"), upper, lambda: b"other")
@@ -177,21 +164,18 @@ def test_damaged_cache_entry_counts_as_absent(tmp_path: Path, damage: str) -> No
         damages = {"empty": b"", "cut": b"cont", "flip": b"cOntent", "unreadable": b"\xff\xfe"}
         file.write_bytes(damages[damage])
     assert [load_cached(entry, upper, make) for _ in range(2)] == ["CONTENT"] * 2
-    assert len(made) == 2
+    assert make.call_count == 2
     assert len(list(entry.parent.glob("world.*"))) == 1
 
 
-def test_cache_entry_that_cannot_be_read_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    load_cached(tmp_path / "a.npz", bytes, lambda: b"\xff")
-    assert load_cached(tmp_path / "a.npz", upper, lambda: b"new") == "NEW"
-    assert "making it again" in caplog.text
-
-
 @pytest.mark.parametrize("place", ["file/below", "/proc/none"])
-def test_unusable_cache_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture, place: str) -> None:
+def test_unusable_cache_or_entry_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture, place: str) -> None:
     (tmp_path / "file").write_bytes(b"")
     assert load_cached(tmp_path / place / "a.npz", upper, lambda: b"made") == "MADE"
     assert "NLOS_CAM_CACHE" in caplog.text
+    load_cached(tmp_path / "a.npz", bytes, lambda: b"\xff")
+    assert load_cached(tmp_path / "a.npz", upper, lambda: b"new") == "NEW"
+    assert "making it again" in caplog.text
 
 
 def test_checked_files_are_refused_when_any_byte_differs(tmp_path: Path) -> None:

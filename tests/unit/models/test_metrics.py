@@ -55,16 +55,13 @@ def test_foreground_rmse_is_over_shared_pixels_and_clips_at_farthest() -> None:
     assert metrics.foreground_rmse_mm(_square(0.06), _square(0.2), 300.0)[0] == pytest.approx(30, rel=1e-5)
 
 
-def test_wrong_color_is_no_error_of_silhouette() -> None:
+def test_wrong_color_is_no_error_of_silhouette_nor_wrong_silhouette_of_color() -> None:
     truth, image = _colored((0.9, 0.2, 0.1)), _colored((0.9, 0.5, 0.1))
     assert [value.item() for value in metrics.color_metrics(truth, truth).values()] == [1.0, 1.0, 0.0, 0.0]
     assert metrics.color_silhouette_iou(image, truth) == 1.0
     assert metrics.color_error(image, truth) == pytest.approx(0.3 / 3, rel=1e-5)
     assert metrics.color_accuracy_mean_abs(image, truth) == pytest.approx(1 - 0.25 * 0.9 * 0.3 / 3, rel=1e-5)
     assert metrics.root_mean_square_error(image, truth) == pytest.approx(np.sqrt(0.25 / 3) * 0.9 * 0.3, rel=1e-5)
-
-
-def test_wrong_silhouette_is_no_error_of_color() -> None:
     truth, image = _colored((0.9, 0.2, 0.1)), _colored((0.9, 0.2, 0.1), slice(16, 32))
     assert metrics.color_silhouette_iou(image, truth) == 0.5
     assert metrics.color_error(image, truth) == 0.0
@@ -81,13 +78,6 @@ def test_color_metrics_do_not_depend_on_channel_order() -> None:
     for name, value in metrics.color_metrics(image, truth).items():
         np.testing.assert_allclose(value, turned[name], rtol=1e-12)
     np.testing.assert_array_equal(metrics.brightness(image), metrics.brightness(image[:, [2, 0, 1]]))
-
-
-def test_image_error_sums_pixels_and_averages_samples() -> None:
-    image, truth = torch.zeros(2, 1, 64, 64), torch.zeros(2, 1, 64, 64)
-    image[0, 0, 3, 4], image[0, 0, 5, 6] = 1.0, 0.5
-    assert image_error(image, truth).item() == pytest.approx((1 + 0.25) / 2)
-    assert image_error(torch.ones(1, 1, 64, 64, dtype=torch.bfloat16), truth[:1]).item() == 4096
 
 
 @pytest.mark.parametrize(("share", "weight"), [(0.75, 1.0), (0.75, 4.0), (0.25, 2.0)])
@@ -109,12 +99,16 @@ def test_absolute_error_is_least_at_weighted_median(share: float, weight: float,
 
 
 @pytest.mark.parametrize("kind", ["squared", "absolute"])
-def test_image_error_in_color_is_sum_over_channels(kind: ImageLoss) -> None:
+def test_image_error_sums_channels_and_pixels_and_averages_samples(kind: ImageLoss) -> None:
     generator = torch.Generator().manual_seed(0)
     image, truth = (torch.rand(2, 3, 64, 64, generator=generator) for _ in range(2))
     truth *= truth.amax(1, keepdim=True) > 0.5
     channels = sum(image_error(image[:, [k]], truth[:, [k]], 2.0, kind) for k in range(3))
     torch.testing.assert_close(image_error(image, truth, 2.0, kind), channels)
+    image, truth = torch.zeros(2, 1, 64, 64), torch.zeros(2, 1, 64, 64)
+    image[0, 0, 3, 4], image[0, 0, 5, 6] = 1.0, 0.5
+    assert image_error(image, truth).item() == pytest.approx((1 + 0.25) / 2)
+    assert image_error(torch.ones(1, 1, 64, 64, dtype=torch.bfloat16), truth[:1]).item() == 4096
 
 
 @pytest.mark.parametrize(("done", "share"), [(0.0, 0.0), (0.2, 0.0), (0.25, 0.25), (0.3, 0.5), (0.4, 1.0), (1.0, 1.0)])

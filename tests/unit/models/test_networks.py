@@ -54,11 +54,16 @@ def test_compressor_width_scales_channels_in_steps_of_eight(width: float) -> Non
         assert compressor(torch.randn(1, 4, 100, 100)).shape == (1, 256)
 
 
+@torch.no_grad()
 def test_blocks_pass_input_on_only_where_shapes_agree() -> None:
     residual = [InvertedResidual(16, out, stride, 6).residual for out, stride in ((16, 1), (24, 1), (16, 2))]
     assert residual == [True, False, False]
     shortcuts = [Bottleneck(channels, 64, stride).shortcut for channels, stride in ((256, 1), (64, 1), (256, 2))]
     assert [isinstance(shortcut, nn.Identity) for shortcut in shortcuts] == [True, False, False]
+    block = Bottleneck(256, 64, 1).eval()
+    nn.init.zeros_(block.main[-1].weight)
+    x = torch.rand(2, 256, 5, 5)
+    assert torch.equal(block(x), x)
 
 
 def test_resnet_has_published_stages_and_one_dropout() -> None:
@@ -75,14 +80,6 @@ def test_resnet_has_published_stages_and_one_dropout() -> None:
     assert isinstance(net.classifier[-1], nn.Linear)
 
 
-@torch.no_grad()
-def test_bottleneck_with_zero_main_path_is_identity() -> None:
-    block = Bottleneck(256, 64, 1).eval()
-    nn.init.zeros_(block.main[-1].weight)
-    x = torch.rand(2, 256, 5, 5)
-    assert torch.equal(block(x), x)
-
-
 @pytest.fixture(scope="module")
 def vae() -> ResVae:
     torch.manual_seed(0)
@@ -93,11 +90,20 @@ def _norms(block: nn.Module) -> tuple[int, ...]:
     return tuple(n.num_features for n in block.modules() if isinstance(n, nn.BatchNorm2d))
 
 
-def test_decoder_matches_table_s1(vae: ResVae) -> None:
-    blocks = list(vae.decoder.blocks)
-    assert tuple(_channels(block) for block in blocks) == TABLE_S1
-    assert [_norms(block) for block in blocks] == [(first[1], second[1]) for first, second, _ in TABLE_S1]
+def test_decoder_matches_table_s1_and_encoder_mirrors_it(vae: ResVae) -> None:
+    assert tuple(_channels(block) for block in vae.decoder.blocks) == TABLE_S1
+    assert [_norms(block) for block in vae.decoder.blocks] == [(first[1], second[1]) for first, second, _ in TABLE_S1]
     assert _channels(vae.decoder.output) == ((32, 1),)
+
+    def ends(block: nn.Module) -> tuple[int, int]:
+        assert isinstance(block, ResBlock)
+        return block.shortcut.in_channels, block.shortcut.out_channels
+
+    down, up = list(vae.encoder.blocks), list(vae.decoder.blocks)[::-1]
+    assert [ends(block) for block in down] == [ends(block)[::-1] for block in up]
+    assert [_norms(block)[0] for block in down] == [_norms(block)[0] for block in up]
+    for conv in (conv for block in (*down, *up) for conv in _convolutions(block)):
+        assert (conv.kernel_size, conv.stride, conv.padding) == ((3, 3), (1, 1), (1, 1))
 
 
 def test_color_vae_differs_in_outer_layers_alone() -> None:
@@ -111,18 +117,6 @@ def test_color_vae_differs_in_outer_layers_alone() -> None:
     assert _channels(vae.decoder.output) == ((32, 3),)
     assert _channels(vae.encoder.input) == ((3, 32),)
     assert _channels(vae.encoder.mean) == _channels(vae.encoder.log_variance) == ((512, 512),)
-
-
-def test_encoder_mirrors_decoder(vae: ResVae) -> None:
-    def ends(block: nn.Module) -> tuple[int, int]:
-        assert isinstance(block, ResBlock)
-        return block.shortcut.in_channels, block.shortcut.out_channels
-
-    down, up = list(vae.encoder.blocks), list(vae.decoder.blocks)[::-1]
-    assert [ends(block) for block in down] == [ends(block)[::-1] for block in up]
-    assert [_norms(block)[0] for block in down] == [_norms(block)[0] for block in up]
-    for conv in (conv for block in (*down, *up) for conv in _convolutions(block)):
-        assert (conv.kernel_size, conv.stride, conv.padding) == ((3, 3), (1, 1), (1, 1))
 
 
 @torch.inference_mode()

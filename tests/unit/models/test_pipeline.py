@@ -1,13 +1,13 @@
-"""From lidar maps to hidden images: split and stack, normalisation, networks of depth and color, silhouettes."""
+"""From lidar maps to hidden images: batches of maps, split and stack, normalisation, networks, silhouettes."""
 
 import numpy as np
 import pytest
 import torch
 from nlos_models import MIN_V, Preprocess, channel_statistics, cut_silhouette, lift_edges, split_and_stack
 from nlos_models.compressor import Compressor, ResNet50
-from nlos_models.data import flip_some
+from nlos_models.data import InMemory, first_of, flip_some, image_batches, map_batches, shuffled, subtract_bare_wall
 from nlos_models.pipeline import KEPT_SHARE, WINDOW, RemappingNetwork, new_pipeline, new_vae, stacked_channels
-from small_maps import HARD_MAPS, hard_maps
+from small_maps import HARD_MAPS, hard_maps, small_maps
 from torch import Tensor
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -27,16 +27,13 @@ def _fitted(maps: tuple[Tensor, Tensor], intensities: int = 1) -> Preprocess:
     return preprocess
 
 
-def test_split_and_stack_puts_halves_in_documented_channels() -> None:
+def test_split_and_stack_puts_halves_and_missing_returns_in_documented_channels() -> None:
     column = torch.arange(80.0).expand(1, 64, 80)
     left_depth, right_depth, left_intensity, right_intensity = split_and_stack(column, 100 + column)[0]
     assert torch.equal(left_depth[0], torch.arange(40.0))
     assert torch.equal(right_depth[0], torch.arange(40.0, 80.0))
     assert torch.equal(left_intensity, 100 + left_depth)
     assert torch.equal(right_intensity, 100 + right_depth)
-
-
-def test_split_and_stack_marks_missing_return_in_all_channels() -> None:
     depth, intensity = torch.ones(1, 64, 80), torch.ones(1, 64, 80)
     depth[0, 5, 10], depth[0, 6, 70] = torch.nan, torch.nan
     missing = torch.isnan(split_and_stack(depth, intensity))[0].nonzero().tolist()
@@ -148,12 +145,7 @@ def test_new_pipeline_is_of_depth_or_color(color: bool, channels: int, latent: i
     assert made.preprocess.left_noise == 0.1
 
 
-def _blurred() -> Tensor:
-    noise = torch.rand(4, 1, 64, 64, generator=torch.Generator().manual_seed(0))
-    return torch.nn.functional.avg_pool2d(noise, 9, stride=1, padding=4) * 1.5
-
-
-def test_cut_silhouette_clears_faint_skirt_beside_bright_surface() -> None:
+def test_cut_silhouette_clears_faint_skirt_beside_bright_surface_and_all_of_a_faint_image() -> None:
     image, faint = torch.zeros(1, 1, 64, 64), 0.9 * KEPT_SHARE * 0.9
     image[..., 10:30, 10:20] = 0.9
     image[..., 10:30, 20:23] = faint
@@ -163,12 +155,9 @@ def test_cut_silhouette_clears_faint_skirt_beside_bright_surface() -> None:
     assert torch.equal(cut[..., 10:20], image[..., 10:20])
     assert (cut[..., 50:60, 50:60] == faint).all()
     assert WINDOW < 30
-
-
-@pytest.mark.parametrize("value", [0.0, 0.05, MIN_V, 1.0])
-def test_cut_silhouette_of_constant_image_is_all_or_nothing(value: float) -> None:
-    image = torch.full((1, 1, 64, 64), value)
-    assert torch.equal(cut_silhouette(image), image if value >= MIN_V else torch.zeros_like(image))
+    for value in (0.0, 0.05, MIN_V, 1.0):
+        image = torch.full((1, 1, 64, 64), value)
+        assert torch.equal(cut_silhouette(image), image if value >= MIN_V else torch.zeros_like(image))
 
 
 def test_cut_silhouette_of_color_uses_brightest_channel() -> None:
@@ -182,7 +171,8 @@ def test_cut_silhouette_of_color_uses_brightest_channel() -> None:
 
 
 def test_lift_edges_brightens_blurred_edge_of_plateau() -> None:
-    blurred = _blurred()
+    noise = torch.rand(4, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+    blurred = torch.nn.functional.avg_pool2d(noise, 9, stride=1, padding=4) * 1.5
     assert (lift_edges(blurred) >= blurred).all()
     assert (lift_edges(blurred) <= blurred.amax((2, 3), keepdim=True) + 1e-6).all()
     image = torch.zeros(1, 1, 64, 64)
@@ -191,3 +181,75 @@ def test_lift_edges_brightens_blurred_edge_of_plateau() -> None:
     lifted = lift_edges(image)
     torch.testing.assert_close(lifted[..., 10:40, 20:48], image[..., 10:40, 20:48])
     assert (lifted[..., 15:35, 50:52] > 0.7).all()
+
+
+def _generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize(("count", "batch"), [(10, 5), (11, 5), (14, 5), (5, 5), (3, 5), (2, 2)])
+def test_shuffled_batches_are_whole_and_repeat_no_sample(count: int, batch: int) -> None:
+    batches = list(shuffled(count, batch, _generator()))
+    assert {len(b) for b in batches} == {min(batch, count)}
+    assert len(batches) == max(count // batch, 1)
+    drawn = torch.cat(batches).tolist()
+    assert len(set(drawn)) == len(drawn)
+    assert set(drawn) <= set(range(count))
+    first, again, other = (torch.cat(list(shuffled(50, 10, _generator(s)))) for s in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_flip_some_mirrors_flagged_samples_and_undoes_itself() -> None:
+    maps, images = torch.rand(3, 64, 80), torch.rand(3, 1, 64, 64)
+    flips = torch.tensor([True, False, True])
+    mirrored_maps, mirrored_images = flip_some([maps, images], flips)
+    assert torch.equal(mirrored_maps[1], maps[1])
+    assert torch.equal(mirrored_maps[0], maps[0].flip(0))
+    assert torch.equal(mirrored_images[2, 0], images[2, 0].flip(0))
+    twice = flip_some([mirrored_maps, mirrored_images], flips)
+    assert torch.equal(twice[0], maps)
+    assert torch.equal(twice[1], images)
+
+
+def test_image_batches_are_images_or_their_mirrors() -> None:
+    images = np.random.default_rng(0).random((6, 64, 64)).astype(np.float16)
+    known = {view.tobytes(): k for k, image in enumerate(images) for view in (image, image[::-1])}
+    batches = list(image_batches(images, 3, _generator()))
+    assert all(b.shape == (3, 1, 64, 64) and b.dtype == torch.float32 for b in batches)
+    found = [known[image[0].numpy().astype(np.float16).tobytes()] for b in batches for image in b]
+    assert sorted(found) == list(range(6))
+
+
+def test_map_batches_mirror_maps_with_their_images() -> None:
+    maps = small_maps(8, 0)
+    batches = list(map_batches(maps, 4, _generator()))
+    for batch in batches:
+        parts = [torch.from_numpy(part)[batch.row] for part in (maps.depth_m, maps.intensity, maps.image[:, None])]
+        depth_m, intensity, image = flip_some(parts, batch.mirrored)
+        found, wanted = [batch.depth_m, batch.intensity, batch.image], [depth_m, intensity, image.float()]
+        torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
+    assert sorted(torch.cat([batch.row for batch in batches]).tolist()) == list(range(8))
+    assert 0 < torch.cat([batch.mirrored for batch in batches]).sum() < 8
+
+
+def test_first_of_returns_first_maps_and_at_most_all() -> None:
+    maps = small_maps(5, 0)
+    few = first_of(maps, 2)
+    for name in ("depth_m", "intensity", "image"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(maps, name)[:2])
+    assert len(InMemory(maps).first(9).image) == 5
+
+
+def test_difference_maps_subtract_bare_wall_where_both_return() -> None:
+    maps = small_maps(3, 0)
+    depth, intensity = np.full((64, 80), 0.125, np.float32), np.full((64, 80), 4.0, np.float32)
+    depth[30] = np.nan
+    difference = subtract_bare_wall(maps, depth, intensity)
+    valid = ~np.isnan(maps.depth_m) & ~np.isnan(depth)
+    assert 0 < valid.sum() < (~np.isnan(maps.depth_m)).sum()
+    np.testing.assert_array_equal(~np.isnan(difference.depth_m), valid)
+    np.testing.assert_allclose(difference.depth_m[valid], maps.depth_m[valid] - 0.125)
+    np.testing.assert_allclose(difference.intensity[valid], maps.intensity[valid] - 4.0)
+    assert not difference.intensity[~valid].any()
+    assert difference.image is maps.image

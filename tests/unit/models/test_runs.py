@@ -43,21 +43,15 @@ def weights(tmp_path: Path) -> Path:
     return tmp_path / "two"
 
 
-def test_vae_start_lists_runs_of_vae_alone(weights: Path) -> None:
-    trained, runs = vae_start(VAE, weights)
-    assert runs == [VAE]
+def test_vae_start_lists_runs_of_vae_alone_and_leaves_an_encoder_that_is_missing_untrained(weights: Path) -> None:
     stored = load_file(weights / "decoder.safetensors")["output.weight"].float()
-    assert torch.equal(trained.decoder.output.weight, stored)
-
-
-def test_vae_start_with_a_decoder_alone_leaves_the_encoder_untrained(weights: Path) -> None:
-    stored = load_file(weights / "decoder.safetensors")["output.weight"].float()
+    whole = vae_start(VAE, weights)
     (weights / "encoder.safetensors").unlink()
-    recipe = small_recipe(start="decoder")
-    (one, runs), (other, _) = vae_start(recipe, weights), vae_start(recipe, weights)
-    assert runs == [VAE]
-    assert torch.equal(one.decoder.output.weight, stored)
-    assert not changed_tensors(one.state_dict(), other.state_dict())
+    one, other = (vae_start(small_recipe(start="decoder"), weights) for _ in range(2))
+    for trained, earlier in (whole, one):
+        assert earlier == [VAE]
+        assert torch.equal(trained.decoder.output.weight, stored)
+    assert not changed_tensors(one[0].state_dict(), other[0].state_dict())
 
 
 def test_compressor_start_lists_runs_of_weights_and_vae(weights: Path, tmp_path: Path) -> None:
@@ -154,17 +148,14 @@ def test_record_run_refuses_weights_of_another_run(tmp_path: Path, recipes: tupl
         _record(tmp_path, *recipes)
 
 
-def test_record_run_refuses_file_and_folder_it_starts_from(tmp_path: Path) -> None:
+def test_record_of_a_run_refuses_a_file_a_finished_run_and_the_folder_that_it_starts_from(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for name, starts in (("file", ()), ("run", (tmp_path / "x" / ".." / "run",))):
         with pytest.raises(OutputExistsError, match="--out"):
             _record(tmp_path / name, VAE, starts=starts)
-
-
-def test_record_doubt_run_refuses_watched_folder_and_finished_run(tmp_path: Path) -> None:
     watched = watched_weights(tmp_path / "watched")
-    known = untrained_doubt(tmp_path / "run", watched)
+    known = untrained_doubt(tmp_path / "doubt", watched)
     assert record_doubt_run(known.recipe, tmp_path / "new", watched, ["a"]).watches == known.watches
-    for out in (watched, tmp_path / "run"):
+    for out in (watched, tmp_path / "doubt"):
         with pytest.raises(OutputExistsError, match="--out"):
             record_doubt_run(known.recipe, out, watched, ["a"])

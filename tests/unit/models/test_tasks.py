@@ -174,12 +174,6 @@ def test_compiled_networks_are_the_trained_ones(
     assert compiled[1:] == [made.latent, made.decoder]
 
 
-@pytest.mark.parametrize(("steps", "word"), [("two", "--vae"), ("two-then-joint", "--weights")])
-def test_compressor_training_names_missing_start(tmp_path: Path, steps: str, word: str) -> None:
-    with pytest.raises(TrainingError, match=word):
-        _compressor(_recipe("compressor", steps=steps, image_weight=1.0), tasks.Start(), tmp_path)
-
-
 def test_turn_some_with_mirror_gives_all_eight_views() -> None:
     image = torch.rand(1, 1, 4, 4)
     turned = tasks.turn_some(image.expand(4, -1, -1, -1), torch.arange(4))
@@ -195,12 +189,7 @@ def test_vae_turns_images_only_by_recipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, augmentation: str, turns: list[int]
 ) -> None:
     quarters: list[int] = []
-
-    def noted(images: Tensor, turns: Tensor) -> Tensor:
-        quarters.extend(turns.tolist())
-        return images
-
-    monkeypatch.setattr(tasks, "turn_some", noted)
+    monkeypatch.setattr(tasks, "turn_some", lambda images, turns: quarters.extend(turns.tolist()) or images)
     _vae(_recipe("vae", epochs=1, augmentation=augmentation), tmp_path)
     assert sorted(set(quarters)) == turns
     assert len(quarters) == (COUNT if turns else 0)
@@ -259,11 +248,6 @@ def test_loss_weights_latent_image_and_surface(tmp_path: Path) -> None:
     assert twice > image
 
 
-def test_latent_loss_without_encoder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(TrainingError, match="encoder"):
-        _first_loss(tmp_path, encoder=False)
-
-
 class Bench:
     """Synthetic weights, and maps of a few recordings."""
 
@@ -292,23 +276,21 @@ class Bench:
         return state_of(self.pipeline)
 
 
-def test_transfer_second_phase_changes_classifier_alone(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    before = bench.state
+def test_transfer_changes_all_of_compressor_and_then_its_classifier_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path / "second")
+    before, fit = bench.state, tasks.Remapping.fit
     bench.go(all_layers_epochs=0, epochs=1, dropout=0.25, left_noise=0.125)
     assert changed_tensors(before, bench.state) == CLASSIFIER_TENSORS
     assert bench.pipeline.compressor.classifier[0].p == 0.25
     assert bench.pipeline.preprocess.left_noise == 0.125
 
-
-def test_transfer_first_phase_changes_all_of_compressor_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench(tmp_path)
-    before, fit = bench.state, tasks.Remapping.fit
-
     def first_alone(self: tasks.Remapping, recipe: Recipe, frozen: list, folder: Path, *rest: object) -> object:
         return fit(self, recipe, frozen, folder, *rest) if folder.name == tasks.ALL_LAYERS else {}
 
     monkeypatch.setattr(tasks.Remapping, "fit", first_alone)
+    bench = Bench(tmp_path / "first")
     bench.go()
     ours = {name for name in before if name.startswith("compressor")}
     assert any("running_mean" in name for name in ours)
@@ -360,3 +342,11 @@ def test_resumed_transfer_equals_uninterrupted(tmp_path: Path, fail_at: int) -> 
     again = Bench(tmp_path / "failed")
     assert again.go() == figures
     assert not changed_tensors(whole.state, again.state)
+
+
+@pytest.mark.parametrize(("steps", "word"), [("two", "--vae"), ("two-then-joint", "--weights")])
+def test_compressor_training_names_missing_start_or_encoder(tmp_path: Path, steps: str, word: str) -> None:
+    with pytest.raises(TrainingError, match=word):
+        _compressor(_recipe("compressor", steps=steps, image_weight=1.0), tasks.Start(), tmp_path)
+    with pytest.raises(TrainingError, match="encoder"):
+        _first_loss(tmp_path, encoder=False)

@@ -1,4 +1,4 @@
-"""The training loop on a tiny network: exact resuming after any stop, the run's files, TensorBoard, torch.compile."""
+"""The training loop on a tiny network: exact resuming after any stop, the run's files, several processes."""
 
 import copy
 import errno
@@ -13,12 +13,15 @@ import sys
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
-from typing import Any, NoReturn
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import pytest
 import torch
 from nlos_models import recipe as schedule
 from nlos_models import train
+from nlos_models.distributed import launch, open_fabric, precision_on, seed_of, share_of
 from nlos_models.errors import CheckpointError, RecipeError, TrainingError
 from small_run import (
     STEPS,
@@ -27,6 +30,7 @@ from small_run import (
     Stopped,
     be_killed,
     changed_tensors,
+    on_two,
     run_watched,
     small_recipe,
     state_of,
@@ -34,6 +38,7 @@ from small_run import (
 from torch import Tensor, nn
 from torch._inductor import config
 from torch._inductor.exc import InductorError
+from torch.multiprocessing.spawn import ProcessExitedException
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -181,12 +186,9 @@ def _state(step: int) -> dict[str, object]:
 
 
 def _damage(path: Path, how: str) -> None:
-    raw = bytearray(path.read_bytes())
-    if how == "cut":
-        raw = raw[: len(raw) // 2]
-    if how == "flipped":
-        raw[-20] ^= 1
-    path.write_bytes(b"" if how == "empty" else raw)
+    raw = path.read_bytes()
+    flipped = raw[:-20] + bytes([raw[-20] ^ 1]) + raw[-19:]
+    path.write_bytes({"cut": raw[: len(raw) // 2], "flipped": flipped, "empty": b""}[how])
 
 
 def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
@@ -199,6 +201,9 @@ def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {train.LAST, train.PREVIOUS}
     (tmp_path / train.LAST).unlink()  # as a kill between the two renames leaves it
     assert train.read_last(tmp_path, pytest.fail)["step"] == 1
+    (tmp_path / "folder" / train.LAST).mkdir(parents=True)
+    with pytest.raises(CheckpointError, match="damaged"):
+        train.read_last(tmp_path / "folder", print)
 
 
 @pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
@@ -221,10 +226,8 @@ def test_full_disk_keeps_earlier_files(tmp_path: Path, monkeypatch: pytest.Monke
     train.write_last(tmp_path, _state(1))
     train.write_log(tmp_path, [{"loss": 1.0}])
 
-    def full(file: int) -> NoReturn:
-        raise OSError(errno.ENOSPC, "No space left on device", str(file))
-
-    monkeypatch.setattr(os, "fsync", full)
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=full))
     for write in (lambda: train.write_last(tmp_path, _state(2)), lambda: train.write_log(tmp_path, [{"loss": 2.0}])):
         with pytest.raises(TrainingError, match="No space left on device"):
             write()
@@ -308,13 +311,10 @@ def _no_gradients(_: Tensor) -> None:
 
 @pytest.mark.usefixtures("compiler")
 @pytest.mark.parametrize("network", [torch.compile(nn.Linear(3, 2), backend=_no_compiler), _no_gradients])
-def test_failed_compilation_is_one_line(network: nn.Module) -> None:
+def test_failed_compilation_is_one_line_and_not_blamed_for_errors_of_the_network(network: nn.Module) -> None:
     with pytest.raises(TrainingError, match=r"--compile .*No g\+\+") as caught, train.explain_compile_errors():
         network(torch.rand(1, 3))
     assert "\n" not in str(caught.value)
-
-
-def test_error_of_network_is_not_blamed_on_compiler() -> None:
     with pytest.raises(RuntimeError, match="shapes cannot be multiplied"), train.explain_compile_errors():
         nn.Linear(3, 2)(torch.rand(1, 4))
 
@@ -344,7 +344,80 @@ def test_state_of_another_kind_is_refused_in_one_line(
     assert "unpickled" not in capsys.readouterr().out
 
 
-def test_state_that_is_a_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / train.LAST).mkdir()
-    with pytest.raises(CheckpointError, match="damaged"):
-        train.read_last(tmp_path, print)
+class Pair(NamedTuple):
+    """Batch with named parts."""
+
+    x: Tensor
+    y: Tensor
+
+
+def test_share_of_splits_batch_without_repeating_samples() -> None:
+    batch = Pair(torch.arange(12).reshape(6, 2), torch.arange(6))
+    shares = [share_of(batch, rank, 3) for rank in range(3)]
+    assert all(type(share) is Pair and len(share.x) == len(share.y) == 2 for share in shares)
+    assert sorted(torch.cat([share.y for share in shares]).tolist()) == list(range(6))
+    for share in shares:
+        assert torch.equal(share.x, batch.x[share.y])
+    assert share_of(batch, 0, 1) is batch
+    assert [part.tolist() for part in share_of((batch.y, batch.y), 1, 2)] == [[1, 3, 5]] * 2
+
+
+def test_seed_of_depends_on_every_number_and_its_place() -> None:
+    parts = [(0,), (1,), (0, 1), (1, 0), (0, 0, 1), (0, 0, 2), (0, 1, 0)]
+    assert len({seed_of(*part) for part in parts}) == len(parts)
+    assert all(0 <= seed_of(*part) < 2**63 for part in parts)
+    assert seed_of(3, 4) == seed_of(3, 4)
+
+
+@pytest.mark.slow
+def test_two_processes_end_with_weights_of_one(tmp_path: Path) -> None:
+    made: dict[str, Any] = launch(open_fabric(small_recipe(), accelerator="cpu", devices=2), on_two, tmp_path)
+    alone = SmallRun(small_recipe(epochs=3, schedule="one-cycle"), tmp_path / "alone", plain=True)
+    figures = alone.go(fabric=open_fabric(small_recipe(), accelerator="cpu"))
+    together = SmallRun(alone.recipe, tmp_path / "whole", plain=True)
+    for name, tensor in alone.net.state_dict().items():
+        torch.testing.assert_close(torch.tensor(made["net"][name]), tensor, rtol=1e-4, atol=1e-6)
+    assert made["figures"] == pytest.approx(figures, rel=1e-4)
+    for mine, its in zip(alone.log, together.log, strict=True):
+        assert {k: float(v) for k, v in mine.items()} == pytest.approx({k: float(v) for k, v in its.items()}, rel=1e-4)
+    assert made["scored"] == 3  # only the leading process evaluates
+    assert len(made["messages"]) == 2
+    assert "step 4" in made["messages"][0]
+    assert made["messages"][1] == "interrupted"
+    assert made["again"] == made["net"]
+
+
+def test_open_fabric_refuses_uneven_batch_and_missing_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(RecipeError, match=r"batch of 4 .* 3 processes"):
+        open_fabric(small_recipe(), accelerator="cpu", devices=3)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(TrainingError, match="2 GPUs"):
+        open_fabric(small_recipe(), accelerator="cuda", devices=2)
+
+
+@pytest.mark.parametrize(("vectors", "made"), [("AVX2", "32-true"), ("AVX512", "bf16-mixed")])
+def test_cpu_that_emulates_bfloat16_trains_in_float32(monkeypatch: pytest.MonkeyPatch, vectors: str, made: str) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: vectors)
+    halves, singles = small_recipe(precision="bf16-mixed"), small_recipe()
+    assert precision_on("cpu", halves) == made
+    assert precision_on("cuda", halves) == "bf16-mixed"
+    assert precision_on("cpu", singles) == "32-true"
+
+
+KILLED = ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -9, "SIGKILL")
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [
+        *((error, type(error)) for error in (KeyboardInterrupt(), RecipeError("a"), ZeroDivisionError(), OSError("b"))),
+        (KILLED, TrainingError),
+    ],
+)
+def test_launch_raises_error_of_process(error: BaseException, raised: type[BaseException]) -> None:
+    fail = Mock(side_effect=error)
+    start = fail if error is KILLED else lambda work: work(None)
+    with pytest.raises(raised, match="SIGKILL" if error is KILLED else None):
+        launch(SimpleNamespace(world_size=2, launch=start), fail)
+    alone = SimpleNamespace(world_size=1, launch=pytest.fail)
+    assert launch(alone, lambda its, a, b: (its is alone, a + b), 2, 3) == (True, 5)

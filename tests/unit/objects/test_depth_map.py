@@ -1,4 +1,4 @@
-"""Rasteriser and depth images: planes, boxes and spheres of known depth, and the image v of a depth map."""
+"""Rasteriser and images: solids of known depth, the image v of a depth map, and textures that keep its silhouette."""
 
 from itertools import pairwise
 
@@ -8,9 +8,21 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration import ObjectBox, load_rig
+from nlos_models import BLACK_V
+from nlos_models.pipeline import KEPT_SHARE
 
-from nlos_cam.objects import cell_centers_m, depth_from_image, image_from_depth, orthographic_depth
+from nlos_cam.objects import (
+    TEXTURES,
+    cell_centers_m,
+    depth_from_image,
+    image_from_albedo,
+    image_from_depth,
+    object_depth,
+    orthographic_depth,
+    paint,
+)
 from nlos_cam.objects.depth_map import share_outside
+from nlos_cam.render import Surface
 
 BOX = ObjectBox(x_min_m=0.0, x_max_m=0.64, y_min_m=-0.32, y_max_m=0.32, z_near_m=0.1, z_far_m=0.6)
 X, Y = np.meshgrid(*cell_centers_m(BOX))
@@ -43,17 +55,13 @@ def test_triangles_sharing_an_edge_leave_no_hole(corner: float) -> None:
     assert np.isfinite(orthographic_depth(np.array(fan, float), BOX)).all()
 
 
-def test_sphere_shows_its_near_half() -> None:
+def test_sphere_and_box_show_their_near_side_in_the_cells_they_cover() -> None:
     radius, centre = 0.2, (0.3, 0.05, 0.4)
-    sphere = trimesh.creation.icosphere(subdivisions=5, radius=radius)
-    depth = orthographic_depth(_triangles(sphere, centre), BOX)
+    depth = orthographic_depth(_triangles(trimesh.creation.icosphere(5, radius), centre), BOX)
     from_axis = np.hypot(X - centre[0], Y - centre[1])
     assert np.isnan(depth[from_axis > radius]).all()
     inside = from_axis < 0.95 * radius
     np.testing.assert_allclose(depth[inside], centre[2] - np.sqrt(radius**2 - from_axis[inside] ** 2), atol=1e-3)
-
-
-def test_box_shows_its_front_in_the_cells_it_covers() -> None:
     solid = trimesh.creation.box(extents=(0.2, 0.1, 0.08))
     depth = orthographic_depth(_triangles(solid, (0.32, 0.1, 0.3)), BOX)
     inside = (np.abs(X - 0.32) < 0.1) & (np.abs(Y - 0.1) < 0.05)
@@ -129,3 +137,49 @@ def test_cell_centers_grow_with_wall_x_and_against_wall_y() -> None:
     np.testing.assert_allclose(np.diff(y_m), -pitch)
     np.testing.assert_allclose([x_m[0], x_m[-1]], [PAPER.x_min_m + pitch / 2, PAPER.x_max_m - pitch / 2])
     np.testing.assert_allclose([y_m[0], y_m[-1]], [PAPER.y_max_m - pitch / 2, PAPER.y_min_m + pitch / 2])
+
+
+def test_painted_depends_on_the_seed_and_draws_every_texture() -> None:
+    depth_m = object_depth(5, PAPER)[1]
+    one, again, other = (paint(seed, depth_m, [*TEXTURES]) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one.albedo, again.albedo)
+    assert one.texture == again.texture
+    assert not np.array_equal(one.albedo, other.albedo)
+    assert paint(5, depth_m, ["stripes"]).texture == "stripes"
+    depth_m = object_depth(1, PAPER)[1]
+    assert {paint(seed, depth_m, [*TEXTURES]).texture for seed in range(40)} == set(TEXTURES)
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_texture_is_an_albedo_that_keeps_the_silhouette(name: str) -> None:
+    depth_m = object_depth(1, PAPER)[1]
+    for seed in range(20):
+        albedo = TEXTURES[name](np.random.default_rng(seed), depth_m)
+        assert Surface(albedo).over((64, 64)).shape == (64, 64, 3)
+        bright = image_from_albedo(albedo, depth_m).max(0)[~np.isnan(depth_m)]
+        assert bright.min() > KEPT_SHARE * bright.max()
+
+
+def test_textures_have_the_colors_of_their_names() -> None:
+    depth_m = object_depth(1, PAPER)[1]
+    made = {name: make(np.random.default_rng(3), depth_m) for name, make in TEXTURES.items()}
+    colours = {name: len(np.unique(albedo.reshape(-1, 3), axis=0)) for name, albedo in made.items()}
+    assert colours["plain"] == 1
+    assert colours["stripes"] == colours["layers"] == 2
+    assert 2 <= colours["patches"] <= 4
+    assert colours["gradient"] > 100
+    near = made["layers"][depth_m == np.nanmin(depth_m)]
+    assert (near == near[0]).all()
+    albedo = TEXTURES["layers"](np.random.default_rng(0), np.full((64, 64), np.nan, np.float32))
+    assert np.isfinite(albedo).all()
+
+
+def test_image_is_the_albedo_on_the_surface_and_0_beside_it() -> None:
+    depth_m = object_depth(2, PAPER)[1]
+    albedo = paint(2, depth_m, [*TEXTURES]).albedo
+    image, hidden = image_from_albedo(albedo, depth_m), np.isnan(depth_m)
+    assert image.shape == (3, 64, 64)
+    black = image_from_albedo(np.zeros((64, 64, 3)), np.full((64, 64), 0.2))
+    np.testing.assert_allclose(black, BLACK_V, atol=1e-6)  # no background
+    assert (image[:, hidden] == 0).all()
+    np.testing.assert_allclose(image[:, ~hidden].T, BLACK_V + (1 - BLACK_V) * albedo[~hidden], atol=1e-6)

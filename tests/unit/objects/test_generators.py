@@ -1,4 +1,4 @@
-"""The 18 object generators: the shape of each kind seen straight from the wall, and how its settings are drawn."""
+"""The 18 object generators, how their settings are drawn, and generic shapes of every family, carved or in pairs."""
 
 import hashlib
 from collections.abc import Callable
@@ -13,7 +13,9 @@ from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
 from nlos_cam.objects import category_triangles, object_box, orthographic_depth, place, random_pose
+from nlos_cam.objects import primitives as solids
 from nlos_cam.objects.generators import CATEGORIES, Category, Setting, category
+from nlos_cam.objects.generic import FAMILIES, MIN_PIXELS, generic_depth
 from nlos_cam.objects.primitives import box
 from nlos_cam.render import paper_scene
 
@@ -59,22 +61,16 @@ def test_hollow_is_deeper_than_its_rim(straight_view: View, kind: str) -> None:
 
 BOX = object_box(load_rig("paper-rig"))
 SEEDS = (*range(47), 10_000_000, 20_000_000, 2**31 - 1)
-SI_1 = "airplane baskets bell birdhouse boat bowl car computer cup cupboard hat lamp motorcycle oven rocket soundbox"
-
-DEFAULT_AIRPLANE = "1ab023dab17e054a"
-"""SHA-256 of the mesh shown in the README, vertices rounded to 9 decimals."""
-
-
-def test_categories_are_those_of_the_paper_in_fixed_order() -> None:
-    """A seed picks by position: sorting or inserting would change every dataset."""
-    assert list(CATEGORIES) == [*SI_1.split(), "table", "tower"]
-    assert all(kind.name == name for name, kind in CATEGORIES.items())
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_category_fits_its_box_and_shows(category: str) -> None:
-    for seed in SEEDS:
-        placed = place(category_triangles(category, seed), random_pose(np.random.default_rng(seed), BOX), BOX)
+def test_category_makes_one_object_of_unit_size_per_seed_that_fits_its_box_and_shows(category: str) -> None:
+    meshes = {seed: category_triangles(category, seed) for seed in SEEDS}
+    np.testing.assert_array_equal(category_triangles(category, SEEDS[-1]), meshes[SEEDS[-1]])
+    assert len({mesh.tobytes() for mesh in meshes.values()}) == len(SEEDS)
+    for seed, mesh in meshes.items():
+        assert 0.5 < np.ptp(mesh.reshape(-1, 3), axis=0).max() < 1.5
+        placed = place(mesh, random_pose(np.random.default_rng(seed), BOX), BOX)
         assert np.isfinite(placed).all()
         low, high = placed.reshape(-1, 3).min(0), placed.reshape(-1, 3).max(0)
         assert (low >= np.array([BOX.x_min_m, BOX.y_min_m, BOX.z_near_m]) - 1e-9).all()
@@ -83,14 +79,6 @@ def test_category_fits_its_box_and_shows(category: str) -> None:
         assert 0.03 < surface.mean() < 0.6
         assert not (surface[0].any() and surface[-1].any()), "it touches the top and the bottom"
         assert not (surface[:, 0].any() and surface[:, -1].any()), "it touches both sides"
-
-
-@pytest.mark.parametrize("category", CATEGORIES)
-def test_category_makes_one_object_of_unit_size_per_seed(category: str) -> None:
-    meshes = [category_triangles(category, seed) for seed in SEEDS]
-    np.testing.assert_array_equal(category_triangles(category, SEEDS[-1]), meshes[-1])
-    assert len({mesh.tobytes() for mesh in meshes}) == len(SEEDS)
-    assert all(0.5 < np.ptp(mesh.reshape(-1, 3), axis=0).max() < 1.5 for mesh in meshes)
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
@@ -105,12 +93,9 @@ def test_category_settings_all_change_the_depth_map(category: str) -> None:
         assert not np.allclose(other, picture, atol=1e-4, equal_nan=True), list(kind.settings)[n]
 
 
-def test_default_scene_keeps_the_airplane_of_the_readme() -> None:
-    """Changes to the generators must leave the default scene as it is."""
-    hidden = paper_scene().hidden
-    assert hashlib.sha256(np.round(hidden.triangles, 9).tobytes()).hexdigest()[:16] == DEFAULT_AIRPLANE
-
-
+NAMES = """
+airplane baskets bell birdhouse boat bowl car computer cup cupboard hat lamp motorcycle oven rocket soundbox table tower
+"""
 DIGESTS = """
 ccf22abf 05632ec4 fda477c2 5a445fee 4e22a452 f9a4b7a7 7c73d173 b40a3603 de419b3a 99239899 290fb1ea e5ea9141
 e9436516 1007c23a d80bea10 f102da95 de848140 c5348870
@@ -118,11 +103,14 @@ e9436516 1007c23a d80bea10 f102da95 de848140 c5348870
 """SHA-256 of each category's mesh for seed 0, vertices rounded to 9 decimals."""
 
 
-def test_seed_makes_the_object_that_it_has_always_made() -> None:
-    """Datasets name their objects by seeds, and a changed shape would make others of them."""
+def test_categories_are_those_of_the_paper_and_a_seed_makes_what_it_has_always_made() -> None:
+    """Datasets name their objects by seeds: a changed shape, or another order, would make others of them."""
+    assert list(CATEGORIES) == [kind.name for kind in CATEGORIES.values()] == NAMES.split()
     meshes = [np.round(category_triangles(name, 0), 9) + 0.0 for name in CATEGORIES]
     found = [hashlib.sha256(mesh.tobytes()).hexdigest()[:8] for mesh in meshes]
     assert dict(zip(CATEGORIES, found, strict=True)) == dict(zip(CATEGORIES, DIGESTS.split(), strict=True))
+    hidden = np.round(paper_scene().hidden.triangles, 9)
+    assert hashlib.sha256(hidden.tobytes()).hexdigest()[:16] == "1ab023dab17e054a", "the README's airplane"
 
 
 UNIT = st.floats(0, 1)
@@ -195,11 +183,6 @@ def test_category_holds_out_enough_and_trains_on_most(kind: Category) -> None:
         low, high = setting.held_out or (0, 0)
         trained = sum(b - a for a, b in setting.training_intervals)
         assert 0.1 < (high - low) / trained < 0.5
-        assert all(
-            not a < u < b
-            for a, b in setting.training_intervals
-            for u in (np.nextafter(low, high), np.nextafter(high, low))
-        )
 
 
 def test_category_decorator_keeps_name_and_setting_order() -> None:
@@ -213,3 +196,110 @@ def test_category_decorator_keeps_name_and_setting_order() -> None:
     assert np.ptp(crate.make(**crate.draw([0.5, 1.0]))[..., 1]) == 5
     with pytest.raises(ValueError, match="shorter"):
         crate.draw([0.5])
+
+
+def test_generic_shape_follows_from_the_seed_stands_in_the_box_and_is_of_every_family_in_its_share() -> None:
+    shapes = [generic_depth(seed, BOX) for seed in range(400)]
+    for seed in (3, 90):
+        np.testing.assert_array_equal(generic_depth(seed, BOX)[1], shapes[seed][1])
+    for name, depth_m in shapes:
+        surface = depth_m[np.isfinite(depth_m)]
+        assert surface.size >= MIN_PIXELS, name
+        assert surface.min() >= BOX.z_near_m - 1e-6, name
+        assert surface.max() <= BOX.z_far_m + 1e-6, name
+    assert len({depth_m.tobytes() for _, depth_m in shapes}) == len(shapes)
+    names = [name for name, _ in shapes]
+    assert {name for name in names if " " not in name} == FAMILIES.keys()
+    assert 0.1 < np.mean([name.startswith("carved") for name in names]) < 0.3
+    assert 0.06 < np.mean([" and " in name for name in names]) < 0.2
+
+
+def _middle(solid: Float64) -> np.ndarray:
+    points = solid.reshape(-1, 3)
+    return (points.min(0) + points.max(0)) / 2
+
+
+def _area(solid: Float64) -> float:
+    return float(np.linalg.norm(np.cross(solid[:, 1] - solid[:, 0], solid[:, 2] - solid[:, 0]), axis=1).sum() / 2)
+
+
+SOLIDS = [
+    (solids.box(0.1, 0.2, 0.3), [0.1, 0.2, 0.3]),
+    (solids.ellipsoid(0.1, 0.2, 0.3), [0.2, 0.4, 0.6]),
+    (solids.knob(0.1, 0.3), [0.2, 0.2, 0.6]),
+    (solids.ring(0.2, 0.05), [0.5, 0.5, 0.1]),
+    (solids.disc(0.2, 0.05), [0.4, 0.4, 0.05]),
+    (solids.pierced(0.5, 0.4, 0.1, 0.05), [0.5, 0.4, 0.05]),
+    (solids.at(solids.slab([(0, 0), (0.4, 0), (0.4, 0.3), (0, 0.3)], 0.1), -0.2, -0.15), [0.4, 0.3, 0.1]),
+]
+
+
+@pytest.mark.parametrize(("solid", "extents"), [*SOLIDS, (solids.frame(0.5, 0.4, 0.1, 0.05), [0.5, 0.4, 0.05])])
+def test_solid_has_its_size_and_is_centered(solid: Float64, extents: list[float]) -> None:
+    assert np.ptp(solid.reshape(-1, 3), axis=0).tolist() == pytest.approx(extents, rel=0.02)
+    np.testing.assert_allclose(_middle(solid), 0, atol=1e-3)
+
+
+def test_lathe_turns_about_y_and_frame_is_open() -> None:
+    x, y, z = solids.lathe([(0, -0.2), (0.3, -0.2), (0.1, 0.5), (0, 0.5)]).reshape(-1, 3).T
+    assert (y.min(), y.max()) == (pytest.approx(-0.2), pytest.approx(0.5))
+    radius = np.hypot(x, z)
+    assert radius[np.isclose(y, -0.2)].max() == pytest.approx(0.3)
+    assert radius[np.isclose(y, 0.5)].max() == pytest.approx(0.1)
+    x, y, _ = solids.frame(0.6, 0.4, 0.1, 0.2).reshape(-1, 3).T
+    assert ((np.abs(x) > 0.2 - 1e-9) | (np.abs(y) > 0.1 - 1e-9)).all()
+
+
+@pytest.mark.parametrize("angle", [90.0, 180.0, 270.0])
+def test_arch_is_part_of_a_ring_from_the_x_axis_on(angle: float) -> None:
+    part = solids.arch(0.4, 0.05, angle)
+    assert _area(part) == pytest.approx(_area(solids.ring(0.4, 0.05)) * angle / 360, rel=0.01)
+    assert part[..., 0].max() == pytest.approx(0.45)
+    assert solids.arch(0.4, 0.05, 180)[..., 1].min() == pytest.approx(0, abs=1e-9)
+    x, y, z = part.reshape(-1, 3).T
+    np.testing.assert_allclose(np.hypot(np.hypot(x, y) - 0.4, z), 0.05)
+
+
+@pytest.mark.parametrize(
+    "solid",
+    [
+        *(solid for solid, _ in SOLIDS),
+        solids.slab([(0, 0), (0.4, 0), (0.5, 0.2), (0.4, 0.3), (0, 0.3)], 0.1),
+        solids.lathe([(0, 0), (0.3, 0), (0.2, 0.5), (0, 0.5)]),
+        solids.bar((0, 0), (1, 1), 0.1, 0.2),
+    ],
+)
+def test_solid_is_closed(solid: Float64) -> None:
+    """Every edge belongs to two triangles, except edges that collapse to a point on a lathe's axis."""
+    corners, index = np.unique(np.round(solid.reshape(-1, 3), 9), axis=0, return_inverse=True)
+    faces = index.reshape(-1, 3)
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    _, times = np.unique(edges, axis=0, return_counts=True)
+    assert len(corners) > 4
+    assert (times == 2).all()
+
+
+def test_solids_move_turn_tip_and_join() -> None:
+    np.testing.assert_allclose(_middle(solids.at(solids.box(1, 1, 1), 1, 2, 3)), [1, 2, 3])
+    np.testing.assert_allclose(_middle(solids.bar((0.1, 0.2), (0.4, 0.6), 0.06, 0.1)), [0.25, 0.4, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        _middle(solids.turned(solids.at(solids.box(1, 1, 1), x=2), (0, 0, 1), 90)), [0, 2, 0], atol=1e-12
+    )
+    there_and_back = solids.turned(solids.turned(solids.box(1, 2, 3), (1, 0, 0), 35), (1, 0, 0), -35)
+    np.testing.assert_allclose(there_and_back, solids.box(1, 2, 3), atol=1e-12)
+    top = solids.tipped(solids.at(solids.box(0.1, 0.1, 0.1), y=1), 30)  # the top tips towards the wall
+    np.testing.assert_allclose(_middle(top), [0, np.cos(np.radians(30)), -0.5], atol=1e-12)
+    parts = solids.box(1, 1, 1), solids.at(solids.ellipsoid(1, 1, 1), 5), solids.ring(1, 0.1)
+    solid = solids.joined(*parts)
+    assert len(solid) == sum(len(part) for part in parts)
+    assert solid[..., 0].max() == pytest.approx(6, abs=0.01)
+
+
+@pytest.mark.parametrize("taper", [0.0, 0.5, 1.0])
+def test_prism_has_the_volume_of_its_frustum(taper: float) -> None:
+    """By the divergence theorem; side faces point one way, so the sign is that of the outline's turn."""
+    angle = np.linspace(0, 2 * np.pi, 5)[:-1]
+    a, b, c = np.moveaxis(solids.prism(np.column_stack([np.cos(angle), np.sin(angle)]), 3.0, taper), 1, 0)
+    area_z = 0.5 * np.abs(np.cross(b - a, c - a)[:, 2])
+    assert area_z.sum() == pytest.approx(2 + 2 * taper**2 + 2 * (1 - taper**2))  # base, front, and sides seen along z

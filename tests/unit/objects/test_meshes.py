@@ -1,24 +1,43 @@
-"""Meshes and depth maps from files, folders of meshes, and errors that name the file."""
+"""Objects by name, meshes and depth maps from files, errors that name the file, and the mesh of a hidden surface."""
 
+import csv
+import json
 import logging
+import struct
 import subprocess
 import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from nlos_calibration import ObjectBox, load_rig
 from trimesh.exchange.ply import export_ply
 
-from nlos_cam.errors import SceneError
-from nlos_cam.objects import Pose, object_box, random_pose
+from nlos_cam.errors import NlosCamError, SceneError
+from nlos_cam.objects import (
+    Pose,
+    SurfaceMesh,
+    category_triangles,
+    cell_centers_m,
+    find_category,
+    load_object,
+    mesh_from_depth,
+    object_box,
+    orthographic_depth,
+    place,
+    random_pose,
+)
 from nlos_cam.objects import meshes as files
 from nlos_cam.objects.meshes import POSES, MeshFile, folder_objects, mesh_depth, plain, read_depth_map, read_mesh
+from nlos_cam.objects.surface_mesh import JUMP_M
 
 SOLID = trimesh.creation.torus(0.3, 0.1, major_sections=9, minor_sections=5)
 EXPORTS = {
@@ -30,29 +49,13 @@ EXPORTS = {
 }
 VERTICES = b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
-PLY = b"""ply
-format ascii 1.0
-comment TextureFile none.png
-element vertex 4
-property float x
-property float y
-property float z
-property float s
-property float t
-element face 2
-property list uchar int vertex_indices
-element edge 1
-property int vertex1
-property int vertex2
-end_header
-0 0 0 0 0
-1 0 0 1 0
-1 1 0 1 1
-0 1 0 0 1
-3 0 1 2
-3 0 2 3
-0 1
-"""
+PLY = (
+    b"ply\nformat ascii 1.0\ncomment TextureFile none.png\nelement vertex 4\n"
+    b"property float x\nproperty float y\nproperty float z\nproperty float s\nproperty float t\n"
+    b"element face 2\nproperty list uchar int vertex_indices\n"
+    b"element edge 1\nproperty int vertex1\nproperty int vertex2\nend_header\n"
+    b"0 0 0 0 0\n1 0 0 1 0\n1 1 0 1 1\n0 1 0 0 1\n3 0 1 2\n3 0 2 3\n0 1\n"
+)
 UNREADABLE = "string or file could not be read to its end due to unmatched data"
 WITHOUT_EXTRAS = """
 import sys
@@ -103,37 +106,25 @@ def test_read_mesh_needs_no_optional_package(tmp_path: Path) -> None:
     assert (done.stdout.split(), done.stderr) == ([str(len(SOLID.faces))] * 5 + ["2", "2"], "")
 
 
-def test_read_mesh_silences_the_log_of_the_parser(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("warning", "is_damage"), [(UNREADABLE, True), ("old fashioned", False)])
+def test_read_mesh_silences_the_parser_and_refuses_unreadable_numbers(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, warning: str, is_damage: bool
 ) -> None:
+    """An older numpy only warns about unreadable numbers and returns those before them."""
     before, load = logging.getLogger("trimesh").level, trimesh.load_scene
 
     def wordy(*arguments: object, **named: object) -> object:
         logging.getLogger("trimesh").error("look at me")
-        return load(*arguments, **named)
-
-    monkeypatch.setattr(trimesh, "load_scene", wordy)
-    _read(tmp_path, "thing.stl", EXPORTS["binary.stl"])
-    assert not caplog.records
-    assert logging.getLogger("trimesh").level == before
-
-
-@pytest.mark.parametrize(("warning", "is_damage"), [(UNREADABLE, True), ("old fashioned", False)])
-def test_read_mesh_refuses_unreadable_numbers_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, warning: str, is_damage: bool
-) -> None:
-    """An older numpy only warns about unreadable numbers and returns those before them."""
-    load = trimesh.load_scene
-
-    def warns(*arguments: object, **named: object) -> object:
         warnings.warn(warning, DeprecationWarning, stacklevel=1)
         return load(*arguments, **named)
 
-    monkeypatch.setattr(trimesh, "load_scene", warns)
+    monkeypatch.setattr(trimesh, "load_scene", wordy)
     if is_damage:
         _assert_refused(_write(tmp_path, "thing.stl", EXPORTS["text.stl"]), "")
     else:
         assert len(_read(tmp_path, "thing.stl", EXPORTS["text.stl"]).triangles) == len(SOLID.faces)
+    assert not caplog.records
+    assert logging.getLogger("trimesh").level == before
 
 
 @pytest.mark.parametrize(
@@ -286,22 +277,18 @@ def test_read_depth_map_refuses_other_arrays(tmp_path: Path, depth: np.ndarray, 
     _assert_refused(tmp_path / "map.npy", word, read_depth_map)
 
 
-def test_read_depth_map_refuses_a_header_that_claims_too_much(tmp_path: Path) -> None:
-    np.save(tmp_path / "map.npy", _map(0.3))
-    content = (tmp_path / "map.npy").read_bytes()
-    claimed = content.replace(b"(16, 16), }            ", b"(1600000, 1600000), }  ")
-    assert claimed != content
-    _assert_refused(_write(tmp_path, "map.npy", claimed), "", read_depth_map)
+def test_read_depth_map_refuses_damaged_files_and_archives(tmp_path: Path) -> None:
+    np.save(path := tmp_path / "map.npy", _map(0.3))
+    content = path.read_bytes()
+    claims_too_much = content.replace(b"(16, 16), }            ", b"(1600000, 1600000), }  ")
+    assert claims_too_much != content
+    for damaged in (
+        claims_too_much,
+        *(content[:cut] + junk for cut in (0, 5, 60, 128, 400) for junk in (b"", b"hello")),
+    ):
+        _assert_refused(_write(tmp_path, "map.npy", damaged), "", read_depth_map)
     np.savez(tmp_path / "maps.npz", depth_m=_map(0.3))
     _assert_refused(tmp_path / "maps.npz", "", read_depth_map)
-
-
-@pytest.mark.parametrize("cut", [0, 5, 60, 128, 400])
-@pytest.mark.parametrize("junk", [b"", b"hello"])
-def test_read_depth_map_refuses_damaged_files(tmp_path: Path, cut: int, junk: bytes) -> None:
-    np.save(tmp_path / "map.npy", _map(0.3))
-    content = (tmp_path / "map.npy").read_bytes()
-    _assert_refused(_write(tmp_path, "map.npy", content[:cut] + junk), "", read_depth_map)
 
 
 BOX = object_box(load_rig("paper-rig"))
@@ -314,7 +301,7 @@ def _save(path: Path, mesh: trimesh.Trimesh = TORUS) -> Path:
     return path
 
 
-def test_folder_objects_finds_meshes_in_a_fixed_order(tmp_path: Path) -> None:
+def test_folder_objects_finds_meshes_in_a_fixed_order_and_refuses_missing_empty_and_file_paths(tmp_path: Path) -> None:
     tmp_path /= ".cache"  # a hidden folder named on purpose is searched
     names = ["b.obj", "a/z.STL", "a/deep/er/y.ply", "c/x.stl"]
     for name in names:
@@ -325,9 +312,6 @@ def test_folder_objects_finds_meshes_in_a_fixed_order(tmp_path: Path) -> None:
     (tmp_path / "folder.obj").mkdir()
     found = [path.relative_to(tmp_path).as_posix() for path in folder_objects(tmp_path)]
     assert found == ["a/deep/er/y.ply", "a/z.STL", "b.obj", "c/x.stl"]
-
-
-def test_folder_objects_refuses_missing_empty_and_file_paths(tmp_path: Path) -> None:
     (tmp_path / "empty" / "sub").mkdir(parents=True)
     for path in (tmp_path / "gone", _save(tmp_path / "a.stl"), tmp_path / "empty"):
         with pytest.raises(SceneError, match=str(path)):
@@ -360,25 +344,156 @@ def test_mesh_depth_names_a_broken_or_invisible_mesh(tmp_path: Path) -> None:
 
 
 def test_mesh_depth_reads_only_the_mesh_it_picks() -> None:
-    read: list[str] = []
-
-    def ball(name: str) -> MeshFile:
-        read.append(name)
-        return MeshFile(Path(name), "", np.asarray(TORUS.triangles, np.float64))
-
+    read = Mock(side_effect=lambda name: MeshFile(Path(name), "", np.asarray(TORUS.triangles, np.float64)))
     names = [f"mesh-{k}" for k in range(1000)]
-    assert [mesh_depth(seed, names, BOX, read=ball)[0] for seed in range(4)] == read
+    picked = [mesh_depth(seed, names, BOX, read=read)[0] for seed in range(4)]
+    assert picked == [call.args[0] for call in read.call_args_list]
 
 
 def test_mesh_depth_draws_another_pose_for_an_edge_on_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
-    poses: list[Pose] = []
-
-    def first_along_the_sight(generator: np.random.Generator, box: ObjectBox) -> Pose:
-        poses.append(Pose() if not poses else random_pose(generator, box))
-        return poses[-1]
-
-    monkeypatch.setattr(files, "random_pose", first_along_the_sight)
+    along_the_sight, others = Pose(), (random_pose(np.random.default_rng(seed), BOX) for seed in range(POSES))
+    monkeypatch.setattr(files, "random_pose", drawn := Mock(side_effect=[along_the_sight, *others]))
     lying = np.array([[[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[1, 0, 0], [1, 0, 1], [0, 0, 1]]], np.float64)
     _, depth_m = mesh_depth(3, ["sheet"], BOX, read=lambda name: MeshFile(Path(name), "", lying))
-    assert 1 < len(poses) <= POSES
+    assert 1 < drawn.call_count <= POSES
     assert np.isfinite(depth_m).any()
+
+
+POSE = Pose(size_m=0.15, tilt_y_rad=0.3)
+
+
+def test_load_object_places_a_category_and_a_mesh_alike(tmp_path: Path) -> None:
+    triangles = category_triangles("cup", 4)
+    corners = triangles.reshape(-1, 3)
+    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    mesh.export(tmp_path / "cup.stl")
+    expected = orthographic_depth(place(triangles, POSE, BOX), BOX)
+    loaded = load_object("cup", BOX, POSE, seed=4)
+    np.testing.assert_array_equal(loaded.depth_m, expected)
+    assert loaded.warnings == ()
+    np.testing.assert_allclose(load_object(str(tmp_path / "cup.stl"), BOX, POSE).depth_m, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("name", "hint"), [("cupp", "Did you mean 'cup'?"), ("teapot", "tower"), ("cup.glb", ".stl")])
+def test_load_object_suggests_the_nearest_category(name: str, hint: str) -> None:
+    with pytest.raises(SceneError) as caught:
+        load_object(name, BOX)
+    assert name in str(caught.value)
+    assert hint in str(caught.value)
+    with pytest.raises(SceneError, match="Did you mean 'airplane'"):
+        find_category("aeroplane")
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"), [("cup", {"up": "z"}), ("a.stl", {"seed": 1}), ("a.npy", {"pose": POSE})]
+)
+def test_load_object_refuses_arguments_that_do_not_apply(name: str, arguments: dict[str, object]) -> None:
+    with pytest.raises(SceneError, match="seed is for categories"):
+        load_object(name, BOX, **arguments)  # type: ignore[arg-type]
+
+
+def test_load_object_refuses_a_plate_seen_edge_on(tmp_path: Path) -> None:
+    plate = tmp_path / "plate.obj"
+    plate.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", encoding="utf-8")
+    with pytest.raises(SceneError, match=r"plate\.obj"):
+        load_object(str(plate), BOX, Pose(tilt_y_rad=np.pi / 2))
+
+
+SMALL_BOX = ObjectBox(x_min_m=0.0, x_max_m=0.16, y_min_m=-0.1, y_max_m=0.06, z_near_m=0.1, z_far_m=0.6)
+NAN = np.float32(np.nan)
+DEPTHS = arrays(np.float32, (8, 8), elements=st.one_of(st.just(NAN), st.floats(0.125, 0.25, width=32)))
+ERROR_M = np.linspace(0.001, 0.05, 64, dtype=np.float32).reshape(8, 8)
+
+
+def slope() -> np.ndarray:
+    """Return a tilted plane with a hole, a line one cell wide and a single cell."""
+    depth_m = np.full((8, 8), NAN)
+    depth_m[:4, :5] = 0.2 + 0.004 * np.arange(20, dtype=np.float32).reshape(4, 5)
+    depth_m[1, 1], depth_m[6, :4], depth_m[7, 7] = NAN, 0.3, 0.15
+    return depth_m
+
+
+def sampled(mesh: SurfaceMesh) -> np.ndarray:
+    """Return the mesh's depth at the cells' centres; triangles grow by 1e-7 so that a centre on an edge is inside."""
+    triangles_m = mesh.vertices_m[mesh.faces]
+    middle_m = triangles_m.mean(axis=1, keepdims=True)
+    return orthographic_depth(middle_m + (1 + 1e-7) * (triangles_m - middle_m), SMALL_BOX, 8)
+
+
+@given(depth_m=DEPTHS, jump_m=st.sampled_from([0.0, JUMP_M, 1.0]))
+def test_mesh_sampled_at_cell_centers_is_the_depth_map(depth_m: np.ndarray, jump_m: float) -> None:
+    mesh = mesh_from_depth(depth_m, SMALL_BOX, ERROR_M, jump_m)
+    np.testing.assert_allclose(sampled(mesh), depth_m, atol=1e-6)
+    corners_m = mesh.vertices_m[mesh.faces]
+    assert not len(corners_m) or np.ptp(corners_m[..., 2], axis=1).max() <= jump_m + 1e-7
+    normal = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    assert (normal[:, 2] < 0).all(), "the lit side faces the wall"
+
+
+def test_vertices_lie_at_cell_centers_with_their_uncertainty() -> None:
+    x_m, y_m = cell_centers_m(SMALL_BOX, 8)
+    mesh = mesh_from_depth(np.full((8, 8), 0.2, np.float32), SMALL_BOX, ERROR_M)
+    np.testing.assert_allclose(mesh.vertices_m[9], [x_m[1], y_m[1], 0.2], atol=1e-8)
+    np.testing.assert_array_equal(mesh.uncertainty_m, ERROR_M.ravel())
+
+
+def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, faces and uncertainty as the glTF 2.0 specification defines them."""
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    tree, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+    (primitive,) = tree["meshes"][0]["primitives"]
+
+    def values(number: int, kind: str) -> np.ndarray:
+        accessor = tree["accessors"][number]
+        view = tree["bufferViews"][accessor["bufferView"]]
+        count = accessor["count"] * {"SCALAR": 1, "VEC3": 3}[accessor["type"]]
+        return np.frombuffer(binary, kind, count, view.get("byteOffset", 0) + accessor.get("byteOffset", 0))
+
+    named = primitive["attributes"]
+    kind = {5123: "<u2", 5125: "<u4"}[tree["accessors"][primitive["indices"]]["componentType"]]
+    assert tree["materials"][primitive["material"]]["doubleSided"]
+    faces = values(primitive["indices"], kind).reshape(-1, 3)
+    return values(named["POSITION"], "<f4").reshape(-1, 3), faces, values(named["_uncertainty_m"], "<f4")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj"])
+def test_opencv_reads_the_saved_mesh(tmp_path: Path, suffix: str) -> None:
+    mesh = mesh_from_depth(slope(), SMALL_BOX, ERROR_M)
+    mesh.save(tmp_path / f"mesh{suffix}")
+    vertices_m, faces, *_ = cv2.loadMesh(str(tmp_path / f"mesh{suffix}"))
+    read = SurfaceMesh(np.float64(vertices_m[0]), np.array(faces, np.int64).reshape(-1, 3))
+    np.testing.assert_allclose(read.vertices_m, mesh.vertices_m, atol=1e-6)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    assert [path.name for path in tmp_path.iterdir()] == [f"mesh{suffix}"]
+
+
+def test_glb_holds_the_mesh_and_its_uncertainty(tmp_path: Path) -> None:
+    mesh = mesh_from_depth(slope(), SMALL_BOX, ERROR_M)
+    mesh.save(tmp_path / "mesh.glb")
+    vertices_m, faces, uncertainty_m = read_glb(tmp_path / "mesh.glb")
+    np.testing.assert_allclose(vertices_m, mesh.vertices_m, atol=1e-6)
+    np.testing.assert_array_equal(faces, mesh.faces)
+    np.testing.assert_array_equal(uncertainty_m, mesh.uncertainty_m)
+
+
+def test_points_are_saved_without_faces(tmp_path: Path) -> None:
+    mesh = mesh_from_depth(slope(), SMALL_BOX)
+    mesh.points_only.save(tmp_path / "points.ply")
+    read, *_ = cv2.loadPointCloud(str(tmp_path / "points.ply"))
+    np.testing.assert_allclose(read[:, 0], mesh.vertices_m, atol=1e-6)
+    mesh.save(str(tmp_path / "points.csv"))
+    rows = [*csv.DictReader((tmp_path / "points.csv").read_text(encoding="utf-8").splitlines())]
+    np.testing.assert_allclose([float(row["z_m"]) for row in rows], mesh.vertices_m[:, 2], atol=1e-5)
+    assert {row["uncertainty_m"] for row in rows} == {""}
+    mesh_from_depth(slope(), SMALL_BOX, ERROR_M).save(tmp_path / "mesh.npz")
+    with np.load(tmp_path / "mesh.npz") as arrays_read:
+        np.testing.assert_array_equal(arrays_read["vertices_m"], mesh.vertices_m)
+        assert len(arrays_read["uncertainty_m"]) == len(mesh.vertices_m)
+
+
+@pytest.mark.parametrize(("name", "depth_m", "word"), [("a.fbx", 0.2, ".glb"), ("a.ply", NAN, "no surface")])
+def test_mesh_that_cannot_be_saved_is_refused(tmp_path: Path, name: str, depth_m: float, word: str) -> None:
+    with pytest.raises(NlosCamError, match=word):
+        mesh_from_depth(np.full((8, 8), depth_m, np.float32), SMALL_BOX).save(tmp_path / name)
+    assert not any(tmp_path.iterdir())

@@ -47,13 +47,16 @@ def score(seen: LidarMaps, expected: Expected) -> float:
     return explain(seen, expected, expected.bare).score
 
 
-def test_score_of_expected_maps_is_zero_and_of_an_empty_bench_one() -> None:
+def test_score_is_0_of_expected_maps_1_of_an_empty_bench_and_more_of_an_object_not_there() -> None:
     scene, nothing = expected_object(), Expected(np.full(SHAPE, np.nan), np.zeros(SHAPE), *[np.zeros(SHAPE)] * 2)
     assert score(maps_of(scene), scene) == pytest.approx(0.0, abs=1e-6)
     assert score(maps_of(scene, noise_m=1e-4), scene) < 0.1
     assert score(maps_of(scene), scene.bare) == 1.0
     assert score(maps_of(nothing), nothing) == 0.0
     assert score(maps_of(nothing), scene) == pytest.approx(1.0)
+    seen = maps_of(expected_object().bare, noise_m=1e-4)
+    assert score(seen, expected_object().bare) < 0.05
+    assert score(seen, expected_object(strength=20.0)) > 1.0
 
 
 def test_score_rises_with_the_distance_from_the_object() -> None:
@@ -61,12 +64,6 @@ def test_score_rises_with_the_distance_from_the_object() -> None:
     scores = [score(maps, expected_object(0.5 + off_m)) for off_m in (0.0, 0.005, 0.01, 0.03, 0.1)]
     assert scores[0] <= scores[1] < scores[2] < scores[3] < scores[4]
     assert scores[-1] > 0.9
-
-
-def test_score_of_an_object_for_a_bare_bench_is_above_one() -> None:
-    seen = maps_of(expected_object().bare, noise_m=1e-4)
-    assert score(seen, expected_object().bare) < 0.05
-    assert score(seen, expected_object(strength=20.0)) > 1.0
 
 
 @pytest.mark.parametrize("albedo", [0.75, 1.0, (4 / 3) ** 0.5])
@@ -88,23 +85,17 @@ def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
     assert fit_gain(replace(seen, valid=np.zeros(SHAPE, np.bool_)), expected_object().bare) == 1.0
 
 
-def test_mean_cost_lets_nearly_equal_echoes_swap() -> None:
+def test_mean_cost_counts_cells_that_wrongly_return_and_lets_equal_echoes_swap_and_full_scale_hide_light() -> None:
     close, clear = (
         mean_cost(maps_of(expected_object().bare), expected_object(strength=by), GAIN, 1.0) for by in (1.1, 10.0)
     )
     assert close < 0.05
     assert clear > 0.4
-
-
-def test_mean_cost_counts_cells_that_wrongly_return_or_do_not() -> None:
     wall = expected_object().bare
     half = replace(wall, direct=np.where(RIGHT, 0.0, wall.direct), direct_m=np.where(RIGHT, np.nan, wall.direct_m))
     assert mean_cost(maps_of(wall), half, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), wall, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), half, GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_mean_cost_lets_full_scale_hide_more_light_only() -> None:
     bright = maps_of(expected_object(strength=1000.0))
     assert bright.intensity.max() == 255
     assert mean_cost(bright, expected_object(strength=1000.0), GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
@@ -180,15 +171,6 @@ def test_periodic_check_is_independent_of_earlier_frames() -> None:
     for seed in SEEDS:
         assert (forwards[seed].frame_number, forwards[seed].score) == (seed, backwards[seed].score)
         np.testing.assert_array_equal(forwards[seed].residual_depth_m, backwards[seed].residual_depth_m)
-
-
-def test_periodic_check_takes_each_third_frame() -> None:
-    numbers = []
-    with PeriodicPhysicsCheck(RIG, every=3) as checks:
-        for number in range(8):
-            checks.offer(number, seen(None), EMPTY)
-            numbers.append(checks.newest.frame_number if checks.newest else None)
-    assert numbers == [0, 0, 0, 3, 3, 3, 6, 6]
 
 
 def test_periodic_check_reports_a_failure_once(caplog: pytest.LogCaptureFixture) -> None:

@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
-from fake_wall import RIG, WallCamera, measured_wall, wall_frame
-from nlos_calibration.errors import CalibrationError
+from fake_wall import RIG, SERIAL, SMALL, WallCamera, bare_wall, measured_wall, other_intrinsics, wall_frame, write_wall
+from nlos_calibration.errors import CalibrationError, RecordFileError
+from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.rig import load_rig
 from small_frames import sheet_network
 
-from nlos_cam.frames import maps_from_frame
+from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.live import FrameReader
 from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD, iterate_batched, iterate_results, with_telemetry
 from nlos_cam.reconstruct import Clock, FrameConditions, PeriodicPhysicsCheck, PhysicsCheckResult, Verdict
-from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
+from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig, open_bench, subtract_reference
 from nlos_cam.reconstruct.pipeline import (
     FrameResult,
     Pipeline,
@@ -170,28 +172,21 @@ def trained(rig_name: str = RIG.name, rig_checksum: str = RIG.checksum, eats: st
     return SimpleNamespace(rig_name=rig_name, rig_checksum=rig_checksum, input=eats)
 
 
-def test_compatibility_warnings_name_what_differs_from_the_training_rig() -> None:
+def test_compatibility_warnings_name_what_differs_from_training_and_a_wall_without_reference(
+    walled: CalibratedRig,
+) -> None:
     farther = RIG.model_copy(update={"lidar": RIG.lidar.model_copy(update={"distance_m": 0.3})})
     assert compatibility_warnings(CalibratedRig(RIG), trained(), DOUBTER) == []
     (note,) = compatibility_warnings(CalibratedRig(farther), trained(), DOUBTER)
     assert "100 mm" in note
     (note,) = compatibility_warnings(CalibratedRig(RIG), trained(), None)
     assert "uncertainty" in note
-
-
-@pytest.mark.parametrize(("checksum", "notes"), [(RIG.checksum, 0), ("0" * 12, 1)])
-def test_compatibility_of_an_unnamed_rig_is_by_checksum(checksum: str, notes: int) -> None:
-    assert (
-        len(compatibility_warnings(CalibratedRig(RIG), trained("a rig of somebody else's", checksum), DOUBTER)) == notes
-    )
-
-
-def test_compatibility_warnings_name_a_wall_without_reference(walled: CalibratedRig) -> None:
     bare = CalibratedRig(RIG, replace(walled.measured, reference=None))
-    more = set(compatibility_warnings(bare, trained(), DOUBTER)) - set(
-        compatibility_warnings(walled, trained(), DOUBTER)
-    )
-    assert ["reference" in note for note in more] == [True]
+    found, more = (compatibility_warnings(each, trained(), DOUBTER) for each in (walled, bare))
+    assert ["reference" in note for note in set(more) - set(found)] == [True]
+    for checksum, notes in ((RIG.checksum, 0), ("0" * 12, 1)):  # a rig of another name
+        unnamed = trained("a rig of somebody else's", checksum)
+        assert len(compatibility_warnings(CalibratedRig(RIG), unnamed, DOUBTER)) == notes
 
 
 @pytest.mark.parametrize("eats", ["raw maps", "difference maps"])
@@ -212,3 +207,114 @@ def test_load_networks_exports_into_the_cache(monkeypatch: pytest.MonkeyPatch, t
     monkeypatch.setattr("nlos_cam.reconstruct.pipeline.load_reconstructor", lambda *given: asked.append(given) or np)
     assert load_networks(Path("mine")) is np
     assert asked == [(Path("mine"), tmp_path / "onnx")]
+
+
+def camera(intrinsics: Intrinsics = SMALL, **others: Any) -> Any:
+    return SimpleNamespace(**{"intrinsics": intrinsics, "rig": None, "identity": {"serial": SERIAL}, **others})
+
+
+@pytest.fixture
+def wall(tmp_path: Path) -> Path:
+    return write_wall(tmp_path / "wall.toml", bare_wall())
+
+
+def observe(bench: CalibratedRig, number: int = 0, nearer_m: float = 0.0) -> BenchObservation:
+    frame = wall_frame(number, nearer_m)
+    return bench.observe(frame, maps_from_frame(frame))
+
+
+def test_open_bench_takes_rig_and_reference_from_the_record_or_else_the_rig_of_the_camera(
+    wall: Path, tmp_path: Path
+) -> None:
+    own = RIG.model_copy(update={"name": "own"})
+    assert open_bench(None, camera(rig=own)).rig is own
+    assert open_bench(None, camera(rig=load_rig("bare-wall"))).rig == RIG
+    bench = open_bench(None, camera(Intrinsics(320, 240, 1.0, 1.0, 0.0, 0.0)))
+    bench.update_temperatures({"ldd_temperature": 90.0})
+    look = observe(bench)
+    assert bench.rig == RIG
+    assert (look.difference, look.warnings, bench.reference) == (None, (), None)
+    bench = open_bench(wall, camera())
+    assert (bench.rig.name, bench.reference.frames, bench.measured.record.serial) == ("measured", 20, SERIAL)
+    bare = open_bench(write_wall(tmp_path / "bare.toml"), camera())
+    assert bare.rig.name == "measured"
+    assert observe(bare).difference is None
+
+
+def test_difference_of_the_bare_wall_is_noise_without_range_drift(walled: CalibratedRig) -> None:
+    levels_m = list[float]()
+    for number in range(100, 160):
+        difference = observe(walled, number, nearer_m=0.0006).difference
+        off_m = difference.depth_m[difference.valid]
+        levels_m.append(float(off_m.mean()))
+        assert off_m.std() == pytest.approx(5e-4, rel=0.1)
+        assert abs(difference.intensity[difference.valid].mean()) < 0.5
+    assert levels_m[0] == pytest.approx(-0.0006, abs=1e-4)
+    assert np.mean(levels_m[-20:]) == pytest.approx(0.0, abs=1e-4)
+
+
+def test_difference_is_valid_where_maps_and_reference_are() -> None:
+    reference = bare_wall()
+    added_m, added = np.random.default_rng(0).normal(0.0, 0.01, (2, 64, 80)).astype(np.float32)
+    depth_m = reference.map_depth_m + added_m
+    depth_m[:, 3] = np.nan
+    maps = LidarMaps(depth_m, reference.map_intensity + added, ~np.isnan(depth_m))
+    found = subtract_reference(maps, reference)
+    np.testing.assert_array_equal(found.valid, maps.valid & np.isfinite(reference.map_depth_m))
+    assert not found.valid[:, 3].any()
+    assert not found.valid.all(axis=0)[79]  # the wall as far as 0.6 m is all that the reference has
+    np.testing.assert_allclose(found.depth_m[found.valid], added_m[found.valid], atol=1e-6)
+    np.testing.assert_allclose(found.intensity[found.valid], added[found.valid], atol=1e-4)
+    assert np.isnan(found.depth_m[~found.valid]).all()
+    assert (found.intensity[~found.valid] == 0.0).all()
+    assert found.depth_m.dtype == found.intensity.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("nearer_m", "celsius", "moved", "frames"),
+    [
+        (0.0, 41.0, False, 40),
+        (0.0, 75.0, False, 40),
+        (0.002, 41.0, False, 40),
+        (0.01, 41.0, True, 40),
+        (-1.0, 41.0, True, 300),
+    ],
+)
+def test_bench_warns_of_drift_heat_and_of_a_moved_lidar(
+    walled: CalibratedRig, nearer_m: float, celsius: float, moved: bool, frames: int
+) -> None:
+    walled.update_temperatures({"ldd_temperature": celsius})
+    looks = [observe(walled, number + 500, nearer_m) for number in range(frames)]
+    assert not looks[0].moved
+    assert looks[-1].moved == moved
+    assert bool(looks[-1].warnings) == (nearer_m != 0 or celsius > 70.0)
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_open_bench_refuses_other_intrinsics(tmp_path: Path, reference: bool) -> None:
+    wall = write_wall(tmp_path / "wall.toml", bare_wall() if reference else None)
+    with pytest.raises(CalibrationError, match=r"80x64.* 40x32"):
+        open_bench(wall, camera(SMALL.scaled(40, 32)))
+    for name in ("fx", "fy", "ppx", "ppy"):
+        value = getattr(SMALL, name)
+        open_bench(wall, camera(other_intrinsics(**{name: np.float32(value * 1.000001)})))
+        with pytest.raises(CalibrationError, match="intrinsics"):
+            open_bench(wall, camera(other_intrinsics(**{name: value * 1.03})))
+    wall = write_wall(tmp_path / "wall.toml", bare_wall(), intrinsics=other_intrinsics(fx=60.0))
+    with pytest.raises(CalibrationError, match="intrinsics"):
+        open_bench(wall, camera(other_intrinsics(fx=60.0)))
+
+
+@pytest.mark.parametrize(("serial", "warned"), [("f9", True), ("", False), (SERIAL, False)])
+def test_open_bench_warns_of_another_camera(wall: Path, serial: str, warned: bool) -> None:
+    warnings = observe(open_bench(wall, camera(identity={"serial": serial} if serial else {}))).warnings
+    assert len(warnings) == warned
+    assert all(SERIAL in warning and serial in warning for warning in warnings)
+
+
+def test_open_bench_refuses_unreadable_records(tmp_path: Path, wall: Path) -> None:
+    with pytest.raises(RecordFileError, match=r"none\.toml"):
+        open_bench(tmp_path / "none.toml", camera())
+    wall.with_suffix(".npz").unlink()
+    with pytest.raises(RecordFileError, match=r"wall\.npz"):
+        open_bench(wall, camera())

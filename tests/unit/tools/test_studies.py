@@ -1,4 +1,4 @@
-"""Each study on a few settings: its JSON and figure are written, and its summary is right where the answer is known."""
+"""Studies, checks and the run on a GPU in the small: files are written, and figures are right where they are known."""
 
 import json
 from collections.abc import Callable
@@ -15,13 +15,16 @@ from nlos_calibration.arrays import Float32
 from nlos_models import MapSet, checkpoint
 from small_maps import small_maps, untrained_weights, use_small_networks
 
-from nlos_cam.dataset import TEST_SEED, DatasetPlan
+from nlos_cam.dataset import TEST_SEED, DatasetPlan, read_labelled
 from nlos_cam.evaluate import TARGETS, HeldOutObjects, seeded_objects
-from nlos_cam.objects import object_box
+from nlos_cam.objects import benchmark_objects, object_box
+from nlos_cam.recording import load_sidecar
+from nlos_cam.render import MultiBounce, SceneFile, load_scene
 
 RIG = load_rig("paper-rig")
 Tool = Callable[[str], ModuleType]
 Read = Callable[..., Any]
+Patch = pytest.MonkeyPatch
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class Size:
 
 
 @pytest.fixture
-def harness(tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def harness(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> ModuleType:
     module = tool("harness")
     monkeypatch.setattr(module, "DOCS", tmp_path / "docs")
     monkeypatch.setattr(module, "cache_folder", lambda: tmp_path / "cache")
@@ -38,7 +41,7 @@ def harness(tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Modu
 
 
 @pytest.fixture
-def run(tool: Tool, harness: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Read:
+def run(tool: Tool, harness: ModuleType, monkeypatch: Patch) -> Read:
     """Run a study's main with arguments, and return its JSON."""
 
     def call(name: str, result: str, *arguments: object) -> Any:
@@ -92,7 +95,7 @@ def test_renderer_bench_agrees_with_the_cpu(run: Read, capsys: pytest.CaptureFix
 
 
 @pytest.fixture
-def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+def weights(tmp_path: Path, monkeypatch: Patch) -> list[Path]:
     """Two untrained networks that take no time."""
     use_small_networks(monkeypatch, checkpoint)
     for seed, name in enumerate(("two", "one")):
@@ -114,9 +117,7 @@ def test_limits_leave_out_the_latent_of_weights_without_one(tool: Tool, weights:
 
 
 @pytest.mark.slow
-def test_rig_map_has_a_cell_for_every_place(
-    tool: Tool, run: Read, weights: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rig_map_has_a_cell_for_every_place(tool: Tool, run: Read, weights: list[Path], monkeypatch: Patch) -> None:
     module = tool("weights")
     network = type("Plate", (), {"record": SimpleNamespace(input="raw maps"), "__call__": plate})()
     monkeypatch.setattr(module, "load_reconstructor", lambda *_: network)
@@ -129,7 +130,7 @@ def test_rig_map_has_a_cell_for_every_place(
 
 
 def test_unseen_kinds_of_equal_weights_cost_nothing(
-    tool: Tool, run: Read, weights: list[Path], monkeypatch: pytest.MonkeyPatch
+    tool: Tool, run: Read, weights: list[Path], monkeypatch: Patch
 ) -> None:
     monkeypatch.setattr(tool("weights"), "dataset_objects", judged)
     rows = run("weights", "unseen_kinds", "unseen", weights[0], f"again={weights[0]}")["rows"]
@@ -138,7 +139,7 @@ def test_unseen_kinds_of_equal_weights_cost_nothing(
         run("weights", "unseen_kinds", "unseen", *weights, "--left-out", "boat")
 
 
-def test_transfer_curve_trains_on_nested_sets(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_transfer_curve_trains_on_nested_sets(tool: Tool, monkeypatch: Patch) -> None:
     transfer, calls = tool("transfer"), list[list[str]]()
     sets = transfer.nested([Path(f"{k}.bag") for k in range(9)], (2, 5, 30))
     assert list(sets) == [2, 5, 9]
@@ -183,19 +184,131 @@ def test_color_demonstration_passes_each_step_on_to_the_next(tool: Tool) -> None
     assert options["--vae"] == vae[vae.index("--out") + 1]
 
 
-def test_word_check_counts_patterns_with_their_lines(
-    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_word_check_counts_patterns_with_their_lines(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
     words = tool("words")
     monkeypatch.setattr(words, "ROOT", tmp_path)
     (tmp_path / "a.py").write_text('"""What is told\nmeanwhile."""\nMOST_X = 1\n', encoding="utf-8")
     found = words.findings(*words.scan(tmp_path), docstrings=True)
-    assert {key: len(lines) for key, (_, lines) in found.items()} == {
-        "begin": 1,
-        "what": 1,
-        "tell": 1,
-        "so": 0,
-        "rare": 1,
-        "names": 1,
-    }
+    counts = {key: len(lines) for key, (_, lines) in found.items()}
+    assert counts == {"begin": 1, "what": 1, "tell": 1, "so": 0, "rare": 1, "names": 1}
     assert found["rare"][1][0].startswith("a.py:2:")
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneFile:
+    """The example's bench with few pixels."""
+    whole = load_scene(Path(__file__).parents[3] / "examples" / "bench.toml")
+    small = whole.rig.intrinsics.model_copy(update=vars(whole.rig.pinhole.scaled(80, 64)))
+    return whole.model_copy(update={"rig": whole.rig.model_copy(update={"intrinsics": small})})
+
+
+@pytest.fixture
+def rendered(tool: Tool, monkeypatch: Patch) -> list[Any]:
+    """What was rendered; echoes are of nothing but a depth, which takes no time."""
+    scenes: list[Any] = []
+
+    def render(scene: Any) -> Any:
+        scenes.append(scene)
+        peak = np.full((64, 80), 1e-4, np.float32)
+        path_m = np.full((64, 80), 2 * np.nanmin(scene.object_depth_m), np.float32)
+        return type("Rendering", (), {"multi": MultiBounce(peak, peak / 4, path_m, direct_included=True)})
+
+    monkeypatch.setattr(tool("transfer"), "render", render)
+    return scenes
+
+
+@pytest.mark.slow
+def test_a_recording_is_of_its_object_on_the_bench_and_labelled(
+    tool: Tool, scene: SceneFile, rendered: list[Any], tmp_path: Path
+) -> None:
+    things = benchmark_objects(object_box(RIG))
+    paths = list(tool("transfer").record_all(scene, things[:2], tmp_path, 3, lambda *_: None))
+    assert [path.name for path in paths] == ["airplane-1.bag", "airplane-2.bag"]
+    for path, thing, shown in zip(paths, things, rendered, strict=False):
+        sidecar = load_sidecar(path.with_suffix(".json"))
+        assert (sidecar.label, sidecar.state, sidecar.rig) == (thing.name, "complete", scene.rig)
+        np.testing.assert_array_equal(shown.object_depth_m, thing.depth_m)
+        assert (shown.rig, shown.pulse_ns) == (scene.rig, scene.sensor.pulse_ns)
+        read = read_labelled([path], known=lambda _: {})
+        np.testing.assert_array_equal(read.object_depth_m, np.stack([thing.depth_m] * 3))
+
+
+def test_every_command_and_subcommand_is_started(tool: Tool) -> None:
+    start = tool("start")
+    names = [*start.programs()]
+    assert {"--version", "doctor", "live --help", "train --help", "train compressor --help"} <= {*names}
+    assert names[:2] == [start.BARE, start.NUMPY]
+
+
+def test_ratios_are_to_the_bare_interpreter_and_to_numpy(tool: Tool) -> None:
+    start = tool("start")
+    times = {start.BARE: start.Times(0.02, 0.01), start.NUMPY: start.Times(0.1, 0.1), "live": start.Times(0.4, 0.3)}
+    assert start.table(times).splitlines()[-1] == "| `live` | 0.40 | 0.30 | 20.0 | 4.0 |"
+
+
+def test_program_that_fails_is_reported(tool: Tool) -> None:
+    start = tool("start")
+    assert start.timed(["-c", "print('x')"]).wall_s > 0
+    with pytest.raises(RuntimeError, match="exit code 7"):
+        start.timed(["-c", "raise SystemExit(7)"])
+
+
+EPOCH = "epochs = 1\nbatch = 16\nlearning_rate = 1e-3\n"
+MAPS = "objects = 64\nheld_out = 20\n" + EPOCH
+DIRECT = "[direct]\nfeatures = 8\nwidth = 8\nblocks = 1\ntoken = 8\nmixers = 1\n"
+RECIPES = {
+    "small": 'task = "direct"\nschedule = "cosine"\nwarm_up_steps = 2\naverage = 0.9\n' + MAPS + DIRECT,
+    "encoder": 'task = "vae"\nstart = "decoder"\nschedule = "one-cycle"\nobjects = 16\nheld_out = 4\n' + EPOCH,
+    "compressor": 'task = "compressor"\nschedule = "one-cycle"\nimage_weight = 1.0\nwidth = 0.1\n' + MAPS,
+}
+
+
+@pytest.fixture
+def gpu(tool: Tool) -> ModuleType:
+    return tool("gpu_run")
+
+
+def test_parts_are_small_and_join_to_the_same_files(gpu: ModuleType, tmp_path: Path, monkeypatch: Patch) -> None:
+    monkeypatch.setattr(gpu, "PART_BYTES", 1000)
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    contents = {name: np.random.default_rng(k).bytes(1700) for k, name in enumerate(("a.safetensors", "b.json"))}
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    parts = gpu.write_parts(folder, list(contents), tmp_path / "direct.zip")
+    assert len(parts) == 4
+    assert max(part.stat().st_size for part in parts) <= 1000
+    gpu.join_parts(parts[0], tmp_path / "joined")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "joined").iterdir()} == contents
+
+
+def test_epochs_fit_the_time_by_the_fastest_epoch(gpu: ModuleType, tmp_path: Path) -> None:
+    (log := tmp_path / "log.csv").write_text("epoch,loss,seconds\n0,1,30.0\n1,1,10.0\n", encoding="utf-8")
+    assert gpu.epochs_within(100, log) == 9
+    log.write_text("epoch,loss,seconds\n", encoding="utf-8")
+    with pytest.raises(SystemExit, match="more --minutes"):
+        gpu.epochs_within(100, log)
+
+
+def test_recipe_gets_other_numbers(gpu: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text("objects = 5\nepochs = 3\n", encoding="utf-8")
+    made = gpu.recipe_with(tmp_path / "a.toml", tmp_path / "b.toml", epochs=70)
+    assert made.read_text(encoding="utf-8") == "objects = 5\nepochs = 70\n"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)  # processes start, render, train and evaluate one after the other
+def test_whole_run_in_the_small(gpu: ModuleType, tmp_path: Path, monkeypatch: Patch) -> None:
+    monkeypatch.setattr(gpu, "DIRECT_SHARE", 1e-9)  # two epochs
+    monkeypatch.setattr(gpu, "TIMING_SHARE", 1.0)
+    for name, text in RECIPES.items():
+        (tmp_path / f"{name}.toml").write_text(text, encoding="utf-8")
+    arguments = ["--out", str(tmp_path / "out"), "--minutes", "20", "--workers", "1", "--accelerator", "cpu"]
+    small = ["--recipe", str(tmp_path / "small.toml"), "--held-out", "20", "--first-objects", "100"]
+    paper = ["--encoder", str(tmp_path / "encoder.toml"), "--compressor", str(tmp_path / "compressor.toml")]
+    gpu.train_and_judge(gpu.options().parse_args([*arguments, *small, *paper, "--compressor-epochs", "1"]))
+    facts = json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))
+    assert facts["objects"] >= 100
+    for name in ("direct", "compressor"):
+        assert 0 <= facts[name]["unseen"]["silhouette_iou"]["value"] <= 1
+        assert facts[f"{name}_parts"][0] == f"{name}.00"

@@ -1,14 +1,26 @@
+import dataclasses
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from nlos_calibration.rig import load_rig
+from made_up_moments import NOTHING, RIG, full_moment, moment
+from measured_walls import HEIGHT, WIDTH, exact_wall
+from nlos_calibration import MeasuredWall, normal_from_angles, wall_from_plane
+from PIL import Image
 
+from nlos_cam.errors import NlosCamError
 from nlos_cam.objects.depth_map import object_box
-from nlos_cam.view import images
+from nlos_cam.reconstruct import Verdict
+from nlos_cam.view import Still, VideoFile, images
+from nlos_cam.view import video as layout
+from nlos_cam.view.calibration import calibration_facts, outline_m, wall_pictures, wall_points_m
 
-BOX = object_box(load_rig("paper-rig"))
-NOTHING = np.full((64, 64), np.nan, np.float32)
+BOX = object_box(RIG)
 
 
 def flat(z_m: float) -> np.ndarray:
@@ -32,8 +44,7 @@ def test_depth_pictures_show_missing_depth_as_background() -> None:
     assert (images.lidar_rgb(NOTHING, 0.1, 1.0) == images.BACKGROUND_RGB).all()
     depth_m = flat(0.3)
     depth_m[5, 6] = np.nan
-    is_background = (images.lidar_rgb(depth_m, 0.1, 1.0) == images.BACKGROUND_RGB).all(axis=-1)
-    assert np.argwhere(is_background).tolist() == [[5, 6]]
+    assert np.argwhere((images.lidar_rgb(depth_m, 0.1, 1.0) == images.BACKGROUND_RGB).all(axis=-1)).tolist() == [[5, 6]]
 
 
 def test_lidar_rgb_is_red_near_and_blue_far() -> None:
@@ -123,3 +134,165 @@ def test_relief_rgb_is_lit_from_the_top_left() -> None:
     brightness = images.relief_rgb(hill_m, BOX).sum(axis=-1).astype(int)
     assert brightness[24, 24] > brightness[40, 40]
     assert (images.relief_rgb(NOTHING, BOX) == images.BACKGROUND_RGB).all()
+
+
+UNSEEN = np.full((HEIGHT, WIDTH), np.nan, np.float32)
+
+
+def with_record(wall: MeasuredWall, **fields: Any) -> MeasuredWall:
+    return dataclasses.replace(wall, record=wall.record.model_copy(update=fields))
+
+
+def test_wall_outline_is_closed_finite_and_on_the_wall() -> None:
+    wall = exact_wall()
+    outline, extent = outline_m(wall), wall.record.rig.wall
+    points_m = wall_points_m(wall.record, wall.reference)[..., :2].reshape(-1, 2)
+    assert (points_m.min(axis=0) > outline.min(axis=0) - 0.01).all()
+    assert (points_m.max(axis=0) < outline.max(axis=0) + 0.01).all()
+    np.testing.assert_array_equal(outline[0], outline[-1])
+    assert (outline >= [extent.x_min_m - 1e-6, extent.y_min_m - 1e-6]).all()
+    assert (outline <= [extent.x_max_m + 1e-6, extent.y_max_m + 1e-6]).all()
+    pose = wall_from_plane(normal_from_angles(np.radians(75.0), 0.0), 0.2)
+    oblique = outline_m(with_record(wall, wall_from_lidar=pose.tolist(), yaw_deg=75.0, facing_deg=75.0))
+    assert len(oblique) > 3
+    assert np.isfinite(oblique).all()
+    assert oblique[:, 0].max() == pytest.approx(extent.x_max_m, abs=0.5)
+    far = extent.model_copy(update={"x_min_m": -1.0, "x_max_m": -0.9})
+    assert len(outline_m(with_record(wall, rig=wall.record.rig.model_copy(update={"wall": far})))) == 0
+
+
+def test_wall_pictures_need_a_reference_and_are_dark_without_returns() -> None:
+    assert wall_pictures(exact_wall(reference=None)) == {}
+    pictures = wall_pictures(exact_wall(depth_m=UNSEEN, depth_std_m=UNSEEN, ir=UNSEEN, inliers=UNSEEN > 0))
+    assert all((pictures[name][1] == images.BACKGROUND_RGB).all() for name in ("wall_residual", "wall_noise"))
+    titles = {name: title for name, (title, _) in wall_pictures(exact_wall()).items()}
+    assert "±2 mm" in titles["wall_residual"]
+    assert "0.5 mm" in titles["wall_noise"]
+
+
+def test_saturated_pixel_survives_thinning() -> None:
+    wall, blank = exact_wall(), np.full((480, 641), 0.3, np.float32)
+    saturated = np.zeros_like(blank)
+    saturated[301, 17] = 1.0
+    fields = {"depth_m": blank, "depth_std_m": blank, "ir": blank, "saturated": saturated, "inliers": blank > 0}
+    large = wall.reference.intrinsics.scaled(641, 480)
+    reference = dataclasses.replace(wall.reference, **fields, intrinsics=large)
+    picture = wall_pictures(dataclasses.replace(wall, reference=reference))["wall_saturated"][1]
+    assert picture.shape == (240, 321, 3)
+    assert np.argwhere((picture == images.SATURATED_RGB).all(axis=-1)).tolist() == [[150, 8]]
+
+
+def test_calibration_facts_begin_with_the_verdict_and_note_a_missing_reference() -> None:
+    record = exact_wall().record
+    facts = calibration_facts(record)
+    assert facts[0][:2] == ["verdict", record.verdict]
+    assert any(row[0] == "distance" for row in facts)
+    assert "drift is not watched" in facts[-1][1]
+    whole = record.model_copy(update={"reference": "wall.npz", "reference_sha256": "0" * 64})
+    assert "drift" not in calibration_facts(whole)[-1][1]
+
+
+def read(path: Path) -> list[np.ndarray]:
+    video, frames = cv2.VideoCapture(str(path)), []
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(layout.FRAMES_PER_S)
+    while (got := video.read())[0]:
+        frames.append(got[1][..., ::-1])
+    return frames
+
+
+def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "film.webm"
+    with VideoFile(path, RIG) as film:
+        for number in range(20):
+            film.show(full_moment(number))
+    frames = read(path)
+    assert len(frames) == film.filmed == 10
+    assert {frame.shape for frame in frames} == {(layout.HEIGHT, layout.WIDTH, 3)}
+    expected = Still(RIG, full_moment(0)).rgb(full_moment(0)).astype(int)
+    assert np.abs(frames[0] - expected).mean() < 6.0
+    assert (np.abs(frames[0].astype(int) - frames[-1]).max(axis=-1) > 60).mean() > 0.005, "it moves"
+    content = path.read_bytes()
+    assert content.startswith(b"\x1a\x45\xdf\xa3")
+    assert b"webm" in content[:64]
+    assert b"V_VP8" in content
+    assert capfd.readouterr().err == "", "the codec writes to the terminal"
+
+
+def test_film_refuses_a_missing_codec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.view.video.CODEC", "none")
+    with pytest.raises(NlosCamError, match="none codec"), VideoFile(tmp_path / "film.webm", RIG):
+        pass
+
+
+Picture = np.ndarray
+PANELS = {
+    "banner": ((20, 20), (880, 96)),
+    "reconstruction": (layout.LARGE_AT, (layout.LARGE, layout.LARGE)),
+    "uncertainty": (layout.MIDDLE_AT, (layout.SMALL, layout.SMALL)),
+    "truth": ((layout.MIDDLE_AT[0], layout.MIDDLE_AT[1] + layout.LOWER), (layout.SMALL, layout.SMALL)),
+    "depth": (layout.RIGHT_AT, (layout.LIDAR_WIDTH, layout.SMALL)),
+    "infrared": ((layout.RIGHT_AT[0], layout.RIGHT_AT[1] + layout.LOWER), (layout.LIDAR_WIDTH, layout.SMALL)),
+    "footer": ((20, 690), (600, 25)),
+}
+
+
+def panel(picture: Picture, name: str) -> Picture:
+    (x, y), (width, height) = PANELS[name]
+    return picture[y : y + height, x : x + width]
+
+
+def changed(before: Picture, after: Picture) -> set[str]:
+    return {name for name in PANELS if (panel(before, name) != panel(after, name)).any()}
+
+
+def test_still_shows_each_part_of_a_moment_in_its_panel() -> None:
+    one = full_moment(0)
+    still = Still(RIG, one)
+    before = still.rgb(one)
+    assert before.shape == (layout.HEIGHT, layout.WIDTH, 3)
+    frame = one.frame
+    for name, other in {
+        "truth": replace(one, frame=replace(frame, truth_depth_m=NOTHING)),
+        "infrared": replace(one, frame=replace(frame, ir=frame.ir + 90)),
+        "depth": replace(one, frame=replace(frame, depth_m=frame.depth_m * np.float32(0.5))),
+        "footer": replace(one, latency_s=0.5, published_s=0.5),
+        "uncertainty": replace(
+            one, reconstruction=replace(one.reconstruction, uncertainty_m=np.zeros((64, 64), np.float32))
+        ),
+    }.items():
+        assert changed(before, still.rgb(other)) == {name}
+
+
+@pytest.mark.parametrize("verdict", [verdict for verdict in Verdict if verdict is not Verdict.SEEN])
+def test_still_marks_a_doubted_reconstruction(verdict: Verdict) -> None:
+    one = full_moment(0)
+    still = Still(RIG, one)
+    assert changed(still.rgb(one), still.rgb(replace(one, verdict=verdict))) == {"banner", "reconstruction"}
+
+
+def test_still_of_a_bare_moment_has_no_surface() -> None:
+    assert (panel(Still(RIG, moment(0)).rgb(moment(0, NOTHING)), "reconstruction") == images.BACKGROUND_RGB).all()
+
+
+def test_still_keeps_lidar_pictures_until_new_ones() -> None:
+    still = Still(RIG, full_moment(0))
+    first, kept, new = (still.rgb(full_moment(number), with_lidar=number != 3) for number in (0, 3, 6))
+    assert not {"depth", "infrared"} & changed(first, kept)
+    assert "reconstruction" in changed(first, kept)
+    assert "depth" in changed(kept, new)
+
+
+def test_still_is_saved_as_png(tmp_path: Path) -> None:
+    one = full_moment(0, size=(480, 640))
+    Still(RIG, one).save(tmp_path / "still.png", one)
+    with Image.open(tmp_path / "still.png") as image:
+        assert (image.format, image.size) == ("PNG", (layout.WIDTH, layout.HEIGHT))
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(64, 64), (64, 80), (480, 640), (3, 1000), (1, 1)])
+def test_fitted_picture_is_whole_and_keeps_its_shape(rows: int, columns: int) -> None:
+    height, width, _ = layout._fitted(np.zeros((rows, columns, 3), np.uint8), 294, 232).shape
+    assert width == 294 or height == 232
+    assert width <= 294
+    assert height <= 232
+    assert abs(width * rows - height * columns) <= max(rows, columns)

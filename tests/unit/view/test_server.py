@@ -22,13 +22,11 @@ def test_server_sends_whole_files_and_forbids_other_origins(server: ViewServer) 
     assert urlsplit(server.address).hostname == server._server.server_address[0] == LOOPBACK
     for path, (kind, content) in ASSETS.items():
         with closing(ask(server.address, path + "?renderer=webgl")) as answer:
-            assert answer.status == 200
-            assert answer.headers["Content-Type"] == kind
+            assert (answer.status, answer.headers["Content-Type"]) == (200, kind)
             assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
             assert answer.read() == content
         with closing(ask(server.address, path, method="HEAD")) as answer:
-            assert answer.status == 200
-            assert int(answer.headers["Content-Length"]) == len(content)
+            assert (answer.status, int(answer.headers["Content-Length"])) == (200, len(content))
             assert answer.read() == b""
 
 
@@ -80,12 +78,9 @@ def test_server_refuses_hosts_that_are_not_this_machine(streams: Streams) -> Non
             resolved(host)
 
 
-@pytest.mark.parametrize(
-    ("method", "path", "status"),
-    [("GET", "/../secret", 404), ("POST", "/", 404), *((name, "/", 501) for name in ("PUT", "DELETE", "OPTIONS"))],
-)
-def test_server_refuses_other_paths_and_methods(server: ViewServer, method: str, path: str, status: int) -> None:
-    assert status_of(server.address, path, method=method) == status
+def test_server_refuses_other_paths_and_methods(server: ViewServer) -> None:
+    assert status_of(server.address, "/../secret") == status_of(server.address, "/", method="POST") == 404
+    assert {status_of(server.address, "/", method=name) for name in ("PUT", "DELETE", "OPTIONS")} == {501}
 
 
 def test_stream_lasts_until_it_is_ended(server: ViewServer, streams: Streams) -> None:
@@ -103,20 +98,15 @@ def test_stream_ends_when_its_browser_leaves(server: ViewServer, streams: Stream
     assert isinstance(streams.error, OSError)
 
 
-@pytest.mark.parametrize(
-    ("host", "status"),
-    [
-        *((host, 403) for host in ("evil.example", "localhost:x.evil.example", "[::1].evil.com", "10.1.2.3", "")),
-        *((host, 200) for host in ("127.0.0.1", "localhost:80", "LOCALHOST:8000", "[::1]:9090")),
-    ],
-)
 @pytest.mark.parametrize("path", ["/", "/file.wasm"])
-def test_server_answers_to_loopback_names_only(server: ViewServer, host: str, path: str, status: int) -> None:
-    with closing(ask(server.address, path, host=host)) as answer:
-        assert answer.status == status
-        assert (answer.read() == ASSETS[path][1]) == (status == 200)
-    if status == 403:
-        assert status_of(server.address, "/stream", host=host) == status
+def test_server_answers_to_loopback_names_only(server: ViewServer, path: str) -> None:
+    for host in ("127.0.0.1", "localhost:80", "LOCALHOST:8000", "[::1]:9090"):
+        with closing(ask(server.address, path, host=host)) as answer:
+            assert (answer.status, answer.read()) == (200, ASSETS[path][1])
+    for host in ("evil.example", "localhost:x.evil.example", "[::1].evil.com", "10.1.2.3", ""):
+        with closing(ask(server.address, path, host=host)) as answer:
+            assert answer.status == status_of(server.address, "/stream", host=host) == 403
+            assert answer.read() != ASSETS[path][1]
 
 
 def test_server_limits_streams_and_reuses_their_room(streams: Streams) -> None:
@@ -137,24 +127,12 @@ def test_server_limits_streams_and_reuses_their_room(streams: Streams) -> None:
     server.close()
 
 
-@pytest.mark.parametrize(
-    ("asked", "address", "known", "unknown"),
-    [
-        (
-            *("127.0.0.1", "127.0.0.1", ["localhost:9090", "127.0.0.1", "[::1]:80"]),
-            ["bench.example", "10.0.0.1", socket.gethostname() + ".evil.example", ""],
-        ),
-        (
-            *("bench.lan", "192.0.2.7"),
-            ["BENCH.lan:9090", "192.0.2.7:9090", "[fe80::1]:1", "localhost", socket.gethostname()],
-            ["evil.example", "bench.lan.evil.example", ""],
-        ),
-    ],
-)
-def test_names_of_a_host_are_this_machines(asked: str, address: str, known: list[str], unknown: list[str]) -> None:
-    is_known = names_of(asked, address)
-    assert all(map(is_known, known))
-    assert not any(map(is_known, unknown))
+def test_names_of_a_host_are_this_machines() -> None:
+    is_known = names_of("bench.lan", "192.0.2.7")
+    known = ("BENCH.lan:9090", "192.0.2.7:9090", "[fe80::1]:1", "localhost", socket.gethostname())
+    unknown = ("evil.example", "bench.lan.evil.example", "")
+    assert [is_known(name) for name in (*known, *unknown)] == [True] * 5 + [False] * 3
+    assert not names_of("127.0.0.1", "127.0.0.1")(socket.gethostname() + ".evil.example")
 
 
 def test_loopback_is_told_from_hosts_that_others_can_reach() -> None:

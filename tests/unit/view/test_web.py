@@ -1,18 +1,30 @@
+import base64
+import json
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import Any, Self
 
+import numpy as np
 import pytest
-from made_up_moments import RIG, full_moment, moment
+from hypothesis import given
+from hypothesis import strategies as st
+from made_up_moments import NOTHING, RIG, bump, full_moment, moment
 from measured_walls import exact_wall
-from view_streams import ask, messages
+from view_streams import ask, messages, messages_of, saved_moments
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.view import PlaybackViewer, RecordedView, SessionFile, WebViewer
-from nlos_cam.view.messages import MomentPacker
+from nlos_cam.objects import object_box
+from nlos_cam.reconstruct.network import Doubt, Quality
+from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.view import PlaybackViewer, RecordedView, WebViewer
+from nlos_cam.view.assessment import RGB, assess, expected_error_m, expected_overlap
+from nlos_cam.view.messages import ERROR_STEP_M, MomentPacker, bench_message, depth_bytes, pack, signed_bytes, unpack
+from nlos_cam.view.session_file import MAX_BYTES, SessionFile
+from nlos_cam.view.viewer import Moment, Viewers
 
 
 @pytest.fixture
@@ -37,8 +49,7 @@ def test_browsers_receive_bench_status_and_the_newest_moment(viewer: WebViewer) 
             found[each["kind"]] = each
             if len(found) == 4:
                 break
-        assert set(found) == {"hello", "bench", "status", "moment"}
-        assert found["moment"]["frame"] == 7
+        assert (set(found), found["moment"]["frame"]) == ({"hello", "bench", "status", "moment"}, 7)
         assert found["bench"]["rig"] == RIG.name
 
 
@@ -147,13 +158,6 @@ def test_playback_keeps_every_moment_for_every_browser() -> None:
             assert times_s == pytest.approx([number / 30 for number in range(70)], abs=1e-3)
 
 
-def test_recorded_view_serves_the_file_as_its_page(tmp_path: Path) -> None:
-    with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
-        session.show(full_moment(0))
-    with RecordedView(tmp_path / "view.html") as view, closing(ask(view.address or "", "/")) as answer:
-        assert answer.read() == (tmp_path / "view.html").read_bytes()
-
-
 @pytest.mark.parametrize(
     ("content", "advice"), [(None, "cannot be read"), (b"something else", "--save-view"), (b"RRF2 old", "rerun")]
 )
@@ -162,3 +166,190 @@ def test_recorded_view_refuses_other_files(tmp_path: Path, content: bytes | None
         (tmp_path / "other.rrd").write_bytes(content)
     with pytest.raises(RecordingError, match=rf"other\.rrd.*{advice}"):
         RecordedView(tmp_path / "other.rrd")
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
+        for number in range(90):
+            session.show(full_moment(number))
+    assert session.kept == 30
+    return tmp_path / "view.html"
+
+
+def test_session_keeps_ten_moments_a_second_in_one_page(saved: Path) -> None:
+    assert [each["frame"] for each in saved_moments(saved)] == list(range(0, 90, 3))
+    page = saved.read_text()
+    assert 'data-mode="session"' in page
+    assert "src=" not in page
+    kinds = [unpack(message)[0]["kind"] for message in messages_of(page.encode())]
+    assert kinds == ["bench", "chunk", "chunk", "chunk"]
+
+
+@pytest.mark.parametrize("share", [0.85, 0.9, 0.99])
+def test_cut_session_lacks_only_its_end(saved: Path, tmp_path: Path, share: float) -> None:
+    content = saved.read_bytes()
+    (tmp_path / "cut.html").write_bytes(content[: int(share * len(content))])
+    frames = [each["frame"] for each in saved_moments(tmp_path / "cut.html")]
+    assert frames == list(range(0, 90, 3))[: len(frames)]
+    assert len(frames) % 10 == 0
+
+
+def test_full_session_ends_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.view.session_file.MAX_BYTES", 1)
+    with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
+        for number in range(0, 300, 3):
+            session.show(moment(number))
+    assert session.full
+    assert session.kept < 40 < MAX_BYTES
+
+
+def test_session_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(FileNotFoundError), SessionFile(tmp_path / "none" / "view.html", RIG):
+        pytest.fail("it is an error at once")
+    monkeypatch.setattr(base64, "b64encode", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError), SessionFile(tmp_path / "view.html", RIG) as session:
+        session.show(moment(0))
+
+
+class Noting:
+    """Viewer that records its calls."""
+
+    def __init__(self, address: str | None = None, *, fails: bool = False) -> None:
+        self.address, self.fails = address, fails
+        self.noted: list[str] = []
+
+    def __enter__(self) -> Self:
+        if self.fails:
+            raise OSError("no room")
+        self.noted.append("entered")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.noted.append("left")
+
+    def show(self, shown: Moment) -> None:
+        self.noted.append(f"frame {shown.frame.frame_number}")
+
+
+def test_viewers_all_see_every_moment() -> None:
+    some = Noting(), Noting("http://one"), Noting("http://two")
+    with Viewers(some) as viewers:
+        viewers.show(moment(7))
+        assert viewers.address == "http://one"
+    assert [each.noted for each in some] == [["entered", "frame 7", "left"]] * 3
+
+
+def test_viewers_leave_none_open_if_one_cannot_begin() -> None:
+    first = Noting()
+    with pytest.raises(OSError, match="no room"), Viewers([first, Noting(fails=True)]):
+        pass
+    assert first.noted == ["entered", "left"]
+
+
+BOX = object_box(RIG)
+
+
+@given(st.dictionaries(st.text(max_size=5).filter(lambda name: name != "arrays"), st.integers()), st.integers(0, 9))
+def test_unpacked_message_is_the_packed_one(fields: dict[str, int], rows: int) -> None:
+    arrays = {"one": np.arange(rows * 3, dtype=np.uint8).reshape(rows, 3), "two": np.full((2, 2, 3), 7, np.uint8)}
+    found, found_arrays = unpack(pack(fields, arrays))
+    assert found == fields
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found_arrays[name], array)
+
+
+def test_depth_bytes_keep_depth_to_a_step_and_holes() -> None:
+    depth_m = bump(0)
+    counts = depth_bytes(depth_m, BOX.z_near_m, BOX.z_far_m)
+    assert ((counts == 0) == np.isnan(depth_m)).all()
+    step_m = (BOX.z_far_m - BOX.z_near_m) / 254
+    found_m = BOX.z_near_m + (counts - 1.0) * step_m
+    assert np.nanmax(np.abs(np.where(counts > 0, found_m, np.nan) - depth_m)) <= 0.51 * step_m
+
+
+def test_signed_bytes_are_symmetric_clipped_and_zero_for_nan() -> None:
+    assert signed_bytes(np.array([-9.0, -1.0, 0.0, 1.0, 9.0, np.nan]), 1.0).tolist() == [1, 1, 128, 255, 255, 0]
+
+
+def test_moment_message_holds_every_layer_and_lidar_pictures_if_requested() -> None:
+    shown = full_moment(3, size=(480, 640))
+    fields, arrays = unpack(MomentPacker(RIG).pack(shown))
+    assert {"depth", "truth", "error", "lidar", "infrared", "change", "residual"} == set(arrays)
+    assert arrays["lidar"].shape == (160, 214)
+    assert fields["frame"] == 3
+    assert fields["stages_ms"]["network"] > 0
+    np.testing.assert_allclose(arrays["error"] * ERROR_STEP_M, shown.reconstruction.uncertainty_m, atol=ERROR_STEP_M)
+    _, small = unpack(MomentPacker(RIG).pack(shown, with_lidar=False))
+    assert {*arrays} - {*small} == {"lidar", "infrared", "change", "residual"}
+
+
+def test_uncertainty_is_sent_where_nothing_was_reconstructed() -> None:
+    shown = full_moment(0)
+    empty = replace(shown, reconstruction=replace(shown.reconstruction, depth_m=NOTHING))
+    _, arrays = unpack(MomentPacker(RIG).pack(empty))
+    assert not arrays["depth"].any()
+    assert arrays["error"].any()
+
+
+def test_bare_moment_and_odd_numbers_are_valid_json() -> None:
+    shown = moment(0, NOTHING)
+    dark = replace(shown, frame=replace(shown.frame, depth_m=np.full_like(shown.frame.depth_m, np.nan)))
+    fields, arrays = unpack(MomentPacker(RIG).pack(dark))
+    json.dumps(fields, allow_nan=False)
+    assert not arrays["lidar"].any()
+
+
+@pytest.mark.parametrize("measured", [None, exact_wall()])
+def test_bench_message_names_every_part(measured: object) -> None:
+    fields, arrays = unpack(bench_message(RIG, measured))  # type: ignore[arg-type]
+    assert {"wall", "occluder", "lidar", "frustum", "light"} <= set(fields["parts"])
+    assert len(fields["parts"]["light"]) == 5, "three bounces between leaving and reaching the lidar"
+    assert fields["parts"]["lidar"] == pytest.approx([0.0, 0.0, 0.2])
+    assert ("footprint" in fields["parts"]) == (measured is not None)
+    assert {"map_depth", "map_error", "map_lidar"} <= set(arrays)
+
+
+def with_doubt(surface: np.ndarray, error_m: float = 0.017, quality: Quality | None = None) -> object:
+    shown = full_moment(0)
+    spread_m = np.full((64, 64), error_m, np.float32)
+    doubt = Doubt(0.0, 0.0, spread_m, surface.astype(np.float32), quality)
+    return replace(shown, reconstruction=replace(shown.reconstruction, doubt=doubt, uncertainty_m=spread_m))
+
+
+def test_expected_overlap_is_exact_for_certain_pixels_and_needs_a_surface() -> None:
+    mask = np.isfinite(bump(0))
+    half = mask & (np.arange(64) < np.argwhere(mask)[:, 1].mean())
+    for surface, overlap in ((mask, 1.0), (half, half.sum() / mask.sum()), (~mask, 0.0)):
+        assert expected_overlap(with_doubt(surface).reconstruction) == pytest.approx(overlap)  # type: ignore[attr-defined]
+    assert expected_overlap(full_moment(0).reconstruction) is None
+    assert expected_overlap(moment(0, NOTHING).reconstruction) is None
+    assert expected_error_m(moment(0).reconstruction) is None
+
+
+def test_detected_object_is_graded_by_the_models_numbers() -> None:
+    told = assess(with_doubt(0.71 * np.isfinite(bump(0))))  # type: ignore[arg-type]
+    assert "71%" in told.detail
+    assert "17 mm" in told.detail
+    assert told.trusted
+
+
+@pytest.mark.parametrize("trusted", [True, False])
+@pytest.mark.parametrize("verdict", [Verdict.SEEN, Verdict.OUTSIDE])
+def test_only_a_trusted_quality_of_a_detected_object_is_green(trusted: bool, verdict: Verdict) -> None:
+    predicted = Quality((0.58, 0.71, 0.82), 0.6, 0.017, trusted=trusted)
+    shown = replace(with_doubt(np.ones((64, 64)), quality=predicted), verdict=verdict)  # type: ignore[type-var]
+    told = assess(shown)  # type: ignore[arg-type]
+    assert (told.tone == "good") == (trusted and verdict is Verdict.SEEN)
+    if verdict is Verdict.SEEN:
+        assert told.detail == "outline typically 71% right (58% to 82%), depth to 17 mm"
+
+
+@pytest.mark.parametrize("verdict", [*Verdict, None])
+def test_no_assessment_is_green_and_only_a_detected_shape_is_trusted(verdict: Verdict | None) -> None:
+    told = assess(replace(full_moment(0), verdict=verdict))
+    assert told.trusted == (verdict in {Verdict.SEEN, None})
+    red, green, blue = told.rgb
+    assert green < max(red, blue)
+    assert told.headline
+    assert set(RGB.values()) >= {told.rgb}

@@ -1,8 +1,9 @@
-"""Attacks of tools/robustness: they notice what they look for."""
+"""Attacks, fuzz and soak of tools/robustness: they notice what they look for, and repeat their damage from a seed."""
 
 import os
 import struct
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
@@ -12,45 +13,32 @@ import numpy as np
 import pytest
 from fake_farm import samples_of
 from nlos_calibration.rig import load_rig
+from soak import FrameLog, summarize
 
 from nlos_cam.dataset import DatasetPlan
 from nlos_cam.dataset.shards import shard_path, store
+from nlos_cam.errors import RecordingError
 from nlos_cam.view.messages import pack
 from nlos_cam.view.session_file import element, page_html
 
 Tool = Callable[[str], ModuleType]
 
 
-def ended(code: int, said: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.CompletedProcess([], code, "", said)
+def test_starved_command_that_ends_badly_or_leaves_parts_is_noticed(tool: Tool, tmp_path: Path) -> None:
+    def wrong(code: int = 1, said: str = "error: a.npz cannot be written: free some space") -> str:
+        ended = subprocess.CompletedProcess([], code, "", said)
+        return tool("starve_commands").wrong_with(tool("trials").COMMANDS["render"], tmp_path, tmp_path, ended)
 
-
-@pytest.mark.parametrize(
-    ("code", "said", "wrong"),
-    [
-        (1, "error: a.npz cannot be written: free some space", ""),
-        (1, "Traceback (most recent call last):\nMemoryError", "Traceback"),
-        (1, "one\ntwo\nthree\nfour", "4 lines"),
-        (-11, "", "-11"),
-        (0, "", "a.npz is not whole"),
-    ],
-)
-def test_starved_command_that_ends_badly_is_noticed(
-    tool: Tool, tmp_path: Path, code: int, said: str, wrong: str
-) -> None:
-    starve = tool("starve_commands")
-    found = starve.wrong_with(tool("trials").COMMANDS["render"], tmp_path, tmp_path, ended(code, said))
-    assert wrong in found
-    assert bool(found) == bool(wrong)
-
-
-def test_starved_command_that_leaves_parts_is_noticed(tool: Tool, tmp_path: Path) -> None:
-    starve, render = tool("starve_commands"), tool("trials").COMMANDS["render"]
+    assert wrong() == ""
+    assert "Traceback" in wrong(1, "Traceback (most recent call last):\nMemoryError")
+    assert "4 lines" in wrong(1, "one\ntwo\nthree\nfour")
+    assert "-11" in wrong(-11, "")
+    assert "a.npz is not whole" in wrong(0, "")
     (tmp_path / ".a.npz.part").mkdir()
-    assert ".a.npz.part" in starve.wrong_with(render, tmp_path, tmp_path, ended(1, "error: full"))
+    assert ".a.npz.part" in wrong()
     (tmp_path / ".a.npz.part").rmdir()
     (tmp_path / "a.npz").touch()
-    assert "not whole" in starve.wrong_with(render, tmp_path, tmp_path, ended(1, "error: full"))
+    assert "not whole" in wrong()
 
 
 def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
@@ -83,8 +71,7 @@ def test_trials_resume_and_a_failed_one_is_a_finding(tool: Tool, tmp_path: Path)
 def test_session_that_does_not_play_is_noticed(tool: Tool) -> None:
     trials, messages = tool("trials"), [pack({"kind": "bench"}), pack({"kind": "chunk"})]
     whole = page_html("session").encode() + b"".join(map(element, messages))
-    assert trials.check_session(whole) == 2
-    assert trials.check_session(whole[:-12]) == 1
+    assert (trials.check_session(whole), trials.check_session(whole[:-12])) == (2, 1)
     for bad in (b"", page_html("session").encode()):
         with pytest.raises(ValueError, match="no saved session"):
             trials.check_session(bad)
@@ -129,3 +116,52 @@ def test_processes_of_a_killed_command_that_run_on_are_noticed(tool: Tool, monke
         process.kill()
         process.wait()
     assert not kills.survivors([process.pid])
+
+
+def fail(error: BaseException) -> None:
+    raise error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "action"),
+    [
+        ("done", lambda: None),
+        ("crash", os.abort),
+        ("crash", lambda: os._exit(3)),
+        ("hang", lambda: time.sleep(60)),
+        ("memory", lambda: bytearray((1 << 30) + (1 << 20))),
+        ("unexpected", lambda: fail(AttributeError("nobody foresaw this"))),
+        ("unexpected", lambda: fail(RecordingError("two\nlines"))),
+        ("refused", lambda: fail(RecordingError("foreseen"))),
+    ],
+)
+def test_judge_notices_each_kind_of_end(tool: Tool, kind: str, action: Callable[[], None]) -> None:
+    verdict = tool("fuzz").judge(action, timeout_s=3.0)
+    assert verdict.kind == kind
+    assert verdict.details or kind == "done"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".bag", ".bin"])
+def test_mutation_is_the_same_for_the_same_seed(tool: Tool, noise_bags: dict[str, Path], suffix: str) -> None:
+    module, content, path = tool("mutations"), noise_bags["packed"].read_bytes(), Path("a").with_suffix(suffix)
+    taken = set[str]()
+    for seed in range(20):
+        ways, bad = module.mutate(path, content, np.random.default_rng(seed))
+        assert (ways, bad) == module.mutate(path, content, np.random.default_rng(seed))
+        taken |= set(ways.split("+"))
+    assert len(taken) > 4
+
+
+def test_rows_of_a_growing_log_are_read_once_and_whole(tmp_path: Path) -> None:
+    path, rows = tmp_path / "frames.csv", list[dict[str, str]]()
+    frames = FrameLog(path)
+    text = "frame,latency_ms,dropped\n" + "".join(f"{i},{10 + i},{i // 5}\n" for i in range(10))
+    for end in (0, 5, 40, 41, 60, len(text) - 1, len(text)):
+        path.write_text(text[:end], encoding="utf-8")
+        rows += frames.rows()
+    assert [row["frame"] for row in rows] == [str(i) for i in range(10)]
+    assert frames.rows() == []
+    minute = summarize(3, (500.0, 13, 15), rows, watchers=2)
+    assert (minute.frames, minute.latency_p50_ms, minute.dropped) == (10, 14.5, 1.0)

@@ -1,0 +1,183 @@
+"""The docs: broken links are found, generated pages are current, pictures are drawn, the tutorial's commands run."""
+
+import runpy
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import typer
+
+from nlos_cam.camera import simulated_world
+from nlos_cam.cli.main import main
+from nlos_cam.render.scene_file import Motion, paper_scene
+
+ROOT = Path(__file__).parents[3]
+Tool = Callable[[str], ModuleType]
+CONFIG = """
+site_name: small
+use_directory_urls: false
+theme: { name: material, font: false }
+validation:
+  links: { not_found: warn, anchors: warn, unrecognized_links: warn }
+  nav: { omitted_files: info, not_found: warn }
+hooks: [build_site.py]
+nav: [index.md, Other: other.md]
+"""
+PAGES = {
+    "mkdocs.yml": CONFIG,
+    "docs/index.md": "# Start\n\nTo the [other](other.md#a-part), [figures](figures.json).\n",
+    "docs/other.md": "# Other\n\n## A part\n",
+    "docs/figures.json": "{}",
+    "docs/left.md": "# Left\n",
+    "docs/decisions/2026-01-01-one.md": "# One\n",
+    "README.md": "# Top\n\n[docs](docs/other.md#a-part) [here](#top) ![x](docs/figures.json) <https://example.org/a>\n",
+}
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Callable[..., Path]:
+    """A small project with docs; what is given takes the place of its pages."""
+
+    def make(changed: Mapping[str, str] | None = None) -> Path:
+        for name, text in {**PAGES, **(changed or {})}.items():
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(text, encoding="utf-8")
+        shutil.copy(ROOT / "tools" / "docs" / "build_site.py", tmp_path)
+        return tmp_path
+
+    return make
+
+
+@pytest.mark.slow
+def test_whole_docs_have_no_problem_and_every_page_a_place(tool: Tool, written: Callable[..., Path]) -> None:
+    root = written()
+    assert tool("build_site").problems(root / "site", root) == []
+    start = (root / "site" / "index.html").read_text(encoding="utf-8")
+    assert 'href="left.html"' in start
+    assert 'href="decisions/2026-01-01-one.html"' in start
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("page", "text", "told"),
+    [
+        ("docs/index.md", "# Start\n\n[gone](gone.md)\n", "gone.md"),
+        ("docs/index.md", "# Start\n\n[gone](other.md#gone)\n", "#gone"),
+        ("docs/index.md", "# Start\n\n![gone](images/gone.png)\n", "images/gone.png"),
+        ("mkdocs.yml", CONFIG.replace("other.md", "gone.md"), "gone.md"),
+        ("README.md", "[gone](docs/gone.md)", "docs/gone.md leads to no file"),
+        ("README.md", "[gone](docs/other.md#gone)", "leads to no heading of other.md"),
+        ("README.md", "[gone](#gone)", "leads to no heading of README.md"),
+        ("README.md", "[plain](http://example.org)", "not a full https address"),
+        ("README.md", "[cut](https://)", "not a full https address"),
+        ("docs/index.md", '# Start\n\n<script src="https://cdn.example.org/a.js"></script>\n', "cdn.example.org"),
+    ],
+)
+def test_each_way_of_being_broken_is_told(
+    tool: Tool, written: Callable[..., Path], page: str, text: str, told: str
+) -> None:
+    root = written({page: text})
+    assert any(told in problem for problem in tool("build_site").problems(root / "site", root))
+
+
+def test_the_gate_and_make_run_it(tool: Tool) -> None:
+    assert ("python", "tools/docs/build_site.py", "--check") in tool("check").GATES
+    assert "tools/docs/build_site.py" in (ROOT / "Makefile").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def commands(tool: Tool) -> ModuleType:
+    return tool("pages")
+
+
+@pytest.mark.slow
+def test_every_command_and_option_of_the_program_is_on_the_page(commands: ModuleType) -> None:
+    text = (commands.DOCS / "commands.md").read_text(encoding="utf-8")
+    assert text == commands.commands_page(), "run `python tools/docs/pages.py commands`"
+
+
+def test_every_command_is_in_the_table_of_what_they_answer(commands: ModuleType) -> None:
+    text = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
+    app = typer.main.get_command(commands.build_app())
+    names = [name.removeprefix("nlos-cam ") for name, _ in commands.commands(app)]
+    assert len(names) > 15
+    assert [name for name in names if f"| `{name}" not in text] == []
+
+
+@pytest.mark.parametrize("name", ["comparison", "gallery"])
+def test_page_has_the_measured_figures(commands: ModuleType, name: str) -> None:
+    page = (commands.DOCS / f"{name}.md").read_text(encoding="utf-8")
+    assert commands.PAGES[name]() == page, "run `python tools/docs/pages.py`"
+
+
+@pytest.mark.slow
+def test_stale_page_fails_the_check_until_written(
+    commands: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(commands, "DOCS", tmp_path)
+    for arguments, code in ((["--check"], 1), ([], 0), (["--check"], 0)):
+        monkeypatch.setattr("sys.argv", ["pages.py", "commands", *arguments])
+        assert commands.main() == code
+    assert "out of date" in capsys.readouterr().out
+
+
+def test_things_unlike_training_lie_in_the_box_and_are_drawn(tool: Tool, tmp_path: Path) -> None:
+    gallery = tool("pictures")
+    *things, nothing = gallery.unlike_training()
+    assert np.isnan(nothing.depth_m).all()
+    for thing in things:
+        assert thing.depth_m.shape == (64, 64)
+        assert 0.12 <= np.nanmin(thing.depth_m) <= np.nanmax(thing.depth_m) <= 0.4
+    image = truth = np.stack([np.eye(64, dtype=np.float32), np.zeros((64, 64), np.float32)])
+    gallery.draw_pairs(tmp_path / "a.png", [("a row", [things[-1], nothing], image, truth, np.array([1.0, np.nan]))])
+    assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+SHORTER = {"--seconds": "0.5", "--count": "2", "--every": "5"}
+
+
+def shortened(words: list[str]) -> list[str]:
+    """The same command for less long, and without a browser."""
+    said = [SHORTER.get(before, word) for before, word in zip(["", *words], words, strict=False)]
+    return [*said, *(["--no-view"] if words[1] == "live" else [])]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], int]:
+    """Run one command in an empty folder with the examples, in this process."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
+    airplane = paper_scene().model_copy(update={"motion": Motion(poses=1)})  # is rendered once, not ninety times
+    monkeypatch.setattr(simulated_world, "paper_scene", lambda: airplane)
+
+    def call(words: list[str]) -> int:
+        if words[0] == "nlos-cam":
+            return main(shortened(words)[1:])
+        monkeypatch.setattr(sys, "argv", words[1:])
+        runpy.run_path(words[1], run_name="__main__")
+        return 0
+
+    return call
+
+
+@pytest.mark.slow
+def test_every_command_of_the_tutorial_does_its_work(tool: Tool, run: Callable[[list[str]], int]) -> None:
+    tutorial = tool("tutorial")
+    commands = tutorial.commands_of(tutorial.PAGE.read_text(encoding="utf-8"))
+    assert len(commands) >= 10
+    for words in commands:
+        assert run(words) == 0, " ".join(words)
+    made = [word for words in commands for before, word in pairwise(words) if before == "--out"]
+    assert [name for name in made if not Path(name).exists()] == []
+
+
+def test_every_command_block_is_followed_by_its_answer(tool: Tool) -> None:
+    tutorial = tool("tutorial")
+    text = tutorial.PAGE.read_text(encoding="utf-8")
+    assert text.count("```sh\n") == len(tutorial.STEP.findall(text))
+    assert all(found["answer"].strip() for found in tutorial.STEP.finditer(text)), "run `python tools/docs/tutorial.py`"
