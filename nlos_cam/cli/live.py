@@ -58,7 +58,7 @@ LOSSES = {
 """Reason of a lost frame in words, by its name in RunReport.counts."""
 EXPLANATION = (
     "A simulated lidar looks at a wall, and an airplane flies around the corner, out of its sight. Of the light that "
-    "bounces wall, airplane, wall, two networks reconstruct it 30 times per second."
+    "bounces wall, airplane, wall, a network reconstructs it 30 times per second."
 )
 SLOW_DROPPED_SHARE, SLOW_MS = 0.05, 200.0
 """Share of dropped frames and median latency above which the summary warns."""
