@@ -20,8 +20,8 @@ PIXELS = 64
 CLIP = 5.0
 """Limit of a normalised cell, in spreads."""
 KEPT_ABOVE = 0.44
-"""Lowest probability of a surface. On 400 held-out objects 0.36 is best for the silhouette's IoU, and 0.5 costs 0.006
-of it; the mean absolute error is least near 0.5. This value costs either of them little."""
+"""Lowest probability of a surface. On 400 held-out objects 0.36 to 0.4 is best for the silhouette's IoU, and 0.5 costs
+0.004 of it; the mean absolute error is least near 0.5. This value costs either of them little."""
 SMALLEST_SHARE = 0.3
 """Smallest spread of a cell, as a share of the median spread: quiet cells would otherwise show noise alone."""
 MIN_LIGHT_SPREAD = 0.04
