@@ -51,6 +51,7 @@ __all__ = [
     "cut_silhouette",
     "describe",
     "digest_of",
+    "direct_start",
     "export_folder",
     "first_of",
     "fit_quality",
@@ -167,6 +168,7 @@ from .records import (
 from .runs import (
     TrainingRun,
     compressor_start,
+    direct_start,
     record_doubt_run,
     record_run,
     run_compressor,

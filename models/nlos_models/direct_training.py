@@ -40,12 +40,23 @@ class NormalSource(Protocol):
 
 
 def train_direct(
-    recipe: Recipe, source: NormalSource, held_out: MapSet, folder: Path, running: Running | None = None
+    recipe: Recipe,
+    source: NormalSource,
+    held_out: MapSet,
+    folder: Path,
+    running: Running | None = None,
+    start: DirectNetwork | None = None,
 ) -> tuple[DirectNetwork, Scores]:
-    """Train a direct network; a second call resumes. Returns it in eval mode, and its held-out figures."""
+    """Train a direct network, from scratch or on from another's weights; a second call resumes.
+
+    `start` has the source's normalisation. Where the recipe has more blocks or mixers, the new ones change nothing at
+    first. Returns the network in eval mode, and its held-out figures.
+    """
     torch.manual_seed(recipe.seed)
     network = DirectNetwork(recipe.direct, recipe.dropout)
     network.normal.load_state_dict(source.normal.state_dict())
+    if start:
+        network.load_state_dict(start.state_dict(), strict=False)
     steps = recipe.objects // recipe.batch
 
     def batches(generator: torch.Generator) -> Iterable[NormalBatch]:

@@ -97,8 +97,8 @@ class Recipe(BaseModel):
     backgrounds: float = Field(default=0.0, ge=0, le=1)
     """Share of a VAE's objects with a post or a panel beside them."""
     start: Literal["scratch", "weights", "decoder"] = "scratch"
-    """VAE or compressor: random initial weights, or those of an earlier run (--weights); or, for a VAE, an untrained
-    encoder before the decoder of such weights, which stays as it is."""
+    """VAE, compressor or direct network: random initial weights, or those of an earlier run (--weights); or, for a VAE,
+    an untrained encoder before the decoder of such weights, which stays as it is."""
     keep: Literal["last", "best"] = "last"
     """Epoch whose weights are saved; the best one has the smallest held-out loss."""
     steps: Literal["two", "one", "two-then-joint"] = "two"
@@ -140,7 +140,7 @@ class Recipe(BaseModel):
         if self.task == "transfer" and self.steps != "two":
             raise ValueError(f"steps = {self.steps!r} is for a compressor: a transfer keeps the decoder")
         if self.start == "weights" and (self.task == "transfer" or self.steps != "two"):
-            raise ValueError("start = 'weights' is for a VAE or a two-step compressor: drop it")
+            raise ValueError("start = 'weights' is for a VAE, a two-step compressor or a direct network: drop it")
         if self.start == "decoder" and self.task != "vae":
             raise ValueError("start = 'decoder' is for a VAE: drop it")
         if self.width != 1 and (self.colour or self.task != "compressor"):

@@ -134,10 +134,12 @@ def run_compressor(fabric: Fabric, training: TrainingRun, start: Start, maps: Ma
     return figures
 
 
-def run_direct(fabric: Fabric, training: TrainingRun, source: NormalSource, held_out: MapSet) -> Scores:
+def run_direct(
+    fabric: Fabric, training: TrainingRun, start: DirectNetwork | None, source: NormalSource, held_out: MapSet
+) -> Scores:
     """Train a direct network and save it; return its held-out figures."""
     with training.watched(fabric, "direct network") as running:
-        network, figures = train_direct(training.recipe, source, held_out, training.out, running)
+        network, figures = train_direct(training.recipe, source, held_out, training.out, running, start)
     save_direct(training.out, network, training.with_figures(figures))
     _export(training)
     return figures
@@ -220,6 +222,24 @@ def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | No
     vae = new_vae(color=recipe.colour)
     vae.encoder, vae.decoder = encoder, pipeline.decoder
     return Start(vae, pipeline), runs
+
+
+def direct_start(recipe: Recipe, weights: Path | None) -> tuple[DirectNetwork | None, list[Recipe]]:
+    """Load the direct network that a recipe goes on from (default: the shipped one) and the runs that made it.
+
+    Raises TrainingError for weights of another network, or one that the recipe's cannot hold.
+    """
+    if recipe.start == "scratch":
+        return None, []
+    folder = weights_folder(weights)
+    network, record = load_network(folder)
+    if not isinstance(network, DirectNetwork):
+        raise TrainingError(f"{folder} does not hold a direct network: choose other --weights")
+    size, wanted = network.size, recipe.direct
+    grown = size.model_copy(update={"blocks": wanted.blocks, "mixers": wanted.mixers})
+    if grown != wanted or wanted.blocks < size.blocks or wanted.mixers < size.mixers:
+        raise TrainingError(f"{folder} holds a network that is not a part of the recipe's: {size} against {wanted}")
+    return network, record.runs
 
 
 def transfer_start(

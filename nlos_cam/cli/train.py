@@ -197,25 +197,32 @@ def direct(
         typer.Option("--dataset", help="Training maps; may be repeated. New shards are used as they appear."),
     ],
     held_out_data: HeldOut,
+    weights: Annotated[
+        Path | None,
+        typer.Option("--weights", help='Direct weights that a recipe with start = "weights" goes on from.'),
+    ] = None,
     store: Annotated[
         Path | None, typer.Option("--store", help="Folder of the packed maps, kept for other runs (default: in --out).")
     ] = None,
 ) -> None:
     """Train a direct network: maps to images by two heads, without a latent; the project's own."""
     recipe = run.recipe("direct")
+    refuse_ignored("the recipe starts from scratch", {"--weights": bool(weights) and recipe.start == "scratch"})
     if run.devices > 1:
         raise SceneError(f"a direct network trains in one process, got --devices {run.devices}: drop it")
     fabric = run.fabric(recipe)
+    start, runs = models.direct_start(recipe, weights)
     with ExitStack() as held:
         with tracked("packing maps") as on_progress:
-            packed = data_sets.open_packed_maps(data, store or run.out / "packed", on_progress)
+            normal = start.normal if start else None
+            packed = data_sets.open_packed_maps(data, store or run.out / "packed", on_progress, normal)
             source = held.enter_context(packed)
         held_out = models.first_of(data_sets.open_dataset(held_out_data).arrays(), recipe.held_out)
         recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
         rig = source.plan.rig
-        record = models.record_run(recipe, run.out, (rig.name, rig.checksum), [])
-        job = run.training(recipe, record, source.digest)
-        run.finish(recipe, models.run_direct(fabric, job, source, held_out))
+        record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+        job = run.training(recipe, record, models.digest_of(start, source.digest) if start else source.digest)
+        run.finish(recipe, models.run_direct(fabric, job, start, source, held_out))
 
 
 def transfer(

@@ -58,10 +58,17 @@ def map_noise(plan: DatasetPlan) -> MapNoise:
 class PackedMaps:
     """Normalised maps and images of one or more datasets of one rig, in a folder that is theirs alone."""
 
-    def __init__(self, datasets: Sequence[Path], store: Path, on_progress: OnProgress = ignore) -> None:
+    def __init__(
+        self,
+        datasets: Sequence[Path],
+        store: Path,
+        on_progress: OnProgress = ignore,
+        normal: CellNormal | None = None,
+    ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
-        Raises RecordingError for no dataset, SceneError for datasets of two rigs.
+        Maps are normalised as `normal` does, by default by their own statistics. Raises RecordingError for no dataset,
+        SceneError for datasets of two rigs or a store that is normalised otherwise.
         """
         opened = [open_dataset(folder, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
@@ -74,16 +81,21 @@ class PackedMaps:
         """To be drawn at each step of training."""
         self._datasets, self._store, self.normal = list(datasets), store, CellNormal()
         self._index = _read_index(store)
+        if normal and not (store / CELLS).exists():
+            self.normal.load_state_dict(normal.state_dict())
+            self._write_cells()
         if not (store / CELLS).exists():
             some = [read_arrays(shard, MAP_CHANNELS[:2]) for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
             self.normal.learn(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*some, strict=True)))
-            with atomic_file(store / CELLS) as part, part.open("wb") as file:
-                np.savez(file, **{name: values.numpy() for name, values in self.normal.state_dict().items()})
+            self._write_cells()
         try:
             cells = read_npz(store / CELLS)
             self.normal.load_state_dict({name: torch.from_numpy(values) for name, values in cells.items()})
         except (OSError, ValueError, TypeError, RuntimeError) as error:
             raise _damaged(store, CELLS) from error
+        found = self.normal.state_dict()
+        if normal and any(not torch.equal(values, found[name]) for name, values in normal.state_dict().items()):
+            raise SceneError(f"{store} holds maps that are normalised for other weights: name another --store")
         self.refresh(on_progress)
 
     def __len__(self) -> int:
@@ -118,6 +130,10 @@ class PackedMaps:
                 self._write_index()
             on_progress(number, len(new))
 
+    def _write_cells(self) -> None:
+        with atomic_file(self._store / CELLS) as part, part.open("wb") as file:
+            np.savez(file, **{name: values.numpy() for name, values in self.normal.state_dict().items()})
+
     def _write_index(self) -> None:
         with atomic_file(self._store / INDEX) as part:
             part.write_text(json.dumps(self._index), encoding="utf-8")
@@ -143,11 +159,13 @@ class PackedMaps:
 
 
 @contextmanager
-def open_packed_maps(datasets: Sequence[Path], store: Path, on_progress: OnProgress = ignore) -> Generator[PackedMaps]:
+def open_packed_maps(
+    datasets: Sequence[Path], store: Path, on_progress: OnProgress = ignore, normal: CellNormal | None = None
+) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
     Raises FileBusyError while another process holds it, and the errors of PackedMaps.
     """
     store.mkdir(parents=True, exist_ok=True)
     with claim(store, inside=True):
-        yield PackedMaps(datasets, store, on_progress)
+        yield PackedMaps(datasets, store, on_progress, normal)

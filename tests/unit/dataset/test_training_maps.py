@@ -9,7 +9,7 @@ import pytest
 import torch
 from fake_farm import samples_of
 from nlos_calibration import load_rig
-from nlos_models import FileBusyError, MapBatch
+from nlos_models import CellNormal, FileBusyError, MapBatch
 from nlos_models.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
@@ -197,6 +197,20 @@ def test_new_shards_enter_new_epochs_and_an_epoch_can_be_seen_again(tmp_path: Pa
         for one, other in zip(_epoch(again, 1), first, strict=True):
             np.testing.assert_array_equal(one, other)
         assert len(_epoch(again, 3)[0]) == 10
+
+
+def test_store_keeps_the_normalisation_of_given_weights(tmp_path: Path) -> None:
+    folder, store_folder, given = _add(tmp_path / "a", 0), tmp_path / "store", CellNormal()
+    given.median += 0.5
+    with open_packed_maps([folder], store_folder, normal=given) as packed:
+        assert torch.equal(packed.normal.median, given.median)
+    with open_packed_maps([folder], store_folder) as packed:
+        assert torch.equal(packed.normal.median, given.median)
+    with (
+        pytest.raises(SceneError, match="name another --store"),
+        open_packed_maps([folder], store_folder, normal=CellNormal()),
+    ):
+        pass
 
 
 def test_open_packed_maps_refuses_a_store_in_use(tmp_path: Path) -> None:

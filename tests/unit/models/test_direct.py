@@ -22,12 +22,12 @@ from nlos_models.direct import (
 )
 from nlos_models.direct_training import NormalBatch, _stains, train_direct, transfer_direct
 from nlos_models.distributed import open_fabric
-from nlos_models.errors import CheckpointError
+from nlos_models.errors import CheckpointError, TrainingError
 from nlos_models.export import export_folder
 from nlos_models.inference import load_reconstructor
 from nlos_models.recipe import DirectSize, Recipe
 from nlos_models.records import CheckpointRecord, load_record
-from nlos_models.runs import TrainingRun, record_run, run_transfer, transfer_start
+from nlos_models.runs import TrainingRun, direct_start, record_run, run_transfer, transfer_start
 from nlos_models.tasks import figures_of
 from nlos_models.tasks import run as reconstruct
 from nlos_models.train import BEST, LAST, MINUTES, Running
@@ -140,6 +140,18 @@ def test_run_stopped_halfway_resumes_exactly_with_its_average(tmp_path: Path) ->
     assert changed_tensors(whole.state_dict(), plain.state_dict())
 
 
+def test_training_goes_on_from_weights_that_grow(weights: Path, tmp_path: Path) -> None:
+    """More blocks and mixers begin as nothing: the first epoch of no learning has the weights' own answers."""
+    recipe = _recipe(
+        start="weights", learning_rate=1e-7, dropout=0.0, epochs=1, direct=SIZE.model_copy(update={"mixers": 3})
+    )
+    start, runs = direct_start(recipe, weights)
+    assert runs == [_recipe()]
+    grown, _ = train_direct(recipe, Source(), small_maps(4, 1), tmp_path, start=start)
+    np.testing.assert_allclose(reconstruct(grown, Source().maps), reconstruct(start, Source().maps), atol=1e-3)
+    assert direct_start(_recipe(), None) == (None, [])
+
+
 def test_average_is_scored_and_kept_and_minutes_are_logged(tmp_path: Path) -> None:
     times = iter(range(0, 100000, 45))
     running = Running(clock=lambda: float(next(times)))
@@ -175,6 +187,15 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
     assert not inline  # no matrix is stored twice, the transposed ones included
     with pytest.raises(CheckpointError, match="direct network"):
         load_pipeline(weights)
+
+
+@pytest.mark.parametrize("change", [{"width": 16}, {"mixers": 0}])
+def test_start_refuses_weights_that_the_recipe_cannot_hold(weights: Path, change: dict[str, int]) -> None:
+    recipe = _recipe(start="weights", direct=SIZE.model_copy(update=change))
+    with pytest.raises(TrainingError, match="not a part of the recipe's"):
+        direct_start(recipe, weights)
+    with pytest.raises(TrainingError, match="not hold a direct network"):
+        direct_start(recipe, Path("paper"))
 
 
 def test_gain_of_a_frame_changes_nothing_and_frames_without_returns_have_none() -> None:
