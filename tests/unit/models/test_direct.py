@@ -127,6 +127,17 @@ def test_loss_is_least_at_the_truth() -> None:
     assert two_heads_error(exact + torch.tensor([0.0, 0.5])[:, None, None], truth) > 0.05
 
 
+def test_image_is_cut_where_the_expected_overlap_is_largest() -> None:
+    """An object of which much is unsure is shown larger than one that is sure; nothing stays nothing."""
+    share = torch.full((3, 64, 64), 0.01)
+    share[:2, 20:40, 20:40] = 0.9
+    share[0, 20:40, 40:44] = 0.4
+    share[1, :, 40:] = 0.28
+    share[1, 20:40, 40:44] = 0.4
+    images = image_from_logits(torch.stack([torch.logit(share), torch.zeros_like(share)], dim=1))
+    assert [int((image > 0).sum()) for image in images] == [400, 480, 0]
+
+
 def test_run_stopped_halfway_resumes_exactly_with_its_average(tmp_path: Path) -> None:
     whole, figures = train_direct(_recipe(), Source(), small_maps(4, 1), tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
