@@ -11,6 +11,7 @@ __all__ = [
     "SMALLEST_SPREAD",
     "TEXT_LIMIT",
     "Accelerator",
+    "Answer",
     "CellNormal",
     "CheckpointRecord",
     "DirectNetwork",
@@ -40,6 +41,7 @@ __all__ = [
     "accuracy_mean_abs",
     "accuracy_within_2_percent",
     "as_batch",
+    "ask",
     "atomic_file",
     "brightness",
     "channel_statistics",
@@ -133,9 +135,11 @@ from .files import (
     write_checked,
 )
 from .inference import (
+    Answer,
     OnnxReconstructor,
     Reconstructor,
     UncertaintyModel,
+    ask,
     load_reconstructor,
     load_uncertainty_model,
     refuse_color,

@@ -198,7 +198,12 @@ class DirectNetwork(nn.Module):
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
         """Return the images of maps (n, 64, 80) with NaN depth where there is no return."""
-        return image_from_logits(self.logits(self.normal(depth_m, intensity)))
+        return self.answer(depth_m, intensity)[0]
+
+    def answer(self, depth_m: Tensor, intensity: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the images of maps, and the probability (n, 64, 64) that there is a surface."""
+        logits = self.logits(self.normal(depth_m, intensity))
+        return image_from_logits(logits), torch.sigmoid(logits[:, 0].float())
 
 
 def _patches(x: Tensor, side: int) -> Tensor:

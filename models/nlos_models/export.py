@@ -15,7 +15,7 @@ import onnx
 import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
-from torch import nn
+from torch import Tensor, nn
 
 from nlos_models.arrays import Float32
 from nlos_models.checkpoint import load_network
@@ -30,6 +30,7 @@ from nlos_models.inference import (
     DOUBT_ONNX,
     NETWORK_INPUTS,
     NETWORK_ONNX,
+    Answer,
     UncertaintyEstimate,
     refuse_color,
 )
@@ -57,10 +58,33 @@ class TorchReconstructor:
         self._pipeline, self._device, self._dtype = pipeline.to(device).eval(), device, dtype
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
+        return self.answer(depth_m, intensity).image
+
+    def answer(self, depth_m: Float32, intensity: Float32) -> Answer:
+        """Return images and, of a direct network, the probability of a surface."""
         mixed = torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
         with torch.inference_mode(), mixed:
             maps = [torch.from_numpy(np.ascontiguousarray(m)).to(self._device) for m in (depth_m, intensity)]
-            return self._pipeline(*maps).float().cpu().numpy()
+            return Answer(*(each.float().cpu().numpy() for each in _Answering(self._pipeline)(*maps)))
+
+
+class _Answering(nn.Module):
+    """Network whose outputs are those of an Answer."""
+
+    def __init__(self, network: RemappingNetwork | DirectNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of the outputs."""
+        return list(Answer._fields[: 1 + isinstance(self.network, DirectNetwork)])
+
+    def forward(self, depth_m: Tensor, intensity: Tensor) -> tuple[Tensor, ...]:
+        """Return the images of maps, and a direct network's probability of a surface."""
+        if isinstance(self.network, DirectNetwork):
+            return self.network.answer(depth_m, intensity)
+        return (self.network(depth_m, intensity),)
 
 
 def load_torch_reconstructor(folder: Path) -> TorchReconstructor:
@@ -78,9 +102,10 @@ def export_folder(folder: Path) -> list[Path]:
     """
     network, record = load_network(folder)
     refuse_color(record, folder)
-    files = watched_files(folder)
-    parts = {"": files[0]} if record.direct_recipe else {f"{name.partition('.')[0]}.": name for name in files}
-    graphs = {NETWORK_ONNX: _linked_graph(network, folder, NETWORK_INPUTS, ["image"], parts, files)}
+    files, answering = watched_files(folder), _Answering(network)
+    names = {"": files[0]} if record.direct_recipe else {f"{name.partition('.')[0]}.": name for name in files}
+    parts = {f"network.{prefix}": name for prefix, name in names.items()}
+    graphs = {NETWORK_ONNX: _linked_graph(answering, folder, NETWORK_INPUTS, answering.outputs, parts, files)}
     if loaded := load_doubt(folder):
         parts = {"network.": DOUBT_FILES[0]}
         graphs[DOUBT_ONNX] = _linked_graph(loaded[0], folder, DOUBT_INPUTS, DOUBT_OUTPUTS, parts, DOUBT_FILES)
@@ -109,7 +134,8 @@ def export_onnx(pipeline: RemappingNetwork | DirectNetwork) -> bytes:
     """Return the pipeline, preprocessing included, as an ONNX file for any batch size. Raises ModelError for color."""
     if isinstance(pipeline, RemappingNetwork) and pipeline.intensities > 1:
         raise ModelError(f"color networks ({SIMULATION_ONLY}) cannot be exported: use them in torch")
-    return write_onnx(pipeline, NETWORK_INPUTS, ["image"])
+    answering = _Answering(pipeline)
+    return write_onnx(answering, NETWORK_INPUTS, answering.outputs)
 
 
 def write_onnx(network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]) -> bytes:

@@ -2,8 +2,9 @@
 
 import ctypes
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -30,6 +31,15 @@ CHECKSUM = "weights"
 """Key of the graph's metadata with the checksum of the files that it was made from."""
 
 
+class Answer(NamedTuple):
+    """Answer of a network to n maps."""
+
+    image: Float32
+    """(n, 64, 64) in [0, 1]."""
+    surface: Float32 | None = None
+    """(n, 64, 64): probability that there is a surface; None for a network that does not tell."""
+
+
 class Reconstructor(Protocol):
     """Trained pipeline that is ready to run."""
 
@@ -41,6 +51,18 @@ class Reconstructor(Protocol):
         ...
 
 
+@runtime_checkable
+class _TellsSurface(Protocol):
+    def answer(self, depth_m: Float32, intensity: Float32) -> Answer: ...
+
+
+def ask(network: Callable[[Float32, Float32], Float32], depth_m: Float32, intensity: Float32) -> Answer:
+    """Return a network's answer to maps (n, 64, 80), with the probability of a surface where its `answer` has one."""
+    if isinstance(network, _TellsSurface):
+        return network.answer(depth_m, intensity)
+    return Answer(network(depth_m, intensity))
+
+
 class OnnxReconstructor:
     """Pipeline in ONNX Runtime on the CPU, about five times faster than torch there for one frame."""
 
@@ -49,8 +71,12 @@ class OnnxReconstructor:
         self._session = open_session(model, threads, checksum)
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
+        return self.answer(depth_m, intensity).image
+
+    def answer(self, depth_m: Float32, intensity: Float32) -> Answer:
+        """Return images and, of a direct network, the probability of a surface."""
         inputs = {"depth_m": np.ascontiguousarray(depth_m), "intensity": np.ascontiguousarray(intensity)}
-        return self._session.run(None, inputs)[0]
+        return Answer(*self._session.run(None, inputs))
 
 
 class UncertaintyEstimate(NamedTuple):

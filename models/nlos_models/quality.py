@@ -1,7 +1,8 @@
 """Quality of one reconstruction, predicted from its image and uncertainty: overlap of the outline, and depth error.
 
-A small network in numpy on some forty figures of the image and of the uncertainty network's answer, fitted to
-reconstructions of known objects by `train quality` (`doubt_training`).
+A small network in numpy on some fifty figures of the image, of the uncertainty network's answer and, where the
+reconstructing network tells one, of its own probability of a surface, fitted to reconstructions of known objects by
+`train quality` (`doubt_training`).
 """
 
 import json
@@ -29,7 +30,8 @@ LEVELS = 0.1, 0.5, 0.9
 """Quantiles of the predicted IoU."""
 OUTLINES = 0.1, 0.3, 0.5, 0.7, 0.9
 """Probabilities of a surface whose outlines are compared with the image's."""
-FEATURES = 35
+FEATURES, WITH_SURFACE = 35, 54
+"""Figures without and with the reconstructing network's own probability of a surface."""
 CLIP = 4.0
 """Limit of a normalised figure, in spreads: a strange frame is not extrapolated to."""
 
@@ -81,12 +83,22 @@ class QualityModel:
             np.asarray(each, np.float32) for each in (record.means, record.spreads, *record.layers)
         )
 
-    def __call__(self, image: Float32, estimate: "UncertaintyEstimate") -> QualityEstimate:
-        """Return the quality of images (n, 64, 64) in v with their uncertainty."""
-        return QualityEstimate.of(self.outputs(quality_features(image, estimate)), self.record.trusted_above)
+    def __call__(
+        self, image: Float32, estimate: "UncertaintyEstimate", surface: Float32 | None = None
+    ) -> QualityEstimate:
+        """Return the quality of images (n, 64, 64) in v with their uncertainty.
+
+        A model that was fitted with a network's probability of a surface takes the estimate's where none is given.
+        """
+        if len(self._means) == FEATURES:
+            surface = None
+        elif surface is None:
+            surface = estimate.p_surface
+        figures = quality_features(image, estimate, surface)
+        return QualityEstimate.of(self.outputs(figures), self.record.trusted_above)
 
     def outputs(self, figures: Float32) -> Float32:
-        """Return the network's outputs (n, 5) for figures (n, FEATURES): logits of LEVELS and `good`, log error."""
+        """Return the network's outputs (n, 5) for figures of n frames: logits of LEVELS and `good`, log error."""
         x = normalised(figures, self._means, self._spreads)
         for number, layer in enumerate(self._layers):
             x = (np.maximum(x, 0.0) if number else x) @ layer[:-1] + layer[-1]
@@ -98,27 +110,21 @@ def normalised(figures: Float32, means: Float32, spreads: Float32) -> Float32:
     return ((figures - means) / spreads).clip(-CLIP, CLIP)
 
 
-def quality_features(image: Float32, estimate: "UncertaintyEstimate") -> Float32:
-    """Return the figures (n, FEATURES) that a quality is predicted from, finite also for an image without a surface.
+def quality_features(image: Float32, estimate: "UncertaintyEstimate", surface: Float32 | None = None) -> Float32:
+    """Return the figures (n, FEATURES or WITH_SURFACE) that a quality is predicted from; all are finite.
 
-    They are the same for the mirrored image. All sums over pixels are divided by the area of the image's surface.
+    `surface` (n, 64, 64) is the reconstructing network's probability of a surface. Figures are the same for the
+    mirrored image. All sums over pixels are divided by the area of the image's surface.
     """
     mask = image > 0
-    images = mask, image, estimate.p_surface, estimate.error_v
-    m, v, p, error = (_flat(np.asarray(each, np.float32)) for each in images)
+    m, v, error = (_flat(np.asarray(each, np.float32)) for each in (mask, image, estimate.error_v))
     area = np.maximum(m.sum(1), 1.0)
 
     def share(values: Float32) -> Float32:
         return values.sum(1) / area
 
-    inside, beside, unsure = share(p * m), share(p * (1 - m)), p * (1 - p)
-    overlap = inside / (1 + beside)
-    found = [overlap, _logit(overlap), area / 4096, np.log(area), np.sqrt(area), inside, beside]
-    found += [share(unsure), share(unsure * m)]
-    for level in OUTLINES:
-        above = (p > level).astype(np.float32)
-        joint, size = (above * m).sum(1), above.sum(1)
-        found += [joint / np.maximum(size + m.sum(1) - joint, 1.0), size / area]
+    outline = _outline(m, p := _flat(estimate.p_surface), area)
+    found = [*outline[:2], area / 4096, np.log(area), np.sqrt(area), *outline[2:]]
     mean = share(v)
     found += [share(error * m), np.sqrt(share(error * error * m)), mean]
     found += [np.sqrt(share((v - mean[:, None]) ** 2 * m))]
@@ -126,7 +132,23 @@ def quality_features(image: Float32, estimate: "UncertaintyEstimate") -> Float32
     rim = np.float32(edges[0] + edges[1])
     found += [rim / np.sqrt(area), rim / area, *_slopes(image, mask, area), *_place(mask, area)]
     found += [_logit(estimate.p_out_of_distribution), _logit(estimate.p_empty)]
+    if surface is not None:
+        own, apart = _flat(surface), np.abs(_flat(surface) - p)
+        sharp = share(own**2) / np.maximum(share(own), 1e-4)
+        found += [*_outline(m, own, area), share(apart), share(apart * m), sharp]
     return np.stack(found, 1).astype(np.float32)
+
+
+def _outline(m: Float32, p: Float32, area: Float32) -> list[Float32]:
+    """Return how an image's surface (n, 4096) fits probabilities of one: expected overlap, and outlines compared."""
+    inside, beside, unsure = (p * m).sum(1) / area, (p * (1 - m)).sum(1) / area, p * (1 - p)
+    overlap = inside / (1 + beside)
+    found = [overlap, _logit(overlap), inside, beside, unsure.sum(1) / area, (unsure * m).sum(1) / area]
+    for level in OUTLINES:
+        above = (p > level).astype(np.float32)
+        joint, size = (above * m).sum(1), above.sum(1)
+        found += [joint / np.maximum(size + m.sum(1) - joint, 1.0), size / area]
+    return found
 
 
 def _flat(images: Float32) -> Float32:
@@ -201,7 +223,7 @@ def _fits(record: QualityRecord) -> bool:
     except ValueError:  # rows of different lengths
         return False
     inputs = len(record.means)
-    if not sizes or inputs != FEATURES or inputs != len(record.spreads) or min(record.spreads) <= 0:
+    if not sizes or inputs not in {FEATURES, WITH_SURFACE} or inputs != len(record.spreads) or min(record.spreads) <= 0:
         return False
     for size in sizes:
         if len(size) != 2 or size[0] != inputs + 1:

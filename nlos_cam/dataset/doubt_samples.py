@@ -15,6 +15,7 @@ from nlos_models import (
     Recipe,
     Reconstructor,
     UncertaintyModel,
+    ask,
     first_of,
     parts_of,
     quality_features,
@@ -245,8 +246,8 @@ def quality_set(
             break
         for part in parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
             depth_m, intensity, truth = maps.depth_m[part], maps.intensity[part], maps.image[part].astype(np.float32)
-            image = pipeline(depth_m, intensity)
-            figures.append(quality_features(image, uncertainty_model(depth_m, intensity, image)))
+            image, surface = ask(pipeline, depth_m, intensity)
+            figures.append(quality_features(image, uncertainty_model(depth_m, intensity, image), surface))
             iou.append(silhouette_iou(image, truth).astype(np.float32))
             error_v.append(shared_error_v(image, truth))
             done += len(part)

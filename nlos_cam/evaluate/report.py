@@ -159,10 +159,10 @@ def evaluate(
     guesses, searched = baseline_answers(objects, training, nearest=nearest, tracked=tracked)
     doubter = load_uncertainty_model(weights, cache_folder() / "onnx") if record.input == "raw maps" else None
     image = reconstruct_all(reconstructor, network_input(objects.maps, bare))
-    predicted, unseen = predict_quality(image, objects.maps, doubter, objects.plan.rig), None
+    predicted, unseen = predict_quality(reconstructor, objects.maps, doubter, objects.plan.rig), None
     if second:
         answers = reconstruct_all(reconstructor, network_input(second.maps, bare))
-        sure = predict_quality(answers, second.maps, doubter, second.plan.rig)
+        sure = predict_quality(reconstructor, second.maps, doubter, second.plan.rig)
         unseen = Unseen(second.names, second.maps.image.astype(np.float32), answers, sure)
     facts = {
         "what": objects.description,

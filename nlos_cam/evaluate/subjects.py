@@ -33,13 +33,11 @@ from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
 from nlos_cam.objects import (
     BenchmarkObject,
     benchmark_objects,
-    depth_from_image,
     image_from_depth,
-    object_box,
     object_depth,
     unseen_objects,
 )
-from nlos_cam.reconstruct import FrameConditions, Reconstruction, Verdict, VerdictFilter, estimate_doubt, verdict_limits
+from nlos_cam.reconstruct import FrameConditions, Verdict, VerdictFilter, reconstruct, verdict_limits
 from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
 
 OnProgress = Callable[[int, int], None]
@@ -123,20 +121,20 @@ def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:
 
 
 def predict_quality(
-    images: Float32, maps: MapSet, uncertainty_model: UncertaintyModel | None, rig: Rig
+    reconstructor: Reconstructor, maps: MapSet, uncertainty_model: UncertaintyModel | None, rig: Rig
 ) -> Predictions | None:
-    """Return the predicted quality of images (n, 64, 64) made from raw maps; None without a quality model.
+    """Return the predicted quality of what raw maps are reconstructed to; None without a quality model.
 
     A frame is trusted as on the page: a detected object, on a verdict from this frame alone, of a trusted quality.
     """
     if uncertainty_model is None or uncertainty_model.quality is None:
         return None
-    rows, box = list[tuple[float, ...]](), object_box(rig)
-    for depth_m, intensity, image in zip(maps.depth_m, maps.intensity, images, strict=True):
-        doubt = estimate_doubt(uncertainty_model, LidarMaps(depth_m, intensity, ~np.isnan(depth_m)), image, box)
-        found = Reconstruction(depth_from_image(image, box), np.eye(4), doubt.error_m, {}, doubt)
+    rows = list[tuple[float, ...]]()
+    for depth_m, intensity in zip(maps.depth_m, maps.intensity, strict=True):
+        frame = LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
+        found = reconstruct(frame, rig, reconstructor, uncertainty_model=uncertainty_model)
         _, verdict = VerdictFilter(verdict_limits(uncertainty_model)).decide(found, FrameConditions())
-        if quality := doubt.quality:
+        if found.doubt and (quality := found.doubt.quality):
             trusted = quality.trusted and verdict is Verdict.SEEN
             rows.append((*quality.iou, 1e3 * quality.error_m, trusted))
         else:  # no surface: no overlap

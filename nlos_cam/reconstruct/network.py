@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
-from nlos_models import MIN_V, Reconstructor, UncertaintyModel
+from nlos_models import MIN_V, Answer, Reconstructor, UncertaintyModel, ask
 from numpy.typing import NDArray
 
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps
@@ -124,40 +124,52 @@ def reconstruct_all(
     """
     box = object_box(rig)
     start_s = clock()
-    images = _run_network(batch, network)
+    images, surfaces = _run_network(batch, network)
     timings_s = {"network": (clock() - start_s) / len(batch)}
     results: list[Reconstruction] = []
-    for maps, image in zip(batch, images, strict=True):
+    for number, (maps, image) in enumerate(zip(batch, images, strict=True)):
         result = Reconstruction(depth_from_image(image, box), box_pose(box), None, timings_s)
         if uncertainty_model is not None:
             start_s = clock()
-            doubt = estimate_doubt(uncertainty_model, maps, image, box)
+            doubt = estimate_doubt(uncertainty_model, maps, image, box, None if surfaces is None else surfaces[number])
             timings = {**timings_s, "doubt": clock() - start_s}
             result = replace(result, uncertainty_m=doubt.error_m, timings_s=timings, doubt=doubt)
         results.append(result)
     return results
 
 
-def _run_network(batch: Sequence[LidarMaps], network: Network) -> Float32:
+def _run_network(batch: Sequence[LidarMaps], network: Network) -> Answer:
     """Return the images (n, 64, 64) in v of a batch; zero (no surface) for maps without any return.
 
     The networks take a cell without a return for an average one, and would show an average object for such maps.
     """
-    images = np.zeros((len(batch), OBJECT_PIXELS, OBJECT_PIXELS), np.float32)
+    images, surfaces = (np.zeros((len(batch), OBJECT_PIXELS, OBJECT_PIXELS), np.float32) for _ in range(2))
+    found = None
     if valid := [index for index, maps in enumerate(batch) if maps.valid.any()]:
         depth_m = np.stack([batch[index].depth_m for index in valid])
-        images[valid] = network(depth_m, np.stack([batch[index].intensity for index in valid]))
-    return images
+        images[valid], found = ask(network, depth_m, np.stack([batch[index].intensity for index in valid]))
+        if found is not None:
+            surfaces[valid] = found
+    return Answer(images, None if found is None else surfaces)
 
 
-def estimate_doubt(uncertainty_model: UncertaintyModel, maps: LidarMaps, image: Float32, box: ObjectBox) -> Doubt:
-    """Return the uncertainty of an image (64, 64) in v that networks made from maps."""
+def estimate_doubt(
+    uncertainty_model: UncertaintyModel,
+    maps: LidarMaps,
+    image: Float32,
+    box: ObjectBox,
+    surface: Float32 | None = None,
+) -> Doubt:
+    """Return the uncertainty of an image (64, 64) in v that networks made from maps.
+
+    `surface` (64, 64) is their own probability of a surface, if they tell one.
+    """
     said = uncertainty_model(*(array[None] for array in (maps.depth_m, maps.intensity, image)))
     # v falls linearly from 1 at z_near to MIN_V at z_far, so an error of 1 in v is this many metres (depth_from_image)
     metres_per_v = (box.z_far_m - box.z_near_m) / (1 - MIN_V)
     error_m, quality = said.error_v[0] * metres_per_v, None
     if uncertainty_model.quality and image.any():
-        found = uncertainty_model.quality(image[None], said)
+        found = uncertainty_model.quality(image[None], said, None if surface is None else surface[None])
         low, middle, high = found.iou[0].tolist()
         error = float(found.error_v[0]) * metres_per_v
         quality = Quality((low, middle, high), float(found.good[0]), error, bool(found.trusted[0]))

@@ -12,6 +12,7 @@ from nlos_models.checkpoint import load_network, load_pipeline, save_direct
 from nlos_models.data import InMemory, as_images
 from nlos_models.direct import (
     CLIP,
+    CUTS,
     MIN_LIGHT_SPREAD,
     CellNormal,
     DirectNetwork,
@@ -23,7 +24,7 @@ from nlos_models.direct import (
 from nlos_models.direct_training import NormalBatch, _stains, train_direct, transfer_direct
 from nlos_models.distributed import open_fabric
 from nlos_models.errors import CheckpointError, TrainingError
-from nlos_models.export import export_folder
+from nlos_models.export import TorchReconstructor, export_folder
 from nlos_models.inference import load_reconstructor
 from nlos_models.recipe import DirectSize, Recipe
 from nlos_models.records import CheckpointRecord, load_record
@@ -192,6 +193,12 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
     maps = Source().maps
     images = load_reconstructor(weights, tmp_path)(maps.depth_m, maps.intensity)
     np.testing.assert_allclose(images, reconstruct(network, maps), atol=1e-5)
+    told = load_reconstructor(weights, tmp_path).answer(maps.depth_m, maps.intensity)
+    in_torch = TorchReconstructor(network, record, "cpu").answer(maps.depth_m, maps.intensity)
+    for one, other in zip(told, in_torch, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+    assert ((told.surface > CUTS[-1]) <= (told.image > 0)).all()
+    assert ((told.image > 0) <= (told.surface > CUTS[0])).all()
     assert not [*tmp_path.iterdir()]
     stored = onnx.load(weights / "network.onnx", load_external_data=False).graph.initializer
     inline = [each.name for each in stored if len(each.dims) == 2 and each.data_location != TensorProto.EXTERNAL]
@@ -272,7 +279,7 @@ def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> 
         network = _shaken(DirectNetwork(SIZE))
         network.normal.load_state_dict(Source().normal.state_dict())
         recipe = _recipe(
-            task="transfer", latent_weight=0.0, image_weight=1.0, all_layers_epochs=6, epochs=3, average=0.0
+            task="transfer", latent_weight=0.0, image_weight=1.0, all_layers_epochs=12, epochs=3, average=0.0
         )
         after, figures = transfer_direct(recipe, network, InMemory(Source().maps), small_maps(4, 1), folder, running)
         return after, figures["held_out_loss"]

@@ -275,6 +275,27 @@ def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite
     alone = quality_features(images[1:2], UncertaintyEstimate(*(part[1:2] for part in said)))
     np.testing.assert_allclose(alone[0], figures[1], rtol=1e-4, atol=1e-5)
     assert np.isfinite(quality_features(np.zeros_like(images), said)).all()
+    with_own = quality_features(images, said, said.p_surface)
+    assert with_own.shape == (4, quality.WITH_SURFACE)
+    np.testing.assert_array_equal(with_own[:, : quality.FEATURES], figures)
+    own = quality_features(images[:, ::-1], turned, turned.p_surface)
+    np.testing.assert_allclose(own, with_own, rtol=1e-4, atol=1e-4)
+    assert np.isfinite(quality_features(np.zeros_like(images), said, np.zeros_like(images))).all()
+
+
+def test_model_takes_a_network_s_own_probability_of_a_surface_where_it_was_fitted_with_one() -> None:
+    """Without one it takes the uncertainty network's, and a model that was fitted without one leaves it out."""
+    (images, said), own = frames(3), np.full((3, 64, 64), 0.5, np.float32)
+    plain, wide = (QualityModel(_sum_of_figures(count)) for count in (quality.FEATURES, quality.WITH_SURFACE))
+    np.testing.assert_array_equal(plain(images, said, own).iou, plain(images, said).iou)
+    np.testing.assert_array_equal(wide(images, said, said.p_surface).iou, wide(images, said).iou)
+    assert (wide(images, said, own).iou != wide(images, said).iou).any()
+
+
+def _sum_of_figures(count: int) -> QualityRecord:
+    """Return a model whose outputs are the sum of its figures, normalised to small numbers."""
+    layers = np.vstack([np.full((count, 5), 0.1), np.zeros((1, 5))])[None].tolist()
+    return record_of(means=[0.0] * count, spreads=[10.0] * count, layers=layers)
 
 
 def test_figure_that_never_differs_leaves_a_model_that_loads() -> None:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
 from nlos_calibration.rig import load_rig
+from nlos_models import Answer
+from nlos_models.quality import QualityEstimate
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
@@ -84,6 +86,30 @@ def test_reconstruct_without_returns_still_asks_for_doubt() -> None:
     assert not found.has_surface
     assert found.uncertainty_m is not None
     assert not doubter.asked[0][2].any()
+
+
+class TellingNetwork:
+    """Network that tells how probable a surface is: as much as the first cell's intensity says."""
+
+    def answer(self, depth_m: np.ndarray, intensity: np.ndarray) -> Answer:
+        images = np.repeat(half(), len(depth_m), 0)
+        return Answer(images, images * intensity[:, :1, :1])
+
+    def __call__(self, *maps: np.ndarray) -> np.ndarray:
+        return self.answer(*maps).image
+
+
+def test_quality_is_predicted_from_each_frame_s_own_probability_of_a_surface() -> None:
+    asked = Mock(return_value=QualityEstimate.of(np.zeros((1, 5), np.float32), None))
+    (doubter := FakeDoubter()).quality = asked
+    bright, blank = some_maps(), np.full((64, 80), np.nan, np.float32)
+    frames = [replace(bright, depth_m=blank, valid=np.zeros((64, 80), bool)), bright]
+    nothing, found = reconstruct_all(frames, RIG, TellingNetwork(), uncertainty_model=doubter)
+    assert nothing.doubt.quality is None
+    assert found.doubt.quality.iou == (0.5, 0.5, 0.5)
+    np.testing.assert_array_equal(asked.call_args.args[2], half() * 40)
+    reconstruct(bright, RIG, half, uncertainty_model=doubter)
+    assert asked.call_args.args[2] is None
 
 
 def test_reconstruct_refuses_a_rig_without_object_box() -> None:
