@@ -20,15 +20,16 @@ PACE_S = 0.002
 
 
 class NapClock:
-    """Clock that moves only by waiting, and records each wait."""
+    """Clock that moves only by waiting, and records each wait; `hook` is called before, with the number of earlier."""
 
-    def __init__(self) -> None:
-        self.time_s, self.naps = 1e9, list[float]()
+    def __init__(self, hook: Callable[[int], object] = lambda _: None) -> None:
+        self.time_s, self.naps, self.hook = 1e9, list[float](), hook
 
     def now(self) -> float:
         return self.time_s
 
     def wait(self, stop: Event, seconds: float) -> bool:
+        self.hook(len(self.naps))
         self.naps.append(seconds)
         self.time_s += seconds
         return stop.wait(0.001)

@@ -37,6 +37,11 @@ class PageReader(HTMLParser):
         self.text += data
 
 
+def decoded(picture: bytes) -> np.ndarray:
+    """Return a picture's pixels (height, width, 3), red first."""
+    return cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+
+
 def read_page(page: str) -> PageReader:
     """Read a page, which must be well-formed and need no other file and no network."""
     found = PageReader(page)
@@ -45,6 +50,5 @@ def read_page(page: str) -> PageReader:
     assert "url(" not in page
     assert "@import" not in page
     for picture in found.pictures:
-        raw = np.frombuffer(base64.b64decode(picture.removeprefix(PNG), validate=True), np.uint8)
-        assert cv2.imdecode(raw, cv2.IMREAD_COLOR) is not None
+        assert decoded(base64.b64decode(picture.removeprefix(PNG), validate=True)).size
     return found

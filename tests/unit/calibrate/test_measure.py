@@ -1,10 +1,11 @@
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import date
 
 import numpy as np
 import pytest
+from fake_wall import SERIAL, WallCamera
 from nlos_calibration.errors import CalibrationError, OccluderRefusedError, WallRefusedError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.reference import BareWallStatistics
@@ -26,52 +27,35 @@ from nlos_cam.render.geometry import cast
 RIG = load_rig("bare-wall")
 BENCH = load_rig("paper-rig")
 INTRINSICS = RIG.pinhole.scaled(160, 120)
-SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
-SHAPE = (64, 80)
+ALL = np.ones((64, 80), np.bool_)
 
 
-class Warming:
-    """Camera of a wall of one depth, with noise, whose temperature rises by a degree with each reading."""
-
-    uri, intrinsics = "l515", SMALL
-
-    def __init__(self, frames: int) -> None:
-        self.identity = {"serial": "f1"}
-        self.celsius = 30.0
-        generator = np.random.default_rng(0)
-        depths_m = 0.2 + 0.001 * generator.standard_normal((frames, *SHAPE))
-        counts = np.full(SHAPE, 48, np.uint8)
-        self.given = [
-            Frame(depth_m.astype(np.float32), counts, counts, number / 30, number, SMALL, {"laser_power": 40.0})
-            for number, depth_m in enumerate(depths_m)
-        ]
-
-    def __iter__(self) -> Iterator[Frame]:
-        return iter(self.given)
+class Warming(WallCamera):
+    """Its temperature rises by a degree with each reading."""
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
-        assert ending == "_temperature"
-        self.celsius += 1.0
-        return {"ldd_temperature": self.celsius}
+        self._celsius += 1.0
+        return super().telemetry(ending)
 
 
 def test_collect_statistics_averages_all_frames() -> None:
-    camera = Warming(20)
-    wall = collect_statistics(camera, 1000).reference(np.ones(SHAPE, np.bool_))
-    depths_m = np.stack([frame.depth_m for frame in camera.given]).astype(np.float64)
-    maps_m = np.stack([maps_from_frame(frame).depth_m for frame in camera.given])
-    np.testing.assert_allclose(wall.depth_m, depths_m.mean(axis=0), rtol=1e-6)
-    np.testing.assert_allclose(wall.map_depth_m, maps_m.mean(axis=0), rtol=1e-6)
-    np.testing.assert_array_equal(wall.map_intensity, 48.0)
-    assert (wall.frames, wall.serial, wall.settings) == (20, "f1", {"laser_power": 40.0})
+    wall = collect_statistics(Warming(20), 1000).reference(ALL)
+    frames = list(Warming(20))
+    maps = [maps_from_frame(frame) for frame in frames]
+    depths_m = [frame.depth_m.astype(np.float64) for frame in frames]
+    counts = [np.where(each.valid, each.intensity, np.nan) for each in maps]
+    np.testing.assert_allclose(wall.depth_m, np.mean(depths_m, axis=0), rtol=1e-6)
+    np.testing.assert_allclose(wall.map_depth_m, np.mean([each.depth_m for each in maps], axis=0), rtol=1e-6)
+    np.testing.assert_allclose(wall.map_intensity, np.mean(counts, axis=0), rtol=1e-6)
+    assert (wall.frames, wall.serial, wall.settings) == (20, SERIAL, {"laser_power": 40.0})
     assert collect_statistics(Warming(10), 4).statistics.depth.frames == 4
 
 
 def test_statistics_read_temperatures_now_and_then() -> None:
-    capture = collect_statistics(Warming(2 * CELSIUS_EVERY + 1), 1000)
+    capture = collect_statistics(Warming(2 * CELSIUS_EVERY + 1, celsius=30.0), 1000)
     assert capture.facts()["temperatures_c"] == {"ldd_temperature": 32.0}
-    assert capture.reference(np.ones(SHAPE, np.bool_)).celsius_span == {"ldd_temperature": 2.0}
-    with pytest.raises(WallRefusedError, match="l515"):
+    assert capture.reference(ALL).celsius_span == {"ldd_temperature": 2.0}
+    with pytest.raises(WallRefusedError, match="fake"):
         collect_statistics(Warming(0), 1000)
 
 

@@ -8,7 +8,7 @@ from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS, MIN_CORNERS, Board, Corners, find_corners
 from nlos_calibration.board_pose import CornerObservations, PrintErrors, _linear, fit_board, refine_pose, solve_pose
 from nlos_calibration.errors import BoardRefusedError
-from nlos_calibration.geometry import Intrinsics, normal_from_angles
+from nlos_calibration.geometry import Intrinsics, normal_from_angles, wall_from_plane
 from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallMeasures, measures_of
 from pydantic import ValidationError
@@ -16,19 +16,16 @@ from synthetic_scenes import Illumination, at_near_edge, clean_infrared, corners
 
 from nlos_cam.calibrate import View
 
-CAMERA = np.array([[457.0, 0.0, 319.5], [0.0, 461.0, 239.5], [0.0, 0.0, 1.0]])
 PRINT_STD = np.array([0.0035, 0.0003, 0.0003])
 TRUE = np.array([0.1, 0.7, 0.05, -0.11, -0.13, 0.30, 0.004, 0.0005, -0.0003])
 """Parameters of an oblique pose of a stretched and bowed print."""
 A4 = BOARDS["a4"]
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)
 NORMAL, DISTANCE_M = normal_from_angles(np.radians(45.0), np.radians(5.0)), 0.2
-SMALL = {"squares_x": 4, "squares_y": 5, "square_mm": 20.0, "marker_mm": 15.0}
 RIG = load_rig("bare-wall")
 
 
 def of_bench(**light: float) -> tuple[Float64, Float64]:
-    """A noiseless view at 0.2 m and 45 degrees, and where its corners are."""
     seen = View(RIG.wall_from_lidar, RIG.pinhole)
     placed = at_near_edge(A4, seen)
     return clean_infrared(A4, seen, placed, Illumination(**light)), corners_px(A4, seen, placed)
@@ -54,8 +51,9 @@ def test_measured_board_is_the_same_board_scaled() -> None:
     ],
 )
 def test_board_that_cannot_exist_is_refused(changed: dict[str, object], problem: str) -> None:
+    small = {"squares_x": 4, "squares_y": 5, "square_mm": 20.0, "marker_mm": 15.0}
     with pytest.raises(ValidationError, match=problem):
-        Board.model_validate(SMALL | changed)
+        Board.model_validate(small | changed)
 
 
 @pytest.mark.parametrize(("counts", "least", "error_px"), [(None, 25, 0.15), (6.0, 20, 0.3), (600.0, 20, 0.3)])
@@ -101,12 +99,8 @@ def test_find_corners_refuses_mirrored_hidden_and_other_boards() -> None:
 
 def seen_of(parameters: Float64, sigma_px: float, generator: np.random.Generator) -> CornerObservations:
     drawn = CornerObservations(
-        A4.corners_m,
-        np.zeros((len(A4.corners_m), 2)),
-        CAMERA,
-        np.array(A4.size_mm) * 1e-3,
-        PRINT_STD,
-        max(sigma_px, 1e-3) ** 2,
+        *(A4.corners_m, np.zeros((40, 2)), PINHOLE.matrix),
+        *(np.array(A4.size_mm) * 1e-3, PRINT_STD, max(sigma_px, 1e-3) ** 2),
     )
     pixels = -_linear(drawn, parameters)[1][:-3].reshape(-1, 2) * np.sqrt(drawn.variance_px2)
     return replace(drawn, pixels=pixels + sigma_px * generator.standard_normal(pixels.shape))
@@ -114,23 +108,19 @@ def seen_of(parameters: Float64, sigma_px: float, generator: np.random.Generator
 
 def projected(points_m: Float64, distance_m: float = DISTANCE_M, normal: Float64 = NORMAL) -> Float64:
     """Return the pixels of points (n, 3) of a board on the wall (z points into the wall)."""
-    right = np.cross([0.0, 1.0, 0.0], -normal)
-    right /= np.linalg.norm(right)
-    down = np.cross(-normal, right)
+    right, up, _ = wall_from_plane(normal, distance_m)[:3, :3]
     middle_m = 0.8 * distance_m / -normal[2] * np.array([0.0, 0.0, 1.0])
     middle_m -= (middle_m @ normal + distance_m) * normal
     x_m, y_m, z_m = (points_m - [0.09, 0.135, 0.0]).T
-    at = middle_m + np.outer(x_m, right) + np.outer(y_m, down) - np.outer(z_m, normal)
-    return np.column_stack(
-        [at[:, 0] / at[:, 2] * PINHOLE.fx + PINHOLE.ppx, at[:, 1] / at[:, 2] * PINHOLE.fy + PINHOLE.ppy]
-    )
+    at = middle_m + np.outer(x_m, right) - np.outer(y_m, up) - np.outer(z_m, normal)
+    seen = at @ PINHOLE.matrix.T
+    return seen[:, :2] / seen[:, 2:]
 
 
 def corners(points_m: Float64 | None = None, sigma_px: float = 0.05, seed: int = 0, **where: float) -> Corners:
     pixels = projected(A4.corners_m if points_m is None else points_m, **where)
-    return Corners(
-        np.arange(len(pixels)), pixels + sigma_px * np.random.default_rng(seed).standard_normal(pixels.shape)
-    )
+    noise_px = sigma_px * np.random.default_rng(seed).standard_normal(pixels.shape)
+    return Corners(np.arange(len(pixels)), pixels + noise_px)
 
 
 def bowed(height_m: float) -> Float64:
@@ -230,7 +220,6 @@ def test_fit_board_refuses_a_print_out_of_shape(points_m: Float64) -> None:
 
 
 def test_fit_board_refuses_wrong_intrinsics_and_weak_views() -> None:
-    """Another camera's intrinsics; corners in a line; a board seen edge on; a tiny board far away."""
     found = corners()
     with pytest.raises(BoardRefusedError):
         fit_board(found, A4, Intrinsics(640, 480, 457.0, 520.0, 300.0, 200.0))

@@ -39,7 +39,7 @@ def moved(slopes: Float64) -> Float64:
     return plane_in_lidar(slopes, np.zeros((3, 3)), POSE, EXACT)[0]
 
 
-def test_plane_in_lidar_moves_plane_and_covariance() -> None:
+def test_plane_in_lidar_moves_plane_and_covariance_or_is_refused_between_camera_and_lidar() -> None:
     rays = np.column_stack([np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2)), np.ones(20)])
     points = rays / (rays @ SLOPES)[:, np.newaxis]
     there = points @ POSE[:3, :3].T + POSE[:3, 3]
@@ -49,9 +49,6 @@ def test_plane_in_lidar_moves_plane_and_covariance() -> None:
     root = np.random.default_rng(1).standard_normal((3, 3)) * 1e-3
     covariance = plane_in_lidar(SLOPES, root @ root.T, POSE, EXACT)[1]
     np.testing.assert_allclose(covariance, by_slopes @ root @ root.T @ by_slopes.T, rtol=1e-5, atol=1e-12)
-
-
-def test_plane_in_lidar_between_camera_and_lidar_is_refused() -> None:
     behind = POSE.copy()
     behind[:3, 3] = POSE[:3, :3] @ (-2.0 * SLOPES / (SLOPES @ SLOPES))
     with pytest.raises(BoardRefusedError, match="between"):
@@ -59,7 +56,6 @@ def test_plane_in_lidar_between_camera_and_lidar_is_refused() -> None:
 
 
 def test_fit_in_lidar_of_exact_corners_needs_lens_and_pose() -> None:
-    """Of a board on a wall at 0.25 m, as a color camera without calibration errors sees it."""
     bench = bench_at(0.25, 40.0, 5.0)
     straight = corners_px(A4, ColorCamera().view(bench.seen), bench.placed)
     inside = np.flatnonzero(((straight > 0.0) & (straight < [1280.0, 720.0])).all(axis=1))
@@ -86,7 +82,6 @@ def infrared(scale: float = 1.0) -> BoardView:
 
 @pytest.fixture(scope="module")
 def depth() -> WallFit:
-    """The wall of the rig by 20 frames of depth."""
     depth_m = View(RIG.wall_from_lidar, PINHOLE).depth_m
     mean = depth_statistics(depth_m, np.random.default_rng(0), frames=20, noise=1.0)
     return fit_wall(mean.mean_m(), PINHOLE, np.random.default_rng(0), mean.noise())
@@ -139,7 +134,6 @@ def test_wall_with_board_doubts_a_board_without_depth() -> None:
 
 
 def test_wall_with_board_out_of_range_gives_advice() -> None:
-    """Squares measured as 60 mm put the same board at twice the distance."""
     fit, _ = wall_with_board(WallRefusedError("none"), infrared(), A4.measured(60.0), measured=True)
     assert fit.distance_m == pytest.approx(0.4, abs=0.005)
     assert "10 cm" in fit.advice
@@ -177,7 +171,6 @@ def test_combine_of_equal_planes_halves_the_covariance_and_keeps_an_exact_plane(
 
 
 def test_combine_takes_each_quantity_from_the_better_plane() -> None:
-    """Depth is certain of the distance, the board of the angle."""
     depth, board = plane(0.2, 45.0, std_m=1e-5, std_deg=1.0), plane(0.2005, 45.5, std_m=1e-3, std_deg=0.01)
     both = combine(depth, board, measured=False)
     assert both.plane.distance_m == pytest.approx(0.2, abs=2e-5)
@@ -225,7 +218,6 @@ def test_combine_names_causes_with_amounts_that_explain_it() -> None:
 
 
 def test_combine_names_no_cause_that_cannot_be() -> None:
-    """Measured squares have the right scale; no printer and no lidar errs by a factor of two."""
     causes = combine(plane(0.2), plane(0.204), measured=True).causes
     assert [cause for cause in causes if "offset" in cause]
     assert not [cause for cause in causes if "scale" in cause]

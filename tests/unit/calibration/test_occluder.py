@@ -24,7 +24,6 @@ def seen() -> View:
 
 
 def noisy(depth_m: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
-    """Return the mean of 30 frames."""
     seen_m = np.where(depth_m < 9.0, depth_m, np.nan)
     return seen_m + np.random.default_rng(seed).normal(0.0, 30**-0.5, depth_m.shape) * depth_noise_m(seen_m)
 

@@ -1,6 +1,5 @@
-"""Files of rigs, measured walls and their references: read as written, or refused with the field at fault."""
-
 import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -54,31 +53,6 @@ def test_rig_and_its_checksum_survive_a_file(tmp_path: Path, name: str) -> None:
     (tmp_path / "rig.toml").write_text(dump_toml(rig), encoding="utf-8")
     again = load_rig(tmp_path / "rig.toml")
     assert (again, again.checksum) == (rig, rig.checksum)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("distance_m = 0.2", "distance_m = -0.2", r"lidar.distance_m: .*\(got "),
-        ("yaw_deg = 45.0", "yaw_degrees = 45.0", "lidar.yaw_deg: is missing"),
-        ("x_max_m = 0.575", "x_max_m = 0.1", r"object_box: .*x_min_m < x_max_m .*\(got .*x_max_m = 0.1"),
-        ("z_far_m = 0.4", "z_far_m = 0.1", r"object_box: .*z_near_m < z_far_m \(got z_near_m = .*, z_far_m = 0.1\)"),
-        ('name = "paper-rig"', 'name = "paper-rig"\nroof = 1', r"roof: .*\(got "),
-    ],
-)
-def test_rig_file_error_names_the_field(tmp_path: Path, old: str, new: str, message: str) -> None:
-    text = dump_toml(load_rig("paper-rig"))
-    assert old in text
-    path = tmp_path / "rig.toml"
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(RecordFileError, match=message):
-        load_rig(path)
-
-
-@pytest.mark.parametrize("name", ["no-such-rig", "."])
-def test_rig_that_does_not_exist_is_refused(name: str) -> None:
-    with pytest.raises(RecordFileError):
-        load_rig(name)
 
 
 def test_wall_record_survives_a_file(tmp_path: Path, record: WallRecord) -> None:
@@ -141,37 +115,49 @@ MATRIX_END = "0.0,\n        0.0,\n        0.0,\n        "
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "problem"),
+    ("load", "old", "new", "problem"),
     [
-        ("schema_version = 3", "schema_version = 4", "3.*got 4"),
-        ("schema_version = 3", "schema_version = 0", "schema_version: .*got 0"),
-        ('reference_sha256 = ""', 'reference_sha256 = "abc"', "reference_sha256: .*got 'abc'"),
-        ("frames = 60", "frames = 60\nmood = 1", "mood: .*got 1"),
-        ("pitch_deg = ", "pitch_deg = 1", r"rig\.lidar"),
-        ("\ndistance_m = 0.2", "\ndistance_m = 0.3", r"rig\.lidar"),
-        (f"{MATRIX_END}1.0", f"{MATRIX_END}2.0", "pose"),
+        (load_rig, "distance_m = 0.2", "distance_m = -0.2", r"lidar.distance_m: .*\(got "),
+        (load_rig, "yaw_deg = 45.0", "yaw_degrees = 45.0", "lidar.yaw_deg: is missing"),
+        (load_rig, "x_max_m = 0.575", "x_max_m = 0.1", r"object_box: .*x_min_m < x_max_m .*\(got .*x_max_m = 0.1"),
+        (
+            load_rig,
+            "z_far_m = 0.4",
+            "z_far_m = 0.1",
+            r"box: .*z_near_m < z_far_m \(got z_near_m = .*, z_far_m = 0.1\)",
+        ),
+        (load_rig, 'name = "paper-rig"', 'name = "paper-rig"\nroof = 1', r"roof: .*\(got "),
+        (load_wall, "schema_version = 3", "schema_version = 4", "3.*got 4"),
+        (load_wall, "schema_version = 3", "schema_version = 0", "schema_version: .*got 0"),
+        (load_wall, 'reference_sha256 = ""', 'reference_sha256 = "abc"', "reference_sha256: .*got 'abc'"),
+        (load_wall, "frames = 60", "frames = 60\nmood = 1", "mood: .*got 1"),
+        (load_wall, "pitch_deg = ", "pitch_deg = 1", r"rig\.lidar"),
+        (load_wall, "\ndistance_m = 0.2", "\ndistance_m = 0.3", r"rig\.lidar"),
+        (load_wall, f"{MATRIX_END}1.0", f"{MATRIX_END}2.0", "pose"),
     ],
 )
-def test_load_wall_error_names_field_and_value(
-    tmp_path: Path, record: WallRecord, old: str, new: str, problem: str
+def test_file_error_names_field_and_value_in_one_line(
+    tmp_path: Path, record: WallRecord, load: Callable[[Path], object], old: str, new: str, problem: str
 ) -> None:
-    path = written(tmp_path, record)
-    text = path.read_text(encoding="utf-8")
+    text, path = dump_toml(record if load is load_wall else load_rig("paper-rig")), tmp_path / "file.toml"
     assert old in text
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(RecordFileError, match=problem) as caught:
-        load_wall(path)
+        load(path)
     assert "\n" not in str(caught.value)
     assert caught.value.exit_code == 4
 
 
 @pytest.mark.parametrize("content", [b"", b"frames = ", b"\x00\xff", b"distance_m = 0.2"])
-def test_load_wall_of_another_kind_of_file_or_of_none_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_file_of_another_kind_or_none_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "wall.toml"
     path.write_bytes(content)
     for read, word in ((path, r"wall\.toml"), (tmp_path / "none.toml", "calibrate --wall"), (tmp_path, tmp_path.name)):
         with pytest.raises(RecordFileError, match=word):
             load_wall(read)
+    for name in ("no-such-rig", "."):
+        with pytest.raises(RecordFileError):
+            load_rig(name)
 
 
 def test_load_wall_reads_the_worked_example() -> None:

@@ -23,7 +23,6 @@ FLAT = Flatness(
 )
 OFFSET = replace(FLAT, bend_m=0.006, bend_deg=0.5, offset_m=0.0045)
 SPREAD = np.array([[4.0, 1.0, -0.5], [1.0, 2.0, 0.3], [-0.5, 0.3, 1.0]])
-"""Shape of a covariance of the plane's slopes."""
 
 
 def bare(distance_m: float = 0.2, yaw_deg: float = 45.0, pitch_deg: float = 0.0) -> Float64:
@@ -43,11 +42,11 @@ def test_fit_wall_of_exact_depth_is_exact() -> None:
     np.testing.assert_allclose(fit.wall_from_lidar, view(0.23, 30.0, -10.0, PINHOLE).pose, atol=1e-9)
     assert (fit.yaw_deg, fit.pitch_deg) == pytest.approx((30.0, -10.0))
     assert fit.facing_deg == pytest.approx(np.degrees(np.arccos(np.cos(np.radians(30)) * np.cos(np.radians(10)))))
-    assert fit.verdict == "good"
+    assert (fit.verdict, fit.inlier_fraction) == ("good", 1.0)
+    assert fit.residual_m < 1e-9
 
 
 def test_fit_wall_refuses_what_is_not_a_wall_in_view() -> None:
-    """A surface where beams miss the wall, and a wavy wall."""
     before = bare(yaw_deg=75.0)
     before[:, -30:] = 0.5
     wavy = bare(0.3, 15.0) + 0.0035 * np.sign(np.sin(np.arange(160) / 2.0))
@@ -154,7 +153,6 @@ WALL_M = view(0.2, 20.0, 6.0, PINHOLE).depth_m
 
 
 def plane_of(depth_m: Float64, *, noise: float = 1.0, seed: int = 0) -> PlaneFit:
-    """The plane of a mean over 25 frames."""
     noisy_m = depth_m + noise * depth_noise_m(WALL_M) * np.random.default_rng(seed).standard_normal(depth_m.shape) / 5
     samples = MeanNoise(np.full(depth_m.size, 25.0))
     return fit_depth(RAYS.reshape(-1, 3), noisy_m.ravel(), np.random.default_rng(0), samples)

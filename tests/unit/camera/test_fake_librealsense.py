@@ -1,5 +1,3 @@
-"""Holds the fake against librealsense: what the camera package uses is there, and fails as the fake does."""
-
 import inspect
 from typing import Any
 

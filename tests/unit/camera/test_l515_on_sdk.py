@@ -1,5 +1,3 @@
-"""The L515's camera on librealsense itself: a software device with an L515's options, delivering from a thread."""
-
 import threading
 from pathlib import Path
 from typing import Any
@@ -19,19 +17,13 @@ RANGES = dict.fromkeys(NEAR_WALL, (0.0, 6.0)) | {"visual_preset": (0.0, 6.0), "l
 
 
 class Desk(SoftwareSdk):
-    """A software device with an L515's options."""
-
     def __init__(self) -> None:
         pinhole = load_rig("paper-rig").pinhole
         super().__init__(pinhole)
         for name, (low, high) in RANGES.items():
             self.lidar._sensor.add_option(getattr(self.sdk.option, name), self._range(low, high), True)
         self.plug_in()
-        shape = pinhole.height, pinhole.width
-        self.dim = SensedImages(
-            np.full(shape, 800, np.uint16), np.full(shape, 48, np.uint8), np.full(shape, 15, np.uint8)
-        )
-        self.bright = SensedImages(self.dim.depth_z16, np.full(shape, 255, np.uint8), self.dim.confidence)
+        self.even = np.ones((pinhole.height, pinhole.width), np.uint8)
 
     def _range(self, low: float, high: float) -> Any:
         made = self.sdk.option_range()
@@ -42,8 +34,8 @@ class Desk(SoftwareSdk):
         number = 0
         while not stop.wait(0.03):
             power = self.lidar._sensor.get_option(self.sdk.option.laser_power)
-            images = self.bright if power > SATURATES_ABOVE else self.dim
-            self.lidar.push(number, 1e9 + number / 30, images)
+            ir = (255 if power > SATURATES_ABOVE else 48) * self.even
+            self.lidar.push(number, 1e9 + number / 30, SensedImages(np.uint16(800) * self.even, ir, 15 * self.even))
             number += 1
 
 

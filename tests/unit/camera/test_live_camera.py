@@ -1,6 +1,3 @@
-"""LiveCamera over an L515's faults, on a fake SDK with its own thread, their recordings, and the stages of recovery."""
-
-import time
 from collections import Counter
 from collections.abc import Callable
 from itertools import islice, pairwise
@@ -14,6 +11,7 @@ from fake_lidar import FakeLidar, NapClock
 
 from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.camera.l515 import NEAR_WALL, L515Camera
+from nlos_cam.camera.protocol import WallClock
 from nlos_cam.camera.recovery import BACK_OFF_S, Hooks, Recovery
 from nlos_cam.errors import CameraError, CameraLostError
 from nlos_cam.frames import Frame
@@ -21,17 +19,15 @@ from nlos_cam.recording import verify
 from nlos_cam.render import Fault
 
 Make = Callable[..., Any]
-SILENCE_S = 0.3
 ENDLESS = 10**6
 
 
-def impatient(camera: L515Camera, silence_s: float = SILENCE_S) -> L515Camera:
+def impatient(camera: L515Camera, silence_s: float = 0.3) -> L515Camera:
     camera.silence_s = silence_s
     return camera
 
 
 def rises(frames: list[Frame]) -> bool:
-    """Return True if numbers and timestamps rise together."""
     steps = [
         (next_one.frame_number - one.frame_number, next_one.timestamp_s - one.timestamp_s)
         for one, next_one in pairwise(frames)
@@ -56,49 +52,47 @@ def test_frames_are_in_metres_and_levels_and_none_is_early(fake_camera: Make) ->
     assert frames[0].truth_depth_m is None
 
 
-def test_device_without_a_stream_or_unit_or_that_does_not_start_is_an_error(fake_camera: Make) -> None:
+def test_device_without_a_stream_or_unit_or_that_fails_at_the_start_is_an_error(fake_camera: Make) -> None:
     with pytest.raises(CameraError, match=r"confidence.*640 x 480"):
         fake_camera(FakeLidar(streams=("depth", "infrared")))
-    device = FakeLidar()
-    del device.options["depth_units"]
-    with pytest.raises(CameraError, match="depth unit"):
-        fake_camera(device)
-    device = FakeLidar()
+    device, vanishing = FakeLidar(), FakeLidar()
     device.start_error = RuntimeError("failed to set power state")
     with pytest.raises(CameraError, match="failed to set power state"):
         fake_camera(device).__enter__()
     assert device.did == ["stop", "close"]
+    with pytest.raises(CameraError, match="vanished"):
+        fake_camera(vanishing, clock=NapClock(lambda _: vanishing.unplug())).__enter__()
+    del device.options["depth_units"]
+    with pytest.raises(CameraError, match="depth unit"):
+        fake_camera(device)
 
 
 @pytest.mark.parametrize(
-    ("runs", "flaps", "counts"),
+    ("runs", "counts"),
     [
-        ((30, ENDLESS), 0, {"restarted": 1}),
-        ((30, 0, 0, 0, ENDLESS), 0, {"restarted": 3, "reset": 1}),
-        ((30, ENDLESS), 1, {"replugged": 1}),
+        ((30, ENDLESS), {"restarted": 1}),
+        ((30, 0, 0, 0, ENDLESS), {"restarted": 3, "reset": 1}),
+        ((30, 30, 30, 30, 30, ENDLESS), {"restarted": 5}),  # each silence starts with a restart
+        ((30, ENDLESS), {"replugged": 1}),
+        pytest.param((30, ENDLESS), {"replugged": 20}, marks=pytest.mark.slow),
     ],
-    ids=["restart", "reset", "replug"],
+    ids=["restart", "reset", "restarts", "replug", "replugs"],
 )
 def test_silent_device_delivers_again_with_its_settings(
-    fake_camera: Make, runs: tuple[int, ...], flaps: int, counts: dict[str, int]
+    fake_camera: Make, runs: tuple[int, ...], counts: dict[str, int]
 ) -> None:
     lidar = FakeLidar(usb="2.1", runs=runs)
-    lidar.flaps = flaps
+    lidar.flaps = flaps = counts.get("replugged", 0)
     with impatient(fake_camera(lidar)) as camera:
-        frames = list(islice(camera, 50))
-        assert camera.counts == counts
+        frames = list(islice(camera, 30 * max(flaps, len(runs) - 1) + 20))
+        # In twenty replugs a busy machine may be silent for long enough to be restarted, too.
+        assert camera.counts == counts or (flaps == 20 == camera.counts["replugged"])
     assert rises(frames)
+    assert lidar.did.count("unplugged") - lidar.did.count("reset") == flaps
     assert camera.dropped + camera.incomplete == holes(frames) > 0
     assert lidar.did.count("reset") == counts.get("reset", 0)
     assert {name: lidar.options[name] for name in NEAR_WALL} == NEAR_WALL
     assert (lidar.options["visual_preset"], frames[-1].settings["min_distance"]) == (5.0, 0.0)
-
-
-def test_each_silence_starts_with_a_restart(fake_camera: Make) -> None:
-    with impatient(fake_camera(FakeLidar(usb="2.1", runs=(30, 30, 30, 30, 30, ENDLESS))), 0.1) as camera:
-        while camera.counts["restarted"] < 5:
-            next(iter(camera))
-        assert camera.counts == {"restarted": 5}
 
 
 def test_device_that_nothing_helps_is_lost_with_counts(fake_camera: Make) -> None:
@@ -146,21 +140,6 @@ def test_device_back_on_a_slow_port_is_lost(fake_camera: Make) -> None:
             list(camera)
 
 
-@pytest.mark.slow
-def test_device_unplugged_twenty_times_comes_back_each_time(fake_camera: Make) -> None:
-    """The fixture `nothing_left_running` fails if a thread is left."""
-    lidar = FakeLidar(usb="2.1", runs=(20, ENDLESS))
-    lidar.flaps = 20
-    with impatient(fake_camera(lidar), 0.2) as camera:
-        frames = list[Frame]()
-        while camera.counts["replugged"] < 20 or len(frames) % 5:
-            frames += islice(camera, 1)
-        assert camera.counts["replugged"] == 20
-        assert camera.dropped + camera.incomplete == holes(frames)
-    assert rises(frames)
-    assert lidar.did.count("unplugged") == 20
-
-
 def test_lost_calibration_is_cured_by_one_reset_or_an_error(fake_camera: Make) -> None:
     cured, broken = FakeLidar(), FakeLidar()
     cured.uncalibrated = broken.uncalibrated = True
@@ -172,35 +151,23 @@ def test_lost_calibration_is_cured_by_one_reset_or_an_error(fake_camera: Make) -
 
 
 def test_leaving_ends_a_recovery_and_may_be_repeated(fake_camera: Make) -> None:
-    lidar, failures, waits = FakeLidar(), list[Exception](), Event()
+    lidar, waits = FakeLidar(), Event()
 
-    class RealPace:
-        """A clock that waits as long as it is asked to."""
-
-        def now(self) -> float:
-            return time.monotonic()
-
+    class RealPace(WallClock):
         def wait(self, stop: Event, seconds: float) -> bool:
             if not lidar.plugged:
                 waits.set()
-            return stop.wait(seconds)
-
-    def iterate() -> None:
-        try:
-            list(camera)
-        except Exception as error:  # noqa: BLE001  whatever it is, the test looks at it
-            failures.append(error)
+            return super().wait(stop, seconds)
 
     with impatient(fake_camera(lidar, clock=RealPace()), 0.05) as camera:
         lidar.unplug()
-        thread = Thread(target=iterate)
+        thread = Thread(target=lambda: list(camera))  # pytest fails a test whose thread raises
         thread.start()
         assert waits.wait(30.0)  # of the 60 s in which it may come back
         assert thread.is_alive()
         camera.__exit__(None, None, None)
         thread.join(30.0)
         assert not thread.is_alive()
-    assert not failures
     lidar = FakeLidar()
     with fake_camera(lidar) as camera:
         camera.__exit__(None, None, None)
@@ -247,8 +214,6 @@ def test_recording_without_a_frame_restarts_with_the_streams(fake_camera: Make, 
 
 
 class Device:
-    """A device that is there at some times, whose starts fail, and its recovery."""
-
     def __init__(self, there: Callable[[float], bool] = lambda _: True, failing: tuple[str, ...] = ()) -> None:
         self.clock, self.left, self.counts, self.did = NapClock(), Event(), Counter[str](), list[str]()
         self.zero_s, self.there, self.failing = self.clock.now(), there, list(failing)

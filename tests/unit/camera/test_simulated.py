@@ -1,5 +1,7 @@
 import time
+from collections.abc import Callable
 from dataclasses import astuple
+from itertools import islice
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -19,27 +21,51 @@ from nlos_cam.camera.streams import intrinsics_of, is_needed, stream_name
 from nlos_cam.recording import ReplayCamera
 from nlos_cam.render import Fault, SensedImages
 
-
-class JumpClock:
-    """A clock that moves only by waiting; `jumps` are seconds lost, by number of the wait."""
-
-    def __init__(self, jumps: dict[int, float]) -> None:
-        self.time_s, self.jumps, self.waits = 0.0, jumps, 0
-
-    def now(self) -> float:
-        return self.time_s
-
-    def wait(self, stop: Event, seconds: float) -> bool:
-        self.waits += 1
-        self.time_s += max(seconds, 0.0) + self.jumps.get(self.waits, 0.0)
-        return stop.wait(0.001)
+Timed = Callable[..., tuple[SimulatedCamera, dict[int, float]]]
 
 
-class SetClock:
+@pytest.fixture
+def timed(noise_world: Any, hurried_clock: Any) -> Timed:
+    """Make a camera whose world takes a time by frame number, and the times at which its exposures start."""
+
+    def make(takes_s: Callable[[int], float], **options: Any) -> tuple[SimulatedCamera, dict[int, float]]:
+        clock, start_s = hurried_clock(0.0), dict[int, float]()
+
+        class World(noise_world):
+            def images(self, number: int) -> Any:
+                start_s[number] = clock.now()
+                clock.time_s += takes_s(number)
+                return super().images(number)
+
+        return SimulatedCamera("sim", World(), clock=clock, **options), start_s
+
+    return make
+
+
+@pytest.mark.parametrize(("takes_s", "ahead_s"), [(0.001, EXPOSED_AHEAD_S), (0.012, 0.024)])
+def test_frames_are_exposed_late_but_in_time(timed: Timed, takes_s: float, ahead_s: float) -> None:
+    camera, start_s = timed(lambda _: takes_s)
+    with camera:
+        assert len(list(islice(camera, 6))) == 6
+    for number in range(2, 6):
+        assert takes_s + number / 30 - start_s[number] == pytest.approx(ahead_s, abs=1e-6)  # compiling took once more
+
+
+@pytest.mark.parametrize(("late_frames", "dropped"), [(0.9 * MAX_LATE_FRAMES, 0), (3 * MAX_LATE_FRAMES, 1)])
+def test_late_world_catches_up_or_drops_numbers(timed: Timed, tmp_path: Path, late_frames: float, dropped: int) -> None:
+    recording = Recording(tmp_path / "late.bag", frames=40)
+    with timed(lambda number: late_frames / 30 if number == 3 else 0.0, recording=recording)[0] as camera:
+        assert list(camera)
+    with ReplayCamera(recording.path) as replayed:
+        gaps = np.diff([-1, *(frame.frame_number for frame in replayed)]) - 1
+    assert (gaps.size, np.count_nonzero(gaps)) == (40, dropped)
+    assert gaps.max() == pytest.approx(dropped * 2 * MAX_LATE_FRAMES, abs=3 * dropped)
+
+
+class SetClock(WallClock):
     """A clock that stands until it is set."""
 
-    def __init__(self) -> None:
-        self.time_s = 0.0
+    time_s = 0.0
 
     def now(self) -> float:
         return self.time_s
@@ -49,35 +75,6 @@ class SetClock:
         while self.time_s < due_s and not stop.wait(0.001):
             pass
         return stop.is_set()
-
-
-def numbers_recorded(path: Path, world: Any, gap_s: float, frames: int) -> list[int]:
-    recording = Recording(path, frames=frames)
-    with SimulatedCamera("sim", world, clock=JumpClock({3: gap_s}), recording=recording) as camera:
-        assert all(frame is not None for frame in camera)
-    with ReplayCamera(path) as replayed:
-        return [frame.frame_number for frame in replayed]
-
-
-@pytest.mark.parametrize(("takes_s", "ahead_s"), [(0.001, EXPOSED_AHEAD_S), (0.012, 0.024)])
-def test_frames_are_exposed_late_but_in_time(
-    noise_world: Any, hurried_clock: Any, takes_s: float, ahead_s: float
-) -> None:
-    clock, start_s = hurried_clock(0.0), dict[int, float]()
-
-    class Timed(noise_world):
-        def images(self, number: int) -> Any:
-            start_s[number] = clock.now()
-            clock.time_s += takes_s
-            return super().images(number)
-
-    camera = SimulatedCamera("sim", Timed(), clock=clock)
-    zero_s = clock.now()
-    with camera:
-        for _ in zip(range(6), camera, strict=False):
-            pass
-    for number in range(2, 6):
-        assert zero_s + number / 30 - start_s[number] == pytest.approx(ahead_s, abs=1e-6)
 
 
 def test_telemetry_holds_the_temperatures_of_the_instant(noise_world: Any, noise_bag: Path) -> None:
@@ -94,13 +91,6 @@ def test_telemetry_holds_the_temperatures_of_the_instant(noise_world: Any, noise
         assert replayed.telemetry("_temperature") == {"ldd_temperature": 20.0}
 
 
-def test_late_world_catches_up_or_drops_numbers(noise_world: Any, tmp_path: Path) -> None:
-    assert numbers_recorded(tmp_path / "late.bag", noise_world(), 0.9 * MAX_LATE_FRAMES / 30, 40) == list(range(40))
-    gaps = np.diff(numbers_recorded(tmp_path / "very late.bag", noise_world(), 3 * MAX_LATE_FRAMES / 30, 10)) - 1
-    assert gaps.max() == pytest.approx(2 * MAX_LATE_FRAMES, abs=3)
-    assert np.count_nonzero(gaps) == 1
-
-
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts native threads, as Linux lists them")
 def test_native_threads_do_not_pile_up(noise_world: Any, hurried_clock: Any) -> None:
     def run() -> int:
@@ -113,11 +103,8 @@ def test_native_threads_do_not_pile_up(noise_world: Any, hurried_clock: Any) -> 
 
 
 def test_software_lidar_looks_like_an_l515() -> None:
-    sdk, pinhole, celsius = (
-        load_sdk(),
-        load_rig("paper-rig").pinhole,
-        {"ldd_temperature": 41.5, "apd_temperature": 36.25},
-    )
+    sdk, pinhole = load_sdk(), load_rig("paper-rig").pinhole
+    celsius = {"ldd_temperature": 41.5, "apd_temperature": 36.25}
     info, lidar = sdk.camera_info, SoftwareLidar(pinhole, sdk, celsius=celsius)
     names = [lidar.device.get_info(key) for key in (info.name, info.serial_number, info.product_line)]
     assert names == ["Simulated L515", "simulated", "L500"]

@@ -1,5 +1,3 @@
-"""Samples of the streams become sets, and sets become frames whose numbers and times rise."""
-
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
@@ -17,7 +15,6 @@ from nlos_cam.frames import Frame
 
 STREAMS = tuple(FORMATS)
 SHAPE = (1, 1)
-PIXELS = np.zeros(SHAPE, np.uint16)
 JITTER_S = {"depth": 0.0, "infrared": 0.004, "confidence": -0.003}
 
 
@@ -159,29 +156,20 @@ def of_another_shape(number: int, *streams: str) -> list[Sample]:
             ([*whole(0, 1, 8), *whole(9, 10, late_s=pause_s)], [0, 1, 8, 9, 10], counts, 0, 6)
             for pause_s, counts in ((0.1, {}), (0.2, {"stalled": 1}), (5.0, {"stalled": 1}))
         ),
+        *(
+            ([*whole(5), *whole(6)[:2], *again * copies, *whole(6)[2:]], [5, 6], {"duplicate": copies}, 0, 0)
+            for copies in (1, 2)
+            for again in (whole(5), whole(5)[1:2], whole(6)[:2], whole(6)[1:2])
+        ),
     ],
 )
-def test_pairing_counts_late_odd_missing_renumbered_stray_and_paused_sets(
+def test_pairing_counts_late_odd_missing_renumbered_stray_paused_and_repeated_sets(
     samples: list[Sample], numbers: list[int], counts: dict[str, int], incomplete: int, dropped: int
 ) -> None:
     pairing = FrameSynchronizer(SHAPE)
     assert numbers_of(paired(pairing, samples)) == numbers
     pairing.finish()
     assert (pairing.counts, pairing.incomplete, pairing.dropped) == (counts, incomplete, dropped)
-
-
-@pytest.mark.parametrize("copies", [1, 2])
-@pytest.mark.parametrize("streams", [STREAMS, STREAMS[1:2]])
-@pytest.mark.parametrize("again", [5, 6])
-def test_pairing_counts_repeats_in_frames(copies: int, streams: tuple[str, ...], again: int) -> None:
-    pairing = FrameSynchronizer()
-    samples = [*whole(4, 5), sample("depth", 6), sample("infrared", 6)]
-    repeated = [
-        sample(stream, again) for _ in range(copies) for stream in streams if again == 5 or stream != "confidence"
-    ]
-    found = paired(pairing, [*samples, *repeated, sample("confidence", 6), *whole(7)])
-    assert numbers_of(found) == [4, 5, 6, 7]
-    assert pairing.counts == {"duplicate": copies}
 
 
 def counted_apart(instants: range, lost: dict[str, int]) -> Iterator[Sample]:
@@ -191,7 +179,7 @@ def counted_apart(instants: range, lost: dict[str, int]) -> Iterator[Sample]:
         for stream in STREAMS:
             if lost.get(stream) != instant:
                 counts[stream] += 1
-                yield Sample(stream, counts[stream], instant / FRAMES_PER_S + JITTER_S[stream], PIXELS)
+                yield Sample(stream, counts[stream], instant / FRAMES_PER_S + JITTER_S[stream], np.zeros(SHAPE))
 
 
 @pytest.mark.parametrize("stream", STREAMS)

@@ -1,5 +1,3 @@
-"""Repair takes what is left of a damaged or killed recording, and harms neither it nor another file."""
-
 import os
 import shutil
 import struct
@@ -19,11 +17,12 @@ from rosbags.rosbag1 import Reader
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
 from nlos_cam.recording import RepairResult, SdkReplayCamera, repair_recording, verify
 
+Bags = dict[str, Path]
 ALL = {"depth": 40, "infrared": 40, "confidence": 40}
 
 
 @pytest.fixture(params=["packed", "plain", "packed-unindexed", "plain-unindexed"])
-def bag(request: pytest.FixtureRequest, noise_bags: dict[str, Path]) -> Path:
+def bag(request: pytest.FixtureRequest, noise_bags: Bags) -> Path:
     return noise_bags[request.param]
 
 
@@ -39,7 +38,7 @@ def whys(found: RepairResult) -> str:
 
 @pytest.mark.parametrize("name", ["packed", "plain", "of an old SDK"])
 def test_repair_of_a_whole_recording_changes_no_byte(
-    noise_bags: dict[str, Path], request: pytest.FixtureRequest, tmp_path: Path, name: str
+    noise_bags: Bags, request: pytest.FixtureRequest, tmp_path: Path, name: str
 ) -> None:
     source = noise_bags[name] if name in noise_bags else request.getfixturevalue("real_bag")
     path, progress = shutil.copy2(source, tmp_path / "original.bag"), list[tuple[int, int]]()
@@ -78,7 +77,7 @@ def test_repaired_bag_is_read_bit_for_bit_by_every_reader(
 
 
 @pytest.mark.parametrize("name", ["packed", "plain"])
-def test_repair_recovers_more_where_more_is_left(noise_bags: dict[str, Path], tmp_path: Path, name: str) -> None:
+def test_repair_recovers_more_where_more_is_left(noise_bags: Bags, tmp_path: Path, name: str) -> None:
     content, frames = noise_bags[name].read_bytes(), list[int]()
     for share in (0.4, 0.6, 0.8, 1.0):
         found = repaired(tmp_path, content[: int(share * len(content))])
@@ -89,7 +88,7 @@ def test_repair_recovers_more_where_more_is_left(noise_bags: dict[str, Path], tm
     assert frames[-1] == 40
 
 
-def test_repair_takes_messages_of_an_unfinished_chunk(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+def test_repair_takes_messages_of_an_unfinished_chunk(noise_bags: Bags, tmp_path: Path) -> None:
     whole, killed = noise_bags["plain"], noise_bags["plain-unindexed"]
     lost = whole.stat().st_size - killed.stat().st_size
     found = repair_recording(killed, tmp_path / "good.bag")
@@ -97,7 +96,7 @@ def test_repair_takes_messages_of_an_unfinished_chunk(noise_bags: dict[str, Path
     assert found.damages[-1].position + found.damages[-1].bytes == killed.stat().st_size
 
 
-def test_repair_takes_repeated_frames_once(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+def test_repair_takes_repeated_frames_once(noise_bags: Bags, tmp_path: Path) -> None:
     content = noise_bags["plain"].read_bytes()
     start, end = (content.index(b"\x04\0\0\0op=\x02", after) - 17 for after in (2_000_000, 2_500_000))
     found = repaired(tmp_path, content[:end] + content[start:end] + content[end:])
@@ -105,7 +104,7 @@ def test_repair_takes_repeated_frames_once(noise_bags: dict[str, Path], tmp_path
     assert "twice" in whys(found)
 
 
-def test_repair_leaves_out_messages_without_description(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+def test_repair_leaves_out_messages_without_description(noise_bags: Bags, tmp_path: Path) -> None:
     content = noise_bags["plain-unindexed"].read_bytes()
     described = content.index(b"topic=/device_0/sensor_0/Infrared_0/image/data")
     found = repaired(tmp_path, content[:described] + b"tonic" + content[described + 5 :])
@@ -114,7 +113,7 @@ def test_repair_leaves_out_messages_without_description(noise_bags: dict[str, Pa
     assert len(found.damages) > len(repair_recording(noise_bags["plain-unindexed"], tmp_path / "other.bag").damages)
 
 
-def test_repair_warns_where_librealsense_will_not_play(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+def test_repair_warns_where_librealsense_will_not_play(noise_bags: Bags, tmp_path: Path) -> None:
     content = noise_bags["plain"].read_bytes()
     found = repaired(tmp_path, content[:4117] + bytes(500) + content[4617:])
     assert "librealsense" in whys(found)
@@ -124,7 +123,7 @@ def test_repair_warns_where_librealsense_will_not_play(noise_bags: dict[str, Pat
         assert sum(1 for _ in reader.messages()) == reader.message_count
 
 
-def test_repair_refuses_a_file_without_frames(noise_bags: dict[str, Path], tmp_path: Path) -> None:
+def test_repair_refuses_a_file_without_frames(noise_bags: Bags, tmp_path: Path) -> None:
     content = noise_bags["plain"].read_bytes()
     first = content.index(b"\x04\0\0\0op=\x07", content.index(b"/option/Depth_Units/description"))
     other = b"", b"a text file\n", bytes(3 << 20), b"\0\0\0op=" * 9999, b"#ROSBAG V2.0\n" + bytes(9000)
@@ -137,7 +136,7 @@ def test_repair_refuses_a_file_without_frames(noise_bags: dict[str, Path], tmp_p
 
 @pytest.mark.parametrize("link", [None, os.link, os.symlink])
 def test_repair_never_writes_to_the_original(
-    noise_bags: dict[str, Path], tmp_path: Path, link: Callable[[Path, Path], None] | None
+    noise_bags: Bags, tmp_path: Path, link: Callable[[Path, Path], None] | None
 ) -> None:
     bag = noise_bags["packed"]
     path = shutil.copy(bag, tmp_path / "original.bag")
@@ -164,7 +163,7 @@ def test_repair_that_is_interrupted_leaves_the_old_output(bag: Path, tmp_path: P
 
 
 def test_repair_refuses_a_full_disk_and_a_missing_folder(
-    noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    noise_bags: Bags, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(NlosCamError, match="nowhere"):
         repair_recording(noise_bags["plain"], tmp_path / "nowhere" / "good.bag")
@@ -175,13 +174,7 @@ def test_repair_refuses_a_full_disk_and_a_missing_folder(
     assert list(tmp_path.iterdir()) == []
 
 
-CAPTURE = """
-import sys
-from pathlib import Path
-sys.path[:0] = [sys.argv[1], sys.argv[1] + "/fakes"]
-from conftest import record_noise
-record_noise(Path(sys.argv[2]), 10**9)
-"""
+PROGRAM = Path(__file__).parents[2] / "fakes/noise_process.py"
 FIRST_CHUNK_AT = 4117
 
 
@@ -202,8 +195,7 @@ def chunks_in(path: Path) -> Iterator[bytes]:
 @pytest.mark.slow
 def test_repair_recovers_every_chunk_of_a_killed_capture(noise_world: Any, tmp_path: Path) -> None:
     path, out, world = tmp_path / "killed.bag", tmp_path / "repaired.bag", noise_world()
-    command = [sys.executable, "-c", CAPTURE, str(Path(__file__).parents[2]), str(path)]
-    with subprocess.Popen(command) as capture:
+    with subprocess.Popen([sys.executable, PROGRAM, path, str(10**9)]) as capture:
         while not (path.exists() and path.stat().st_size) and capture.poll() is None:
             time.sleep(0.01)
         time.sleep(1.0)
@@ -224,6 +216,6 @@ def test_repair_recovers_every_chunk_of_a_killed_capture(noise_world: Any, tmp_p
         assert {stream: camera.arrived[stream] for stream in found.recovered_frames} == found.recovered_frames
 
 
-def test_naive_reader_finds_the_chunks_of_an_unfinished_recording(noise_bags: dict[str, Path]) -> None:
+def test_naive_reader_finds_the_chunks_of_an_unfinished_recording(noise_bags: Bags) -> None:
     for name in ("packed", "plain"):
         assert list(chunks_in(noise_bags[f"{name}-unindexed"])) == [*chunks_in(noise_bags[name])][:-1] != []

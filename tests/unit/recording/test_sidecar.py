@@ -27,8 +27,6 @@ READ = VerifyResult(frames=9, dropped=2, seconds=0.5, streams={"depth": 9, "infr
 
 @dataclass
 class Warm:
-    """A camera that warms by a degree at each call of `telemetry`."""
-
     uri: str = "l515"
     intrinsics: Intrinsics = PINHOLE
     rig: Rig | None = None
