@@ -9,7 +9,7 @@ import pytest
 import torch
 from nlos_models import Recipe, checkpoint
 from nlos_models import pipeline as networks
-from nlos_models.arrays import Float16
+from nlos_models.arrays import Float16, Float32
 from nlos_models.data import MapBatch, MapSet, map_batches
 from nlos_models.pipeline import RemappingNetwork
 from torch import Tensor, nn
@@ -34,6 +34,14 @@ def small_maps(count: int, seed: int) -> MapSet:
     intensity = np.pad(images.astype(np.float32), ((0, 0), (0, 0), (8, 8))) * 50
     depth = np.where(intensity > 0, intensity / 100, np.float32(np.nan)).astype(np.float32)
     return MapSet(depth, intensity, images)
+
+
+def noise_maps(count: int) -> tuple[Float32, Float32]:
+    """Return depth and intensity (n, 64, 80) of noise by their count; a tenth of the cells have no return."""
+    generator = np.random.default_rng(count)
+    depth = generator.uniform(0.2, 0.8, (count, 64, 80)).astype(np.float32)
+    depth[generator.random(depth.shape) < 0.1] = np.nan
+    return depth, generator.uniform(0, 255, depth.shape).astype(np.float32)
 
 
 def hard_maps(name: str, channels: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:

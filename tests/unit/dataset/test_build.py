@@ -117,14 +117,6 @@ def test_interrupted_build_resumes(tmp_path: Path, whole: Shards, after: int, or
     assert len(again) == len(set(again)) == built.made == COUNT - sum(3 if name == LAST else 5 for name in kept)
 
 
-def test_build_raises_error_of_an_object(tmp_path: Path) -> None:
-    farm = FakeFarm(fails_after=4, error=errors.SceneError("cup.stl shows nothing"))
-    with pytest.raises(errors.SceneError, match=r"cup\.stl"):
-        _build(tmp_path, farm)
-    assert farm.closed
-    assert len(_bytes(tmp_path)) == 1
-
-
 @pytest.mark.parametrize(
     ("name", "keep", "count", "made"),
     [*(("shard-000000045.h5", share, COUNT, 5) for share in (0.0, 0.3, 0.99)), (LAST, 0.0, 10, 0)],
@@ -140,20 +132,19 @@ def test_build_replaces_only_damaged_shards_it_needs(
     assert (_bytes(finished) == whole) == bool(made)
 
 
-def test_build_leaves_finished_dataset_alone(finished: Path, whole: Shards) -> None:
-    farm, checked = FakeFarm(), list[tuple[int, int]]()
-    built = _build(finished, farm, on_check=lambda *at: checked.append(at))
-    assert (farm.made, built.made) == ([], 0)
-    assert checked == [(k, 5) for k in range(1, 6)]
-    assert _bytes(finished) == whole
-
-
 @pytest.mark.parametrize("first", [1, 5, 7, 22])
-def test_build_grows_dataset_to_count(tmp_path: Path, whole: Shards, first: int) -> None:
+def test_build_grows_dataset_to_count_and_leaves_a_finished_one_alone(
+    tmp_path: Path, whole: Shards, first: int
+) -> None:
     """7 objects leave a shard half full, which a larger count must fill."""
     _build(tmp_path, count=first)
     assert len(open_dataset(tmp_path)) == first
     assert _build(tmp_path).made == COUNT - first // 5 * 5
+    assert _bytes(tmp_path) == whole
+    farm, checked = FakeFarm(), list[tuple[int, int]]()
+    built = _build(tmp_path, farm, on_check=lambda *at: checked.append(at))
+    assert (farm.made, built.made) == ([], 0)
+    assert checked == [(k, 5) for k in range(1, 6)]
     assert _bytes(tmp_path) == whole
 
 
@@ -184,20 +175,20 @@ def test_build_locks_its_folder_and_refuses_a_file(tmp_path: Path) -> None:
         _build(tmp_path / "file")
 
 
-def test_build_keeps_shards_when_disk_is_full(tmp_path: Path, whole: Shards, monkeypatch: Patch) -> None:
-    stores, farm = list[Path](), FakeFarm()
-
-    def full(path: Path, *others: Any) -> None:
-        stores.append(path)
-        if len(stores) == 3:
-            raise errors.DiskFullError(str(path))
-        store(path, *others)
-
-    monkeypatch.setattr(dataset, "store", full)
+def test_build_keeps_shards_when_an_object_fails_or_the_disk_is_full(
+    tmp_path: Path, whole: Shards, monkeypatch: Patch
+) -> None:
+    farm = FakeFarm(fails_after=4, error=errors.SceneError("cup.stl shows nothing"))
+    with pytest.raises(errors.SceneError, match=r"cup\.stl"):
+        _build(tmp_path, farm)
+    assert farm.closed
+    assert len(_bytes(tmp_path)) == 1
+    farm, stores = FakeFarm(), iter([store, store, Mock(side_effect=errors.DiskFullError("full")), *[store] * 9])
+    monkeypatch.setattr(dataset, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108  another each time
     with pytest.raises(errors.DiskFullError):
         _build(tmp_path, farm)
     assert farm.closed
-    assert len(list(tmp_path.glob(SHARD_PATTERN))) == 2
+    assert len(list(tmp_path.glob(SHARD_PATTERN))) == 3
     _build(tmp_path)
     assert _bytes(tmp_path) == whole
 
@@ -229,6 +220,10 @@ def test_processes_replace_killed_workers_or_give_up(tmp_path: Path, whole: Shar
     assert 0 < len(_bytes(tmp_path)) <= 2
     _build(tmp_path, processes(2))
     assert _bytes(tmp_path) == whole
+    refusal = OSError(errno.EROFS, "Read-only file system")
+    monkeypatch.setattr(dataset, "ProcessPoolExecutor", Mock(side_effect=refusal))
+    with pytest.raises(errors.WorkersLostError, match=r"Read-only file system.*/dev/shm"):
+        build_dataset(PLAN, COUNT, tmp_path / "other", workers=1, on_progress=lambda *_: None)
 
 
 @pytest.mark.slow
@@ -263,17 +258,16 @@ def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: Patch) -> Non
         signal.signal(signal.SIGINT, handler)
 
 
-def test_worker_module_does_not_import_numpy() -> None:
-    """BLAS counts the processors when numpy is imported, which must happen after `begin_worker`."""
-    program = "import sys, nlos_cam.cli.main, nlos_cam.dataset.worker; raise SystemExit('numpy' in sys.modules)"
+@pytest.mark.parametrize(
+    ("modules", "without"),
+    [
+        ("nlos_cam.cli.main, nlos_cam.dataset.worker", "numpy"),  # BLAS counts processors at import: after begin_worker
+        pytest.param("nlos_cam.dataset.samples", "torch", marks=pytest.mark.slow),
+    ],
+)
+def test_module_does_not_import(modules: str, without: str) -> None:
+    program = f"import sys, {modules}; raise SystemExit({without!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
-
-
-def test_workers_without_shared_memory_are_one_line(tmp_path: Path, monkeypatch: Patch) -> None:
-    refusal = OSError(errno.EROFS, "Read-only file system")
-    monkeypatch.setattr(dataset, "ProcessPoolExecutor", Mock(side_effect=refusal))
-    with pytest.raises(errors.WorkersLostError, match=r"Read-only file system.*/dev/shm"):
-        build_dataset(PLAN, COUNT, tmp_path, workers=1, on_progress=lambda *_: None)
 
 
 PIECES = [range(k, k + 2) for k in range(0, 40, 2)]
@@ -298,8 +292,10 @@ class RayError(Exception):
 class FakeRay:
     """The part of Ray that the farm uses, in this process; results arrive last first."""
 
+    exceptions = SimpleNamespace(RayError=RayError)
+    cluster_resources = Mock(return_value={"CPU": 2.0})
+
     def __init__(self, fails: RayError | None = None) -> None:
-        self.exceptions = SimpleNamespace(RayError=RayError)
         self.fails, self.running, self.most_waiting = fails, False, 0
 
     def init(self, address: str, **_: object) -> None:
@@ -309,9 +305,6 @@ class FakeRay:
 
     def shutdown(self) -> None:
         self.running = False
-
-    def cluster_resources(self) -> dict[str, float]:
-        return {"CPU": 2.0}
 
     def remote(self, **options: object) -> Callable[..., Any]:
         assert options == {"num_cpus": 1, "max_retries": ray_backend.MAX_RETRIES}
@@ -349,7 +342,7 @@ def test_ray_farm_makes_every_piece_once_and_leaves_cluster() -> None:
     assert not ray.running
 
 
-def test_ray_farm_raises_error_of_missing_cluster_and_of_failed_or_lost_worker() -> None:
+def test_ray_farm_raises_error_of_missing_cluster_and_of_failed_lost_or_other_worker() -> None:
     assert list(RayFarm(FakeRay(), "nowhere")(PLAN, [])) == []  # nothing to make needs no cluster
     with pytest.raises(WorkersLostError, match="nowhere") as caught:
         list(RayFarm(FakeRay(), "nowhere")(PLAN, PIECES))
@@ -362,9 +355,6 @@ def test_ray_farm_raises_error_of_missing_cluster_and_of_failed_or_lost_worker()
     with pytest.raises(WorkersLostError, match="the worker died"):
         list(RayFarm(ray, "auto")(PLAN, PIECES))
     assert not ray.running
-
-
-def test_ray_worker_of_another_version_is_refused() -> None:
     assert make_piece(PLAN, range(1), nlos_cam.__version__).keys() == samples_of(range(1)).keys()
     with pytest.raises(SceneError, match=rf"{nlos_cam.__version__}.*9\.9"):
         make_piece(PLAN, range(1), "9.9")

@@ -1,11 +1,12 @@
 """Shards are read as written or refused by name, in memory by the file's size; one builder at a time holds a folder."""
 
+import multiprocessing
 import os
-import re
 import resource
 import shutil
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,75 +50,61 @@ def _replace(file: h5py.File, name: str, **options: Any) -> h5py.Dataset:
     return made
 
 
-def _declare(**options: Any) -> Callable[[Path], None]:
-    def change(path: Path) -> None:
-        with h5py.File(path, "a") as file:
-            _replace(file, "image", **options)
-
-    return change
+def _declare(**options: Any) -> Callable[[h5py.File], object]:
+    return lambda file: _replace(file, "image", **options)
 
 
-def _bomb(path: Path) -> None:
+def _bomb(file: h5py.File) -> None:
     """Give a chunk of 4 KiB bytes that unpack to 256 MiB."""
-    with h5py.File(path, "a") as file:
-        image = _replace(file, "image", shape=(1 << 10,), dtype="f4", chunks=(1 << 10,), compression="gzip")
-        image.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 28)))
+    image = _replace(file, "image", shape=(1 << 10,), dtype="f4", chunks=(1 << 10,), compression="gzip")
+    image.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 28)))
 
 
-def _one_text_in_all_rows(path: Path) -> None:
-    with h5py.File(path, "a") as file:
-        texts = ["x" * TEXT_BYTES, *"y" * (ROWS - 1)]
-        rows = _replace(file, "category", data=texts, dtype=h5py.string_dtype()).id
-        start, size = rows.get_offset(), rows.get_storage_size()
+def _one_text_in_all_rows(file: h5py.File) -> None:
+    texts = ["x" * TEXT_BYTES, *"y" * (ROWS - 1)]
+    rows = _replace(file, "category", data=texts, dtype=h5py.string_dtype()).id
+    path, start, size = Path(file.filename), rows.get_offset(), rows.get_storage_size()
+    file.close()
     content = bytearray(path.read_bytes())
     content[start : start + size] = content[start : start + size // ROWS] * ROWS  # the address of the first text
     path.write_bytes(content)
 
 
-def _plan_of_two_texts(path: Path) -> None:
-    with h5py.File(path, "a") as file:
-        file.attrs["plan"] = np.array(["a", "b"], h5py.string_dtype())
-
-
-def _crafted(path: Path, harm: str) -> None:
+def _crafted(file: h5py.File, harm: str) -> None:
     """Change a shard consistently, as no accident does."""
-    other = path.with_name("other.h5")
-    shutil.copyfile(path, other)
-    with h5py.File(path, "a") as file:
-        image = file["image"][:]
-        if harm == "no checksum":
-            del file["image"].attrs["sha256"]
-            file["image"][:] = 0
-        elif harm == "no plan checksum":
-            del file.attrs["plan_sha256"]
-        elif harm == "external link":
-            del file["image"]
-            file["image"] = h5py.ExternalLink(other.name, "/image")
-        elif harm == "soft link":
-            file.move("image", "moved")
-            file["image"] = h5py.SoftLink("/moved")
-        elif harm == "external storage":
-            _replace(file, "image", shape=image.shape, dtype=image.dtype, external=[(str(other), 0, image.nbytes)])
-        elif harm == "virtual":
-            layout = h5py.VirtualLayout(image.shape, image.dtype)
-            layout[:] = h5py.VirtualSource(str(other), "image", image.shape)
-            checksum = file["image"].attrs["sha256"]
-            del file["image"]
-            file.create_virtual_dataset("image", layout).attrs["sha256"] = checksum
-        else:
-            _replace(file, "image", shape=(3,), dtype=h5py.ref_dtype)
+    image, other = file["image"][:], shutil.copy(file.filename, Path(file.filename).with_name("other.h5"))
+    if harm == "no checksum":
+        del file["image"].attrs["sha256"]
+        file["image"][:] = 0
+    elif harm == "no plan checksum":
+        del file.attrs["plan_sha256"]
+    elif harm == "plan of two texts":
+        file.attrs["plan"] = np.array(["a", "b"], h5py.string_dtype())
+    elif harm == "external link":
+        del file["image"]
+        file["image"] = h5py.ExternalLink("other.h5", "/image")
+    elif harm == "soft link":
+        file.move("image", "moved")
+        file["image"] = h5py.SoftLink("/moved")
+    elif harm == "external storage":
+        _replace(file, "image", shape=image.shape, dtype=image.dtype, external=[(str(other), 0, image.nbytes)])
+    else:
+        layout = h5py.VirtualLayout(image.shape, image.dtype)
+        layout[:] = h5py.VirtualSource(str(other), "image", image.shape)
+        checksum = file["image"].attrs["sha256"]
+        del file["image"]
+        file.create_virtual_dataset("image", layout).attrs["sha256"] = checksum
 
 
-def _without_seeds(path: Path, other: str) -> None:
-    with h5py.File(path, "a") as file:
-        del file["seed"]
-        if other == "group":
-            file.create_group("seed")
-        else:
-            file["seed"] = np.dtype(int) if other == "type" else np.array(["a", "b"], h5py.string_dtype())
+def _without_seeds(file: h5py.File, other: str) -> None:
+    del file["seed"]
+    if other == "group":
+        file.create_group("seed")
+    else:
+        file["seed"] = np.dtype(int) if other == "type" else np.array(["a", "b"], h5py.string_dtype())
 
 
-CRAFTED = "no checksum", "no plan checksum", "external link", "soft link", "external storage", "virtual", "refs"
+CRAFTED = "no checksum", "no plan checksum", "plan of two texts", "external link", "soft link", "external storage"
 HARMS = {
     "chunk for each number": _declare(shape=(1 << 18,), dtype="f4", chunks=(1,), compression="gzip"),
     "chunks that are absent": _declare(shape=(1 << 40,), dtype="f4", chunks=(1 << 20,), compression="gzip"),
@@ -128,40 +115,32 @@ HARMS = {
     "texts in chunks": _declare(shape=(3,), dtype="S1000", chunks=(1,)),
     "bomb": _bomb,
     "one text in all rows": _one_text_in_all_rows,
-    "plan of two texts": _plan_of_two_texts,
-    **{harm: partial(_crafted, harm=harm) for harm in CRAFTED},
+    "references": _declare(shape=(3,), dtype=h5py.ref_dtype),
+    **{harm: partial(_crafted, harm=harm) for harm in (*CRAFTED, "virtual")},
     **{f"{other} instead of seeds": partial(_without_seeds, other=other) for other in ("group", "type", "words")},
 }
 
 
-def _growth_mib(act: Callable[[], object]) -> int:
-    """Return the memory that an action adds to a forked process; fail where it raises."""
-    read_end, write_end = os.pipe()
-    if (child := os.fork()) == 0:
-        try:
-            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            act()
-            os.write(write_end, str(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before >> 10).encode())
-        finally:
-            os._exit(0)
-    os.close(write_end)
-    with os.fdopen(read_end) as answer:
-        grown = answer.read()
-    os.waitpid(child, 0)
-    assert grown, "the action failed"
-    return int(grown)
+def _in_child(act: Callable[[Path], Any], path: Path) -> Any:
+    """Act in a forked process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
+        return pool.submit(act, path).result()
 
 
-def _refuse(path: Path) -> None:
+def _refuse(path: Path) -> int:
+    """Refuse a shard; return the memory in MiB that this adds to the process."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(RecordingError, match=f"{path.name} is damaged"):
         check_arrays(read_head(path))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before >> 10
 
 
 @pytest.mark.parametrize("harm", HARMS)
 def test_crafted_shard_is_refused_within_little_memory(shard: Path, harm: str) -> None:
-    HARMS[harm](shard)
+    with h5py.File(shard, "a") as file:
+        HARMS[harm](file)
     assert shard.stat().st_size < 600_000
-    assert _growth_mib(lambda: _refuse(shard)) < MAX_GROWTH_MIB
+    assert _in_child(_refuse, shard) < MAX_GROWTH_MIB
 
 
 @pytest.mark.parametrize("shape", [(7,), (5, 3, 4), (33, 65)])
@@ -181,10 +160,13 @@ def test_read_array_returns_what_was_stored(
         assert read_array(file, "texts").tolist() == ["", "ä", "b\nc"]
 
 
-def test_lack_of_memory_does_not_count_as_damage(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lack_of_memory_or_permission_does_not_count_as_damage(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(np, "empty", Mock(side_effect=MemoryError))
     with pytest.raises(MemoryError):
         read_head(shard)
+    monkeypatch.setattr(Path, "mkdir", Mock(side_effect=PermissionError(13, "Permission denied", str(shard))))
+    with pytest.raises(OutputExistsError, match=str(shard.parent)), only_builder(shard.parent):
+        pass
 
 
 def _assert_as_stored(path: Path) -> None:
@@ -234,19 +216,11 @@ def test_shards_of_refuses_overlapping_and_renamed_shards(tmp_path: Path) -> Non
         shards_of(tmp_path)
 
 
-def _store_on_full_disk(folder: Path) -> int:
-    """Store in a child process whose files may not grow, since our own output may be a file; 0 for DiskFullError."""
-    child = os.fork()
-    if child == 0:
-        code = 1
-        try:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
-            _stored(folder)
-        except DiskFullError as error:
-            code = 0 if re.search(r"shard-000000040\.h5", str(error)) else 2
-        finally:
-            os._exit(code)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+def _fill_disk(folder: Path) -> None:
+    """Store where files may not grow: in another process, since our own output may be a file."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
+    with pytest.raises(DiskFullError, match=r"shard-000000040\.h5"):
+        _stored(folder)
 
 
 def test_full_disk_and_ctrl_c_keep_the_earlier_shard_and_leave_no_partial_file(
@@ -254,16 +228,9 @@ def test_full_disk_and_ctrl_c_keep_the_earlier_shard_and_leave_no_partial_file(
 ) -> None:
     path = _stored(tmp_path)
     before = path.read_bytes()
-    assert _store_on_full_disk(tmp_path) == 0
+    _in_child(_fill_disk, tmp_path)
     monkeypatch.setattr(os, "fsync", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         _stored(tmp_path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_lock_refuses_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    refused = PermissionError(13, "Permission denied", str(tmp_path))
-    monkeypatch.setattr(Path, "mkdir", Mock(side_effect=refused))
-    with pytest.raises(OutputExistsError, match=str(tmp_path)), only_builder(tmp_path):
-        pass

@@ -4,14 +4,14 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from nlos_calibration import ObjectBox, Rig, dump_toml, load_rig
-from nlos_calibration.arrays import Float32
+from nlos_calibration import Rig, dump_toml, load_rig
 from nlos_calibration.errors import CalibrationError
 from nlos_models import MapSet
 
@@ -32,12 +32,9 @@ RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
 SLOPE = np.linspace(BOX.z_near_m, BOX.z_far_m, 4096, dtype=np.float32).reshape(64, 64)
 KNOWN = {"slope": SLOPE, "half": np.where(np.arange(64) < 32, np.float32(0.2), np.float32(np.nan)) + 0 * SLOPE}
+known = Mock(return_value=KNOWN)
 CUP = np.full((64, 64), 0.2, np.float32)
 BALL = trimesh.creation.icosphere(subdivisions=3)
-
-
-def known(_: ObjectBox) -> dict[str, Float32]:
-    return KNOWN
 
 
 def _sidecar(path: Path, rig: Rig | None = None, **facts: Any) -> Path:
@@ -228,7 +225,7 @@ def _samples(count: int) -> Labelled:
 
 
 @pytest.mark.parametrize("count", [3, SHARD + 7])
-def test_labelled_shards_are_read_as_written(tmp_path: Path, count: int) -> None:
+def test_labelled_shards_are_read_as_written_and_not_extended(tmp_path: Path, count: int) -> None:
     write_shards(_samples(SHARD + 5), tmp_path)  # a larger dataset, which the next replaces as a whole
     write_shards(samples := _samples(count), tmp_path)
     maps, plan = (data := open_dataset(tmp_path)).arrays(), data.plan
@@ -238,27 +235,16 @@ def test_labelled_shards_are_read_as_written(tmp_path: Path, count: int) -> None
     np.testing.assert_array_equal(data.column("object_depth_m"), samples.object_depth_m)
     assert np.isnan(data.column("scene")).any(axis=0).sum() == 1  # the gain is not known
     assert (plan.rig, plan.accuracy) == (RIG, RECORDED)
+    with pytest.raises(RecordingError, match="--out"):
+        build_dataset(DatasetPlan(RIG, 0), 4, tmp_path, workers=1, on_progress=lambda *_: None)
 
 
 def test_labelled_shards_survive_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out, stored = tmp_path / "data", list[Path]()
+    out, stores = tmp_path / "data", iter([store, Mock(side_effect=DiskFullError("full"))])
     write_shards(_samples(SHARD + 7), out)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-
-    def full(path: Path, *others: Any) -> None:
-        stored.append(path)
-        if len(stored) == 2:
-            raise DiskFullError(str(path))
-        store(path, *others)
-
-    monkeypatch.setattr(labelled_shards, "store", full)
+    monkeypatch.setattr(labelled_shards, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108  another each time
     with pytest.raises(DiskFullError, match=str(out)):
         write_shards(_samples(SHARD + 9), out)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     assert list(tmp_path.iterdir()) == [out]
-
-
-def test_build_refuses_to_extend_labelled_shards(tmp_path: Path) -> None:
-    write_shards(_samples(4), tmp_path)
-    with pytest.raises(RecordingError, match="--out"):
-        build_dataset(DatasetPlan(RIG, 0), 4, tmp_path, workers=1, on_progress=lambda *_: None)

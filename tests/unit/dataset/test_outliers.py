@@ -9,21 +9,9 @@ import pytest
 from nlos_calibration import load_rig
 from small_run import small_recipe
 
-from nlos_cam.dataset import (
-    EMPTY,
-    GENERIC,
-    HELD_OUT_OUTLIERS,
-    ORDINARY,
-    SHAPE_OUTLIERS,
-    TRAINING_OUTLIERS,
-    Stimulus,
-    doubt_samples,
-    draw_outlier,
-    outliers_beside,
-    samples_on_disk,
-)
-from nlos_cam.dataset.doubt_samples import SEEDS_PER_BENCH, DoubtSamples, _generator, _stimulus, counts_of, make_samples
-from nlos_cam.dataset.outliers import MIN_PIXELS, SLIGHT, WIDE, BenchSpread, ordinary, vary_bench, vary_empty_bench
+from nlos_cam.dataset import HELD_OUT_OUTLIERS, SHAPE_OUTLIERS, TRAINING_OUTLIERS, Stimulus, doubt_samples, outliers
+from nlos_cam.dataset.doubt_samples import EMPTY, GENERIC, ORDINARY, SEEDS_PER_BENCH, _stimulus, make_samples
+from nlos_cam.dataset.outliers import SLIGHT, WIDE, BenchSpread, draw_outlier, ordinary, vary_bench, vary_empty_bench
 from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.objects import object_box
 from nlos_cam.render import SensorModel
@@ -38,25 +26,21 @@ def made(name: str, seed: int) -> Stimulus:
     return draw_outlier({**TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}[name], np.random.default_rng(seed), PLAIN)
 
 
-def width_m(depth_m: np.ndarray) -> float:
-    rows, columns = np.nonzero(np.isfinite(depth_m))
-    return float(max(np.ptp(rows), np.ptp(columns)) + 1) * 0.25 / 64
-
-
 def touches_edge(stimulus: Stimulus) -> bool:
     seen = np.isfinite(stimulus.depth_m)
     return bool(seen[[0, -1]].any() or seen[:, [0, -1]].any())
 
 
 @pytest.mark.parametrize("name", [*TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS])
-def test_outlier_shows_surface_before_wall_and_repeats_by_seed(name: str) -> None:
+def test_outlier_shows_surface_before_wall_outside_by_its_own_measure_and_repeats_by_seed(name: str) -> None:
     for seed in SEEDS:
         one, again = made(name, seed), made(name, seed)
         np.testing.assert_array_equal(one.depth_m, again.depth_m)
         surface_m = one.depth_m[np.isfinite(one.depth_m)]
-        assert surface_m.size >= MIN_PIXELS
+        assert surface_m.size >= outliers.MIN_PIXELS
         assert surface_m.min() > 0.0
         assert one.scene.rig == one.rig
+        assert name not in OUTSIDE or OUTSIDE[name](one)
 
 
 def test_outlier_kinds_to_learn_and_judge_differ_and_exclude_shapes_that_weights_saw() -> None:
@@ -65,14 +49,13 @@ def test_outlier_kinds_to_learn_and_judge_differ_and_exclude_shapes_that_weights
         assert set(kinds) & SHAPE_OUTLIERS
         assert set(kinds) - SHAPE_OUTLIERS
     assert {*TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS} > SHAPE_OUTLIERS
-    assert outliers_beside(0.0) == TRAINING_OUTLIERS
-    learnt = set(outliers_beside(0.5))
-    assert not learnt & (SHAPE_OUTLIERS | {"several", "tilted"})
+    assert outliers.outliers_beside(0.0) == TRAINING_OUTLIERS
+    learnt = set(outliers.outliers_beside(0.5))
     assert learnt == {"small", "large", "far", "near", "half out", "dim", "other rig", "other sensor"}
 
 
 OUTSIDE: dict[str, Callable[[Stimulus], bool]] = {
-    "small": lambda s: width_m(s.depth_m) < 0.5 * 0.25,
+    "small": lambda s: np.ptp(np.nonzero(np.isfinite(s.depth_m)), axis=1).max() + 1 < 64 / 2,
     "large": touches_edge,
     "far": lambda s: float(np.nanmin(s.depth_m)) > BOX.z_near_m + 0.119,
     "near": lambda s: float(np.nanmin(s.depth_m)) < BOX.z_near_m,
@@ -86,30 +69,15 @@ OUTSIDE: dict[str, Callable[[Stimulus], bool]] = {
 }
 
 
-@pytest.mark.parametrize("name", list(OUTSIDE))
-def test_outlier_is_outside_by_its_own_measure(name: str) -> None:
-    assert all(OUTSIDE[name](made(name, seed)) for seed in SEEDS)
-
-
-def test_ordinary_object_is_no_outlier() -> None:
+def test_ordinary_object_is_no_outlier_and_outlier_without_surface_is_drawn_again() -> None:
     for seed in SEEDS:
         stimulus = ordinary(np.random.default_rng(seed), PLAIN)
         assert (stimulus.rig, stimulus.sensor) == (RIG, SENSOR)
         for name in ("far", "near", "dim", "glossy", "other rig", "other sensor"):
             assert not OUTSIDE[name](stimulus)
-
-
-def test_outlier_without_surface_is_drawn_again() -> None:
     shy = Mock(side_effect=[PLAIN, PLAIN, ordinary(np.random.default_rng(0), PLAIN)])
     assert np.isfinite(draw_outlier(shy, np.random.default_rng(0), PLAIN).depth_m).any()
     assert shy.call_count == 3
-
-
-def test_moved_rig_differs_in_lidar_pose_alone() -> None:
-    other = move_lidar(RIG, 0.01, 2.0, -3.0)
-    assert other.lidar.distance_m == pytest.approx(RIG.lidar.distance_m + 0.01)
-    assert other.facing_deg == pytest.approx(47.0, abs=0.2)
-    assert other.model_copy(update={"lidar": RIG.lidar}) == RIG
 
 
 @pytest.mark.parametrize("spread", [BenchSpread(*(0.0,) * len(SLIGHT)), SLIGHT, WIDE])
@@ -124,7 +92,11 @@ def test_varied_rig_lies_within_its_spread(spread: BenchSpread) -> None:
         assert any(spread) or (rig, sensor) == (RIG, SENSOR)
 
 
-def test_varied_empty_benches_are_plain_wide_or_without_occluder() -> None:
+def test_moved_rig_differs_in_lidar_pose_alone_and_empty_benches_are_plain_wide_or_without_occluder() -> None:
+    other = move_lidar(RIG, 0.01, 2.0, -3.0)
+    assert other.lidar.distance_m == pytest.approx(RIG.lidar.distance_m + 0.01)
+    assert other.facing_deg == pytest.approx(47.0, abs=0.2)
+    assert other.model_copy(update={"lidar": RIG.lidar}) == RIG
     benches = [vary_empty_bench(RIG, SENSOR, np.random.default_rng(seed)) for seed in range(200)]
     assert any(sensor == SENSOR for _, sensor in benches)
     assert any(abs(rig.lidar.distance_m - 0.2) > SLIGHT.place_m for rig, _ in benches)
@@ -144,18 +116,25 @@ def test_sample_shows_its_object_or_an_empty_bench_and_depends_on_its_seed_alone
     np.testing.assert_array_equal(alone.intensity[0], ordinary.intensity[1])
 
 
-def test_ordinary_and_half_of_outlier_benches_lie_slightly_off() -> None:
+def test_ordinary_and_half_of_outlier_benches_lie_slightly_off_and_kinds_share_no_bench_and_no_noise() -> None:
+    """A shared bench would let a network tell outliers from ordinary objects."""
     seeds = 0, SEEDS_PER_BENCH - 1, SEEDS_PER_BENCH
     ordinary, plates = ([_stimulus(kind, seed, RIG, SENSOR).rig for seed in seeds] for kind in (ORDINARY, "plates"))
     assert [rig == RIG for rig in plates] == [True, True, False]
     assert RIG not in ordinary
     assert ordinary[0] == ordinary[1] != ordinary[2]
+    kinds = [EMPTY, ORDINARY, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS]
+    for of in range(3):
+        assert len({doubt_samples._generator(kind, 3, of).bytes(8) for kind in kinds}) == len(kinds)
+    slight = [_stimulus(kind, SEEDS_PER_BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)]
+    assert len({stimulus.rig.checksum for stimulus in slight}) == 3
+    assert len({stimulus.sensor.bare_wall_counts for stimulus in slight}) == 3
 
 
 def test_usual_objects_are_as_many_as_outliers_with_generic_shapes_by_their_share() -> None:
     recipe = small_recipe(task="doubt", outliers=20, empties=9)
     for share, kinds in ((0.0, 17), (0.25, 8)):
-        counts = counts_of(recipe, share)
+        counts = doubt_samples.counts_of(recipe, share)
         assert counts[EMPTY] == 9
         assert sum(counts.values()) == 9 + kinds * 20 + kinds * 10
         assert counts.get(GENERIC, 0) == share * kinds * 10
@@ -164,26 +143,17 @@ def test_usual_objects_are_as_many_as_outliers_with_generic_shapes_by_their_shar
     assert _stimulus(GENERIC, 0, RIG, SENSOR).rig != RIG
 
 
-def test_kinds_share_no_bench_and_no_noise() -> None:
-    """A shared bench would let a network tell outliers from ordinary objects."""
-    kinds = [EMPTY, ORDINARY, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS]
-    for of in range(3):
-        assert len({_generator(kind, 3, of).bytes(8) for kind in kinds}) == len(kinds)
-    slight = [_stimulus(kind, SEEDS_PER_BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)]
-    assert len({stimulus.rig.checksum for stimulus in slight}) == 3
-    assert len({stimulus.sensor.bare_wall_counts for stimulus in slight}) == 3
-
-
 def test_samples_on_disk_makes_only_missing_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = list[tuple[str, int]]()
 
-    def quick(kind: str, seeds: range, *_: object) -> DoubtSamples:
+    def quick(kind: str, seeds: range, *_: object) -> doubt_samples.DoubtSamples:
         made.append((kind, seeds.start))
-        maps, images = np.zeros((len(seeds), 2, 2), np.float32), np.zeros((len(seeds), 2, 2), np.float16)
-        cells = np.array(seeds, np.int32)
-        return DoubtSamples(maps, maps, images, cells, np.array([kind] * len(seeds)))
+        maps = np.zeros((len(seeds), 2, 2), np.float32)
+        kinds = np.array([kind] * len(seeds))
+        return doubt_samples.DoubtSamples(maps, maps, maps.astype(np.float16), np.array(seeds, np.int32), kinds)
 
     monkeypatch.setattr(doubt_samples, "make_samples", quick)
+    samples_on_disk = doubt_samples.samples_on_disk
     first = samples_on_disk(tmp_path, {EMPTY: 150}, 7, RIG, SENSOR)
     assert made == [(EMPTY, 7), (EMPTY, 107)]
     told, asked = list[tuple[int, int]](), {EMPTY: 150, "far": 20}

@@ -1,7 +1,6 @@
 """Dataset samples: maps of the objects of their seeds on the rigs of their seeds, in one color or in three."""
 
 import os
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from nlos_cam.dataset import objects_from_folder, procedural_images
 from nlos_cam.dataset import samples as dataset_samples
 from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.plan import DatasetPlan, Objects, RigSpread, scene_row
-from nlos_cam.dataset.samples import Samples, hidden_object, join_samples, make_samples, sense_color, sense_object
+from nlos_cam.dataset.samples import hidden_object, join_samples, make_samples, sense_color, sense_object
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import CATEGORIES, TEXTURES, image_from_albedo, image_from_depth, object_depth, paint
@@ -37,12 +36,8 @@ SHAPE[:20, :20] = np.nan
 PAINT = np.random.default_rng(0).choice([0.25, 0.5, 1.0], (64, 64, 3)).astype(np.float32)  # exact in any order of sums
 
 
-@pytest.fixture(scope="module")
-def samples() -> Samples:
-    return make_samples(PLAN, range(3))
-
-
-def test_samples_are_rendered_and_sensed_objects_of_their_seeds(samples: Samples) -> None:
+def test_samples_are_rendered_and_sensed_objects_of_their_seeds_in_any_pieces() -> None:
+    samples = make_samples(PLAN, range(3))
     for seed in (0, 2):
         category, depth_m = object_depth(seed, BOX)
         sensed = sense_object(Scene(RIG, depth_m), NOISY, seed, "draft")
@@ -51,23 +46,15 @@ def test_samples_are_rendered_and_sensed_objects_of_their_seeds(samples: Samples
         np.testing.assert_array_equal(samples["object_depth_m"][seed], depth_m)
         np.testing.assert_array_equal(samples["image"][seed], image_from_depth(depth_m, BOX).astype(np.float16))
         assert samples["category"][seed] == category
+        other = sense_object(Scene(RIG, depth_m), NOISY, seed + 1, "draft")  # of another noise
+        assert not np.array_equal(sensed.depth_m, other.depth_m, equal_nan=True)
     np.testing.assert_array_equal(samples["image"], procedural_images(0, 3, BOX))
     np.testing.assert_array_equal(samples["scene"], [[0.2, 45.0, 0.0, 0.2, 0.1, 48.0]] * 3)
-
-
-def test_samples_are_independent_of_pieces(samples: Samples) -> None:
     pieces = join_samples([make_samples(PLAN, [0]), make_samples(PLAN, [1, 2])])
     assert pieces.keys() == samples.keys()
     for name, values in pieces.items():
         assert values.dtype == samples[name].dtype
         np.testing.assert_array_equal(values, samples[name])
-
-
-def test_sense_object_draws_noise_by_seed() -> None:
-    scene = Scene(RIG, object_depth(0, BOX)[1])
-    first, again, other = (sense_object(scene, NOISY, seed, "draft") for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first.depth_m, again.depth_m)
-    assert not np.array_equal(first.depth_m, other.depth_m, equal_nan=True)
 
 
 def test_samples_are_rendered_with_pulse_and_radiometry_of_plan(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,15 +89,12 @@ def test_expected_maps_with_drawn_noise_have_the_law_of_exposures() -> None:
     assert 0.97 < np.nanmedian(ratio) < 1.03
 
 
-def test_cells_without_a_return_do_not_vary() -> None:
-    reflectance, offset_m = torch.ones(1, 64, 80), torch.ones(1)
-    assert not CellNormal().vary(torch.zeros(1, 2, 64, 80), map_noise(PLAN), reflectance, offset_m).any()
-
-
-def test_expected_samples_differ_from_exposures_by_noise_alone() -> None:
+def test_expected_samples_differ_from_exposures_by_noise_alone_and_cells_without_a_return_do_not_vary() -> None:
     exposed, expected = (make_samples(replace(PLAN, expected=one), [3]) for one in (False, True))
     np.testing.assert_array_equal(exposed["image"], expected["image"])
     assert 0 < np.abs(exposed["intensity"] - expected["intensity"]).max() < 3
+    reflectance, offset_m = torch.ones(1, 64, 80), torch.ones(1)
+    assert not CellNormal().vary(torch.zeros(1, 2, 64, 80), map_noise(PLAN), reflectance, offset_m).any()
 
 
 def test_expected_maps_of_textured_walls_and_in_color_are_refused() -> None:
@@ -122,29 +106,18 @@ def test_expected_maps_of_textured_walls_and_in_color_are_refused() -> None:
             plan.check()
 
 
-def test_hidden_object_draws_no_category_left_out() -> None:
-    kept = Objects.without(["hat", "boat", "cup"])
-    drawn = {hidden_object(kept, seed, BOX)[0] for seed in range(150)}
-    assert drawn == set(CATEGORIES) - {"hat", "boat", "cup"}
+def test_objects_leave_categories_out_and_get_backgrounds_and_generic_shapes_by_their_share() -> None:
+    def drawn(objects: Objects, count: int = 60) -> list[tuple[str, Float32]]:
+        return [hidden_object(objects, seed, BOX) for seed in range(count)]
 
-
-def test_backgrounds_fill_empty_pixels_of_some_objects() -> None:
-    alone = [hidden_object(Objects(), seed, BOX)[1] for seed in range(20)]
-    beside = [hidden_object(Objects(backgrounds=0.5), seed, BOX)[1] for seed in range(20)]
-    more = [np.isfinite(two).sum() > np.isfinite(one).sum() for one, two in zip(alone, beside, strict=True)]
-    assert 3 < sum(more) < 17
-
-
-def test_generic_shapes_take_their_share_and_leave_the_other_objects_alone() -> None:
-    kinds, mixed = (
-        [hidden_object(one, seed, BOX) for seed in range(60)] for one in (Objects(), Objects(share_generic=0.5))
-    )
-    same = [
-        one[0] == two[0] and np.array_equal(one[1], two[1], equal_nan=True)
-        for one, two in zip(kinds, mixed, strict=True)
-    ]
-    assert 18 < sum(same) < 42
-    assert not {name for (name, _), is_same in zip(mixed, same, strict=True) if not is_same} & set(CATEGORIES)
+    left_out, plain = {"hat", "boat", "cup"}, drawn(Objects())
+    assert {name for name, _ in drawn(Objects.without([*left_out]), 150)} == set(CATEGORIES) - left_out
+    pairs = zip(plain, drawn(Objects(backgrounds=0.5)), strict=True)
+    assert 9 < sum(np.isfinite(two).sum() > np.isfinite(one).sum() for (_, one), (_, two) in pairs) < 51
+    pairs = zip(plain, drawn(Objects(share_generic=0.5)), strict=True)
+    others = [two[0] for one, two in pairs if one[0] != two[0] or not np.array_equal(one[1], two[1], equal_nan=True)]
+    assert 18 < len(others) < 42
+    assert not set(others) & set(CATEGORIES)
 
 
 @pytest.fixture
@@ -187,35 +160,37 @@ def test_objects_of_refuses_mesh_name_that_is_not_utf8(meshes: Path) -> None:
         objects_from_folder(meshes)
 
 
-@pytest.mark.slow
-def test_samples_module_does_not_import_torch() -> None:
-    program = "import sys, nlos_cam.dataset.samples; raise SystemExit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
-
-
 def _sensed(depth_m: Float32, albedo: Float32, sensor: Sensor, seed: int = 0) -> LidarMaps:
     return sense_color(Scene(RIG, depth_m, Surface(albedo)), sensor, seed, "draft")
 
 
 @pytest.mark.slow
-def test_swapped_colors_swap_intensities_and_keep_depth() -> None:
+def test_swapped_colors_swap_intensities_and_keep_depth_and_mirrored_object_gives_mirrored_maps() -> None:
     before = _sensed(SHAPE, PAINT, QUIET)
     assert not np.array_equal(before.intensity[0], before.intensity[1])
     for order in ([0, 2, 1], [1, 2, 0], [2, 1, 0]):
         after = _sensed(SHAPE, PAINT[..., order], QUIET)
         np.testing.assert_array_equal(after.intensity, before.intensity[order])
         np.testing.assert_array_equal(after.depth_m, before.depth_m)
+    mirrored = _sensed(SHAPE[::-1].copy(), PAINT[::-1], QUIET)
+    valid = ~np.isnan(before.depth_m) & ~np.isnan(mirrored.depth_m[::-1])
+    apart = np.abs(mirrored.intensity[:, ::-1] - before.intensity)[:, valid]
+    assert (apart <= 1.0).mean() > 0.99  # rounding decides some ties between echoes
 
 
 @pytest.mark.slow
-def test_grey_object_is_sensed_as_in_one_color() -> None:
+def test_grey_object_is_sensed_as_in_one_color_and_each_exposure_has_its_own_noise_by_seed() -> None:
     scene = Scene(RIG, SHAPE, Surface(0.5))
     maps, alone = _sensed(SHAPE, GREY, QUIET), sense_object(scene, QUIET, 0, "draft")
     np.testing.assert_array_equal(maps.depth_m, alone.depth_m)
     for intensity in maps.intensity:
         np.testing.assert_array_equal(intensity, alone.intensity)
+    one, again, other = (_sensed(SHAPE, GREY, NOISY, seed) for seed in (7, 7, 2))
     white = sense_object(scene, NOISY, 7, "draft")  # the noise of the depth is that of the white exposure
-    np.testing.assert_array_equal(_sensed(SHAPE, GREY, NOISY, 7).depth_m, white.depth_m)
+    np.testing.assert_array_equal(one.depth_m, white.depth_m)
+    np.testing.assert_array_equal(one.intensity, again.intensity)
+    assert not np.array_equal(one.intensity, other.intensity)
+    assert not np.array_equal(one.intensity[0], one.intensity[1])
 
 
 @pytest.mark.slow
@@ -226,22 +201,6 @@ def test_exposures_match_rendered_colors_where_one_echo_wins() -> None:
         same = (alone.depth_m == whole.depth_m) & (alone.intensity == alone.multi.peak)
         assert same.sum() > 100
         np.testing.assert_allclose(alone.intensity[same], whole.color[same, channel], rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_each_exposure_has_its_own_noise_by_seed() -> None:
-    one, again, other = (_sensed(SHAPE, GREY, NOISY, seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one.intensity, again.intensity)
-    assert not np.array_equal(one.intensity, other.intensity)
-    assert not np.array_equal(one.intensity[0], one.intensity[1])
-
-
-@pytest.mark.slow
-def test_mirrored_object_gives_mirrored_color_maps() -> None:
-    straight, mirrored = _sensed(SHAPE, PAINT, QUIET), _sensed(SHAPE[::-1].copy(), PAINT[::-1], QUIET)
-    valid = ~np.isnan(straight.depth_m) & ~np.isnan(mirrored.depth_m[::-1])
-    apart = np.abs(mirrored.intensity[:, ::-1] - straight.intensity)[:, valid]
-    assert (apart <= 1.0).mean() > 0.99  # rounding decides some ties between echoes
 
 
 def test_color_samples_are_painted_depth_samples_on_drawn_rig() -> None:

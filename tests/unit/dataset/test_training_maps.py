@@ -18,7 +18,7 @@ from nlos_cam.dataset import DatasetPlan, RigSpread, training_maps
 from nlos_cam.dataset.packed import CELLS, IMAGES, INDEX, MAPS, PackedMaps, map_noise, open_packed_maps
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
-from nlos_cam.dataset.training_maps import MapSplit, Streamed, measured_bare_wall, read_maps, render_bare_wall
+from nlos_cam.dataset.training_maps import MapSplit, Streamed, read_maps, render_bare_wall
 from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.render import Scene, Sensor, render
@@ -45,12 +45,16 @@ def _read(
     return read_maps(RECIPE.model_copy(update=changes), Path(data), Path(other), wall, stream=stream)
 
 
-def test_read_maps_takes_first_objects_of_recipe() -> None:
+def test_read_maps_takes_first_objects_of_recipe_and_a_digest_of_objects_and_rig() -> None:
     maps = _read()
     np.testing.assert_array_equal(maps.training.image, small_maps(6, 4).image[:4])
     np.testing.assert_array_equal(maps.held_out.image, small_maps(6, 5).image[:2])
     assert maps.limit_recipe(RECIPE) == RECIPE
     assert _read(held_out=400).limit_recipe(RECIPE).held_out == 6  # all that there are
+    pairs = (("data", "other"), ("also", "other"), ("others", "other"), ("rig1", "rig2"))
+    digests = [_read(*pair).digest for pair in pairs]
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 3
 
 
 @pytest.mark.parametrize("stream", [False, True])
@@ -70,13 +74,6 @@ def test_expected_maps_get_noise_anew_in_each_epoch(stream: bool) -> None:
     assert abs(float(off.mean())) < 0.05
     assert 0.95 < float(off.std()) < 1.05
     assert not torch.equal(one.intensity, other.intensity)
-
-
-def test_digest_depends_on_objects_and_rig() -> None:
-    pairs = (("data", "other"), ("also", "other"), ("others", "other"), ("rig1", "rig2"))
-    digests = [_read(*pair).digest for pair in pairs]
-    assert digests[0] == digests[1]
-    assert len(set(digests)) == 3
 
 
 @pytest.mark.parametrize(
@@ -106,26 +103,23 @@ def test_rendered_bare_wall_cancels_a_frame_of_bare_wall_of_the_one_rig() -> Non
         render_bare_wall(replace(PLAN, spread=RigSpread(place_m=0.01)))
 
 
-def test_measured_bare_wall_is_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    reference = SimpleNamespace(map_depth_m=np.ones((64, 80)), map_intensity=np.zeros((64, 80)))
-    monkeypatch.setattr(training_maps, "load_measured", lambda _: SimpleNamespace(reference=reference))
-    depth_m, intensity = measured_bare_wall(WALL)
-    assert depth_m is reference.map_depth_m
-    assert intensity is reference.map_intensity
-    monkeypatch.setattr(training_maps, "load_measured", lambda _: SimpleNamespace(reference=None))
-    with pytest.raises(SceneError, match=r"wall\.toml"):
-        measured_bare_wall(WALL)
-
-
 @pytest.mark.parametrize("wall", [None, WALL])
-def test_difference_maps_subtract_measured_or_rendered_wall(monkeypatch: pytest.MonkeyPatch, wall: Path | None) -> None:
+def test_difference_maps_subtract_rendered_wall_or_reference_of_measured_one(
+    monkeypatch: pytest.MonkeyPatch, wall: Path | None
+) -> None:
     flat = np.zeros((64, 80), np.float32)
-    monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (flat, flat + 1))
-    monkeypatch.setattr(training_maps, "measured_bare_wall", lambda _: (flat, flat + 2))
+    measured = SimpleNamespace(reference=SimpleNamespace(map_depth_m=flat + 0.5, map_intensity=flat + 2))
+    monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (flat + 0.25, flat + 1))
+    monkeypatch.setattr(training_maps, "load_measured", lambda _: measured)
     made = _read(wall=wall, maps="difference maps")
     for maps, raw in ((made.training.first(4), small_maps(6, 4)), (made.held_out, small_maps(6, 5))):
         difference = raw.intensity[: len(maps.image)] - maps.intensity
         np.testing.assert_allclose(difference[~np.isnan(maps.depth_m)], 2.0 if wall else 1.0)
+        nearer_m = (raw.depth_m[: len(maps.image)] - maps.depth_m)[~np.isnan(maps.depth_m)]
+        np.testing.assert_allclose(nearer_m, 0.5 if wall else 0.25, rtol=1e-5)
+    measured.reference = None
+    with pytest.raises(SceneError, match=r"wall\.toml"):
+        _read(wall=WALL, maps="difference maps")
 
 
 def test_streamed_maps_equal_maps_in_memory() -> None:

@@ -45,14 +45,6 @@ def _usual(*, guesses: bool = True) -> dict[str, Any]:
     return _figures(_judgement(guesses=guesses))
 
 
-@pytest.fixture
-def undrawn(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures of one inch, for tests of the text beside them."""
-    small = (drawn / "sheet.png").read_bytes()
-    for name in ("sheet", "gallery", "categories", "against_surface"):
-        monkeypatch.setattr(report.pictures, f"draw_{name}", lambda path, *_: path.write_bytes(small))
-
-
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the pictures of a report."""
@@ -60,6 +52,14 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in PICTURES:
         (folder / name).write_bytes(png(figure_of(1.0, 1.0)))
     return folder
+
+
+@pytest.fixture
+def undrawn(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of one inch, for tests of the text beside them."""
+    small = (drawn / "sheet.png").read_bytes()
+    for name in ("sheet", "gallery", "categories", "against_surface"):
+        monkeypatch.setattr(report.pictures, f"draw_{name}", lambda path, *_: path.write_bytes(small))
 
 
 def _rows(folder: Path) -> list[dict[str, str]]:
@@ -155,7 +155,6 @@ def test_second_set_and_recognition_have_their_figures(tmp_path: Path) -> None:
 def test_interrupted_write_leaves_earlier_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (out := tmp_path / "out").mkdir()
     (out / "report.md").write_text("earlier")
-
     monkeypatch.setattr(report.pictures, "draw_gallery", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         write_report(out, _judgement(3), {})

@@ -40,8 +40,7 @@ def _facts(rows: list[RuntimeRow], planned: int) -> dict[str, Any]:
 def test_recommended_is_fastest_without_loss_in_any_metric_and_pareto_front_is_undominated() -> None:
     blind = replace(ROWS[1], figures={**ROWS[1].figures, "foreground_rmse_mm": Interval(None, None, None)})
     for rows, name in ((ROWS, "quick"), (ROWS[:1], "exact"), ([ROWS[0], blind], "exact")):
-        pick = recommended(rows)
-        assert pick.setting.name == name
+        assert recommended(rows).setting.name == name
     assert recommended([]) is None
     worse = {**ROWS[0].figures, "silhouette_iou": Interval(0.7, 0, 1), "foreground_rmse_mm": Interval(25.0, 0, 50)}
     lost = runtime_tradeoff.losses(replace(ROWS[0], figures=worse), ROWS[0])
@@ -50,6 +49,12 @@ def test_recommended_is_fastest_without_loss_in_any_metric_and_pareto_front_is_u
     assert lost["accuracy_mean_abs"] == 0
     assert [row.setting.name for row in pareto_front(ROWS)] == ["quicker", "quick", "exact"]
     assert [row.setting.name for row in pareto_front([*ROWS, _row("best", 1, 0.95)])] == ["best"]
+    table = _facts(
+        [replace(row, setting=replace(row.setting, weights=of)) for of in ("large", "small") for row in ROWS], 8
+    )
+    assert table["recommended"] == {"name": "quick", "weights": "large"}
+    assert {"name": "quicker", "weights": "large"} in table["pareto_front"]
+    assert "large: quick" in runtime_document(table).as_markdown()
 
 
 def test_settings_combine_weights_runtimes_and_threads_once() -> None:
@@ -117,11 +122,3 @@ def test_table_and_plot_show_measured_rows(tmp_path: Path, measured: int) -> Non
         assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     else:
         assert table["recommended"] is None
-
-
-def test_table_of_several_weights_names_the_recommended() -> None:
-    rows = [replace(row, setting=replace(row.setting, weights=name)) for name in ("large", "small") for row in ROWS]
-    table = _facts(rows, 8)
-    assert table["recommended"] == {"name": "quick", "weights": "large"}
-    assert {"name": "quicker", "weights": "large"} in table["pareto_front"]
-    assert "large: quick" in runtime_document(table).as_markdown()

@@ -37,7 +37,7 @@ def echoes() -> list[MultiBounce]:
     return made
 
 
-def test_seeded_and_fresh_objects_are_those_of_their_seeds() -> None:
+def test_seeded_objects_are_those_of_their_seeds_and_second_set_is_of_other_kinds_in_the_same_poses() -> None:
     subjects = seeded_objects(TEST_SEED, 2, BOX)
     for k, subject in enumerate(subjects):
         category, depth_m = object_depth(TEST_SEED + k, BOX)
@@ -49,6 +49,11 @@ def test_seeded_and_fresh_objects_are_those_of_their_seeds() -> None:
     np.testing.assert_array_equal(judged.maps.image, truth_of(subjects[:1], BOX))
     assert judged.maps.depth_m.shape == (1, 64, 80)
     assert (len(judged.names), judged.plan) == (1, PLAN)
+    kinds, unseen = benchmark_objects(BOX), unseen_objects(BOX)
+    assert [one.pose for one in unseen] == [one.pose for one in kinds]
+    names = {one.category for one in unseen}
+    assert (len(unseen), len(names), names & CATEGORIES.keys()) == (54, 18, set())
+    assert min(int(np.isfinite(one.depth_m).sum()) for one in unseen) > 150
 
 
 def test_sense_repeats_matches_simulated_camera_and_averages_noise_down_with_frames(echoes: list[MultiBounce]) -> None:
@@ -73,29 +78,10 @@ def test_reconstruct_all_takes_one_object_at_a_time(echoes: list[MultiBounce]) -
     assert [part.shape for call in network.call_args_list for part in call.args] == [(1, 64, 80)] * 4
 
 
-def test_second_set_is_of_other_kinds_in_the_same_poses() -> None:
-    kinds, unseen = benchmark_objects(BOX), unseen_objects(BOX)
-    assert [one.pose for one in unseen] == [one.pose for one in kinds]
-    names = {one.category for one in unseen}
-    assert (len(unseen), len(names), names & CATEGORIES.keys()) == (54, 18, set())
-    assert min(int(np.isfinite(one.depth_m).sum()) for one in unseen) > 150
-
-
-def test_rig_of_weights_that_is_missing_is_asked_for() -> None:
+def test_rig_of_weights_is_asked_for_where_missing_and_notes_name_other_rigs_and_categories_left_out() -> None:
     assert rig_of(RECORD) == RIG
     with pytest.raises(SceneError, match=r"'my bench'.*--rig"):
         rig_of(RECORD.model_copy(update={"rig_name": "my bench"}))
-
-
-def test_guesses_without_nearest_take_mean_of_training_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(baselines, "NEIGHBOURS", 3)
-    images, among = baseline_answers(JUDGED, None, nearest=False)
-    assert (set(images), among) == ({"all_background", "mean_object"}, None)
-    mean = procedural_images(TRAINING_SEED, 3, BOX).astype(np.float32).mean(0)
-    np.testing.assert_allclose(images["mean_object"][1], mean, atol=1e-3)
-
-
-def test_notes_name_other_rigs_and_categories_left_out() -> None:
     recipe = Recipe(task="vae", objects=4, held_out=2, epochs=1, batch=2, learning_rate=1e-3, left_out=["hat", "car"])
     training = SmallDataset(JUDGED.maps, ELSEWHERE)
     training.folder = Path("train")
@@ -110,7 +96,7 @@ def test_notes_name_other_rigs_and_categories_left_out() -> None:
 
 @pytest.fixture(scope="module")
 def images() -> np.ndarray:
-    return procedural_images(0, 12, object_box(RIG)).astype(np.float32)
+    return procedural_images(0, 12, BOX).astype(np.float32)
 
 
 def _maps(images: np.ndarray, seed: int = 0) -> MapSet:
@@ -141,7 +127,12 @@ def _guesses(sought: MapSet, training: MapSet, size: int = 12, **others: object)
     return answers_with_nearest(sought, Chunked(maps=training, size=size), **options)  # type: ignore[arg-type]
 
 
-def test_baselines_answer_every_object(images: np.ndarray) -> None:
+def test_baselines_answer_every_object(images: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(baselines, "NEIGHBOURS", 3)
+    without_nearest, among = baseline_answers(JUDGED, None, nearest=False)
+    assert (set(without_nearest), among) == ({"all_background", "mean_object"}, None)
+    trained = procedural_images(TRAINING_SEED, 3, BOX).astype(np.float32)
+    np.testing.assert_allclose(without_nearest["mean_object"][1], trained.mean(0), atol=1e-3)
     mean = mean_image(images.astype(np.float16))
     np.testing.assert_allclose(mean, images.mean(0), atol=1e-3)
     alone, guesses = trivial_answers(5, mean), _guesses(_maps(images[:5], seed=1), _maps(images))
@@ -188,8 +179,4 @@ def test_training_maps_are_cached_by_what_determines_them(tmp_path: Path, monkey
     assert first.parent.parent == tmp_path
     assert built[0][1] == 7
     assert (built[0][0].first_seed, built[0][0].objects) == (TRAINING_SEED, Objects())
-
-
-def test_objects_that_identify_the_cache_cover_all_categories() -> None:
-    seen = {object_depth(seed, object_box(RIG))[0] for seed in range(baselines.FINGERPRINT_OBJECTS)}
-    assert seen == set(CATEGORIES)
+    assert {object_depth(seed, BOX)[0] for seed in range(baselines.FINGERPRINT_OBJECTS)} == set(CATEGORIES)

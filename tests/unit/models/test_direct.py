@@ -8,19 +8,10 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from nlos_models import direct
 from nlos_models.checkpoint import load_network, load_pipeline, save_direct
-from nlos_models.data import InMemory, as_images
-from nlos_models.direct import (
-    CLIP,
-    CUTS,
-    MIN_LIGHT_SPREAD,
-    CellNormal,
-    DirectNetwork,
-    MapNoise,
-    MirrorLinear,
-    image_from_logits,
-    two_heads_error,
-)
+from nlos_models.data import InMemory, MapNoise, as_images
+from nlos_models.direct import CellNormal, DirectNetwork, image_from_logits, two_heads_error
 from nlos_models.direct_training import NormalBatch, _stains, train_direct, transfer_direct
 from nlos_models.distributed import open_fabric
 from nlos_models.errors import CheckpointError, TrainingError
@@ -31,7 +22,7 @@ from nlos_models.records import CheckpointRecord, load_record
 from nlos_models.runs import TrainingRun, direct_start, record_run, run_transfer, transfer_start
 from nlos_models.tasks import figures_of
 from nlos_models.tasks import run as reconstruct
-from nlos_models.train import BEST, LAST, MINUTES, Running
+from nlos_models.train import BEST, LAST, MINUTES, Running, Scores
 from onnx import TensorProto
 from small_maps import small_maps
 from small_run import changed_tensors
@@ -40,14 +31,6 @@ from torch import Tensor, nn
 pytestmark = pytest.mark.usefixtures("one_thread")
 TRANSFER: dict[str, object] = {"task": "transfer", "latent_weight": 0.0, "image_weight": 1.0}
 SIZE = DirectSize(features=8, width=8, blocks=1, token=8, mixers=1)
-
-
-def _shaken(network: DirectNetwork) -> DirectNetwork:
-    """Give every parameter a random value: residual blocks would otherwise start as nothing."""
-    torch.manual_seed(1)
-    for parameter in network.parameters():
-        nn.init.normal_(parameter, 0, 0.2)
-    return network.eval()
 
 
 def _recipe(**changes: object) -> Recipe:
@@ -74,16 +57,23 @@ class Source:
             yield NormalBatch(*(values[rows] for values in self.batch))
 
 
-def test_answer_to_mirrored_maps_is_the_mirrored_answer() -> None:
-    network, normal = _shaken(DirectNetwork(SIZE)), torch.randn(3, 2, 64, 80)
+def _shaken() -> DirectNetwork:
+    """Return a network for these maps, of random parameters: residual blocks would otherwise start as nothing."""
+    network = DirectNetwork(SIZE)
+    network.normal.load_state_dict(Source().normal.state_dict())
+    torch.manual_seed(1)
+    for parameter in network.parameters():
+        nn.init.normal_(parameter, 0, 0.2)
+    return network.eval()
+
+
+def test_answer_to_mirrored_maps_is_the_mirrored_answer_by_linear_layers_of_both_sides() -> None:
+    network, normal = _shaken(), torch.randn(3, 2, 64, 80)
     logits = network.logits(normal)
     torch.testing.assert_close(network.logits(normal.flip(-2)), logits.flip(-2), rtol=0, atol=1e-5)
     assert float(logits.detach().std()) > 0.1
     assert (logits - logits.flip(-2)).abs().max() > 0.1
-
-
-def test_mirror_linear_is_a_linear_layer_of_both_sides() -> None:
-    layer, sides = MirrorLinear(5, 3), torch.randn(4, 2, 5)
+    layer, sides = direct.MirrorLinear(5, 3), torch.randn(4, 2, 5)
     own, other = (layer.even.weight + layer.odd.weight) / 2, (layer.even.weight - layer.odd.weight) / 2
     top = 0.98 * (sides[:, 0] @ own.T + sides[:, 1] @ other.T) + 0.7 * layer.even.bias
     torch.testing.assert_close(layer(sides)[:, 0], top)
@@ -92,8 +82,8 @@ def test_mirror_linear_is_a_linear_layer_of_both_sides() -> None:
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (9, 21), (40, 63), (63, 5)])
 def test_each_pixel_has_its_place(row: int, column: int) -> None:
     """A head's bias moves the same pixel of every token: its rows count down above, up below the middle."""
-    network = _shaken(DirectNetwork(SIZE))
-    normal, plain = torch.zeros(1, 2, 64, 80), network.logits(torch.zeros(1, 2, 64, 80))
+    network, normal = _shaken(), torch.zeros(1, 2, 64, 80)
+    plain = network.logits(normal)
     within = (row if row < 32 else 63 - row) % 8
     with torch.no_grad():
         network.heads.bias[64 + 8 * within + column % 8] += 1  # the second head: depth
@@ -102,15 +92,25 @@ def test_each_pixel_has_its_place(row: int, column: int) -> None:
     assert int(moved.sum()) == 64
 
 
-def test_cells_are_normalised_symmetrically_and_clipped() -> None:
+def test_cells_are_normalised_symmetrically_clipped_and_without_the_gain_of_a_frame() -> None:
     maps, normal = small_maps(40, 0), CellNormal()
     depth_m, intensity = torch.from_numpy(maps.depth_m.copy()), torch.from_numpy(maps.intensity)
     depth_m[:, 3, 7] = torch.nan
     normal.learn(depth_m, intensity)
     values = normal(depth_m, intensity)
     assert (values[:, :, 3, 7] == 0).all()
-    assert values.abs().max() <= CLIP
+    assert values.abs().max() <= direct.CLIP
     torch.testing.assert_close(normal(depth_m.flip(-2), intensity.flip(-2)), values.flip(-2))
+    normal, generator = CellNormal(), torch.Generator().manual_seed(0)
+    depth_m = 0.3 + 0.01 * torch.randn(30, 64, 80, generator=generator)
+    busy = torch.linspace(0, 0.2, 80) * torch.randn(30, 64, 80, generator=generator)  # columns differ more and more
+    intensity = 20 * torch.exp(busy)
+    normal.learn(depth_m, intensity)
+    assert float(normal.spread[1].min()) == pytest.approx(direct.MIN_LIGHT_SPREAD)
+    for gain in (-1.0, 0.05, 0.7):
+        brighter = torch.expm1(torch.log1p(intensity) + gain)
+        torch.testing.assert_close(normal(depth_m, brighter), normal(depth_m, intensity), atol=1e-3, rtol=0)
+    assert not normal(torch.full_like(depth_m, torch.nan), intensity).any()
 
 
 def test_loss_is_least_at_the_truth() -> None:
@@ -123,7 +123,7 @@ def test_loss_is_least_at_the_truth() -> None:
 
     exact = logits(truth > 0)
     assert float(two_heads_error(exact, truth)) < 1e-3
-    torch.testing.assert_close(image_from_logits(exact), truth, rtol=0, atol=1e-3)
+    torch.testing.assert_close(direct.image_from_logits(exact), truth, rtol=0, atol=1e-3)
     assert two_heads_error(logits(truth.roll(1, -1) > 0), truth) > 0.1
     assert two_heads_error(exact + torch.tensor([0.0, 0.5])[:, None, None], truth) > 0.05
 
@@ -139,17 +139,19 @@ def test_image_is_cut_where_the_expected_overlap_is_largest() -> None:
     assert [int((image > 0).sum()) for image in images] == [400, 480, 0]
 
 
-def test_run_stopped_halfway_resumes_exactly_with_its_average(tmp_path: Path) -> None:
-    whole, figures = train_direct(_recipe(), Source(), small_maps(4, 1), tmp_path / "whole")
+def _train(folder: Path, running: Running | None = None, **changes: object) -> tuple[DirectNetwork, Scores]:
+    return train_direct(_recipe(**changes), Source(), small_maps(4, 1), folder, running)
+
+
+def test_run_stopped_halfway_resumes_exactly_and_follows_its_recipe(tmp_path: Path) -> None:
+    whole, figures = _train(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
-        train_direct(
-            _recipe(), Source(), small_maps(4, 1), tmp_path / "cut", Running(stop=iter([False] * 4 + [True]).__next__)
-        )
-    resumed, again = train_direct(_recipe(), Source(), small_maps(4, 1), tmp_path / "cut")
+        _train(tmp_path / "cut", Running(stop=iter([False] * 4 + [True]).__next__))
+    resumed, again = _train(tmp_path / "cut")
     assert not changed_tensors(whole.state_dict(), resumed.state_dict())
     assert figures == again
-    plain, _ = train_direct(_recipe(average=0.0), Source(), small_maps(4, 1), tmp_path / "plain")
-    assert changed_tensors(whole.state_dict(), plain.state_dict())
+    for name, changes in (("plain", {"average": 0.0}), ("varied", {"wall_texture": 0.05, "range_offset_m": 0.05})):
+        assert changed_tensors(whole.state_dict(), _train(tmp_path / name, **changes)[0].state_dict())
 
 
 def test_training_goes_on_from_weights_that_grow(weights: Path, tmp_path: Path) -> None:
@@ -166,8 +168,7 @@ def test_training_goes_on_from_weights_that_grow(weights: Path, tmp_path: Path) 
 
 def test_average_is_scored_and_kept_and_minutes_are_logged(tmp_path: Path) -> None:
     times = iter(range(0, 100000, 45))
-    running = Running(clock=lambda: float(next(times)))
-    network, figures = train_direct(_recipe(), Source(), small_maps(4, 1), tmp_path, running)
+    network, figures = _train(tmp_path, Running(clock=lambda: float(next(times))))
     truth = as_images(small_maps(4, 1).image)[:, 0].numpy()
     error = np.square(reconstruct(network, small_maps(4, 1)) - truth).sum((1, 2)).mean()
     assert figures["held_out_loss"] == pytest.approx(error, rel=1e-5)
@@ -179,9 +180,8 @@ def test_average_is_scored_and_kept_and_minutes_are_logged(tmp_path: Path) -> No
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, network = tmp_path_factory.mktemp("direct"), _shaken(DirectNetwork(SIZE))
-    network.normal.load_state_dict(Source().normal.state_dict())
-    save_direct(folder, network, CheckpointRecord.of([_recipe()], ("paper-rig", "0" * 64)))
+    folder = tmp_path_factory.mktemp("direct")
+    save_direct(folder, _shaken(), CheckpointRecord.of([_recipe()], ("paper-rig", "0" * 64)))
     export_folder(folder)
     return folder
 
@@ -197,8 +197,8 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
     in_torch = TorchReconstructor(network, record, "cpu").answer(maps.depth_m, maps.intensity)
     for one, other in zip(told, in_torch, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
-    assert ((told.surface > CUTS[-1]) <= (told.image > 0)).all()
-    assert ((told.image > 0) <= (told.surface > CUTS[0])).all()
+    assert ((told.surface > direct.CUTS[-1]) <= (told.image > 0)).all()
+    assert ((told.image > 0) <= (told.surface > direct.CUTS[0])).all()
     assert not [*tmp_path.iterdir()]
     stored = onnx.load(weights / "network.onnx", load_external_data=False).graph.initializer
     inline = [each.name for each in stored if len(each.dims) == 2 and each.data_location != TensorProto.EXTERNAL]
@@ -216,20 +216,7 @@ def test_start_refuses_weights_that_the_recipe_cannot_hold(weights: Path, change
         direct_start(recipe, Path("paper"))
 
 
-def test_gain_of_a_frame_changes_nothing_and_frames_without_returns_have_none() -> None:
-    normal, generator = CellNormal(), torch.Generator().manual_seed(0)
-    depth_m = 0.3 + 0.01 * torch.randn(30, 64, 80, generator=generator)
-    busy = torch.linspace(0, 0.2, 80) * torch.randn(30, 64, 80, generator=generator)  # columns differ more and more
-    intensity = 20 * torch.exp(busy)
-    normal.learn(depth_m, intensity)
-    assert float(normal.spread[1].min()) == pytest.approx(MIN_LIGHT_SPREAD)
-    for gain in (-1.0, 0.05, 0.7):
-        brighter = torch.expm1(torch.log1p(intensity) + gain)
-        torch.testing.assert_close(normal(depth_m, brighter), normal(depth_m, intensity), atol=1e-3, rtol=0)
-    assert not normal(torch.full_like(depth_m, torch.nan), intensity).any()
-
-
-def test_varied_maps_are_those_of_another_wall_and_range() -> None:
+def test_varied_maps_are_those_of_another_wall_with_stains_of_variance_1_and_of_another_range() -> None:
     """Stains and an offset on normalised maps are what they would be on the maps themselves."""
     maps, normal = small_maps(40, 0), CellNormal()
     depth_m, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
@@ -240,22 +227,11 @@ def test_varied_maps_are_those_of_another_wall_and_range() -> None:
     varied = normal.vary(normal(depth_m, intensity), None, reflectance, offset_m)
     assert float((measured - varied).abs().median()) < 0.02
     torch.testing.assert_close(normal.vary(varied, None, None, None), varied, atol=1e-4, rtol=0)
-
-
-def test_stains_have_mean_0_and_variance_1() -> None:
     patterns = _stains(200, torch.device("cpu"))
     assert float(patterns.mean()) == pytest.approx(0, abs=0.03)
     assert float(patterns.var()) == pytest.approx(1, abs=0.05)
     neighbours = (patterns[..., 1:] * patterns[..., :-1]).mean()
     assert 0.4 < float(neighbours) < 0.6  # half stains, half grain
-
-
-def test_recipe_varies_the_bench(tmp_path: Path) -> None:
-    plain, varied = (
-        train_direct(_recipe(wall_texture=texture, range_offset_m=texture), Source(), small_maps(4, 1), tmp_path / name)
-        for name, texture in (("plain", 0.0), ("varied", 0.05))
-    )
-    assert changed_tensors(plain[0].state_dict(), varied[0].state_dict())
 
 
 def test_shift_follows_another_bench_and_nothing_else() -> None:
@@ -276,18 +252,12 @@ def test_shift_follows_another_bench_and_nothing_else() -> None:
 
 def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> None:
     def go(folder: Path, running: Running | None = None) -> tuple[DirectNetwork, float]:
-        network = _shaken(DirectNetwork(SIZE))
-        network.normal.load_state_dict(Source().normal.state_dict())
-        recipe = _recipe(
-            task="transfer", latent_weight=0.0, image_weight=1.0, all_layers_epochs=12, epochs=3, average=0.0
-        )
-        after, figures = transfer_direct(recipe, network, InMemory(Source().maps), small_maps(4, 1), folder, running)
+        recipe = _recipe(**TRANSFER, all_layers_epochs=12, epochs=3, average=0.0)
+        after, figures = transfer_direct(recipe, _shaken(), InMemory(Source().maps), small_maps(4, 1), folder, running)
         return after, figures["held_out_loss"]
 
-    before = _shaken(DirectNetwork(SIZE))
-    before.normal.load_state_dict(Source().normal.state_dict())
     network, loss = go(tmp_path / "whole")
-    assert loss < figures_of(reconstruct(before, small_maps(4, 1)), small_maps(4, 1).image)["held_out_loss"]
+    assert loss < figures_of(reconstruct(_shaken(), small_maps(4, 1)), small_maps(4, 1).image)["held_out_loss"]
     first = torch.load(io.BytesIO((tmp_path / "whole" / "all-layers" / LAST).read_bytes()[32:]), weights_only=True)
     last = {name for name, values in network.state_dict().items() if not torch.equal(values, first["module"][name])}
     assert {name.partition(".")[0] for name in last} <= {"norm", "heads"}

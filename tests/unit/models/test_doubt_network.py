@@ -14,7 +14,7 @@ from nlos_models.errors import CheckpointError
 from nlos_models.inference import UncertaintyEstimate
 from nlos_models.quality import QualityEstimate, QualityModel, QualityRecord, quality_features
 from small_doubt import DARK_V, small_doubt_set, untrained_doubt, watched_weights
-from small_maps import hard_maps
+from small_maps import HARD_MAPS, hard_maps, noise_maps
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -37,7 +37,7 @@ def test_features_are_zero_at_the_median_bare_wall_and_mark_a_cell_without_retur
     assert network.features(bare_m[None], counts[None] + 9)[0, :, 3, 4].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
 
 
-@pytest.mark.parametrize("name", ["all zero", "saturated", "half invalid", "all invalid"])
+@pytest.mark.parametrize("name", HARD_MAPS)
 @pytest.mark.parametrize("v", [0.0, 1.0])
 def test_doubt_of_hard_maps_is_finite_and_in_range(network: DoubtNetwork, name: str, v: float) -> None:
     calibrated = CalibratedDoubt(network, (1.0, 2.0), 3.0).eval()
@@ -62,46 +62,30 @@ def test_calibration_scales_error_and_divides_logits(network: DoubtNetwork) -> N
 QUICK = RECIPE.model_copy(
     update={"objects": 128, "epochs": 8, "batch": 16, "learning_rate": 5e-3, "schedule": "one-cycle"}
 )
-Trained = tuple[DoubtNetwork, Path]
 
 
 def _train(folder: Path, steps: list[int], **running: Any) -> DoubtNetwork:
-    sets = small_doubt_set(128, 0), small_doubt_set(32, 1)
-    return doubt_training.train_doubt(
-        QUICK, *sets, folder, Running(on_step=lambda done, _: steps.append(done), **running)
-    )[0]
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    folder = tmp_path_factory.mktemp("run")
-    return _train(folder, []), folder
+    counted = Running(on_step=lambda done, _: steps.append(done), **running)
+    return doubt_training.train_doubt(QUICK, small_doubt_set(128, 0), small_doubt_set(32, 1), folder, counted)[0]
 
 
 @pytest.mark.slow
-def test_doubt_network_learns_empty_unusual_and_uncertain(trained: Trained) -> None:
-    fresh = small_doubt_set(64, 2)
-    said = doubt_training.predict(trained[0], fresh)
+def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain_within_its_limits(
+    tmp_path: Path,
+) -> None:
+    steps, trained, fresh = list[int](), _train(tmp_path / "whole", []), small_doubt_set(64, 2)
+    with pytest.raises(KeyboardInterrupt):
+        _train(tmp_path / "stopped", steps, stop=lambda: len(steps) == 11)
+    torch.testing.assert_close(_train(tmp_path / "stopped", steps).state_dict(), trained.state_dict())
+    assert steps == list(range(1, 65))
+    said = doubt_training.predict(trained, fresh)
     assert ((said.nothing.numpy() > 0) == fresh.nothing).mean() > 0.9
     there = ~fresh.nothing
     assert np.corrcoef(said.outside.numpy()[there], fresh.outside[there])[0, 1] > 0.8
     dark, bright = (said.log_error.numpy()[fresh.truth == value].mean() for value in np.float16([DARK_V, 0.8]))
     assert dark > bright + 0.3
-
-
-@pytest.mark.slow
-def test_stopped_doubt_run_resumes_to_same_weights(trained: Trained, tmp_path: Path) -> None:
-    steps = list[int]()
-    with pytest.raises(KeyboardInterrupt):
-        _train(tmp_path, steps, stop=lambda: len(steps) == 11)
-    torch.testing.assert_close(_train(tmp_path, steps).state_dict(), trained[0].state_dict())
-    assert steps == list(range(1, 65))
-
-
-@pytest.mark.slow
-def test_calibrated_limits_keep_their_false_alarm_rates(trained: Trained) -> None:
     some = small_doubt_set(200, 3)
-    fitted, said = doubt_training.calibrate(trained[0], some), doubt_training.predict(trained[0], some)
+    fitted, said = doubt_training.calibrate(trained, some), doubt_training.predict(trained, some)
     nothing, outside = (
         torch.sigmoid(logits / t).numpy() for logits, t in zip(said[:2], fitted.temperatures, strict=True)
     )
@@ -112,7 +96,7 @@ def test_calibrated_limits_keep_their_false_alarm_rates(trained: Trained) -> Non
     assert fitted.error_scale > 0
 
 
-def test_doubt_loss_is_least_at_mean_error_and_ignores_it_where_nothing_is_hidden() -> None:
+def test_doubt_loss_is_least_at_mean_error_of_pixels_in_both_images() -> None:
     some = small_doubt_set(64, 0)
     there, empty = (doubt_training.as_doubt_batch(some.where(rows)) for rows in (~some.nothing, some.nothing))
 
@@ -124,6 +108,10 @@ def test_doubt_loss_is_least_at_mean_error_and_ignores_it_where_nothing_is_hidde
     mean = float((there.made - there.truth).abs()[shared].mean().log())
     assert loss(there, mean) < min(loss(there, mean - 0.2), loss(there, mean + 0.2))
     assert loss(empty, -3.0) == loss(empty, 1.0)
+    made, truth = np.array([[[0.5, 0.5], [0.0, 0.0]]]), np.array([[[0.25, 0.0], [0.5, 0.0]]])
+    known, error = doubt_training.shared_errors(made, truth)
+    assert known.tolist() == [[[True, False], [False, False]]]
+    assert error.tolist() == [0.25]
 
 
 def test_doubt_batches_mirror_maps_with_their_images() -> None:
@@ -153,13 +141,6 @@ def test_temperature_finds_overconfidence(true: float) -> None:
     assert doubt_training.temperature(np.where(truth, 9.0, -9.0), truth) == 1.0  # separable
 
 
-def test_shared_errors_are_of_pixels_in_both_images() -> None:
-    made, truth = np.array([[[0.5, 0.5], [0.0, 0.0]]]), np.array([[[0.25, 0.0], [0.5, 0.0]]])
-    shared, error = doubt_training.shared_errors(made, truth)
-    assert shared.tolist() == [[[True, False], [False, False]]]
-    assert error.tolist() == [0.25]
-
-
 @pytest.fixture
 def watched(tmp_path: Path) -> Path:
     return watched_weights(tmp_path / "watched")
@@ -170,7 +151,9 @@ def record(tmp_path: Path, watched: Path) -> DoubtRecord:
     return untrained_doubt(tmp_path / "run", watched)
 
 
-def test_saved_doubt_restores_with_watched_weights(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
+def test_doubt_is_restored_with_watched_weights_which_alone_have_none(
+    tmp_path: Path, watched: Path, record: DoubtRecord
+) -> None:
     network, found = doubt_network.load_doubt(tmp_path / "run")
     assert found == record
     assert not network.training
@@ -179,9 +162,6 @@ def test_saved_doubt_restores_with_watched_weights(tmp_path: Path, watched: Path
     assert (tmp_path / "run" / "doubt.safetensors").stat().st_size < 700_000
     for name in (*records.WATCHED, "checkpoint.json"):
         assert (tmp_path / "run" / name).read_bytes() == (watched / name).read_bytes()
-
-
-def test_weights_without_doubt_network_load_none(tmp_path: Path, watched: Path) -> None:
     assert doubt_network.load_doubt(watched) is None
     assert load_uncertainty_model(watched, tmp_path) is None
     with pytest.raises(CheckpointError, match="compressor"):
@@ -225,14 +205,10 @@ def test_doubter_onnx_equals_torch_and_is_exported_once(tmp_path: Path, record: 
     assert again.record == doubter.record == record
     assert model.stat().st_mtime_ns == written_ns
     for count in (1, 5):
-        generator = np.random.default_rng(count)
-        depth_m = generator.uniform(0.2, 0.8, (count, 64, 80)).astype(np.float32)
-        depth_m[generator.random(depth_m.shape) < 0.1] = np.nan
-        intensity = generator.uniform(0, 255, depth_m.shape).astype(np.float32)
-        image = generator.uniform(0, 1, (count, 64, 64)).astype(np.float32)
+        seen = *noise_maps(count), np.random.default_rng(count).random((count, 64, 64), np.float32)
         with torch.inference_mode():
-            theirs = doubt_network.load_doubt(folder)[0](*(torch.from_numpy(a) for a in (depth_m, intensity, image)))
-        for mine, its in zip(again(depth_m, intensity, image), theirs, strict=True):
+            theirs = doubt_network.load_doubt(folder)[0](*(torch.from_numpy(part) for part in seen))
+        for mine, its in zip(again(*seen), theirs, strict=True):
             assert mine.shape == tuple(its.shape)
             np.testing.assert_allclose(mine, its, rtol=1e-3, atol=1e-5)
 
@@ -298,14 +274,6 @@ def _sum_of_figures(count: int) -> QualityRecord:
     return record_of(means=[0.0] * count, spreads=[10.0] * count, layers=layers)
 
 
-def test_figure_that_never_differs_leaves_a_model_that_loads() -> None:
-    samples = known_objects(60)
-    samples.figures[:, 5] = 1.0
-    record = QualityRecord.model_validate_json(fit_quality(samples, "0" * 12).model_dump_json())
-    assert min(record.spreads) > 0
-    assert np.isfinite(QualityModel(record).outputs(samples.figures)).all()
-
-
 def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> None:
     kinds = [*KINDS, "carved blobs", "cup"]
     judged = list[int]()
@@ -316,8 +284,11 @@ def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> N
     assert sorted(judged) == list(range(len(kinds)))
 
 
-def test_fit_predicts_the_quality_of_kinds_that_it_never_saw() -> None:
-    record = fit_quality(samples := known_objects(600), "0" * 12)
+def test_fit_predicts_the_quality_of_kinds_that_it_never_saw_also_by_a_figure_that_never_differs() -> None:
+    samples = known_objects(600)
+    samples.figures[:, 5] = 1.0
+    record = QualityRecord.model_validate_json(fit_quality(samples, "0" * 12).model_dump_json())
+    assert min(record.spreads) > 0
     assert record.figures["all_correlation"] > 0.8
     found = QualityEstimate.of(QualityModel(record).outputs(samples.figures), record.trusted_above)
     assert (np.diff(found.iou, axis=1) >= 0).all()

@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -21,10 +22,9 @@ from nlos_models.pipeline import RemappingNetwork, split_and_stack
 from nlos_models.records import SHIPPED, CheckpointRecord, checksum_of_watched, shipped_folder, weights_folder
 from nlos_models.vae import Decoder
 from onnx import TensorProto, numpy_helper
-from small_maps import HARD_MAPS, hard_maps
+from small_maps import HARD_MAPS, hard_maps, noise_maps
 from small_run import small_recipe
 
-WITHOUT_TORCH = Mock(side_effect=ModuleNotFoundError("No module named 'torch'", name="torch"))
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 RECORD = CheckpointRecord.of([small_recipe()], ("paper-rig", "0123456789ab"))
@@ -33,22 +33,17 @@ HANDFUL = 8
 Pair = tuple[Reconstructor, Reconstructor]
 
 
-@pytest.fixture
-def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inference, "_has_cuda", lambda: False)
-
-
-def _maps(n: int) -> tuple[np.ndarray, np.ndarray]:
-    generator = np.random.default_rng(n)
-    depth = generator.uniform(0.2, 0.8, (n, 64, 80)).astype(np.float32)
-    depth[generator.random(depth.shape) < 0.1] = np.nan
-    return depth, generator.uniform(0, 255, (n, 64, 80)).astype(np.float32)
+@pytest.fixture(autouse=True, scope="module")
+def _no_gpu() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inference, "_has_cuda", lambda: False)
+        yield
 
 
 @pytest.fixture(scope="module")
 def pipeline() -> RemappingNetwork:
     torch.manual_seed(0)
-    made, maps = RemappingNetwork(Compressor(), Decoder()), [torch.from_numpy(m) for m in _maps(8)]
+    made, maps = RemappingNetwork(Compressor(), Decoder()), [torch.from_numpy(m) for m in noise_maps(8)]
     made.preprocess.learn(split_and_stack(*maps))
     with torch.no_grad():
         made.train()(*maps)  # statistics that are not those of a new network
@@ -69,19 +64,18 @@ def folders(pipeline: RemappingNetwork, tmp_path_factory: pytest.TempPathFactory
 @pytest.fixture(scope="module")
 def pair(folders: tuple[Path, Path]) -> Pair:
     """The exported pipeline, and the same weights in torch."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(inference, "_has_cuda", lambda: False)
-        exported = load_reconstructor(*folders)
-    return exported, TorchReconstructor(*load_pipeline(folders[0]), "cpu")
+    return load_reconstructor(*folders), TorchReconstructor(*load_pipeline(folders[0]), "cpu")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("batch", [1, 5])
-def test_onnx_reconstruction_equals_torch(pair: Pair, batch: int) -> None:
+def test_onnx_reconstruction_equals_torch_and_is_exported_once(
+    folders: tuple[Path, Path], pair: Pair, monkeypatch: pytest.MonkeyPatch, batch: int
+) -> None:
     assert isinstance(pair[0], OnnxReconstructor)
     assert pair[0].record == pair[1].record == RECORD
     assert pair[0].runtime != pair[1].runtime
-    maps = _maps(batch)
+    maps = noise_maps(batch)
     mine, its = (reconstructor(*maps) for reconstructor in pair)
     for image, reconstructor in zip((mine, its), pair, strict=True):
         strided = reconstructor(*(np.asfortranarray(part) for part in maps))
@@ -92,6 +86,9 @@ def test_onnx_reconstruction_equals_torch(pair: Pair, batch: int) -> None:
     assert ((mine > 0) != (its > 0)).sum((1, 2)).max() <= HANDFUL
     assert 0 < both.mean() < 1
     np.testing.assert_allclose(mine[both], its[both], atol=1e-4)
+    monkeypatch.setattr(export, "export_onnx", lambda _: pytest.fail("exported again"))
+    np.testing.assert_array_equal(load_reconstructor(*folders)(*maps), mine)
+    assert [path.suffix for path in folders[1].iterdir()] == [".onnx"]
 
 
 @pytest.mark.slow
@@ -102,22 +99,10 @@ def test_reconstruction_of_hard_maps_is_a_possible_image(pair: Pair, name: str) 
         assert ((image == 0) | ((image >= MIN_V) & (image <= 1))).all()
 
 
-@pytest.mark.slow
-def test_second_load_exports_nothing(folders: tuple[Path, Path], pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inference, "_has_cuda", lambda: False)
-    monkeypatch.setattr(export, "export_onnx", lambda _: pytest.fail("exported again"))
-    again, maps = load_reconstructor(*folders), _maps(1)
-    np.testing.assert_array_equal(again(*maps), pair[0](*maps))
-    assert [path.suffix for path in folders[1].iterdir()] == [".onnx"]
-
-
-def test_color_networks_are_not_exported(pipeline: RemappingNetwork) -> None:
+def test_color_networks_are_not_exported_and_exports_are_named_by_weights(pipeline: RemappingNetwork) -> None:
     color = RemappingNetwork(pipeline.compressor, Decoder(3, 512), intensities=3)
     with pytest.raises(ModelError, match="simulation only"):
         export.export_onnx(color)
-
-
-def test_export_checksum_depends_on_weights(pipeline: RemappingNetwork) -> None:
     before = export.checksum_of(pipeline)
     assert export.checksum_of(pipeline) == before
     assert export.checksum_of(RemappingNetwork(pipeline.compressor, Decoder())) != before
@@ -137,22 +122,18 @@ small (float[n, 64, 80] depth_m, float[n, 64, 80] intensity) => (float[n, 1, 64,
 """A network of two convolutions, with a stale shape of the kind that exporters leave."""
 
 
-@pytest.fixture(scope="module")
-def model() -> bytes:
-    made, generator = onnx.parser.parse_model(GRAPH), np.random.default_rng(0)
-    kernel, mix = (generator.normal(size=size).astype(np.float32) for size in ((8, 1, 3, 3), (1, 8, 1, 1)))
-    constants = {"kernel": kernel, "mix": mix, "axes": np.array([1])}
-    made.graph.initializer.extend(numpy_helper.from_array(array, name) for name, array in constants.items())
-    return made.SerializeToString()
-
-
 def _samples(seed: int) -> list[tuple[np.ndarray, ...]]:
     generator = np.random.default_rng(seed)
     return [tuple(generator.random((1, 64, 80), np.float32) for _ in range(2)) for _ in range(4)]
 
 
 @pytest.mark.parametrize("static", [False, True])
-def test_quantized_network_is_nearly_exact_for_any_batch_or_one_of_our_errors(model: bytes, static: bool) -> None:
+def test_quantized_network_is_nearly_exact_for_any_batch_or_one_of_our_errors(static: bool) -> None:
+    made, generator = onnx.parser.parse_model(GRAPH), np.random.default_rng(0)
+    kernel, mix = (generator.normal(size=size).astype(np.float32) for size in ((8, 1, 3, 3), (1, 8, 1, 1)))
+    constants = {"kernel": kernel, "mix": mix, "axes": np.array([1])}
+    made.graph.initializer.extend(numpy_helper.from_array(array, name) for name, array in constants.items())
+    model = made.SerializeToString()
     small = quantize(model, _samples(0) if static else None)
     weights = {tensor.name: tensor.data_type for tensor in onnx.load_from_string(small).graph.initializer}
     assert {TensorProto.INT8, TensorProto.UINT8} & set(weights.values())
@@ -166,7 +147,7 @@ def test_quantized_network_is_nearly_exact_for_any_batch_or_one_of_our_errors(mo
 
 @pytest.mark.slow
 def test_linked_graphs_equal_full_exports_bit_for_bit(folders: tuple[Path, Path], pair: Pair, tmp_path: Path) -> None:
-    weights, maps = Path(shutil.copytree(folders[0], tmp_path / "weights")), _maps(3)
+    weights, maps = Path(shutil.copytree(folders[0], tmp_path / "weights")), noise_maps(3)
     (graph,) = export.export_folder(weights)
     assert graph.stat().st_size < 400_000
     linked = load_reconstructor(weights, tmp_path / "unused")
@@ -180,7 +161,6 @@ def test_linked_graphs_equal_full_exports_bit_for_bit(folders: tuple[Path, Path]
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("no_gpu")
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_graphs_equal_shipped_checkpoint_in_torch(name: str) -> None:
     """The images to within 1e-4, and at most a handful of pixels on the other side of the silhouette's threshold."""
@@ -203,35 +183,30 @@ def test_shipped_graphs_equal_shipped_checkpoint_in_torch(name: str) -> None:
         np.testing.assert_allclose(said, wanted, rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.usefixtures("no_gpu")
 def test_weights_without_graph_need_torch_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for path in shipped_folder().glob("*.*"):
         if path.suffix != ".onnx":
             (tmp_path / path.name).symlink_to(path)
+    assert errors.require("json", "reading").__name__ == "json"
+    with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+        errors.require("no_such_module", "reading")
     monkeypatch.setitem(sys.modules, "nlos_models.export", None)
-    monkeypatch.setattr(errors, "import_module", WITHOUT_TORCH)
+    without_torch = Mock(side_effect=ModuleNotFoundError("No module named 'torch'", name="torch"))
+    monkeypatch.setattr(errors, "import_module", without_torch)
     for load in (load_reconstructor, load_uncertainty_model):
         with pytest.raises(MissingExtraError, match=r"onnx.* torch.*pip install \"nlos-cam\[train\]\"") as found:
             load(tmp_path, tmp_path / "cache")
         assert "\n" not in str(found.value)
-
-
-def test_require_names_the_extra_for_its_modules_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert errors.require("json", "reading").__name__ == "json"
-    with pytest.raises(ModuleNotFoundError, match="no_such_module"):
-        errors.require("no_such_module", "reading")
-    monkeypatch.setattr(errors, "import_module", WITHOUT_TORCH)
     with pytest.raises(MissingExtraError, match="training needs torch"):
         errors.require("nlos_models.train", "training")
 
 
-def test_paper_weights_without_encoder_name_the_recipe_that_makes_one() -> None:
+def test_paper_weights_name_what_they_or_a_package_without_them_lack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(CheckpointError, match=r"encoder.*train vae --recipe vae-encoder"):
         checkpoint.load_vae()
     assert checkpoint.load_encoder() is None
-
-
-def test_paper_weights_are_named_where_a_package_has_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(records, "shipped_folder", lambda name="direct": tmp_path / name)
     with pytest.raises(CheckpointError, match="from a clone"):
         load_reconstructor(Path("paper"), tmp_path)

@@ -32,21 +32,17 @@ def test_equal_images_score_perfectly(truth: np.ndarray) -> None:
     assert rmse == 0 if truth.any() else np.isnan(rmse)
 
 
-def test_accuracies_count_every_pixel() -> None:
+def test_accuracies_count_every_pixel_iou_masks_above_5_percent_and_rmse_shared_pixels_up_to_the_farthest() -> None:
     assert metrics.accuracy_mean_abs(_square(0.5), EMPTY)[0] == pytest.approx(1 - 0.5 * 100 / 4096)
     assert metrics.accuracy_within_2_percent(_square(0.515), _square(0.5))[0] == 1
     assert metrics.accuracy_within_2_percent(_square(0.53), _square(0.5))[0] == pytest.approx(1 - 100 / 4096)
 
-
-def test_silhouette_iou_compares_masks_above_5_percent() -> None:
     shifted = _square(0.9, columns=slice(15, 25))
     assert metrics.silhouette_iou(_square(0.4), shifted)[0] == pytest.approx(50 / 150)
     assert metrics.silhouette_iou(_square(0.06), _square(1.0)) == 1
     assert metrics.silhouette_iou(_square(0.04), _square(1.0)) == 0
     assert metrics.silhouette_iou(EMPTY, _square(0.5)) == 0
 
-
-def test_foreground_rmse_is_over_shared_pixels_and_clips_at_farthest() -> None:
     image = _square(0.6, columns=slice(10, 30))
     assert metrics.foreground_rmse_mm(image, _square(0.5), 300.0)[0] == pytest.approx(30, rel=1e-5)
     for apart in (EMPTY, _square(0.5, rows=slice(40, 50))):

@@ -34,22 +34,17 @@ def _channels(module: nn.Module) -> tuple[tuple[int, int], ...]:
     return tuple((c.in_channels, c.out_channels) for c in _convolutions(module))
 
 
-def test_compressor_matches_table_s2() -> None:
-    compressor = Compressor()
+@pytest.mark.parametrize("width", [0.35, 0.5, 1.0, 1.4])
+def test_compressor_matches_table_s2_and_width_scales_channels_in_steps_of_eight(width: float) -> None:
+    compressor = Compressor(width=width).eval()
     table = ((16, 1, 1), (24, 2, 2), (32, 3, 2), (64, 4, 2), (96, 3, 1), (160, 3, 2), (320, 1, 1))
     expected = [(out, stride if k == 0 else 1) for out, repeats, stride in table for k in range(repeats)]
     blocks = [_convolutions(m) for m in compressor.features if isinstance(m, InvertedResidual)]
-    assert [(block[-1].out_channels, max(c.stride[0] for c in block)) for block in blocks] == expected
-    assert _parameters(compressor) == 2_552_096
-
-
-@pytest.mark.parametrize("width", [0.35, 0.5, 1.4])
-def test_compressor_width_scales_channels_in_steps_of_eight(width: float) -> None:
-    compressor = Compressor(width=width).eval()
-    blocks = [m for m in compressor.features if isinstance(m, InvertedResidual)]
-    out = [_convolutions(block)[-1].out_channels for block in blocks]
-    full = [16, *[24] * 2, *[32] * 3, *[64] * 4, *[96] * 3, *[160] * 3, 320]
-    assert all(mine % 8 == 0 and abs(mine - width * its) <= 8 for mine, its in zip(out, full, strict=True))
+    for block, (full, stride) in zip(blocks, expected, strict=True):
+        out = block[-1].out_channels
+        assert max(c.stride[0] for c in block) == stride
+        assert out == full if width == 1 else out % 8 == 0 and abs(out - width * full) <= 8
+    assert (_parameters(compressor) == 2_552_096) == (width == 1)
     with torch.inference_mode():
         assert compressor(torch.randn(1, 4, 100, 100)).shape == (1, 256)
 

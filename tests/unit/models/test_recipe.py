@@ -16,10 +16,11 @@ RECIPES = Path(__file__).parents[3] / "models" / "recipes"
 
 
 @pytest.mark.parametrize("path", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
-def test_committed_recipes_load_and_state_deviations(path: Path) -> None:
-    recipe = load_recipe(path)
+def test_committed_recipes_load_by_path_or_name_and_state_deviations(path: Path) -> None:
+    recipe, name = load_recipe(path), path.stem.removeprefix("paper-rig-")
     assert recipe.task in path.stem
     assert recipe.deviations
+    assert load_recipe(packaged_recipes()[name]) == load_recipe(Path(name)) == load_recipe(Path(path.stem)) == recipe
 
 
 def test_si_recipes_have_the_values_of_the_paper() -> None:
@@ -103,7 +104,7 @@ def test_wrong_or_contradictory_recipe_is_refused_in_one_line_that_names_the_fie
 
 
 @pytest.mark.parametrize("content", [b"task = ", b"\xff\xfe\x00", b"", None])
-def test_load_recipe_names_unreadable_file(tmp_path: Path, content: bytes | None) -> None:
+def test_load_recipe_names_unreadable_file_or_similar_name(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "recipe.toml"
     if content is not None:
         path.write_bytes(content)
@@ -111,6 +112,8 @@ def test_load_recipe_names_unreadable_file(tmp_path: Path, content: bytes | None
         load_recipe(path)
     assert isinstance(caught.value, ModelError)
     assert caught.value.exit_code == 4
+    with pytest.raises(RecipeError, match="Did you mean 'transfer'"):
+        load_recipe(Path("transfre"))
 
 
 def _optimizer(rate: float) -> torch.optim.Optimizer:
@@ -142,11 +145,3 @@ def test_one_cycle_schedule_rises_to_rate_and_falls_to_end() -> None:
     assert rates == sorted(rates[: peak + 1]) + sorted(rates[peak + 1 :], reverse=True)
     assert optimizer.param_groups[0]["lr"] < SMALLEST_RATE
     assert not has_ended(recipe, 0.0)
-
-
-def test_packaged_recipes_load_by_name() -> None:
-    names = packaged_recipes()
-    assert {"transfer", "compressor", "si-vae"} <= names.keys()
-    assert load_recipe(Path("transfer")) == load_recipe(names["transfer"]) == load_recipe(Path("paper-rig-transfer"))
-    with pytest.raises(RecipeError, match="Did you mean 'transfer'"):
-        load_recipe(Path("transfre"))

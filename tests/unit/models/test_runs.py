@@ -13,9 +13,8 @@ from nlos_models.errors import OutputExistsError, TrainingError
 from nlos_models.files import CHECKSUMS
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import Recipe
-from nlos_models.runs import compressor_start, record_doubt_run, record_run, transfer_start, vae_start
+from nlos_models.runs import compressor_start, record_run, transfer_start, vae_start
 from safetensors.torch import load_file, save_file
-from small_doubt import untrained_doubt, watched_weights
 from small_maps import SmallCompressor, SmallVae, use_small_networks
 from small_run import changed_tensors, small_recipe
 
@@ -67,11 +66,9 @@ def test_compressor_start_lists_runs_of_weights_and_vae(weights: Path, tmp_path:
 
 
 def _start(recipe: Recipe, weights: Path) -> object:
-    if recipe.task == "vae":
-        return vae_start(recipe, weights)
     if recipe.task == "transfer":
         return transfer_start(recipe, weights, partial=False, on_report=pytest.fail)
-    return compressor_start(recipe, weights, weights)
+    return vae_start(recipe, weights) if recipe.task == "vae" else compressor_start(recipe, weights, weights)
 
 
 @pytest.mark.parametrize(
@@ -87,20 +84,17 @@ def test_start_refuses_weights_of_other_kind(weights: Path, recipe: Recipe, chan
         _start(recipe.model_copy(update=changes), weights)
 
 
-def test_start_refuses_color_weights_for_depth(weights: Path) -> None:
+def test_start_refuses_weights_without_encoder_for_latent_loss_and_color_weights_for_depth(weights: Path) -> None:
+    (weights / "encoder.safetensors").unlink()
+    with pytest.raises(TrainingError, match="encoder"):
+        _start(JOINT, weights)
+    _start(JOINT.model_copy(update=IMAGES_ALONE), weights)
     record = CheckpointRecord.of([small_recipe(colour=True)], NAMED).model_dump_json()
     (weights / "checkpoint.json").write_text(record, encoding="utf-8")
     (weights / CHECKSUMS).unlink()
     for recipe in (AGAIN, JOINT, TRANSFER):
         with pytest.raises(TrainingError, match="simulation only"):
             _start(recipe, weights)
-
-
-def test_joint_start_needs_encoder_for_latent_loss(weights: Path) -> None:
-    (weights / "encoder.safetensors").unlink()
-    with pytest.raises(TrainingError, match="encoder"):
-        _start(JOINT, weights)
-    _start(JOINT.model_copy(update=IMAGES_ALONE), weights)
 
 
 def test_transfer_starts_by_default_from_weights_that_its_loss_fits(
@@ -148,14 +142,8 @@ def test_record_run_refuses_weights_of_another_run(tmp_path: Path, recipes: tupl
         _record(tmp_path, *recipes)
 
 
-def test_record_of_a_run_refuses_a_file_a_finished_run_and_the_folder_that_it_starts_from(tmp_path: Path) -> None:
+def test_record_of_a_run_refuses_a_file_and_the_folder_that_it_starts_from(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for name, starts in (("file", ()), ("run", (tmp_path / "x" / ".." / "run",))):
         with pytest.raises(OutputExistsError, match="--out"):
             _record(tmp_path / name, VAE, starts=starts)
-    watched = watched_weights(tmp_path / "watched")
-    known = untrained_doubt(tmp_path / "doubt", watched)
-    assert record_doubt_run(known.recipe, tmp_path / "new", watched, ["a"]).watches == known.watches
-    for out in (watched, tmp_path / "doubt"):
-        with pytest.raises(OutputExistsError, match="--out"):
-            record_doubt_run(known.recipe, out, watched, ["a"])

@@ -60,23 +60,21 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     return *_vae(_recipe("vae"), folder), folder
 
 
-def test_vae_loss_falls_and_figures_are_of_last_epoch(trained: Trained) -> None:
+def test_vae_loss_falls_and_figures_are_of_last_epoch_and_resumed_run_equals_it(
+    trained: Trained, tmp_path: Path
+) -> None:
     vae, figures, folder = trained
     log = log_rows(folder)
     assert float(log[-1]["loss"]) < float(log[0]["loss"])
     assert {key: float(log[-1][key]) for key in figures} == figures
     assert 0 <= figures["held_out_iou"] <= 1
     assert not vae.training
-
-
-def test_resumed_vae_equals_uninterrupted(trained: Trained, tmp_path: Path) -> None:
     with pytest.raises(Stopped):
         _vae(_recipe("vae"), tmp_path, on_step=stop_halfway)
     torch.manual_seed(99)
-    vae, figures = _vae(_recipe("vae"), tmp_path)
-    assert not changed_tensors(vae.state_dict(), trained[0].state_dict())
-    assert figures == trained[1]
-    assert log_rows(tmp_path) == log_rows(trained[2])
+    resumed, again = _vae(_recipe("vae"), tmp_path)
+    assert not changed_tensors(vae.state_dict(), resumed.state_dict())
+    assert (again, log_rows(tmp_path)) == (figures, log)
 
 
 def test_vae_warm_up_ignores_divergence(tmp_path: Path) -> None:
@@ -85,12 +83,12 @@ def test_vae_warm_up_ignores_divergence(tmp_path: Path) -> None:
         recipe = _recipe("vae", latent_warm_up=0.5, kl_weight=weight, epochs=4)
         _vae(recipe, tmp_path / f"{weight}")
         losses.append([row["loss"] for row in log_rows(tmp_path / f"{weight}")])
-    without, with_it = losses
-    assert without[:2] == with_it[:2]
-    assert all(one != other for one, other in zip(without[2:], with_it[2:], strict=True))
+    assert [one == other for one, other in zip(*losses, strict=True)] == [True, True, False, False]
 
 
-def test_vae_continues_from_given_weights(trained: Trained, tmp_path: Path) -> None:
+def test_vae_continues_from_given_weights_or_trains_an_encoder_for_a_decoder_that_is_kept(
+    trained: Trained, tmp_path: Path
+) -> None:
     start = SmallVae()
     start.load_state_dict(before := state_of(trained[0]))
     vae, figures = _vae(_recipe("vae", start="weights", epochs=1, learning_rate=1e-7), tmp_path, start=start)
@@ -98,14 +96,10 @@ def test_vae_continues_from_given_weights(trained: Trained, tmp_path: Path) -> N
         torch.testing.assert_close(tensor.data, before[name], rtol=0, atol=1e-5)
     assert changed_tensors(before, vae.state_dict())
     assert figures["held_out_loss"] == pytest.approx(trained[1]["held_out_loss"], rel=0.05)
-
-
-def test_encoder_is_trained_for_a_decoder_that_is_kept(trained: Trained, tmp_path: Path) -> None:
-    torch.manual_seed(5)
     start = SmallVae()
     start.decoder.load_state_dict(kept := state_of(trained[0].decoder))
     encoder = state_of(start.encoder)
-    vae, _ = _vae(_recipe("vae", start="decoder", epochs=1), tmp_path, start=start)
+    vae, _ = _vae(_recipe("vae", start="decoder", epochs=1), tmp_path / "decoder", start=start)
     assert not changed_tensors(kept, vae.decoder.state_dict())
     assert changed_tensors(encoder, vae.encoder.state_dict())
 
@@ -116,9 +110,8 @@ def test_compressor_keeps_vae_frozen_and_learns_statistics(trained: Trained, tmp
     pipeline, _ = _compressor(recipe, tasks.Start(trained[0]), tmp_path)
     assert not changed_tensors(before, trained[0].state_dict())
     assert not changed_tensors(pipeline.decoder.state_dict(), trained[0].decoder.state_dict())
-    mean, spread = _statistics(small_maps(COUNT, 0))
-    assert torch.equal(pipeline.preprocess.mean, mean)
-    assert torch.equal(pipeline.preprocess.spread, spread)
+    learnt = pipeline.preprocess.mean, pipeline.preprocess.spread
+    assert all(map(torch.equal, learnt, _statistics(small_maps(COUNT, 0))))
     assert pipeline.preprocess.left_noise == 0.1
     assert not pipeline.training
 
@@ -196,21 +189,16 @@ def test_vae_turns_images_only_by_recipe(
 
 
 @torch.no_grad()
-def test_latents_of_batches_equal_those_of_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_and_latents_in_parts_equal_those_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline, maps = RemappingNetwork(SmallCompressor(), SmallVae().decoder).eval(), small_maps(8, 3)
+    whole, encoder = tasks.run(pipeline, maps), SmallVae().eval().encoder
+    assert whole.shape == (8, 64, 64)
     monkeypatch.setattr(tasks, "SCORING_BATCH", 3)
-    encoder, maps = SmallVae().eval().encoder, small_maps(8, 3)
+    np.testing.assert_allclose(tasks.run(pipeline, maps), whole, atol=1e-5)
     straight, mirrored = tasks.latents_of(encoder, maps.image), tasks.latents_of(encoder, maps.image[:, ::-1])
     for batch in map_batches(maps, 4, torch.Generator().manual_seed(0)):
         chosen = torch.where(batch.mirrored[:, None, None], mirrored[batch.row], straight[batch.row])
         torch.testing.assert_close(chosen, torch.stack(encoder(batch.image), dim=1), atol=1e-5, rtol=1e-4)
-
-
-def test_run_in_parts_equals_run_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    pipeline, maps = RemappingNetwork(SmallCompressor(), SmallVae().decoder).eval(), small_maps(5, 2)
-    whole = tasks.run(pipeline, maps)
-    assert whole.shape == (5, 64, 64)
-    monkeypatch.setattr(tasks, "SCORING_BATCH", 2)
-    np.testing.assert_allclose(tasks.run(pipeline, maps), whole, atol=1e-5)
 
 
 def test_figures_are_mean_squared_error_sum_and_iou() -> None:
@@ -297,14 +285,20 @@ def test_transfer_changes_all_of_compressor_and_then_its_classifier_alone(
     assert changed_tensors(before, bench.state) == ours
 
 
-def test_transfer_phases_have_epochs_and_rates_of_recipe(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
+def test_transfer_phases_have_epochs_and_rates_of_recipe_and_resume_exactly(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "whole")
     figures = bench.go()
-    first, second = (log_rows(tmp_path / name) for name in (tasks.ALL_LAYERS, tasks.CLASSIFIER))
+    first, second = (log_rows(bench.folder / name) for name in (tasks.ALL_LAYERS, tasks.CLASSIFIER))
     assert (len(first), len(second)) == (2, 3)
     assert {float(row["rate"]) for row in first + second} == {1e-3}
     assert figures["held_out_loss"] == float(second[-1]["held_out_loss"])
     assert bench.steps == [(k + 1, 5 * STEPS) for k in range(5 * STEPS)]
+    for fail_at in (STEPS + 1, 3 * STEPS + 1):
+        with pytest.raises(Stopped):
+            Bench(tmp_path / f"{fail_at}").go(fail_at)
+        again = Bench(tmp_path / f"{fail_at}")
+        assert again.go() == figures
+        assert not changed_tensors(bench.state, again.state)
 
 
 def test_transfer_second_phase_starts_from_best_epoch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -329,19 +323,7 @@ def test_transfer_normalises_maps_by_recipe(tmp_path: Path, statistics: str, own
     for values, theirs in zip(wanted, _statistics(bench.maps), strict=True):
         values[own] = theirs[own]
     bench.go(statistics=statistics, all_layers_epochs=0, epochs=1)
-    assert torch.equal(bench.pipeline.preprocess.mean, wanted[0])
-    assert torch.equal(bench.pipeline.preprocess.spread, wanted[1])
-
-
-@pytest.mark.parametrize("fail_at", [STEPS + 1, 3 * STEPS + 1])
-def test_resumed_transfer_equals_uninterrupted(tmp_path: Path, fail_at: int) -> None:
-    whole = Bench(tmp_path / "whole")
-    figures = whole.go()
-    with pytest.raises(Stopped):
-        Bench(tmp_path / "failed").go(fail_at)
-    again = Bench(tmp_path / "failed")
-    assert again.go() == figures
-    assert not changed_tensors(whole.state, again.state)
+    assert all(map(torch.equal, (bench.pipeline.preprocess.mean, bench.pipeline.preprocess.spread), wanted))
 
 
 @pytest.mark.parametrize(("steps", "word"), [("two", "--vae"), ("two-then-joint", "--weights")])

@@ -14,27 +14,18 @@ from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import small_run
 import torch
 from nlos_models import recipe as schedule
 from nlos_models import train
+from nlos_models.direct_training import NormalBatch
 from nlos_models.distributed import launch, open_fabric, precision_on, seed_of, share_of
 from nlos_models.errors import CheckpointError, RecipeError, TrainingError
-from small_run import (
-    STEPS,
-    Executioner,
-    SmallRun,
-    Stopped,
-    be_killed,
-    changed_tensors,
-    on_two,
-    run_watched,
-    small_recipe,
-    state_of,
-)
+from small_run import STEPS, SmallRun, Stopped, changed_tensors, small_recipe, state_of
 from torch import Tensor, nn
 from torch._inductor import config
 from torch._inductor.exc import InductorError
@@ -67,14 +58,15 @@ def test_resumed_run_equals_uninterrupted(tmp_path: Path, schedule: str, fail_at
 @pytest.mark.slow
 def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> None:
     recipe = small_recipe(schedule="one-cycle", epochs=2)
-    clerk = Executioner()
-    whole = run_watched(recipe, tmp_path / "whole", clerk)
+    clerk = small_run.Executioner()
+    whole = small_run.run_watched(recipe, tmp_path / "whole", clerk)
     moments = random.Random(0).sample(range(2, clerk.seen // 2), 4)  # noqa: S311  each start resumes the last one
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["nlos_models.train", "pytest"])  # each process begins with them imported
     ends: list[int | None] = []
     for moment in moments:
-        child = context.Process(target=be_killed, args=(recipe.model_dump_json(), str(tmp_path / "killed"), moment))
+        facts = recipe.model_dump_json(), str(tmp_path / "killed"), moment
+        child = context.Process(target=small_run.be_killed, args=facts)
         child.start()
         child.join()
         ends.append(child.exitcode)
@@ -83,25 +75,19 @@ def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> No
     _assert_same(_trained(tmp_path / "killed", schedule="one-cycle", epochs=2), whole)
 
 
-def test_stopped_run_names_step_and_resumes_there(tmp_path: Path) -> None:
+def test_stopped_run_names_step_and_resumes_there_and_failed_run_from_its_last_checkpoint(tmp_path: Path) -> None:
     whole, calls, messages = _trained(tmp_path / "whole"), count(1), list[str]()
     run = SmallRun(whole.recipe, tmp_path / "stopped")
     with pytest.raises(KeyboardInterrupt):
         run.go(stop=lambda: next(calls) == STEPS + 2, on_message=messages.append)
-    assert len(messages) == 1
-    assert "epoch 1" in messages[0]
-    assert "step 2" in messages[0]
+    assert [("epoch 1" in message, "step 2" in message) for message in messages] == [(True, True)]
     again = _trained(tmp_path / "stopped")
     assert again.steps[0] == (STEPS + 3, 4 * STEPS)
     _assert_same(again, whole)
-
-
-def test_run_saves_state_at_checkpoint_interval(tmp_path: Path) -> None:
-    seconds = count(0.0, 1.0)
-    run = SmallRun(small_recipe(epochs=1), tmp_path)
+    run, seconds = SmallRun(small_recipe(epochs=1), tmp_path / "failed"), count(0.0, 1.0)
     with pytest.raises(Stopped):
         run.go(fail_at=5, clock=lambda: next(seconds), checkpoint_s=2.5)  # saved after steps 2 and 4
-    assert _trained(tmp_path, epochs=1).steps[0][0] in {3, 4, 5}
+    assert _trained(tmp_path / "failed", epochs=1).steps[0][0] in {3, 4, 5}
 
 
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
@@ -195,9 +181,7 @@ def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
     assert train.read_last(tmp_path, pytest.fail) is None
     for step in range(3):
         train.write_last(tmp_path, _state(step))
-    state = train.read_last(tmp_path, pytest.fail)
-    assert (state["step"], state["rows"]) == (2, [{"loss": 2.0}])
-    assert torch.equal(state["module"]["weight"], torch.arange(4.0) + 2)
+    torch.testing.assert_close(train.read_last(tmp_path, pytest.fail), _state(2), rtol=0, atol=0)
     assert {path.name for path in tmp_path.iterdir()} == {train.LAST, train.PREVIOUS}
     (tmp_path / train.LAST).unlink()  # as a kill between the two renames leaves it
     assert train.read_last(tmp_path, pytest.fail)["step"] == 1
@@ -207,14 +191,20 @@ def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
-def test_read_last_falls_back_to_previous_state(tmp_path: Path, how: str) -> None:
+def test_read_last_falls_back_to_previous_state_and_read_best_refuses(tmp_path: Path, how: str) -> None:
+    with pytest.raises(CheckpointError, match=train.BEST):
+        train.read_best(tmp_path)
+    train.write_best(tmp_path, _state(3))
+    assert train.read_best(tmp_path)["step"] == 3
+    _damage(tmp_path / train.BEST, how)
+    with pytest.raises(CheckpointError, match=train.BEST):
+        train.read_best(tmp_path)
     for step in (1, 2):
         train.write_last(tmp_path, _state(step))
     _damage(tmp_path / train.LAST, how)
     messages: list[str] = []
     assert train.read_last(tmp_path, messages.append)["step"] == 1
-    assert len(messages) == 1
-    assert str(tmp_path / train.LAST) in messages[0]
+    assert [str(tmp_path / train.LAST) in message for message in messages] == [True]
     _damage(tmp_path / train.PREVIOUS, "flipped")
     with pytest.raises(CheckpointError, match=train.LAST) as caught:
         train.read_last(tmp_path, pytest.fail)
@@ -225,25 +215,13 @@ def test_read_last_falls_back_to_previous_state(tmp_path: Path, how: str) -> Non
 def test_full_disk_keeps_earlier_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     train.write_last(tmp_path, _state(1))
     train.write_log(tmp_path, [{"loss": 1.0}])
-
-    full = OSError(errno.ENOSPC, "No space left on device")
-    monkeypatch.setattr(os, "fsync", Mock(side_effect=full))
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     for write in (lambda: train.write_last(tmp_path, _state(2)), lambda: train.write_log(tmp_path, [{"loss": 2.0}])):
         with pytest.raises(TrainingError, match="No space left on device"):
             write()
     assert train.read_last(tmp_path, pytest.fail)["step"] == 1
     assert {path.name for path in tmp_path.iterdir()} == {train.LAST, train.LOG}
     assert "1.0" in (tmp_path / train.LOG).read_text(encoding="utf-8")
-
-
-def test_read_best_refuses_missing_or_damaged_state(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=train.BEST):
-        train.read_best(tmp_path)
-    train.write_best(tmp_path, _state(3))
-    assert train.read_best(tmp_path)["step"] == 3
-    _damage(tmp_path / train.BEST, "cut")
-    with pytest.raises(CheckpointError, match=train.BEST):
-        train.read_best(tmp_path)
 
 
 def test_digest_depends_on_every_bit_and_order() -> None:
@@ -344,25 +322,15 @@ def test_state_of_another_kind_is_refused_in_one_line(
     assert "unpickled" not in capsys.readouterr().out
 
 
-class Pair(NamedTuple):
-    """Batch with named parts."""
-
-    x: Tensor
-    y: Tensor
-
-
-def test_share_of_splits_batch_without_repeating_samples() -> None:
-    batch = Pair(torch.arange(12).reshape(6, 2), torch.arange(6))
+def test_processes_share_a_batch_without_repeating_samples_and_have_seeds_of_their_own() -> None:
+    batch = NormalBatch(torch.arange(12).reshape(6, 2), torch.arange(6))
     shares = [share_of(batch, rank, 3) for rank in range(3)]
-    assert all(type(share) is Pair and len(share.x) == len(share.y) == 2 for share in shares)
-    assert sorted(torch.cat([share.y for share in shares]).tolist()) == list(range(6))
+    assert all(type(share) is NormalBatch and len(share.normal) == len(share.image) == 2 for share in shares)
+    assert sorted(torch.cat([share.image for share in shares]).tolist()) == list(range(6))
     for share in shares:
-        assert torch.equal(share.x, batch.x[share.y])
+        assert torch.equal(share.normal, batch.normal[share.image])
     assert share_of(batch, 0, 1) is batch
-    assert [part.tolist() for part in share_of((batch.y, batch.y), 1, 2)] == [[1, 3, 5]] * 2
-
-
-def test_seed_of_depends_on_every_number_and_its_place() -> None:
+    assert [part.tolist() for part in share_of((batch.image, batch.image), 1, 2)] == [[1, 3, 5]] * 2
     parts = [(0,), (1,), (0, 1), (1, 0), (0, 0, 1), (0, 0, 2), (0, 1, 0)]
     assert len({seed_of(*part) for part in parts}) == len(parts)
     assert all(0 <= seed_of(*part) < 2**63 for part in parts)
@@ -371,7 +339,7 @@ def test_seed_of_depends_on_every_number_and_its_place() -> None:
 
 @pytest.mark.slow
 def test_two_processes_end_with_weights_of_one(tmp_path: Path) -> None:
-    made: dict[str, Any] = launch(open_fabric(small_recipe(), accelerator="cpu", devices=2), on_two, tmp_path)
+    made: dict[str, Any] = launch(open_fabric(small_recipe(), accelerator="cpu", devices=2), small_run.on_two, tmp_path)
     alone = SmallRun(small_recipe(epochs=3, schedule="one-cycle"), tmp_path / "alone", plain=True)
     figures = alone.go(fabric=open_fabric(small_recipe(), accelerator="cpu"))
     together = SmallRun(alone.recipe, tmp_path / "whole", plain=True)
@@ -381,9 +349,8 @@ def test_two_processes_end_with_weights_of_one(tmp_path: Path) -> None:
     for mine, its in zip(alone.log, together.log, strict=True):
         assert {k: float(v) for k, v in mine.items()} == pytest.approx({k: float(v) for k, v in its.items()}, rel=1e-4)
     assert made["scored"] == 3  # only the leading process evaluates
-    assert len(made["messages"]) == 2
-    assert "step 4" in made["messages"][0]
-    assert made["messages"][1] == "interrupted"
+    told, interrupted = made["messages"]
+    assert ("step 4" in told, interrupted) == (True, "interrupted")
     assert made["again"] == made["net"]
 
 
