@@ -37,7 +37,7 @@ class Answer(NamedTuple):
     image: Float32
     """(n, 64, 64) in [0, 1]."""
     surface: Float32 | None = None
-    """(n, 64, 64): probability that there is a surface; None for a network that does not tell."""
+    """(n, 64, 64): probability that there is a surface; None for a network without such a head."""
 
 
 class Reconstructor(Protocol):
@@ -52,13 +52,13 @@ class Reconstructor(Protocol):
 
 
 @runtime_checkable
-class _TellsSurface(Protocol):
+class _HasSurface(Protocol):
     def answer(self, depth_m: Float32, intensity: Float32) -> Answer: ...
 
 
 def ask(network: Callable[[Float32, Float32], Float32], depth_m: Float32, intensity: Float32) -> Answer:
     """Return a network's answer to maps (n, 64, 80), with the probability of a surface where its `answer` has one."""
-    if isinstance(network, _TellsSurface):
+    if isinstance(network, _HasSurface):
         return network.answer(depth_m, intensity)
     return Answer(network(depth_m, intensity))
 

@@ -162,7 +162,7 @@ def estimate_doubt(
 ) -> Doubt:
     """Return the uncertainty of an image (64, 64) in v that networks made from maps.
 
-    `surface` (64, 64) is their own probability of a surface, if they tell one.
+    `surface` (64, 64) is their own probability of a surface, if they have one.
     """
     said = uncertainty_model(*(array[None] for array in (maps.depth_m, maps.intensity, image)))
     # v falls linearly from 1 at z_near to MIN_V at z_far, so an error of 1 in v is this many metres (depth_from_image)

@@ -1,6 +1,6 @@
 """Settings: option before environment before the folder's file before the user's; unknown keys are refused."""
 
-import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from nlos_cam.cli.config import FILE, SETTINGS, read_settings, shared_options, v
 from nlos_cam.cli.main import main
 from nlos_cam.errors import RecordingError
 
+Run = Callable[..., Any]
 LIVE = """camera = "sim:scene.toml"\nwall = "bench.toml"\nview_port = 9300\n"""
 
 
@@ -99,20 +100,19 @@ def test_wrong_variable_is_a_usage_error() -> None:
 
 
 def test_config_shows_values_with_their_sources(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:
     (folders[0] / FILE).write_text(LIVE + 'cache = "c"', encoding="utf-8")
     monkeypatch.setenv("NLOS_CAM_WEIGHTS", "mine")
-    assert main(["--json", "config"]) == 0
-    settings = json.loads(capsys.readouterr().out)["settings"]
+    settings = run("config")["settings"]
     assert settings["cache"] == {"value": "c", "source": FILE}
     assert settings["weights"] == {"value": "mine", "source": "NLOS_CAM_WEIGHTS"}
     assert settings["camera"]["source"] == FILE
 
 
 def test_settings_in_use_are_printed_with_verbose(
-    folders: tuple[Path, Path], live: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]
+    folders: tuple[Path, Path], live: list[dict[str, Any]], shown: Run
 ) -> None:
     (folders[0] / FILE).write_text(LIVE, encoding="utf-8")
-    assert (main(["-v", "live"]), len(live)) == (0, 1)
-    assert f"wall = bench.toml (from {FILE})" in capsys.readouterr().err
+    assert f"wall = bench.toml (from {FILE})" in shown("-v", "live").err
+    assert len(live) == 1

@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,11 @@ from nlos_models import SIMULATION_ONLY
 from rich.progress import Progress
 
 from nlos_cam.cli.dataset import Rate
-from nlos_cam.cli.main import main
 from nlos_cam.dataset import DatasetPlan, RigSpread, build, open_dataset, read_head
 from nlos_cam.objects import CATEGORIES, TEXTURES
 from nlos_cam.recording import ReplayCamera, SidecarFile, sidecar_path
 
-Run = Callable[..., dict[str, Any]]
+Run = Callable[..., Any]
 
 
 @pytest.fixture(autouse=True)
@@ -34,17 +34,12 @@ def _no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(build, "processes", processes)
 
 
-def _build(folder: Path, *options: str) -> int:
-    return main(["dataset", "build", "--out", str(folder), "--count", "4", *options, "--json"])
-
-
 @pytest.fixture
-def built(capsys: pytest.CaptureFixture[str]) -> Run:
+def built(run: Run) -> Run:
     """Build a dataset; returns what is printed, without the times."""
 
-    def call(folder: Path, *options: str, code: int = 0) -> dict[str, Any]:
-        assert _build(folder, *options) == code
-        result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    def call(folder: Path, *options: object, code: int = 0) -> dict[str, Any]:
+        result = run("dataset", "build", "--out", folder, "--count", "4", *options, code=code)
         if made := result.get("made"):
             assert result.pop("objects_per_s") == pytest.approx(made / result.pop("seconds"))
         return result
@@ -65,11 +60,10 @@ def test_build_reports_and_resumes(tmp_path: Path, built: Run) -> None:
     assert open_dataset(tmp_path).plan == DatasetPlan(load_rig("paper-rig"), 0)
 
 
-def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path) -> None:
+def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path, built: Run) -> None:
     spread = ["--rig-spread-mm", "10", "--rig-spread-deg", "3", "--gain-spread-percent", "20"]
     others = ["--without", "hat, boat", "--backgrounds", "0.25", "--accuracy", "draft", "--seed", "7"]
-    others, folder = [*others, "--expected-maps"], tmp_path / "a b"
-    assert _build(folder, *spread, *others, "--workers", "1") == 0
+    built(folder := tmp_path / "a b", *spread, *others, "--expected-maps", "--workers", "1")
     plan = open_dataset(folder, expected=True).plan
     assert plan.spread == RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
     assert set(CATEGORIES) - set(plan.objects.categories) == {"hat", "boat"}
@@ -85,24 +79,22 @@ def test_build_in_color_is_noted_as_simulation_only(tmp_path: Path, built: Run) 
     assert "textures" in built(tmp_path, code=4)["error"]["message"]
 
 
-def test_build_takes_rig_and_sensor_of_scene_and_hides_meshes_of_folder(tmp_path: Path) -> None:
+def test_build_takes_rig_and_sensor_of_scene_and_hides_meshes_of_folder(tmp_path: Path, built: Run) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text('name = "s"\nrig = "paper-rig"\n[sensor]\nambient_counts = 20.0\n', encoding="utf-8")
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.stl")
-    assert _build(tmp_path / "d", "--scene", str(scene), "--objects", str(tmp_path)) == 0
+    built(tmp_path / "d", "--scene", scene, "--objects", tmp_path)
     plan = open_dataset(tmp_path / "d").plan
     assert plan.sensor.ambient_counts == 20
     assert [name for name, _ in plan.objects.meshes] == ["cube.stl"]
 
 
-def test_build_reports_damaged_shard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert _build(tmp_path) == 0
+def test_build_reports_damaged_shard(tmp_path: Path, built: Run, shown: Run) -> None:
+    built(tmp_path)
     (shard := tmp_path / "shard-000000000.h5").write_bytes(b"")
-    capsys.readouterr()
-    assert _build(tmp_path) == 0
-    captured = capsys.readouterr()
-    assert shard.name in captured.err
-    assert json.loads(captured.out)["damaged"] == [str(shard)]
+    printed = shown("dataset", "build", "--out", tmp_path, "--count", "4", "--json")
+    assert shard.name in printed.err
+    assert json.loads(printed.out)["damaged"] == [str(shard)]
     assert len(read_head(shard).seeds) == 4
 
 
@@ -133,13 +125,8 @@ def recordings(noise_bag: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def label(recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    def call(*options: str, code: int = 0) -> dict[str, Any]:
-        command = ["dataset", "label", str(recordings), "--out", str(tmp_path / "my data")]
-        assert main([*command, *options, "--json"]) == code
-        return json.loads(capsys.readouterr().out.splitlines()[-1])
-
-    return call
+def label(recordings: Path, tmp_path: Path, run: Run) -> Run:
+    return partial(run, "dataset", "label", recordings, "--out", tmp_path / "my data")
 
 
 def test_label_makes_dataset_of_single_frames(label: Run, tmp_path: Path) -> None:

@@ -16,14 +16,17 @@ from nlos_models import CheckpointRecord, MapSet, Recipe
 from small_maps import SmallDataset
 
 from nlos_cam import evaluate
-from nlos_cam.cli.main import main
 from nlos_cam.dataset import HELD_OUT_SEED, TRAINING_SEED, DatasetPlan, procedural_images
 from nlos_cam.evaluate import TARGETS, baselines, measure_renders, render_settings, report, runtime_tradeoff, subjects
 from nlos_cam.objects import benchmark_objects
 from nlos_cam.render import STOPS, Scene, paper_scene, render
 
 RIG = load_rig("paper-rig")
-Patch, Run = pytest.MonkeyPatch, Callable[..., Any]
+Patch, Run, OUT = pytest.MonkeyPatch, Callable[..., Any], Path("cost")
+JUDGE, RENDER, RECONSTRUCT = (
+    (*command.split(), "--out", out)
+    for command, out in (("evaluate", "figures"), ("tradeoff render", OUT), ("tradeoff reconstruct", OUT))
+)
 STORED = ["--dataset", "held-out", "--training", "held-out"]
 
 
@@ -65,7 +68,7 @@ class Stored(SmallDataset):
 
 
 @pytest.fixture(autouse=True)
-def guessing(monkeypatch: Patch) -> list[DatasetPlan]:
+def guessing(monkeypatch: Patch, tmp_path: Path) -> list[DatasetPlan]:
     """A guesser as weights, a dataset, and training objects that are not rendered; their plans are kept."""
     asked: list[DatasetPlan] = []
 
@@ -77,20 +80,18 @@ def guessing(monkeypatch: Patch) -> list[DatasetPlan]:
     monkeypatch.setattr(baselines, "NEIGHBOURS", 4)
     monkeypatch.setattr(report, "load_reconstructor", lambda *_: Guesser())
     monkeypatch.setattr(subjects, "open_dataset", lambda _: Stored(HELD_OUT_SEED, 3))
+    monkeypatch.chdir(tmp_path)
     return asked
 
 
 @pytest.fixture
-def judge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    def call(*options: str, code: int = 0) -> Any:
-        assert main(["evaluate", "--out", str(tmp_path / "figures"), *options, "--json"]) == code
-        return json.loads(capsys.readouterr().out.splitlines()[-1])
-
-    return call
+def unwritten(monkeypatch: Patch) -> None:
+    """Reports take seconds."""
+    monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
 
 
-def test_evaluate_writes_figures_of_dataset_beside_baselines(tmp_path: Path, judge: Run, monkeypatch: Patch) -> None:
-    result, out = judge(*STORED), tmp_path / "figures"
+def test_evaluate_writes_figures_of_dataset_beside_baselines(run: Run, monkeypatch: Patch) -> None:
+    result, out = run(*JUDGE, *STORED), Path("figures")
     assert {*TARGETS, "baselines", "per_category", "objects", "seconds", "out"} < set(result)
     assert (result["objects"], result["training_objects"]) == (3, 3)
     assert set(result["baselines"]) == {"all_background", "mean_object", "nearest_neighbour"}
@@ -100,49 +101,49 @@ def test_evaluate_writes_figures_of_dataset_beside_baselines(tmp_path: Path, jud
     assert ["cup" in note for note in result["notes"]] == [True]
     assert json.loads((out / "figures.json").read_text("utf-8")) == {k: v for k, v in result.items() if k != "out"}
     assert "\nhat 1," in (out / "objects.csv").read_text("utf-8")
-    assert judge(*STORED, code=1)["error"]["type"] == "OutputExistsError"
+    assert run(*JUDGE, *STORED, code=1)["error"]["type"] == "OutputExistsError"
     monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
-    judge(*STORED, "--overwrite")
+    run(*JUDGE, *STORED, "--overwrite")
 
 
 @pytest.mark.slow
-def test_evaluate_uses_test_set_without_dataset(judge: Run, monkeypatch: Patch, guessing: list[DatasetPlan]) -> None:
+def test_evaluate_uses_test_set_without_dataset(run: Run, monkeypatch: Patch, guessing: list[DatasetPlan]) -> None:
     monkeypatch.setattr(subjects, "benchmark_objects", lambda box: benchmark_objects(box)[:2])
-    result = judge()
+    result = run(*JUDGE)
     assert (result["objects"], result["rig"], guessing[0].rig) == (2, RIG.name, RIG)
     assert list(result["per_category"]) == [benchmark_objects(DatasetPlan(RIG, 0).box)[0].category]
     assert "nearest_neighbour" in result["baselines"]
 
 
-def test_evaluate_count_uses_seeded_objects(judge: Run, monkeypatch: Patch, guessing: list[DatasetPlan]) -> None:
-    monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
-    result = judge("--count", "1", "--no-nearest")
+@pytest.mark.usefixtures("unwritten")
+def test_evaluate_count_uses_seeded_objects(run: Run, guessing: list[DatasetPlan]) -> None:
+    result = run(*JUDGE, "--count", "1", "--no-nearest")
     assert (result["objects"], set(result["baselines"])) == (1, {"all_background", "mean_object"})
     assert result["advantage_over_nearest_neighbour"] is None
     assert not guessing
 
 
+@pytest.mark.usefixtures("unwritten")
 @pytest.mark.parametrize(
     ("maps", "options", "wall_m"),
     [("raw maps", [], 0), ("difference maps", [], 0.25), ("difference maps", ["--wall", "wall.toml"], 0.5)],
 )
 def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
-    judge: Run, monkeypatch: Patch, maps: str, options: list[str], wall_m: float
+    run: Run, monkeypatch: Patch, maps: str, options: list[str], wall_m: float
 ) -> None:
     network, blank = Guesser(maps), np.zeros((64, 80), np.float32)
     monkeypatch.setattr(report, "load_reconstructor", lambda *_: network)
     monkeypatch.setattr(subjects, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank))
     monkeypatch.setattr(subjects, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank))
-    monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
-    result, raw = judge(*STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
-    np.testing.assert_allclose(np.concatenate(network.seen), raw.depth_m - wall_m, atol=1e-6)
+    result, raw = run(*JUDGE, *STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
+    np.testing.assert_allclose(np.concatenate(network.seen[:3]), raw.depth_m - wall_m, atol=1e-6)
     assert result["input"] == maps
     assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1
 
 
-def test_evaluate_refuses_wall_for_weights_of_raw_maps(tmp_path: Path, judge: Run) -> None:
-    assert "--wall" in judge(*STORED, "--wall", "wall.toml", code=1)["error"]["message"]
-    assert not list(tmp_path.iterdir())
+def test_evaluate_refuses_wall_for_weights_of_raw_maps(run: Run) -> None:
+    assert "--wall" in run(*JUDGE, *STORED, "--wall", "wall.toml", code=1)["error"]["message"]
+    assert not list(Path().iterdir())
 
 
 SMALL = {name: replace(stop, relay_columns=8, relay_rows=4) for name, stop in STOPS.items()}
@@ -183,24 +184,20 @@ def plates(monkeypatch: Patch) -> None:
     monkeypatch.setattr(runtime_tradeoff, "MIN_CALLS", 2)
 
 
-@pytest.fixture
-def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    def call(name: str, *options: str, code: int = 0) -> dict[str, Any]:
-        assert main(["tradeoff", name, *options, "--out", str(tmp_path / "cost"), "--json"]) == code
-        return json.loads(capsys.readouterr().out.splitlines()[-1])
-
-    return call
+def _assert_written(result: dict[str, Any]) -> None:
+    assert result["out"] == str(OUT)
+    assert {path.name for path in OUT.iterdir()} == FILES
+    assert json.loads((OUT / "tradeoff.json").read_text()) == {k: v for k, v in result.items() if k != "out"}
 
 
-def _assert_written(out: Path, result: dict[str, Any]) -> None:
-    assert result["out"] == str(out)
-    assert {path.name for path in out.iterdir()} == FILES
-    assert json.loads((out / "tradeoff.json").read_text()) == {k: v for k, v in result.items() if k != "out"}
-
-
-def test_tradeoff_render_writes_table_and_plot(tmp_path: Path, run: Run, small: list[Scene]) -> None:
-    result = run("render")
-    _assert_written(tmp_path / "cost", result)
+def test_tradeoff_render_writes_table_and_plot_and_overwrites_when_asked(run: Run, small: list[Scene]) -> None:
+    OUT.mkdir()
+    (precious := OUT / "tradeoff.md").write_text("precious")
+    assert run(*RENDER, code=1)["error"]["type"] == "OutputExistsError"
+    assert precious.read_text() == "precious"
+    result = run(*RENDER, "--overwrite")
+    assert precious.read_text() != "precious"
+    _assert_written(result)
     assert result["complete"]
     assert {stop["name"] for stop in result["stops"]} == set(STOPS)
     assert result["patches"] == np.isfinite(paper_scene().scene_at(0).object_depth_m).sum()
@@ -208,37 +205,36 @@ def test_tradeoff_render_writes_table_and_plot(tmp_path: Path, run: Run, small: 
 
 
 @pytest.mark.usefixtures("plates")
-def test_tradeoff_reconstruct_writes_table_and_plot(tmp_path: Path, run: Run) -> None:
-    result = run("reconstruct", "--count", "1")
-    _assert_written(tmp_path / "cost", result)
+def test_tradeoff_reconstruct_writes_table_and_plot(run: Run) -> None:
+    result = run(*RECONSTRUCT, "--count", "1")
+    _assert_written(result)
     assert (result["complete"], result["objects"], len(result["settings"])) == (True, 1, 6)
     assert result["recommended"]["name"] in {row["name"] for row in result["settings"]}
 
 
 @pytest.mark.slow
-def test_tradeoff_render_uses_object_that_render_renders(tmp_path: Path, run: Run, small: list[Scene]) -> None:
-    thing = ["--object", "bowl", "--seed", "4"]
-    run("render", *thing)
-    assert main(["render", "bowl", *thing[2:], "--accuracy", "draft", "--out", str(tmp_path / "maps.npz")]) == 0
-    with np.load(tmp_path / "maps.npz") as file:
+def test_tradeoff_render_uses_object_that_render_renders(run: Run, small: list[Scene]) -> None:
+    run(*RENDER, "--object", "bowl", "--seed", "4")
+    run("render", "bowl", "--seed", "4", "--accuracy", "draft", "--out", "maps.npz")
+    with np.load("maps.npz") as file:
         np.testing.assert_array_equal(small[0].object_depth_m, file["object_depth_m"])
         np.testing.assert_array_equal(render(small[0], "draft").depth_m, file["depth_m"])
 
 
 @pytest.mark.usefixtures("plates")
 @pytest.mark.parametrize(
-    ("name", "number", "rows"),
+    ("command", "number", "rows"),
     [
-        pytest.param("render", signal.SIGINT, 3, marks=pytest.mark.slow),
-        pytest.param("render", signal.SIGTERM, 3, marks=pytest.mark.slow),
-        ("render", signal.SIGINT, 0),
-        ("reconstruct", signal.SIGINT, 2),
+        pytest.param(RENDER, signal.SIGINT, 3, marks=pytest.mark.slow),
+        pytest.param(RENDER, signal.SIGTERM, 3, marks=pytest.mark.slow),
+        (RENDER, signal.SIGINT, 0),
+        ((*RECONSTRUCT, "--count", "1"), signal.SIGINT, 2),
     ],
 )
 def test_tradeoff_keeps_rows_measured_before_signal(
-    tmp_path: Path, run: Run, monkeypatch: Patch, name: str, number: signal.Signals, rows: int
+    run: Run, monkeypatch: Patch, command: tuple[str, ...], number: signal.Signals, rows: int
 ) -> None:
-    measure = "measure_renders" if name == "render" else "measure_runtimes"
+    measure = "measure_renders" if command is RENDER else "measure_runtimes"
     whole = getattr(evaluate, measure)
 
     def cut_short(*arguments: Any) -> Iterator[Any]:
@@ -249,29 +245,20 @@ def test_tradeoff_keeps_rows_measured_before_signal(
 
     monkeypatch.setattr(f"nlos_cam.evaluate.{measure}", cut_short)
     before = signal.getsignal(number)
-    result = run(name, *(["--count", "1"] if name == "reconstruct" else []), code=130)
+    result = run(*command, code=130)
     assert signal.getsignal(number) == before
     if rows:
-        _assert_written(tmp_path / "cost", result)
+        _assert_written(result)
         assert (result["complete"], len(result.get("stops", result.get("settings")))) == (False, rows)
     else:
         assert result["out"] is None
-        assert not list(tmp_path.iterdir())
+        assert not list(Path().iterdir())
 
 
-@pytest.mark.slow
-def test_tradeoff_overwrites_only_on_demand(tmp_path: Path, run: Run) -> None:
-    (tmp_path / "cost").mkdir()
-    (precious := tmp_path / "cost" / "tradeoff.md").write_text("precious")
-    assert run("render", code=1)["error"]["type"] == "OutputExistsError"
-    assert precious.read_text() == "precious"
-    run("render", "--overwrite")
-    assert precious.read_text() != "precious"
-
-
-def test_tradeoff_refuses_color_weights_before_rendering(tmp_path: Path, run: Run) -> None:
+def test_tradeoff_refuses_color_weights_before_rendering(run: Run) -> None:
     recipe = Recipe(task="vae", colour=True, objects=2, held_out=1, epochs=1, batch=2, learning_rate=1e-3)
     record = CheckpointRecord.of([recipe], ("paper-rig", "0"))
-    (tmp_path / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
-    assert str(tmp_path) in run("reconstruct", "--weights", str(tmp_path), code=4)["error"]["message"]
-    assert not (tmp_path / "cost").exists()
+    (weights := Path("color")).mkdir()
+    (weights / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
+    assert str(weights) in run(*RECONSTRUCT, "--weights", weights, code=4)["error"]["message"]
+    assert not OUT.exists()

@@ -1,4 +1,3 @@
-import json
 import os
 import re
 import signal
@@ -53,11 +52,6 @@ class Opened:
         quick: Any = {"uri": uri, "make": lambda number: replace(small_frame(number), timestamp_s=number / 1000)}
         return self.camera or FrameCamera(self.count, self.on_frame, **quick)
 
-    def interrupt_at(self, number: int) -> None:
-        """Press Ctrl-C at frame `number` of an endless camera."""
-        self.count = None
-        self.on_frame = lambda wanted: wanted == number and os.kill(os.getpid(), signal.SIGINT)
-
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Opened]:
@@ -81,26 +75,13 @@ def walled(opened: Opened, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> O
     return opened
 
 
-Run = Callable[..., tuple[dict[str, Any], str]]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command with --json, assert its exit code, and return what ends stdout, and stderr on one line."""
-
-    def run(*arguments: str, code: int = 0) -> tuple[dict[str, Any], str]:
-        capsys.readouterr()
-        assert main([*arguments, "--json"]) == code
-        captured = capsys.readouterr()
-        return json.loads((captured.out.splitlines() or ["{}"])[-1]), captured.err.replace("\n", " ")
-
-    return run
+Run = Callable[..., Any]
 
 
 @pytest.mark.usefixtures("opened")
 def test_live_json_and_log_have_their_fields(run: Run) -> None:
     arguments = [*RECORDED, "--log", "log.csv"]
-    report, _ = run(*arguments)
+    report = run(*arguments)
     fields = ("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings")
     assert set(report) == {*fields, "stages_percentiles_ms", "verdicts", "stalled_s", "quality", "camera_ms"}
     assert (report["frames"], report["dropped"]) == (20, 0)
@@ -111,27 +92,21 @@ def test_live_json_and_log_have_their_fields(run: Run) -> None:
     assert [int(line.split(",")[0]) for line in lines] == list(range(20))
     assert {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"} <= set(header.split(","))
     run(*arguments, code=1)
+    assert "http://127.0.0.1:" in run("live", "--camera", "bag:fake").err
 
 
 def test_live_ends_with_a_live_camera_or_after_its_seconds(opened: Opened, run: Run) -> None:
-    report, _ = run(*SIMULATED)
+    report = run(*SIMULATED)
     assert report["frames"] + report["dropped"] == 20
     opened.on_frame = lambda number: threading.Event().wait(0.05 if number else 0.0)
-    report, _ = run(*SIMULATED, "--seconds", "0.2")
-    assert report["frames"] < 20
+    assert run(*SIMULATED, "--seconds", "0.2")["frames"] < 20
     assert [uri for uri, _ in opened.calls] == ["sim", "sim"]
-
-
-@pytest.mark.usefixtures("opened")
-def test_live_prints_the_address_of_its_view(run: Run) -> None:
-    _, printed = run("live", "--camera", "bag:fake")
-    assert "http://127.0.0.1:" in printed
 
 
 def test_live_saves_its_view_and_overwrites_only_when_asked(opened: Opened, run: Run) -> None:
     opened.camera = Recorded(12)
     arguments = [*RECORDED, "--save-view", "view.html"]
-    assert "open view.html" in run(*arguments)[1]
+    assert "open view.html" in run(*arguments).err
     assert Path("view.html").stat().st_size > 10_000
     run(*arguments, code=1)
     run(*arguments, "--overwrite")
@@ -144,33 +119,29 @@ def test_replay_saves_view_stills_and_video(opened: Opened, run: Run) -> None:
     assert {"view.html", "replay.webm", "still-000000.png"} < {file.name for file in Path("out").iterdir()}
 
 
-def test_live_record_overwrites_only_when_asked(opened: Opened, tmp_path: Path, run: Run) -> None:
-    bag = tmp_path / "run.bag"
-    arguments = [*SIMULATED, "--record", str(bag)]
+def test_live_record_overwrites_only_when_asked(opened: Opened, run: Run) -> None:
+    arguments = [*SIMULATED, "--record", "run.bag"]
     run(*arguments)
-    assert opened.calls[-1][1]["recording"].path == bag
-    bag.write_text("mine")
-    refused, _ = run(*arguments, code=1)
-    assert refused["error"]["type"] == "OutputExistsError"
+    assert opened.calls[-1][1]["recording"].path == Path("run.bag")
+    Path("run.bag").write_text("mine")
+    assert run(*arguments, code=1)["error"]["type"] == "OutputExistsError"
     run(*arguments, "--overwrite")
 
 
 @pytest.mark.usefixtures("opened")
-def test_replay_on_a_wall_notes_that_the_rig_differs(tmp_path: Path, run: Run) -> None:
-    write_wall(tmp_path / "wall.toml")
-    _, printed = run(*WALLED, "wall.toml")
-    assert "training rig" in printed
-    with np.load(tmp_path / "out" / "reconstruction.npz") as file:
+def test_replay_on_a_wall_notes_that_the_rig_differs(run: Run) -> None:
+    write_wall(Path("wall.toml"))
+    assert "training rig" in run(*WALLED, "wall.toml").err
+    with np.load("out/reconstruction.npz") as file:
         assert str(file["rig_name"]) == "measured"
-    refused, _ = run(*WALLED, "none.toml", code=4)
-    assert refused["error"]["type"] == "RecordFileError"
+    assert run(*WALLED, "none.toml", code=4)["error"]["type"] == "RecordFileError"
 
 
 def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) -> None:
-    report, printed = run(*REPLAY)
+    report = run(*REPLAY)
     assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts", "quality"}
     assert (report["frames"], report["out"]) == (20, "out")
-    assert "training rig" not in printed
+    assert "training rig" not in report.err
     run(*REPLAY, code=1)
     run(*REPLAY, "--overwrite", "--reader", "sdk")
     assert opened.calls == [("bag:run.bag", {"reader": "plain"}), ("bag:run.bag", {"reader": "sdk"})]
@@ -178,8 +149,8 @@ def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) 
 
 @pytest.mark.parametrize("command", [RECORDED, REPLAY])
 def test_interrupted_command_keeps_its_results(opened: Opened, run: Run, command: list[str]) -> None:
-    opened.interrupt_at(10)
-    report, _ = run(*command, code=130)
+    opened.count, opened.on_frame = None, lambda number: number == 10 and os.kill(os.getpid(), signal.SIGINT)
+    report = run(*command, code=130)
     if command is REPLAY:
         with np.load("out/reconstruction.npz") as file:
             assert len(file["depth_m"]) == report["frames"]
@@ -193,14 +164,14 @@ def test_interrupt_while_a_camera_opens_begins_no_run(opened: Opened, run: Run, 
             signal.raise_signal(signal.SIGINT)
 
     opened.on_open = swallow
-    assert run(*command, code=130)[0] == {}
+    assert run(*command, code=130) == {}
 
 
 def test_live_budget_reports_whether_it_was_kept(opened: Opened, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.live.setting_loader", lambda *_: lambda _: opened.network)
-    report, printed = run(*RECORDED, "--budget-ms", "100000")
+    report = run(*RECORDED, "--budget-ms", "100000")
     assert report["budget"]["kept"]
-    assert "100000 ms" in printed
+    assert "100000 ms" in report.err
 
 
 @pytest.mark.usefixtures("walled")
@@ -209,11 +180,11 @@ def test_command_prints_begin_and_end_of_a_warning_once(
     run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
     monkeypatch.setattr("nlos_cam.live.frame_queue.QUEUE_FRAMES", 1000)
-    report, printed = run(*command, "--wall", "wall.toml")
+    report = run(*command, "--wall", "wall.toml")
     [(warning, frames)] = report["warnings"].items()
     assert 0 < frames < 100
-    assert printed.count("drifted") == 2
-    assert printed.count(warning) >= 1
+    assert report.err.count("drifted") == 2
+    assert report.err.count(warning) >= 1
 
 
 def test_average_is_over_as_many_frames_as_asked(walled: Opened) -> None:
@@ -227,8 +198,7 @@ def test_weights_of_difference_maps_need_a_wall(walled: Opened, run: Run) -> Non
     walled.camera, walled.network.record.input = WallCamera(21), "difference maps"
     run(*WALLED, "wall.toml")
     assert abs(np.nanmean(walled.network.given[20])) < 1e-3
-    refused, _ = run(*SIMULATED, code=1)
-    assert "--wall" in refused["error"]["message"]
+    assert "--wall" in run(*SIMULATED, code=1)["error"]["message"]
 
 
 def test_summary_has_a_sentence_per_fact_and_stages_if_verbose() -> None:
@@ -286,10 +256,13 @@ def serve(*, no_view: bool = False, host: str | None = None, port: int | None = 
         announce_view(viewer, host=host, port=port, open_it=open_it)
 
 
-def test_no_view_serves_nothing_and_refuses_an_address(printed: list[str]) -> None:
+def test_view_on_all_addresses_notes_who_can_see_it_and_no_view_serves_nothing(printed: list[str]) -> None:
+    serve(host=EVERYWHERE)
     serve(no_view=True, open_it=True)
-    [line] = printed
-    assert "http" not in line
+    line, note, without = printed
+    assert "http://127.0.0.1:" in line
+    assert "anyone" in note
+    assert "http" not in without
     assert isinstance(viewer_of(RunControl(), no_view=True), NullViewer)
     for place in ({"host": "127.0.0.1"}, {"port": 9090}):
         with pytest.raises(typer.BadParameter, match="--no-view"):
@@ -307,13 +280,6 @@ def test_view_moves_from_a_taken_port_unless_asked_for(printed: list[str], monke
         assert f"127.0.0.1:{port}/" not in line
         with pytest.raises(NlosCamError, match="--view-port"):
             serve(port=port)
-
-
-def test_view_on_all_addresses_notes_who_can_see_it(printed: list[str]) -> None:
-    serve(host=EVERYWHERE)
-    line, note = printed
-    assert "http://127.0.0.1:" in line
-    assert "anyone" in note
 
 
 @pytest.mark.parametrize("opens", [True, False])

@@ -2,7 +2,6 @@
 
 import errno
 import inspect
-import json
 import os
 import resource
 import signal
@@ -16,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from threading import Event
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import typer
@@ -26,20 +26,10 @@ from rich.table import Table
 from typer.main import get_command
 
 from nlos_cam import errors
+from nlos_cam.cli import common
 from nlos_cam.cli import main as module
-from nlos_cam.cli import run
-from nlos_cam.cli.common import (
-    Json,
-    exit_interrupted,
-    finish,
-    interrupted_by_signals,
-    output_path,
-    progress,
-    say,
-    say_error,
-    show,
-    stderr,
-)
+from nlos_cam.cli import run as run_script
+from nlos_cam.cli.common import Json, finish, say, say_error
 from nlos_cam.cli.main import COMMANDS, MIN_ADDRESS_BYTES, TORCH_ADDRESS_BYTES, _share_options, build_app, main
 from nlos_cam.cli.plain_help import plain_help, range_text
 
@@ -48,59 +38,45 @@ CODES = {
     3: (errors.CameraNotFoundError, errors.CameraLostError),
     4: (errors.RecordingError, errors.StreamMissingError, RecordFileError, CheckpointError, RecipeError),
 }
-Act = Callable[[], object]
-Capsys = pytest.CaptureFixture[str]
+Act, Run = Callable[[], object], Callable[..., Any]
+Does = Callable[[Act | BaseException], None]
+Capsys, Patch = pytest.CaptureFixture[str], pytest.MonkeyPatch
 
 
 @pytest.fixture
-def does(monkeypatch: pytest.MonkeyPatch) -> Callable[[Act | BaseException], None]:
+def does(monkeypatch: Patch) -> Does:
     """A command line whose only command, `act`, calls a function or raises an error."""
 
     def install(act: Act | BaseException) -> None:
-        app = typer.Typer()
-
-        @app.callback()
-        def root() -> None: ...
-
-        @app.command("act")
         def command(count: int = 1, json: Json = False) -> None:
             if isinstance(act, BaseException):
                 raise act
             act()
             finish({"count": count}, as_json=json, text=f"{count} done")
 
+        app = typer.Typer()
+        app.callback()(lambda: None)
+        app.command("act")(command)
         _share_options(app)
         monkeypatch.setattr(module, "build_app", lambda _: app)
 
     return install
 
 
-Does = Callable[[Act | BaseException], None]
-
-
-def _json(capsys: Capsys) -> dict[str, Any]:
-    return json.loads(capsys.readouterr().out.splitlines()[-1])
-
-
-def test_command_prints_its_sentence_or_one_json_object(does: Does, capsys: Capsys) -> None:
+def test_command_prints_its_sentence_or_one_json_object(does: Does, shown: Run, run: Run) -> None:
     does(lambda: None)
-    assert main(["act"]) == 0
-    assert capsys.readouterr().out == "1 done\n"
+    assert shown("act").out == "1 done\n"
     does(lambda: sys.stdout.write("a line of the command's own\n"))
-    assert main(["act", "--count", "3", "--json"]) == 0
-    assert _json(capsys) == {"count": 3}
+    assert run("act", "--count", "3") == {"count": 3}
 
 
 @pytest.mark.parametrize(("kind", "code"), [(kind, code) for code, kinds in CODES.items() for kind in kinds])
 def test_foreseen_error_has_its_exit_code_and_one_line(
-    does: Does, capsys: Capsys, kind: type[Exception], code: int
+    does: Does, shown: Run, run: Run, kind: type[Exception], code: int
 ) -> None:
-    message = "a depth of [3] m\nin [red]"
-    does(kind(message))
-    assert main(["act"]) == code
-    assert capsys.readouterr() == ("", "error: a depth of [3] m in [red]\n")
-    assert main(["act", "--json"]) == code
-    assert _json(capsys) == {"error": {"type": kind.__name__, "message": message}}
+    does(kind(message := "a depth of [3] m\nin [red]"))
+    assert shown("act", code=code) == ("", "error: a depth of [3] m in [red]\n")
+    assert run("act", code=code) == {"error": {"type": kind.__name__, "message": message}}
 
 
 DISK, FILE = (errno.ENOSPC, errno.EROFS, errno.EIO), (errno.EACCES, errno.ENOENT, errno.EISDIR)
@@ -109,10 +85,9 @@ DISK, FILE = (errno.ENOSPC, errno.EROFS, errno.EIO), (errno.EACCES, errno.ENOENT
 @pytest.mark.parametrize(
     ("code", "kind"), [*((c, "DiskFullError") for c in DISK), *((c, "RecordingError") for c in FILE)]
 )
-def test_system_error_names_file_and_reason(does: Does, capsys: Capsys, code: int, kind: str) -> None:
+def test_system_error_names_file_and_reason(does: Does, run: Run, code: int, kind: str) -> None:
     does(OSError(code, os.strerror(code), "out/F.npz"))
-    assert main(["act", "--json"]) == (1 if code in DISK else 4)
-    error = _json(capsys)["error"]
+    error = run("act", code=1 if code in DISK else 4)["error"]
     assert error["type"] == kind
     assert "out/F.npz" in error["message"]
     assert os.strerror(code) in error["message"]
@@ -138,47 +113,43 @@ def _made_an_error() -> None:
 
 
 def _inner_block() -> None:
-    with interrupted_by_signals("two rows are kept"):
+    with common.interrupted_by_signals("two rows are kept"):
         signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.parametrize("act", [_inner_block, lambda: exit_interrupted("two rows are kept")])
-def test_interrupted_command_says_once_what_it_kept(does: Does, capsys: Capsys, act: Act) -> None:
+@pytest.mark.parametrize("act", [_inner_block, lambda: common.exit_interrupted("two rows are kept")])
+def test_interrupted_command_says_once_what_it_kept(does: Does, shown: Run, act: Act) -> None:
     does(act)
-    assert main(["act"]) == 130
-    assert capsys.readouterr().err == "interrupted: two rows are kept\n"
+    assert shown("act", code=130).err == "interrupted: two rows are kept\n"
 
 
 def test_progress_prints_lines_where_stderr_is_no_terminal(capsys: Capsys) -> None:
-    with progress(period_s=0.001) as bar:
+    with common.progress(period_s=0.001) as bar:
         bar.add_task("hidden", visible=False)
         bar.update(bar.add_task("rendering", total=4), completed=3)
         while "rendering" not in (shown := capsys.readouterr().err):
             time.sleep(0.001)
     assert set(shown.splitlines()) == {"rendering: 3/4, 0 s"}
-    with progress() as bar:
+    with common.progress() as bar:
         bar.add_task("short")
     assert capsys.readouterr().err == ""
 
 
-def test_quiet_prints_results_and_errors_only(does: Does, capsys: Capsys) -> None:
+def test_quiet_prints_results_and_errors_only(does: Does, shown: Run) -> None:
     does(lambda: say("a note"))
-    assert main(["-q", "act"]) == 0
-    assert capsys.readouterr() == ("1 done\n", "")
+    assert shown("-q", "act") == ("1 done\n", "")
     does(errors.SceneError("no light"))
-    assert main(["act", "--quiet"]) == 1
-    assert capsys.readouterr() == ("", "error: no light\n")
+    assert shown("act", "--quiet", code=1) == ("", "error: no light\n")
 
 
 @pytest.mark.parametrize("act", [KeyboardInterrupt(), typer.Abort(), _swallowed, _made_an_error])
-def test_ctrl_c_exits_with_130_even_if_a_library_catches_it(does: Does, capsys: Capsys, act: Any) -> None:
+def test_ctrl_c_exits_with_130_even_if_a_library_catches_it(does: Does, shown: Run, act: Any) -> None:
     does(act)
-    assert main(["act"]) == 130
-    assert "Traceback" not in capsys.readouterr().err
+    assert "Traceback" not in shown("act", code=130).err
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal here")
-def test_ctrl_c_while_loading_exits_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_while_loading_exits_with_130(monkeypatch: Patch) -> None:
     def interrupted(_: str) -> typer.Typer:
         os.kill(os.getpid(), signal.SIGINT)
         return build_app("devices")
@@ -187,21 +158,20 @@ def test_ctrl_c_while_loading_exits_with_130(monkeypatch: pytest.MonkeyPatch) ->
     assert main(["live"]) == 130
 
 
-@pytest.mark.parametrize("arguments", [["act", "--cuont", "3"], ["act", "--count", "many"], ["nothing"], ["act", "3"]])
-def test_wrong_usage_exits_with_2(does: Does, capsys: Capsys, arguments: list[str]) -> None:
+@pytest.mark.parametrize("arguments", ["act --cuont 3", "act --count many", "nothing", "act 3"])
+def test_wrong_usage_exits_with_2(does: Does, shown: Run, arguments: str) -> None:
     does(lambda: None)
-    assert main(arguments) == 2
-    shown = capsys.readouterr()
-    assert (shown.out, bool(shown.err)) == ("", True)
+    out, err = shown(*arguments.split(), code=2)
+    assert (out, bool(err)) == ("", True)
 
 
-def test_console_script_exits_with_the_code(does: Does, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
+def test_console_script_exits_with_the_code(does: Does, monkeypatch: Patch, capsys: Capsys) -> None:
     does(errors.CameraNotFoundError("no device"))
     monkeypatch.setattr(sys, "argv", ["nlos-cam", "act"])
     before = signal.getsignal(signal.SIGINT)
     try:
         with pytest.raises(SystemExit) as caught:
-            run()
+            run_script()
     finally:
         signal.signal(signal.SIGINT, before)
     assert caught.value.code == 3
@@ -228,11 +198,10 @@ def leaves(app: typer.Typer, path: str = "") -> list[tuple[str, object]]:
     return found
 
 
-def test_help_names_every_command_and_all_take_json(capsys: Capsys) -> None:
-    assert main(["--help"]) == 0
-    shown = capsys.readouterr().out
+def test_help_names_every_command_and_all_take_json(shown: Run) -> None:
+    page = shown("--help").out
     named = "devices doctor capture calibrate live replay render dataset train evaluate tradeoff"
-    assert not [name for name in {*named.split(), *COMMANDS} if name not in shown]
+    assert not [name for name in {*named.split(), *COMMANDS} if name not in page]
     commands = leaves(build_app())
     assert len(commands) >= 10
     for name, callback in commands:
@@ -246,44 +215,39 @@ def test_command_table_names_the_right_module(command: str) -> None:
     assert names <= {name for name, _ in leaves(build_app())}
 
 
-def test_version_is_that_of_the_package(capsys: Capsys) -> None:
-    assert main(["--version"]) == main(["-V"]) == 0
-    assert capsys.readouterr().out == 2 * f"nlos-cam {version('nlos-cam')}\n"
+def test_version_is_that_of_the_package(shown: Run) -> None:
+    assert shown("--version").out == shown("-V").out == f"nlos-cam {version('nlos-cam')}\n"
 
 
-def test_option_help_has_placeholders_and_ranges_in_words(capsys: Capsys) -> None:
+def test_option_help_has_placeholders_and_ranges_in_words(shown: Run) -> None:
     tree = get_command(build_app("capture"))
     plain_help(tree)
     options = {parameter.name: parameter for parameter in tree.commands["capture"].params}  # type: ignore[attr-defined]
     assert (options["seconds"].metavar, options["takes"].metavar, options["overwrite"].metavar) == ("SECONDS", "N", "")
     assert options["takes"].help.endswith("(1 to 9999).")
-    assert main(["capture", "--help"]) == 0
-    assert not {"<bool>", "<=", ">="} & {*capsys.readouterr().out.replace("[", " ").split()}
-
-
-def test_range_in_words_leaves_out_bounds_against_nonsense() -> None:
+    assert not {"<bool>", "<=", ">="} & {*shown("capture", "--help").out.replace("[", " ").split()}
     texts = {(1, 65535): "1 to 65535", (0.1, None): "at least 0.1", (None, 5): "at most 5"}
-    texts |= dict.fromkeys([(1 / 30, 1e9), (0, None)], "")
+    texts |= dict.fromkeys([(1 / 30, 1e9), (0, None)], "")  # bounds against nonsense are left out
     assert {bounds: range_text(*bounds) for bounds in texts} == texts
 
 
-def test_output_path_refuses_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_output_path_refuses_read_only_folder(tmp_path: Path, monkeypatch: Patch) -> None:
     """The system's answer is replaced, since the tests may run as a user who may write anywhere."""
     out = tmp_path / "wall.toml"
-    assert output_path(out, "wall", ".toml", overwrite=False) == out
+    assert common.output_path(out, "wall", ".toml", overwrite=False) == out
     monkeypatch.setattr(os, "access", lambda path, mode: not (path == tmp_path and mode == os.W_OK))
     with pytest.raises(errors.OutputExistsError, match=r"wall\.toml"):
-        output_path(out, "wall", ".toml", overwrite=True)
+        common.output_path(out, "wall", ".toml", overwrite=True)
 
 
-def test_table_on_a_narrow_terminal_is_blocks_of_lines(monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
+def test_table_on_a_narrow_terminal_is_blocks_of_lines(monkeypatch: Patch, capsys: Capsys) -> None:
     table = Table("camera", "serial", "name")
     table.add_row("sim", "", "simulated: the paper's rig")
     monkeypatch.setenv("COLUMNS", "30")
-    show(table)
+    common.show(table)
     assert capsys.readouterr().out == "camera: sim\nname: simulated: the paper's rig\n\n"
     monkeypatch.setenv("COLUMNS", "80")
-    show(table)
+    common.show(table)
     assert "serial" not in capsys.readouterr().out
 
 
@@ -338,7 +302,7 @@ def test_interruption_that_python_ignores_is_raised_again() -> None:
     def lose_a_signal() -> None:
         gone = Gone()
         reference = weakref.ref(gone, lambda _: signal.raise_signal(signal.SIGINT))
-        with interrupted_by_signals("kept"):
+        with common.interrupted_by_signals("kept"):
             del gone
             assert reference() is None
             Event().wait(20)
@@ -352,23 +316,19 @@ def test_interruption_that_python_ignores_is_raised_again() -> None:
 
 @pytest.mark.parametrize(("command", "needed"), [("rigs", MIN_ADDRESS_BYTES), ("train", TORCH_ADDRESS_BYTES)])
 def test_too_little_address_space_is_one_line_before_libraries_load(
-    monkeypatch: pytest.MonkeyPatch, capsys: Capsys, command: str, needed: int
+    monkeypatch: Patch, shown: Run, command: str, needed: int
 ) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (needed - 1, needed))
-    assert main([command, "--help"]) == 1
-    assert f"is {(needed >> 20) - 1} MiB" in capsys.readouterr().err
+    assert f"is {(needed >> 20) - 1} MiB" in shown(command, "--help", code=1).err
     monkeypatch.setattr(resource, "getrlimit", lambda _: (needed, needed))
-    assert main([command, "--help"]) == 0
+    shown(command, "--help")
 
 
 @pytest.mark.parametrize("error", [MemoryError(), ImportError("no room")])
 def test_error_is_printed_without_rich_where_memory_is_short(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception
+    monkeypatch: Patch, capfd: pytest.CaptureFixture[str], error: Exception
 ) -> None:
-    def lack(*_: object, **__: object) -> None:
-        raise error
-
-    monkeypatch.setattr(stderr, "print", lack)
+    monkeypatch.setattr(common.stderr, "print", Mock(side_effect=error))
     say_error("out of\nmemory")
     assert capfd.readouterr().err == "error: out of memory\n"
 
@@ -378,19 +338,16 @@ FAILED = [RuntimeError(f"export failed\n{reason}") for reason in ("std::bad_allo
 
 
 @pytest.mark.parametrize("error", [*FAILED, NO_MAP, MemoryError(), RuntimeError("of one")], ids=str)
-def test_lack_of_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: Capsys, error: Exception) -> None:
+def test_lack_of_memory_is_one_line(monkeypatch: Patch, shown: Run, error: Exception) -> None:
     def lack(_: object) -> None:
         raise error from (MemoryError() if str(error) == "of one" else None)
 
     monkeypatch.setattr("nlos_cam.cli.main.build_app", lack)
-    assert main(["rigs"]) == 1
-    assert capsys.readouterr().err.startswith("error: out of memory: close")
+    assert shown("rigs", code=1).err.startswith("error: out of memory: close")
 
 
-def test_open_session_without_memory_does_not_blame_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
-    def lack(*_: object, **__: object) -> None:
-        raise RuntimeError("Exception during initialization: std::bad_alloc")
-
+def test_open_session_without_memory_does_not_blame_the_file(monkeypatch: Patch) -> None:
+    lack = Mock(side_effect=RuntimeError("Exception during initialization: std::bad_alloc"))
     monkeypatch.setattr("onnxruntime.InferenceSession", lack)
     with pytest.raises(MemoryError, match="bad_alloc"):
         inference.open_session(b"")

@@ -1,6 +1,6 @@
 """`render`: objects to files of maps, options that reach the scene or the accuracy, and exit codes."""
 
-import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,96 +9,87 @@ import pytest
 import trimesh
 from nlos_calibration.rig import Rig, dump_toml, load_rig
 
-from nlos_cam.cli.main import main
 from nlos_cam.cli.render import hidden_depth
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render import EFFECTS, HiddenObject, Scene, SceneFile, SensorModel, render, sensor_effects
 
-Capsys = pytest.CaptureFixture[str]
+Run = Callable[..., Any]
+DRAFT = "--accuracy", "draft", "--out", "maps.npz", "--overwrite"
 
 RIG = load_rig("paper-rig")
 NAMES = [*EFFECTS, *(effect.name for effect in sensor_effects(SensorModel()))]
 
 
 @pytest.fixture(autouse=True)
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def undrawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Pictures take a second each."""
     monkeypatch.setattr("nlos_cam.cli.render._draw", lambda path, *_: path.touch())
+    monkeypatch.chdir(tmp_path)
 
 
-def _depth() -> np.ndarray:
-    return object_depth(2, RIG.object_box)[1]
+@pytest.fixture
+def rendered(run: Run) -> Run:
+    """Render in draft unless a bound is given; returns the JSON result and the contents of the file."""
 
+    def call(hidden: object, *options: object) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        chosen = DRAFT[2:] if any(str(option).startswith("--max") for option in options) else DRAFT
+        result = run("render", hidden, *chosen, *options)
+        with np.load(result["out"]) as file:
+            return result, dict(file)
 
-def _render(capsys: Capsys, *arguments: object) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the JSON result and the contents of the file."""
-    assert main(["render", *map(str, arguments), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out.splitlines()[-1])
-    with np.load(result["out"]) as file:
-        return result, dict(file)
+    return call
 
 
 def test_render_writes_maps_a_picture_and_reports_effects(
-    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+    rendered: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.undo()  # the picture is drawn
-    out = tmp_path / "cup.npz"
-    assert main(["render", "cup", "--accuracy", "draft", "--out", str(out), "--explain", "--json"]) == 0
-    shown = capsys.readouterr()
-    result = json.loads(shown.out.splitlines()[-1])
+    result, file = rendered("cup", "--out", out := tmp_path / "cup.npz", "--explain")
     assert (result["accuracy"], result["out"]) == ("draft", str(out))
     assert result["seconds"] > 0
     assert [effect["name"] for effect in result["effects"]] == NAMES
     assert all(set(e) == {"name", "included", "reason", "bound", "seconds"} for e in result["effects"])
-    assert "self-occlusion" in shown.err
+    assert "self-occlusion" in result.err
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
-    with np.load(out) as file:
-        assert file["depth_m"].shape == file["intensity"].shape == file["margin"].shape == (64, 80)
-        assert file["object_depth_m"].shape == (64, 64)
-        assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
+    assert file["depth_m"].shape == file["intensity"].shape == file["margin"].shape == (64, 80)
+    assert file["object_depth_m"].shape == (64, 64)
+    assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
 
 
-def test_render_of_a_depth_map_equals_the_library(tmp_path: Path, capsys: Capsys) -> None:
-    np.save(tmp_path / "thing.npy", _depth())
-    _, file = _render(capsys, tmp_path / "thing.npy", "--accuracy", "draft", "--out", tmp_path / "maps.npz")
-    expected = render(Scene(RIG, _depth()), "draft")
+def test_render_of_a_depth_map_equals_the_library(rendered: Run) -> None:
+    depth_m = object_depth(2, RIG.object_box)[1]
+    np.save("thing.npy", depth_m)
+    _, file = rendered("thing.npy")
+    expected = render(Scene(RIG, depth_m), "draft")
     np.testing.assert_array_equal(file["depth_m"], expected.depth_m)
     np.testing.assert_array_equal(file["intensity"], expected.intensity)
-    np.testing.assert_array_equal(file["object_depth_m"], _depth())
+    np.testing.assert_array_equal(file["object_depth_m"], depth_m)
 
 
 @pytest.mark.parametrize("kind", ["category", "file"])
-def test_render_places_its_object_as_a_scene_file_does(mesh: str, tmp_path: Path, capsys: Capsys, kind: str) -> None:
+def test_render_places_its_object_as_a_scene_file_does(mesh: str, rendered: Run, kind: str) -> None:
     """Every option is given, and each arrives."""
     name, only = {"category": ("hat", {"seed": 4}), "file": (mesh, {"up": "z"})}[kind]
     pose = {"size_m": 0.15, "tilt_x_deg": -10.0, "tilt_y_deg": 200.0, "turn_deg": 30.0}
     fields = {**pose, "x_m": -0.01, "y_m": 0.02, "front_m": 0.05, **only}
     options = [text for field, value in fields.items() for text in (f"--{field.replace('_', '-')}", value)]
-    _, file = _render(capsys, name, *options, "--accuracy", "draft", "--out", tmp_path / "maps.npz")
-    np.testing.assert_array_equal(file["object_depth_m"], _of_scene(**{kind: name, **fields}))
+    np.testing.assert_array_equal(rendered(name, *options)[1]["object_depth_m"], _of_scene(**{kind: name, **fields}))
 
 
-def test_render_takes_the_rig_of_a_scene_and_reports_its_file(tmp_path: Path, capsys: Capsys) -> None:
-    scene, out = tmp_path / "scene.toml", tmp_path / "maps.npz"
+def test_render_takes_the_rig_of_a_scene_and_reports_its_file(rendered: Run) -> None:
     lent = SceneFile(name="a scene", rig=RIG.model_copy(update={"name": "lent"}))
-    scene.write_text(dump_toml(lent), encoding="utf-8")
-    _, file = _render(capsys, "hat", "--scene", scene, "--accuracy", "draft", "--out", out)
-    assert str(file["rig_name"]) == "lent"
-    result, _ = _render(capsys, "cup", "--accuracy", "draft", "--out", tmp_path / "other")
+    Path("scene.toml").write_text(dump_toml(lent), encoding="utf-8")
+    assert str(rendered("hat", "--scene", "scene.toml")[1]["rig_name"]) == "lent"
+    result, _ = rendered("cup", "--out", "other")
     assert Path(result["out"]).is_file()
 
 
 @pytest.fixture
-def plate(tmp_path: Path) -> str:
+def plate() -> str:
     depth = np.full((16, 16), np.nan, np.float32)
     depth[4:12, 4:12] = 0.2
-    np.save(tmp_path / "plate.npy", depth)
-    return str(tmp_path / "plate.npy")
-
-
-def _rendered(plate: str, capsys: Capsys, *options: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    chosen = () if any(option.startswith("--max") for option in options) else ("--accuracy", "draft")
-    return _render(capsys, plate, "--out", Path(plate).with_name("maps.npz"), "--overwrite", *chosen, *options)
+    np.save("plate.npy", depth)
+    return "plate.npy"
 
 
 def _included(result: dict[str, Any]) -> set[str]:
@@ -106,74 +97,67 @@ def _included(result: dict[str, Any]) -> set[str]:
 
 
 @pytest.mark.slow
-def test_render_takes_a_material_and_an_albedo(plate: str, capsys: Capsys) -> None:
-    result, _ = _rendered(
-        plate, capsys, "--material", "phong", "--specular", "0.3", "--exponent", "4", "--accuracy", "draft"
-    )
+def test_render_takes_a_material_and_an_albedo(plate: str, rendered: Run) -> None:
+    result, _ = rendered(plate, "--material", "phong", "--specular", "0.3", "--exponent", "4")
     assert "brdf" in _included(result)
-    _, black = _rendered(plate, capsys, "--albedo", "0")
-    _, white = _rendered(plate, capsys, "--albedo", "1")
+    (_, black), (_, white) = (rendered(plate, "--albedo", albedo) for albedo in "01")
     assert (white["intensity"] > black["intensity"]).any()
 
 
-def test_render_with_three_albedos_gives_color(plate: str, capsys: Capsys) -> None:
-    result, file = _rendered(plate, capsys, "--albedo", "0.9,0.5,0.1")
+def test_render_with_three_albedos_gives_color(plate: str, rendered: Run) -> None:
+    result, file = rendered(plate, "--albedo", "0.9,0.5,0.1")
     assert "colour" in _included(result)
     assert file["colour"].shape == (64, 80, 3)
     assert (file["colour"][..., 0] >= file["colour"][..., 2]).all()
     assert (file["colour"][..., 0] > file["colour"][..., 2]).any()
 
 
-def test_render_takes_effects_radiometry_pulse_and_beams(plate: str, capsys: Capsys) -> None:
-    only, _ = _rendered(plate, capsys, "--effects", "three-bounce")
+def test_render_takes_effects_radiometry_pulse_and_beams(plate: str, rendered: Run) -> None:
+    only, _ = rendered(plate, "--effects", "three-bounce")
     assert _included(only) & {"direct", "occluder", "three-bounce"} == {"three-bounce"}
-    plain, sharp = _rendered(plate, capsys)
-    _, lambertian = _rendered(plate, capsys, "--radiometry", "lambertian")
+    plain, sharp = rendered(plate)
+    _, lambertian = rendered(plate, "--radiometry", "lambertian")
     assert (str(sharp["radiometry"]), str(lambertian["radiometry"])) == ("paper", "lambertian")
     assert lambertian["intensity"].max() > 1.5 * sharp["intensity"].max()  # 1/pi in place of 1/(2 pi)
-    wide, blurred = _rendered(plate, capsys, "--pulse-ns", "1")
+    wide, blurred = rendered(plate, "--pulse-ns", "1")
     assert "pulse" in _included(wide) - _included(plain)
-    assert not np.array_equal(sharp["intensity"], blurred["intensity"])
-    _, finer = _rendered(plate, capsys, "--beams-per-cell", "2")
-    assert not np.array_equal(sharp["intensity"], finer["intensity"])
+    for _, other in ((wide, blurred), rendered(plate, "--beams-per-cell", "2")):
+        assert not np.array_equal(sharp["intensity"], other["intensity"])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bound", [["--max-error", "0.9"], ["--max-seconds", "1000"]])
-def test_render_chooses_an_accuracy_within_a_bound(plate: str, capsys: Capsys, bound: list[str]) -> None:
-    result, _ = _rendered(plate, capsys, *bound)
-    assert result["accuracy"] in {"draft", "standard", "fine", "reference"}
-    if bound[0] == "--max-seconds":
-        assert result["accuracy"] == "reference"  # time for everything
+def test_render_chooses_an_accuracy_within_a_bound(plate: str, rendered: Run) -> None:
+    assert rendered(plate, "--max-error", "0.9")[0]["accuracy"] in {"draft", "standard", "fine", "reference"}
+    assert rendered(plate, "--max-seconds", "1000")[0]["accuracy"] == "reference"  # time for everything
 
 
 @pytest.fixture
-def mesh(tmp_path: Path) -> str:
+def mesh() -> str:
     corners = [(0, 0, 0), (1, 0, 0), (0, 0.6, 0), (0, 0, 0.4)]
     solid = trimesh.Trimesh(corners, [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], process=False)
-    solid.export(tmp_path / "wedge [b].stl")
-    return str(tmp_path / "wedge [b].stl")
+    solid.export("wedge [b].stl")
+    return "wedge [b].stl"
 
 
 def _of_scene(rig: Rig = RIG, **fields: Any) -> np.ndarray:
     return SceneFile(name="same", rig=rig, object=HiddenObject(**fields)).scene_at(0).object_depth_m
 
 
-def test_hidden_depth_takes_a_depth_map_as_it_is(tmp_path: Path, capsys: Capsys) -> None:
+def test_hidden_depth_takes_a_depth_map_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
     depth = _of_scene(category="hat")
-    np.save(tmp_path / "hat.NPY.npy", depth)
-    np.testing.assert_array_equal(hidden_depth(str(tmp_path / "hat.NPY.npy"), RIG, {"size_m": None}), depth)
+    np.save("hat.NPY.npy", depth)
+    np.testing.assert_array_equal(hidden_depth("hat.NPY.npy", RIG, {"size_m": None}), depth)
     assert capsys.readouterr().err == ""
-    np.save(tmp_path / "none [b].npy", np.full((64, 64), np.nan))
-    assert np.isnan(hidden_depth(str(tmp_path / "none [b].npy"), RIG, {})).all()
+    np.save("none [b].npy", np.full((64, 64), np.nan))
+    assert np.isnan(hidden_depth("none [b].npy", RIG, {})).all()
     warning = capsys.readouterr().err
-    assert "none [b].npy" in warning
-    assert warning.count("\n") == 1
+    assert ("none [b].npy" in warning, warning.count("\n")) == (True, 1)
 
 
-def test_hidden_depth_warns_of_an_object_cut_or_flattened_by_the_box(mesh: str, capsys: Capsys) -> None:
-    plate = str(Path(mesh).with_name("plate [b].ply"))
-    trimesh.creation.box(extents=(1, 0.2, 0.01)).export(plate)
+def test_hidden_depth_warns_of_an_object_cut_or_flattened_by_the_box(
+    mesh: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trimesh.creation.box(extents=(1, 0.2, 0.01)).export(plate := "plate [b].ply")
     half = hidden_depth(plate, RIG, {"size_m": 0.2, "x_m": 0.125})  # the box ends in its middle
     flat = hidden_depth(mesh, RIG, {"tilt_y_deg": 90, "front_m": 0.2})
     of_half, of_flat = capsys.readouterr().err.splitlines()

@@ -1,6 +1,5 @@
 """`train` on rendered datasets, in color and of depth: both steps, streams, and refused combinations of the two."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,7 @@ RECIPES = {
     "compressor-of-depth": 'task = "compressor"\n',
     "transfer-of-depth": 'task = "transfer"\n',
 }
-Answer = dict[str, Any]
-Go = Callable[..., tuple[int, Answer]]
+Run = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
@@ -52,41 +50,43 @@ def folder(one_thread: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def go(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Go:
-    def train(recipe: str, *flags: str, data: str = "data", **options: str) -> tuple[int, Answer]:
-        maps = ["--dataset", str(folder / data), "--held-out", str(folder / f"{data}-held-out"), *flags]
-        named = [part for name, value in options.items() for part in (f"--{name}", str(folder / value))]
-        task, out = recipe.split("-", maxsplit=1)[0], tmp_path / "out"
-        code = main(["train", task, "--recipe", f"{folder / recipe}.toml", "--out", str(out), *maps, *named, "--json"])
-        return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+def go(folder: Path, out: Path, run: Run) -> Run:
+    def train(recipe: str, *flags: str, data: str = "data", code: int = 0, **options: str) -> Any:
+        named = {"recipe": f"{recipe}.toml", "dataset": data, "held-out": f"{data}-held-out", **options}
+        paths = [part for name, value in named.items() for part in (f"--{name}", folder / value)]
+        return run("train", recipe.split("-", maxsplit=1)[0], "--out", out, *paths, *flags, code=code)
 
     return train
 
 
-def test_color_training_notes_simulation_and_continues(go: Go, folder: Path, tmp_path: Path) -> None:
-    code, answer = go("compressor", "--tensorboard", vae="vae")
-    assert (tmp_path / "out" / "tensorboard").is_dir()
-    assert (code, answer["note"]) == (0, SIMULATION_ONLY)
-    pipeline, record = load_pipeline(tmp_path / "out")
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "out"
+
+
+def test_color_training_notes_simulation_and_continues(go: Run, folder: Path, out: Path) -> None:
+    answer = go("compressor", "--tensorboard", vae="vae")
+    assert (out / "tensorboard").is_dir()
+    assert answer["note"] == SIMULATION_ONLY
+    pipeline, record = load_pipeline(out)
     held_out = open_dataset(folder / "data-held-out", color=True).arrays()
     assert run(pipeline, held_out).shape == held_out.image.shape == (2, 3, 64, 64)
-    encoder, vae = load_encoder(tmp_path / "out"), load_vae(folder / "vae")[0]
+    encoder, vae = load_encoder(out), load_vae(folder / "vae")[0]
     torch.testing.assert_close(encoder.state_dict(), vae.encoder.state_dict(), rtol=0, atol=0)
     with pytest.raises(CheckpointError, match="simulation only"):
-        load_reconstructor(tmp_path / "out", tmp_path / "onnx")
-    for log in (log_rows(tmp_path / "out"), log_rows(folder / "vae")):
+        load_reconstructor(out, out.with_name("onnx"))
+    for log in (log_rows(out), log_rows(folder / "vae")):
         assert float(log[-1]["loss"]) < float(log[0]["loss"])
     assert set(record.figures) == {"held_out_loss", "held_out_iou", "held_out_colour_error"}
     assert record.figures == {name: value for name, value in answer.items() if name not in {"out", "note"}}
     assert (record.color, record.note) == (True, SIMULATION_ONLY)
     assert record.vae_recipe == load_record(folder / "vae").vae_recipe
-    assert go("compressor", vae="vae") == (code, answer)  # it had finished
-    (tmp_path / "out").rename(folder / "first")
-    assert go("compressor-on", "--stream", vae="vae", weights="first")[0] == 0
-    assert [run.start for run in load_record(tmp_path / "out").runs] == ["scratch", "scratch", "weights"]
-    code, answer = go("transfer-of-depth", data="depth", weights="first")
-    assert code == 1
-    assert all(word in answer["error"]["message"] for word in (str(folder / "first"), "simulation only"))
+    assert go("compressor", vae="vae") == answer  # it had finished
+    out.rename(folder / "first")
+    go("compressor-on", "--stream", vae="vae", weights="first")
+    assert [run.start for run in load_record(out).runs] == ["scratch", "scratch", "weights"]
+    refused = go("transfer-of-depth", data="depth", weights="first", code=1)["error"]["message"]
+    assert all(word in refused for word in (str(folder / "first"), "simulation only"))
 
 
 @pytest.mark.parametrize(
@@ -101,10 +101,9 @@ def test_color_training_notes_simulation_and_continues(go: Go, folder: Path, tmp
     ],
 )
 def test_train_refuses_mixture_of_depth_and_color(
-    go: Go, folder: Path, tmp_path: Path, recipe: str, options: dict[str, str], code: int, word: str
+    go: Run, folder: Path, out: Path, recipe: str, options: dict[str, str], code: int, word: str
 ) -> None:
     with pytest.raises(RecordingError, match="simulation only"):
         open_dataset(folder / "data")
-    ended, answer = go(recipe, **options)
-    assert (ended, word in answer["error"]["message"]) == (code, True), answer
-    assert not (tmp_path / "out").exists()
+    assert word in go(recipe, **options, code=code)["error"]["message"]
+    assert not out.exists()

@@ -171,15 +171,11 @@ CASES = [
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with every kind of unusable file, whose name has a space and an accent."""
     folder = tmp_path_factory.mktemp("wröng files")
-    for name, text in SCENES.items():
-        (folder / name).write_text(text, encoding="utf-8")
-    noise = np.random.default_rng(5).bytes(5000)
-    for name in ("binary.toml", "random.bag"):
-        (folder / name).write_bytes(b"\x85\xff" + noise)
-    for name in ("zero.bag", "taken.npz", "taken.pdf"):
-        (folder / name).touch()
-    for name in ("words.npy", "words.stl"):
-        (folder / name).write_bytes(b"hello")
+    noise = b"\x85\xff" + np.random.default_rng(5).bytes(5000)
+    contents = {name: text.encode() for name, text in SCENES.items()} | {"binary.toml": noise, "random.bag": noise}
+    contents |= dict.fromkeys(("zero.bag", "taken.npz", "taken.pdf"), b"")
+    for name, content in (contents | dict.fromkeys(("words.npy", "words.stl"), b"hello")).items():
+        (folder / name).write_bytes(content)
     for name in ("folder.bag", "folder.toml", "folder.stl", "precious"):
         (folder / name).mkdir()
     (folder / "precious" / "thesis.txt").write_text("years of work", encoding="utf-8")

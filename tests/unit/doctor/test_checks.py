@@ -4,6 +4,7 @@ A case: steps that cause the fault, names of the checks that fail, checks with t
 is given), and words of the detail and fix of the first of them.
 """
 
+from functools import partial
 from operator import attrgetter
 from operator import methodcaller as do
 from typing import Any
@@ -21,17 +22,16 @@ LINUX_ONLY = ("container", "udev-rules", "permissions", "video-driver", "hid-sen
 CAMERA_ONLY = ("recovery", "link", "permissions", "video-driver", "hid-sensors", "in-use", "sdk-camera", "firmware")
 
 
-def write(path: str, content: str = "") -> Any:
-    """Write a file of the fake Linux."""
-    return lambda bench: bench.linux.write(path, content)
+def linux(name: str, *arguments: Any) -> Any:
+    """Call a method of the fake Linux."""
+    return lambda bench: do(name, *arguments)(bench.linux)
+
+
+write, runs, load = (partial(linux, name) for name in ("write", "process", "load"))
 
 
 def remove(path: str) -> Any:
     return lambda bench: (bench.linux.root / path).unlink()
-
-
-def runs(pid: int, name: str, *nodes: str) -> Any:
-    return lambda bench: bench.linux.process(pid, name, *nodes)
 
 
 def put(name: str, value: Any) -> Any:
@@ -44,12 +44,8 @@ def all_of(status: str, *names: str) -> str:
     return ", ".join(f"{name} {status}" for name in names)
 
 
-def load(*modules: str) -> Any:
-    return lambda bench: bench.linux.load(*modules)
-
-
 UNPLUG, HIDE, NO_RULES, REFUSE = do("unplug"), do("hide"), do("remove_rules"), do("refuse")
-DOCKER, NO_USB = write(".dockerenv"), put("usb.devices", [])
+DOCKER, NO_USB = write(".dockerenv", ""), put("usb.devices", [])
 SECOND = do("plug_second", hid=0)
 NO_SDK = put("sdk_error", ImportError("No module named 'pyrealsense2'"))
 WSL = write("proc/version", "Linux version 6.6.87-microsoft-standard-WSL2")
@@ -103,7 +99,7 @@ WSL = write("proc/version", "Linux version 6.6.87-microsoft-standard-WSL2")
         # containers
         ([DOCKER, NO_USB, HIDE], "container usb-camera",
          "container", '-v /dev:/dev|-v /sys:/sys|"c 81:* rmw"|"c 189:* rmw"'),
-        ([write("run/.containerenv"), UNPLUG], "usb-camera", "container warning", "podman"),
+        ([write("run/.containerenv", ""), UNPLUG], "usb-camera", "container warning", "podman"),
         ([DOCKER, NO_RULES], "", "container ok, udev-rules skipped", ""),
         ([DOCKER, REFUSE], "permissions", "permissions, container warning", "--device-cgroup-rule"),
         # systems
@@ -115,6 +111,7 @@ WSL = write("proc/version", "Linux version 6.6.87-microsoft-standard-WSL2")
         ([WSL], "", "system warning", ""),
         # times of frames
         ([], "", "metadata ok", "host's clock"),
+        ([write("sys/module/uvcvideo/version", "1.1.1")], "", "metadata ok", "host's clock"),
         ([write("sys/module/uvcvideo/version", "1.1.1.realsense-6.1")], "", "metadata ok", "camera's clock"),
         ([do("run_on", "darwin", "arm64")], "", "metadata skipped, system warning", "Linux and Windows"),
         ([do("run_on", "windows")], "", "metadata ok, sdk-camera ok", "realsense_metadata_win10.ps1"),

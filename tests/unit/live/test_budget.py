@@ -5,7 +5,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from fake_wall import RIG
 from hypothesis import given
@@ -14,19 +13,8 @@ from nlos_models import shipped_folder
 from small_frames import FrameCamera, sheet_network
 
 from nlos_cam.errors import BudgetError, RecordingError
-from nlos_cam.live import SHIPPED, BudgetChoice, available_settings, choose_within_budget, pipeline_timer
-from nlos_cam.live.budget import (
-    BUSY_SHARE,
-    CALLS,
-    HANDOVER_MS,
-    PERIOD_MS,
-    Machine,
-    Setting,
-    Timing,
-    choose,
-    keeping_pace,
-    load_tradeoff,
-)
+from nlos_cam.live import SHIPPED, BudgetChoice, available_settings, budget, choose_within_budget, pipeline_timer
+from nlos_cam.live.budget import HANDOVER_MS, PERIOD_MS, Machine, Setting, Timing, choose, keeping_pace, load_tradeoff
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
 
 AS_MEASURED = Machine(slower=1.0, rest_ms=1.0)
@@ -69,7 +57,7 @@ def test_choose_is_no_less_accurate_with_a_larger_budget(
 
 
 def test_choose_weighs_pace_speed_of_the_machine_and_threads() -> None:
-    quick, slow = setting(20.0, 4.0), setting(10.0, BUSY_SHARE * PERIOD_MS)
+    quick, slow = setting(20.0, 4.0), setting(10.0, budget.BUSY_SHARE * PERIOD_MS)
     assert choose([slow, quick], AS_MEASURED, 1e6) == quick
     assert choose([slow, setting(20.0, 99.0)], AS_MEASURED, 1e6) == slow
     settings = [setting(10.0, 12.0), setting(20.0, 2.0)]
@@ -103,48 +91,33 @@ MEAN = setting(12.0, 2.0, frames=4, runtime="mean")
 ALL = [GOOD, QUICK, MEAN]
 
 
-def chosen(
-    budget_ms: float, slower: float = 1.0, surprises: dict[str, float] | None = None
-) -> tuple[BudgetChoice, list[str]]:
-    """Choice on a machine `slower` than the table's, with `surprises` in ms by runtime, and the loaded runtimes."""
-    loaded: list[str] = []
-
-    def load(wanted: Setting) -> Any:
-        loaded.append(wanted.runtime)
-        return wanted
+def chosen(budget_ms: float, slower: float = 1.0, **late_ms: float) -> tuple[BudgetChoice, list[Setting]]:
+    """Choice on a machine `slower` than the table's and, by runtime, later than it first was; and what was loaded."""
+    loaded: list[Any] = []
 
     def measure(made: Any) -> Timing:
-        late_ms = (surprises or {}).get(made.runtime, 0.0) if len(loaded) > 1 else 0.0
-        return Timing(slower * made.milliseconds_p90 + late_ms, 1.0)
+        return Timing(slower * made.milliseconds_p90 + late_ms.get(made.runtime, 0.0) * (len(loaded) > 1), 1.0)
 
-    _, choice = choose_within_budget(budget_ms, ALL, lambda network, _: network, load, measure)  # type: ignore[arg-type]
+    building: Any = lambda network, _: network, lambda wanted: loaded.append(wanted) or wanted
+    _, choice = choose_within_budget(budget_ms, ALL, *building, measure)  # type: ignore[arg-type]
     return choice, loaded
 
 
-def test_within_budget_takes_the_most_accurate_that_fits_and_names_its_error() -> None:
-    for budget_ms, name, texts in (
-        (7.0, "quick", ()),
-        (15.0, "good", ("15.0 mm", "3.0 mm", MEAN.name)),
-        (60.0, "mean", ("4 frames", "50 ms", "best")),
+def test_within_budget_takes_the_most_accurate_that_fits_as_measured_and_names_its_error() -> None:
+    for budget_ms, machine, loads, texts in (
+        (7.0, {}, [QUICK, QUICK], ()),
+        (15.0, {}, [QUICK, GOOD], ("15.0 mm", "3.0 mm", MEAN.name)),
+        (60.0, {}, [QUICK, MEAN], ("4 frames", "50 ms", "best")),
+        (15.0, {"slower": 4.0}, [QUICK, QUICK], ()),
+        (15.0, {"good": 9.0}, [QUICK, GOOD, QUICK], ()),
     ):
-        choice, loaded = chosen(budget_ms)
-        assert choice.setting.runtime == loaded[-1] == name
+        choice, loaded = chosen(budget_ms, **machine)
+        assert (loaded, choice.setting, choice.best) == (loads, loads[-1], MEAN)
         assert choice.expected_ms <= budget_ms
-        assert choice.best is MEAN
         assert all(text in choice.describe() for text in texts)
-
-
-def test_within_budget_measures_a_slow_machine() -> None:
-    assert chosen(15.0, slower=4.0)[0].setting is QUICK
-    with pytest.raises(BudgetError, match=rf"{re.escape(str(HANDOVER_MS + 9))} ms"):
-        chosen(5.0, slower=4.0)
-
-
-def test_within_budget_gives_up_a_setting_slower_than_expected() -> None:
-    choice, loaded = chosen(15.0, surprises={"good": 9.0})
-    assert (choice.setting, loaded) == (QUICK, ["quick", "good", "quick"])
-    with pytest.raises(BudgetError, match=rf"{re.escape(str(HANDOVER_MS + 13))} ms"):
-        chosen(15.0, surprises={"good": 99.0, "quick": 10.0})
+    for budget_ms, machine, least_ms in ((5.0, {"slower": 4.0}, 9), (15.0, {"good": 99.0, "quick": 10.0}, 13)):
+        with pytest.raises(BudgetError, match=rf"{re.escape(str(HANDOVER_MS + least_ms))} ms"):
+            chosen(budget_ms, **machine)
 
 
 @pytest.mark.parametrize(("p95_ms", "kept"), [(9.9, True), (10.1, False)])
@@ -159,21 +132,17 @@ def test_outcome_counts_averaging_towards_the_delay(p95_ms: float, kept: bool) -
 def test_available_settings_leaves_out_what_cannot_run(monkeypatch: pytest.MonkeyPatch) -> None:
     impossible = {"threads": 10_000, "weights": "/no/such/folder", "runtime": "torch float32, cuda"}
     elsewhere = [setting(1.0, 1.0, **{name: value}) for name, value in impossible.items()]
-    monkeypatch.setattr("nlos_cam.live.budget.load_tradeoff", lambda _: [*elsewhere, *ALL])
+    monkeypatch.setattr(budget, "load_tradeoff", lambda _: [*elsewhere, *ALL])
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     assert available_settings(None, None) == ALL
-    monkeypatch.setattr("nlos_cam.live.budget.load_tradeoff", lambda _: elsewhere)
+    monkeypatch.setattr(budget, "load_tradeoff", lambda _: elsewhere)
     with pytest.raises(BudgetError):
         available_settings(Path("other"), None)
 
 
 def test_timer_measures_late_calls_without_the_first() -> None:
-    ticks, calls = count_up(0.004, 0.004), []
-
-    def network(*_: np.ndarray) -> np.ndarray:
-        calls.append(1)
-        return sheet_network()
-
-    timed = pipeline_timer(FrameCamera(0), lambda: next(ticks))(Pipeline(CalibratedRig(RIG), network))
-    assert len(calls) == CALLS + 1
+    ticks, shapes = count_up(0.004, 0.004), list[tuple[int, ...]]()
+    pipeline = Pipeline(CalibratedRig(RIG), lambda depth_m, _: shapes.append(depth_m.shape) or sheet_network())
+    timed = pipeline_timer(FrameCamera(0), lambda: next(ticks))(pipeline)
+    assert shapes == [(1, 64, 80)] * (budget.CALLS + 1)
     assert (timed.network_ms, timed.rest_ms) == pytest.approx((4.0, 8.0))

@@ -1,20 +1,19 @@
 import json
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 import numpy as np
 import pytest
-from fake_wall import SMALL, wall_frame
+from fake_wall import wall_frame
 from made_up_moments import RIG, Recorded, full_moment, moment
 from nlos_calibration import load_measured
 from small_frames import FrameCamera, sheet_network
 from view_streams import saved_moments
 
 from nlos_cam.errors import NlosCamError
-from nlos_cam.live import RunControl, run_live
+from nlos_cam.live import RunControl, RunReport, run_live
 from nlos_cam.live.statistics import SLOW_FRAMES, PaceWatch
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
 from nlos_cam.view import NullViewer
@@ -125,12 +124,7 @@ def test_commands_before_the_first_frame_say_to_wait(tmp_path: Path) -> None:
 
 def test_one_command_runs_at_a_time(control: RunControl) -> None:
     entered, leave = Event(), Event()
-
-    def wait() -> None:
-        entered.set()
-        leave.wait(60.0)
-
-    control.thread_start = wait
+    control.thread_start = lambda: entered.set() or leave.wait(60.0)
     thread = threading.Thread(target=control.run, args=("pause", {}))
     thread.start()
     assert entered.wait(60.0)
@@ -141,35 +135,21 @@ def test_one_command_runs_at_a_time(control: RunControl) -> None:
     assert control.paused
 
 
-class Paced(FrameCamera):
-    """Endless camera that calls a function before each frame."""
-
-    intrinsics = RIG.pinhole
-
-    def __init__(self, on_frame: Callable[[int], object], count: int | None = None) -> None:
-        super().__init__(count, on_frame, make=lambda number: full_moment(number, size=(480, 640)).frame, uri="sim")
-
-
-def run(camera: Any, control: RunControl, **options: Any) -> Any:
+def run(camera: FrameCamera, control: RunControl) -> RunReport:
     pipeline = Pipeline(CalibratedRig(RIG), sheet_network)
-    return run_live(camera, pipeline, NullViewer(), stop=Event(), control=control, recorded=True, **options)
+    return run_live(camera, pipeline, NullViewer(), stop=Event(), control=control, recorded=True)
 
 
 def test_paused_run_reads_frames_and_reconstructs_none(tmp_path: Path) -> None:
-    control = RunControl(folder=tmp_path)
-
-    def act(number: int) -> None:
-        if number in {5, 15}:
-            control.run("pause" if number == 5 else "resume", {})
-
-    report = run(Paced(act, 30), control)
+    control, commands = RunControl(folder=tmp_path), {5: "pause", 15: "resume"}
+    report = run(FrameCamera(30, lambda number: number in commands and control.run(commands[number], {})), control)
     assert 14 <= report.frames <= 26
     assert report.dropped == 0
 
 
 def test_run_ends_what_was_begun(tmp_path: Path) -> None:
     control = RunControl(folder=tmp_path)
-    run(Paced(lambda number: control.run("save_session", {}) if number == 5 else None, 30), control)
+    run(FrameCamera(30, lambda number: number == 5 and control.run("save_session", {})), control)
     assert control.status()["state"] == "ended"
     assert saved_moments(next(tmp_path.glob("session-*.html")))
 
@@ -177,20 +157,16 @@ def test_run_ends_what_was_begun(tmp_path: Path) -> None:
 def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     control, benches, told = RunControl(folder=tmp_path), list[CalibratedRig](), list[str]()
     control.on_bench = benches.append
+    command = threading.Thread(target=lambda: told.append(control.run("take_reference", {"frames": 8})))
 
     def act(number: int) -> None:
         if number == 3:
-            command = threading.Thread(target=lambda: told.append(control.run("take_reference", {"frames": 8})))
             command.start()
-            threads.append(command)
         elif number > 3:
-            threads[0].join(0.02)
+            command.join(0.02)
 
-    threads: list[threading.Thread] = []
-    camera = FrameCamera(200, act, make=wall_frame, uri="sim")
-    camera.intrinsics = SMALL
-    run(camera, control)
-    threads[0].join()
+    run(FrameCamera(200, act, make=wall_frame, uri="sim"), control)
+    command.join()
     assert "reference of 8 frames" in told[0]
     (bench,) = benches
     assert bench.rig is RIG

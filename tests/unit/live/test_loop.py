@@ -1,22 +1,22 @@
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from itertools import count as count_up
 from itertools import pairwise
 from pathlib import Path
 from threading import Event
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from fake_wall import SMALL, WallCamera, measured_wall
-from nlos_calibration import load_rig
+from fake_wall import WallCamera, measured_wall
+from nlos_calibration import MeasuredWall, load_rig
 from small_frames import FrameCamera, ListViewer, sheet_network, small_frame
 
 from nlos_cam.errors import CameraLostError
-from nlos_cam.frames import Frame
 from nlos_cam.live.frame_queue import QUEUE_FRAMES, FrameReader
-from nlos_cam.live.loop import pace, run_live, warm_up
+from nlos_cam.live.loop import pace, run_live
 from nlos_cam.live.statistics import OUTSIDE_LATENCY, STALLED, RunReport
 from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict, frame_issues
 from nlos_cam.view import Moment, NullViewer
@@ -25,8 +25,8 @@ RIG = load_rig("paper-rig")
 PERIOD_S = 1 / 30
 
 
-def pipeline(network: Callable[..., np.ndarray] = sheet_network) -> Pipeline:
-    return Pipeline(CalibratedRig(RIG), network)
+def pipeline(network: Callable[..., np.ndarray] = sheet_network, wall: MeasuredWall | None = None) -> Pipeline:
+    return Pipeline(CalibratedRig(RIG, wall), network)
 
 
 def test_pace_yields_frames_at_their_timestamps() -> None:
@@ -87,16 +87,9 @@ def test_run_live_reports_latency_on_any_clock(offset_s: float, delivery_ms: flo
         assert 0.0 <= parts_s <= moment.latency_s + 1e-6
 
 
-def test_warm_up_runs_the_pipeline_without_taking_a_frame() -> None:
-    shapes: list[tuple[int, ...]] = []
-    warm_up(FrameCamera(0), pipeline(lambda depth_m, _: shapes.append(depth_m.shape) or sheet_network()))
-    assert shapes == [(1, 64, 80)]
-
-
 def test_run_live_warns_while_the_lidar_is_moved(tmp_path: Path) -> None:
     begins, viewer, clock = list[tuple[str, bool]](), ListViewer(), count_up(1.0)
-    camera, bench = WallCamera(150, moved=range(30, 80)), CalibratedRig(RIG, measured_wall(tmp_path))
-    method = Pipeline(bench, sheet_network)
+    camera, method = WallCamera(150, moved=range(30, 80)), pipeline(wall=measured_wall(tmp_path))
     run: Any = {"stop": Event(), "recorded": True, "clock": lambda: next(clock)}  # the recording is never ahead of it
     report = run_live(camera, method, viewer, **run, on_warning=lambda *about: begins.append(about))
     [(warning, frames)] = report.warnings.items()
@@ -109,14 +102,11 @@ def test_run_live_warns_while_the_lidar_is_moved(tmp_path: Path) -> None:
 
 
 def test_run_live_counts_and_survives_failed_frames(caplog: pytest.LogCaptureFixture) -> None:
-    viewer, logged, calls = ListViewer(), list[Moment](), count_up()
-
-    def failing(*_: np.ndarray) -> np.ndarray:
-        if next(calls) in {3, 4}:
-            raise ZeroDivisionError("an odd frame")
-        return sheet_network()
-
-    report = run_live(FrameCamera(10), pipeline(failing), viewer, stop=Event(), recorded=True, on_moment=logged.append)
+    viewer, logged, sheet = ListViewer(), list[Moment](), sheet_network()
+    network = Mock(
+        spec=sheet_network, side_effect=[*[sheet] * 3, *[ZeroDivisionError("an odd frame")] * 2, *[sheet] * 5]
+    )
+    report = run_live(FrameCamera(10), pipeline(network), viewer, stop=Event(), recorded=True, on_moment=logged.append)
     assert [moment.frame.frame_number for moment in viewer.moments] == [0, 1, 2, 5, 6, 7, 8, 9]
     assert [moment.dropped for moment in viewer.moments] == [0, 0, 0, 2, 2, 2, 2, 2]
     assert logged == viewer.moments
@@ -127,11 +117,8 @@ def test_run_live_counts_and_survives_failed_frames(caplog: pytest.LogCaptureFix
 
 
 def test_run_live_reports_before_it_raises_the_cameras_error() -> None:
-    def fail_at_two(number: int) -> None:
-        if number == 2:
-            raise CameraLostError("unplugged")
-
-    camera, reports = FrameCamera(None, fail_at_two), list[RunReport]()
+    camera = FrameCamera(None, Mock(side_effect=[None, None, CameraLostError("unplugged")]))
+    reports = list[RunReport]()
     camera.counts = Counter(restarted=3)
     with pytest.raises(CameraLostError, match="unplugged"):
         run_live(camera, pipeline(), NullViewer(), stop=Event(), recorded=True, on_error=reports.append)
@@ -157,29 +144,24 @@ def test_run_live_ends_in_time_without_further_frames(monkeypatch: pytest.Monkey
 
 
 class Stalling(ListViewer):
-    """Viewer and camera that yields nothing between frames 4 and 5 until the stall was shown twice; 40 degrees warm.
+    """Viewer whose camera yields nothing between frames 4 and 5 until the stall was shown twice; 40 degrees warm.
 
     The clock goes on by 0.3 s whenever it is read during the stall.
     """
-
-    uri, intrinsics, incomplete, dropped, counts = "fake", SMALL, 0, 0, Counter[str]()
 
     def __init__(self) -> None:
         super().__init__()
         self.now_s, self.stalling = 100.0, False
         self._shown, self._shown_twice = Event(), Event()
+        self.camera = FrameCamera(10, self._on_frame, make=lambda number: small_frame(number, 100.0))
+        self.camera.telemetry = lambda _="": {"ldd_temperature": 40.0}  # type: ignore[method-assign]
 
-    def __iter__(self) -> Iterator[Frame]:
-        for number in range(10):
-            if number == 5:
-                assert self._shown.wait(60.0)
-                self.stalling = True
-                assert self._shown_twice.wait(60.0)
-                self.stalling = False
-            yield small_frame(number, 100.0)
-
-    def telemetry(self, _: str = "") -> Mapping[str, float]:
-        return {"ldd_temperature": 40.0}
+    def _on_frame(self, number: int) -> None:
+        if number == 5:
+            assert self._shown.wait(60.0)
+            self.stalling = True
+            assert self._shown_twice.wait(60.0)
+            self.stalling = False
 
     def clock(self) -> float:
         self.now_s += 0.3 if self.stalling else 0.0
@@ -194,19 +176,19 @@ class Stalling(ListViewer):
 
 
 def test_run_live_shows_a_stall_with_the_last_moment() -> None:
-    camera, begins = Stalling(), list[tuple[str, bool]]()
-    run: Any = {"stop": Event(), "recorded": True, "clock": camera.clock}
-    report = run_live(camera, pipeline(), camera, **run, on_warning=lambda *about: begins.append(about))
-    frames = [moment.frame.frame_number for moment in camera.moments if moment.verdict is not Verdict.STALLED]
+    viewer, begins = Stalling(), list[tuple[str, bool]]()
+    run: Any = {"stop": Event(), "recorded": True, "clock": viewer.clock}
+    report = run_live(viewer.camera, pipeline(), viewer, **run, on_warning=lambda *about: begins.append(about))
+    frames = [moment.frame.frame_number for moment in viewer.moments if moment.verdict is not Verdict.STALLED]
     assert frames == list(range(10))
-    again = [moment for moment in camera.moments if moment.verdict is Verdict.STALLED]
+    again = [moment for moment in viewer.moments if moment.verdict is Verdict.STALLED]
     assert len(again) >= 2
     assert {moment.frame.frame_number for moment in again} == {4}
     assert all(later.latency_s > before.latency_s for before, later in pairwise(again))
     assert begins == [(STALLED, True), (STALLED, False)]
     assert (report.frames, report.counts, report.verdicts) == (10, {"stalls": 1}, {})
     assert report.stalled_s >= 1.0
-    assert {moment.celsius["ldd_temperature"] for moment in camera.moments} == {40.0}
+    assert {moment.celsius["ldd_temperature"] for moment in viewer.moments} == {40.0}
 
 
 PIXELS = 80 * 64
@@ -215,7 +197,6 @@ PIXELS = 80 * 64
 @pytest.mark.parametrize("depths", [0, PIXELS // 2, PIXELS // 2 + 1])
 @pytest.mark.parametrize("saturated", [PIXELS // 1000, PIXELS // 1000 + 1])
 def test_frame_issues_are_named(depths: int, saturated: int) -> None:
-    """Of a frame in which so many pixels have a depth, and so many are at 255."""
     frame = small_frame(0)
     frame.depth_m.ravel()[depths:] = np.nan
     frame.ir[:] = 254
@@ -230,16 +211,12 @@ def wait_for_end(reader: FrameReader) -> None:
     assert not reader._thread.is_alive()
 
 
-def numbers_of(reader: FrameReader) -> list[int]:
-    return [arrival.frame.frame_number for arrival in reader]
-
-
 @pytest.mark.parametrize("lossless", [True, False])
 def test_reader_yields_every_frame_or_drops_the_oldest(lossless: bool) -> None:
     with FrameReader(FrameCamera(200), lossless=lossless, stop=Event()) as reader:
         if not lossless:
             wait_for_end(reader)
-        numbers = numbers_of(reader)
+        numbers = [arrival.frame.frame_number for arrival in reader]
     assert numbers == list(range(0 if lossless else 200 - QUEUE_FRAMES, 200))
     assert reader.dropped == list(range(numbers[0]))
 

@@ -66,15 +66,13 @@ def test_background_check_equals_a_check_in_this_process() -> None:
 
 
 def test_background_checks_take_the_newest_frame_once_a_period() -> None:
-    now_s = 100.0
+    now_s, steps = 100.0, [(1.9, False, 0), (0.2, True, 0), (1.0, True, 0), (1.5, True, 1)]
     with BackgroundPhysicsCheck(RIG, period_s=2.0, clock=lambda: now_s, command=python(SILENT)) as checks:
         checks.offer(1, DARK, NOTHING)
         wait_until(lambda: not checks.waits)
-        for number, (later_s, waits, dropped) in enumerate(
-            [(1.9, False, 0), (0.2, True, 0), (1.0, True, 0), (1.5, True, 1)]
-        ):
+        for number, (later_s, waits, dropped) in enumerate(steps, 2):
             now_s += later_s
-            checks.offer(2 + number, DARK, NOTHING)
+            checks.offer(number, DARK, NOTHING)
             assert (checks.waits, checks.dropped) == (waits, dropped)
 
 
@@ -167,15 +165,13 @@ def test_worker_leaves_when_its_parent_is_gone(end: bytes) -> None:
 
 
 def test_worker_is_nice_and_keeps_prints_out_of_its_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    niced, served, stderr = [], [], SimpleNamespace(buffer="stderr")
+    niced, served = [], []
     monkeypatch.setattr(os, "nice", niced.append, raising=False)
-    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer="asked"))
-    monkeypatch.setattr(sys, "stdout", SimpleNamespace(buffer="told"))
-    monkeypatch.setattr(sys, "stderr", stderr)
+    for name in ("stdin", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, SimpleNamespace(buffer=name))
     monkeypatch.setattr(
         "nlos_cam.live.physics_check_process.serve",
-        lambda asked, told, leave: served.append((asked, told, sys.stdout is stderr, callable(leave))),
+        lambda asked, told, leave: served.append((asked, told, sys.stdout.buffer, callable(leave))),
     )
     main()
-    assert niced == [19]
-    assert served == [("asked", "told", True, True)]
+    assert (niced, served) == ([19], [("stdin", "stdout", "stderr", True)])

@@ -2,8 +2,8 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
+from itertools import count as count_up
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
 from fake_wall import SMALL, WallCamera, measured_wall, wall_frame
-from made_up_moments import RIG, Recorded, bump, full_moment
+from made_up_moments import RIG, Recorded, full_moment
 from matplotlib.figure import Figure
 from page_reader import read_page
-from small_frames import NOTHING, FrameCamera
+from small_frames import NOTHING, FrameCamera, SheetNetwork
 from view_streams import saved_moments
 
 from nlos_cam.errors import OutputExistsError, RecordingError
@@ -25,10 +25,14 @@ from nlos_cam.live import OBJECT_FORMATS, VIDEO, ReplayMedia, export_objects
 from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD
 from nlos_cam.live.replay import DIFFERENCE, REPORT, RESULT, SHEET, ReplayReport, replay_recording
 from nlos_cam.live.replay_media import VIEW, FrameSampler, draw_contact_sheet, moment_of
-from nlos_cam.objects import image_from_depth, mesh_from_depth, object_box
+from nlos_cam.objects import mesh_from_depth, object_box
 from nlos_cam.reconstruct import CalibratedRig, FrameResult, PeriodicPhysicsCheck, Pipeline, Verdict
 
 TEXT = "report.md"
+NAMES = {REPORT, RESULT, SHEET, TEXT}
+BENCH, BOX = CalibratedRig(RIG), object_box(RIG)
+FULL = full_moment(0)
+STEP = FrameResult(FULL.frame, maps_from_frame(FULL.frame), FULL.reconstruction, 0.0, {})
 
 
 def left_half(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
@@ -44,9 +48,8 @@ def noise_frame(number: int) -> Frame:
 def replayed_noise(out: Path, count: int = 2, **options: Any) -> ReplayReport:
     """Replay `count` frames of noise without a wall; the camera counts duplicates."""
     camera = FrameCamera(count, make=noise_frame)
-    pipeline = options.pop("pipeline", Pipeline(CalibratedRig(RIG), left_half))
     camera.counts.update(duplicate=2, out_of_order=1)
-    return replay_recording(camera, pipeline, out, **{"stop": Event(), **options})
+    return replay_recording(camera, out=out, **{"pipeline": Pipeline(BENCH, left_half), "stop": Event(), **options})
 
 
 def replayed_wall(tmp_path: Path, camera: WallCamera, out: str = "out") -> Path:
@@ -72,8 +75,8 @@ def test_replay_writes_every_frame_with_number_time_and_place(tmp_path: Path) ->
         assert file["verdict"].tolist() == [""] * 12
         assert np.isnan(file["uncertainty_m"]).all()
         assert file["check_score"].size == file["check_frame_number"].size == 0
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["out"]
-    assert sorted(file.name for file in out.iterdir()) == sorted([RESULT, SHEET, REPORT, TEXT])
+    assert list(tmp_path.iterdir()) == [out]
+    assert {file.name for file in out.iterdir()} == NAMES
     assert (out / SHEET).read_bytes().startswith(b"\x89PNG")
     assert len(read_page((out / REPORT).read_text()).pictures) == 1
     text = (out / TEXT).read_text()
@@ -85,7 +88,7 @@ def test_replay_writes_every_frame_with_number_time_and_place(tmp_path: Path) ->
 def test_replay_writes_uncertainty_and_verdict_of_each_frame(tmp_path: Path) -> None:
     says = iter([(0.0, 0.0), (0.9, 0.0), (0.0, 0.9)])
     doubter = FakeDoubter(lambda *_: next(says), error_v=0.1)
-    replayed_noise(tmp_path / "out", 3, pipeline=Pipeline(CalibratedRig(RIG), left_half, uncertainty_model=doubter))
+    replayed_noise(tmp_path / "out", 3, pipeline=Pipeline(BENCH, left_half, uncertainty_model=doubter))
     with np.load(tmp_path / "out" / RESULT) as file:
         assert file["verdict"].tolist() == ["object seen", "nothing there", "outside the trained range"]
         assert np.isfinite(file["depth_m"]).any((1, 2)).tolist() == [True, False, True]
@@ -97,7 +100,7 @@ def test_replay_writes_uncertainty_and_verdict_of_each_frame(tmp_path: Path) -> 
 def test_replay_with_checks_is_reproducible_to_the_bit(tmp_path: Path) -> None:
     for name in ("a", "b"):
         checks = PeriodicPhysicsCheck(RIG, every=9, accuracy="draft")
-        replayed_noise(tmp_path / name, 12, pipeline=Pipeline(CalibratedRig(RIG), left_half, checks=checks))
+        replayed_noise(tmp_path / name, 12, pipeline=Pipeline(BENCH, left_half, checks=checks))
     for file in (RESULT, SHEET):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
     one, other = ((tmp_path / name / REPORT).read_text(encoding="utf-8") for name in ("a", "b"))
@@ -110,14 +113,8 @@ def test_replay_with_checks_is_reproducible_to_the_bit(tmp_path: Path) -> None:
 
 
 def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:
-    stop, done = Event(), []
-
-    def on_frame() -> None:
-        done.append(1)
-        if len(done) == 7:
-            stop.set()
-
-    report = replayed_noise(tmp_path / "out", 1000, stop=stop, on_frame=on_frame)
+    stop, done = Event(), count_up(1)
+    report = replayed_noise(tmp_path / "out", 1000, stop=stop, on_frame=lambda: next(done) == 7 and stop.set())
     assert report.frames == BATCH_FRAMES * (MAX_BATCHES_AHEAD + 2)
     with np.load(tmp_path / "out" / RESULT) as result:
         assert result["frame_number"].tolist() == list(range(100, 100 + report.frames))
@@ -143,10 +140,8 @@ def test_replay_writes_difference_maps_and_their_reference(tmp_path: Path) -> No
     wall = measured_wall(tmp_path)
     assert wall.reference is not None
     with np.load(out / DIFFERENCE) as file:
-        assert set(file) == {
-            *("depth_m", "intensity", "frame_number", "timestamp_s"),
-            *("rig_name", "rig_checksum", "reference_sha256"),
-        }
+        names = "depth_m intensity frame_number timestamp_s rig_name rig_checksum reference_sha256"
+        assert set(file) == set(names.split())
         assert file["depth_m"].shape == file["intensity"].shape == (9, 64, 80)
         assert file["depth_m"].dtype == file["intensity"].dtype == np.float32
         np.testing.assert_array_equal(file["frame_number"], np.arange(9))
@@ -157,7 +152,7 @@ def test_replay_writes_difference_maps_and_their_reference(tmp_path: Path) -> No
     text = (out / TEXT).read_text()
     assert DIFFERENCE in text
     assert "20 frames" in text
-    replay_recording(WallCamera(2), Pipeline(CalibratedRig(RIG), left_half), out, stop=Event())
+    replay_recording(WallCamera(2), Pipeline(BENCH, left_half), out, stop=Event())
     assert not (out / DIFFERENCE).exists(), "of an earlier replay"
     assert "difference maps" not in (out / TEXT).read_text()
 
@@ -174,36 +169,18 @@ def test_replay_reports_warnings_with_their_frames(tmp_path: Path) -> None:
     assert any(first in range(30, 60) for _, first, _ in warnings)
 
 
-WITHOUT_SDK = """
-import sys
-sys.modules["pyrealsense2"] = None
-from nlos_cam.cli.main import main
-sys.exit(main(sys.argv[1:]))
-"""
-
-
 @pytest.mark.slow
 def test_replay_command_needs_no_sdk(noise_bag: Path, tmp_path: Path) -> None:
-    run = [sys.executable, "-c", WITHOUT_SDK, "replay", str(noise_bag), "--out", str(tmp_path / "out"), "--json"]
+    without = "import sys; sys.modules['pyrealsense2'] = None; from nlos_cam.cli import run; run()"
+    run = [sys.executable, "-c", without, "replay", str(noise_bag), "--out", str(tmp_path / "out"), "--json"]
     ended = subprocess.run(run, capture_output=True, text=True, timeout=250)  # noqa: PLW1510  the code is what is tested
     assert ended.returncode == 0, ended.stderr
     assert json.loads(ended.stdout.splitlines()[-1])["frames"] == 20
 
 
-BENCH, BOX = CalibratedRig(RIG), object_box(RIG)
-FULL = full_moment(0)
-STEP = FrameResult(FULL.frame, maps_from_frame(FULL.frame), FULL.reconstruction, 0.0, {})
-Titles = Callable[[list[FrameResult]], list[str]]
-NAMES = {REPORT, RESULT, SHEET, "report.md"}
-
-
-def network(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
-    """Return the same hill for all maps."""
-    return np.repeat(image_from_depth(bump(0), BOX)[np.newaxis], len(depth_m), axis=0)
-
-
 def replayed(out: Path, count: int, **asked: Any) -> set[str]:
-    replay_recording(Recorded(count), Pipeline(BENCH, network), out, stop=Event(), media=ReplayMedia(BENCH, **asked))
+    media, pipeline = ReplayMedia(BENCH, **asked), Pipeline(BENCH, SheetNetwork())
+    replay_recording(Recorded(count), pipeline, out, stop=Event(), media=media)
     return {file.name for file in out.iterdir()}
 
 
@@ -267,20 +244,14 @@ def wall_step(number: int, difference: LidarMaps | None = None) -> FrameResult:
     return FrameResult(frame, maps_from_frame(frame), NOTHING, 0.0, {}, difference)
 
 
-@pytest.fixture
-def titles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Titles:
-    """Titles of the contact sheet's columns and labels of its colour bars."""
+def test_sheet_has_a_row_per_map_and_a_column_per_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved: list[Any] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: saved.append(figure))
 
-    def titles_of(steps: list[FrameResult]) -> list[str]:
-        saved: list[Any] = []
-        monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: saved.append(figure))
+    def titles(steps: list[FrameResult]) -> list[str]:
         draw_contact_sheet(tmp_path / "sheet.png", steps)
-        return [title for axis in saved[0].axes if (title := axis.get_ylabel() or axis.get_title())]
+        return [title for axis in saved[-1].axes if (title := axis.get_ylabel() or axis.get_title())]
 
-    return titles_of
-
-
-def test_sheet_has_a_row_per_map_and_a_column_per_frame(titles: Titles) -> None:
     plain = ["lidar depth (m)", "infrared (counts)", "hidden depth (m)"]
     assert titles([wall_step(3), wall_step(9)]) == ["frame 3", "frame 9", *plain]
     differing = [wall_step(number, maps_from_frame(wall_frame(number))) for number in (3, 9)]
@@ -299,26 +270,22 @@ def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_export_of_result_equals_files_of_replay(replay: Path, tmp_path: Path) -> None:
-    count = export_objects(replay / "reconstruction.npz", tmp_path / "exported", OBJECT_FORMATS, 3, stop=Event())
-    made, exported = (
-        {file.name: file for file in folder.iterdir()} for folder in (replay / "object", tmp_path / "exported")
-    )
-    assert count == 3
-    assert sorted(made) == sorted(exported)
-    assert len(made) == 3 * len(OBJECT_FORMATS)
-    vertices = [np.load(files["000003.npz"])["vertices_m"] for files in (made, exported)]
+    made, exported = replay / "object", tmp_path / "exported"
+    assert export_objects(replay / RESULT, exported, OBJECT_FORMATS, 3, stop=Event()) == 3
+    names = [sorted(file.name for file in folder.iterdir()) for folder in (made, exported)]
+    assert names[0] == names[1]
+    assert len(names[0]) == 3 * len(OBJECT_FORMATS)
+    vertices = [np.load(folder / "000003.npz")["vertices_m"] for folder in (made, exported)]
     np.testing.assert_allclose(*vertices, atol=1e-9)
-    depth_m = np.load(replay / "reconstruction.npz")["depth_m"][3]
+    depth_m = np.load(replay / RESULT)["depth_m"][3]
     np.testing.assert_array_equal(vertices[0], mesh_from_depth(depth_m, BOX).vertices_m)
 
 
 def test_export_stops_when_asked_and_skips_frames_without_surface(replay: Path, tmp_path: Path) -> None:
     (stop := Event()).set()
-    assert export_objects(replay / "reconstruction.npz", tmp_path / "a", ["ply"], stop=stop) == 0
-    with np.load(replay / "reconstruction.npz") as file:
-        arrays = dict(file)
-    arrays["depth_m"][:] = np.nan
-    np.savez(tmp_path / "empty.npz", **arrays)
+    assert export_objects(replay / RESULT, tmp_path / "a", ["ply"], stop=stop) == 0
+    with np.load(replay / RESULT) as file:
+        np.savez(tmp_path / "empty.npz", **{**file, "depth_m": np.full_like(file["depth_m"], np.nan)})
     assert export_objects(tmp_path / "empty.npz", tmp_path / "b", ["ply"], stop=Event()) == 0
 
 
@@ -338,7 +305,7 @@ BAD = {"pitch_m": [0.1], "z_far_m": 0.0, "frame_number": [1, 2], "z_near_m": [[]
 
 @pytest.mark.parametrize(("name", "value"), [("depth_m", "text"), ("depth_m", 1.0), *BAD.items()])
 def test_export_refuses_arrays_that_contradict(replay: Path, tmp_path: Path, name: str, value: object) -> None:
-    with np.load(replay / "reconstruction.npz") as file:
+    with np.load(replay / RESULT) as file:
         np.savez(tmp_path / "bad.npz", **{**file, name: np.array(value)})
     with pytest.raises(RecordingError, match="not the reconstruction"):
         export_objects(tmp_path / "bad.npz", tmp_path / "out", ["ply"], stop=Event())

@@ -5,9 +5,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import count as count_up
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, call
 
 import made_up_moments
 import numpy as np
@@ -26,16 +28,6 @@ from nlos_cam.reconstruct import FrameResult, Quality, Verdict
 from nlos_cam.reconstruct.network import Doubt
 from nlos_cam.recording.sidecar import Sidecar, Temperatures, sidecar_path
 from nlos_cam.view import Moment
-
-
-@pytest.fixture
-def begins() -> list[tuple[str, bool]]:
-    return []
-
-
-@pytest.fixture
-def watch(begins: list[tuple[str, bool]]) -> StallWatch:
-    return StallWatch(lambda *about: begins.append(about))
 
 
 def step_of(number: int, *warnings: str, **others: Any) -> FrameResult:
@@ -82,11 +74,12 @@ def test_statistics_raise_after_many_failures_in_a_row() -> None:
         tally.fail(small_frame(1), SceneError("no object_box"), 1)
 
 
-def test_warning_log_ignores_numbers_in_a_warning(begins: list[tuple[str, bool]]) -> None:
-    found = WarningLog(lambda *about: begins.append(about))
+def test_warning_log_ignores_numbers_in_a_warning() -> None:
+    found = WarningLog(told := Mock())
     for step in (step_of(1, "46.5 degrees"), step_of(2, "48 degrees"), step_of(3, "48 degrees", "48 mm"), step_of(4)):
         found.add(step)
-    assert begins == [("46.5 degrees", True), ("48 mm", True), ("48 degrees", False), ("48 mm", False)]
+    begins = [call("46.5 degrees", True), call("48 mm", True)]
+    assert told.call_args_list == [*begins, call("48 degrees", False), call("48 mm", False)]
     assert found.frames == {"48 degrees": 3, "48 mm": 1}
 
 
@@ -108,22 +101,22 @@ def test_stage_times_replace_the_oldest_in_constant_memory() -> None:
 JUST_BEFORE_S = 0.999 * STALLED_AFTER_S
 
 
-def test_stall_watch_reports_a_stall_once_until_a_frame_comes(
-    watch: StallWatch, begins: list[tuple[str, bool]]
-) -> None:
+def test_stall_watch_reports_a_stall_once_until_a_frame_comes() -> None:
+    watch = StallWatch(told := Mock())
     assert not watch.update(1000.0, None), "no frame has come yet"
     assert not watch.update(10.0 + JUST_BEFORE_S, 10.0)
     shown = [time_s for time_s in (10.5, 10.6, 10.9, 11.0, 11.4, 11.6) if watch.update(time_s, 10.0)]
     assert shown == [10.5, 11.0, 11.6]
     watch.frame_arrived(10.0)
-    assert begins == [(STALLED, True)], "a frame from before the stall does not end it"
+    assert told.call_args_list == [call(STALLED, True)], "a frame from before the stall does not end it"
     watch.frame_arrived(12.0)
     watch.frame_arrived(12.1)
-    assert begins == [(STALLED, True), (STALLED, False)]
+    assert told.call_args_list == [call(STALLED, True), call(STALLED, False)]
     assert (watch.stalls, watch.stalled_s) == (1, 2.0)
 
 
-def test_stall_watch_counts_a_stall_that_lasts_to_the_end(watch: StallWatch, begins: list[tuple[str, bool]]) -> None:
+def test_stall_watch_counts_a_stall_that_lasts_to_the_end() -> None:
+    watch = StallWatch(told := Mock())
     for start_s in (0.0, 10.0):
         assert watch.update(start_s + 1.0, start_s)
         watch.frame_arrived(start_s + 2.0)
@@ -132,7 +125,7 @@ def test_stall_watch_counts_a_stall_that_lasts_to_the_end(watch: StallWatch, beg
     watch.update(24.0, 23.0)
     watch.close(25.0)
     watch.close(99.0)
-    assert [each for _, each in begins] == [True, False, True, False, True, False, True]
+    assert [each.args[1] for each in told.call_args_list] == [True, False, True, False, True, False, True]
     assert (watch.stalls, watch.stalled_s) == (4, pytest.approx(2.0 + 2.0 + 1.5 + 2.0))
 
 
@@ -158,15 +151,9 @@ FRAMES = [wall_frame(number) for number in range(1, 100, 10)]
 """A third of a second apart."""
 
 
-class Asked:
+def warming() -> Mock:
     """Telemetry that is warmer by a degree each time it is read."""
-
-    def __init__(self) -> None:
-        self.times_s: list[float] = []
-
-    def __call__(self, time_s: float) -> Mapping[str, float]:
-        self.times_s.append(time_s)
-        return {"ldd_temperature": 40.0 + len(self.times_s)}
+    return Mock(side_effect=({"ldd_temperature": 40.0 + read} for read in count_up(1)))
 
 
 def camera(uri: str, **values: float) -> Any:
@@ -178,19 +165,14 @@ def readings(telemetry: Telemetry, frames: list[Frame]) -> list[Mapping[str, flo
 
 
 def test_telemetry_reads_periodically_by_the_frames_clock() -> None:
-    asked = Asked()
-    assert list(Telemetry(asked, every_s=1.0).watch(FRAMES)) == FRAMES
-    assert asked.times_s == pytest.approx([0.0, 1.0, 2.0, 3.0])
-    given = readings(Telemetry(Asked(), every_s=1.0), FRAMES)
+    given = readings(Telemetry(warming(), every_s=1.0), FRAMES)
     assert [bool(celsius) for celsius in given] == [number % 3 == 0 for number in range(10)], "each reading once"
     assert given[3] == {"ldd_temperature": 42.0}
-    late = Telemetry(Asked(), every_s=1.0)
-    ahead = list(late.watch(FRAMES))
-    assert [late.at(ahead[number]) for number in (2, 2, 9)] == [
-        {"ldd_temperature": 41.0},
-        None,
-        {"ldd_temperature": 44.0},  # frames between were dropped
-    ]
+    late = Telemetry(asked := warming(), every_s=1.0)
+    assert list(late.watch(FRAMES)) == FRAMES
+    assert [call.args[0] for call in asked.call_args_list] == pytest.approx([0.0, 1.0, 2.0, 3.0])
+    first, none, last = (late.at(FRAMES[number]) for number in (2, 2, 9))  # frames between were dropped
+    assert (first, none, last) == ({"ldd_temperature": 41.0}, None, {"ldd_temperature": 44.0})
 
 
 def test_telemetry_of_a_camera_reads_temperatures_only() -> None:
@@ -249,14 +231,9 @@ def test_log_keeps_its_columns_when_a_stage_comes_later(tmp_path: Path) -> None:
 
 
 def test_log_ends_on_a_full_disk_without_ending_the_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    class Full:
-        def write(self, _: str = "") -> int:
-            raise OSError(28, "No space left on device")
-
-        close = write
-
+    full = OSError(28, "No space left on device")
     with caplog.at_level(logging.WARNING), FrameLog(tmp_path / "log.jsonl") as log:
-        real, log._file = log._file, Full()  # type: ignore[assignment]
+        real, log._file = log._file, Mock(**{"write.side_effect": full, "close.side_effect": full})
         for number in range(5):
             log.add(moment(number))
         real.close()

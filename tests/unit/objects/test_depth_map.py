@@ -1,5 +1,3 @@
-"""Rasteriser and images: solids of known depth, the image v of a depth map, and textures that keep its silhouette."""
-
 from itertools import pairwise
 
 import numpy as np
@@ -11,17 +9,8 @@ from nlos_calibration import ObjectBox, load_rig
 from nlos_models import BLACK_V
 from nlos_models.pipeline import KEPT_SHARE
 
-from nlos_cam.objects import (
-    TEXTURES,
-    cell_centers_m,
-    depth_from_image,
-    image_from_albedo,
-    image_from_depth,
-    object_depth,
-    orthographic_depth,
-    paint,
-)
-from nlos_cam.objects.depth_map import share_outside
+from nlos_cam.objects import TEXTURES, cell_centers_m, depth_from_image, image_from_albedo, object_depth, paint
+from nlos_cam.objects.depth_map import image_from_depth, orthographic_depth, share_outside
 from nlos_cam.render import Surface
 
 BOX = ObjectBox(x_min_m=0.0, x_max_m=0.64, y_min_m=-0.32, y_max_m=0.32, z_near_m=0.1, z_far_m=0.6)
@@ -39,11 +28,8 @@ def _triangles(mesh: trimesh.Trimesh, centre: tuple[float, float, float]) -> np.
 
 
 def test_tilted_plane_has_its_depth_at_every_cell_center() -> None:
-    def plane(x: float, y: float) -> float:
-        return 0.3 + 0.1 * x - 0.05 * y
-
-    corners = plane(-1, -1), plane(1, -1), plane(1, 1), plane(-1, 1)
-    np.testing.assert_allclose(orthographic_depth(_quad(corners), BOX), plane(X, Y), rtol=1e-6)
+    depth = orthographic_depth(_quad((0.25, 0.45, 0.35, 0.15)), BOX)
+    np.testing.assert_allclose(depth, 0.3 + 0.1 * X - 0.05 * Y, rtol=1e-6)
 
 
 @pytest.mark.parametrize("corner", [0.0, 0.1, 1 / 3, 0.123456789])
@@ -88,15 +74,12 @@ def test_share_outside_counts_the_silhouette_once_and_no_edges() -> None:
     inside, outside = _quad((0.3, 0.3, 0.3, 0.3), 0.1, 0.2), _quad((0.3, 0.3, 0.3, 0.3), 0.65, 0.75)
     layers = [outside + np.array((0, 0, 0.1 * k)) for k in range(4)]
     assert share_outside(np.concatenate([inside, *layers]), BOX) == pytest.approx(0.5)
-    edge_on = np.array([[(3.0, -1, 0.2), (3.0, 1, 0.2), (3.0, 0, 0.5)]])
-    sliver = np.array(
-        [
-            [(3.0, -1, 0.2), (3.5, 0.37, 0.2), (3.5, 0.37 + 1e-9, 0.5)],
-            [(4.0, 1, 0.2), (4.0 - 1e-6, 1, 0.2), (4, 1 - 1e-6, 0.2)],
-        ]
-    )
-    exact = np.array([[(0.0, -0.32, 0.2), (0.64, -0.32, 0.2), (0.64, 0.32 + 1e-12, 0.2)]])
-    assert [share_outside(triangles, BOX) for triangles in (edge_on, sliver, exact)] == [0, 0, 0]
+    edge_on = (3.0, -1, 0.2), (3.0, 1, 0.2), (3.0, 0, 0.5)
+    sliver = (3.0, -1, 0.2), (3.5, 0.37, 0.2), (3.5, 0.37 + 1e-9, 0.5)
+    speck = (4.0, 1, 0.2), (4.0 - 1e-6, 1, 0.2), (4, 1 - 1e-6, 0.2)
+    exact = (0.0, -0.32, 0.2), (0.64, -0.32, 0.2), (0.64, 0.32 + 1e-12, 0.2)
+    thin = [edge_on], [sliver, speck], [exact]
+    assert [share_outside(np.array(triangles), BOX) for triangles in thin] == [0, 0, 0]
 
 
 PAPER = load_rig("paper-rig").object_box
@@ -139,45 +122,43 @@ def test_cell_centers_grow_with_wall_x_and_against_wall_y() -> None:
     np.testing.assert_allclose([y_m[0], y_m[-1]], [PAPER.y_max_m - pitch / 2, PAPER.y_min_m + pitch / 2])
 
 
+THING = object_depth(1, PAPER)[1]
+
+
 def test_painted_depends_on_the_seed_and_draws_every_texture() -> None:
-    depth_m = object_depth(5, PAPER)[1]
-    one, again, other = (paint(seed, depth_m, [*TEXTURES]) for seed in (5, 5, 6))
+    one, again, other = (paint(seed, THING, [*TEXTURES]) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one.albedo, again.albedo)
     assert one.texture == again.texture
     assert not np.array_equal(one.albedo, other.albedo)
-    assert paint(5, depth_m, ["stripes"]).texture == "stripes"
-    depth_m = object_depth(1, PAPER)[1]
-    assert {paint(seed, depth_m, [*TEXTURES]).texture for seed in range(40)} == set(TEXTURES)
+    assert paint(5, THING, ["stripes"]).texture == "stripes"
+    assert {paint(seed, THING, [*TEXTURES]).texture for seed in range(40)} == set(TEXTURES)
 
 
 @pytest.mark.parametrize("name", TEXTURES)
 def test_texture_is_an_albedo_that_keeps_the_silhouette(name: str) -> None:
-    depth_m = object_depth(1, PAPER)[1]
     for seed in range(20):
-        albedo = TEXTURES[name](np.random.default_rng(seed), depth_m)
+        albedo = TEXTURES[name](np.random.default_rng(seed), THING)
         assert Surface(albedo).over((64, 64)).shape == (64, 64, 3)
-        bright = image_from_albedo(albedo, depth_m).max(0)[~np.isnan(depth_m)]
+        bright = image_from_albedo(albedo, THING).max(0)[~np.isnan(THING)]
         assert bright.min() > KEPT_SHARE * bright.max()
 
 
 def test_textures_have_the_colors_of_their_names() -> None:
-    depth_m = object_depth(1, PAPER)[1]
-    made = {name: make(np.random.default_rng(3), depth_m) for name, make in TEXTURES.items()}
+    made = {name: make(np.random.default_rng(3), THING) for name, make in TEXTURES.items()}
     colours = {name: len(np.unique(albedo.reshape(-1, 3), axis=0)) for name, albedo in made.items()}
     assert colours["plain"] == 1
     assert colours["stripes"] == colours["layers"] == 2
     assert 2 <= colours["patches"] <= 4
     assert colours["gradient"] > 100
-    near = made["layers"][depth_m == np.nanmin(depth_m)]
+    near = made["layers"][np.nanmin(THING) == THING]
     assert (near == near[0]).all()
     albedo = TEXTURES["layers"](np.random.default_rng(0), np.full((64, 64), np.nan, np.float32))
     assert np.isfinite(albedo).all()
 
 
 def test_image_is_the_albedo_on_the_surface_and_0_beside_it() -> None:
-    depth_m = object_depth(2, PAPER)[1]
-    albedo = paint(2, depth_m, [*TEXTURES]).albedo
-    image, hidden = image_from_albedo(albedo, depth_m), np.isnan(depth_m)
+    albedo = paint(2, THING, [*TEXTURES]).albedo
+    image, hidden = image_from_albedo(albedo, THING), np.isnan(THING)
     assert image.shape == (3, 64, 64)
     black = image_from_albedo(np.zeros((64, 64, 3)), np.full((64, 64), 0.2))
     np.testing.assert_allclose(black, BLACK_V, atol=1e-6)  # no background

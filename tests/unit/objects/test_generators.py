@@ -1,5 +1,3 @@
-"""The 18 object generators, how their settings are drawn, and generic shapes of every family, carved or in pairs."""
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -280,20 +278,18 @@ def test_solid_is_closed(solid: Float64) -> None:
     assert (times == 2).all()
 
 
-def test_solids_move_turn_tip_and_join() -> None:
-    np.testing.assert_allclose(_middle(solids.at(solids.box(1, 1, 1), 1, 2, 3)), [1, 2, 3])
-    np.testing.assert_allclose(_middle(solids.bar((0.1, 0.2), (0.4, 0.6), 0.06, 0.1)), [0.25, 0.4, 0], atol=1e-12)
-    np.testing.assert_allclose(
-        _middle(solids.turned(solids.at(solids.box(1, 1, 1), x=2), (0, 0, 1), 90)), [0, 2, 0], atol=1e-12
-    )
-    there_and_back = solids.turned(solids.turned(solids.box(1, 2, 3), (1, 0, 0), 35), (1, 0, 0), -35)
-    np.testing.assert_allclose(there_and_back, solids.box(1, 2, 3), atol=1e-12)
-    top = solids.tipped(solids.at(solids.box(0.1, 0.1, 0.1), y=1), 30)  # the top tips towards the wall
-    np.testing.assert_allclose(_middle(top), [0, np.cos(np.radians(30)), -0.5], atol=1e-12)
-    parts = solids.box(1, 1, 1), solids.at(solids.ellipsoid(1, 1, 1), 5), solids.ring(1, 0.1)
-    solid = solids.joined(*parts)
-    assert len(solid) == sum(len(part) for part in parts)
-    assert solid[..., 0].max() == pytest.approx(6, abs=0.01)
+MOVED = [
+    (solids.at(solids.box(1, 1, 1), 1, 2, 3), [1, 2, 3]),
+    (solids.bar((0.1, 0.2), (0.4, 0.6), 0.06, 0.1), [0.25, 0.4, 0]),
+    (solids.turned(solids.at(solids.box(1, 1, 1), x=2), (0, 0, 1), 90), [0, 2, 0]),
+    (solids.tipped(solids.at(solids.box(0.1, 0.1, 0.1), y=1), 30), [0, np.sqrt(3) / 2, -0.5]),  # towards the wall
+    (solids.joined(solids.box(1, 1, 1), solids.at(solids.box(1, 1, 1), 5)), [2.5, 0, 0]),
+]
+
+
+@pytest.mark.parametrize(("solid", "middle"), MOVED, ids=["at", "bar", "turned", "tipped", "joined"])
+def test_solid_is_moved_to_its_place(solid: Float64, middle: list[float]) -> None:
+    np.testing.assert_allclose(_middle(solid), middle, atol=1e-12)
 
 
 @pytest.mark.parametrize("taper", [0.0, 0.5, 1.0])

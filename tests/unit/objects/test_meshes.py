@@ -1,9 +1,5 @@
-"""Objects by name, meshes and depth maps from files, errors that name the file, and the mesh of a hidden surface."""
-
 import csv
-import json
 import logging
-import struct
 import subprocess
 import sys
 import warnings
@@ -22,22 +18,12 @@ from nlos_calibration import ObjectBox, load_rig
 from trimesh.exchange.ply import export_ply
 
 from nlos_cam.errors import NlosCamError, SceneError
-from nlos_cam.objects import (
-    Pose,
-    SurfaceMesh,
-    category_triangles,
-    cell_centers_m,
-    find_category,
-    load_object,
-    mesh_from_depth,
-    object_box,
-    orthographic_depth,
-    place,
-    random_pose,
-)
+from nlos_cam.objects import find_category, load_object
 from nlos_cam.objects import meshes as files
+from nlos_cam.objects.depth_map import cell_centers_m, object_box, orthographic_depth
 from nlos_cam.objects.meshes import POSES, MeshFile, folder_objects, mesh_depth, plain, read_depth_map, read_mesh
-from nlos_cam.objects.surface_mesh import JUMP_M
+from nlos_cam.objects.placement import Pose, category_triangles, place, random_pose
+from nlos_cam.objects.surface_mesh import JUMP_M, SurfaceMesh, mesh_from_depth
 
 SOLID = trimesh.creation.torus(0.3, 0.1, major_sections=9, minor_sections=5)
 EXPORTS = {
@@ -318,9 +304,11 @@ def test_folder_objects_finds_meshes_in_a_fixed_order_and_refuses_missing_empty_
             folder_objects(path)
 
 
-def test_mesh_depth_is_one_mesh_at_one_pose_per_seed(tmp_path: Path) -> None:
+def test_mesh_depth_is_one_mesh_at_one_pose_per_seed_and_reads_no_other(tmp_path: Path) -> None:
     meshes = [_save(tmp_path / "a.stl"), _save(tmp_path / "b.ply", trimesh.creation.box((3, 2, 1)))]
-    made = [mesh_depth(seed, meshes, BOX, read=read_mesh) for seed in range(12)]
+    read = Mock(wraps=read_mesh)
+    made = [mesh_depth(seed, meshes, BOX, read=read) for seed in range(12)]
+    assert [path for path, _ in made] == [call.args[0] for call in read.call_args_list]
     assert {path for path, _ in made} == set(meshes)
     assert len({depth.tobytes() for _, depth in made}) == 12
     for seed, (path, depth) in enumerate(made):
@@ -341,13 +329,6 @@ def test_mesh_depth_names_a_broken_or_invisible_mesh(tmp_path: Path) -> None:
     needle = trimesh.Trimesh([[0, 0, 0], [0, 1, 0], [1e-5, 0.5, 0]], [[0, 1, 2]], process=False)
     with pytest.raises(SceneError, match=r"needle\.ply"):
         mesh_depth(0, [_save(tmp_path / "needle.ply", needle)], BOX, read=read_mesh)
-
-
-def test_mesh_depth_reads_only_the_mesh_it_picks() -> None:
-    read = Mock(side_effect=lambda name: MeshFile(Path(name), "", np.asarray(TORUS.triangles, np.float64)))
-    names = [f"mesh-{k}" for k in range(1000)]
-    picked = [mesh_depth(seed, names, BOX, read=read)[0] for seed in range(4)]
-    assert picked == [call.args[0] for call in read.call_args_list]
 
 
 def test_mesh_depth_draws_another_pose_for_an_edge_on_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -437,26 +418,6 @@ def test_vertices_lie_at_cell_centers_with_their_uncertainty() -> None:
     np.testing.assert_array_equal(mesh.uncertainty_m, ERROR_M.ravel())
 
 
-def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and uncertainty as the glTF 2.0 specification defines them."""
-    content = path.read_bytes()
-    (length,) = struct.unpack_from("<I", content, 12)
-    tree, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
-    (primitive,) = tree["meshes"][0]["primitives"]
-
-    def values(number: int, kind: str) -> np.ndarray:
-        accessor = tree["accessors"][number]
-        view = tree["bufferViews"][accessor["bufferView"]]
-        count = accessor["count"] * {"SCALAR": 1, "VEC3": 3}[accessor["type"]]
-        return np.frombuffer(binary, kind, count, view.get("byteOffset", 0) + accessor.get("byteOffset", 0))
-
-    named = primitive["attributes"]
-    kind = {5123: "<u2", 5125: "<u4"}[tree["accessors"][primitive["indices"]]["componentType"]]
-    assert tree["materials"][primitive["material"]]["doubleSided"]
-    faces = values(primitive["indices"], kind).reshape(-1, 3)
-    return values(named["POSITION"], "<f4").reshape(-1, 3), faces, values(named["_uncertainty_m"], "<f4")
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])
 def test_opencv_reads_the_saved_mesh(tmp_path: Path, suffix: str) -> None:
     mesh = mesh_from_depth(slope(), SMALL_BOX, ERROR_M)
@@ -471,10 +432,11 @@ def test_opencv_reads_the_saved_mesh(tmp_path: Path, suffix: str) -> None:
 def test_glb_holds_the_mesh_and_its_uncertainty(tmp_path: Path) -> None:
     mesh = mesh_from_depth(slope(), SMALL_BOX, ERROR_M)
     mesh.save(tmp_path / "mesh.glb")
-    vertices_m, faces, uncertainty_m = read_glb(tmp_path / "mesh.glb")
-    np.testing.assert_allclose(vertices_m, mesh.vertices_m, atol=1e-6)
-    np.testing.assert_array_equal(faces, mesh.faces)
-    np.testing.assert_array_equal(uncertainty_m, mesh.uncertainty_m)
+    (read,) = trimesh.load_scene(tmp_path / "mesh.glb", process=False).geometry.values()
+    np.testing.assert_allclose(read.vertices, mesh.vertices_m, atol=1e-6)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    np.testing.assert_array_equal(read.vertex_attributes["_uncertainty_m"].ravel(), mesh.uncertainty_m)
+    assert read.visual.material.doubleSided
 
 
 def test_points_are_saved_without_faces(tmp_path: Path) -> None:

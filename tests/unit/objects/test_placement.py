@@ -1,5 +1,3 @@
-"""Placement of objects in the box, the objects of a seed, backgrounds, and the 54 objects of the benchmark."""
-
 import numpy as np
 import pytest
 from nlos_calibration import ObjectBox, load_rig
@@ -7,20 +5,9 @@ from nlos_calibration.arrays import Float32
 
 from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
-from nlos_cam.objects import CATEGORIES, BenchmarkObject, benchmark_objects, object_box
-from nlos_cam.objects.placement import (
-    POSE_UNITS,
-    Pose,
-    add_background,
-    category_triangles,
-    fit_in_box,
-    object_depth,
-    panel,
-    place,
-    pose_from_units,
-    post,
-    random_pose,
-)
+from nlos_cam.objects import CATEGORIES, object_box, object_depth, panel, place, post, random_pose
+from nlos_cam.objects.benchmark import BenchmarkObject, benchmark_objects
+from nlos_cam.objects.placement import POSE_UNITS, Pose, add_background, category_triangles, fit_in_box, pose_from_units
 
 BOX = object_box(load_rig("paper-rig"))
 CUP = category_triangles("cup", 0)

@@ -12,13 +12,7 @@ from nlos_models.quality import QualityEstimate
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_map import depth_from_image, image_from_depth, object_box
-from nlos_cam.reconstruct.network import (
-    Doubt,
-    Mirrored,
-    Reconstruction,
-    reconstruct,
-    reconstruct_all,
-)
+from nlos_cam.reconstruct.network import Doubt, Mirrored, Reconstruction, reconstruct, reconstruct_all
 from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
 from nlos_cam.reconstruct.verdict import STEADY_FRAMES, FrameConditions, Verdict, VerdictFilter, VerdictLimits
 

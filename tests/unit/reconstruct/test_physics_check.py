@@ -7,22 +7,14 @@ import pytest
 from fake_wall import WallCamera
 from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float32
-from small_frames import sheet_network
+from small_frames import ListViewer, sheet_network
 
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live import run_live
 from nlos_cam.objects import object_box, object_depth
-from nlos_cam.reconstruct import (
-    CalibratedRig,
-    PeriodicPhysicsCheck,
-    Pipeline,
-    check_reconstruction,
-    describe_failure,
-    log_warning,
-)
-from nlos_cam.reconstruct.physics_check import Expected, explain, fit_gain, mean_cost
+from nlos_cam.reconstruct import CalibratedRig, PeriodicPhysicsCheck, Pipeline, check_reconstruction
+from nlos_cam.reconstruct.physics_check import Expected, describe_failure, explain, fit_gain, log_warning, mean_cost
 from nlos_cam.render import Scene, render
-from nlos_cam.view import Moment, NullViewer
 
 SHAPE = 64, 80
 GAIN = 1e5
@@ -186,14 +178,7 @@ def test_periodic_check_reports_a_failure_once(caplog: pytest.LogCaptureFixture)
 
 
 def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
-    shown = list[int]()
-
-    class Noting(NullViewer):
-        def show(self, moment: Moment) -> None:
-            shown.append(moment.check.frame_number)
-
-    processing = Pipeline(
-        CalibratedRig(RIG), sheet_network, checks=PeriodicPhysicsCheck(RIG, every=2, accuracy="draft")
-    )
-    run_live(WallCamera(5, period_s=0.0), processing, Noting(), stop=Event(), recorded=True)
-    assert shown == [0, 0, 2, 2, 4]
+    viewer, checks = ListViewer(), PeriodicPhysicsCheck(RIG, every=2, accuracy="draft")
+    pipeline = Pipeline(CalibratedRig(RIG), sheet_network, checks=checks)
+    run_live(WallCamera(5, period_s=0.0), pipeline, viewer, stop=Event(), recorded=True)
+    assert [moment.check.frame_number for moment in viewer.moments] == [0, 0, 2, 2, 4]

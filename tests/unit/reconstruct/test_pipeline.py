@@ -13,21 +13,15 @@ from fake_wall import RIG, SERIAL, SMALL, WallCamera, bare_wall, measured_wall, 
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
-from small_frames import sheet_network
+from small_frames import SheetNetwork, sheet_network
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.live import FrameReader
 from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD, iterate_batched, iterate_results, with_telemetry
-from nlos_cam.reconstruct import Clock, FrameConditions, PeriodicPhysicsCheck, PhysicsCheckResult, Verdict
+from nlos_cam.reconstruct import Clock, FrameConditions, FrameResult, Pipeline, Verdict, build_pipeline, load_networks
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig, open_bench, subtract_reference
-from nlos_cam.reconstruct.pipeline import (
-    FrameResult,
-    Pipeline,
-    build_pipeline,
-    compatibility_warnings,
-    frame_conditions,
-    load_networks,
-)
+from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
+from nlos_cam.reconstruct.pipeline import compatibility_warnings, frame_conditions
 
 
 def all_steps(
@@ -46,17 +40,6 @@ def walled(tmp_path: Path) -> CalibratedRig:
     return CalibratedRig(RIG, measured_wall(tmp_path))
 
 
-class Noting:
-    """Network that keeps the depth maps that it is given, one by one."""
-
-    def __init__(self) -> None:
-        self.given = list[np.ndarray]()
-
-    def __call__(self, depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
-        self.given.append(depth_m[0])
-        return sheet_network()
-
-
 def test_steps_time_every_stage_with_the_given_clock() -> None:
     ticks = iter(range(10_000))
     done = all_steps(Pipeline(CalibratedRig(RIG), sheet_network), WallCamera(3), lambda: float(next(ticks)))
@@ -68,7 +51,7 @@ def test_steps_time_every_stage_with_the_given_clock() -> None:
 
 
 def test_pipeline_feeds_the_mean_of_raw_or_difference_maps(walled: CalibratedRig) -> None:
-    noting = Noting()
+    noting = SheetNetwork()
     for uses_difference in (False, True):
         done = all_steps(Pipeline(walled, noting, uses_difference=uses_difference, average=4), WallCamera(6))
     mean_m = np.mean([wall_frame(number).depth_m for number in range(2, 6)], axis=0)
@@ -82,7 +65,7 @@ def test_pipeline_feeds_the_mean_of_raw_or_difference_maps(walled: CalibratedRig
 
 @pytest.mark.parametrize("offset_m", [0.0, 0.0045])
 def test_pipeline_adds_the_measured_offset_to_raw_maps(walled: CalibratedRig, offset_m: float) -> None:
-    noting, record = Noting(), walled.measured.record.model_copy(update={"range_offset_m": offset_m})
+    noting, record = SheetNetwork(), walled.measured.record.model_copy(update={"range_offset_m": offset_m})
     bench = CalibratedRig(RIG, replace(walled.measured, record=record))
     (step,) = all_steps(Pipeline(bench, noting), WallCamera(1))
     np.testing.assert_array_equal(noting.given[0], step.maps.depth_m + np.float32(offset_m))
@@ -115,11 +98,12 @@ def looking(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
 def test_batched_results_equal_results_in_turn(tmp_path: Path, count: int) -> None:
     done: list[list[FrameResult]] = []
     for ahead in (False, True):
-        bench, checks = (
+        checks = PeriodicPhysicsCheck(RIG, every=5, accuracy="draft")
+        bench, others = (
             CalibratedRig(RIG, measured_wall(tmp_path)),
-            PeriodicPhysicsCheck(RIG, every=5, accuracy="draft"),
+            {"uncertainty_model": FakeDoubter(), "checks": checks},
         )
-        pipeline = Pipeline(bench, looking, average=3, uncertainty_model=FakeDoubter(), checks=checks)
+        pipeline = Pipeline(bench, looking, average=3, **others)
         done.append(all_steps(pipeline, WallCamera(count, moved=range(count // 2)), ahead=ahead))
     assert [step.frame.frame_number for step in done[1]] == list(range(count))
     for one, other in zip(*done, strict=True):
@@ -144,7 +128,7 @@ def test_results_raise_the_error_of_a_frame(ahead: bool, count: int) -> None:
 
 @pytest.mark.parametrize(("nothing", "verdict"), [(0.9, Verdict.NOTHING), (0.0, Verdict.SEEN)])
 def test_result_shows_what_its_verdict_says(walled: CalibratedRig, nothing: float, verdict: Verdict) -> None:
-    noting, doubter = Noting(), FakeDoubter(lambda *_: (nothing, 0.0))
+    noting, doubter = SheetNetwork(), FakeDoubter(lambda *_: (nothing, 0.0))
     pipeline = Pipeline(walled, noting, uses_difference=True, average=3, uncertainty_model=doubter)
     done = all_steps(pipeline, WallCamera(100, moved=range(50, 100)))
     for step, asked, given in zip(done[:50], doubter.asked, noting.given, strict=False):
@@ -191,7 +175,7 @@ def test_compatibility_warnings_name_what_differs_from_training_and_a_wall_witho
 
 @pytest.mark.parametrize("eats", ["raw maps", "difference maps"])
 def test_build_pipeline_feeds_the_networks_their_kind_of_maps(walled: CalibratedRig, eats: str) -> None:
-    network = Noting()
+    network = SheetNetwork()
     network.record = trained(eats=eats)
     pipeline: Any = build_pipeline(walled, network, average=7)
     done = all_steps(pipeline, WallCamera(1))

@@ -1,28 +1,16 @@
-"""Search for an accuracy that keeps bounds of error and time, without looking at a clock."""
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render import STOPS, Scene, Surface, prepare, render, three_bounce
-from nlos_cam.render.accuracy_search import (
-    AccuracyChoice,
-    EchoMaps,
-    Work,
-    agreement,
-    beam_histograms,
-    choose,
-    costs,
-    least_seconds,
-    pick,
-    predict,
-    relative_error,
-)
+from nlos_cam.render import STOPS, EchoMaps, Scene, Surface, Work, agreement, choose, costs, least_seconds, prepare
+from nlos_cam.render.accuracy_search import AccuracyChoice, beam_histograms, pick, predict, relative_error
+from nlos_cam.render.renderer import render, three_bounce
 
 RIG = load_rig("paper-rig")
 SMALL = tuple(
@@ -53,22 +41,15 @@ def by_rows(fixed_s: float, each_s: float) -> Callable[[Work, int], float]:
     return stopwatch
 
 
-def _choices(*figures: tuple[str, float, float]) -> list[AccuracyChoice]:
-    return [AccuracyChoice(replace(STOPS["standard"], name=name), error, seconds) for name, error, seconds in figures]
-
-
-DIAL = _choices(("rough", 0.03, 0.005), ("middling", 0.003, 0.02), ("good", 0.0005, 0.03), ("exact", 0.0, 20.0))
+FIGURES = ("rough", 0.03, 0.005), ("middling", 0.003, 0.02), ("good", 0.0005, 0.03), ("exact", 0.0, 20.0)
+DIAL = [AccuracyChoice(replace(STOPS["standard"], name=name), *figures) for name, *figures in FIGURES]
 
 
 @pytest.mark.parametrize(
     ("max_error", "max_seconds", "name"),
     [
-        *[
-            (error, None, name)
-            for error, name in ((0.05, "rough"), (0.01, "middling"), (0.001, "good"), (0.0, "exact"))
-        ],
-        *[(None, seconds, name) for seconds, name in ((0.025, "middling"), (100.0, "exact"))],
-        *[(0.05, 100.0, "rough"), (0.001, 0.03, "good")],
+        *[(0.05, None, "rough"), (0.01, None, "middling"), (0.001, None, "good"), (0.0, None, "exact")],
+        *[(None, 0.025, "middling"), (None, 100.0, "exact"), (0.05, 100.0, "rough"), (0.001, 0.03, "good")],
     ],
 )
 def test_pick_takes_the_cheapest_stop_within_its_bounds(
@@ -108,33 +89,17 @@ def test_predict_scales_seconds_to_all_beams() -> None:
 def test_predict_times_one_rendering_for_each_color_channel(
     albedo: np.ndarray, renderings: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    work: list[Work] = []
-
-    def keep(one: Work, repeats: int) -> float:
-        work.append(one)
-        return float(repeats)
-
-    predict(_scene(surface=Surface(albedo)), "auto", "cpu", SMALL, keep)
-    calls: list[int] = []
-
-    def counted(*arguments: Any) -> Any:
-        calls.append(1)
-        return beam_histograms(*arguments)
-
+    watch, counted = Mock(return_value=1.0), Mock(wraps=beam_histograms)
+    predict(_scene(surface=Surface(albedo)), "auto", "cpu", SMALL, watch)
     monkeypatch.setattr("nlos_cam.render.accuracy_search.beam_histograms", counted)
-    work[0]()
-    assert len(calls) == renderings
+    watch.call_args_list[0].args[0]()
+    assert counted.call_count == renderings
 
 
 def test_predict_times_the_pulse_and_only_the_named_effects() -> None:
     found: list[np.ndarray] = []
-
-    def watch(work: Work, repeats: int) -> float:
-        found.append(work())
-        return float(repeats)
-
     for scene, effects in ((_scene(), "auto"), (_scene(pulse_ns=1.0), "auto"), (_scene(), ["direct"])):
-        choices = predict(scene, effects, "cpu", SMALL, watch)
+        choices = predict(scene, effects, "cpu", SMALL, lambda work, _: found.append(work()) or 1.0)
     sharp, wide, direct = (found[k * len(found) // 3 : (k + 1) * len(found) // 3] for k in range(3))
     assert all(one.shape[1] < other.shape[1] for one, other in zip(sharp, wide, strict=True))
     assert not any(histogram.any() for histogram in direct)  # no third bounce is rendered
@@ -180,9 +145,8 @@ def test_choose_refuses_bad_or_missing_bounds_and_backends(options: dict[str, An
 
 
 def test_least_seconds_repeats_the_work() -> None:
-    runs: list[int] = []
-    assert least_seconds(lambda: runs.append(1), 3) >= 0
-    assert len(runs) == 3
+    assert least_seconds(work := Mock(), 3) >= 0
+    assert work.call_count == 3
 
 
 BIN_M = 0.01
@@ -233,10 +197,7 @@ PRICES = {"direct": 0.5, "three-bounce": 8.0, "self-occlusion": 4.0, "tilt": 1.0
 
 
 def test_costs_are_the_seconds_that_each_effect_adds(monkeypatch: pytest.MonkeyPatch) -> None:
-    depth = np.full((16, 16), np.nan, np.float32)
-    depth[4:12, 4:12] = 0.3
-    depth[6:10, 6:10] = 0.2
-    scene = Scene(load_rig("paper-rig"), depth)
+    scene = _scene()
     plan, now = render(scene).plan, [0.0]
 
     def priced(_scene: Scene, _accuracy: str, effects: list[str], _backend: str) -> None:

@@ -74,9 +74,3 @@ def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
         found, best = backend_numba.echoes(job), strongest(whole, job.bin_m)
         for name in ("peak", "runner_up", "path_m"):
             np.testing.assert_array_equal(getattr(found, name), getattr(best, name))
-
-
-def test_a_constant_brdf_is_a_lambertian_surface() -> None:
-    found = backend_numba.histograms(replace(JOB, brdf=phong(0.6, 0.0, 10)))
-    plain = backend_numba.histograms(replace(JOB, brdf=None))
-    np.testing.assert_allclose(found, 0.6 * plain, rtol=1e-4, atol=1e-6 * plain.max())

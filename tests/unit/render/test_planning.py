@@ -182,16 +182,14 @@ def test_accuracy_refuses_values_out_of_range_by_field(field: str, value: float)
 
 
 def test_survey_share_is_cautious_and_at_most_1() -> None:
-    two = np.ones(2)
-    found = EnergySurvey(two, two, 0 * two, 0 * two, 0 * two, 0 * two, 1.0)
-    assert found.share(np.array([0.1, 0.0])) == pytest.approx(CAUTION * 0.05)
-    assert found.share(np.array([5.0, 0.0])) == 1
-    assert found.tilt == found.occluder == 0
-    dark = EnergySurvey(0 * two, two, two, two, two, two, 1.0)
-    assert dark.share(two) == 1
-    assert dark.share(0 * two) == 0
-    uneven = EnergySurvey(two, two, 0 * two, 0 * two, 0 * two, 0 * two, 4.0)
-    assert uneven.share(np.array([0.1, 0.0])) == pytest.approx(4 * found.share(np.array([0.1, 0.0])))
+    two, none = np.ones(2), np.zeros(2)
+    for ratio in (1.0, 4.0):
+        found = EnergySurvey(two, two, none, none, none, none, uneven=ratio)
+        assert found.share(np.array([0.1, 0.0])) == pytest.approx(ratio * CAUTION * 0.05)
+        assert found.share(np.array([5.0, 0.0])) == 1
+        assert found.tilt == found.occluder == 0
+    dark = EnergySurvey(none, two, two, two, two, two, 1.0)
+    assert (dark.share(two), dark.share(none)) == (1, 0)
 
 
 @pytest.mark.parametrize("z_m", [0.0, 1e-9])

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,19 +11,16 @@ from hypothesis.extra.numpy import arrays
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects import object_box, object_depth
-from nlos_cam.render import backend_numba, legs
-from nlos_cam.render.accuracy import STOPS, Accuracy
-from nlos_cam.render.backend_numba import LANES, echoes, histograms, tables
+from nlos_cam.render import STOPS, Accuracy, Scene, Surface, backend_numba, phong, prepare, render, transient
+from nlos_cam.render.backend_numba import echoes, histograms
 from nlos_cam.render.brdf_table import MAX_NODES, node_count, nodes, scattered, scattering
 from nlos_cam.render.echoes import MultiBounce, compete, no_echoes, strongest
 from nlos_cam.render.effects import Effect
 from nlos_cam.render.geometry import Beams
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.material import Brdf, Surface, phong
-from nlos_cam.render.planning import prepare
-from nlos_cam.render.renderer import render, transient
+from nlos_cam.render.material import Brdf
 from nlos_cam.render.scanning import render_scan, scan_effect, slices
-from nlos_cam.render.scene import Radiometry, Scene
+from nlos_cam.render.scene import Radiometry
 
 RIG = load_rig("paper-rig")
 COARSE = Accuracy("coarse", relay_columns=4, relay_rows=3)
@@ -66,9 +62,7 @@ BIN_M = 0.01
 
 
 def _beams(direct: list[float], length_m: float = 0.5) -> Beams:
-    n = len(direct)
-    every = np.full(n, length_m)
-    foot = np.zeros((n, 3))
+    n, every, foot = len(direct), np.full(len(direct), length_m), np.zeros((len(direct), 3))
     lit = np.ones(n, np.bool_)
     return Beams((1, n), foot, foot, every, every, np.full(n, 0.5), lit, np.array(direct), np.zeros(3))
 
@@ -175,19 +169,13 @@ def test_scattering_compiled_and_plain_agree_leg_by_leg(job: TransportJob) -> No
     assert table.max() > 0.5
 
 
-def test_nodes_interpolate_every_beam_exactly(job: TransportJob) -> None:
-    made = list(nodes(job, BRDF))
-    share = np.stack([part for _, part in made])
-    feet = np.stack([foot for foot, _ in made])
+def test_nodes_interpolate_every_beam_exactly_whichever_are_rendered(job: TransportJob) -> None:
+    feet, share = map(np.stack, zip(*nodes(job, BRDF), strict=True))
     np.testing.assert_allclose(share.sum(0), 1)
     np.testing.assert_allclose(share.T @ feet, job.laser_spot_m, atol=1e-9)
-
-
-def test_nodes_do_not_depend_on_the_rendered_beams(job: TransportJob) -> None:
-    few = job.select(np.array([5, 900]))
-    whole = {tuple(foot): share[[5, 900]] for foot, share in nodes(job, BRDF)}
-    for foot, share in nodes(few, BRDF):
-        np.testing.assert_array_equal(whole[tuple(foot)], share)
+    whole = {tuple(foot): each[[5, 900]] for foot, each in zip(feet, share, strict=True)}
+    for foot, each in nodes(job.select(np.array([5, 900])), BRDF):
+        np.testing.assert_array_equal(whole[tuple(foot)], each)
 
 
 def test_node_count_grows_as_the_error_shrinks(job: TransportJob) -> None:
@@ -197,24 +185,6 @@ def test_node_count_grows_as_the_error_shrinks(job: TransportJob) -> None:
     assert count(0.5) == 4
     assert 4 < count(5e-3) <= count(1e-4) <= MAX_NODES
     assert count(1e-4, phong(0.5, 0.0, 10)) == 4
-
-
-@pytest.mark.parametrize("per_bin", [1, 4, 8])
-def test_tables_are_the_histogram_at_each_sub_bin_shift(per_bin: int) -> None:
-    width = 2 * LANES
-    fine = np.zeros((3, width * per_bin), np.float32)
-    fine[:, : (width - 1) * per_bin] = np.random.default_rng(0).random((3, (width - 1) * per_bin))
-    found = tables(np.zeros(3, np.int32), fine, per_bin)
-    padded = found.rows.reshape(3 * per_bin + 1, -1)
-    assert not padded[:, : legs.WINDOW].any()
-    assert not padded[-1].any()
-    table = padded[:-1, legs.WINDOW :].reshape(3, per_bin, width)
-    for shift in range(per_bin):
-        later = np.roll(fine, shift, axis=1).reshape(3, width, per_bin).sum(-1)
-        np.testing.assert_allclose(table[:, shift], later, rtol=1e-5, atol=1e-6)
-    for start in range(width + 1):
-        rest = table[:, :, start:].max((1, 2), initial=0)
-        np.testing.assert_array_equal(found.rest[:, start], rest)
 
 
 @pytest.mark.parametrize("bound", [backend_numba.ROUNDED, np.float32(np.inf)])
@@ -235,21 +205,3 @@ def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
     found, whole = echoes(job), strongest(histograms(job), job.bin_m)
     for name in ("peak", "runner_up", "path_m"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
-
-
-def test_rows_are_added_in_order_with_their_weights() -> None:
-    generator = np.random.default_rng(0)
-    table, weight = generator.random(400, np.float32), generator.random(12, np.float32)
-    base, offset = np.array([0, 50, 200]), generator.integers(0, 100, 12).astype(np.int32)
-
-    @numba.njit
-    def add(sums: Any) -> None:
-        legs.add_rows(sums, 8, table, base, offset, weight, 1, 4, 3)
-
-    sums = np.zeros(48, np.float32)
-    add(sums)
-    expected = np.zeros(48)
-    for j in range(3):
-        start = base[j] + offset[1 + 4 * j]
-        expected[8 : 8 + legs.WINDOW] += weight[1 + 4 * j] * table[start : start + legs.WINDOW].astype(float)
-    np.testing.assert_allclose(sums, expected, rtol=1e-6)

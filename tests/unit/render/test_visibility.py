@@ -1,5 +1,3 @@
-"""Visibility: self-occlusion, line of sight from the lidar, and form factors of inter-reflection."""
-
 from typing import Any
 
 import numba
@@ -127,22 +125,18 @@ UNIT_BOX = ObjectBox(x_min_m=0, x_max_m=1, y_min_m=0, y_max_m=1, z_near_m=0.1, z
 
 
 def _hit(depth: np.ndarray, start: list[float], towards: list[float]) -> tuple[float, float, int, int]:
-    ray = np.array(towards) - start
+    ray, field = np.array(towards) - start, height_field(depth, UNIT_BOX, shades=True)
     length = float(np.linalg.norm(ray))
     slope = np.zeros((2, *depth.shape))
-    found = first_hits(
-        height_field(depth, UNIT_BOX, shades=True), slope, np.array(start), ray[None] / length, np.array([length])
-    )
+    found = first_hits(field, slope, np.array(start), ray[None] / length, np.array([length]))
     return float(found[0][0]) / length, float(found[1][0]), int(found[2][0]), int(found[3][0])
 
 
 def test_first_hits_meet_a_column_by_its_front_or_side() -> None:
     depth = np.full((4, 4), np.nan)
     depth[1, 2] = 0.5  # x in 0.5 to 0.75, y in 0.5 to 0.75
-    share, cosine, row, column = _hit(depth, [0.6, 0.6, 0.0], [0.6, 0.6, 1.0])
-    assert (share, cosine, row, column) == pytest.approx((0.5, 1.0, 1, 2))
-    share, cosine, row, column = _hit(depth, [0.0, 0.6, 0.8], [1.0, 0.6, 0.8])
-    assert (share, cosine, row, column) == pytest.approx((0.5, 1.0, 1, 2))
+    assert _hit(depth, [0.6, 0.6, 0.0], [0.6, 0.6, 1.0]) == pytest.approx((0.5, 1.0, 1, 2))
+    assert _hit(depth, [0.0, 0.6, 0.8], [1.0, 0.6, 0.8]) == pytest.approx((0.5, 1.0, 1, 2))
     assert _hit(depth, [0.0, 0.6, 0.3], [1.0, 0.6, 0.3])[0] == np.inf  # between the object and the wall
     assert _hit(depth, [0.0, 0.2, 0.8], [1.0, 0.2, 0.8])[0] == np.inf  # past it
     assert _hit(depth, [0.0, 0.6, 0.8], [0.4, 0.6, 0.8])[0] == np.inf  # not so far

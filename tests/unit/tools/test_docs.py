@@ -90,39 +90,27 @@ def test_the_gate_and_make_run_it(tool: Tool) -> None:
     assert "tools/docs/build_site.py" in (ROOT / "Makefile").read_text(encoding="utf-8")
 
 
-@pytest.fixture
-def commands(tool: Tool) -> ModuleType:
-    return tool("pages")
-
-
-@pytest.mark.slow
-def test_every_command_and_option_of_the_program_is_on_the_page(commands: ModuleType) -> None:
-    text = (commands.DOCS / "commands.md").read_text(encoding="utf-8")
-    assert text == commands.commands_page(), "run `python tools/docs/pages.py commands`"
-
-
-def test_every_command_is_in_the_table_of_what_they_answer(commands: ModuleType) -> None:
-    text = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
-    app = typer.main.get_command(commands.build_app())
-    names = [name.removeprefix("nlos-cam ") for name, _ in commands.commands(app)]
+def test_every_command_is_in_the_table_of_what_they_answer(tool: Tool) -> None:
+    pages, text = tool("pages"), (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
+    names = [name.removeprefix("nlos-cam ") for name, _ in pages.commands(typer.main.get_command(pages.build_app()))]
     assert len(names) > 15
     assert [name for name in names if f"| `{name}" not in text] == []
 
 
-@pytest.mark.parametrize("name", ["comparison", "gallery"])
-def test_page_has_the_measured_figures(commands: ModuleType, name: str) -> None:
-    page = (commands.DOCS / f"{name}.md").read_text(encoding="utf-8")
-    assert commands.PAGES[name]() == page, "run `python tools/docs/pages.py`"
+@pytest.mark.parametrize("name", [pytest.param("commands", marks=pytest.mark.slow), "comparison", "gallery"])
+def test_page_has_every_command_and_the_measured_figures(tool: Tool, name: str) -> None:
+    page = (tool("pages").DOCS / f"{name}.md").read_text(encoding="utf-8")
+    assert tool("pages").PAGES[name]() == page, f"run `python tools/docs/pages.py {name}`"
 
 
 @pytest.mark.slow
 def test_stale_page_fails_the_check_until_written(
-    commands: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(commands, "DOCS", tmp_path)
+    monkeypatch.setattr(tool("pages"), "DOCS", tmp_path)
     for arguments, code in ((["--check"], 1), ([], 0), (["--check"], 0)):
         monkeypatch.setattr("sys.argv", ["pages.py", "commands", *arguments])
-        assert commands.main() == code
+        assert tool("pages").main() == code
     assert "out of date" in capsys.readouterr().out
 
 
@@ -141,15 +129,9 @@ def test_things_unlike_training_lie_in_the_box_and_are_drawn(tool: Tool, tmp_pat
 SHORTER = {"--seconds": "0.5", "--count": "2", "--every": "5"}
 
 
-def shortened(words: list[str]) -> list[str]:
-    """The same command for less long, and without a browser."""
-    said = [SHORTER.get(before, word) for before, word in zip(["", *words], words, strict=False)]
-    return [*said, *(["--no-view"] if words[1] == "live" else [])]
-
-
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], int]:
-    """Run one command in an empty folder with the examples, in this process."""
+    """Run one command in an empty folder with the examples, in this process, for less long and without a browser."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     airplane = paper_scene().model_copy(update={"motion": Motion(poses=1)})  # is rendered once, not ninety times
@@ -157,7 +139,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]]
 
     def call(words: list[str]) -> int:
         if words[0] == "nlos-cam":
-            return main(shortened(words)[1:])
+            said = [SHORTER.get(before, word) for before, word in pairwise(words)]
+            return main([*said, *(["--no-view"] if words[1] == "live" else [])])
         monkeypatch.setattr(sys, "argv", words[1:])
         runpy.run_path(words[1], run_name="__main__")
         return 0

@@ -84,11 +84,9 @@ def dataset(folder: Path, harm: str = "") -> Path:
     folder.mkdir()
     samples = samples_of(range(3))
     if harm == "category":
-        samples = {**samples, harm: samples[harm][::-1]}
+        samples[harm] = samples[harm][::-1]
     elif harm:
-        values = samples[harm].copy()
-        values.reshape(-1).view(np.uint8)[-1] ^= 1
-        samples = {**samples, harm: values}
+        samples[harm].reshape(-1).view(np.uint8)[-1] ^= 1
     store(shard_path(folder, 0), samples, DatasetPlan(load_rig("paper-rig"), 0).provenance, "")
     return folder
 

@@ -19,7 +19,7 @@ from nlos_cam.dataset import TEST_SEED, DatasetPlan, read_labelled
 from nlos_cam.evaluate import TARGETS, HeldOutObjects, seeded_objects
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.recording import load_sidecar
-from nlos_cam.render import MultiBounce, SceneFile, load_scene
+from nlos_cam.render import MultiBounce, load_scene
 
 RIG = load_rig("paper-rig")
 Tool = Callable[[str], ModuleType]
@@ -44,9 +44,9 @@ def harness(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> ModuleType:
 def run(tool: Tool, harness: ModuleType, monkeypatch: Patch) -> Read:
     """Run a study's main with arguments, and return its JSON."""
 
-    def call(name: str, result: str, *arguments: object) -> Any:
-        monkeypatch.setattr("sys.argv", [name, *map(str, arguments)])
-        tool(name).main()
+    def call(line: str, result: str, *arguments: object) -> Any:
+        monkeypatch.setattr("sys.argv", [*line.split(), *map(str, arguments)])
+        tool(line.split(maxsplit=1)[0]).main()
         return json.loads((harness.DOCS / f"{result}.json").read_text(encoding="utf-8"))
 
     return call
@@ -60,19 +60,17 @@ def test_interrupted_collection_resumes_with_the_same_records(harness: ModuleTyp
     measured: list[int] = []
 
     def measure(one: Size, generator: np.random.Generator) -> dict[str, float]:
-        if len(measured) == 3:
-            measured.append(-1)
-            raise KeyboardInterrupt
         measured.append(one.size)
+        if len(measured) == 4:
+            raise KeyboardInterrupt
         return {"drawn": generator.uniform()}
 
     grid = [Size(1), Size(2)]
     with pytest.raises(KeyboardInterrupt):
         harness.collect("sizes", grid, measure, 2)
     resumed = harness.collect("sizes", grid, measure, 2)
-    assert measured == [1, 1, 2, -1, 2]
+    assert measured == [1, 1, 2, 2, 2]
     assert [(one["size"], one["seed"]) for one in resumed] == [(1, 0), (1, 1), (2, 0), (2, 1)]
-    measured.clear()
     assert harness.collect("sizes", grid[:1], measure, 2) == resumed[:2]
     assert harness.fingerprint(grid, 2) != harness.fingerprint(grid, 2, "other weights")
 
@@ -86,11 +84,7 @@ def test_interval_of_a_share_narrows_with_its_count(harness: ModuleType) -> None
 @pytest.mark.slow
 def test_renderer_bench_agrees_with_the_cpu(run: Read, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(FileNotFoundError):  # it writes no file
-        run(
-            "renderer",
-            "cuda",
-            *["cuda", "--backend", "torch", "--accuracy", "draft", "--objects", "1", "--batch", "1", "--repeats", "1"],
-        )
+        run("renderer cuda --backend torch --accuracy draft --objects 1 --batch 1 --repeats 1", "cuda")
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["difference_from_cpu"] < 1e-3
 
 
@@ -101,11 +95,6 @@ def weights(tmp_path: Path, monkeypatch: Patch) -> list[Path]:
     for seed, name in enumerate(("two", "one")):
         untrained_weights(tmp_path / name, rig=RIG, seed=seed, steps=name, objects=40 - 30 * seed)
     return [tmp_path / "two", tmp_path / "one"]
-
-
-def judged(*_: object) -> HeldOutObjects:
-    kinds = ["airplane", "table", "cup"]
-    return HeldOutObjects("some", kinds, kinds, small_maps(3, 0), DatasetPlan(RIG, TEST_SEED))
 
 
 @pytest.mark.slow
@@ -124,7 +113,7 @@ def test_rig_map_has_a_cell_for_every_place(tool: Tool, run: Read, weights: list
     monkeypatch.setattr(module, "benchmark_objects", lambda box: seeded_objects(0, 1, box))
     monkeypatch.setattr(module, "DISTANCES_M", (0.2,))
     monkeypatch.setattr(module, "ANGLES_DEG", (15.0, 45.0))
-    table = run("weights", "rig_map", "rigs", "--weights", f"plate={weights[0]}")
+    table = run("weights rigs --weights", "rig_map", f"plate={weights[0]}")
     assert [(cell["distance_m"], cell["yaw_deg"]) for cell in table["cells"]] == [(0.2, 15.0), (0.2, 45.0)]
     assert set(table["cells"][0]["weights"]["plate"]) >= set(TARGETS)
 
@@ -132,11 +121,13 @@ def test_rig_map_has_a_cell_for_every_place(tool: Tool, run: Read, weights: list
 def test_unseen_kinds_of_equal_weights_cost_nothing(
     tool: Tool, run: Read, weights: list[Path], monkeypatch: Patch
 ) -> None:
-    monkeypatch.setattr(tool("weights"), "dataset_objects", judged)
-    rows = run("weights", "unseen_kinds", "unseen", weights[0], f"again={weights[0]}")["rows"]
+    kinds = ["airplane", "table", "cup"]
+    judged = HeldOutObjects("some", kinds, kinds, small_maps(3, 0), DatasetPlan(RIG, TEST_SEED))
+    monkeypatch.setattr(tool("weights"), "dataset_objects", lambda *_: judged)
+    rows = run("weights unseen", "unseen_kinds", weights[0], f"again={weights[0]}")["rows"]
     assert {row["without_better_by"]["silhouette_iou"]["value"] for row in rows} == {0}
     with pytest.raises(SystemExit, match="no boat among the maps"):
-        run("weights", "unseen_kinds", "unseen", *weights, "--left-out", "boat")
+        run("weights unseen --left-out boat", "unseen_kinds", *weights)
 
 
 def test_transfer_curve_trains_on_nested_sets(tool: Tool, monkeypatch: Patch) -> None:
@@ -194,33 +185,20 @@ def test_word_check_counts_patterns_with_their_lines(tool: Tool, tmp_path: Path,
     assert found["rare"][1][0].startswith("a.py:2:")
 
 
-@pytest.fixture(scope="module")
-def scene() -> SceneFile:
-    """The example's bench with few pixels."""
-    whole = load_scene(Path(__file__).parents[3] / "examples" / "bench.toml")
-    small = whole.rig.intrinsics.model_copy(update=vars(whole.rig.pinhole.scaled(80, 64)))
-    return whole.model_copy(update={"rig": whole.rig.model_copy(update={"intrinsics": small})})
-
-
-@pytest.fixture
-def rendered(tool: Tool, monkeypatch: Patch) -> list[Any]:
-    """What was rendered; echoes are of nothing but a depth, which takes no time."""
-    scenes: list[Any] = []
+@pytest.mark.slow
+def test_a_recording_is_of_its_object_on_the_bench_and_labelled(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
+    whole, rendered = load_scene(Path(__file__).parents[3] / "examples" / "bench.toml"), list[Any]()
+    small = whole.rig.intrinsics.model_copy(update=vars(whole.rig.pinhole.scaled(80, 64)))  # few pixels
+    scene = whole.model_copy(update={"rig": whole.rig.model_copy(update={"intrinsics": small})})
 
     def render(scene: Any) -> Any:
-        scenes.append(scene)
+        """Echoes of nothing but a depth, which take no time."""
+        rendered.append(scene)
         peak = np.full((64, 80), 1e-4, np.float32)
         path_m = np.full((64, 80), 2 * np.nanmin(scene.object_depth_m), np.float32)
-        return type("Rendering", (), {"multi": MultiBounce(peak, peak / 4, path_m, direct_included=True)})
+        return SimpleNamespace(multi=MultiBounce(peak, peak / 4, path_m, direct_included=True))
 
     monkeypatch.setattr(tool("transfer"), "render", render)
-    return scenes
-
-
-@pytest.mark.slow
-def test_a_recording_is_of_its_object_on_the_bench_and_labelled(
-    tool: Tool, scene: SceneFile, rendered: list[Any], tmp_path: Path
-) -> None:
     things = benchmark_objects(object_box(RIG))
     paths = list(tool("transfer").record_all(scene, things[:2], tmp_path, 3, lambda *_: None))
     assert [path.name for path in paths] == ["airplane-1.bag", "airplane-2.bag"]
@@ -233,21 +211,13 @@ def test_a_recording_is_of_its_object_on_the_bench_and_labelled(
         np.testing.assert_array_equal(read.object_depth_m, np.stack([thing.depth_m] * 3))
 
 
-def test_every_command_and_subcommand_is_started(tool: Tool) -> None:
+def test_every_command_is_started_and_compared_with_the_bare_interpreter_and_numpy(tool: Tool) -> None:
     start = tool("start")
     names = [*start.programs()]
     assert {"--version", "doctor", "live --help", "train --help", "train compressor --help"} <= {*names}
     assert names[:2] == [start.BARE, start.NUMPY]
-
-
-def test_ratios_are_to_the_bare_interpreter_and_to_numpy(tool: Tool) -> None:
-    start = tool("start")
     times = {start.BARE: start.Times(0.02, 0.01), start.NUMPY: start.Times(0.1, 0.1), "live": start.Times(0.4, 0.3)}
     assert start.table(times).splitlines()[-1] == "| `live` | 0.40 | 0.30 | 20.0 | 4.0 |"
-
-
-def test_program_that_fails_is_reported(tool: Tool) -> None:
-    start = tool("start")
     assert start.timed(["-c", "print('x')"]).wall_s > 0
     with pytest.raises(RuntimeError, match="exit code 7"):
         start.timed(["-c", "raise SystemExit(7)"])
@@ -263,14 +233,9 @@ RECIPES = {
 }
 
 
-@pytest.fixture
-def gpu(tool: Tool) -> ModuleType:
-    return tool("gpu_run")
-
-
-def test_parts_are_small_and_join_to_the_same_files(gpu: ModuleType, tmp_path: Path, monkeypatch: Patch) -> None:
+def test_parts_are_small_and_join_to_the_same_files(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
+    gpu, folder = tool("gpu_run"), tmp_path / "weights"
     monkeypatch.setattr(gpu, "PART_BYTES", 1000)
-    folder = tmp_path / "weights"
     folder.mkdir()
     contents = {name: np.random.default_rng(k).bytes(1700) for k, name in enumerate(("a.safetensors", "b.json"))}
     for name, content in contents.items():
@@ -282,31 +247,30 @@ def test_parts_are_small_and_join_to_the_same_files(gpu: ModuleType, tmp_path: P
     assert {path.name: path.read_bytes() for path in (tmp_path / "joined").iterdir()} == contents
 
 
-def test_epochs_fit_the_time_by_the_fastest_epoch(gpu: ModuleType, tmp_path: Path) -> None:
-    (log := tmp_path / "log.csv").write_text("epoch,loss,seconds\n0,1,30.0\n1,1,10.0\n", encoding="utf-8")
+def test_epochs_fit_the_time_by_the_fastest_epoch_and_go_into_the_recipe(tool: Tool, tmp_path: Path) -> None:
+    gpu, log, recipe = tool("gpu_run"), tmp_path / "log.csv", tmp_path / "a.toml"
+    log.write_text("epoch,loss,seconds\n0,1,30.0\n1,1,10.0\n", encoding="utf-8")
     assert gpu.epochs_within(100, log) == 9
     log.write_text("epoch,loss,seconds\n", encoding="utf-8")
     with pytest.raises(SystemExit, match="more --minutes"):
         gpu.epochs_within(100, log)
-
-
-def test_recipe_gets_other_numbers(gpu: ModuleType, tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text("objects = 5\nepochs = 3\n", encoding="utf-8")
-    made = gpu.recipe_with(tmp_path / "a.toml", tmp_path / "b.toml", epochs=70)
+    recipe.write_text("objects = 5\nepochs = 3\n", encoding="utf-8")
+    made = gpu.recipe_with(recipe, tmp_path / "b.toml", epochs=70)
     assert made.read_text(encoding="utf-8") == "objects = 5\nepochs = 70\n"
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)  # processes start, render, train and evaluate one after the other
-def test_whole_run_in_the_small(gpu: ModuleType, tmp_path: Path, monkeypatch: Patch) -> None:
+def test_whole_run_in_the_small(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
+    gpu = tool("gpu_run")
     monkeypatch.setattr(gpu, "DIRECT_SHARE", 1e-9)  # two epochs
     monkeypatch.setattr(gpu, "TIMING_SHARE", 1.0)
     for name, text in RECIPES.items():
         (tmp_path / f"{name}.toml").write_text(text, encoding="utf-8")
-    arguments = ["--out", str(tmp_path / "out"), "--minutes", "20", "--workers", "1", "--accelerator", "cpu"]
-    small = ["--recipe", str(tmp_path / "small.toml"), "--held-out", "20", "--first-objects", "100"]
-    paper = ["--encoder", str(tmp_path / "encoder.toml"), "--compressor", str(tmp_path / "compressor.toml")]
-    gpu.train_and_judge(gpu.options().parse_args([*arguments, *small, *paper, "--compressor-epochs", "1"]))
+    recipes = [part for name in ("encoder", "compressor") for part in (f"--{name}", str(tmp_path / f"{name}.toml"))]
+    recipes += ["--recipe", str(tmp_path / "small.toml"), "--out", str(tmp_path / "out"), "--accelerator", "cpu"]
+    small = "--held-out 20 --first-objects 100 --compressor-epochs 1 --minutes 20 --workers 1"
+    gpu.train_and_judge(gpu.options().parse_args([*recipes, *small.split()]))
     facts = json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))
     assert facts["objects"] >= 100
     for name in ("direct", "compressor"):

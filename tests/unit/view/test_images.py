@@ -1,4 +1,3 @@
-import dataclasses
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,16 +26,10 @@ def flat(z_m: float) -> np.ndarray:
     return np.full((64, 64), z_m, np.float32)
 
 
-@pytest.mark.parametrize(
-    "rgb",
-    [
-        np.concatenate([images.hidden_rgb(flat(z_m), BOX)[:1, :1] for z_m in (np.nan, 0.4, 0.25, 0.13)], axis=1),
-        images.noise_rgb(np.array([[np.nan, 0.0, 1.0, 2.0]]), 2.0),
-    ],
-    ids=["hidden depth, nearer", "noise, larger"],
-)
-def test_picture_is_brighter_the_larger_its_value(rgb: np.ndarray) -> None:
-    assert (np.diff(rgb[0].sum(axis=-1).astype(int)) > 0).all()
+def test_hidden_depth_is_brighter_when_nearer_and_noise_when_larger() -> None:
+    nearer = np.concatenate([images.hidden_rgb(flat(z_m), BOX)[:1, :1] for z_m in (np.nan, 0.4, 0.25, 0.13)], axis=1)
+    for rgb in (nearer, images.noise_rgb(np.array([[np.nan, 0.0, 1.0, 2.0]]), 2.0)):
+        assert (np.diff(rgb[0].sum(axis=-1).astype(int)) > 0).all()
 
 
 def test_depth_pictures_show_missing_depth_as_background() -> None:
@@ -47,19 +40,16 @@ def test_depth_pictures_show_missing_depth_as_background() -> None:
     assert np.argwhere((images.lidar_rgb(depth_m, 0.1, 1.0) == images.BACKGROUND_RGB).all(axis=-1)).tolist() == [[5, 6]]
 
 
-def test_lidar_rgb_is_red_near_and_blue_far() -> None:
-    near, far = images.lidar_rgb(flat(0.1), 0.1, 1.0)[0, 0], images.lidar_rgb(flat(1.0), 0.1, 1.0)[0, 0]
-    assert near[0] > near[2]
-    assert far[2] > far[0]
-
-
 def test_infrared_grey_keeps_order_and_ends_of_counts() -> None:
     grey = images.infrared_grey(np.arange(256, dtype=np.uint8)[None])[0].astype(int)
     assert (grey[0], grey[255]) == (0, 255)
     assert (np.diff(grey) >= 0).all()
 
 
-def test_difference_rgb_is_red_nearer_grey_same_and_blue_farther() -> None:
+def test_near_is_red_and_far_is_blue_and_a_difference_of_none_is_grey() -> None:
+    near, far = images.lidar_rgb(np.array([[0.1, 1.0]], np.float32), 0.1, 1.0)[0]
+    assert near[0] > near[2]
+    assert far[2] > far[0]
     near, same, far, nothing = images.difference_rgb(np.array([-0.01, 0.0, 0.01, np.nan]), 0.01).astype(int)
     assert near[0] > 2 * near[2]
     assert far[2] > 2 * far[0]
@@ -140,7 +130,7 @@ UNSEEN = np.full((HEIGHT, WIDTH), np.nan, np.float32)
 
 
 def with_record(wall: MeasuredWall, **fields: Any) -> MeasuredWall:
-    return dataclasses.replace(wall, record=wall.record.model_copy(update=fields))
+    return replace(wall, record=wall.record.model_copy(update=fields))
 
 
 def test_wall_outline_is_closed_finite_and_on_the_wall() -> None:
@@ -171,13 +161,11 @@ def test_wall_pictures_need_a_reference_and_are_dark_without_returns() -> None:
 
 
 def test_saturated_pixel_survives_thinning() -> None:
-    wall, blank = exact_wall(), np.full((480, 641), 0.3, np.float32)
+    blank = np.full((480, 641), 0.3, np.float32)
     saturated = np.zeros_like(blank)
     saturated[301, 17] = 1.0
     fields = {"depth_m": blank, "depth_std_m": blank, "ir": blank, "saturated": saturated, "inliers": blank > 0}
-    large = wall.reference.intrinsics.scaled(641, 480)
-    reference = dataclasses.replace(wall.reference, **fields, intrinsics=large)
-    picture = wall_pictures(dataclasses.replace(wall, reference=reference))["wall_saturated"][1]
+    picture = wall_pictures(exact_wall(**fields, intrinsics=RIG.pinhole.scaled(641, 480)))["wall_saturated"][1]
     assert picture.shape == (240, 321, 3)
     assert np.argwhere((picture == images.SATURATED_RGB).all(axis=-1)).tolist() == [[150, 8]]
 
@@ -192,20 +180,15 @@ def test_calibration_facts_begin_with_the_verdict_and_note_a_missing_reference()
     assert "drift" not in calibration_facts(whole)[-1][1]
 
 
-def read(path: Path) -> list[np.ndarray]:
-    video, frames = cv2.VideoCapture(str(path)), []
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(layout.FRAMES_PER_S)
-    while (got := video.read())[0]:
-        frames.append(got[1][..., ::-1])
-    return frames
-
-
 def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "film.webm"
     with VideoFile(path, RIG) as film:
         for number in range(20):
             film.show(full_moment(number))
-    frames = read(path)
+    video, frames = cv2.VideoCapture(str(path)), list[np.ndarray]()
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(layout.FRAMES_PER_S)
+    while (got := video.read())[0]:
+        frames.append(got[1][..., ::-1])
     assert len(frames) == film.filmed == 10
     assert {frame.shape for frame in frames} == {(layout.HEIGHT, layout.WIDTH, 3)}
     expected = Still(RIG, full_moment(0)).rgb(full_moment(0)).astype(int)
@@ -224,7 +207,6 @@ def test_film_refuses_a_missing_codec(tmp_path: Path, monkeypatch: pytest.Monkey
         pass
 
 
-Picture = np.ndarray
 PANELS = {
     "banner": ((20, 20), (880, 96)),
     "reconstruction": (layout.LARGE_AT, (layout.LARGE, layout.LARGE)),
@@ -236,38 +218,29 @@ PANELS = {
 }
 
 
-def panel(picture: Picture, name: str) -> Picture:
+def panel(picture: np.ndarray, name: str) -> np.ndarray:
     (x, y), (width, height) = PANELS[name]
     return picture[y : y + height, x : x + width]
 
 
-def changed(before: Picture, after: Picture) -> set[str]:
+def changed(before: np.ndarray, after: np.ndarray) -> set[str]:
     return {name for name in PANELS if (panel(before, name) != panel(after, name)).any()}
 
 
-def test_still_shows_each_part_of_a_moment_in_its_panel() -> None:
+def test_still_shows_each_part_of_a_moment_in_its_panel_and_marks_a_doubted_reconstruction() -> None:
     one = full_moment(0)
-    still = Still(RIG, one)
+    frame, still = one.frame, Still(RIG, one)
     before = still.rgb(one)
     assert before.shape == (layout.HEIGHT, layout.WIDTH, 3)
-    frame = one.frame
-    for name, other in {
-        "truth": replace(one, frame=replace(frame, truth_depth_m=NOTHING)),
-        "infrared": replace(one, frame=replace(frame, ir=frame.ir + 90)),
-        "depth": replace(one, frame=replace(frame, depth_m=frame.depth_m * np.float32(0.5))),
-        "footer": replace(one, latency_s=0.5, published_s=0.5),
-        "uncertainty": replace(
-            one, reconstruction=replace(one.reconstruction, uncertainty_m=np.zeros((64, 64), np.float32))
-        ),
-    }.items():
-        assert changed(before, still.rgb(other)) == {name}
-
-
-@pytest.mark.parametrize("verdict", [verdict for verdict in Verdict if verdict is not Verdict.SEEN])
-def test_still_marks_a_doubted_reconstruction(verdict: Verdict) -> None:
-    one = full_moment(0)
-    still = Still(RIG, one)
-    assert changed(still.rgb(one), still.rgb(replace(one, verdict=verdict))) == {"banner", "reconstruction"}
+    for panels, others in (
+        ({"truth"}, {"frame": replace(frame, truth_depth_m=NOTHING)}),
+        ({"infrared"}, {"frame": replace(frame, ir=frame.ir + 90)}),
+        ({"depth"}, {"frame": replace(frame, depth_m=frame.depth_m * np.float32(0.5))}),
+        ({"footer"}, {"latency_s": 0.5, "published_s": 0.5}),
+        ({"uncertainty"}, {"reconstruction": replace(one.reconstruction, uncertainty_m=flat(0.0))}),
+        *(({"banner", "reconstruction"}, {"verdict": verdict}) for verdict in Verdict if verdict is not Verdict.SEEN),
+    ):
+        assert changed(before, still.rgb(replace(one, **others))) == panels
 
 
 def test_still_of_a_bare_moment_has_no_surface() -> None:

@@ -1,12 +1,13 @@
 import base64
 import json
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Any, Self
+from typing import Any
+from unittest.mock import MagicMock, Mock, call
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from nlos_cam.view import PlaybackViewer, RecordedView, WebViewer
 from nlos_cam.view.assessment import RGB, assess, expected_error_m, expected_overlap
 from nlos_cam.view.messages import ERROR_STEP_M, MomentPacker, bench_message, depth_bytes, pack, signed_bytes, unpack
 from nlos_cam.view.session_file import MAX_BYTES, SessionFile
-from nlos_cam.view.viewer import Moment, Viewers
+from nlos_cam.view.viewer import Viewers
 
 
 @pytest.fixture
@@ -80,51 +81,30 @@ def test_nothing_is_packed_without_browser(viewer: WebViewer, monkeypatch: pytes
     assert threading.active_count() <= 4
 
 
-class Starved:
-    """Browser that takes what it is sent only when allowed."""
-
-    def __init__(self) -> None:
-        self.asked, self.let, self.taken = Event(), Event(), []
-
-    def __call__(self, content: bytes) -> None:
-        if b"moment" in content:
-            self.asked.set()
-            if not self.let.wait(60.0):
-                raise TimeoutError
-        self.taken.append(content)
-
-
 def test_slow_browser_skips_to_the_newest_moment() -> None:
-    browser = Starved()
+    asked, let, taken = Event(), Event(), list[bytes]()
+
+    def slow_browser(content: bytes) -> None:
+        if b"moment" in content:
+            asked.set()
+            assert let.wait(60.0)
+        taken.append(content)
+
     with WebViewer(RIG) as viewer:
-        thread = threading.Thread(target=viewer._stream, args=(browser,))
+        thread = threading.Thread(target=viewer._stream, args=(slow_browser,))
         thread.start()
         viewer.show(full_moment(0))
-        assert browser.asked.wait(60.0)
+        assert asked.wait(60.0)
         for number in range(1, 500):
             viewer.show(moment(number))
         assert any(each.get("frame") == 499 for each in frames(viewer)), "another browser is not kept waiting"
-        browser.let.set()
+        let.set()
     thread.join(60.0)
-    assert sum(b"moment" in content for content in browser.taken) < 10
-
-
-class Scripted:
-    """Controls that record what they were asked."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[str, Mapping[str, Any]]] = []
-
-    def status(self) -> dict[str, Any]:
-        return {"state": "stalled", "camera": "sim"}
-
-    def run(self, command: str, arguments: Mapping[str, Any]) -> str:
-        self.asked.append((command, arguments))
-        return "done"
+    assert sum(b"moment" in content for content in taken) < 10
 
 
 def test_page_controls_with_the_token_of_the_address() -> None:
-    controls = Scripted()
+    controls = Mock(**{"status.return_value": {"state": "stalled", "camera": "sim"}, "run.return_value": "done"})
     with WebViewer(RIG, controls=controls) as viewer:
         address, _, token = (viewer.address or "").partition("#")
         assert next(each for each in frames(viewer) if each["kind"] == "status")["state"] == "stalled"
@@ -132,7 +112,7 @@ def test_page_controls_with_the_token_of_the_address() -> None:
             body = '{"command": "average", "frames": 4}'
             with closing(ask(address, "/command", method="POST", body=body, X_Token=sent)) as answer:
                 assert answer.status == status
-    assert controls.asked == [("average", {"frames": 4})]
+    assert controls.run.call_args_list == [call("average", {"frames": 4})]
 
 
 def test_page_is_whole_and_names_no_other_address(viewer: WebViewer) -> None:
@@ -212,39 +192,18 @@ def test_session_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch:
         session.show(moment(0))
 
 
-class Noting:
-    """Viewer that records its calls."""
-
-    def __init__(self, address: str | None = None, *, fails: bool = False) -> None:
-        self.address, self.fails = address, fails
-        self.noted: list[str] = []
-
-    def __enter__(self) -> Self:
-        if self.fails:
-            raise OSError("no room")
-        self.noted.append("entered")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.noted.append("left")
-
-    def show(self, shown: Moment) -> None:
-        self.noted.append(f"frame {shown.frame.frame_number}")
-
-
-def test_viewers_all_see_every_moment() -> None:
-    some = Noting(), Noting("http://one"), Noting("http://two")
+def test_viewers_all_see_every_moment_and_none_stays_open_if_one_cannot_begin() -> None:
+    some, shown = [MagicMock(address=address) for address in (None, "http://one", "http://two")], moment(7)
     with Viewers(some) as viewers:
-        viewers.show(moment(7))
+        viewers.show(shown)
         assert viewers.address == "http://one"
-    assert [each.noted for each in some] == [["entered", "frame 7", "left"]] * 3
-
-
-def test_viewers_leave_none_open_if_one_cannot_begin() -> None:
-    first = Noting()
-    with pytest.raises(OSError, match="no room"), Viewers([first, Noting(fails=True)]):
+    for each in some:
+        assert [name for name, *_ in each.mock_calls] == ["__enter__", "show", "__exit__"]
+        each.show.assert_called_once_with(shown)
+    some[2].__enter__.side_effect = OSError("no room")
+    with pytest.raises(OSError, match="no room"), Viewers(some[1:]):
         pass
-    assert first.noted == ["entered", "left"]
+    assert [name for name, *_ in some[1].mock_calls[3:]] == ["__enter__", "__exit__"]
 
 
 BOX = object_box(RIG)

@@ -1,5 +1,3 @@
-"""Effects of the sensor: a stage is included exactly when the model has it, and its bound holds."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -99,11 +97,8 @@ def test_stage_changes_the_images_only_if_the_model_has_it(name: str, monkeypatc
     ("name", "deviates"), [("shot noise", 1), ("read noise", 1), ("range noise", 1), ("dead pixels", 0), ("none", 0)]
 )
 def test_noise_left_out_is_not_drawn(name: str, deviates: int) -> None:
-    sensor, drawn, counted = (
-        Sensor(BARE, QUIET.model_copy(update=HAS.get(name, {}))),
-        *map(np.random.default_rng, (7, 7)),
-    )
-    sensor.expose(_flat(30.0), drawn)
+    drawn, counted = map(np.random.default_rng, (7, 7))
+    Sensor(BARE, QUIET.model_copy(update=HAS.get(name, {}))).expose(_flat(30.0), drawn)
     counted.standard_normal((deviates, WIDTH * HEIGHT), np.float32)
     assert drawn.bit_generator.state == counted.bit_generator.state
 
