@@ -1,7 +1,7 @@
 """Quality of one reconstruction, predicted from its image and uncertainty: overlap of the outline, and depth error.
 
 A small network in numpy on some fifty figures of the image, of the uncertainty network's answer and, where the
-reconstructing network tells one, of its own probability of a surface, fitted to reconstructions of known objects by
+reconstructing network has one, of its own probability of a surface, fitted to reconstructions of known objects by
 `train quality` (`doubt_training`).
 """
 
