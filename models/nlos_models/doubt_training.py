@@ -207,7 +207,7 @@ class QualitySet:
     """Figures and true quality of n reconstructions."""
 
     figures: Float32
-    """(n, FEATURES)."""
+    """(n, FEATURES or WITH_SURFACE)."""
     iou: Float32
     """(n,): silhouette IoU."""
     error_v: Float32

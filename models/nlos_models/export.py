@@ -55,7 +55,7 @@ class TorchReconstructor:
         dtype: torch.dtype = torch.float32,
     ) -> None:
         self.record, self.runtime = record, f"torch on {device}"
-        self._pipeline, self._device, self._dtype = pipeline.to(device).eval(), device, dtype
+        self._network, self._device, self._dtype = _Answering(pipeline.to(device).eval()), device, dtype
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
         return self.answer(depth_m, intensity).image
@@ -65,7 +65,7 @@ class TorchReconstructor:
         mixed = torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
         with torch.inference_mode(), mixed:
             maps = [torch.from_numpy(np.ascontiguousarray(m)).to(self._device) for m in (depth_m, intensity)]
-            return Answer(*(each.float().cpu().numpy() for each in _Answering(self._pipeline)(*maps)))
+            return Answer(*(each.float().cpu().numpy() for each in self._network(*maps)))
 
 
 class _Answering(nn.Module):

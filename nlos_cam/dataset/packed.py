@@ -81,13 +81,15 @@ class PackedMaps:
         """To be drawn at each step of training."""
         self._datasets, self._store, self.normal = list(datasets), store, CellNormal()
         self._index = _read_index(store)
-        if normal and not (store / CELLS).exists():
-            self.normal.load_state_dict(normal.state_dict())
-            self._write_cells()
         if not (store / CELLS).exists():
-            some = [read_arrays(shard, MAP_CHANNELS[:2]) for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
-            self.normal.learn(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*some, strict=True)))
-            self._write_cells()
+            if normal:
+                self.normal.load_state_dict(normal.state_dict())
+            else:
+                heads = [shard for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
+                some = [read_arrays(shard, MAP_CHANNELS[:2]) for shard in heads]
+                self.normal.learn(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*some, strict=True)))
+            with atomic_file(store / CELLS) as part, part.open("wb") as file:
+                np.savez(file, **{name: values.numpy() for name, values in self.normal.state_dict().items()})
         try:
             cells = read_npz(store / CELLS)
             self.normal.load_state_dict({name: torch.from_numpy(values) for name, values in cells.items()})
@@ -129,10 +131,6 @@ class PackedMaps:
             if number % 50 == 0 or number == len(new):
                 self._write_index()
             on_progress(number, len(new))
-
-    def _write_cells(self) -> None:
-        with atomic_file(self._store / CELLS) as part, part.open("wb") as file:
-            np.savez(file, **{name: values.numpy() for name, values in self.normal.state_dict().items()})
 
     def _write_index(self) -> None:
         with atomic_file(self._store / INDEX) as part:

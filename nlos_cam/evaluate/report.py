@@ -35,6 +35,7 @@ from nlos_cam.evaluate.recognition import PER_KIND, recognised
 from nlos_cam.evaluate.subjects import (
     HeldOutObjects,
     Tracked,
+    answer_all,
     bare_wall_for,
     baseline_answers,
     dataset_objects,
@@ -42,7 +43,6 @@ from nlos_cam.evaluate.subjects import (
     network_input,
     notes_about,
     predict_quality,
-    reconstruct_all,
     rendered_objects,
     rig_of,
     untracked,
@@ -158,12 +158,12 @@ def evaluate(
     bare = bare_wall_for(record, objects.plan, wall)
     guesses, searched = baseline_answers(objects, training, nearest=nearest, tracked=tracked)
     doubter = load_uncertainty_model(weights, cache_folder() / "onnx") if record.input == "raw maps" else None
-    image = reconstruct_all(reconstructor, network_input(objects.maps, bare))
-    predicted, unseen = predict_quality(reconstructor, objects.maps, doubter, objects.plan.rig), None
+    answers = answer_all(reconstructor, network_input(objects.maps, bare))
+    predicted, unseen = predict_quality(answers, objects.maps, doubter, objects.plan.rig), None
     if second:
-        answers = reconstruct_all(reconstructor, network_input(second.maps, bare))
-        sure = predict_quality(reconstructor, second.maps, doubter, second.plan.rig)
-        unseen = Unseen(second.names, second.maps.image.astype(np.float32), answers, sure)
+        others = answer_all(reconstructor, network_input(second.maps, bare))
+        sure = predict_quality(others, second.maps, doubter, second.plan.rig)
+        unseen = Unseen(second.names, second.maps.image.astype(np.float32), others.image, sure)
     facts = {
         "what": objects.description,
         "weights": str(weights or SHIPPED),
@@ -175,7 +175,9 @@ def evaluate(
     }
     truth, left_out = objects.maps.image.astype(np.float32), left_out_categories(record)
     box = objects.plan.box
-    return Evaluation(objects.names, objects.categories, truth, image, guesses, box, facts, left_out, unseen, predicted)
+    return Evaluation(
+        objects.names, objects.categories, truth, answers.image, guesses, box, facts, left_out, unseen, predicted
+    )
 
 
 def as_figures(evaluation: Evaluation) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from nlos_calibration import ObjectBox, Rig, rig_named
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import RecordFileError
-from nlos_models import CheckpointRecord, MapSet, Reconstructor, UncertaintyModel, subtract_bare_wall
+from nlos_models import Answer, CheckpointRecord, MapSet, Reconstructor, UncertaintyModel, ask, subtract_bare_wall
 
 from nlos_cam.camera import World
 from nlos_cam.dataset import (
@@ -33,11 +33,13 @@ from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
 from nlos_cam.objects import (
     BenchmarkObject,
     benchmark_objects,
+    depth_from_image,
     image_from_depth,
+    object_box,
     object_depth,
     unseen_objects,
 )
-from nlos_cam.reconstruct import FrameConditions, Verdict, VerdictFilter, reconstruct, verdict_limits
+from nlos_cam.reconstruct import FrameConditions, Reconstruction, Verdict, VerdictFilter, estimate_doubt, verdict_limits
 from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
 
 OnProgress = Callable[[int, int], None]
@@ -116,25 +118,34 @@ def as_map_set(maps: Sequence[LidarMaps], truth: Float32) -> MapSet:
 
 def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:
     """Reconstruct images v (n, 64, 64), one object at a time as `live` does."""
+    return answer_all(reconstructor, maps).image
+
+
+def answer_all(reconstructor: Reconstructor, maps: MapSet) -> Answer:
+    """Return images and, where the network has one, the probability of a surface, one object at a time."""
     pairs = zip(maps.depth_m, maps.intensity, strict=True)
-    return np.concatenate([reconstructor(depth[None], intensity[None]) for depth, intensity in pairs])
+    answers = [ask(reconstructor, depth_m[None], intensity[None]) for depth_m, intensity in pairs]
+    surfaces = [answer.surface for answer in answers if answer.surface is not None]
+    return Answer(np.concatenate([answer.image for answer in answers]), np.concatenate(surfaces) if surfaces else None)
 
 
 def predict_quality(
-    reconstructor: Reconstructor, maps: MapSet, uncertainty_model: UncertaintyModel | None, rig: Rig
+    answers: Answer, maps: MapSet, uncertainty_model: UncertaintyModel | None, rig: Rig
 ) -> Predictions | None:
-    """Return the predicted quality of what raw maps are reconstructed to; None without a quality model.
+    """Return the predicted quality of a network's answers to raw maps; None without a quality model.
 
     A frame is trusted as on the page: a detected object, on a verdict from this frame alone, of a trusted quality.
     """
     if uncertainty_model is None or uncertainty_model.quality is None:
         return None
-    rows = list[tuple[float, ...]]()
-    for depth_m, intensity in zip(maps.depth_m, maps.intensity, strict=True):
+    rows, box = list[tuple[float, ...]](), object_box(rig)
+    surfaces = [None] * len(answers.image) if answers.surface is None else answers.surface
+    for depth_m, intensity, image, surface in zip(maps.depth_m, maps.intensity, answers.image, surfaces, strict=True):
         frame = LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
-        found = reconstruct(frame, rig, reconstructor, uncertainty_model=uncertainty_model)
+        doubt = estimate_doubt(uncertainty_model, frame, image, box, surface)
+        found = Reconstruction(depth_from_image(image, box), np.eye(4), doubt.error_m, {}, doubt)
         _, verdict = VerdictFilter(verdict_limits(uncertainty_model)).decide(found, FrameConditions())
-        if found.doubt and (quality := found.doubt.quality):
+        if quality := doubt.quality:
             trusted = quality.trusted and verdict is Verdict.SEEN
             rows.append((*quality.iou, 1e3 * quality.error_m, trusted))
         else:  # no surface: no overlap

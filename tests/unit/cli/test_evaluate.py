@@ -136,7 +136,7 @@ def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
     monkeypatch.setattr(subjects, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank))
     monkeypatch.setattr(subjects, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank))
     result, raw = run(*JUDGE, *STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
-    np.testing.assert_allclose(np.concatenate(network.seen[:3]), raw.depth_m - wall_m, atol=1e-6)
+    np.testing.assert_allclose(np.concatenate(network.seen), raw.depth_m - wall_m, atol=1e-6)
     assert result["input"] == maps
     assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1
 

@@ -73,7 +73,7 @@ def test_sense_repeats_matches_simulated_camera_and_averages_noise_down_with_fra
 
 def test_reconstruct_all_takes_one_object_at_a_time(echoes: list[MultiBounce]) -> None:
     maps = as_map_set(sense(echoes, RIG), np.zeros((2, 64, 64), np.float32))
-    network = Mock(side_effect=lambda depth_m, _: np.nan_to_num(depth_m[:, :, 8:72]))
+    network = Mock(spec=reconstruct_all, side_effect=lambda depth_m, _: np.nan_to_num(depth_m[:, :, 8:72]))
     np.testing.assert_array_equal(reconstruct_all(network, maps), np.nan_to_num(maps.depth_m[:, :, 8:72]))
     assert [part.shape for call in network.call_args_list for part in call.args] == [(1, 64, 80)] * 4
 
